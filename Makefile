@@ -1,0 +1,72 @@
+# One command for everything. `make` alone lists the targets.
+
+SHELL := /bin/bash
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.PHONY: help demo test check bench docs clean
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+INSTALLED := $(VENV)/.installed
+
+# The measured data sets are optional: tests that need them skip without them.
+ifeq ($(MWDCAL_DATA),)
+ifneq ($(wildcard ../shared/data/.),)
+export MWDCAL_DATA := $(abspath ../shared/data)
+endif
+endif
+
+# One BLAS thread: repeatable last digits, and no contention between test workers.
+ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1
+
+# First words of every recipe: stop at the first error, say the seconds at the end.
+CLOCK = set -e; start=$$(date +%s); \
+	trap 'code=$$?; echo "make $@: $$(($$(date +%s) - start)) s"; exit $$code' EXIT
+
+help: ## list the targets
+	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /  make \1\t/' | expand -t 16
+	@echo "Another interpreter: make PYTHON=python3.12 test"
+
+demo: $(INSTALLED) ## calibrate the example tool, verify it, write its report
+	@$(CLOCK); mkdir -p build/demo; \
+	$(BIN)/mwdcal calibrate examples/servo/run.csv --tool examples/servo/tool.toml \
+		-o build/demo/tool.json --report build/demo/tool.html; \
+	$(BIN)/mwdcal verify build/demo/tool.json examples/servo/rolltest.csv; \
+	echo "report: build/demo/tool.html"
+
+test: $(INSTALLED) ## run the tests on all cores
+	@$(CLOCK); $(ONE_THREAD) $(BIN)/python -m pytest -q -n auto
+
+check: $(INSTALLED) ## lint, format, types, architecture, doctests, docs
+	@$(CLOCK); \
+	echo "ruff check"; $(BIN)/ruff check .; \
+	echo "ruff format"; $(BIN)/ruff format --check .; \
+	echo "mypy"; $(BIN)/mypy; \
+	echo "architecture"; $(BIN)/python -m pytest -q tests/test_architecture.py; \
+	echo "doctests"; $(ONE_THREAD) $(BIN)/python -m pytest -q --doctest-modules src \
+		|| [ $$? -eq 5 ]; \
+	echo "docs"; $(BIN)/sphinx-build -q -W --keep-going -b html docs build/docs
+
+bench: $(INSTALLED) ## time the commands against a bare import of SciPy
+	@$(CLOCK); $(ONE_THREAD) $(BIN)/python benchmarks/bench.py
+
+docs: $(INSTALLED) ## build the documentation into build/docs
+	@$(CLOCK); $(BIN)/sphinx-build -q -W --keep-going -b html docs build/docs; \
+	echo "documentation: build/docs/index.html"
+
+clean: ## remove everything that can be made again
+	@$(CLOCK); rm -rf build dist $(VENV) .mypy_cache .pytest_cache .ruff_cache .hypothesis; \
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+$(INSTALLED): pyproject.toml constraints.txt
+	@start=$$(date +%s); \
+	command -v $(PYTHON) >/dev/null 2>&1 || { \
+		echo "mwdcal needs Python 3.11 or newer; '$(PYTHON)' was not found. Name one: make PYTHON=/path/to/python3" >&2; exit 1; }; \
+	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
+		found=$$($(PYTHON) -c 'import sys; print(sys.version.split()[0])'); \
+		echo "mwdcal needs Python 3.11 or newer; '$(PYTHON)' is $$found. Name another: make PYTHON=/path/to/python3" >&2; exit 1; }; \
+	set -e; echo "installing into $(VENV)"; \
+	$(PYTHON) -m venv $(VENV); \
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[all,dev]'; \
+	touch $@; echo "installed: $$(($$(date +%s) - start)) s"

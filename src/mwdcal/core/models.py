@@ -1,0 +1,235 @@
+"""Sensor models: parameters and readings to field vectors, with Jacobian and slope.
+
+Two families, composed and never subclassed:
+
+polynomial   field = Σ_k φ_k(T) (A_k x + c_k)            linear in its 12 (n + 1) parameters
+factors      field = (I - m) (x / SF(T) - B(T))          Moosavi 1-8: 6 (n + 1) + 6 parameters
+
+Readings x are already in tool axes and nominal units (`files`), so an ideal triad has
+A = I, c = 0, SF = 1, B = 0, m = 0. Shapes: parameters (..., p), readings (..., n, 3),
+temperature (..., n); results (..., n, 3), Jacobian (..., n, 3, p), slope d field / d x
+(..., n, 3, 3).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from mwdcal.core.vectors import Array
+
+OFF_DIAGONAL = tuple((i, j) for i in range(3) for j in range(3) if i != j)
+
+
+@dataclass(frozen=True)
+class Basis:
+    """Polynomials of temperature up to `order`, in t = (T - middle) / half.
+
+    Chebyshev polynomials keep a fit well conditioned (raw powers of 50 °C to the cube do
+    not); plain powers with half = 1 are what files and firmware use.
+    """
+
+    order: int = 0
+    middle: float = 0.0
+    half: float = 1.0
+    chebyshev: bool = False
+
+    def __call__(self, temperature: Array) -> Array:
+        """Values φ_k (..., n, order + 1)."""
+        scaled = (np.asarray(temperature, float) - self.middle) / self.half
+        if self.chebyshev:
+            return np.asarray(np.polynomial.chebyshev.chebvander(scaled, self.order))
+        return np.asarray(np.polynomial.polynomial.polyvander(scaled, self.order))
+
+    def powers(self, reference: float) -> Array:
+        """Matrix (order + 1, order + 1): power coefficients of T - reference from ours."""
+        size = self.order + 1
+        if size == 1:
+            return np.eye(1)
+        shift, step = (reference - self.middle) / self.half, 1.0 / self.half
+        nodes = np.cos(np.pi * (np.arange(size) + 0.5) / size)
+        ours = self(self.middle + self.half * nodes)
+        theirs = np.polynomial.polynomial.polyvander((nodes - shift) / step, self.order)
+        return np.asarray(np.linalg.solve(theirs, ours))
+
+
+@dataclass(frozen=True)
+class Polynomial:
+    """The model linear in its parameters: order n has A_k (row by row), then c_k, for each k.
+
+    `centre` and `scale` (..., 1, 3) condition a fit with offsets of many times the field;
+    they are zero and one in a finished calibration.
+    """
+
+    basis: Basis
+    centre: Array = field(default_factory=lambda: np.zeros((1, 3)))
+    scale: Array = field(default_factory=lambda: np.ones((1, 3)))
+    kind = "polynomial"
+
+    @property
+    def size(self) -> int:
+        """Number of parameters."""
+        return 12 * (self.basis.order + 1)
+
+    def _terms(self, params: Array, temperature: Array) -> Array:
+        blocks = params.reshape(*params.shape[:-1], self.basis.order + 1, 12)
+        return np.einsum("...nk,...kp->...np", self.basis(temperature), blocks)
+
+    def fields(self, params: Array, raw: Array, temperature: Array) -> Array:
+        """Field vectors (..., n, 3)."""
+        terms = self._terms(params, temperature)
+        matrix = terms[..., :9].reshape(*terms.shape[:-1], 3, 3)
+        scaled = (raw - self.centre) / self.scale
+        return np.einsum("...ij,...j->...i", matrix, scaled) + terms[..., 9:]
+
+    def slope(self, params: Array, raw: Array, temperature: Array) -> Array:
+        """Derivative of the field with respect to the reading (..., n, 3, 3)."""
+        terms = self._terms(params, temperature)
+        matrix = terms[..., :9].reshape(*terms.shape[:-1], 3, 3)
+        return np.asarray(matrix / self.scale[..., None, :])
+
+    def jacobian(self, params: Array, raw: Array, temperature: Array) -> Array:
+        """Derivative of the field with respect to the parameters (..., n, 3, p): the basis."""
+        scaled = (raw - self.centre) / self.scale
+        rows = np.einsum("ij,...k->...ijk", np.eye(3), scaled)
+        rows = rows.reshape(*scaled.shape[:-1], 3, 9)
+        one = np.concatenate([rows, np.broadcast_to(np.eye(3), (*scaled.shape[:-1], 3, 3))], -1)
+        blocks = np.einsum("...nk,...nip->...nikp", self.basis(temperature), one)
+        return blocks.reshape(*one.shape[:-1], self.size)
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters: `gain-xy` is A[x, y], `offset-x` is c[x]; `·k` for T^k."""
+        one = [f"gain-{i}{j}" for i in "xyz" for j in "xyz"] + [f"offset-{i}" for i in "xyz"]
+        return tuple(_with_order(name, k) for k in range(self.basis.order + 1) for name in one)
+
+    def start(self, matrix: Array, offset: Array) -> Array:
+        """Parameters (..., p) of field = matrix · raw + offset."""
+        offset = offset + np.einsum("...ij,...j->...i", matrix, self.centre[..., 0, :])
+        matrix = matrix * self.scale
+        first = np.concatenate([matrix.reshape(*matrix.shape[:-2], 9), offset], -1)
+        later = np.zeros((*first.shape[:-1], self.size - 12))
+        return np.concatenate([first, later], -1)
+
+    def transformed(self, params: Array, turn: Array) -> Array:
+        """Parameters of the model whose fields are a matrix `turn` (..., 3, 3) times ours."""
+        blocks = params.reshape(*params.shape[:-1], self.basis.order + 1, 12)
+        shape = blocks.shape[:-1]
+        matrix = turn[..., None, :, :] @ blocks[..., :9].reshape(*shape, 3, 3)
+        offset = np.einsum("...ij,...kj->...ki", turn, blocks[..., 9:])
+        joined = np.concatenate([matrix.reshape(*shape, 9), offset], -1)
+        return joined.reshape(params.shape)
+
+    def finished(self, reference: float) -> tuple[Polynomial, Array]:
+        """The same model on plain readings and powers of T - reference, and the linear map to it.
+
+        The map (..., p, p) takes our parameters to the finished model's: use it on the
+        covariance as well.
+        """
+        basis = Basis(self.basis.order, reference)
+        centre, scale = np.broadcast_arrays(self.centre, self.scale)
+        one = np.zeros((*scale.shape[:-2], 12, 12))
+        for row in range(3):
+            for column in range(3):
+                where = 3 * row + column
+                one[..., where, where] = 1 / scale[..., 0, column]
+                one[..., 9 + row, where] = -centre[..., 0, column] / scale[..., 0, column]
+            one[..., 9 + row, 9 + row] = 1.0
+        mixed = np.einsum("ab,...ij->...aibj", self.basis.powers(reference), one)
+        return Polynomial(basis), mixed.reshape(*one.shape[:-2], self.size, self.size)
+
+
+@dataclass(frozen=True)
+class Factors:
+    """Moosavi's factors: SF_i,k, then B_i,k (k fastest), then the six m_ij row by row."""
+
+    basis: Basis
+    kind = "factors"
+
+    @property
+    def size(self) -> int:
+        """Number of parameters: 12 at order 0, 30 at order 3."""
+        return 6 * (self.basis.order + 1) + 6
+
+    def _split(self, params: Array, temperature: Array) -> tuple[Array, Array, Array]:
+        count = self.basis.order + 1
+        values = self.basis(temperature)
+        both = params[..., : 6 * count].reshape(*params.shape[:-1], 2, 3, count)
+        both = np.einsum("...nk,...sik->...sni", values, both)
+        return both[..., 0, :, :], both[..., 1, :, :], self._mixing(params)
+
+    def _mixing(self, params: Array) -> Array:
+        mixing = np.broadcast_to(np.eye(3), (*params.shape[:-1], 3, 3)).copy()
+        for where, (i, j) in enumerate(OFF_DIAGONAL):
+            mixing[..., i, j] = -params[..., 6 * (self.basis.order + 1) + where]
+        return mixing
+
+    def fields(self, params: Array, raw: Array, temperature: Array) -> Array:
+        """Field vectors (..., n, 3)."""
+        scale, bias, mixing = self._split(params, temperature)
+        return np.einsum("...ij,...nj->...ni", mixing, raw / scale - bias)
+
+    def slope(self, params: Array, raw: Array, temperature: Array) -> Array:
+        """Derivative of the field with respect to the reading (..., n, 3, 3)."""
+        scale, _, mixing = self._split(params, temperature)
+        return np.asarray(mixing[..., None, :, :] / scale[..., None, :])
+
+    def jacobian(self, params: Array, raw: Array, temperature: Array) -> Array:
+        """Derivative of the field with respect to the parameters (..., n, 3, p)."""
+        scale, bias, mixing = self._split(params, temperature)
+        values, column = self.basis(temperature), mixing[..., None, :, :]
+        by_scale = -(raw / scale**2)[..., None, :, None] * column[..., None]
+        by_scale = by_scale * values[..., None, None, :]
+        by_bias = -column[..., None] * values[..., None, None, :]
+        flat = (*by_scale.shape[:-2], by_scale.shape[-2] * by_scale.shape[-1])
+        by_bias = np.broadcast_to(by_bias, by_scale.shape)
+        unit = raw / scale - bias
+        by_mixing = np.zeros((*unit.shape, 6))
+        for where, (i, j) in enumerate(OFF_DIAGONAL):
+            by_mixing[..., i, where] = -unit[..., j]
+        return np.concatenate([by_scale.reshape(flat), by_bias.reshape(flat), by_mixing], -1)
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters: `scale-x`, `bias-x` (with `·k` for T^k), `misalignment-xy`."""
+        count = range(self.basis.order + 1)
+        linear = [_with_order(f"{w}-{i}", k) for w in ("scale", "bias") for i in "xyz" for k in count]
+        return (*linear, *(f"misalignment-{'xyz'[i]}{'xyz'[j]}" for i, j in OFF_DIAGONAL))
+
+    def start(self, matrix: Array, offset: Array) -> Array:
+        """Parameters (..., p) of field = matrix · raw + offset."""
+        scale = 1 / np.diagonal(matrix, axis1=-2, axis2=-1)
+        mixing = matrix * scale[..., None, :]
+        bias = -np.linalg.solve(mixing, offset[..., None])[..., 0]
+        count = self.basis.order + 1
+        linear = np.zeros((*offset.shape[:-1], 6, count))
+        linear[..., 0] = np.concatenate([scale, bias], -1)
+        off = np.stack([-mixing[..., i, j] for i, j in OFF_DIAGONAL], -1)
+        return np.concatenate([linear.reshape(*offset.shape[:-1], 6 * count), off], -1)
+
+    def transformed(self, params: Array, turn: Array) -> Array:
+        """Parameters of the model whose fields are a matrix `turn` (..., 3, 3) times ours."""
+        count = self.basis.order + 1
+        linear = params[..., : 6 * count].reshape(*params.shape[:-1], 2, 3, count)
+        mixing = turn @ self._mixing(params)
+        gain = np.diagonal(mixing, axis1=-2, axis2=-1)
+        linear = linear * np.stack([1 / gain, gain], -2)[..., None]
+        mixing = mixing / gain[..., None, :]
+        off = np.stack([-mixing[..., i, j] for i, j in OFF_DIAGONAL], -1)
+        return np.concatenate([linear.reshape(*params.shape[:-1], 6 * count), off], -1)
+
+    def finished(self, reference: float) -> tuple[Factors, Array]:
+        """The same model in powers of T - reference, and the linear map to it."""
+        count = self.basis.order + 1
+        whole = np.eye(self.size)
+        whole[: 6 * count, : 6 * count] = np.kron(np.eye(6), self.basis.powers(reference))
+        return Factors(Basis(self.basis.order, reference)), whole
+
+
+Model = Polynomial | Factors
+
+
+def _with_order(name: str, order: int) -> str:
+    return f"{name}·{order}" if order else name

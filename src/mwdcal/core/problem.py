@@ -1,0 +1,355 @@
+"""A calibration problem: sensor models, what the stations are known to be, one residual.
+
+Per station the raw readings are compared with what the model says the reference vectors
+would have read:
+
+    ρ = (slope⁻¹ (field(reading) - R e)) / σ
+
+R is the station's attitude, e the earth's vectors. Every reference angle is a private
+unknown with its own standard uncertainty: zero for an exact stand, π/√3 where the angle is
+not known. Directions shared by a group, and unknown or uncertain field strength, dip and
+gravity, are shared unknowns. Value, constant in a group, absent and exactly vertical
+stations are thereby one path. Residual and Jacobian are taken at the predicted reading,
+which makes this the estimator of errors in the readings for any evidence.
+
+Batch axis B first, station next, component last.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mwdcal.core.models import Model
+from mwdcal.core.solvers import Linear
+from mwdcal.core.vectors import Array, Bools, Ints, earth_field, earth_gravity, rotation, skew
+
+UNKNOWN = np.pi / np.sqrt(3)
+"""Standard uncertainty of an angle about which nothing is known, rad."""
+GEOMETRIC_NOISE = 1e-4
+"""Noise, as a share of the field, at which rank is counted whatever the actual noise."""
+
+
+@dataclass(frozen=True)
+class Triad:
+    """One sensor triad: model, readings (B, n, 3) and their noise (B, n, 3)."""
+
+    model: Model
+    raw: Array
+    sd: Array
+
+
+@dataclass(frozen=True)
+class Constant:
+    """A constant of the run that is estimated: gravity, field or dip, or an error of theirs.
+
+    `mask` (B, n) says which stations it acts on; `value` (B,) is where it starts. `sd` (B,)
+    is the standard uncertainty of the reference; for an unknown constant it is only a scale.
+    """
+
+    name: str
+    mask: Array
+    value: Array
+    sd: Array
+    unknown: bool
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What is known of the stations: arrays (B, n), radians, g, nT; NaN where unknown.
+
+    `sd` of the angles are independent per station. `group` shares a direction among
+    stations of the same number (-1: none). `include` is 1 for stations that count, 0 for
+    those left out.
+    """
+
+    known: dict[str, Array]
+    sd: dict[str, Array]
+    group: Ints
+    include: Array
+    constants: tuple[Constant, ...]
+
+    def is_known(self, name: str) -> Bools:
+        """Where a reference value is given (B, n)."""
+        return ~np.isnan(self.known[name])
+
+    @property
+    def members(self) -> Array:
+        """Membership (B, n, k) of the k groups, as zeros and ones."""
+        numbers = np.arange(int(self.group.max(initial=-1)) + 1)
+        return np.asarray(self.group[..., None] == numbers, float)
+
+    def shared(self, name: str) -> Array:
+        """Membership (B, n, k) of the groups for which an angle is a shared unknown."""
+        members = self.members
+        given = np.einsum("bnk,bn->bk", members, self.is_known(name))
+        return np.asarray(members * (given == 0)[:, None, :])
+
+
+@dataclass(frozen=True)
+class State:
+    """Where a fit stands: parameters (B, p), attitudes (B, n, 3, 3), constants (B, q)."""
+
+    params: Array
+    attitude: Array
+    constants: Array
+
+    def take(self, index: Ints) -> State:
+        """Some members of the batch."""
+        return State(self.params[index], self.attitude[index], self.constants[index])
+
+    def put(self, index: Ints, other: State) -> State:
+        """Ours with some members replaced."""
+        changed = State(self.params.copy(), self.attitude.copy(), self.constants.copy())
+        changed.params[index] = other.params
+        changed.attitude[index] = other.attitude
+        changed.constants[index] = other.constants
+        return changed
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """One triad at a state: misfit of the reading, its derivatives, and the size of the field.
+
+    `misfit` (B, n, 3) raw; `by_params` (B, n, 3, p); `by_turn` (B, n, 3, 3) for a turn of the
+    station; `by_constant` (B, n, 3, q); `strength` (B, n) of the field in raw units.
+    """
+
+    misfit: Array
+    by_params: Array
+    by_turn: Array
+    by_constant: Array
+    strength: Array
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Models, readings and evidence of a batch of runs."""
+
+    triads: tuple[Triad, ...]
+    temperature: Array
+    evidence: Evidence
+
+    def take(self, index: Ints) -> Problem:
+        """The problem of some members of the batch."""
+        evidence = self.evidence
+        constants = tuple(
+            replace(c, mask=c.mask[index], value=c.value[index], sd=c.sd[index])
+            for c in evidence.constants
+        )
+        chosen = replace(
+            evidence,
+            known={k: v[index] for k, v in evidence.known.items()},
+            sd={k: v[index] for k, v in evidence.sd.items()},
+            group=evidence.group[index],
+            include=evidence.include[index],
+            constants=constants,
+        )
+        triads = tuple(
+            Triad(_model_of(t.model, index), t.raw[index], t.sd[index]) for t in self.triads
+        )
+        return Problem(triads, self.temperature[index], chosen)
+
+    def slices(self) -> list[slice]:
+        """Where each triad's parameters lie."""
+        ends = np.cumsum([0] + [t.model.size for t in self.triads])
+        return [slice(int(a), int(b)) for a, b in zip(ends[:-1], ends[1:], strict=True)]
+
+    def constant(self, state: State, name: str) -> Array:
+        """Value (B, n) of gravity, field or dip at each station."""
+        value = np.nan_to_num(self.evidence.known[name])
+        for index, constant in enumerate(self.evidence.constants):
+            if constant.name == name:
+                value = value + constant.mask * state.constants[:, index, None]
+        return np.asarray(value)
+
+    def earth(self, state: State) -> tuple[list[Array], list[Array]]:
+        """Earth vectors (B, n, 3) of each triad, and their derivatives (B, n, 3, q)."""
+        gravity, field, dip = (self.constant(state, c) for c in ("gravity", "field", "dip"))
+        vectors = [earth_gravity(gravity), earth_field(field, dip)]
+        slopes = {
+            "gravity": [earth_gravity(np.ones_like(gravity)), np.zeros_like(vectors[1])],
+            "field": [np.zeros_like(vectors[0]), earth_field(np.ones_like(field), dip)],
+            "dip": [np.zeros_like(vectors[0]), earth_field(field, dip + np.pi / 2)],
+        }
+        columns = [[slopes[c.name][t] * c.mask[..., None] for c in self.evidence.constants] for t in (0, 1)]
+        empty = np.zeros((*gravity.shape, 3, 0))
+        return vectors, [np.stack(c, -1) if c else empty for c in columns]
+
+    def predictions(self, state: State) -> list[Prediction]:
+        """Compare each triad's readings with the reference vectors."""
+        vectors, slopes = self.earth(state)
+        result = []
+        for triad, where, earth, change in zip(self.triads, self.slices(), vectors, slopes, strict=False):
+            params = state.params[:, where]
+            target = np.einsum("bnij,bnj->bni", state.attitude, earth)
+            field = triad.model.fields(params, triad.raw, self.temperature)
+            inverse = np.linalg.inv(triad.model.slope(params, triad.raw, self.temperature))
+            misfit = np.einsum("bnij,bnj->bni", inverse, field - target)
+            by_params = triad.model.jacobian(params, triad.raw - misfit, self.temperature)
+            result.append(
+                Prediction(
+                    misfit,
+                    inverse @ by_params,
+                    inverse @ skew(target),
+                    -inverse @ state.attitude @ change,
+                    np.linalg.norm(np.einsum("bnij,bnj->bni", inverse, target), axis=-1),
+                )
+            )
+        return result
+
+    def linear(self, state: State, geometry: bool = False) -> Linear:
+        """Linearise at a state; `geometry` takes references as exact and noise as uniform."""
+        predictions = self.predictions(state)
+        weights = self._weights(predictions, geometry)
+        residual = np.concatenate([p.misfit * w for p, w in zip(predictions, weights, strict=True)], -1)
+        turns = np.concatenate([p.by_turn * w[..., None] for p, w in zip(predictions, weights, strict=True)], -2)
+        constants = np.concatenate(
+            [p.by_constant * w[..., None] for p, w in zip(predictions, weights, strict=True)], -2
+        )
+        blocks = [p.by_params * w[..., None] for p, w in zip(predictions, weights, strict=True)]
+        unknown = np.array([c.unknown for c in self.evidence.constants], float)
+        if geometry:
+            constants = constants * unknown
+        groups = np.concatenate(self._group_turns(state, turns), -1)
+        design = np.concatenate([_side_by_side(blocks), constants, groups], -1)
+        own = turns @ self._own_turns(state, geometry)
+        prior, pull = self._prior(state, groups.shape[-1])
+        return Linear(residual, design, own, prior, pull, design.shape[-1] - prior.shape[-1])
+
+    def _weights(self, predictions: list[Prediction], geometry: bool) -> list[Array]:
+        """One over the noise (B, n, 3), zero for stations left out."""
+        include = self.evidence.include[..., None]
+        if geometry:
+            return [
+                np.broadcast_to(include / (GEOMETRIC_NOISE * p.strength[..., None]), p.misfit.shape)
+                for p in predictions
+            ]
+        return [include / t.sd for t in self.triads]
+
+    def _prior(self, state: State, turns: int) -> tuple[Array, Array]:
+        """Precision and pull (B, s) of the shared unknowns."""
+        batch = len(state.params)
+        wide = np.full((batch, turns), UNKNOWN**-2)
+        constants = self.evidence.constants
+        empty = np.zeros((batch, 0))
+        precision = np.stack([c.sd**-2 for c in constants], -1) if constants else empty
+        pull = [
+            np.zeros(batch) if c.unknown else state.constants[:, i] - c.value
+            for i, c in enumerate(constants)
+        ]
+        pulls = np.stack(pull, -1) if constants else empty
+        return np.concatenate([precision, wide], -1), np.concatenate([pulls, np.zeros_like(wide)], -1)
+
+    def _free(self) -> Bools:
+        """Stations (B, n) of which neither direction nor toolface is known."""
+        loose = ~self.evidence.is_known("inclination") & ~self.evidence.is_known("azimuth")
+        return loose & ~self.evidence.is_known("toolface") & (self.evidence.group < 0)
+
+    def _own_sd(self, geometry: bool) -> list[Array]:
+        """Standard uncertainty (B, n) of each station's own inclination, azimuth, toolface."""
+        evidence = self.evidence
+        result = []
+        for name in ("inclination", "azimuth", "toolface"):
+            known, exact = evidence.is_known(name), np.zeros_like(evidence.sd[name])
+            grouped = np.zeros_like(known) if name == "toolface" else evidence.group >= 0
+            stated = exact if geometry else evidence.sd[name]
+            result.append(np.where(known, stated, np.where(grouped, 0.0, UNKNOWN)))
+        return result
+
+    def _own_turns(self, state: State, geometry: bool) -> Array:
+        """Axes (B, n, 3, 3), as columns, of the station's private turns times their σ."""
+        inclination, azimuth, toolface = self._own_sd(geometry)
+        across = np.einsum("bnij,bnj->bni", state.attitude, self._inclination_axis(state))
+        down = state.attitude[..., :, 2]
+        along = np.broadcast_to(np.array([0.0, 0.0, 1.0]), down.shape)
+        natural = np.stack(
+            [across * inclination[..., None], down * azimuth[..., None], along * toolface[..., None]], -1
+        )
+        return np.where(self._free()[..., None, None], UNKNOWN * np.eye(3), natural)
+
+    def _inclination_axis(self, state: State) -> Array:
+        """Earth axis (B, n, 3) about which a station inclines: horizontal, across its azimuth."""
+        axis = state.attitude[..., 2, :]
+        azimuth = np.arctan2(axis[..., 1], axis[..., 0])
+        known = self.evidence.known["azimuth"]
+        azimuth = np.where(np.isnan(known), azimuth, known)
+        return np.stack([np.sin(azimuth), -np.cos(azimuth), np.zeros_like(azimuth)], -1)
+
+    def _group_axes(self, state: State) -> tuple[Array, Array]:
+        """Two earth axes (B, k, 3) of each group's shared turns: inclining, and across or about down."""
+        members = self.evidence.members
+        count = np.maximum(members.sum(-2), 1.0)
+        axis = np.einsum("bnk,bni->bki", members, state.attitude[..., 2, :]) / count[..., None]
+        azimuth = np.arctan2(axis[..., 1], axis[..., 0])
+        first = np.stack([np.sin(azimuth), -np.cos(azimuth), np.zeros_like(azimuth)], -1)
+        tied = self.evidence.is_known("toolface") | self.evidence.is_known("inclination")
+        upright = np.einsum("bnk,bn->bk", members, tied) > 0
+        second = np.where(upright[..., None], np.array([0.0, 0.0, 1.0]), np.cross(axis, first))
+        return first, second
+
+    def _group_turns(self, state: State, turns: Array) -> list[Array]:
+        """Columns (B, n, m, k) of both shared turns of each group."""
+        columns = []
+        for name, axis in zip(("inclination", "azimuth"), self._group_axes(state), strict=True):
+            tool = np.einsum("bnij,bkj->bnik", state.attitude, axis)
+            columns.append(turns @ tool * self.evidence.shared(name)[..., None, :])
+        return columns
+
+    def move(self, state: State, linear: Linear, step: Array) -> State:
+        """The state after a step; unknown private angles follow, known ones stay at their reference."""
+        p, q = linear.size, len(self.evidence.constants)
+        private = linear.private(step)
+        attitude = self._turn_groups(state, step[:, p + q :])
+        attitude = self._turn_stations(state, attitude, private)
+        return State(state.params + step[:, :p], attitude, state.constants + step[:, p : p + q])
+
+    def _turn_groups(self, state: State, turns: Array) -> Array:
+        half = turns.shape[-1] // 2
+        first, second = self._group_axes(state)
+        attitude = state.attitude
+        for axis, name, turn in (
+            (second, "azimuth", turns[:, half:]),
+            (first, "inclination", turns[:, :half]),
+        ):
+            vector = np.einsum("bnk,bk,bki->bni", self.evidence.shared(name), turn, axis)
+            attitude = attitude @ rotation(vector)
+        return attitude
+
+    def _turn_stations(self, state: State, attitude: Array, private: Array) -> Array:
+        own = self._own_turns(state, geometry=True)
+        turn = own * private[..., None, :]
+        free = rotation(np.sum(turn, -1)) @ attitude
+        about_down = np.zeros_like(turn[..., 0])
+        about_down[..., 2] = np.einsum("bni,bni->bn", turn[..., 1], state.attitude[..., :, 2])
+        natural = rotation(turn[..., 2]) @ rotation(turn[..., 0]) @ attitude @ rotation(about_down)
+        return np.where(self._free()[..., None, None], free, natural)
+
+    def size_of(self, state: State) -> Array:
+        """Largest parameter of each triad (B, p): steps far below it are rounding."""
+        parts = [
+            np.broadcast_to(np.max(np.abs(state.params[:, w]), -1, keepdims=True), state.params[:, w].shape)
+            for w in self.slices()
+        ]
+        return np.concatenate(parts, -1)
+
+
+def _model_of(model: Model, index: Ints) -> Model:
+    """The model of some members of the batch."""
+    centre = getattr(model, "centre", None)
+    if centre is None:
+        return model
+    return replace(model, centre=centre[index], scale=model.scale[index])  # type: ignore[union-attr,call-arg]
+
+
+def _side_by_side(blocks: list[Array]) -> Array:
+    """Block-diagonal columns: each triad's rows depend on its own parameters only."""
+    width = sum(block.shape[-1] for block in blocks)
+    rows, start = [], 0
+    for block in blocks:
+        padded = np.zeros((*block.shape[:-1], width))
+        padded[..., start : start + block.shape[-1]] = block
+        rows.append(padded)
+        start += block.shape[-1]
+    return np.concatenate(rows, -2)

@@ -1,0 +1,158 @@
+"""What a fit is worth: covariance, rank, free directions by name, residuals per station.
+
+Nothing is quoted for a direction that the evidence does not determine.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mwdcal.core.problem import Problem, State
+from mwdcal.core.solvers import Determined, Linear, Normal
+from mwdcal.core.vectors import Array, rotation
+
+COUPLED = 0.9
+"""Share of a candidate direction that must lie in the null space to be called free."""
+
+
+@dataclass(frozen=True)
+class Analysis:
+    """A fit at its solution, with leading batch axis B and t triads.
+
+    `covariance` (B, p, p) with declared noise; `determined` says which directions;
+    `variance_factor` (B, t) is s² and `freedom` (B, t) its degrees of freedom;
+    `residual` (B, n, m) are whitened residuals left on the readings, and `spread`
+    (B, n, m, m) their expected covariance, so that residual · spread⁺ · residual is χ²;
+    `constants` (B, q, q) is the covariance of the constants of the run.
+    """
+
+    covariance: Array
+    determined: Determined
+    variance_factor: Array
+    freedom: Array
+    residual: Array
+    spread: Array
+    constants: Array
+
+
+def analyse(problem: Problem, state: State) -> Analysis:
+    """Covariance, rank and residuals at a state."""
+    linear = problem.linear(state)
+    determined = Determined.by(Normal.of(problem.linear(state, geometry=True)))
+    whole = _whole_covariance(linear, determined)
+    weighed_design = linear.weigh(linear.design)
+    residual = linear.weigh(linear.residual[..., None])[..., 0]
+    spread = linear.weigh(np.broadcast_to(np.eye(residual.shape[-1]), (*residual.shape, residual.shape[-1])))
+    spread = spread - weighed_design @ whole[:, None] @ np.swapaxes(weighed_design, -1, -2)
+    spread = spread * problem.evidence.include[..., None, None]
+    factor, freedom = _variance_factors(residual, spread)
+    p, q = linear.size, len(problem.evidence.constants)
+    return Analysis(
+        whole[:, :p, :p], determined, factor, freedom, residual, spread, whole[:, p : p + q, p : p + q]
+    )
+
+
+def _whole_covariance(linear: Linear, determined: Determined) -> Array:
+    """Covariance (B, p + s, p + s) of parameters and shared unknowns."""
+    normal = Normal.of(linear)
+    reduced, _, eliminate = normal.reduced()
+    own = determined.inverse(reduced)
+    cross = -own @ np.swapaxes(eliminate, -1, -2)
+    p = normal.size
+    shared = np.linalg.inv(normal.information[..., p:, p:]) - eliminate @ cross
+    top = np.concatenate([own, cross], -1)
+    return np.concatenate([top, np.concatenate([np.swapaxes(cross, -1, -2), shared], -1)], -2)
+
+
+def _variance_factors(residual: Array, spread: Array) -> tuple[Array, Array]:
+    """s² and degrees of freedom (B, t) of each triad: restricted maximum likelihood."""
+    expected = np.diagonal(spread, axis1=-2, axis2=-1)
+    shape = (*residual.shape[:-1], residual.shape[-1] // 3, 3)
+    squares = np.sum((residual**2).reshape(shape), (1, 3))
+    freedom = np.sum(expected.reshape(shape), (1, 3))
+    return squares / np.where(freedom > 1e-9, freedom, np.nan), freedom
+
+
+def candidates(problem: Problem, state: State, triads: list[int]) -> dict[str, Array]:
+    """Directions (B, p) of parameter space that have a name: turns and scales of some triads."""
+    directions = {}
+    zero = np.zeros_like(state.params)
+    for axis, name in enumerate(("rotation-x", "rotation-y", "toolface-zero")):
+        directions[name] = zero.copy()
+        directions[name][:, _columns(problem, triads)] = _tangent(
+            problem, state, triads, rotation(1e-5 * np.eye(3)[axis])
+        )
+    directions["scale"] = zero.copy()
+    directions["scale"][:, _columns(problem, triads)] = _tangent(problem, state, triads, np.eye(3) * (1 + 1e-5))
+    return directions
+
+
+def _columns(problem: Problem, triads: list[int]) -> Array:
+    slices = problem.slices()
+    return np.concatenate([np.arange(slices[t].start, slices[t].stop) for t in triads])
+
+
+def _tangent(problem: Problem, state: State, triads: list[int], change: Array) -> Array:
+    """Change of the parameters when the fields of some triads are transformed, per unit."""
+    slices = problem.slices()
+    parts = [
+        problem.triads[t].model.transformed(state.params[:, slices[t]], change) - state.params[:, slices[t]]
+        for t in triads
+    ]
+    return np.asarray(np.concatenate(parts, -1) / 1e-5)
+
+
+def free_share(determined: Determined, direction: Array) -> Array:
+    """Share (B,), 0…1, of a direction of parameter space that lies in the free subspace."""
+    scaled = direction * determined.norms
+    inside = np.einsum("bpk,bp->bk", determined.null(), scaled)
+    total = np.sum(scaled**2, -1)
+    return np.asarray(np.sum(inside**2, -1) / np.where(total > 0, total, 1.0))
+
+
+def settle_gauge(problem: Problem, state: State) -> State:
+    """Put free rotations where they belong by convention: the gain's polar factor has none."""
+    if not len(state.params):
+        return state
+    determined = Determined.by(Normal.of(problem.linear(state, geometry=True)))
+    every = list(range(len(problem.triads)))
+    for triads in [every] + [[t] for t in every if len(every) > 1]:
+        named = candidates(problem, state, triads)
+        axes = ("rotation-x", "rotation-y", "toolface-zero")
+        free = np.stack([free_share(determined, named[axis]) > COUPLED for axis in axes], -1)
+        turn = _polar_turn(problem, state, triads[0], free)
+        state = _turn(problem, state, triads, turn, stations=len(triads) == len(every))
+    return state
+
+
+def _polar_turn(problem: Problem, state: State, triad: int, free: Array) -> Array:
+    """Rotation (B, 3, 3) about the free axes that leaves the triad's gain without rotation."""
+    where = problem.slices()[triad]
+    chosen = problem.triads[triad]
+    gain = chosen.model.slope(state.params[:, where], chosen.raw, problem.temperature).mean(1)
+    gain = np.where(np.isfinite(gain), gain, np.eye(3))
+    u, _, vt = np.linalg.svd(gain)
+    sign = np.where(np.linalg.det(u @ vt) < 0, -1.0, 1.0)
+    polar = (u * np.stack([np.ones_like(sign), np.ones_like(sign), sign], -1)[:, None, :]) @ vt
+    about_z = np.arctan2(polar[:, 0, 1] - polar[:, 1, 0], polar[:, 0, 0] + polar[:, 1, 1])
+    along = np.zeros((len(polar), 3))
+    along[:, 2] = np.where(free[:, 2], about_z, 0.0)
+    whole = np.swapaxes(polar, -1, -2)
+    return np.where(free.all(-1)[:, None, None], whole, rotation(along))
+
+
+def _turn(problem: Problem, state: State, triads: list[int], turn: Array, stations: bool) -> State:
+    params = state.params.copy()
+    for triad in triads:
+        where = problem.slices()[triad]
+        params[:, where] = problem.triads[triad].model.transformed(params[:, where], turn)
+    attitude = turn[:, None] @ state.attitude if stations else state.attitude
+    return State(params, attitude, state.constants)
+
+
+def polar_free(gain: Array) -> Array:
+    """Rotation vector's matrix part: the polar factor (…, 3, 3) of a gain matrix."""
+    u, _, vt = np.linalg.svd(gain)
+    return np.asarray(u @ vt)

@@ -1,0 +1,94 @@
+"""Attitudes and the two reference vectors, in the tool frame of SPE 67616.
+
+Frame: right-handed, z along the tool downhole, y the toolface scribe, x to the left of y
+looking downhole. The earth frame is x magnetic north, y magnetic east, z down. Gravity
+points down: a vertical tool reads gz = +|g|. Dip is positive down.
+
+All functions broadcast over leading axes; the component axis is last.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+Bools = npt.NDArray[np.bool_]
+Ints = npt.NDArray[np.int64]
+ArrayLike = npt.ArrayLike
+AnyArray = npt.NDArray[Any]
+
+
+def wrap(angle: ArrayLike, period: float = 2 * np.pi) -> Array:
+    """An angle in [0, period): azimuths and toolfaces as the industry writes them."""
+    return np.asarray(np.mod(angle, period), float)
+
+
+def centred(angle: ArrayLike, period: float = 2 * np.pi) -> Array:
+    """An angle difference in [-period/2, period/2)."""
+    return np.asarray(np.mod(np.asarray(angle) + period / 2, period) - period / 2, float)
+
+
+def tool_from_earth(inclination: ArrayLike, azimuth: ArrayLike, toolface: ArrayLike) -> Array:
+    """Attitude matrix (..., 3, 3) that turns earth vectors (north, east, down) into tool vectors.
+
+    Units: radians. Reference: SPE 67616; defined everywhere (at vertical only
+    azimuth + toolface matters).
+    """
+    inc, azi, tool = np.broadcast_arrays(inclination, azimuth, toolface)
+    ci, si, ca, sa = np.cos(inc), np.sin(inc), np.cos(azi), np.sin(azi)
+    ct, st = np.cos(tool), np.sin(tool)
+    rows = [
+        [ci * ca * st + sa * ct, ci * sa * st - ca * ct, -si * st],
+        [ci * ca * ct - sa * st, ci * sa * ct + ca * st, -si * ct],
+        [si * ca, si * sa, ci],
+    ]
+    return np.stack([np.stack(row, -1) for row in rows], -2)
+
+
+def earth_gravity(gravity: ArrayLike) -> Array:
+    """Gravity (..., 3) in the earth frame: straight down, in the unit of `gravity`."""
+    g = np.asarray(gravity, float)
+    return np.stack([np.zeros_like(g), np.zeros_like(g), g], -1)
+
+
+def earth_field(field: ArrayLike, dip: ArrayLike) -> Array:
+    """Geomagnetic field (..., 3) in the earth frame; `dip` in radians, positive down."""
+    b, d = np.broadcast_arrays(np.asarray(field, float), np.asarray(dip, float))
+    return np.stack([b * np.cos(d), np.zeros_like(b), b * np.sin(d)], -1)
+
+
+def reference_vectors(
+    inclination: ArrayLike,
+    azimuth: ArrayLike,
+    toolface: ArrayLike,
+    gravity: ArrayLike = 1.0,
+    field: ArrayLike = 1.0,
+    dip: ArrayLike = 0.0,
+) -> tuple[Array, Array]:
+    """Gravity and magnetic vector (..., 3) each that a perfect tool reads at an attitude.
+
+    Units: radians; the vectors have the units of `gravity` and `field`.
+    """
+    attitude = tool_from_earth(inclination, azimuth, toolface)
+    g = np.einsum("...ij,...j->...i", attitude, earth_gravity(gravity))
+    b = np.einsum("...ij,...j->...i", attitude, earth_field(field, dip))
+    return g, b
+
+
+def skew(vector: Array) -> Array:
+    """The matrix (..., 3, 3) of the cross product: skew(a) @ b = a × b."""
+    x, y, z = np.moveaxis(vector, -1, 0)
+    zero = np.zeros_like(x)
+    rows = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]
+    return np.stack([np.stack(row, -1) for row in rows], -2)
+
+
+def rotation(turn: Array) -> Array:
+    """Rotation matrix (..., 3, 3) of a rotation vector (..., 3), radians (Rodrigues)."""
+    angle = np.linalg.norm(turn, axis=-1)[..., None, None]
+    cross = skew(turn)
+    half = np.sinc(angle / (2 * np.pi))
+    return np.eye(3) + np.sinc(angle / np.pi) * cross + 0.5 * half * half * (cross @ cross)

@@ -1,0 +1,182 @@
+"""From readings to a fitted problem: evidence, noise, gauge. The estimator behind every method.
+
+A method is a selection of evidence; the solver is the same. See `METHODS`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mwdcal.core.models import Basis, Factors, Model, Polynomial
+from mwdcal.core.problem import UNKNOWN, Constant, Evidence, Problem, State, Triad
+from mwdcal.core.solvers import Status, gauss_newton
+from mwdcal.core.start import start
+from mwdcal.core.uncertainty import Analysis, analyse, settle_gauge
+from mwdcal.core.vectors import Array, Ints
+from mwdcal.readings import ANGLES, CONSTANTS, Readings
+
+FLOOR = 1e-9
+"""Smallest noise, as a share of the signal, that an estimate from residuals may reach."""
+
+
+def joint(evidence: Evidence) -> Evidence:
+    """All evidence, weighted by its uncertainty."""
+    return evidence
+
+
+def whole_vectors(evidence: Evidence) -> Evidence:
+    """Reference vectors only, taken as exact: least squares as in the six-state test."""
+    exact = {name: np.zeros_like(sd) for name, sd in evidence.sd.items()}
+    return replace(evidence, sd=exact, group=np.full_like(evidence.group, -1))
+
+
+METHODS: dict[str, Callable[[Evidence], Evidence]] = {
+    "joint": joint,
+    "least-squares": whole_vectors,
+}
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A batch of fitted problems: shapes lead with the batch axis B.
+
+    `noise` (B, triads) is the estimated standard deviation, NaN where it was declared;
+    `status` holds `Status` codes.
+    """
+
+    problem: Problem
+    state: State
+    status: Ints
+    iterations: Ints
+    noise: Array
+    analysis: Analysis
+
+
+def _batched(value: Array | None, shape: tuple[int, ...], default: float = np.nan) -> Array:
+    whole = np.full(shape, default) if value is None else np.broadcast_to(np.asarray(value, float), shape)
+    return np.asarray(whole)
+
+
+def evidence_of(readings: Readings, include: Array | None = None) -> Evidence:
+    """Everything the readings say about their stations, for one batch axis."""
+    lead = readings.accelerometer.shape[:-1]
+    shape = (int(np.prod(lead[:-1])), lead[-1])
+    known = {n: np.broadcast_to(readings.reference(n), lead).reshape(shape) for n in ANGLES + CONSTANTS}
+    sd = {n: np.broadcast_to(readings.uncertainty(n), lead).reshape(shape) for n in ANGLES + CONSTANTS}
+    group = np.full(shape, -1) if readings.group is None else np.broadcast_to(readings.group, lead).reshape(shape)
+    included = np.ones(shape) if include is None else np.broadcast_to(include, shape).astype(float)
+    nowhere = np.isnan(known["field"]).all(-1, keepdims=True)
+    known["field"] = np.where(nowhere, 1.0, known["field"])
+    bare = Evidence(known, sd, group, included, ())
+    return replace(bare, known=_share_known(bare), constants=_constants(bare))
+
+
+def _share_known(evidence: Evidence) -> dict[str, Array]:
+    """Blank inclinations and azimuths of a group take the mean of its filled cells."""
+    known = dict(evidence.known)
+    for name in ("inclination", "azimuth"):
+        members = evidence.members * evidence.is_known(name)[..., None]
+        count = members.sum(-2)
+        turn = np.einsum("bnk,bn->bk", members, np.exp(1j * np.nan_to_num(known[name])))
+        mean = np.einsum("bnk,bk->bn", evidence.members, np.where(count > 0, np.angle(turn), np.nan_to_num(0)))
+        filled = np.einsum("bnk,bk->bn", evidence.members, count) > 0
+        known[name] = np.where(np.isnan(known[name]) & filled, mean, known[name])
+    return known
+
+
+def _constants(evidence: Evidence) -> tuple[Constant, ...]:
+    """Constants of the run to estimate: unknown ones, and errors of uncertain references."""
+    found = []
+    for name, size in (("gravity", 1.0), ("field", 0.0), ("dip", UNKNOWN)):
+        known = evidence.is_known(name)
+        if not known.all():
+            value = np.nan_to_num(np.nansum(evidence.known[name], -1) / np.maximum(known.sum(-1), 1))
+            scale = np.full(len(value), size) if size else np.where(value > 0, value, 1.0)
+            found.append(Constant(name, (~known).astype(float), value, scale, unknown=True))
+        sd = np.max(np.where(known, evidence.sd[name], 0.0), -1)
+        if (sd > 0).any():
+            floor = np.where(sd > 0, sd, 1e-12)
+            found.append(Constant(name, known.astype(float), np.zeros(len(sd)), floor, unknown=False))
+    return tuple(found)
+
+
+def model_of(kind: str, order: int, raw: Array, temperature: Array, include: Array) -> Model:
+    """A conditioned model for readings (B, n, 3): centred, scaled, Chebyshev in temperature."""
+    low, high = float(temperature.min()), float(temperature.max())
+    half = (high - low) / 2 or 1.0
+    basis = Basis(order, (low + high) / 2, half, chebyshev=True)
+    if kind == "factors":
+        return Factors(basis)
+    weight = include[..., None] / include.sum(-1)[:, None, None]
+    centre = np.sum(raw * weight, -2, keepdims=True)
+    radius = np.sqrt(np.sum((raw - centre) ** 2 * weight, (-2, -1)))
+    radius = np.where(radius > 0, radius, 1.0)
+    return Polynomial(basis, centre, np.broadcast_to(radius[:, None, None], centre.shape).copy())
+
+
+def _problem(readings: Readings, evidence: Evidence, kind: str, order: int) -> tuple[Problem, list[bool]]:
+    shape = evidence.include.shape
+    temperature = _batched(readings.temperature, readings.accelerometer.shape[:-1], 0.0).reshape(shape)
+    triads, declared = [], []
+    for name in ("accelerometer", "magnetometer"):
+        raw = getattr(readings, name)
+        if raw is None:
+            continue
+        raw = np.broadcast_to(raw, readings.accelerometer.shape).reshape(*shape, 3)
+        model = model_of(kind, order, raw, temperature, evidence.include)
+        declared.append(name in readings.sd)
+        size = np.sqrt(np.mean((raw - raw.mean(-2, keepdims=True)) ** 2, (-2, -1), keepdims=True))
+        sd = readings.sd.get(name, 1e-3 * np.where(size > 0, size, 1.0))
+        sd = np.broadcast_to(np.asarray(sd, float), readings.accelerometer.shape if name in readings.sd else raw.shape)
+        triads.append(Triad(model, raw, sd.reshape(raw.shape).copy()))
+    return Problem(tuple(triads), temperature, evidence), declared
+
+
+def fit(
+    readings: Readings,
+    method: str = "joint",
+    kind: str = "polynomial",
+    order: int = 0,
+    include: Array | None = None,
+    rounds: int = 8,
+) -> Fit:
+    """Fit a run, or a batch of runs (leading axes of the readings, or of `include`)."""
+    evidence = METHODS[method](evidence_of(readings, include))
+    problem, declared = _problem(readings, evidence, kind, order)
+    state = start(problem)
+    state, status, iterations = gauss_newton(problem, state)
+    noise = np.full((len(status), len(declared)), np.nan)
+    if not all(declared):
+        problem, state, status, noise = _estimate_noise(problem, state, status, declared, rounds)
+    state = settle_gauge(problem, state)
+    return Fit(problem, state, status, iterations, noise, analyse(problem, state))
+
+
+def _estimate_noise(
+    problem: Problem, state: State, status: Ints, declared: list[bool], rounds: int
+) -> tuple[Problem, State, Ints, Array]:
+    """Variance per triad by restricted maximum likelihood, fit and estimate in turn."""
+    for _ in range(rounds):
+        scale = np.sqrt(analyse(problem, state).variance_factor)
+        triads = tuple(
+            t if known else replace(t, sd=_scaled_noise(t, scale[:, i]))
+            for i, (t, known) in enumerate(zip(problem.triads, declared, strict=True))
+        )
+        problem = replace(problem, triads=triads)
+        state, status, _ = gauss_newton(problem, state)
+        free = [i for i, known in enumerate(declared) if not known]
+        if np.all(np.abs(scale[:, free] - 1) < 1e-3):
+            break
+    noise = [np.full(len(status), np.nan) if k else t.sd[:, 0, 0] for t, k in zip(problem.triads, declared, strict=True)]
+    return problem, state, status, np.stack(noise, -1)
+
+
+def _scaled_noise(triad: Triad, scale: Array) -> Array:
+    size = np.sqrt(np.mean((triad.raw - triad.raw.mean(-2, keepdims=True)) ** 2, (-2, -1), keepdims=True))
+    return np.maximum(triad.sd * np.where(np.isfinite(scale), scale, 1.0)[:, None, None], FLOOR * size)
+
+
+__all__ = ["METHODS", "Fit", "Status", "evidence_of", "fit", "joint", "whole_vectors"]

@@ -1,0 +1,58 @@
+"""The tool profile: which axis each channel measures, nominal scales, noise, stand.
+
+Instrument polarity and raw units live here and nowhere else: `files.tables` turns
+raw channels into nominal readings along the tool axes with it, and `notation`
+turns fitted parameters back into the instrument's own channels.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import msgspec
+import numpy as np
+
+from mwdcal.core.vectors import Array
+
+Axis = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
+
+
+class TriadProfile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Three channels of one kind: axes, nominal scale and noise, in raw units.
+
+    `scale` is raw units per g (accelerometer) or per nT (magnetometer); None means
+    unknown: it is then taken from the readings and cannot serve as a check.
+    `noise` is the standard uncertainty of one station's raw reading (None: it is
+    estimated from the residuals); `repeatability` is added to it in quadrature.
+    """
+
+    axes: tuple[Axis, Axis, Axis] = ("+x", "+y", "+z")
+    scale: float | None = None
+    noise: float | None = None
+    repeatability: float = 0.0
+
+    @property
+    def permutation(self) -> Array:
+        """The signed permutation P (3, 3): tool axes from channels."""
+        matrix = np.zeros((3, 3))
+        for channel, (sign, axis) in enumerate(self.axes):
+            matrix["xyz".index(axis), channel] = 1.0 if sign == "+" else -1.0
+        return matrix
+
+
+class StandProfile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Standard uncertainties of the stand's reference angles, degrees."""
+
+    inclination_deg: float = 0.0
+    azimuth_deg: float = 0.0
+    toolface_deg: float = 0.0
+
+
+class Profile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A tool as its maker describes it: see `docs/files.md` for the TOML form."""
+
+    name: str
+    reference_temperature_c: float = 30.0
+    accelerometer: TriadProfile = TriadProfile()
+    magnetometer: TriadProfile = TriadProfile()
+    stand: StandProfile = StandProfile()

@@ -1,0 +1,99 @@
+"""`Readings`: the noun of input. What the sensors said, and what is known about it.
+
+Inside the package raw channels have already been mapped to the tool axes and divided
+by their nominal scale (`files.tables` does it): values are nominal g and nominal nT,
+angles are radians, temperatures are °C. A blank cell is NaN, never zero.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from mwdcal.core.vectors import Array
+
+ANGLES = ("inclination", "azimuth", "toolface")
+CONSTANTS = ("gravity", "field", "dip")
+
+
+@dataclass(frozen=True)
+class Readings:
+    """Static stations of one tool (or of many: leading axes).
+
+    Shapes: `accelerometer` and `magnetometer` (..., n, 3); `temperature`, `group` and
+    each entry of `known` (..., n).
+
+    Attributes:
+        accelerometer: nominal g along the tool axes.
+        magnetometer: nominal nT along the tool axes, or None.
+        temperature: °C, or None (then no model can have temperature terms).
+        known: reference values by name, of `ANGLES` and `CONSTANTS`; NaN where blank.
+            A missing key is blank everywhere, but for gravity, which is then 1 g.
+        sd: standard uncertainties: of `accelerometer` and `magnetometer` (..., n, 3) per
+            station and axis (missing: estimated from the residuals), of reference angles
+            (..., n) independent per station, of gravity, field and dip (..., n) common
+            to the run. Missing or NaN reference uncertainties are zero.
+        group: stations of the same non-negative number share one direction of the tool
+            axis; -1 is none.
+        station: labels, for messages and tables.
+        digest: SHA-256 of each station's raw reading: tells fit from verification data.
+        metadata: what the file said about itself (serial, date, operator, …).
+        source: name of the file.
+    """
+
+    accelerometer: Array
+    magnetometer: Array | None = None
+    temperature: Array | None = None
+    known: Mapping[str, Array] = field(default_factory=dict)
+    sd: Mapping[str, Array] = field(default_factory=dict)
+    group: Array | None = None
+    station: tuple[str, ...] = ()
+    digest: tuple[str, ...] = ()
+    metadata: Mapping[str, object] = field(default_factory=dict)
+    source: str = ""
+
+    @property
+    def count(self) -> int:
+        """Number of stations."""
+        return int(self.accelerometer.shape[-2])
+
+    def reference(self, name: str) -> Array:
+        """The known value `name` (..., n), NaN where blank; gravity defaults to 1 g."""
+        blank = 1.0 if name == "gravity" else np.nan
+        value = self.known.get(name)
+        shape = self.accelerometer.shape[:-1]
+        if value is None:
+            return np.full(shape, blank)
+        value = np.broadcast_to(np.asarray(value, float), shape)
+        return np.where(np.isnan(value), blank, value) if name == "gravity" else value
+
+    def uncertainty(self, name: str) -> Array:
+        """Standard uncertainty of the known value `name` (..., n); 0 where not stated."""
+        value = np.asarray(self.sd.get(name, 0.0), float)
+        return np.broadcast_to(np.nan_to_num(value), self.accelerometer.shape[:-1])
+
+    def select(self, keep: Array) -> Readings:
+        """The stations where `keep` (n,) is true, of a run without leading axes."""
+        chosen = np.flatnonzero(keep)
+
+        def rows(value: Array | None) -> Array | None:
+            return None if value is None else np.asarray(value)[chosen]
+
+        per_station = {k: np.broadcast_to(v, self._shape(k)) for k, v in self.sd.items()}
+        return replace(
+            self,
+            accelerometer=self.accelerometer[chosen],
+            magnetometer=rows(self.magnetometer),
+            temperature=rows(self.temperature),
+            known={k: self.reference(k)[chosen] for k in self.known},
+            sd={k: v[chosen] for k, v in per_station.items()},
+            group=rows(self.group),
+            station=tuple(self.station[i] for i in chosen) if self.station else (),
+            digest=tuple(self.digest[i] for i in chosen) if self.digest else (),
+        )
+
+    def _shape(self, name: str) -> tuple[int, ...]:
+        shape = self.accelerometer.shape
+        return shape if name.endswith("meter") else shape[:-1]
