@@ -5,6 +5,7 @@ A method is a selection of evidence; the solver is the same. See `METHODS`.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -55,19 +56,20 @@ class Fit:
     analysis: Analysis
 
 
-def _batched(value: Array | None, shape: tuple[int, ...], default: float = np.nan) -> Array:
-    whole = np.full(shape, default) if value is None else np.broadcast_to(np.asarray(value, float), shape)
-    return np.asarray(whole)
+def _flat(value: Array, lead: tuple[int, ...], *tail: int) -> Array:
+    """A value with one batch axis: (B, n, *tail)."""
+    whole = np.broadcast_to(np.asarray(value), (*lead, *tail))
+    return np.asarray(whole.reshape(math.prod(lead[:-1]), lead[-1], *tail))
 
 
-def evidence_of(readings: Readings, include: Array | None = None) -> Evidence:
+def evidence_of(readings: Readings, include: Array) -> Evidence:
     """Everything the readings say about their stations, for one batch axis."""
-    lead = readings.accelerometer.shape[:-1]
-    shape = (int(np.prod(lead[:-1])), lead[-1])
-    known = {n: np.broadcast_to(readings.reference(n), lead).reshape(shape) for n in ANGLES + CONSTANTS}
-    sd = {n: np.broadcast_to(readings.uncertainty(n), lead).reshape(shape) for n in ANGLES + CONSTANTS}
-    group = np.full(shape, -1) if readings.group is None else np.broadcast_to(readings.group, lead).reshape(shape)
-    included = np.ones(shape) if include is None else np.broadcast_to(include, shape).astype(float)
+    lead = np.broadcast_shapes(readings.accelerometer.shape[:-1], include.shape)
+    known = {n: _flat(readings.reference(n), lead) for n in ANGLES + CONSTANTS}
+    sd = {n: _flat(readings.uncertainty(n), lead) for n in ANGLES + CONSTANTS}
+    alone = np.full(readings.count, -1)
+    group = _flat(alone if readings.group is None else readings.group, lead)
+    included = _flat(include, lead).astype(float)
     nowhere = np.isnan(known["field"]).all(-1, keepdims=True)
     known["field"] = np.where(nowhere, 1.0, known["field"])
     bare = Evidence(known, sd, group, included, ())
@@ -103,7 +105,7 @@ def _constants(evidence: Evidence) -> tuple[Constant, ...]:
     return tuple(found)
 
 
-def model_of(kind: str, order: int, raw: Array, temperature: Array, include: Array) -> Model:
+def model_of(kind: str, order: int, raw: Array, temperature: Array, include: Array, curved: bool = False) -> Model:
     """A conditioned model for readings (B, n, 3): centred, scaled, Chebyshev in temperature."""
     low, high = float(temperature.min()), float(temperature.max())
     half = (high - low) / 2 or 1.0
@@ -114,25 +116,42 @@ def model_of(kind: str, order: int, raw: Array, temperature: Array, include: Arr
     centre = np.sum(raw * weight, -2, keepdims=True)
     radius = np.sqrt(np.sum((raw - centre) ** 2 * weight, (-2, -1)))
     radius = np.where(radius > 0, radius, 1.0)
-    return Polynomial(basis, centre, np.broadcast_to(radius[:, None, None], centre.shape).copy())
+    return Polynomial(basis, centre, np.broadcast_to(radius[:, None, None], centre.shape).copy(), curved)
 
 
-def _problem(readings: Readings, evidence: Evidence, kind: str, order: int) -> tuple[Problem, list[bool]]:
-    shape = evidence.include.shape
-    temperature = _batched(readings.temperature, readings.accelerometer.shape[:-1], 0.0).reshape(shape)
+def _problem(
+    readings: Readings, evidence: Evidence, lead: tuple[int, ...], kind: str, order: int, curved: frozenset[str]
+) -> tuple[Problem, list[bool]]:
+    """The problem, and for each triad whether its noise is declared."""
+    cold = np.zeros(readings.count)
+    temperature = _flat(cold if readings.temperature is None else readings.temperature, lead)
     triads, declared = [], []
     for name in ("accelerometer", "magnetometer"):
-        raw = getattr(readings, name)
-        if raw is None:
+        values = getattr(readings, name)
+        if values is None:
             continue
-        raw = np.broadcast_to(raw, readings.accelerometer.shape).reshape(*shape, 3)
-        model = model_of(kind, order, raw, temperature, evidence.include)
+        raw = _flat(values, lead, 3)
+        model = model_of(kind, order, raw, temperature, evidence.include, name in curved)
+        sd = _flat(readings.sd[name], lead, 3) if name in readings.sd else 1e-3 * _size(raw) + 0 * raw
+        triads.append(Triad(model, raw, sd, _prior(model, evidence, name)))
         declared.append(name in readings.sd)
-        size = np.sqrt(np.mean((raw - raw.mean(-2, keepdims=True)) ** 2, (-2, -1), keepdims=True))
-        sd = readings.sd.get(name, 1e-3 * np.where(size > 0, size, 1.0))
-        sd = np.broadcast_to(np.asarray(sd, float), readings.accelerometer.shape if name in readings.sd else raw.shape)
-        triads.append(Triad(model, raw, sd.reshape(raw.shape).copy()))
     return Problem(tuple(triads), temperature, evidence), declared
+
+
+CURVATURE = 0.005
+def _prior(model: Model, evidence: Evidence, name: str) -> Array:
+    """Prior precision (B, p): curved terms are small, all else is free."""
+    prior = np.zeros((len(evidence.include), model.size))
+    if isinstance(model, Polynomial) and model.curved:
+        strength = np.nanmean(evidence.known["field" if name == "magnetometer" else "gravity"], -1)
+        prior[:, -6:] = (CURVATURE * strength[:, None]) ** -2
+    return prior
+
+
+def _size(raw: Array) -> Array:
+    """Root mean square departure of readings from their mean (B, 1, 1)."""
+    size = np.sqrt(np.mean((raw - raw.mean(-2, keepdims=True)) ** 2, (-2, -1), keepdims=True))
+    return np.where(size > 0, size, 1.0)
 
 
 def fit(
@@ -141,11 +160,14 @@ def fit(
     kind: str = "polynomial",
     order: int = 0,
     include: Array | None = None,
+    curved: frozenset[str] = frozenset(),
     rounds: int = 8,
 ) -> Fit:
     """Fit a run, or a batch of runs (leading axes of the readings, or of `include`)."""
+    include = np.ones(readings.count) if include is None else np.asarray(include, float)
     evidence = METHODS[method](evidence_of(readings, include))
-    problem, declared = _problem(readings, evidence, kind, order)
+    lead = np.broadcast_shapes(readings.accelerometer.shape[:-1], include.shape)
+    problem, declared = _problem(readings, evidence, lead, kind, order, curved)
     state = start(problem)
     state, status, iterations = gauss_newton(problem, state)
     noise = np.full((len(status), len(declared)), np.nan)
@@ -175,8 +197,8 @@ def _estimate_noise(
 
 
 def _scaled_noise(triad: Triad, scale: Array) -> Array:
-    size = np.sqrt(np.mean((triad.raw - triad.raw.mean(-2, keepdims=True)) ** 2, (-2, -1), keepdims=True))
-    return np.maximum(triad.sd * np.where(np.isfinite(scale), scale, 1.0)[:, None, None], FLOOR * size)
+    factor = np.where(np.isfinite(scale), scale, 1.0)[:, None, None]
+    return np.maximum(triad.sd * factor, FLOOR * _size(triad.raw))
 
 
 __all__ = ["METHODS", "Fit", "Status", "evidence_of", "fit", "joint", "whole_vectors"]

@@ -2,7 +2,8 @@
 
 Two families, composed and never subclassed:
 
-polynomial   field = Σ_k φ_k(T) (A_k x + c_k)            linear in its 12 (n + 1) parameters
+polynomial   field = Σ_k φ_k(T) (A_k x + c_k) [+ e₂ x² + e₃ x³, own axis, where asked for]
+             linear in its 12 (n + 1) parameters [+ 6]
 factors      field = (I - m) (x / SF(T) - B(T))          Moosavi 1-8: 6 (n + 1) + 6 parameters
 
 Readings x are already in tool axes and nominal units (`files`), so an ideal triad has
@@ -59,51 +60,75 @@ class Basis:
 class Polynomial:
     """The model linear in its parameters: order n has A_k (row by row), then c_k, for each k.
 
+    With `curved`, six more follow: e₂ and e₃ of each axis, its own quadratic and cubic terms.
     `centre` and `scale` (..., 1, 3) condition a fit with offsets of many times the field;
-    they are zero and one in a finished calibration.
+    they are zero and one in a finished calibration, but for a curved one, whose powers are
+    always of the centred reading.
     """
 
     basis: Basis
     centre: Array = field(default_factory=lambda: np.zeros((1, 3)))
     scale: Array = field(default_factory=lambda: np.ones((1, 3)))
+    curved: bool = False
     kind = "polynomial"
+
+    @property
+    def affine(self) -> int:
+        """Number of parameters without the curved ones."""
+        return 12 * (self.basis.order + 1)
 
     @property
     def size(self) -> int:
         """Number of parameters."""
-        return 12 * (self.basis.order + 1)
+        return self.affine + 6 * self.curved
 
-    def _terms(self, params: Array, temperature: Array) -> Array:
-        blocks = params.reshape(*params.shape[:-1], self.basis.order + 1, 12)
-        return np.einsum("...nk,...kp->...np", self.basis(temperature), blocks)
+    def _scaled(self, raw: Array) -> Array:
+        return np.asarray((raw - self.centre) / self.scale)
+
+    def _blocks(self, params: Array) -> Array:
+        return params[..., : self.affine].reshape(*params.shape[:-1], self.basis.order + 1, 12)
+
+    def _terms(self, params: Array, temperature: Array) -> tuple[Array, Array]:
+        terms = np.einsum("...nk,...kp->...np", self.basis(temperature), self._blocks(params))
+        return terms[..., :9].reshape(*terms.shape[:-1], 3, 3), terms[..., 9:]
 
     def fields(self, params: Array, raw: Array, temperature: Array) -> Array:
         """Field vectors (..., n, 3)."""
-        terms = self._terms(params, temperature)
-        matrix = terms[..., :9].reshape(*terms.shape[:-1], 3, 3)
-        scaled = (raw - self.centre) / self.scale
-        return np.einsum("...ij,...j->...i", matrix, scaled) + terms[..., 9:]
+        matrix, offset = self._terms(params, temperature)
+        x = self._scaled(raw)
+        result = np.einsum("...ij,...j->...i", matrix, x) + offset
+        if self.curved:
+            square, cube = params[..., None, -6:-3], params[..., None, -3:]
+            result = result + (square + cube * x) * x * x
+        return np.asarray(result)
 
     def slope(self, params: Array, raw: Array, temperature: Array) -> Array:
         """Derivative of the field with respect to the reading (..., n, 3, 3)."""
-        terms = self._terms(params, temperature)
-        matrix = terms[..., :9].reshape(*terms.shape[:-1], 3, 3)
+        matrix, _ = self._terms(params, temperature)
+        if self.curved:
+            x, diagonal = self._scaled(raw), np.arange(3)
+            square, cube = params[..., None, -6:-3], params[..., None, -3:]
+            matrix[..., diagonal, diagonal] += (2 * square + 3 * cube * x) * x
         return np.asarray(matrix / self.scale[..., None, :])
 
     def jacobian(self, params: Array, raw: Array, temperature: Array) -> Array:
         """Derivative of the field with respect to the parameters (..., n, 3, p): the basis."""
-        scaled = (raw - self.centre) / self.scale
-        rows = np.einsum("ij,...k->...ijk", np.eye(3), scaled)
-        rows = rows.reshape(*scaled.shape[:-1], 3, 9)
-        one = np.concatenate([rows, np.broadcast_to(np.eye(3), (*scaled.shape[:-1], 3, 3))], -1)
+        x = self._scaled(raw)
+        rows = np.einsum("ij,...k->...ijk", np.eye(3), x).reshape(*x.shape[:-1], 3, 9)
+        one = np.concatenate([rows, np.broadcast_to(np.eye(3), (*x.shape[:-1], 3, 3))], -1)
         blocks = np.einsum("...nk,...nip->...nikp", self.basis(temperature), one)
-        return blocks.reshape(*one.shape[:-1], self.size)
+        result = blocks.reshape(*one.shape[:-1], self.affine)
+        if self.curved:
+            own = [np.eye(3) * (x**power)[..., None, :] for power in (2, 3)]
+            result = np.concatenate([result, *own], -1)
+        return result
 
     @cached_property
     def names(self) -> tuple[str, ...]:
         """Names of the parameters: `gain-xy` is A[x, y], `offset-x` is c[x]; `·k` for T^k."""
         one = [f"gain-{i}{j}" for i in "xyz" for j in "xyz"] + [f"offset-{i}" for i in "xyz"]
-        return tuple(_with_order(name, k) for k in range(self.basis.order + 1) for name in one)
+        names = [_with_order(name, k) for k in range(self.basis.order + 1) for name in one]
+        return (*names, *(f"{w}-{i}" for w in ("square", "cube") for i in "xyz" if self.curved))
 
     def start(self, matrix: Array, offset: Array) -> Array:
         """Parameters (..., p) of field = matrix · raw + offset."""
@@ -114,13 +139,17 @@ class Polynomial:
         return np.concatenate([first, later], -1)
 
     def transformed(self, params: Array, turn: Array) -> Array:
-        """Parameters of the model whose fields are a matrix `turn` (..., 3, 3) times ours."""
-        blocks = params.reshape(*params.shape[:-1], self.basis.order + 1, 12)
+        """Parameters of the model whose fields are a matrix `turn` (..., 3, 3) times ours.
+
+        Curved terms stay on their own axes: they are small, and so are the turns asked for.
+        """
+        blocks = self._blocks(params)
         shape = blocks.shape[:-1]
         matrix = turn[..., None, :, :] @ blocks[..., :9].reshape(*shape, 3, 3)
         offset = np.einsum("...ij,...kj->...ki", turn, blocks[..., 9:])
         joined = np.concatenate([matrix.reshape(*shape, 9), offset], -1)
-        return joined.reshape(params.shape)
+        flat = joined.reshape(*params.shape[:-1], self.affine)
+        return np.concatenate([flat, params[..., self.affine :]], -1)
 
     def finished(self, reference: float) -> tuple[Polynomial, Array]:
         """The same model on plain readings and powers of T - reference, and the linear map to it.
@@ -129,6 +158,11 @@ class Polynomial:
         covariance as well.
         """
         basis = Basis(self.basis.order, reference)
+        powers, size = self.basis.powers(reference), self.size
+        if self.curved:
+            whole = np.eye(size)
+            whole[: self.affine, : self.affine] = np.kron(powers, np.eye(12))
+            return Polynomial(basis, self.centre, self.scale, True), whole
         centre, scale = np.broadcast_arrays(self.centre, self.scale)
         one = np.zeros((*scale.shape[:-2], 12, 12))
         for row in range(3):
@@ -137,8 +171,8 @@ class Polynomial:
                 one[..., where, where] = 1 / scale[..., 0, column]
                 one[..., 9 + row, where] = -centre[..., 0, column] / scale[..., 0, column]
             one[..., 9 + row, 9 + row] = 1.0
-        mixed = np.einsum("ab,...ij->...aibj", self.basis.powers(reference), one)
-        return Polynomial(basis), mixed.reshape(*one.shape[:-2], self.size, self.size)
+        mixed = np.einsum("ab,...ij->...aibj", powers, one)
+        return Polynomial(basis), mixed.reshape(*one.shape[:-2], size, size)
 
 
 @dataclass(frozen=True)

@@ -33,11 +33,15 @@ GEOMETRIC_NOISE = 1e-4
 
 @dataclass(frozen=True)
 class Triad:
-    """One sensor triad: model, readings (B, n, 3) and their noise (B, n, 3)."""
+    """One sensor triad: model, readings (B, n, 3), their noise (B, n, 3), prior precision (B, p).
+
+    The prior value of every parameter that has a precision is zero.
+    """
 
     model: Model
     raw: Array
     sd: Array
+    prior: Array
 
 
 @dataclass(frozen=True)
@@ -147,7 +151,7 @@ class Problem:
             constants=constants,
         )
         triads = tuple(
-            Triad(_model_of(t.model, index), t.raw[index], t.sd[index]) for t in self.triads
+            Triad(_model_of(t.model, index), t.raw[index], t.sd[index], t.prior[index]) for t in self.triads
         )
         return Problem(triads, self.temperature[index], chosen)
 
@@ -216,7 +220,7 @@ class Problem:
         design = np.concatenate([_side_by_side(blocks), constants, groups], -1)
         own = turns @ self._own_turns(state, geometry)
         prior, pull = self._prior(state, groups.shape[-1])
-        return Linear(residual, design, own, prior, pull, design.shape[-1] - prior.shape[-1])
+        return Linear(residual, design, own, prior, pull, state.params.shape[-1])
 
     def _weights(self, predictions: list[Prediction], geometry: bool) -> list[Array]:
         """One over the noise (B, n, 3), zero for stations left out."""
@@ -229,8 +233,9 @@ class Problem:
         return [include / t.sd for t in self.triads]
 
     def _prior(self, state: State, turns: int) -> tuple[Array, Array]:
-        """Precision and pull (B, s) of the shared unknowns."""
+        """Precision and pull (B, p + s) of the parameters and the shared unknowns."""
         batch = len(state.params)
+        params = np.concatenate([t.prior for t in self.triads], -1)
         wide = np.full((batch, turns), UNKNOWN**-2)
         constants = self.evidence.constants
         empty = np.zeros((batch, 0))
@@ -240,7 +245,8 @@ class Problem:
             for i, c in enumerate(constants)
         ]
         pulls = np.stack(pull, -1) if constants else empty
-        return np.concatenate([precision, wide], -1), np.concatenate([pulls, np.zeros_like(wide)], -1)
+        pulled = np.concatenate([state.params, pulls, np.zeros_like(wide)], -1)
+        return np.concatenate([params, precision, wide], -1), pulled
 
     def _free(self) -> Bools:
         """Stations (B, n) of which neither direction nor toolface is known."""

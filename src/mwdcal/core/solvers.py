@@ -51,10 +51,10 @@ _MESSAGES = {
 
 @dataclass(frozen=True)
 class Linear:
-    """A problem at one state: ρ (B, n, m), X (B, n, m, p + s), own (B, n, m, 3), prior (B, s).
+    """A problem at one state: ρ (B, n, m), X (B, n, m, p + s), own (B, n, m, 3), prior (B, p + s).
 
-    `pull` (B, s) is the prior's residual of the shared unknowns (zero where unknown), and
-    `size` is p, the number of model parameters at the head of X.
+    `prior` is the precision of each unknown, `pull` (B, p + s) its departure from the prior
+    value (zero where unknown); `size` is p, the number of model parameters at the head of X.
     """
 
     residual: Array
@@ -92,14 +92,14 @@ class Normal:
 
     @classmethod
     def of(cls, linear: Linear) -> Normal:
-        """Sum over stations, prior of the shared unknowns included."""
+        """Sum over stations, priors included."""
         columns = np.concatenate([linear.design, linear.residual[..., None]], -1)
         weighed = linear.weigh(columns)
         whole = np.einsum("...nmi,...nmj->...ij", columns, weighed, optimize=True)
         information, gradient = whole[..., :-1, :-1].copy(), whole[..., :-1, -1].copy()
-        shared = np.arange(linear.size, information.shape[-1])
-        information[..., shared, shared] += linear.prior
-        gradient[..., shared] += linear.prior * linear.pull
+        diagonal = np.arange(information.shape[-1])
+        information[..., diagonal, diagonal] += linear.prior
+        gradient += linear.prior * linear.pull
         cost = whole[..., -1, -1] + np.sum(linear.prior * linear.pull**2, -1)
         return cls(information, gradient, cost, linear.size)
 

@@ -1,0 +1,67 @@
+"""Atomic writing: an interrupted command leaves the old file or none, never half of one."""
+
+from __future__ import annotations
+
+import os
+import secrets
+from pathlib import Path
+
+from mwdcal.errors import InputError
+
+
+def write(path: str | os.PathLike[str], data: bytes | str) -> None:
+    """Write `data` (text as UTF-8) to `path`, which is replaced as a whole or not at all."""
+    target = _target(path)
+    content = data.encode("utf-8", "backslashreplace") if isinstance(data, str) else data
+    temporary = target.with_name(f".mwdcal-{secrets.token_hex(8)}.tmp")
+    try:
+        _write_through(temporary, content)
+        os.replace(temporary, target)
+    except OSError as error:
+        raise _refusal(path, error) from error
+    finally:
+        _remove(temporary)
+
+
+def _target(path: str | os.PathLike[str]) -> Path:
+    """The file behind `path`, links followed; refuses folders and devices."""
+    try:
+        target = Path(os.path.realpath(path))
+        special = target.exists() and not target.is_file()
+    except (OSError, ValueError) as error:
+        raise _refusal(path, error) from error
+    if special:
+        kind = "a folder" if target.is_dir() else "not a regular file"
+        raise InputError(f"cannot write '{path}': it is {kind}. Name a file to write.")
+    if not target.parent.is_dir():
+        raise InputError(
+            f"cannot write '{path}': the folder '{target.parent}' does not exist. "
+            "Create it, or name another folder."
+        )
+    return target
+
+
+def _write_through(path: Path, content: bytes) -> None:
+    """Write a new file and wait until it is on the disk."""
+    with open(path, "xb") as stream:
+        stream.write(content)
+        stream.flush()
+        os.fsync(stream.fileno())
+
+
+def _remove(path: Path) -> None:
+    """Remove what an error or an interruption left; nothing is left after a success."""
+    try:
+        path.unlink(missing_ok=True)
+    except OSError:
+        pass
+
+
+def _refusal(path: str | os.PathLike[str], error: Exception) -> InputError:
+    """The error of the operating system in our form."""
+    if isinstance(error, PermissionError):
+        advice = "Close the program that has it open, or choose a folder you may write to."
+    else:
+        advice = "Choose another place, or make room on this one."
+    reason = getattr(error, "strerror", None) or str(error)
+    return InputError(f"cannot write '{path}': {reason}. {advice}")

@@ -1,0 +1,136 @@
+"""The columns of a run file: names, units, accepted ranges, near misses."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Iterable, Sequence
+from math import pi
+from typing import NamedTuple
+
+from mwdcal.errors import InputError
+
+CHANNELS = {"accelerometer": ("ax", "ay", "az"), "magnetometer": ("mx", "my", "mz")}
+RAW = tuple(name for triad in CHANNELS.values() for name in triad)
+
+# Metadata that changes what the numbers mean.
+AZIMUTH_KEYS = ("azimuth_reference", "declination_deg", "convergence_deg")
+
+
+class Range(NamedTuple):
+    """Accepted values, both ends included unless `positive`, which leaves out zero."""
+
+    low: float
+    high: float
+    unit: str
+    positive: bool = False
+
+    def __str__(self) -> str:
+        if self.positive:
+            return f"above {self.low:g} and at most {self.high:g} {self.unit}".rstrip()
+        return f"between {self.low:g} and {self.high:g} {self.unit}".rstrip()
+
+
+class Reference(NamedTuple):
+    """A reference column: accepted values and uncertainties, and the factor to inside units."""
+
+    column: str
+    values: Range
+    spread: Range
+    factor: float
+
+
+def _angle(name: str, low: float, high: float) -> Reference:
+    return Reference(
+        f"ref_{name}_deg", Range(low, high, "°"), Range(0.0, 180.0, "°"), pi / 180.0
+    )
+
+
+REFERENCES = {
+    "inclination": _angle("inclination", 0.0, 180.0),
+    "azimuth": _angle("azimuth", -360.0, 360.0),
+    "toolface": _angle("toolface", -360.0, 360.0),
+    "gravity": Reference("ref_gravity_g", Range(0, 2, "g", True), Range(0, 2, "g"), 1.0),
+    "field": Reference(
+        "ref_field_nt", Range(0, 200_000, "nT", True), Range(0, 200_000, "nT"), 1.0
+    ),
+    "dip": _angle("dip", -90.0, 90.0),
+}
+TEMPERATURE = Range(-273.15, 1000.0, "°C")
+RAW_RANGE = Range(-1e15, 1e15, "")
+RAW_SPREAD = Range(0.0, 1e15, "")
+ROTATION = Range(-180.0, 180.0, "°")
+
+_MEASURED = (*RAW, *(reference.column for reference in REFERENCES.values()))
+COLUMNS = (
+    "station",
+    "group",
+    "temperature_c",
+    *_MEASURED,
+    *(f"sd_{name}" for name in _MEASURED),
+)
+
+_UNIT = re.compile(
+    r"[\s_(\[-]+(°|°?c|deg|degc|degrees?|rad|f|k|m?g|m/?s2|[nµu]t|gauss|m?v|counts?|raw)[)\]]?$"
+)
+
+
+def check_columns(names: Sequence[str], source: str) -> None:
+    """Refuse near misses of the contract's names, and missing or half-present triads."""
+    check_near_misses(names, COLUMNS, f"{source}: column")
+    missing = [name for name in CHANNELS["accelerometer"] if name not in names]
+    if missing:
+        raise _missing(missing, names, source)
+    magnetometer = CHANNELS["magnetometer"]
+    absent = [name for name in magnetometer if name not in names]
+    if 0 < len(absent) < len(magnetometer):
+        raise InputError(
+            f"{source}: the columns mx, my, mz must be all present or all absent; "
+            f"{_listed(absent)} missing. Add what is missing or remove the others."
+        )
+
+
+def check_near_misses(names: Iterable[str], contract: Sequence[str], what: str) -> None:
+    """Refuse a name that differs from an absent one of the contract in case or unit only.
+
+    Such a column would be ignored in silence; any other unknown column is the user's own.
+    """
+    present = set(names)
+    expected = {form: name for name in contract if name not in present for form in _forms(name)}
+    for name in present.difference(contract):
+        meant = next((expected[form] for form in _forms(name) if form in expected), None)
+        if meant is not None:
+            raise InputError(
+                f"{what} '{name}' must be spelled exactly as documented. Did you mean "
+                f"'{meant}'? Rename it (and convert its unit), or choose a different name."
+            )
+
+
+def _forms(name: str) -> tuple[str, str]:
+    """The name without case and separators, and the same without its unit.
+
+    >>> _forms("Ref inclination [deg]")
+    ('refinclinationdeg', 'refinclination')
+    """
+    bare = name.strip().lower()
+    return _squeezed(bare), _squeezed(_UNIT.sub("", bare))
+
+
+def _squeezed(name: str) -> str:
+    return re.sub(r"[^a-z0-9]", "", name)
+
+
+def _missing(missing: Sequence[str], names: Sequence[str], source: str) -> InputError:
+    closest = {m: difflib.get_close_matches(m, names[:100], n=1, cutoff=0.5) for m in missing}
+    hints = [f"'{near[0]}' for '{name}'" for name, near in closest.items() if near]
+    meant = f" Did you mean {', '.join(hints)}?" if hints else ""
+    found = ", ".join(f"'{name[:40]}'" for name in names[:20]) + (" …" if names[20:] else "")
+    return InputError(
+        f"{source}: the columns ax, ay, az must be present; {_listed(missing)} missing; "
+        f"found {found}.{meant} Rename the columns, or check the delimiter of the file."
+    )
+
+
+def _listed(names: Sequence[str]) -> str:
+    quoted = ", ".join(f"'{name}'" for name in names)
+    return f"{quoted} {'is' if len(names) == 1 else 'are'}"

@@ -1,0 +1,103 @@
+"""Metadata lines `# key = value`, with values in TOML, at the head of text tables and sheets.
+
+A bare word that is no TOML value (`serial = MWD-123`) is taken as text. Dates become ISO
+text, so that every format holds the same values: text, numbers, booleans, lists, tables.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import tomllib
+from collections.abc import Iterable, Mapping
+from datetime import date, time
+
+from mwdcal.errors import InputError
+
+_BARE = re.compile(r"([A-Za-z0-9_-]+)\s*=\s*([^\s\"'\[{].*)")
+_LONGEST_SHOWN = 60
+
+
+def parse(lines: Iterable[tuple[int, str]], source: str, word: str = "line") -> dict[str, object]:
+    """The metadata of numbered `#` lines; an empty comment line says nothing.
+
+    >>> parse([(1, "# serial = MWD-123"), (2, "# declination_deg = 3.5")], "run.csv")
+    {'serial': 'MWD-123', 'declination_deg': 3.5}
+    """
+    metadata: dict[str, object] = {}
+    for number, line in lines:
+        text = line.lstrip("#").strip()
+        if not text:
+            continue
+        key, value = _entry(text, f"{source}, {word} {number}")
+        if key in metadata:
+            raise InputError(
+                f"{source}, {word} {number}: metadata keys must be unique; got '{key}' a "
+                "second time. Remove one of the two lines."
+            )
+        metadata[key] = value
+    return metadata
+
+
+def render(metadata: Mapping[str, object]) -> list[str]:
+    """The lines that `parse` turns back into `metadata`; empty values are left out."""
+    return [f"# {_key(k)} = {_toml(v)}" for k, v in metadata.items() if v is not None]
+
+
+def _entry(text: str, where: str) -> tuple[str, object]:
+    """Key and value of one line."""
+    bare = _BARE.fullmatch(text)
+    try:
+        found = {} if text.startswith("[") else tomllib.loads(text)
+    except (ValueError, RecursionError):
+        found = {bare[1]: bare[2]} if bare else {}
+    if len(found) != 1:
+        raise InputError(
+            f"{where}: a line that starts with '#' must read `# key = value`, the key of "
+            f"letters, digits, '_' and '-', the value as in TOML; got {_shown(text)}. "
+            "Correct or remove the line."
+        )
+    ((key, value),) = found.items()
+    return key, _plain(value, bare[2] if bare else "")
+
+
+def _plain(value: object, text: str = "") -> object:
+    """The value without the types that JSON has not: dates, and numbers beyond its range."""
+    if isinstance(value, list):
+        return [_plain(item) for item in value]
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, date | time):
+        return value.isoformat()
+    if isinstance(value, float) and not math.isfinite(value):
+        return text or str(value)
+    if isinstance(value, int) and abs(value) >= 2**63:
+        return text or "an integer beyond 64 bits"
+    return value
+
+
+def _key(key: str) -> str:
+    return key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else _quoted(key)
+
+
+def _toml(value: object) -> str:
+    """The value as TOML on one line."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, int) or (isinstance(value, float) and math.isfinite(value)):
+        return repr(value)
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(_toml(item) for item in value) + "]"
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(f"{_key(k)} = {_toml(v)}" for k, v in value.items()) + "}"
+    return _quoted(str(value))
+
+
+def _quoted(text: str) -> str:
+    """A TOML string: JSON's escapes, and DEL, which JSON leaves alone."""
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
+def _shown(text: str) -> str:
+    return repr(text if len(text) <= _LONGEST_SHOWN else text[:_LONGEST_SHOWN] + "…")
