@@ -20,9 +20,9 @@ SOURCE = ROOT / "src" / "mwdcal"
 LAYERS = (
     ("errors", "core.vectors", "core.solvers"),
     ("core.observables", "core.models"),
-    ("core.problem", "core.uncertainty", "core"),
-    ("readings", "profile"),
-    ("calibration",),
+    ("core.problem", "core.uncertainty", "core.start", "core"),
+    ("readings", "profile", "profiles"),
+    ("calibration", "estimate"),
     ("quality", "simulate"),
     ("files", "files.*"),
     ("registry", "registry.*"),

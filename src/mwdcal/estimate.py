@@ -6,7 +6,7 @@ A method is a selection of evidence; the solver is the same. See `METHODS`.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -120,7 +120,7 @@ def model_of(kind: str, order: int, raw: Array, temperature: Array, include: Arr
 
 
 def _problem(
-    readings: Readings, evidence: Evidence, lead: tuple[int, ...], kind: str, order: int, curved: frozenset[str]
+    readings: Readings, evidence: Evidence, lead: tuple[int, ...], kind: str, order: int, curved: Mapping[str, float]
 ) -> tuple[Problem, list[bool]]:
     """The problem, and for each triad whether its noise is declared."""
     cold = np.zeros(readings.count)
@@ -133,18 +133,17 @@ def _problem(
         raw = _flat(values, lead, 3)
         model = model_of(kind, order, raw, temperature, evidence.include, name in curved)
         sd = _flat(readings.sd[name], lead, 3) if name in readings.sd else 1e-3 * _size(raw) + 0 * raw
-        triads.append(Triad(model, raw, sd, _prior(model, evidence, name)))
+        triads.append(Triad(model, raw, sd, _prior(model, evidence, name, curved.get(name, 0.0))))
         declared.append(name in readings.sd)
     return Problem(tuple(triads), temperature, evidence), declared
 
 
-CURVATURE = 0.005
-def _prior(model: Model, evidence: Evidence, name: str) -> Array:
+def _prior(model: Model, evidence: Evidence, name: str, nonlinearity: float) -> Array:
     """Prior precision (B, p): curved terms are small, all else is free."""
     prior = np.zeros((len(evidence.include), model.size))
     if isinstance(model, Polynomial) and model.curved:
         strength = np.nanmean(evidence.known["field" if name == "magnetometer" else "gravity"], -1)
-        prior[:, -6:] = (CURVATURE * strength[:, None]) ** -2
+        prior[:, -6:] = (nonlinearity * strength[:, None]) ** -2
     return prior
 
 
@@ -160,14 +159,14 @@ def fit(
     kind: str = "polynomial",
     order: int = 0,
     include: Array | None = None,
-    curved: frozenset[str] = frozenset(),
+    curved: Mapping[str, float] | None = None,
     rounds: int = 8,
 ) -> Fit:
     """Fit a run, or a batch of runs (leading axes of the readings, or of `include`)."""
     include = np.ones(readings.count) if include is None else np.asarray(include, float)
     evidence = METHODS[method](evidence_of(readings, include))
     lead = np.broadcast_shapes(readings.accelerometer.shape[:-1], include.shape)
-    problem, declared = _problem(readings, evidence, lead, kind, order, curved)
+    problem, declared = _problem(readings, evidence, lead, kind, order, curved or {})
     state = start(problem)
     state, status, iterations = gauss_newton(problem, state)
     noise = np.full((len(status), len(declared)), np.nan)

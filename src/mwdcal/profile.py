@@ -24,12 +24,15 @@ class TriadProfile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     unknown: it is then taken from the readings and cannot serve as a check.
     `noise` is the standard uncertainty of one station's raw reading (None: it is
     estimated from the residuals); `repeatability` is added to it in quadrature.
+    `nonlinearity` is the linearity error of the datasheet as a share of the field (1 σ, for
+    example 0.005): each axis then has its own quadratic and cubic term with that prior.
     """
 
     axes: tuple[Axis, Axis, Axis] = ("+x", "+y", "+z")
     scale: float | None = None
     noise: float | None = None
     repeatability: float = 0.0
+    nonlinearity: float | None = None
 
     @property
     def permutation(self) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import secrets
 from pathlib import Path
@@ -16,7 +17,7 @@ def write(path: str | os.PathLike[str], data: bytes | str) -> None:
     temporary = target.with_name(f".mwdcal-{secrets.token_hex(8)}.tmp")
     try:
         _write_through(temporary, content)
-        os.replace(temporary, target)
+        temporary.replace(target)
     except OSError as error:
         raise _refusal(path, error) from error
     finally:
@@ -43,7 +44,7 @@ def _target(path: str | os.PathLike[str]) -> Path:
 
 def _write_through(path: Path, content: bytes) -> None:
     """Write a new file and wait until it is on the disk."""
-    with open(path, "xb") as stream:
+    with path.open("xb") as stream:
         stream.write(content)
         stream.flush()
         os.fsync(stream.fileno())
@@ -51,10 +52,8 @@ def _write_through(path: Path, content: bytes) -> None:
 
 def _remove(path: Path) -> None:
     """Remove what an error or an interruption left; nothing is left after a success."""
-    try:
+    with contextlib.suppress(OSError):
         path.unlink(missing_ok=True)
-    except OSError:
-        pass
 
 
 def _refusal(path: str | os.PathLike[str], error: Exception) -> InputError:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Sequence
 from math import pi
 from typing import NamedTuple
 
@@ -41,9 +41,7 @@ class Reference(NamedTuple):
 
 
 def _angle(name: str, low: float, high: float) -> Reference:
-    return Reference(
-        f"ref_{name}_deg", Range(low, high, "°"), Range(0.0, 180.0, "°"), pi / 180.0
-    )
+    return Reference(f"ref_{name}_deg", Range(low, high, "°"), Range(0.0, 180.0, "°"), pi / 180.0)
 
 
 REFERENCES = {
@@ -51,9 +49,7 @@ REFERENCES = {
     "azimuth": _angle("azimuth", -360.0, 360.0),
     "toolface": _angle("toolface", -360.0, 360.0),
     "gravity": Reference("ref_gravity_g", Range(0, 2, "g", True), Range(0, 2, "g"), 1.0),
-    "field": Reference(
-        "ref_field_nt", Range(0, 200_000, "nT", True), Range(0, 200_000, "nT"), 1.0
-    ),
+    "field": Reference("ref_field_nt", Range(0, 200_000, "nT", True), Range(0, 200_000, "nT"), 1.0),
     "dip": _angle("dip", -90.0, 90.0),
 }
 TEMPERATURE = Range(-273.15, 1000.0, "°C")
@@ -90,16 +86,16 @@ def check_columns(names: Sequence[str], source: str) -> None:
         )
 
 
-def check_near_misses(names: Iterable[str], contract: Sequence[str], what: str) -> None:
+def check_near_misses(names: Collection[str], contract: Sequence[str], what: str) -> None:
     """Refuse a name that differs from an absent one of the contract in case or unit only.
 
     Such a column would be ignored in silence; any other unknown column is the user's own.
     """
     present = set(names)
     expected = {form: name for name in contract if name not in present for form in _forms(name)}
-    for name in present.difference(contract):
+    for name in names:
         meant = next((expected[form] for form in _forms(name) if form in expected), None)
-        if meant is not None:
+        if meant is not None and name not in contract:
             raise InputError(
                 f"{what} '{name}' must be spelled exactly as documented. Did you mean "
                 f"'{meant}'? Rename it (and convert its unit), or choose a different name."

@@ -49,7 +49,8 @@ def render(columns: Mapping[str, Column], metadata: Mapping[str, object], source
     """The bytes that `parse` turns back into the same columns and metadata."""
     arrow, parquet = _modules(source)
     arrays = {name: _array(column, arrow) for name, column in columns.items()}
-    table = arrow.table(arrays).replace_schema_metadata({_KEY: msgspec.json.encode(metadata, enc_hook=str)})
+    described = {_KEY: msgspec.json.encode(metadata, enc_hook=str)}
+    table = arrow.table(arrays).replace_schema_metadata(described)
     stream = arrow.BufferOutputStream()
     parquet.write_table(table, stream)
     return bytes(stream.getvalue())

@@ -7,13 +7,13 @@ import io
 import re
 import warnings
 import zipfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import islice
 from typing import Any
 
 from mwdcal.errors import InputError
 from mwdcal.files import metadata as meta
-from mwdcal.files.columns import Column, Parts, assemble, typed
+from mwdcal.files.columns import Column, Parts, assemble, number, typed
 
 _LARGEST_UNPACKED = 100_000_000
 _MAX_ROWS = 1_048_576
@@ -31,31 +31,31 @@ def parse(data: bytes, source: str, delimiter: str | None = None) -> Parts:
     rows = iter(_rows(data, source))
     comments: list[tuple[int, str]] = []
     header: list[Row] = []
-    for number, row in rows:
+    for line, row in rows:
         if row and str(row[0]).lstrip().startswith("#"):
-            comments.append((number, str(row[0]).strip()))
+            comments.append((line, str(row[0]).strip()))
         elif row:
-            header.append((number, row))
+            header.append((line, row))
             break
     metadata = meta.parse(comments, source, "row")
     width = len(header[0][1]) if header else 0
-    names, cells, numbers = assemble(_padded(header, rows, width), source, "row")
+    names, cells, lines = assemble(_padded(header, rows, width), source, "row")
     columns = {
         name: typed(name, column)
         for name, column in zip(names, zip(*cells, strict=True), strict=True)
     }
-    return Parts(columns, metadata, numbers)
+    return Parts(columns, metadata, lines)
 
 
 def render(columns: Mapping[str, Column], metadata: Mapping[str, object], source: str) -> bytes:
     """The bytes that `parse` turns back into the same columns and metadata."""
     book = _module(source).Workbook(write_only=True)
+    rows: list[Sequence[str | float]] = [[line] for line in meta.render(metadata)]
+    rows += [list(columns), *zip(*columns.values(), strict=True)]
+    _check_texts(rows, source)
     sheet = book.create_sheet("run")
-    for line in meta.render(metadata):
-        sheet.append([_text_cell(sheet, line, source)])
-    sheet.append([_text_cell(sheet, name, source) for name in columns])
-    for row in zip(*columns.values(), strict=True):
-        sheet.append([_cell(sheet, value, source) for value in row])
+    for row in rows:
+        sheet.append([_cell(sheet, value) for value in row])
     stream = io.BytesIO()
     book.save(stream)
     return _timeless(stream)
@@ -83,7 +83,7 @@ def _rows(data: bytes, source: str) -> list[Row]:
             sheet = book.worksheets[0]
             sheet.reset_dimensions()
             cells = islice(sheet.iter_rows(values_only=True), _MAX_ROWS + 1)
-            rows = [(number, _trimmed(row)) for number, row in enumerate(cells, 1)]
+            rows = [(line, _trimmed(row)) for line, row in enumerate(cells, 1)]
     except InputError:
         raise
     except Exception as error:
@@ -123,27 +123,29 @@ def _trimmed(row: Sequence[object]) -> Sequence[object]:
 def _padded(header: Sequence[Row], rows: Iterator[Row], width: int) -> Iterator[Row]:
     """Header and rows, each row filled up with blank cells to `width`."""
     yield from header
-    for number, row in rows:
-        yield number, [*row, *[None] * (width - len(row))]
+    for line, row in rows:
+        yield line, [*row, *[None] * (width - len(row))]
 
 
-def _cell(sheet: Any, value: str | float, source: str) -> Any:
-    if isinstance(value, str):
-        return _text_cell(sheet, value, source) if value else None
-    return None if value != value else float(value)
+def _check_texts(rows: Iterable[Sequence[str | float]], source: str) -> None:
+    """Refuse text that a workbook cannot hold, before any of it is written."""
+    for value in (value for row in rows for value in row if isinstance(value, str)):
+        if len(value) > _LONGEST_CELL or _UNWRITABLE.search(value):
+            raise InputError(
+                f"{source}: a cell of a workbook must be plain text of at most {_LONGEST_CELL} "
+                f"characters; got {value[:40]!r}. Write CSV or Parquet."
+            )
 
 
-def _text_cell(sheet: Any, value: str, source: str) -> Any:
-    """A cell that stays text, whatever it looks like: a formula, a date, a number."""
+def _cell(sheet: Any, value: str | float) -> Any:
+    """A cell with all digits of a number, or text that stays text, whatever it looks like."""
     from openpyxl.cell import WriteOnlyCell
 
-    if len(value) > _LONGEST_CELL or _UNWRITABLE.search(value):
-        raise InputError(
-            f"{source}: a cell of a workbook must be plain text of at most {_LONGEST_CELL} "
-            f"characters; got {value[:40]!r}. Write CSV or Parquet."
-        )
-    cell = WriteOnlyCell(sheet, value)
-    cell.data_type = "s"
+    content = value if isinstance(value, str) else number(value)
+    if not content:
+        return None
+    cell = WriteOnlyCell(sheet, content)
+    cell.data_type = "s" if isinstance(value, str) else "n"
     return cell
 
 

@@ -1,0 +1,75 @@
+"""Sphinx configuration. The build needs no network, and neither do the pages."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import sys
+from pathlib import Path
+
+import mwdcal
+
+sys.path.insert(0, str(Path(__file__).parent / "_extensions"))
+
+project = "mwdcal"
+author = "The mwdcal authors"
+project_copyright = author
+version = release = mwdcal.__version__
+
+extensions = [
+    "mathml",
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+    "sphinx_click",
+]
+exclude_patterns = ["_build"]
+source_suffix = {".md": "markdown"}
+
+myst_enable_extensions = ["colon_fence", "dollarmath", "fieldlist"]
+myst_heading_anchors = 3
+
+default_role = "code"
+autodoc_member_order = "bysource"
+autodoc_typehints = "signature"
+autodoc_default_options = {"members": True, "undoc-members": False}
+autodoc_type_aliases = {"Array": "Array", "ArrayLike": "ArrayLike"}
+napoleon_google_docstring = True
+napoleon_numpy_docstring = False
+napoleon_use_ivar = True
+
+html_theme = "furo"
+html_title = f"mwdcal {release}"
+html_math_renderer = "mathml"
+html_copy_source = False
+html_show_sphinx = False
+
+# A section of a page whose only content is the documentation of one module.
+MODULE_SECTION = re.compile(
+    r"^## [^\n]+\n\n```\{eval-rst\}\n\.\. (?:automodule|click):: ([\w.]+).*?\n```\n", re.M | re.S
+)
+
+
+def exists(module: str) -> bool:
+    """Whether a module can be found, without importing it."""
+    try:
+        return importlib.util.find_spec(module) is not None
+    except ModuleNotFoundError:
+        return False
+
+
+def leave_out_missing(app, docname, source) -> None:
+    """Drop the sections about modules that do not exist (yet)."""
+    source[0] = MODULE_SECTION.sub(lambda m: m[0] if exists(m[1]) else "", source[0])
+
+
+def escape_bars(app, what, name, obj, options, lines) -> None:
+    """Let docstrings write |g| for a magnitude: bars are substitutions in reStructuredText."""
+    for index, line in enumerate(lines):
+        pieces = re.split(r"(`+[^`]*`+)", line)
+        lines[index] = "".join(p if p.startswith("`") else p.replace("|", r"\|") for p in pieces)
+
+
+def setup(app) -> None:
+    app.connect("source-read", leave_out_missing)
+    app.connect("autodoc-process-docstring", escape_bars)

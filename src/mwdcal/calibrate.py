@@ -1,0 +1,277 @@
+"""`calibrate`: readings and profile in, a `Calibration` out, or a refusal with its reason."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from mwdcal import __version__
+from mwdcal.calibration import Calibration, Constant, Finding, StationRow, TriadCalibration, Undetermined
+from mwdcal.checks import TRIADS, check_fit, check_readings
+from mwdcal.core.observability import Free, free_directions
+from mwdcal.core.vectors import Array
+from mwdcal.errors import InputError
+from mwdcal.estimate import METHODS, Fit, fit
+from mwdcal.profile import Profile
+from mwdcal.readings import Readings
+from mwdcal.residuals import REASONS, error_rows, measure_rows, shown_in, station_rows
+
+DIGITS = 12
+"""Significant digits in files: more would differ from machine to machine."""
+SUSPECT = 3.0
+"""A fit whose residuals exceed the declared noise this many times is reported."""
+IDENTITY = ("serial", "tool", "operator", "lab", "date", "stand")
+
+
+def calibrate(
+    readings: Readings,
+    profile: Profile,
+    method: str = "joint",
+    model: str | None = None,
+    order: int = 0,
+    *,
+    profile_sha256: str = "",
+    run_sha256: str = "",
+    progress: Callable[[str], None] = lambda text: None,
+) -> Calibration:
+    """Fit the sensor model to a run and state what it is worth.
+
+    `model` is "polynomial" or "factors" (default: polynomial at order 0, factors above).
+    Raises `FitError` where the data cannot give a calibration to be trusted.
+    """
+    if method not in METHODS:
+        raise InputError(f"--method must be one of {', '.join(METHODS)}; got {method!r}.")
+    kind = model or ("factors" if order else "polynomial")
+    check_readings(readings, method, kind, order)
+    progress(f"fitting {readings.count} stations, method {method}, {kind} of order {order}")
+    result = fit(readings, method, kind, order, curved=_curved(profile, kind))
+    free = free_directions(result.problem, result.state, result.analysis.determined)
+    check_fit(result, free, profile, readings)
+    made = _Record(readings, profile, result, free)
+    temperature = readings.temperature
+    stations = station_rows(readings, result)
+    return Calibration(
+        tool={k: str(v) for k, v in readings.metadata.items() if k in IDENTITY},
+        profile=profile,
+        profile_sha256=profile_sha256,
+        run=readings.source,
+        run_sha256=run_sha256,
+        software=f"mwdcal {__version__}",
+        method=method,
+        time=datetime.now(UTC).isoformat(timespec="seconds"),
+        field_unit="relative (field = 1)" if made.relative else "nT",
+        stations=readings.count,
+        temperature_c=None if temperature is None else (float(temperature.min()), float(temperature.max())),
+        triads=made.triads(),
+        covariance=listed(made.covariance),
+        free=[listed(d) for d in made.directions],
+        singular_values=listed(result.analysis.determined.values[0]),
+        constants=made.constants(),
+        earth=made.earth(),
+        errors=error_rows(readings, result),
+        measures=measure_rows(readings, result),
+        station_rows=stations,
+        findings=made.findings(stations),
+    )
+
+
+def _curved(profile: Profile, kind: str) -> dict[str, float]:
+    """Triads whose profile declares a nonlinearity, with its prior."""
+    if kind != "polynomial":
+        return {}
+    declared = {name: getattr(profile, name).nonlinearity for name in TRIADS}
+    return {name: value for name, value in declared.items() if value}
+
+
+def digits(value: float) -> float:
+    """A number to 12 significant digits, as files keep it."""
+    return float(f"{value:.{DIGITS - 1}e}")
+
+
+def listed(values: Any) -> Any:
+    """An array as nested lists of rounded numbers."""
+    flat = [digits(v) for v in np.asarray(values, float).ravel()]
+    return np.array(flat).reshape(np.shape(values)).tolist()
+
+
+TEXTS = {
+    "toolface-zero": "toolface zero is undetermined: no evidence fixes rotation about the tool axis; kept at nominal. "
+    "Give ref_toolface_deg at some stations to determine it",
+    "rotation-x": "rotation about the tool's x axis is undetermined: no evidence fixes it; kept at nominal. Give "
+    "reference inclinations, or roll sets at three or more directions",
+    "rotation-y": "rotation about the tool's y axis is undetermined: no evidence fixes it; kept at nominal. Give "
+    "reference inclinations, or roll sets at three or more directions",
+    "scale": "overall scale is undetermined: no evidence fixes it; kept at nominal. Give a reference strength",
+}
+
+
+@dataclass(frozen=True)
+class _Record:
+    """The parts of a calibration file, from one fit."""
+
+    readings: Readings
+    profile: Profile
+    result: Fit
+    free: list[Free]
+
+    @property
+    def relative(self) -> bool:
+        """Whether the magnetometer is calibrated to a field of one."""
+        return self.readings.magnetometer is not None and bool(np.isnan(self.readings.reference("field")).all())
+
+    @cached_property
+    def map(self) -> Array:
+        """Linear map (p, p) from the fit's parameters to the file's."""
+        slices = self.result.problem.slices()
+        whole = np.zeros((slices[-1].stop, slices[-1].stop))
+        for triad, where in zip(self.result.problem.triads, slices, strict=True):
+            _, one = triad.model.finished(self.profile.reference_temperature_c)
+            whole[where, where] = one.reshape(-1, triad.model.size, triad.model.size)[0]
+        return whole
+
+    @cached_property
+    def factors(self) -> Array:
+        """What scales each triad's variances: s², or 1 where there is no redundancy."""
+        analysis = self.result.analysis
+        usable = analysis.freedom[0] >= 1
+        return np.where(usable, np.nan_to_num(analysis.variance_factor[0], nan=1.0), 1.0)
+
+    @cached_property
+    def covariance(self) -> Array:
+        """Covariance (p, p) of the file's parameters, scaled by s²."""
+        sizes = [t.model.size for t in self.result.problem.triads]
+        spread = np.sqrt(np.repeat(self.factors, sizes))
+        scaled = self.result.analysis.covariance[0] * np.outer(spread, spread)
+        return np.asarray(self.map @ scaled @ self.map.transpose())
+
+    @cached_property
+    def directions(self) -> list[Array]:
+        """Free directions (p,) in the file's parameters, turning or stretching by one."""
+        return [self.map @ entry.direction for entry in self.free]
+
+    def earth(self) -> dict[str, float]:
+        """Mean gravity, field and dip of the run: given or estimated."""
+        state, problem = self.result.state, self.result.problem
+        found = {"gravity_g": digits(float(problem.constant(state, "gravity").mean()))}
+        if len(problem.triads) > 1:
+            found["field"] = digits(float(problem.constant(state, "field").mean()))
+            found["dip_deg"] = digits(float(np.degrees(problem.constant(state, "dip").mean())))
+        return found
+
+    def constants(self) -> list[Constant]:
+        """Estimated constants of the run with their uncertainty."""
+        found = []
+        scale = float(np.sqrt(self.factors.max()))
+        for index, constant in enumerate(self.result.problem.evidence.constants):
+            if constant.name == "dip" and len(self.result.problem.triads) == 1:
+                continue
+            degrees = float(np.degrees(1)) if constant.name == "dip" else 1.0
+            found.append(
+                Constant(
+                    name=constant.name if constant.unknown else f"{constant.name} reference error",
+                    value=digits(float(self.result.state.constants[0, index]) * degrees),
+                    standard_uncertainty=digits(
+                        float(np.sqrt(self.result.analysis.constants[0, index, index])) * scale * degrees
+                    ),
+                    unit={"dip": "°", "gravity": "g", "field": "nT"}[constant.name],
+                )
+            )
+        return found
+
+    def triads(self) -> list[TriadCalibration]:
+        """One record per triad."""
+        return [self._triad(index) for index in range(len(self.result.problem.triads))]
+
+    def _triad(self, index: int) -> TriadCalibration:
+        problem, analysis = self.result.problem, self.result.analysis
+        triad, where = problem.triads[index], problem.slices()[index]
+        free = [f for f in self.free if index in f.triads]
+        noise, declared = self.result.noise[0, index], np.isnan(self.result.noise[0, index])
+        curved = bool(getattr(triad.model, "curved", False))
+        finished, _ = triad.model.finished(self.profile.reference_temperature_c)
+        freedom = float(analysis.freedom[0, index])
+        return TriadCalibration(
+            name=TRIADS[index],
+            unit="g" if index == 0 else ("1 (field = 1)" if self.relative else "nT"),
+            model=triad.model.kind,
+            order=triad.model.basis.order,
+            curved=curved,
+            centre=listed(finished.centre.reshape(-1, 3)[0]) if curved else [0.0, 0.0, 0.0],  # type: ignore[union-attr]
+            radius=digits(float(finished.scale.ravel()[0])) if curved else 1.0,  # type: ignore[union-attr]
+            parameter_names=list(finished.names),
+            parameters=listed(self.map[where, where] @ self.result.state.params[0, where]),
+            standard_uncertainties=self._uncertainties(where),
+            rank=triad.model.size - len(free),
+            size=triad.model.size,
+            singular_values=listed(_own_values(self.result, where)),
+            undetermined=[
+                Undetermined(id=f.id, text=f"{TRIADS[index]}: {TEXTS.get(f.id, f.id)}") for f in free
+            ],
+            noise=digits(float(triad.sd[0].mean() if declared else noise)),
+            noise_source="declared" if declared else "estimated from the residuals",
+            variance_factor=digits(float(analysis.variance_factor[0, index])) if freedom >= 1 else None,
+            degrees_of_freedom=digits(freedom),
+        )
+
+    def _uncertainties(self, where: slice) -> list[float | None]:
+        """Standard uncertainties; None for parameters that move with a free direction."""
+        values = np.sqrt(np.diag(self.covariance)[where])
+        size = np.abs(self.map[where, where] @ self.result.state.params[0, where]).max()
+        moved = np.zeros(len(values))
+        for direction in self.directions:
+            moved = np.maximum(moved, np.abs(direction[where]))
+        return [None if m > 1e-2 * size else digits(float(v)) for v, m in zip(values, moved, strict=True)]
+
+    def findings(self, stations: list[StationRow]) -> list[Finding]:
+        """What the reader should know, in order of weight."""
+        found = []
+        for triad in self.triads():
+            excess = triad.variance_factor
+            if triad.noise_source == "declared" and excess is not None and excess > SUSPECT**2:
+                found.append(
+                    Finding(
+                        id=f"{triad.name}-residuals",
+                        text=f"{triad.name}: residuals are {excess**0.5:.1f} times the declared noise: "
+                        "the noise figure, a reference, or the model is wrong. Uncertainties are "
+                        "scaled up accordingly.",
+                    )
+                )
+        for entry in self.free:
+            names = " and ".join(TRIADS[t] for t in entry.triads)
+            found.append(Finding(id=entry.id, text=f"{names}: {TEXTS.get(entry.id, entry.id)}."))
+        if self.relative:
+            text = "field strength is known at no station: the magnetometer is calibrated to field = 1. "
+            found.append(Finding(id="field-unknown", text=text + "Give ref_field_nt to have nT."))
+        return found + [self._reshoot(row) for row in stations if row.reshoot]
+
+    def _reshoot(self, row: StationRow) -> Finding:
+        worst = row.worst or "gravity"
+        factor, unit = shown_in(worst, self.relative)
+        value = row.errors.get(worst, float("nan"))
+        text = (
+            f"station {row.station}: residual {row.deviation:.1f}σ, most in {worst} ({value:+.3g} {unit}): "
+            f"{REASONS[worst]} Re-shoot it, or --exclude {row.station}"
+        )
+        return Finding(id="reshoot", text=text, station=row.station)
+
+
+def _own_values(result: Fit, where: slice) -> Array:
+    """Singular values of one triad when all that is shared with the other is free."""
+    from mwdcal.core.solvers import Normal
+
+    normal = Normal.of(result.problem.linear(result.state, geometry=True))
+    reduced, _, _ = normal.reduced()
+    norms = normal.norms()[0]
+    scaled = reduced[0] / np.outer(norms, norms)
+    other = np.ones(len(norms), bool)
+    other[where] = False
+    cross = scaled[other][:, where]
+    inverse = np.linalg.pinv(scaled[np.ix_(other, other)], rcond=1e-6, hermitian=True)
+    values = np.linalg.eigvalsh(scaled[where, where] - cross.transpose() @ inverse @ cross)
+    values = np.sqrt(np.clip(values[::-1], 0, None))
+    return np.asarray(values / values[0])

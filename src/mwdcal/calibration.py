@@ -1,0 +1,274 @@
+"""`Calibration`: what a fit leaves behind, and what is applied to readings ever after.
+
+The record is the file: every number is rounded to 12 significant digits when it is made, so
+a calibration in memory and one read back give the same results.
+"""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+
+from mwdcal.core.models import Basis, Factors, Model, Polynomial
+from mwdcal.core.observables import OBSERVABLES
+from mwdcal.core.vectors import Array, Bools
+from mwdcal.profile import Profile
+from mwdcal.readings import Readings
+
+SCHEMA_VERSION = 1
+FREE_SHARE = 1e-2
+"""An output rests on a free direction if it moves by more than this share of it (rad per rad,
+or of its own strength), the direction being scaled to turn or stretch the fields by one."""
+
+
+class Finding(msgspec.Struct, frozen=True, kw_only=True):
+    """Something the reader should know: `id` for machines, `text` for people, maybe a station."""
+
+    id: str
+    text: str
+    station: str | None = None
+
+
+class Undetermined(msgspec.Struct, frozen=True, kw_only=True):
+    """A direction of parameter space that the evidence leaves free, in plain language."""
+
+    id: str
+    text: str
+
+
+class Constant(msgspec.Struct, frozen=True, kw_only=True):
+    """A constant of the run that was estimated, with its standard uncertainty."""
+
+    name: str
+    value: float
+    standard_uncertainty: float
+    unit: str
+
+
+class ErrorRow(msgspec.Struct, frozen=True, kw_only=True):
+    """Root mean square error of one observable over the stations where it is known."""
+
+    observable: str
+    unit: str
+    stations: int
+    before: float
+    after: float
+    expected: float | None = None
+
+
+class StationRow(msgspec.Struct, frozen=True, kw_only=True):
+    """One station of the fit: errors left where references are known, and how unlikely they are.
+
+    `deviation` is the station's χ² put as an equivalent number of standard deviations of one
+    normal variable; `reshoot` marks the ones to take again.
+    """
+
+    station: str
+    digest: str
+    temperature_c: float | None
+    inclination_deg: float | None
+    toolface_deg: float | None
+    azimuth_deg: float | None
+    errors: dict[str, float]
+    errors_before: dict[str, float]
+    deviation: float
+    reshoot: bool = False
+    worst: str | None = None
+
+
+class Measures(msgspec.Struct, frozen=True, kw_only=True):
+    """Moradi's measures of the vector error |ideal - estimated|, as a share of the field."""
+
+    triad: str
+    when: str
+    mean: float
+    std: float
+    mse: float
+    rmse: float
+
+
+class TriadCalibration(msgspec.Struct, frozen=True, kw_only=True):
+    """One triad: field = model(x, T - reference), x = P (raw / scale), in tool axes.
+
+    model "polynomial": parameters are A (row by row) and c for each power of temperature,
+    field = Σ τᵏ (A_k x + c_k); with `curved`, e₂ x² + e₃ x³ on each own axis follow, all
+    terms then of (x - centre) / radius.
+    model "factors": SF, B (temperature powers fastest) and m, field = (I - m)(x / SF - B).
+    """
+
+    name: str
+    unit: str
+    model: str
+    order: int
+    curved: bool
+    centre: list[float]
+    radius: float
+    parameter_names: list[str]
+    parameters: list[float]
+    standard_uncertainties: list[float | None]
+    rank: int
+    size: int
+    singular_values: list[float]
+    undetermined: list[Undetermined]
+    noise: float
+    noise_source: str
+    variance_factor: float | None
+    degrees_of_freedom: float
+
+    def functions(self, reference: float) -> Model:
+        """The model that these parameters belong to."""
+        basis = Basis(self.order, reference)
+        if self.model == "factors":
+            return Factors(basis)
+        centre, radius = np.array([self.centre]), np.full((1, 3), self.radius)
+        return Polynomial(basis, centre, radius, self.curved)
+
+
+class Calibration(msgspec.Struct, frozen=True, kw_only=True):
+    """A calibrated tool: see `docs/files.md` for every field.
+
+    `covariance` is of the parameters of all triads in order, scaled by s² where that is
+    estimated; `free` are directions (rows) of parameter space that no evidence determines.
+    """
+
+    schema_version: int = SCHEMA_VERSION
+    tool: dict[str, str]
+    profile: Profile
+    profile_sha256: str
+    run: str
+    run_sha256: str
+    software: str
+    method: str
+    seed: int | None = None
+    time: str
+    field_unit: str
+    stations: int
+    temperature_c: tuple[float, float] | None
+    triads: list[TriadCalibration]
+    covariance: list[list[float]]
+    free: list[list[float]]
+    singular_values: list[float]
+    constants: list[Constant]
+    earth: dict[str, float]
+    errors: list[ErrorRow]
+    measures: list[Measures]
+    station_rows: list[StationRow]
+    findings: list[Finding]
+
+    @property
+    def reference_temperature(self) -> float:
+        """The temperature τ = 0 of the model, °C."""
+        return self.profile.reference_temperature_c
+
+    @property
+    def digests(self) -> frozenset[str]:
+        """Fingerprints of the stations of the fit."""
+        return frozenset(row.digest for row in self.station_rows)
+
+    def triad(self, name: str) -> TriadCalibration:
+        """A triad by its name; KeyError where the tool was calibrated without it."""
+        for triad in self.triads:
+            if triad.name == name:
+                return triad
+        raise KeyError(name)
+
+    @property
+    def has_field(self) -> bool:
+        """Whether the magnetometer was calibrated."""
+        return len(self.triads) > 1
+
+    def _temperature(self, readings: Readings) -> Array:
+        if readings.temperature is None:
+            return np.full(readings.accelerometer.shape[:-1], self.reference_temperature)
+        return readings.temperature
+
+    def fields(self, readings: Readings) -> tuple[Array, Array]:
+        """Gravity (…, n, 3), g, and magnetic field (…, n, 3), nT: NaN without magnetometer."""
+        temperature = self._temperature(readings)
+        found = []
+        for triad in self.triads:
+            model = triad.functions(self.reference_temperature)
+            raw = getattr(readings, triad.name)
+            if raw is None:
+                found.append(np.full_like(readings.accelerometer, np.nan))
+            else:
+                found.append(model.fields(np.array(triad.parameters), raw, temperature))
+        while len(found) < 2:
+            found.append(np.full_like(readings.accelerometer, np.nan))
+        return found[0], found[1]
+
+    def jacobian(self, readings: Readings) -> Array:
+        """Derivative (…, n, 6, p) of both vectors with respect to the parameters of all triads."""
+        temperature = self._temperature(readings)
+        size = sum(t.size for t in self.triads)
+        result = np.zeros((*readings.accelerometer.shape[:-1], 6, size))
+        at = 0
+        for index, triad in enumerate(self.triads):
+            model, raw = triad.functions(self.reference_temperature), getattr(readings, triad.name)
+            if raw is not None:
+                block = model.jacobian(np.array(triad.parameters), raw, temperature)
+                result[..., 3 * index : 3 * index + 3, at : at + triad.size] = block
+            at += triad.size
+        return result
+
+    def noise_covariance(self, readings: Readings) -> Array:
+        """Covariance (…, n, 6, 6) of both vectors from the noise of one reading."""
+        temperature = self._temperature(readings)
+        result = np.zeros((*readings.accelerometer.shape[:-1], 6, 6))
+        for index, triad in enumerate(self.triads):
+            raw = getattr(readings, triad.name)
+            if raw is None:
+                continue
+            model = triad.functions(self.reference_temperature)
+            slope = model.slope(np.array(triad.parameters), raw, temperature)
+            sd = np.broadcast_to(readings.sd.get(triad.name, np.array(triad.noise)), raw.shape)
+            block = slice(3 * index, 3 * index + 3)
+            result[..., block, block] = slope * sd[..., None, :] ** 2 @ np.swapaxes(slope, -1, -2)
+        return result
+
+    def sensitivity(self, name: str, readings: Readings) -> Array:
+        """Gradient (…, n, p) of an observable with respect to the parameters."""
+        gradient = OBSERVABLES[name].gradient(*self.fields(readings))
+        gradient = np.where(np.isnan(gradient), 0.0, gradient) if not self.has_field else gradient
+        return np.einsum("...ni,...nip->...np", gradient, self.jacobian(readings))
+
+    def uncertainty(self, name: str, readings: Readings, noise: bool = False) -> Array:
+        """Standard uncertainty (…, n) of an observable, of the calibration or of one reading too.
+
+        NaN where the observable rests on a free direction: no uncertainty can be quoted.
+        """
+        rows = self.sensitivity(name, readings)
+        variance = np.einsum("...ni,ij,...nj->...n", rows, np.array(self.covariance), rows)
+        if noise:
+            gradient = OBSERVABLES[name].gradient(*self.fields(readings))
+            gradient = np.where(np.isnan(gradient), 0.0, gradient) if not self.has_field else gradient
+            spread = self.noise_covariance(readings)
+            variance = variance + np.einsum("...ni,...nij,...nj->...n", gradient, spread, gradient)
+        return np.where(self.rests_on_free(name, readings), np.nan, np.sqrt(variance))
+
+    def rests_on_free(self, name: str, readings: Readings) -> Bools:
+        """Where (…, n) an observable moves with a direction that no evidence determines."""
+        shape = readings.accelerometer.shape[:-1]
+        g, b = self.fields(readings)
+        moved = np.einsum("...nip,kp->...nki", self.jacobian(readings), self._free_rows())
+        gradient = np.nan_to_num(OBSERVABLES[name].gradient(g, b))
+        change = np.abs(np.einsum("...ni,...nki->...nk", gradient, moved))
+        scale = {"g": np.linalg.norm(g, axis=-1), "nT": np.linalg.norm(b, axis=-1)}
+        limit = FREE_SHARE * scale.get(OBSERVABLES[name].unit, np.ones(shape))
+        return np.asarray(np.any(change > np.nan_to_num(limit)[..., None], -1))
+
+    def _free_rows(self) -> Array:
+        size = sum(t.size for t in self.triads)
+        return np.array(self.free, float).reshape(len(self.free), size)
+
+    def undetermined(self) -> list[Undetermined]:
+        """Free directions of all triads, each once."""
+        return [entry for triad in self.triads for entry in triad.undetermined]
+
+    def outside(self, readings: Readings, margin: float = 0.5) -> Bools:
+        """Stations (…, n) outside the calibrated temperature range by more than `margin` °C."""
+        shape = readings.accelerometer.shape[:-1]
+        if self.temperature_c is None or readings.temperature is None:
+            return np.zeros(shape, bool)
+        low, high = self.temperature_c
+        return np.asarray((readings.temperature < low - margin) | (readings.temperature > high + margin))

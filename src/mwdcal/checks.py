@@ -1,0 +1,136 @@
+"""Refusals: what no fit could mend, and what no fit result may be trusted with."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mwdcal.core.observability import Free
+from mwdcal.core.solvers import Status
+from mwdcal.core.vectors import Array
+from mwdcal.errors import FitError, InputError
+from mwdcal.estimate import Fit
+from mwdcal.profile import Profile
+from mwdcal.readings import Readings
+
+TRIADS = ("accelerometer", "magnetometer")
+GAIN = (0.3, 3.0)
+"""An own-axis gain outside this share of nominal is a wrong profile, not a sensor error."""
+
+
+def check_fit(result: Fit, free: list[Free], profile: Profile, readings: Readings) -> None:
+    """Refuse a fit that did not settle, is too weak, has no redundancy, or absurd gains."""
+    _check_status(result)
+    _check_geometry(result, free)
+    _check_freedom(result)
+    _check_gains(result, profile, readings)
+
+
+def check_readings(readings: Readings, method: str, kind: str, order: int) -> None:
+    """Refuse what no fit could mend, before trying."""
+    size = 6 * (order + 1) + 6 if kind == "factors" else 12 * (order + 1)
+    if 3 * readings.count < size:
+        raise FitError(
+            f"{readings.source or 'the run'} has {readings.count} stations; the model has {size} "
+            f"parameters per triad and needs {-(-size // 3)} or more. Add stations at other "
+            f"attitudes{', or lower --order' if order else ''}."
+        )
+    for triad in TRIADS:
+        _check_channels(readings, triad)
+    _check_temperature(readings, order)
+    if method == "least-squares":
+        _check_whole(readings)
+
+
+def _check_channels(readings: Readings, triad: str) -> None:
+    values = getattr(readings, triad)
+    if values is None:
+        return
+    spread = np.ptp(values, axis=-2)
+    for axis in np.flatnonzero(spread <= 1e-12 * np.abs(values).max()):
+        raise FitError(
+            f"{readings.source or 'the run'}: the {triad} channel on tool axis {'xyz'[axis]} does "
+            f"not move: the same value at all {readings.count} stations. A dead sensor, a wrong "
+            "column, or all stations in one attitude; check the wiring and the columns."
+        )
+
+
+def _check_temperature(readings: Readings, order: int) -> None:
+    if order == 0:
+        return
+    if readings.temperature is None:
+        raise InputError(f"--order {order} needs the column 'temperature_c'; use --order 0.")
+    levels = len(np.unique(np.round(readings.temperature / 5)))
+    span = float(np.ptp(readings.temperature))
+    if levels < order + 1 or span < 10 * order:
+        raise FitError(
+            f"the run spans {span:.1f} °C at {levels} temperatures more than 5 °C apart: too little "
+            f"for --order {order}, which needs {order + 1} of them over {10 * order} °C or more. "
+            "Add temperatures, or lower --order."
+        )
+
+
+def _check_whole(readings: Readings) -> None:
+    needed = ["inclination", "toolface"]
+    needed += ["azimuth"] if readings.magnetometer is not None else []
+    for name in needed:
+        blank = int(np.isnan(readings.reference(name)).sum())
+        if blank:
+            raise FitError(
+                f"method least-squares needs the whole reference vector at every station; "
+                f"'ref_{name}_deg' is blank at {blank} of {readings.count}. Fill it in, or use "
+                "--method joint, which takes what is known."
+            )
+
+
+def _check_status(result: Fit) -> None:
+    status = Status(int(result.status[0]))
+    if status is not Status.OK:
+        raise FitError(f"the fit failed: {status.message}.")
+
+
+def _check_geometry(result: Fit, free: list[Free]) -> None:
+    """Rotations and scales may stay free; anything else is a design too weak to fit."""
+    benign = ("rotation-x", "rotation-y", "toolface-zero", "scale")
+    bad = [entry for entry in free if entry.id not in benign]
+    if bad:
+        names = ", ".join(f"{TRIADS[t]} {e.id.removeprefix('weak-')}" for e in bad for t in e.triads)
+        raise FitError(
+            f"the stations are too weak to fit the model: nothing determines {names}. Add stations "
+            "at other inclinations (at least three, well apart, up and down) with six or more "
+            "toolfaces each, or give more reference angles."
+        )
+
+
+def _check_freedom(result: Fit) -> None:
+    for name, noise, freedom in zip(TRIADS, result.noise[0], result.analysis.freedom[0], strict=False):
+        if np.isfinite(noise) and freedom < 1:
+            raise FitError(
+                f"the {name} has no redundancy ({freedom:.1f} degrees of freedom): its noise cannot "
+                "be estimated. Add stations, or declare 'noise' in the tool profile."
+            )
+
+
+def gains(result: Fit) -> list[Array]:
+    """Own-axis gain (3,) of each triad as a share of nominal, at the mean temperature."""
+    found = []
+    for triad, where in zip(result.problem.triads, result.problem.slices(), strict=True):
+        params = result.state.params[:, where]
+        slope = triad.model.slope(params, triad.raw, result.problem.temperature)
+        found.append(np.diagonal(slope[0].mean(0)))
+    return found
+
+
+def _check_gains(result: Fit, profile: Profile, readings: Readings) -> None:
+    relative = bool(np.isnan(readings.reference("field")).all())
+    for index, gain in enumerate(gains(result)):
+        name = TRIADS[index]
+        unknown = getattr(profile, name).scale is None or (index == 1 and relative)
+        share = gain / np.median(np.abs(gain)) if unknown else gain
+        for axis, value in enumerate(share):
+            if not GAIN[0] <= value <= GAIN[1]:
+                wrong = "has the wrong sign" if value < 0 else "is far from nominal"
+                raise FitError(
+                    f"the {name}'s gain on tool axis {'xyz'[axis]} comes out at {value:.3g} times "
+                    f"nominal and {wrong} (accepted: {GAIN[0]}…{GAIN[1]}). Check 'axes' and 'scale' "
+                    f"of [{name}] in the tool profile, and the reference angles."
+                )

@@ -1,0 +1,216 @@
+"""Tool profiles by name (built in) or path (TOML), checked, with messages that name the key."""
+
+from __future__ import annotations
+
+import difflib
+import hashlib
+import math
+import re
+from importlib import resources
+from pathlib import Path
+
+import msgspec
+
+from mwdcal.errors import InputError
+from mwdcal.files.table import shown
+from mwdcal.profile import Profile, StandProfile, TriadProfile
+
+_DEFAULT = "generic"
+_PACKAGE = "mwdcal.profiles"
+_SUFFIX = ".toml"
+_LARGEST = 1_000_000
+_STRUCTS: dict[str, type[msgspec.Struct]] = {
+    "": Profile,
+    "accelerometer": TriadProfile,
+    "magnetometer": TriadProfile,
+    "stand": StandProfile,
+}
+_WORDS = {
+    "float": "a number",
+    "int": "a whole number",
+    "str": "text",
+    "bool": "true or false",
+    "array": "a list",
+    "object": "a section",
+    "date": "a date",
+    "datetime": "a date with time",
+    "time": "a time of day",
+}
+_SMALLEST_SCALE, _LARGEST_SCALE = 1e-15, 1e15
+
+
+def list_profiles() -> list[str]:
+    """Names of the built-in tool profiles.
+
+    >>> "generic" in list_profiles()
+    True
+    """
+    files = (file.name for file in resources.files(_PACKAGE).iterdir())
+    return sorted(name.removesuffix(_SUFFIX) for name in files if name.endswith(_SUFFIX))
+
+
+def load_profile(name_or_path: str | None = None) -> tuple[Profile, str]:
+    """A tool profile and the SHA-256 of its bytes: built in by name, or a TOML file by path.
+
+    None is the built-in `generic`: channels along the tool axes, nothing else known.
+    """
+    name = _DEFAULT if name_or_path is None else name_or_path
+    if name in list_profiles():
+        data = resources.files(_PACKAGE).joinpath(name + _SUFFIX).read_bytes()
+    else:
+        data = _content(name)
+    return _profile(data, Path(name).name), hashlib.sha256(data).hexdigest()
+
+
+def _content(name: str) -> bytes:
+    """The bytes of a profile given by path."""
+    path = Path(name)
+    try:
+        if path.is_file() and path.stat().st_size <= _LARGEST:
+            return path.read_bytes()
+        found = path.exists()
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise InputError(
+            f"cannot read the tool profile '{name}': {reason}. Check its permissions."
+        ) from error
+    if found:
+        raise InputError(
+            f"'{name}' is no tool profile: expected a TOML file of at most {_LARGEST} bytes. "
+            "Name a file such as tool.toml."
+        )
+    raise _unknown(name)
+
+
+def _unknown(name: str) -> InputError:
+    builtin = list_profiles()
+    near = difflib.get_close_matches(name.lower(), builtin, n=2)
+    meant = f" Did you mean {' or '.join(repr(n) for n in near)}?" if near else ""
+    return InputError(
+        f"tool profile must be a built-in name ({', '.join(builtin)}) or the path of a TOML "
+        f"file; got '{name}', which is neither.{meant} Check the name or the path."
+    )
+
+
+def _profile(data: bytes, source: str) -> Profile:
+    """The checked profile in the bytes of a TOML file."""
+    try:
+        profile = msgspec.toml.decode(data.removeprefix(b"\xef\xbb\xbf"), type=Profile)
+    except msgspec.ValidationError as error:
+        raise _invalid(str(error), source) from None
+    except UnicodeDecodeError as error:
+        line = data.count(b"\n", 0, error.start) + 1
+        raise InputError(
+            f"{source}, line {line}: expected UTF-8 text; got byte 0x{data[error.start]:02X}. "
+            "Save the file as UTF-8."
+        ) from None
+    except (msgspec.DecodeError, ValueError, RecursionError) as error:
+        raise InputError(
+            f"{source}: a tool profile must be TOML; {_lower_first(str(error))}. Correct the "
+            'file; text needs quotes, axes are a list such as ["+x", "+y", "+z"].'
+        ) from None
+    _check(profile, source)
+    return profile
+
+
+def _lower_first(text: str) -> str:
+    return text[:1].lower() + text[1:]
+
+
+def _invalid(message: str, source: str) -> InputError:
+    """What the decoder says about structure and types, with the key and what to do."""
+    problem, _, path = message.partition(" - at `$.")
+    where = path.rstrip("`")
+    unknown = re.fullmatch(r"Object contains unknown field `(.*)`", problem, re.DOTALL)
+    if unknown:
+        return _unknown_key(unknown[1], where, source)
+    missing = re.fullmatch(r"Object missing required field `(.*)`", problem)
+    if missing:
+        return InputError(
+            f"{source}: key '{missing[1]}' must be present; got none. "
+            f'Add a line such as {missing[1]} = "my tool".'
+        )
+    if "axes" in where:
+        return _axes_error(where, _axes_got(problem), source)
+    return InputError(
+        f"{source}, key '{where}': {_plain_types(problem)}. Write numbers without quotes, text "
+        "in quotes, and the triads as sections, such as [accelerometer]."
+    )
+
+
+def _plain_types(problem: str) -> str:
+    """The decoder's sentence on types in the words of a profile's author."""
+    types = re.fullmatch(r"Expected `(\w+).*`, got `(\w+)`", problem)
+    if types is None:
+        return _lower_first(problem)
+    expected, got = (_WORDS.get(word, word) for word in types.groups())
+    return f"must be {expected}; got {got}"
+
+
+def _unknown_key(key: str, section: str, source: str) -> InputError:
+    struct = _STRUCTS.get(section, Profile)
+    known = [field.encode_name for field in msgspec.structs.fields(struct)]
+    near = difflib.get_close_matches(key.lower(), known, n=1)
+    meant = f" Did you mean '{near[0]}'?" if near else ""
+    full = f"{section}.{key}" if section else key
+    return InputError(
+        f"{source}, key '{full[:80]}': must be one of {', '.join(known)}; got an unknown "
+        f"key.{meant} Rename or remove it."
+    )
+
+
+def _axes_error(key: str, problem: str, source: str) -> InputError:
+    return InputError(
+        f"{source}, key '{key}': must be three of +x, -x, +y, -y, +z, -z, each letter once; "
+        f"got {problem}. State for each channel the tool axis it "
+        'measures, such as ["+x", "+y", "+z"].'
+    )
+
+
+def _axes_got(problem: str) -> str:
+    """What stands in `axes`, out of the decoder's sentence."""
+    value = re.search(r"(?:got|value) (.*)", problem, re.DOTALL)
+    got = value[1].strip("`") if value else problem
+    return f"{got} of them" if got.isdigit() else _WORDS.get(got, got[:80])
+
+
+def _check(profile: Profile, source: str) -> None:
+    """Refuse values that no tool can have."""
+    if not profile.name.strip():
+        raise InputError(f"{source}, key 'name': must not be blank; got ''. Name the tool.")
+    temperature = profile.reference_temperature_c
+    _check_number(temperature, (-273.15, 1000.0), source, "reference_temperature_c", "In °C.")
+    _check_triad(profile.accelerometer, "accelerometer", source)
+    _check_triad(profile.magnetometer, "magnetometer", source)
+    for field in StandProfile.__struct_fields__:
+        sigma = getattr(profile.stand, field)
+        _check_number(sigma, (0.0, 180.0), source, f"stand.{field}", "1 sigma, in degrees.")
+
+
+def _check_triad(triad: TriadProfile, name: str, source: str) -> None:
+    """Axes form a signed permutation (either hand); scale and noise are positive."""
+    if len({axis[1] for axis in triad.axes}) < len(triad.axes):
+        raise _axes_error(f"{name}.axes", " ".join(triad.axes), source)
+    limits = (_SMALLEST_SCALE, _LARGEST_SCALE)
+    advice = 'Put the sign into `axes`, for example "-x"; leave it out where it is unknown.'
+    if triad.scale is not None:
+        _check_number(triad.scale, limits, source, f"{name}.scale", advice)
+    advice = "1 sigma in raw units; leave it out where it is unknown."
+    if triad.noise is not None:
+        _check_number(triad.noise, limits, source, f"{name}.noise", advice)
+    if triad.nonlinearity is not None:
+        share = "1 sigma as a share of the field, such as 0.005; leave it out for a linear axis."
+        _check_number(triad.nonlinearity, (1e-9, 1.0), source, f"{name}.nonlinearity", share)
+    limits = (0.0, _LARGEST_SCALE)
+    _check_number(triad.repeatability, limits, source, f"{name}.repeatability", advice)
+
+
+def _check_number(
+    value: float, limits: tuple[float, float], source: str, key: str, advice: str
+) -> None:
+    low, high = limits
+    if not (math.isfinite(value) and low <= value <= high):
+        raise InputError(
+            f"{source}, key '{key}': must be between {low:g} and {high:g}; "
+            f"got {shown(value)}. {advice}"
+        )

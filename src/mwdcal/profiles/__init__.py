@@ -1,0 +1,1 @@
+"""The built-in tool profiles, one TOML file each; `mwdcal.files.profiles` reads them."""

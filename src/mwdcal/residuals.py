@@ -1,0 +1,234 @@
+"""Errors of a fit where references are known: per observable, per station, per triad."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from mwdcal.calibration import ErrorRow, Measures, StationRow
+from mwdcal.core.observables import OBSERVABLES
+from mwdcal.core.vectors import Array, centred
+from mwdcal.estimate import Fit
+from mwdcal.readings import Readings
+
+SHOWN = ("gravity", "inclination", "toolface", "azimuth", "field", "dip")
+UNITS = {"gravity": "mg", "field": "nT"}
+RESHOOT = 0.01
+"""A station is marked when one in a hundred runs would have any station as bad as it."""
+REASONS = {
+    "gravity": "moved before it settled?",
+    "inclination": "stand inclination misread?",
+    "toolface": "stand toolface misread?",
+    "azimuth": "stand azimuth misread, or iron nearby?",
+    "field": "iron or current near the stand?",
+    "dip": "iron near the stand, or the tool moved?",
+}
+
+
+def shown_in(name: str, relative: bool = False) -> tuple[float, str]:
+    """Factor and unit in which an observable's errors are shown: mg, nT, °, or per mille."""
+    if name == "field" and relative:
+        return 1e3, "‰ of the field"
+    if name == "gravity":
+        return 1e3, "mg"
+    return (1.0, "nT") if name == "field" else (float(np.degrees(1)), "°")
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """The errors of one fitted run (B = 1), before and after, with what was to be expected."""
+
+    readings: Readings
+    fit: Fit
+
+    @property
+    def relative(self) -> bool:
+        """Whether the field strength is known nowhere."""
+        return bool(np.isnan(self.readings.reference("field")).all())
+
+    @cached_property
+    def after(self) -> tuple[Array, Array]:
+        """Corrected vectors (n, 3) each; the field is (0, 0, NaN) without magnetometer."""
+        problem, state = self.fit.problem, self.fit.state
+        found = [
+            t.model.fields(state.params[:, w], t.raw, problem.temperature)[0]
+            for t, w in zip(problem.triads, problem.slices(), strict=True)
+        ]
+        return found[0], found[1] if len(found) > 1 else np.full_like(found[0], np.nan)
+
+    @cached_property
+    def targets(self) -> tuple[Array, Array]:
+        """Vectors (n, 3) each that a perfect tool would read at the fitted attitudes."""
+        attitude, (g, b) = self.fit.state.attitude[0], self.fit.problem.earth(self.fit.state)[0]
+        first, second = (np.einsum("nij,nj->ni", attitude, e[0]) for e in (g, b))
+        return first, second
+
+    @cached_property
+    def before(self) -> tuple[Array, Array]:
+        """Nominal readings as vectors: what the tool says uncalibrated."""
+        triads = [t.raw[0] for t in self.fit.problem.triads]
+        if len(triads) == 1:
+            return triads[0], np.full_like(triads[0], np.nan)
+        scale = np.linalg.norm(triads[1], axis=-1).mean() if self.relative else 1.0
+        return triads[0], triads[1] / scale
+
+    def known(self, name: str) -> Array:
+        """Reference (n,) of an observable: given, or the estimated constant; NaN where unknown."""
+        if name in ("gravity", "field", "dip"):
+            return np.asarray(self.fit.problem.constant(self.fit.state, name)[0])
+        return np.asarray(self.fit.problem.evidence.known[name][0])
+
+    def _weight(self, name: str) -> Array:
+        if name not in ("toolface", "azimuth"):
+            return np.ones(self.readings.count)
+        inclination = self.known("inclination")
+        guess = OBSERVABLES["inclination"].value(*self.after)
+        return np.sin(np.where(np.isnan(inclination), guess, inclination))
+
+    def errors(self, name: str, fields: tuple[Array, Array]) -> Array:
+        """Departure (n,) from the reference; toolface and azimuth times sin(inclination)."""
+        observable = OBSERVABLES[name]
+        value = observable.value(*fields) - self.known(name)
+        value = centred(value, observable.period) if observable.period else value
+        weight = self._weight(name)
+        return np.where((weight < 1e-9) & ~np.isnan(self.known(name)), 0.0, value * weight)
+
+    @cached_property
+    def _spread(self) -> Array:
+        """Expected covariance (n, m, m) of the whitened misfit left after the fit."""
+        linear = self.fit.problem.linear(self.fit.state)
+        inverse = linear.weigh(np.broadcast_to(np.eye(linear.residual.shape[-1]), self.fit.analysis.spread.shape))
+        total = np.linalg.inv(inverse)
+        inner = total @ self.fit.analysis.spread @ total
+        return np.asarray(inner[0])
+
+    def expected(self, name: str) -> Array:
+        """Standard deviation (n,) to expect of `errors` after the fit."""
+        problem, state = self.fit.problem, self.fit.state
+        gradient = OBSERVABLES[name].gradient(*self.targets)
+        rows = []
+        for index, (triad, where) in enumerate(zip(problem.triads, problem.slices(), strict=True)):
+            slope = triad.model.slope(state.params[:, where], triad.raw, problem.temperature)[0]
+            part = gradient[:, 3 * index : 3 * index + 3]
+            rows.append(np.einsum("ni,nij->nj", part, slope) * triad.sd[0])
+        row = np.nan_to_num(np.concatenate(rows, -1) * self._weight(name)[:, None])
+        factor = np.repeat(np.nan_to_num(self.fit.analysis.variance_factor[0], nan=1.0), 3)
+        row = row * np.sqrt(factor)
+        return np.sqrt(np.maximum(np.einsum("ni,nij,nj->n", row, self._spread, row), 0))
+
+    def names(self) -> list[str]:
+        """Observables with a reference somewhere in this run."""
+        usable = SHOWN if len(self.fit.problem.triads) > 1 else SHOWN[:3]
+        return [n for n in usable if not np.isnan(self.known(n)).all()]
+
+
+def error_rows(readings: Readings, fit: Fit) -> list[ErrorRow]:
+    """Root mean square errors before and after, and what was to be expected after."""
+    residuals = Residuals(readings, fit)
+    rows = []
+    for name in residuals.names():
+        factor, unit = shown_in(name, residuals.relative)
+        known = ~np.isnan(residuals.known(name))
+        before, after, expected = (
+            float(np.sqrt(np.nanmean(values[known] ** 2)) * factor)
+            for values in (
+                residuals.errors(name, residuals.before),
+                residuals.errors(name, residuals.after),
+                residuals.expected(name),
+            )
+        )
+        rows.append(
+            ErrorRow(
+                observable=name, unit=unit, stations=int(known.sum()),
+                before=before, after=after, expected=expected,
+            )  # fmt: skip
+        )
+    return rows
+
+
+def measure_rows(readings: Readings, fit: Fit) -> list[Measures]:
+    """Moradi's mean, STD, MSE and RMSE of the vector error, where reference vectors are whole."""
+    residuals, problem = Residuals(readings, fit), fit.problem
+    rows = []
+    for index, name in enumerate(("accelerometer", "magnetometer")[: len(problem.triads)]):
+        needed = ("inclination", "toolface", "azimuth")[: 2 + index]
+        whole = np.all([~np.isnan(residuals.known(n)) for n in needed], axis=0)
+        if whole.sum() < 2:
+            continue
+        for when, fields in (("before", residuals.before), ("after", residuals.after)):
+            error = np.linalg.norm((fields[index] - residuals.targets[index])[whole], axis=-1)
+            error = error / np.linalg.norm(residuals.targets[index][whole], axis=-1)
+            mse = float(np.mean(error**2))
+            rows.append(
+                Measures(
+                    triad=name, when=when, mean=float(error.mean()), std=float(error.std(ddof=1)),
+                    mse=mse, rmse=mse**0.5,
+                )  # fmt: skip
+            )
+    return rows
+
+
+def deviations(fit: Fit) -> Array:
+    """Each station's misfit (n,) as standard deviations of one normal variable."""
+    from scipy.special import chdtrc, ndtri
+
+    spread, residual = fit.analysis.spread[0], fit.analysis.residual[0]
+    values, vectors = np.linalg.eigh(spread)
+    keep = values > 1e-3
+    along = np.einsum("nij,ni->nj", vectors, residual) ** 2
+    chi = np.sum(np.where(keep, along / np.where(keep, values, 1.0), 0.0), -1)
+    count = keep.sum(-1)
+    others = np.maximum(count.sum() - count, 1)
+    variance = np.maximum((chi.sum() - chi) / others, 1e-30)
+    declared = np.isnan(fit.noise[0]).all()
+    chi = chi / (np.maximum(variance, 1.0) if declared else variance)
+    chance = np.clip(chdtrc(np.maximum(count, 1), chi), 1e-300, 1.0)
+    return np.where(count > 0, -ndtri(chance / 2), 0.0)
+
+
+def station_rows(readings: Readings, fit: Fit) -> list[StationRow]:
+    """Errors of every station, with the ones to take again."""
+    from scipy.special import ndtri
+
+    residuals = Residuals(readings, fit)
+    names = residuals.names()
+    deviation = deviations(fit)
+    limit = -float(ndtri(RESHOOT / readings.count / 2))
+    after = {n: residuals.errors(n, residuals.after) for n in names}
+    before = {n: residuals.errors(n, residuals.before) for n in names}
+    ratio = {n: np.abs(after[n]) / np.maximum(residuals.expected(n), 1e-30) for n in names}
+    factors = {n: shown_in(n, residuals.relative)[0] for n in names}
+    attitude = {n: np.degrees(OBSERVABLES[n].value(*residuals.after)) for n in SHOWN[1:4]}
+    rows = []
+    for i in range(readings.count):
+        bad = bool(deviation[i] > limit)
+        scores = {n: float(ratio[n][i]) for n in names if not np.isnan(after[n][i])}
+        rows.append(
+            StationRow(
+                station=readings.station[i] if readings.station else str(i + 1),
+                digest=readings.digest[i] if readings.digest else "",
+                temperature_c=None if readings.temperature is None else float(readings.temperature[i]),
+                inclination_deg=_plain(attitude["inclination"][i]),
+                toolface_deg=_plain(attitude["toolface"][i]),
+                azimuth_deg=_plain(attitude["azimuth"][i]),
+                errors=_scaled(after, factors, i),
+                errors_before=_scaled(before, factors, i),
+                deviation=float(deviation[i]),
+                reshoot=bad,
+                worst=max(scores, key=lambda n: scores[n]) if bad and scores else None,
+            )
+        )
+    return rows
+
+
+def _plain(value: float) -> float | None:
+    return None if np.isnan(value) else float(value)
+
+
+def _scaled(errors: dict[str, Array], factors: dict[str, float], index: int) -> dict[str, float]:
+    pairs = {n: float(e[index] * factors[n]) for n, e in errors.items()}
+    return {n: v for n, v in pairs.items() if not np.isnan(v)}
+
+
