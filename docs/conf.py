@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import re
 import sys
+import textwrap
 from pathlib import Path
 
 import mwdcal
@@ -65,11 +66,28 @@ def leave_out_missing(app, docname, source) -> None:
 
 def escape_bars(app, what, name, obj, options, lines) -> None:
     """Let docstrings write |g| for a magnitude: bars are substitutions in reStructuredText."""
+    literal = False
     for index, line in enumerate(lines):
+        literal = line == "::" or (literal and (not line or line.startswith("    ")))
+        if literal:
+            continue
         pieces = re.split(r"(`+[^`]*`+)", line)
         lines[index] = "".join(p if p.startswith("`") else p.replace("|", r"\|") for p in pieces)
 
 
+def literal_columns(app, what, name, obj, options, lines) -> None:
+    """Keep the layout of paragraphs in module docstrings that are set in columns."""
+    if what != "module":
+        return
+    paragraphs = re.split(r"\n\s*\n", "\n".join(lines).strip("\n"))
+    kept = [
+        "::\n\n" + textwrap.indent(p, "    ") if re.search(r"\S {3,}\S", p) else p
+        for p in paragraphs
+    ]
+    lines[:] = [*"\n\n".join(kept).split("\n"), ""]
+
+
 def setup(app) -> None:
     app.connect("source-read", leave_out_missing)
+    app.connect("autodoc-process-docstring", literal_columns)
     app.connect("autodoc-process-docstring", escape_bars)

@@ -20,10 +20,11 @@ SOURCE = ROOT / "src" / "mwdcal"
 LAYERS = (
     ("errors", "core.vectors", "core.solvers"),
     ("core.observables", "core.models"),
-    ("core.problem", "core.uncertainty", "core.start", "core"),
+    ("core.problem", "core.uncertainty", "core.observability", "core.start", "core"),
     ("readings", "profile", "profiles"),
     ("calibration", "estimate"),
-    ("quality", "simulate"),
+    ("checks", "residuals"),
+    ("calibrate", "quality", "simulate"),
     ("files", "files.*"),
     ("registry", "registry.*"),
     ("",),  # the package itself: its public names
@@ -76,7 +77,9 @@ def from_targets(name: str, node: ast.ImportFrom) -> set[str]:
     base = imported_base(name, node)
     if base is None:
         return set()
-    members = [f"{base}.{alias.name}".lstrip(".") for alias in node.names]
+    # The version is bound before the package imports anything: no dependency on its public names.
+    names = [alias.name for alias in node.names if (base, alias.name) != ("", "__version__")]
+    members = [f"{base}.{name}".lstrip(".") for name in names]
     return {member if member in PATHS else base for member in members}
 
 

@@ -67,7 +67,7 @@ def calibrate(
         field_unit="relative (field = 1)" if made.relative else "nT",
         stations=readings.count,
         temperature_c=None if temperature is None else (float(temperature.min()), float(temperature.max())),
-        triads=made.triads(),
+        **{t.name: t for t in made.triads()},
         covariance=listed(made.covariance),
         free=[listed(d) for d in made.directions],
         singular_values=listed(result.analysis.determined.values[0]),

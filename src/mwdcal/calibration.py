@@ -144,7 +144,8 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
     field_unit: str
     stations: int
     temperature_c: tuple[float, float] | None
-    triads: list[TriadCalibration]
+    accelerometer: TriadCalibration
+    magnetometer: TriadCalibration | None = None
     covariance: list[list[float]]
     free: list[list[float]]
     singular_values: list[float]
@@ -165,17 +166,15 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
         """Fingerprints of the stations of the fit."""
         return frozenset(row.digest for row in self.station_rows)
 
-    def triad(self, name: str) -> TriadCalibration:
-        """A triad by its name; KeyError where the tool was calibrated without it."""
-        for triad in self.triads:
-            if triad.name == name:
-                return triad
-        raise KeyError(name)
+    @property
+    def triads(self) -> list[TriadCalibration]:
+        """The calibrated triads, accelerometer first."""
+        return [t for t in (self.accelerometer, self.magnetometer) if t is not None]
 
     @property
     def has_field(self) -> bool:
         """Whether the magnetometer was calibrated."""
-        return len(self.triads) > 1
+        return self.magnetometer is not None
 
     def _temperature(self, readings: Readings) -> Array:
         if readings.temperature is None:
@@ -265,7 +264,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
         """Free directions of all triads, each once."""
         return [entry for triad in self.triads for entry in triad.undetermined]
 
-    def outside(self, readings: Readings, margin: float = 0.5) -> Bools:
+    def outside(self, readings: Readings, margin: float = 1.0) -> Bools:
         """Stations (…, n) outside the calibrated temperature range by more than `margin` °C."""
         shape = readings.accelerometer.shape[:-1]
         if self.temperature_c is None or readings.temperature is None:

@@ -104,6 +104,14 @@ class Residuals:
         inner = total @ self.fit.analysis.spread @ total
         return np.asarray(inner[0])
 
+    @property
+    def _variance_factor(self) -> float:
+        """s² of all triads together: one, so that unknown turns still cancel between them."""
+        analysis = self.fit.analysis
+        freedom = float(analysis.freedom[0].sum())
+        squares = float(np.nansum(analysis.variance_factor[0] * analysis.freedom[0]))
+        return squares / freedom if freedom >= 1 else 1.0
+
     def expected(self, name: str) -> Array:
         """Standard deviation (n,) to expect of `errors` after the fit."""
         problem, state = self.fit.problem, self.fit.state
@@ -114,9 +122,8 @@ class Residuals:
             part = gradient[:, 3 * index : 3 * index + 3]
             rows.append(np.einsum("ni,nij->nj", part, slope) * triad.sd[0])
         row = np.nan_to_num(np.concatenate(rows, -1) * self._weight(name)[:, None])
-        factor = np.repeat(np.nan_to_num(self.fit.analysis.variance_factor[0], nan=1.0), 3)
-        row = row * np.sqrt(factor)
-        return np.sqrt(np.maximum(np.einsum("ni,nij,nj->n", row, self._spread, row), 0))
+        variance = np.einsum("ni,nij,nj->n", row, self._spread, row)
+        return np.sqrt(np.maximum(variance, 0) * self._variance_factor)
 
     def names(self) -> list[str]:
         """Observables with a reference somewhere in this run."""

@@ -28,6 +28,8 @@ def magnetic_offset(metadata: Mapping[str, object], source: str) -> float:
     """
     check_near_misses(list(metadata), AZIMUTH_KEYS, f"{source}: metadata")
     kind = metadata.get("azimuth_reference", "magnetic")
+    if kind is True:  # the bare word `true` in a metadata line
+        kind = "true"
     stated = {
         key: _degrees(metadata[key], key, source) for key in AZIMUTH_KEYS[1:] if key in metadata
     }

@@ -1,0 +1,164 @@
+"""The same calibration in another notation, with covariance, at one temperature.
+
+forward   raw = S · field + o          (Moradi 3-4)
+affine    field = M · raw + b          (Ivanov)
+factors   SF, B, m                     (Moosavi 1-8, in the order of the raw channels)
+
+Raw units, channels in the order of the file; fields in g and nT (or a field of one).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from mwdcal.calibration import Calibration, TriadCalibration
+from mwdcal.core.models import OFF_DIAGONAL
+from mwdcal.core.vectors import AnyArray, Array
+from mwdcal.errors import InputError
+from mwdcal.profile import TriadProfile
+
+NOTATIONS = ("factors", "forward", "affine")
+
+
+@dataclass(frozen=True)
+class Notation:
+    """One triad in one notation: named arrays, their standard uncertainties and covariance.
+
+    `covariance` is of all values in the order of `values`, each row by row.
+    """
+
+    values: dict[str, Array]
+    uncertainty: dict[str, Array]
+    covariance: Array
+
+
+def convert(
+    calibration: Calibration, notation: str, temperature: float | None = None
+) -> dict[str, Notation]:
+    """Each triad of a calibration in a notation, at a temperature (default: the reference).
+
+    Errors: unknown notation; own-axis nonlinearity, which no notation can carry; factors of
+    a temperature-dependent polynomial, which are no polynomials themselves.
+    """
+    if notation not in NOTATIONS:
+        raise InputError(f"--notation must be one of {', '.join(NOTATIONS)}; got {notation!r}.")
+    at = calibration.reference_temperature if temperature is None else temperature
+    start, result = 0, {}
+    whole = np.array(calibration.covariance)
+    for triad in calibration.triads:
+        where = slice(start, start + triad.size)
+        profile: TriadProfile = getattr(calibration.profile, triad.name)
+        result[triad.name] = _one(triad, profile, whole[where, where], notation, at, calibration)
+        start += triad.size
+    return result
+
+
+def _one(
+    triad: TriadCalibration,
+    profile: TriadProfile,
+    covariance: Array,
+    notation: str,
+    temperature: float,
+    calibration: Calibration,
+) -> Notation:
+    if triad.curved:
+        raise InputError(
+            f"the {triad.name} has own-axis quadratic and cubic terms, which the notation "
+            f"{notation!r} cannot carry. Calibrate without 'nonlinearity' in the profile, or use "
+            "mwdcal apply."
+        )
+    tau = temperature - calibration.reference_temperature
+    scale = np.full(3, 1.0 if profile.scale is None else profile.scale)
+    if notation == "factors" and triad.model == "factors":
+        return _propagate(lambda p: _own_factors(p, triad.order, profile.permutation, scale), triad, covariance)
+    if notation == "factors" and triad.order:
+        raise InputError(
+            f"the {triad.name} is a polynomial of order {triad.order} in temperature: its factors "
+            "are no polynomials of temperature. Use --notation affine or forward with "
+            "--temperature, or calibrate with --model factors."
+        )
+    permutation = profile.permutation
+
+    def values(params: AnyArray) -> dict[str, AnyArray]:
+        matrix, offset = _affine(params, triad, tau)
+        matrix = matrix @ permutation / scale
+        return _FORMS[notation](matrix, offset, permutation)
+
+    return _propagate(values, triad, covariance)
+
+
+def _affine(params: AnyArray, triad: TriadCalibration, tau: float) -> tuple[AnyArray, AnyArray]:
+    """Matrix and offset of field = A x + c at a temperature, x in tool axes and nominal units."""
+    powers = tau ** np.arange(triad.order + 1)
+    if triad.model == "polynomial":
+        terms = powers @ params.reshape(triad.order + 1, 12)
+        return terms[:9].reshape(3, 3), terms[9:]
+    linear = params[: 6 * len(powers)].reshape(2, 3, len(powers)) @ powers
+    mixing = np.eye(3, dtype=params.dtype)
+    for (i, j), value in zip(OFF_DIAGONAL, params[6 * len(powers) :], strict=True):
+        mixing[i, j] = -value
+    return mixing / linear[0], -mixing @ linear[1]
+
+
+def _as_affine(matrix: AnyArray, offset: AnyArray, permutation: Array) -> dict[str, AnyArray]:
+    return {"M": matrix, "b": offset}
+
+
+def _as_forward(matrix: AnyArray, offset: AnyArray, permutation: Array) -> dict[str, AnyArray]:
+    inverse = np.linalg.inv(matrix)
+    return {"S": inverse, "o": -inverse @ offset}
+
+
+def _as_factors(matrix: AnyArray, offset: AnyArray, permutation: Array) -> dict[str, AnyArray]:
+    channel = permutation.transpose() @ matrix
+    scale = 1 / np.diagonal(channel)
+    mixing = channel * scale
+    bias = -np.linalg.solve(mixing, permutation.transpose() @ offset)
+    return {"SF": scale[:, None], "B": bias[:, None], "m": np.eye(3) - mixing}
+
+
+_FORMS: dict[str, Callable[[AnyArray, AnyArray, Array], dict[str, AnyArray]]] = {
+    "affine": _as_affine,
+    "forward": _as_forward,
+    "factors": _as_factors,
+}
+
+
+def _own_factors(params: AnyArray, order: int, permutation: Array, scale: Array) -> dict[str, AnyArray]:
+    """Stored factors, tool axes and nominal units, to channels and raw units: exact."""
+    count = order + 1
+    linear = params[: 6 * count].reshape(2, 3, count)
+    mixing = np.zeros((3, 3), dtype=params.dtype)
+    for (i, j), value in zip(OFF_DIAGONAL, params[6 * count :], strict=True):
+        mixing[i, j] = value
+    back = permutation.transpose()
+    return {
+        "SF": np.abs(back) @ linear[0] * scale[:, None],
+        "B": back @ linear[1],
+        "m": back @ mixing @ permutation,
+    }
+
+
+def _propagate(
+    values: Callable[[AnyArray], dict[str, AnyArray]], triad: TriadCalibration, covariance: Array
+) -> Notation:
+    """Values and covariance; derivatives by complex step, exact to rounding."""
+    params = np.array(triad.parameters)
+    found = values(params)
+    columns = []
+    for index in range(len(params)):
+        step = np.zeros(len(params), complex)
+        size = max(abs(params[index]), 1.0) * 1e-30
+        step[index] = 1j * size
+        columns.append(np.concatenate([v.imag.ravel() / size for v in values(params + step).values()]))
+    jacobian = np.stack(columns, -1)
+    spread = jacobian @ covariance @ jacobian.transpose()
+    sd = np.sqrt(np.maximum(np.diag(spread), 0.0))
+    uncertainty, start = {}, 0
+    for name, value in found.items():
+        uncertainty[name] = sd[start : start + value.size].reshape(value.shape)
+        start += value.size
+    return Notation({k: np.asarray(v.real) for k, v in found.items()}, uncertainty, spread)
