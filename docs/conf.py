@@ -64,15 +64,26 @@ def leave_out_missing(app, docname, source) -> None:
     source[0] = MODULE_SECTION.sub(lambda m: m[0] if exists(m[1]) else "", source[0])
 
 
-def escape_bars(app, what, name, obj, options, lines) -> None:
-    """Let docstrings write |g| for a magnitude: bars are substitutions in reStructuredText."""
+def escaped(line: str) -> str:
+    """A line in which |g| and sd_, outside backticks, stand for themselves."""
+    pieces = re.split(r"(`+[^`]*`+_*)", line)
+    return "".join(
+        p if p.startswith("`") else re.sub(r"(?<=\w)_(?!\w)", r"\_", p.replace("|", r"\|"))
+        for p in pieces
+    )
+
+
+def escape_docstring(app, what, name, obj, options, lines) -> None:
+    """Let docstrings be plain text, in which bars and a last underscore mean nothing."""
     literal = False
     for index, line in enumerate(lines):
         literal = line == "::" or (literal and (not line or line.startswith("    ")))
-        if literal:
-            continue
-        pieces = re.split(r"(`+[^`]*`+)", line)
-        lines[index] = "".join(p if p.startswith("`") else p.replace("|", r"\|") for p in pieces)
+        lines[index] = line if literal else escaped(line)
+
+
+def escape_command(app, context, lines) -> None:
+    """The same for the help texts of commands."""
+    lines[:] = [line if line.lstrip().startswith("..") else escaped(line) for line in lines]
 
 
 def literal_columns(app, what, name, obj, options, lines) -> None:
@@ -90,4 +101,6 @@ def literal_columns(app, what, name, obj, options, lines) -> None:
 def setup(app) -> None:
     app.connect("source-read", leave_out_missing)
     app.connect("autodoc-process-docstring", literal_columns)
-    app.connect("autodoc-process-docstring", escape_bars)
+    app.connect("autodoc-process-docstring", escape_docstring)
+    for part in ("description", "options", "arguments", "epilog"):
+        app.connect(f"sphinx-click-process-{part}", escape_command)

@@ -25,7 +25,7 @@ DIGITS = 12
 """Significant digits in files: more would differ from machine to machine."""
 SUSPECT = 3.0
 """A fit whose residuals exceed the declared noise this many times is reported."""
-IDENTITY = ("serial", "tool", "operator", "lab", "date", "stand")
+IDENTITY = ("serial", "tool", "operator", "lab", "date", "stand", "simulated")
 
 
 def calibrate(

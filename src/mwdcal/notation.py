@@ -117,7 +117,7 @@ def _as_factors(matrix: AnyArray, offset: AnyArray, permutation: Array) -> dict[
     scale = 1 / np.diagonal(channel)
     mixing = channel * scale
     bias = -np.linalg.solve(mixing, permutation.transpose() @ offset)
-    return {"SF": scale[:, None], "B": bias[:, None], "m": np.eye(3) - mixing}
+    return {"SF": scale[:, None], "B": bias[:, None], "m": -mixing * (1 - np.eye(3))}
 
 
 _FORMS: dict[str, Callable[[AnyArray, AnyArray, Array], dict[str, AnyArray]]] = {

@@ -215,22 +215,22 @@ class _Test:
         size = {"g": 1.0, "nT": self.calibration.earth.get("field", 1.0)}.get(OBSERVABLES[name].unit, 1.0)
         return bool((np.ptp(moved, axis=0) > FREE_SHARE * size).any())
 
-    def _uncertainty(self, name: str, contrast: Array, reference: bool) -> float:
+    def _uncertainty(self, name: str, contrast: Array) -> float:
+        """Calibration, noise of the readings and uncertainty of the stand, of a sum of stations."""
         rows = np.nan_to_num(contrast @ self.calibration.sensitivity(name, self.readings))
         variance = float((rows @ np.array(self.calibration.covariance) @ rows.transpose())[0, 0])
         gradient = OBSERVABLES[name].gradient(*self.calibration.fields(self.readings))
         gradient = np.nan_to_num(gradient)
         noise = self.calibration.noise_covariance(self.readings)
         each = np.einsum("ni,nij,nj->n", gradient, noise, gradient)
-        if reference:
-            each = each + self.readings.uncertainty(name) ** 2
+        each = each + self.readings.uncertainty(name) ** 2
         return float(np.sqrt(variance + np.sum(contrast[0] ** 2 * each)))
 
     def _row(
         self, title: str, name: str, value: float, contrast: Array, limit: float, free: bool, note: str
     ) -> VerdictRow:
         factor, unit = self._scale(name)
-        uncertainty = self._uncertainty(name, contrast, title.startswith("error")) * factor
+        uncertainty = self._uncertainty(name, contrast) * factor
         value = value * factor
         guard = COVERAGE * uncertainty if self.limits.rule == "guarded" else 0.0
         if free:

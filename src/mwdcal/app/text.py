@@ -1,0 +1,108 @@
+"""What commands print: one screen that a technician can act on."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mwdcal.calibration import Calibration, ErrorRow, Finding
+from mwdcal.notation import Notation
+from mwdcal.quality import Verdict
+from mwdcal.selection import OrderScore
+
+WEIGHED = {"toolface": "toolface·sin I", "azimuth": "azimuth·sin I", "gravity": "|g|", "field": "|b|"}
+
+
+def number(value: float | None) -> str:
+    """Three significant digits, or a dash."""
+    return "–" if value is None or np.isnan(value) else f"{value:.3g}" if abs(value) < 100 else f"{value:.0f}"
+
+
+def quantity(value: float | None, unit: str) -> str:
+    """A value with its unit; no space before the degree sign."""
+    return number(value) if value is None else f"{number(value)}{'' if unit == '°' else ' '}{unit}"
+
+
+def table(rows: list[list[str]], header: list[str]) -> str:
+    """Columns aligned: the first to the left, the others to the right."""
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    made = Table(box=box.SIMPLE, pad_edge=False, show_edge=False)
+    for index, title in enumerate(header):
+        made.add_column(title, justify="left" if index == 0 else "right", no_wrap=True)
+    for row in rows:
+        made.add_row(*row)
+    console = Console(width=160, color_system=None, legacy_windows=False)
+    with console.capture() as capture:
+        console.print(made)
+    return "\n".join(line.rstrip() for line in capture.get().splitlines())
+
+
+def heading(calibration: Calibration) -> str:
+    """What was calibrated, from what, and how much of it is determined."""
+    serial = calibration.tool.get("serial", calibration.profile.name)
+    inclinations = [r.inclination_deg for r in calibration.station_rows if r.inclination_deg is not None]
+    parts = [calibration.run, serial, f"{calibration.stations} stations"]
+    if calibration.temperature_c:
+        parts.append("{:.1f}–{:.1f} °C".format(*calibration.temperature_c))
+    parts.append(f"I {min(inclinations):.0f}–{max(inclinations):.0f}°")
+    if "simulated" in calibration.tool:
+        parts.append("SIMULATED DATA")
+    ranks = [f"{t.name} {t.rank} of {t.size} determined" for t in calibration.triads]
+    model = f"{calibration.accelerometer.model} of order {calibration.accelerometer.order}"
+    return "   ".join(parts) + "\n" + "   ".join([f"method {calibration.method}, {model}", *ranks])
+
+
+def errors(rows: list[ErrorRow]) -> str:
+    """Errors before and after, with what was to be expected."""
+    cells = [
+        [
+            f"{WEIGHED.get(r.observable, r.observable)} error, rms",
+            *(quantity(v, r.unit) for v in (r.before, r.after, r.expected)),
+        ]
+        for r in rows
+    ]
+    return table(cells, ["", "before", "after", "1σ expected"])
+
+
+def findings(found: list[Finding]) -> list[str]:
+    """One line each."""
+    return [f"! {finding.text}" for finding in found]
+
+
+def orders(scores: list[OrderScore]) -> str:
+    """The table that chose the temperature order."""
+    rows = [[str(s.order), number(s.inside), number(s.ends), "chosen" if s.chosen else ""] for s in scores]
+    return table(rows, ["order", "left-out soaks χ²", "end soaks χ²", ""])
+
+
+def verdict(result: Verdict) -> str:
+    """The outcome first, then each limit."""
+    rows = [
+        [
+            row.name,
+            quantity(row.value, row.unit),
+            "not stated" if row.uncertainty is None else quantity(row.uncertainty, row.unit),
+            quantity(row.limit, row.unit),
+            "pass" if row.passed else "FAIL",
+            row.note,
+        ]
+        for row in result.rows
+    ]
+    lines = [f"{'PASS' if result.passed else 'FAIL'}   {result.run}   {result.stations} stations"]
+    lines += [f"limits {result.limits} ({result.source})", f"rule: {result.rule}"]
+    return "\n".join(lines) + "\n\n" + table(rows, ["", "worst", "1σ", "limit", "", "where"])
+
+
+def notation(found: dict[str, Notation]) -> str:
+    """Values with standard uncertainties, in as many digits as a firmware can hold."""
+    blocks = []
+    for triad, item in found.items():
+        rows = []
+        for name, value in item.values.items():
+            for index in np.ndindex(value.shape):
+                where = "".join(f"[{i}]" for i in index)
+                rows.append([f"{name}{where}", f"{value[index]:.12g}", f"{item.uncertainty[name][index]:.2g}"])
+        blocks.append(f"{triad}\n" + table(rows, ["", "value", "1σ"]))
+    return "\n\n".join(blocks)
