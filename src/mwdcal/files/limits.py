@@ -17,7 +17,11 @@ from mwdcal.quality import Limits
 def list_limits() -> list[str]:
     """Names of the limits profiles that come with the package."""
     folder = resources.files("mwdcal").joinpath("limits")
-    return sorted(entry.name.removesuffix(".toml") for entry in folder.iterdir() if entry.name.endswith(".toml"))
+    return sorted(
+        entry.name.removesuffix(".toml")
+        for entry in folder.iterdir()
+        if entry.name.endswith(".toml")
+    )
 
 
 def load_limits(name_or_path: str | os.PathLike[str] = "roll-test") -> Limits:

@@ -282,7 +282,8 @@ def _digests(triads: list[Array], temperature: Array | None) -> tuple[str, ...]:
     """One hash per station over raw reading and temperature, to 12 significant digits."""
     extra = [] if temperature is None else [temperature[:, None]]
     rows = np.concatenate([*triads, *extra], axis=-1) + 0.0
-    texts = (",".join(f"{value:.12g}" for value in row) for row in rows.tolist())
+    form = ",".join(["%.12g"] * rows.shape[-1])
+    texts = (form % tuple(row.tolist()) for row in rows)
     return tuple(hashlib.sha256(t.encode()).hexdigest()[:_DIGEST_LENGTH] for t in texts)
 
 

@@ -25,7 +25,7 @@ _PARSERS = {
 SUFFIXES = tuple(_PARSERS)
 
 _LARGEST = {".parquet": 2_000_000_000}
-_LARGEST_TEXT = 100_000_000
+_LARGEST_TEXT = 50_000_000
 _MARKS = {sign: frozenset(f"0123456789+-eE {sign}") for sign in ".,"}
 _LONGEST_SHOWN = 40
 

@@ -12,6 +12,7 @@ from mwdcal.files import metadata as meta
 from mwdcal.files.columns import Column, Parts, assemble, number
 
 _LONGEST_LINE = 100_000
+_MAX_LINES = 1_000_000
 
 _FOREIGN = {
     b"\xff\xfe": ("UTF-16 text", "Save it as UTF-8 (in Excel: 'CSV UTF-8')."),
@@ -73,6 +74,12 @@ def _lines(data: bytes, source: str) -> list[str]:
         raise InputError(
             f"{source}: the file is empty. A run file needs a line with the column names, "
             "such as ax,ay,az, and one row per station."
+        )
+    ends = content.count("\n")
+    if ends > _MAX_LINES:
+        raise InputError(
+            f"{source}: a text table must have at most {_MAX_LINES} lines; got {ends}. "
+            "Split it, or write long tables as Parquet."
         )
     lines = content.split("\n")
     for position, line in enumerate(lines, 1):

@@ -1,0 +1,55 @@
+"""Scatter of the tool direction in groups of one direction, in sample and leave-one-out.
+
+In-sample scatter flatters a model with many parameters: judge by the left-out one.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mwdcal.core.vectors import Array, Ints
+from mwdcal.estimate import Fit, fit
+from mwdcal.readings import Readings
+
+
+def directions(g: Array, b: Array) -> Array:
+    """Unit vector (..., 3) of the tool axis in the earth frame: north, east, down.
+
+    Singular: where field and gravity are parallel (a magnetic pole) there is no north.
+    """
+    down = g / np.linalg.norm(g, axis=-1, keepdims=True)
+    east = np.cross(down, b)
+    east = east / np.linalg.norm(east, axis=-1, keepdims=True)
+    north = np.cross(east, down)
+    return np.stack([north[..., 2], east[..., 2], down[..., 2]], -1)
+
+
+def group_scatter(axis: Array, group: Ints) -> float:
+    """Mean over groups of the norm of the (N - 1) standard deviations of `axis`, radians.
+
+    Shapes: axis (n, 3), group (n,), -1: in no group. Reference: the accuracy measure of
+    CircuitPython_mag_cal, so that results compare.
+    """
+    numbers = range(int(group.max(initial=-1)) + 1)
+    each = [np.linalg.norm(axis[group == k].std(axis=0, ddof=1)) for k in numbers]
+    return float(np.mean(each))
+
+
+def fitted_fields(result: Fit) -> tuple[Array, Array]:
+    """Corrected vectors (B, n, 3) of both triads of a fit, left-out stations included."""
+    problem = result.problem
+    found = [
+        triad.model.fields(result.state.params[:, where], triad.raw, problem.temperature)
+        for triad, where in zip(problem.triads, problem.slices(), strict=True)
+    ]
+    return found[0], found[1]
+
+
+def scatter(readings: Readings, curved: dict[str, float] | None = None) -> tuple[float, float]:
+    """Direction scatter of a run's groups, radians: in sample, and each station left out in turn."""
+    group = np.full(readings.count, -1) if readings.group is None else readings.group
+    whole = directions(*fitted_fields(fit(readings, curved=curved)))[0]
+    left_out = fit(readings, include=1 - np.eye(readings.count), curved=curved)
+    own = np.arange(readings.count)
+    axis = directions(*fitted_fields(left_out))[own, own]
+    return group_scatter(whole, group), group_scatter(axis, group)
