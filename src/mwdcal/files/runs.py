@@ -73,7 +73,7 @@ def to_readings(table: Table, profile: Profile) -> tuple[Readings, Profile]:
         sd=_uncertainties(table, profile, list(triads), list(known)),
         group=_group(table),
         station=_stations(table),
-        digest=_digests([*triads.values()], temperature),
+        digest=_digests([*triads.values()]),
         metadata=table.metadata,
         source=table.source,
     )
@@ -278,10 +278,9 @@ def _stations(table: Table) -> tuple[str, ...]:
     return tuple(label or str(i) for i, label in enumerate(given, 1))
 
 
-def _digests(triads: list[Array], temperature: Array | None) -> tuple[str, ...]:
-    """One hash per station over raw reading and temperature, to 12 significant digits."""
-    extra = [] if temperature is None else [temperature[:, None]]
-    rows = np.concatenate([*triads, *extra], axis=-1) + 0.0
+def _digests(triads: list[Array]) -> tuple[str, ...]:
+    """One hash per station over its raw reading to 12 significant digits, and nothing else."""
+    rows = np.concatenate(triads, axis=-1) + 0.0
     form = ",".join(["%.12g"] * rows.shape[-1])
     texts = (form % tuple(row.tolist()) for row in rows)
     return tuple(hashlib.sha256(t.encode()).hexdigest()[:_DIGEST_LENGTH] for t in texts)
