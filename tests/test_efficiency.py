@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from simulation import DEG, Tool, bound, plan
 
 from mwdcal.core.observables import OBSERVABLES
 from mwdcal.estimate import fit
 from mwdcal.readings import Readings
+from simulation import DEG, Tool, bound, plan
 
 SEEDS = 400
 CASES = {

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import csv
 import json
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +23,7 @@ from mwdcal.files.table import Table
 from mwdcal.notation import convert
 from mwdcal.profile import Profile, TriadProfile
 from mwdcal.readings import Readings
-from mwdcal.scatter import directions, fitted_fields, group_scatter, scatter
+from mwdcal.scatter import directions, group_scatter, scatter
 
 SAP = {
     "sap6/BB": (0.692, 0.389), "sap6/CF": (0.556, 0.414), "sap6/HC": (0.724, 0.181),
@@ -67,7 +67,9 @@ def distox(name: str) -> tuple[float, ...]:
     rows = list(csv.DictReader(path.read_text().splitlines()))
     names = {"ax": "gx", "ay": "gy", "az": "gz", "mx": "mx", "my": "my", "mz": "mz"}
     columns = {ours: [row[theirs] for row in rows] for ours, theirs in names.items()}
-    columns["group"] = ["ABCD"[(int(r["shot"]) - 1) // 4] if int(r["shot"]) <= 16 else "" for r in rows]
+    columns["group"] = [
+        "ABCD"[(int(r["shot"]) - 1) // 4] if int(r["shot"]) <= 16 else "" for r in rows
+    ]
     readings, _ = to_readings(Table(columns, {}, path.name, range(2, len(rows) + 2)), profile)
     curved = {"accelerometer": profile.accelerometer.nonlinearity or 0.0}
     ours = np.degrees([*scatter(readings), *scatter(readings, curved)])
@@ -88,11 +90,15 @@ def distox_peer(name: str, rows: list[dict[str, str]], group: np.ndarray) -> flo
     return float(np.degrees(group_scatter(directions(g @ turn.T, m @ turn.T), group)))
 
 
-def accelerometer_only(raw: np.ndarray, scale: float, sd: np.ndarray | None = None, **known: np.ndarray):
+def accelerometer_only(
+    raw: np.ndarray, scale: float, sd: np.ndarray | None = None, **known: np.ndarray
+):
     """Readings and profile of a lone accelerometer, axes as they come."""
     profile = Profile(name="accelerometer", accelerometer=TriadProfile(scale=scale))
     spread = {} if sd is None else {"accelerometer": sd / scale}
-    return Readings(raw / scale, known=known, sd=spread, station=tuple(map(str, range(1, len(raw) + 1)))), profile
+    return Readings(
+        raw / scale, known=known, sd=spread, station=tuple(map(str, range(1, len(raw) + 1)))
+    ), profile
 
 
 def triangular(matrix: np.ndarray) -> np.ndarray:
@@ -126,7 +132,9 @@ def xsens() -> dict[str, float]:
 def mikov() -> dict[str, tuple[float, float]]:
     """Three MPU-9150 accelerometers, |g| alone: worst and rms difference from the publication, in σ."""
     rows = list(csv.DictReader(fetch("mikov/static_means.csv").read_text().splitlines()))
-    published = {r["param"]: r for r in csv.DictReader(fetch("mikov/published.csv").read_text().splitlines())}
+    published = {
+        r["param"]: r for r in csv.DictReader(fetch("mikov/published.csv").read_text().splitlines())
+    }
     result = {}
     for unit in ("imu0", "imu1", "imu2"):
         own = [r for r in rows if r["imu"] == unit]
@@ -145,7 +153,12 @@ def mikov_parameters(fitted) -> tuple[np.ndarray, np.ndarray]:
     """Scales in %, misalignments in degrees, biases in m/s² of raw = M a + b, M upper triangular."""
     model, params = fitted.problem.triads[0].model, fitted.state.params[0]
     _, whole = model.finished(0.0)
-    covariance = whole[0] @ fitted.analysis.covariance[0] @ whole[0].T * fitted.analysis.variance_factor[0, 0]
+    covariance = (
+        whole[0]
+        @ fitted.analysis.covariance[0]
+        @ whole[0].T
+        * fitted.analysis.variance_factor[0, 0]
+    )
 
     def published_form(values: np.ndarray) -> np.ndarray:
         matrix, offset = values[:9].reshape(3, 3), values[9:]
@@ -156,11 +169,20 @@ def mikov_parameters(fitted) -> tuple[np.ndarray, np.ndarray]:
 
     values = whole[0] @ params
     steps = 1e-6 * np.eye(12)
-    slope = np.stack([(published_form(values + h) - published_form(values - h)) / 2e-6 for h in steps], -1)
+    slope = np.stack(
+        [(published_form(values + h) - published_form(values - h)) / 2e-6 for h in steps], -1
+    )
     return published_form(values), np.sqrt(np.diag(slope @ covariance @ slope.T))
 
 
-FACES = {"x_p": (90, 270), "x_a": (90, 90), "y_p": (90, 180), "y_a": (90, 0), "z_p": (0, 0), "z_a": (180, 0)}
+FACES = {
+    "x_p": (90, 270),
+    "x_a": (90, 90),
+    "y_p": (90, 180),
+    "y_a": (90, 0),
+    "z_p": (0, 0),
+    "z_a": (180, 0),
+}
 """Inclination and toolface of each face in the tool frame."""
 
 
@@ -168,13 +190,19 @@ def imucal() -> float:
     """Six static faces by least squares: largest difference from the published K_a R_a, relative."""
     rows = list(csv.DictReader(fetch("imucal/annotated_session.csv").read_text().splitlines()))
     means = {
-        face: np.mean([[float(r[f"acc_{axis}"]) for axis in "xyz"] for r in rows if r["part"] == face], axis=0)
+        face: np.mean(
+            [[float(r[f"acc_{axis}"]) for axis in "xyz"] for r in rows if r["part"] == face], axis=0
+        )
         for face in FACES
     }
     raw = np.stack([means[face] for face in FACES])
     angles = np.radians([FACES[face] for face in FACES])
-    readings, profile = accelerometer_only(raw, 2045.0, inclination=angles[:, 0], toolface=angles[:, 1])
-    found = convert(calibrate(readings, profile, "least-squares"), "forward")["accelerometer"].values
+    readings, profile = accelerometer_only(
+        raw, 2045.0, inclination=angles[:, 0], toolface=angles[:, 1]
+    )
+    found = convert(calibrate(readings, profile, "least-squares"), "forward")[
+        "accelerometer"
+    ].values
     published = json.loads(fetch("imucal/published.json").read_text())
     expected = np.array(published["K_a"]) @ np.array(published["R_a"])
     return float(np.abs(found["S"] / 9.81 - expected).max() / np.abs(expected).max())

@@ -39,7 +39,11 @@ def main() -> None:
     rng = np.random.default_rng(SEED)
     profile, _ = load_profile(str(HERE / "tool.toml"))
     truth = servo(rng)
-    stand = tuple(np.radians([profile.stand.inclination_deg, profile.stand.azimuth_deg, profile.stand.toolface_deg]))
+    stand = tuple(
+        np.radians(
+            [profile.stand.inclination_deg, profile.stand.azimuth_deg, profile.stand.toolface_deg]
+        )
+    )
     plans = {
         "run.csv": grid([5, 45, 90, 135], 12, [0, 90, 180, 270], [25.0]),
         "rolltest.csv": grid([45], 12, [60], [25.2]),
@@ -51,7 +55,11 @@ def main() -> None:
         written = from_readings(readings, profile, IDENTITY)
         columns = {key: logged(key, values) for key, values in written.columns.items()}
         table.write(HERE / name, replace(written, columns=columns))
-    earth = {"gravity_g": truth.gravity, "field_nt": truth.field, "dip_deg": float(np.degrees(truth.dip))}
+    earth = {
+        "gravity_g": truth.gravity,
+        "field_nt": truth.field,
+        "dip_deg": float(np.degrees(truth.dip)),
+    }
     document = {
         "simulated": True,
         "seed": SEED,

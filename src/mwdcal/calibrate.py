@@ -11,7 +11,14 @@ from typing import Any
 import numpy as np
 
 from mwdcal import __version__
-from mwdcal.calibration import Calibration, Constant, Finding, StationRow, TriadCalibration, Undetermined
+from mwdcal.calibration import (
+    Calibration,
+    Constant,
+    Finding,
+    StationRow,
+    TriadCalibration,
+    Undetermined,
+)
 from mwdcal.checks import TRIADS, check_fit, check_readings
 from mwdcal.core.observability import Free, free_directions
 from mwdcal.core.vectors import Array
@@ -66,8 +73,11 @@ def calibrate(
         time=datetime.now(UTC).isoformat(timespec="seconds"),
         field_unit="relative (field = 1)" if made.relative else "nT",
         stations=readings.count,
-        temperature_c=None if temperature is None else (float(temperature.min()), float(temperature.max())),
-        **{t.name: t for t in made.triads()},
+        temperature_c=None
+        if temperature is None
+        else (float(temperature.min()), float(temperature.max())),
+        accelerometer=made.triad(0),
+        magnetometer=made.triad(1) if readings.magnetometer is not None else None,
         covariance=listed(made.covariance),
         free=[listed(d) for d in made.directions],
         singular_values=listed(result.analysis.determined.values[0]),
@@ -122,7 +132,9 @@ class _Record:
     @property
     def relative(self) -> bool:
         """Whether the magnetometer is calibrated to a field of one."""
-        return self.readings.magnetometer is not None and bool(np.isnan(self.readings.reference("field")).all())
+        return self.readings.magnetometer is not None and bool(
+            np.isnan(self.readings.reference("field")).all()
+        )
 
     @cached_property
     def map(self) -> Array:
@@ -176,18 +188,17 @@ class _Record:
                     name=constant.name if constant.unknown else f"{constant.name} reference error",
                     value=digits(float(self.result.state.constants[0, index]) * degrees),
                     standard_uncertainty=digits(
-                        float(np.sqrt(self.result.analysis.constants[0, index, index])) * scale * degrees
+                        float(np.sqrt(self.result.analysis.constants[0, index, index]))
+                        * scale
+                        * degrees
                     ),
                     unit={"dip": "°", "gravity": "g", "field": "nT"}[constant.name],
                 )
             )
         return found
 
-    def triads(self) -> list[TriadCalibration]:
-        """One record per triad."""
-        return [self._triad(index) for index in range(len(self.result.problem.triads))]
-
-    def _triad(self, index: int) -> TriadCalibration:
+    def triad(self, index: int) -> TriadCalibration:
+        """The record of one triad."""
         problem, analysis = self.result.problem, self.result.analysis
         triad, where = problem.triads[index], problem.slices()[index]
         free = [f for f in self.free if index in f.triads]
@@ -210,11 +221,14 @@ class _Record:
             size=triad.model.size,
             singular_values=listed(_own_values(self.result, where)),
             undetermined=[
-                Undetermined(id=f.id, text=f"{TRIADS[index]}: {TEXTS.get(f.id, f.id)}") for f in free
+                Undetermined(id=f.id, text=f"{TRIADS[index]}: {TEXTS.get(f.id, f.id)}")
+                for f in free
             ],
             noise=digits(float(triad.sd[0].mean() if declared else noise)),
             noise_source="declared" if declared else "estimated from the residuals",
-            variance_factor=digits(float(analysis.variance_factor[0, index])) if freedom >= 1 else None,
+            variance_factor=digits(float(analysis.variance_factor[0, index]))
+            if freedom >= 1
+            else None,
             degrees_of_freedom=digits(freedom),
         )
 
@@ -225,12 +239,15 @@ class _Record:
         moved = np.zeros(len(values))
         for direction in self.directions:
             moved = np.maximum(moved, np.abs(direction[where]))
-        return [None if m > 1e-2 * size else digits(float(v)) for v, m in zip(values, moved, strict=True)]
+        return [
+            None if m > 1e-2 * size else digits(float(v))
+            for v, m in zip(values, moved, strict=True)
+        ]
 
     def findings(self, stations: list[StationRow]) -> list[Finding]:
         """What the reader should know, in order of weight."""
         found = []
-        for triad in self.triads():
+        for triad in (self.triad(i) for i in range(len(self.result.problem.triads))):
             excess = triad.variance_factor
             if triad.noise_source == "declared" and excess is not None and excess > SUSPECT**2:
                 found.append(
@@ -251,7 +268,7 @@ class _Record:
 
     def _reshoot(self, row: StationRow) -> Finding:
         worst = row.worst or "gravity"
-        factor, unit = shown_in(worst, self.relative)
+        _, unit = shown_in(worst, self.relative)
         value = row.errors.get(worst, float("nan"))
         text = (
             f"station {row.station}: residual {row.deviation:.1f}σ, most in {worst} ({value:+.3g} {unit}): "

@@ -229,7 +229,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
         """Gradient (…, n, p) of an observable with respect to the parameters."""
         gradient = OBSERVABLES[name].gradient(*self.fields(readings))
         gradient = np.where(np.isnan(gradient), 0.0, gradient) if not self.has_field else gradient
-        return np.einsum("...ni,...nip->...np", gradient, self.jacobian(readings))
+        return np.asarray(np.einsum("...ni,...nip->...np", gradient, self.jacobian(readings)))
 
     def uncertainty(self, name: str, readings: Readings, noise: bool = False) -> Array:
         """Standard uncertainty (…, n) of an observable, of the calibration or of one reading too.
@@ -240,7 +240,9 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
         variance = np.einsum("...ni,ij,...nj->...n", rows, np.array(self.covariance), rows)
         if noise:
             gradient = OBSERVABLES[name].gradient(*self.fields(readings))
-            gradient = np.where(np.isnan(gradient), 0.0, gradient) if not self.has_field else gradient
+            gradient = (
+                np.where(np.isnan(gradient), 0.0, gradient) if not self.has_field else gradient
+            )
             spread = self.noise_covariance(readings)
             variance = variance + np.einsum("...ni,...nij,...nj->...n", gradient, spread, gradient)
         return np.where(self.rests_on_free(name, readings), np.nan, np.sqrt(variance))
@@ -270,4 +272,6 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
         if self.temperature_c is None or readings.temperature is None:
             return np.zeros(shape, bool)
         low, high = self.temperature_c
-        return np.asarray((readings.temperature < low - margin) | (readings.temperature > high + margin))
+        return np.asarray(
+            (readings.temperature < low - margin) | (readings.temperature > high + margin)
+        )

@@ -93,7 +93,9 @@ def _check_geometry(result: Fit, free: list[Free]) -> None:
     benign = ("rotation-x", "rotation-y", "toolface-zero", "scale")
     bad = [entry for entry in free if entry.id not in benign]
     if bad:
-        names = ", ".join(f"{TRIADS[t]} {e.id.removeprefix('weak-')}" for e in bad for t in e.triads)
+        names = ", ".join(
+            f"{TRIADS[t]} {e.id.removeprefix('weak-')}" for e in bad for t in e.triads
+        )
         raise FitError(
             f"the stations are too weak to fit the model: nothing determines {names}. Add stations "
             "at other inclinations (at least three, well apart, up and down) with six or more "
@@ -102,7 +104,9 @@ def _check_geometry(result: Fit, free: list[Free]) -> None:
 
 
 def _check_freedom(result: Fit) -> None:
-    for name, noise, freedom in zip(TRIADS, result.noise[0], result.analysis.freedom[0], strict=False):
+    for name, noise, freedom in zip(
+        TRIADS, result.noise[0], result.analysis.freedom[0], strict=False
+    ):
         if np.isfinite(noise) and freedom < 1:
             raise FitError(
                 f"the {name} has no redundancy ({freedom:.1f} degrees of freedom): its noise cannot "

@@ -26,7 +26,9 @@ def correct(
     if outside not in OUTSIDE:
         raise InputError(f"--outside must be one of {', '.join(OUTSIDE)}; got {outside!r}.")
     if calibration.has_field and readings.magnetometer is None:
-        findings = [Finding(id="no-magnetometer", text="no columns mx, my, mz: magnetic results are blank.")]
+        findings = [
+            Finding(id="no-magnetometer", text="no columns mx, my, mz: magnetic results are blank.")
+        ]
     else:
         findings = []
     columns = _columns(calibration, readings)
@@ -56,12 +58,18 @@ def _columns(calibration: Calibration, readings: Readings) -> dict[str, Array]:
 
 def _outside(calibration: Calibration, readings: Readings, how: str, count: int) -> Finding:
     low, high = calibration.temperature_c or (np.nan, np.nan)
-    text = f"{count} of {readings.count} rows lie outside the calibrated range {low:.1f}…{high:.1f} °C"
+    text = (
+        f"{count} of {readings.count} rows lie outside the calibrated range {low:.1f}…{high:.1f} °C"
+    )
     if how == "refuse":
         raise InputError(
             f"{readings.source}: {text}. Use --outside blank or extrapolate, or calibrate over a wider range."
         )
-    done = "their results are blank" if how == "blank" else "their results are extrapolated, with no statement of accuracy"
+    done = (
+        "their results are blank"
+        if how == "blank"
+        else "their results are extrapolated, with no statement of accuracy"
+    )
     return Finding(id="outside-temperature", text=f"{text}: {done}.")
 
 
@@ -69,11 +77,20 @@ def _undetermined(calibration: Calibration, readings: Readings) -> list[Finding]
     """Outputs that rest on a direction which the calibration leaves free."""
     names = [
         name
-        for name in ("gravity", "inclination", "toolface", "azimuth", "field", "dip", "magnetic_toolface")
+        for name in (
+            "gravity",
+            "inclination",
+            "toolface",
+            "azimuth",
+            "field",
+            "dip",
+            "magnetic_toolface",
+        )
         if bool(calibration.rests_on_free(name, readings).any())
     ]
     if not names:
         return []
     free = ", ".join(dict.fromkeys(u.id for u in calibration.undetermined()))
-    text = f"{', '.join(names)} rest on what the calibration leaves undetermined ({free}): no uncertainty can be stated."
+    text = f"{', '.join(names)} rest on what the calibration leaves undetermined ({free})"
+    text += ": no uncertainty can be stated."
     return [Finding(id="undetermined", text=text)]

@@ -30,7 +30,9 @@ def fetch(name: str) -> Path:
     """
     known = registry()
     if name not in known:
-        raise InputError(f"{name!r} is no measured file of the registry; see mwdcal.datasets.registry().")
+        raise InputError(
+            f"{name!r} is no measured file of the registry; see mwdcal.datasets.registry()."
+        )
     if FOLDER not in os.environ and ADDRESS not in os.environ:
         raise InputError(
             f"{name}: set {FOLDER} to the folder of a local copy of the measured sets, or "
@@ -39,7 +41,9 @@ def fetch(name: str) -> Path:
     try:
         import pooch
     except ImportError:
-        raise InputError("measured sets need the extra 'data': pip install 'mwdcal[data]'.") from None
+        raise InputError(
+            "measured sets need the extra 'data': pip install 'mwdcal[data]'."
+        ) from None
     cache = pooch.create(
         path=pooch.os_cache("mwdcal"),
         base_url=os.environ.get(ADDRESS, "https://localhost/"),

@@ -16,7 +16,7 @@ from mwdcal.core.problem import UNKNOWN, Constant, Evidence, Problem, State, Tri
 from mwdcal.core.solvers import Status, gauss_newton
 from mwdcal.core.start import start
 from mwdcal.core.uncertainty import Analysis, analyse, settle_gauge
-from mwdcal.core.vectors import Array, Ints
+from mwdcal.core.vectors import AnyArray, Array, Ints
 from mwdcal.readings import ANGLES, CONSTANTS, Readings
 
 FLOOR = 1e-9
@@ -56,7 +56,7 @@ class Fit:
     analysis: Analysis
 
 
-def _flat(value: Array, lead: tuple[int, ...], *tail: int) -> Array:
+def _flat(value: AnyArray, lead: tuple[int, ...], *tail: int) -> AnyArray:
     """A value with one batch axis: (B, n, *tail)."""
     whole = np.broadcast_to(np.asarray(value), (*lead, *tail))
     return np.asarray(whole.reshape(math.prod(lead[:-1]), lead[-1], *tail))
@@ -67,8 +67,7 @@ def evidence_of(readings: Readings, include: Array) -> Evidence:
     lead = np.broadcast_shapes(readings.accelerometer.shape[:-1], include.shape)
     known = {n: _flat(readings.reference(n), lead) for n in ANGLES + CONSTANTS}
     sd = {n: _flat(readings.uncertainty(n), lead) for n in ANGLES + CONSTANTS}
-    alone = np.full(readings.count, -1)
-    group = _flat(alone if readings.group is None else readings.group, lead)
+    group = _flat(readings.groups, lead)
     included = _flat(include, lead).astype(float)
     nowhere = np.isnan(known["field"]).all(-1, keepdims=True)
     known["field"] = np.where(nowhere, 1.0, known["field"])
@@ -83,7 +82,9 @@ def _share_known(evidence: Evidence) -> dict[str, Array]:
         members = evidence.members * evidence.is_known(name)[..., None]
         count = members.sum(-2)
         turn = np.einsum("bnk,bn->bk", members, np.exp(1j * np.nan_to_num(known[name])))
-        mean = np.einsum("bnk,bk->bn", evidence.members, np.where(count > 0, np.angle(turn), np.nan_to_num(0)))
+        mean = np.einsum(
+            "bnk,bk->bn", evidence.members, np.where(count > 0, np.angle(turn), np.nan_to_num(0))
+        )
         filled = np.einsum("bnk,bk->bn", evidence.members, count) > 0
         known[name] = np.where(np.isnan(known[name]) & filled, mean, known[name])
     return known
@@ -95,17 +96,23 @@ def _constants(evidence: Evidence) -> tuple[Constant, ...]:
     for name, size in (("gravity", 1.0), ("field", 0.0), ("dip", UNKNOWN)):
         known = evidence.is_known(name)
         if not known.all():
-            value = np.nan_to_num(np.nansum(evidence.known[name], -1) / np.maximum(known.sum(-1), 1))
+            value = np.nan_to_num(
+                np.nansum(evidence.known[name], -1) / np.maximum(known.sum(-1), 1)
+            )
             scale = np.full(len(value), size) if size else np.where(value > 0, value, 1.0)
             found.append(Constant(name, (~known).astype(float), value, scale, unknown=True))
         sd = np.max(np.where(known, evidence.sd[name], 0.0), -1)
         if (sd > 0).any():
             floor = np.where(sd > 0, sd, 1e-12)
-            found.append(Constant(name, known.astype(float), np.zeros(len(sd)), floor, unknown=False))
+            found.append(
+                Constant(name, known.astype(float), np.zeros(len(sd)), floor, unknown=False)
+            )
     return tuple(found)
 
 
-def model_of(kind: str, order: int, raw: Array, temperature: Array, include: Array, curved: bool = False) -> Model:
+def model_of(
+    kind: str, order: int, raw: Array, temperature: Array, include: Array, curved: bool = False
+) -> Model:
     """A conditioned model for readings (B, n, 3): centred, scaled, Chebyshev in temperature."""
     low, high = float(temperature.min()), float(temperature.max())
     half = (high - low) / 2 or 1.0
@@ -116,11 +123,18 @@ def model_of(kind: str, order: int, raw: Array, temperature: Array, include: Arr
     centre = np.sum(raw * weight, -2, keepdims=True)
     radius = np.sqrt(np.sum((raw - centre) ** 2 * weight, (-2, -1)))
     radius = np.where(radius > 0, radius, 1.0)
-    return Polynomial(basis, centre, np.broadcast_to(radius[:, None, None], centre.shape).copy(), curved)
+    return Polynomial(
+        basis, centre, np.broadcast_to(radius[:, None, None], centre.shape).copy(), curved
+    )
 
 
 def _problem(
-    readings: Readings, evidence: Evidence, lead: tuple[int, ...], kind: str, order: int, curved: Mapping[str, float]
+    readings: Readings,
+    evidence: Evidence,
+    lead: tuple[int, ...],
+    kind: str,
+    order: int,
+    curved: Mapping[str, float],
 ) -> tuple[Problem, list[bool]]:
     """The problem, and for each triad whether its noise is declared."""
     cold = np.zeros(readings.count)
@@ -132,7 +146,11 @@ def _problem(
             continue
         raw = _flat(values, lead, 3)
         model = model_of(kind, order, raw, temperature, evidence.include, name in curved)
-        sd = _flat(readings.sd[name], lead, 3) if name in readings.sd else 1e-3 * _size(raw) + 0 * raw
+        sd = (
+            _flat(readings.sd[name], lead, 3)
+            if name in readings.sd
+            else 1e-3 * _size(raw) + 0 * raw
+        )
         triads.append(Triad(model, raw, sd, _prior(model, evidence, name, curved.get(name, 0.0))))
         declared.append(name in readings.sd)
     return Problem(tuple(triads), temperature, evidence), declared
@@ -191,7 +209,10 @@ def _estimate_noise(
         free = [i for i, known in enumerate(declared) if not known]
         if np.all(np.abs(scale[:, free] - 1) < 1e-3):
             break
-    noise = [np.full(len(status), np.nan) if k else t.sd[:, 0, 0] for t, k in zip(problem.triads, declared, strict=True)]
+    noise = [
+        np.full(len(status), np.nan) if k else t.sd[:, 0, 0]
+        for t, k in zip(problem.triads, declared, strict=True)
+    ]
     return problem, state, status, np.stack(noise, -1)
 
 

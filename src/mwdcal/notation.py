@@ -73,7 +73,9 @@ def _one(
     tau = temperature - calibration.reference_temperature
     scale = np.full(3, 1.0 if profile.scale is None else profile.scale)
     if notation == "factors" and triad.model == "factors":
-        return _propagate(lambda p: _own_factors(p, triad.order, profile.permutation, scale), triad, covariance)
+        return _propagate(
+            lambda p: _own_factors(p, triad.order, profile.permutation, scale), triad, covariance
+        )
     if notation == "factors" and triad.order:
         raise InputError(
             f"the {triad.name} is a polynomial of order {triad.order} in temperature: its factors "
@@ -127,7 +129,9 @@ _FORMS: dict[str, Callable[[AnyArray, AnyArray, Array], dict[str, AnyArray]]] = 
 }
 
 
-def _own_factors(params: AnyArray, order: int, permutation: Array, scale: Array) -> dict[str, AnyArray]:
+def _own_factors(
+    params: AnyArray, order: int, permutation: Array, scale: Array
+) -> dict[str, AnyArray]:
     """Stored factors, tool axes and nominal units, to channels and raw units: exact."""
     count = order + 1
     linear = params[: 6 * count].reshape(2, 3, count)
@@ -153,7 +157,9 @@ def _propagate(
         step = np.zeros(len(params), complex)
         size = max(abs(params[index]), 1.0) * 1e-30
         step[index] = 1j * size
-        columns.append(np.concatenate([v.imag.ravel() / size for v in values(params + step).values()]))
+        columns.append(
+            np.concatenate([v.imag.ravel() / size for v in values(params + step).values()])
+        )
     jacobian = np.stack(columns, -1)
     spread = jacobian @ covariance @ jacobian.transpose()
     sd = np.sqrt(np.maximum(np.diag(spread), 0.0))

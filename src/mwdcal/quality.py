@@ -11,7 +11,7 @@ import numpy as np
 
 from mwdcal.calibration import FREE_SHARE, Calibration, Finding
 from mwdcal.core.observables import OBSERVABLES
-from mwdcal.core.vectors import Array, Bools, centred
+from mwdcal.core.vectors import AnyArray, Array, Bools, centred
 from mwdcal.errors import InputError
 from mwdcal.readings import Readings
 
@@ -117,7 +117,7 @@ def verify(calibration: Calibration, readings: Readings, limits: Limits) -> Verd
 def _check_independent(calibration: Calibration, readings: Readings) -> None:
     used = [
         label
-        for label, digest in zip(readings.station, readings.digest, strict=True)
+        for label, digest in zip(readings.labels, readings.digest, strict=False)
         if digest in calibration.digests
     ]
     if used:
@@ -135,7 +135,7 @@ def _check_temperature(calibration: Calibration, readings: Readings) -> None:
         first = int(np.flatnonzero(outside)[0])
         raise InputError(
             f"{readings.source}: {int(outside.sum())} stations lie outside the calibrated range "
-            f"{low:.1f}…{high:.1f} °C (first: station {readings.station[first]}). Verify within "
+            f"{low:.1f}…{high:.1f} °C (first: station {readings.labels[first]}). Verify within "
             "the range, or calibrate over a wider one."
         )
 
@@ -155,9 +155,11 @@ class _Test:
 
     def _applies(self, name: str) -> bool:
         magnetic = name in ("azimuth", "field", "dip")
-        return not magnetic or (self.calibration.has_field and self.readings.magnetometer is not None)
+        return not magnetic or (
+            self.calibration.has_field and self.readings.magnetometer is not None
+        )
 
-    def sets(self) -> list[tuple[str, Array]]:
+    def sets(self) -> list[tuple[str, AnyArray]]:
         """Roll sets: label and station numbers."""
         found = []
         for label, members in _directions(self.readings):
@@ -171,7 +173,7 @@ class _Test:
         if not self._applies(name):
             return None
         value, period = self._value(name), OBSERVABLES[name].period
-        worst: tuple[float, Array, str] | None = None
+        worst: tuple[float, AnyArray, str] | None = None
         for label, index in self.sets():
             part = value[index]
             if np.isnan(part).any():
@@ -186,9 +188,11 @@ class _Test:
         width, ends, label = worst
         contrast = np.zeros((1, self.readings.count))
         contrast[0, ends] = 1.0, -1.0
-        labels = " to ".join(self.readings.station[i] for i in sorted(ends))
+        labels = " to ".join(self.readings.labels[i] for i in sorted(ends))
         free = any(self._free_spread(name, index) for _, index in self.sets())
-        return self._row(f"spread of {name}", name, width, contrast, limit, free, f"{label}; stations {labels}")
+        return self._row(
+            f"spread of {name}", name, width, contrast, limit, free, f"{label}; stations {labels}"
+        )
 
     def error(self, name: str, limit: float) -> VerdictRow | None:
         """The largest departure from the reference, or None where there is no reference."""
@@ -203,16 +207,20 @@ class _Test:
         contrast = np.zeros((1, self.readings.count))
         contrast[0, worst] = 1.0
         free = bool(self.calibration.rests_on_free(name, self.readings)[~np.isnan(error)].any())
-        note = f"station {self.readings.station[worst]}"
-        return self._row(f"error of {name}", name, abs(float(error[worst])), contrast, limit, free, note)
+        note = f"station {self.readings.labels[worst]}"
+        return self._row(
+            f"error of {name}", name, abs(float(error[worst])), contrast, limit, free, note
+        )
 
-    def _free_spread(self, name: str, index: Array) -> bool:
+    def _free_spread(self, name: str, index: AnyArray) -> bool:
         """Whether the spread of a set moves with a direction that no evidence determines."""
         if not self.calibration.free:
             return False
         rows = np.nan_to_num(self.calibration.sensitivity(name, self.readings)[index])
         moved = rows @ np.array(self.calibration.free).transpose()
-        size = {"g": 1.0, "nT": self.calibration.earth.get("field", 1.0)}.get(OBSERVABLES[name].unit, 1.0)
+        size = {"g": 1.0, "nT": self.calibration.earth.get("field", 1.0)}.get(
+            OBSERVABLES[name].unit, 1.0
+        )
         return bool((np.ptp(moved, axis=0) > FREE_SHARE * size).any())
 
     def _uncertainty(self, name: str, contrast: Array) -> float:
@@ -227,7 +235,14 @@ class _Test:
         return float(np.sqrt(variance + np.sum(contrast[0] ** 2 * each)))
 
     def _row(
-        self, title: str, name: str, value: float, contrast: Array, limit: float, free: bool, note: str
+        self,
+        title: str,
+        name: str,
+        value: float,
+        contrast: Array,
+        limit: float,
+        free: bool,
+        note: str,
     ) -> VerdictRow:
         factor, unit = self._scale(name)
         uncertainty = self._uncertainty(name, contrast) * factor
@@ -256,7 +271,9 @@ class _Test:
 def _directions(readings: Readings) -> list[tuple[str, Bools]]:
     """Stations of one direction: by group, else by equal reference angles, else all of them."""
     group = np.full(readings.count, -1) if readings.group is None else readings.group
-    found = [(f"roll set {k + 1}", np.asarray(group == k)) for k in range(int(group.max(initial=-1)) + 1)]
+    found = [
+        (f"roll set {k + 1}", np.asarray(group == k)) for k in range(int(group.max(initial=-1)) + 1)
+    ]
     inclination, azimuth = readings.reference("inclination"), readings.reference("azimuth")
     if not found and np.isnan(inclination).all():
         return [("all stations", np.ones(readings.count, bool))]

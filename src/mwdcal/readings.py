@@ -9,10 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
-from mwdcal.core.vectors import Array
+from mwdcal.core.vectors import AnyArray, Array, Bools, Ints
 
 ANGLES = ("inclination", "azimuth", "toolface")
 CONSTANTS = ("gravity", "field", "dip")
@@ -48,7 +49,7 @@ class Readings:
     temperature: Array | None = None
     known: Mapping[str, Array] = field(default_factory=dict)
     sd: Mapping[str, Array] = field(default_factory=dict)
-    group: Array | None = None
+    group: Ints | None = None
     station: tuple[str, ...] = ()
     digest: tuple[str, ...] = ()
     metadata: Mapping[str, object] = field(default_factory=dict)
@@ -58,6 +59,16 @@ class Readings:
     def count(self) -> int:
         """Number of stations."""
         return int(self.accelerometer.shape[-2])
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Labels of the stations: the given ones, else their numbers from 1."""
+        return self.station or tuple(str(i) for i in range(1, self.count + 1))
+
+    @property
+    def groups(self) -> Ints:
+        """Group numbers (..., n): -1 everywhere where none are given."""
+        return np.full(self.count, -1) if self.group is None else self.group
 
     def reference(self, name: str) -> Array:
         """The known value `name` (..., n), NaN where blank; gravity defaults to 1 g."""
@@ -74,11 +85,11 @@ class Readings:
         value = np.asarray(self.sd.get(name, 0.0), float)
         return np.broadcast_to(np.nan_to_num(value), self.accelerometer.shape[:-1])
 
-    def select(self, keep: Array) -> Readings:
+    def select(self, keep: Bools) -> Readings:
         """The stations where `keep` (n,) is true, of a run without leading axes."""
         chosen = np.flatnonzero(keep)
 
-        def rows(value: Array | None) -> Array | None:
+        def rows(value: AnyArray | None) -> Any:
             return None if value is None else np.asarray(value)[chosen]
 
         per_station = {k: np.broadcast_to(v, self._shape(k)) for k, v in self.sd.items()}

@@ -99,7 +99,9 @@ class Residuals:
     def _spread(self) -> Array:
         """Expected covariance (n, m, m) of the whitened misfit left after the fit."""
         linear = self.fit.problem.linear(self.fit.state)
-        inverse = linear.weigh(np.broadcast_to(np.eye(linear.residual.shape[-1]), self.fit.analysis.spread.shape))
+        inverse = linear.weigh(
+            np.broadcast_to(np.eye(linear.residual.shape[-1]), self.fit.analysis.spread.shape)
+        )
         total = np.linalg.inv(inverse)
         inner = total @ self.fit.analysis.spread @ total
         return np.asarray(inner[0])
@@ -123,7 +125,7 @@ class Residuals:
             rows.append(np.einsum("ni,nij->nj", part, slope) * triad.sd[0])
         row = np.nan_to_num(np.concatenate(rows, -1) * self._weight(name)[:, None])
         variance = np.einsum("ni,nij,nj->n", row, self._spread, row)
-        return np.sqrt(np.maximum(variance, 0) * self._variance_factor)
+        return np.asarray(np.sqrt(np.maximum(variance, 0) * self._variance_factor))
 
     def names(self) -> list[str]:
         """Observables with a reference somewhere in this run."""
@@ -148,9 +150,13 @@ def error_rows(readings: Readings, fit: Fit) -> list[ErrorRow]:
         )
         rows.append(
             ErrorRow(
-                observable=name, unit=unit, stations=int(known.sum()),
-                before=before, after=after, expected=expected,
-            )  # fmt: skip
+                observable=name,
+                unit=unit,
+                stations=int(known.sum()),
+                before=before,
+                after=after,
+                expected=expected,
+            )
         )
     return rows
 
@@ -170,9 +176,13 @@ def measure_rows(readings: Readings, fit: Fit) -> list[Measures]:
             mse = float(np.mean(error**2))
             rows.append(
                 Measures(
-                    triad=name, when=when, mean=float(error.mean()), std=float(error.std(ddof=1)),
-                    mse=mse, rmse=mse**0.5,
-                )  # fmt: skip
+                    triad=name,
+                    when=when,
+                    mean=float(error.mean()),
+                    std=float(error.std(ddof=1)),
+                    mse=mse,
+                    rmse=mse**0.5,
+                )
             )
     return rows
 
@@ -214,9 +224,11 @@ def station_rows(readings: Readings, fit: Fit) -> list[StationRow]:
         scores = {n: float(ratio[n][i]) for n in names if not np.isnan(after[n][i])}
         rows.append(
             StationRow(
-                station=readings.station[i] if readings.station else str(i + 1),
+                station=readings.labels[i],
                 digest=readings.digest[i] if readings.digest else "",
-                temperature_c=None if readings.temperature is None else float(readings.temperature[i]),
+                temperature_c=None
+                if readings.temperature is None
+                else float(readings.temperature[i]),
                 inclination_deg=_plain(attitude["inclination"][i]),
                 toolface_deg=_plain(attitude["toolface"][i]),
                 azimuth_deg=_plain(attitude["azimuth"][i]),
@@ -237,5 +249,3 @@ def _plain(value: float) -> float | None:
 def _scaled(errors: dict[str, Array], factors: dict[str, float], index: int) -> dict[str, float]:
     pairs = {n: float(e[index] * factors[n]) for n, e in errors.items()}
     return {n: v for n, v in pairs.items() if not np.isnan(v)}
-
-

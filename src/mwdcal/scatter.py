@@ -46,10 +46,9 @@ def fitted_fields(result: Fit) -> tuple[Array, Array]:
 
 
 def scatter(readings: Readings, curved: dict[str, float] | None = None) -> tuple[float, float]:
-    """Direction scatter of a run's groups, radians: in sample, and each station left out in turn."""
-    group = np.full(readings.count, -1) if readings.group is None else readings.group
+    """Direction scatter of a run's groups, radians: in sample, and with each station left out."""
     whole = directions(*fitted_fields(fit(readings, curved=curved)))[0]
     left_out = fit(readings, include=1 - np.eye(readings.count), curved=curved)
     own = np.arange(readings.count)
     axis = directions(*fitted_fields(left_out))[own, own]
-    return group_scatter(whole, group), group_scatter(axis, group)
+    return group_scatter(whole, readings.groups), group_scatter(axis, readings.groups)

@@ -59,19 +59,27 @@ def choose_order(
     totals = np.array([s.mean() for _, s in scores])
     best = int(np.flatnonzero(totals <= NEAR_BEST * np.nanmin(totals))[0])
     table = [
-        OrderScore(o, float(s[1:-1].mean()) if levels > 2 else float("nan"), float(s[[0, -1]].mean()), o == best)  # noqa: PLR2004
+        OrderScore(
+            o,
+            float(s[1:-1].mean()) if levels > 2 else float("nan"),
+            float(s[[0, -1]].mean()),
+            o == best,
+        )
         for o, s in scores
     ]
     return best, table
 
 
-def _held_out(readings: Readings, method: str, kind: str | None, order: int, numbers: Ints) -> Array:
+def _held_out(
+    readings: Readings, method: str, kind: str | None, order: int, numbers: Ints
+) -> Array:
     """χ² per reading (levels,) of each soak, fitted without it."""
     levels = int(numbers.max()) + 1
     include = (np.arange(levels)[:, None] != numbers).astype(float)
     result = fit(readings, method, kind or ("factors" if order else "polynomial"), order, include)
     held = 1 - include
-    return np.sum(misfit(result) * held, -1) / (held.sum(-1) * 3 * len(result.problem.triads))
+    count = held.sum(-1) * 3 * len(result.problem.triads)
+    return np.asarray(np.sum(misfit(result) * held, -1) / count)
 
 
 def misfit(result: Fit) -> Array:
@@ -79,7 +87,9 @@ def misfit(result: Fit) -> Array:
     from dataclasses import replace
 
     evidence = result.problem.evidence
-    problem = replace(result.problem, evidence=replace(evidence, include=np.ones_like(evidence.include)))
+    problem = replace(
+        result.problem, evidence=replace(evidence, include=np.ones_like(evidence.include))
+    )
     state = result.state
     for _ in range(3):
         linear = problem.linear(state)

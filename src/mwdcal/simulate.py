@@ -30,7 +30,10 @@ def grid(
     azi = np.repeat(np.resize(np.radians(azimuths), len(inclinations)), toolfaces)
     count, soaks = len(inc), len(temperatures)
     return Plan(
-        np.tile(inc, soaks), np.tile(azi, soaks), np.tile(tool, soaks), np.repeat(temperatures, count)
+        np.tile(inc, soaks),
+        np.tile(azi, soaks),
+        np.tile(tool, soaks),
+        np.repeat(temperatures, count),
     )
 
 
@@ -59,15 +62,23 @@ def servo(rng: np.random.Generator) -> Truth:
     ± 100 µg/°C, with a tenth and a hundredth of the drift over 100 °C in the square and the
     cube. The magnetometer: scale ± 2 %, hard iron ± 1 % of 50 µT, alignment ± 4 mrad.
     """
-    return Truth(_triad(rng, 0.05, 0.010, 2e-3, 180e-6, 100e-6), _triad(rng, 0.02, 500.0, 4e-3, 100e-6, 2.0))
+    return Truth(
+        _triad(rng, 0.05, 0.010, 2e-3, 180e-6, 100e-6), _triad(rng, 0.02, 500.0, 4e-3, 100e-6, 2.0)
+    )
 
 
 def _triad(
-    rng: np.random.Generator, scale: float, bias: float, alignment: float, scale_drift: float, bias_drift: float
+    rng: np.random.Generator,
+    scale: float,
+    bias: float,
+    alignment: float,
+    scale_drift: float,
+    bias_drift: float,
 ) -> Array:
     course = np.array([1.0, 1e-3, 1e-6])
     scales = np.concatenate(
-        [1 + rng.uniform(-scale, scale, (3, 1)), scale_drift * rng.uniform(-1, 1, (3, 3)) * course], -1
+        [1 + rng.uniform(-scale, scale, (3, 1)), scale_drift * rng.uniform(-1, 1, (3, 3)) * course],
+        -1,
     )
     biases = np.concatenate(
         [rng.uniform(-bias, bias, (3, 1)), bias_drift * rng.uniform(-1, 1, (3, 3)) * course], -1
@@ -80,24 +91,29 @@ def reading(truth: Truth, plan: Plan) -> tuple[Array, Array]:
     fields = reference_vectors(
         plan.inclination, plan.azimuth, plan.toolface, truth.gravity, truth.field, truth.dip
     )
-    result = []
+    result: list[Array] = []
     for params, field in zip((truth.accelerometer, truth.magnetometer), fields, strict=True):
         zero = np.zeros_like(field)
         slope = truth.model.slope(params, zero, plan.temperature)
         offset = truth.model.fields(params, zero, plan.temperature)
-        result.append(np.linalg.solve(slope, (field - offset)[..., None])[..., 0])
+        solved = np.linalg.solve(slope, (field - offset)[..., None])[..., 0]
+        result.append(np.asarray(solved, float))
     return result[0], result[1]
 
 
 def run(
-    truth: Truth, plan: Plan, rng: np.random.Generator, noise: tuple[float, float] = (1e-4, 15.0),
+    truth: Truth,
+    plan: Plan,
+    rng: np.random.Generator,
+    noise: tuple[float, float] = (1e-4, 15.0),
     stand: tuple[float, float, float] = (0.0, 0.0, 0.0),
-) -> Readings:  # fmt: skip
+) -> Readings:
     """Readings with noise (g, nT), at a stand whose angles are off by `stand` (radians, 1 σ)."""
-    actual = Plan(
-        *(a + s * rng.normal(size=a.shape) for a, s in zip((plan.inclination, plan.azimuth, plan.toolface), stand, strict=True)),
-        plan.temperature,
+    inclination, azimuth, toolface = (
+        angle + sd * rng.normal(size=angle.shape)
+        for angle, sd in zip((plan.inclination, plan.azimuth, plan.toolface), stand, strict=True)
     )
+    actual = Plan(inclination, azimuth, toolface, plan.temperature)
     g, b = reading(truth, actual)
     count = len(plan.inclination)
     known = {

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypedDict
 
 import click
 
@@ -20,10 +20,23 @@ if TYPE_CHECKING:
     from mwdcal.selection import OrderScore
 
 INTERNAL = 70
+
+
+class Digests(TypedDict):
+    """What the calibration file says about its sources."""
+
+    profile_sha256: str
+    run_sha256: str
+
+
 FILE = click.Path(path_type=Path)
 as_json = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
 decimal_sign = click.option(
-    "--decimal", default=".", show_default=True, metavar="SIGN", help="Decimal sign of numbers in text files."
+    "--decimal",
+    default=".",
+    show_default=True,
+    metavar="SIGN",
+    help="Decimal sign of numbers in text files.",
 )
 
 
@@ -59,16 +72,37 @@ def print_json(value: Any) -> None:
 
 @cli.command()
 @click.argument("run", type=FILE)
-@click.option("-o", "--output", type=FILE, required=True, metavar="CAL.json", help="Calibration file to write.")
+@click.option(
+    "-o",
+    "--output",
+    type=FILE,
+    required=True,
+    metavar="CAL.json",
+    help="Calibration file to write.",
+)
 @click.option("--tool", metavar="NAME|FILE", help="Tool profile: a shipped name or a TOML file.")
 @click.option(
     "--method", default="joint", show_default=True, metavar="METHOD",
     help="joint: all evidence, weighted. least-squares: reference vectors only.",
 )  # fmt: skip
-@click.option("--model", type=click.Choice(["polynomial", "factors"]), help="Default: polynomial at order 0, factors above.")
-@click.option("--order", default="auto", show_default=True, metavar="0…3|auto", help="Order of temperature terms.")
-@click.option("--exclude", multiple=True, metavar="STATION", help="Leave a station out; may be repeated.")
-@click.option("--report", type=FILE, metavar="R.html", help="Also write a self-contained HTML report.")
+@click.option(
+    "--model",
+    type=click.Choice(["polynomial", "factors"]),
+    help="Default: polynomial at order 0, factors above.",
+)
+@click.option(
+    "--order",
+    default="auto",
+    show_default=True,
+    metavar="0…3|auto",
+    help="Order of temperature terms.",
+)
+@click.option(
+    "--exclude", multiple=True, metavar="STATION", help="Leave a station out; may be repeated."
+)
+@click.option(
+    "--report", type=FILE, metavar="R.html", help="Also write a self-contained HTML report."
+)
 @decimal_sign
 @as_json
 def calibrate(
@@ -94,18 +128,26 @@ def calibrate(
         write_report(report, made)
     documents.write(output, made)
     if as_json:
-        print_json({**_summary(made), "orders": scores, "calibration": str(output), "report": str(report or "")})
+        print_json(
+            {
+                **_summary(made),
+                "orders": scores,
+                "calibration": str(output),
+                "report": str(report or ""),
+            }
+        )
     else:
         _show(made, scores, output, report)
 
 
-def _load(run: Path, tool: str | None, decimal: str) -> tuple[Readings, Profile, dict[str, str]]:
+def _load(run: Path, tool: str | None, decimal: str) -> tuple[Readings, Profile, Digests]:
     from mwdcal.files import profiles, runs, table
 
     profile, profile_sha256 = profiles.load_profile(tool)
     read = table.read(run, decimal=decimal)
     readings, profile = runs.to_readings(read, profile)
-    return readings, profile, {"profile_sha256": profile_sha256, "run_sha256": read.digest}
+    digests = Digests(profile_sha256=profile_sha256, run_sha256=read.digest)
+    return readings, profile, digests
 
 
 def _without(readings: Readings, exclude: tuple[str, ...]) -> Readings:
@@ -120,7 +162,9 @@ def _without(readings: Readings, exclude: tuple[str, ...]) -> Readings:
     return readings.select(np.array([label not in exclude for label in readings.station]))
 
 
-def _order(order: str, readings: Readings, method: str, model: str | None) -> tuple[int, list[OrderScore]]:
+def _order(
+    order: str, readings: Readings, method: str, model: str | None
+) -> tuple[int, list[OrderScore]]:
     from mwdcal.selection import choose_order
 
     if order == "auto":
@@ -134,7 +178,12 @@ def _summary(made: Calibration) -> dict[str, Any]:
     from mwdcal.predict import typical_accuracy
 
     triads = {
-        t.name: {"rank": t.rank, "size": t.size, "undetermined": t.undetermined, "variance_factor": t.variance_factor}
+        t.name: {
+            "rank": t.rank,
+            "size": t.size,
+            "undetermined": t.undetermined,
+            "variance_factor": t.variance_factor,
+        }
         for t in made.triads
     }
     return {
@@ -152,7 +201,10 @@ def _show(made: Calibration, scores: list[OrderScore], output: Path, report: Pat
     if scores:
         click.echo(text.orders(scores) + "\n")
     click.echo(text.errors(made.errors) + "\n")
-    accuracy = "  ".join(f"{n} {text.number(v)}{'°' if v is not None else ''}" for n, v in typical_accuracy(made).items())
+    accuracy = "  ".join(
+        f"{n} {text.number(v)}{'°' if v is not None else ''}"
+        for n, v in typical_accuracy(made).items()
+    )
     click.echo(f"accuracy to expect (1σ, calibration alone, typical): {accuracy}")
     for constant in made.constants:
         value = f"{constant.value:.6g} ± {constant.standard_uncertainty:.2g} {constant.unit}"
@@ -166,14 +218,23 @@ def _show(made: Calibration, scores: list[OrderScore], output: Path, report: Pat
 @cli.command()
 @click.argument("calibration", type=FILE)
 @click.argument("readings", type=FILE)
-@click.option("-o", "--output", type=FILE, required=True, metavar="OUT", help="Table to write; format by suffix.")
+@click.option(
+    "-o",
+    "--output",
+    type=FILE,
+    required=True,
+    metavar="OUT",
+    help="Table to write; format by suffix.",
+)
 @click.option(
     "--outside", type=click.Choice(["blank", "refuse", "extrapolate"]), default="blank", show_default=True,
     help="Rows outside the calibrated temperature range.",
 )  # fmt: skip
 @decimal_sign
 @as_json
-def apply(calibration: Path, readings: Path, output: Path, outside: str, decimal: str, as_json: bool) -> None:
+def apply(
+    calibration: Path, readings: Path, output: Path, outside: str, decimal: str, as_json: bool
+) -> None:
     """Correct READINGS with a CALIBRATION: adds vectors, angles and strengths as columns.
 
     \b
@@ -197,8 +258,12 @@ def apply(calibration: Path, readings: Path, output: Path, outside: str, decimal
 @cli.command()
 @click.argument("calibration", type=FILE)
 @click.argument("run", type=FILE)
-@click.option("--limits", default="roll-test", show_default=True, metavar="NAME|FILE", help="Limits profile.")
-@click.option("--report", type=FILE, metavar="R.html", help="Also write the report, with this verdict.")
+@click.option(
+    "--limits", default="roll-test", show_default=True, metavar="NAME|FILE", help="Limits profile."
+)
+@click.option(
+    "--report", type=FILE, metavar="R.html", help="Also write the report, with this verdict."
+)
 @decimal_sign
 @as_json
 def verify(
@@ -232,11 +297,20 @@ def verify(
 
 @cli.command()
 @click.argument("calibration", type=FILE)
-@click.option("--notation", required=True, type=click.Choice(["factors", "forward", "affine"]), help="Form to print.")
+@click.option(
+    "--notation",
+    required=True,
+    type=click.Choice(["factors", "forward", "affine"]),
+    help="Form to print.",
+)
 @click.option("--temperature", type=float, metavar="°C", help="Default: the reference temperature.")
-@click.option("-o", "--output", type=FILE, metavar="OUT.json", help="Write JSON here instead of printing.")
+@click.option(
+    "-o", "--output", type=FILE, metavar="OUT.json", help="Write JSON here instead of printing."
+)
 @as_json
-def convert(calibration: Path, notation: str, temperature: float | None, output: Path | None, as_json: bool) -> None:
+def convert(
+    calibration: Path, notation: str, temperature: float | None, output: Path | None, as_json: bool
+) -> None:
     """Print a CALIBRATION in another notation, in raw units, with covariance.
 
     \b

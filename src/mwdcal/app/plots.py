@@ -122,7 +122,7 @@ def station_errors(calibration: Calibration, name: str) -> str:
         if row.expected:
             second.axhspan(-row.expected, row.expected, color=BAND, lw=0, zorder=0.5)
         _stems(second, stations, [s.errors.get(name, np.nan) for s in stations], AFTER, "s")
-        expected = f"  (band: 1σ expected, ±{quantity(row.expected, 2, row.unit)})" if row.expected else ""
+        expected = "  (band: ±1σ expected)" if row.expected else ""
         second.set_title(f"after: rms {quantity(row.after, 3, row.unit)}{expected}")
         for axes in (first, second):
             axes.set_ylabel(label)
@@ -152,18 +152,23 @@ def _stems(
     axes: Axes, rows: Sequence[StationRow], values: Sequence[float], colour: str, marker: str
 ) -> None:
     """Stems over the stations; the ones to re-shoot have a triangle and their label."""
+    from matplotlib.patheffects import withStroke
+
     where, heights = np.arange(len(rows)), np.asarray(values, float)
     marked = np.array([row.reshoot for row in rows])
     small = 3.6 if len(rows) <= 80 else 2.2
-    axes.vlines(where, 0, heights, color=colour, lw=0.7, alpha=0.6)
+    gaps = np.full(len(rows), np.nan)
+    stems = np.stack([np.zeros(len(rows)), heights, gaps], -1).ravel()
+    axes.plot(np.repeat(where, 3), stems, color=colour, lw=0.7, alpha=0.6)
     axes.plot(where[~marked], heights[~marked], marker, color=colour, ms=small, mfc="white", mew=0.9)
     axes.plot(where[marked], heights[marked], "^", color=MARKED, ms=6)
+    halo = [withStroke(linewidth=2, foreground="white")]
     for index in np.flatnonzero(marked & ~np.isnan(heights)):
         below = heights[index] < 0
         axes.annotate(
             f"station {rows[index].station}", (float(where[index]), heights[index]),
             (5, -3 if below else 3), textcoords="offset points", va="top" if below else "bottom",
-            color="#9a3d00", fontsize=7,
+            color="#9a3d00", fontsize=7, path_effects=halo,
         )  # fmt: skip
     axes.grid(axis="x", visible=False)
     axes.margins(x=0.02, y=0.16)

@@ -9,12 +9,23 @@ from mwdcal.notation import Notation
 from mwdcal.quality import Verdict
 from mwdcal.selection import OrderScore
 
-WEIGHED = {"toolface": "toolface·sin I", "azimuth": "azimuth·sin I", "gravity": "|g|", "field": "|b|"}
+WEIGHED = {
+    "toolface": "toolface·sin I",
+    "azimuth": "azimuth·sin I",
+    "gravity": "|g|",
+    "field": "|b|",
+}
 
 
 def number(value: float | None) -> str:
     """Three significant digits, or a dash."""
-    return "–" if value is None or np.isnan(value) else f"{value:.3g}" if abs(value) < 100 else f"{value:.0f}"
+    return (
+        "–"
+        if value is None or np.isnan(value)
+        else f"{value:.3g}"
+        if abs(value) < 100
+        else f"{value:.0f}"
+    )
 
 
 def quantity(value: float | None, unit: str) -> str:
@@ -42,7 +53,9 @@ def table(rows: list[list[str]], header: list[str]) -> str:
 def heading(calibration: Calibration) -> str:
     """What was calibrated, from what, and how much of it is determined."""
     serial = calibration.tool.get("serial", calibration.profile.name)
-    inclinations = [r.inclination_deg for r in calibration.station_rows if r.inclination_deg is not None]
+    inclinations = [
+        r.inclination_deg for r in calibration.station_rows if r.inclination_deg is not None
+    ]
     parts = [calibration.run, serial, f"{calibration.stations} stations"]
     if calibration.temperature_c:
         parts.append("{:.1f}–{:.1f} °C".format(*calibration.temperature_c))
@@ -73,7 +86,10 @@ def findings(found: list[Finding]) -> list[str]:
 
 def orders(scores: list[OrderScore]) -> str:
     """The table that chose the temperature order."""
-    rows = [[str(s.order), number(s.inside), number(s.ends), "chosen" if s.chosen else ""] for s in scores]
+    rows = [
+        [str(s.order), number(s.inside), number(s.ends), "chosen" if s.chosen else ""]
+        for s in scores
+    ]
     return table(rows, ["order", "left-out soaks χ²", "end soaks χ²", ""])
 
 
@@ -103,6 +119,12 @@ def notation(found: dict[str, Notation]) -> str:
         for name, value in item.values.items():
             for index in np.ndindex(value.shape):
                 where = "".join(f"[{i}]" for i in index)
-                rows.append([f"{name}{where}", f"{value[index]:.12g}", f"{item.uncertainty[name][index]:.2g}"])
+                rows.append(
+                    [
+                        f"{name}{where}",
+                        f"{value[index]:.12g}",
+                        f"{item.uncertainty[name][index]:.2g}",
+                    ]
+                )
         blocks.append(f"{triad}\n" + table(rows, ["", "value", "1σ"]))
     return "\n\n".join(blocks)

@@ -14,12 +14,12 @@ temperature (..., n); results (..., n, 3), Jacobian (..., n, 3, p), slope d fiel
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 
-from mwdcal.core.vectors import Array
+from mwdcal.core.vectors import Array, Ints
 
 OFF_DIAGONAL = tuple((i, j) for i in range(3) for j in range(3) if i != j)
 
@@ -121,7 +121,7 @@ class Polynomial:
         if self.curved:
             own = [np.eye(3) * (x**power)[..., None, :] for power in (2, 3)]
             result = np.concatenate([result, *own], -1)
-        return result
+        return np.asarray(result)
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -150,6 +150,10 @@ class Polynomial:
         joined = np.concatenate([matrix.reshape(*shape, 9), offset], -1)
         flat = joined.reshape(*params.shape[:-1], self.affine)
         return np.concatenate([flat, params[..., self.affine :]], -1)
+
+    def take(self, index: Ints) -> Polynomial:
+        """The model of some members of a batch."""
+        return replace(self, centre=self.centre[index], scale=self.scale[index])
 
     def finished(self, reference: float) -> tuple[Polynomial, Array]:
         """The same model on plain readings and powers of T - reference, and the linear map to it.
@@ -203,7 +207,7 @@ class Factors:
     def fields(self, params: Array, raw: Array, temperature: Array) -> Array:
         """Field vectors (..., n, 3)."""
         scale, bias, mixing = self._split(params, temperature)
-        return np.einsum("...ij,...nj->...ni", mixing, raw / scale - bias)
+        return np.asarray(np.einsum("...ij,...nj->...ni", mixing, raw / scale - bias))
 
     def slope(self, params: Array, raw: Array, temperature: Array) -> Array:
         """Derivative of the field with respect to the reading (..., n, 3, 3)."""
@@ -229,7 +233,9 @@ class Factors:
     def names(self) -> tuple[str, ...]:
         """Names of the parameters: `scale-x`, `bias-x` (with `·k` for T^k), `misalignment-xy`."""
         count = range(self.basis.order + 1)
-        linear = [_with_order(f"{w}-{i}", k) for w in ("scale", "bias") for i in "xyz" for k in count]
+        linear = [
+            _with_order(f"{w}-{i}", k) for w in ("scale", "bias") for i in "xyz" for k in count
+        ]
         return (*linear, *(f"misalignment-{'xyz'[i]}{'xyz'[j]}" for i, j in OFF_DIAGONAL))
 
     def start(self, matrix: Array, offset: Array) -> Array:
@@ -253,6 +259,10 @@ class Factors:
         mixing = mixing / gain[..., None, :]
         off = np.stack([-mixing[..., i, j] for i, j in OFF_DIAGONAL], -1)
         return np.concatenate([linear.reshape(*params.shape[:-1], 6 * count), off], -1)
+
+    def take(self, index: Ints) -> Factors:
+        """The model of some members of a batch: the same for all."""
+        return self
 
     def finished(self, reference: float) -> tuple[Factors, Array]:
         """The same model in powers of T - reference, and the linear map to it."""

@@ -34,10 +34,8 @@ def free_directions(problem: Problem, state: State, determined: Determined) -> l
     while null.shape[-1]:
         scores = [_share(null, free.direction * norms) for free in named]
         best = int(np.argmax(np.round(scores, 3)))
-        if scores[best] > COUPLED:
-            chosen = named.pop(best)
-        else:
-            chosen = _weakest(problem, null, norms)
+        clear = scores[best] > COUPLED
+        chosen = named.pop(best) if clear else _weakest(problem, null, norms)
         found.append(chosen)
         null = _without(null, chosen.direction * norms)
     return found
@@ -53,8 +51,8 @@ def _named(problem: Problem, state: State) -> list[Free]:
     ]
     names = [name for triad in problem.triads for name in triad.model.names]
     for triad, where in enumerate(problem.slices()):
-        for index in range(where.start, where.stop):
-            result.append(Free(names[index], (triad,), np.eye(len(names))[index]))
+        unit = np.eye(len(names))
+        result += [Free(names[i], (triad,), unit[i]) for i in range(where.start, where.stop)]
     return result
 
 

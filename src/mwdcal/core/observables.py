@@ -128,10 +128,14 @@ def _dip_gradient(g: Array, b: Array) -> Array:
     down, north = g / strength, b / total
     sine = np.sum(down * north, -1, keepdims=True)
     cosine = np.linalg.norm(np.cross(down, north), axis=-1, keepdims=True)
-    return _six((north - sine * down) / (strength * cosine), (down - sine * north) / (total * cosine))
+    return _six(
+        (north - sine * down) / (strength * cosine), (down - sine * north) / (total * cosine)
+    )
 
 
-def _component(index: int) -> tuple[Callable[[Array, Array], Array], Callable[[Array, Array], Array]]:
+def _component(
+    index: int,
+) -> tuple[Callable[[Array, Array], Array], Callable[[Array, Array], Array]]:
     def value(g: Array, b: Array) -> Array:
         return _six(g, b)[..., index]
 
@@ -155,7 +159,9 @@ OBSERVABLES: dict[str, Observable] = {
     "inclination": Observable(inclination, _inclination_gradient, 0.0, "rad"),
     "toolface": Observable(toolface, _toolface_gradient, 2 * np.pi, "rad"),
     "azimuth": Observable(azimuth, _azimuth_gradient, 2 * np.pi, "rad"),
-    "magnetic_toolface": Observable(magnetic_toolface, _magnetic_toolface_gradient, 2 * np.pi, "rad"),
+    "magnetic_toolface": Observable(
+        magnetic_toolface, _magnetic_toolface_gradient, 2 * np.pi, "rad"
+    ),
     "gravity": Observable(gravity, _gravity_gradient, 0.0, "g"),
     "field": Observable(field, _field_gradient, 0.0, "nT"),
     "dip": Observable(dip, _dip_gradient, 0.0, "rad"),

@@ -18,6 +18,7 @@ Batch axis B first, station next, component last.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -151,14 +152,15 @@ class Problem:
             constants=constants,
         )
         triads = tuple(
-            Triad(_model_of(t.model, index), t.raw[index], t.sd[index], t.prior[index]) for t in self.triads
+            Triad(t.model.take(index), t.raw[index], t.sd[index], t.prior[index])
+            for t in self.triads
         )
         return Problem(triads, self.temperature[index], chosen)
 
     def slices(self) -> list[slice]:
         """Where each triad's parameters lie."""
         ends = np.cumsum([0] + [t.model.size for t in self.triads])
-        return [slice(int(a), int(b)) for a, b in zip(ends[:-1], ends[1:], strict=True)]
+        return [slice(int(a), int(b)) for a, b in pairwise(ends)]
 
     def constant(self, state: State, name: str) -> Array:
         """Value (B, n) of gravity, field or dip at each station."""
@@ -177,7 +179,9 @@ class Problem:
             "field": [np.zeros_like(vectors[0]), earth_field(np.ones_like(field), dip)],
             "dip": [np.zeros_like(vectors[0]), earth_field(field, dip + np.pi / 2)],
         }
-        columns = [[slopes[c.name][t] * c.mask[..., None] for c in self.evidence.constants] for t in (0, 1)]
+        columns = [
+            [slopes[c.name][t] * c.mask[..., None] for c in self.evidence.constants] for t in (0, 1)
+        ]
         empty = np.zeros((*gravity.shape, 3, 0))
         return vectors, [np.stack(c, -1) if c else empty for c in columns]
 
@@ -185,7 +189,9 @@ class Problem:
         """Compare each triad's readings with the reference vectors."""
         vectors, slopes = self.earth(state)
         result = []
-        for triad, where, earth, change in zip(self.triads, self.slices(), vectors, slopes, strict=False):
+        for triad, where, earth, change in zip(
+            self.triads, self.slices(), vectors, slopes, strict=False
+        ):
             params = state.params[:, where]
             target = np.einsum("bnij,bnj->bni", state.attitude, earth)
             field = triad.model.fields(params, triad.raw, self.temperature)
@@ -207,8 +213,12 @@ class Problem:
         """Linearise at a state; `geometry` takes references as exact and noise as uniform."""
         predictions = self.predictions(state)
         weights = self._weights(predictions, geometry)
-        residual = np.concatenate([p.misfit * w for p, w in zip(predictions, weights, strict=True)], -1)
-        turns = np.concatenate([p.by_turn * w[..., None] for p, w in zip(predictions, weights, strict=True)], -2)
+        residual = np.concatenate(
+            [p.misfit * w for p, w in zip(predictions, weights, strict=True)], -1
+        )
+        turns = np.concatenate(
+            [p.by_turn * w[..., None] for p, w in zip(predictions, weights, strict=True)], -2
+        )
         constants = np.concatenate(
             [p.by_constant * w[..., None] for p, w in zip(predictions, weights, strict=True)], -2
         )
@@ -271,7 +281,12 @@ class Problem:
         down = state.attitude[..., :, 2]
         along = np.broadcast_to(np.array([0.0, 0.0, 1.0]), down.shape)
         natural = np.stack(
-            [across * inclination[..., None], down * azimuth[..., None], along * toolface[..., None]], -1
+            [
+                across * inclination[..., None],
+                down * azimuth[..., None],
+                along * toolface[..., None],
+            ],
+            -1,
         )
         return np.where(self._free()[..., None, None], UNKNOWN * np.eye(3), natural)
 
@@ -335,18 +350,12 @@ class Problem:
     def size_of(self, state: State) -> Array:
         """Largest parameter of each triad (B, p): steps far below it are rounding."""
         parts = [
-            np.broadcast_to(np.max(np.abs(state.params[:, w]), -1, keepdims=True), state.params[:, w].shape)
+            np.broadcast_to(
+                np.max(np.abs(state.params[:, w]), -1, keepdims=True), state.params[:, w].shape
+            )
             for w in self.slices()
         ]
         return np.concatenate(parts, -1)
-
-
-def _model_of(model: Model, index: Ints) -> Model:
-    """The model of some members of the batch."""
-    centre = getattr(model, "centre", None)
-    if centre is None:
-        return model
-    return replace(model, centre=centre[index], scale=model.scale[index])  # type: ignore[union-attr,call-arg]
 
 
 def _side_by_side(blocks: list[Array]) -> Array:

@@ -72,7 +72,9 @@ class Linear:
 
     def weigh(self, columns: Array) -> Array:
         """C⁻¹ times columns (B, n, m, k)."""
-        return np.asarray(columns - self.own @ (self.core @ (np.swapaxes(self.own, -1, -2) @ columns)))
+        return np.asarray(
+            columns - self.own @ (self.core @ (np.swapaxes(self.own, -1, -2) @ columns))
+        )
 
     def private(self, step: Array) -> Array:
         """Private unknowns (B, n, 3), in their prior's units, after a step of X's unknowns."""

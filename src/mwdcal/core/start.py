@@ -6,6 +6,8 @@ nominal values but for the orientation of the axes, and where all else fails.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from mwdcal.core import observables
@@ -85,20 +87,27 @@ def _linear(
     gram = np.where(usable[:, None, None], gram, np.eye(4))
 
     def regress(target: Array) -> Array:
-        return np.asarray(np.linalg.solve(gram, np.einsum("bn,bni,bnj->bij", weight, terms, target)))
+        crossed = np.einsum("bn,bni,bnj->bij", weight, terms, target)
+        return np.asarray(np.linalg.solve(gram, crossed))
 
     if index == 0:
         earth = earth_gravity(problem.constant(state, "gravity"))
     else:
         field, dip = problem.constant(state, "field"), problem.constant(state, "dip")
-        unknown = _unknown_dip(problem, attitude, field, terms, weight, regress)
+        unknown = _unknown_dip(attitude, field, terms, weight, regress)
         blank = ~evidence.is_known("dip")
         earth = earth_field(field, np.where(blank, unknown[:, None], dip))
     solution = regress(np.einsum("bnij,bnj->bni", attitude, earth))
     return np.swapaxes(solution[:, :3], -1, -2), solution[:, 3], np.asarray(usable)
 
 
-def _unknown_dip(problem, attitude, field, terms, weight, regress):  # type: ignore[no-untyped-def]
+def _unknown_dip(
+    attitude: Array,
+    field: Array,
+    terms: Array,
+    weight: Array,
+    regress: Callable[[Array], Array],
+) -> Array:
     """Dip (B,) at which the readings fit best: the weakest direction of what they leave over."""
     parts = [
         np.einsum("bnij,bnj->bni", attitude, earth_field(field, np.full_like(field, angle)))
@@ -112,7 +121,7 @@ def _unknown_dip(problem, attitude, field, terms, weight, regress):  # type: ign
     north, down = vectors[:, 0, 0], vectors[:, 1, 0]
     gains = [np.trace(regress(part)[:, :3], axis1=-2, axis2=-1) for part in parts]
     sign = np.where(north * gains[0] + down * gains[1] < 0, -1.0, 1.0)
-    return np.arctan2(sign * down, sign * north)
+    return np.asarray(np.arctan2(sign * down, sign * north))
 
 
 def _attitudes(problem: Problem, state: State) -> State:
@@ -141,7 +150,9 @@ def _attitudes(problem: Problem, state: State) -> State:
     return State(state.params, attitude, state.constants)
 
 
-def best_turn(fields: list[Array], targets: list[Array], weights: list[Array], axis: Array) -> Array:
+def best_turn(
+    fields: list[Array], targets: list[Array], weights: list[Array], axis: Array
+) -> Array:
     """Angle (B, n) about a unit axis that brings targets closest to fields, in closed form."""
     sine, cosine = np.zeros(axis.shape[:-1]), np.zeros(axis.shape[:-1])
     for field, target, weight in zip(fields, targets, weights, strict=False):
@@ -161,7 +172,9 @@ def _share(problem: Problem, angles: dict[str, Array]) -> dict[str, Array]:
     inc, azi = angles["inclination"], angles["azimuth"]
     axis = tool_from_earth(inc, azi, np.zeros_like(inc))[..., 2, :]
     members = evidence.members * evidence.include[..., None]
-    mean = np.einsum("bnk,bnk,bki->bni", evidence.members, evidence.members, members.swapaxes(-1, -2) @ axis)
+    mean = np.einsum(
+        "bnk,bnk,bki->bni", evidence.members, evidence.members, members.swapaxes(-1, -2) @ axis
+    )
     shared = {n: evidence.shared(n).sum(-1) > 0 for n in ("inclination", "azimuth")}
     means = {
         "inclination": np.arctan2(np.hypot(mean[..., 0], mean[..., 1]), mean[..., 2]),

@@ -11,7 +11,7 @@ import numpy as np
 
 from mwdcal.core.problem import Problem, State
 from mwdcal.core.solvers import Determined, Linear, Normal
-from mwdcal.core.vectors import Array, rotation
+from mwdcal.core.vectors import AnyArray, Array, rotation
 
 COUPLED = 0.9
 """Share of a candidate direction that must lie in the null space to be called free."""
@@ -44,13 +44,21 @@ def analyse(problem: Problem, state: State) -> Analysis:
     whole = _whole_covariance(linear, determined)
     weighed_design = linear.weigh(linear.design)
     residual = linear.weigh(linear.residual[..., None])[..., 0]
-    spread = linear.weigh(np.broadcast_to(np.eye(residual.shape[-1]), (*residual.shape, residual.shape[-1])))
+    spread = linear.weigh(
+        np.broadcast_to(np.eye(residual.shape[-1]), (*residual.shape, residual.shape[-1]))
+    )
     spread = spread - weighed_design @ whole[:, None] @ np.swapaxes(weighed_design, -1, -2)
     spread = spread * problem.evidence.include[..., None, None]
     factor, freedom = _variance_factors(residual, spread)
     p, q = linear.size, len(problem.evidence.constants)
     return Analysis(
-        whole[:, :p, :p], determined, factor, freedom, residual, spread, whole[:, p : p + q, p : p + q]
+        whole[:, :p, :p],
+        determined,
+        factor,
+        freedom,
+        residual,
+        spread,
+        whole[:, p : p + q, p : p + q],
     )
 
 
@@ -85,7 +93,9 @@ def candidates(problem: Problem, state: State, triads: list[int]) -> dict[str, A
             problem, state, triads, rotation(1e-5 * np.eye(3)[axis])
         )
     directions["scale"] = zero.copy()
-    directions["scale"][:, _columns(problem, triads)] = _tangent(problem, state, triads, np.eye(3) * (1 + 1e-5))
+    directions["scale"][:, _columns(problem, triads)] = _tangent(
+        problem, state, triads, np.eye(3) * (1 + 1e-5)
+    )
     return directions
 
 
@@ -98,7 +108,8 @@ def _tangent(problem: Problem, state: State, triads: list[int], change: Array) -
     """Change of the parameters when the fields of some triads are transformed, per unit."""
     slices = problem.slices()
     parts = [
-        problem.triads[t].model.transformed(state.params[:, slices[t]], change) - state.params[:, slices[t]]
+        problem.triads[t].model.transformed(state.params[:, slices[t]], change)
+        - state.params[:, slices[t]]
         for t in triads
     ]
     return np.asarray(np.concatenate(parts, -1) / 1e-5)
@@ -127,7 +138,7 @@ def settle_gauge(problem: Problem, state: State) -> State:
     return state
 
 
-def _polar_turn(problem: Problem, state: State, triad: int, free: Array) -> Array:
+def _polar_turn(problem: Problem, state: State, triad: int, free: AnyArray) -> Array:
     """Rotation (B, 3, 3) about the free axes that leaves the triad's gain without rotation."""
     where = problem.slices()[triad]
     chosen = problem.triads[triad]
@@ -140,7 +151,7 @@ def _polar_turn(problem: Problem, state: State, triad: int, free: Array) -> Arra
     along = np.zeros((len(polar), 3))
     along[:, 2] = np.where(free[:, 2], about_z, 0.0)
     whole = np.swapaxes(polar, -1, -2)
-    return np.where(free.all(-1)[:, None, None], whole, rotation(along))
+    return np.where(np.all(free, -1, keepdims=True)[..., None], whole, rotation(along))
 
 
 def _turn(problem: Problem, state: State, triads: list[int], turn: Array, stations: bool) -> State:

@@ -91,4 +91,6 @@ def rotation(turn: Array) -> Array:
     angle = np.linalg.norm(turn, axis=-1)[..., None, None]
     cross = skew(turn)
     half = np.sinc(angle / (2 * np.pi))
-    return np.eye(3) + np.sinc(angle / np.pi) * cross + 0.5 * half * half * (cross @ cross)
+    return np.asarray(
+        np.eye(3) + np.sinc(angle / np.pi) * cross + 0.5 * half * half * (cross @ cross)
+    )
