@@ -21,6 +21,7 @@ from mwdcal.calibration import (
 )
 from mwdcal.checks import TRIADS, check_fit, check_readings
 from mwdcal.core.observability import Free, free_directions
+from mwdcal.core.uncertainty import marginal_rank
 from mwdcal.core.vectors import Array
 from mwdcal.errors import InputError
 from mwdcal.estimate import METHODS, Fit, fit
@@ -217,7 +218,7 @@ class _Record:
             parameter_names=list(finished.names),
             parameters=listed(self.map[where, where] @ self.result.state.params[0, where]),
             standard_uncertainties=self._uncertainties(where),
-            rank=triad.model.size - len(free),
+            rank=int(marginal_rank(analysis.determined, where)[0]),
             size=triad.model.size,
             singular_values=listed(_own_values(self.result, where)),
             undetermined=[

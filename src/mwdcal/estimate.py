@@ -16,7 +16,7 @@ from mwdcal.core.problem import UNKNOWN, Constant, Evidence, Problem, State, Tri
 from mwdcal.core.solvers import Status, gauss_newton
 from mwdcal.core.start import start
 from mwdcal.core.uncertainty import Analysis, analyse, settle_gauge
-from mwdcal.core.vectors import AnyArray, Array, Ints
+from mwdcal.core.vectors import AnyArray, Array, Bools, Ints
 from mwdcal.readings import ANGLES, CONSTANTS, Readings
 
 FLOOR = 1e-9
@@ -185,13 +185,35 @@ def fit(
     evidence = METHODS[method](evidence_of(readings, include))
     lead = np.broadcast_shapes(readings.accelerometer.shape[:-1], include.shape)
     problem, declared = _problem(readings, evidence, lead, kind, order, curved or {})
+    problem, finite = _without_broken(problem)
     state = start(problem)
     state, status, iterations = gauss_newton(problem, state)
     noise = np.full((len(status), len(declared)), np.nan)
     if not all(declared):
         problem, state, status, noise = _estimate_noise(problem, state, status, declared, rounds)
     state = settle_gauge(problem, state)
+    status = np.where(finite, status, int(Status.NOT_FINITE))
     return Fit(problem, state, status, iterations, noise, analyse(problem, state))
+
+
+def _without_broken(problem: Problem) -> tuple[Problem, Bools]:
+    """Members with readings that are not finite get stand-ins, so that the batch goes on."""
+    finite = np.all([np.isfinite(t.raw).all((-1, -2)) for t in problem.triads], axis=0)
+    if finite.all():
+        return problem, finite
+    pattern = np.sin(np.arange(problem.triads[0].raw[0].size) ** 1.5).reshape(-1, 3)
+    triads = []
+    for triad in problem.triads:
+        raw = np.where(finite[:, None, None], triad.raw, pattern)
+        triads.append(replace(triad, raw=raw, model=_finite_model(triad.model)))
+    return replace(problem, triads=tuple(triads)), finite
+
+
+def _finite_model(model: Model) -> Model:
+    if isinstance(model, Factors):
+        return model
+    centre = np.where(np.isfinite(model.centre), model.centre, 0.0)
+    return replace(model, centre=centre, scale=np.where(np.isfinite(model.scale), model.scale, 1.0))
 
 
 def _estimate_noise(

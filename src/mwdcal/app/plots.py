@@ -115,7 +115,7 @@ def station_errors(calibration: Calibration, name: str) -> str:
     row = next(r for r in calibration.errors if r.observable == name)
     stations, label = calibration.station_rows, f"{TITLES[name]} error, {row.unit}"
     with _style():
-        figure = _figure(1.75)
+        figure = _figure(1.5)
         first, second = figure.subplots(1, 2)
         _stems(first, stations, [s.errors_before.get(name, np.nan) for s in stations], BEFORE, "o")
         first.set_title(f"before: rms {quantity(row.before, 3, row.unit)}")
@@ -134,7 +134,7 @@ def deviations(calibration: Calibration, limit: float) -> str:
     """Each station's misfit in σ, with the limit above which it is to be taken again."""
     rows = calibration.station_rows
     with _style():
-        figure = _figure(1.9)
+        figure = _figure(1.7)
         axes = figure.subplots()
         _stems(axes, rows, [row.deviation for row in rows], AFTER, "s")
         axes.axhline(limit, color=MARKED, lw=1, ls=(0, (5, 3)))

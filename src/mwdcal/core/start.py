@@ -53,7 +53,7 @@ def _ellipsoid(x: Array, strength: Array, include: Array) -> tuple[Array, Array]
     features = np.concatenate([x[..., i] * x[..., j] * np.where(i == j, 1.0, 2.0), 2 * x], -1)
     weighed = features * include[..., None]
     gram = np.swapaxes(weighed, -1, -2) @ features
-    gram = gram + 1e-9 * np.trace(gram, axis1=-2, axis2=-1)[:, None, None] * np.eye(9)
+    gram = gram + (1e-9 * np.trace(gram, axis1=-2, axis2=-1)[:, None, None] + 1e-30) * np.eye(9)
     solution = np.linalg.solve(gram, np.sum(weighed, -2)[..., None])[..., 0]
     quadric = np.zeros((len(x), 3, 3))
     quadric[:, i, j] = solution[:, :6]

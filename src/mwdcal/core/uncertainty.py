@@ -11,8 +11,10 @@ import numpy as np
 
 from mwdcal.core.problem import Problem, State
 from mwdcal.core.solvers import Determined, Linear, Normal
-from mwdcal.core.vectors import AnyArray, Array, rotation
+from mwdcal.core.vectors import AnyArray, Array, Ints, rotation
 
+SEEN = 0.05
+"""A free direction with less than this share on a triad does not move the triad."""
 COUPLED = 0.9
 """Share of a candidate direction that must lie in the null space to be called free."""
 
@@ -121,6 +123,12 @@ def free_share(determined: Determined, direction: Array) -> Array:
     inside = np.einsum("bpk,bp->bk", determined.null(), scaled)
     total = np.sum(scaled**2, -1)
     return np.asarray(np.sum(inside**2, -1) / np.where(total > 0, total, 1.0))
+
+
+def marginal_rank(determined: Determined, where: slice) -> Ints:
+    """Rank (B,) of one triad: its size less the dimension of the free subspace as seen by it."""
+    seen = np.linalg.svd(determined.null()[..., where, :], compute_uv=False)
+    return np.asarray(where.stop - where.start - np.sum(seen > SEEN, -1))
 
 
 def settle_gauge(problem: Problem, state: State) -> State:

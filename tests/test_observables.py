@@ -1,0 +1,95 @@
+"""Gradients against complex steps and against the ISCWSA weighting functions."""
+
+import numpy as np
+import pytest
+
+from mwdcal.core.observables import OBSERVABLES
+from mwdcal.core.vectors import reference_vectors
+
+SHAPES = [(), (1,), (3, 1, 2)]
+
+
+def complex_value(name, x):
+    """The observable written once more, for complex arguments: atan2 with its derivative."""
+    g, b = x[..., :3], x[..., 3:]
+    dot = lambda u, v: np.sum(u * v, -1)  # noqa: E731
+    size = lambda u: np.sqrt(dot(u, u))  # noqa: E731
+
+    def atan2(y, x):
+        real = np.arctan2(y.real, x.real)
+        return real + 1j * (y.imag * x.real - x.imag * y.real) / (x.real**2 + y.real**2)
+
+    cross = np.cross(g, b)
+    across = np.sqrt(g[..., 0] ** 2 + g[..., 1] ** 2)
+    east = (g[..., 0] * b[..., 1] - g[..., 1] * b[..., 0]) * size(g)
+    north = b[..., 2] * across**2 - g[..., 2] * (g[..., 0] * b[..., 0] + g[..., 1] * b[..., 1])
+    return {
+        "inclination": lambda: atan2(across, g[..., 2]),
+        "toolface": lambda: atan2(-g[..., 0], -g[..., 1]),
+        "azimuth": lambda: atan2(east, north),
+        "magnetic_toolface": lambda: atan2(b[..., 0], b[..., 1]),
+        "gravity": lambda: size(g),
+        "field": lambda: size(b),
+        "dip": lambda: atan2(dot(g, b), size(cross)),
+    }[name]()
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize(
+    "name", ["inclination", "toolface", "azimuth", "magnetic_toolface", "gravity", "field", "dip"]
+)
+def test_gradients_by_complex_step(name, shape):
+    rng = np.random.default_rng(4)
+    inc = np.where(rng.uniform(size=shape) < 0.3, 1e-4, rng.uniform(0.02, 3.1, shape))
+    azi, tool = rng.uniform(0, 6, (2, *shape))
+    g, b = reference_vectors(inc, azi, tool, 1.003, 1.7, rng.uniform(-1.4, 1.4, shape))
+    x = np.concatenate([g, b], -1)
+    expected = np.stack(
+        [complex_value(name, x + 1e-30j * np.eye(6)[j]).imag / 1e-30 for j in range(6)], -1
+    )
+    got = OBSERVABLES[name].gradient(g, b)
+    np.testing.assert_allclose(got, expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())
+
+
+def weighting_functions(G, B, I, A, T, D):  # noqa: E741
+    """SPE 67616 Table 1: inclination and azimuth per unit of each of the 12 sensor errors."""
+    si, ci, sa, ca, st, ct = np.sin(I), np.cos(I), np.sin(A), np.cos(A), np.sin(T), np.cos(T)
+    td, cd, cot = np.tan(D), np.cos(D), np.cos(I) / np.sin(I)
+    return {
+        "ABX": (-ci * st / G, ((ci * sa * st - ca * ct) * td + cot * ct) / G),
+        "ABY": (-ci * ct / G, ((ci * sa * ct + ca * st) * td - cot * st) / G),
+        "ABZ": (-si / G, td * si * sa / G),
+        "ASX": (ci * si * st**2, -(td * si * (ci * sa * st - ca * ct) + ci * ct) * st),
+        "ASY": (ci * si * ct**2, -(td * si * (ci * sa * ct + ca * st) - ci * st) * ct),
+        "ASZ": (-si * ci, td * si * ci * sa),
+        "MBX": (0 * I, (ca * ct - ci * sa * st) / (B * cd)),
+        "MBY": (0 * I, -(ca * st + ci * sa * ct) / (B * cd)),
+        "MBZ": (0 * I, -si * sa / (B * cd)),
+        "MSX": (0 * I, (ci * ca * st - td * si * st + sa * ct) * (ca * ct - ci * sa * st)),
+        "MSY": (0 * I, -(ci * ca * ct - td * si * ct - sa * st) * (ca * st + ci * sa * ct)),
+        "MSZ": (0 * I, -(si * ca + td * ci) * si * sa),
+    }
+
+
+def test_iscwsa_weighting_functions_are_gradient_times_model():
+    rng = np.random.default_rng(5)
+    inc, dip = np.radians(rng.uniform(5, 120, 500)), np.radians(rng.uniform(-80, 80, 500))
+    azi, tool = rng.uniform(0, 2 * np.pi, (2, 500))
+    G, B = 9.80665, 50_000.0
+    g, b = reference_vectors(inc, azi, tool, G, B, dip)
+    readings = np.concatenate([g, b], -1)
+    gradients = [OBSERVABLES[name].gradient(g, b) for name in ("inclination", "azimuth")]
+    expected = weighting_functions(G, B, inc, azi, tool, dip)
+    for index, sensor in enumerate("XYZXYZ"):
+        letter = "A" if index < 3 else "M"
+        columns = {
+            f"{letter}B{sensor}": np.eye(6)[index],
+            f"{letter}S{sensor}": np.eye(6)[index] * readings,
+        }
+        for term, column in columns.items():
+            for got, want in zip(gradients, expected[term], strict=True):
+                value = np.sum(got * column, -1)
+                scale = max(np.abs(want).max(), np.abs(value).max(), 1e-300)
+                np.testing.assert_allclose(
+                    value / scale, want / scale, rtol=0, atol=1e-12, err_msg=term
+                )

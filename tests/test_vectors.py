@@ -1,0 +1,88 @@
+"""Frame, attitudes and rotations: laws over batch shapes and singular attitudes."""
+
+import numpy as np
+import pytest
+
+from mwdcal.core import observables as ob
+from mwdcal.core.vectors import centred, reference_vectors, rotation, skew, tool_from_earth, wrap
+
+SHAPES = [(), (1,), (3, 1, 2)]
+DEG = np.pi / 180
+
+# Published with the frame: G = 9.80665 m/s², B = 50 000 nT, (I, A, T, dip) in degrees.
+FORWARD = [
+    ((10, 45, 30, 60), (-0.851453, -1.474761, 9.657665), (20254.2706, -273.9134, 45713.1217)),
+    ((45, 120, 200, 72), (2.371687, 6.516156, 6.934349), (794.8897, 41306.8665, 28162.2253)),
+    ((3, 10, 350, -65), (0.089123, -0.505443, 9.793210), (-406.8759, 23438.4211, -44164.1808)),
+]
+
+
+@pytest.mark.parametrize(("angles", "g", "b"), FORWARD)
+def test_forward_values_to_the_printed_digits(angles, g, b):
+    inc, azi, tool, dip = np.radians(angles)
+    got_g, got_b = reference_vectors(inc, azi, tool, 9.80665, 50_000.0, dip)
+    np.testing.assert_allclose(got_g, g, rtol=0, atol=0.5000001e-6)
+    np.testing.assert_allclose(got_b, b, rtol=0, atol=0.5000001e-4)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_round_trip_of_angles(shape):
+    rng = np.random.default_rng(1)
+    inc = rng.uniform(1e-3, np.pi - 1e-3, shape)
+    azi, tool = rng.uniform(0, 2 * np.pi, (2, *shape))
+    dip = rng.uniform(-1.4, 1.4, shape)
+    g, b = reference_vectors(inc, azi, tool, 0.998, 47_000.0, dip)
+    assert g.shape == (*shape, 3)
+    np.testing.assert_allclose(ob.inclination(g, b), inc, atol=1e-14)
+    near = rng.uniform(1, 2) * 1e-15 / np.sin(inc) * 1e2
+    assert (np.abs(centred(ob.azimuth(g, b) - azi)) < 1e-13 + near / np.cos(dip)).all()
+    assert (np.abs(centred(ob.toolface(g, b) - tool)) < 1e-13 + near).all()
+    np.testing.assert_allclose(ob.dip(g, b), dip, atol=1e-14)
+    np.testing.assert_allclose(ob.gravity(g, b), 0.998, rtol=1e-14)
+    np.testing.assert_allclose(ob.field(g, b), 47_000.0, rtol=1e-14)
+
+
+@pytest.mark.parametrize("inclination", [0.0, np.pi])
+def test_exactly_vertical_has_no_azimuth_and_no_toolface(inclination):
+    g, b = reference_vectors(inclination, 1.0, 0.5, 1.0, 50_000.0, 1.1)
+    g[..., :2] = 0.0
+    assert np.isnan(ob.azimuth(g, b))
+    assert np.isnan(ob.toolface(g, b))
+    assert ob.inclination(g, b) == inclination
+    turn = 1.5 if inclination == 0 else np.pi + 1.0 - 0.5
+    expected = wrap(turn) if inclination == 0 else wrap(np.arctan2(b[0], b[1]))
+    np.testing.assert_allclose(ob.magnetic_toolface(g, b), expected, atol=1e-12)
+    assert np.isfinite(ob.OBSERVABLES["inclination"].gradient(g, b)).all()
+    assert np.isnan(ob.OBSERVABLES["azimuth"].gradient(g, b)).any()
+
+
+def test_dip_is_exact_at_the_poles():
+    g = np.array([0.0, 0.0, 1.0])
+    b = np.array([1e-9, 0.0, 1.0])
+    assert np.pi / 2 - ob.dip(g, b) == pytest.approx(1e-9, rel=1e-6)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_rotation_matrices(shape):
+    turn = np.random.default_rng(2).normal(size=(*shape, 3))
+    matrix = rotation(turn)
+    np.testing.assert_allclose(
+        matrix @ np.swapaxes(matrix, -1, -2), np.broadcast_to(np.eye(3), (*shape, 3, 3)), atol=1e-14
+    )
+    np.testing.assert_allclose(np.einsum("...ij,...j->...i", matrix, turn), turn, atol=1e-14)
+    np.testing.assert_allclose(rotation(np.zeros(3)), np.eye(3))
+    # against the series of the exponential, a second formula
+    cross, term, total = skew(turn), np.eye(3), np.eye(3)
+    for k in range(1, 40):
+        term = term @ cross / k
+        total = total + term
+    np.testing.assert_allclose(matrix, total, atol=1e-12)
+
+
+def test_attitude_is_a_proper_rotation():
+    inc, azi, tool = np.random.default_rng(3).uniform(0, 6, (3, 50))
+    matrix = tool_from_earth(inc, azi, tool)
+    np.testing.assert_allclose(np.linalg.det(matrix), 1.0)
+    np.testing.assert_allclose(
+        matrix @ np.swapaxes(matrix, -1, -2), np.broadcast_to(np.eye(3), (50, 3, 3)), atol=1e-14
+    )
