@@ -23,12 +23,12 @@ LAYERS = (
     ("core.problem", "core.uncertainty", "core.observability", "core.start", "core"),
     ("readings", "profile", "profiles"),
     ("calibration", "estimate", "notation"),
-    ("checks", "correction", "residuals", "selection"),
+    ("checks", "correction", "residuals", "scatter", "selection"),
     ("calibrate", "predict", "quality", "simulate"),
     ("files", "files.*"),
-    ("registry", "registry.*"),
+    ("registry", "registry.*", "datasets"),
     ("",),  # the package itself: its public names
-    ("app", "app.report", "app.report.*", "app.tables", "app.text"),
+    ("app", "app.plots", "app.report", "app.report.*", "app.tables", "app.text"),
     ("app.cli", "app.cli.*", "app.web", "app.web.*", "__main__"),
 )
 # Pairs that share a layer and still never import each other.

@@ -270,9 +270,10 @@ class _Record:
     def _reshoot(self, row: StationRow) -> Finding:
         worst = row.worst or "gravity"
         _, unit = shown_in(worst, self.relative)
+        gap = "" if unit == "°" else " "
         value = row.errors.get(worst, float("nan"))
         text = (
-            f"station {row.station}: residual {row.deviation:.1f}σ, most in {worst} ({value:+.3g} {unit}): "
+            f"station {row.station}: residual {row.deviation:.1f}σ, most in {worst} ({value:+.3g}{gap}{unit}): "
             f"{REASONS[worst]} Re-shoot it, or --exclude {row.station}"
         )
         return Finding(id="reshoot", text=text, station=row.station)

@@ -16,6 +16,8 @@ from mwdcal.profile import Profile
 from mwdcal.readings import Readings
 
 SCHEMA_VERSION = 1
+MAGNETIC = ("azimuth", "field", "dip", "magnetic_toolface", "bx", "by", "bz")
+"""Observables that need a magnetometer."""
 FREE_SHARE = 1e-2
 """An output rests on a free direction if it moves by more than this share of it (rad per rad,
 or of its own strength), the direction being scaled to turn or stretch the fields by one."""
@@ -245,7 +247,12 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
             )
             spread = self.noise_covariance(readings)
             variance = variance + np.einsum("...ni,...nij,...nj->...n", gradient, spread, gradient)
-        return np.where(self.rests_on_free(name, readings), np.nan, np.sqrt(variance))
+        blank = self.rests_on_free(name, readings) | self._lacks(name)
+        return np.where(blank, np.nan, np.sqrt(variance))
+
+    def _lacks(self, name: str) -> bool:
+        """Whether an observable needs a magnetometer that was not calibrated."""
+        return name in MAGNETIC and not self.has_field
 
     def rests_on_free(self, name: str, readings: Readings) -> Bools:
         """Where (…, n) an observable moves with a direction that no evidence determines."""

@@ -8,13 +8,15 @@ from mwdcal.core.observability import Free
 from mwdcal.core.solvers import Status
 from mwdcal.core.vectors import Array
 from mwdcal.errors import FitError, InputError
-from mwdcal.estimate import Fit
+from mwdcal.estimate import METHODS, Fit
 from mwdcal.profile import Profile
 from mwdcal.readings import Readings
 
 TRIADS = ("accelerometer", "magnetometer")
 GAIN = (0.3, 3.0)
 """An own-axis gain outside this share of nominal is a wrong profile, not a sensor error."""
+MOTION = (1e-2, 1e3)
+"""A channel that moves by less or more than this share of the field has not seen the field."""
 
 
 def check_fit(result: Fit, free: list[Free], profile: Profile, readings: Readings) -> None:
@@ -27,6 +29,8 @@ def check_fit(result: Fit, free: list[Free], profile: Profile, readings: Reading
 
 def check_readings(readings: Readings, method: str, kind: str, order: int) -> None:
     """Refuse what no fit could mend, before trying."""
+    if method not in METHODS:
+        raise InputError(f"--method must be one of {', '.join(METHODS)}; got {method!r}.")
     size = 6 * (order + 1) + 6 if kind == "factors" else 12 * (order + 1)
     if 3 * readings.count < size:
         raise FitError(
@@ -46,11 +50,23 @@ def _check_channels(readings: Readings, triad: str) -> None:
     if values is None:
         return
     spread = np.ptp(values, axis=-2)
+    where = f"{readings.source or 'the run'}: the {triad} channel on tool axis "
     for axis in np.flatnonzero(spread <= 1e-12 * np.abs(values).max()):
         raise FitError(
-            f"{readings.source or 'the run'}: the {triad} channel on tool axis {'xyz'[axis]} does "
-            f"not move: the same value at all {readings.count} stations. A dead sensor, a wrong "
-            "column, or all stations in one attitude; check the wiring and the columns."
+            f"{where}{'xyz'[axis]} does not move: the same value at all {readings.count} stations. "
+            "A dead sensor, a wrong column, or all stations in one attitude; check the wiring and "
+            "the columns."
+        )
+    name, unit = ("gravity", "g") if triad == "accelerometer" else ("field", "nT")
+    known = readings.reference(name)
+    if np.isnan(known).all():
+        return
+    share = spread / np.nanmean(known)
+    for axis in np.flatnonzero((share < MOTION[0]) | (share > MOTION[1])):
+        raise FitError(
+            f"{where}{'xyz'[axis]} moves by {spread[axis]:.3g} {unit} over the run, which no turning "
+            f"of the tool explains. All stations in one attitude, a wrong column or cell, or a wrong "
+            f"'scale' of [{triad}] in the tool profile; check these."
         )
 
 

@@ -44,15 +44,22 @@ def fetch(name: str) -> Path:
         raise InputError(
             "measured sets need the extra 'data': pip install 'mwdcal[data]'."
         ) from None
-    cache = pooch.create(
-        path=pooch.os_cache("mwdcal"),
-        base_url=os.environ.get(ADDRESS, "https://localhost/"),
-        registry=known,
-        env=FOLDER,
-    )
-    if ADDRESS not in os.environ and not (Path(cache.path) / name).exists():
-        raise InputError(f"{name} is not in {cache.path} ({FOLDER}). Complete the local copy.")
+    if FOLDER in os.environ:
+        return _local(Path(os.environ[FOLDER]), name, known[name])
+    cache = pooch.create(pooch.os_cache("mwdcal"), os.environ[ADDRESS], registry=known)
     try:
         return Path(cache.fetch(name))
-    except ValueError as error:
-        raise InputError(f"{name}: {error}") from None
+    except (ValueError, OSError) as error:
+        raise InputError(f"{name} could not be fetched: {error}. Check {ADDRESS}.") from None
+
+
+def _local(folder: Path, name: str, digest: str) -> Path:
+    """A file of a local copy, read-only, checked against its hash."""
+    import pooch
+
+    path = folder / name
+    if not path.exists():
+        raise InputError(f"{name} is not in {folder} ({FOLDER}). Complete the local copy.")
+    if pooch.file_hash(str(path)) != digest:
+        raise InputError(f"{path} is not the published file (its SHA-256 differs). Replace it.")
+    return path

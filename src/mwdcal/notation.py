@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mwdcal.calibration import Calibration, TriadCalibration
+from mwdcal.calibration import FREE_SHARE, Calibration, TriadCalibration
 from mwdcal.core.models import OFF_DIAGONAL
 from mwdcal.core.vectors import AnyArray, Array
 from mwdcal.errors import InputError
@@ -27,7 +27,8 @@ NOTATIONS = ("factors", "forward", "affine")
 class Notation:
     """One triad in one notation: named arrays, their standard uncertainties and covariance.
 
-    `covariance` is of all values in the order of `values`, each row by row.
+    `covariance` is of all values in the order of `values`, each row by row. A value that
+    moves with a direction which no evidence determines has the uncertainty NaN.
     """
 
     values: dict[str, Array]
@@ -46,36 +47,65 @@ def convert(
     if notation not in NOTATIONS:
         raise InputError(f"--notation must be one of {', '.join(NOTATIONS)}; got {notation!r}.")
     at = calibration.reference_temperature if temperature is None else temperature
-    start, result = 0, {}
-    whole = np.array(calibration.covariance)
-    for triad in calibration.triads:
+    return {
+        triad.name: _one(_Part.of(calibration, index), notation, at)
+        for index, triad in enumerate(calibration.triads)
+    }
+
+
+@dataclass(frozen=True)
+class _Part:
+    """One triad of a calibration, with its part of the covariance and of the free directions."""
+
+    triad: TriadCalibration
+    profile: TriadProfile
+    covariance: Array
+    free: Array
+    strength: float
+    reference: float
+    half_range: float
+
+    @classmethod
+    def of(cls, calibration: Calibration, index: int) -> _Part:
+        triads = calibration.triads
+        triad, start = triads[index], sum(t.size for t in triads[:index])
         where = slice(start, start + triad.size)
-        profile: TriadProfile = getattr(calibration.profile, triad.name)
-        result[triad.name] = _one(triad, profile, whole[where, where], notation, at, calibration)
-        start += triad.size
-    return result
+        low, high = calibration.temperature_c or (0.0, 0.0)
+        free = np.array(calibration.free, float).reshape(len(calibration.free), -1)
+        return cls(
+            triad,
+            getattr(calibration.profile, triad.name),
+            np.array(calibration.covariance)[where, where],
+            free[:, where],
+            calibration.earth.get("field", 1.0) if index else 1.0,
+            calibration.reference_temperature,
+            max((high - low) / 2, 1.0),
+        )
+
+    def sizes(self, values: dict[str, Array]) -> Array:
+        """What each value is compared with to see whether a free direction moves it."""
+        gain = np.abs(values["S" if "S" in values else "SF" if "SF" in values else "M"]).max()
+        own = {"m": 1.0, "b": self.strength, "B": self.strength, "o": gain * self.strength}
+        found = []
+        for name, value in values.items():
+            powers = np.arange(value.shape[1]) if name in ("SF", "B") else np.zeros(1)
+            size = own.get(name, gain) / self.half_range**powers
+            found.append(np.broadcast_to(size, value.shape).ravel())
+        return np.concatenate(found)
 
 
-def _one(
-    triad: TriadCalibration,
-    profile: TriadProfile,
-    covariance: Array,
-    notation: str,
-    temperature: float,
-    calibration: Calibration,
-) -> Notation:
+def _one(part: _Part, notation: str, temperature: float) -> Notation:
+    triad, profile = part.triad, part.profile
     if triad.curved:
         raise InputError(
             f"the {triad.name} has own-axis quadratic and cubic terms, which the notation "
             f"{notation!r} cannot carry. Calibrate without 'nonlinearity' in the profile, or use "
             "mwdcal apply."
         )
-    tau = temperature - calibration.reference_temperature
+    tau = temperature - part.reference
     scale = np.full(3, 1.0 if profile.scale is None else profile.scale)
     if notation == "factors" and triad.model == "factors":
-        return _propagate(
-            lambda p: _own_factors(p, triad.order, profile.permutation, scale), triad, covariance
-        )
+        return _propagate(lambda p: _own_factors(p, triad.order, profile.permutation, scale), part)
     if notation == "factors" and triad.order:
         raise InputError(
             f"the {triad.name} is a polynomial of order {triad.order} in temperature: its factors "
@@ -89,7 +119,7 @@ def _one(
         matrix = matrix @ permutation / scale
         return _FORMS[notation](matrix, offset, permutation)
 
-    return _propagate(values, triad, covariance)
+    return _propagate(values, part)
 
 
 def _affine(params: AnyArray, triad: TriadCalibration, tau: float) -> tuple[AnyArray, AnyArray]:
@@ -146,12 +176,10 @@ def _own_factors(
     }
 
 
-def _propagate(
-    values: Callable[[AnyArray], dict[str, AnyArray]], triad: TriadCalibration, covariance: Array
-) -> Notation:
+def _propagate(values: Callable[[AnyArray], dict[str, AnyArray]], part: _Part) -> Notation:
     """Values and covariance; derivatives by complex step, exact to rounding."""
-    params = np.array(triad.parameters)
-    found = values(params)
+    params = np.array(part.triad.parameters)
+    found = {name: np.asarray(value.real) for name, value in values(params).items()}
     columns = []
     for index in range(len(params)):
         step = np.zeros(len(params), complex)
@@ -161,10 +189,11 @@ def _propagate(
             np.concatenate([v.imag.ravel() / size for v in values(params + step).values()])
         )
     jacobian = np.stack(columns, -1)
-    spread = jacobian @ covariance @ jacobian.transpose()
-    sd = np.sqrt(np.maximum(np.diag(spread), 0.0))
-    uncertainty, start = {}, 0
-    for name, value in found.items():
-        uncertainty[name] = sd[start : start + value.size].reshape(value.shape)
-        start += value.size
-    return Notation({k: np.asarray(v.real) for k, v in found.items()}, uncertainty, spread)
+    spread = jacobian @ part.covariance @ jacobian.transpose()
+    moved = np.abs(jacobian @ part.free.transpose()).max(-1, initial=0.0)
+    loose = moved > FREE_SHARE * part.sizes(found)
+    sd = np.where(loose, np.nan, np.sqrt(np.maximum(np.diag(spread), 0.0)))
+    ends = np.cumsum([value.size for value in found.values()])[:-1]
+    parts = zip(found.items(), np.split(sd, ends), strict=True)
+    uncertainty = {name: part.reshape(value.shape) for (name, value), part in parts}
+    return Notation(found, uncertainty, spread)

@@ -47,10 +47,11 @@ def readings_at(
     reads a definite vector. Reference: the sensor model inverted by Newton steps, one of
     which is exact unless an axis is curved.
     """
-    attitude = np.broadcast_arrays(inclination, azimuth, toolface)
+    inc, azi, face = np.broadcast_arrays(inclination, azimuth, toolface)
     earth = calibration.earth
     dip = np.radians(earth.get("dip_deg", 0.0))
-    g, b = reference_vectors(*attitude, earth["gravity_g"], earth.get("field", 1.0), dip)
+    strength = earth.get("field", 1.0)
+    g, b = reference_vectors(inc, azi, face, earth["gravity_g"], strength, dip)
     at = middle_temperature(calibration) if temperature is None else temperature
     warmth = np.full(g.shape[:-1], at)
     reference = calibration.reference_temperature
@@ -124,7 +125,7 @@ def accuracy_at(
     Units: radians. Singular: NaN at exactly vertical for toolface and azimuth, and where
     an angle rests on an undetermined direction.
     """
-    azimuth = np.arange(24) * np.pi / 12
+    azimuth = np.arange(12) * np.pi / 6
     grid = np.meshgrid(np.asarray(inclinations, float), azimuth, indexing="ij")
     found = _over_toolface(calibration, grid[0], grid[1], temperature, noise)
     return {name: np.sqrt(np.mean(sd**2, -1)) for name, sd in found.items()}

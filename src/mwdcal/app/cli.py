@@ -118,6 +118,7 @@ def calibrate(
     from mwdcal.calibrate import calibrate as fit
     from mwdcal.files import documents
 
+    _check_outputs([output, report], [run, Path(tool or "")])
     readings, profile, digests = _load(run, tool, decimal)
     readings = _without(readings, exclude)
     number, scores = _order(order, readings, method, model)
@@ -138,6 +139,21 @@ def calibrate(
         )
     else:
         _show(made, scores, output, report)
+
+
+def _check_outputs(outputs: list[Path | None], inputs: list[Path]) -> None:
+    """Refuse, before any work, an output that cannot be written or would replace an input."""
+    from mwdcal.files import atomic
+
+    taken = [path.resolve() for path in inputs if path.is_file()]
+    for path in filter(None, outputs):
+        target = atomic.target(path)
+        if target in taken:
+            raise InputError(
+                f"cannot write '{path}': it is named twice, or is an input that would be lost. "
+                "Name another file."
+            )
+        taken.append(target)
 
 
 def _load(run: Path, tool: str | None, decimal: str) -> tuple[Readings, Profile, Digests]:
@@ -165,9 +181,11 @@ def _without(readings: Readings, exclude: tuple[str, ...]) -> Readings:
 def _order(
     order: str, readings: Readings, method: str, model: str | None
 ) -> tuple[int, list[OrderScore]]:
+    from mwdcal.checks import check_readings
     from mwdcal.selection import choose_order
 
     if order == "auto":
+        check_readings(readings, method, model or "polynomial", 0)
         return choose_order(readings, method, model, say)
     if order not in ("0", "1", "2", "3"):
         raise InputError(f"--order must be 0, 1, 2, 3 or auto; got {order!r}.")
@@ -244,6 +262,7 @@ def apply(
     from mwdcal.app.tables import apply_to_table
     from mwdcal.files import documents, table
 
+    _check_outputs([output], [calibration])
     made = documents.read(calibration)
     source = table.read(readings, decimal=decimal)
     result, findings = apply_to_table(made, source, outside)

@@ -11,7 +11,7 @@ import re
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from mwdcal.core.vectors import Array
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.patheffects import AbstractPathEffect
 
     from mwdcal.calibration import Calibration, StationRow
     from mwdcal.predict import AccuracyMap
@@ -35,7 +36,7 @@ TITLES = {
 """How an observable's error is called: toolface and azimuth are weighted by sin I."""
 BEFORE, AFTER, MARKED, BAND = "#6b7280", "#0072b2", "#d55e00", "#dbe7f0"
 WIDTH = 7.1
-STYLE = {
+STYLE: dict[Any, Any] = {
     "axes.axisbelow": True,
     "axes.edgecolor": "#4b5563",
     "axes.grid": True,
@@ -78,10 +79,10 @@ def _style() -> Iterator[None]:
         yield
 
 
-def _figure(height: float) -> Figure:
+def _figure(height: float, layout: Literal["constrained"] | None = "constrained") -> Figure:
     from matplotlib.figure import Figure
 
-    return Figure(figsize=(WIDTH, height), layout="constrained")
+    return Figure(figsize=(WIDTH, height), layout=layout)
 
 
 def _svg(figure: Figure, key: str, title: str) -> str:
@@ -91,10 +92,13 @@ def _svg(figure: Figure, key: str, title: str) -> str:
     figure.savefig(stream, format="svg", metadata=nothing)
     text = stream.getvalue()
     text = text[text.index("<svg") :]
-    text = re.sub(r"<!--.*?-->\s*|<metadata>.*?</metadata>\s*", "", text, flags=re.DOTALL)
+    text = re.sub(
+        r"<!--.*?-->\s*|<metadata>.*?</metadata>\s*|<style.*?</style>\s*", "", text, flags=re.DOTALL
+    )
     text = re.sub(r' xmlns(:\w+)?="[^"]*"', "", text)
     text = re.sub(r'(\bid="|href="#|url\(#)', rf"\g<1>{key}-", text)
-    text = re.sub(r'\bd="[^"]*"', _shortened, text)
+    text = re.sub(r'\b(d|x|y)="[^"]*"', _shortened, text)
+    text = re.sub(r'<g([^<>]*)>\s*((?:<use [^<>]* style="([^"]*)"/>\s*)+)</g>', _gathered, text)
     head, rest = text.split(">", 1)
     text = re.sub(r' (width|height|version)="[^"]*"', "", head) + ">" + rest
     return text.replace("<svg", f'<svg role="img" aria-label="{title}"', 1)
@@ -105,6 +109,15 @@ def _shortened(path: re.Match[str]) -> str:
     return re.sub(r"(\.\d\d)\d+", r"\1", path[0]).replace("\n", "")
 
 
+def _gathered(group: re.Match[str]) -> str:
+    """Markers of one series: their style said once."""
+    own, markers, style = group.groups()
+    if markers.count(f' style="{style}"') != markers.count("<use "):
+        return group[0]
+    markers = re.sub(r"\s*\n\s*", "", markers.replace(f' style="{style}"', ""))
+    return f'<g{own} style="{style}">{markers}</g>'
+
+
 def quantity(value: float, digits: int, unit: str) -> str:
     """A number with its unit: 0.52°, 8.4 mg."""
     return f"{value:.{digits}g}{'' if unit == '°' else ' '}{unit}"
@@ -113,21 +126,23 @@ def quantity(value: float, digits: int, unit: str) -> str:
 def station_errors(calibration: Calibration, name: str) -> str:
     """Errors of one observable per station: before and after, each on its own scale."""
     row = next(r for r in calibration.errors if r.observable == name)
-    stations, label = calibration.station_rows, f"{TITLES[name]} error, {row.unit}"
+    stations, unit = calibration.station_rows, row.unit.partition(" ")[0]
+    label = f"{TITLES[name]}, {unit}"
     with _style():
-        figure = _figure(1.5)
-        first, second = figure.subplots(1, 2)
+        figure = _figure(1.5, layout=None)
+        place = {"left": 0.095, "right": 0.995, "bottom": 0.27, "top": 0.87, "wspace": 0.24}
+        first, second = figure.subplots(1, 2, gridspec_kw=place)
         _stems(first, stations, [s.errors_before.get(name, np.nan) for s in stations], BEFORE, "o")
-        first.set_title(f"before: rms {quantity(row.before, 3, row.unit)}")
+        first.set_title(f"before: rms {quantity(row.before, 3, unit)}")
         if row.expected:
             second.axhspan(-row.expected, row.expected, color=BAND, lw=0, zorder=0.5)
         _stems(second, stations, [s.errors.get(name, np.nan) for s in stations], AFTER, "s")
         expected = "  (band: ±1σ expected)" if row.expected else ""
-        second.set_title(f"after: rms {quantity(row.after, 3, row.unit)}{expected}")
+        second.set_title(f"after: rms {quantity(row.after, 3, unit)}{expected}")
         for axes in (first, second):
             axes.set_ylabel(label)
             axes.axhline(0, color="#4b5563", lw=0.6, zorder=1)
-        return _svg(figure, f"error-{name}", f"{label}, per station, before and after")
+        return _svg(figure, f"error-{name}", f"Error of {label}, per station, before and after")
 
 
 def deviations(calibration: Calibration, limit: float) -> str:
@@ -160,13 +175,15 @@ def _stems(
     gaps = np.full(len(rows), np.nan)
     stems = np.stack([np.zeros(len(rows)), heights, gaps], -1).ravel()
     axes.plot(np.repeat(where, 3), stems, color=colour, lw=0.7, alpha=0.6)
-    axes.plot(where[~marked], heights[~marked], marker, color=colour, ms=small, mfc="white", mew=0.9)
+    axes.plot(
+        where[~marked], heights[~marked], marker, color=colour, ms=small, mfc="white", mew=0.9
+    )
     axes.plot(where[marked], heights[marked], "^", color=MARKED, ms=6)
     halo = [withStroke(linewidth=2, foreground="white")]
-    for index in np.flatnonzero(marked & ~np.isnan(heights)):
+    for index in np.flatnonzero(marked & ~np.isnan(heights)).tolist():
         below = heights[index] < 0
         axes.annotate(
-            f"station {rows[index].station}", (float(where[index]), heights[index]),
+            f"station {rows[index].station}", (float(where[index]), float(heights[index])),
             (5, -3 if below else 3), textcoords="offset points", va="top" if below else "bottom",
             color="#9a3d00", fontsize=7, path_effects=halo,
         )  # fmt: skip
@@ -227,12 +244,14 @@ def _contours(axes: Axes, x: Array, y: Array, values: Array) -> None:
     axes.set_facecolor("#f3f4f6")
     filled = axes.contourf(x, y, drawn, levels=levels, cmap=colours, norm=norm, extend="neither")
     lines = axes.contour(x, y, drawn, levels=levels[1:-1], colors="#374151", linewidths=0.4)
-    halo = [withStroke(linewidth=1.6, foreground="white")]
+    halo: list[AbstractPathEffect] = [withStroke(linewidth=1.6, foreground="white")]
     for text in axes.clabel(lines, fmt=_short, fontsize=6, colors="#111827"):
         text.set_path_effects(halo)
-    bar = axes.figure.colorbar(filled, ax=axes, orientation="horizontal", aspect=22, pad=0.03, spacing="uniform")
+    bar = axes.figure.colorbar(
+        filled, ax=axes, orientation="horizontal", aspect=22, pad=0.03, spacing="uniform"
+    )
     every = -(-len(levels) // 6)
-    bar.set_ticks(levels[::every], labels=[_short(v) for v in levels[::every]])
+    bar.set_ticks(levels[::every].tolist(), labels=[_short(v) for v in levels[::every]])
     bar.ax.tick_params(labelsize=6, length=2)
     bar.set_label("1σ, °", fontsize=7)
 

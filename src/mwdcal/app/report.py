@@ -7,12 +7,9 @@ fixed text stands in `templates/`. Needs the extra `report` (jinja2, matplotlib)
 from __future__ import annotations
 
 import os
-import re
-from collections.abc import Iterable
 from datetime import datetime
 from typing import TYPE_CHECKING, Any
 
-import msgspec
 import numpy as np
 
 from mwdcal.app import plots
@@ -35,8 +32,6 @@ LONG_TABLE = 60
 """A run of more stations has its station table at the end, as an annex."""
 ROWS = (5.0, 45.0, 90.0)
 """Inclinations of the table of predicted accuracy, degrees."""
-MOVED = 1e-2
-"""A converted parameter is undetermined if a free direction moves it by this share of its size."""
 
 
 def write_report(
@@ -51,6 +46,7 @@ def render(calibration: Calibration, verdict: Verdict | None = None) -> str:
     template = _environment().get_template("report.html")
     return template.render(
         cal=calibration,
+        name=calibration.tool.get("serial") or calibration.profile.name,
         verdict=verdict,
         banner=banner(calibration, verdict),
         findings=_findings(calibration, verdict),
@@ -93,6 +89,7 @@ def _environment() -> Environment:
         "css": css_string,
         "svg": svg,
         "plural": plural,
+        "unit": unit,
     }
     return made
 
@@ -148,6 +145,11 @@ def plural(count: int, noun: str) -> str:
     return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
+def unit(symbol: str) -> str:
+    """A unit as it follows a number: the degree sign without a space."""
+    return symbol if symbol in ("", "°") else f" {symbol}"
+
+
 def css_string(text: str) -> str:
     """Text as the inside of a CSS string: nothing but letters and digits is left bare."""
     return "".join(c if c.isascii() and c.isalnum() else f"\\{ord(c):x} " for c in text)
@@ -192,17 +194,19 @@ def _fit_outcome(calibration: Calibration) -> tuple[str, str]:
     ids = [finding.id for finding in calibration.findings]
     doubts = [i.removesuffix("-residuals") for i in ids if i.endswith("-residuals")]
     parts = [f"{name} residuals exceed the declared noise" for name in doubts]
-    free = dict.fromkeys(entry.id for entry in calibration.undetermined())
-    if free:
-        parts.append(", ".join(name.replace("-", " ") for name in free) + " undetermined")
+    free = dict.fromkeys(entry.id.replace("-", " ") for entry in calibration.undetermined())
+    undetermined = f"{', '.join(free)} undetermined"
+    if free and doubts:
+        parts.append(undetermined)
     if _relative(calibration):
         parts.append("magnetic field relative, not in nT")
     again = sum(row.reshoot for row in calibration.station_rows)
     if again:
         parts.append(f"{plural(again, 'station')} to re-shoot")
-    headline = "Fit doubtful" if doubts else "Fit accepted"
+    accepted = undetermined[0].upper() + undetermined[1:] if free else "Fit accepted"
+    headline = "Fit doubtful" if doubts else accepted
     text = f"{headline} – {'; '.join(parts)}" if parts else headline
-    return text, "attention" if parts else "good"
+    return text, "attention" if parts or free else "good"
 
 
 def _findings(calibration: Calibration, verdict: Verdict | None) -> list[Finding]:
@@ -296,15 +300,11 @@ def _parameters(calibration: Calibration) -> dict[str, Any]:
     except InputError:
         tables = {triad.name: _own_rows(triad) for triad in calibration.triads}
         return {"notation": "record", "tables": tables}
-    moved = _moved(calibration, found)
-    tables = {
-        triad.name: _factor_rows(triad, found[triad.name], moved[triad.name])
-        for triad in calibration.triads
-    }
+    tables = {triad.name: _factor_rows(triad, found[triad.name]) for triad in calibration.triads}
     return {"notation": "factors", "tables": tables}
 
 
-def _row(name: str, index: str, power: int, value: float, sd: float | None, unit: str) -> Any:
+def _row(name: str, index: str, power: int, value: float, sd: float | None, symbol: str) -> Any:
     per = "" if power == 0 else "/°C" + (str(power).translate(SUPERSCRIPT) if power > 1 else "")
     shown = measured(value, sd)
     course = "" if power == 0 else "τ" + (str(power).translate(SUPERSCRIPT) if power > 1 else "")
@@ -314,7 +314,7 @@ def _row(name: str, index: str, power: int, value: float, sd: float | None, unit
         "course": course,
         "value": shown[0],
         "sd": shown[1],
-        "unit": unit + per,
+        "unit": symbol + per,
     }
 
 
@@ -327,8 +327,8 @@ def _own_rows(triad: TriadCalibration) -> list[Any]:
     for full, value, sd in columns:
         base, _, power = full.partition("·")
         name, _, index = base.rpartition("-")
-        unit = "1" if name in ("gain", "scale", "misalignment") else _unit(triad)
-        rows.append(_row(name, index, int(power or 0), value, sd, unit))
+        symbol = "1" if name in ("gain", "scale", "misalignment") else _unit(triad)
+        rows.append(_row(name, index, int(power or 0), value, sd, symbol))
     return rows
 
 
@@ -336,7 +336,11 @@ def _unit(triad: TriadCalibration) -> str:
     return triad.unit if triad.unit in ("g", "nT") else "1"
 
 
-def _factor_rows(triad: TriadCalibration, found: Notation, moved: dict[str, Any]) -> list[Any]:
+def _stated(uncertainty: float) -> float | None:
+    return None if np.isnan(uncertainty) else float(uncertainty)
+
+
+def _factor_rows(triad: TriadCalibration, found: Notation) -> list[Any]:
     raw = "raw" if _unit(triad) == "1" else f"raw/{triad.unit}"
     units, channels = {"SF": raw, "B": _unit(triad), "m": "1"}, "xyz"
     rows = []
@@ -344,45 +348,11 @@ def _factor_rows(triad: TriadCalibration, found: Notation, moved: dict[str, Any]
         for i, j in np.ndindex(values.shape):
             if name == "m" and i == j:
                 continue
-            sd = None if moved[name][i, j] else float(found.uncertainty[name][i, j])
+            sd = _stated(found.uncertainty[name][i, j])
             index = channels[i] + channels[j] if name == "m" else channels[i]
             power = 0 if name == "m" else j
             rows.append(_row(name, index, power, float(values[i, j]), sd, units[name]))
     return rows
-
-
-def _moved(calibration: Calibration, found: dict[str, Notation]) -> dict[str, dict[str, Any]]:
-    """Which converted parameters move with a direction that no evidence determines."""
-    strength = {"accelerometer": 1.0, "magnetometer": calibration.earth.get("field", 1.0)}
-    result = {
-        triad: {name: np.zeros(value.shape, bool) for name, value in item.values.items()}
-        for triad, item in found.items()
-    }
-    for direction in calibration.free:
-        turned = convert(_shifted(calibration, direction, 1e-6), "factors")
-        for triad, item in found.items():
-            for name, value in item.values.items():
-                size = {"SF": np.abs(value[:, :1]).max(), "B": strength[triad], "m": 1.0}[name]
-                size = size / _half_range(calibration) ** np.arange(value.shape[1])
-                size = np.ones(value.shape[1]) if name == "m" else size
-                change = np.abs(turned[triad].values[name] - value) / 1e-6
-                result[triad][name] |= change > MOVED * size
-    return result
-
-
-def _half_range(calibration: Calibration) -> float:
-    """Half the calibrated temperature range, at least a degree, °C."""
-    low, high = calibration.temperature_c or (0.0, 0.0)
-    return max((high - low) / 2, 1.0)
-
-
-def _shifted(calibration: Calibration, direction: Iterable[float], step: float) -> Calibration:
-    """The calibration with its parameters moved along a direction."""
-    moves, changed = iter(direction), {}
-    for triad in calibration.triads:
-        params = [p + step * next(moves) for p in triad.parameters]
-        changed[triad.name] = msgspec.structs.replace(triad, parameters=params)
-    return msgspec.structs.replace(calibration, **changed)
 
 
 def _accuracy(calibration: Calibration) -> dict[str, Any]:
@@ -408,22 +378,24 @@ def _degrees(angle: float) -> str:
 def _earth(calibration: Calibration) -> list[tuple[str, str, str]]:
     """Gravity, field and dip of the run: name, value with unit, and where it comes from."""
     estimated = {c.name: c for c in calibration.constants}
-    unit = "" if _relative(calibration) else "nT"
-    keys = (("gravity", "gravity_g", "g"), ("field", "field", unit), ("dip", "dip_deg", "°"))
+    nanotesla = "" if _relative(calibration) else "nT"
+    keys = (("gravity", "gravity_g", "g"), ("field", "field", nanotesla), ("dip", "dip_deg", "°"))
     rows = []
-    for name, key, unit in keys:
+    for name, key, symbol in keys:
         if key not in calibration.earth:
             continue
         value, source = calibration.earth[key], "given"
         text = f"{value:.7g}".replace("-", "−")
         if name in estimated:
             text, sd = measured(value, estimated[name].standard_uncertainty)
-            source = f"estimated from the run, 1σ {sd}{'' if unit == '°' else ' '}{unit}"
+            source = f"estimated from the run, 1σ {sd}{unit(symbol)}"
         elif name == "field" and _relative(calibration):
             text, source = "1", "by convention: the strength is known at no station"
-        rows.append((f"mean {name}", f"{text}{'' if unit == '°' else ' '}{unit}", source))
+        rows.append((f"mean {name}", f"{text}{unit(symbol)}", source))
     for c in calibration.constants:
-        if re.search("error", c.name):
+        if c.name.endswith("reference error"):
             text, sd = measured(c.value, c.standard_uncertainty)
-            rows.append((c.name, f"{text} {c.unit}", f"estimated with the fit, 1σ {sd} {c.unit}"))
+            rows.append(
+                (c.name, f"{text}{unit(c.unit)}", f"estimated with the fit, 1σ {sd}{unit(c.unit)}")
+            )
     return rows

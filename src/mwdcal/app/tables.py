@@ -10,7 +10,9 @@ from mwdcal.files.runs import to_readings
 from mwdcal.files.table import Table
 
 
-def apply_to_table(calibration: Calibration, source: Table, outside: str) -> tuple[Table, list[Finding]]:
+def apply_to_table(
+    calibration: Calibration, source: Table, outside: str
+) -> tuple[Table, list[Finding]]:
     """The input's columns and metadata, the results, and what the calibration was."""
     readings, _ = to_readings(source, calibration.profile)
     columns, findings = correct(calibration, readings, outside)

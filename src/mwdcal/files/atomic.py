@@ -12,34 +12,34 @@ from mwdcal.errors import InputError
 
 def write(path: str | os.PathLike[str], data: bytes | str) -> None:
     """Write `data` (text as UTF-8) to `path`, which is replaced as a whole or not at all."""
-    target = _target(path)
+    file = target(path)
     content = data.encode("utf-8", "backslashreplace") if isinstance(data, str) else data
-    temporary = target.with_name(f".mwdcal-{secrets.token_hex(8)}.tmp")
+    temporary = file.with_name(f".mwdcal-{secrets.token_hex(8)}.tmp")
     try:
         _write_through(temporary, content)
-        temporary.replace(target)
+        temporary.replace(file)
     except OSError as error:
         raise _refusal(path, error) from error
     finally:
         _remove(temporary)
 
 
-def _target(path: str | os.PathLike[str]) -> Path:
+def target(path: str | os.PathLike[str]) -> Path:
     """The file behind `path`, links followed; refuses folders and devices."""
     try:
-        target = Path(os.path.realpath(path))
-        special = target.exists() and not target.is_file()
+        file = Path(os.path.realpath(path))
+        special = file.exists() and not file.is_file()
     except (OSError, ValueError) as error:
         raise _refusal(path, error) from error
     if special:
-        kind = "a folder" if target.is_dir() else "not a regular file"
+        kind = "a folder" if file.is_dir() else "not a regular file"
         raise InputError(f"cannot write '{path}': it is {kind}. Name a file to write.")
-    if not target.parent.is_dir():
+    if not file.parent.is_dir():
         raise InputError(
-            f"cannot write '{path}': the folder '{target.parent}' does not exist. "
+            f"cannot write '{path}': the folder '{file.parent}' does not exist. "
             "Create it, or name another folder."
         )
-    return target
+    return file
 
 
 def _write_through(path: Path, content: bytes) -> None:

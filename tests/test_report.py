@@ -1,0 +1,405 @@
+"""The report: self-contained, deterministic, safe, whole; and the predictions behind it."""
+
+from __future__ import annotations
+
+import builtins
+import re
+import warnings
+from dataclasses import dataclass, field, replace
+from functools import cache
+from html.parser import HTMLParser
+
+import msgspec
+import numpy as np
+import pytest
+
+from mwdcal import simulate
+from mwdcal.app import plots, report
+from mwdcal.app.report import css_string, measured, number, render, signed, write_report
+from mwdcal.calibrate import calibrate
+from mwdcal.core.vectors import reference_vectors
+from mwdcal.errors import InputError
+from mwdcal.predict import accuracy_at, accuracy_map, readings_at, typical_accuracy
+from mwdcal.profile import Profile, TriadProfile
+from mwdcal.readings import Readings
+from simulation import DEG, Tool, plan
+
+SERVO = Profile(
+    name="servo",
+    accelerometer=TriadProfile(scale=3.0, noise=3e-4),
+    magnetometer=TriadProfile(scale=5e-5, noise=7.5e-4),
+)
+SECTIONS = (
+    "outcome", "errors", "figures", "measures", "residuals", "stations", "parameters",
+    "undetermined", "accuracy", "conditions", "signatures",
+)  # fmt: skip
+
+
+def run(drop=(), magnetometer=True, moved=True, **metadata):
+    tool = Tool.random(7)
+    inc, azi, face = plan()
+    a, m = (v[0] for v in tool.readings(np.random.default_rng(1), 1, inc, azi, face))
+    if moved:
+        a[6] += [3e-4, 6e-4, 0]
+    known = {
+        "inclination": inc, "azimuth": azi, "toolface": face,
+        "field": np.full(48, tool.field), "dip": np.full(48, tool.dip),
+    }  # fmt: skip
+    return Readings(
+        a,
+        m if magnetometer else None,
+        known={k: v for k, v in known.items() if k not in drop},
+        sd={"accelerometer": np.array(1e-4), "magnetometer": np.array(15.0)},
+        station=tuple(f"P{i + 1}" for i in range(48)),
+        metadata={"serial": "MWD-123", **metadata},
+        source="run.csv",
+    )
+
+
+@cache
+def calibrated(drop=(), magnetometer=True, moved=True, profile=SERVO, **metadata):
+    made = calibrate(run(drop, magnetometer, moved, **metadata), profile, run_sha256="ab" * 32)
+    return msgspec.structs.replace(made, time="2025-01-02T03:04:05+00:00")
+
+
+@cache
+def heated(model=None):
+    stations = simulate.grid([5.0, 45.0, 90.0, 135.0], 6, [0, 90, 200, 300], [25.0, 65.0, 105.0])
+    made = simulate.run(
+        simulate.servo(np.random.default_rng(5)), stations, np.random.default_rng(6)
+    )
+    return calibrate(replace(made, source="hot.csv"), SERVO, model=model, order=1)
+
+
+@dataclass
+class Row:
+    name: str = "spread of azimuth"
+    unit: str = "°"
+    value: float | None = 1.23
+    limit: float = 1.0
+    uncertainty: float | None = 0.04
+    passed: bool = False
+    note: str = "roll set 1; stations 3 to 9"
+
+
+@dataclass
+class Outcome:
+    passed: bool
+    rows: list[Row]
+    rule: str = "simple acceptance"
+    limits: str = "moosavi"
+    source: str = ""
+    run: str = "roll.csv"
+    stations: int = 12
+    findings: list = field(default_factory=list)
+
+
+@pytest.fixture(scope="module")
+def whole():
+    return calibrated()
+
+
+@pytest.fixture
+def words(monkeypatch):
+    """`render` without its pictures, for tests of what it says."""
+    for name in ("station_errors", "deviations", "accuracy"):
+        monkeypatch.setattr(plots, name, lambda *arguments: "")
+    monkeypatch.setattr(report, "accuracy_map", lambda calibration: None)
+    return render
+
+
+@pytest.fixture(scope="module")
+def page(whole):
+    return render(whole)
+
+
+class Page(HTMLParser):
+    """Tags that stay open, ids, and attributes that could load something."""
+
+    VOID = ("meta", "br", "link", "img", "path", "use")
+
+    def __init__(self):
+        super().__init__()
+        self.open, self.ids, self.links, self.tags = [], [], [], set()
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.add(tag)
+        if tag not in ("meta", "br"):
+            self.open.append(tag)
+        self.handle_startendtag(tag, attrs)
+
+    def handle_startendtag(self, tag, attrs):
+        self.tags.add(tag)
+        self.ids += [v for k, v in attrs if k == "id"]
+        self.links += [v for k, v in attrs if k in ("src", "href", "xlink:href", "srcset", "data")]
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+
+def parsed(text):
+    found = Page()
+    found.feed(text)
+    return found
+
+
+def test_self_contained_and_well_formed(page):
+    found = parsed(page)
+    assert not found.open
+    assert not found.tags & {"script", "link", "img", "iframe", "object", "image"}
+    assert all(link.startswith("#") for link in found.links)
+    assert not re.search(r"https?://|@import|url\((?!#)", page)
+    assert len(found.ids) == len(set(found.ids))
+    assert {link[1:] for link in found.links} <= set(found.ids)
+    assert len(page) < 1_000_000
+
+
+def test_every_section_is_present(page):
+    assert set(SECTIONS) <= set(parsed(page).ids)
+    for text in (
+        "MWD-123", "run.csv", "2025-01-02 03:04 UTC", "12 of 12", "ab" * 32, "Not verified",
+        "Approved by", "degrees of freedom", "RMSE", "toolface·sin I", "Accuracy to expect",
+    ):  # fmt: skip
+        assert text in page
+
+
+def test_same_input_same_bytes(whole, page, tmp_path):
+    write_report(tmp_path / "r.html", whole)
+    assert (tmp_path / "r.html").read_bytes() == page.encode()
+
+
+def test_user_settings_of_matplotlib_change_nothing(whole, page):
+    import matplotlib as mpl
+
+    with mpl.rc_context({"font.size": 20, "axes.facecolor": "red", "svg.fonttype": "none"}):
+        assert plots.station_errors(whole, "gravity") in page
+        assert mpl.rcParams["font.size"] == 20
+
+
+def test_station_to_reshoot_is_first_and_marked(page):
+    assert "Fit accepted – 1 station to re-shoot" in page
+    assert page.index("Station P7: residual") < page.index('id="errors"')
+    assert re.search(r'<tr class="mark"><td>P7</td>.*?re-shoot', page, re.DOTALL)
+
+
+def test_clean_fit_says_so(words):
+    page = words(calibrated(moved=False))
+    assert '<p class="headline">Fit accepted</p>' in page
+    assert "No findings" in page
+
+
+def test_metadata_is_escaped(words):
+    evil = "<script>alert(1)</script>\"'</style>"
+    page = words(calibrated(serial=evil, operator=evil, tool=evil, lab=evil, date=evil))
+    assert "<script" not in page
+    assert page.count("</style>") == 1
+    assert "&lt;script&gt;" in page
+
+
+def test_station_labels_may_be_anything(whole):
+    rows = [
+        msgspec.structs.replace(r, station=s)
+        for r, s in zip(whole.station_rows, ["$x_", "--><script>", "井", *"a" * 45], strict=True)
+    ]
+    odd = msgspec.structs.replace(whole, station_rows=rows)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = plots.station_errors(odd, "field") + plots.deviations(odd, 3.7)
+    assert "<script" not in found
+    parsed(found)
+
+
+def test_undetermined_toolface_shows():
+    page = render(calibrated(("toolface",), moved=False))
+    assert '<p class="headline">Toolface zero undetermined</p>' in page
+    assert "11 of 12" in page
+    assert '<td class="free">undetermined</td>' in page
+    assert "Not shown, for want of a reference: toolface·sin I." in page
+    assert "Not stated: these measures need" in page
+
+
+def test_undetermined_parameters_are_those_of_the_free_turn(words):
+    page = words(calibrated(("toolface",), moved=False))
+    rows = re.findall(r"<td>(\w+)<sub>(\w+)</sub></td><td>[^<]*</td><td class=\"free\">", page)
+    assert rows[:2] == [("m", "xy"), ("m", "yx")]
+    assert {name for name, _ in rows} <= {"m", "B"}
+
+
+def test_without_magnetometer():
+    page = render(calibrated(magnetometer=False))
+    assert "no magnetometer was calibrated" in page
+    assert "nT" not in re.sub(r"<svg.*?</svg>", "", page, flags=re.DOTALL)
+    assert "azimuth, °" not in page
+
+
+def test_relative_field_has_no_unit(words):
+    page = words(calibrated(("field", "toolface"), moved=False))
+    assert "magnetic field relative, not in nT" in page
+    assert "calibrated to field = 1" in page
+    assert "‰ of the field" in page
+
+
+def test_no_reference_angles_at_all(words):
+    page = words(calibrated(("inclination", "azimuth", "toolface", "dip"), moved=False))
+    assert "estimated from the run, 1σ" in page
+    assert "inclination, toolface·sin I, azimuth·sin I" in page
+
+
+def test_verdict_comes_first(whole, words):
+    failed = words(whole, Outcome(False, [Row(), Row(passed=True, value=0.5, note="<b>")]))
+    assert "Verification failed – 1 of 2 limits not met" in failed
+    assert failed.index("Verification failed") < failed.index("Fit accepted")
+    assert "1.23°" in failed
+    assert "&lt;b&gt;" in failed
+    assert "Not verified" not in failed
+    passed = words(whole, Outcome(True, [Row(passed=True, value=0.5, uncertainty=None)]))
+    assert "Verification passed – 1 limit met" in passed
+    assert "not stated" in passed
+
+
+@pytest.mark.parametrize("model", [None, "polynomial"])
+def test_temperature_terms_and_annex(model, words):
+    made = heated(model)
+    page = words(made)
+    assert "SIMULATED DATA" in page
+    assert {"annex", "stations"} <= set(parsed(page).ids)
+    assert "/°C" in page
+    assert "105.0 °C" in page
+    assert ("SF<sub>" in page) == (model is None)
+
+
+def test_curved_axes_have_the_parameters_of_the_record(words):
+    curved = msgspec.structs.replace(
+        SERVO, accelerometer=TriadProfile(scale=3.0, noise=3e-4, nonlinearity=1e-3)
+    )
+    made = calibrated(moved=False, profile=curved)
+    assert "square<sub>x</sub>" in words(made)
+    check_inverse(made)
+
+
+def test_real_data_is_not_called_simulated(page):
+    assert "SIMULATED" not in page
+
+
+def test_missing_extra_says_what_to_install(whole, monkeypatch):
+    real = builtins.__import__
+
+    def without(name, *rest, **more):
+        if name.startswith("jinja2"):
+            raise ImportError(name=name)
+        return real(name, *rest, **more)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    with pytest.raises(InputError, match=r"install 'mwdcal\[report\]'"):
+        render(whole)
+
+
+def check_inverse(made):
+    rng = np.random.default_rng(2)
+    inc = np.r_[0, np.pi, rng.uniform(0, np.pi, 40)]
+    azi, face = rng.uniform(0, 2 * np.pi, (2, 42))
+    earth = made.earth
+    dip = earth.get("dip_deg", 0.0) * DEG
+    field = earth.get("field", 1.0)
+    for temperature in (None, 80.0):
+        found = made.fields(readings_at(made, inc, azi, face, temperature))
+        wanted = reference_vectors(inc, azi, face, earth["gravity_g"], field, dip)
+        np.testing.assert_allclose(found[0], wanted[0], atol=1e-12)
+        if made.has_field:
+            np.testing.assert_allclose(found[1] / field, wanted[1] / field, atol=1e-12)
+
+
+@pytest.mark.parametrize("drop", [(), ("field",), ("toolface", "dip")])
+@pytest.mark.parametrize("magnetometer", [True, False])
+def test_readings_at_invert_the_model(drop, magnetometer):
+    check_inverse(calibrated(drop, magnetometer))
+
+
+@pytest.mark.parametrize("model", ["factors", "polynomial"])
+def test_readings_at_invert_the_model_at_any_temperature(model):
+    check_inverse(heated(model))
+
+
+def test_readings_at_broadcast(whole):
+    made = readings_at(whole, np.full((2, 1, 3), 0.5), 0.1, np.zeros(3))
+    assert made.accelerometer.shape == (2, 1, 3, 3)
+
+
+def test_accuracy_is_that_of_the_calibration(whole):
+    chart = accuracy_map(whole)
+    at = (10, 7)
+    inc, azi = chart.inclination[at[0]], chart.azimuth[at[1]]
+    faces = np.arange(12) * 30 * DEG
+    for name, sd in chart.sd.items():
+        each = whole.uncertainty(name, readings_at(whole, inc, azi, faces))
+        np.testing.assert_allclose(sd[at], np.sqrt(np.mean(each**2)), rtol=1e-10)
+        assert np.isfinite(sd).all()
+
+
+def test_accuracy_agrees_with_refits():
+    rng, tool = np.random.default_rng(4), Tool.random(7)
+    inc, azi, face = plan(toolfaces=6)
+    values = []
+    wanted = (45 * DEG, 30 * DEG, 70 * DEG)
+    clean = [v[None] for v in tool.clean(*(np.array(w) for w in wanted))]
+    known = {"inclination": inc, "azimuth": azi, "toolface": face, "dip": np.full(24, tool.dip)}
+    known["field"] = np.full(24, tool.field)
+    sd = {"accelerometer": np.array(1e-4), "magnetometer": np.array(15.0)}
+    for _ in range(24):
+        a, m = (v[0] for v in tool.readings(rng, 1, inc, azi, face))
+        made = calibrate(Readings(a, m, known=known, sd=sd), SERVO)
+        g, _ = made.fields(Readings(*clean))
+        values.append(np.arctan2(np.hypot(g[0, 0], g[0, 1]), g[0, 2]))
+    stated = made.uncertainty("inclination", readings_at(made, *(np.array([w]) for w in wanted)))
+    assert 0.7 < np.std(values, ddof=1) / stated[0] < 1.4
+
+
+def test_accuracy_tables(whole):
+    alone, one = (accuracy_at(whole, np.radians([5, 45, 90]), noise) for noise in (False, True))
+    for name in ("inclination", "toolface", "azimuth"):
+        assert (one[name] > alone[name]).all()
+    assert alone["toolface"][0] > 3 * alone["toolface"][2]
+    typical = typical_accuracy(whole)
+    assert typical["azimuth"] == pytest.approx(np.degrees(alone["azimuth"][1]))
+
+
+def test_no_accuracy_is_quoted_for_what_is_undetermined():
+    made = calibrated(("toolface",), moved=False)
+    assert np.isnan(accuracy_map(made).sd["toolface"]).all()
+    assert typical_accuracy(made)["toolface"] is None
+    assert typical_accuracy(made)["inclination"] is not None
+    assert "azimuth" not in typical_accuracy(calibrated(magnetometer=False))
+
+
+@pytest.mark.parametrize(
+    ("value", "uncertainty", "text"),
+    [
+        (0.123456, 0.00123, ("0.1235", "0.0012")),
+        (-0.00001, 0.0996, ("0.00", "0.10")),
+        (-274.512, 2.166, ("−274.5", "2.2")),
+        (48012.3, 123.0, ("48010", "120")),
+        (2.34567e-5, 1.2e-9, ("2.34567×10⁻⁵", "0.00012×10⁻⁵")),
+        (0.5, None, ("0.500000", "undetermined")),
+        (0.5, float("nan"), ("0.500000", "undetermined")),
+    ],
+)
+def test_values_are_rounded_to_their_uncertainty(value, uncertainty, text):
+    assert measured(value, uncertainty) == text
+
+
+def test_numbers():
+    assert [number(v) for v in (0, 22.44, -0.0649, 1.5e-7, None, float("nan"), 12345)] == [
+        "0", "22.4", "−0.0649", "1.50×10⁻⁷", "–", "–", "12345",
+    ]  # fmt: skip
+    assert [signed(v, 2) for v in (1, -1, -0.001, None)] == ["+1.00", "−1.00", "0.00", "–"]
+    assert set(css_string("a<é\n}")) <= set("0123456789abcdef\\ ")
+
+
+@pytest.mark.parametrize("low", [1e-7, 0.0011, 0.3, 7.0])
+@pytest.mark.parametrize("ratio", [1.0, 1.0001, 1.3, 3.9, 4.1, 60.0, 1e4])
+def test_contour_levels_enclose_the_values(low, ratio):
+    levels = plots.contour_levels(np.array([low, low * ratio]))
+    assert levels[0] <= low
+    assert levels[-1] >= low * ratio
+    assert (np.diff(levels) > 0).all()
+    assert 2 <= len(levels) <= 20
