@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
@@ -18,6 +17,7 @@ from mwdcal.calibration import (
     StationRow,
     TriadCalibration,
     Undetermined,
+    rounded,
 )
 from mwdcal.checks import TRIADS, check_fit, check_readings
 from mwdcal.core.observability import Free, free_directions
@@ -29,8 +29,6 @@ from mwdcal.profile import Profile
 from mwdcal.readings import Readings
 from mwdcal.residuals import REASONS, error_rows, measure_rows, shown_in, station_rows
 
-DIGITS = 12
-"""Significant digits in files: more would differ from machine to machine."""
 SUSPECT = 3.0
 """A fit whose residuals exceed the declared noise this many times is reported."""
 IDENTITY = ("serial", "tool", "operator", "lab", "date", "stand", "simulated")
@@ -63,7 +61,7 @@ def calibrate(
     made = _Record(readings, profile, result, free)
     temperature = readings.temperature
     stations = station_rows(readings, result)
-    return Calibration(
+    record = Calibration(
         tool={k: str(v) for k, v in readings.metadata.items() if k in IDENTITY},
         profile=profile,
         profile_sha256=profile_sha256,
@@ -79,9 +77,9 @@ def calibrate(
         else (float(temperature.min()), float(temperature.max())),
         accelerometer=made.triad(0),
         magnetometer=made.triad(1) if readings.magnetometer is not None else None,
-        covariance=listed(made.covariance),
-        free=[listed(d) for d in made.directions],
-        singular_values=listed(result.analysis.determined.values[0]),
+        covariance=made.covariance.tolist(),
+        free=[d.tolist() for d in made.directions],
+        singular_values=result.analysis.determined.values[0].tolist(),
         constants=made.constants(),
         earth=made.earth(),
         errors=error_rows(readings, result),
@@ -89,6 +87,7 @@ def calibrate(
         station_rows=stations,
         findings=made.findings(stations),
     )
+    return rounded(record)
 
 
 def _curved(profile: Profile, kind: str) -> dict[str, float]:
@@ -97,17 +96,6 @@ def _curved(profile: Profile, kind: str) -> dict[str, float]:
         return {}
     declared = {name: getattr(profile, name).nonlinearity for name in TRIADS}
     return {name: value for name, value in declared.items() if value}
-
-
-def digits(value: float) -> float:
-    """A number to 12 significant digits, as files keep it."""
-    return float(f"{value:.{DIGITS - 1}e}")
-
-
-def listed(values: Any) -> Any:
-    """An array as nested lists of rounded numbers."""
-    flat = [digits(v) for v in np.asarray(values, float).ravel()]
-    return np.array(flat).reshape(np.shape(values)).tolist()
 
 
 TEXTS = {
@@ -170,10 +158,10 @@ class _Record:
     def earth(self) -> dict[str, float]:
         """Mean gravity, field and dip of the run: given or estimated."""
         state, problem = self.result.state, self.result.problem
-        found = {"gravity_g": digits(float(problem.constant(state, "gravity").mean()))}
+        found = {"gravity_g": float(problem.constant(state, "gravity").mean())}
         if len(problem.triads) > 1:
-            found["field"] = digits(float(problem.constant(state, "field").mean()))
-            found["dip_deg"] = digits(float(np.degrees(problem.constant(state, "dip").mean())))
+            found["field"] = float(problem.constant(state, "field").mean())
+            found["dip_deg"] = float(np.degrees(problem.constant(state, "dip").mean()))
         return found
 
     def constants(self) -> list[Constant]:
@@ -187,8 +175,8 @@ class _Record:
             found.append(
                 Constant(
                     name=constant.name if constant.unknown else f"{constant.name} reference error",
-                    value=digits(float(self.result.state.constants[0, index]) * degrees),
-                    standard_uncertainty=digits(
+                    value=float(self.result.state.constants[0, index]) * degrees,
+                    standard_uncertainty=(
                         float(np.sqrt(self.result.analysis.constants[0, index, index]))
                         * scale
                         * degrees
@@ -213,24 +201,22 @@ class _Record:
             model=triad.model.kind,
             order=triad.model.basis.order,
             curved=curved,
-            centre=listed(finished.centre.reshape(-1, 3)[0]) if curved else [0.0, 0.0, 0.0],  # type: ignore[union-attr]
-            radius=digits(float(finished.scale.ravel()[0])) if curved else 1.0,  # type: ignore[union-attr]
+            centre=(finished.centre.reshape(-1, 3)[0]).tolist() if curved else [0.0, 0.0, 0.0],  # type: ignore[union-attr]
+            radius=float(finished.scale.ravel()[0]) if curved else 1.0,  # type: ignore[union-attr]
             parameter_names=list(finished.names),
-            parameters=listed(self.map[where, where] @ self.result.state.params[0, where]),
+            parameters=(self.map[where, where] @ self.result.state.params[0, where]).tolist(),
             standard_uncertainties=self._uncertainties(where),
             rank=int(marginal_rank(analysis.determined, where)[0]),
             size=triad.model.size,
-            singular_values=listed(_own_values(self.result, where)),
+            singular_values=(_own_values(self.result, where)).tolist(),
             undetermined=[
                 Undetermined(id=f.id, text=f"{TRIADS[index]}: {TEXTS.get(f.id, f.id)}")
                 for f in free
             ],
-            noise=digits(float(triad.sd[0].mean() if declared else noise)),
+            noise=float(triad.sd[0].mean() if declared else noise),
             noise_source="declared" if declared else "estimated from the residuals",
-            variance_factor=digits(float(analysis.variance_factor[0, index]))
-            if freedom >= 1
-            else None,
-            degrees_of_freedom=digits(freedom),
+            variance_factor=float(analysis.variance_factor[0, index]) if freedom >= 1 else None,
+            degrees_of_freedom=freedom,
         )
 
     def _uncertainties(self, where: slice) -> list[float | None]:
@@ -240,10 +226,7 @@ class _Record:
         moved = np.zeros(len(values))
         for direction in self.directions:
             moved = np.maximum(moved, np.abs(direction[where]))
-        return [
-            None if m > 1e-2 * size else digits(float(v))
-            for v, m in zip(values, moved, strict=True)
-        ]
+        return [None if m > 1e-2 * size else float(v) for v, m in zip(values, moved, strict=True)]
 
     def findings(self, stations: list[StationRow]) -> list[Finding]:
         """What the reader should know, in order of weight."""

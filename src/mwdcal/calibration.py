@@ -6,16 +6,21 @@ a calibration in memory and one read back give the same results.
 
 from __future__ import annotations
 
+from typing import Any
+
 import msgspec
 import numpy as np
 
 from mwdcal.core.models import Basis, Factors, Model, Polynomial
 from mwdcal.core.observables import OBSERVABLES
 from mwdcal.core.vectors import Array, Bools
+from mwdcal.errors import InputError
 from mwdcal.profile import Profile
 from mwdcal.readings import Readings
 
 SCHEMA_VERSION = 1
+DIGITS = 12
+"""Significant digits of every number in a calibration file."""
 MAGNETIC = ("azimuth", "field", "dip", "magnetic_toolface", "bx", "by", "bz")
 """Observables that need a magnetometer."""
 FREE_SHARE = 1e-2
@@ -179,6 +184,11 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
         return self.magnetometer is not None
 
     def _temperature(self, readings: Readings) -> Array:
+        if readings.temperature is None and any(t.order for t in self.triads):
+            raise InputError(
+                f"{readings.source or 'the readings'} have no 'temperature_c', and this calibration "
+                "depends on temperature. Add the column."
+            )
         if readings.temperature is None:
             return np.full(readings.accelerometer.shape[:-1], self.reference_temperature)
         return readings.temperature
@@ -254,6 +264,29 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
         """Whether an observable needs a magnetometer that was not calibrated."""
         return name in MAGNETIC and not self.has_field
 
+    def expanded_uncertainty(
+        self, name: str, readings: Readings, probability: float = 0.95
+    ) -> Array:
+        """Half width (…, n) of the interval that holds the calibration's error with a probability.
+
+        Student's t with the effective degrees of freedom of both triads (Welch-Satterthwaite);
+        NaN as in `uncertainty`. Reference: JCGM 100, G.4.
+        """
+        from scipy.special import stdtrit
+
+        rows, covariance = self.sensitivity(name, readings), np.array(self.covariance)
+        start, spread = 0, np.zeros(rows.shape[:-1])
+        for triad in self.triads:
+            own = slice(start, start + triad.size)
+            part = np.einsum(
+                "...i,ij,...j->...", rows[..., own], covariance[own, own], rows[..., own]
+            )
+            spread = spread + part**2 / max(triad.degrees_of_freedom, 1.0)
+            start += triad.size
+        sd = self.uncertainty(name, readings)
+        freedom = sd**4 / np.where(spread > 0, spread, 1.0)
+        return np.asarray(sd * stdtrit(np.maximum(freedom, 1.0), (1 + probability) / 2))
+
     def rests_on_free(self, name: str, readings: Readings) -> Bools:
         """Where (…, n) an observable moves with a direction that no evidence determines."""
         shape = readings.accelerometer.shape[:-1]
@@ -282,3 +315,19 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
         return np.asarray(
             (readings.temperature < low - margin) | (readings.temperature > high + margin)
         )
+
+
+def rounded(calibration: Calibration) -> Calibration:
+    """The same record with every number at 12 significant digits, as files keep it.
+
+    More digits would differ from machine to machine with the threads of its linear algebra.
+    """
+    return msgspec.convert(_rounded(msgspec.to_builtins(calibration)), Calibration)
+
+
+def _rounded(value: Any) -> Any:
+    if isinstance(value, float):
+        return float(f"{value:.{DIGITS - 1}e}")
+    if isinstance(value, dict):
+        return {key: _rounded(item) for key, item in value.items()}
+    return [_rounded(item) for item in value] if isinstance(value, list | tuple) else value

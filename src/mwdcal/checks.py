@@ -11,6 +11,7 @@ from mwdcal.errors import FitError, InputError
 from mwdcal.estimate import METHODS, Fit
 from mwdcal.profile import Profile
 from mwdcal.readings import Readings
+from mwdcal.selection import soaks
 
 TRIADS = ("accelerometer", "magnetometer")
 GAIN = (0.3, 3.0)
@@ -63,10 +64,15 @@ def _check_channels(readings: Readings, triad: str) -> None:
         return
     share = spread / np.nanmean(known)
     for axis in np.flatnonzero((share < MOTION[0]) | (share > MOTION[1])):
+        moves = f"{where}{'xyz'[axis]} moves by {spread[axis]:.3g} {unit} over the run, "
+        scale = f"a wrong 'scale' of [{triad}] in the tool profile"
+        if share[axis] < MOTION[0]:
+            raise FitError(
+                f"{moves}too little to calibrate it. Add stations at other inclinations and "
+                f"toolfaces; if there are, look for a dead sensor, a wrong column, or {scale}."
+            )
         raise FitError(
-            f"{where}{'xyz'[axis]} moves by {spread[axis]:.3g} {unit} over the run, which no turning "
-            f"of the tool explains. All stations in one attitude, a wrong column or cell, or a wrong "
-            f"'scale' of [{triad}] in the tool profile; check these."
+            f"{moves}more than any field explains. Look for a wrong column or cell, or {scale}."
         )
 
 
@@ -75,7 +81,7 @@ def _check_temperature(readings: Readings, order: int) -> None:
         return
     if readings.temperature is None:
         raise InputError(f"--order {order} needs the column 'temperature_c'; use --order 0.")
-    levels = len(np.unique(np.round(readings.temperature / 5)))
+    levels = int(soaks(readings.temperature).max()) + 1
     span = float(np.ptp(readings.temperature))
     if levels < order + 1 or span < 10 * order:
         raise FitError(

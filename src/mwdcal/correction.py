@@ -31,6 +31,7 @@ def correct(
         ]
     else:
         findings = []
+    findings += _other_tool(calibration, readings)
     columns = _columns(calibration, readings)
     beyond = calibration.outside(readings)
     if beyond.any():
@@ -54,6 +55,16 @@ def _columns(calibration: Calibration, readings: Readings) -> dict[str, Array]:
     columns["dip_deg"] = np.degrees(OBSERVABLES["dip"].value(g, b))
     columns["magnetic_toolface_deg"] = np.degrees(OBSERVABLES["magnetic_toolface"].value(g, b))
     return columns
+
+
+def _other_tool(calibration: Calibration, readings: Readings) -> list[Finding]:
+    ours, theirs = calibration.tool.get("serial"), readings.metadata.get("serial")
+    if ours is None or theirs is None or ours == str(theirs):
+        return []
+    text = (
+        f"the readings are of tool {theirs}, the calibration of tool {ours}: is it the right one?"
+    )
+    return [Finding(id="other-tool", text=text)]
 
 
 def _outside(calibration: Calibration, readings: Readings, how: str, count: int) -> Finding:

@@ -181,10 +181,23 @@ def fit(
     rounds: int = 8,
 ) -> Fit:
     """Fit a run, or a batch of runs (leading axes of the readings, or of `include`)."""
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        return _fit(readings, method, kind, order, include, curved or {}, rounds)
+
+
+def _fit(
+    readings: Readings,
+    method: str,
+    kind: str,
+    order: int,
+    include: Array | None,
+    curved: Mapping[str, float],
+    rounds: int,
+) -> Fit:
     include = np.ones(readings.count) if include is None else np.asarray(include, float)
     evidence = METHODS[method](evidence_of(readings, include))
     lead = np.broadcast_shapes(readings.accelerometer.shape[:-1], include.shape)
-    problem, declared = _problem(readings, evidence, lead, kind, order, curved or {})
+    problem, declared = _problem(readings, evidence, lead, kind, order, curved)
     problem, finite = _without_broken(problem)
     state = start(problem)
     state, status, iterations = gauss_newton(problem, state)

@@ -71,7 +71,8 @@ class _Part:
         triad, start = triads[index], sum(t.size for t in triads[:index])
         where = slice(start, start + triad.size)
         low, high = calibration.temperature_c or (0.0, 0.0)
-        free = np.array(calibration.free, float).reshape(len(calibration.free), -1)
+        total = sum(t.size for t in triads)
+        free = np.array(calibration.free, float).reshape(len(calibration.free), total)
         return cls(
             triad,
             getattr(calibration.profile, triad.name),

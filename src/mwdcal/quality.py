@@ -90,6 +90,7 @@ def verify(calibration: Calibration, readings: Readings, limits: Limits) -> Verd
     Errors: stations of the fit, temperatures outside the calibrated range, or nothing that
     any of the limits could be applied to.
     """
+    _check_tool(calibration, readings)
     _check_independent(calibration, readings)
     _check_temperature(calibration, readings)
     test = _Test(calibration, readings, limits)
@@ -112,6 +113,15 @@ def verify(calibration: Calibration, readings: Readings, limits: Limits) -> Verd
         rows=found,
         findings=test.findings(),
     )
+
+
+def _check_tool(calibration: Calibration, readings: Readings) -> None:
+    ours, theirs = calibration.tool.get("serial"), readings.metadata.get("serial")
+    if ours is not None and theirs is not None and ours != str(theirs):
+        raise InputError(
+            f"{readings.source} is of tool {theirs}, the calibration of tool {ours}. Verify with a "
+            "run of the same tool, or correct 'serial' in the file."
+        )
 
 
 def _check_independent(calibration: Calibration, readings: Readings) -> None:
@@ -248,11 +258,19 @@ class _Test:
         uncertainty = self._uncertainty(name, contrast) * factor
         value = value * factor
         guard = COVERAGE * uncertainty if self.limits.rule == "guarded" else 0.0
-        if free:
+        relative = name == "field" and self.calibration.field_unit != "nT"
+        if free or relative:
+            reason = "it rests on a direction that the calibration leaves undetermined"
+            reason = "the calibration is relative: field = 1, not nT" if relative else reason
             return VerdictRow(
-                name=title, unit=unit, value=value, uncertainty=None, limit=limit, passed=False,
-                note="cannot be passed: it rests on a direction that the calibration leaves undetermined",
-            )  # fmt: skip
+                name=title,
+                unit="of the field" if relative else unit,
+                value=value,
+                uncertainty=None,
+                limit=limit,
+                passed=False,
+                note=f"cannot be passed: {reason}",
+            )
         if abs(value - limit) < COVERAGE * uncertainty:
             note += "; closer to the limit than twice its uncertainty"
         return VerdictRow(
@@ -262,7 +280,7 @@ class _Test:
 
     def findings(self) -> list[Finding]:
         """What was left out, and what to know."""
-        found = [Finding(id=u.id, text=u.text) for u in self.calibration.accelerometer.undetermined]
+        found = [Finding(id=u.id, text=u.text) for u in self.calibration.undetermined()]
         if not self.sets():
             found.append(Finding(id="no-roll-set", text="no roll set: spreads were not judged."))
         return found

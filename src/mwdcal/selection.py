@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -50,6 +50,7 @@ def choose_order(
     numbers = soaks(readings.temperature)
     levels = int(numbers.max()) + 1
     highest = min(HIGHEST, levels - 2)
+    readings = _with_noise(readings, method, kind, max(highest, 0))
     scores = []
     for order in range(highest + 1):
         progress(f"order {order}: leaving out each of {levels} temperatures")
@@ -70,13 +71,28 @@ def choose_order(
     return best, table
 
 
+def _with_noise(readings: Readings, method: str, kind: str | None, order: int) -> Readings:
+    """The readings with noise declared: where it was not, as the highest order leaves it.
+
+    Every order is then judged by the same yardstick.
+    """
+    result = fit(readings, method, kind or _default(order), order)
+    noise = dict(zip(("accelerometer", "magnetometer"), result.noise[0], strict=False))
+    found = {name: np.array(sd) for name, sd in noise.items() if np.isfinite(sd)}
+    return replace(readings, sd={**readings.sd, **found})
+
+
+def _default(order: int) -> str:
+    return "factors" if order else "polynomial"
+
+
 def _held_out(
     readings: Readings, method: str, kind: str | None, order: int, numbers: Ints
 ) -> Array:
     """χ² per reading (levels,) of each soak, fitted without it."""
     levels = int(numbers.max()) + 1
     include = (np.arange(levels)[:, None] != numbers).astype(float)
-    result = fit(readings, method, kind or ("factors" if order else "polynomial"), order, include)
+    result = fit(readings, method, kind or _default(order), order, include)
     held = 1 - include
     count = held.sum(-1) * 3 * len(result.problem.triads)
     return np.asarray(np.sum(misfit(result) * held, -1) / count)
@@ -84,8 +100,6 @@ def _held_out(
 
 def misfit(result: Fit) -> Array:
     """χ² (B, n) of every station, left out of the fit or not, attitudes at their best."""
-    from dataclasses import replace
-
     evidence = result.problem.evidence
     problem = replace(
         result.problem, evidence=replace(evidence, include=np.ones_like(evidence.include))

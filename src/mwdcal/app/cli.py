@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from mwdcal.selection import OrderScore
 
 INTERNAL = 70
+INTERRUPTED = 130
 
 
 class Digests(TypedDict):
@@ -390,19 +391,31 @@ def completion(shell: str) -> None:
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line; no traceback ever reaches the user."""
     try:
-        cli.main(arguments, prog_name="mwdcal", standalone_mode=True)
+        code = cli.main(arguments, prog_name="mwdcal", standalone_mode=False)
+    except click.ClickException as error:
+        error.show()
+        sys.exit(error.exit_code)
+    except click.Abort:
+        say("mwdcal: interrupted. Files are as they were before.")
+        sys.exit(INTERRUPTED)
     except MwdcalError as error:
         say(f"mwdcal: {error}")
         sys.exit(error.exit_code)
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(1)
     except MemoryError:
         say("mwdcal: not enough memory for this input. Split the file, or use a larger machine.")
+        sys.exit(2)
+    except OSError as error:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if not isinstance(error, BrokenPipeError):
+            say(f"mwdcal: cannot write the result: {error.strerror or error}. Send it elsewhere.")
         sys.exit(2)
     except Exception as error:
         if os.environ.get("MWDCAL_DEBUG"):
             raise
-        say(f"mwdcal: internal error ({type(error).__name__}: {error}). This is a defect of mwdcal: "
-            "please report it with the command and the file. MWDCAL_DEBUG=1 shows where.")  # fmt: skip
+        say(
+            f"mwdcal: internal error ({type(error).__name__}: {error}). This is a defect of "
+            "mwdcal: please report it with the command and the file. MWDCAL_DEBUG=1 shows where."
+        )
         sys.exit(INTERNAL)
+    if isinstance(code, int):
+        sys.exit(code)

@@ -337,7 +337,7 @@ def _unit(triad: TriadCalibration) -> str:
 
 
 def _stated(uncertainty: float) -> float | None:
-    return None if np.isnan(uncertainty) else float(uncertainty)
+    return None if np.isnan(uncertainty) else uncertainty
 
 
 def _factor_rows(triad: TriadCalibration, found: Notation) -> list[Any]:
@@ -348,7 +348,7 @@ def _factor_rows(triad: TriadCalibration, found: Notation) -> list[Any]:
         for i, j in np.ndindex(values.shape):
             if name == "m" and i == j:
                 continue
-            sd = _stated(found.uncertainty[name][i, j])
+            sd = _stated(float(found.uncertainty[name][i, j]))
             index = channels[i] + channels[j] if name == "m" else channels[i]
             power = 0 if name == "m" else j
             rows.append(_row(name, index, power, float(values[i, j]), sd, units[name]))

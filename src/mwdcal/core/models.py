@@ -19,7 +19,7 @@ from functools import cached_property
 
 import numpy as np
 
-from mwdcal.core.vectors import Array, Ints
+from mwdcal.core.vectors import Array, Ints, inverse
 
 OFF_DIAGONAL = tuple((i, j) for i in range(3) for j in range(3) if i != j)
 
@@ -242,7 +242,7 @@ class Factors:
         """Parameters (..., p) of field = matrix · raw + offset."""
         scale = 1 / np.diagonal(matrix, axis1=-2, axis2=-1)
         mixing = matrix * scale[..., None, :]
-        bias = -np.linalg.solve(mixing, offset[..., None])[..., 0]
+        bias = -np.einsum("...ij,...j->...i", inverse(mixing), offset)
         count = self.basis.order + 1
         linear = np.zeros((*offset.shape[:-1], 6, count))
         linear[..., 0] = np.concatenate([scale, bias], -1)

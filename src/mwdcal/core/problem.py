@@ -24,7 +24,16 @@ import numpy as np
 
 from mwdcal.core.models import Model
 from mwdcal.core.solvers import Linear
-from mwdcal.core.vectors import Array, Bools, Ints, earth_field, earth_gravity, rotation, skew
+from mwdcal.core.vectors import (
+    Array,
+    Bools,
+    Ints,
+    earth_field,
+    earth_gravity,
+    inverse,
+    rotation,
+    skew,
+)
 
 UNKNOWN = np.pi / np.sqrt(3)
 """Standard uncertainty of an angle about which nothing is known, rad."""
@@ -195,16 +204,16 @@ class Problem:
             params = state.params[:, where]
             target = np.einsum("bnij,bnj->bni", state.attitude, earth)
             field = triad.model.fields(params, triad.raw, self.temperature)
-            inverse = np.linalg.inv(triad.model.slope(params, triad.raw, self.temperature))
-            misfit = np.einsum("bnij,bnj->bni", inverse, field - target)
+            back = inverse(triad.model.slope(params, triad.raw, self.temperature))
+            misfit = np.einsum("bnij,bnj->bni", back, field - target)
             by_params = triad.model.jacobian(params, triad.raw - misfit, self.temperature)
             result.append(
                 Prediction(
                     misfit,
-                    inverse @ by_params,
-                    inverse @ skew(target),
-                    -inverse @ state.attitude @ change,
-                    np.linalg.norm(np.einsum("bnij,bnj->bni", inverse, target), axis=-1),
+                    back @ by_params,
+                    back @ skew(target),
+                    -back @ state.attitude @ change,
+                    np.linalg.norm(np.einsum("bnij,bnj->bni", back, target), axis=-1),
                 )
             )
         return result

@@ -18,7 +18,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from mwdcal.core.vectors import Array, Bools, Ints
+from mwdcal.core.vectors import Array, Bools, Ints, inverse
 
 RANK_TOLERANCE = 2e-2
 """Singular values of the column-normalised design below this share of the largest are free."""
@@ -30,7 +30,6 @@ class Status(IntEnum):
     OK = 0
     NOT_CONVERGED = 1
     NOT_FINITE = 2
-    TOO_FEW = 3
 
     @property
     def message(self) -> str:
@@ -44,8 +43,6 @@ _MESSAGES = {
     "reference cell, or a station that moved",
     Status.NOT_FINITE: "the fit ran into numbers that are not finite: the stations do not span "
     "enough attitudes for a start value; add stations at other inclinations and toolfaces",
-    Status.TOO_FEW: "too few stations for the parameters of the model: add stations, or lower "
-    "the temperature order",
 }
 
 
@@ -68,7 +65,7 @@ class Linear:
     def core(self) -> Array:
         """(I + GᵀG)⁻¹ (B, n, 3, 3)."""
         gram = np.swapaxes(self.own, -1, -2) @ self.own
-        return np.asarray(np.linalg.inv(np.eye(gram.shape[-1]) + gram))
+        return np.asarray(inverse(np.eye(gram.shape[-1]) + gram))
 
     def weigh(self, columns: Array) -> Array:
         """C⁻¹ times columns (B, n, m, k)."""
@@ -113,8 +110,7 @@ class Normal:
         """
         p = self.size
         own, cross = self.information[..., :p, :p], self.information[..., p:, :p]
-        inverse = np.linalg.inv(self.information[..., p:, p:])
-        eliminate = inverse @ cross
+        eliminate = inverse(self.information[..., p:, p:]) @ cross
         reduced = own - np.swapaxes(cross, -1, -2) @ eliminate
         offset = np.swapaxes(eliminate, -1, -2) @ self.gradient[..., p:, None]
         return reduced, self.gradient[..., :p] - offset[..., 0], eliminate
@@ -144,10 +140,10 @@ class Determined:
         """From the evidence's geometry: what is known, not how precisely."""
         norms = geometry.norms()
         reduced, _, _ = geometry.reduced()
-        scaled = reduced / (norms[..., :, None] * norms[..., None, :])
+        scaled = np.nan_to_num(reduced / (norms[..., :, None] * norms[..., None, :]))
         values, basis = np.linalg.eigh(scaled)
         values = np.sqrt(np.clip(values[..., ::-1], 0, None))
-        values = values / values[..., :1]
+        values = values / np.maximum(values[..., :1], 1e-300)
         return cls(basis[..., ::-1], values, norms, values > tolerance)
 
     @property
@@ -163,7 +159,7 @@ class Determined:
         diagonal = np.arange(inner.shape[-1])
         extra = np.asarray(damping)[..., None] * inner[..., diagonal, diagonal]
         inner[..., diagonal, diagonal] += np.where(self.keep, extra, 1.0)
-        outer = kept @ np.linalg.inv(inner) @ np.swapaxes(kept, -1, -2)
+        outer = kept @ inverse(inner) @ np.swapaxes(kept, -1, -2)
         return np.asarray(outer / (self.norms[..., :, None] * self.norms[..., None, :]))
 
     def null(self) -> Array:
@@ -222,7 +218,7 @@ def _step(normal: Normal, determined: Determined, damping: Array) -> Array:
     reduced, gradient, eliminate = normal.reduced()
     step = -(determined.inverse(reduced, damping) @ gradient[..., None])
     p = normal.size
-    shared = np.linalg.inv(normal.information[..., p:, p:]) @ normal.gradient[..., p:, None]
+    shared = inverse(normal.information[..., p:, p:]) @ normal.gradient[..., p:, None]
     return np.concatenate([step, -shared - eliminate @ step], -2)[..., 0]
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from mwdcal.core.problem import Problem, State
 from mwdcal.core.solvers import Determined, Linear, Normal
-from mwdcal.core.vectors import AnyArray, Array, Ints, rotation
+from mwdcal.core.vectors import AnyArray, Array, Ints, inverse, rotation
 
 SEEN = 0.05
 """A free direction with less than this share on a triad does not move the triad."""
@@ -71,7 +71,7 @@ def _whole_covariance(linear: Linear, determined: Determined) -> Array:
     own = determined.inverse(reduced)
     cross = -own @ np.swapaxes(eliminate, -1, -2)
     p = normal.size
-    shared = np.linalg.inv(normal.information[..., p:, p:]) - eliminate @ cross
+    shared = inverse(normal.information[..., p:, p:]) - eliminate @ cross
     top = np.concatenate([own, cross], -1)
     return np.concatenate([top, np.concatenate([np.swapaxes(cross, -1, -2), shared], -1)], -2)
 
@@ -169,9 +169,3 @@ def _turn(problem: Problem, state: State, triads: list[int], turn: Array, statio
         params[:, where] = problem.triads[triad].model.transformed(params[:, where], turn)
     attitude = turn[:, None] @ state.attitude if stations else state.attitude
     return State(params, attitude, state.constants)
-
-
-def polar_free(gain: Array) -> Array:
-    """Rotation vector's matrix part: the polar factor (…, 3, 3) of a gain matrix."""
-    u, _, vt = np.linalg.svd(gain)
-    return np.asarray(u @ vt)

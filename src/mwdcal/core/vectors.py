@@ -94,3 +94,13 @@ def rotation(turn: Array) -> Array:
     return np.asarray(
         np.eye(3) + np.sinc(angle / np.pi) * cross + 0.5 * half * half * (cross @ cross)
     )
+
+
+def inverse(matrix: Array) -> Array:
+    """Inverse (..., k, k) of every matrix of a stack; NaN for a singular one, never an exception."""
+    try:
+        return np.asarray(np.linalg.inv(matrix))
+    except np.linalg.LinAlgError:
+        sound = np.linalg.slogdet(matrix)[0] != 0
+        whole = np.where(sound[..., None, None], matrix, np.eye(matrix.shape[-1]))
+        return np.where(sound[..., None, None], np.linalg.inv(whole), np.nan)

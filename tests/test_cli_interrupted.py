@@ -1,0 +1,159 @@
+"""Killed or interrupted at any moment: the old file or the new one, whole; and the same bytes again."""
+
+import json
+import os
+import random
+import re
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+from cli_support import EXAMPLE, mwdcal, process, write_csv
+
+pytestmark = pytest.mark.skipif(os.name == "nt", reason="POSIX signals")
+
+SLOW_WRITE = """
+import os, sys, time
+real = os.fsync
+def fsync(descriptor):
+    print("writing", flush=True)
+    time.sleep(0.25)
+    real(descriptor)
+    print("synced", flush=True)
+os.fsync = fsync
+from mwdcal.app.cli import main
+main(sys.argv[1:])
+"""
+OLD = b"the old file\n"
+CALIBRATE = ("calibrate", EXAMPLE / "run.csv", "--tool", EXAMPLE / "tool.toml", "-o")
+
+
+def started(script, *arguments):
+    """The command as a process, its output unbuffered."""
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    return subprocess.Popen(
+        [sys.executable, "-c", script, *map(str, arguments)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        encoding="utf-8",
+        env=environment,
+    )
+
+
+def whole(path):
+    """Whether the file is the old one, or a complete calibration."""
+    content = path.read_bytes()
+    return content == OLD or json.loads(content)["schema_version"] == 1
+
+
+def kill_after(delay, script, target):
+    """Kill the command some seconds after its start, or after its first line where negative."""
+    child = started(script, *CALIBRATE, target)
+    if delay < 0:
+        child.stdout.readline()
+    time.sleep(abs(delay))
+    child.kill()
+    child.communicate()
+    return child.returncode
+
+
+def test_killed_at_any_moment_it_leaves_the_old_file_or_the_new_one(tmp_path):
+    target, dice = tmp_path / "cal.json", random.Random(1)
+    target.write_bytes(OLD)
+    outcomes = []
+    for _ in range(18):
+        kill_after(dice.uniform(0, 0.7), SLOW_WRITE, target)
+        outcomes.append(target.read_bytes() == OLD)
+        assert whole(target)
+        target.write_bytes(OLD)
+    assert any(outcomes)
+
+
+def test_killed_around_the_write_it_leaves_the_old_file_or_the_new_one(tmp_path):
+    target, dice = tmp_path / "cal.json", random.Random(2)
+    target.write_bytes(OLD)
+    outcomes = set()
+    for delay in [0, 0.1, 0.2, 0.249, 0.25, 0.255, 0.3, *(dice.uniform(0.2, 0.3) for _ in range(5))]:
+        assert kill_after(-delay or -1e-9, SLOW_WRITE, target) in (0, -signal.SIGKILL)
+        outcomes.add(target.read_bytes() == OLD)
+        assert whole(target)
+        target.write_bytes(OLD)
+    assert outcomes == {True, False}
+    rerun = mwdcal(*CALIBRATE, target)
+    assert rerun.code == 0
+    assert json.loads(target.read_bytes())["stations"] == 48
+
+
+def test_a_killed_first_run_leaves_no_file_of_that_name(tmp_path):
+    assert kill_after(-0.1, SLOW_WRITE, tmp_path / "cal.json") == -signal.SIGKILL
+    assert not (tmp_path / "cal.json").exists()
+
+
+@pytest.mark.parametrize("when", ["fitting", "writing"])
+def test_ctrl_c_ends_with_130_and_one_line(tmp_path, when):
+    target = tmp_path / "cal.json"
+    fitting = "import mwdcal.estimate as e, time\nreal = e.start\ndef slow(p):\n" + (
+        "    print('writing', flush=True); time.sleep(20); return real(p)\ne.start = slow\n"
+    )
+    child = started(("" if when == "writing" else fitting) + SLOW_WRITE, *CALIBRATE, target)
+    assert child.stdout.readline() == "writing\n"
+    child.send_signal(signal.SIGINT)
+    _, err = child.communicate(timeout=10)
+    assert child.returncode == 130
+    assert err.split("\n", 1)[-1].strip() == "mwdcal: interrupted. Files are as they were before."
+    assert err.strip() == "mwdcal: interrupted. Files are as they were before."
+    assert not list(tmp_path.iterdir())
+
+
+def without_time(path):
+    """The bytes with the value of the time fields taken out."""
+    return re.sub(rb'(_?time"?[: =]+")[^"]*"', rb"\1", path.read_bytes())
+
+
+def twice(tmp_path, *arguments, suffix):
+    """The output of a command in two folders, with one and with four threads."""
+    found = []
+    for threads in ("1", "4"):
+        folder = tmp_path / threads
+        folder.mkdir(exist_ok=True)
+        names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+        environment = {**os.environ, **dict.fromkeys(names, threads), "PYTHONHASHSEED": threads}
+        done = process(*arguments, f"out{suffix}", cwd=folder, env=environment)
+        assert done.returncode == 0, done
+        found.append(folder / f"out{suffix}")
+    return found
+
+
+def test_the_same_input_gives_the_same_calibration(tmp_path):
+    first, second = twice(tmp_path, *CALIBRATE, suffix=".json")
+    assert without_time(first) == without_time(second)
+    left, right = (json.loads(p.read_bytes()) for p in (first, second))
+    assert {k for k in left if left[k] != right[k]} <= {"time"}
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".parquet", ".xlsx"])
+def test_the_same_input_gives_the_same_corrected_readings(tmp_path, suffix):
+    if suffix == ".parquet":
+        pytest.importorskip("pyarrow")
+    if suffix == ".xlsx":
+        pytest.importorskip("openpyxl")
+    assert mwdcal(*CALIBRATE, tmp_path / "cal.json").code == 0
+    run = EXAMPLE / "rolltest.csv"
+    first, second = twice(tmp_path, "apply", tmp_path / "cal.json", run, "-o", suffix=suffix)
+    assert first.read_bytes() == second.read_bytes()
+
+
+def test_the_same_input_gives_the_same_report(tmp_path):
+    pytest.importorskip("mwdcal.app.report")
+    arguments = (*CALIBRATE, "cal.json", "--report")
+    first, second = twice(tmp_path, *arguments, suffix=".html")
+    times = {json.loads((p.parent / "cal.json").read_bytes())["time"] for p in (first, second)}
+    texts = []
+    for path in (first, second):
+        text = path.read_text("utf-8")
+        for stamp in times:
+            text = text.replace(stamp, "").replace(stamp[:16].replace("T", " "), "")
+        texts.append(text)
+    assert texts[0] == texts[1]
