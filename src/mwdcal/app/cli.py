@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 INTERNAL = 70
 INTERRUPTED = 130
+COLDEST, HOTTEST = -273.15, 1000.0
 
 
 class Digests(TypedDict):
@@ -296,12 +297,15 @@ def verify(
     Exit: 0 pass, 1 fail, 2 input cannot be read or is not independent.
     """
     from mwdcal.app import text
+    from mwdcal.correction import check_temperature
     from mwdcal.files import documents, runs, table
     from mwdcal.files.limits import load_limits
     from mwdcal.quality import verify as judge
 
+    _check_outputs([report], [calibration, run])
     made = documents.read(calibration)
     readings, _ = runs.to_readings(table.read(run, decimal=decimal), made.profile)
+    check_temperature(made, readings)
     result = judge(made, readings, load_limits(limits))
     if report:
         from mwdcal.app.report import write_report
@@ -341,6 +345,9 @@ def convert(
     from mwdcal.files import atomic, documents
     from mwdcal.notation import convert as rewrite
 
+    _check_outputs([output], [calibration])
+    if temperature is not None and not COLDEST <= temperature <= HOTTEST:
+        raise InputError(f"--temperature must be between {COLDEST:g} and {HOTTEST:g} °C; got {temperature:g}.")
     made = documents.read(calibration)
     found = rewrite(made, notation, temperature)
     if not as_json and output is None:

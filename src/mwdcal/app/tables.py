@@ -6,6 +6,7 @@ from dataclasses import replace
 
 from mwdcal.calibration import Calibration, Finding
 from mwdcal.correction import correct
+from mwdcal.errors import InputError
 from mwdcal.files.runs import to_readings
 from mwdcal.files.table import Table
 
@@ -16,6 +17,12 @@ def apply_to_table(
     """The input's columns and metadata, the results, and what the calibration was."""
     readings, _ = to_readings(source, calibration.profile)
     columns, findings = correct(calibration, readings, outside)
+    taken = [name for name in columns if name in source.columns]
+    if taken:
+        raise InputError(
+            f"{source.source}: the column '{taken[0]}' is there already, and would be lost under "
+            "the result of that name. Rename it, or correct the readings without it."
+        )
     metadata = {
         **source.metadata,
         "calibration_run": calibration.run,

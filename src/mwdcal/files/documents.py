@@ -9,10 +9,17 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 
 from mwdcal.calibration import SCHEMA_VERSION, Calibration
 from mwdcal.errors import InputError
 from mwdcal.files import atomic
+from mwdcal.files.profiles import check_profile
+
+HIGHEST = 3
+"""The highest order of temperature terms."""
+WORST = 1e4
+"""Gains with a greater condition number are those of no sensor."""
 
 
 def encode(calibration: Calibration) -> bytes:
@@ -48,16 +55,60 @@ def read(path: str | os.PathLike[str]) -> Calibration:
 
 
 def check(calibration: Calibration, name: str) -> Calibration:
-    """Refuse a file whose parts do not fit together."""
-    size = sum(t.size for t in calibration.triads)
-    square = [len(row) for row in calibration.covariance] == [size] * size
-    lengths = all(len(t.parameters) == len(t.parameter_names) == t.size for t in calibration.triads)
-    if not square or not lengths:
+    """Refuse a file whose parts do not fit together, or whose numbers no calibration has."""
+    problem = _misfit(calibration)
+    if problem:
         raise InputError(
-            f"{name}: parameters and covariance do not fit together; the file was changed by "
-            "hand or damaged. Use the file as mwdcal calibrate wrote it."
+            f"{name}: {problem}; the file was changed by hand or damaged. Use the file as mwdcal "
+            "calibrate wrote it."
         )
+    check_profile(calibration.profile, name)
     return calibration
+
+
+def _misfit(calibration: Calibration) -> str:
+    """What does not fit together in a calibration; empty where all does."""
+    for triad, expected in zip(calibration.triads, ("accelerometer", "magnetometer"), strict=False):
+        if triad.name != expected:
+            return f"the triad '{triad.name}' stands where the {expected} belongs"
+        if triad.model not in ("polynomial", "factors") or not 0 <= triad.order <= HIGHEST:
+            return f"the {triad.name} has the unknown model '{triad.model}' of order {triad.order}"
+        if len(triad.centre) != 3 or not 0 < triad.radius < np.inf:
+            return f"the {triad.name} has no usable centre and radius"
+        names = triad.functions(calibration.reference_temperature).names
+        given = (triad.parameter_names, triad.parameters, triad.standard_uncertainties)
+        if list(names) != triad.parameter_names or {len(g) for g in given} != {triad.size}:
+            return f"the parameters of the {triad.name} are not those of its model"
+    size = sum(t.size for t in calibration.triads)
+    if [len(row) for row in calibration.covariance] != [size] * size:
+        return "parameters and covariance do not fit together"
+    if any(len(row) != size for row in calibration.free):
+        return "parameters and undetermined directions do not fit together"
+    low, high = calibration.temperature_c or (0.0, 0.0)
+    needed = {"gravity_g", "field", "dip_deg"} if calibration.has_field else {"gravity_g"}
+    if not low <= high or not needed <= set(calibration.earth):
+        return "temperature range or earth's field are not usable"
+    return _unusable(calibration)
+
+
+def _unusable(calibration: Calibration) -> str:
+    """Which numbers could not be computed with."""
+    covariance = np.array(calibration.covariance)
+    diagonal = np.diag(covariance)
+    norm = np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
+    scaled = covariance / np.outer(norm, norm)
+    even = np.allclose(scaled, scaled.transpose(), atol=1e-6)
+    if not even or (diagonal < 0).any() or np.linalg.eigvalsh(scaled)[0] < -1e-6:
+        return "the covariance is none: it is not symmetric, or has negative variances"
+    middle = np.array([calibration.reference_temperature])
+    for triad in calibration.triads:
+        parameters = np.array(triad.parameters)
+        with np.errstate(all="ignore"):
+            model = triad.functions(calibration.reference_temperature)
+            slope = model.slope(parameters, np.zeros((1, 3)), middle)[0]
+        if not np.isfinite(slope).all() or np.linalg.cond(slope) > WORST:
+            return f"the gains of the {triad.name} cannot be inverted"
+    return ""
 
 
 def schema() -> dict[str, Any]:

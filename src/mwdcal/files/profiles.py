@@ -109,7 +109,7 @@ def _profile(data: bytes, source: str) -> Profile:
             f"{source}: a tool profile must be TOML; {_lower_first(str(error))}. Correct the "
             'file; text needs quotes, axes are a list such as ["+x", "+y", "+z"].'
         ) from None
-    _check(profile, source)
+    check_profile(profile, source)
     return profile
 
 
@@ -174,7 +174,7 @@ def _axes_got(problem: str) -> str:
     return f"{got} of them" if got.isdigit() else _WORDS.get(got, got[:80])
 
 
-def _check(profile: Profile, source: str) -> None:
+def check_profile(profile: Profile, source: str) -> None:
     """Refuse values that no tool can have."""
     if not profile.name.strip():
         raise InputError(f"{source}, key 'name': must not be blank; got ''. Name the tool.")

@@ -1,0 +1,245 @@
+"""From readings to a record: stated intervals, findings, refusals, rounding, temperature."""
+
+import msgspec
+import numpy as np
+import pytest
+
+from mwdcal.calibrate import calibrate
+from mwdcal.calibration import Calibration
+from mwdcal.core.observables import OBSERVABLES
+from mwdcal.core.vectors import reference_vectors
+from mwdcal.errors import FitError, InputError
+from mwdcal.predict import readings_at
+from mwdcal.profile import Profile, TriadProfile
+from mwdcal.readings import Readings
+from mwdcal.selection import choose_order, soaks
+from mwdcal.simulate import grid, run, servo
+from simulation import Tool, plan
+
+PROFILE = Profile(name="test tool")
+NOISE = {"accelerometer": np.array(1e-4), "magnetometer": np.array(15.0)}
+
+
+def make(seed=0, inclinations=(5, 45, 90, 135), toolfaces=12, unknown=(), sd=NOISE, tool=None):
+    tool = tool or Tool.random(7)
+    inc, azi, face = plan(inclinations, toolfaces)
+    a, m = tool.readings(np.random.default_rng(seed), 1, inc, azi, face)
+    known = {
+        "inclination": inc, "azimuth": azi, "toolface": face,
+        "field": np.full(len(inc), tool.field), "dip": np.full(len(inc), tool.dip),
+    }  # fmt: skip
+    return Readings(a[0], m[0], known={k: v for k, v in known.items() if k not in unknown}, sd=sd)
+
+
+@pytest.mark.parametrize("sd", [NOISE, {}], ids=["declared", "estimated"])
+@pytest.mark.parametrize(
+    "unknown", [(), ("toolface", "dip")], ids=["whole", "toolface and dip unknown"]
+)
+def test_stated_95_percent_intervals_cover(unknown, sd):
+    """12 stations only, so that Student's t matters: 24 degrees of freedom or fewer per triad."""
+    tool = Tool.random(7)
+    attitudes = np.radians([[20.0, 60, 100, 150], [10.0, 100, 200, 300], [15.0, 75, 160, 301]])
+    g, b = reference_vectors(*attitudes, tool.gravity, tool.field, tool.dip)
+    raw = [v @ s.T + o for v, s, o in zip((g, b), tool.matrix, tool.offset, strict=True)]
+    probe = Readings(raw[0], raw[1])
+    covered = []
+    for seed in range(250):
+        record = calibrate(make(seed, (10, 60, 120), 4, unknown, sd, tool), PROFILE)
+        for name in ("gravity", "inclination", "azimuth", "field", "dip"):
+            error = OBSERVABLES[name].value(*record.fields(probe)) - OBSERVABLES[name].value(g, b)
+            covered.append(np.abs(error) < record.expanded_uncertainty(name, probe))
+    assert 0.93 < np.mean(covered) < 0.97
+
+
+def test_undetermined_outputs_have_no_uncertainty():
+    record = calibrate(make(unknown=("toolface",)), PROFILE)
+    probe = readings_at(record, np.radians([30.0, 80.0]), 1.0, 0.7)
+    assert np.isnan(record.uncertainty("toolface", probe)).all()
+    assert np.isnan(record.expanded_uncertainty("toolface", probe)).all()
+    for name in ("inclination", "azimuth", "gravity", "field", "dip"):
+        assert np.isfinite(record.uncertainty(name, probe)).all()
+    assert record.accelerometer.rank == record.magnetometer.rank == 11
+    assert [u.id for u in record.accelerometer.undetermined] == ["toolface-zero"]
+    assert None in record.accelerometer.standard_uncertainties
+
+
+def test_a_station_that_moved_is_named():
+    data = make()
+    raw = data.accelerometer.copy()
+    raw[6] += [1e-3, 0, 0]
+    record = calibrate(msgspec_replace(data, accelerometer=raw), PROFILE)
+    assert [f.station for f in record.findings if f.id == "reshoot"] == ["7"]
+    assert [row.station for row in record.station_rows if row.reshoot] == ["7"]
+
+
+def msgspec_replace(data, **changes):
+    from dataclasses import replace
+
+    return replace(data, **changes)
+
+
+def test_good_runs_are_rarely_accused():
+    """One in a hundred good runs has a marked station."""
+    marked = sum(
+        any(r.reshoot for r in calibrate(make(seed), PROFILE).station_rows) for seed in range(200)
+    )
+    assert marked <= 8
+
+
+def test_wrong_noise_figure_is_a_finding_and_scales_the_uncertainty():
+    honest = calibrate(make(3), PROFILE)
+    small = {"accelerometer": np.array(1e-5), "magnetometer": np.array(15.0)}
+    record = calibrate(make(3, sd=small), PROFILE)
+    assert any(f.id == "accelerometer-residuals" for f in record.findings)
+    probe = readings_at(record, 0.8, 1.0, 0.7)
+    ratio = record.uncertainty("gravity", probe) / honest.uncertainty("gravity", probe)
+    assert 0.8 < ratio < 1.25
+
+
+def test_every_number_has_twelve_digits_and_a_file_is_the_record():
+    record = calibrate(make(), PROFILE)
+    again = msgspec.json.decode(msgspec.json.encode(record), type=Calibration)
+    assert again == record
+
+    def check(value):
+        if isinstance(value, float):
+            assert value == float(f"{value:.11e}")
+        elif isinstance(value, dict):
+            [check(v) for v in value.values()]
+        elif isinstance(value, list):
+            [check(v) for v in value]
+
+    check(msgspec.to_builtins(record))
+
+
+REFUSED = {
+    "few": (lambda: (make(inclinations=(45,), toolfaces=3), {}), FitError, "stations"),
+    "one direction": (lambda: (make(inclinations=(45,), unknown=("toolface",)), {}), FitError, "other inclinations"),
+    "dead": (lambda: (dead(), {}), FitError, "does not move"),
+    "order without temperature": (lambda: (make(), {"order": 1}), InputError, "temperature_c"),
+    "least squares without toolface": (
+        lambda: (make(unknown=("toolface",)), {"method": "least-squares"}), FitError, "ref_toolface_deg",
+    ),
+    "unknown method": (lambda: (make(), {"method": "magic"}), InputError, "joint"),
+    "wrong sign": (lambda: (flipped(), {}), FitError, "sign"),
+    "no redundancy": (lambda: (make(inclinations=(10, 100), toolfaces=2, sd={}), {}), FitError, "Add stations"),
+}  # fmt: skip
+
+
+def dead():
+    data = make()
+    raw = data.accelerometer.copy()
+    raw[:, 1] = 0.123
+    return msgspec_replace(data, accelerometer=raw)
+
+
+def flipped():
+    data = make()
+    return msgspec_replace(data, accelerometer=data.accelerometer * [1, 1, -1])
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_refusals_say_why(case):
+    build, kind, word = REFUSED[case]
+    data, options = build()
+    with pytest.raises(kind, match=word):
+        calibrate(data, PROFILE, **options)
+
+
+def test_field_known_nowhere_is_calibrated_to_one_and_said_so():
+    record = calibrate(make(unknown=("field",)), PROFILE)
+    _, b = record.fields(make(5, unknown=("field",)))
+    assert np.linalg.norm(b, axis=-1).mean() == pytest.approx(1.0, abs=1e-3)
+    assert record.field_unit == "relative (field = 1)"
+    assert any(f.id == "field-unknown" for f in record.findings)
+
+
+def test_unknown_dip_is_a_constant_with_uncertainty():
+    found = [calibrate(make(seed, unknown=("dip",)), PROFILE).constants[0] for seed in range(60)]
+    errors = np.array([c.value - 65.0 for c in found])
+    assert {c.name for c in found} == {"dip"}
+    stated = np.mean([c.standard_uncertainty for c in found])
+    assert np.sqrt(np.mean(errors**2)) == pytest.approx(stated, rel=0.25)
+
+
+def hot(seed=1, soak=(25, 55, 85, 115, 145)):
+    """A simulated tool with cubic temperature terms over five soaks."""
+    rng = np.random.default_rng(seed)
+    truth = servo(rng)
+    stations = grid([5, 45, 90, 135], 6, [0, 90, 180, 270], list(map(float, soak)))
+    data = run(truth, stations, rng)
+    return truth, msgspec_replace(data, sd=NOISE, station=())
+
+
+@pytest.mark.parametrize("course", [0, 1, 2, 3])
+def test_temperature_order_is_chosen_by_leaving_soaks_out_simulated(course):
+    """The tool drifts by a polynomial of known degree: that degree comes out."""
+    rng = np.random.default_rng(course)
+    truth = servo(rng)
+    linear = np.zeros((2, 6, 4))
+    for index, params in enumerate((truth.accelerometer, truth.magnetometer)):
+        linear[index] = params[:24].reshape(6, 4)
+        linear[index, :, 1:] = 0.0
+        for power in range(1, course + 1):
+            size = np.array([[0.01] * 3 + [(0.01, 500.0)[index]] * 3]).reshape(6, 1)
+            linear[index, :, power : power + 1] = size * rng.choice([-1, 1], (6, 1)) / 60.0**power
+    triads = [
+        np.concatenate([linear[i].ravel(), p[24:]])
+        for i, p in enumerate((truth.accelerometer, truth.magnetometer))
+    ]
+    truth = msgspec_replace(truth, accelerometer=triads[0], magnetometer=triads[1])
+    soak = [25.0, 50.0, 75.0, 100.0, 125.0, 150.0]
+    data = run(truth, grid([5, 45, 90, 135], 6, [0, 90, 180, 270], soak), rng)
+    data = msgspec_replace(data, sd=NOISE, station=())
+    order, table = choose_order(data, "joint", None, lambda text: None)
+    assert order == course
+    assert [row.order for row in table if row.chosen] == [order]
+    assert table[order].inside == pytest.approx(1.0, abs=0.5)
+    cold = msgspec_replace(data, temperature=None)
+    assert choose_order(cold, "joint", None, lambda text: None) == (0, [])
+
+
+def test_factors_of_order_three_recover_the_truth_simulated():
+    truth, data = hot(2)
+    record = calibrate(data, PROFILE, order=3)
+    assert record.accelerometer.size == record.magnetometer.size == 30
+    for triad, true in (
+        (record.accelerometer, truth.accelerometer),
+        (record.magnetometer, truth.magnetometer),
+    ):
+        assert triad.rank == 30
+        sd = np.array(triad.standard_uncertainties, float)
+        assert np.sqrt(np.mean(((np.array(triad.parameters) - true) / sd) ** 2)) < 1.6
+
+
+def test_temperature_outside_and_missing():
+    _, data = hot(3)
+    record = calibrate(data, PROFILE, order=1)
+    assert not record.outside(data).any()
+    assert record.outside(msgspec_replace(data, temperature=data.temperature + 200)).all()
+    with pytest.raises(InputError, match="temperature_c"):
+        record.fields(msgspec_replace(data, temperature=None))
+
+
+def test_soaks_are_told_apart_by_gaps():
+    assert soaks(np.array([100.0, 22.4, 22.6, 101.0, 60.0])).tolist() == [2, 0, 0, 2, 1]
+
+
+def test_narrow_span_is_refused_for_a_high_order():
+    _, data = hot(4, (20, 22, 24, 25))
+    with pytest.raises(FitError, match="span"):
+        calibrate(data, PROFILE, order=3)
+
+
+def test_own_axis_terms_of_the_profile_are_found():
+    tool = Tool.random(7)
+    inc, azi, face = plan()
+    a, m = tool.readings(np.random.default_rng(0), 1, inc, azi, face)
+    _, b = reference_vectors(inc, azi, face, 1.0, tool.field, tool.dip)
+    bent = m[0] + 300.0 * (b / tool.field) ** 2
+    data = msgspec_replace(make(), accelerometer=a[0], magnetometer=bent)
+    straight = calibrate(data, PROFILE)
+    curved = calibrate(data, Profile(name="bent", magnetometer=TriadProfile(nonlinearity=0.01)))
+    assert straight.magnetometer.variance_factor > 5
+    assert curved.magnetometer.variance_factor == pytest.approx(1.0, abs=0.4)
+    assert curved.magnetometer.size == 18
