@@ -75,7 +75,16 @@ def test_killed_around_the_write_it_leaves_the_old_file_or_the_new_one(tmp_path)
     target, dice = tmp_path / "cal.json", random.Random(2)
     target.write_bytes(OLD)
     outcomes = set()
-    for delay in [0, 0.1, 0.2, 0.249, 0.25, 0.255, 0.3, *(dice.uniform(0.2, 0.3) for _ in range(5))]:
+    for delay in [
+        0,
+        0.1,
+        0.2,
+        0.249,
+        0.25,
+        0.255,
+        0.3,
+        *(dice.uniform(0.2, 0.3) for _ in range(5)),
+    ]:
         assert kill_after(-delay or -1e-9, SLOW_WRITE, target) in (0, -signal.SIGKILL)
         outcomes.add(target.read_bytes() == OLD)
         assert whole(target)

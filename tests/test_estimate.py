@@ -232,3 +232,14 @@ def test_attitude_of_unknown_stations_is_found():
     found = np.arctan2(-result.state.attitude[0, :, 0, 2], -result.state.attitude[0, :, 1, 2])
     turned = np.angle(np.exp(1j * (found - face)))
     assert np.std(turned) < 0.05 * DEG
+
+
+def test_a_group_of_one_is_no_group():
+    data = readings(Tool.random(4), plan((5, 45, 90, 135)), ("inclination", "field"))
+    lonely = fit(
+        Readings(
+            data.accelerometer, data.magnetometer, known=data.known, sd=NOISE, group=np.arange(48)
+        )
+    )
+    free = fit(data)
+    np.testing.assert_allclose(lonely.state.params, free.state.params, rtol=1e-12)

@@ -12,6 +12,12 @@ from mwdcal.readings import Readings
 
 ANGULAR = ("inclination", "azimuth", "toolface", "dip", "magnetic_toolface")
 OUTSIDE = ("blank", "refuse", "extrapolate")
+JUDGED = ("gravity", "inclination", "toolface", "azimuth", "field", "dip", "magnetic_toolface")
+DIRECTIONS = {
+    "gravity_g": ("inclination_deg", "azimuth_deg", "toolface_deg", "dip_deg"),
+    "field_nt": ("azimuth_deg", "dip_deg", "magnetic_toolface_deg"),
+}
+"""Directions that do not exist where a strength is zero."""
 
 
 def correct(
@@ -20,7 +26,7 @@ def correct(
     """Output columns (n,) by name, and what the reader should know.
 
     Singular: at exactly vertical attitudes azimuth and toolface are NaN (blank in files);
-    `magnetic_toolface_deg` stands beside them. Temperatures outside the calibrated range are
+    `magnetic_toolface_deg` stands beside them. A strength of zero has no direction: NaN. Temperatures outside the calibrated range are
     blanked, refused or extrapolated as `outside` says.
     """
     if outside not in OUTSIDE:
@@ -64,6 +70,10 @@ def _columns(calibration: Calibration, readings: Readings) -> dict[str, Array]:
     columns["field_nt"] = OBSERVABLES["field"].value(g, b)
     columns["dip_deg"] = np.degrees(OBSERVABLES["dip"].value(g, b))
     columns["magnetic_toolface_deg"] = np.degrees(OBSERVABLES["magnetic_toolface"].value(g, b))
+    for strength, names in DIRECTIONS.items():
+        nothing = columns[strength] == 0.0
+        for name in names:
+            columns[name] = np.where(nothing, np.nan, columns[name])
     return columns
 
 
@@ -95,20 +105,15 @@ def _outside(calibration: Calibration, readings: Readings, how: str, count: int)
 
 
 def _undetermined(calibration: Calibration, readings: Readings) -> list[Finding]:
-    """Outputs that rest on a direction which the calibration leaves free."""
-    names = [
-        name
-        for name in (
-            "gravity",
-            "inclination",
-            "toolface",
-            "azimuth",
-            "field",
-            "dip",
-            "magnetic_toolface",
-        )
-        if bool(calibration.rests_on_free(name, readings).any())
-    ]
+    """Outputs that rest on a direction which the calibration leaves free.
+
+    A row without field or gravity has no directions, and none that could be undetermined.
+    """
+    if not calibration.free:
+        return []
+    with np.errstate(invalid="ignore", divide="ignore"):
+        moved = {name: calibration.rests_on_free(name, readings).any() for name in JUDGED}
+    names = [name for name, any_row in moved.items() if any_row]
     if not names:
         return []
     free = ", ".join(dict.fromkeys(u.id for u in calibration.undetermined()))

@@ -67,12 +67,22 @@ def evidence_of(readings: Readings, include: Array) -> Evidence:
     lead = np.broadcast_shapes(readings.accelerometer.shape[:-1], include.shape)
     known = {n: _flat(readings.reference(n), lead) for n in ANGLES + CONSTANTS}
     sd = {n: _flat(readings.uncertainty(n), lead) for n in ANGLES + CONSTANTS}
-    group = _flat(readings.groups, lead)
+    group = _shared_groups(_flat(readings.groups, lead))
     included = _flat(include, lead).astype(float)
     nowhere = np.isnan(known["field"]).all(-1, keepdims=True)
     known["field"] = np.where(nowhere, 1.0, known["field"])
     bare = Evidence(known, sd, group, included, ())
     return replace(bare, known=_share_known(bare), constants=_constants(bare))
+
+
+def _shared_groups(group: Ints) -> Ints:
+    """Group numbers (B, n) without gaps, -1 where a station is alone in its group."""
+    labels, compact = np.unique(group, return_inverse=True)
+    keys = compact.reshape(group.shape) + len(labels) * np.arange(len(group))[:, None]
+    _, where, counts = np.unique(keys, return_inverse=True, return_counts=True)
+    shared = (counts[where].reshape(group.shape) > 1) & (group >= 0)
+    kept = np.unique(group[shared])
+    return np.where(shared, np.searchsorted(kept, group), -1)
 
 
 def _share_known(evidence: Evidence) -> dict[str, Array]:
