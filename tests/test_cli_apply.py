@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+
 from cli_support import (
     SCALE,
     calibrated,
@@ -18,10 +19,11 @@ from cli_support import (
 )
 from simulation import DEG, Tool, attitude
 
-ADDED = (
-    "gx_g gy_g gz_g bx_nt by_nt bz_nt inclination_deg azimuth_deg toolface_deg gravity_g field_nt "
-    "dip_deg magnetic_toolface_deg"
-).split()
+ADDED = [
+    *("gx_g", "gy_g", "gz_g", "bx_nt", "by_nt", "bz_nt"),
+    *("inclination_deg", "azimuth_deg", "toolface_deg", "gravity_g", "field_nt", "dip_deg"),
+    "magnetic_toolface_deg",
+]
 MAGNETIC = (
     "bx_nt",
     "by_nt",

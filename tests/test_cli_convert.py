@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+
 from cli_support import calibrated, mwdcal, numbers, read_csv, refused, servo_run, write_csv
 from simulation import Tool
 

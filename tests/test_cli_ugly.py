@@ -5,8 +5,7 @@ import time
 import numpy as np
 import pytest
 
-from cli_support import RAW, SERVO_NOISE, channels, mwdcal, refused, servo_run, stations, write_csv
-from simulation import Tool
+from cli_support import RAW, mwdcal, refused, servo_run, write_csv
 
 HEADER = ",".join(servo_run())
 FIRST = HEADER + "\n" + ",".join("1" for _ in HEADER.split(",")) + "\n"
@@ -295,15 +294,3 @@ def test_optional_columns_may_be_absent(tmp_path, missing):
     if missing == "magnetometer":
         run = {k: v for k, v in run.items() if not k.startswith("m")}
     assert ran(tmp_path, run).code == 0
-
-
-def test_a_hundred_thousand_stations(tmp_path):
-    rng = np.random.default_rng(3)
-    count = 100_000
-    inc = np.arccos(rng.uniform(-1, 1, count))
-    azi, face = rng.uniform(0, 2 * np.pi, (2, count))
-    g, b = (v[0] for v in Tool.random(3, noise=SERVO_NOISE).readings(rng, 1, inc, azi, face))
-    run = {**stations(inc, azi, face), **channels(g, b)}
-    start = time.perf_counter()
-    assert ran(tmp_path, run).code == 0
-    assert time.perf_counter() - start < 120

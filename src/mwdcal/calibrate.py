@@ -11,6 +11,7 @@ import numpy as np
 
 from mwdcal import __version__
 from mwdcal.calibration import (
+    FREE_SHARE,
     Calibration,
     Constant,
     Finding,
@@ -205,7 +206,7 @@ class _Record:
             radius=float(finished.scale.ravel()[0]) if curved else 1.0,  # type: ignore[union-attr]
             parameter_names=list(finished.names),
             parameters=(self.map[where, where] @ self.result.state.params[0, where]).tolist(),
-            standard_uncertainties=self._uncertainties(where),
+            standard_uncertainties=self._uncertainties(index),
             rank=int(marginal_rank(analysis.determined, where)[0]),
             size=triad.model.size,
             singular_values=(_own_values(self.result, where)).tolist(),
@@ -219,14 +220,26 @@ class _Record:
             degrees_of_freedom=freedom,
         )
 
-    def _uncertainties(self, where: slice) -> list[float | None]:
-        """Standard uncertainties; None for parameters that move with a free direction."""
+    def _uncertainties(self, index: int) -> list[float | None]:
+        """Standard uncertainties; None for parameters that a free direction moves.
+
+        A parameter is moved if its share of the direction changes the field by more than
+        `FREE_SHARE` of its strength, over the stations of the run.
+        """
+        problem, where = self.result.problem, self.result.problem.slices()[index]
+        triad, temperature = problem.triads[index], problem.temperature
+        params = self.result.state.params[:, where]
+        strength = np.linalg.norm(triad.model.fields(params, triad.raw, temperature)[0], axis=-1)
+        finished, whole = triad.model.finished(self.profile.reference_temperature_c)
+        moved = whole.reshape(-1, triad.model.size, triad.model.size)[0] @ params[0]
+        columns = finished.jacobian(moved, triad.raw[0], temperature[0]).reshape(-1, 3, len(moved))
+        effect = np.sqrt(np.mean(np.sum(columns**2, 1), 0)) / strength.mean()
+        share = np.abs([d[where] for d in self.directions] or [np.zeros(len(effect))]).max(0)
         values = np.sqrt(np.diag(self.covariance)[where])
-        size = np.abs(self.map[where, where] @ self.result.state.params[0, where]).max()
-        moved = np.zeros(len(values))
-        for direction in self.directions:
-            moved = np.maximum(moved, np.abs(direction[where]))
-        return [None if m > 1e-2 * size else float(v) for v, m in zip(values, moved, strict=True)]
+        return [
+            None if s * e > FREE_SHARE else float(v)
+            for v, s, e in zip(values, share, effect, strict=True)
+        ]
 
     def findings(self, stations: list[StationRow]) -> list[Finding]:
         """What the reader should know, in order of weight."""

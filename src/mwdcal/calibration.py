@@ -23,7 +23,7 @@ DIGITS = 12
 """Significant digits of every number in a calibration file."""
 MAGNETIC = ("azimuth", "field", "dip", "magnetic_toolface", "bx", "by", "bz")
 """Observables that need a magnetometer."""
-FREE_SHARE = 1e-2
+FREE_SHARE = 5e-2
 """An output rests on a free direction if it moves by more than this share of it (rad per rad,
 or of its own strength), the direction being scaled to turn or stretch the fields by one."""
 

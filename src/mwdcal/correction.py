@@ -26,8 +26,8 @@ def correct(
     """Output columns (n,) by name, and what the reader should know.
 
     Singular: at exactly vertical attitudes azimuth and toolface are NaN (blank in files);
-    `magnetic_toolface_deg` stands beside them. A strength of zero has no direction: NaN. Temperatures outside the calibrated range are
-    blanked, refused or extrapolated as `outside` says.
+    `magnetic_toolface_deg` stands beside them. A strength of zero has no direction: NaN.
+    Temperatures outside the calibrated range are blanked, refused or extrapolated as `outside` says.
     """
     if outside not in OUTSIDE:
         raise InputError(f"--outside must be one of {', '.join(OUTSIDE)}; got {outside!r}.")

@@ -347,7 +347,9 @@ def convert(
 
     _check_outputs([output], [calibration])
     if temperature is not None and not COLDEST <= temperature <= HOTTEST:
-        raise InputError(f"--temperature must be between {COLDEST:g} and {HOTTEST:g} °C; got {temperature:g}.")
+        raise InputError(
+            f"--temperature must be between {COLDEST:g} and {HOTTEST:g} °C; got {temperature:g}."
+        )
     made = documents.read(calibration)
     found = rewrite(made, notation, temperature)
     if not as_json and output is None:

@@ -119,12 +119,8 @@ def notation(found: dict[str, Notation]) -> str:
         for name, value in item.values.items():
             for index in np.ndindex(value.shape):
                 where = "".join(f"[{i}]" for i in index)
-                rows.append(
-                    [
-                        f"{name}{where}",
-                        f"{value[index]:.12g}",
-                        f"{item.uncertainty[name][index]:.2g}",
-                    ]
-                )
+                sd = float(item.uncertainty[name][index])
+                stated = "undetermined" if np.isnan(sd) else f"{sd:.2g}"
+                rows.append([f"{name}{where}", f"{value[index]:.12g}", stated])
         blocks.append(f"{triad}\n" + table(rows, ["", "value", "1σ"]))
     return "\n\n".join(blocks)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -10,6 +10,9 @@ from mwdcal.core.problem import Problem, State
 from mwdcal.core.solvers import Determined
 from mwdcal.core.uncertainty import COUPLED, candidates
 from mwdcal.core.vectors import Array
+
+EXACT = 1 - 1e-6
+"""A named direction with this share in the null space is taken as it is, free of rounding."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +39,8 @@ def free_directions(problem: Problem, state: State, determined: Determined) -> l
         best = int(np.argmax(np.round(scores, 3)))
         clear = scores[best] > COUPLED
         chosen = named.pop(best) if clear else _weakest(problem, null, norms)
+        if clear and scores[best] < EXACT:
+            chosen = _inside(chosen, null, norms)
         found.append(chosen)
         null = _without(null, chosen.direction * norms)
     return found
@@ -68,6 +73,12 @@ def _weakest(problem: Problem, null: Array, norms: Array) -> Free:
         t for t, where in enumerate(problem.slices()) if np.sum(direction[where] ** 2) > 0.01
     )
     return Free(f"weak-{names[int(np.argmax(np.abs(direction)))]}", triads, direction / norms)
+
+
+def _inside(free: Free, null: Array, norms: Array) -> Free:
+    """A named direction's part in the null space: own-axis terms do not turn with the rest."""
+    part = null @ (null.transpose() @ (free.direction * norms))
+    return replace(free, direction=part / norms)
 
 
 def _without(null: Array, direction: Array) -> Array:

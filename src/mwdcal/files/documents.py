@@ -18,6 +18,8 @@ from mwdcal.files.profiles import check_profile
 
 HIGHEST = 3
 """The highest order of temperature terms."""
+LARGEST = 1e30
+"""No number of a calibration comes near this one."""
 WORST = 1e4
 """Gains with a greater condition number are those of no sensor."""
 
@@ -86,7 +88,7 @@ def _misfit(calibration: Calibration) -> str:
         return "parameters and undetermined directions do not fit together"
     low, high = calibration.temperature_c or (0.0, 0.0)
     needed = {"gravity_g", "field", "dip_deg"} if calibration.has_field else {"gravity_g"}
-    if not low <= high or not needed <= set(calibration.earth):
+    if not -LARGEST <= low <= high <= LARGEST or not needed <= set(calibration.earth):
         return "temperature range or earth's field are not usable"
     return _unusable(calibration)
 
@@ -94,6 +96,10 @@ def _misfit(calibration: Calibration) -> str:
 def _unusable(calibration: Calibration) -> str:
     """Which numbers could not be computed with."""
     covariance = np.array(calibration.covariance)
+    lists = [[t.radius, t.noise, *t.centre, *t.parameters] for t in calibration.triads]
+    lists += [*calibration.free, covariance.ravel().tolist(), list(calibration.earth.values())]
+    if max(abs(v) for numbers in lists for v in numbers) > LARGEST:
+        return f"a number is beyond {LARGEST:g}"
     diagonal = np.diag(covariance)
     norm = np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
     scaled = covariance / np.outer(norm, norm)
@@ -113,7 +119,7 @@ def _unusable(calibration: Calibration) -> str:
 
 def schema() -> dict[str, Any]:
     """JSON Schema of a calibration file, from its definition in code."""
-    made = msgspec.json.schema(Calibration)
+    made = json.loads(msgspec.json.encode(msgspec.json.schema(Calibration)))
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": f"mwdcal calibration file, schema version {SCHEMA_VERSION}",

@@ -1,0 +1,412 @@
+"""The outside of the command line: exit codes, help, completion, pipes, and calibration files not to be trusted."""
+
+import json
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from cli_support import (
+    EXAMPLE,
+    SCALE,
+    calibrated,
+    mwdcal,
+    numbers,
+    process,
+    read_csv,
+    refused,
+    servo_run,
+    write_csv,
+)
+from mwdcal.app.cli import cli
+from mwdcal.files import documents
+
+COMMANDS = sorted(cli.commands)
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """A calibration file, readings, and a roll test."""
+    folder = tmp_path_factory.mktemp("files")
+    calibration = calibrated(folder, servo_run())
+    roll = write_csv(folder / "roll.csv", servo_run(seed=1, inclinations=(30,)))
+    return calibration, roll
+
+
+def every_command(calibration, roll, folder):
+    """The three commands that read a calibration file."""
+    return {
+        "apply": ("apply", calibration, roll, "-o", folder / "out.csv"),
+        "verify": ("verify", calibration, roll),
+        "convert": ("convert", calibration, "--notation", "forward"),
+    }
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_has_help_with_an_example(command):
+    for option in ("-h", "--help"):
+        ran = mwdcal(command, option)
+        assert ran.code == 0
+        assert ran.err == ""
+        assert f"mwdcal {command} " in ran.out.split("Example", 1)[1]
+
+
+def test_help_and_version_of_the_whole():
+    ran = mwdcal("--help")
+    assert ran.code == 0
+    for command in ("calibrate", "apply", "verify", "convert", "completion"):
+        assert f"\n  {command} " in ran.out
+    assert mwdcal("--version").out.startswith("mwdcal, version ")
+
+
+@pytest.mark.parametrize(
+    "arguments", [("calibrat",), ("calibrate",), ("--colour",), ("apply", "x")]
+)
+def test_misused_it_exits_with_2(arguments):
+    ran = mwdcal(*arguments)
+    assert ran.code == 2
+    assert ran.out == ""
+    assert ran.err.startswith("Usage: mwdcal")
+    assert len(ran.messages) == 1
+
+
+@pytest.mark.parametrize(
+    ("shell", "part"), [("bash", "complete -o"), ("zsh", "compdef"), ("fish", "complete")]
+)
+def test_completion(shell, part):
+    try:
+        ran = mwdcal("completion", shell)
+    except RuntimeError:
+        pytest.skip(f"no {shell} here")
+    assert ran.code == 0
+    assert part in ran.out
+    assert "_MWDCAL_COMPLETE" in ran.out
+
+
+def test_completion_completes():
+    environment = {
+        **os.environ,
+        "_MWDCAL_COMPLETE": "bash_complete",
+        "COMP_WORDS": "mwdcal ca",
+        "COMP_CWORD": "1",
+    }
+    done = process(env=environment)
+    assert done.stdout.splitlines() == ["plain,calibrate"]
+
+
+def test_help_imports_neither_numpy_nor_scipy():
+    script = (
+        "import sys\nfrom mwdcal.app.cli import main\n"
+        "try:\n    main(['--help'])\nexcept SystemExit:\n    pass\n"
+        "heavy = {'numpy', 'scipy', 'matplotlib', 'rich', 'pyarrow', 'openpyxl', 'jinja2'}\n"
+        "print(sorted(heavy & set(sys.modules)), file=sys.stderr)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, encoding="utf-8", check=True
+    )
+    assert done.stderr.strip() == "[]"
+
+
+@pytest.mark.skipif(os.name == "nt", reason="POSIX pipes")
+@pytest.mark.parametrize("reader", ["head -1", "true"])
+def test_a_reader_that_leaves_early_sees_no_traceback(files, reader):
+    mine = f"'{sys.executable}' -c 'from mwdcal.app.cli import main; main()'"
+    line = f"{mine} convert '{files[0]}' --notation forward --json | {reader}"
+    done = subprocess.run(line, shell=True, capture_output=True, encoding="utf-8", check=False)
+    assert done.returncode == 0
+    assert done.stderr == ""
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")
+def test_a_full_disk_behind_stdout_is_told(files):
+    with open("/dev/full", "w") as full:
+        arguments = (sys.executable, "-c", "from mwdcal.app.cli import main; main()")
+        done = subprocess.run(
+            [*arguments, "convert", str(files[0]), "--notation", "forward"],
+            stdout=full,
+            stderr=subprocess.PIPE,
+            encoding="utf-8",
+            check=False,
+        )
+    assert done.returncode == 2
+    assert done.stderr.startswith("mwdcal: cannot write the result: No space left on device")
+    assert done.stderr.count("\n") == 1
+
+
+def test_a_defect_is_called_one_and_shows_no_traceback(tmp_path, monkeypatch):
+    def broken(*arguments):
+        raise ZeroDivisionError("oh")
+
+    monkeypatch.setattr(documents, "read", broken)
+    monkeypatch.delenv("MWDCAL_DEBUG", raising=False)
+    ran = mwdcal("convert", tmp_path / "c.json", "--notation", "affine")
+    assert ran.code == 70
+    assert "internal error (ZeroDivisionError: oh)" in ran.err
+    assert "Traceback" not in ran.err
+    monkeypatch.setenv("MWDCAL_DEBUG", "1")
+    with pytest.raises(ZeroDivisionError):
+        mwdcal("convert", tmp_path / "c.json", "--notation", "affine")
+
+
+def test_not_enough_memory_is_told(tmp_path, monkeypatch):
+    def big(*arguments):
+        raise MemoryError
+
+    monkeypatch.setattr(documents, "read", big)
+    assert "not enough memory" in refused(mwdcal("convert", "c", "--notation", "affine"), 2)
+
+
+def test_json_of_calibrate_holds_the_numbers_of_the_text(tmp_path):
+    run = write_csv(tmp_path / "run.csv", servo_run())
+    arguments = ("calibrate", run, "--tool", "servo", "-o", tmp_path / "cal.json")
+    said, told = mwdcal(*arguments), mwdcal(*arguments, "--json").json
+    lines = [" ".join(s.split()) for s in said.out.splitlines()]
+    names = {
+        "toolface": "toolface·sin I",
+        "azimuth": "azimuth·sin I",
+        "gravity": "|g|",
+        "field": "|b|",
+    }
+
+    def shown(value, unit):
+        digits = f"{value:.3g}" if abs(value) < 100 else f"{value:.0f}"
+        return digits + ("" if unit == "°" else " ") + unit
+
+    for row in told["errors"]:
+        cells = [shown(row[k], row["unit"]) for k in ("before", "after", "expected")]
+        assert (
+            f"{names.get(row['observable'], row['observable'])} error, rms {' '.join(cells)}"
+            in lines
+        )
+    accuracy = "  ".join(f"{n} {v:.3g}°" for n, v in told["accuracy_1sigma_deg"].items())
+    assert f"accuracy to expect (1σ, calibration alone, typical): {accuracy}" in said.out
+    for name, triad in told["triads"].items():
+        assert f"{name} {triad['rank']} of {triad['size']} determined" in said.out
+    assert told["calibration"] == str(tmp_path / "cal.json")
+    assert [s for s in lines if s.startswith("! ")] == [f"! {f['text']}" for f in told["findings"]]
+
+
+def test_json_of_apply_holds_the_numbers_of_the_text(tmp_path, files):
+    arguments = ("apply", *files, "-o", tmp_path / "out.csv")
+    said, told = mwdcal(*arguments), mwdcal(*arguments, "--json").json
+    assert said.out == f"{told['rows']} rows corrected   wrote {told['output']}\n"
+    assert said.err == "".join(f"! {f['text']}\n" for f in told["findings"])
+
+
+def test_json_of_the_order_table(tmp_path):
+    run = write_csv(tmp_path / "run.csv", servo_run(temperatures=(0.0, 30.0, 60.0)))
+    arguments = ("calibrate", run, "--tool", "servo", "-o", tmp_path / "cal.json")
+    said, told = mwdcal(*arguments), mwdcal(*arguments, "--json").json
+    assert [o["order"] for o in told["orders"]] == [0, 1]
+    assert sum(o["chosen"] for o in told["orders"]) == 1
+    for score in told["orders"]:
+        cells = f"{score['order']} {score['inside']:.3g} {score['ends']:.3g}"
+        assert any(" ".join(s.split()).startswith(cells) for s in said.out.splitlines())
+
+
+# Calibration files
+
+
+def test_the_published_schema_is_that_of_the_code():
+    assert documents.published_schema() == documents.schema()
+
+
+RUNS = {
+    "both triads": lambda: (servo_run(), ()),
+    "accelerometer alone": lambda: (
+        {k: v for k, v in servo_run().items() if not k.startswith("m")},
+        (),
+    ),
+    "order 1": lambda: (servo_run(temperatures=(0.0, 40.0)), ("--order", 1)),
+    "polynomial of order 1": lambda: (
+        servo_run(temperatures=(0.0, 40.0)),
+        ("--order", 1, "--model", "polynomial"),
+    ),
+    "no temperature": lambda: (
+        {k: v for k, v in servo_run().items() if k != "temperature_c"},
+        (),
+    ),
+    "nothing known": lambda: ({k: v for k, v in servo_run().items() if "ref" not in k}, ()),
+    "least squares": lambda: (servo_run(), ("--method", "least-squares")),
+    "unknown noise": lambda: (servo_run(), ("--tool", "generic")),
+    "curved": lambda: (servo_run(toolfaces=24), ("--tool", "distox")),
+}
+
+
+@pytest.mark.parametrize("make", RUNS.values(), ids=RUNS)
+def test_every_calibration_file_is_valid(tmp_path, make):
+    validator = pytest.importorskip("jsonschema").Draft202012Validator
+    run, options = make()
+    if "distox" in options:
+        scale = dict.fromkeys(("ax", "ay", "az"), 14000 / 3) | dict.fromkeys(
+            ("mx", "my", "mz"), 1e7
+        )
+        own = {"ax": "az", "ay": "ax", "az": "ay", "mx": "mz", "my": "mx", "mz": "my"}
+        sign = {"ay": -1, "az": -1, "my": -1, "mz": -1}
+        run = {**run, **{k: run[own[k]] * scale[k] * sign.get(k, 1) for k in own}}
+    path = calibrated(tmp_path, run, *options)
+    validator.check_schema(documents.schema())
+    validator(documents.published_schema()).validate(json.loads(path.read_bytes()))
+    assert documents.encode(documents.read(path)) == path.read_bytes()
+
+
+def shortened(document):
+    document["accelerometer"]["parameters"].pop()
+
+
+def with_value(*keys, value):
+    def change(document):
+        entry = document
+        for key in keys[:-1]:
+            entry = entry[key]
+        entry[keys[-1]] = value
+
+    return change
+
+
+def without(*keys):
+    def change(document):
+        entry = document
+        for key in keys[:-1]:
+            entry = entry[key]
+        del entry[keys[-1]]
+
+    return change
+
+
+EDITED = {
+    "parameter list shortened": shortened,
+    "parameter of no number": with_value("accelerometer", "parameters", 0, value="1,02"),
+    "parameter missing": with_value("accelerometer", "parameters", 0, value=None),
+    "names shortened": without("magnetometer", "parameter_names", 3),
+    "names exchanged": with_value("magnetometer", "parameter_names", 0, value="gain-xy"),
+    "uncertainties shortened": without("magnetometer", "standard_uncertainties", 3),
+    "covariance shortened": without("covariance", 5),
+    "covariance row shortened": without("covariance", 5, 5),
+    "covariance one-sided": with_value("covariance", 0, 1, value=1.0),
+    "variance negative": with_value("covariance", 3, 3, value=-1.0),
+    "free direction of another length": with_value("free", value=[[1.0, 0.0]]),
+    "no schema version": without("schema_version"),
+    "schema version 0": with_value("schema_version", value=0),
+    "schema version 2": with_value("schema_version", value=2),
+    "schema version text": with_value("schema_version", value="1"),
+    "schema version true": with_value("schema_version", value=True),
+    "another model": with_value("accelerometer", "model", value="spline"),
+    "factors for polynomial": with_value("accelerometer", "model", value="factors"),
+    "another order": with_value("accelerometer", "order", value=1),
+    "order negative": with_value("accelerometer", "order", value=-1),
+    "order huge": with_value("accelerometer", "order", value=10**9),
+    "order beyond 64 bits": with_value("accelerometer", "order", value=10**30),
+    "curved": with_value("accelerometer", "curved", value=True),
+    "no accelerometer": without("accelerometer"),
+    "triads exchanged": with_value("accelerometer", "name", value="magnetometer"),
+    "triad of another name": with_value("accelerometer", "name", value="gyro"),
+    "no magnetometer": with_value("magnetometer", value=None),
+    "radius zero": with_value("accelerometer", "radius", value=0.0),
+    "centre shortened": with_value("accelerometer", "centre", value=[0.0]),
+    "gains zero": with_value("accelerometer", "parameters", value=[0.0] * 12),
+    "gains huge": with_value("accelerometer", "parameters", 4, value=1e300),
+    "axes repeated": with_value("profile", "accelerometer", "axes", value=["+x", "+x", "+z"]),
+    "axes unknown": with_value("profile", "accelerometer", "axes", value=["+x", "+y", "+w"]),
+    "scale zero": with_value("profile", "accelerometer", "scale", value=0.0),
+    "scale negative": with_value("profile", "magnetometer", "scale", value=-5e-5),
+    "temperatures reversed": with_value("temperature_c", value=[60.0, 20.0]),
+    "temperatures of three": with_value("temperature_c", value=[20.0, 30.0, 40.0]),
+    "no stations": without("station_rows"),
+    "earth unknown": with_value("earth", value={}),
+}
+
+
+def refused_by_all(folder, calibration, roll):
+    for name, arguments in every_command(calibration, roll, folder).items():
+        message = refused(mwdcal(*arguments), 2)
+        assert calibration.name in message, name
+    assert not (folder / "out.csv").exists()
+
+
+@pytest.mark.parametrize("change", EDITED.values(), ids=EDITED)
+def test_an_edited_calibration_file_is_refused(tmp_path, files, change):
+    document = json.loads(files[0].read_bytes())
+    change(document)
+    path = tmp_path / "edited.json"
+    path.write_text(json.dumps(document))
+    refused_by_all(tmp_path, path, files[1])
+
+
+CONTENTS = {
+    "empty": lambda data: b"",
+    "truncated": lambda data: data[: len(data) // 2],
+    "without its last brace": lambda data: data.rstrip()[:-1],
+    "followed by more": lambda data: data + b"{}",
+    "a list": lambda data: b"[" + data + b"]",
+    "a number": lambda data: b"1",
+    "null": lambda data: b"null",
+    "an empty object": lambda data: b"{}",
+    "no JSON": lambda data: b"schema_version = 1\n",
+    "binary": lambda data: bytes(range(256)),
+    "UTF-16": lambda data: data.decode().encode("utf-16"),
+    "Latin-1": lambda data: data.replace(b'"run": "', b'"run": "\xe9'),
+    "NaN": lambda data: data.replace(b'"parameters": [', b'"parameters": [NaN,', 1),
+    "1e999": lambda data: data.replace(b'"parameters": [', b'"parameters": [1e999,', 1),
+    "deep": lambda data: b"[" * 100_000,
+    "a run": lambda data: (EXAMPLE / "run.csv").read_bytes(),
+}
+
+
+@pytest.mark.parametrize("content", CONTENTS.values(), ids=CONTENTS)
+def test_a_damaged_calibration_file_is_refused(tmp_path, files, content):
+    path = tmp_path / "damaged.json"
+    path.write_bytes(content(files[0].read_bytes()))
+    refused_by_all(tmp_path, path, files[1])
+
+
+def test_a_calibration_that_is_not_there(tmp_path, files):
+    for path in (tmp_path / "missing.json", tmp_path):
+        refused_by_all(tmp_path, path, files[1])
+
+
+def leaves(value, path=()):
+    """Every place in a document where a value stands, long lists by their first entry only."""
+    if isinstance(value, dict):
+        for key, item in value.items():
+            yield from leaves(item, (*path, key))
+    elif isinstance(value, list) and value:
+        yield path
+        yield from leaves(value[0], (*path, 0))
+    else:
+        yield path
+
+
+@pytest.mark.parametrize("value", [None, 0, -1e300, 1e300, "", [], {}], ids=repr)
+def test_whatever_stands_in_a_calibration_file_there_is_no_internal_error(tmp_path, files, value):
+    text = files[0].read_text("utf-8")
+    path = tmp_path / "edited.json"
+    for place in leaves(json.loads(text)):
+        document = json.loads(text)
+        with_value(*place, value=value)(document)
+        path.write_text(json.dumps(document))
+        for arguments in every_command(path, files[1], tmp_path).values():
+            ran = mwdcal(*arguments)
+            assert ran.code in (0, 1, 2), (place, ran)
+            assert ran.code != 2 or len(ran.messages) == 1, (place, ran)
+
+
+def test_12_digits_are_enough_to_give_the_same_corrections(tmp_path, files):
+    """The file says what was fitted: its parameters by the documented formula are what `apply` gives."""
+    document = json.loads(files[0].read_bytes())
+    found = tmp_path / "out.csv"
+    assert mwdcal("apply", *files, "-o", found, "--json").code == 0
+    table = read_csv(found)
+    for index, (name, raw, field) in enumerate(
+        [
+            ("accelerometer", ("ax", "ay", "az"), ("gx_g", "gy_g", "gz_g")),
+            ("magnetometer", ("mx", "my", "mz"), ("bx_nt", "by_nt", "bz_nt")),
+        ]
+    ):
+        parameters = np.array(document[name]["parameters"])
+        x = np.stack([numbers(table[n]) for n in raw], -1) / SCALE[index]
+        wanted = x @ parameters[:9].reshape(3, 3).T + parameters[9:]
+        got = np.stack([numbers(table[n]) for n in field], -1)
+        np.testing.assert_allclose(got, wanted, rtol=1e-12, atol=1e-12 * np.abs(wanted).max())
