@@ -215,9 +215,6 @@ def test_one_common_station_is_one_too_many(tmp_path, fitted):
     assert "station 18" in message
 
 
-@pytest.mark.xfail(
-    strict=True, reason="a station's hash is of both triads: one triad alone has another"
-)
 def test_data_of_the_fit_without_magnetometer_cannot_verify_it(tmp_path, fitted):
     bare = {k: v for k, v in fitted[1].items() if not k.startswith("m")}
     refused(mwdcal("verify", fitted[0], write_csv(tmp_path / "m.csv", bare)), 2)

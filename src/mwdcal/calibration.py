@@ -6,6 +6,7 @@ a calibration in memory and one read back give the same results.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import msgspec
@@ -168,10 +169,15 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
         """The temperature τ = 0 of the model, °C."""
         return self.profile.reference_temperature_c
 
-    @property
-    def digests(self) -> frozenset[str]:
-        """Fingerprints of the stations of the fit."""
-        return frozenset(row.digest for row in self.station_rows)
+    def used(self, digests: Iterable[str]) -> list[bool]:
+        """Which stations, by their fingerprints, were in the fit; by the triads both have."""
+        fitted = {row.digest for row in self.station_rows}
+        first = {digest.partition("-")[0] for digest in fitted}
+        whole = self.has_field
+        return [
+            d in fitted or (("-" not in d or not whole) and d.partition("-")[0] in first)
+            for d in digests
+        ]
 
     @property
     def triads(self) -> list[TriadCalibration]:

@@ -127,8 +127,8 @@ def _check_tool(calibration: Calibration, readings: Readings) -> None:
 def _check_independent(calibration: Calibration, readings: Readings) -> None:
     used = [
         label
-        for label, digest in zip(readings.labels, readings.digest, strict=False)
-        if digest in calibration.digests
+        for label, seen in zip(readings.labels, calibration.used(readings.digest), strict=False)
+        if seen
     ]
     if used:
         raise InputError(

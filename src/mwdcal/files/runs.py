@@ -279,11 +279,18 @@ def _stations(table: Table) -> tuple[str, ...]:
 
 
 def _digests(triads: list[Array]) -> tuple[str, ...]:
-    """One hash per station over its raw reading to 12 significant digits, and nothing else."""
-    rows = np.concatenate(triads, axis=-1) + 0.0
-    form = ",".join(["%.12g"] * rows.shape[-1])
-    texts = (form % tuple(row.tolist()) for row in rows)
-    return tuple(hashlib.sha256(t.encode()).hexdigest()[:_DIGEST_LENGTH] for t in texts)
+    """One hash per station and triad over the raw reading to 12 significant digits.
+
+    Accelerometer first, then after a dash the magnetometer: data of a fit are known again
+    without their magnetometer too.
+    """
+    parts = [[_digest(row) for row in (triad + 0.0).tolist()] for triad in triads]
+    return tuple("-".join(pair) for pair in zip(*parts, strict=True))
+
+
+def _digest(row: list[float]) -> str:
+    text = ",".join(f"{value:.12g}" for value in row)
+    return hashlib.sha256(text.encode()).hexdigest()[:_DIGEST_LENGTH]
 
 
 def _labelled(readings: Readings) -> tuple[str, ...]:
