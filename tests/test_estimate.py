@@ -1,10 +1,11 @@
 """The estimator: ranks, free directions, start values, gauges, noise estimates, groups."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from mwdcal.core.observability import free_directions
-from mwdcal.core.problem import State
 from mwdcal.core.uncertainty import marginal_rank
 from mwdcal.core.vectors import rotation
 from mwdcal.estimate import fit
@@ -209,7 +210,12 @@ def moved_without_private(problem, state, step):
     linear = problem.linear(state)
     p, q = linear.size, len(problem.evidence.constants)
     attitude = problem._turn_groups(state, step[:, p + q :])
-    return State(state.params + step[:, :p], attitude, state.constants + step[:, p : p + q])
+    return replace(
+        state,
+        params=state.params + step[:, :p],
+        attitude=attitude,
+        constants=state.constants + step[:, p : p + q],
+    )
 
 
 def test_reference_uncertainty_common_to_the_run_is_not_averaged_away():

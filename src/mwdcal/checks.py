@@ -20,6 +20,10 @@ MOTION = (1e-2, 1e3)
 """A channel that moves by less or more than this share of the field has not seen the field."""
 
 
+NAMED = 4
+"""Most undetermined parameters that a message lists."""
+
+
 def check_fit(result: Fit, free: list[Free], profile: Profile, readings: Readings) -> None:
     """Refuse a fit that did not settle, is too weak, has no redundancy, or absurd gains."""
     _check_status(result)
@@ -115,9 +119,9 @@ def _check_geometry(result: Fit, free: list[Free]) -> None:
     benign = ("rotation-x", "rotation-y", "toolface-zero", "scale")
     bad = [entry for entry in free if entry.id not in benign]
     if bad:
-        names = ", ".join(
-            f"{TRIADS[t]} {e.id.removeprefix('weak-')}" for e in bad for t in e.triads
-        )
+        each = [f"{TRIADS[t]} {e.id.removeprefix('weak-')}" for e in bad for t in e.triads]
+        more = f" and {len(each) - NAMED} more" if len(each) > NAMED else ""
+        names = ", ".join(each[:NAMED]) + more
         raise FitError(
             f"the stations are too weak to fit the model: nothing determines {names}. Add stations "
             "at other inclinations (at least three, well apart, up and down) with six or more "

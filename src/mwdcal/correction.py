@@ -31,7 +31,6 @@ def correct(
     """
     if outside not in OUTSIDE:
         raise InputError(f"--outside must be one of {', '.join(OUTSIDE)}; got {outside!r}.")
-    check_temperature(calibration, readings)
     if calibration.has_field and readings.magnetometer is None:
         findings = [
             Finding(id="no-magnetometer", text="no columns mx, my, mz: magnetic results are blank.")
@@ -49,15 +48,6 @@ def correct(
         text = "the magnetometer is calibrated to field = 1: bx_nt, by_nt, bz_nt and field_nt are relative, not nT."
         findings.append(Finding(id="field-relative", text=text))
     return columns, findings + _undetermined(calibration, readings)
-
-
-def check_temperature(calibration: Calibration, readings: Readings) -> None:
-    """Refuse readings without temperatures where the calibration has terms of them."""
-    if readings.temperature is None and any(triad.order for triad in calibration.triads):
-        raise InputError(
-            f"{readings.source or 'the table'}: the calibration has temperature terms, and the column "
-            "'temperature_c' is missing or blank. Add it, or calibrate with --order 0."
-        )
 
 
 def _columns(calibration: Calibration, readings: Readings) -> dict[str, Array]:

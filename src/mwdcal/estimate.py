@@ -34,9 +34,31 @@ def whole_vectors(evidence: Evidence) -> Evidence:
     return replace(evidence, sd=exact, group=np.full_like(evidence.group, -1))
 
 
+def angles_alone(evidence: Evidence) -> Evidence:
+    """Inclination and toolface of the accelerometer, without |g| (Ivanov); scale stays nominal."""
+    return _reset(evidence, absent=("gravity",))
+
+
+def strengths_alone(evidence: Evidence) -> Evidence:
+    """|g| and |b| at every station, and nothing else: the scalar (total field) method."""
+    known = dict(evidence.known)
+    for name in (*ANGLES, "dip"):
+        known[name] = np.full_like(known[name], np.nan)
+    alone = np.full_like(evidence.group, -1)
+    return _reset(replace(evidence, known=known, group=alone), absent=("dip",))
+
+
+def _reset(evidence: Evidence, absent: tuple[str, ...]) -> Evidence:
+    """The evidence with its constants worked out again after a change."""
+    changed = replace(evidence, absent=absent, constants=())
+    return replace(changed, constants=_constants(changed))
+
+
 METHODS: dict[str, Callable[[Evidence], Evidence]] = {
     "joint": joint,
     "least-squares": whole_vectors,
+    "toolface-inclination": angles_alone,
+    "scalar": strengths_alone,
 }
 
 
@@ -104,6 +126,8 @@ def _constants(evidence: Evidence) -> tuple[Constant, ...]:
     """Constants of the run to estimate: unknown ones, and errors of uncertain references."""
     found = []
     for name, size in (("gravity", 1.0), ("field", 0.0), ("dip", UNKNOWN)):
+        if name in evidence.absent:
+            continue
         known = evidence.is_known(name)
         if not known.all():
             value = np.nan_to_num(

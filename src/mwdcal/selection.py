@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from mwdcal.core.uncertainty import marginal_rank
 from mwdcal.core.vectors import Array, Ints
 from mwdcal.estimate import Fit, fit
 from mwdcal.readings import Readings
@@ -16,6 +17,10 @@ GAP = 5.0
 SPAN = 10.0
 """A run that spans less has no temperature terms, °C."""
 HIGHEST = 3
+FEWEST = 3
+"""Fewest soaks among which one can be left out."""
+LOWEST_RANK = 8
+"""A triad of 12 parameters whose three rotations and scale are free has this rank."""
 NEAR_BEST = 1.02
 
 
@@ -49,26 +54,39 @@ def choose_order(
         return 0, []
     numbers = soaks(readings.temperature)
     levels = int(numbers.max()) + 1
+    if levels < FEWEST:
+        progress(
+            f"{levels} temperatures cannot choose an order by leaving one out: order 0 is taken. "
+            "Use --order 1 for a linear course, or add temperatures."
+        )
+        return 0, []
+    if _hopeless(readings, method):
+        return 0, []
     highest = min(HIGHEST, levels - 2)
-    readings = _with_noise(readings, method, kind, max(highest, 0))
+    readings = _with_noise(readings, method, kind, highest)
     scores = []
     for order in range(highest + 1):
         progress(f"order {order}: leaving out each of {levels} temperatures")
         scores.append((order, _held_out(readings, method, kind, order, numbers)))
-    if not scores:
-        return 0, []
     totals = np.array([s.mean() for _, s in scores])
     best = int(np.flatnonzero(totals <= NEAR_BEST * np.nanmin(totals))[0])
     table = [
         OrderScore(
             o,
-            float(s[1:-1].mean()) if levels > 2 else float("nan"),
+            float(s[1:-1].mean()),
             float(s[[0, -1]].mean()),
             o == best,
         )
         for o, s in scores
     ]
     return best, table
+
+
+def _hopeless(readings: Readings, method: str) -> bool:
+    """Whether the stations cannot even determine what all temperatures have in common."""
+    result = fit(readings, method)
+    ranks = [marginal_rank(result.analysis.determined, w)[0] for w in result.problem.slices()]
+    return bool(min(ranks) < LOWEST_RANK)
 
 
 def _with_noise(readings: Readings, method: str, kind: str | None, order: int) -> Readings:

@@ -297,7 +297,6 @@ def verify(
     Exit: 0 pass, 1 fail, 2 input cannot be read or is not independent.
     """
     from mwdcal.app import text
-    from mwdcal.correction import check_temperature
     from mwdcal.files import documents, runs, table
     from mwdcal.files.limits import load_limits
     from mwdcal.quality import verify as judge
@@ -305,7 +304,6 @@ def verify(
     _check_outputs([report], [calibration, run])
     made = documents.read(calibration)
     readings, _ = runs.to_readings(table.read(run, decimal=decimal), made.profile)
-    check_temperature(made, readings)
     result = judge(made, readings, load_limits(limits))
     if report:
         from mwdcal.app.report import write_report

@@ -35,6 +35,7 @@ from mwdcal.core.vectors import (
     skew,
 )
 
+EARTH = ("gravity", "field", "dip")
 UNKNOWN = np.pi / np.sqrt(3)
 """Standard uncertainty of an angle about which nothing is known, rad."""
 GEOMETRIC_NOISE = 1e-4
@@ -75,7 +76,8 @@ class Evidence:
 
     `sd` of the angles are independent per station. `group` shares a direction among
     stations of the same number (-1: none). `include` is 1 for stations that count, 0 for
-    those left out.
+    those left out. `absent` names the strengths and the dip of which nothing may be used:
+    each station then has its own.
     """
 
     known: dict[str, Array]
@@ -83,6 +85,7 @@ class Evidence:
     group: Ints
     include: Array
     constants: tuple[Constant, ...]
+    absent: tuple[str, ...] = ()
 
     def is_known(self, name: str) -> Bools:
         """Where a reference value is given (B, n)."""
@@ -103,23 +106,30 @@ class Evidence:
 
 @dataclass(frozen=True)
 class State:
-    """Where a fit stands: parameters (B, p), attitudes (B, n, 3, 3), constants (B, q)."""
+    """Where a fit stands: parameters (B, p), attitudes (B, n, 3, 3), constants (B, q).
+
+    `own` (B, n, a) are the stations' own departures of the absent strengths and dip.
+    """
 
     params: Array
     attitude: Array
     constants: Array
+    own: Array
 
     def take(self, index: Ints) -> State:
         """Some members of the batch."""
-        return State(self.params[index], self.attitude[index], self.constants[index])
+        return State(
+            self.params[index], self.attitude[index], self.constants[index], self.own[index]
+        )
 
     def put(self, index: Ints, other: State) -> State:
         """Ours with some members replaced."""
-        changed = State(self.params.copy(), self.attitude.copy(), self.constants.copy())
-        changed.params[index] = other.params
-        changed.attitude[index] = other.attitude
-        changed.constants[index] = other.constants
-        return changed
+        ours = (self.params, self.attitude, self.constants, self.own)
+        theirs = (other.params, other.attitude, other.constants, other.own)
+        changed = [part.copy() for part in ours]
+        for part, new in zip(changed, theirs, strict=True):
+            part[index] = new
+        return State(*changed)
 
 
 @dataclass(frozen=True)
@@ -127,13 +137,14 @@ class Prediction:
     """One triad at a state: misfit of the reading, its derivatives, and the size of the field.
 
     `misfit` (B, n, 3) raw; `by_params` (B, n, 3, p); `by_turn` (B, n, 3, 3) for a turn of the
-    station; `by_constant` (B, n, 3, q); `strength` (B, n) of the field in raw units.
+    station; `by_earth` (B, n, 3, 3) for its gravity, field and dip; `strength` (B, n) of the
+    field in raw units.
     """
 
     misfit: Array
     by_params: Array
     by_turn: Array
-    by_constant: Array
+    by_earth: Array
     strength: Array
 
 
@@ -177,22 +188,20 @@ class Problem:
         for index, constant in enumerate(self.evidence.constants):
             if constant.name == name:
                 value = value + constant.mask * state.constants[:, index, None]
+        if name in self.evidence.absent:
+            value = value + state.own[..., self.evidence.absent.index(name)]
         return np.asarray(value)
 
     def earth(self, state: State) -> tuple[list[Array], list[Array]]:
-        """Earth vectors (B, n, 3) of each triad, and their derivatives (B, n, 3, q)."""
-        gravity, field, dip = (self.constant(state, c) for c in ("gravity", "field", "dip"))
+        """Earth vectors (B, n, 3) of each triad, and (B, n, 3, 3) by gravity, field and dip."""
+        gravity, field, dip = (self.constant(state, c) for c in EARTH)
         vectors = [earth_gravity(gravity), earth_field(field, dip)]
-        slopes = {
-            "gravity": [earth_gravity(np.ones_like(gravity)), np.zeros_like(vectors[1])],
-            "field": [np.zeros_like(vectors[0]), earth_field(np.ones_like(field), dip)],
-            "dip": [np.zeros_like(vectors[0]), earth_field(field, dip + np.pi / 2)],
-        }
-        columns = [
-            [slopes[c.name][t] * c.mask[..., None] for c in self.evidence.constants] for t in (0, 1)
+        zero = np.zeros_like(vectors[0])
+        slopes = [
+            [earth_gravity(np.ones_like(gravity)), zero, zero],
+            [zero, earth_field(np.ones_like(field), dip), earth_field(field, dip + np.pi / 2)],
         ]
-        empty = np.zeros((*gravity.shape, 3, 0))
-        return vectors, [np.stack(c, -1) if c else empty for c in columns]
+        return vectors, [np.stack(columns, -1) for columns in slopes]
 
     def predictions(self, state: State) -> list[Prediction]:
         """Compare each triad's readings with the reference vectors."""
@@ -228,18 +237,40 @@ class Problem:
         turns = np.concatenate(
             [p.by_turn * w[..., None] for p, w in zip(predictions, weights, strict=True)], -2
         )
-        constants = np.concatenate(
-            [p.by_constant * w[..., None] for p, w in zip(predictions, weights, strict=True)], -2
+        by_earth = np.concatenate(
+            [p.by_earth * w[..., None] for p, w in zip(predictions, weights, strict=True)], -2
         )
         blocks = [p.by_params * w[..., None] for p, w in zip(predictions, weights, strict=True)]
-        unknown = np.array([c.unknown for c in self.evidence.constants], float)
-        if geometry:
-            constants = constants * unknown
         groups = np.concatenate(self._group_turns(state, turns), -1)
+        constants = self._constant_columns(by_earth, geometry)
         design = np.concatenate([_side_by_side(blocks), constants, groups], -1)
-        own = turns @ self._own_turns(state, geometry)
+        private = [turns @ self._own_turns(state, geometry), self._own_earth(state, by_earth)]
+        own = np.concatenate(private, -1)
         prior, pull = self._prior(state, groups.shape[-1])
         return Linear(residual, design, own, prior, pull, state.params.shape[-1])
+
+    def _constant_columns(self, by_earth: Array, geometry: bool) -> Array:
+        """Columns (B, n, m, q) of the constants; `geometry` takes references as exact."""
+        columns = [
+            by_earth[..., EARTH.index(c.name)] * c.mask[..., None] * (c.unknown or not geometry)
+            for c in self.evidence.constants
+        ]
+        return np.stack(columns, -1) if columns else np.zeros((*by_earth.shape[:-1], 0))
+
+    def _own_scales(self, state: State) -> Array:
+        """How far (B, n, a) each absent strength or dip may be anywhere: its own size, or any angle."""
+        scales = [
+            np.full(state.attitude.shape[:2], UNKNOWN)
+            if name == "dip"
+            else np.abs(self.constant(state, name))
+            for name in self.evidence.absent
+        ]
+        return np.stack(scales, -1) if scales else np.zeros((*state.attitude.shape[:2], 0))
+
+    def _own_earth(self, state: State, by_earth: Array) -> Array:
+        """Columns (B, n, m, a) of the stations' own strengths and dip, times their scale."""
+        chosen = [EARTH.index(name) for name in self.evidence.absent]
+        return np.asarray(by_earth[..., chosen] * self._own_scales(state)[..., None, :])
 
     def _weights(self, predictions: list[Prediction], geometry: bool) -> list[Array]:
         """One over the noise (B, n, 3), zero for stations left out."""
@@ -332,8 +363,10 @@ class Problem:
         p, q = linear.size, len(self.evidence.constants)
         private = linear.private(step)
         attitude = self._turn_groups(state, step[:, p + q :])
-        attitude = self._turn_stations(state, attitude, private)
-        return State(state.params + step[:, :p], attitude, state.constants + step[:, p : p + q])
+        attitude = self._turn_stations(state, attitude, private[..., :3])
+        own = state.own + private[..., 3:] * self._own_scales(state)
+        constants = state.constants + step[:, p : p + q]
+        return State(state.params + step[:, :p], attitude, constants, own)
 
     def _turn_groups(self, state: State, turns: Array) -> Array:
         half = turns.shape[-1] // 2

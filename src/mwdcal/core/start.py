@@ -7,6 +7,7 @@ nominal values but for the orientation of the axes, and where all else fails.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -25,9 +26,10 @@ def start(problem: Problem) -> State:
         np.zeros((batch, 0)),
         np.broadcast_to(np.eye(3), (batch, count, 3, 3)),
         np.stack(constants, -1) if constants else np.zeros((batch, 0)),
+        np.zeros((batch, count, len(problem.evidence.absent))),
     )
     params = [_triad_start(problem, empty, index) for index in range(len(problem.triads))]
-    state = State(np.concatenate(params, -1), empty.attitude, empty.constants)
+    state = replace(empty, params=np.concatenate(params, -1))
     return _attitudes(problem, state)
 
 
@@ -136,7 +138,7 @@ def _attitudes(problem: Problem, state: State) -> State:
     guess = {name: np.nan_to_num(observables.OBSERVABLES[name].value(g, b)) for name in ANGLES}
     angles = {n: np.where(evidence.is_known(n), evidence.known[n], guess[n]) for n in ANGLES}
     angles = _share(problem, angles)
-    state = _with_dip(problem, state, g, b)
+    state = _with_own(problem, _with_dip(problem, state, g, b), g, b)
     attitude = tool_from_earth(*(angles[name] for name in ANGLES))
     weights = [1 / np.maximum(np.linalg.norm(f, axis=-1), 1e-30) ** 2 for f in fields]
     earth = problem.earth(state)[0]
@@ -147,7 +149,7 @@ def _attitudes(problem: Problem, state: State) -> State:
         targets = [np.einsum("bnij,bnj->bni", attitude, e) for e in earth]
         turn = best_turn(fields, targets, weights, np.broadcast_to(axis, g.shape))
         attitude = _turned(attitude, np.broadcast_to(axis, g.shape), np.where(loose, turn, 0.0))
-    return State(state.params, attitude, state.constants)
+    return replace(state, attitude=attitude)
 
 
 def best_turn(
@@ -183,6 +185,15 @@ def _share(problem: Problem, angles: dict[str, Array]) -> dict[str, Array]:
     return {n: np.where(shared[n], means[n], a) if n in shared else a for n, a in angles.items()}
 
 
+def _with_own(problem: Problem, state: State, g: Array, b: Array) -> State:
+    """Strengths and dip of which nothing may be used start as the start's own fields have them."""
+    own = state.own.copy()
+    for index, name in enumerate(problem.evidence.absent):
+        value = observables.OBSERVABLES[name].value(g, b)
+        own[..., index] = value - problem.constant(state, name)
+    return replace(state, own=own)
+
+
 def _with_dip(problem: Problem, state: State, g: Array, b: Array) -> State:
     """Unknown dip starts from the mean angle between the two vectors."""
     include = problem.evidence.include
@@ -192,4 +203,4 @@ def _with_dip(problem: Problem, state: State, g: Array, b: Array) -> State:
             weight = constant.mask * include
             total = np.sum(observables.dip(g, b) * weight, -1) / np.maximum(weight.sum(-1), 1)
             constants[:, index] = total
-    return State(state.params, state.attitude, constants)
+    return replace(state, constants=constants)

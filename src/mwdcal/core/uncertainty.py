@@ -5,7 +5,7 @@ Nothing is quoted for a direction that the evidence does not determine.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -168,4 +168,4 @@ def _turn(problem: Problem, state: State, triads: list[int], turn: Array, statio
         where = problem.slices()[triad]
         params[:, where] = problem.triads[triad].model.transformed(params[:, where], turn)
     attitude = turn[:, None] @ state.attitude if stations else state.attitude
-    return State(params, attitude, state.constants)
+    return replace(state, params=params, attitude=attitude)
