@@ -23,7 +23,7 @@ LAYERS = (
     ("core.problem", "core.uncertainty", "core.observability", "core.start", "core"),
     ("readings", "profile", "profiles"),
     ("calibration", "estimate", "notation"),
-    ("checks", "correction", "residuals", "scatter", "selection"),
+    ("checks", "correction", "residuals", "scatter", "selection", "stand"),
     ("calibrate", "predict", "quality", "simulate"),
     ("files", "files.*"),
     ("registry", "registry.*", "datasets"),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cached_property
@@ -22,13 +22,14 @@ from mwdcal.calibration import (
 )
 from mwdcal.checks import TRIADS, check_fit, check_readings
 from mwdcal.core.observability import Free, free_directions
+from mwdcal.core.problem import STAND
 from mwdcal.core.uncertainty import marginal_rank
 from mwdcal.core.vectors import Array
-from mwdcal.errors import InputError
-from mwdcal.estimate import METHODS, Fit, fit
+from mwdcal.estimate import Fit, fit
 from mwdcal.profile import Profile
 from mwdcal.readings import Readings
 from mwdcal.residuals import REASONS, error_rows, measure_rows, shown_in, station_rows
+from mwdcal.stand import check_separable, stand_errors, turns
 
 SUSPECT = 3.0
 """A fit whose residuals exceed the declared noise this many times is reported."""
@@ -42,53 +43,28 @@ def calibrate(
     model: str | None = None,
     order: int = 0,
     *,
+    estimate: Sequence[str] = (),
     profile_sha256: str = "",
     run_sha256: str = "",
     progress: Callable[[str], None] = lambda text: None,
 ) -> Calibration:
     """Fit the sensor model to a run and state what it is worth.
 
-    `model` is "polynomial" or "factors" (default: polynomial at order 0, factors above).
+    `model` is "polynomial" or "factors" (default: polynomial at order 0, factors above);
+    `estimate` names errors of the stand to find as well: "azimuth-zero", "tilt".
     Raises `FitError` where the data cannot give a calibration to be trusted.
     """
-    if method not in METHODS:
-        raise InputError(f"--method must be one of {', '.join(METHODS)}; got {method!r}.")
     kind = model or ("factors" if order else "polynomial")
     check_readings(readings, method, kind, order)
     progress(f"fitting {readings.count} stations, method {method}, {kind} of order {order}")
-    result = fit(readings, method, kind, order, curved=_curved(profile, kind))
+    stand = turns(estimate, method)
+    result = fit(readings, method, kind, order, curved=_curved(profile, kind), stand=stand)
+    if stand:
+        check_separable(result, estimate)
     free = free_directions(result.problem, result.state, result.analysis.determined)
     check_fit(result, free, profile, readings)
     made = _Record(readings, profile, result, free)
-    temperature = readings.temperature
-    stations = station_rows(readings, result)
-    record = Calibration(
-        tool={k: str(v) for k, v in readings.metadata.items() if k in IDENTITY},
-        profile=profile,
-        profile_sha256=profile_sha256,
-        run=readings.source,
-        run_sha256=run_sha256,
-        software=f"mwdcal {__version__}",
-        method=method,
-        time=datetime.now(UTC).isoformat(timespec="seconds"),
-        field_unit="relative (field = 1)" if made.relative else "nT",
-        stations=readings.count,
-        temperature_c=None
-        if temperature is None
-        else (float(temperature.min()), float(temperature.max())),
-        accelerometer=made.triad(0),
-        magnetometer=made.triad(1) if readings.magnetometer is not None else None,
-        covariance=made.covariance.tolist(),
-        free=[d.tolist() for d in made.directions],
-        singular_values=result.analysis.determined.values[0].tolist(),
-        constants=made.constants(),
-        earth=made.earth(),
-        errors=error_rows(readings, result),
-        measures=measure_rows(readings, result),
-        station_rows=stations,
-        findings=made.findings(stations),
-    )
-    return rounded(record)
+    return rounded(made.calibration(method, profile_sha256, run_sha256))
 
 
 def _curved(profile: Profile, kind: str) -> dict[str, float]:
@@ -118,6 +94,42 @@ class _Record:
     profile: Profile
     result: Fit
     free: list[Free]
+
+    def calibration(self, method: str, profile_sha256: str, run_sha256: str) -> Calibration:
+        """The whole record."""
+        readings, result = self.readings, self.result
+        stations = station_rows(readings, result)
+        return Calibration(
+            tool={k: str(v) for k, v in readings.metadata.items() if k in IDENTITY},
+            profile=self.profile,
+            profile_sha256=profile_sha256,
+            run=readings.source,
+            run_sha256=run_sha256,
+            software=f"mwdcal {__version__}",
+            method=method,
+            time=datetime.now(UTC).isoformat(timespec="seconds"),
+            field_unit="relative (field = 1)" if self.relative else "nT",
+            stations=readings.count,
+            temperature_c=self.temperatures,
+            accelerometer=self.triad(0),
+            magnetometer=self.triad(1) if readings.magnetometer is not None else None,
+            covariance=self.covariance.tolist(),
+            free=[d.tolist() for d in self.directions],
+            singular_values=result.analysis.determined.values[0].tolist(),
+            constants=self.constants(),
+            stand=stand_errors(result, float(np.sqrt(self.factors.max()))),
+            earth=self.earth(),
+            errors=error_rows(readings, result),
+            measures=measure_rows(readings, result),
+            station_rows=stations,
+            findings=self.findings(stations),
+        )
+
+    @property
+    def temperatures(self) -> tuple[float, float] | None:
+        """Coldest and hottest station, °C."""
+        temperature = self.readings.temperature
+        return None if temperature is None else (float(temperature.min()), float(temperature.max()))
 
     @property
     def relative(self) -> bool:
@@ -170,7 +182,8 @@ class _Record:
         found = []
         scale = float(np.sqrt(self.factors.max()))
         for index, constant in enumerate(self.result.problem.evidence.constants):
-            if constant.name == "dip" and len(self.result.problem.triads) == 1:
+            lone = constant.name == "dip" and len(self.result.problem.triads) == 1
+            if lone or constant.name in STAND:
                 continue
             degrees = float(np.degrees(1)) if constant.name == "dip" else 1.0
             found.append(
@@ -258,6 +271,13 @@ class _Record:
         for entry in self.free:
             names = " and ".join(TRIADS[t] for t in entry.triads)
             found.append(Finding(id=entry.id, text=f"{names}: {TEXTS.get(entry.id, entry.id)}."))
+        ignored = [t for t in TRIADS if getattr(self.profile, t).nonlinearity]
+        if ignored and not any(hasattr(t.model, "curved") for t in self.result.problem.triads):
+            text = (
+                f"nonlinearity of the {' and '.join(ignored)} is not fitted: the model of factors "
+            )
+            text += "has no such terms. Use --model polynomial for it."
+            found.append(Finding(id="nonlinearity-ignored", text=text))
         if self.relative:
             text = "field strength is known at no station: the magnetometer is calibrated to field = 1. "
             found.append(Finding(id="field-unknown", text=text + "Give ref_field_nt to have nT."))

@@ -53,6 +53,21 @@ class Constant(msgspec.Struct, frozen=True, kw_only=True):
     unit: str
 
 
+class StandErrors(msgspec.Struct, frozen=True, kw_only=True):
+    """Errors of the stand, estimated: reference reading = value in the earth's frame + zero.
+
+    The stand's vertical leans by `tilt_deg` towards the azimuth `tilt_azimuth_deg`: a reading
+    of inclination at azimuth A is too large by tilt · cos(A - tilt azimuth). None: not asked for.
+    """
+
+    azimuth_zero_deg: float | None = None
+    azimuth_zero_uncertainty_deg: float | None = None
+    tilt_deg: float | None = None
+    tilt_uncertainty_deg: float | None = None
+    tilt_azimuth_deg: float | None = None
+    tilt_azimuth_uncertainty_deg: float | None = None
+
+
 class ErrorRow(msgspec.Struct, frozen=True, kw_only=True):
     """Root mean square error of one observable over the stations where it is known."""
 
@@ -158,6 +173,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
     free: list[list[float]]
     singular_values: list[float]
     constants: list[Constant]
+    stand: StandErrors = StandErrors()
     earth: dict[str, float]
     errors: list[ErrorRow]
     measures: list[Measures]

@@ -46,8 +46,7 @@ def check_readings(readings: Readings, method: str, kind: str, order: int) -> No
     for triad in TRIADS:
         _check_channels(readings, triad)
     _check_temperature(readings, order)
-    if method == "least-squares":
-        _check_whole(readings)
+    _check_needs(readings, method)
 
 
 def _check_channels(readings: Readings, triad: str) -> None:
@@ -95,16 +94,25 @@ def _check_temperature(readings: Readings, order: int) -> None:
         )
 
 
-def _check_whole(readings: Readings) -> None:
-    needed = ["inclination", "toolface"]
-    needed += ["azimuth"] if readings.magnetometer is not None else []
+NEEDS = {
+    "least-squares": ("inclination", "toolface"),
+    "toolface-inclination": ("inclination", "toolface"),
+}
+"""Reference angles that a method needs at every station."""
+
+
+def _check_needs(readings: Readings, method: str) -> None:
+    needed = list(NEEDS.get(method, ()))
+    if method == "least-squares" and readings.magnetometer is not None:
+        needed.append("azimuth")
     for name in needed:
-        blank = int(np.isnan(readings.reference(name)).sum())
-        if blank:
+        blank = np.isnan(readings.reference(name))
+        if blank.any():
+            first = readings.labels[int(np.flatnonzero(blank)[0])]
             raise FitError(
-                f"method least-squares needs the whole reference vector at every station; "
-                f"'ref_{name}_deg' is blank at {blank} of {readings.count}. Fill it in, or use "
-                "--method joint, which takes what is known."
+                f"method {method} needs {', '.join(needed)} at every station; 'ref_{name}_deg' is "
+                f"blank at {int(blank.sum())} of {readings.count} (first: station {first}). Fill it "
+                "in, or use --method joint, which takes what is known."
             )
 
 

@@ -48,6 +48,17 @@ def strengths_alone(evidence: Evidence) -> Evidence:
     return _reset(replace(evidence, known=known, group=alone), absent=("dip",))
 
 
+def with_stand_errors(evidence: Evidence, names: tuple[str, ...]) -> Evidence:
+    """The evidence with errors of the stand as unknown constants of the run (see `STAND`)."""
+    found = list(evidence.constants)
+    zero = np.zeros(len(evidence.include))
+    for name in names:
+        angle = "azimuth" if name == "azimuth-zero" else "inclination"
+        mask = evidence.is_known(angle).astype(float)
+        found.append(Constant(name, mask, zero, np.full(len(zero), UNKNOWN), unknown=True))
+    return replace(evidence, constants=tuple(found))
+
+
 def _reset(evidence: Evidence, absent: tuple[str, ...]) -> Evidence:
     """The evidence with its constants worked out again after a change."""
     changed = replace(evidence, absent=absent, constants=())
@@ -212,11 +223,16 @@ def fit(
     order: int = 0,
     include: Array | None = None,
     curved: Mapping[str, float] | None = None,
+    stand: tuple[str, ...] = (),
     rounds: int = 8,
 ) -> Fit:
-    """Fit a run, or a batch of runs (leading axes of the readings, or of `include`)."""
+    """Fit a run, or a batch of runs (leading axes of the readings, or of `include`).
+
+    `curved` names triads with own-axis quadratic and cubic terms, and their prior as a share
+    of the field; `stand` names turns of the stand's frame to estimate (`core.problem.STAND`).
+    """
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        return _fit(readings, method, kind, order, include, curved or {}, rounds)
+        return _fit(readings, method, kind, order, include, curved or {}, stand, rounds)
 
 
 def _fit(
@@ -226,10 +242,11 @@ def _fit(
     order: int,
     include: Array | None,
     curved: Mapping[str, float],
+    stand: tuple[str, ...],
     rounds: int,
 ) -> Fit:
     include = np.ones(readings.count) if include is None else np.asarray(include, float)
-    evidence = METHODS[method](evidence_of(readings, include))
+    evidence = with_stand_errors(METHODS[method](evidence_of(readings, include)), stand)
     lead = np.broadcast_shapes(readings.accelerometer.shape[:-1], include.shape)
     problem, declared = _problem(readings, evidence, lead, kind, order, curved)
     problem, finite = _without_broken(problem)

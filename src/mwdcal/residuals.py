@@ -76,6 +76,8 @@ class Residuals:
 
     def known(self, name: str) -> Array:
         """Reference (n,) of an observable: given, or the estimated constant; NaN where unknown."""
+        if name in self.fit.problem.evidence.absent:
+            return np.asarray(self.fit.problem.evidence.known[name][0])
         if name in ("gravity", "field", "dip"):
             return np.asarray(self.fit.problem.constant(self.fit.state, name)[0])
         return np.asarray(self.fit.problem.evidence.known[name][0])

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mwdcal.core.uncertainty import marginal_rank
+from mwdcal.core.uncertainty import marginal_rank, readjusted
 from mwdcal.core.vectors import Array, Ints
 from mwdcal.estimate import Fit, fit
 from mwdcal.readings import Readings
@@ -122,10 +122,6 @@ def misfit(result: Fit) -> Array:
     problem = replace(
         result.problem, evidence=replace(evidence, include=np.ones_like(evidence.include))
     )
-    state = result.state
-    for _ in range(3):
-        linear = problem.linear(state)
-        state = problem.move(state, linear, np.zeros((len(state.params), linear.design.shape[-1])))
-    linear = problem.linear(state)
+    linear = problem.linear(readjusted(problem, result.state))
     weighed = linear.weigh(linear.residual[..., None])[..., 0]
     return np.asarray(np.sum(linear.residual * weighed, -1))

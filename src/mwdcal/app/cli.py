@@ -85,7 +85,12 @@ def print_json(value: Any) -> None:
 @click.option("--tool", metavar="NAME|FILE", help="Tool profile: a shipped name or a TOML file.")
 @click.option(
     "--method", default="joint", show_default=True, metavar="METHOD",
-    help="joint: all evidence, weighted. least-squares: reference vectors only.",
+    help="joint: all evidence, weighted. least-squares: reference vectors only. "
+    "toolface-inclination: the accelerometer by angles alone. scalar: |g| and |b| alone.",
+)  # fmt: skip
+@click.option(
+    "--estimate", default="", metavar="NAMES",
+    help="Errors of the stand to find as well: azimuth-zero, tilt, or both with a comma.",
 )  # fmt: skip
 @click.option(
     "--model",
@@ -108,7 +113,7 @@ def print_json(value: Any) -> None:
 @decimal_sign
 @as_json
 def calibrate(
-    run: Path, output: Path, tool: str | None, method: str, model: str | None, order: str,
+    run: Path, output: Path, tool: str | None, method: str, estimate: str, model: str | None, order: str,
     exclude: tuple[str, ...], report: Path | None, decimal: str, as_json: bool,
 ) -> None:  # fmt: skip
     """Fit the sensor model to a calibration RUN (CSV, TSV, Parquet or XLSX).
@@ -124,7 +129,8 @@ def calibrate(
     readings, profile, digests = _load(run, tool, decimal)
     readings = _without(readings, exclude)
     number, scores = _order(order, readings, method, model)
-    made = fit(readings, profile, method, model, number, **digests)
+    names = [name.strip() for name in estimate.split(",") if name.strip()]
+    made = fit(readings, profile, method, model, number, estimate=names, **digests)
     if report:
         from mwdcal.app.report import write_report
 
@@ -209,6 +215,7 @@ def _summary(made: Calibration) -> dict[str, Any]:
     return {
         "run": made.run, "stations": made.stations, "method": made.method, "triads": triads,
         "errors": made.errors, "accuracy_1sigma_deg": typical_accuracy(made), "constants": made.constants,
+        "stand": made.stand,
         "findings": made.findings,
     }  # fmt: skip
 
@@ -229,7 +236,7 @@ def _show(made: Calibration, scores: list[OrderScore], output: Path, report: Pat
     for constant in made.constants:
         value = f"{constant.value:.6g} ± {constant.standard_uncertainty:.2g} {constant.unit}"
         click.echo(f"estimated constant of the run: {constant.name} {value}")
-    for line in text.findings(made.findings):
+    for line in text.stand(made.stand) + text.findings(made.findings):
         click.echo(line)
     wrote = f"wrote {output} (calibration)" + (f"   {report} (report)" if report else "")
     click.echo(f"{wrote}   next: mwdcal verify {output} ROLLTEST.csv")

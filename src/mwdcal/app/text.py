@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mwdcal.calibration import Calibration, ErrorRow, Finding
+from mwdcal.calibration import Calibration, ErrorRow, Finding, StandErrors
 from mwdcal.notation import Notation
 from mwdcal.quality import Verdict
 from mwdcal.selection import OrderScore
@@ -77,6 +77,19 @@ def errors(rows: list[ErrorRow]) -> str:
         for r in rows
     ]
     return table(cells, ["", "before", "after", "1σ expected"])
+
+
+def stand(found: StandErrors) -> list[str]:
+    """Estimated errors of the stand."""
+    lines = []
+    if found.azimuth_zero_deg is not None:
+        sd = number(found.azimuth_zero_uncertainty_deg)
+        lines.append(f"stand: azimuth zero {found.azimuth_zero_deg:+.4g}° ± {sd}°")
+    if found.tilt_deg is not None:
+        lean = f"{found.tilt_deg:.3g}° ± {number(found.tilt_uncertainty_deg)}°"
+        azimuth = f"{found.tilt_azimuth_deg:.0f}° ± {number(found.tilt_azimuth_uncertainty_deg)}°"
+        lines.append(f"stand: its vertical leans by {lean} towards azimuth {azimuth}")
+    return lines
 
 
 def findings(found: list[Finding]) -> list[str]:

@@ -36,6 +36,12 @@ from mwdcal.core.vectors import (
 )
 
 EARTH = ("gravity", "field", "dip")
+STAND = {
+    "stand-north": np.array([1.0, 0.0, 0.0]),
+    "stand-east": np.array([0.0, 1.0, 0.0]),
+    "azimuth-zero": np.array([0.0, 0.0, 1.0]),
+}
+"""Turns of the stand's frame, by the earth axis (north, east, down) they are about."""
 UNKNOWN = np.pi / np.sqrt(3)
 """Standard uncertainty of an angle about which nothing is known, rad."""
 GEOMETRIC_NOISE = 1e-4
@@ -57,7 +63,10 @@ class Triad:
 
 @dataclass(frozen=True)
 class Constant:
-    """A constant of the run that is estimated: gravity, field or dip, or an error of theirs.
+    """A constant of the run that is estimated: gravity, field, dip, or an error.
+
+    Errors are of one of these references, or of the stand: a small turn of its frame about one
+    of `STAND`'s axes.
 
     `mask` (B, n) says which stations it acts on; `value` (B,) is where it starts. `sd` (B,)
     is the standard uncertainty of the reference; for an unknown constant it is only a scale.
@@ -242,19 +251,26 @@ class Problem:
         )
         blocks = [p.by_params * w[..., None] for p, w in zip(predictions, weights, strict=True)]
         groups = np.concatenate(self._group_turns(state, turns), -1)
-        constants = self._constant_columns(by_earth, geometry)
+        constants = self._constant_columns(state, by_earth, turns, geometry)
         design = np.concatenate([_side_by_side(blocks), constants, groups], -1)
         private = [turns @ self._own_turns(state, geometry), self._own_earth(state, by_earth)]
         own = np.concatenate(private, -1)
         prior, pull = self._prior(state, groups.shape[-1])
         return Linear(residual, design, own, prior, pull, state.params.shape[-1])
 
-    def _constant_columns(self, by_earth: Array, geometry: bool) -> Array:
+    def _constant_columns(
+        self, state: State, by_earth: Array, turns: Array, geometry: bool
+    ) -> Array:
         """Columns (B, n, m, q) of the constants; `geometry` takes references as exact."""
-        columns = [
-            by_earth[..., EARTH.index(c.name)] * c.mask[..., None] * (c.unknown or not geometry)
-            for c in self.evidence.constants
-        ]
+        columns = []
+        for constant in self.evidence.constants:
+            if constant.name in STAND:
+                axis = state.attitude @ STAND[constant.name]
+                column = np.einsum("bnmi,bni->bnm", turns, axis)
+            else:
+                column = by_earth[..., EARTH.index(constant.name)]
+            counts = constant.unknown or not geometry
+            columns.append(column * constant.mask[..., None] * counts)
         return np.stack(columns, -1) if columns else np.zeros((*by_earth.shape[:-1], 0))
 
     def _own_scales(self, state: State) -> Array:
@@ -362,11 +378,20 @@ class Problem:
         """The state after a step; unknown private angles follow, known ones stay at their reference."""
         p, q = linear.size, len(self.evidence.constants)
         private = linear.private(step)
-        attitude = self._turn_groups(state, step[:, p + q :])
+        attitude = self._turn_stand(state, step[:, p : p + q])
+        attitude = self._turn_groups(replace(state, attitude=attitude), step[:, p + q :])
         attitude = self._turn_stations(state, attitude, private[..., :3])
         own = state.own + private[..., 3:] * self._own_scales(state)
         constants = state.constants + step[:, p : p + q]
         return State(state.params + step[:, :p], attitude, constants, own)
+
+    def _turn_stand(self, state: State, constants: Array) -> Array:
+        attitude = state.attitude
+        for index, constant in enumerate(self.evidence.constants):
+            if constant.name in STAND:
+                turn = constants[:, index, None] * constant.mask
+                attitude = attitude @ rotation(turn[..., None] * STAND[constant.name])
+        return attitude
 
     def _turn_groups(self, state: State, turns: Array) -> Array:
         half = turns.shape[-1] // 2

@@ -11,7 +11,7 @@ import numpy as np
 
 from mwdcal.core.problem import Problem, State
 from mwdcal.core.solvers import Determined, Linear, Normal
-from mwdcal.core.vectors import AnyArray, Array, Ints, inverse, rotation
+from mwdcal.core.vectors import AnyArray, Array, Bools, Ints, inverse, rotation
 
 SEEN = 0.05
 """A free direction with less than this share on a triad does not move the triad."""
@@ -132,7 +132,11 @@ def marginal_rank(determined: Determined, where: slice) -> Ints:
 
 
 def settle_gauge(problem: Problem, state: State) -> State:
-    """Put free rotations where they belong by convention: the gain's polar factor has none."""
+    """Put free directions where they belong by convention, whatever solver or model came here.
+
+    Free rotation: the gain's polar factor has none. Free scale: the mean strength of the field
+    is the nominal one.
+    """
     if not len(state.params):
         return state
     determined = Determined.by(Normal.of(problem.linear(state, geometry=True)))
@@ -143,7 +147,36 @@ def settle_gauge(problem: Problem, state: State) -> State:
         free = np.stack([free_share(determined, named[axis]) > COUPLED for axis in axes], -1)
         turn = _polar_turn(problem, state, triads[0], free)
         state = _turn(problem, state, triads, turn, stations=len(triads) == len(every))
+    for triad in every:
+        share = free_share(determined, candidates(problem, state, [triad])["scale"])
+        state = _rescale(problem, state, triad, share > COUPLED)
+    return readjusted(problem, state)
+
+
+def readjusted(problem: Problem, state: State) -> State:
+    """The state with every station's private unknowns at their best for the parameters."""
+    for _ in range(3):
+        linear = problem.linear(state)
+        still = np.zeros((len(state.params), linear.design.shape[-1]))
+        state = problem.move(state, linear, still)
     return state
+
+
+def _rescale(problem: Problem, state: State, triad: int, free: Bools) -> State:
+    """Bring the mean strength of a triad of free scale to the nominal one."""
+    name = ("gravity", "field")[triad]
+    known = problem.evidence.known[name]
+    nominal = np.nan_to_num(known).sum(-1) / np.maximum((~np.isnan(known)).sum(-1), 1)
+    factor = np.where(free, nominal / problem.constant(state, name).mean(-1), 1.0)
+    where, params = problem.slices()[triad], state.params.copy()
+    matrix = factor[:, None, None] * np.eye(3)
+    params[:, where] = problem.triads[triad].model.transformed(params[:, where], matrix)
+    own = state.own.copy()
+    if name in problem.evidence.absent:
+        place = problem.evidence.absent.index(name)
+        base = problem.constant(state, name) - own[..., place]
+        own[..., place] = factor[:, None] * problem.constant(state, name) - base
+    return replace(state, params=params, own=own)
 
 
 def _polar_turn(problem: Problem, state: State, triad: int, free: AnyArray) -> Array:
