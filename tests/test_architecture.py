@@ -24,7 +24,7 @@ LAYERS = (
     ("readings", "profile", "profiles"),
     ("calibration", "estimate", "notation"),
     ("checks", "correction", "residuals", "scatter", "selection", "stand"),
-    ("calibrate", "predict", "quality", "simulate"),
+    ("calibrate", "compare", "predict", "quality", "simulate"),
     ("files", "files.*"),
     ("registry", "registry.*", "datasets"),
     ("",),  # the package itself: its public names

@@ -58,7 +58,7 @@ def calibrate(
     check_readings(readings, method, kind, order)
     progress(f"fitting {readings.count} stations, method {method}, {kind} of order {order}")
     stand = turns(estimate, method)
-    result = fit(readings, method, kind, order, curved=_curved(profile, kind), stand=stand)
+    result = fit(readings, method, kind, order, curved=nonlinearities(profile, kind), stand=stand)
     if stand:
         check_separable(result, estimate)
     free = free_directions(result.problem, result.state, result.analysis.determined)
@@ -67,7 +67,7 @@ def calibrate(
     return rounded(made.calibration(method, profile_sha256, run_sha256))
 
 
-def _curved(profile: Profile, kind: str) -> dict[str, float]:
+def nonlinearities(profile: Profile, kind: str) -> dict[str, float]:
     """Triads whose profile declares a nonlinearity, with its prior."""
     if kind != "polynomial":
         return {}

@@ -243,6 +243,33 @@ def _show(made: Calibration, scores: list[OrderScore], output: Path, report: Pat
 
 
 @cli.command()
+@click.argument("run", type=FILE)
+@click.option("--tool", metavar="NAME|FILE", help="Tool profile: a shipped name or a TOML file.")
+@click.option(
+    "--order", type=click.IntRange(0, 3), default=0, show_default=True, help="Temperature order."
+)
+@decimal_sign
+@as_json
+def compare(run: Path, tool: str | None, order: int, decimal: str, as_json: bool) -> None:
+    """Calibrate a RUN by every method, side by side, judged by stations left out.
+
+    \b
+    Example: mwdcal compare run.csv --tool servo
+    Exit: 0 compared, 2 input cannot be read.
+    """
+    from mwdcal.app import text
+    from mwdcal.compare import compare as side_by_side
+
+    readings, profile, _ = _load(run, tool, decimal)
+    say("every method, and each again with an eighth of the stations left out in turn")
+    found = side_by_side(readings, profile, order)
+    if as_json:
+        print_json(text.plain(found))
+    else:
+        click.echo(text.comparison(found))
+
+
+@cli.command()
 @click.argument("calibration", type=FILE)
 @click.argument("readings", type=FILE)
 @click.option(

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import fields, is_dataclass
+from typing import Any
+
 import numpy as np
 
 from mwdcal.calibration import Calibration, ErrorRow, Finding, StandErrors
+from mwdcal.compare import Comparison, Row
 from mwdcal.notation import Notation
 from mwdcal.quality import Verdict
 from mwdcal.selection import OrderScore
@@ -124,6 +128,36 @@ def verdict(result: Verdict) -> str:
     return "\n".join(lines) + "\n\n" + table(rows, ["", "worst", "1σ", "limit", "", "where"])
 
 
+def comparison(found: Comparison) -> str:
+    """Errors of every method on left-out stations, then the reasons for refusals and the advice."""
+    able = [row for row in found.rows if not row.refused]
+    lines = [f"{found.run}   {found.stations} stations"]
+    if able:
+        lines += ["", table(_compared(found, able), ["", *(row.method for row in able)])]
+    lines += [f"{row.method} refused: {row.refused}" for row in found.rows if row.refused]
+    lines += [
+        f"{row.method} leaves undetermined: {', '.join(row.undetermined)}"
+        for row in able
+        if row.undetermined
+    ]
+    return "\n".join([*lines, "", found.advice])
+
+
+def _compared(found: Comparison, able: list[Row]) -> list[list[str]]:
+    rows = []
+    for kind in ("held_out", "in_sample"):
+        for name, unit in found.units.items():
+            values = [quantity(getattr(row, kind).get(name), unit) for row in able]
+            label = f"{WEIGHED.get(name, name)}, rms {kind.replace('held_out', 'left out').replace('_', ' ')}"
+            rows.append([label, *values])
+    rows += [
+        [f"rank, {triad}", *("{} of {}".format(*row.ranks[triad]) for row in able)]
+        for triad in able[0].ranks
+    ]
+    rows.append(["iterations", *(str(row.iterations) for row in able)])
+    return [*rows, ["time", *(f"{row.seconds:.2f} s" for row in able)]]
+
+
 def notation(found: dict[str, Notation]) -> str:
     """Values with standard uncertainties, in as many digits as a firmware can hold."""
     blocks = []
@@ -137,3 +171,14 @@ def notation(found: dict[str, Notation]) -> str:
                 rows.append([f"{name}{where}", f"{value[index]:.12g}", stated])
         blocks.append(f"{triad}\n" + table(rows, ["", "value", "1σ"]))
     return "\n\n".join(blocks)
+
+
+def plain(value: Any) -> Any:
+    """Dataclasses and arrays as what JSON can hold."""
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if is_dataclass(value):
+        return {f.name: plain(getattr(value, f.name)) for f in fields(value)}
+    if isinstance(value, dict):
+        return {key: plain(item) for key, item in value.items()}
+    return [plain(item) for item in value] if isinstance(value, list | tuple) else value
