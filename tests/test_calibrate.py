@@ -192,11 +192,33 @@ def test_temperature_order_is_chosen_by_leaving_soaks_out_simulated(course):
     data = run(truth, grid([5, 45, 90, 135], 6, [0, 90, 180, 270], soak), rng)
     data = msgspec_replace(data, sd=NOISE, station=())
     order, table = choose_order(data, "joint", None, lambda text: None)
-    assert order == course
-    assert [row.order for row in table if row.chosen] == [order]
-    assert table[order].inside == pytest.approx(1.0, abs=0.5)
+    assert order == (course, course)
+    chosen = [row for row in table if row.chosen]
+    assert [(row.triad, row.order) for row in chosen] == [
+        ("accelerometer", course),
+        ("magnetometer", course),
+    ]
+    assert all(row.inside == pytest.approx(1.0, abs=0.5) for row in chosen)
     cold = msgspec_replace(data, temperature=None)
     assert choose_order(cold, "joint", None, lambda text: None) == (0, [])
+
+
+def test_each_triad_has_its_own_order_simulated():
+    """Only the accelerometer drifts: only it gets temperature terms."""
+    rng = np.random.default_rng(5)
+    truth = servo(rng)
+    still = truth.magnetometer.copy()
+    still[:24].reshape(6, 4)[:, 1:] = 0.0
+    truth = msgspec_replace(truth, magnetometer=still)
+    soak = [25.0, 60.0, 95.0, 130.0]
+    data = run(truth, grid([5, 45, 90, 135], 6, [0, 90, 180, 270], soak), rng)
+    data = msgspec_replace(data, sd=NOISE, station=())
+    order, _ = choose_order(data, "joint", None, lambda text: None)
+    assert order[0] >= 1
+    assert order[1] == 0
+    record = calibrate(data, PROFILE, order=order)
+    assert (record.accelerometer.model, record.magnetometer.model) == ("factors", "polynomial")
+    assert record.magnetometer.variance_factor == pytest.approx(1.0, abs=0.35)
 
 
 def test_factors_of_order_three_recover_the_truth_simulated():

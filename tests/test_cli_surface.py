@@ -199,10 +199,12 @@ def test_json_of_the_order_table(tmp_path):
     run = write_csv(tmp_path / "run.csv", servo_run(temperatures=(0.0, 30.0, 60.0)))
     arguments = ("calibrate", run, "--tool", "servo", "-o", tmp_path / "cal.json")
     said, told = mwdcal(*arguments), mwdcal(*arguments, "--json").json
-    assert [o["order"] for o in told["orders"]] == [0, 1]
-    assert sum(o["chosen"] for o in told["orders"]) == 1
+    for triad in ("accelerometer", "magnetometer"):
+        own = [o for o in told["orders"] if o["triad"] == triad]
+        assert [o["order"] for o in own] == [0, 1]
+        assert sum(o["chosen"] for o in own) == 1
     for score in told["orders"]:
-        cells = f"{score['order']} {score['inside']:.3g} {score['ends']:.3g}"
+        cells = f"{score['triad']} {score['order']} {score['inside']:.3g} {score['ends']:.3g}"
         assert any(" ".join(s.split()).startswith(cells) for s in said.out.splitlines())
 
 

@@ -25,7 +25,7 @@ from mwdcal.core.observability import Free, free_directions
 from mwdcal.core.problem import STAND
 from mwdcal.core.uncertainty import marginal_rank
 from mwdcal.core.vectors import Array
-from mwdcal.estimate import Fit, fit
+from mwdcal.estimate import Fit, Orders, default_kind, fit, orders
 from mwdcal.profile import Profile
 from mwdcal.readings import Readings
 from mwdcal.residuals import REASONS, error_rows, measure_rows, shown_in, station_rows
@@ -41,7 +41,7 @@ def calibrate(
     profile: Profile,
     method: str = "joint",
     model: str | None = None,
-    order: int = 0,
+    order: Orders = 0,
     *,
     estimate: Sequence[str] = (),
     profile_sha256: str = "",
@@ -54,11 +54,11 @@ def calibrate(
     `estimate` names errors of the stand to find as well: "azimuth-zero", "tilt".
     Raises `FitError` where the data cannot give a calibration to be trusted.
     """
-    kind = model or ("factors" if order else "polynomial")
-    check_readings(readings, method, kind, order)
-    progress(f"fitting {readings.count} stations, method {method}, {kind} of order {order}")
+    check_readings(readings, method, model, order)
+    progress(f"fitting {readings.count} stations, method {method}, order {order}")
     stand = turns(estimate, method)
-    result = fit(readings, method, kind, order, curved=nonlinearities(profile, kind), stand=stand)
+    curved = nonlinearities(profile, model, order)
+    result = fit(readings, method, model, order, curved=curved, stand=stand)
     if stand:
         check_separable(result, estimate)
     free = free_directions(result.problem, result.state, result.analysis.determined)
@@ -67,12 +67,14 @@ def calibrate(
     return rounded(made.calibration(method, profile_sha256, run_sha256))
 
 
-def nonlinearities(profile: Profile, kind: str) -> dict[str, float]:
-    """Triads whose profile declares a nonlinearity, with its prior."""
-    if kind != "polynomial":
-        return {}
-    declared = {name: getattr(profile, name).nonlinearity for name in TRIADS}
-    return {name: value for name, value in declared.items() if value}
+def nonlinearities(profile: Profile, model: str | None, order: Orders) -> dict[str, float]:
+    """Triads whose profile declares a nonlinearity and whose model can have it, with its prior."""
+    found = {}
+    for name, own in zip(TRIADS, orders(order), strict=True):
+        value = getattr(profile, name).nonlinearity
+        if value and (model or default_kind(own)) == "polynomial":
+            found[name] = value
+    return found
 
 
 TEXTS = {
@@ -271,8 +273,10 @@ class _Record:
         for entry in self.free:
             names = " and ".join(TRIADS[t] for t in entry.triads)
             found.append(Finding(id=entry.id, text=f"{names}: {TEXTS.get(entry.id, entry.id)}."))
-        ignored = [t for t in TRIADS if getattr(self.profile, t).nonlinearity]
-        if ignored and not any(hasattr(t.model, "curved") for t in self.result.problem.triads):
+        models = zip(TRIADS, self.result.problem.triads, strict=False)
+        bent = [name for name, t in models if not getattr(t.model, "curved", False)]
+        ignored = [name for name in bent if getattr(self.profile, name).nonlinearity]
+        if ignored:
             text = (
                 f"nonlinearity of the {' and '.join(ignored)} is not fitted: the model of factors "
             )

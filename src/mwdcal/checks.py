@@ -8,7 +8,7 @@ from mwdcal.core.observability import Free
 from mwdcal.core.solvers import Status
 from mwdcal.core.vectors import Array
 from mwdcal.errors import FitError, InputError
-from mwdcal.estimate import METHODS, Fit
+from mwdcal.estimate import METHODS, Fit, Orders, default_kind, orders
 from mwdcal.profile import Profile
 from mwdcal.readings import Readings
 from mwdcal.selection import soaks
@@ -32,20 +32,22 @@ def check_fit(result: Fit, free: list[Free], profile: Profile, readings: Reading
     _check_gains(result, profile, readings)
 
 
-def check_readings(readings: Readings, method: str, kind: str, order: int) -> None:
+def check_readings(readings: Readings, method: str, kind: str | None, order: Orders) -> None:
     """Refuse what no fit could mend, before trying."""
     if method not in METHODS:
         raise InputError(f"--method must be one of {', '.join(METHODS)}; got {method!r}.")
-    size = 6 * (order + 1) + 6 if kind == "factors" else 12 * (order + 1)
+    highest = max(orders(order))
+    factors = (kind or default_kind(highest)) == "factors"
+    size = 6 * (highest + 1) + 6 if factors else 12 * (highest + 1)
     if 3 * readings.count < size:
         raise FitError(
             f"{readings.source or 'the run'} has {readings.count} stations; the model has {size} "
             f"parameters per triad and needs {-(-size // 3)} or more. Add stations at other "
-            f"attitudes{', or lower --order' if order else ''}."
+            f"attitudes{', or lower --order' if highest else ''}."
         )
     for triad in TRIADS:
         _check_channels(readings, triad)
-    _check_temperature(readings, order)
+    _check_temperature(readings, highest)
     _check_needs(readings, method)
 
 

@@ -9,11 +9,10 @@ import numpy as np
 
 from mwdcal.calibrate import calibrate, nonlinearities
 from mwdcal.calibration import Calibration, Measures
-from mwdcal.checks import check_readings
 from mwdcal.core.observables import OBSERVABLES
 from mwdcal.core.vectors import Array, centred
 from mwdcal.errors import MwdcalError
-from mwdcal.estimate import METHODS, fit
+from mwdcal.estimate import METHODS, Orders, fit
 from mwdcal.notation import Notation, convert
 from mwdcal.profile import Profile
 from mwdcal.readings import Readings
@@ -58,7 +57,7 @@ class Comparison:
     advice: str
 
 
-def compare(readings: Readings, profile: Profile, order: int = 0) -> Comparison:
+def compare(readings: Readings, profile: Profile, order: Orders = 0) -> Comparison:
     """Calibrate a run by every method and judge each by stations left out of its fit."""
     relative = bool(np.isnan(readings.reference("field")).all())
     names = _referenced(readings)
@@ -76,18 +75,16 @@ def _referenced(readings: Readings) -> list[str]:
     return [n for n in usable if not np.isnan(readings.reference(n)).all()]
 
 
-def _row(readings: Readings, profile: Profile, method: str, order: int, relative: bool) -> Row:
+def _row(readings: Readings, profile: Profile, method: str, order: Orders, relative: bool) -> Row:
     started = time.perf_counter()
     try:
-        check_readings(readings, method, "factors" if order else "polynomial", order)
         made = calibrate(readings, profile, method, order=order)
     except MwdcalError as error:
         return Row(method, refused=str(error))
     seconds = time.perf_counter() - started
-    kind = made.accelerometer.model
-    curved = nonlinearities(profile, kind)
-    whole = fit(readings, method, kind, order, curved=curved)
-    left_out = _left_out(readings, method, kind, order, curved)
+    curved = nonlinearities(profile, None, order)
+    whole = fit(readings, method, order=order, curved=curved)
+    left_out = _left_out(readings, method, order, curved)
     return Row(
         method,
         ranks={t.name: (t.rank, t.size) for t in made.triads},
@@ -134,12 +131,12 @@ def _summary(readings: Readings, g: Array, b: Array, relative: bool) -> dict[str
 
 
 def _left_out(
-    readings: Readings, method: str, kind: str, order: int, curved: dict[str, float]
+    readings: Readings, method: str, order: Orders, curved: dict[str, float]
 ) -> tuple[Array, Array]:
     """Vectors (n, 3) of each station from the fit that left its part out."""
     part = np.arange(readings.count) % FOLDS
     include = (np.arange(FOLDS)[:, None] != part).astype(float)
-    result = fit(readings, method, kind, order, include, curved)
+    result = fit(readings, method, None, order, include, curved)
     problem = result.problem
     own = np.arange(readings.count)
     chosen = [

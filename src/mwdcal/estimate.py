@@ -19,6 +19,8 @@ from mwdcal.core.uncertainty import Analysis, analyse, settle_gauge
 from mwdcal.core.vectors import AnyArray, Array, Bools, Ints
 from mwdcal.readings import ANGLES, CONSTANTS, Readings
 
+Orders = int | tuple[int, int]
+"""Temperature order of both triads, or of accelerometer and magnetometer."""
 FLOOR = 1e-9
 """Smallest noise, as a share of the signal, that an estimate from residuals may reach."""
 
@@ -173,24 +175,38 @@ def model_of(
     )
 
 
+def orders(order: Orders) -> tuple[int, int]:
+    """Temperature order of accelerometer and magnetometer."""
+    return (order, order) if isinstance(order, int) else order
+
+
+def default_kind(order: int) -> str:
+    """The model for a temperature order: identical at 0, where the linear one is simpler."""
+    return "factors" if order else "polynomial"
+
+
 def _problem(
     readings: Readings,
     evidence: Evidence,
     lead: tuple[int, ...],
-    kind: str,
-    order: int,
+    kind: str | None,
+    order: Orders,
     curved: Mapping[str, float],
 ) -> tuple[Problem, list[bool]]:
     """The problem, and for each triad whether its noise is declared."""
     cold = np.zeros(readings.count)
     temperature = _flat(cold if readings.temperature is None else readings.temperature, lead)
-    triads, declared = [], []
+    triads: list[Triad] = []
+    declared: list[bool] = []
     for name in ("accelerometer", "magnetometer"):
         values = getattr(readings, name)
         if values is None:
             continue
         raw = _flat(values, lead, 3)
-        model = model_of(kind, order, raw, temperature, evidence.include, name in curved)
+        own = orders(order)[len(triads)]
+        model = model_of(
+            kind or default_kind(own), own, raw, temperature, evidence.include, name in curved
+        )
         sd = (
             _flat(readings.sd[name], lead, 3)
             if name in readings.sd
@@ -219,8 +235,8 @@ def _size(raw: Array) -> Array:
 def fit(
     readings: Readings,
     method: str = "joint",
-    kind: str = "polynomial",
-    order: int = 0,
+    kind: str | None = None,
+    order: Orders = 0,
     include: Array | None = None,
     curved: Mapping[str, float] | None = None,
     stand: tuple[str, ...] = (),
@@ -228,6 +244,8 @@ def fit(
 ) -> Fit:
     """Fit a run, or a batch of runs (leading axes of the readings, or of `include`).
 
+    `kind` is "polynomial" or "factors" (default: polynomial at order 0, factors above), and
+    `order` the temperature order of both triads or of each.
     `curved` names triads with own-axis quadratic and cubic terms, and their prior as a share
     of the field; `stand` names turns of the stand's frame to estimate (`core.problem.STAND`).
     """
@@ -238,8 +256,8 @@ def fit(
 def _fit(
     readings: Readings,
     method: str,
-    kind: str,
-    order: int,
+    kind: str | None,
+    order: Orders,
     include: Array | None,
     curved: Mapping[str, float],
     stand: tuple[str, ...],

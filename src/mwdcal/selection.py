@@ -9,7 +9,7 @@ import numpy as np
 
 from mwdcal.core.uncertainty import marginal_rank, readjusted
 from mwdcal.core.vectors import Array, Ints
-from mwdcal.estimate import Fit, fit
+from mwdcal.estimate import Fit, Orders, fit
 from mwdcal.readings import Readings
 
 GAP = 5.0
@@ -17,6 +17,7 @@ GAP = 5.0
 SPAN = 10.0
 """A run that spans less has no temperature terms, °C."""
 HIGHEST = 3
+TRIADS = ("accelerometer", "magnetometer")
 FEWEST = 3
 """Fewest soaks among which one can be left out."""
 LOWEST_RANK = 8
@@ -26,8 +27,13 @@ NEAR_BEST = 1.02
 
 @dataclass(frozen=True)
 class OrderScore:
-    """Held-out χ² per reading of one order: soaks inside the range, and the ends (extrapolation)."""
+    """Held-out χ² per reading of one triad at one order.
 
+    `inside`: mean over soaks inside the range (interpolation); `ends`: over the coldest and
+    the hottest (extrapolation).
+    """
+
+    triad: str
     order: int
     inside: float
     ends: float
@@ -45,8 +51,8 @@ def soaks(temperature: Array) -> Ints:
 
 def choose_order(
     readings: Readings, method: str, kind: str | None, progress: Callable[[str], None]
-) -> tuple[int, list[OrderScore]]:
-    """The lowest order whose held-out χ² is within 2 % of the best, and the table that decided.
+) -> tuple[Orders, list[OrderScore]]:
+    """Each triad's lowest order whose held-out χ² is within 2 % of its best, and the tables.
 
     Order 0 without a table where there is no temperature, or too short a span of it.
     """
@@ -64,22 +70,24 @@ def choose_order(
         return 0, []
     highest = min(HIGHEST, levels - 2)
     readings = _with_noise(readings, method, kind, highest)
-    scores = []
+    found = []
     for order in range(highest + 1):
         progress(f"order {order}: leaving out each of {levels} temperatures")
-        scores.append((order, _held_out(readings, method, kind, order, numbers)))
-    totals = np.array([s.mean() for _, s in scores])
+        found.append(_held_out(readings, method, kind, order, numbers))
+    names = TRIADS if readings.magnetometer is not None else TRIADS[:1]
+    tables = [_scored(name, [f[:, t] for f in found]) for t, name in enumerate(names)]
+    chosen = [next(s.order for s in table if s.chosen) for table in tables]
+    return (chosen[0], chosen[-1]), [score for table in tables for score in table]
+
+
+def _scored(triad: str, found: list[Array]) -> list[OrderScore]:
+    """The table of one triad from held-out χ² (soaks,) of each order."""
+    totals = np.array([f.mean() for f in found])
     best = int(np.flatnonzero(totals <= NEAR_BEST * np.nanmin(totals))[0])
-    table = [
-        OrderScore(
-            o,
-            float(s[1:-1].mean()),
-            float(s[[0, -1]].mean()),
-            o == best,
-        )
-        for o, s in scores
+    return [
+        OrderScore(triad, order, float(f[1:-1].mean()), float(f[[0, -1]].mean()), order == best)
+        for order, f in enumerate(found)
     ]
-    return best, table
 
 
 def _hopeless(readings: Readings, method: str) -> bool:
@@ -94,34 +102,29 @@ def _with_noise(readings: Readings, method: str, kind: str | None, order: int) -
 
     Every order is then judged by the same yardstick.
     """
-    result = fit(readings, method, kind or _default(order), order)
+    result = fit(readings, method, kind, order)
     noise = dict(zip(("accelerometer", "magnetometer"), result.noise[0], strict=False))
     found = {name: np.array(sd) for name, sd in noise.items() if np.isfinite(sd)}
     return replace(readings, sd={**readings.sd, **found})
 
 
-def _default(order: int) -> str:
-    return "factors" if order else "polynomial"
-
-
 def _held_out(
     readings: Readings, method: str, kind: str | None, order: int, numbers: Ints
 ) -> Array:
-    """χ² per reading (levels,) of each soak, fitted without it."""
+    """χ² per reading (soaks, triads) of each soak, fitted without it."""
     levels = int(numbers.max()) + 1
     include = (np.arange(levels)[:, None] != numbers).astype(float)
-    result = fit(readings, method, kind or _default(order), order, include)
-    held = 1 - include
-    count = held.sum(-1) * 3 * len(result.problem.triads)
-    return np.asarray(np.sum(misfit(result) * held, -1) / count)
+    result = fit(readings, method, kind, order, include)
+    held = (1 - include)[..., None]
+    return np.asarray(np.sum(misfit(result) * held, 1) / (held.sum(1) * 3))
 
 
 def misfit(result: Fit) -> Array:
-    """χ² (B, n) of every station, left out of the fit or not, attitudes at their best."""
+    """χ² (B, n, t) of every station by triad, left out or not, attitudes at their best."""
     evidence = result.problem.evidence
-    problem = replace(
-        result.problem, evidence=replace(evidence, include=np.ones_like(evidence.include))
-    )
+    everyone = replace(evidence, include=np.ones_like(evidence.include))
+    problem = replace(result.problem, evidence=everyone)
     linear = problem.linear(readjusted(problem, result.state))
     weighed = linear.weigh(linear.residual[..., None])[..., 0]
-    return np.asarray(np.sum(linear.residual * weighed, -1))
+    rows = linear.residual * weighed
+    return np.asarray(rows.reshape(*rows.shape[:-1], rows.shape[-1] // 3, 3).sum(-1))

@@ -14,6 +14,7 @@ from mwdcal.errors import InputError, MwdcalError
 
 if TYPE_CHECKING:
     from mwdcal.calibration import Calibration, Finding
+    from mwdcal.estimate import Orders
     from mwdcal.notation import Notation
     from mwdcal.profile import Profile
     from mwdcal.readings import Readings
@@ -188,7 +189,7 @@ def _without(readings: Readings, exclude: tuple[str, ...]) -> Readings:
 
 def _order(
     order: str, readings: Readings, method: str, model: str | None
-) -> tuple[int, list[OrderScore]]:
+) -> tuple[Orders, list[OrderScore]]:
     from mwdcal.checks import check_readings
     from mwdcal.selection import choose_order
 

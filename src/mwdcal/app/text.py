@@ -67,7 +67,8 @@ def heading(calibration: Calibration) -> str:
     if "simulated" in calibration.tool:
         parts.append("SIMULATED DATA")
     ranks = [f"{t.name} {t.rank} of {t.size} determined" for t in calibration.triads]
-    model = f"{calibration.accelerometer.model} of order {calibration.accelerometer.order}"
+    models = dict.fromkeys(f"{t.model} of order {t.order}" for t in calibration.triads)
+    model = " and ".join(models)
     return "   ".join(parts) + "\n" + "   ".join([f"method {calibration.method}, {model}", *ranks])
 
 
@@ -104,10 +105,10 @@ def findings(found: list[Finding]) -> list[str]:
 def orders(scores: list[OrderScore]) -> str:
     """The table that chose the temperature order."""
     rows = [
-        [str(s.order), number(s.inside), number(s.ends), "chosen" if s.chosen else ""]
+        [s.triad, str(s.order), number(s.inside), number(s.ends), "chosen" if s.chosen else ""]
         for s in scores
     ]
-    return table(rows, ["order", "left-out soaks χ²", "end soaks χ²", ""])
+    return table(rows, ["", "order", "χ² left out, inside", "χ² left out, ends", ""])
 
 
 def verdict(result: Verdict) -> str:
