@@ -21,7 +21,7 @@ def test_ranks_and_free_directions_are_those_of_theory(whole):
     ranks = {row.method: [rank for rank, _ in row.ranks.values()] for row in whole.rows}
     assert ranks == {
         "joint": [12, 12], "least-squares": [12, 12],
-        "toolface-inclination": [11, 12], "scalar": [9, 9],
+        "swarm": [12, 12], "toolface-inclination": [11, 12], "scalar": [9, 9],
     }  # fmt: skip
     free = {row.method: row.undetermined for row in whole.rows}
     assert free["joint"] == free["least-squares"] == ()
@@ -35,13 +35,14 @@ def test_left_out_errors_exceed_those_in_sample_and_equal_evidence_agrees(whole)
         assert np.mean([row.held_out[n] / row.in_sample[n] for n in row.held_out]) > 1.0
     # with exact references all weights are the same, so joint and least squares are one estimator
     assert rows["joint"].held_out == pytest.approx(rows["least-squares"].held_out, rel=1e-5)
+    assert rows["swarm"].held_out == pytest.approx(rows["least-squares"].held_out, rel=1e-5)
     assert "joint" in whole.advice
 
 
 def test_methods_that_do_not_apply_say_why():
     found = compare(make(1, unknown=("toolface",)), PROFILE)
     refused = {row.method: row.refused for row in found.rows if row.refused}
-    assert set(refused) == {"least-squares", "toolface-inclination"}
+    assert set(refused) == {"least-squares", "swarm", "toolface-inclination"}
     assert all("ref_toolface_deg" in reason for reason in refused.values())
 
 

@@ -205,7 +205,7 @@ def angle_bound(tool, inc, face):
     columns = [forward(x + 1e-30j * step, inc, face, count).imag / 1e-30 for step in np.eye(len(x))]
     jacobian = np.stack(columns, -1) / tool.noise[0]
     scale = np.linalg.norm(jacobian, axis=0)
-    u, values, vt = np.linalg.svd(jacobian / scale, full_matrices=False)
+    _, values, vt = np.linalg.svd(jacobian / scale, full_matrices=False)
     assert values[-1] < 1e-12 * values[0] < 1e-3 * values[-2]  # the scale alone is free
     kept = vt[:-1] / scale / values[:-1, None]
     return (kept.T @ kept)[:12, :12]

@@ -759,6 +759,10 @@ def draw_ratios(disturbances: list[Comparison], lows: list[Comparison]) -> None:
             left.errorbar(x, mean, 2 * share * mean, marker=marker, color=colour, label=label)
         left.set_xscale("symlog", linthresh=0.1)
         left.set_yscale("log")
+        left.set_yticks(
+            [0.01, 0.02, 0.05, 0.1, 0.2, 0.5], ["0.01", "0.02", "0.05", "0.1", "0.2", "0.5"]
+        )
+        left.minorticks_off()
         left.set_xticks([0, 0.1, 1, 10], ["0", "0.1", "1", "10"])
         left.set_xlim(-0.01, 25)
         left.set_xlabel("disturbance of |g| at each station, 1σ, mg")
@@ -865,8 +869,8 @@ In short:
 - **It cannot find the overall scale**: rank 11 of 12. A wrong but constant g spoils the scale, of any method;
   the angles of least squares do not suffer, so an unknown local g alone is no reason to choose it.
 - **It does not help against a bad stand.** An inclination offset does <<offset>> times the harm.
-- Of the derivatives printed for the inclination **most have the wrong sign**; with them the method does not
-  converge.
+- Of the derivatives printed for inclinations up to 90° **most have the wrong sign**; with them the method does
+  not converge.
 
 The paper reports an advantage over a classical method on its own sensor data, which are not available. A
 disturbed |g| would give one; stand errors would not.
@@ -881,8 +885,8 @@ $\operatorname{atan2}(-g_x, -g_y)$ here.
 
 A and B mean two things. With those of equation 13 the toolface rows are right; with those defined just after
 it, for the inclination, they are not. In the inclination rows up to 60° the sign is wrong for the eight
-parameters that move $B_1$ and $B_2$. From 60° to 90° all twelve are derivatives of the complement, whose sign
-is opposite; above 90° they are right again.
+parameters that move $B_1$ and $B_2$. From 60° they are derivatives of $-\arcsin(\sqrt A/B)$: up to 90° the
+complement of the inclination, with all twelve signs opposite; above 90° they are right again.
 
 ![Printed over true derivative of the inclination, by inclination](ivanov-derivatives.svg)
 
@@ -977,16 +981,16 @@ them (`<<face free>>`), and `calibrate` refuses:
 > <<refusal>>
 
 Six positions, which suffice for least squares, do not suffice here; stations between the axes do. What both
-methods determine agrees to <<face axes>> mrad in the channel axes and <<face offset>> mg in the offset. The noise of the
-means is at most <<face repeat>> mg, but after least squares a face is still up to <<face error>>° off its nominal direction:
-the hand that laid it down. The difference in offset is of that kind.
+methods determine agrees to <<face axes>> mrad in the channel axes and <<face offset>> mg in the offset. The noise
+of the means is at most <<face repeat>> mg, but after least squares a face is still up to <<face error>>° off its
+nominal direction: the hand that laid it down. The difference in offset is of that kind.
 """
 
 
 def page() -> str:
     """The documentation page: the template with every figure computed."""
     text = TEMPLATE
-    values = {**_paper_values(), **_simulated_values(), **_measured_values()}
+    values = {**_measured_values(), **_paper_values(), **_simulated_values()}
     for name, value in values.items():
         text = text.replace(f"<<{name}>>", str(value))
     if "<<" in text:

@@ -44,6 +44,7 @@ def calibrate(
     order: Orders = 0,
     *,
     estimate: Sequence[str] = (),
+    seed: int = 0,
     profile_sha256: str = "",
     run_sha256: str = "",
     progress: Callable[[str], None] = lambda text: None,
@@ -51,20 +52,21 @@ def calibrate(
     """Fit the sensor model to a run and state what it is worth.
 
     `model` is "polynomial" or "factors" (default: polynomial at order 0, factors above);
-    `estimate` names errors of the stand to find as well: "azimuth-zero", "tilt".
+    `estimate` names errors of the stand to find as well: "azimuth-zero", "tilt";
+    `seed` is that of the swarm.
     Raises `FitError` where the data cannot give a calibration to be trusted.
     """
     check_readings(readings, method, model, order)
     progress(f"fitting {readings.count} stations, method {method}, order {order}")
     stand = turns(estimate, method)
     curved = nonlinearities(profile, model, order)
-    result = fit(readings, method, model, order, curved=curved, stand=stand)
+    result = fit(readings, method, model, order, curved=curved, stand=stand, seed=seed)
     if stand:
         check_separable(result, estimate)
     free = free_directions(result.problem, result.state, result.analysis.determined)
     check_fit(result, free, profile, readings)
     made = _Record(readings, profile, result, free)
-    return rounded(made.calibration(method, profile_sha256, run_sha256))
+    return rounded(made.calibration(method, seed, profile_sha256, run_sha256))
 
 
 def nonlinearities(profile: Profile, model: str | None, order: Orders) -> dict[str, float]:
@@ -97,7 +99,9 @@ class _Record:
     result: Fit
     free: list[Free]
 
-    def calibration(self, method: str, profile_sha256: str, run_sha256: str) -> Calibration:
+    def calibration(
+        self, method: str, seed: int, profile_sha256: str, run_sha256: str
+    ) -> Calibration:
         """The whole record."""
         readings, result = self.readings, self.result
         stations = station_rows(readings, result)
@@ -109,6 +113,7 @@ class _Record:
             run_sha256=run_sha256,
             software=f"mwdcal {__version__}",
             method=method,
+            seed=seed if method == "swarm" else None,
             time=datetime.now(UTC).isoformat(timespec="seconds"),
             field_unit="relative (field = 1)" if self.relative else "nT",
             stations=readings.count,

@@ -49,6 +49,11 @@ def check_readings(readings: Readings, method: str, kind: str | None, order: Ord
         _check_channels(readings, triad)
     _check_temperature(readings, highest)
     _check_needs(readings, method)
+    if method == "swarm" and highest:
+        raise FitError(
+            "method swarm finds the 12 parameters of one temperature: use --order 0 for it, or "
+            "--method joint for temperature terms."
+        )
 
 
 def _check_channels(readings: Readings, triad: str) -> None:
@@ -97,6 +102,7 @@ def _check_temperature(readings: Readings, order: int) -> None:
 
 
 NEEDS = {
+    "swarm": ("inclination", "toolface"),
     "least-squares": ("inclination", "toolface"),
     "toolface-inclination": ("inclination", "toolface"),
 }
@@ -105,8 +111,8 @@ NEEDS = {
 
 def _check_needs(readings: Readings, method: str) -> None:
     needed = list(NEEDS.get(method, ()))
-    if method == "least-squares" and readings.magnetometer is not None:
-        needed.append("azimuth")
+    if method in ("least-squares", "swarm") and readings.magnetometer is not None:
+        needed += ["azimuth", "dip"][: 1 + (method == "swarm")]
     for name in needed:
         blank = np.isnan(readings.reference(name))
         if blank.any():

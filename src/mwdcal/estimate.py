@@ -15,12 +15,15 @@ from mwdcal.core.models import Basis, Factors, Model, Polynomial
 from mwdcal.core.problem import UNKNOWN, Constant, Evidence, Problem, State, Triad
 from mwdcal.core.solvers import Status, gauss_newton
 from mwdcal.core.start import start
+from mwdcal.core.swarm import forward_parts, swarm_forward
 from mwdcal.core.uncertainty import Analysis, analyse, settle_gauge
-from mwdcal.core.vectors import AnyArray, Array, Bools, Ints
+from mwdcal.core.vectors import AnyArray, Array, Bools, Ints, inverse
 from mwdcal.readings import ANGLES, CONSTANTS, Readings
 
 Orders = int | tuple[int, int]
 """Temperature order of both triads, or of accelerometer and magnetometer."""
+ITERATIONS = 600
+"""Iterations of the swarm, as Moradi's."""
 FLOOR = 1e-9
 """Smallest noise, as a share of the signal, that an estimate from residuals may reach."""
 
@@ -70,6 +73,7 @@ def _reset(evidence: Evidence, absent: tuple[str, ...]) -> Evidence:
 METHODS: dict[str, Callable[[Evidence], Evidence]] = {
     "joint": joint,
     "least-squares": whole_vectors,
+    "swarm": whole_vectors,
     "toolface-inclination": angles_alone,
     "scalar": strengths_alone,
 }
@@ -240,6 +244,7 @@ def fit(
     include: Array | None = None,
     curved: Mapping[str, float] | None = None,
     stand: tuple[str, ...] = (),
+    seed: int = 0,
     rounds: int = 8,
 ) -> Fit:
     """Fit a run, or a batch of runs (leading axes of the readings, or of `include`).
@@ -247,10 +252,11 @@ def fit(
     `kind` is "polynomial" or "factors" (default: polynomial at order 0, factors above), and
     `order` the temperature order of both triads or of each.
     `curved` names triads with own-axis quadratic and cubic terms, and their prior as a share
-    of the field; `stand` names turns of the stand's frame to estimate (`core.problem.STAND`).
+    of the field; `stand` names turns of the stand's frame to estimate (`core.problem.STAND`);
+    `seed` is that of the swarm.
     """
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        return _fit(readings, method, kind, order, include, curved or {}, stand, rounds)
+        return _fit(readings, method, kind, order, include, curved or {}, stand, seed, rounds)
 
 
 def _fit(
@@ -261,6 +267,7 @@ def _fit(
     include: Array | None,
     curved: Mapping[str, float],
     stand: tuple[str, ...],
+    seed: int,
     rounds: int,
 ) -> Fit:
     include = np.ones(readings.count) if include is None else np.asarray(include, float)
@@ -269,13 +276,45 @@ def _fit(
     problem, declared = _problem(readings, evidence, lead, kind, order, curved)
     problem, finite = _without_broken(problem)
     state = start(problem)
-    state, status, iterations = gauss_newton(problem, state)
+    if method == "swarm":
+        state, status, iterations = _swarmed(problem, state, seed)
+    else:
+        state, status, iterations = gauss_newton(problem, state)
     noise = np.full((len(status), len(declared)), np.nan)
     if not all(declared):
-        problem, state, status, noise = _estimate_noise(problem, state, status, declared, rounds)
+        refit = gauss_newton if method != "swarm" else None
+        problem, state, status, noise = _estimate_noise(
+            problem, state, status, declared, refit, rounds
+        )
     state = settle_gauge(problem, state)
     status = np.where(finite, status, int(Status.NOT_FINITE))
     return Fit(problem, state, status, iterations, noise, analyse(problem, state))
+
+
+def _swarmed(problem: Problem, state: State, seed: int) -> tuple[State, Ints, Ints]:
+    """Parameters by particle swarm on the error in the readings, directions and strengths known."""
+    parts = []
+    for triad, earth in zip(problem.triads, problem.earth(state)[0], strict=False):
+        target = np.einsum("bnij,bnj->bni", state.attitude, earth)
+        found = _swarm_forward(triad.raw, target, problem.evidence.include > 0, seed)
+        matrix, offset = forward_parts(found)
+        back = inverse(matrix)
+        parts.append(triad.model.start(back, -np.einsum("bij,bj->bi", back, offset)))
+    params = np.concatenate(parts, -1)
+    finite = np.isfinite(params).all(-1)
+    status = np.where(finite, int(Status.OK), int(Status.NOT_FINITE))
+    return replace(state, params=params), status, np.full(len(params), ITERATIONS)
+
+
+def _swarm_forward(raw: Array, target: Array, include: Bools, seed: int) -> Array:
+    """Forward parameters (B, 12); members that leave stations out fly one by one."""
+    if include.all():
+        return swarm_forward(raw, target, "reading", iterations=ITERATIONS, seed=seed).position
+    each = [
+        swarm_forward(r[keep], t[keep], "reading", iterations=ITERATIONS, seed=seed).position
+        for r, t, keep in zip(raw, target, include, strict=True)
+    ]
+    return np.stack(each)
 
 
 def _without_broken(problem: Problem) -> tuple[Problem, Bools]:
@@ -299,7 +338,12 @@ def _finite_model(model: Model) -> Model:
 
 
 def _estimate_noise(
-    problem: Problem, state: State, status: Ints, declared: list[bool], rounds: int
+    problem: Problem,
+    state: State,
+    status: Ints,
+    declared: list[bool],
+    refit: Callable[[Problem, State], tuple[State, Ints, Ints]] | None,
+    rounds: int,
 ) -> tuple[Problem, State, Ints, Array]:
     """Variance per triad by restricted maximum likelihood, fit and estimate in turn."""
     for _ in range(rounds):
@@ -309,7 +353,8 @@ def _estimate_noise(
             for i, (t, known) in enumerate(zip(problem.triads, declared, strict=True))
         )
         problem = replace(problem, triads=triads)
-        state, status, _ = gauss_newton(problem, state)
+        if refit is not None:
+            state, status, _ = refit(problem, state)
         free = [i for i, known in enumerate(declared) if not known]
         if np.all(np.abs(scale[:, free] - 1) < 1e-3):
             break

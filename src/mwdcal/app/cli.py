@@ -87,7 +87,8 @@ def print_json(value: Any) -> None:
 @click.option(
     "--method", default="joint", show_default=True, metavar="METHOD",
     help="joint: all evidence, weighted. least-squares: reference vectors only. "
-    "toolface-inclination: the accelerometer by angles alone. scalar: |g| and |b| alone.",
+    "swarm: the same by particle swarm. toolface-inclination: the accelerometer by angles alone. "
+    "scalar: |g| and |b| alone.",
 )  # fmt: skip
 @click.option(
     "--estimate", default="", metavar="NAMES",

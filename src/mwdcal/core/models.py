@@ -123,6 +123,12 @@ class Polynomial:
             result = np.concatenate([result, *own], -1)
         return np.asarray(result)
 
+    def curvature(self, params: Array, raw: Array, temperature: Array, covector: Array) -> Array:
+        """Second derivatives (..., p, p) of Σ covector (..., n, 3) · field: none, it is linear."""
+        vectors = np.broadcast_shapes(raw.shape, covector.shape, (*temperature.shape, 3))
+        lead = np.broadcast_shapes(params.shape[:-1], vectors[:-2])
+        return np.zeros((*lead, self.size, self.size))
+
     @cached_property
     def names(self) -> tuple[str, ...]:
         """Names of the parameters: `gain-xy` is A[x, y], `offset-x` is c[x]; `·k` for T^k."""
@@ -228,6 +234,27 @@ class Factors:
         for where, (i, j) in enumerate(OFF_DIAGONAL):
             by_mixing[..., i, where] = -unit[..., j]
         return np.concatenate([by_scale.reshape(flat), by_bias.reshape(flat), by_mixing], -1)
+
+    def curvature(self, params: Array, raw: Array, temperature: Array, covector: Array) -> Array:
+        """Second derivatives (..., p, p) of Σ covector (..., n, 3) · field, summed over stations."""
+        scale, _, mixing = self._split(params, temperature)
+        values, count = self.basis(temperature), self.basis.order + 1
+        pulled = np.einsum("...ni,...ij->...nj", covector, mixing)
+        bend = np.einsum(
+            "...nj,...nk,...nl->...jkl", 2 * pulled * raw / scale**3, values, values, optimize=True
+        )
+        both = np.stack([raw / scale**2, np.ones_like(scale)], -2)
+        cross = np.einsum("...ni,...nsj,...nk->...isjk", covector, both, values, optimize=True)
+        result = np.zeros((*cross.shape[:-4], self.size, self.size))
+        for j in range(3):
+            own = slice(j * count, (j + 1) * count)
+            result[..., own, own] = bend[..., j, :, :]
+        for where, (i, j) in enumerate(OFF_DIAGONAL):
+            column = 6 * count + where
+            for s in range(2):
+                rows = slice((3 * s + j) * count, (3 * s + j + 1) * count)
+                result[..., rows, column] = result[..., column, rows] = cross[..., i, s, j, :]
+        return result
 
     @cached_property
     def names(self) -> tuple[str, ...]:

@@ -1,0 +1,304 @@
+"""Particle swarm, and the two least-squares costs of a triad against known vectors.
+
+swarm                  the minimiser, for any cost
+vector_cost            mean squared error in the field (Moradi 13) or in the reading (Moradi 12)
+least_squares_forward  where the error in the reading is least: one linear solve
+least_squares_affine   where the error in the field is least: another one
+swarm_forward          the swarm on either cost, in coordinates that suit it
+
+Forward parameters (..., 12) of a triad: S row by row, then o, of reading = S · field + o.
+
+Moradi's equations 12 and 13 are two estimators. Each is a convex quadratic (13 in the matrix
+that takes readings to fields), so swarm and least squares meet on either, and neither
+estimator depends on the method that finds it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from mwdcal.core.vectors import Array, ArrayLike, inverse
+
+ACCELERATION = 2.05
+"""Pull towards a particle's own best and towards the swarm's best, each."""
+CONSTRICTION = 2 / (2 * ACCELERATION - 2 + np.sqrt((2 * ACCELERATION) ** 2 - 8 * ACCELERATION))
+"""Factor on every velocity: 0.7298 (Clerc and Kennedy 2002, κ = 1)."""
+FASTEST = 1.0
+"""Largest velocity along an axis, in half widths of the box."""
+
+Cost = Callable[[Array], Array]
+"""Takes places (..., particles, p) to their costs (..., particles)."""
+Error = Literal["field", "reading"]
+
+
+@dataclass(frozen=True)
+class Swarm:
+    """Where a swarm ended: best position (..., p), its cost (...) and how it got there.
+
+    `history` (..., iterations) is the best cost after each iteration.
+    """
+
+    position: Array
+    cost: Array
+    history: Array
+    iterations: int
+
+
+@dataclass
+class _Flight:
+    """Particles in units of the box, -1 to 1: places and best places (..., particles, p)."""
+
+    cost: Cost
+    place: Array
+    velocity: Array
+    best: Array
+    best_cost: Array
+
+    @property
+    def leader(self) -> Array:
+        """Best place of the whole swarm (..., 1, p)."""
+        first = np.argmin(self.best_cost, -1)[..., None, None]
+        return np.asarray(np.take_along_axis(self.best, first, -2))
+
+    def step(self, own: Array, social: Array) -> None:
+        """Move all particles once; `own` and `social` are draws from 0 to 1."""
+        pull = own * (self.best - self.place) + social * (self.leader - self.place)
+        velocity = CONSTRICTION * (self.velocity + ACCELERATION * pull)
+        velocity = np.clip(velocity, -FASTEST, FASTEST)
+        place = self.place + velocity
+        outside = np.abs(place) > 1
+        self.place = np.where(outside, np.sign(place) * 2 - place, place)
+        self.velocity = np.where(outside, -velocity, velocity)
+        cost = self.cost(self.place)
+        better = cost < self.best_cost
+        self.best = np.where(better[..., None], self.place, self.best)
+        self.best_cost = np.where(better, cost, self.best_cost)
+
+
+def swarm(
+    cost: Cost,
+    low: ArrayLike,
+    high: ArrayLike,
+    *,
+    particles: int = 60,
+    iterations: int = 600,
+    seed: int = 0,
+) -> Swarm:
+    """Minimise a cost inside a box with a swarm of particles.
+
+    Definition: v ← χ [v + 2.05 r₁ (own best - x) + 2.05 r₂ (swarm's best - x)], x ← x + v,
+    χ = 0.7298, r₁ and r₂ drawn from 0 to 1 per particle and axis; every particle knows the
+    whole swarm's best. Velocity is clamped to half the width of the box; at a bound position
+    and velocity are reflected. Places start uniform in the box, velocities uniform up to half
+    the clamp. It always runs all its iterations: a best cost that stays the same for a while
+    says nothing about convergence. No gradient and no local search is used.
+
+    Shapes: `low`, `high` (..., p); `cost` takes places (..., particles, p) to (..., particles).
+    Leading axes are tools. All tools share the random numbers, so a tool in a batch takes the
+    path that it takes alone; equal seeds give equal results.
+    Singular: a cost that is not finite counts as infinite; where all are, the cost returned is
+    infinite and the position means nothing.
+    Reference: M. Clerc, J. Kennedy (2002), IEEE Trans. Evol. Comput. 6 (1), 58-73; 60 particles
+    and 600 iterations are Moradi's.
+    """
+    low, high = np.broadcast_arrays(np.asarray(low, float), np.asarray(high, float))
+    middle, half = (low + high)[..., None, :] / 2, (high - low)[..., None, :] / 2
+
+    def boxed(place: Array) -> Array:
+        value = cost(middle + half * place)
+        return np.where(np.isfinite(value), value, np.inf)
+
+    random = np.random.default_rng(seed)
+    shape = (particles, low.shape[-1])
+    place, velocity = random.uniform(-1, 1, (2, *shape)) * np.array([1, FASTEST / 2])[:, None, None]
+    first = boxed(place)
+    place = np.broadcast_to(place, (*first.shape[:-1], *shape))
+    flight = _Flight(boxed, place, np.broadcast_to(velocity, place.shape), place, first)
+    history = np.empty((*first.shape[:-1], iterations))
+    for index in range(iterations):
+        flight.step(*random.uniform(size=(2, *shape)))
+        history[..., index] = flight.best_cost.min(-1)
+    position = (middle + half * flight.leader)[..., 0, :]
+    return Swarm(position, flight.best_cost.min(-1), history, iterations)
+
+
+def forward_parts(params: Array) -> tuple[Array, Array]:
+    """S (..., 3, 3) and o (..., 3) of forward parameters (..., 12)."""
+    return params[..., :9].reshape(*params.shape[:-1], 3, 3), params[..., 9:]
+
+
+def _joined(matrix: Array, offset: Array) -> Array:
+    flat = matrix.reshape(*matrix.shape[:-2], 9)
+    return np.concatenate([flat, offset], -1)
+
+
+def vector_cost(raw: Array, reference: Array, error: Error = "field") -> Cost:
+    """Mean squared length of the error over the stations, as a function of forward parameters.
+
+    Definition: error in the field (Moradi 13): S⁻¹ (reading - o) - reference;
+    error in the reading (Moradi 12): reading - S · reference - o.
+    Units: those of the reference, or of the readings, squared.
+    Shapes: `raw`, `reference` (..., n, 3); the cost takes (..., particles, 12) to
+    (..., particles).
+    Singular: NaN in the field where S has no inverse.
+    """
+    readings, known = raw[..., None, :, :], reference[..., None, :, :]
+
+    def in_reading(params: Array) -> Array:
+        matrix, offset = forward_parts(params)
+        return (readings - offset[..., None, :]) - known @ np.swapaxes(matrix, -1, -2)
+
+    def in_field(params: Array) -> Array:
+        matrix, offset = forward_parts(params)
+        back = np.swapaxes(inverse(matrix), -1, -2)
+        return (readings - offset[..., None, :]) @ back - known
+
+    misfit = {"field": in_field, "reading": in_reading}[error]
+
+    def cost(params: Array) -> Array:
+        found = misfit(params)
+        return np.asarray(np.einsum("...ni,...ni->...", found, found) / raw.shape[-2])
+
+    return cost
+
+
+def _centred(vectors: Array) -> tuple[Array, Array]:
+    """Vectors (..., n, 3) about their mean, and the mean (..., 1, 3)."""
+    mean = vectors.mean(-2, keepdims=True)
+    return vectors - mean, mean
+
+
+def _regressed(target: Array, terms: Array) -> Array:
+    """Matrix K (..., 3, 3) of least squares target = K · terms, both centred."""
+    q, r = np.linalg.qr(terms)
+    return np.swapaxes(inverse(r) @ (np.swapaxes(q, -1, -2) @ target), -1, -2)
+
+
+def _through_means(matrix: Array, raw: Array, reference: Array) -> Array:
+    """Forward parameters of S and the offset that takes the mean reference to the mean reading."""
+    return _joined(matrix, (raw - reference @ np.swapaxes(matrix, -1, -2))[..., 0, :])
+
+
+def least_squares_forward(raw: Array, reference: Array) -> Array:
+    """Forward parameters (..., 12) with the least error in the readings (Moradi 12).
+
+    Shapes: `raw`, `reference` (..., n, 3). Singular: NaN or meaningless where the reference
+    vectors do not span space about their mean (fewer than four stations, or all in a plane).
+    """
+    (x, mean_x), (a, mean_a) = _centred(raw), _centred(reference)
+    return _through_means(_regressed(x, a), mean_x, mean_a)
+
+
+def least_squares_affine(raw: Array, reference: Array) -> Array:
+    """Forward parameters (..., 12) with the least error in the field (Moradi 13).
+
+    Definition: field = M · reading + b by linear least squares, then S = M⁻¹, o = -M⁻¹ b. With
+    noise in the readings M is a little too small, by (noise / signal)².
+    Shapes and singular cases: as `least_squares_forward`.
+    """
+    (x, mean_x), (a, mean_a) = _centred(raw), _centred(reference)
+    return _through_means(inverse(_regressed(a, x)), mean_x, mean_a)
+
+
+@dataclass(frozen=True)
+class Coordinates:
+    """Centred and whitened coordinates u (..., 12) of target = K (terms - mean) + middle.
+
+    K = gain I + spread · U whiten, with U the first nine of u row by row; middle is the mean
+    of the targets plus spread times the last three of u. In u the mean squared error of the
+    targets is a sphere about its minimum, and a unit of u is an error as large as their
+    spread. Zero is a triad without misalignment.
+
+    `spread`, `gain` (...): spread of the targets, and its ratio to that of the terms;
+    `whiten` (..., 3, 3); the means (..., 1, 3).
+    """
+
+    gain: Array
+    spread: Array
+    whiten: Array
+    mean_target: Array
+    mean_terms: Array
+
+    @classmethod
+    def of(cls, target: Array, terms: Array) -> Coordinates:
+        """Coordinates for targets and terms (..., n, 3), both in tool axes."""
+        (y, mean_target), (x, mean_terms) = _centred(target), _centred(terms)
+        spread, size = (np.sqrt(np.sum(v * v, (-1, -2)) / v.shape[-2]) for v in (y, x))
+        _, r = np.linalg.qr(x / np.sqrt(x.shape[-2]))
+        whiten = np.swapaxes(inverse(r), -1, -2)
+        return cls(spread / size, spread, whiten, mean_target, mean_terms)
+
+    def parts(self, place: Array) -> tuple[Array, Array]:
+        """K (..., particles, 3, 3) and middle (..., particles, 3) at u (..., particles, 12)."""
+        turn, shift = forward_parts(place)
+        spread = self.spread[..., None, None]
+        matrix = (turn @ self.whiten[..., None, :, :]) * spread[..., None]
+        matrix = matrix + self.gain[..., None, None, None] * np.eye(3)
+        return matrix, self.mean_target + spread * shift
+
+
+def _field_search(raw: Array, reference: Array) -> Callable[[Array], Array]:
+    """Forward parameters at coordinates of field = M (reading - mean) + middle, S = M⁻¹."""
+    coordinates = Coordinates.of(reference, raw)
+
+    def params(place: Array) -> Array:
+        matrix, middle = coordinates.parts(place)
+        back = inverse(matrix)
+        return _joined(back, coordinates.mean_terms - np.einsum("...ij,...j->...i", back, middle))
+
+    return params
+
+
+def _reading_search(raw: Array, reference: Array) -> Callable[[Array], Array]:
+    """Forward parameters at coordinates of reading = S (reference - mean) + middle."""
+    coordinates = Coordinates.of(raw, reference)
+
+    def params(place: Array) -> Array:
+        matrix, middle = coordinates.parts(place)
+        mean = np.einsum("...ij,...j->...i", matrix, coordinates.mean_terms)
+        return _joined(matrix, middle - mean)
+
+    return params
+
+
+_SEARCHES = {"field": _field_search, "reading": _reading_search}
+
+
+def swarm_forward(
+    raw: Array,
+    reference: Array,
+    error: Error = "field",
+    *,
+    reach: float = 1.0,
+    particles: int = 60,
+    iterations: int = 600,
+    seed: int = 0,
+) -> Swarm:
+    """Forward parameters of least error in the field or in the readings, by a particle swarm.
+
+    The swarm minimises `vector_cost`, but flies in `Coordinates`: centred, so that an offset of
+    many times the field is nothing to search for, and whitened, so that all axes of the search
+    are alike however the stations are spread. The box is ± `reach` about a triad without
+    misalignment, which takes in gains from none to twice the mean one. The least-squares
+    solutions are not used. In M and b of uncentred readings a swarm misses: with hard iron of
+    five times the field, always.
+
+    Shapes: `raw`, `reference` (..., n, 3). Result: as `swarm`, the position as forward
+    parameters (..., 12).
+    Accuracy: a cost is seen to 16 digits, hence the position to 8 digits of the residual.
+    Singular: as `least_squares_forward`.
+    """
+    params, cost = _SEARCHES[error](raw, reference), vector_cost(raw, reference, error)
+    found = swarm(
+        lambda place: cost(params(place)),
+        np.full(12, -reach),
+        np.full(12, reach),
+        particles=particles,
+        iterations=iterations,
+        seed=seed,
+    )
+    return replace(found, position=params(found.position[..., None, :])[..., 0, :])
