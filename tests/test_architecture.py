@@ -20,7 +20,15 @@ SOURCE = ROOT / "src" / "mwdcal"
 LAYERS = (
     ("errors", "core.vectors", "core.solvers"),
     ("core.observables", "core.models"),
-    ("core.newton", "core.problem", "core.swarm", "core.uncertainty", "core.observability", "core.start", "core"),
+    (
+        "core.newton",
+        "core.problem",
+        "core.swarm",
+        "core.uncertainty",
+        "core.observability",
+        "core.start",
+        "core",
+    ),
     ("readings", "profile", "profiles"),
     ("calibration", "estimate", "notation"),
     ("checks", "correction", "residuals", "scatter", "selection", "stand"),

@@ -16,7 +16,9 @@ def visit_inline(writer, node) -> None:
 
 def visit_block(writer, node) -> None:
     formula = latex2mathml.tex2mathml(node.astext(), as_block=True)
-    writer.body.append(f'<div class="math" style="overflow-y: hidden; padding: 0.3em 0">{formula}</div>')
+    writer.body.append(
+        f'<div class="math" style="overflow-y: hidden; padding: 0.3em 0">{formula}</div>'
+    )
     raise nodes.SkipNode
 
 

@@ -109,7 +109,7 @@ def accelerometer_only(
     raw: np.ndarray, scale: float, sd: np.ndarray | None = None, **known: np.ndarray
 ):
     """Readings and profile of a lone accelerometer, axes as they come."""
-    profile = Profile(name="accelerometer", accelerometer=TriadProfile(scale=scale))
+    profile = Profile(name="accelerometer", accelerometer=TriadProfile(scale=float(scale)))
     spread = {} if sd is None else {"accelerometer": sd / scale}
     return Readings(
         raw / scale, known=known, sd=spread, station=tuple(map(str, range(1, len(raw) + 1)))
@@ -270,13 +270,14 @@ def _distox_lines() -> list[str]:
         "| set | peer | linear, in sample | linear, left out | curved, in sample | curved, left out |",
         "|---|---|---|---|---|---|",
     ]
-    for name in DISTOX:
-        lines.append(f"| {name} | " + " | ".join(f"{v:.3f}" for v in distox(name)) + " |")
-    return lines
+    rows = ((name, distox(name)) for name in DISTOX)
+    return lines + [
+        f"| {name} | " + " | ".join(f"{v:.3f}" for v in found) + " |" for name, found in rows
+    ]
 
 
 def _other_lines() -> list[str]:
-    lines = [
+    return [
         "## Accelerometers alone",
         "",
         "Xsens MTi, 38 hand-held positions, |g| alone, against the published calibration (largest",
@@ -296,7 +297,6 @@ def _other_lines() -> list[str]:
         "imucal (Ferraris session), six static faces, least squares: largest difference from the",
         f"published K·R, relative: {imucal():.1e}.",
     ]
-    return lines
 
 
 if __name__ == "__main__":

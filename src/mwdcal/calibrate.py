@@ -90,6 +90,13 @@ TEXTS = {
 }
 
 
+def described(name: str) -> str:
+    """What a free direction means, and what would determine it."""
+    steady, _, power = name.partition("-temperature-")
+    course = f" (its course with temperature, power {power})" if power else ""
+    return TEXTS.get(steady, steady) + course
+
+
 @dataclass(frozen=True)
 class _Record:
     """The parts of a calibration file, from one fit."""
@@ -231,8 +238,7 @@ class _Record:
             size=triad.model.size,
             singular_values=(_own_values(self.result, where)).tolist(),
             undetermined=[
-                Undetermined(id=f.id, text=f"{TRIADS[index]}: {TEXTS.get(f.id, f.id)}")
-                for f in free
+                Undetermined(id=f.id, text=f"{TRIADS[index]}: {described(f.id)}") for f in free
             ],
             noise=float(triad.sd[0].mean() if declared else noise),
             noise_source="declared" if declared else "estimated from the residuals",
@@ -264,7 +270,8 @@ class _Record:
     def findings(self, stations: list[StationRow]) -> list[Finding]:
         """What the reader should know, in order of weight."""
         found = []
-        for triad in (self.triad(i) for i in range(len(self.result.problem.triads))):
+        made = [self.triad(i) for i in range(len(self.result.problem.triads))]
+        for triad in made:
             excess = triad.variance_factor
             if triad.noise_source == "declared" and excess is not None and excess > SUSPECT**2:
                 found.append(
@@ -275,9 +282,13 @@ class _Record:
                         "scaled up accordingly.",
                     )
                 )
+        bare = [t.name for t in made if t.degrees_of_freedom < 1]
+        if bare:
+            text = f"{' and '.join(bare)}: no redundancy, so nothing in this run checks the fit. Add stations."
+            found.append(Finding(id="no-redundancy", text=text))
         for entry in self.free:
             names = " and ".join(TRIADS[t] for t in entry.triads)
-            found.append(Finding(id=entry.id, text=f"{names}: {TEXTS.get(entry.id, entry.id)}."))
+            found.append(Finding(id=entry.id, text=f"{names}: {described(entry.id)}."))
         models = zip(TRIADS, self.result.problem.triads, strict=False)
         bent = [name for name, t in models if not getattr(t.model, "curved", False)]
         ignored = [name for name in bent if getattr(self.profile, name).nonlinearity]

@@ -24,12 +24,19 @@ NAMED = 4
 """Most undetermined parameters that a message lists."""
 
 
+ABSURD = 30.0
+"""Residuals of more than this many times the declared noise mean that something is plain wrong."""
+COARSE = 0.05
+"""Estimated noise of more than this share of the field likewise."""
+
+
 def check_fit(result: Fit, free: list[Free], profile: Profile, readings: Readings) -> None:
     """Refuse a fit that did not settle, is too weak, has no redundancy, or absurd gains."""
     _check_status(result)
     _check_geometry(result, free)
     _check_freedom(result)
     _check_gains(result, profile, readings)
+    _check_residuals(result)
 
 
 def check_readings(readings: Readings, method: str, kind: str | None, order: Orders) -> None:
@@ -133,9 +140,10 @@ def _check_status(result: Fit) -> None:
 def _check_geometry(result: Fit, free: list[Free]) -> None:
     """Rotations and scales may stay free; anything else is a design too weak to fit."""
     benign = ("rotation-x", "rotation-y", "toolface-zero", "scale")
-    bad = [entry for entry in free if entry.id not in benign]
+    bad = [entry for entry in free if entry.id.partition("-temperature-")[0] not in benign]
     if bad:
         each = [f"{TRIADS[t]} {e.id.removeprefix('weak-')}" for e in bad for t in e.triads]
+        each = list(dict.fromkeys(each))
         more = f" and {len(each) - NAMED} more" if len(each) > NAMED else ""
         names = ", ".join(each[:NAMED]) + more
         raise FitError(
@@ -180,3 +188,28 @@ def _check_gains(result: Fit, profile: Profile, readings: Readings) -> None:
                     f"nominal and {wrong} (accepted: {GAIN[0]}…{GAIN[1]}). Check 'axes' and 'scale' "
                     f"of [{name}] in the tool profile, and the reference angles."
                 )
+
+
+def _check_residuals(result: Fit) -> None:
+    """Refuse what no error of a sensor explains: columns, references or groups are mixed up."""
+    problem, analysis = result.problem, result.analysis
+    for index, name in enumerate(TRIADS[: len(problem.triads)]):
+        excess = float(np.sqrt(np.nan_to_num(analysis.variance_factor[0, index])))
+        noise = result.noise[0, index]
+        strength = np.linalg.norm(problem.triads[index].raw[0], axis=-1)
+        spread = float(np.std(problem.triads[index].raw[0], axis=0).max())
+        size = max(min(float(strength.mean()), 2 * spread), 1e-300)
+        declared = bool(np.isnan(noise))
+        if (
+            declared and excess > ABSURD and analysis.freedom[0, index] >= 1
+        ) or noise > COARSE * size:
+            much = (
+                f"{excess:.0f} times the declared noise"
+                if declared
+                else f"{noise / size:.0%} of the field"
+            )
+            raise FitError(
+                f"the {name}'s residuals are {much}: no sensor model explains these readings. Check "
+                "that columns, reference angles and groups belong to the stations they stand at, and "
+                "'axes' and 'noise' in the tool profile."
+            )

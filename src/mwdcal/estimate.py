@@ -111,7 +111,8 @@ def evidence_of(readings: Readings, include: Array) -> Evidence:
     nowhere = np.isnan(known["field"]).all(-1, keepdims=True)
     known["field"] = np.where(nowhere, 1.0, known["field"])
     bare = Evidence(known, sd, group, included, ())
-    return replace(bare, known=_share_known(bare), constants=_constants(bare))
+    known, sd = _share_known(bare)
+    return replace(bare, known=known, sd=sd, constants=_constants(bare))
 
 
 def _shared_groups(group: Ints) -> Ints:
@@ -124,19 +125,27 @@ def _shared_groups(group: Ints) -> Ints:
     return np.where(shared, np.searchsorted(kept, group), -1)
 
 
-def _share_known(evidence: Evidence) -> dict[str, Array]:
-    """Blank inclinations and azimuths of a group take the mean of its filled cells."""
-    known = dict(evidence.known)
+def _share_known(evidence: Evidence) -> tuple[dict[str, Array], dict[str, Array]]:
+    """References and their σ where blank angles of a group take the mean of its filled cells.
+
+    One error is then common to the group: every member gets a σ that leaves the group as
+    uncertain as the mean of its k filled cells, σ √(members / k).
+    """
+    known, spread = dict(evidence.known), dict(evidence.sd)
     for name in ("inclination", "azimuth"):
-        members = evidence.members * evidence.is_known(name)[..., None]
-        count = members.sum(-2)
-        turn = np.einsum("bnk,bn->bk", members, np.exp(1j * np.nan_to_num(known[name])))
-        mean = np.einsum(
-            "bnk,bk->bn", evidence.members, np.where(count > 0, np.angle(turn), np.nan_to_num(0))
-        )
-        filled = np.einsum("bnk,bk->bn", evidence.members, count) > 0
-        known[name] = np.where(np.isnan(known[name]) & filled, mean, known[name])
-    return known
+        given = evidence.is_known(name)
+        filled = evidence.members * given[..., None]
+        count, total = filled.sum(-2), evidence.members.sum(-2)
+        turn = np.einsum("bnk,bn->bk", filled, np.exp(1j * np.nan_to_num(known[name])))
+        square = np.einsum("bnk,bn->bk", filled, evidence.sd[name] ** 2)
+        partly = (count > 0) & (count < total)
+        factor = np.where(partly, total / np.maximum(count, 1) ** 2, 0.0)
+        common = np.einsum("bnk,bk->bn", evidence.members, np.sqrt(square * factor))
+        mean = np.einsum("bnk,bk->bn", evidence.members, np.angle(turn))
+        within = np.einsum("bnk,bk->bn", evidence.members, partly) > 0
+        known[name] = np.where(within & ~given, mean, known[name])
+        spread[name] = np.where(within, common, evidence.sd[name])
+    return known, spread
 
 
 def _constants(evidence: Evidence) -> tuple[Constant, ...]:

@@ -13,10 +13,13 @@ from mwdcal.calibration import FREE_SHARE, Calibration, Finding
 from mwdcal.core.observables import OBSERVABLES
 from mwdcal.core.vectors import AnyArray, Array, Bools, centred
 from mwdcal.errors import InputError
-from mwdcal.readings import Readings
+from mwdcal.readings import ANGLES, Readings
 
 COVERAGE = 2.0
 """Coverage factor of the guard band and of the remark that a value is close to its limit."""
+UPRIGHT = ("azimuth", "toolface")
+NEAR_VERTICAL = np.radians(5.0)
+"""Spreads of azimuth and toolface are not judged nearer to vertical than this."""
 ROLL_SET = 3
 """Fewest stations that make a roll set."""
 
@@ -94,9 +97,10 @@ def verify(calibration: Calibration, readings: Readings, limits: Limits) -> Verd
     _check_independent(calibration, readings)
     _check_temperature(calibration, readings)
     test = _Test(calibration, readings, limits)
-    rows = [test.spread(name, limit) for name, limit in limits.spread.items()]
-    rows += [test.error(name, limit) for name, limit in limits.error.items()]
-    found = [row for row in rows if row is not None]
+    judged = {f"spread of {n}": test.spread(n, limit) for n, limit in limits.spread.items()}
+    judged |= {f"error of {n}": test.error(n, limit) for n, limit in limits.error.items()}
+    found = [row for row in judged.values() if row is not None]
+    skipped = [name for name, row in judged.items() if row is None]
     if not found:
         raise InputError(
             f"{readings.source}: no limit of '{limits.name}' applies: there is neither a roll set "
@@ -111,7 +115,7 @@ def verify(calibration: Calibration, readings: Readings, limits: Limits) -> Verd
         run=readings.source,
         stations=readings.count,
         rows=found,
-        findings=test.findings(),
+        findings=test.findings(skipped),
     )
 
 
@@ -178,6 +182,11 @@ class _Test:
                 found.append((label, index))
         return found
 
+    def _upright(self, index: AnyArray) -> bool:
+        """Whether a roll set is too close to vertical for a spread of azimuth or toolface."""
+        across = np.sin(self._value("inclination")[index])
+        return bool(across.mean() < np.sin(NEAR_VERTICAL))
+
     def spread(self, name: str, limit: float) -> VerdictRow | None:
         """The widest spread over the roll sets, or None where there is none."""
         if not self._applies(name):
@@ -186,7 +195,7 @@ class _Test:
         worst: tuple[float, AnyArray, str] | None = None
         for label, index in self.sets():
             part = value[index]
-            if np.isnan(part).any():
+            if np.isnan(part).any() or (name in UPRIGHT and self._upright(index)):
                 continue
             middle = np.angle(np.mean(np.exp(1j * part))) if period else 0.0
             part = centred(part - middle, period) if period else part
@@ -233,15 +242,16 @@ class _Test:
         )
         return bool((np.ptp(moved, axis=0) > FREE_SHARE * size).any())
 
-    def _uncertainty(self, name: str, contrast: Array) -> float:
-        """Calibration, noise of the readings and uncertainty of the stand, of a sum of stations."""
+    def _uncertainty(self, name: str, contrast: Array, common_cancels: bool) -> float:
+        """Calibration, noise and references, of a sum of stations; common references may cancel."""
         rows = np.nan_to_num(contrast @ self.calibration.sensitivity(name, self.readings))
         variance = float((rows @ np.array(self.calibration.covariance) @ rows.transpose())[0, 0])
         gradient = OBSERVABLES[name].gradient(*self.calibration.fields(self.readings))
         gradient = np.nan_to_num(gradient)
         noise = self.calibration.noise_covariance(self.readings)
         each = np.einsum("ni,nij,nj->n", gradient, noise, gradient)
-        each = each + self.readings.uncertainty(name) ** 2
+        if not common_cancels:
+            each = each + self.readings.uncertainty(name) ** 2
         return float(np.sqrt(variance + np.sum(contrast[0] ** 2 * each)))
 
     def _row(
@@ -255,7 +265,8 @@ class _Test:
         note: str,
     ) -> VerdictRow:
         factor, unit = self._scale(name)
-        uncertainty = self._uncertainty(name, contrast) * factor
+        cancels = title.startswith("spread") and name not in ANGLES
+        uncertainty = self._uncertainty(name, contrast, cancels) * factor
         value = value * factor
         guard = COVERAGE * uncertainty if self.limits.rule == "guarded" else 0.0
         relative = name == "field" and self.calibration.field_unit != "nT"
@@ -264,8 +275,8 @@ class _Test:
             reason = "the calibration is relative: field = 1, not nT" if relative else reason
             return VerdictRow(
                 name=title,
-                unit="of the field" if relative else unit,
-                value=value,
+                unit=unit,
+                value=None if relative else value,
                 uncertainty=None,
                 limit=limit,
                 passed=False,
@@ -278,9 +289,12 @@ class _Test:
             passed=value + guard <= limit, note=note,
         )  # fmt: skip
 
-    def findings(self) -> list[Finding]:
+    def findings(self, skipped: list[str]) -> list[Finding]:
         """What was left out, and what to know."""
-        found = [Finding(id=u.id, text=u.text) for u in self.calibration.undetermined()]
+        found = [Finding(id=u.id, text=f"{u.text}.") for u in self.calibration.undetermined()]
+        if skipped:
+            text = f"not judged, for want of references, roll sets or magnetometer: {', '.join(skipped)}."
+            found.append(Finding(id="not-judged", text=text))
         if not self.sets():
             found.append(Finding(id="no-roll-set", text="no roll set: spreads were not judged."))
         return found

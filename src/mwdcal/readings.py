@@ -31,7 +31,7 @@ class Readings:
         magnetometer: nominal nT along the tool axes, or None.
         temperature: °C, or None (then no model can have temperature terms).
         known: reference values by name, of `ANGLES` and `CONSTANTS`; NaN where blank.
-            A missing key is blank everywhere, but for gravity, which is then 1 g.
+            A missing key is blank everywhere; gravity is then 1 g.
         sd: standard uncertainties: of `accelerometer` and `magnetometer` (..., n, 3) per
             station and axis (missing: estimated from the residuals), of reference angles
             (..., n) independent per station, of gravity, field and dip (..., n) common
@@ -71,14 +71,18 @@ class Readings:
         return np.full(self.count, -1) if self.group is None else self.group
 
     def reference(self, name: str) -> Array:
-        """The known value `name` (..., n), NaN where blank; gravity defaults to 1 g."""
-        blank = 1.0 if name == "gravity" else np.nan
-        value = self.known.get(name)
+        """The known value `name` (..., n), NaN where blank.
+
+        Blank gravity is the mean of what is given at other stations, or 1 g.
+        """
         shape = self.accelerometer.shape[:-1]
-        if value is None:
-            return np.full(shape, blank)
-        value = np.broadcast_to(np.asarray(value, float), shape)
-        return np.where(np.isnan(value), blank, value) if name == "gravity" else value
+        value = np.broadcast_to(np.asarray(self.known.get(name, np.nan), float), shape)
+        if name != "gravity":
+            return value
+        blank = np.isnan(value)
+        count = np.maximum((~blank).sum(-1, keepdims=True), 1)
+        mean = np.where(blank, 0.0, value).sum(-1, keepdims=True) / count
+        return np.where(blank, np.where(blank.all(-1, keepdims=True), 1.0, mean), value)
 
     def uncertainty(self, name: str) -> Array:
         """Standard uncertainty of the known value `name` (..., n); 0 where not stated."""

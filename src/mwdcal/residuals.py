@@ -100,11 +100,8 @@ class Residuals:
     @cached_property
     def _spread(self) -> Array:
         """Expected covariance (n, m, m) of the whitened misfit left after the fit."""
-        linear = self.fit.problem.linear(self.fit.state)
-        inverse = linear.weigh(
-            np.broadcast_to(np.eye(linear.residual.shape[-1]), self.fit.analysis.spread.shape)
-        )
-        total = np.linalg.inv(inverse)
+        own = self.fit.problem.linear(self.fit.state).own
+        total = np.eye(own.shape[-2]) + own @ np.swapaxes(own, -1, -2)
         inner = total @ self.fit.analysis.spread @ total
         return np.asarray(inner[0])
 

@@ -18,6 +18,8 @@ SPAN = 10.0
 """A run that spans less has no temperature terms, °C."""
 HIGHEST = 3
 TRIADS = ("accelerometer", "magnetometer")
+EXCESS = 1.5
+"""Residual variance of order 0, in units of the noise, beyond which a linear course is fitted."""
 FEWEST = 3
 """Fewest soaks among which one can be left out."""
 LOWEST_RANK = 8
@@ -60,14 +62,10 @@ def choose_order(
         return 0, []
     numbers = soaks(readings.temperature)
     levels = int(numbers.max()) + 1
+    if _hopeless(readings, method) or levels == 1:
+        return 0, []
     if levels < FEWEST:
-        progress(
-            f"{levels} temperatures cannot choose an order by leaving one out: order 0 is taken. "
-            "Use --order 1 for a linear course, or add temperatures."
-        )
-        return 0, []
-    if _hopeless(readings, method):
-        return 0, []
+        return _linear_if_needed(readings, method, kind, progress), []
     highest = min(HIGHEST, levels - 2)
     readings = _with_noise(readings, method, kind, highest)
     found = []
@@ -88,6 +86,21 @@ def _scored(triad: str, found: list[Array]) -> list[OrderScore]:
         OrderScore(triad, order, float(f[1:-1].mean()), float(f[[0, -1]].mean()), order == best)
         for order, f in enumerate(found)
     ]
+
+
+def _linear_if_needed(
+    readings: Readings, method: str, kind: str | None, progress: Callable[[str], None]
+) -> Orders:
+    """Between two temperatures: order 1 where order 0 leaves clearly more than its noise."""
+    readings = _with_noise(readings, method, kind, 1)
+    factor = fit(readings, method, kind, 0).analysis.variance_factor[0]
+    wanted = [int(value > EXCESS) for value in factor]
+    progress(
+        "two temperatures cannot be left out in turn: order 1 is taken where order 0 leaves "
+        f"residuals beyond the noise ({', '.join(f'{v**0.5:.1f}' for v in factor)} times). "
+        "A third temperature would test the course between."
+    )
+    return wanted[0], wanted[-1]
 
 
 def _hopeless(readings: Readings, method: str) -> bool:

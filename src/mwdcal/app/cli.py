@@ -179,6 +179,12 @@ def _load(run: Path, tool: str | None, decimal: str) -> tuple[Readings, Profile,
 def _without(readings: Readings, exclude: tuple[str, ...]) -> Readings:
     import numpy as np
 
+    twice = [label for label in exclude if readings.station.count(label) > 1]
+    if twice:
+        raise InputError(
+            f"--exclude {twice[0]}: {readings.station.count(twice[0])} stations of {readings.source} "
+            "have this label. Give each its own in the column 'station'."
+        )
     missing = [label for label in exclude if label not in readings.station]
     if missing:
         raise InputError(
@@ -402,7 +408,8 @@ def convert(
 def _notation_document(
     made: Calibration, notation: str, temperature: float | None, found: dict[str, Notation]
 ) -> dict[str, Any]:
-    at = made.reference_temperature if temperature is None else temperature
+    steady = notation == "factors" or temperature is None
+    at = made.reference_temperature if steady else temperature
     document: dict[str, Any] = {"notation": notation, "temperature_c": at}
     for name, item in found.items():
         profile = getattr(made.profile, name)

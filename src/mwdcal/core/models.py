@@ -157,6 +157,13 @@ class Polynomial:
         flat = joined.reshape(*params.shape[:-1], self.affine)
         return np.concatenate([flat, params[..., self.affine :]], -1)
 
+    def with_course(self, direction: Array, power: int) -> Array:
+        """A change (..., p) of the steady parameters, moved to a power of temperature."""
+        blocks = np.zeros((*direction.shape[:-1], self.basis.order + 1, 12))
+        blocks[..., power, :] = self._blocks(direction)[..., 0, :]
+        flat = blocks.reshape(*direction.shape[:-1], self.affine)
+        return np.concatenate([flat, np.zeros_like(direction[..., self.affine :])], -1)
+
     def take(self, index: Ints) -> Polynomial:
         """The model of some members of a batch."""
         return replace(self, centre=self.centre[index], scale=self.scale[index])
@@ -286,6 +293,18 @@ class Factors:
         mixing = mixing / gain[..., None, :]
         off = np.stack([-mixing[..., i, j] for i, j in OFF_DIAGONAL], -1)
         return np.concatenate([linear.reshape(*params.shape[:-1], 6 * count), off], -1)
+
+    def with_course(self, direction: Array, power: int) -> Array:
+        """A change (..., p) of the steady parameters, moved to a power of temperature.
+
+        Misalignments have no course: what needs one is left as zero.
+        """
+        count = self.basis.order + 1
+        linear = direction[..., : 6 * count].reshape(*direction.shape[:-1], 6, count)
+        moved = np.zeros_like(linear)
+        moved[..., power] = linear[..., 0]
+        flat = moved.reshape(*direction.shape[:-1], 6 * count)
+        return np.concatenate([flat, np.zeros_like(direction[..., 6 * count :])], -1)
 
     def take(self, index: Ints) -> Factors:
         """The model of some members of a batch: the same for all."""

@@ -12,7 +12,7 @@ Shared unknowns (field strength, dip, group directions) are eliminated by a Schu
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import Any, Protocol
 
@@ -203,7 +203,8 @@ class _Descent:
         determined = Determined.by(Normal.of(problem.linear(state, geometry=True)))
         step = _step(normal, determined, self.damping[active])
         trial = problem.move(state, linear, step)
-        cost = Normal.of(problem.linear(trial)).cost
+        # the gradient holds the weights fixed, and so must the cost that judges the step
+        cost = Normal.of(replace(problem.linear(trial), own=linear.own)).cost
         small = _small(normal, step, problem.size_of(state))
         with np.errstate(invalid="ignore"):
             better = (cost <= normal.cost * (1 + 1e-9) + 1e-9) | small

@@ -98,7 +98,21 @@ def candidates(problem: Problem, state: State, triads: list[int]) -> dict[str, A
     directions["scale"][:, _columns(problem, triads)] = _tangent(
         problem, state, triads, np.eye(3) * (1 + 1e-5)
     )
-    return directions
+    return directions | _courses(problem, directions, triads)
+
+
+def _courses(problem: Problem, steady: dict[str, Array], triads: list[int]) -> dict[str, Array]:
+    """Turns and scales in proportion to each power of temperature, named `…-temperature-k`."""
+    orders = [problem.triads[t].model.basis.order for t in triads]
+    found = {}
+    for name, direction in steady.items():
+        for power in range(1, min(orders) + 1):
+            moved = np.zeros_like(direction)
+            for triad in triads:
+                where, model = problem.slices()[triad], problem.triads[triad].model
+                moved[:, where] = model.with_course(direction[:, where], power)
+            found[f"{name}-temperature-{power}"] = moved
+    return found
 
 
 def _columns(problem: Problem, triads: list[int]) -> Array:
@@ -154,11 +168,15 @@ def settle_gauge(problem: Problem, state: State) -> State:
 
 
 def readjusted(problem: Problem, state: State) -> State:
-    """The state with every station's private unknowns at their best for the parameters."""
-    for _ in range(3):
+    """The state with stations' and groups' own unknowns at their best for the parameters."""
+    for _ in range(4):
         linear = problem.linear(state)
-        still = np.zeros((len(state.params), linear.design.shape[-1]))
-        state = problem.move(state, linear, still)
+        normal = Normal.of(linear)
+        fixed = linear.size + len(problem.evidence.constants)
+        step = np.zeros((len(state.params), linear.design.shape[-1]))
+        groups = inverse(normal.information[:, fixed:, fixed:])
+        step[:, fixed:] = -(groups @ normal.gradient[:, fixed:, None])[..., 0]
+        state = problem.move(state, linear, step)
     return state
 
 
