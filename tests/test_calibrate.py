@@ -265,3 +265,77 @@ def test_own_axis_terms_of_the_profile_are_found():
     assert straight.magnetometer.variance_factor > 5
     assert curved.magnetometer.variance_factor == pytest.approx(1.0, abs=0.4)
     assert curved.magnetometer.size == 18
+
+
+def test_order_is_chosen_with_groups_of_unknown_direction_in_one_soak_simulated():
+    """A left-out group's own direction is found before it is judged."""
+    rng = np.random.default_rng(6)
+    truth = servo(rng)
+    stations = grid([5, 45, 90, 135], 6, [0, 90, 180, 270], [25.0, 60.0, 95.0, 130.0])
+    data = run(truth, stations, rng)
+    group = np.full(data.count, -1)
+    inclination = data.known["inclination"].copy()
+    azimuth = data.known["azimuth"].copy()
+    for number, first in enumerate((6, 30, 54, 78)):
+        group[first : first + 6] = number
+        inclination[first : first + 6] = azimuth[first : first + 6] = np.nan
+    known = {**data.known, "inclination": inclination, "azimuth": azimuth}
+    data = msgspec_replace(data, sd=NOISE, station=(), known=known, group=group)
+    order, table = choose_order(data, "joint", None, lambda text: None)
+    assert min(order) >= 1
+    assert min(row.inside for row in table) < 3
+
+
+def test_two_temperatures_get_a_linear_course_where_it_is_needed_simulated():
+    _, data = hot(7, (25, 145))
+    said = []
+    assert choose_order(data, "joint", None, said.append)[0] == (1, 1)
+    assert "third temperature" in said[-1]
+
+
+def test_gravity_given_at_some_stations_holds_for_all():
+    data = make()
+    gravity = np.full(48, np.nan)
+    gravity[3] = 0.9978
+    partly = msgspec_replace(data, known={**data.known, "gravity": gravity})
+    np.testing.assert_allclose(partly.reference("gravity"), 0.9978)
+
+
+@pytest.mark.parametrize("what", ["columns", "azimuths"])
+def test_what_no_sensor_explains_is_refused(what):
+    data = make(2)
+    if what == "columns":
+        data = msgspec_replace(data, magnetometer=5e4 * data.accelerometer)
+    else:
+        azimuth = np.random.default_rng(0).permutation(data.known["azimuth"])
+        data = msgspec_replace(data, known={**data.known, "azimuth": azimuth})
+    with pytest.raises(FitError):
+        calibrate(data, PROFILE)
+
+
+def four_faces():
+    """Four stations that span space, no more: 12 numbers for 12 parameters of each triad."""
+    tool = Tool.random(7)
+    inc, azi, face = np.radians([[0.0, 90, 90, 120], [0.0, 20, 140, 260], [0.0, 0, 90, 215]])
+    a, m = tool.readings(np.random.default_rng(0), 1, inc, azi, face)
+    known = {"inclination": inc, "azimuth": azi, "toolface": face}
+    known |= {"field": np.full(4, tool.field), "dip": np.full(4, tool.dip)}
+    return Readings(a[0], m[0], known=known, sd=NOISE)
+
+
+def test_no_redundancy_is_a_finding():
+    record = calibrate(four_faces(), PROFILE)
+    assert any(f.id == "no-redundancy" for f in record.findings)
+
+
+def test_free_turn_and_its_course_with_temperature_are_named_simulated():
+    _, data = hot(8)
+    blank = np.full(data.count, np.nan)
+    data = msgspec_replace(data, known={**data.known, "toolface": blank})
+    record = calibrate(data, PROFILE, model="polynomial", order=2)
+    assert [u.id for u in record.accelerometer.undetermined] == [
+        "toolface-zero",
+        "toolface-zero-temperature-1",
+        "toolface-zero-temperature-2",
+    ]
+    assert record.accelerometer.rank == 33

@@ -249,3 +249,53 @@ def test_a_group_of_one_is_no_group():
     )
     free = fit(data)
     np.testing.assert_allclose(lonely.state.params, free.state.params, rtol=1e-12)
+
+
+@pytest.mark.parametrize("stand", [(0.05, 0.2, 0.1), (0.2, 0.5, 0.5)])
+@pytest.mark.parametrize("inclinations", [(5, 45, 90, 135), (0, 45, 90, 180)])
+def test_a_coarse_stand_of_known_uncertainty_always_settles(stand, inclinations):
+    """Weights depend on the state: a step is judged under the weights it was made with."""
+    tool = Tool.random(20)
+    inc, azi, face = plan(inclinations)
+    rng = np.random.default_rng(3)
+    true = [
+        x + s * DEG * rng.normal(size=(100, 48))
+        for x, s in zip((inc, azi, face), stand, strict=True)
+    ]
+    pair = [
+        c + s * rng.normal(size=(100, 48, 3))
+        for c, s in zip(tool.clean(*true), tool.noise, strict=True)
+    ]
+    known = {"inclination": inc, "azimuth": azi, "toolface": face}
+    known |= {"field": np.full(48, tool.field), "dip": np.full(48, tool.dip)}
+    angles = dict(zip(("inclination", "azimuth", "toolface"), np.radians(stand), strict=True))
+    for sd in ({**NOISE, **{k: np.array(v) for k, v in angles.items()}}, angles):
+        result = fit(Readings(*pair, known=known, sd={k: np.asarray(v) for k, v in sd.items()}))
+        assert (result.status == 0).all()
+        # 0.5° of error is 5 % of the inclination of a station at 5°: what is second order shows
+        np.testing.assert_allclose(result.analysis.variance_factor.mean(0), 1.0, atol=0.1)
+
+
+def test_a_group_with_few_filled_cells_is_as_uncertain_as_they_are():
+    """One filled inclination of σ = 0.2° in each roll set: the error is common to the set."""
+    tool = Tool.random(21)
+    inc, azi, face = plan()
+    group, sigma = np.repeat(np.arange(4), 12), 0.2 * DEG
+    azi = np.repeat(azi[::12], 12)
+    rng = np.random.default_rng(4)
+    error = np.repeat(sigma * rng.normal(size=(300, 4)), 12, axis=1)
+    a, m = tool.readings(rng, 300, inc, azi, face)
+    filled = np.where(np.arange(48) % 12 == 0, inc + error, np.nan)
+    known = {"inclination": filled, "toolface": face, "field": np.full(48, tool.field)}
+    sd = {**NOISE, "inclination": np.array(sigma)}
+    result = fit(Readings(a, m, known=known, sd=sd, group=group))
+    assert (result.status == 0).all()
+    model, where = result.problem.triads[0].model, result.problem.slices()[0]
+    finished, whole = model.finished(0.0)
+    params = np.einsum("bij,bj->bi", whole, result.state.params[:, where])
+    spread = whole @ result.analysis.covariance[:, where, where] @ np.swapaxes(whole, -1, -2)
+    true = np.linalg.inv(tool.matrix[0])
+    row = true[2, :2]
+    z = (params[:, 6:8] - row) / np.sqrt(np.diagonal(spread, axis1=1, axis2=2))[:, 6:8]
+    assert 0.8 < np.sqrt(np.mean(z**2)) < 1.2
+    assert finished.size == 12

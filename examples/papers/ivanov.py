@@ -848,11 +848,7 @@ def _unsettled(found: list[Comparison]) -> str:
     return f"Fits that did not meet the solver's criterion, kept in the means: {'; '.join(each)}."
 
 
-TEMPLATE = r"""---
-orphan: true
----
-
-# Ivanov: toolface and inclination
+TEMPLATE = r"""# Ivanov: toolface and inclination
 
 T. B. Ivanov and G. S. Lyutskanova-Zhekova (2019) calibrate an accelerometer triad on the two angles it is
 bought for: the sum of squares of the errors in toolface and inclination, minimised by Gauss–Newton with an

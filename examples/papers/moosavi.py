@@ -399,11 +399,7 @@ def page(cases: list[Case]) -> str:
     return re.sub(r"\n{3,}", "\n\n", "\n".join(lines)).rstrip() + "\n"
 
 
-TEXT = """---
-orphan: true
----
-
-# Moosavi et al., recomputed
+TEXT = """# Moosavi et al., recomputed
 
 The method of S. M. Seyed Moosavi, B. Moaveni, B. Moshiri, M. R. Arvan, *Error Analysis in Accelerometers
 Calibration of Measurement while Drilling Instrument used in Directional Drilling Operations* (full reference and

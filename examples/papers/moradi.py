@@ -270,11 +270,7 @@ def page(draws: int = DRAWS, seeds: int = 50) -> str:
     return PAGE.format(**values)
 
 
-PAGE = """---
-orphan: true
----
-
-# Moradi 2019, recomputed
+PAGE = """# Moradi 2019, recomputed
 
 Written by `python examples/papers/moradi.py`; every figure below is computed there.
 

@@ -173,10 +173,8 @@ def _share(problem: Problem, angles: dict[str, Array]) -> dict[str, Array]:
     evidence = problem.evidence
     inc, azi = angles["inclination"], angles["azimuth"]
     axis = tool_from_earth(inc, azi, np.zeros_like(inc))[..., 2, :]
-    members = evidence.members * evidence.include[..., None]
-    mean = np.einsum(
-        "bnk,bnk,bki->bni", evidence.members, evidence.members, members.swapaxes(-1, -2) @ axis
-    )
+    members = evidence.members
+    mean = members @ (np.swapaxes(members, -1, -2) @ axis)
     shared = {n: evidence.shared(n).sum(-1) > 0 for n in ("inclination", "azimuth")}
     means = {
         "inclination": np.arctan2(np.hypot(mean[..., 0], mean[..., 1]), mean[..., 2]),
