@@ -109,6 +109,7 @@ def _check_temperature(readings: Readings, order: int) -> None:
 
 
 NEEDS = {
+    "newton": ("inclination",),
     "swarm": ("inclination", "toolface"),
     "least-squares": ("inclination", "toolface"),
     "toolface-inclination": ("inclination", "toolface"),

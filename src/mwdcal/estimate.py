@@ -12,16 +12,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mwdcal.core.models import Basis, Factors, Model, Polynomial
+from mwdcal.core.newton import newton, propagated
 from mwdcal.core.problem import UNKNOWN, Constant, Evidence, Problem, State, Triad
 from mwdcal.core.solvers import Status, gauss_newton
 from mwdcal.core.start import start
 from mwdcal.core.swarm import forward_parts, swarm_forward
-from mwdcal.core.uncertainty import Analysis, analyse, settle_gauge
+from mwdcal.core.uncertainty import Analysis, analyse, readjusted, settle_gauge
 from mwdcal.core.vectors import AnyArray, Array, Bools, Ints, inverse
 from mwdcal.readings import ANGLES, CONSTANTS, Readings
 
 Orders = int | tuple[int, int]
 """Temperature order of both triads, or of accelerometer and magnetometer."""
+HELD = 1e18
+"""Precision of a parameter that is held at its value."""
 ITERATIONS = 600
 """Iterations of the swarm, as Moradi's."""
 FLOOR = 1e-9
@@ -64,6 +67,12 @@ def with_stand_errors(evidence: Evidence, names: tuple[str, ...]) -> Evidence:
     return replace(evidence, constants=tuple(found))
 
 
+def inclination_and_strength(evidence: Evidence) -> Evidence:
+    """|g| and inclination of the accelerometer (Moosavi); azimuth, |b| and dip of the magnetometer."""
+    known = {**evidence.known, "toolface": np.full_like(evidence.known["toolface"], np.nan)}
+    return replace(evidence, known=known, group=np.full_like(evidence.group, -1))
+
+
 def _reset(evidence: Evidence, absent: tuple[str, ...]) -> Evidence:
     """The evidence with its constants worked out again after a change."""
     changed = replace(evidence, absent=absent, constants=())
@@ -73,6 +82,7 @@ def _reset(evidence: Evidence, absent: tuple[str, ...]) -> Evidence:
 METHODS: dict[str, Callable[[Evidence], Evidence]] = {
     "joint": joint,
     "least-squares": whole_vectors,
+    "newton": inclination_and_strength,
     "swarm": whole_vectors,
     "toolface-inclination": angles_alone,
     "scalar": strengths_alone,
@@ -225,7 +235,8 @@ def _problem(
             if name in readings.sd
             else 1e-3 * _size(raw) + 0 * raw
         )
-        triads.append(Triad(model, raw, sd, _prior(model, evidence, name, curved.get(name, 0.0))))
+        prior = _prior(model, evidence, name, curved.get(name, 0.0))
+        triads.append(Triad(model, raw, sd, prior, np.zeros_like(prior)))
         declared.append(name in readings.sd)
     return Problem(tuple(triads), temperature, evidence), declared
 
@@ -287,11 +298,13 @@ def _fit(
     state = start(problem)
     if method == "swarm":
         state, status, iterations = _swarmed(problem, state, seed)
+    elif method == "newton":
+        state, status, iterations = _by_newton(problem, state)
     else:
         state, status, iterations = gauss_newton(problem, state)
     noise = np.full((len(status), len(declared)), np.nan)
     if not all(declared):
-        refit = gauss_newton if method != "swarm" else None
+        refit = None if method in ("swarm", "newton") else gauss_newton
         problem, state, status, noise = _estimate_noise(
             problem, state, status, declared, refit, rounds
         )
@@ -313,6 +326,32 @@ def _swarmed(problem: Problem, state: State, seed: int) -> tuple[State, Ints, In
     finite = np.isfinite(params).all(-1)
     status = np.where(finite, int(Status.OK), int(Status.NOT_FINITE))
     return replace(state, params=params), status, np.full(len(params), ITERATIONS)
+
+
+def _by_newton(problem: Problem, state: State) -> tuple[State, Ints, Ints]:
+    """The accelerometer by Newton-Raphson from the datasheet, then the magnetometer against it."""
+    triad, evidence = problem.triads[0], problem.evidence
+    batch = len(state.params)
+    nominal = triad.model.start(np.zeros((batch, 3, 3)) + np.eye(3), np.zeros((batch, 3)))
+    gravity = problem.constant(state, "gravity")
+    noise = np.sqrt(np.mean(triad.sd**2, -1))
+    weights = propagated(gravity, noise, evidence.sd["inclination"])
+    weights = weights * evidence.include[..., None]
+    found = newton(
+        triad.model, nominal, triad.raw, problem.temperature, gravity,
+        evidence.known["inclination"], weights=weights,
+    )  # fmt: skip
+    where = problem.slices()[0]
+    params = state.params.copy()
+    params[:, where] = found.params
+    state = readjusted(problem, replace(state, params=params))
+    if len(problem.triads) > 1:
+        fixed = replace(triad, prior=np.full_like(triad.prior, HELD), expected=found.params)
+        held = replace(problem, triads=(fixed, *problem.triads[1:]))
+        state, status, _ = gauss_newton(held, state)
+    else:
+        status = found.status
+    return state, np.maximum(status, found.status), found.iterations
 
 
 def _swarm_forward(raw: Array, target: Array, include: Bools, seed: int) -> Array:

@@ -86,9 +86,9 @@ def print_json(value: Any) -> None:
 @click.option("--tool", metavar="NAME|FILE", help="Tool profile: a shipped name or a TOML file.")
 @click.option(
     "--method", default="joint", show_default=True, metavar="METHOD",
-    help="joint: all evidence, weighted. least-squares: reference vectors only. "
-    "swarm: the same by particle swarm. toolface-inclination: the accelerometer by angles alone. "
-    "scalar: |g| and |b| alone.",
+    help="joint: all evidence, weighted. least-squares: reference vectors only. swarm: the same "
+    "by particle swarm. newton: Newton-Raphson on |g| and inclination. toolface-inclination: the "
+    "accelerometer by angles alone. scalar: |g| and |b| alone.",
 )  # fmt: skip
 @click.option(
     "--estimate", default="", metavar="NAMES",

@@ -52,13 +52,14 @@ GEOMETRIC_NOISE = 1e-4
 class Triad:
     """One sensor triad: model, readings (B, n, 3), their noise (B, n, 3), prior precision (B, p).
 
-    The prior value of every parameter that has a precision is zero.
+    `prior` is the precision about `expected` (B, p): zero where nothing is known beforehand.
     """
 
     model: Model
     raw: Array
     sd: Array
     prior: Array
+    expected: Array
 
 
 @dataclass(frozen=True)
@@ -181,7 +182,7 @@ class Problem:
             constants=constants,
         )
         triads = tuple(
-            Triad(t.model.take(index), t.raw[index], t.sd[index], t.prior[index])
+            Triad(t.model.take(index), t.raw[index], t.sd[index], t.prior[index], t.expected[index])
             for t in self.triads
         )
         return Problem(triads, self.temperature[index], chosen)
@@ -311,7 +312,8 @@ class Problem:
             for i, c in enumerate(constants)
         ]
         pulls = np.stack(pull, -1) if constants else empty
-        pulled = np.concatenate([state.params, pulls, np.zeros_like(wide)], -1)
+        expected = np.concatenate([t.expected for t in self.triads], -1)
+        pulled = np.concatenate([state.params - expected, pulls, np.zeros_like(wide)], -1)
         return np.concatenate([params, precision, wide], -1), pulled
 
     def _free(self) -> Bools:
