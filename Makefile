@@ -3,7 +3,7 @@
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: measured help demo test check bench docs clean
+.PHONY: papers measured help demo test check bench docs clean
 
 PYTHON ?= python3
 VENV := .venv
@@ -53,6 +53,9 @@ bench: $(INSTALLED) ## time the commands against a bare import of SciPy
 
 measured: $(INSTALLED) ## calibrate the measured sets (MWDCAL_DATA) and rewrite docs/measured.md
 	@$(CLOCK); $(ONE_THREAD) $(BIN)/python examples/measured/measured.py
+
+papers: $(INSTALLED) ## recompute the papers and rewrite their pages and figures (a minute or two)
+	@$(CLOCK); for name in moradi moosavi ivanov; do $(ONE_THREAD) $(BIN)/python examples/papers/$$name.py; done
 
 docs: $(INSTALLED) ## build the documentation into build/docs
 	@$(CLOCK); $(BIN)/sphinx-build -q -W --keep-going -b html docs build/docs; \

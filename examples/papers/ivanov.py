@@ -940,7 +940,7 @@ What to read from it:
 - `scalar` uses no stand, so no stand can harm it, and it knows no mounting.
 
 By components (degrees; mg; LS is `least-squares`, T+I `toolface-inclination`, whose |g| is a convention: the
-scale stays where the start value from nominal gravity puts it, and no uncertainty is quoted for it):
+scale is set so that the mean strength is the nominal one, and no uncertainty is quoted for it):
 
 <<components>>
 

@@ -114,8 +114,10 @@ class Residuals:
         return squares / freedom if freedom >= 1 else 1.0
 
     def expected(self, name: str) -> Array:
-        """Standard deviation (n,) to expect of `errors` after the fit."""
+        """Standard deviation (n,) to expect of `errors` after the fit; NaN if the fit did not use it."""
         problem, state = self.fit.problem, self.fit.state
+        if name in problem.evidence.absent:
+            return np.full(self.readings.count, np.nan)
         gradient = OBSERVABLES[name].gradient(*self.targets)
         rows = []
         for index, (triad, where) in enumerate(zip(problem.triads, problem.slices(), strict=True)):
@@ -140,7 +142,7 @@ def error_rows(readings: Readings, fit: Fit) -> list[ErrorRow]:
         factor, unit = shown_in(name, residuals.relative)
         known = ~np.isnan(residuals.known(name))
         before, after, expected = (
-            float(np.sqrt(np.nanmean(values[known] ** 2)) * factor)
+            float(np.sqrt(np.mean(values[known] ** 2)) * factor)
             for values in (
                 residuals.errors(name, residuals.before),
                 residuals.errors(name, residuals.after),
@@ -154,7 +156,7 @@ def error_rows(readings: Readings, fit: Fit) -> list[ErrorRow]:
                 stations=int(known.sum()),
                 before=before,
                 after=after,
-                expected=expected,
+                expected=None if np.isnan(expected) else expected,
             )
         )
     return rows
@@ -214,7 +216,8 @@ def station_rows(readings: Readings, fit: Fit) -> list[StationRow]:
     limit = -float(ndtri(RESHOOT / readings.count / 2))
     after = {n: residuals.errors(n, residuals.after) for n in names}
     before = {n: residuals.errors(n, residuals.before) for n in names}
-    ratio = {n: np.abs(after[n]) / np.maximum(residuals.expected(n), 1e-30) for n in names}
+    expected = {n: np.nan_to_num(residuals.expected(n), nan=np.inf) for n in names}
+    ratio = {n: np.abs(after[n]) / np.maximum(expected[n], 1e-30) for n in names}
     factors = {n: shown_in(n, residuals.relative)[0] for n in names}
     attitude = {n: np.degrees(OBSERVABLES[n].value(*residuals.after)) for n in SHOWN[1:4]}
     rows = []

@@ -91,6 +91,9 @@ def print_json(value: Any) -> None:
     "accelerometer by angles alone. scalar: |g| and |b| alone.",
 )  # fmt: skip
 @click.option(
+    "--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of the swarm."
+)
+@click.option(
     "--estimate", default="", metavar="NAMES",
     help="Errors of the stand to find as well: azimuth-zero, tilt, or both with a comma.",
 )  # fmt: skip
@@ -115,7 +118,8 @@ def print_json(value: Any) -> None:
 @decimal_sign
 @as_json
 def calibrate(
-    run: Path, output: Path, tool: str | None, method: str, estimate: str, model: str | None, order: str,
+    run: Path, output: Path, tool: str | None, method: str, seed: int, estimate: str,
+    model: str | None, order: str,
     exclude: tuple[str, ...], report: Path | None, decimal: str, as_json: bool,
 ) -> None:  # fmt: skip
     """Fit the sensor model to a calibration RUN (CSV, TSV, Parquet or XLSX).
@@ -132,7 +136,7 @@ def calibrate(
     readings = _without(readings, exclude)
     number, scores = _order(order, readings, method, model)
     names = [name.strip() for name in estimate.split(",") if name.strip()]
-    made = fit(readings, profile, method, model, number, estimate=names, **digests)
+    made = fit(readings, profile, method, model, number, estimate=names, seed=seed, **digests)
     if report:
         from mwdcal.app.report import write_report
 
