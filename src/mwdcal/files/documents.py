@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import os
 from importlib import resources
@@ -125,6 +126,18 @@ def schema() -> dict[str, Any]:
         "title": f"mwdcal calibration file, schema version {SCHEMA_VERSION}",
         **made,
     }
+
+
+def _cleaned(value: Any) -> Any:
+    """Descriptions without the indent that docstrings have before Python 3.13."""
+    if isinstance(value, dict):
+        return {
+            key: inspect.cleandoc(item)
+            if key == "description" and isinstance(item, str)
+            else _cleaned(item)
+            for key, item in value.items()
+        }
+    return [_cleaned(item) for item in value] if isinstance(value, list) else value
 
 
 def published_schema() -> dict[str, Any]:
