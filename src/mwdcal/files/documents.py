@@ -120,7 +120,7 @@ def _unusable(calibration: Calibration) -> str:
 
 def schema() -> dict[str, Any]:
     """JSON Schema of a calibration file, from its definition in code."""
-    made = json.loads(msgspec.json.encode(msgspec.json.schema(Calibration)))
+    made = _cleaned(json.loads(msgspec.json.encode(msgspec.json.schema(Calibration))))
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": f"mwdcal calibration file, schema version {SCHEMA_VERSION}",
