@@ -20,14 +20,14 @@ from mwdcal.calibration import (
     Undetermined,
     rounded,
 )
-from mwdcal.checks import TRIADS, check_fit, check_readings
+from mwdcal.checks import check_fit, check_readings
 from mwdcal.core.observability import Free, free_directions
 from mwdcal.core.problem import STAND
 from mwdcal.core.uncertainty import marginal_rank
 from mwdcal.core.vectors import Array
 from mwdcal.estimate import Fit, Orders, default_kind, fit, orders
 from mwdcal.profile import Profile
-from mwdcal.readings import Readings
+from mwdcal.readings import TRIADS, Readings
 from mwdcal.residuals import REASONS, error_rows, measure_rows, shown_in, station_rows
 from mwdcal.stand import check_separable, stand_errors, turns
 

@@ -324,6 +324,13 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
         size = sum(t.size for t in self.triads)
         return np.array(self.free, float).reshape(len(self.free), size)
 
+    def other_tool(self, readings: Readings) -> tuple[str, str] | None:
+        """Our serial and the readings', where both are stated and differ."""
+        ours, theirs = self.tool.get("serial"), readings.metadata.get("serial")
+        if ours is None or theirs is None or ours == str(theirs):
+            return None
+        return ours, str(theirs)
+
     def undetermined(self) -> list[Undetermined]:
         """Free directions of all triads, each once."""
         return [entry for triad in self.triads for entry in triad.undetermined]

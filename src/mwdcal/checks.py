@@ -10,10 +10,9 @@ from mwdcal.core.vectors import Array
 from mwdcal.errors import FitError, InputError
 from mwdcal.estimate import METHODS, Fit, Orders, default_kind, orders
 from mwdcal.profile import Profile
-from mwdcal.readings import Readings
+from mwdcal.readings import TRIADS, Readings
 from mwdcal.selection import soaks
 
-TRIADS = ("accelerometer", "magnetometer")
 GAIN = (0.3, 3.0)
 """An own-axis gain outside this share of nominal is a wrong profile, not a sensor error."""
 MOTION = (1e-2, 1e3)

@@ -137,13 +137,9 @@ def _left_out(
     part = np.arange(readings.count) % FOLDS
     include = (np.arange(FOLDS)[:, None] != part).astype(float)
     result = fit(readings, method, None, order, include, curved)
-    problem = result.problem
+    g, b = result.problem.fields(result.state)
     own = np.arange(readings.count)
-    chosen = [
-        triad.model.fields(result.state.params[:, where], triad.raw, problem.temperature)[part, own]
-        for triad, where in zip(problem.triads, problem.slices(), strict=True)
-    ]
-    return chosen[0], chosen[1] if len(chosen) > 1 else np.full_like(chosen[0], np.nan)
+    return g[part, own], b[part, own]
 
 
 def score(row: Row, best: dict[str, float]) -> float:

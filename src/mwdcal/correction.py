@@ -68,9 +68,10 @@ def _columns(calibration: Calibration, readings: Readings) -> dict[str, Array]:
 
 
 def _other_tool(calibration: Calibration, readings: Readings) -> list[Finding]:
-    ours, theirs = calibration.tool.get("serial"), readings.metadata.get("serial")
-    if ours is None or theirs is None or ours == str(theirs):
+    other = calibration.other_tool(readings)
+    if other is None:
         return []
+    ours, theirs = other
     text = (
         f"the readings are of tool {theirs}, the calibration of tool {ours}: is it the right one?"
     )

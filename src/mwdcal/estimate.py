@@ -19,7 +19,7 @@ from mwdcal.core.start import start
 from mwdcal.core.swarm import forward_parts, swarm_forward
 from mwdcal.core.uncertainty import Analysis, analyse, readjusted, settle_gauge
 from mwdcal.core.vectors import AnyArray, Array, Bools, Ints, inverse
-from mwdcal.readings import ANGLES, CONSTANTS, Readings
+from mwdcal.readings import ANGLES, CONSTANTS, TRIADS, Readings
 
 Orders = int | tuple[int, int]
 """Temperature order of both triads, or of accelerometer and magnetometer."""
@@ -221,7 +221,7 @@ def _problem(
     temperature = _flat(cold if readings.temperature is None else readings.temperature, lead)
     triads: list[Triad] = []
     declared: list[bool] = []
-    for name in ("accelerometer", "magnetometer"):
+    for name in TRIADS:
         values = getattr(readings, name)
         if values is None:
             continue

@@ -120,8 +120,9 @@ def verify(calibration: Calibration, readings: Readings, limits: Limits) -> Verd
 
 
 def _check_tool(calibration: Calibration, readings: Readings) -> None:
-    ours, theirs = calibration.tool.get("serial"), readings.metadata.get("serial")
-    if ours is not None and theirs is not None and ours != str(theirs):
+    other = calibration.other_tool(readings)
+    if other is not None:
+        ours, theirs = other
         raise InputError(
             f"{readings.source} is of tool {theirs}, the calibration of tool {ours}. Verify with a "
             "run of the same tool, or correct 'serial' in the file."

@@ -16,6 +16,7 @@ import numpy as np
 from mwdcal.core.vectors import AnyArray, Array, Bools, Ints
 
 ANGLES = ("inclination", "azimuth", "toolface")
+TRIADS = ("accelerometer", "magnetometer")
 CONSTANTS = ("gravity", "field", "dip")
 
 

@@ -11,7 +11,7 @@ from mwdcal.calibration import ErrorRow, Measures, StationRow
 from mwdcal.core.observables import OBSERVABLES
 from mwdcal.core.vectors import Array, centred
 from mwdcal.estimate import Fit
-from mwdcal.readings import Readings
+from mwdcal.readings import TRIADS, Readings
 
 SHOWN = ("gravity", "inclination", "toolface", "azimuth", "field", "dip")
 UNITS = {"gravity": "mg", "field": "nT"}
@@ -50,13 +50,9 @@ class Residuals:
 
     @cached_property
     def after(self) -> tuple[Array, Array]:
-        """Corrected vectors (n, 3) each; the field is (0, 0, NaN) without magnetometer."""
-        problem, state = self.fit.problem, self.fit.state
-        found = [
-            t.model.fields(state.params[:, w], t.raw, problem.temperature)[0]
-            for t, w in zip(problem.triads, problem.slices(), strict=True)
-        ]
-        return found[0], found[1] if len(found) > 1 else np.full_like(found[0], np.nan)
+        """Corrected vectors (n, 3) each; the field is NaN without magnetometer."""
+        g, b = self.fit.problem.fields(self.fit.state)
+        return g[0], b[0]
 
     @cached_property
     def targets(self) -> tuple[Array, Array]:
@@ -166,7 +162,7 @@ def measure_rows(readings: Readings, fit: Fit) -> list[Measures]:
     """Moradi's mean, STD, MSE and RMSE of the vector error, where reference vectors are whole."""
     residuals, problem = Residuals(readings, fit), fit.problem
     rows = []
-    for index, name in enumerate(("accelerometer", "magnetometer")[: len(problem.triads)]):
+    for index, name in enumerate(TRIADS[: len(problem.triads)]):
         needed = ("inclination", "toolface", "azimuth")[: 2 + index]
         whole = np.all([~np.isnan(residuals.known(n)) for n in needed], axis=0)
         if whole.sum() < 2:

@@ -35,20 +35,14 @@ def group_scatter(axis: Array, group: Ints) -> float:
     return float(np.mean(each))
 
 
-def fitted_fields(result: Fit) -> tuple[Array, Array]:
-    """Corrected vectors (B, n, 3) of both triads of a fit, left-out stations included."""
-    problem = result.problem
-    found = [
-        triad.model.fields(result.state.params[:, where], triad.raw, problem.temperature)
-        for triad, where in zip(problem.triads, problem.slices(), strict=True)
-    ]
-    return found[0], found[1]
+def _fields(result: Fit) -> tuple[Array, Array]:
+    return result.problem.fields(result.state)
 
 
 def scatter(readings: Readings, curved: dict[str, float] | None = None) -> tuple[float, float]:
     """Direction scatter of a run's groups, radians: in sample, and with each station left out."""
-    whole = directions(*fitted_fields(fit(readings, curved=curved)))[0]
+    whole = directions(*_fields(fit(readings, curved=curved)))[0]
     left_out = fit(readings, include=1 - np.eye(readings.count), curved=curved)
     own = np.arange(readings.count)
-    axis = directions(*fitted_fields(left_out))[own, own]
+    axis = directions(*_fields(left_out))[own, own]
     return group_scatter(whole, readings.groups), group_scatter(axis, readings.groups)

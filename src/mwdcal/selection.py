@@ -10,14 +10,13 @@ import numpy as np
 from mwdcal.core.uncertainty import marginal_rank, readjusted
 from mwdcal.core.vectors import Array, Ints
 from mwdcal.estimate import Fit, Orders, fit
-from mwdcal.readings import Readings
+from mwdcal.readings import TRIADS, Readings
 
 GAP = 5.0
 """Temperatures closer than this belong to one soak, °C."""
 SPAN = 10.0
 """A run that spans less has no temperature terms, °C."""
 HIGHEST = 3
-TRIADS = ("accelerometer", "magnetometer")
 EXCESS = 1.5
 """Residual variance of order 0, in units of the noise, beyond which a linear course is fitted."""
 FEWEST = 3
@@ -116,7 +115,7 @@ def _with_noise(readings: Readings, method: str, kind: str | None, order: int) -
     Every order is then judged by the same yardstick.
     """
     result = fit(readings, method, kind, order)
-    noise = dict(zip(("accelerometer", "magnetometer"), result.noise[0], strict=False))
+    noise = dict(zip(TRIADS, result.noise[0], strict=False))
     found = {name: np.array(sd) for name, sd in noise.items() if np.isfinite(sd)}
     return replace(readings, sd={**readings.sd, **found})
 

@@ -192,6 +192,14 @@ class Problem:
         ends = np.cumsum([0] + [t.model.size for t in self.triads])
         return [slice(int(a), int(b)) for a, b in pairwise(ends)]
 
+    def fields(self, state: State) -> tuple[Array, Array]:
+        """Corrected vectors (B, n, 3) of both triads, left-out stations too; NaN for a missing one."""
+        found = [
+            triad.model.fields(state.params[:, where], triad.raw, self.temperature)
+            for triad, where in zip(self.triads, self.slices(), strict=True)
+        ]
+        return found[0], found[1] if len(found) > 1 else np.full_like(found[0], np.nan)
+
     def constant(self, state: State, name: str) -> Array:
         """Value (B, n) of gravity, field or dip at each station."""
         value = np.nan_to_num(self.evidence.known[name])

@@ -16,6 +16,7 @@ from mwdcal.calibration import SCHEMA_VERSION, Calibration
 from mwdcal.errors import InputError
 from mwdcal.files import atomic
 from mwdcal.files.profiles import check_profile
+from mwdcal.readings import TRIADS
 
 HIGHEST = 3
 """The highest order of temperature terms."""
@@ -71,7 +72,7 @@ def check(calibration: Calibration, name: str) -> Calibration:
 
 def _misfit(calibration: Calibration) -> str:
     """What does not fit together in a calibration; empty where all does."""
-    for triad, expected in zip(calibration.triads, ("accelerometer", "magnetometer"), strict=False):
+    for triad, expected in zip(calibration.triads, TRIADS, strict=False):
         if triad.name != expected:
             return f"the triad '{triad.name}' stands where the {expected} belongs"
         if triad.model not in ("polynomial", "factors") or not 0 <= triad.order <= HIGHEST:
