@@ -23,6 +23,8 @@ LAYERS = (
     (
         "core.newton",
         "core.problem",
+        "core.robust",
+        "core.sums",
         "core.swarm",
         "core.uncertainty",
         "core.observability",
@@ -30,7 +32,8 @@ LAYERS = (
         "core",
     ),
     ("readings", "profile", "profiles"),
-    ("calibration", "estimate", "notation"),
+    ("evidence", "prior", "options"),
+    ("calibration", "methods", "estimate", "notation"),
     ("checks", "correction", "residuals", "scatter", "selection", "stand"),
     ("calibrate", "compare", "predict", "quality", "simulate"),
     ("files", "files.*"),

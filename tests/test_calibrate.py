@@ -9,6 +9,7 @@ from mwdcal.calibration import Calibration
 from mwdcal.core.observables import OBSERVABLES
 from mwdcal.core.vectors import reference_vectors
 from mwdcal.errors import FitError, InputError
+from mwdcal.options import Options
 from mwdcal.predict import readings_at
 from mwdcal.profile import Profile, TriadProfile
 from mwdcal.readings import Readings
@@ -143,7 +144,7 @@ def test_refusals_say_why(case):
     build, kind, word = REFUSED[case]
     data, options = build()
     with pytest.raises(kind, match=word):
-        calibrate(data, PROFILE, **options)
+        calibrate(data, PROFILE, Options(**options))
 
 
 def test_field_known_nowhere_is_calibrated_to_one_and_said_so():
@@ -191,7 +192,7 @@ def test_temperature_order_is_chosen_by_leaving_soaks_out_simulated(course):
     soak = [25.0, 50.0, 75.0, 100.0, 125.0, 150.0]
     data = run(truth, grid([5, 45, 90, 135], 6, [0, 90, 180, 270], soak), rng)
     data = msgspec_replace(data, sd=NOISE, station=())
-    order, table = choose_order(data, "joint", None, lambda text: None)
+    order, table = choose_order(data, Options(), lambda text: None)
     assert order == (course, course)
     chosen = [row for row in table if row.chosen]
     assert [(row.triad, row.order) for row in chosen] == [
@@ -200,7 +201,7 @@ def test_temperature_order_is_chosen_by_leaving_soaks_out_simulated(course):
     ]
     assert all(row.inside == pytest.approx(1.0, abs=0.5) for row in chosen)
     cold = msgspec_replace(data, temperature=None)
-    assert choose_order(cold, "joint", None, lambda text: None) == (0, [])
+    assert choose_order(cold, Options(), lambda text: None) == (0, [])
 
 
 def test_each_triad_has_its_own_order_simulated():
@@ -213,17 +214,17 @@ def test_each_triad_has_its_own_order_simulated():
     soak = [25.0, 60.0, 95.0, 130.0]
     data = run(truth, grid([5, 45, 90, 135], 6, [0, 90, 180, 270], soak), rng)
     data = msgspec_replace(data, sd=NOISE, station=())
-    order, _ = choose_order(data, "joint", None, lambda text: None)
+    order, _ = choose_order(data, Options(), lambda text: None)
     assert order[0] >= 1
     assert order[1] == 0
-    record = calibrate(data, PROFILE, order=order)
+    record = calibrate(data, PROFILE, Options(order=order))
     assert (record.accelerometer.model, record.magnetometer.model) == ("factors", "polynomial")
     assert record.magnetometer.variance_factor == pytest.approx(1.0, abs=0.35)
 
 
 def test_factors_of_order_three_recover_the_truth_simulated():
     truth, data = hot(2)
-    record = calibrate(data, PROFILE, order=3)
+    record = calibrate(data, PROFILE, Options(order=3))
     assert record.accelerometer.size == record.magnetometer.size == 30
     for triad, true in (
         (record.accelerometer, truth.accelerometer),
@@ -236,7 +237,7 @@ def test_factors_of_order_three_recover_the_truth_simulated():
 
 def test_temperature_outside_and_missing():
     _, data = hot(3)
-    record = calibrate(data, PROFILE, order=1)
+    record = calibrate(data, PROFILE, Options(order=1))
     assert not record.outside(data).any()
     assert record.outside(msgspec_replace(data, temperature=data.temperature + 200)).all()
     with pytest.raises(InputError, match="temperature_c"):
@@ -250,7 +251,7 @@ def test_soaks_are_told_apart_by_gaps():
 def test_narrow_span_is_refused_for_a_high_order():
     _, data = hot(4, (20, 22, 24, 25))
     with pytest.raises(FitError, match="span"):
-        calibrate(data, PROFILE, order=3)
+        calibrate(data, PROFILE, Options(order=3))
 
 
 def test_own_axis_terms_of_the_profile_are_found():
@@ -281,7 +282,7 @@ def test_order_is_chosen_with_groups_of_unknown_direction_in_one_soak_simulated(
         inclination[first : first + 6] = azimuth[first : first + 6] = np.nan
     known = {**data.known, "inclination": inclination, "azimuth": azimuth}
     data = msgspec_replace(data, sd=NOISE, station=(), known=known, group=group)
-    order, table = choose_order(data, "joint", None, lambda text: None)
+    order, table = choose_order(data, Options(), lambda text: None)
     assert min(order) >= 1
     assert min(row.inside for row in table) < 3
 
@@ -289,7 +290,7 @@ def test_order_is_chosen_with_groups_of_unknown_direction_in_one_soak_simulated(
 def test_two_temperatures_get_a_linear_course_where_it_is_needed_simulated():
     _, data = hot(7, (25, 145))
     said = []
-    assert choose_order(data, "joint", None, said.append)[0] == (1, 1)
+    assert choose_order(data, Options(), said.append)[0] == (1, 1)
     assert "third temperature" in said[-1]
 
 
@@ -332,7 +333,7 @@ def test_free_turn_and_its_course_with_temperature_are_named_simulated():
     _, data = hot(8)
     blank = np.full(data.count, np.nan)
     data = msgspec_replace(data, known={**data.known, "toolface": blank})
-    record = calibrate(data, PROFILE, model="polynomial", order=2)
+    record = calibrate(data, PROFILE, Options(model="polynomial", order=2))
     assert [u.id for u in record.accelerometer.undetermined] == [
         "toolface-zero",
         "toolface-zero-temperature-1",

@@ -5,6 +5,7 @@ import pytest
 
 from mwdcal.core.observables import OBSERVABLES
 from mwdcal.estimate import fit
+from mwdcal.options import Options
 from mwdcal.readings import Readings
 from simulation import DEG, Tool, bound, plan
 
@@ -39,7 +40,7 @@ def simulated(case, method="joint"):
     known["field"] = np.full(len(inc), tool.field)
     sd = {"accelerometer": np.array(tool.noise[0]), "magnetometer": np.array(tool.noise[1])}
     readings = Readings(a, m, known=known, sd=sd)
-    return tool, bound(tool, inc, azi, face, unknown), fit(readings, method)
+    return tool, bound(tool, inc, azi, face, unknown), fit(readings, Options(method))
 
 
 def affine(result):

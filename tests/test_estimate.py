@@ -9,6 +9,7 @@ from mwdcal.core.observability import free_directions
 from mwdcal.core.uncertainty import marginal_rank
 from mwdcal.core.vectors import rotation
 from mwdcal.estimate import fit
+from mwdcal.options import Options
 from mwdcal.readings import Readings
 from simulation import DEG, Tool, plan
 
@@ -114,7 +115,9 @@ def test_no_start_leads_astray(known, iron):
 def test_free_toolface_zero_is_set_by_convention_not_by_the_solver(kind):
     """The gain's polar factor has no rotation about the tool axis, whatever the model."""
     tool = Tool.random(6)
-    result = fit(readings(tool, plan(), ("inclination", "azimuth", "field", "dip")), kind=kind)
+    result = fit(
+        readings(tool, plan(), ("inclination", "azimuth", "field", "dip")), Options(model=kind)
+    )
     model, where = result.problem.triads[0].model, result.problem.slices()[0]
     gain = model.slope(
         result.state.params[:, where], result.problem.triads[0].raw, result.problem.temperature
@@ -133,7 +136,7 @@ def test_models_agree_at_order_zero():
     data = readings(Tool.random(8), plan(), EVERYTHING)
     fields = []
     for kind in ("polynomial", "factors"):
-        result = fit(data, kind=kind)
+        result = fit(data, Options(model=kind))
         triad, where = result.problem.triads[1], result.problem.slices()[1]
         fields.append(
             triad.model.fields(result.state.params[:, where], triad.raw, result.problem.temperature)

@@ -10,6 +10,7 @@ import pytest
 from mwdcal.core.observability import free_directions
 from mwdcal.core.observables import OBSERVABLES
 from mwdcal.estimate import fit
+from mwdcal.options import Options
 from mwdcal.readings import Readings
 from simulation import DEG, Tool, attitude, plan
 
@@ -163,7 +164,7 @@ def test_angles_alone_leave_the_scale_free(lowest, kind):
     (inc, _, face), a, _, sd = stations_of(Tool.random(21), lowest=lowest)
     del sd["magnetometer"]
     result = fit(Readings(a, known={"inclination": inc, "toolface": face}, sd=sd),
-                 "toolface-inclination", kind)  # fmt: skip
+                 Options("toolface-inclination", kind))  # fmt: skip
     assert result.status[0] == 0
     assert result.analysis.determined.rank[0] == 11
     assert free(result) == [("scale", (0,))]
@@ -173,7 +174,7 @@ def test_strengths_alone_leave_three_rotations_of_each_triad_free():
     tool = Tool.random(22)
     (inc, _, face), a, m, sd = stations_of(tool)
     known = {"inclination": inc, "toolface": face, "field": np.full(len(inc), tool.field)}
-    result = fit(Readings(a, m, known=known, sd=sd), "scalar")
+    result = fit(Readings(a, m, known=known, sd=sd), Options("scalar"))
     assert result.status[0] == 0
     assert result.analysis.determined.rank[0] == 9 + 9
     names = ("rotation-x", "rotation-y", "toolface-zero")
@@ -233,7 +234,7 @@ def test_errors_in_angles_meet_the_bound_and_intervals_cover(lowest):
     a = a + tool.noise[0] * rng.normal(size=a.shape)
     sd = {"accelerometer": np.array(tool.noise[0])}
     known = {"inclination": inc, "toolface": face}
-    result = fit(Readings(a, known=known, sd=sd), "toolface-inclination")
+    result = fit(Readings(a, known=known, sd=sd), Options("toolface-inclination"))
     assert (result.status == 0).all()
 
     params, covariance = affine(result)

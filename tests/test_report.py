@@ -19,6 +19,7 @@ from mwdcal.app.report import css_string, measured, number, render, signed, writ
 from mwdcal.calibrate import calibrate
 from mwdcal.core.vectors import reference_vectors
 from mwdcal.errors import InputError
+from mwdcal.options import Options
 from mwdcal.predict import accuracy_at, accuracy_map, readings_at, typical_accuracy
 from mwdcal.profile import Profile, TriadProfile
 from mwdcal.readings import Readings
@@ -68,7 +69,7 @@ def heated(model=None):
     made = simulate.run(
         simulate.servo(np.random.default_rng(5)), stations, np.random.default_rng(6)
     )
-    return calibrate(replace(made, source="hot.csv"), SERVO, model=model, order=1)
+    return calibrate(replace(made, source="hot.csv"), SERVO, Options(model=model, order=1))
 
 
 @dataclass

@@ -7,6 +7,7 @@ from mwdcal.calibrate import calibrate
 from mwdcal.core.vectors import earth_field, earth_gravity, rotation, tool_from_earth
 from mwdcal.errors import FitError, InputError
 from mwdcal.estimate import fit
+from mwdcal.options import Options
 from mwdcal.profile import Profile
 from mwdcal.readings import Readings
 from simulation import DEG, Tool, plan
@@ -47,7 +48,7 @@ def test_sign_convention_of_tilt():
 @pytest.mark.parametrize("unknown", [(), ("dip", "field"), ("toolface",)])
 def test_stand_errors_are_unbiased_and_their_uncertainty_is_honest(unknown):
     _, data = crooked(200, unknown)
-    result = fit(data, stand=("stand-north", "stand-east", "azimuth-zero"))
+    result = fit(data, Options(estimate=("tilt", "azimuth-zero")))
     assert (result.status == 0).all()
     found = result.state.constants[:, -3:] / DEG
     stated = np.sqrt(np.diagonal(result.analysis.constants, axis1=1, axis2=2))[:, -3:] / DEG
@@ -62,7 +63,16 @@ def test_stand_errors_are_unbiased_and_their_uncertainty_is_honest(unknown):
 def test_record_of_stand_errors():
     _, data = crooked(1)
     single = Readings(data.accelerometer[0], data.magnetometer[0], known=data.known, sd=NOISE)
-    stand = calibrate(single, Profile(name="x"), estimate=["azimuth-zero", "tilt"]).stand
+    stand = calibrate(
+        single,
+        Profile(name="x"),
+        Options(
+            estimate=(
+                "azimuth-zero",
+                "tilt",
+            )
+        ),
+    ).stand
     assert stand.azimuth_zero_deg == pytest.approx(ZERO, abs=4 * stand.azimuth_zero_uncertainty_deg)
     assert stand.tilt_deg == pytest.approx(TILT, abs=4 * stand.tilt_uncertainty_deg)
     assert stand.tilt_azimuth_deg == pytest.approx(
@@ -75,11 +85,11 @@ def test_toolface_zero_is_never_separable_and_unknown_names_are_listed():
     _, data = crooked(1)
     single = Readings(data.accelerometer[0], data.magnetometer[0], known=data.known, sd=NOISE)
     with pytest.raises(FitError, match="never be told"):
-        calibrate(single, Profile(name="x"), estimate=["toolface-zero"])
+        calibrate(single, Profile(name="x"), Options(estimate=("toolface-zero",)))
     with pytest.raises(InputError, match="azimuth-zero"):
-        calibrate(single, Profile(name="x"), estimate=["azimut"])
+        calibrate(single, Profile(name="x"), Options(estimate=("azimut",)))
     with pytest.raises(InputError, match="joint"):
-        calibrate(single, Profile(name="x"), "least-squares", estimate=["tilt"])
+        calibrate(single, Profile(name="x"), Options("least-squares", estimate=("tilt",)))
 
 
 def test_not_separable_without_magnetometer():
@@ -88,4 +98,4 @@ def test_not_separable_without_magnetometer():
         data.accelerometer[0], known=data.known, sd={"accelerometer": NOISE["accelerometer"]}
     )
     with pytest.raises(FitError, match="cannot tell"):
-        calibrate(lone, Profile(name="x"), estimate=["azimuth-zero"])
+        calibrate(lone, Profile(name="x"), Options(estimate=("azimuth-zero",)))

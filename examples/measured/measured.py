@@ -22,6 +22,7 @@ from mwdcal.files.profiles import load_profile
 from mwdcal.files.runs import read_run, to_readings
 from mwdcal.files.table import Table
 from mwdcal.notation import convert
+from mwdcal.options import Options
 from mwdcal.profile import Profile, TriadProfile
 from mwdcal.readings import Readings
 from mwdcal.scatter import directions, group_scatter, scatter
@@ -71,7 +72,7 @@ def sap(name: str) -> Sap:
     readings, _ = read_run(fetch(f"{name}.csv"), profile)
     linear = np.degrees(scatter(readings))
     nonlinearity = profile.magnetometer.nonlinearity or 0.0
-    curved = np.degrees(scatter(readings, {"magnetometer": nonlinearity}))
+    curved = np.degrees(scatter(readings, Options(nonlinearity={"magnetometer": nonlinearity})))
     return Sap(name, SAP[name][0], *map(float, (*linear, *curved)))
 
 
@@ -87,7 +88,7 @@ def distox(name: str) -> tuple[float, ...]:
     ]
     readings, _ = to_readings(Table(columns, {}, path.name, range(2, len(rows) + 2)), profile)
     curved = {"accelerometer": profile.accelerometer.nonlinearity or 0.0}
-    ours = np.degrees([*scatter(readings), *scatter(readings, curved)])
+    ours = np.degrees([*scatter(readings), *scatter(readings, Options(nonlinearity=curved))])
     return distox_peer(name, rows, readings.group), *map(float, ours)
 
 
@@ -215,7 +216,7 @@ def imucal() -> float:
     readings, profile = accelerometer_only(
         raw, 2045.0, inclination=angles[:, 0], toolface=angles[:, 1]
     )
-    found = convert(calibrate(readings, profile, "least-squares"), "forward")[
+    found = convert(calibrate(readings, profile, Options("least-squares")), "forward")[
         "accelerometer"
     ].values
     published = json.loads(fetch("imucal/published.json").read_text())

@@ -24,6 +24,7 @@ from mwdcal.core.vectors import Array, centred, earth_gravity, rotation, tool_fr
 from mwdcal.datasets import fetch
 from mwdcal.errors import FitError
 from mwdcal.estimate import Fit, fit
+from mwdcal.options import Options
 from mwdcal.profile import Profile, TriadProfile
 from mwdcal.readings import Readings
 from mwdcal.simulate import Truth, grid, run, servo
@@ -330,7 +331,7 @@ def ours(method: str) -> Callable[[Readings], Solved]:
     """A method of mwdcal."""
 
     def solve(readings: Readings) -> Solved:
-        return affine(fit(readings, method))
+        return affine(fit(readings, Options(method)))
 
     return solve
 
@@ -587,7 +588,7 @@ def _rank(method: str, truth: Truth, order: int, temperatures: list[float]) -> i
         {name: whole.known[name] for name in ("inclination", "toolface")},
         {"accelerometer": np.array(1e-4)},
     )
-    return int(fit(alone, method, "factors", order).analysis.determined.rank[0])
+    return int(fit(alone, Options(method, "factors", order)).analysis.determined.rank[0])
 
 
 # ── Measured ─────────────────────────────────────────────────────────────────────────────────
@@ -636,12 +637,12 @@ def imucal() -> Measured:
         calibrate(
             readings,
             Profile(name="imucal", accelerometer=TriadProfile(scale=1 / COUNTS)),
-            "toolface-inclination",
+            Options("toolface-inclination"),
         )
         refusal = "accepted"
     except FitError as error:
         refusal = str(error)
-    ours_, theirs = fit(readings, "toolface-inclination"), fit(readings, "least-squares")
+    ours_, theirs = (fit(readings, Options(m)) for m in ("toolface-inclination", "least-squares"))
     determined = ours_.analysis.determined
     return Measured(
         int(determined.rank[0]),

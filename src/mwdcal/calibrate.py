@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from mwdcal import __version__
 from mwdcal.calibration import (
     FREE_SHARE,
     Calibration,
+    Choices,
     Constant,
     Finding,
     StationRow,
@@ -25,11 +27,12 @@ from mwdcal.core.observability import Free, free_directions
 from mwdcal.core.problem import STAND
 from mwdcal.core.uncertainty import marginal_rank
 from mwdcal.core.vectors import Array
-from mwdcal.estimate import Fit, Orders, default_kind, fit, orders
+from mwdcal.estimate import Fit, fit
+from mwdcal.options import Options
 from mwdcal.profile import Profile
 from mwdcal.readings import TRIADS, Readings
 from mwdcal.residuals import REASONS, error_rows, measure_rows, shown_in, station_rows
-from mwdcal.stand import check_separable, stand_errors, turns
+from mwdcal.stand import check_names, check_separable, stand_errors
 
 SUSPECT = 3.0
 """A fit whose residuals exceed the declared noise this many times is reported."""
@@ -39,44 +42,42 @@ IDENTITY = ("serial", "tool", "operator", "lab", "date", "stand", "simulated")
 def calibrate(
     readings: Readings,
     profile: Profile,
-    method: str = "joint",
-    model: str | None = None,
-    order: Orders = 0,
+    options: Options | None = None,
     *,
-    estimate: Sequence[str] = (),
-    seed: int = 0,
     profile_sha256: str = "",
     run_sha256: str = "",
     progress: Callable[[str], None] = lambda text: None,
 ) -> Calibration:
     """Fit the sensor model to a run and state what it is worth.
 
-    `model` is "polynomial" or "factors" (default: polynomial at order 0, factors above);
-    `estimate` names errors of the stand to find as well: "azimuth-zero", "tilt";
-    `seed` is that of the swarm.
     Raises `FitError` where the data cannot give a calibration to be trusted.
     """
-    check_readings(readings, method, model, order)
-    progress(f"fitting {readings.count} stations, method {method}, order {order}")
-    stand = turns(estimate, method)
-    curved = nonlinearities(profile, model, order)
-    result = fit(readings, method, model, order, curved=curved, stand=stand, seed=seed)
-    if stand:
-        check_separable(result, estimate)
+    options = with_nonlinearity(options or Options(), profile)
+    check_readings(readings, options)
+    check_names(options.estimate, options.method)
+    progress(f"fitting {readings.count} stations, method {options.method}, order {options.order}")
+    result = fit(readings, options)
+    if options.estimate:
+        check_separable(result, options.estimate)
     free = free_directions(result.problem, result.state, result.analysis.determined)
     check_fit(result, free, profile, readings)
-    made = _Record(readings, profile, result, free)
-    return rounded(made.calibration(method, seed, profile_sha256, run_sha256))
+    made = _Record(readings, profile, options, result, free)
+    return rounded(made.calibration(profile_sha256, run_sha256))
 
 
-def nonlinearities(profile: Profile, model: str | None, order: Orders) -> dict[str, float]:
-    """Triads whose profile declares a nonlinearity and whose model can have it, with its prior."""
+def with_nonlinearity(options: Options, profile: Profile) -> Options:
+    """The options with the own-axis terms that the profile declares, unless they say otherwise.
+
+    Only the polynomial model has such terms.
+    """
+    if options.nonlinearity is not None:
+        return options
     found = {}
-    for name, own in zip(TRIADS, orders(order), strict=True):
+    for name, order in zip(TRIADS, options.orders, strict=True):
         value = getattr(profile, name).nonlinearity
-        if value and (model or default_kind(own)) == "polynomial":
+        if value and options.kind(order) == "polynomial":
             found[name] = value
-    return found
+    return replace(options, nonlinearity=found)
 
 
 TEXTS = {
@@ -103,14 +104,13 @@ class _Record:
 
     readings: Readings
     profile: Profile
+    options: Options
     result: Fit
     free: list[Free]
 
-    def calibration(
-        self, method: str, seed: int, profile_sha256: str, run_sha256: str
-    ) -> Calibration:
+    def calibration(self, profile_sha256: str, run_sha256: str) -> Calibration:
         """The whole record."""
-        readings, result = self.readings, self.result
+        readings, result, options = self.readings, self.result, self.options
         stations = station_rows(readings, result)
         return Calibration(
             tool={k: str(v) for k, v in readings.metadata.items() if k in IDENTITY},
@@ -119,8 +119,14 @@ class _Record:
             run=readings.source,
             run_sha256=run_sha256,
             software=f"mwdcal {__version__}",
-            method=method,
-            seed=seed if method == "swarm" else None,
+            method=options.method,
+            options=Choices(
+                parameters=options.parameters,
+                robust=options.robust,
+                paper_weights=options.paper_weights,
+                prior=options.prior.source if options.prior else None,
+            ),
+            seed=options.seed if options.method == "swarm" else None,
             time=datetime.now(UTC).isoformat(timespec="seconds"),
             field_unit="relative (field = 1)" if self.relative else "nT",
             stations=readings.count,
@@ -154,13 +160,21 @@ class _Record:
 
     @cached_property
     def map(self) -> Array:
-        """Linear map (p, p) from the fit's parameters to the file's."""
-        slices = self.result.problem.slices()
-        whole = np.zeros((slices[-1].stop, slices[-1].stop))
-        for triad, where in zip(self.result.problem.triads, slices, strict=True):
-            _, one = triad.model.finished(self.profile.reference_temperature_c)
-            whole[where, where] = one.reshape(-1, triad.model.size, triad.model.size)[0]
+        """Linear map from the fit's parameters (p,) to the file's, held ones included."""
+        slices, ours = self.result.problem.slices(), self.slices
+        whole = np.zeros((ours[-1].stop, slices[-1].stop))
+        for triad, mine, where in zip(self.result.problem.triads, ours, slices, strict=True):
+            model, one = triad.model.finished(self.profile.reference_temperature_c)
+            whole[mine, where] = one.reshape(-1, model.size, triad.model.size)[0]
         return whole
+
+    @cached_property
+    def slices(self) -> list[slice]:
+        """Where each triad's parameters lie in the file."""
+        reference = self.profile.reference_temperature_c
+        sizes = [t.model.finished(reference)[0].size for t in self.result.problem.triads]
+        ends = np.cumsum([0, *sizes])
+        return [slice(int(a), int(b)) for a, b in pairwise(ends)]
 
     @cached_property
     def factors(self) -> Array:
@@ -217,10 +231,10 @@ class _Record:
     def triad(self, index: int) -> TriadCalibration:
         """The record of one triad."""
         problem, analysis = self.result.problem, self.result.analysis
-        triad, where = problem.triads[index], problem.slices()[index]
+        triad, where, mine = problem.triads[index], problem.slices()[index], self.slices[index]
         free = [f for f in self.free if index in f.triads]
         noise, declared = self.result.noise[0, index], np.isnan(self.result.noise[0, index])
-        curved = bool(getattr(triad.model, "curved", False))
+        curved = TRIADS[index] in (self.options.nonlinearity or {})
         finished, _ = triad.model.finished(self.profile.reference_temperature_c)
         freedom = float(analysis.freedom[0, index])
         return TriadCalibration(
@@ -232,7 +246,7 @@ class _Record:
             centre=(finished.centre.reshape(-1, 3)[0]).tolist() if curved else [0.0, 0.0, 0.0],  # type: ignore[union-attr]
             radius=float(finished.scale.ravel()[0]) if curved else 1.0,  # type: ignore[union-attr]
             parameter_names=list(finished.names),
-            parameters=(self.map[where, where] @ self.result.state.params[0, where]).tolist(),
+            parameters=(self.map[mine, where] @ self.result.state.params[0, where]).tolist(),
             standard_uncertainties=self._uncertainties(index),
             rank=int(marginal_rank(analysis.determined, where)[0]),
             size=triad.model.size,
@@ -256,12 +270,15 @@ class _Record:
         triad, temperature = problem.triads[index], problem.temperature
         params = self.result.state.params[:, where]
         strength = np.linalg.norm(triad.model.fields(params, triad.raw, temperature)[0], axis=-1)
-        finished, whole = triad.model.finished(self.profile.reference_temperature_c)
-        moved = whole.reshape(-1, triad.model.size, triad.model.size)[0] @ params[0]
+        finished, mine = (
+            triad.model.finished(self.profile.reference_temperature_c)[0],
+            self.slices[index],
+        )
+        moved = self.map[mine, where] @ params[0]
         columns = finished.jacobian(moved, triad.raw[0], temperature[0]).reshape(-1, 3, len(moved))
         effect = np.sqrt(np.mean(np.sum(columns**2, 1), 0)) / strength.mean()
-        share = np.abs([d[where] for d in self.directions] or [np.zeros(len(effect))]).max(0)
-        values = np.sqrt(np.diag(self.covariance)[where])
+        share = np.abs([d[mine] for d in self.directions] or [np.zeros(len(effect))]).max(0)
+        values = np.sqrt(np.diag(self.covariance)[mine])
         return [
             None if s * e > FREE_SHARE else float(v)
             for v, s, e in zip(values, share, effect, strict=True)
@@ -289,9 +306,13 @@ class _Record:
         for entry in self.free:
             names = " and ".join(TRIADS[t] for t in entry.triads)
             found.append(Finding(id=entry.id, text=f"{names}: {described(entry.id)}."))
-        models = zip(TRIADS, self.result.problem.triads, strict=False)
-        bent = [name for name, t in models if not getattr(t.model, "curved", False)]
-        ignored = [name for name in bent if getattr(self.profile, name).nonlinearity]
+        bent = self.options.nonlinearity or {}
+        kinds = {t.name: t.model for t in made if t.name not in bent}
+        ignored = [
+            n
+            for n, kind in kinds.items()
+            if kind == "factors" and getattr(self.profile, n).nonlinearity
+        ]
         if ignored:
             text = (
                 f"nonlinearity of the {' and '.join(ignored)} is not fitted: the model of factors "

@@ -110,6 +110,15 @@ class Measures(msgspec.Struct, frozen=True, kw_only=True):
     rmse: float
 
 
+class Choices(msgspec.Struct, frozen=True, kw_only=True):
+    """How the fit was asked for, beyond method, model and order; see `mwdcal.options.Options`."""
+
+    parameters: int = 12
+    robust: str | None = None
+    paper_weights: bool = False
+    prior: str | None = None
+
+
 class TriadCalibration(msgspec.Struct, frozen=True, kw_only=True):
     """One triad: field = model(x, T - reference), x = P (raw / scale), in tool axes.
 
@@ -117,6 +126,8 @@ class TriadCalibration(msgspec.Struct, frozen=True, kw_only=True):
     field = Σ τᵏ (A_k x + c_k); with `curved`, e₂ x² + e₃ x³ on each own axis follow, all
     terms then of (x - centre) / radius.
     model "factors": SF, B (temperature powers fastest) and m, field = (I - m)(x / SF - B).
+    `size` counts the fitted parameters, `rank` the determined ones: in a model of 9 or 6
+    parameters the others stand in the list as zero, without uncertainty.
     """
 
     name: str
@@ -162,6 +173,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
     run_sha256: str
     software: str
     method: str
+    options: Choices = Choices()
     seed: int | None = None
     time: str
     field_unit: str
@@ -233,15 +245,15 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
     def jacobian(self, readings: Readings) -> Array:
         """Derivative (…, n, 6, p) of both vectors with respect to the parameters of all triads."""
         temperature = self._temperature(readings)
-        size = sum(t.size for t in self.triads)
+        size = sum(len(t.parameters) for t in self.triads)
         result = np.zeros((*readings.accelerometer.shape[:-1], 6, size))
         at = 0
         for index, triad in enumerate(self.triads):
             model, raw = triad.functions(self.reference_temperature), getattr(readings, triad.name)
             if raw is not None:
                 block = model.jacobian(np.array(triad.parameters), raw, temperature)
-                result[..., 3 * index : 3 * index + 3, at : at + triad.size] = block
-            at += triad.size
+                result[..., 3 * index : 3 * index + 3, at : at + block.shape[-1]] = block
+            at += len(triad.parameters)
         return result
 
     def noise_covariance(self, readings: Readings) -> Array:
@@ -299,12 +311,12 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
         rows, covariance = self.sensitivity(name, readings), np.array(self.covariance)
         start, spread = 0, np.zeros(rows.shape[:-1])
         for triad in self.triads:
-            own = slice(start, start + triad.size)
+            own = slice(start, start + len(triad.parameters))
             part = np.einsum(
                 "...i,ij,...j->...", rows[..., own], covariance[own, own], rows[..., own]
             )
             spread = spread + part**2 / max(triad.degrees_of_freedom, 1.0)
-            start += triad.size
+            start += len(triad.parameters)
         sd = self.uncertainty(name, readings)
         freedom = sd**4 / np.where(spread > 0, spread, 1.0)
         return np.asarray(sd * stdtrit(np.maximum(freedom, 1.0), (1 + probability) / 2))
@@ -321,7 +333,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
         return np.asarray(np.any(change > np.nan_to_num(limit)[..., None], -1))
 
     def _free_rows(self) -> Array:
-        size = sum(t.size for t in self.triads)
+        size = sum(len(t.parameters) for t in self.triads)
         return np.array(self.free, float).reshape(len(self.free), size)
 
     def other_tool(self, readings: Readings) -> tuple[str, str] | None:

@@ -5,10 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from mwdcal.core.observability import Free
+from mwdcal.core.robust import LOSSES
 from mwdcal.core.solvers import Status
 from mwdcal.core.vectors import Array
 from mwdcal.errors import FitError, InputError
-from mwdcal.estimate import METHODS, Fit, Orders, default_kind, orders
+from mwdcal.estimate import Fit
+from mwdcal.methods import EVIDENCE
+from mwdcal.options import Options
 from mwdcal.profile import Profile
 from mwdcal.readings import TRIADS, Readings
 from mwdcal.selection import soaks
@@ -38,14 +41,42 @@ def check_fit(result: Fit, free: list[Free], profile: Profile, readings: Reading
     _check_residuals(result)
 
 
-def check_readings(readings: Readings, method: str, kind: str | None, order: Orders) -> None:
+def check_options(options: Options) -> None:
+    """Refuse choices that do not go together."""
+    method = options.method
+    if method not in EVIDENCE:
+        raise InputError(f"--method must be one of {', '.join(EVIDENCE)}; got {method!r}.")
+    if options.parameters not in (6, 9, 12):
+        raise InputError(f"--parameters must be 6, 9 or 12; got {options.parameters}.")
+    if options.robust not in (None, *LOSSES):
+        raise InputError(f"--robust must be one of {', '.join(LOSSES)}; got {options.robust!r}.")
+    own = method in ("newton", "swarm") or options.paper_weights
+    if own and options.robust:
+        raise InputError(
+            f"--robust cannot weigh the stations of {'unweighted sums' if options.paper_weights else method}. "
+            "Use --method joint with it."
+        )
+    if options.paper_weights and method == "joint":
+        raise InputError(
+            "--paper-weights: method joint is of no paper. Name the paper's method: least-squares, "
+            "swarm, newton, toolface-inclination or scalar."
+        )
+    if options.prior and (own or options.nonlinearity):
+        what = "own-axis nonlinearity" if options.nonlinearity else f"method {method}"
+        raise InputError(
+            f"--prior cannot be combined with {what}. Use --method joint, without "
+            "--paper-weights and with --nonlinearity none."
+        )
+
+
+def check_readings(readings: Readings, options: Options) -> None:
     """Refuse what no fit could mend, before trying."""
-    if method not in METHODS:
-        raise InputError(f"--method must be one of {', '.join(METHODS)}; got {method!r}.")
-    highest = max(orders(order))
-    factors = (kind or default_kind(highest)) == "factors"
+    check_options(options)
+    method, highest = options.method, max(options.orders)
+    factors = options.kind(highest) == "factors"
     size = 6 * (highest + 1) + 6 if factors else 12 * (highest + 1)
-    if 3 * readings.count < size:
+    size -= (12 - options.parameters) * (1 if factors else highest + 1)
+    if 3 * readings.count < size and options.prior is None:
         raise FitError(
             f"{readings.source or 'the run'} has {readings.count} stations; the model has {size} "
             f"parameters per triad and needs {-(-size // 3)} or more. Add stations at other "

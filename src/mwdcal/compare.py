@@ -7,13 +7,15 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from mwdcal.calibrate import calibrate, nonlinearities
+from mwdcal.calibrate import calibrate, with_nonlinearity
 from mwdcal.calibration import Calibration, Measures
 from mwdcal.core.observables import OBSERVABLES
 from mwdcal.core.vectors import Array, centred
 from mwdcal.errors import MwdcalError
-from mwdcal.estimate import METHODS, Orders, fit
+from mwdcal.estimate import fit
+from mwdcal.methods import EVIDENCE
 from mwdcal.notation import Notation, convert
+from mwdcal.options import Options, Orders
 from mwdcal.profile import Profile
 from mwdcal.readings import Readings
 from mwdcal.residuals import SHOWN, shown_in
@@ -64,7 +66,7 @@ def compare(readings: Readings, profile: Profile, order: Orders = 0) -> Comparis
     units = {name: shown_in(name, relative)[1] for name in names}
     if (readings.groups >= 0).any() and readings.magnetometer is not None:
         units[SCATTER] = "°"
-    rows = tuple(_row(readings, profile, method, order, relative) for method in METHODS)
+    rows = tuple(_row(readings, profile, method, order, relative) for method in EVIDENCE)
     return Comparison(readings.source, readings.count, units, rows, advice(rows))
 
 
@@ -77,14 +79,14 @@ def _referenced(readings: Readings) -> list[str]:
 
 def _row(readings: Readings, profile: Profile, method: str, order: Orders, relative: bool) -> Row:
     started = time.perf_counter()
+    options = with_nonlinearity(Options(method, order=order), profile)
     try:
-        made = calibrate(readings, profile, method, order=order)
+        made = calibrate(readings, profile, options)
     except MwdcalError as error:
         return Row(method, refused=str(error))
     seconds = time.perf_counter() - started
-    curved = nonlinearities(profile, None, order)
-    whole = fit(readings, method, order=order, curved=curved)
-    left_out = _left_out(readings, method, order, curved)
+    whole = fit(readings, options)
+    left_out = _left_out(readings, options)
     return Row(
         method,
         ranks={t.name: (t.rank, t.size) for t in made.triads},
@@ -130,13 +132,11 @@ def _summary(readings: Readings, g: Array, b: Array, relative: bool) -> dict[str
     return result
 
 
-def _left_out(
-    readings: Readings, method: str, order: Orders, curved: dict[str, float]
-) -> tuple[Array, Array]:
+def _left_out(readings: Readings, options: Options) -> tuple[Array, Array]:
     """Vectors (n, 3) of each station from the fit that left its part out."""
     part = np.arange(readings.count) % FOLDS
     include = (np.arange(FOLDS)[:, None] != part).astype(float)
-    result = fit(readings, method, None, order, include, curved)
+    result = fit(readings, options, include)
     g, b = result.problem.fields(result.state)
     own = np.arange(readings.count)
     return g[part, own], b[part, own]

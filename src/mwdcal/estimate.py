@@ -1,92 +1,31 @@
-"""From readings to a fitted problem: evidence, noise, gauge. The estimator behind every method.
-
-A method is a selection of evidence; the solver is the same. See `METHODS`.
-"""
+"""From readings to a fitted problem: evidence, noise, weights, gauge, uncertainty."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mwdcal.core.models import Basis, Factors, Model, Polynomial
-from mwdcal.core.newton import newton, propagated
-from mwdcal.core.problem import UNKNOWN, Constant, Evidence, Problem, State, Triad
-from mwdcal.core.solvers import Status, gauss_newton
+from mwdcal.core.models import Basis, Factors, Polynomial, Restricted, Whole, restricted
+from mwdcal.core.problem import Evidence, Problem, State, Triad
+from mwdcal.core.robust import LOSSES, consistency, inflation, weight
+from mwdcal.core.solvers import Status
 from mwdcal.core.start import start
-from mwdcal.core.swarm import forward_parts, swarm_forward
-from mwdcal.core.uncertainty import Analysis, analyse, readjusted, settle_gauge
-from mwdcal.core.vectors import AnyArray, Array, Bools, Ints, inverse
-from mwdcal.readings import ANGLES, CONSTANTS, TRIADS, Readings
+from mwdcal.core.sums import Sums
+from mwdcal.core.uncertainty import Analysis, analyse, settle_gauge, station_misfit
+from mwdcal.core.vectors import Array, Bools, Ints
+from mwdcal.evidence import evidence_of, flat
+from mwdcal.methods import EVIDENCE, Solved, solve, with_stand_errors
+from mwdcal.options import Options
+from mwdcal.prior import prior_of
+from mwdcal.readings import ANGLES, TRIADS, Readings
 
-Orders = int | tuple[int, int]
-"""Temperature order of both triads, or of accelerometer and magnetometer."""
-HELD = 1e18
-"""Precision of a parameter that is held at its value."""
-ITERATIONS = 600
-"""Iterations of the swarm, as Moradi's."""
 FLOOR = 1e-9
 """Smallest noise, as a share of the signal, that an estimate from residuals may reach."""
-
-
-def joint(evidence: Evidence) -> Evidence:
-    """All evidence, weighted by its uncertainty."""
-    return evidence
-
-
-def whole_vectors(evidence: Evidence) -> Evidence:
-    """Reference vectors only, taken as exact: least squares as in the six-state test."""
-    exact = {name: np.zeros_like(sd) for name, sd in evidence.sd.items()}
-    return replace(evidence, sd=exact, group=np.full_like(evidence.group, -1))
-
-
-def angles_alone(evidence: Evidence) -> Evidence:
-    """Inclination and toolface of the accelerometer, without |g| (Ivanov); scale stays nominal."""
-    return _reset(evidence, absent=("gravity",))
-
-
-def strengths_alone(evidence: Evidence) -> Evidence:
-    """|g| and |b| at every station, and nothing else: the scalar (total field) method."""
-    known = dict(evidence.known)
-    for name in (*ANGLES, "dip"):
-        known[name] = np.full_like(known[name], np.nan)
-    alone = np.full_like(evidence.group, -1)
-    return _reset(replace(evidence, known=known, group=alone), absent=("dip",))
-
-
-def with_stand_errors(evidence: Evidence, names: tuple[str, ...]) -> Evidence:
-    """The evidence with errors of the stand as unknown constants of the run (see `STAND`)."""
-    found = list(evidence.constants)
-    zero = np.zeros(len(evidence.include))
-    for name in names:
-        angle = "azimuth" if name == "azimuth-zero" else "inclination"
-        mask = evidence.is_known(angle).astype(float)
-        found.append(Constant(name, mask, zero, np.full(len(zero), UNKNOWN), unknown=True))
-    return replace(evidence, constants=tuple(found))
-
-
-def inclination_and_strength(evidence: Evidence) -> Evidence:
-    """|g| and inclination of the accelerometer (Moosavi); azimuth, |b| and dip of the magnetometer."""
-    known = {**evidence.known, "toolface": np.full_like(evidence.known["toolface"], np.nan)}
-    return replace(evidence, known=known, group=np.full_like(evidence.group, -1))
-
-
-def _reset(evidence: Evidence, absent: tuple[str, ...]) -> Evidence:
-    """The evidence with its constants worked out again after a change."""
-    changed = replace(evidence, absent=absent, constants=())
-    return replace(changed, constants=_constants(changed))
-
-
-METHODS: dict[str, Callable[[Evidence], Evidence]] = {
-    "joint": joint,
-    "least-squares": whole_vectors,
-    "newton": inclination_and_strength,
-    "swarm": whole_vectors,
-    "toolface-inclination": angles_alone,
-    "scalar": strengths_alone,
-}
+ROBUST_ROUNDS = 40
+SETTLED = 1e-3
+"""Change of the stations' weights, as a share, at which weighing and fitting in turn ends."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +33,7 @@ class Fit:
     """A batch of fitted problems: shapes lead with the batch axis B.
 
     `noise` (B, triads) is the estimated standard deviation, NaN where it was declared;
-    `status` holds `Status` codes.
+    `status` holds `Status` codes; `trust` (B, n) are the weights of a robust fit, else 1.
     """
 
     problem: Problem
@@ -102,87 +41,13 @@ class Fit:
     status: Ints
     iterations: Ints
     noise: Array
+    trust: Array
     analysis: Analysis
-
-
-def _flat(value: AnyArray, lead: tuple[int, ...], *tail: int) -> AnyArray:
-    """A value with one batch axis: (B, n, *tail)."""
-    whole = np.broadcast_to(np.asarray(value), (*lead, *tail))
-    return np.asarray(whole.reshape(math.prod(lead[:-1]), lead[-1], *tail))
-
-
-def evidence_of(readings: Readings, include: Array) -> Evidence:
-    """Everything the readings say about their stations, for one batch axis."""
-    lead = np.broadcast_shapes(readings.accelerometer.shape[:-1], include.shape)
-    known = {n: _flat(readings.reference(n), lead) for n in ANGLES + CONSTANTS}
-    sd = {n: _flat(readings.uncertainty(n), lead) for n in ANGLES + CONSTANTS}
-    group = _shared_groups(_flat(readings.groups, lead))
-    included = _flat(include, lead).astype(float)
-    nowhere = np.isnan(known["field"]).all(-1, keepdims=True)
-    known["field"] = np.where(nowhere, 1.0, known["field"])
-    bare = Evidence(known, sd, group, included, ())
-    known, sd = _share_known(bare)
-    return replace(bare, known=known, sd=sd, constants=_constants(bare))
-
-
-def _shared_groups(group: Ints) -> Ints:
-    """Group numbers (B, n) without gaps, -1 where a station is alone in its group."""
-    labels, compact = np.unique(group, return_inverse=True)
-    keys = compact.reshape(group.shape) + len(labels) * np.arange(len(group))[:, None]
-    _, where, counts = np.unique(keys, return_inverse=True, return_counts=True)
-    shared = (counts[where].reshape(group.shape) > 1) & (group >= 0)
-    kept = np.unique(group[shared])
-    return np.where(shared, np.searchsorted(kept, group), -1)
-
-
-def _share_known(evidence: Evidence) -> tuple[dict[str, Array], dict[str, Array]]:
-    """References and their σ where blank angles of a group take the mean of its filled cells.
-
-    One error is then common to the group: every member gets a σ that leaves the group as
-    uncertain as the mean of its k filled cells, σ √(members / k).
-    """
-    known, spread = dict(evidence.known), dict(evidence.sd)
-    for name in ("inclination", "azimuth"):
-        given = evidence.is_known(name)
-        filled = evidence.members * given[..., None]
-        count, total = filled.sum(-2), evidence.members.sum(-2)
-        turn = np.einsum("bnk,bn->bk", filled, np.exp(1j * np.nan_to_num(known[name])))
-        square = np.einsum("bnk,bn->bk", filled, evidence.sd[name] ** 2)
-        partly = (count > 0) & (count < total)
-        factor = np.where(partly, total / np.maximum(count, 1) ** 2, 0.0)
-        common = np.einsum("bnk,bk->bn", evidence.members, np.sqrt(square * factor))
-        mean = np.einsum("bnk,bk->bn", evidence.members, np.angle(turn))
-        within = np.einsum("bnk,bk->bn", evidence.members, partly) > 0
-        known[name] = np.where(within & ~given, mean, known[name])
-        spread[name] = np.where(within, common, evidence.sd[name])
-    return known, spread
-
-
-def _constants(evidence: Evidence) -> tuple[Constant, ...]:
-    """Constants of the run to estimate: unknown ones, and errors of uncertain references."""
-    found = []
-    for name, size in (("gravity", 1.0), ("field", 0.0), ("dip", UNKNOWN)):
-        if name in evidence.absent:
-            continue
-        known = evidence.is_known(name)
-        if not known.all():
-            value = np.nan_to_num(
-                np.nansum(evidence.known[name], -1) / np.maximum(known.sum(-1), 1)
-            )
-            scale = np.full(len(value), size) if size else np.where(value > 0, value, 1.0)
-            found.append(Constant(name, (~known).astype(float), value, scale, unknown=True))
-        sd = np.max(np.where(known, evidence.sd[name], 0.0), -1)
-        if (sd > 0).any():
-            floor = np.where(sd > 0, sd, 1e-12)
-            found.append(
-                Constant(name, known.astype(float), np.zeros(len(sd)), floor, unknown=False)
-            )
-    return tuple(found)
 
 
 def model_of(
     kind: str, order: int, raw: Array, temperature: Array, include: Array, curved: bool = False
-) -> Model:
+) -> Whole:
     """A conditioned model for readings (B, n, 3): centred, scaled, Chebyshev in temperature."""
     low, high = float(temperature.min()), float(temperature.max())
     half = (high - low) / 2 or 1.0
@@ -198,56 +63,39 @@ def model_of(
     )
 
 
-def orders(order: Orders) -> tuple[int, int]:
-    """Temperature order of accelerometer and magnetometer."""
-    return (order, order) if isinstance(order, int) else order
-
-
-def default_kind(order: int) -> str:
-    """The model for a temperature order: identical at 0, where the linear one is simpler."""
-    return "factors" if order else "polynomial"
-
-
 def _problem(
-    readings: Readings,
-    evidence: Evidence,
-    lead: tuple[int, ...],
-    kind: str | None,
-    order: Orders,
-    curved: Mapping[str, float],
+    readings: Readings, evidence: Evidence, lead: tuple[int, ...], options: Options
 ) -> tuple[Problem, list[bool]]:
     """The problem, and for each triad whether its noise is declared."""
     cold = np.zeros(readings.count)
-    temperature = _flat(cold if readings.temperature is None else readings.temperature, lead)
+    temperature = flat(cold if readings.temperature is None else readings.temperature, lead)
+    curved = options.nonlinearity or {}
     triads: list[Triad] = []
-    declared: list[bool] = []
-    for name in TRIADS:
+    for name, order in zip(TRIADS, options.orders, strict=True):
         values = getattr(readings, name)
         if values is None:
             continue
-        raw = _flat(values, lead, 3)
-        own = orders(order)[len(triads)]
-        model = model_of(
-            kind or default_kind(own), own, raw, temperature, evidence.include, name in curved
+        raw = flat(values, lead, 3)
+        whole = model_of(
+            options.kind(order), order, raw, temperature, evidence.include, name in curved
         )
         sd = (
-            _flat(readings.sd[name], lead, 3)
-            if name in readings.sd
-            else 1e-3 * _size(raw) + 0 * raw
+            flat(readings.sd[name], lead, 3) if name in readings.sd else 1e-3 * _size(raw) + 0 * raw
         )
-        prior = _prior(model, evidence, name, curved.get(name, 0.0))
-        triads.append(Triad(model, raw, sd, prior, np.zeros_like(prior)))
-        declared.append(name in readings.sd)
-    return Problem(tuple(triads), temperature, evidence), declared
+        triads.append(Triad(restricted(whole, options.parameters), raw, sd))
+    prior = prior_of(options.prior, [t.model for t in triads], len(evidence.include))
+    problem = Problem(tuple(triads), temperature, evidence, prior)
+    _bound_curves(problem, curved)
+    return problem, [name in readings.sd for name in TRIADS[: len(triads)]]
 
 
-def _prior(model: Model, evidence: Evidence, name: str, nonlinearity: float) -> Array:
-    """Prior precision (B, p): curved terms are small, all else is free."""
-    prior = np.zeros((len(evidence.include), model.size))
-    if isinstance(model, Polynomial) and model.curved:
-        strength = np.nanmean(evidence.known["field" if name == "magnetometer" else "gravity"], -1)
-        prior[:, -6:] = (nonlinearity * strength[:, None]) ** -2
-    return prior
+def _bound_curves(problem: Problem, curved: Mapping[str, float]) -> None:
+    """Give the own-axis terms, the last six of a triad, their prior."""
+    for name, strength, where in zip(TRIADS, ("gravity", "field"), problem.slices(), strict=False):
+        if name in curved:
+            last = np.arange(where.stop - 6, where.stop)
+            size = np.nanmean(problem.evidence.known[strength], -1)[:, None]
+            problem.prior.precision[:, last, last] += (curved[name] * size) ** -2
 
 
 def _size(raw: Array) -> Array:
@@ -256,113 +104,81 @@ def _size(raw: Array) -> Array:
     return np.where(size > 0, size, 1.0)
 
 
-def fit(
-    readings: Readings,
-    method: str = "joint",
-    kind: str | None = None,
-    order: Orders = 0,
-    include: Array | None = None,
-    curved: Mapping[str, float] | None = None,
-    stand: tuple[str, ...] = (),
-    seed: int = 0,
-    rounds: int = 8,
-) -> Fit:
+def fit(readings: Readings, options: Options | None = None, include: Array | None = None) -> Fit:
     """Fit a run, or a batch of runs (leading axes of the readings, or of `include`).
 
-    `kind` is "polynomial" or "factors" (default: polynomial at order 0, factors above), and
-    `order` the temperature order of both triads or of each.
-    `curved` names triads with own-axis quadratic and cubic terms, and their prior as a share
-    of the field; `stand` names turns of the stand's frame to estimate (`core.problem.STAND`);
-    `seed` is that of the swarm.
+    `include` (..., n) is 1 for stations that count and 0 for those left out.
     """
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        return _fit(readings, method, kind, order, include, curved or {}, stand, seed, rounds)
+        return _fit(readings, options or Options(), include)
 
 
-def _fit(
-    readings: Readings,
-    method: str,
-    kind: str | None,
-    order: Orders,
-    include: Array | None,
-    curved: Mapping[str, float],
-    stand: tuple[str, ...],
-    seed: int,
-    rounds: int,
-) -> Fit:
+def _fit(readings: Readings, options: Options, include: Array | None) -> Fit:
     include = np.ones(readings.count) if include is None else np.asarray(include, float)
-    evidence = with_stand_errors(METHODS[method](evidence_of(readings, include)), stand)
+    evidence = EVIDENCE[options.method](evidence_of(readings, include))
+    evidence = with_stand_errors(evidence, options.estimate)
     lead = np.broadcast_shapes(readings.accelerometer.shape[:-1], include.shape)
-    problem, declared = _problem(readings, evidence, lead, kind, order, curved)
+    problem, declared = _problem(readings, evidence, lead, options)
     problem, finite = _without_broken(problem)
-    state = start(problem)
-    if method == "swarm":
-        state, status, iterations = _swarmed(problem, state, seed)
-    elif method == "newton":
-        state, status, iterations = _by_newton(problem, state)
-    else:
-        state, status, iterations = gauss_newton(problem, state)
-    noise = np.full((len(status), len(declared)), np.nan)
+    solved = solve(problem, start(problem), options)
+    iterations = solved.iterations
     if not all(declared):
-        refit = None if method in ("swarm", "newton") else gauss_newton
-        problem, state, status, noise = _estimate_noise(
-            problem, state, status, declared, refit, rounds
-        )
-    state = settle_gauge(problem, state)
-    status = np.where(finite, status, int(Status.NOT_FINITE))
-    return Fit(problem, state, status, iterations, noise, analyse(problem, state))
-
-
-def _swarmed(problem: Problem, state: State, seed: int) -> tuple[State, Ints, Ints]:
-    """Parameters by particle swarm on the error in the readings, directions and strengths known."""
-    parts = []
-    for triad, earth in zip(problem.triads, problem.earth(state)[0], strict=False):
-        target = np.einsum("bnij,bnj->bni", state.attitude, earth)
-        found = _swarm_forward(triad.raw, target, problem.evidence.include > 0, seed)
-        matrix, offset = forward_parts(found)
-        back = inverse(matrix)
-        parts.append(triad.model.start(back, -np.einsum("bij,bj->bi", back, offset)))
-    params = np.concatenate(parts, -1)
-    finite = np.isfinite(params).all(-1)
-    status = np.where(finite, int(Status.OK), int(Status.NOT_FINITE))
-    return replace(state, params=params), status, np.full(len(params), ITERATIONS)
-
-
-def _by_newton(problem: Problem, state: State) -> tuple[State, Ints, Ints]:
-    """The accelerometer by Newton-Raphson from the datasheet, then the magnetometer against it."""
-    triad, evidence = problem.triads[0], problem.evidence
-    batch = len(state.params)
-    nominal = triad.model.start(np.zeros((batch, 3, 3)) + np.eye(3), np.zeros((batch, 3)))
-    gravity = problem.constant(state, "gravity")
-    noise = np.sqrt(np.mean(triad.sd**2, -1))
-    weights = propagated(gravity, noise, evidence.sd["inclination"])
-    weights = weights * evidence.include[..., None]
-    found = newton(
-        triad.model, nominal, triad.raw, problem.temperature, gravity,
-        evidence.known["inclination"], weights=weights,
-    )  # fmt: skip
-    where = problem.slices()[0]
-    params = state.params.copy()
-    params[:, where] = found.params
-    state = readjusted(problem, replace(state, params=params))
-    if len(problem.triads) > 1:
-        fixed = replace(triad, prior=np.full_like(triad.prior, HELD), expected=found.params)
-        held = replace(problem, triads=(fixed, *problem.triads[1:]))
-        state, status, _ = gauss_newton(held, state)
-    else:
-        status = found.status
-    return state, np.maximum(status, found.status), found.iterations
-
-
-def _swarm_forward(raw: Array, target: Array, include: Bools, seed: int) -> Array:
-    """Forward parameters (B, 12); members that leave stations out fly one by one."""
-    if include.all():
-        return swarm_forward(raw, target, "reading", iterations=ITERATIONS, seed=seed).position
-    each = [
-        swarm_forward(r[keep], t[keep], "reading", iterations=ITERATIONS, seed=seed).position
-        for r, t, keep in zip(raw, target, include, strict=True)
+        problem, solved = _estimate_noise(problem, solved, declared, options)
+    trust = np.ones(problem.evidence.include.shape)
+    if options.robust:
+        problem, solved, trust = _downweigh(problem, solved, declared, options)
+    trusted = _trusting(problem, trust)
+    state = settle_gauge(trusted, solved.state)
+    status = np.where(finite, solved.status, int(Status.NOT_FINITE))
+    noise = [
+        np.full(len(status), np.nan) if k else t.sd[:, 0, 0]
+        for t, k in zip(problem.triads, declared, strict=True)
     ]
-    return np.stack(each)
+    analysis = _analysed(trusted, state, solved.sums, options.robust)
+    return Fit(trusted, state, status, iterations, np.stack(noise, -1), trust, analysis)
+
+
+def _analysed(
+    problem: Problem, state: State, sums: Mapping[int, Sums], robust: str | None
+) -> Analysis:
+    """The analysis of the estimator that was used: not every one is the likelihood's."""
+    found = analyse(problem, state)
+    if sums:
+        found = replace(found, covariance=_sandwiched(problem, state, found.covariance, sums))
+    if robust:
+        freedom = _tested(station_misfit(found)[1])
+        found = replace(
+            found,
+            covariance=found.covariance * inflation(robust, freedom),
+            constants=found.constants * inflation(robust, freedom),
+            variance_factor=found.variance_factor / consistency(robust, freedom),
+        )
+    return found
+
+
+def _sandwiched(
+    problem: Problem, state: State, covariance: Array, sums: Mapping[int, Sums]
+) -> Array:
+    """Covariance (B, p, p) when some triads minimise sums of their own.
+
+    The other triad follows the first as it does in the likelihood, by its regression on it.
+    """
+    slices, result = problem.slices(), covariance.copy()
+    for index, one in sums.items():
+        result[:, slices[index], slices[index]] = one.covariance(state.params[:, slices[index]])
+    if len(slices) == 1 or len(sums) == 2:
+        return result
+    a, m = slices
+    scale = np.sqrt(np.maximum(np.diagonal(covariance[:, a, a], axis1=-2, axis2=-1), 1e-300))
+    normal = covariance[:, a, a] / (scale[:, :, None] * scale[:, None, :])
+    back = np.linalg.pinv(normal, rcond=1e-10, hermitian=True)
+    back = back / (scale[:, :, None] * scale[:, None, :])
+    follow = covariance[:, m, a] @ back
+    change = result[:, a, a] - covariance[:, a, a]
+    result[:, m, a] = follow @ result[:, a, a]
+    result[:, a, m] = np.swapaxes(result[:, m, a], -1, -2)
+    result[:, m, m] = covariance[:, m, m] + follow @ change @ np.swapaxes(follow, -1, -2)
+    return result
 
 
 def _without_broken(problem: Problem) -> tuple[Problem, Bools]:
@@ -374,11 +190,16 @@ def _without_broken(problem: Problem) -> tuple[Problem, Bools]:
     triads = []
     for triad in problem.triads:
         raw = np.where(finite[:, None, None], triad.raw, pattern)
-        triads.append(replace(triad, raw=raw, model=_finite_model(triad.model)))
+        model = triad.model
+        if isinstance(model, Restricted):
+            model = replace(model, whole=_finite_model(model.whole))
+        else:
+            model = _finite_model(model)
+        triads.append(replace(triad, raw=raw, model=model))
     return replace(problem, triads=tuple(triads)), finite
 
 
-def _finite_model(model: Model) -> Model:
+def _finite_model(model: Whole) -> Whole:
     if isinstance(model, Factors):
         return model
     centre = np.where(np.isfinite(model.centre), model.centre, 0.0)
@@ -386,31 +207,72 @@ def _finite_model(model: Model) -> Model:
 
 
 def _estimate_noise(
-    problem: Problem,
-    state: State,
-    status: Ints,
-    declared: list[bool],
-    refit: Callable[[Problem, State], tuple[State, Ints, Ints]] | None,
-    rounds: int,
-) -> tuple[Problem, State, Ints, Array]:
+    problem: Problem, solved: Solved, declared: list[bool], options: Options
+) -> tuple[Problem, Solved]:
     """Variance per triad by restricted maximum likelihood, fit and estimate in turn."""
-    for _ in range(rounds):
-        scale = np.sqrt(analyse(problem, state).variance_factor)
-        triads = tuple(
-            t if known else replace(t, sd=_scaled_noise(t, scale[:, i]))
-            for i, (t, known) in enumerate(zip(problem.triads, declared, strict=True))
-        )
-        problem = replace(problem, triads=triads)
-        if refit is not None:
-            state, status, _ = refit(problem, state)
+    for _ in range(options.rounds):
+        scale = np.sqrt(analyse(problem, solved.state).variance_factor)
+        problem = _rescaled(problem, scale, declared)
+        if options.method not in ("swarm", "newton"):
+            solved = solve(problem, solved.state, options)
         free = [i for i, known in enumerate(declared) if not known]
         if np.all(np.abs(scale[:, free] - 1) < 1e-3):
             break
-    noise = [
-        np.full(len(status), np.nan) if k else t.sd[:, 0, 0]
-        for t, k in zip(problem.triads, declared, strict=True)
-    ]
-    return problem, state, status, np.stack(noise, -1)
+    return problem, solved
+
+
+def _downweigh(
+    problem: Problem, solved: Solved, declared: list[bool], options: Options
+) -> tuple[Problem, Solved, Array]:
+    """Weigh the stations by their misfit and fit in turn; also the weights (B, n) that result."""
+    loss = options.robust or LOSSES[0]
+    trust = np.ones(problem.evidence.include.shape)
+    for _ in range(ROBUST_ROUNDS):
+        analysis = analyse(_trusting(problem, trust), solved.state)
+        square, freedom = station_misfit(analysis)
+        square = square / trust
+        excess = _typical(square, freedom)
+        excess = np.maximum(excess, 1.0) if all(declared) else excess
+        before, trust = trust, weight(loss, square / excess[:, None], freedom)
+        if not all(declared):
+            share = consistency(loss, _tested(freedom))
+            problem = _rescaled(problem, np.sqrt(analysis.variance_factor / share), declared)
+        solved = solve(_trusting(problem, trust), solved.state, options)
+        if np.all(np.abs(trust / before - 1) < SETTLED):
+            break
+    return problem, solved, trust
+
+
+def _typical(square: Array, freedom: Array) -> Array:
+    """Misfit (B,) of the median station, over what is to be expected of good ones."""
+    from scipy.special import chdtri
+
+    ratio = square / chdtri(np.maximum(freedom, 1.0), 0.5)
+    return np.asarray(np.nanmedian(np.where(freedom > 0, ratio, np.nan), -1))
+
+
+def _tested(freedom: Array) -> float:
+    """Mean degrees of freedom of the stations that anything tests."""
+    return float(freedom.sum() / max(np.count_nonzero(freedom), 1))
+
+
+def _trusting(problem: Problem, trust: Array) -> Problem:
+    """The problem with the covariance of each station, readings and angles, over its weight."""
+    if (trust == 1).all():
+        return problem
+    grown = 1 / np.sqrt(trust)
+    triads = tuple(replace(t, sd=t.sd * grown[..., None]) for t in problem.triads)
+    sd = {n: s * grown if n in ANGLES else s for n, s in problem.evidence.sd.items()}
+    return replace(problem, triads=triads, evidence=replace(problem.evidence, sd=sd))
+
+
+def _rescaled(problem: Problem, scale: Array, declared: list[bool]) -> Problem:
+    """The problem with the noise of triads that declare none times `scale` (B, triads)."""
+    triads = tuple(
+        t if known else replace(t, sd=_scaled_noise(t, scale[:, i]))
+        for i, (t, known) in enumerate(zip(problem.triads, declared, strict=True))
+    )
+    return replace(problem, triads=triads)
 
 
 def _scaled_noise(triad: Triad, scale: Array) -> Array:
@@ -418,4 +280,4 @@ def _scaled_noise(triad: Triad, scale: Array) -> Array:
     return np.maximum(triad.sd * factor, FLOOR * _size(triad.raw))
 
 
-__all__ = ["METHODS", "Fit", "Status", "evidence_of", "fit", "joint", "whole_vectors"]
+__all__ = ["Fit", "Status", "fit", "model_of"]

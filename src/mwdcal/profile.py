@@ -17,6 +17,20 @@ from mwdcal.core.vectors import Array
 Axis = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
 
 
+class Datasheet(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What the maker promises of a triad, 1 σ: knowledge for a fit that asks for it.
+
+    `scale` as a share, `bias` in g or nT, `misalignment_deg`; `scale_per_c` and `bias_per_c`
+    their drift per °C. What is not given is not known.
+    """
+
+    scale: float | None = None
+    bias: float | None = None
+    misalignment_deg: float | None = None
+    scale_per_c: float | None = None
+    bias_per_c: float | None = None
+
+
 class TriadProfile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Three channels of one kind: axes, nominal scale and noise, in raw units.
 
@@ -26,6 +40,7 @@ class TriadProfile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     estimated from the residuals); `repeatability` is added to it in quadrature.
     `nonlinearity` is the linearity error of the datasheet as a share of the field (1 σ, for
     example 0.005): each axis then has its own quadratic and cubic term with that prior.
+    `datasheet` are the maker's tolerances.
     """
 
     axes: tuple[Axis, Axis, Axis] = ("+x", "+y", "+z")
@@ -33,6 +48,7 @@ class TriadProfile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     noise: float | None = None
     repeatability: float = 0.0
     nonlinearity: float | None = None
+    datasheet: Datasheet | None = None
 
     @property
     def permutation(self) -> Array:

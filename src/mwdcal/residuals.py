@@ -9,6 +9,7 @@ import numpy as np
 
 from mwdcal.calibration import ErrorRow, Measures, StationRow
 from mwdcal.core.observables import OBSERVABLES
+from mwdcal.core.uncertainty import station_misfit
 from mwdcal.core.vectors import Array, centred
 from mwdcal.estimate import Fit
 from mwdcal.readings import TRIADS, Readings
@@ -188,12 +189,8 @@ def deviations(fit: Fit) -> Array:
     """Each station's misfit (n,) as standard deviations of one normal variable."""
     from scipy.special import chdtrc, ndtri
 
-    spread, residual = fit.analysis.spread[0], fit.analysis.residual[0]
-    values, vectors = np.linalg.eigh(spread)
-    keep = values > 1e-3
-    along = np.einsum("nij,ni->nj", vectors, residual) ** 2
-    chi = np.sum(np.where(keep, along / np.where(keep, values, 1.0), 0.0), -1)
-    count = keep.sum(-1)
+    square, freedom = station_misfit(fit.analysis)
+    chi, count = square[0] / fit.trust[0], freedom[0]
     others = np.maximum(count.sum() - count, 1)
     variance = np.maximum((chi.sum() - chi) / others, 1e-30)
     declared = np.isnan(fit.noise[0]).all()

@@ -9,6 +9,7 @@ import numpy as np
 
 from mwdcal.core.vectors import Array, Ints
 from mwdcal.estimate import Fit, fit
+from mwdcal.options import Options
 from mwdcal.readings import Readings
 
 
@@ -39,10 +40,10 @@ def _fields(result: Fit) -> tuple[Array, Array]:
     return result.problem.fields(result.state)
 
 
-def scatter(readings: Readings, curved: dict[str, float] | None = None) -> tuple[float, float]:
+def scatter(readings: Readings, options: Options | None = None) -> tuple[float, float]:
     """Direction scatter of a run's groups, radians: in sample, and with each station left out."""
-    whole = directions(*_fields(fit(readings, curved=curved)))[0]
-    left_out = fit(readings, include=1 - np.eye(readings.count), curved=curved)
+    whole = directions(*_fields(fit(readings, options)))[0]
+    left_out = fit(readings, options, 1 - np.eye(readings.count))
     own = np.arange(readings.count)
     axis = directions(*_fields(left_out))[own, own]
     return group_scatter(whole, readings.groups), group_scatter(axis, readings.groups)

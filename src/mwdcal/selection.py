@@ -9,7 +9,8 @@ import numpy as np
 
 from mwdcal.core.uncertainty import marginal_rank, readjusted
 from mwdcal.core.vectors import Array, Ints
-from mwdcal.estimate import Fit, Orders, fit
+from mwdcal.estimate import Fit, fit
+from mwdcal.options import Options, Orders
 from mwdcal.readings import TRIADS, Readings
 
 GAP = 5.0
@@ -51,7 +52,7 @@ def soaks(temperature: Array) -> Ints:
 
 
 def choose_order(
-    readings: Readings, method: str, kind: str | None, progress: Callable[[str], None]
+    readings: Readings, options: Options, progress: Callable[[str], None]
 ) -> tuple[Orders, list[OrderScore]]:
     """Each triad's lowest order whose held-out χ² is within 2 % of its best, and the tables.
 
@@ -61,16 +62,16 @@ def choose_order(
         return 0, []
     numbers = soaks(readings.temperature)
     levels = int(numbers.max()) + 1
-    if _hopeless(readings, method) or levels == 1:
+    if _hopeless(readings, options) or levels == 1:
         return 0, []
     if levels < FEWEST:
-        return _linear_if_needed(readings, method, kind, progress), []
+        return _linear_if_needed(readings, options, progress), []
     highest = min(HIGHEST, levels - 2)
-    readings = _with_noise(readings, method, kind, highest)
+    readings = _with_noise(readings, replace(options, order=highest))
     found = []
     for order in range(highest + 1):
         progress(f"order {order}: leaving out each of {levels} temperatures")
-        found.append(_held_out(readings, method, kind, order, numbers))
+        found.append(_held_out(readings, replace(options, order=order), numbers))
     names = TRIADS if readings.magnetometer is not None else TRIADS[:1]
     tables = [_scored(name, [f[:, t] for f in found]) for t, name in enumerate(names)]
     chosen = [next(s.order for s in table if s.chosen) for table in tables]
@@ -88,11 +89,11 @@ def _scored(triad: str, found: list[Array]) -> list[OrderScore]:
 
 
 def _linear_if_needed(
-    readings: Readings, method: str, kind: str | None, progress: Callable[[str], None]
+    readings: Readings, options: Options, progress: Callable[[str], None]
 ) -> Orders:
     """Between two temperatures: order 1 where order 0 leaves clearly more than its noise."""
-    readings = _with_noise(readings, method, kind, 1)
-    factor = fit(readings, method, kind, 0).analysis.variance_factor[0]
+    readings = _with_noise(readings, replace(options, order=1))
+    factor = fit(readings, replace(options, order=0)).analysis.variance_factor[0]
     wanted = [int(value > EXCESS) for value in factor]
     progress(
         "two temperatures cannot be left out in turn: order 1 is taken where order 0 leaves "
@@ -102,31 +103,29 @@ def _linear_if_needed(
     return wanted[0], wanted[-1]
 
 
-def _hopeless(readings: Readings, method: str) -> bool:
+def _hopeless(readings: Readings, options: Options) -> bool:
     """Whether the stations cannot even determine what all temperatures have in common."""
-    result = fit(readings, method)
+    result = fit(readings, Options(method=options.method))
     ranks = [marginal_rank(result.analysis.determined, w)[0] for w in result.problem.slices()]
     return bool(min(ranks) < LOWEST_RANK)
 
 
-def _with_noise(readings: Readings, method: str, kind: str | None, order: int) -> Readings:
-    """The readings with noise declared: where it was not, as the highest order leaves it.
+def _with_noise(readings: Readings, options: Options) -> Readings:
+    """The readings with noise declared: where it was not, as a fit leaves it.
 
     Every order is then judged by the same yardstick.
     """
-    result = fit(readings, method, kind, order)
+    result = fit(readings, options)
     noise = dict(zip(TRIADS, result.noise[0], strict=False))
     found = {name: np.array(sd) for name, sd in noise.items() if np.isfinite(sd)}
     return replace(readings, sd={**readings.sd, **found})
 
 
-def _held_out(
-    readings: Readings, method: str, kind: str | None, order: int, numbers: Ints
-) -> Array:
-    """χ² per reading (soaks, triads) of each soak, fitted without it."""
+def _held_out(readings: Readings, options: Options, numbers: Ints) -> Array:
+    """χ² per reading (parts, triads) of each part of the stations, fitted without it."""
     levels = int(numbers.max()) + 1
     include = (np.arange(levels)[:, None] != numbers).astype(float)
-    result = fit(readings, method, kind, order, include)
+    result = fit(readings, options, include)
     held = (1 - include)[..., None]
     return np.asarray(np.sum(misfit(result) * held, 1) / (held.sum(1) * 3))
 

@@ -12,15 +12,14 @@ from mwdcal.core.problem import STAND, UNKNOWN
 from mwdcal.core.solvers import Determined, Normal
 from mwdcal.errors import FitError, InputError
 from mwdcal.estimate import Fit
+from mwdcal.methods import ESTIMABLE
 
-ESTIMABLE = {"azimuth-zero": ("azimuth-zero",), "tilt": ("stand-north", "stand-east")}
-"""What `--estimate` takes, and the turns of the stand's frame that it stands for."""
 LOOSE = 0.1
 """A turn known no better than this share of no knowledge at all is not separated."""
 
 
-def turns(names: Sequence[str], method: str) -> tuple[str, ...]:
-    """The turns of the stand's frame behind the names of `--estimate`, or a refusal."""
+def check_names(names: Sequence[str], method: str) -> None:
+    """Refuse what `--estimate` cannot find, whatever the stations."""
     for name in names:
         if name == "toolface-zero":
             raise FitError(
@@ -34,7 +33,6 @@ def turns(names: Sequence[str], method: str) -> tuple[str, ...]:
             )
     if names and method != "joint":
         raise InputError(f"--estimate needs --method joint; got {method!r}.")
-    return tuple(turn for name in names for turn in ESTIMABLE[name])
 
 
 def check_separable(result: Fit, names: Sequence[str]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict
 
@@ -14,8 +15,8 @@ from mwdcal.errors import InputError, MwdcalError
 
 if TYPE_CHECKING:
     from mwdcal.calibration import Calibration, Finding
-    from mwdcal.estimate import Orders
     from mwdcal.notation import Notation
+    from mwdcal.options import Options
     from mwdcal.profile import Profile
     from mwdcal.readings import Readings
     from mwdcal.selection import OrderScore
@@ -130,13 +131,14 @@ def calibrate(
     """
     from mwdcal.calibrate import calibrate as fit
     from mwdcal.files import documents
+    from mwdcal.options import Options
 
     _check_outputs([output, report], [run, Path(tool or "")])
     readings, profile, digests = _load(run, tool, decimal)
     readings = _without(readings, exclude)
-    number, scores = _order(order, readings, method, model)
-    names = [name.strip() for name in estimate.split(",") if name.strip()]
-    made = fit(readings, profile, method, model, number, estimate=names, seed=seed, **digests)
+    names = tuple(name.strip() for name in estimate.split(",") if name.strip())
+    options, scores = _order(order, readings, Options(method, model, estimate=names, seed=seed))
+    made = fit(readings, profile, options, **digests)
     if report:
         from mwdcal.app.report import write_report
 
@@ -198,18 +200,18 @@ def _without(readings: Readings, exclude: tuple[str, ...]) -> Readings:
     return readings.select(np.array([label not in exclude for label in readings.station]))
 
 
-def _order(
-    order: str, readings: Readings, method: str, model: str | None
-) -> tuple[Orders, list[OrderScore]]:
+def _order(order: str, readings: Readings, options: Options) -> tuple[Options, list[OrderScore]]:
+    """The options with the order asked for, or the one that left-out temperatures speak for."""
     from mwdcal.checks import check_readings
     from mwdcal.selection import choose_order
 
     if order == "auto":
-        check_readings(readings, method, model or "polynomial", 0)
-        return choose_order(readings, method, model, say)
+        check_readings(readings, replace(options, model=options.model or "polynomial"))
+        chosen, scores = choose_order(readings, options, say)
+        return replace(options, order=chosen), scores
     if order not in ("0", "1", "2", "3"):
         raise InputError(f"--order must be 0, 1, 2, 3 or auto; got {order!r}.")
-    return int(order), []
+    return replace(options, order=int(order)), []
 
 
 def _summary(made: Calibration) -> dict[str, Any]:

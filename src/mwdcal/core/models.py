@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from math import prod
 
 import numpy as np
 
@@ -164,6 +165,17 @@ class Polynomial:
         flat = blocks.reshape(*direction.shape[:-1], self.affine)
         return np.concatenate([flat, np.zeros_like(direction[..., self.affine :])], -1)
 
+    @property
+    def lead(self) -> tuple[int, ...]:
+        """Leading axes of the model's own numbers."""
+        return self.centre.shape[:-2]
+
+    def flat(self, lead: tuple[int, ...]) -> Polynomial:
+        """The model with one batch axis for these leading axes."""
+        count = prod(lead)
+        centre, scale = (np.broadcast_to(x, (*lead, 1, 3)) for x in (self.centre, self.scale))
+        return replace(self, centre=centre.reshape(count, 1, 3), scale=scale.reshape(count, 1, 3))
+
     def take(self, index: Ints) -> Polynomial:
         """The model of some members of a batch."""
         return replace(self, centre=self.centre[index], scale=self.scale[index])
@@ -306,6 +318,15 @@ class Factors:
         flat = moved.reshape(*direction.shape[:-1], 6 * count)
         return np.concatenate([flat, np.zeros_like(direction[..., 6 * count :])], -1)
 
+    @property
+    def lead(self) -> tuple[int, ...]:
+        """Leading axes of the model's own numbers: it has none."""
+        return ()
+
+    def flat(self, lead: tuple[int, ...]) -> Factors:
+        """The model with one batch axis: the same for all."""
+        return self
+
     def take(self, index: Ints) -> Factors:
         """The model of some members of a batch: the same for all."""
         return self
@@ -318,7 +339,108 @@ class Factors:
         return Factors(Basis(self.basis.order, reference)), whole
 
 
-Model = Polynomial | Factors
+Whole = Polynomial | Factors
+
+
+@dataclass(frozen=True)
+class Restricted:
+    """A model of which only some parameters are fitted, `kept`; the others are zero.
+
+    It has no rotation of its own: what a turn needs of the parameters left out is dropped.
+    """
+
+    whole: Whole
+    kept: tuple[int, ...]
+
+    @property
+    def kind(self) -> str:
+        """The whole model's kind."""
+        return self.whole.kind
+
+    @property
+    def basis(self) -> Basis:
+        """The whole model's temperature basis."""
+        return self.whole.basis
+
+    @property
+    def size(self) -> int:
+        """Number of fitted parameters."""
+        return len(self.kept)
+
+    def _full(self, params: Array) -> Array:
+        full = np.zeros((*params.shape[:-1], self.whole.size), params.dtype)
+        full[..., self.kept] = params
+        return full
+
+    def fields(self, params: Array, raw: Array, temperature: Array) -> Array:
+        """Field vectors (..., n, 3)."""
+        return self.whole.fields(self._full(params), raw, temperature)
+
+    def slope(self, params: Array, raw: Array, temperature: Array) -> Array:
+        """Derivative of the field with respect to the reading (..., n, 3, 3)."""
+        return self.whole.slope(self._full(params), raw, temperature)
+
+    def jacobian(self, params: Array, raw: Array, temperature: Array) -> Array:
+        """Derivative of the field with respect to the fitted parameters (..., n, 3, p)."""
+        return self.whole.jacobian(self._full(params), raw, temperature)[..., self.kept]
+
+    def curvature(self, params: Array, raw: Array, temperature: Array, covector: Array) -> Array:
+        """Second derivatives (..., p, p) of Σ covector (..., n, 3) · field, summed over stations."""
+        whole = self.whole.curvature(self._full(params), raw, temperature, covector)
+        return whole[..., self.kept, :][..., self.kept]
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Names of the fitted parameters."""
+        return tuple(self.whole.names[index] for index in self.kept)
+
+    def start(self, matrix: Array, offset: Array) -> Array:
+        """Parameters (..., p) near field = matrix · raw + offset."""
+        return self.whole.start(matrix, offset)[..., self.kept]
+
+    def transformed(self, params: Array, turn: Array) -> Array:
+        """Parameters near those of the model whose fields are a matrix `turn` times ours."""
+        return self.whole.transformed(self._full(params), turn)[..., self.kept]
+
+    def with_course(self, direction: Array, power: int) -> Array:
+        """A change (..., p) of the steady parameters, moved to a power of temperature."""
+        return self.whole.with_course(self._full(direction), power)[..., self.kept]
+
+    @property
+    def lead(self) -> tuple[int, ...]:
+        """Leading axes of the whole model's own numbers."""
+        return self.whole.lead
+
+    def flat(self, lead: tuple[int, ...]) -> Restricted:
+        """The model with one batch axis for these leading axes."""
+        return replace(self, whole=self.whole.flat(lead))
+
+    def take(self, index: Ints) -> Restricted:
+        """The model of some members of a batch."""
+        return replace(self, whole=self.whole.take(index))
+
+    def finished(self, reference: float) -> tuple[Whole, Array]:
+        """The whole model on plain readings, and the linear map (..., all, p) to it."""
+        model, whole = self.whole.finished(reference)
+        return model, whole[..., self.kept]
+
+
+def restricted(model: Whole, parameters: int) -> Model:
+    """A model of 6, 9 or 12 parameters per triad (at one temperature).
+
+    12: all. 9: without the misalignments xy, xz, yz: the sensor x is the frame's x, and the
+    sensor y lies in its x-y plane (the sensor frame, which has no mounting rotation).
+    6: scale and bias alone.
+    """
+    dropped = {12: (), 9: ("xy", "xz", "yz"), 6: ("xy", "xz", "yz", "yx", "zx", "zy")}[parameters]
+    if not dropped:
+        return model
+    cross = [name for name in model.names if name.startswith(("gain-", "misalignment-"))]
+    lost = {n for n in cross if n.partition("-")[2].partition("·")[0] in dropped}
+    return Restricted(model, tuple(i for i, n in enumerate(model.names) if n not in lost))
+
+
+Model = Whole | Restricted
 
 
 def _with_order(name: str, order: int) -> str:

@@ -27,12 +27,12 @@ it is in `docs/errata.md`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import prod
 
 import numpy as np
 
-from mwdcal.core.models import Factors, Model
+from mwdcal.core.models import Model
 from mwdcal.core.observables import OBSERVABLES, VERTICAL, is_vertical
 from mwdcal.core.solvers import Determined, Normal, Status
 from mwdcal.core.uncertainty import COUPLED, free_share
@@ -135,12 +135,13 @@ def newton(
     shares = np.ones(2) if weights is None else np.asarray(weights, float)
     known = [np.asarray(values, float) for values in (temperature, gravity, inclination)]
     shapes = [values.shape[:-1] for values in known]
-    ours = () if isinstance(model, Factors) else model.centre.shape[:-2]
-    lead = np.broadcast_shapes(params.shape[:-1], raw.shape[:-2], shares.shape[:-2], ours, *shapes)
+    lead = np.broadcast_shapes(
+        params.shape[:-1], raw.shape[:-2], shares.shape[:-2], model.lead, *shapes
+    )
     stations = _stations(raw, known, shares, lead)
     start = np.broadcast_to(params, (*lead, model.size)).reshape(prod(lead), model.size)
     with np.errstate(all="ignore"):
-        descent = _Descent.at(_flat(model, lead), stations, start, limit)
+        descent = _Descent.at(model.flat(lead), stations, start, limit)
         for _ in range(limit):
             if descent.active.size:
                 descent.step()
@@ -175,16 +176,6 @@ def _stations(raw: Array, known: list[Array], shares: Array, lead: tuple[int, ..
         np.where(inclined, inclination, 0.0),
         weights,
     )
-
-
-def _flat(model: Model, lead: tuple[int, ...]) -> Model:
-    """The model with one batch axis."""
-    if isinstance(model, Factors):
-        return model
-    shape = (*lead, 1, 3)
-    centre, scale = (np.broadcast_to(x, shape) for x in (model.centre, model.scale))
-    count = prod(lead)
-    return replace(model, centre=centre.reshape(count, 1, 3), scale=scale.reshape(count, 1, 3))
 
 
 def _outer(first: Array, second: Array) -> Array:

@@ -44,22 +44,19 @@ STAND = {
 """Turns of the stand's frame, by the earth axis (north, east, down) they are about."""
 UNKNOWN = np.pi / np.sqrt(3)
 """Standard uncertainty of an angle about which nothing is known, rad."""
+INFORMED = 1e-13
+"""A prior says something of a direction if its precision exceeds this share of the largest."""
 GEOMETRIC_NOISE = 1e-4
 """Noise, as a share of the field, at which rank is counted whatever the actual noise."""
 
 
 @dataclass(frozen=True)
 class Triad:
-    """One sensor triad: model, readings (B, n, 3), their noise (B, n, 3), prior precision (B, p).
-
-    `prior` is the precision about `expected` (B, p): zero where nothing is known beforehand.
-    """
+    """One sensor triad: model, readings (B, n, 3), their noise (B, n, 3)."""
 
     model: Model
     raw: Array
     sd: Array
-    prior: Array
-    expected: Array
 
 
 @dataclass(frozen=True)
@@ -159,12 +156,37 @@ class Prediction:
 
 
 @dataclass(frozen=True)
+class Prior:
+    """What is known of all parameters beforehand: `precision` (B, p, p) about `expected` (B, p)."""
+
+    precision: Array
+    expected: Array
+
+    def take(self, index: Ints) -> Prior:
+        """That of some members of the batch."""
+        return Prior(self.precision[index], self.expected[index])
+
+    def informed(self, norms: Array) -> Array:
+        """Precision (B, p, p) as large as the data's wherever it is not zero.
+
+        It tells which directions a prior determines, however loosely; `norms` (B, p) are
+        those of the data's columns.
+        """
+        outer = norms[:, :, None] * norms[:, None, :]
+        values, vectors = np.linalg.eigh(self.precision / outer)
+        known = values > INFORMED * np.maximum(values[:, -1:], 1e-300)
+        known = vectors * known[:, None, :]
+        return np.asarray(known @ np.swapaxes(known, -1, -2) * outer)
+
+
+@dataclass(frozen=True)
 class Problem:
-    """Models, readings and evidence of a batch of runs."""
+    """Models, readings, evidence and prior knowledge of a batch of runs."""
 
     triads: tuple[Triad, ...]
     temperature: Array
     evidence: Evidence
+    prior: Prior
 
     def take(self, index: Ints) -> Problem:
         """The problem of some members of the batch."""
@@ -181,11 +203,8 @@ class Problem:
             include=evidence.include[index],
             constants=constants,
         )
-        triads = tuple(
-            Triad(t.model.take(index), t.raw[index], t.sd[index], t.prior[index], t.expected[index])
-            for t in self.triads
-        )
-        return Problem(triads, self.temperature[index], chosen)
+        triads = tuple(Triad(t.model.take(index), t.raw[index], t.sd[index]) for t in self.triads)
+        return Problem(triads, self.temperature[index], chosen, self.prior.take(index))
 
     def slices(self) -> list[slice]:
         """Where each triad's parameters lie."""
@@ -264,7 +283,7 @@ class Problem:
         design = np.concatenate([_side_by_side(blocks), constants, groups], -1)
         private = [turns @ self._own_turns(state, geometry), self._own_earth(state, by_earth)]
         own = np.concatenate(private, -1)
-        prior, pull = self._prior(state, groups.shape[-1])
+        prior, pull = self._prior(state, design, geometry)
         return Linear(residual, design, own, prior, pull, state.params.shape[-1])
 
     def _constant_columns(
@@ -307,22 +326,25 @@ class Problem:
             ]
         return [include / t.sd for t in self.triads]
 
-    def _prior(self, state: State, turns: int) -> tuple[Array, Array]:
-        """Precision and pull (B, p + s) of the parameters and the shared unknowns."""
-        batch = len(state.params)
-        params = np.concatenate([t.prior for t in self.triads], -1)
-        wide = np.full((batch, turns), UNKNOWN**-2)
-        constants = self.evidence.constants
-        empty = np.zeros((batch, 0))
-        precision = np.stack([c.sd**-2 for c in constants], -1) if constants else empty
-        pull = [
-            np.zeros(batch) if c.unknown else state.constants[:, i] - c.value
-            for i, c in enumerate(constants)
-        ]
-        pulls = np.stack(pull, -1) if constants else empty
-        expected = np.concatenate([t.expected for t in self.triads], -1)
-        pulled = np.concatenate([state.params - expected, pulls, np.zeros_like(wide)], -1)
-        return np.concatenate([params, precision, wide], -1), pulled
+    def _prior(self, state: State, design: Array, geometry: bool) -> tuple[Array, Array]:
+        """Precision (B, u, u) and pull (B, u) of the parameters and the shared unknowns.
+
+        `geometry` asks which directions of the parameters have a prior, not how precise it is.
+        """
+        p, constants = state.params.shape[-1], self.evidence.constants
+        pull = np.zeros((len(design), design.shape[-1]))
+        pull[:, :p] = state.params - self.prior.expected
+        own = np.full(pull.shape, UNKNOWN**-2)
+        for index, constant in enumerate(constants):
+            own[:, p + index] = constant.sd**-2
+            if not constant.unknown:
+                pull[:, p + index] = state.constants[:, index] - constant.value
+        precision = own[..., None] * np.eye(own.shape[-1])
+        known = self.prior.precision
+        if geometry and known.any():
+            known = self.prior.informed(np.sqrt(np.sum(design[..., :p] ** 2, (1, 2))))
+        precision[:, :p, :p] = known
+        return precision, pull
 
     def _free(self) -> Bools:
         """Stations (B, n) of which neither direction nor toolface is known."""

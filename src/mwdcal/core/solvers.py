@@ -48,10 +48,10 @@ _MESSAGES = {
 
 @dataclass(frozen=True)
 class Linear:
-    """A problem at one state: ρ (B, n, m), X (B, n, m, p + s), own (B, n, m, 3), prior (B, p + s).
+    """A problem at one state: ρ (B, n, m), X (B, n, m, u), own (B, n, m, 3), prior (B, u, u).
 
-    `prior` is the precision of each unknown, `pull` (B, p + s) its departure from the prior
-    value (zero where unknown); `size` is p, the number of model parameters at the head of X.
+    The u unknowns of X are p = `size` model parameters, then s shared ones. `prior` is their
+    precision matrix, `pull` (B, u) their departure from the prior value (zero where unknown).
     """
 
     residual: Array
@@ -96,10 +96,10 @@ class Normal:
         weighed = linear.weigh(columns)
         whole = np.einsum("...nmi,...nmj->...ij", columns, weighed, optimize=True)
         information, gradient = whole[..., :-1, :-1].copy(), whole[..., :-1, -1].copy()
-        diagonal = np.arange(information.shape[-1])
-        information[..., diagonal, diagonal] += linear.prior
-        gradient += linear.prior * linear.pull
-        cost = whole[..., -1, -1] + np.sum(linear.prior * linear.pull**2, -1)
+        pulled = (linear.prior @ linear.pull[..., None])[..., 0]
+        information += linear.prior
+        gradient += pulled
+        cost = whole[..., -1, -1] + np.sum(linear.pull * pulled, -1)
         return cls(information, gradient, cost, linear.size)
 
     def reduced(self) -> tuple[Array, Array, Array]:

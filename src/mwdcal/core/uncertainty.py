@@ -15,6 +15,8 @@ from mwdcal.core.vectors import AnyArray, Array, Bools, Ints, inverse, rotation
 
 SEEN = 0.05
 """A free direction with less than this share on a triad does not move the triad."""
+TESTED = 1e-3
+"""A direction of a station's readings counts if this share of its variance is left by the fit."""
 COUPLED = 0.9
 """Share of a candidate direction that must lie in the null space to be called free."""
 
@@ -83,6 +85,18 @@ def _variance_factors(residual: Array, spread: Array) -> tuple[Array, Array]:
     squares = np.sum((residual**2).reshape(shape), (1, 3))
     freedom = np.sum(expected.reshape(shape), (1, 3))
     return squares / np.where(freedom > 1e-9, freedom, np.nan), freedom
+
+
+def station_misfit(analysis: Analysis) -> tuple[Array, Array]:
+    """Misfit d² (B, n) of every station, χ² when all is as declared, and its degrees of freedom.
+
+    Directions of a station's readings that nothing tests (share below `TESTED`) do not count.
+    """
+    values, vectors = np.linalg.eigh(analysis.spread)
+    tested = values > TESTED
+    along = np.einsum("bnij,bni->bnj", vectors, analysis.residual) ** 2
+    square = np.sum(np.where(tested, along / np.where(tested, values, 1.0), 0.0), -1)
+    return square, np.sum(tested, -1).astype(float)
 
 
 def candidates(problem: Problem, state: State, triads: list[int]) -> dict[str, Array]:

@@ -81,9 +81,11 @@ def _misfit(calibration: Calibration) -> str:
             return f"the {triad.name} has no usable centre and radius"
         names = triad.functions(calibration.reference_temperature).names
         given = (triad.parameter_names, triad.parameters, triad.standard_uncertainties)
-        if list(names) != triad.parameter_names or {len(g) for g in given} != {triad.size}:
+        if list(names) != triad.parameter_names or {len(g) for g in given} != {len(names)}:
             return f"the parameters of the {triad.name} are not those of its model"
-    size = sum(t.size for t in calibration.triads)
+        if not 0 <= triad.rank <= triad.size <= len(names):
+            return f"rank and size of the {triad.name} are not those of its parameters"
+    size = sum(len(t.parameters) for t in calibration.triads)
     if [len(row) for row in calibration.covariance] != [size] * size:
         return "parameters and covariance do not fit together"
     if any(len(row) != size for row in calibration.free):

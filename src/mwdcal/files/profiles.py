@@ -13,7 +13,7 @@ import msgspec
 
 from mwdcal.errors import InputError
 from mwdcal.files.table import shown
-from mwdcal.profile import Profile, StandProfile, TriadProfile
+from mwdcal.profile import Datasheet, Profile, StandProfile, TriadProfile
 
 _DEFAULT = "generic"
 _PACKAGE = "mwdcal.profiles"
@@ -24,6 +24,8 @@ _STRUCTS: dict[str, type[msgspec.Struct]] = {
     "accelerometer": TriadProfile,
     "magnetometer": TriadProfile,
     "stand": StandProfile,
+    "accelerometer.datasheet": Datasheet,
+    "magnetometer.datasheet": Datasheet,
 }
 _WORDS = {
     "float": "a number",
@@ -201,6 +203,11 @@ def _check_triad(triad: TriadProfile, name: str, source: str) -> None:
     if triad.nonlinearity is not None:
         share = "1 sigma as a share of the field, such as 0.005; leave it out for a linear axis."
         _check_number(triad.nonlinearity, (1e-9, 1.0), source, f"{name}.nonlinearity", share)
+    sheet = "1 sigma, more than zero; leave it out where it is unknown."
+    for field in Datasheet.__struct_fields__:
+        value = getattr(triad.datasheet, field, None)
+        if value is not None:
+            _check_number(value, limits, source, f"{name}.datasheet.{field}", sheet)
     limits = (0.0, _LARGEST_SCALE)
     _check_number(triad.repeatability, limits, source, f"{name}.repeatability", advice)
 

@@ -1,0 +1,283 @@
+"""Standstills in a continuous record: where the tool did not move, and what it read there.
+
+Each channel is cut into short cells, each with the median of its samples (its *level*, which a
+few spikes cannot move). The range of the levels within a window of five cells says how much the
+channel moves; the range of its quietest windows is its noise floor. The *activity* of a cell is
+that range, in noise floors, of the quietest window that covers it, in the liveliest channel.
+Where it stays below a threshold the tool stands still.
+
+The threshold is the one that matters least: counted over a geometric series of thresholds, the
+number of standstills stays the same over the widest stretch, between noise that breaks
+standstills up and movements that are swallowed. It is taken a quarter into that stretch, in
+logarithm: near the quiet end, where edges are sharpest.
+
+The uncertainty of a mean is the long-run one: with correlated noise the autocovariances add up.
+
+Reference: P. J. Huber, Robust Statistics, chapter 6 (medians, MAD); C. J. Geyer, Statistical
+Science 7, 473 (1992), section 3.3 (initial monotone sequence).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from mwdcal.core.vectors import Array, Bools, Ints
+
+CELL = 0.2
+"""Shortest cell, seconds."""
+FEWEST = 3
+"""Samples that a cell needs for its median to stand a spike."""
+WINDOW = 5
+"""Cells of a window."""
+QUIET = 0.05
+"""Quantile of the windows' ranges that is the noise floor."""
+STEPS = 120
+"""Thresholds tried."""
+SAME = 0.02
+"""Share by which the number of standstills may change and still count as the same."""
+TURN = 0.05
+"""Share of a triad's size by which no channel of a tool at rest moves within a window."""
+NOISE = 8.0
+"""The same in standard deviations of the difference of successive samples."""
+CLEAR = 4.0
+"""Distance from the median, in robust standard deviations, above which a sample is a spike."""
+BLOCKS = 64
+"""Blocks whose means tell the long-run variance."""
+SIGNIFICANT = 1e-4
+"""Chance that a steady channel is said to drift."""
+
+
+class Cells(NamedTuple):
+    """One channel in short cells of equal numbers of samples (m,): start, end, median; `step`
+    is the time between samples."""
+
+    start: Array
+    end: Array
+    level: Array
+    step: float
+
+
+class Activity(NamedTuple):
+    """Activity on a common grid of cells.
+
+    Attributes:
+        edge: start of each cell, and the end of the last (m + 1,), s.
+        value: activity (m,), in noise floors; infinite where a channel has no samples.
+        cells: the channels that were looked at.
+        floor: noise floor of each, in its own unit.
+    """
+
+    edge: Array
+    value: Array
+    cells: tuple[Cells, ...]
+    floor: Array
+
+
+class Threshold(NamedTuple):
+    """The threshold, the stretch (first, last) over which it hardly matters, and all that were
+    tried with the number of standstills of each."""
+
+    value: float
+    stretch: tuple[float, float]
+    tried: Array
+    counts: Ints
+
+
+class Summary(NamedTuple):
+    """What one channel read during one standstill.
+
+    Attributes:
+        mean: of the samples that are no spikes.
+        sd: standard uncertainty of the mean, correlation of the noise included.
+        spread: robust standard deviation of one sample, from the median of deviations.
+        drift: change over the standstill by the straight line.
+        drifts: whether that is more than the noise explains.
+        used: samples in the mean.
+    """
+
+    mean: float
+    sd: float
+    spread: float
+    drift: float
+    drifts: bool
+    used: int
+
+
+def cells_of(time: Array, value: Array, length: float) -> Cells:
+    """A channel in cells of about `length` seconds, but of no fewer than `FEWEST` samples.
+
+    Shapes: `time` (n,) ascending, `value` (n,) without blanks; the last, incomplete cell is
+    left out.
+    """
+    step = time_step(time)
+    size = max(FEWEST, round(length / step)) if step > 0 else FEWEST
+    count = len(time) // size
+    whole = value[: count * size].reshape(count, size)
+    starts = np.arange(count) * size
+    return Cells(time[starts], time[starts + size - 1] + step, np.median(whole, axis=-1), step)
+
+
+def time_step(time: Array) -> float:
+    """Median time between samples that differ in time; 0 where there are none."""
+    steps = np.diff(time)
+    steps = steps[steps > 0]
+    return float(np.median(steps)) if steps.size else 0.0
+
+
+def activity(channels: Sequence[tuple[Array, Array]]) -> Activity:
+    """How much each moment moves, of channels (time (n,), value (n,)) with rates of their own.
+
+    A channel too slow to have a cell within a window of the fastest is not looked at.
+    Singular: fewer samples than a window needs give no cells at all.
+    """
+    steps = [time_step(time) for time, _ in channels]
+    length = max(CELL, FEWEST * min((s for s in steps if s > 0), default=0.0))
+    cells = [cells_of(*c, length) for c, s in zip(channels, steps, strict=True) if s > 0]
+    cells = [c for c in cells if FEWEST * c.step <= WINDOW * length and len(c.level) >= WINDOW]
+    if not cells:
+        return Activity(np.zeros(1), np.zeros(0), (), np.zeros(0))
+    start = min(c.start[0] for c in cells)
+    count = round(float(max(c.end[-1] for c in cells) - start) / length)
+    edge = start + length * np.arange(max(count, 1) + 1)
+    floors, value = [], np.zeros(len(edge) - 1)
+    for own in cells:
+        ranges = quietest_range(own.level)
+        floor = noise_floor(ranges)
+        ranges = np.where(_torn(own), np.inf, ranges)
+        value = np.maximum(value, _on_grid(edge, own, ranges) / floor)
+        floors.append(floor)
+    return Activity(edge, value, tuple(cells), np.array(floors))
+
+
+def quietest_range(level: Array) -> Array:
+    """Range of the levels (m,) in the quietest window of `WINDOW` cells that covers each."""
+    from scipy.ndimage import maximum_filter1d, minimum_filter1d
+
+    ranges = maximum_filter1d(level, WINDOW) - minimum_filter1d(level, WINDOW)
+    half = WINDOW // 2
+    ranges[:half] = ranges[-half:] = np.inf
+    return np.asarray(minimum_filter1d(ranges, WINDOW, mode="constant", cval=np.inf))
+
+
+def noise_floor(ranges: Array) -> float:
+    """The low quantile of the ranges (m,), without those that are zero; 1 if all are."""
+    alive = ranges[(ranges > 0) & np.isfinite(ranges)]
+    return float(np.quantile(alive, QUIET)) if alive.size else 1.0
+
+
+def _torn(cells: Cells) -> Bools:
+    """Cells with a gap in them: they last more than twice as long as most."""
+    length = cells.end - cells.start
+    return np.asarray(length > 2 * np.median(length))
+
+
+def _on_grid(edge: Array, cells: Cells, value: Array) -> Array:
+    """Each grid cell's value of the channel: that of the channel's cell at its middle."""
+    middle = (edge[1:] + edge[:-1]) / 2
+    place = np.searchsorted(cells.start, middle, side="right") - 1
+    inside = (place >= 0) & (middle <= cells.end[place] + cells.step)
+    return np.where(inside, value[place], np.inf)
+
+
+def rest_limit(cells: Cells, size: float) -> float:
+    """Largest range within a window that can be rest: a share of the triad's `size`, or noise."""
+    steps = np.abs(np.diff(cells.level))
+    rough = float(np.median(steps)) / 0.6745 / np.sqrt(2) if steps.size else 0.0
+    return max(TURN * size, NOISE * rough)
+
+
+def stretches(still: Bools, least: int = 1) -> tuple[Ints, Ints]:
+    """First cells, and cells after the last, of the runs of at least `least` true ones."""
+    step = np.diff(still.astype(np.int8), prepend=0, append=0)
+    first, last = np.flatnonzero(step == 1), np.flatnonzero(step == -1)
+    long = last - first >= least
+    return first[long], last[long]
+
+
+def choose_threshold(value: Array, least: int, highest: float) -> Threshold:
+    """The threshold of the activity (m,) on which the number of standstills depends least.
+
+    Definition: of all stretches of thresholds over which the number of standstills of at least
+    `least` cells stays within `SAME` of what it is at their start, the longest in logarithm; a
+    quarter into it. None above `highest` is tried.
+    Singular: without any standstill at any threshold the value is NaN.
+    """
+    alive = value[np.isfinite(value) & (value > 0)]
+    low = float(alive.min()) if alive.size else 1.0
+    high = min(float(alive.max()) if alive.size else 1.0, highest)
+    tried = np.geomspace(low, max(high, low), STEPS) if high >= low else np.zeros(0)
+    counts = np.array([len(stretches(value <= t, least)[0]) for t in tried], int)
+    best = (-1.0, 0, 0)
+    for first, count in enumerate(counts):
+        if count:
+            other = np.abs(counts[first:] - count) > SAME * count
+            last = first + (int(np.argmax(other)) if other.any() else len(other)) - 1
+            best = max(best, (float(np.log(tried[last] / tried[first])), -first, last))
+    if best[0] < 0:
+        return Threshold(np.nan, (np.nan, np.nan), tried, counts)
+    first, last = float(tried[-best[1]]), float(tried[best[2]])
+    return Threshold(first * (last / first) ** 0.25, (first, last), tried, counts)
+
+
+def summarise(time: Array, value: Array, resolution: float) -> Summary:
+    """What a channel read: `time` and `value` (n,) of the samples of one standstill, n >= 2.
+
+    `resolution` is the smallest step of the channel: readings that never change are known no
+    better than to resolution/√12.
+    """
+    middle = np.median(value)
+    distance = np.abs(value - middle)
+    spread = float(1.4826 * np.median(distance))
+    kept = distance <= CLEAR * max(spread, resolution)
+    time, value = time[kept], value[kept]
+    mean, sd, _ = long_run(value)
+    clock = time - time.mean()
+    square = float(clock @ clock)
+    slope = float(clock @ value) / square if square > 0 else 0.0
+    drift = slope * float(time[-1] - time[0])
+    _, sd_steady, freedom = long_run(value - slope * clock)
+    return Summary(
+        mean=mean,
+        sd=max(sd, resolution / np.sqrt(12)) if sd < resolution / 12 else sd,
+        spread=spread,
+        drift=drift,
+        drifts=bool(abs(drift) > _drift_limit(freedom) * np.sqrt(12) * max(sd_steady, 0.0)),
+        used=len(value),
+    )
+
+
+def _drift_limit(freedom: float) -> float:
+    """Two-sided Student quantile for `SIGNIFICANT`."""
+    from scipy.special import stdtrit
+
+    return float(stdtrit(freedom, 1 - SIGNIFICANT / 2))
+
+
+def long_run(value: Array) -> tuple[float, float, float]:
+    """Mean of correlated samples (n,), its standard uncertainty, and degrees of freedom.
+
+    Definition: autocovariances of the means of at most `BLOCKS` blocks are added up in pairs
+    as long as the pairs are positive, each no larger than the one before. With n' the number
+    of independent means that leaves, the variance is freed of what the mean took away, n'/(n' - 1),
+    and widened to that of Student's t, ν/(ν - 2), ν = n' - 1.
+    Errors: low by a tenth where the standstill is only 15 correlation times long; a line of
+    drift counts as noise.
+    """
+    mean = float(value.mean())
+    blocks = min(len(value), BLOCKS)
+    bounds = np.linspace(0, len(value), blocks + 1).astype(int)
+    means = np.add.reduceat(value - mean, bounds[:-1]) / np.diff(bounds)
+    means = means - means.mean()
+    products = np.correlate(means, means, "full")[blocks - 1 :] / blocks
+    pairs = products[: blocks // 4 * 2].reshape(-1, 2).sum(-1)
+    if not pairs.size:
+        pairs = products[:1]
+    pairs = np.minimum.accumulate(pairs) * np.logical_and.accumulate(pairs > 0)
+    variance = max(2 * float(pairs.sum()) - products[0], products[0]) / blocks
+    independent = max(products[0] / variance, 1.5) if variance > 0 else float(blocks)
+    freedom = max(independent - 1, 3.0)
+    widened = variance * independent / (independent - 1) * freedom / (freedom - 2)
+    return mean, float(np.sqrt(widened)), freedom

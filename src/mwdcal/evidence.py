@@ -1,0 +1,87 @@
+"""What a run's readings say about its stations: references, uncertainties, groups, constants."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from mwdcal.core.problem import UNKNOWN, Constant, Evidence
+from mwdcal.core.vectors import AnyArray, Array, Ints
+from mwdcal.readings import ANGLES, CONSTANTS, Readings
+
+
+def flat(value: AnyArray, lead: tuple[int, ...], *tail: int) -> AnyArray:
+    """A value with one batch axis: (B, n, *tail)."""
+    whole = np.broadcast_to(np.asarray(value), (*lead, *tail))
+    return np.asarray(whole.reshape(math.prod(lead[:-1]), lead[-1], *tail))
+
+
+def evidence_of(readings: Readings, include: Array) -> Evidence:
+    """Everything the readings say about their stations, for one batch axis."""
+    lead = np.broadcast_shapes(readings.accelerometer.shape[:-1], include.shape)
+    known = {n: flat(readings.reference(n), lead) for n in ANGLES + CONSTANTS}
+    sd = {n: flat(readings.uncertainty(n), lead) for n in ANGLES + CONSTANTS}
+    group = _shared_groups(flat(readings.groups, lead))
+    included = flat(include, lead).astype(float)
+    nowhere = np.isnan(known["field"]).all(-1, keepdims=True)
+    known["field"] = np.where(nowhere, 1.0, known["field"])
+    bare = Evidence(known, sd, group, included, ())
+    known, sd = _share_known(bare)
+    return replace(bare, known=known, sd=sd, constants=constants(bare))
+
+
+def _shared_groups(group: Ints) -> Ints:
+    """Group numbers (B, n) without gaps, -1 where a station is alone in its group."""
+    labels, compact = np.unique(group, return_inverse=True)
+    keys = compact.reshape(group.shape) + len(labels) * np.arange(len(group))[:, None]
+    _, where, counts = np.unique(keys, return_inverse=True, return_counts=True)
+    shared = (counts[where].reshape(group.shape) > 1) & (group >= 0)
+    kept = np.unique(group[shared])
+    return np.where(shared, np.searchsorted(kept, group), -1)
+
+
+def _share_known(evidence: Evidence) -> tuple[dict[str, Array], dict[str, Array]]:
+    """References and their σ where blank angles of a group take the mean of its filled cells.
+
+    One error is then common to the group: every member gets a σ that leaves the group as
+    uncertain as the mean of its k filled cells, σ √(members / k).
+    """
+    known, spread = dict(evidence.known), dict(evidence.sd)
+    for name in ("inclination", "azimuth"):
+        given = evidence.is_known(name)
+        filled = evidence.members * given[..., None]
+        count, total = filled.sum(-2), evidence.members.sum(-2)
+        turn = np.einsum("bnk,bn->bk", filled, np.exp(1j * np.nan_to_num(known[name])))
+        square = np.einsum("bnk,bn->bk", filled, evidence.sd[name] ** 2)
+        partly = (count > 0) & (count < total)
+        factor = np.where(partly, total / np.maximum(count, 1) ** 2, 0.0)
+        common = np.einsum("bnk,bk->bn", evidence.members, np.sqrt(square * factor))
+        mean = np.einsum("bnk,bk->bn", evidence.members, np.angle(turn))
+        within = np.einsum("bnk,bk->bn", evidence.members, partly) > 0
+        known[name] = np.where(within & ~given, mean, known[name])
+        spread[name] = np.where(within, common, evidence.sd[name])
+    return known, spread
+
+
+def constants(evidence: Evidence) -> tuple[Constant, ...]:
+    """Constants of the run to estimate: unknown ones, and errors of uncertain references."""
+    found = []
+    for name, size in (("gravity", 1.0), ("field", 0.0), ("dip", UNKNOWN)):
+        if name in evidence.absent:
+            continue
+        known = evidence.is_known(name)
+        if not known.all():
+            value = np.nan_to_num(
+                np.nansum(evidence.known[name], -1) / np.maximum(known.sum(-1), 1)
+            )
+            scale = np.full(len(value), size) if size else np.where(value > 0, value, 1.0)
+            found.append(Constant(name, (~known).astype(float), value, scale, unknown=True))
+        sd = np.max(np.where(known, evidence.sd[name], 0.0), -1)
+        if (sd > 0).any():
+            floor = np.where(sd > 0, sd, 1e-12)
+            found.append(
+                Constant(name, known.astype(float), np.zeros(len(sd)), floor, unknown=False)
+            )
+    return tuple(found)
