@@ -115,3 +115,63 @@ def bound(tool, inc, azi, toolface, unknown=(), tolerance=1e-9):
     scale[scale == 0] = 1
     inverse = np.linalg.pinv(whole / np.outer(scale, scale), rcond=tolerance, hermitian=True)
     return (inverse / np.outer(scale, scale))[:24, :24]
+
+
+# Sixty factors: SF (3 x 4 powers of T - 30 °C), B (3 x 4) and m (6), accelerometer then magnetometer
+
+LIMITS = np.array([[0.05, 0.01, 180e-6, 100e-6, 2e-3], [0.05, 500.0, 180e-6, 5.0, 2e-3]])
+"""Moosavi's Table 1: scale, bias (g), drift of both per °C, alignment; and 50 000 nT for 1 g."""
+COURSE = np.array([1 / 2, 1 / 8 / 120, 1 / 12 / 120**2])
+"""Shares of the powers of T - 30 °C in a drift that reaches its limit at 150 °C and not before."""
+
+
+def factors_within_limits(rng, count):
+    """Factors (count, 60) of servo instruments, and of magnetometers comparable to them."""
+    triads = []
+    for scale, bias, scale_drift, bias_drift, alignment in LIMITS:
+        first = rng.uniform(-1, 1, (count, 6, 1)) * np.repeat([scale, bias], 3)[:, None]
+        later = rng.uniform(-1, 1, (count, 6, 3)) * COURSE
+        later = later * np.repeat([scale_drift, bias_drift], 3)[:, None]
+        linear = np.concatenate([first, later], -1)
+        linear[:, :3, 0] += 1
+        turned = rng.uniform(-alignment, alignment, (count, 6))
+        triads.append(np.concatenate([linear.reshape(count, 24), turned], -1))
+    return np.concatenate(triads, -1)
+
+
+def _factor_parts(one, temperature):
+    """SF and B (..., n, 3), and I - m (..., 3, 3), of one triad's 30 factors, complex ones too."""
+    powers = (temperature - 30.0)[:, None] ** np.arange(4)
+    scale, bias = (
+        np.einsum("nk,...ik->...ni", powers, one[..., w : w + 12].reshape(*one.shape[:-1], 3, 4))
+        for w in (0, 12)
+    )
+    mixing = np.eye(3) + np.zeros((*one.shape[:-1], 3, 3), one.dtype)
+    mixing[..., ~np.eye(3, dtype=bool)] -= one[..., 24:]
+    return scale, bias, mixing
+
+
+def factor_readings(factors, temperature, vectors):
+    """Readings (..., n, 6) of tools (..., 60) in fields (..., n, 6): V = SF ((I - m)⁻¹ v + B)."""
+    readings = []
+    for t in (0, 1):
+        scale, bias, mixing = _factor_parts(factors[..., 30 * t : 30 * t + 30], temperature)
+        field = vectors[..., 3 * t : 3 * t + 3] @ np.swapaxes(np.linalg.inv(mixing), -1, -2)
+        readings.append(scale * (field + bias))
+    return np.concatenate(readings, -1)
+
+
+def factor_fields(factors, temperature, readings):
+    """Fields (..., n, 6) from the readings: (I - m) (V / SF - B)."""
+    fields = []
+    for t in (0, 1):
+        scale, bias, mixing = _factor_parts(factors[..., 30 * t : 30 * t + 30], temperature)
+        unit = readings[..., 3 * t : 3 * t + 3] / scale - bias
+        fields.append(unit @ np.swapaxes(mixing, -1, -2))
+    return np.concatenate(fields, -1)
+
+
+def complex_steps(function, x):
+    """Derivative (..., p) of a function of x (..., p) by complex step, one component at a time."""
+    units = np.eye(x.shape[-1])
+    return np.stack([function(x + 1e-30j * unit).imag / 1e-30 for unit in units], -1)

@@ -176,6 +176,93 @@ def test_at_a_temperature_all_notations_give_what_apply_gives(tmp_path, warm, te
             np.testing.assert_allclose(again, field, rtol=0, atol=1e-9 * np.abs(field).max())
 
 
+COURSES = {"factors": "forward", "polynomial": "affine"}
+
+
+def test_a_course_gives_what_apply_gives_at_every_temperature(tmp_path, warm):
+    """raw = Σ (S_k · field + o_k) τᵏ, or field = Σ (M_k · raw + b_k) τᵏ, at 48 temperatures."""
+    calibration, run, _, model = warm
+    temperature = np.linspace(-10, 80, len(run["ax"]))
+    results = corrected(tmp_path, calibration, {**run, "temperature_c": temperature})
+    document = converted(calibration, COURSES[model], "--temperature", "course")
+    assert document["temperature_c"] == "course"
+    assert document["powers_of"] == "T - reference_temperature_c"
+    names = ("S", "o") if model == "factors" else ("M", "b")
+    for triad, (raw, field) in results.items():
+        entry, tau = document[triad], temperature - document[triad]["reference_temperature_c"]
+        source, target = (field, raw) if model == "factors" else (raw, field)
+        matrix, offset = (np.array(entry[name]) for name in names)
+        assert matrix.shape == (3, 3, 3)
+        assert offset.shape == (5 if model == "factors" else 3, 3)
+        again = np.einsum("kij,nj,nk->ni", matrix, source, tau[:, None] ** np.arange(3))
+        again = again + tau[:, None] ** np.arange(len(offset)) @ offset
+        np.testing.assert_allclose(again, target, rtol=0, atol=1e-9 * np.abs(target).max())
+        count = matrix.size + offset.size
+        assert np.shape(entry["covariance"]) == (count, count)
+        for name in names:
+            assert np.shape(entry["standard_uncertainty"][name]) == np.shape(entry[name])
+
+
+def test_the_steady_part_of_a_course_is_the_reference_temperature(warm):
+    notation = COURSES[warm[3]]
+    steady, course = (
+        converted(warm[0], notation),
+        converted(warm[0], notation, "--temperature", "course"),
+    )
+    assert steady["temperature_c"] == 20.0
+    assert "powers_of" not in steady
+    for triad in TRIADS:
+        for name in {"S", "o", "M", "b"} & set(steady[triad]):
+            value = np.array(steady[triad][name])
+            np.testing.assert_allclose(course[triad][name][0], value, rtol=1e-9)
+            spread = steady[triad]["standard_uncertainty"][name]
+            np.testing.assert_allclose(
+                course[triad]["standard_uncertainty"][name][0], spread, rtol=1e-9
+            )
+
+
+@pytest.mark.parametrize("notation", NOTATIONS)
+def test_without_temperature_terms_a_course_is_one_power(case, notation):
+    steady = converted(case[0], notation)
+    course = converted(case[0], notation, "--temperature", "course")
+    for triad in TRIADS:
+        for name in {"S", "o", "M", "b", "SF", "B", "m"} & set(steady[triad]):
+            value = np.array(steady[triad][name])
+            lead = value if notation == "factors" else value[None]
+            np.testing.assert_allclose(course[triad][name], lead, rtol=1e-12)
+
+
+def test_a_course_that_is_no_polynomial_is_refused(warm):
+    other = {"factors": "affine", "polynomial": "forward"}[warm[3]]
+    ran = mwdcal("convert", warm[0], "--notation", other, "--temperature", "course")
+    message = refused(ran, 2)
+    remedy = {"factors": "polynomial", "polynomial": "factors"}[warm[3]]
+    assert f"--model {remedy}" in message
+    assert "accelerometer" in message
+    assert "°C" in message
+
+
+def test_the_text_of_a_course_names_the_powers(warm):
+    notation = COURSES[warm[3]]
+    said = mwdcal("convert", warm[0], "--notation", notation, "--temperature", "course").out
+    assert said.startswith("τ = T - 20 °C\n\naccelerometer\n")
+    blocks = dict(zip(TRIADS, said.split("\n\nmagnetometer\n"), strict=True))
+    document = converted(warm[0], notation, "--temperature", "course")
+    for triad, block in blocks.items():
+        rows = {
+            row[0]: row[1:] for line in block.splitlines() if "[" in line for row in [line.split()]
+        }
+        entry, count = document[triad], 0
+        for name in {"S", "o", "M", "b"} & set(entry):
+            value, spread = np.array(entry[name]), np.array(entry["standard_uncertainty"][name])
+            count += value.size
+            for index in np.ndindex(value.shape):
+                power = ("", "·τ", "·τ²", "·τ³", "·τ⁴")[index[0]]
+                label = name + "".join(f"[{i}]" for i in index[1:]) + power
+                assert rows[label] == [f"{value[index]:.12g}", f"{spread[index]:.2g}"]
+        assert len(rows) == count
+
+
 def test_a_polynomial_of_temperature_has_no_factors(warm):
     if warm[3] == "factors":
         pytest.skip("has factors")
@@ -212,6 +299,13 @@ def test_options_that_cannot_be_meant(case, options):
     refused(mwdcal("convert", case[0], "--notation", *options), 2)
 
 
+@pytest.mark.parametrize("word", ["warm", "20,5", "Course", ""])
+def test_a_word_that_is_no_temperature(case, word):
+    message = refused(mwdcal("convert", case[0], "--notation", "affine", "--temperature", word), 2)
+    assert "'course'" in message
+    assert f"got {word!r}" in message
+
+
 def test_undetermined_values_have_no_uncertainty(tmp_path):
     """No toolface reference: what turns with the tool axis has none to state, what does not has."""
     run = servo_run(tool=TOOL)
@@ -222,3 +316,21 @@ def test_undetermined_values_have_no_uncertainty(tmp_path):
     assert found[2][2] is not None
     said = mwdcal("convert", calibration, "--notation", "affine").out
     assert "nan" not in said.lower()
+
+
+def test_undetermined_values_of_a_course_have_no_uncertainty(tmp_path):
+    """No toolface reference: what turns with the tool axis has none to state, the zeros have."""
+    run = servo_run(tool=TOOL, temperatures=(0.0, 30.0, 60.0))
+    del run["ref_toolface_deg"], run["ref_azimuth_deg"]
+    calibration = calibrated(tmp_path, run, "--model", "factors", "--order", 1)
+    free = [u["id"] for u in json.loads(calibration.read_bytes())["accelerometer"]["undetermined"]]
+    assert free == ["toolface-zero"]
+    options = ("--notation", "forward", "--temperature", "course")
+    ran = mwdcal("convert", calibration, *options, "--json")
+    stated = ran.json["accelerometer"]["standard_uncertainty"]
+    assert None in (stated["S"][0][0][1], stated["S"][0][1][0])
+    assert stated["S"][0][2][2] is not None
+    assert None not in np.ravel(stated["o"])
+    said = mwdcal("convert", calibration, *options).out
+    assert "nan" not in said.lower()
+    assert "undetermined" in said

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cached_property
 from itertools import pairwise
 
+import msgspec
 import numpy as np
 
 from mwdcal import __version__
@@ -16,8 +17,7 @@ from mwdcal.calibration import (
     Calibration,
     Choices,
     Constant,
-    Finding,
-    StationRow,
+    OrderScore,
     TriadCalibration,
     Undetermined,
     rounded,
@@ -27,15 +27,15 @@ from mwdcal.core.observability import Free, free_directions
 from mwdcal.core.problem import STAND
 from mwdcal.core.uncertainty import marginal_rank
 from mwdcal.core.vectors import Array
+from mwdcal.curves import with_nonlinearity
 from mwdcal.estimate import Fit, fit
+from mwdcal.findings import Findings, described, is_relative
 from mwdcal.options import Options
 from mwdcal.profile import Profile
 from mwdcal.readings import TRIADS, Readings
-from mwdcal.residuals import REASONS, error_rows, measure_rows, shown_in, station_rows
+from mwdcal.residuals import error_rows, measure_rows, station_rows
 from mwdcal.stand import check_names, check_separable, stand_errors
 
-SUSPECT = 3.0
-"""A fit whose residuals exceed the declared noise this many times is reported."""
 IDENTITY = ("serial", "tool", "operator", "lab", "date", "stand", "simulated")
 
 
@@ -46,10 +46,12 @@ def calibrate(
     *,
     profile_sha256: str = "",
     run_sha256: str = "",
+    orders: Sequence[OrderScore] = (),
     progress: Callable[[str], None] = lambda text: None,
 ) -> Calibration:
     """Fit the sensor model to a run and state what it is worth.
 
+    `orders`: what left-out temperatures say of the order (`mwdcal.selection`), for the record.
     Raises `FitError` where the data cannot give a calibration to be trusted.
     """
     options = with_nonlinearity(options or Options(), profile)
@@ -62,40 +64,8 @@ def calibrate(
     free = free_directions(result.problem, result.state, result.analysis.determined)
     check_fit(result, free, profile, readings)
     made = _Record(readings, profile, options, result, free)
-    return rounded(made.calibration(profile_sha256, run_sha256))
-
-
-def with_nonlinearity(options: Options, profile: Profile) -> Options:
-    """The options with the own-axis terms that the profile declares, unless they say otherwise.
-
-    Only the polynomial model has such terms.
-    """
-    if options.nonlinearity is not None:
-        return options
-    found = {}
-    for name, order in zip(TRIADS, options.orders, strict=True):
-        value = getattr(profile, name).nonlinearity
-        if value and options.kind(order) == "polynomial":
-            found[name] = value
-    return replace(options, nonlinearity=found)
-
-
-TEXTS = {
-    "toolface-zero": "toolface zero is undetermined: no evidence fixes rotation about the tool axis; kept at nominal. "
-    "Give ref_toolface_deg at some stations to determine it",
-    "rotation-x": "rotation about the tool's x axis is undetermined: no evidence fixes it; kept at nominal. Give "
-    "reference inclinations, or roll sets at three or more directions",
-    "rotation-y": "rotation about the tool's y axis is undetermined: no evidence fixes it; kept at nominal. Give "
-    "reference inclinations, or roll sets at three or more directions",
-    "scale": "overall scale is undetermined: no evidence fixes it; kept at nominal. Give a reference strength",
-}
-
-
-def described(name: str) -> str:
-    """What a free direction means, and what would determine it."""
-    steady, _, power = name.partition("-temperature-")
-    course = f" (its course with temperature, power {power})" if power else ""
-    return TEXTS.get(steady, steady) + course
+    record = made.calibration(profile_sha256, run_sha256)
+    return rounded(msgspec.structs.replace(record, orders=list(orders)))
 
 
 @dataclass(frozen=True)
@@ -142,7 +112,9 @@ class _Record:
             errors=error_rows(readings, result),
             measures=measure_rows(readings, result),
             station_rows=stations,
-            findings=self.findings(stations),
+            findings=Findings(readings, self.profile, options, result, self.free).all(
+                [self.triad(i) for i in range(len(result.problem.triads))], stations
+            ),
         )
 
     @property
@@ -154,9 +126,7 @@ class _Record:
     @property
     def relative(self) -> bool:
         """Whether the magnetometer is calibrated to a field of one."""
-        return self.readings.magnetometer is not None and bool(
-            np.isnan(self.readings.reference("field")).all()
-        )
+        return is_relative(self.readings)
 
     @cached_property
     def map(self) -> Array:
@@ -283,57 +253,6 @@ class _Record:
             None if s * e > FREE_SHARE else float(v)
             for v, s, e in zip(values, share, effect, strict=True)
         ]
-
-    def findings(self, stations: list[StationRow]) -> list[Finding]:
-        """What the reader should know, in order of weight."""
-        found = []
-        made = [self.triad(i) for i in range(len(self.result.problem.triads))]
-        for triad in made:
-            excess = triad.variance_factor
-            if triad.noise_source == "declared" and excess is not None and excess > SUSPECT**2:
-                found.append(
-                    Finding(
-                        id=f"{triad.name}-residuals",
-                        text=f"{triad.name}: residuals are {excess**0.5:.1f} times the declared noise: "
-                        "the noise figure, a reference, or the model is wrong. Uncertainties are "
-                        "scaled up accordingly.",
-                    )
-                )
-        bare = [t.name for t in made if t.degrees_of_freedom < 1]
-        if bare:
-            text = f"{' and '.join(bare)}: no redundancy, so nothing in this run checks the fit. Add stations."
-            found.append(Finding(id="no-redundancy", text=text))
-        for entry in self.free:
-            names = " and ".join(TRIADS[t] for t in entry.triads)
-            found.append(Finding(id=entry.id, text=f"{names}: {described(entry.id)}."))
-        bent = self.options.nonlinearity or {}
-        kinds = {t.name: t.model for t in made if t.name not in bent}
-        ignored = [
-            n
-            for n, kind in kinds.items()
-            if kind == "factors" and getattr(self.profile, n).nonlinearity
-        ]
-        if ignored:
-            text = (
-                f"nonlinearity of the {' and '.join(ignored)} is not fitted: the model of factors "
-            )
-            text += "has no such terms. Use --model polynomial for it."
-            found.append(Finding(id="nonlinearity-ignored", text=text))
-        if self.relative:
-            text = "field strength is known at no station: the magnetometer is calibrated to field = 1. "
-            found.append(Finding(id="field-unknown", text=text + "Give ref_field_nt to have nT."))
-        return found + [self._reshoot(row) for row in stations if row.reshoot]
-
-    def _reshoot(self, row: StationRow) -> Finding:
-        worst = row.worst or "gravity"
-        _, unit = shown_in(worst, self.relative)
-        gap = "" if unit == "°" else " "
-        value = row.errors.get(worst, float("nan"))
-        text = (
-            f"station {row.station}: residual {row.deviation:.1f}σ, most in {worst} ({value:+.3g}{gap}{unit}): "
-            f"{REASONS[worst]} Re-shoot it, or --exclude {row.station}"
-        )
-        return Finding(id="reshoot", text=text, station=row.station)
 
 
 def _own_values(result: Fit, where: slice) -> Array:

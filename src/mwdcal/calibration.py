@@ -83,7 +83,9 @@ class StationRow(msgspec.Struct, frozen=True, kw_only=True):
     """One station of the fit: errors left where references are known, and how unlikely they are.
 
     `deviation` is the station's χ² put as an equivalent number of standard deviations of one
-    normal variable; `reshoot` marks the ones to take again.
+    normal variable; `reshoot` marks the ones to take again. `errors_left_out` are the errors
+    when the station has no part in the fit, `influence` the largest change it makes by itself
+    at any station of the run, `weight` its share in a robust fit.
     """
 
     station: str
@@ -94,6 +96,9 @@ class StationRow(msgspec.Struct, frozen=True, kw_only=True):
     azimuth_deg: float | None
     errors: dict[str, float]
     errors_before: dict[str, float]
+    errors_left_out: dict[str, float] = {}
+    influence: dict[str, float] = {}
+    weight: float = 1.0
     deviation: float
     reshoot: bool = False
     worst: str | None = None
@@ -117,6 +122,30 @@ class Choices(msgspec.Struct, frozen=True, kw_only=True):
     robust: str | None = None
     paper_weights: bool = False
     prior: str | None = None
+
+
+class OrderScore(msgspec.Struct, frozen=True, kw_only=True):
+    """How well a triad's model of one temperature order predicts soaks left out of the fit.
+
+    `…inside`: soaks between the coldest and the hottest, predicted by interpolation; `…ends`:
+    those two, by extrapolation. Of both: χ² per reading (`inside`, `ends`); root mean square
+    error of the vector per axis in `unit` (`error_…`); of its two components across the field,
+    as angles in degrees (`error_…_deg`). The noise of the readings is part of the errors:
+    `noise` and `noise_deg` are what it alone would leave. None: nothing tests it.
+    """
+
+    triad: str
+    order: int
+    chosen: bool
+    inside: float | None
+    ends: float | None
+    unit: str
+    noise: float | None
+    error_inside: float | None
+    error_ends: float | None
+    noise_deg: float | None
+    error_inside_deg: float | None
+    error_ends_deg: float | None
 
 
 class TriadCalibration(msgspec.Struct, frozen=True, kw_only=True):
@@ -189,6 +218,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
     earth: dict[str, float]
     errors: list[ErrorRow]
     measures: list[Measures]
+    orders: list[OrderScore] = []
     station_rows: list[StationRow]
     findings: list[Finding]
 

@@ -7,6 +7,7 @@ import numpy as np
 from mwdcal.core.observability import Free
 from mwdcal.core.robust import LOSSES
 from mwdcal.core.solvers import Status
+from mwdcal.core.uncertainty import station_misfit
 from mwdcal.core.vectors import Array
 from mwdcal.errors import FitError, InputError
 from mwdcal.estimate import Fit
@@ -28,6 +29,8 @@ NAMED = 4
 
 ABSURD = 30.0
 """Residuals of more than this many times the declared noise mean that something is plain wrong."""
+MOST = 0.3
+"""Share of all misfit at which a single station is named as the cause."""
 COARSE = 0.05
 """Estimated noise of more than this share of the field likewise."""
 
@@ -38,7 +41,7 @@ def check_fit(result: Fit, free: list[Free], profile: Profile, readings: Reading
     _check_geometry(result, free)
     _check_freedom(result)
     _check_gains(result, profile, readings)
-    _check_residuals(result)
+    _check_residuals(result, readings)
 
 
 def check_options(options: Options) -> None:
@@ -83,7 +86,7 @@ def check_readings(readings: Readings, options: Options) -> None:
             f"attitudes{', or lower --order' if highest else ''}."
         )
     for triad in TRIADS:
-        _check_channels(readings, triad)
+        _check_channels(readings, triad, options.prior is not None)
     _check_temperature(readings, highest)
     _check_needs(readings, method)
     if method == "swarm" and highest:
@@ -93,7 +96,8 @@ def check_readings(readings: Readings, options: Options) -> None:
         )
 
 
-def _check_channels(readings: Readings, triad: str) -> None:
+def _check_channels(readings: Readings, triad: str, prior: bool) -> None:
+    """Refuse channels that are dead or cannot have seen the field; a prior needs no motion."""
     values = getattr(readings, triad)
     if values is None:
         return
@@ -110,7 +114,8 @@ def _check_channels(readings: Readings, triad: str) -> None:
     if np.isnan(known).all():
         return
     share = spread / np.nanmean(known)
-    for axis in np.flatnonzero((share < MOTION[0]) | (share > MOTION[1])):
+    least = 0.0 if prior else MOTION[0]
+    for axis in np.flatnonzero((share < least) | (share > MOTION[1])):
         moves = f"{where}{'xyz'[axis]} moves by {spread[axis]:.3g} {unit} over the run, "
         scale = f"a wrong 'scale' of [{triad}] in the tool profile"
         if share[axis] < MOTION[0]:
@@ -221,7 +226,7 @@ def _check_gains(result: Fit, profile: Profile, readings: Readings) -> None:
                 )
 
 
-def _check_residuals(result: Fit) -> None:
+def _check_residuals(result: Fit, readings: Readings) -> None:
     """Refuse what no error of a sensor explains: columns, references or groups are mixed up."""
     problem, analysis = result.problem, result.analysis
     for index, name in enumerate(TRIADS[: len(problem.triads)]):
@@ -242,5 +247,19 @@ def _check_residuals(result: Fit) -> None:
             raise FitError(
                 f"the {name}'s residuals are {much}: no sensor model explains these readings. Check "
                 "that columns, reference angles and groups belong to the stations they stand at, and "
-                "'axes' and 'noise' in the tool profile."
+                f"'axes' and 'noise' in the tool profile.{_culprit(result, readings)}"
             )
+
+
+def _culprit(result: Fit, readings: Readings) -> str:
+    """The station to look at first, if a single one has most of the misfit."""
+    square, _ = station_misfit(result.analysis)
+    worst = int(np.argmax(square[0]))
+    share = square[0, worst] / max(float(square[0].sum()), 1e-300)
+    if share < MOST:
+        return ""
+    label = readings.labels[worst]
+    return (
+        f" Station {label} alone has {share:.0%} of the misfit: --exclude {label}, or fit with "
+        "--robust student-t."
+    )

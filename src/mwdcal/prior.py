@@ -11,9 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mwdcal.calibration import Calibration
 from mwdcal.core.models import Model, Restricted
 from mwdcal.core.problem import Prior
 from mwdcal.core.vectors import Array
+from mwdcal.errors import FitError, InputError
 from mwdcal.profile import Datasheet, Profile
 from mwdcal.readings import TRIADS
 
@@ -26,7 +28,8 @@ class Knowledge:
     """Expected values (k,) of named parameters and their precision (k, k).
 
     Names are "accelerometer scale-x" and so on, in nominal units and tool axes, of powers of
-    T - `reference`. A direction without precision is not known.
+    T - `reference`. A direction without precision is not known. `loose`: names that a model
+    does not have are of no account; else they are an error.
     """
 
     source: str
@@ -34,10 +37,14 @@ class Knowledge:
     names: tuple[str, ...]
     expected: Array
     precision: Array
+    loose: bool = False
 
 
 def prior_of(knowledge: Knowledge | None, models: Sequence[Model], batch: int) -> Prior:
-    """Knowledge as precision and expectation (B, p) of a fit's own parameters; none: all free."""
+    """Knowledge as precision and expectation (B, p) of a fit's own parameters; none: all free.
+
+    Raises `FitError` where the knowledge is of another model.
+    """
     size = sum(model.size for model in models)
     precision, nothing = np.zeros((batch, size, size)), np.zeros((batch, size))
     if knowledge is None:
@@ -50,6 +57,12 @@ def prior_of(knowledge: Knowledge | None, models: Sequence[Model], batch: int) -
         whole[:, where, where] = one[..., list(kept), :]
         names += [f"{triad} {name}" for name in model.names]
         start += model.size
+    strange = [name for name in knowledge.names if name not in names]
+    if strange and not knowledge.loose:
+        raise FitError(
+            f"the prior ({knowledge.source}) has parameters that this model lacks, such as "
+            f"{strange[0]}. Use the same --model, --order and --parameters as it had."
+        )
     rows = [i for i, name in enumerate(names) if name in knowledge.names]
     theirs = [knowledge.names.index(names[i]) for i in rows]
     values, known = np.zeros(size), np.zeros((size, size))
@@ -78,8 +91,60 @@ def from_datasheet(profile: Profile, relative: bool = False) -> Knowledge:
                 spread.append(sd)
     precision = np.diag(np.array(spread) ** -2.0)
     return Knowledge(
-        "datasheet", profile.reference_temperature_c, tuple(names), np.array(expected), precision
+        "datasheet",
+        profile.reference_temperature_c,
+        tuple(names),
+        np.array(expected),
+        precision,
+        loose=True,
     )
+
+
+def from_calibration(previous: Calibration, relative: bool = False) -> Knowledge:
+    """A previous calibration of the same tool, with its covariance and what it left undetermined.
+
+    Raises `InputError` for one with own-axis terms (they are centred on their own run), or in
+    another unit of the field than this run's.
+    """
+    where = f"--prior {previous.run}"
+    if any(triad.curved for triad in previous.triads):
+        raise InputError(
+            f"{where}: its own-axis quadratic and cubic terms belong to the readings of its own run. "
+            "Calibrate that run with --nonlinearity none to use it as a prior."
+        )
+    if previous.has_field and previous.field_unit.startswith("relative") != relative:
+        raise InputError(
+            f"{where}: it is in {previous.field_unit}, this run is not. Give both runs ref_field_nt, "
+            "or neither."
+        )
+    names = [f"{t.name} {name}" for t in previous.triads for name in t.parameter_names]
+    expected = np.concatenate([t.parameters for t in previous.triads])
+    covariance = np.array(previous.covariance)
+    free = np.array(previous.free, float).reshape(len(previous.free), len(expected))
+    moving = np.flatnonzero(np.diag(covariance) > 0)
+    return Knowledge(
+        previous.run,
+        previous.reference_temperature,
+        tuple(names[i] for i in moving),
+        expected[moving],
+        _precision(covariance[np.ix_(moving, moving)], free[:, moving]),
+    )
+
+
+def _precision(covariance: Array, free: Array) -> Array:
+    """Inverse (k, k) of a covariance of which some directions, the rows of `free`, are not known.
+
+    The covariance is singular there; the precision says nothing along them: both have the
+    oblique projector onto its range, along the free directions, in common.
+    """
+    scale = np.sqrt(np.diag(covariance))
+    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
+    kept = np.argsort(values)[len(free) :]
+    span = vectors[:, kept]
+    whole = np.concatenate([span, (free / scale).transpose()], -1)
+    onto = np.linalg.solve(whole, np.eye(len(scale)))[: len(kept)]
+    inner = onto.transpose() / values[kept] @ onto
+    return np.asarray(inner / np.outer(scale, scale))
 
 
 def _tolerances(sheet: Datasheet) -> list[tuple[str, float, float | None]]:

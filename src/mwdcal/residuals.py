@@ -9,7 +9,7 @@ import numpy as np
 
 from mwdcal.calibration import ErrorRow, Measures, StationRow
 from mwdcal.core.observables import OBSERVABLES
-from mwdcal.core.uncertainty import station_misfit
+from mwdcal.core.uncertainty import station_misfit, without_station
 from mwdcal.core.vectors import Array, centred
 from mwdcal.estimate import Fit
 from mwdcal.readings import TRIADS, Readings
@@ -18,6 +18,8 @@ SHOWN = ("gravity", "inclination", "toolface", "azimuth", "field", "dip")
 UNITS = {"gravity": "mg", "field": "nT"}
 RESHOOT = 0.01
 """A station is marked when one in a hundred runs would have any station as bad as it."""
+PROBES = 200
+"""Stations at which the influence of each is looked at: no more, however long the run."""
 REASONS = {
     "gravity": "moved before it settled?",
     "inclination": "stand inclination misread?",
@@ -125,6 +127,38 @@ class Residuals:
         variance = np.einsum("ni,nij,nj->n", row, self._spread, row)
         return np.asarray(np.sqrt(np.maximum(variance, 0) * self._variance_factor))
 
+    @cached_property
+    def _moves(self) -> list[Array]:
+        """Change (n, p) of each triad's parameters when a station is left out."""
+        fit = self.fit
+        moved = without_station(fit.problem, fit.state, fit.analysis)[0]
+        return [moved[:, where] for where in fit.problem.slices()]
+
+    @cached_property
+    def left_out(self) -> tuple[Array, Array]:
+        """Corrected vectors (n, 3) of each station, by the fit without it."""
+        problem, state = self.fit.problem, self.fit.state
+        found = []
+        for triad, where, moved in zip(problem.triads, problem.slices(), self._moves, strict=True):
+            params = state.params[:, where] + moved
+            raw, temperature = triad.raw[0][:, None], problem.temperature[0][:, None]
+            found.append(triad.model.fields(params, raw, temperature)[:, 0])
+        return found[0], found[1] if len(found) > 1 else np.full_like(found[0], np.nan)
+
+    def influence(self, name: str) -> Array:
+        """Largest change (n,) that each station makes to an observable, at stations of the run."""
+        some = np.unique(np.linspace(0, self.readings.count - 1, PROBES).astype(int))
+        problem, state = self.fit.problem, self.fit.state
+        gradient = OBSERVABLES[name].gradient(*self.after)[some]
+        change = np.zeros((len(some), self.readings.count))
+        for index, (triad, where) in enumerate(zip(problem.triads, problem.slices(), strict=True)):
+            raw, temperature = triad.raw[:, some], problem.temperature[:, some]
+            rows = triad.model.jacobian(state.params[:, where], raw, temperature)[0]
+            part = np.nan_to_num(gradient[:, 3 * index : 3 * index + 3])
+            change += np.einsum("ni,nip->np", part, rows) @ self._moves[index].transpose()
+        weight = np.nan_to_num(self._weight(name)[some])
+        return np.asarray(np.abs(change * weight[:, None]).max(0))
+
     def names(self) -> list[str]:
         """Observables with a reference somewhere in this run."""
         usable = SHOWN if len(self.fit.problem.triads) > 1 else SHOWN[:3]
@@ -209,6 +243,8 @@ def station_rows(readings: Readings, fit: Fit) -> list[StationRow]:
     limit = -float(ndtri(RESHOOT / readings.count / 2))
     after = {n: residuals.errors(n, residuals.after) for n in names}
     before = {n: residuals.errors(n, residuals.before) for n in names}
+    left_out = {n: residuals.errors(n, residuals.left_out) for n in names}
+    influence = {n: residuals.influence(n) for n in names}
     expected = {n: np.nan_to_num(residuals.expected(n), nan=np.inf) for n in names}
     ratio = {n: np.abs(after[n]) / np.maximum(expected[n], 1e-30) for n in names}
     factors = {n: shown_in(n, residuals.relative)[0] for n in names}
@@ -229,6 +265,9 @@ def station_rows(readings: Readings, fit: Fit) -> list[StationRow]:
                 azimuth_deg=_plain(attitude["azimuth"][i]),
                 errors=_scaled(after, factors, i),
                 errors_before=_scaled(before, factors, i),
+                errors_left_out=_scaled(left_out, factors, i),
+                influence=_scaled(influence, factors, i),
+                weight=float(fit.trust[0, i]),
                 deviation=float(deviation[i]),
                 reshoot=bad,
                 worst=max(scores, key=lambda n: scores[n]) if bad and scores else None,

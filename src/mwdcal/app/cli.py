@@ -4,22 +4,21 @@ from __future__ import annotations
 
 import os
 import sys
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypedDict
+from typing import TYPE_CHECKING, Any, TypedDict, Unpack
 
 import click
 
 from mwdcal import __version__
+from mwdcal.app.asked import Asked, standstill_options
 from mwdcal.errors import InputError, MwdcalError
 
 if TYPE_CHECKING:
+    from mwdcal.app.choices import Chosen, Typed
     from mwdcal.calibration import Calibration, Finding
     from mwdcal.notation import Notation
-    from mwdcal.options import Options
     from mwdcal.profile import Profile
     from mwdcal.readings import Readings
-    from mwdcal.selection import OrderScore
 
 INTERNAL = 70
 INTERRUPTED = 130
@@ -95,6 +94,19 @@ def print_json(value: Any) -> None:
     "--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of the swarm."
 )
 @click.option(
+    "--paper-weights", is_flag=True,
+    help="Sum the squares as the method's paper does, unweighted, instead of by their uncertainty.",
+)  # fmt: skip
+@click.option(
+    "--robust", type=click.Choice(["huber", "student-t"]),
+    help="Bound what a bad station can do: huber keeps a little of its pull, student-t loses it.",
+)  # fmt: skip
+@click.option(
+    "--prior", metavar="CAL.json|datasheet",
+    help="What is known beforehand: a previous calibration of this tool, with its covariance, or "
+    "the tolerances in the tool profile.",
+)  # fmt: skip
+@click.option(
     "--estimate", default="", metavar="NAMES",
     help="Errors of the stand to find as well: azimuth-zero, tilt, or both with a comma.",
 )  # fmt: skip
@@ -104,12 +116,22 @@ def print_json(value: Any) -> None:
     help="Default: polynomial at order 0, factors above.",
 )
 @click.option(
+    "--parameters", type=click.Choice(["12", "9", "6"]), default="12", show_default=True,
+    help="Per triad at one temperature. 9: the sensor frame, without mounting rotation. "
+    "6: scale and bias alone.",
+)  # fmt: skip
+@click.option(
     "--order",
     default="auto",
     show_default=True,
     metavar="0…3|auto",
     help="Order of temperature terms.",
 )
+@click.option(
+    "--nonlinearity", default="auto", show_default=True, metavar="auto|none|NAMES",
+    help="Own-axis quadratic and cubic terms. auto: of the triads whose profile declares them, "
+    "where left-out stations improve. NAMES: accelerometer, magnetometer, or both with a comma.",
+)  # fmt: skip
 @click.option(
     "--exclude", multiple=True, metavar="STATION", help="Leave a station out; may be repeated."
 )
@@ -119,9 +141,8 @@ def print_json(value: Any) -> None:
 @decimal_sign
 @as_json
 def calibrate(
-    run: Path, output: Path, tool: str | None, method: str, seed: int, estimate: str,
-    model: str | None, order: str,
-    exclude: tuple[str, ...], report: Path | None, decimal: str, as_json: bool,
+    run: Path, output: Path, tool: str | None, exclude: tuple[str, ...], report: Path | None,
+    decimal: str, as_json: bool, **typed: Unpack[Typed],
 ) -> None:  # fmt: skip
     """Fit the sensor model to a calibration RUN (CSV, TSV, Parquet or XLSX).
 
@@ -129,16 +150,15 @@ def calibrate(
     Example: mwdcal calibrate run.csv --tool servo -o tool.json --report tool.html
     Exit: 0 calibrated, 2 input cannot be read, 3 fit failed or refused.
     """
+    from mwdcal.app.choices import choose
     from mwdcal.calibrate import calibrate as fit
     from mwdcal.files import documents
-    from mwdcal.options import Options
 
-    _check_outputs([output, report], [run, Path(tool or "")])
+    _check_outputs([output, report], [run, Path(tool or ""), Path(typed["prior"] or "")])
     readings, profile, digests = _load(run, tool, decimal)
     readings = _without(readings, exclude)
-    names = tuple(name.strip() for name in estimate.split(",") if name.strip())
-    options, scores = _order(order, readings, Options(method, model, estimate=names, seed=seed))
-    made = fit(readings, profile, options, **digests)
+    chosen = choose(readings, profile, typed, say)
+    made = fit(readings, profile, chosen.options, orders=chosen.orders, **digests)
     if report:
         from mwdcal.app.report import write_report
 
@@ -148,13 +168,14 @@ def calibrate(
         print_json(
             {
                 **_summary(made),
-                "orders": scores,
+                "orders": made.orders,
+                "nonlinearity": chosen.curves,
                 "calibration": str(output),
                 "report": str(report or ""),
             }
         )
     else:
-        _show(made, scores, output, report)
+        _show(made, chosen, output, report)
 
 
 def _check_outputs(outputs: list[Path | None], inputs: list[Path]) -> None:
@@ -200,20 +221,6 @@ def _without(readings: Readings, exclude: tuple[str, ...]) -> Readings:
     return readings.select(np.array([label not in exclude for label in readings.station]))
 
 
-def _order(order: str, readings: Readings, options: Options) -> tuple[Options, list[OrderScore]]:
-    """The options with the order asked for, or the one that left-out temperatures speak for."""
-    from mwdcal.checks import check_readings
-    from mwdcal.selection import choose_order
-
-    if order == "auto":
-        check_readings(readings, replace(options, model=options.model or "polynomial"))
-        chosen, scores = choose_order(readings, options, say)
-        return replace(options, order=chosen), scores
-    if order not in ("0", "1", "2", "3"):
-        raise InputError(f"--order must be 0, 1, 2, 3 or auto; got {order!r}.")
-    return replace(options, order=int(order)), []
-
-
 def _summary(made: Calibration) -> dict[str, Any]:
     from mwdcal.predict import typical_accuracy
 
@@ -234,13 +241,15 @@ def _summary(made: Calibration) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _show(made: Calibration, scores: list[OrderScore], output: Path, report: Path | None) -> None:
+def _show(made: Calibration, chosen: Chosen, output: Path, report: Path | None) -> None:
     from mwdcal.app import text
     from mwdcal.predict import typical_accuracy
 
     click.echo(text.heading(made) + "\n")
-    if scores:
-        click.echo(text.orders(scores) + "\n")
+    if made.orders:
+        click.echo(text.orders(made.orders) + "\n")
+    if chosen.curves:
+        click.echo(text.curves(chosen.curves) + "\n")
     click.echo(text.errors(made.errors) + "\n")
     accuracy = "  ".join(
         f"{n} {text.number(v)}{'°' if v is not None else ''}"
@@ -281,6 +290,23 @@ def compare(run: Path, tool: str | None, order: int, decimal: str, as_json: bool
         print_json(text.plain(found))
     else:
         click.echo(text.comparison(found))
+
+
+@cli.command()
+@standstill_options
+def stations(**asked: Unpack[Asked]) -> None:
+    """Find the standstills in a continuous LOG and write each as a station of a run file.
+
+    \b
+    Example: mwdcal stations log.csv -o run.csv --plot log.png
+    Exit: 0 written, 2 input cannot be read or never stands still.
+    """
+    from mwdcal.app import standstills
+
+    _check_outputs([asked["output"], asked["plot"]], [asked["log"]])
+    findings, result = standstills.run(asked, say)
+    tell(findings)
+    (print_json if asked["as_json"] else click.echo)(result)
 
 
 @cli.command()
@@ -373,35 +399,39 @@ def verify(
     type=click.Choice(["factors", "forward", "affine"]),
     help="Form to print.",
 )
-@click.option("--temperature", type=float, metavar="°C", help="Default: the reference temperature.")
+@click.option(
+    "--temperature",
+    metavar="°C|course",
+    help="One temperature, or 'course': coefficients by power of T - reference. "
+    "Default: the reference temperature.",
+)
 @click.option(
     "-o", "--output", type=FILE, metavar="OUT.json", help="Write JSON here instead of printing."
 )
 @as_json
 def convert(
-    calibration: Path, notation: str, temperature: float | None, output: Path | None, as_json: bool
+    calibration: Path, notation: str, temperature: str | None, output: Path | None, as_json: bool
 ) -> None:
     """Print a CALIBRATION in another notation, in raw units, with covariance.
 
     \b
     forward: raw = S·field + o    affine: field = M·raw + b    factors: SF, B, m (Moosavi)
     Example: mwdcal convert tool.json --notation forward --json
+    Example: mwdcal convert tool.json --notation forward --temperature course
     """
     from mwdcal.app import text
     from mwdcal.files import atomic, documents
+    from mwdcal.notation import COURSE
     from mwdcal.notation import convert as rewrite
 
     _check_outputs([output], [calibration])
-    if temperature is not None and not COLDEST <= temperature <= HOTTEST:
-        raise InputError(
-            f"--temperature must be between {COLDEST:g} and {HOTTEST:g} °C; got {temperature:g}."
-        )
+    at = _temperature(temperature)
     made = documents.read(calibration)
-    found = rewrite(made, notation, temperature)
+    found = rewrite(made, notation, at)
     if not as_json and output is None:
-        click.echo(text.notation(found))
+        click.echo(text.notation(found, made.reference_temperature if at == COURSE else None))
         return
-    document = _notation_document(made, notation, temperature, found)
+    document = _notation_document(made, notation, at, found)
     if output is None:
         print_json(document)
     else:
@@ -411,12 +441,27 @@ def convert(
         click.echo(f"wrote {output}")
 
 
+def _temperature(option: str | None) -> float | str | None:
+    """A temperature in °C if it is a number; a word is left to `notation.convert`."""
+    try:
+        value = None if option is None else float(option)
+    except ValueError:
+        return option
+    if value is not None and not COLDEST <= value <= HOTTEST:
+        raise InputError(
+            f"--temperature must be between {COLDEST:g} and {HOTTEST:g} °C; got {value:g}."
+        )
+    return value
+
+
 def _notation_document(
-    made: Calibration, notation: str, temperature: float | None, found: dict[str, Notation]
+    made: Calibration, notation: str, temperature: float | str | None, found: dict[str, Notation]
 ) -> dict[str, Any]:
-    steady = notation == "factors" or temperature is None
-    at = made.reference_temperature if steady else temperature
-    document: dict[str, Any] = {"notation": notation, "temperature_c": at}
+    document: dict[str, Any] = {"notation": notation, "temperature_c": temperature}
+    if isinstance(temperature, str):
+        document["powers_of"] = "T - reference_temperature_c"
+    elif notation == "factors" or temperature is None:
+        document["temperature_c"] = made.reference_temperature
     for name, item in found.items():
         profile = getattr(made.profile, name)
         document[name] = {

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.patheffects import AbstractPathEffect
 
-    from mwdcal.calibration import Calibration, StationRow
+    from mwdcal.calibration import Calibration, OrderScore, StationRow
     from mwdcal.predict import AccuracyMap
 
 TITLES = {
@@ -161,6 +161,42 @@ def deviations(calibration: Calibration, limit: float) -> str:
         )  # fmt: skip
         axes.set_ylabel("misfit of the station, σ")
         return _svg(figure, "deviation", "Misfit of each station in standard deviations")
+
+
+def order_errors(scores: Sequence[OrderScore]) -> str:
+    """Error at temperatures left out of the fit by order, inside and at the ends, per triad."""
+    triads = list(dict.fromkeys(row.triad for row in scores))
+    with _style():
+        figure = _figure(2.0)
+        panels = figure.subplots(1, len(triads), squeeze=False)[0]
+        for axes, triad in zip(panels, triads, strict=True):
+            _by_order(axes, [row for row in scores if row.triad == triad])
+            axes.set_title(triad)
+        panels[0].legend(loc="upper right")
+        return _svg(figure, "orders", "Error at left-out temperatures by temperature order")
+
+
+def _by_order(axes: Axes, rows: Sequence[OrderScore]) -> None:
+    """One triad's errors over the order, on a logarithmic scale, with the noise below them."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    where = [row.order for row in rows]
+    inside, ends, noise = (
+        np.array([getattr(row, name) for row in rows], float)
+        for name in ("error_inside", "error_ends", "noise")
+    )
+    axes.plot(where, ends, "^--", color=MARKED, label="at the ends (extrapolation)")
+    axes.plot(where, inside, "s-", color=AFTER, label="inside (interpolation)")
+    axes.plot(where, noise, ":", color=BEFORE, lw=1.2, label="noise of a reading")
+    axes.set_yscale("log")
+    wide = np.nanmax([inside, ends]) > 30 * np.nanmin([inside, ends])
+    axes.yaxis.set_major_locator(LogLocator(subs=(1.0,) if wide else (1.0, 2.0, 5.0)))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.yaxis.set_minor_formatter(NullFormatter())
+    axes.set_xticks(where, [f"{row.order}\nchosen" if row.chosen else str(row.order) for row in rows])
+    axes.margins(x=0.08, y=0.12)
+    axes.set_xlabel("order")
+    axes.set_ylabel(f"error, {rows[0].unit}")
 
 
 def _stems(

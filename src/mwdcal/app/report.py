@@ -281,8 +281,14 @@ def _figures(calibration: Calibration) -> dict[str, Any]:
         "errors": [plots.station_errors(calibration, name) for name in names],
         "missing": missing,
         "deviations": plots.deviations(calibration, _limit(calibration)),
+        "orders": plots.order_errors(calibration.orders) if _compared(calibration) else "",
         "accuracy": plots.accuracy(accuracy_map(calibration), angles(calibration)),
     }
+
+
+def _compared(calibration: Calibration) -> bool:
+    """Whether orders were compared, rather than one given."""
+    return not all(row.chosen for row in calibration.orders)
 
 
 def _decimals(calibration: Calibration) -> dict[str, int]:

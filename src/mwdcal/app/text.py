@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from mwdcal.calibration import Calibration, ErrorRow, Finding, StandErrors
+from mwdcal.calibration import Calibration, Choices, ErrorRow, Finding, OrderScore, StandErrors
 from mwdcal.compare import Comparison, Row
-from mwdcal.notation import Notation
+from mwdcal.curves import CurveScore
+from mwdcal.notation import Notation, powers
 from mwdcal.quality import Verdict
-from mwdcal.selection import OrderScore
 
 WEIGHED = {
     "toolface": "toolface·sin I",
@@ -19,6 +19,7 @@ WEIGHED = {
     "gravity": "|g|",
     "field": "|b|",
 }
+SUPERSCRIPT = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def number(value: float | None) -> str:
@@ -69,7 +70,18 @@ def heading(calibration: Calibration) -> str:
     ranks = [f"{t.name} {t.rank} of {t.size} determined" for t in calibration.triads]
     models = dict.fromkeys(f"{t.model} of order {t.order}" for t in calibration.triads)
     model = " and ".join(models)
-    return "   ".join(parts) + "\n" + "   ".join([f"method {calibration.method}, {model}", *ranks])
+    how = ", ".join([f"method {calibration.method}", model, *choices(calibration.options)])
+    return "   ".join(parts) + "\n" + "   ".join([how, *ranks])
+
+
+def choices(made: Choices) -> list[str]:
+    """What was asked for beyond method, model and order."""
+    return [
+        *([f"{made.parameters} parameters"] if made.parameters != 12 else []),
+        *([f"robust ({made.robust})"] if made.robust else []),
+        *(["the paper's weights"] if made.paper_weights else []),
+        *([f"prior {made.prior}"] if made.prior else []),
+    ]
 
 
 def errors(rows: list[ErrorRow]) -> str:
@@ -103,12 +115,28 @@ def findings(found: list[Finding]) -> list[str]:
 
 
 def orders(scores: list[OrderScore]) -> str:
-    """The table that chose the temperature order."""
+    """Error at temperatures left out of the fit, by triad and order: what chose the order."""
+    word = "" if all(s.chosen for s in scores) else "chosen"
     rows = [
-        [s.triad, str(s.order), number(s.inside), number(s.ends), "chosen" if s.chosen else ""]
+        [
+            *(s.triad, str(s.order)),
+            *(quantity(v, s.unit.partition(" ")[0]) for v in (s.error_inside, s.error_ends, s.noise)),
+            *(number(s.inside), number(s.ends), word if s.chosen else ""),
+        ]
         for s in scores
     ]
-    return table(rows, ["", "order", "χ² left out, inside", "χ² left out, ends", ""])
+    header = ["left-out temperatures", "order", "error inside", "at the ends", "noise"]
+    note = "rms per axis, noise included; inside: interpolation, at the ends: extrapolation"
+    return table(rows, [*header, "χ² inside", "χ² ends", ""]) + "\n" + note
+
+
+def curves(scores: list[CurveScore]) -> str:
+    """The table that took or left the own-axis terms."""
+    rows = [
+        [" and ".join(s.triads) or "none", number(s.left_out), "chosen" if s.chosen else ""]
+        for s in scores
+    ]
+    return table(rows, ["own-axis nonlinearity of", "χ² left out", ""])
 
 
 def verdict(result: Verdict) -> str:
@@ -159,19 +187,33 @@ def _compared(found: Comparison, able: list[Row]) -> list[list[str]]:
     return [*rows, ["time", *(f"{row.seconds:.2f} s" for row in able)]]
 
 
-def notation(found: dict[str, Notation]) -> str:
-    """Values with standard uncertainties, in as many digits as a firmware can hold."""
-    blocks = []
+def notation(found: dict[str, Notation], reference: float | None = None) -> str:
+    """Values with standard uncertainties, in as many digits as a firmware can hold.
+
+    A course is told by its `reference` temperature: each coefficient then names its power of τ.
+    """
+    blocks = [] if reference is None else [f"τ = T - {reference:g} °C"]
     for triad, item in found.items():
         rows = []
         for name, value in item.values.items():
+            power = powers(name, value)
             for index in np.ndindex(value.shape):
-                where = "".join(f"[{i}]" for i in index)
+                label = _label(name, index, None if reference is None else int(power[index]))
                 sd = float(item.uncertainty[name][index])
                 stated = "undetermined" if np.isnan(sd) else f"{sd:.2g}"
-                rows.append([f"{name}{where}", f"{value[index]:.12g}", stated])
+                rows.append([label, f"{value[index]:.12g}", stated])
         blocks.append(f"{triad}\n" + table(rows, ["", "value", "1σ"]))
     return "\n\n".join(blocks)
+
+
+def _label(name: str, index: tuple[int, ...], power: int | None) -> str:
+    """Name and place of a value; in a course its power of τ instead of that index."""
+    if power is not None and name != "m":
+        index = index[:-1] if name in ("SF", "B") else index[1:]
+    course = "·τ" if power else ""
+    if power and power > 1:
+        course += str(power).translate(SUPERSCRIPT)
+    return name + "".join(f"[{i}]" for i in index) + course
 
 
 def plain(value: Any) -> Any:

@@ -99,6 +99,23 @@ def station_misfit(analysis: Analysis) -> tuple[Array, Array]:
     return square, np.sum(tested, -1).astype(float)
 
 
+def without_station(problem: Problem, state: State, analysis: Analysis) -> Array:
+    """Change (B, n, p) of the parameters when one station is left out, for each station.
+
+    Exact for a linear problem: Cov Xᵀ C⁻¹ spread⁺ C⁻¹ρ, every term as the fit has it.
+    Directions of a station's readings that nothing else tests are left as they are.
+    """
+    linear = problem.linear(state)
+    whole = _whole_covariance(linear, analysis.determined)[:, : linear.size]
+    values, vectors = np.linalg.eigh(analysis.spread)
+    tested = values > TESTED
+    along = np.einsum("bnij,bni->bnj", vectors, analysis.residual)
+    along = np.where(tested, along / np.where(tested, values, 1.0), 0.0)
+    pulled = np.einsum("bnij,bnj->bni", vectors, along)
+    pulled = np.einsum("bnmu,bnm->bnu", linear.weigh(linear.design), pulled)
+    return np.asarray(np.einsum("bpu,bnu->bnp", whole, pulled))
+
+
 def candidates(problem: Problem, state: State, triads: list[int]) -> dict[str, Array]:
     """Directions (B, p) of parameter space that have a name: turns and scales of some triads."""
     directions = {}

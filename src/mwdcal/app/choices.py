@@ -1,0 +1,176 @@
+"""From what was typed at `calibrate` to the options of a fit: prior, order and own-axis terms."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TypedDict
+
+import numpy as np
+
+from mwdcal.calibration import Calibration, OrderScore
+from mwdcal.checks import check_readings
+from mwdcal.curves import USUAL, CurveScore, choose_curves, declared
+from mwdcal.errors import InputError
+from mwdcal.files import documents
+from mwdcal.options import Options
+from mwdcal.prior import Knowledge, from_calibration, from_datasheet
+from mwdcal.profile import Profile
+from mwdcal.readings import TRIADS, Readings
+from mwdcal.selection import choose_order, order_errors
+from mwdcal.stand import check_names
+
+DATASHEET = "datasheet"
+
+
+class Typed(TypedDict):
+    """The options of `mwdcal calibrate` that say how to fit, as they come from the command line."""
+
+    method: str
+    model: str | None
+    order: str
+    parameters: str
+    nonlinearity: str
+    estimate: str
+    robust: str | None
+    paper_weights: bool
+    prior: str | None
+    seed: int
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """Options of the fit, and the tables that decided what was left to the data."""
+
+    options: Options
+    orders: list[OrderScore]
+    curves: list[CurveScore]
+
+
+def choose(
+    readings: Readings, profile: Profile, typed: Typed, say: Callable[[str], None]
+) -> Chosen:
+    """Options as typed; what was left to the data is decided by stations left out of the fit."""
+    options = Options(
+        method=typed["method"],
+        model=typed["model"],
+        parameters=int(typed["parameters"]),
+        nonlinearity={},
+        estimate=tuple(names(typed["estimate"])),
+        robust=typed["robust"],
+        paper_weights=typed["paper_weights"],
+        seed=typed["seed"],
+    )
+    check_names(options.estimate, options.method)
+    order = typed["order"]
+    if typed["prior"]:
+        options, order = _with_prior(options, order, typed["prior"], readings, profile)
+    options, orders = _with_order(options, order, readings, say)
+    options, curves = _with_curves(options, typed["nonlinearity"], readings, profile, say)
+    if not orders:
+        check_readings(readings, options)
+        orders = order_errors(readings, options, say)
+    return Chosen(options, orders, curves)
+
+
+def names(text: str) -> list[str]:
+    """The words of a list with commas."""
+    return [name.strip() for name in text.split(",") if name.strip()]
+
+
+def _with_prior(
+    options: Options, order: str, prior: str, readings: Readings, profile: Profile
+) -> tuple[Options, str]:
+    """What is known beforehand; a previous calibration brings its model and order along."""
+    relative = bool(np.isnan(readings.reference("field")).all())
+    if prior == DATASHEET:
+        if profile.accelerometer.datasheet is None and profile.magnetometer.datasheet is None:
+            raise InputError(
+                f"--prior datasheet: the tool profile '{profile.name}' has none. Add a section "
+                "[accelerometer.datasheet] with scale, bias and misalignment_deg (1 sigma)."
+            )
+        return replace(options, prior=from_datasheet(profile, relative)), order
+    previous = documents.read(Path(prior))
+    other = previous.other_tool(readings)
+    if other:
+        raise InputError(
+            f"--prior {prior} is of tool {other[0]}, the run is of {other[1]}. Give the previous "
+            "calibration of the same tool."
+        )
+    if any(previous.used(readings.digest)):
+        raise InputError(
+            f"--prior {prior} was made from stations of this run, which would count twice. Give a "
+            "calibration from an earlier run."
+        )
+    kinds = {triad.model for triad in previous.triads}
+    options = replace(
+        options,
+        model=options.model or (kinds.pop() if len(kinds) == 1 else None),
+        order=(previous.triads[0].order, previous.triads[-1].order),
+        parameters=previous.options.parameters,
+        prior=_of(previous, readings, relative),
+    )
+    return options, "prior" if order == "auto" else order
+
+
+def _of(previous: Calibration, readings: Readings, relative: bool) -> Knowledge:
+    """A previous calibration's knowledge, of the triads that this run has."""
+    known = from_calibration(previous, relative)
+    if readings.magnetometer is not None or not previous.has_field:
+        return known
+    own = [i for i, name in enumerate(known.names) if name.startswith(TRIADS[0])]
+    spread = np.linalg.pinv(known.precision, hermitian=True)[np.ix_(own, own)]
+    return replace(
+        known,
+        names=tuple(known.names[i] for i in own),
+        expected=known.expected[own],
+        precision=np.linalg.pinv(spread, hermitian=True),
+    )
+
+
+def _with_order(
+    options: Options, order: str, readings: Readings, say: Callable[[str], None]
+) -> tuple[Options, list[OrderScore]]:
+    """The order asked for, that of the prior, or the one that left-out temperatures speak for."""
+    if order == "prior":
+        return options, []
+    if order == "auto":
+        check_readings(readings, replace(options, model=options.model or "polynomial"))
+        chosen, scores = choose_order(readings, options, say)
+        return replace(options, order=chosen), scores
+    if order not in ("0", "1", "2", "3"):
+        raise InputError(f"--order must be 0, 1, 2, 3 or auto; got {order!r}.")
+    return replace(options, order=int(order)), []
+
+
+def _with_curves(
+    options: Options,
+    asked: str,
+    readings: Readings,
+    profile: Profile,
+    say: Callable[[str], None],
+) -> tuple[Options, list[CurveScore]]:
+    """Own-axis terms: as asked, or of the triads that declare them where left-out stations improve."""
+    if asked == "none":
+        return options, []
+    offered = declared(profile, options)
+    if asked == "auto":
+        if not offered or options.prior or options.method == "swarm":
+            return options, []
+        check_readings(readings, options)
+        say("own-axis nonlinearity: leaving stations out, with and without it")
+        found, scores = choose_curves(readings, options, offered)
+        return replace(options, nonlinearity=found), scores
+    wanted = names(asked)
+    if not set(wanted) <= set(TRIADS):
+        raise InputError(
+            f"--nonlinearity must be auto, none, {' or '.join(TRIADS)}; got {asked!r}."
+        )
+    for name, order in zip(TRIADS, options.orders, strict=True):
+        if name in wanted and options.kind(order) != "polynomial":
+            raise InputError(
+                f"--nonlinearity {name}: the model of factors has no own-axis terms. Use "
+                "--model polynomial with it."
+            )
+    return replace(options, nonlinearity={n: offered.get(n, USUAL) for n in wanted}), []

@@ -1,0 +1,287 @@
+"""A continuous log: many samples a second, in any table format, with or without column names.
+
+Text is read in pieces of a few megabytes, so that a log may be larger than a run file. A piece
+that is plain numbers goes through NumPy's own reader; any other goes cell by cell, which finds
+the one that is wrong.
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import os
+import re
+from collections.abc import Callable, Iterator, Sequence
+from itertools import chain
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+
+import numpy as np
+
+from mwdcal.core.vectors import Array
+from mwdcal.errors import InputError
+from mwdcal.files import metadata as meta
+from mwdcal.files import table as tables
+from mwdcal.files.columns import LABELS, Column, assemble, check_names, looks_numeric
+from mwdcal.files.contract import COLUMNS, check_columns, check_near_misses
+from mwdcal.files.table import Table, shown
+
+TIME = "time_s"
+READ = tuple(name for name in (TIME, *COLUMNS) if name not in LABELS)
+"""Columns of a log that mean something, all of them numbers."""
+
+_PIECE = 16_000_000
+_TYPED = (".parquet", ".xlsx")
+_ODD = re.compile(r"nan|inf|[\"\r]", re.IGNORECASE)
+_BINARY = re.compile(rb"[\x00-\x08\x0e-\x1f]")
+_EXAMPLE = "--columns time_s,ax,ay,az"
+
+
+def _silent(text: str) -> None:
+    """Say nothing."""
+
+
+class _Layout(NamedTuple):
+    """How the lines of a text log are to be read; the delimiter None is white space."""
+
+    names: list[str]
+    delimiter: str | None
+    decimal: str
+    source: str
+
+
+def read(
+    path: str | os.PathLike[str],
+    names: Sequence[str] = (),
+    *,
+    decimal: str = ".",
+    say: Callable[[str], None] = _silent,
+) -> Table:
+    """The columns of a log that mean something, as numbers (NaN: blank), and its metadata.
+
+    `names` are the columns of a text log without a line of column names. `say` is told how
+    far the reading has come. Errors name file, line and column.
+    """
+    file = Path(path)
+    if file.suffix.lower() in _TYPED:
+        if names:
+            raise InputError(
+                f"--columns names the columns of a text log without column names; '{path}' has "
+                "names of its own. Leave --columns out."
+            )
+        return _numeric(tables.read(file, decimal=decimal))
+    if decimal not in (".", ","):
+        raise InputError(f"--decimal must be '.' or ','; got {shown(decimal)}.")
+    try:
+        if file.exists() and not file.is_file():
+            raise InputError(f"'{path}' is not a regular file. Name a file with a log.")
+        with file.open("rb") as stream:
+            return _text(stream, list(names), decimal, file.name, say)
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise InputError(f"cannot read '{path}': {reason}. Check the name and the file.") from None
+
+
+def _numeric(table: Table) -> Table:
+    """The table with the columns that mean something as numbers, the others as they are."""
+    _check(list(table.columns), table.source)
+    columns: dict[str, Column] = {
+        name: tables.numbers(table, name) if name in READ else column
+        for name, column in table.columns.items()
+    }
+    return Table(columns, table.metadata, table.source, table.lines, table.digest, table.decimal)
+
+
+def _text(
+    stream: BinaryIO, names: list[str], decimal: str, source: str, say: Callable[[str], None]
+) -> Table:
+    """The table of a text log."""
+    comments, first, number = _top(stream, source)
+    metadata = meta.parse(comments, source)
+    layout = _layout(first, number, names, decimal, source)
+    size = os.fstat(stream.fileno()).st_size
+    done = number if not names else number - 1
+    pieces, lines = [], []
+    ahead = first + "\n" if names else ""
+    for piece in _pieces(stream, ahead, done, source):
+        values, own, done = _piece(piece, done, layout)
+        pieces.append(values)
+        lines.append(own)
+        say(f"reading {source}: {100 * stream.tell() / size:.0f} %")
+    if not sum(map(len, lines)):
+        raise InputError(f"{source}: the log has no samples. Is the file complete?")
+    whole = np.concatenate(pieces)
+    columns: dict[str, Column] = {name: [] for name in layout.names if name not in READ}
+    columns |= {name: whole[:, i].copy() for i, name in enumerate(_wanted(layout))}
+    stream.seek(0)
+    digest = hashlib.sha256()
+    while data := stream.read(_PIECE):
+        digest.update(data)
+    return Table(columns, metadata, source, _joined(lines), digest.hexdigest(), decimal)
+
+
+def _top(stream: BinaryIO, source: str) -> tuple[list[tuple[int, str]], str, int]:
+    """Numbered comments above the table, and its first line with its number."""
+    comments = []
+    for number, data in enumerate(stream, 1):
+        line = _decoded(data, number, source).lstrip("\ufeff").strip("\r\n")
+        text = line.strip()
+        if text.startswith('"#'):  # a spreadsheet has saved it
+            text = ",".join(next(csv.reader([text])))
+        if text.startswith("#"):
+            comments.append((number, text.rstrip(",;\t ")))
+        elif text:
+            return comments, line, number
+    raise InputError(
+        f"{source}: the file is empty. A log needs a line with the column names, such as "
+        f"time_s,ax,ay,az, or {_EXAMPLE}; and one row per sample."
+    )
+
+
+def _decoded(data: bytes, number: int, source: str) -> str:
+    """Text of a piece whose first line has this number."""
+    strange = _BINARY.search(data)
+    try:
+        if strange is None:
+            return data.decode("utf-8")
+        bad = strange.start()
+    except UnicodeDecodeError as error:
+        bad = error.start
+    line = number + data.count(b"\n", 0, bad)
+    raise InputError(
+        f"{source}, line {line}: expected UTF-8 text; got byte 0x{data[bad]:02X}. Save the log "
+        "as UTF-8 text, or as .parquet."
+    )
+
+
+def _layout(first: str, number: int, names: list[str], decimal: str, source: str) -> _Layout:
+    """Names and delimiter, from the first line of the table."""
+    marks = [mark for mark in ",;\t" if mark != decimal]
+    best = max(marks, key=first.count)
+    delimiter = best if best in first else None
+    cells = [cell.strip() for cell in _cells([first], delimiter, number, source)[0]]
+    numeric = all(looks_numeric(cell, decimal) or not cell for cell in cells)
+    if names:
+        _check(names, "--columns")
+        if not numeric and any(re.match(r"[A-Za-z]", cell) for cell in cells):
+            raise InputError(
+                f"{source}, line {number}: expected numbers, as --columns names the columns; got "
+                f"{shown(first.strip())}. Leave --columns out, or remove this line."
+            )
+        return _Layout(names, delimiter, decimal, source)
+    if numeric:
+        raise InputError(
+            f"{source}, line {number}: expected the column names; got numbers. Name the columns: "
+            f"{_EXAMPLE} (in the order of the file)."
+        )
+    _check(cells, f"{source}, line {number}")
+    return _Layout(cells, delimiter, decimal, source)
+
+
+def _check(names: list[str], where: str) -> None:
+    """Refuse names that are missing, doubled, or nearly those of the contract."""
+    check_names(names, where)
+    check_near_misses(names, (TIME, *COLUMNS), f"{where}: column")
+    check_columns(names, where)
+
+
+def _wanted(layout: _Layout) -> list[str]:
+    return [name for name in layout.names if name in READ]
+
+
+def _pieces(stream: BinaryIO, ahead: str, done: int, source: str) -> Iterator[str]:
+    """The rest of the file in whole lines; `done` lines stand above, `ahead` was read already."""
+    while data := stream.read(_PIECE) + stream.readline():
+        text = ahead + _decoded(data, done + 1 + ahead.count("\n"), source)
+        done += text.count("\n")
+        ahead = ""
+        yield text.replace("\r\n", "\n")
+    if ahead:
+        yield ahead
+
+
+def _piece(text: str, done: int, layout: _Layout) -> tuple[Array, Sequence[int], int]:
+    """Values (rows, wanted columns) and line numbers of a piece, and the lines done after it."""
+    after = done + text.count("\n") + (not text.endswith("\n"))
+    text = text.rstrip("\n")
+    if not text.strip():
+        return np.zeros((0, len(_wanted(layout)))), range(0), after
+    lines = text.split("\n")
+    values = _plain(text, len(lines), layout)
+    if values is not None and len(values) == len(lines):
+        return values, range(done + 1, done + len(lines) + 1), after
+    rows = enumerate(_cells(lines, layout.delimiter, done + 1, layout.source), done + 1)
+    head: tuple[int, Sequence[object]] = (done, layout.names)
+    names, cells, numbers = assemble(chain([head], rows), layout.source, "line")
+    columns: dict[str, Column] = {
+        name: [str(cell) for cell in column]
+        for name, column in zip(names, zip(*cells, strict=True), strict=True)
+    }
+    table = Table(columns, {}, layout.source, numbers, "", layout.decimal)
+    values = np.stack([tables.numbers(table, name) for name in _wanted(layout)], -1)
+    return values, numbers, after
+
+
+def _plain(text: str, count: int, layout: _Layout) -> Array | None:
+    """The values of a piece of plain numbers and blanks, None where it is anything else."""
+    mark, names = layout.delimiter, layout.names
+    if _ODD.search(text) or (layout.decimal == "," and "." in text):
+        return None
+    if mark is not None:
+        if text.count(mark) != (len(names) - 1) * count:
+            return None
+        text = _filled(text, mark)
+    pointed = text.replace(",", ".") if layout.decimal == "," else text
+    try:
+        values = np.loadtxt(
+            pointed.split("\n"), delimiter=mark, comments=None, ndmin=2,
+            usecols=[names.index(n) for n in _wanted(layout)] if mark else None,
+        )  # fmt: skip
+    except ValueError:
+        return None
+    if not mark:
+        if values.shape[-1] != len(names):
+            return None
+        values = values[:, [names.index(n) for n in _wanted(layout)]]
+    return None if np.isinf(values).any() else values
+
+
+def _filled(text: str, mark: str) -> str:
+    """The text with `nan` in every blank cell."""
+    if text.startswith(mark):
+        text = "nan" + text
+    for blank, filled in (
+        (mark * 2, f"{mark}nan{mark}"),
+        (mark * 2, f"{mark}nan{mark}"),
+        (f"{mark}\n", f"{mark}nan\n"),
+        (f"\n{mark}", f"\nnan{mark}"),
+    ):
+        if blank in text:
+            text = text.replace(blank, filled)
+    return text + "nan" if text.endswith(mark) else text
+
+
+def _cells(
+    lines: Sequence[str], delimiter: str | None, first: int, source: str
+) -> list[Sequence[str]]:
+    """The cells of each line."""
+    if delimiter is None:
+        return [line.split() for line in lines]
+    try:
+        reader = csv.reader(lines, delimiter=delimiter, strict=True, skipinitialspace=True)
+        rows: list[Sequence[str]] = list(reader)
+    except csv.Error as error:
+        raise InputError(f"{source}, from line {first}: {error}. Remove the quotes.") from None
+    if len(rows) != len(lines):
+        raise InputError(
+            f"{source}, from line {first}: a cell in quotes must end on its line. Remove the quotes."
+        )
+    return rows
+
+
+def _joined(lines: Sequence[Sequence[int]]) -> Sequence[int]:
+    """Line numbers of all pieces; a range where they follow each other."""
+    full = [own for own in lines if len(own)]
+    if all(isinstance(own, range) for own in full):
+        return range(full[0][0], full[-1][-1] + 1)
+    return list(chain.from_iterable(lines))

@@ -1,0 +1,187 @@
+"""What the reader of a calibration should know, in plain words, each with its remedy."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mwdcal.calibration import Finding, StationRow, TriadCalibration
+from mwdcal.core.observability import Free, free_directions
+from mwdcal.core.problem import Prior
+from mwdcal.core.solvers import Determined, Normal
+from mwdcal.estimate import Fit
+from mwdcal.options import Options
+from mwdcal.profile import Profile
+from mwdcal.readings import TRIADS, Readings
+from mwdcal.residuals import REASONS, shown_in
+
+SUSPECT = 3.0
+"""A fit whose residuals exceed the declared noise this many times is reported."""
+UNLIKELY = 1e-3
+"""Chance of so large a departure from the prior, below which it is reported."""
+DISTRUSTED = 0.1
+"""A station of less weight than this in a robust fit is reported."""
+
+TEXTS = {
+    "toolface-zero": "toolface zero is undetermined: no evidence fixes rotation about the tool axis; kept at nominal. "
+    "Give ref_toolface_deg at some stations to determine it",
+    "rotation-x": "rotation about the tool's x axis is undetermined: no evidence fixes it; kept at nominal. Give "
+    "reference inclinations, or roll sets at three or more directions",
+    "rotation-y": "rotation about the tool's y axis is undetermined: no evidence fixes it; kept at nominal. Give "
+    "reference inclinations, or roll sets at three or more directions",
+    "scale": "overall scale is undetermined: no evidence fixes it; kept at nominal. Give a reference strength",
+}
+
+
+def described(name: str) -> str:
+    """What a free direction means, and what would determine it."""
+    steady, _, power = name.partition("-temperature-")
+    course = f" (its course with temperature, power {power})" if power else ""
+    return TEXTS.get(steady, steady) + course
+
+
+def is_relative(readings: Readings) -> bool:
+    """Whether the magnetometer is calibrated to a field of one."""
+    return readings.magnetometer is not None and bool(np.isnan(readings.reference("field")).all())
+
+
+@dataclass(frozen=True)
+class Findings:
+    """The findings of one fit."""
+
+    readings: Readings
+    profile: Profile
+    options: Options
+    result: Fit
+    free: list[Free]
+
+    def all(self, triads: list[TriadCalibration], stations: list[StationRow]) -> list[Finding]:
+        """All of them, in order of weight."""
+        return [
+            *self.residuals(triads),
+            *self.undetermined(),
+            *self.prior(),
+            *self.model(triads),
+            *(self.reshoot(row) for row in stations if row.reshoot),
+            *self.distrusted(stations),
+        ]
+
+    def residuals(self, triads: list[TriadCalibration]) -> list[Finding]:
+        """Residuals beyond the declared noise; no redundancy."""
+        found = []
+        for triad in triads:
+            excess = triad.variance_factor
+            if triad.noise_source == "declared" and excess is not None and excess > SUSPECT**2:
+                text = (
+                    f"{triad.name}: residuals are {excess**0.5:.1f} times the declared noise: "
+                    "the noise figure, a reference, or the model is wrong. Uncertainties are "
+                    "scaled up accordingly."
+                )
+                found.append(Finding(id=f"{triad.name}-residuals", text=text))
+        bare = [t.name for t in triads if t.degrees_of_freedom < 1]
+        if bare:
+            text = f"{' and '.join(bare)}: no redundancy, so nothing in this run checks the fit. Add stations."
+            found.append(Finding(id="no-redundancy", text=text))
+        return found
+
+    def undetermined(self) -> list[Finding]:
+        """Directions that nothing determines."""
+        found = []
+        for entry in self.free:
+            names = " and ".join(TRIADS[t] for t in entry.triads)
+            found.append(Finding(id=entry.id, text=f"{names}: {described(entry.id)}."))
+        return found
+
+    def model(self, triads: list[TriadCalibration]) -> list[Finding]:
+        """What the chosen model cannot say."""
+        found = []
+        bent = self.options.nonlinearity or {}
+        ignored = [
+            t.name
+            for t in triads
+            if t.name not in bent
+            and t.model == "factors"
+            and getattr(self.profile, t.name).nonlinearity
+        ]
+        if ignored:
+            text = (
+                f"nonlinearity of the {' and '.join(ignored)} is not fitted: the model of factors "
+            )
+            text += "has no such terms. Use --model polynomial for it."
+            found.append(Finding(id="nonlinearity-ignored", text=text))
+        if is_relative(self.readings):
+            text = "field strength is known at no station: the magnetometer is calibrated to field = 1. "
+            found.append(Finding(id="field-unknown", text=text + "Give ref_field_nt to have nT."))
+        if self.options.parameters < 12:
+            lost = "any misalignment" if self.options.parameters == 6 else "mounting rotation"
+            text = (
+                f"{self.options.parameters} parameters: {lost} of the sensors in the tool is taken as "
+                "none, and no uncertainty here includes it. Use --parameters 12 to fit it."
+            )
+            found.append(Finding(id="restricted", text=text))
+        return found
+
+    def prior(self) -> list[Finding]:
+        """What rests on the prior alone, and whether run and prior agree."""
+        knowledge, problem = self.options.prior, self.result.problem
+        if knowledge is None:
+            return []
+        bare = replace(problem, prior=Prior(0 * problem.prior.precision, problem.prior.expected))
+        determined = Determined.by(Normal.of(bare.linear(self.result.state, geometry=True)))
+        found = []
+        for entry in free_directions(bare, self.result.state, determined):
+            names = " and ".join(TRIADS[t] for t in entry.triads)
+            if entry.id not in [f.id for f in self.free]:
+                text = (
+                    f"{names}: {entry.id.removeprefix('weak-')} is not determined by this run: value "
+                    f"and uncertainty are those of the prior ({knowledge.source})."
+                )
+                found.append(Finding(id=f"prior-{entry.id}", text=text))
+        return found + self._conflict(knowledge.source)
+
+    def _conflict(self, source: str) -> list[Finding]:
+        """The χ² of the departure from the prior, Λd with covariance Λ - ΛCΛ, if it is unlikely."""
+        from scipy.special import chdtrc
+
+        prior, analysis = self.result.problem.prior, self.result.analysis
+        precision, params = prior.precision[0], self.result.state.params[0]
+        pull = precision @ (params - prior.expected[0])
+        spread = precision - precision @ analysis.covariance[0] @ precision
+        scale = np.sqrt(np.maximum(np.diag(precision), 1e-300))
+        values, vectors = np.linalg.eigh(spread / np.outer(scale, scale))
+        tested = values > 1e-6
+        along = vectors[:, tested].transpose() @ (pull / scale)
+        square = float(np.sum(along**2 / values[tested]))
+        if chdtrc(max(int(tested.sum()), 1), square) > UNLIKELY:
+            return []
+        ratio = np.sqrt(square / tested.sum())
+        text = (
+            f"the run departs from the prior ({source}) by {ratio:.1f} times what both allow: the tool has "
+            "changed, or the prior is too narrow. Leave --prior out, or widen it."
+        )
+        return [Finding(id="prior-conflict", text=text)]
+
+    def reshoot(self, row: StationRow) -> Finding:
+        """A station to take again, with the reason."""
+        worst = row.worst or "gravity"
+        _, unit = shown_in(worst, is_relative(self.readings))
+        gap = "" if unit == "°" else " "
+        value = row.errors.get(worst, float("nan"))
+        alone, moves = (d.get(worst, 0.0) for d in (row.errors_left_out, row.influence))
+        text = (
+            f"station {row.station}: residual {row.deviation:.1f}σ, most in {worst} "
+            f"({value:+.3g}{gap}{unit}; {alone:+.3g}{gap}{unit} if left out of the fit, which it moves "
+            f"by up to {moves:.2g}{gap}{unit}): {REASONS[worst]} Re-shoot it, or --exclude {row.station}"
+        )
+        return Finding(id="reshoot", text=text, station=row.station)
+
+    def distrusted(self, stations: list[StationRow]) -> list[Finding]:
+        """Stations that a robust fit all but left out."""
+        low = [row for row in stations if row.weight < DISTRUSTED]
+        if not low:
+            return []
+        each = ", ".join(f"{row.station} ({row.weight:.1g})" for row in low[:8])
+        more = f" and {len(low) - 8} more" if len(low) > 8 else ""
+        text = f"robust fit: of little weight are station {each}{more}. Look at what they have in common."
+        return [Finding(id="distrusted", text=text)]

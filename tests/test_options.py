@@ -1,0 +1,225 @@
+"""Choices of a fit: fewer parameters, the papers' own sums, own-axis terms by left-out stations."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from cli_support import mwdcal
+from mwdcal.calibrate import calibrate
+from mwdcal.core.observables import OBSERVABLES
+from mwdcal.core.vectors import centred
+from mwdcal.curves import choose_curves
+from mwdcal.errors import InputError
+from mwdcal.estimate import fit
+from mwdcal.options import Options
+from mwdcal.predict import readings_at
+from mwdcal.readings import Readings
+from simulation import Tool, information, plan
+from test_calibrate import NOISE, PROFILE, make
+from test_efficiency import sensitivity
+from test_robust import NAMES
+
+LOWER = np.tril(np.ones((3, 3), bool))
+KEPT = {9: LOWER, 6: np.eye(3, dtype=bool)}
+
+
+def framed(parameters, seed=7):
+    """A tool whose gains have no more parameters than that."""
+    tool = Tool.random(seed)
+    tool.matrix = tool.matrix * KEPT[parameters]
+    return tool
+
+
+@pytest.mark.parametrize("kind", ["polynomial", "factors"])
+@pytest.mark.parametrize("parameters", [9, 6])
+def test_fewer_parameters_meet_their_own_bound(parameters, kind):
+    tool, (inc, azi, face) = framed(parameters), plan()
+    a, m = tool.readings(np.random.default_rng(5), 300, inc, azi, face)
+    known = {"inclination": inc, "azimuth": azi, "toolface": face}
+    known |= {"field": np.full(48, tool.field), "dip": np.full(48, tool.dip)}
+    result = fit(Readings(a, m, known=known, sd=NOISE), Options(model=kind, parameters=parameters))
+    assert (result.status == 0).all()
+    assert (result.analysis.determined.rank == 2 * parameters).all()
+    kept = np.concatenate([np.tile(KEPT[parameters].ravel(), 2), np.ones(6, bool)])
+    whole = information(tool, inc, azi, face, ())[np.ix_(kept, kept)]
+    scale = np.sqrt(np.diag(whole))
+    limit = np.linalg.inv(whole / np.outer(scale, scale)) / np.outer(scale, scale)
+    ratios = []
+    for name in NAMES:
+        forward = sensitivity(tool, name)[1][:, kept]
+        clean = tool.clean(*np.array([[20.0, 33, 70, 110, 150], [10.0, 100, 200, 250, 333],
+                                      [15.0, 75, 160, 222, 301]]) * np.pi / 180)  # fmt: skip
+        pairs = zip(result.problem.triads, result.problem.slices(), clean, strict=True)
+        fields = [
+            t.model.fields(result.state.params[:, w], raw, np.zeros(5)) for t, w, raw in pairs
+        ]
+        true = [
+            (r - o) @ np.linalg.inv(s).T
+            for r, s, o in zip(clean, tool.matrix, tool.offset, strict=True)
+        ]
+        error = OBSERVABLES[name].value(*fields) - OBSERVABLES[name].value(*true)
+        allowed = np.sqrt(np.einsum("ni,ij,nj->n", forward, limit, forward))
+        error = error if name in ("gravity", "field") else centred(error)
+        ratios.append(np.mean((error / allowed) ** 2))
+    assert np.sqrt(np.mean(ratios)) == pytest.approx(1, abs=0.03)
+
+
+def test_the_file_of_nine_parameters_is_a_whole_model_with_zeros():
+    record = calibrate(make(tool=framed(9)), PROFILE, Options(parameters=9))
+    triad = record.accelerometer
+    assert (triad.rank, triad.size, len(triad.parameters)) == (9, 9, 12)
+    held = dict(zip(triad.parameter_names, triad.parameters, strict=True))
+    assert [held[f"gain-{n}"] for n in ("xy", "xz", "yz")] == [0, 0, 0]
+    spread = dict(zip(triad.parameter_names, triad.standard_uncertainties, strict=True))
+    assert [spread[f"gain-{n}"] for n in ("xy", "xz", "yz")] == [0, 0, 0]
+    assert any(f.id == "restricted" for f in record.findings)
+    again = calibrate(make(tool=framed(9)), PROFILE)
+    probe = readings_at(again, np.radians([30.0, 80.0]), 1.0, 0.7)
+    assert (record.uncertainty("azimuth", probe) < again.uncertainty("azimuth", probe)).all()
+
+
+def alone(seed, count):
+    """Runs with references for the papers' sums."""
+    tool = Tool.random(seed)
+    inc, azi, face = plan((20, 60, 110, 150))
+    a, m = tool.readings(np.random.default_rng(seed), count, inc, azi, face)
+    known = {"inclination": inc, "azimuth": azi, "toolface": face}
+    known |= {"field": np.full(48, tool.field), "dip": np.full(48, tool.dip)}
+    return tool, Readings(a, m, known=known, sd=NOISE)
+
+
+def paper_sum(method, data, member=0):
+    """Residuals of the printed sums, of twelve affine parameters of the accelerometer."""
+    raw, known = data.accelerometer[member], data.known
+
+    def residuals(x):
+        g = raw @ x[:9].reshape(3, 3).T + x[9:]
+        inclination = np.arctan2(np.hypot(g[:, 0], g[:, 1]), g[:, 2]) - known["inclination"]
+        toolface = centred(np.arctan2(-g[:, 0], -g[:, 1]) - known["toolface"])
+        square = np.sum(g**2, -1) - 1
+        return np.concatenate({
+            "newton": (square, inclination),
+            "toolface-inclination": (toolface, inclination),
+            "scalar": (square,),
+        }[method])  # fmt: skip
+
+    return residuals
+
+
+@pytest.mark.parametrize("method", ["newton", "toolface-inclination", "scalar"])
+def test_paper_weights_are_at_the_minimum_of_the_printed_sum(method):
+    _, data = alone(3, 1)
+    result = fit(data, Options(method, paper_weights=True))
+    assert result.status[0] == 0
+    model, where = result.problem.triads[0].model, result.problem.slices()[0]
+    _, whole = model.finished(0.0)
+    ours = whole[0] @ result.state.params[0, where]
+    residuals = paper_sum(method, data)
+    theirs = least_squares(residuals, ours, x_scale="jac", xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    assert np.sum(residuals(ours) ** 2) == pytest.approx(2 * theirs.cost, rel=1e-9)
+    weighted = fit(data, Options(method))
+    ours = whole[0] @ weighted.state.params[0, where]
+    assert np.sum(residuals(ours) ** 2) > 2 * theirs.cost * (1 + 1e-6)
+
+
+OBSERVED = {
+    "newton": ("gravity", "inclination", "field", "dip", "azimuth"),
+    "toolface-inclination": ("inclination", "toolface", "azimuth", "dip"),
+    "scalar": ("gravity", "field"),
+    "least-squares": ("gravity", "inclination", "toolface", "azimuth", "field", "dip"),
+}
+
+
+@pytest.mark.parametrize("method", OBSERVED)
+def test_intervals_of_paper_weights_cover(method):
+    tool, many = alone(4, 120)
+    covered = []
+    for member in range(120):
+        data = replace(
+            many, accelerometer=many.accelerometer[member], magnetometer=many.magnetometer[member]
+        )
+        record = calibrate(data, PROFILE, Options(method, paper_weights=True))
+        clean = tool.clean(*np.radians([[25.0, 70, 140], [10.0, 100, 200], [15.0, 75, 160]]))
+        true = [(r - o) @ np.linalg.inv(s).T
+                for r, s, o in zip(clean, tool.matrix, tool.offset, strict=True)]  # fmt: skip
+        probe = Readings(*clean)
+        for name in OBSERVED[method]:
+            value = OBSERVABLES[name].value
+            error = centred(
+                value(*record.fields(probe)) - value(*true),
+                2 * np.pi if name not in ("field", "gravity") else 1e9,
+            )
+            covered.append(np.abs(error) < record.expanded_uncertainty(name, probe))
+    assert 0.93 < np.mean(covered) < 0.97
+
+
+def test_paper_weights_are_of_papers():
+    with pytest.raises(InputError, match="no paper"):
+        calibrate(make(), PROFILE, Options(paper_weights=True))
+
+
+def bent(seed, size):
+    """Runs of a magnetometer with own-axis terms of a share `size` of the field."""
+    data = make(seed)
+    m = data.magnetometer / 50_000
+    return replace(data, magnetometer=data.magnetometer + 50_000 * size * (m**2 - m**3))
+
+
+def test_own_axis_terms_are_taken_only_where_left_out_stations_improve():
+    offered = {"accelerometer": 0.005, "magnetometer": 0.005}
+    for seed in range(5):
+        straight, table = choose_curves(bent(seed, 0.0), Options(), offered)
+        assert straight == {}
+        assert [s.triads for s in table if s.chosen] == [()]
+        curved, table = choose_curves(bent(seed, 0.004), Options(), offered)
+        assert curved == {"magnetometer": 0.005}
+        assert min(table, key=lambda s: s.left_out).left_out < 0.9 * table[0].left_out
+
+
+SERVO = "examples/servo"
+
+
+def test_choices_reach_the_file_and_the_screen(tmp_path):
+    first = mwdcal("calibrate", f"{SERVO}/run.csv", "--tool", f"{SERVO}/tool.toml", "-o", tmp_path / "a.json",
+                   "--parameters", "9", "--robust", "huber")  # fmt: skip
+    assert first.code == 0
+    assert "9 parameters" in first.out and "robust (huber)" in first.out
+    options = json.loads((tmp_path / "a.json").read_text("utf-8"))["options"]
+    assert options == {"parameters": 9, "robust": "huber", "paper_weights": False, "prior": None}
+
+
+@pytest.mark.parametrize(
+    ("typed", "code", "said"),
+    [
+        (("--prior", "a.json"), 2, "count twice"),
+        (("--prior", "datasheet"), 2, "datasheet"),
+        (("--prior", "missing.json"), 2, "missing.json"),
+        (("--paper-weights",), 2, "no paper"),
+        (("--robust", "huber", "--method", "swarm"), 2, "--robust"),
+        (("--nonlinearity", "thermometer"), 2, "--nonlinearity"),
+        (("--nonlinearity", "magnetometer", "--model", "factors"), 2, "--model polynomial"),
+        (("--parameters", "7"), 2, "7"),
+    ],
+)
+def test_choices_that_make_no_sense_are_refused(tmp_path, monkeypatch, typed, code, said):
+    run = ("calibrate", f"{SERVO}/run.csv", "--tool", f"{SERVO}/tool.toml", "-o")
+    assert mwdcal(*run, tmp_path / "a.json").code == 0
+    typed = [str(tmp_path / "a.json") if word == "a.json" else word for word in typed]
+    ran = mwdcal(*run, tmp_path / "b.json", *typed)
+    assert ran.code == code
+    assert said in ran.err
+    assert not (tmp_path / "b.json").exists()
+
+
+def test_a_previous_calibration_is_taken_as_prior(tmp_path):
+    out, tool = tmp_path / "a.json", f"{SERVO}/tool.toml"
+    assert mwdcal("calibrate", f"{SERVO}/run.csv", "--tool", tool, "-o", out).code == 0
+    ran = mwdcal("calibrate", f"{SERVO}/rolltest.csv", "--tool", tool, "-o", tmp_path / "b.json",
+                 "--prior", out)  # fmt: skip
+    assert ran.code == 0, ran.err
+    assert "prior run.csv" in ran.out
+    made = json.loads((tmp_path / "b.json").read_text("utf-8"))
+    assert made["accelerometer"]["rank"] == 12
