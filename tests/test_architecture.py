@@ -18,8 +18,10 @@ SOURCE = ROOT / "src" / "mwdcal"
 
 # From the bottom up: a module imports from its own layer or from one above it in this table.
 LAYERS = (
-    ("errors", "core.vectors", "core.solvers"),
+    ("errors", "core.vectors"),
     ("core.observables", "core.models"),
+    ("core.fast", "core.compiled"),
+    ("core.solvers",),
     (
         "core.newton",
         "core.problem",
@@ -38,15 +40,25 @@ LAYERS = (
     ("methods", "estimate", "notation"),
     ("checks", "curves", "correction", "residuals", "scatter", "selection", "stand"),
     ("findings",),
-    ("calibrate", "compare", "predict", "quality", "simulate"),
+    ("calibrate", "compare", "gauge", "predict", "quality", "simulate"),
+    ("fleet", "fleet_accuracy", "fleet_checks"),
     ("files", "files.*"),
     ("registry", "registry.*", "datasets", "stations"),
     ("",),  # the package itself: its public names
     (
         "app",
         "app.asked",
+        "app.calibrating",
         "app.choices",
+        "app.comparison",
+        "app.comparison_plots",
+        "app.fleet_asked",
+        "app.fleet_plots",
+        "app.fleet_report",
+        "app.fleet_summary",
+        "app.fleets",
         "app.plots",
+        "app.pool",
         "app.report",
         "app.report.*",
         "app.standstills",

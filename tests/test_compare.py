@@ -1,20 +1,53 @@
-"""Methods side by side: what each reaches where theory says so, refusals, advice, JSON."""
+"""Methods side by side: what each reaches where theory says so, refusals, advice, text, JSON, HTML."""
 
 import json
+import re
+from dataclasses import replace
+from functools import cache
+from html.parser import HTMLParser
 
 import numpy as np
 import pytest
+from scipy.linalg import polar
+from scipy.spatial.transform import Rotation
 
-from cli_support import mwdcal
-from mwdcal.compare import compare
-from test_calibrate import PROFILE, make, msgspec_replace
+from cli_support import mwdcal, refused, servo_run, write_csv
+from mwdcal import compare as module
+from mwdcal import simulate
+from mwdcal.app import comparison
+from mwdcal.calibrate import calibrate
+from mwdcal.compare import SCATTER, compare
+from mwdcal.core.observability import Free
+from mwdcal.gauge import Gauge, in_gauge
+from mwdcal.methods import EVIDENCE
+from mwdcal.options import Options
+from mwdcal.readings import Readings
+from simulation import Tool, attitude, plan
+from test_calibrate import PROFILE, make
 
 EXAMPLE = "examples/servo/run.csv"
+TURNS = ("rotation-x", "rotation-y", "toolface-zero")
+EVERYTHING = Gauge(
+    frozenset((name, (t,)) for t in (0, 1) for name in (*TURNS, "scale")),
+)
 
 
 @pytest.fixture(scope="module")
 def whole():
     return compare(make(1), PROFILE)
+
+
+@cache
+def heated():
+    stations = simulate.grid([5.0, 45.0, 90.0, 135.0], 6, [0, 90, 200, 300], [25.0, 65.0, 105.0])
+    tool = simulate.servo(np.random.default_rng(5))
+    made = simulate.run(tool, stations, np.random.default_rng(6))
+    sd = {"accelerometer": np.array(1e-4), "magnetometer": np.array(15.0)}
+    return compare(replace(made, source="hot.csv", sd=sd), PROFILE)
+
+
+def by_method(found):
+    return {row.method: row for row in found.rows}
 
 
 def test_ranks_and_free_directions_are_those_of_theory(whole):
@@ -30,8 +63,16 @@ def test_ranks_and_free_directions_are_those_of_theory(whole):
     assert set(free["scalar"]) == {"rotation-x", "rotation-y", "toolface-zero"}
 
 
+def test_what_rests_on_a_convention_is_named(whole):
+    resting = {row.method: row.resting for row in whole.rows}
+    assert resting["joint"] == resting["swarm"] == ()
+    assert resting["newton"] == ("toolface",)
+    assert resting["toolface-inclination"] == ("gravity",)
+    assert resting["scalar"] == ("inclination", "toolface", "azimuth", "dip")
+
+
 def test_left_out_errors_exceed_those_in_sample_and_equal_evidence_agrees(whole):
-    rows = {row.method: row for row in whole.rows}
+    rows = by_method(whole)
     for row in rows.values():
         assert np.mean([row.held_out[n] / row.in_sample[n] for n in row.held_out]) > 1.0
     # with exact references all weights are the same, so joint and least squares are one estimator
@@ -44,23 +85,311 @@ def test_left_out_errors_exceed_those_in_sample_and_equal_evidence_agrees(whole)
     assert "joint" in whole.advice
 
 
+def test_small_runs_leave_each_station_out():
+    readings = make(2, (20, 60, 120), 8)
+    found = compare(readings, PROFILE)
+    assert found.parts == readings.count == 24
+    shown = {"gravity": 1e3, "field": 1.0}
+    for index in (0, 11, 23):
+        rest = np.arange(24) != index
+        for method in ("joint", "newton"):
+            made = calibrate(readings.select(rest), PROFILE, Options(method))
+            g, b = (v[index] for v in made.fields(readings))
+            errors = by_method(found)[method].station_errors
+            for name, strength, expected in (("gravity", g, 1.0), ("field", b, 50_000.0)):
+                error = (np.linalg.norm(strength) - expected) * shown[name]
+                assert errors[name][index] == pytest.approx(error, rel=1e-6)
+
+
+def moradi(error):
+    mse = sum(e**2 for e in error) / len(error)
+    mean = sum(error) / len(error)
+    std = (sum((e - mean) ** 2 for e in error) / (len(error) - 1)) ** 0.5
+    return pytest.approx((mean, std, mse, mse**0.5), rel=1e-9)
+
+
+@pytest.mark.parametrize("method", ["joint", "newton", "scalar"])
+def test_moradis_measures_are_those_of_the_corrected_vectors(whole, method):
+    readings = make(1)
+    ideal = attitude(*plan())(1.0, 50_000.0, np.radians(65.0))
+    fields = calibrate(readings, PROFILE, Options(method)).fields(readings)
+    nominal = (readings.accelerometer, readings.magnetometer)
+    stated = [*whole.measures_before, *by_method(whole)[method].measures]
+    for when, vectors in (("before", nominal), ("after", fields)):
+        for name, vector, target in zip(
+            ("accelerometer", "magnetometer"), vectors, ideal, strict=True
+        ):
+            one = next(m for m in stated if (m.triad, m.when) == (name, when))
+            error = [
+                np.hypot.reduce(v - t) / np.hypot.reduce(t)
+                for v, t in zip(vector, target, strict=True)
+            ]
+            assert (one.mean, one.std, one.mse, one.rmse) == moradi(error)
+
+
+def test_measures_of_the_joint_method_are_those_of_its_calibration(whole):
+    own = calibrate(make(1), PROFILE).measures
+    assert {(m.triad, m.when): m.rmse for m in own} == pytest.approx(
+        {
+            (m.triad, m.when): m.rmse
+            for m in (*whole.measures_before, *whole.rows[0].measures)
+            if m.when != "left out"
+        },
+        rel=1e-6,
+    )
+
+
+def test_all_methods_give_the_same_parameters_in_one_gauge_without_noise():
+    tool = Tool.random(7, noise=(0.0, 0.0))
+    sd = {"accelerometer": np.array(1e-6), "magnetometer": np.array(0.05)}
+    found = compare(make(tool=tool, sd=sd), PROFILE)
+    assert set(found.gauge["accelerometer"]) == {*TURNS, "scale"}
+    first = found.rows[0]
+    for row in found.rows:
+        assert not row.refused
+        for triad, size in (("accelerometer", 1.0), ("magnetometer", 50_000.0)):
+            ours, theirs = row.parameters[triad].values, first.parameters[triad].values
+            for name, one in (("SF", 1.0), ("B", size), ("m", 1.0)):
+                np.testing.assert_allclose(ours[name], theirs[name], atol=1e-6 * one)
+            assert np.isfinite(row.parameters[triad].uncertainty["SF"]).all()
+
+
+def test_what_is_taken_out_is_the_rotation_and_the_stretch_is_left():
+    tool = Tool.random(7, noise=(0.0, 0.0))
+    sd = {"accelerometer": np.array(1e-6), "magnetometer": np.array(0.05)}
+    made = calibrate(make(tool=tool, sd=sd), PROFILE)
+    factors, taken = in_gauge(made, make(tool=tool, sd=sd), EVERYTHING)
+    for index, triad in enumerate(("accelerometer", "magnetometer")):
+        turn, stretch = polar(np.linalg.inv(tool.matrix[index]))
+        angles = Rotation.from_matrix(turn).as_rotvec(degrees=True)
+        np.testing.assert_allclose(taken[triad].values["rotation_deg"], angles, atol=1e-7)
+        assert taken[triad].values["scale"][0] == pytest.approx(1, abs=1e-9)
+        values = factors[triad].values
+        np.testing.assert_allclose(values["SF"][:, 0], 1 / np.diag(stretch), rtol=1e-9)
+        np.testing.assert_allclose(np.eye(3) - values["m"], stretch / np.diag(stretch), atol=1e-9)
+
+
+@pytest.mark.parametrize("method", ["joint", "scalar"])
+def test_uncertainties_in_the_gauge_are_those_of_repeated_runs(method):
+    found, stated = [], []
+    for seed in range(40):
+        readings = make(seed, (10, 60, 120), 8)
+        factors, _ = in_gauge(calibrate(readings, PROFILE, Options(method)), readings, EVERYTHING)
+        own = factors["magnetometer"]
+        found.append(np.concatenate([own.values[n].ravel() for n in ("SF", "B")]))
+        stated.append(np.concatenate([own.uncertainty[n].ravel() for n in ("SF", "B")]))
+    ratio = np.var(found, axis=0, ddof=1) / np.mean(np.square(stated), axis=0)
+    assert 0.7 < ratio.mean() < 1.4
+
+
+def test_undetermined_is_said_of_what_a_method_leaves_free(whole):
+    rows = by_method(whole)
+    turned = {m: row.taken_out["accelerometer"].uncertainty for m, row in rows.items()}
+    assert np.isfinite(turned["joint"]["rotation_deg"]).all()
+    assert list(np.isnan(turned["newton"]["rotation_deg"])) == [False, False, True]
+    assert np.isnan(turned["scalar"]["rotation_deg"]).all()
+    assert np.isnan(turned["toolface-inclination"]["scale"]).all()
+
+
+def test_a_turn_of_both_triads_together_is_taken_out_together():
+    readings = make(3)
+    made = calibrate(readings, PROFILE)
+    common = Gauge.of(
+        [Free("toolface-zero", (0, 1), np.zeros(24)), Free("weak-gain-xx", (0,), np.zeros(24))]
+    )
+    assert common.names(0) == common.names(1) == ["toolface-zero"]
+    _, taken = in_gauge(made, readings, common)
+    turns = [item.values["rotation_deg"] for item in taken.values()]
+    np.testing.assert_allclose(turns[0], turns[1])
+    np.testing.assert_allclose(turns[0][:2], 0)
+    assert abs(turns[0][2]) > 1e-3
+
+
+def test_own_axis_terms_leave_the_tangent():
+    readings = make(1)
+    raw = readings.accelerometer
+    readings = replace(readings, accelerometer=raw - 2e-3 * raw**2 - 1e-3 * raw**3)
+    made = calibrate(readings, PROFILE, Options(nonlinearity={"accelerometer": 0.005}))
+    assert made.accelerometer.curved
+    factors, _ = in_gauge(made, readings, Gauge(frozenset()))
+    centre, step = np.array(made.accelerometer.centre), 1e-4
+    near = Readings(
+        np.concatenate([[centre], centre + step * np.eye(3), centre - step * np.eye(3)])
+    )
+    at = made.fields(near)[0]
+    slope = (at[1:4] - at[4:]).T / (2 * step)
+    gain = np.diag(slope)
+    values = factors["accelerometer"].values
+    np.testing.assert_allclose(values["SF"][:, 0], 1 / gain, rtol=1e-6)
+    np.testing.assert_allclose(np.eye(3) - values["m"], slope / gain, atol=1e-6)
+    bias = np.linalg.solve(slope / gain, slope @ centre - at[0])
+    np.testing.assert_allclose(values["B"][:, 0], bias, atol=1e-6)
+
+
+def test_order_is_chosen_and_shown_and_the_swarm_says_why_it_cannot():
+    found = heated()
+    assert min(found.orders) >= 1
+    rows = by_method(found)
+    assert [m for m, row in rows.items() if row.refused] == ["swarm"]
+    assert "one temperature" in rows["swarm"].refused
+    assert rows["joint"].parameters["accelerometer"].values["SF"].shape == (3, found.orders[0] + 1)
+    text = comparison.text(found, parameters=True)
+    assert f"temperature order {found.orders[0]}" in text
+    assert "SF x·τ, raw/g/°C" in text
+    assert "swarm refused: " in text
+    assert "SIMULATED DATA" in text
+
+
 def test_methods_that_do_not_apply_say_why():
     found = compare(make(1, unknown=("toolface",)), PROFILE)
-    refused = {row.method: row.refused for row in found.rows if row.refused}
-    assert set(refused) == {"least-squares", "swarm", "toolface-inclination"}
-    assert all("ref_toolface_deg" in reason for reason in refused.values())
+    refusals = {row.method: row.refused for row in found.rows if row.refused}
+    assert set(refusals) == {"least-squares", "swarm", "toolface-inclination"}
+    assert all("ref_toolface_deg" in reason for reason in refusals.values())
 
 
 def test_a_run_that_nothing_can_calibrate():
-    found = compare(msgspec_replace(make(1).select(np.arange(48) < 3)), PROFILE)
+    found = compare(make(1).select(np.arange(48) < 3), PROFILE)
     assert all(row.refused for row in found.rows)
     assert "no method" in found.advice
+    page = comparison.render(found)
+    assert all(row.refused.split("'")[0] in page for row in found.rows)
+    assert "before" not in comparison.text(found)
 
 
-def test_command_prints_the_same_as_its_json():
-    screen = mwdcal("compare", EXAMPLE, "--tool", "servo")
-    document = json.loads(mwdcal("compare", EXAMPLE, "--tool", "servo", "--json").out)
+def test_a_failing_part_is_counted_and_its_method_not_preferred(monkeypatch):
+    original = module.fit
+
+    def failing(readings, options=None, include=None):
+        result = original(readings, options, include)
+        if include is not None and options.method in ("joint", "least-squares"):
+            result.status[2] = 1
+        return result
+
+    monkeypatch.setattr(module, "fit", failing)
+    readings = replace(make(1), group=np.repeat(np.arange(4), 12))
+    found = compare(readings, PROFILE)
+    rows = by_method(found)
+    assert rows["joint"].lost == 6
+    assert rows["swarm"].lost == 0
+    assert np.isnan(rows["joint"].station_errors["gravity"]).sum() == 6
+    assert np.isfinite(list(rows["joint"].held_out.values())).all()
+    assert SCATTER in rows["joint"].held_out
+    assert "use swarm" in found.advice
+    assert "stations no fit could judge" in comparison.text(found)
+    assert "stations no fit could judge" in comparison.render(found)
+
+
+class Page(HTMLParser):
+    """Tags balanced, and all that could point outside."""
+
+    VOID = ("meta", "br", "use", "path")
+
+    def __init__(self):
+        super().__init__()
+        self.open, self.links, self.ids = [], [], []
+
+    def handle_starttag(self, tag, attributes):
+        if tag not in self.VOID:
+            self.open.append(tag)
+        self.ids += [v for k, v in attributes if k == "id"]
+        self.links += [v for k, v in attributes if k in ("src", "href", "xlink:href")]
+
+    def handle_startendtag(self, tag, attributes):
+        self.ids += [v for k, v in attributes if k == "id"]
+        self.links += [v for k, v in attributes if k in ("src", "href", "xlink:href")]
+
+    def handle_endtag(self, tag):
+        if tag not in self.VOID:
+            assert self.open.pop() == tag
+
+
+def test_the_page_is_whole_and_needs_nothing_else(whole):
+    page = comparison.render(whole, [("run file", "<run>", "ab" * 32)])
+    parsed = Page()
+    parsed.feed(page)
+    assert parsed.open == []
+    assert all(link.startswith("#") for link in parsed.links)
+    assert not re.search(r"https?:|@import|<script|url\((?!#)", page)
+    assert len(parsed.ids) == len(set(parsed.ids))
+    assert all(f"<th>{method}</th>" in page for method in EVIDENCE)
+    assert page.count("<svg") == 4
+    assert page.index("Use joint") < page.index("<svg")
+    assert "&lt;run&gt;" in page
+    assert "SIMULATED" not in page
+    assert page == comparison.render(whole, [("run file", "<run>", "ab" * 32)])
+
+
+def test_the_page_says_what_is_simulated_and_what_is_refused():
+    page = comparison.render(heated())
+    assert "SIMULATED DATA" in page
+    assert "<b>swarm refused:</b>" in page
+    assert "SF x·τ" in page
+    assert page.count("<svg") == 3
+
+
+def test_long_runs_show_the_worst_of_each_part():
+    from mwdcal.app.comparison_plots import MOST_STATIONS, _largest
+
+    values = np.sin(np.arange(1000) ** 2) * 1e-3
+    values[737] = 9.0
+    values[:20] = np.nan
+    where, shown = _largest(values)
+    assert len(shown) <= MOST_STATIONS
+    assert shown[np.flatnonzero(where == 738)] == 9.0
+
+
+@pytest.mark.parametrize(
+    ("pair", "text"),
+    [
+        (("2.93051", "0.00010"), "2.93051(10)"),
+        (("−304.7", "2.9"), "−304.7(29)"),
+        (("48010", "120"), "48010(120)"),
+        (("5.06292×10⁻⁵", "0.00056×10⁻⁵"), "5.06292(56)×10⁻⁵"),
+        (("1", "0"), "1(0)"),
+        (("0.5", "undetermined"), "undetermined"),
+    ],
+)
+def test_uncertainty_in_parentheses(pair, text):
+    assert comparison._joined(*pair) == text
+
+
+def test_command_prints_the_same_as_its_json(tmp_path):
+    report = tmp_path / "methods.html"
+    screen = mwdcal("compare", EXAMPLE, "--tool", "servo", "--report", report)
+    ran = mwdcal("compare", EXAMPLE, "--tool", "servo", "--json")
+    document = json.loads(ran.out)
     assert screen.code == 0
     assert document["advice"] in screen.out
     assert [row["method"] for row in document["rows"]][:2] == ["joint", "least-squares"]
     assert set(document["units"]) == set(document["rows"][0]["held_out"])
+    assert document["orders"] == [0, 0]
+    assert document["simulated"] is True
+    assert len(document["rows"][0]["parameters"]["accelerometer"]["values"]["SF"]) == 3
+    newton = next(row for row in document["rows"] if row["method"] == "newton")
+    assert newton["taken_out"]["accelerometer"]["uncertainty"]["rotation_deg"][2] is None
+    assert all(f"{method}: fit" in ran.err for method in EVIDENCE)
+    assert "RMSE left out" in screen.out
+    assert "SF x" not in screen.out
+    assert "SIMULATED DATA" in report.read_text("utf-8")
+
+
+def test_seed_and_parameters(tmp_path):
+    run = write_csv(tmp_path / "run.csv", servo_run(3, (20, 70, 120), 8))
+    ran = mwdcal("compare", run, "--tool", "servo", "--parameters", "--seed", 5)
+    assert ran.code == 0
+    assert "each station left out in turn" in ran.out
+    assert "toolface-zero, °" in ran.out
+    assert "…" not in ran.out.split("Factors of the raw channels")[1]
+
+
+def test_what_cannot_be_done_is_refused_at_once(tmp_path):
+    columns = servo_run(3)
+    run = write_csv(tmp_path / "run.csv", columns)
+    bare = write_csv(
+        tmp_path / "cold.csv", {n: v for n, v in columns.items() if n != "temperature_c"}
+    )
+    assert "temperature_c" in refused(mwdcal("compare", bare, "--tool", "servo", "--order", 1), 2)
+    assert mwdcal("compare", run, "--tool", "servo", "--order", 4).code == 2
+    lost = mwdcal("compare", run, "--tool", "servo", "--report", run)
+    assert "lost" in refused(lost, 2)
+    refused(mwdcal("compare", tmp_path / "none.csv"), 2)

@@ -23,6 +23,7 @@ from mwdcal.options import Options
 from mwdcal.predict import accuracy_at, accuracy_map, readings_at, typical_accuracy
 from mwdcal.profile import Profile, TriadProfile
 from mwdcal.readings import Readings
+from mwdcal.selection import choose_order, order_errors
 from simulation import DEG, Tool, plan
 
 SERVO = Profile(
@@ -64,12 +65,29 @@ def calibrated(drop=(), magnetometer=True, moved=True, profile=SERVO, **metadata
 
 
 @cache
-def heated(model=None):
+def soaked(unknown=()):
     stations = simulate.grid([5.0, 45.0, 90.0, 135.0], 6, [0, 90, 200, 300], [25.0, 65.0, 105.0])
     made = simulate.run(
         simulate.servo(np.random.default_rng(5)), stations, np.random.default_rng(6)
     )
-    return calibrate(replace(made, source="hot.csv"), SERVO, Options(model=model, order=1))
+    known = {k: v for k, v in made.known.items() if k not in unknown}
+    return replace(made, source="hot.csv", known=known)
+
+
+@cache
+def heated(model=None):
+    return calibrate(soaked(), SERVO, Options(model=model, order=1))
+
+
+@cache
+def judged(order="auto", unknown=()):
+    """Calibrated with the table of errors at temperatures left out."""
+    data = soaked(unknown)
+    if order == "auto":
+        order, scores = choose_order(data, Options(), lambda text: None)
+    else:
+        scores = order_errors(data, Options(order=order), lambda text: None)
+    return calibrate(data, SERVO, Options(order=order), orders=scores)
 
 
 @dataclass
@@ -103,7 +121,7 @@ def whole():
 @pytest.fixture
 def words(monkeypatch):
     """`render` without its pictures, for tests of what it says."""
-    for name in ("station_errors", "deviations", "accuracy"):
+    for name in ("station_errors", "deviations", "accuracy", "order_errors"):
         monkeypatch.setattr(plots, name, lambda *arguments: "")
     monkeypatch.setattr(report, "accuracy_map", lambda calibration: None)
     return render
@@ -267,6 +285,55 @@ def test_temperature_terms_and_annex(model, words):
     assert "/°C" in page
     assert "105.0 °C" in page
     assert ("SF<sub>" in page) == (model is None)
+
+
+def test_errors_at_left_out_temperatures(words, monkeypatch):
+    monkeypatch.setattr(plots, "order_errors", lambda scores: "<svg>by order</svg>")
+    made = judged()
+    page = words(made)
+    parsed(page)
+    assert 'id="orders"' in page
+    assert "by order" in page
+    for score in made.orders:
+        row = rf"<tr><td>{score.triad}</td><td>{score.order}</td>.*?</tr>"
+        row = re.search(row, page, re.DOTALL)[0]
+        for value in (score.error_inside, score.error_ends, score.noise, score.inside, score.ends):
+            assert f">{number(value)}<" in row
+        assert f">{number(score.error_ends_deg, 2)}<" in row
+        assert ("chosen" in row) == score.chosen
+    for text in ("interpolation", "extrapolation", "within 2 % of the best", "25.0 to 105.0 °C",
+                 "--outside refuse", "--outside extrapolate", "The course with temperature is simulated"):  # fmt: skip
+        assert text in page
+
+
+def test_a_given_order_has_errors_but_nothing_to_compare(words):
+    page = words(judged(1))
+    assert 'id="orders"' in page
+    assert "within 2 %" not in page
+    assert ">chosen<" not in page
+
+
+def test_errors_of_a_relative_field_are_per_mille(words):
+    page = words(judged(1, ("field", "dip")))
+    assert "‰: of the field" in page
+    assert re.search(r'<td>magnetometer</td><td>1</td>.*?<td class="text">‰</td>', page, re.DOTALL)
+
+
+def test_a_course_that_nothing_tests_says_so(words, whole):
+    page = words(heated())
+    assert 'id="orders"' not in page
+    assert "nothing tests its course" in page
+    assert "--outside extrapolate" in page
+    assert "--outside" not in words(whole)
+
+
+def test_picture_of_the_orders_has_both_triads():
+    scores = judged().orders
+    parsed(plots.order_errors(scores))
+    alone = plots.order_errors([s for s in scores if s.triad == "accelerometer"])
+    assert len(alone) < len(plots.order_errors(scores))
+    blank = [msgspec.structs.replace(s, error_inside=None) for s in scores]
+    parsed(plots.order_errors(blank))
 
 
 def test_curved_axes_have_the_parameters_of_the_record(words):

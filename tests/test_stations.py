@@ -143,6 +143,16 @@ def test_options_say_what_counts():
     assert np.all(far["start_s"] - near["start_s"] == pytest.approx(0.6, abs=0.02))
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_coarse_readings(seed):
+    """Steps of 5 mg, noise of 0.5 mg: most samples repeat the one before."""
+    log, starts, *_ = tumble(seed, noise=5e-4)
+    coarse = {n: np.round(log.columns[n] * 200) / 200 for n in ACC}
+    found = find_stations(without(log, **coarse))
+    assert found.table.count == len(starts)
+    assert means(found, tuple(f"sd_{n}" for n in ACC)).min() > 0.005 / 12**0.5 * 0.99
+
+
 # Uncertainty
 
 
@@ -444,6 +454,7 @@ BAD = {
     "nan": (lambda c: changed(c, "ay", 40, "nan"), ("line 42", "column 'ay'", "'nan'")),
     "a decimal comma": (lambda c: changed(c, "az", 7, "0,5"), ("line 9",)),
     "time that goes back": (lambda c: changed(c, "time_s", 500, "1.0"), ("line 502", "'time_s'", "1 s after")),
+    "time that jumps": (lambda c: changed(c, "time_s", -1, "1e12"), ("'time_s'", "must not jump so far")),
     "time blank": (lambda c: changed(c, "time_s", 9, ""), ("line 11", "'time_s'", "blank")),
     "a channel blank": (lambda c: {**c, "ay": np.full(len(c["ay"]), np.nan)}, ("column 'ay'", "every cell is blank")),
     "a channel missing": (lambda c: {k: v for k, v in c.items() if k != "ay"}, ("'ay' is missing",)),

@@ -261,7 +261,7 @@ def _own_values(result: Fit, where: slice) -> Array:
 
     normal = Normal.of(result.problem.linear(result.state, geometry=True))
     reduced, _, _ = normal.reduced()
-    norms = normal.norms()[0]
+    norms = result.analysis.determined.norms[0]
     scaled = reduced[0] / np.outer(norms, norms)
     other = np.ones(len(norms), bool)
     other[where] = False

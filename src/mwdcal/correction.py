@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import NamedTuple
+
 import numpy as np
 
 from mwdcal.calibration import Calibration, Finding
+from mwdcal.core import fused
 from mwdcal.core.observables import OBSERVABLES
 from mwdcal.core.vectors import Array
 from mwdcal.errors import InputError
@@ -18,6 +22,22 @@ DIRECTIONS = {
     "field_nt": ("azimuth_deg", "dip_deg", "magnetic_toolface_deg"),
 }
 """Directions that do not exist where a strength is zero."""
+NAMES = (
+    *("gx_g", "gy_g", "gz_g", "bx_nt", "by_nt", "bz_nt"),
+    *("inclination_deg", "azimuth_deg", "toolface_deg", "gravity_g", "field_nt", "dip_deg"),
+    "magnetic_toolface_deg",
+)
+"""The output columns, in their order."""
+MANY = 100_000
+"""From this number of rows on the compiled loops are worth their start."""
+
+
+class Tally(NamedTuple):
+    """What the findings need to know of the rows: their number, and what was seen in them."""
+
+    rows: int
+    beyond: int = 0
+    moved: tuple[str, ...] = ()
 
 
 def correct(
@@ -29,28 +49,24 @@ def correct(
     `magnetic_toolface_deg` stands beside them. A strength of zero has no direction: NaN.
     Temperatures outside the calibrated range are blanked, refused or extrapolated as `outside` says.
     """
+    check_outside(outside)
+    columns = compiled(calibration, readings) or reference(calibration, readings)
+    beyond = calibration.outside(readings)
+    tally = Tally(readings.count, int(beyond.sum()), undetermined(calibration, readings))
+    told = findings(calibration, readings, tally, outside)
+    if outside == "blank" and tally.beyond:
+        columns = {name: np.where(beyond, np.nan, value) for name, value in columns.items()}
+    return columns, told
+
+
+def check_outside(outside: str) -> None:
+    """Refuse a word that says nothing about temperatures outside the calibrated range."""
     if outside not in OUTSIDE:
         raise InputError(f"--outside must be one of {', '.join(OUTSIDE)}; got {outside!r}.")
-    if calibration.has_field and readings.magnetometer is None:
-        findings = [
-            Finding(id="no-magnetometer", text="no columns mx, my, mz: magnetic results are blank.")
-        ]
-    else:
-        findings = []
-    findings += _other_tool(calibration, readings)
-    columns = _columns(calibration, readings)
-    beyond = calibration.outside(readings)
-    if beyond.any():
-        findings.append(_outside(calibration, readings, outside, int(beyond.sum())))
-    if outside == "blank":
-        columns = {name: np.where(beyond, np.nan, value) for name, value in columns.items()}
-    if calibration.field_unit != "nT" and calibration.has_field:
-        text = "the magnetometer is calibrated to field = 1: bx_nt, by_nt, bz_nt and field_nt are relative, not nT."
-        findings.append(Finding(id="field-relative", text=text))
-    return columns, findings + _undetermined(calibration, readings)
 
 
-def _columns(calibration: Calibration, readings: Readings) -> dict[str, Array]:
+def reference(calibration: Calibration, readings: Readings) -> dict[str, Array]:
+    """The output columns (..., n) by plain NumPy, nothing blanked for its temperature."""
     g, b = calibration.fields(readings)
     columns = {f"g{axis}_g": g[..., i] for i, axis in enumerate("xyz")}
     columns |= {f"b{axis}_nt": b[..., i] for i, axis in enumerate("xyz")}
@@ -67,6 +83,64 @@ def _columns(calibration: Calibration, readings: Readings) -> dict[str, Array]:
     return columns
 
 
+def compiled(
+    calibration: Calibration, readings: Readings, least: int = MANY
+) -> dict[str, Array] | None:
+    """The same columns by the compiled loops; None below `least` rows, or where they cannot."""
+    shape = readings.accelerometer.shape[:-1]
+    triads = numbers(calibration)
+    unknown = readings.temperature is None and any(t.order for t in calibration.triads)
+    if np.prod(shape) < least or triads is None or unknown or not fused.available():
+        return None
+    zero = calibration.reference_temperature
+    warmth = zero if readings.temperature is None else readings.temperature
+    flat = np.ascontiguousarray(np.broadcast_to(warmth, shape), float).reshape(-1)
+    g, b = readings.accelerometer, readings.magnetometer
+    vectors = [*_axes(g), *(_axes(b) if b is not None else [np.full(flat.shape, np.nan)] * 3)]
+    found = fused.run([*vectors, flat], triads, zero)
+    return {n: c.reshape(shape) for n, c in zip(NAMES, found.columns, strict=True)}
+
+
+def _axes(vectors: Array) -> list[Array]:
+    """The three components (n,) of vectors (..., 3), as views where the memory allows it."""
+    flat = np.ascontiguousarray(vectors, float).reshape(-1, 3)
+    return [flat[:, i] for i in range(3)]
+
+
+def numbers(calibration: Calibration) -> tuple[fused.Numbers, fused.Numbers] | None:
+    """Both triads for the compiled loops; None where a model is not for them."""
+    found = [
+        fused.numbers(t.functions(calibration.reference_temperature), np.array(t.parameters))
+        for t in calibration.triads
+    ]
+    first, second = [*found, fused.NOTHING][:2]
+    return None if first is None or second is None else (first, second)
+
+
+def findings(
+    calibration: Calibration, readings: Readings, tally: Tally, outside: str
+) -> list[Finding]:
+    """What the reader should know of the results; refuses rows outside if `outside` says so.
+
+    Of the readings only their metadata count, and whether there is a magnetometer.
+    """
+    found = []
+    if calibration.has_field and readings.magnetometer is None:
+        text = "no columns mx, my, mz: magnetic results are blank."
+        found.append(Finding(id="no-magnetometer", text=text))
+    found += _other_tool(calibration, readings)
+    if tally.beyond:
+        found.append(_outside(calibration, readings.source, outside, tally))
+    if calibration.field_unit != "nT" and calibration.has_field:
+        text = "the magnetometer is calibrated to field = 1: bx_nt, by_nt, bz_nt and field_nt are relative, not nT."
+        found.append(Finding(id="field-relative", text=text))
+    if tally.moved:
+        free = ", ".join(dict.fromkeys(u.id for u in calibration.undetermined()))
+        text = f"{', '.join(tally.moved)} rest on what the calibration leaves undetermined ({free})"
+        found.append(Finding(id="undetermined", text=f"{text}: no uncertainty can be stated."))
+    return found
+
+
 def _other_tool(calibration: Calibration, readings: Readings) -> list[Finding]:
     other = calibration.other_tool(readings)
     if other is None:
@@ -78,14 +152,12 @@ def _other_tool(calibration: Calibration, readings: Readings) -> list[Finding]:
     return [Finding(id="other-tool", text=text)]
 
 
-def _outside(calibration: Calibration, readings: Readings, how: str, count: int) -> Finding:
+def _outside(calibration: Calibration, source: str, how: str, tally: Tally) -> Finding:
     low, high = calibration.temperature_c or (np.nan, np.nan)
-    text = (
-        f"{count} of {readings.count} rows lie outside the calibrated range {low:.1f}…{high:.1f} °C"
-    )
+    text = f"{tally.beyond} of {tally.rows} rows lie outside the calibrated range {low:.1f}…{high:.1f} °C"
     if how == "refuse":
         raise InputError(
-            f"{readings.source}: {text}. Use --outside blank or extrapolate, or calibrate over a wider range."
+            f"{source}: {text}. Use --outside blank or extrapolate, or calibrate over a wider range."
         )
     done = (
         "their results are blank"
@@ -95,19 +167,14 @@ def _outside(calibration: Calibration, readings: Readings, how: str, count: int)
     return Finding(id="outside-temperature", text=f"{text}: {done}.")
 
 
-def _undetermined(calibration: Calibration, readings: Readings) -> list[Finding]:
-    """Outputs that rest on a direction which the calibration leaves free.
+def undetermined(
+    calibration: Calibration, readings: Readings, names: Sequence[str] = JUDGED
+) -> tuple[str, ...]:
+    """Those of the outputs that rest, in any row, on a direction the calibration leaves free.
 
     A row without field or gravity has no directions, and none that could be undetermined.
     """
     if not calibration.free:
-        return []
+        return ()
     with np.errstate(invalid="ignore", divide="ignore"):
-        moved = {name: calibration.rests_on_free(name, readings).any() for name in JUDGED}
-    names = [name for name, any_row in moved.items() if any_row]
-    if not names:
-        return []
-    free = ", ".join(dict.fromkeys(u.id for u in calibration.undetermined()))
-    text = f"{', '.join(names)} rest on what the calibration leaves undetermined ({free})"
-    text += ": no uncertainty can be stated."
-    return [Finding(id="undetermined", text=text)]
+        return tuple(n for n in names if calibration.rests_on_free(n, readings).any())

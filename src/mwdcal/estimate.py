@@ -10,10 +10,16 @@ import numpy as np
 from mwdcal.core.models import Basis, Factors, Polynomial, Restricted, Whole, restricted
 from mwdcal.core.problem import Evidence, Problem, State, Triad
 from mwdcal.core.robust import LOSSES, consistency, inflation, weight
-from mwdcal.core.solvers import Status
+from mwdcal.core.solvers import Determined, Status
 from mwdcal.core.start import start
-from mwdcal.core.sums import Sums
-from mwdcal.core.uncertainty import Analysis, analyse, settle_gauge, station_misfit
+from mwdcal.core.uncertainty import (
+    Analysis,
+    analyse,
+    determined_apart,
+    sandwich,
+    settle_gauge,
+    station_misfit,
+)
 from mwdcal.core.vectors import Array, Bools, Ints
 from mwdcal.evidence import evidence_of, flat
 from mwdcal.methods import EVIDENCE, Solved, solve, with_stand_errors
@@ -128,23 +134,38 @@ def _fit(readings: Readings, options: Options, include: Array | None) -> Fit:
     if options.robust:
         problem, solved, trust = _downweigh(problem, solved, declared, options)
     trusted = _trusting(problem, trust)
-    state = settle_gauge(trusted, solved.state)
+    state = solved.state
+    determined = _determined(trusted, state, solved)
+    if len(state.params) and not determined.keep.all():
+        state = settle_gauge(trusted, state, determined)
+        determined = _determined(trusted, state, solved)
     status = np.where(finite, solved.status, int(Status.NOT_FINITE))
     noise = [
         np.full(len(status), np.nan) if k else t.sd[:, 0, 0]
         for t, k in zip(problem.triads, declared, strict=True)
     ]
-    analysis = _analysed(trusted, state, solved.sums, options.robust)
+    analysis = _analysed(analyse(trusted, state, determined), trusted, state, solved, options)
     return Fit(trusted, state, status, iterations, np.stack(noise, -1), trust, analysis)
 
 
+def _determined(problem: Problem, state: State, solved: Solved) -> Determined:
+    """Which directions the evidence that the method uses determines."""
+    if solved.known:
+        return determined_apart(problem, state, solved.known)
+    return Determined.of(problem, state)
+
+
 def _analysed(
-    problem: Problem, state: State, sums: Mapping[int, Sums], robust: str | None
+    found: Analysis, problem: Problem, state: State, solved: Solved, options: Options
 ) -> Analysis:
     """The analysis of the estimator that was used: not every one is the likelihood's."""
-    found = analyse(problem, state)
-    if sums:
-        found = replace(found, covariance=_sandwiched(problem, state, found.covariance, sums))
+    robust = options.robust
+    if solved.sums:
+        pairs = zip(problem.slices(), problem.targets(state), strict=False)
+        where = {index: pair for index, pair in enumerate(pairs) if index in solved.sums}
+        pulls = {i: solved.sums[i].pulls(state.params[:, w], t) for i, (w, t) in where.items()}
+        covariance, constants = sandwich(problem, state, pulls)
+        found = replace(found, covariance=covariance, constants=constants)
     if robust:
         freedom = _tested(station_misfit(found)[1])
         found = replace(
@@ -154,31 +175,6 @@ def _analysed(
             variance_factor=found.variance_factor / consistency(robust, freedom),
         )
     return found
-
-
-def _sandwiched(
-    problem: Problem, state: State, covariance: Array, sums: Mapping[int, Sums]
-) -> Array:
-    """Covariance (B, p, p) when some triads minimise sums of their own.
-
-    The other triad follows the first as it does in the likelihood, by its regression on it.
-    """
-    slices, result = problem.slices(), covariance.copy()
-    for index, one in sums.items():
-        result[:, slices[index], slices[index]] = one.covariance(state.params[:, slices[index]])
-    if len(slices) == 1 or len(sums) == 2:
-        return result
-    a, m = slices
-    scale = np.sqrt(np.maximum(np.diagonal(covariance[:, a, a], axis1=-2, axis2=-1), 1e-300))
-    normal = covariance[:, a, a] / (scale[:, :, None] * scale[:, None, :])
-    back = np.linalg.pinv(normal, rcond=1e-10, hermitian=True)
-    back = back / (scale[:, :, None] * scale[:, None, :])
-    follow = covariance[:, m, a] @ back
-    change = result[:, a, a] - covariance[:, a, a]
-    result[:, m, a] = follow @ result[:, a, a]
-    result[:, a, m] = np.swapaxes(result[:, m, a], -1, -2)
-    result[:, m, m] = covariance[:, m, m] + follow @ change @ np.swapaxes(follow, -1, -2)
-    return result
 
 
 def _without_broken(problem: Problem) -> tuple[Problem, Bools]:

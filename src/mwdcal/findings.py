@@ -9,7 +9,7 @@ import numpy as np
 from mwdcal.calibration import Finding, StationRow, TriadCalibration
 from mwdcal.core.observability import Free, free_directions
 from mwdcal.core.problem import Prior
-from mwdcal.core.solvers import Determined, Normal
+from mwdcal.core.solvers import Determined
 from mwdcal.estimate import Fit
 from mwdcal.options import Options
 from mwdcal.profile import Profile
@@ -128,7 +128,7 @@ class Findings:
         if knowledge is None:
             return []
         bare = replace(problem, prior=Prior(0 * problem.prior.precision, problem.prior.expected))
-        determined = Determined.by(Normal.of(bare.linear(self.result.state, geometry=True)))
+        determined = Determined.of(bare, self.result.state)
         found = []
         for entry in free_directions(bare, self.result.state, determined):
             names = " and ".join(TRIADS[t] for t in entry.triads)

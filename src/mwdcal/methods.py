@@ -7,7 +7,7 @@ swarm have their own, and so have the papers' unweighted sums (`Options.paper_we
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -94,13 +94,15 @@ EVIDENCE: dict[str, Callable[[Evidence], Evidence]] = {
 class Solved:
     """A minimum: state, `Status` codes and iterations (B,), and the sums it minimises, by triad.
 
-    Triads without an entry in `sums` have the likelihood of their readings at its largest.
+    Triads without an entry in `sums` have the likelihood of their readings at its largest; for
+    the others `known` (B, p_t, p_t) is the information of what they are fitted to.
     """
 
     state: State
     status: Ints
     iterations: Ints
-    sums: dict[int, Sums]
+    sums: dict[int, Sums] = field(default_factory=dict)
+    known: dict[int, Array] = field(default_factory=dict)
 
 
 def solve(problem: Problem, state: State, options: Options) -> Solved:
@@ -113,7 +115,7 @@ def solve(problem: Problem, state: State, options: Options) -> Solved:
         return _by_sums(problem, state, options.method)
     if options.paper_weights:
         problem = _alike(problem)
-    return Solved(*gauss_newton(problem, state), {})
+    return Solved(*gauss_newton(problem, state))
 
 
 def _alike(problem: Problem) -> Problem:
@@ -134,7 +136,7 @@ def _swarmed(problem: Problem, state: State, seed: int) -> Solved:
     params = np.concatenate(parts, -1)
     finite = np.isfinite(params).all(-1)
     status = np.where(finite, int(Status.OK), int(Status.NOT_FINITE))
-    return Solved(replace(state, params=params), status, np.full(len(params), ITERATIONS), {})
+    return Solved(replace(state, params=params), status, np.full(len(params), ITERATIONS))
 
 
 def _swarm_forward(raw: Array, target: Array, include: Bools, seed: int) -> Array:
@@ -166,7 +168,7 @@ def _by_newton(problem: Problem, state: State, paper: bool) -> Solved:
     own = _sums(problem, state, 0, (STRENGTH, "inclination"), weights)
     later = _magnetometer(problem, state, found.params)
     status = np.maximum(later.status, found.status)
-    return Solved(later.state, status, found.iterations, {0: own})
+    return Solved(later.state, status, found.iterations, {0: own}, {0: found.information})
 
 
 def _by_sums(problem: Problem, state: State, method: str) -> Solved:
@@ -185,10 +187,12 @@ def _by_sums(problem: Problem, state: State, method: str) -> Solved:
     status = np.max([each[1] for each in found], 0)
     iterations = np.max([each[2] for each in found], 0)
     if scalar:
-        later = readjusted(problem, replace(state, params=params))
-        return Solved(later, status, iterations, sums)
-    after = _magnetometer(problem, state, params)
-    return Solved(after.state, np.maximum(status, after.status), iterations, sums)
+        after = Solved(readjusted(problem, replace(state, params=params)), status, iterations)
+    else:
+        after = _magnetometer(problem, state, params)
+    pairs = zip(sums.items(), found, strict=True)
+    known = {index: one.information(each[0].params) for (index, one), each in pairs}
+    return Solved(after.state, np.maximum(status, after.status), iterations, sums, known)
 
 
 def _sums(
@@ -198,13 +202,10 @@ def _sums(
     evidence, strength = problem.evidence, ("gravity", "field")[index]
     value = problem.constant(state, strength)
     known = [value**2 if n == STRENGTH else evidence.known[n] for n in names]
-    sd = [2 * value * evidence.sd[strength] if n == STRENGTH else evidence.sd[n] for n in names]
     reference = np.stack(known, -1)
-    counts = ~np.isnan(reference)
-    return Sums(
-        problem.triads[index], problem.temperature, names,
-        np.nan_to_num(reference), np.stack(sd, -1), weights * counts,
-    )  # fmt: skip
+    weights = weights * ~np.isnan(reference)
+    triad, temperature = problem.triads[index], problem.temperature
+    return Sums(triad, temperature, names, np.nan_to_num(reference), weights)
 
 
 def _magnetometer(problem: Problem, state: State, accelerometer: Array) -> Solved:
@@ -215,10 +216,10 @@ def _magnetometer(problem: Problem, state: State, accelerometer: Array) -> Solve
     state = readjusted(problem, replace(state, params=params))
     if len(problem.triads) == 1:
         none = np.zeros(len(params), int)
-        return Solved(state, none, none, {})
+        return Solved(state, none, none)
     precision[:, where, :] = precision[:, :, where] = 0.0
     precision[:, where, where] = HELD * np.eye(accelerometer.shape[-1])
     expected = problem.prior.expected.copy()
     expected[:, where] = accelerometer
     held = replace(problem, prior=Prior(precision, expected))
-    return Solved(*gauss_newton(held, state), {})
+    return Solved(*gauss_newton(held, state))

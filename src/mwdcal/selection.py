@@ -9,6 +9,7 @@ import numpy as np
 
 from mwdcal.calibration import OrderScore
 from mwdcal.core.problem import Problem, State
+from mwdcal.core.solvers import Linear
 from mwdcal.core.uncertainty import TESTED, marginal_rank, readjusted
 from mwdcal.core.vectors import Array, Ints
 from mwdcal.estimate import Fit, fit
@@ -188,9 +189,9 @@ def _held_out(readings: Readings, options: Options, numbers: Ints) -> Array:
     include = (np.arange(_count(numbers))[:, None] != numbers).astype(float)
     result = fit(readings, options, include)
     held = 1 - include
-    chi = np.sum(misfit(result) * held[..., None], 1) / (3 * held.sum(1))[:, None]
     problem, state = _everyone(result)
     linear = problem.linear(state)
+    chi = np.sum(_chi(linear) * held[..., None], 1) / (3 * held.sum(1))[:, None]
     left = linear.weigh(linear.residual[..., None])
     share = linear.weigh(
         np.broadcast_to(np.eye(left.shape[-2]), (*left.shape[:-1], left.shape[-2]))
@@ -239,7 +240,10 @@ def _everyone(result: Fit) -> tuple[Problem, State]:
 def misfit(result: Fit) -> Array:
     """χ² (B, n, t) of every station by triad, left out or not, attitudes at their best."""
     problem, state = _everyone(result)
-    linear = problem.linear(state)
+    return _chi(problem.linear(state))
+
+
+def _chi(linear: Linear) -> Array:
     weighed = linear.weigh(linear.residual[..., None])[..., 0]
     rows = linear.residual * weighed
     return np.asarray(rows.reshape(*rows.shape[:-1], rows.shape[-1] // 3, 3).sum(-1))

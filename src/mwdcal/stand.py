@@ -9,7 +9,7 @@ import numpy as np
 
 from mwdcal.calibration import StandErrors
 from mwdcal.core.problem import STAND, UNKNOWN
-from mwdcal.core.solvers import Determined, Normal
+from mwdcal.core.solvers import Determined
 from mwdcal.errors import FitError, InputError
 from mwdcal.estimate import Fit
 from mwdcal.methods import ESTIMABLE
@@ -43,10 +43,7 @@ def check_separable(result: Fit, names: Sequence[str]) -> None:
     fewer = replace(evidence, constants=tuple(evidence.constants[i] for i in keep))
     bare = replace(problem, evidence=fewer)
     still = replace(state, constants=state.constants[:, keep])
-    ranks = [
-        int(Determined.by(Normal.of(p.linear(s, geometry=True))).rank[0])
-        for p, s in ((problem, state), (bare, still))
-    ]
+    ranks = [int(Determined.of(p, s).rank[0]) for p, s in ((problem, state), (bare, still))]
     sd = np.sqrt(np.diag(result.analysis.constants[0]))
     loose = [
         c.name

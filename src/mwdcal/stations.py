@@ -29,6 +29,8 @@ GAP = 5.0
 """Times the usual step between samples that are a gap."""
 MANY_SPIKES = 0.01
 """Share of spikes that is worth a word."""
+MOST_CELLS = 50_000_000
+"""Cells of the longest log: four months at 15 samples a second or more."""
 SMALLEST = 1e-12
 """Resolution of a channel that never changes, as a share of its reading."""
 PARTS = {"": "mean", "sd_": "sd", "spread_": "spread", "drift_": "drift", "samples_": "used"}
@@ -142,7 +144,7 @@ def _none(log: Table, found: Standstills, shortest: float) -> InputError:
     )
     return InputError(
         f"{log.source}: no standstill of at least {shortest:g} s; {seen}. Stand still for longer, or "
-        "lower --min-seconds, or raise --threshold; --plot shows what was looked at."
+        "lower --min-seconds, or set --threshold."
     )
 
 
@@ -158,6 +160,7 @@ def _time(log: Table, sampling_hz: float | None) -> Array:
             got = f"{shown(float(time[row + 1]))} s after {shown(float(time[row]))} s"
             advice = "Sort the log by time, or split it where the clock was set back."
             raise cell_error(log, TIME, int(row) + 1, f"must not go back; got {got}. {advice}")
+        _check_span(log, time)
         return time
     if stated is None:
         raise InputError(
@@ -170,6 +173,16 @@ def _time(log: Table, sampling_hz: float | None) -> Array:
             f"{shown(stated)}. Correct it, or add --sampling-hz."
         )
     return np.arange(len(numbers(log, RAW[0]))) / float(stated)
+
+
+def _check_span(log: Table, time: Array) -> None:
+    """Refuse a clock that jumps so far that most of the log would be nothing."""
+    cell = max(standstill.CELL, standstill.FEWEST * standstill.time_step(time))
+    if time[-1] - time[0] > MOST_CELLS * cell:
+        row = int(np.argmax(np.diff(time))) + 1
+        got = f"{shown(float(time[row]))} s after {shown(float(time[row - 1]))} s"
+        advice = "Correct the clock, split the log there, or write the time in seconds."
+        raise cell_error(log, TIME, row, f"must not jump so far; got {got}. {advice}")
 
 
 def _traces(

@@ -1,8 +1,8 @@
-"""What `mwdcal stations` asks for: kept apart from the work, so that help is quick."""
+"""What `mwdcal stations` and `mwdcal compare` ask for: apart from the work, so that help is quick."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TypedDict
 
@@ -24,7 +24,25 @@ class Asked(TypedDict):
     as_json: bool
 
 
+class AskedToCompare(TypedDict):
+    """What was typed at `mwdcal compare`."""
+
+    run: Path
+    tool: str | None
+    order: str
+    seed: int
+    parameters: bool
+    report: Path | None
+    decimal: str
+    as_json: bool
+
+
 _FILE = click.Path(path_type=Path)
+_DECIMAL = click.option(
+    "--decimal", default=".", show_default=True, metavar="SIGN",
+    help="Decimal sign of numbers in text files.",
+)  # fmt: skip
+_JSON = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
 _OPTIONS = (
     click.argument("log", type=_FILE),
     click.option(
@@ -53,16 +71,116 @@ _OPTIONS = (
     click.option(
         "--plot", type=_FILE, metavar="FILE.png|svg", help="Also draw what was taken and left."
     ),
+    _DECIMAL,
+    _JSON,
+)  # fmt: skip
+_CALIBRATE = (
+    click.argument("run", type=_FILE),
     click.option(
-        "--decimal", default=".", show_default=True, metavar="SIGN",
-        help="Decimal sign of numbers in text files.",
+        "-o",
+        "--output",
+        type=_FILE,
+        required=True,
+        metavar="CAL.json",
+        help="Calibration file to write.",
     ),
-    click.option("--json", "as_json", is_flag=True, help="Print the result as JSON."),
+    click.option("--tool", metavar="NAME|FILE", help="Tool profile: a shipped name or a TOML file."),
+    click.option(
+        "--method", default="joint", show_default=True, metavar="METHOD",
+        help="joint: all evidence, weighted. least-squares: reference vectors only. swarm: the same "
+        "by particle swarm. newton: Newton-Raphson on |g| and inclination. toolface-inclination: the "
+        "accelerometer by angles alone. scalar: |g| and |b| alone.",
+    ),
+    click.option(
+        "--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of the swarm."
+    ),
+    click.option(
+        "--paper-weights", is_flag=True,
+        help="Sum the squares as the method's paper does, unweighted, instead of by their uncertainty.",
+    ),
+    click.option(
+        "--robust", type=click.Choice(["huber", "student-t"]),
+        help="Bound what a bad station can do: huber keeps a little of its pull, student-t loses it.",
+    ),
+    click.option(
+        "--prior", metavar="CAL.json|datasheet",
+        help="What is known beforehand: a previous calibration of this tool, with its covariance, or "
+        "the tolerances in the tool profile.",
+    ),
+    click.option(
+        "--estimate", default="", metavar="NAMES",
+        help="Errors of the stand to find as well: azimuth-zero, tilt, or both with a comma.",
+    ),
+    click.option(
+        "--model",
+        type=click.Choice(["polynomial", "factors"]),
+        help="Default: polynomial at order 0, factors above.",
+    ),
+    click.option(
+        "--parameters", type=click.Choice(["12", "9", "6"]), default="12", show_default=True,
+        help="Per triad at one temperature. 9: the sensor frame, without mounting rotation. "
+        "6: scale and bias alone.",
+    ),
+    click.option(
+        "--order",
+        default="auto",
+        show_default=True,
+        metavar="0…3|auto",
+        help="Order of temperature terms.",
+    ),
+    click.option(
+        "--nonlinearity", default="auto", show_default=True, metavar="auto|none|NAMES",
+        help="Own-axis quadratic and cubic terms. auto: of the triads whose profile declares them, "
+        "where left-out stations improve. NAMES: accelerometer, magnetometer, or both with a comma.",
+    ),
+    click.option(
+        "--exclude", multiple=True, metavar="STATION", help="Leave a station out; may be repeated."
+    ),
+    click.option(
+        "--report", type=_FILE, metavar="R.html", help="Also write a self-contained HTML report."
+    ),
+    _DECIMAL,
+    _JSON,
+)  # fmt: skip
+_COMPARE = (
+    click.argument("run", type=_FILE),
+    click.option(
+        "--tool", metavar="NAME|FILE", help="Tool profile: a shipped name or a TOML file."
+    ),
+    click.option(
+        "--order", type=click.Choice(["0", "1", "2", "3", "auto"]), default="auto",
+        show_default=True, help="Order of temperature terms, the same for all methods.",
+    ),
+    click.option(
+        "--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of the swarm."
+    ),
+    click.option(
+        "--parameters", is_flag=True, help="Print the parameters of every method as well."
+    ),
+    click.option(
+        "--report", type=_FILE, metavar="R.html", help="Also write a self-contained HTML report."
+    ),
+    _DECIMAL,
+    _JSON,
 )  # fmt: skip
 
 
+def calibration_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """The command `calibrate` with its argument and options, in this order."""
+    return _with(_CALIBRATE, command)
+
+
 def standstill_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """The command with its argument and options, in this order."""
-    for option in reversed(_OPTIONS):
+    """The command `stations` with its argument and options, in this order."""
+    return _with(_OPTIONS, command)
+
+
+def comparison_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """The command `compare` with its argument and options, in this order."""
+    return _with(_COMPARE, command)
+
+
+def _with(options: Sequence[Callable[..., Any]], command: Callable[..., Any]) -> Callable[..., Any]:
+    for option in reversed(options):
         command = option(command)
     return command

@@ -5,31 +5,30 @@ from __future__ import annotations
 import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypedDict, Unpack
+from typing import TYPE_CHECKING, Any, Unpack
 
 import click
 
 from mwdcal import __version__
-from mwdcal.app.asked import Asked, standstill_options
+from mwdcal.app.asked import (
+    Asked,
+    AskedToCompare,
+    calibration_options,
+    comparison_options,
+    standstill_options,
+)
+from mwdcal.app.fleet_asked import Asked as FleetAsked
+from mwdcal.app.fleet_asked import fleet_options
 from mwdcal.errors import InputError, MwdcalError
 
 if TYPE_CHECKING:
-    from mwdcal.app.choices import Chosen, Typed
+    from mwdcal.app.choices import Typed
     from mwdcal.calibration import Calibration, Finding
     from mwdcal.notation import Notation
-    from mwdcal.profile import Profile
-    from mwdcal.readings import Readings
 
 INTERNAL = 70
 INTERRUPTED = 130
 COLDEST, HOTTEST = -273.15, 1000.0
-
-
-class Digests(TypedDict):
-    """What the calibration file says about its sources."""
-
-    profile_sha256: str
-    run_sha256: str
 
 
 FILE = click.Path(path_type=Path)
@@ -74,72 +73,7 @@ def print_json(value: Any) -> None:
 
 
 @cli.command()
-@click.argument("run", type=FILE)
-@click.option(
-    "-o",
-    "--output",
-    type=FILE,
-    required=True,
-    metavar="CAL.json",
-    help="Calibration file to write.",
-)
-@click.option("--tool", metavar="NAME|FILE", help="Tool profile: a shipped name or a TOML file.")
-@click.option(
-    "--method", default="joint", show_default=True, metavar="METHOD",
-    help="joint: all evidence, weighted. least-squares: reference vectors only. swarm: the same "
-    "by particle swarm. newton: Newton-Raphson on |g| and inclination. toolface-inclination: the "
-    "accelerometer by angles alone. scalar: |g| and |b| alone.",
-)  # fmt: skip
-@click.option(
-    "--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of the swarm."
-)
-@click.option(
-    "--paper-weights", is_flag=True,
-    help="Sum the squares as the method's paper does, unweighted, instead of by their uncertainty.",
-)  # fmt: skip
-@click.option(
-    "--robust", type=click.Choice(["huber", "student-t"]),
-    help="Bound what a bad station can do: huber keeps a little of its pull, student-t loses it.",
-)  # fmt: skip
-@click.option(
-    "--prior", metavar="CAL.json|datasheet",
-    help="What is known beforehand: a previous calibration of this tool, with its covariance, or "
-    "the tolerances in the tool profile.",
-)  # fmt: skip
-@click.option(
-    "--estimate", default="", metavar="NAMES",
-    help="Errors of the stand to find as well: azimuth-zero, tilt, or both with a comma.",
-)  # fmt: skip
-@click.option(
-    "--model",
-    type=click.Choice(["polynomial", "factors"]),
-    help="Default: polynomial at order 0, factors above.",
-)
-@click.option(
-    "--parameters", type=click.Choice(["12", "9", "6"]), default="12", show_default=True,
-    help="Per triad at one temperature. 9: the sensor frame, without mounting rotation. "
-    "6: scale and bias alone.",
-)  # fmt: skip
-@click.option(
-    "--order",
-    default="auto",
-    show_default=True,
-    metavar="0…3|auto",
-    help="Order of temperature terms.",
-)
-@click.option(
-    "--nonlinearity", default="auto", show_default=True, metavar="auto|none|NAMES",
-    help="Own-axis quadratic and cubic terms. auto: of the triads whose profile declares them, "
-    "where left-out stations improve. NAMES: accelerometer, magnetometer, or both with a comma.",
-)  # fmt: skip
-@click.option(
-    "--exclude", multiple=True, metavar="STATION", help="Leave a station out; may be repeated."
-)
-@click.option(
-    "--report", type=FILE, metavar="R.html", help="Also write a self-contained HTML report."
-)
-@decimal_sign
-@as_json
+@calibration_options
 def calibrate(
     run: Path, output: Path, tool: str | None, exclude: tuple[str, ...], report: Path | None,
     decimal: str, as_json: bool, **typed: Unpack[Typed],
@@ -150,32 +84,15 @@ def calibrate(
     Example: mwdcal calibrate run.csv --tool servo -o tool.json --report tool.html
     Exit: 0 calibrated, 2 input cannot be read, 3 fit failed or refused.
     """
-    from mwdcal.app.choices import choose
-    from mwdcal.calibrate import calibrate as fit
-    from mwdcal.files import documents
+    from mwdcal.app import calibrating
 
     _check_outputs([output, report], [run, Path(tool or ""), Path(typed["prior"] or "")])
-    readings, profile, digests = _load(run, tool, decimal)
-    readings = _without(readings, exclude)
-    chosen = choose(readings, profile, typed, say)
-    made = fit(readings, profile, chosen.options, orders=chosen.orders, **digests)
-    if report:
-        from mwdcal.app.report import write_report
-
-        write_report(report, made)
-    documents.write(output, made)
+    chosen, made = calibrating.run(run, tool, exclude, decimal, typed, say)
+    calibrating.write(made, output, report)
     if as_json:
-        print_json(
-            {
-                **_summary(made),
-                "orders": made.orders,
-                "nonlinearity": chosen.curves,
-                "calibration": str(output),
-                "report": str(report or ""),
-            }
-        )
+        print_json(calibrating.summary(made, chosen, output, report))
     else:
-        _show(made, chosen, output, report)
+        click.echo(calibrating.screen(made, chosen, output, report))
 
 
 def _check_outputs(outputs: list[Path | None], inputs: list[Path]) -> None:
@@ -193,103 +110,21 @@ def _check_outputs(outputs: list[Path | None], inputs: list[Path]) -> None:
         taken.append(target)
 
 
-def _load(run: Path, tool: str | None, decimal: str) -> tuple[Readings, Profile, Digests]:
-    from mwdcal.files import profiles, runs, table
-
-    profile, profile_sha256 = profiles.load_profile(tool)
-    read = table.read(run, decimal=decimal)
-    readings, profile = runs.to_readings(read, profile)
-    digests = Digests(profile_sha256=profile_sha256, run_sha256=read.digest)
-    return readings, profile, digests
-
-
-def _without(readings: Readings, exclude: tuple[str, ...]) -> Readings:
-    import numpy as np
-
-    twice = [label for label in exclude if readings.station.count(label) > 1]
-    if twice:
-        raise InputError(
-            f"--exclude {twice[0]}: {readings.station.count(twice[0])} stations of {readings.source} "
-            "have this label. Give each its own in the column 'station'."
-        )
-    missing = [label for label in exclude if label not in readings.station]
-    if missing:
-        raise InputError(
-            f"--exclude {missing[0]}: no such station in {readings.source}; "
-            f"stations are {readings.station[0]} … {readings.station[-1]}."
-        )
-    return readings.select(np.array([label not in exclude for label in readings.station]))
-
-
-def _summary(made: Calibration) -> dict[str, Any]:
-    from mwdcal.predict import typical_accuracy
-
-    triads = {
-        t.name: {
-            "rank": t.rank,
-            "size": t.size,
-            "undetermined": t.undetermined,
-            "variance_factor": t.variance_factor,
-        }
-        for t in made.triads
-    }
-    return {
-        "run": made.run, "stations": made.stations, "method": made.method, "triads": triads,
-        "errors": made.errors, "accuracy_1sigma_deg": typical_accuracy(made), "constants": made.constants,
-        "stand": made.stand,
-        "findings": made.findings,
-    }  # fmt: skip
-
-
-def _show(made: Calibration, chosen: Chosen, output: Path, report: Path | None) -> None:
-    from mwdcal.app import text
-    from mwdcal.predict import typical_accuracy
-
-    click.echo(text.heading(made) + "\n")
-    if made.orders:
-        click.echo(text.orders(made.orders) + "\n")
-    if chosen.curves:
-        click.echo(text.curves(chosen.curves) + "\n")
-    click.echo(text.errors(made.errors) + "\n")
-    accuracy = "  ".join(
-        f"{n} {text.number(v)}{'°' if v is not None else ''}"
-        for n, v in typical_accuracy(made).items()
-    )
-    click.echo(f"accuracy to expect (1σ, calibration alone, typical): {accuracy}")
-    for constant in made.constants:
-        value = f"{constant.value:.6g} ± {constant.standard_uncertainty:.2g} {constant.unit}"
-        click.echo(f"estimated constant of the run: {constant.name} {value}")
-    for line in text.stand(made.stand) + text.findings(made.findings):
-        click.echo(line)
-    wrote = f"wrote {output} (calibration)" + (f"   {report} (report)" if report else "")
-    click.echo(f"{wrote}   next: mwdcal verify {output} ROLLTEST.csv")
-
-
 @cli.command()
-@click.argument("run", type=FILE)
-@click.option("--tool", metavar="NAME|FILE", help="Tool profile: a shipped name or a TOML file.")
-@click.option(
-    "--order", type=click.IntRange(0, 3), default=0, show_default=True, help="Temperature order."
-)
-@decimal_sign
-@as_json
-def compare(run: Path, tool: str | None, order: int, decimal: str, as_json: bool) -> None:
+@comparison_options
+def compare(**asked: Unpack[AskedToCompare]) -> None:
     """Calibrate a RUN by every method, side by side, judged by stations left out.
 
     \b
-    Example: mwdcal compare run.csv --tool servo
+    Example: mwdcal compare run.csv --tool servo --report methods.html
     Exit: 0 compared, 2 input cannot be read.
     """
-    from mwdcal.app import text
-    from mwdcal.compare import compare as side_by_side
+    from mwdcal.app import calibrating, comparison
 
-    readings, profile, _ = _load(run, tool, decimal)
-    say("every method, and each again with an eighth of the stations left out in turn")
-    found = side_by_side(readings, profile, order)
-    if as_json:
-        print_json(text.plain(found))
-    else:
-        click.echo(text.comparison(found))
+    _check_outputs([asked["report"]], [asked["run"], Path(asked["tool"] or "")])
+    readings, profile, digests = calibrating.load(asked["run"], asked["tool"], asked["decimal"])
+    result = comparison.run(asked, readings, profile, say, **digests)
+    (print_json if asked["as_json"] else click.echo)(result)
 
 
 @cli.command()
@@ -472,6 +307,25 @@ def _notation_document(
             "covariance": item.covariance.tolist(),
         }
     return document
+
+
+@cli.command()
+@fleet_options
+def fleet(**asked: Unpack[FleetAsked]) -> None:
+    """Calibrate many tools: RUNS is a Parquet table, or a folder of them, with a column `serial`.
+
+    Interrupted, the same command goes on where it was: finished parts are kept beside the output.
+
+    \b
+    Example: mwdcal fleet runs.parquet -o cals.parquet --tool servo --report fleet.html
+    Exit: 0 at least one tool calibrated, 2 input cannot be read, 3 not a single one.
+    """
+    from mwdcal.app import fleets
+
+    _check_outputs([asked["output"], asked["report"]], [asked["runs"], Path(asked["tool"] or "")])
+    sound, result = fleets.run(asked, say)
+    (print_json if asked["as_json"] else click.echo)(result)
+    sys.exit(0 if sound else fleets.REFUSED)
 
 
 @cli.command()

@@ -189,14 +189,16 @@ def _by_order(axes: Axes, rows: Sequence[OrderScore]) -> None:
     axes.plot(where, inside, "s-", color=AFTER, label="inside (interpolation)")
     axes.plot(where, noise, ":", color=BEFORE, lw=1.2, label="noise of a reading")
     axes.set_yscale("log")
-    wide = np.nanmax([inside, ends]) > 30 * np.nanmin([inside, ends])
+    wide = np.nanmax([inside, ends, noise]) > 30 * np.nanmin([inside, ends, noise])
     axes.yaxis.set_major_locator(LogLocator(subs=(1.0,) if wide else (1.0, 2.0, 5.0)))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.yaxis.set_minor_formatter(NullFormatter())
-    axes.set_xticks(where, [f"{row.order}\nchosen" if row.chosen else str(row.order) for row in rows])
+    axes.set_xticks(
+        where, [f"{row.order}\nchosen" if row.chosen else str(row.order) for row in rows]
+    )
     axes.margins(x=0.08, y=0.12)
     axes.set_xlabel("order")
-    axes.set_ylabel(f"error, {rows[0].unit}")
+    axes.set_ylabel("error, " + rows[0].unit.partition(" ")[0])
 
 
 def _stems(

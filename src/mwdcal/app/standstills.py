@@ -27,7 +27,7 @@ PATIENCE = 2.0
 """Seconds between two words on progress."""
 MOST_LINES = 40
 """Stations of a table on screen."""
-POINTS = 4000
+POINTS = 2000
 """Points of a line in the picture."""
 PICTURES = (".png", ".svg")
 LINES = ("-", (0, (5, 1.5)), (0, (1.5, 1.2)))
@@ -169,9 +169,14 @@ def _to_sd(value: float, sd: float) -> str:
 
 def picture(made: Stations, kind: str) -> bytes:
     """The log with what was taken and what was left, as PNG or SVG (`kind` the suffix)."""
-    import matplotlib as mpl
-    from matplotlib.figure import Figure
-
+    try:
+        import matplotlib as mpl
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise InputError(
+            "--plot needs matplotlib, which is not installed. Install mwdcal[report]: "
+            "pip install 'mwdcal[report]'"
+        ) from None
     triads = [t for t in CHANNELS.values() if any(name in made.traces for name in t)]
     with mpl.rc_context():
         mpl.rcdefaults()
@@ -240,7 +245,11 @@ def _shade(axes: Axes, made: Stations) -> None:
     """Taken intervals filled, left ones hatched."""
     found = made.found
     bars = np.stack([found.start, found.end - found.start], -1)
-    place = {"yrange": (0, 1), "transform": axes.get_xaxis_transform(), "zorder": 0.5}
+    place: dict[str, Any] = {
+        "yrange": (0, 1),
+        "transform": axes.get_xaxis_transform(),
+        "zorder": 0.5,
+    }
     axes.broken_barh(bars[found.taken].tolist(), fc=plots.BAND, lw=0, **place)
     left = bars[~found.taken].tolist()
     axes.broken_barh(left, fc="none", ec=plots.BEFORE, hatch="////", lw=0.4, **place)
@@ -259,7 +268,7 @@ def _number_stations(axes: Axes, made: Stations) -> None:
         )  # fmt: skip
     left = int(np.count_nonzero(~found.taken))
     axes.set_title(
-        f"{made.table.source}: {made.table.count} stations (filled, numbered), "
-        f"{left} calm intervals left (hatched)",
+        f"{made.table.source}: stations taken {made.table.count} (filled, numbered), "
+        f"calm intervals left {left} (hatched)",
         pad=12,
     )

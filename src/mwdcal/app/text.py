@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from mwdcal.calibration import Calibration, Choices, ErrorRow, Finding, OrderScore, StandErrors
-from mwdcal.compare import Comparison, Row
 from mwdcal.curves import CurveScore
 from mwdcal.notation import Notation, powers
 from mwdcal.quality import Verdict
@@ -117,17 +116,22 @@ def findings(found: list[Finding]) -> list[str]:
 def orders(scores: list[OrderScore]) -> str:
     """Error at temperatures left out of the fit, by triad and order: what chose the order."""
     word = "" if all(s.chosen for s in scores) else "chosen"
-    rows = [
-        [
-            *(s.triad, str(s.order)),
-            *(quantity(v, s.unit.partition(" ")[0]) for v in (s.error_inside, s.error_ends, s.noise)),
-            *(number(s.inside), number(s.ends), word if s.chosen else ""),
-        ]
-        for s in scores
+    rows = []
+    for s in scores:
+        values = (s.error_inside, s.error_ends, s.noise)
+        shown = [quantity(value, s.unit.partition(" ")[0]) for value in values]
+        row = [s.triad, str(s.order), number(s.inside), number(s.ends), *shown]
+        rows.append([*row, word if s.chosen else ""])
+    header = [
+        "temperatures left out",
+        "order",
+        "χ² inside",
+        "χ² ends",
+        "error inside",
+        "at the ends",
     ]
-    header = ["left-out temperatures", "order", "error inside", "at the ends", "noise"]
-    note = "rms per axis, noise included; inside: interpolation, at the ends: extrapolation"
-    return table(rows, [*header, "χ² inside", "χ² ends", ""]) + "\n" + note
+    note = "error: rms per axis, with the noise; inside: interpolation, at the ends: extrapolation"
+    return table(rows, [*header, "noise", ""]) + "\n" + note
 
 
 def curves(scores: list[CurveScore]) -> str:
@@ -155,36 +159,6 @@ def verdict(result: Verdict) -> str:
     lines = [f"{'PASS' if result.passed else 'FAIL'}   {result.run}   {result.stations} stations"]
     lines += [f"limits {result.limits} ({result.source})", f"rule: {result.rule}"]
     return "\n".join(lines) + "\n\n" + table(rows, ["", "worst", "1σ", "limit", "", "where"])
-
-
-def comparison(found: Comparison) -> str:
-    """Errors of every method on left-out stations, then the reasons for refusals and the advice."""
-    able = [row for row in found.rows if not row.refused]
-    lines = [f"{found.run}   {found.stations} stations"]
-    if able:
-        lines += ["", table(_compared(found, able), ["", *(row.method for row in able)])]
-    lines += [f"{row.method} refused: {row.refused}" for row in found.rows if row.refused]
-    lines += [
-        f"{row.method} leaves undetermined: {', '.join(row.undetermined)}"
-        for row in able
-        if row.undetermined
-    ]
-    return "\n".join([*lines, "", found.advice])
-
-
-def _compared(found: Comparison, able: list[Row]) -> list[list[str]]:
-    rows = []
-    for kind in ("held_out", "in_sample"):
-        for name, unit in found.units.items():
-            values = [quantity(getattr(row, kind).get(name), unit) for row in able]
-            label = f"{WEIGHED.get(name, name)}, rms {kind.replace('held_out', 'left out').replace('_', ' ')}"
-            rows.append([label, *values])
-    rows += [
-        [f"rank, {triad}", *("{} of {}".format(*row.ranks[triad]) for row in able)]
-        for triad in able[0].ranks
-    ]
-    rows.append(["iterations", *(str(row.iterations) for row in able)])
-    return [*rows, ["time", *(f"{row.seconds:.2f} s" for row in able)]]
 
 
 def notation(found: dict[str, Notation], reference: float | None = None) -> str:

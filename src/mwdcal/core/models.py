@@ -367,26 +367,27 @@ class Restricted:
         """Number of fitted parameters."""
         return len(self.kept)
 
-    def _full(self, params: Array) -> Array:
+    def full(self, params: Array) -> Array:
+        """Parameters (..., all) of the whole model."""
         full = np.zeros((*params.shape[:-1], self.whole.size), params.dtype)
         full[..., self.kept] = params
         return full
 
     def fields(self, params: Array, raw: Array, temperature: Array) -> Array:
         """Field vectors (..., n, 3)."""
-        return self.whole.fields(self._full(params), raw, temperature)
+        return self.whole.fields(self.full(params), raw, temperature)
 
     def slope(self, params: Array, raw: Array, temperature: Array) -> Array:
         """Derivative of the field with respect to the reading (..., n, 3, 3)."""
-        return self.whole.slope(self._full(params), raw, temperature)
+        return self.whole.slope(self.full(params), raw, temperature)
 
     def jacobian(self, params: Array, raw: Array, temperature: Array) -> Array:
         """Derivative of the field with respect to the fitted parameters (..., n, 3, p)."""
-        return self.whole.jacobian(self._full(params), raw, temperature)[..., self.kept]
+        return self.whole.jacobian(self.full(params), raw, temperature)[..., self.kept]
 
     def curvature(self, params: Array, raw: Array, temperature: Array, covector: Array) -> Array:
         """Second derivatives (..., p, p) of Σ covector (..., n, 3) · field, summed over stations."""
-        whole = self.whole.curvature(self._full(params), raw, temperature, covector)
+        whole = self.whole.curvature(self.full(params), raw, temperature, covector)
         return whole[..., self.kept, :][..., self.kept]
 
     @cached_property
@@ -400,11 +401,11 @@ class Restricted:
 
     def transformed(self, params: Array, turn: Array) -> Array:
         """Parameters near those of the model whose fields are a matrix `turn` times ours."""
-        return self.whole.transformed(self._full(params), turn)[..., self.kept]
+        return self.whole.transformed(self.full(params), turn)[..., self.kept]
 
     def with_course(self, direction: Array, power: int) -> Array:
         """A change (..., p) of the steady parameters, moved to a power of temperature."""
-        return self.whole.with_course(self._full(direction), power)[..., self.kept]
+        return self.whole.with_course(self.full(direction), power)[..., self.kept]
 
     @property
     def lead(self) -> tuple[int, ...]:

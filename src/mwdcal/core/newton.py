@@ -100,6 +100,7 @@ class Local:
 class Newton:
     """Outcome of a batch: parameters (..., p), `Status` codes and iteration counts (...).
 
+    `information` (..., p, p) is that of the observables, in units of gravity and radians.
     `cost` (..., limit + 1) begins with that of the start values, `criterion` (..., limit) is
     number 22 of each undamped step; both are NaN after the last one. `determined` says which
     directions of parameter space the stations determine; `free` (...) by name whether a turn
@@ -112,6 +113,7 @@ class Newton:
     cost: Array
     criterion: Array
     determined: Determined
+    information: Array
     free: dict[str, Bools]
 
 
@@ -246,7 +248,14 @@ def local(model: Model, params: Array, stations: Stations) -> Local:
 
 
 def determines(model: Model, params: Array, stations: Stations) -> Determined:
-    """Which directions of parameter space the stations determine, however noisy they are.
+    """Which directions of parameter space the stations determine, however noisy they are."""
+    gram, norms = geometry(model, params, stations)
+    nothing = np.zeros_like(params)
+    return Determined.by(Normal(gram, nothing, nothing[:, 0], model.size), norms)
+
+
+def geometry(model: Model, params: Array, stations: Stations) -> tuple[Array, Array]:
+    """Information (B, p, p) of what the stations compare, and norms (B, p) of the whole columns.
 
     Rows are the logarithm of |g| and the inclination; at a vertical reference, where the
     square of the latter counts, both transverse components. They are taken at readings that
@@ -260,8 +269,10 @@ def determines(model: Model, params: Array, stations: Stations) -> Determined:
     slope = model.jacobian(params, agreeing, temperature)
     rows = (_rows(target, stations) @ slope).reshape(len(slope), 3 * slope.shape[1], model.size)
     gram = np.nan_to_num(np.swapaxes(rows, -1, -2) @ rows, posinf=0.0, neginf=0.0)
-    nothing = np.zeros_like(params)
-    return Determined.by(Normal(gram, nothing, nothing[:, 0], model.size))
+    whole = slope / np.linalg.norm(target, axis=-1)[..., None, None]
+    counted = np.any(stations.used, -1)[..., None, None]
+    norms = np.sqrt(np.nan_to_num(np.sum((whole * counted) ** 2, (1, 2))))
+    return gram, norms
 
 
 def _target(g: Array, stations: Stations) -> Array:
@@ -411,5 +422,6 @@ class _Descent:
             led(self.cost),
             led(self.criterion),
             Determined(led(known.basis), led(known.values), led(known.norms), led(known.keep)),
+            led(geometry(self.model, self.params, self.stations)[0]),
             {name: led(values) for name, values in self.free(known).items()},
         )

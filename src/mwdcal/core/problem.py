@@ -17,11 +17,12 @@ Batch axis B first, station next, component last.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
 
+from mwdcal.core import fast
 from mwdcal.core.models import Model
 from mwdcal.core.solvers import Linear
 from mwdcal.core.vectors import (
@@ -179,6 +180,14 @@ class Prior:
         return np.asarray(known @ np.swapaxes(known, -1, -2) * outer)
 
 
+@dataclass
+class Memo:
+    """The last state that was predicted, and the answer: rank and step ask at the same one."""
+
+    state: State | None = None
+    predictions: list[Prediction] = field(default_factory=list)
+
+
 @dataclass(frozen=True)
 class Problem:
     """Models, readings, evidence and prior knowledge of a batch of runs."""
@@ -187,6 +196,7 @@ class Problem:
     temperature: Array
     evidence: Evidence
     prior: Prior
+    memo: Memo = field(init=False, repr=False, compare=False, default_factory=Memo)
 
     def take(self, index: Ints) -> Problem:
         """The problem of some members of the batch."""
@@ -240,8 +250,17 @@ class Problem:
         ]
         return vectors, [np.stack(columns, -1) for columns in slopes]
 
+    def targets(self, state: State) -> list[Array]:
+        """Vectors (B, n, 3) that perfect triads would read: gravity, then the field."""
+        return [np.einsum("bnij,bnj->bni", state.attitude, e) for e in self.earth(state)[0]]
+
     def predictions(self, state: State) -> list[Prediction]:
-        """Compare each triad's readings with the reference vectors."""
+        """Compare each triad's readings with the reference vectors; the last answer is kept."""
+        if self.memo.state is not state:
+            self.memo.state, self.memo.predictions = state, self._predictions(state)
+        return self.memo.predictions
+
+    def _predictions(self, state: State) -> list[Prediction]:
         vectors, slopes = self.earth(state)
         result = []
         for triad, where, earth, change in zip(
@@ -249,6 +268,13 @@ class Problem:
         ):
             params = state.params[:, where]
             target = np.einsum("bnij,bnj->bni", state.attitude, earth)
+            if fast.pays(target):
+                back, misfit, by_params = fast.responses(
+                    triad.model, params, triad.raw, self.temperature, target
+                )
+                turned = fast.turned(back, target, state.attitude, change)
+                result.append(Prediction(misfit, by_params, *turned))
+                continue
             field = triad.model.fields(params, triad.raw, self.temperature)
             back = inverse(triad.model.slope(params, triad.raw, self.temperature))
             misfit = np.einsum("bnij,bnj->bni", back, field - target)
@@ -280,11 +306,11 @@ class Problem:
         blocks = [p.by_params * w[..., None] for p, w in zip(predictions, weights, strict=True)]
         groups = np.concatenate(self._group_turns(state, turns), -1)
         constants = self._constant_columns(state, by_earth, turns, geometry)
-        design = np.concatenate([_side_by_side(blocks), constants, groups], -1)
+        shared = np.concatenate([constants, groups], -1)
         private = [turns @ self._own_turns(state, geometry), self._own_earth(state, by_earth)]
         own = np.concatenate(private, -1)
-        prior, pull = self._prior(state, design, geometry)
-        return Linear(residual, design, own, prior, pull, state.params.shape[-1])
+        prior, pull = self._prior(state, blocks, shared.shape[-1], geometry)
+        return Linear(residual, tuple(blocks), shared, own, prior, pull)
 
     def _constant_columns(
         self, state: State, by_earth: Array, turns: Array, geometry: bool
@@ -326,13 +352,15 @@ class Problem:
             ]
         return [include / t.sd for t in self.triads]
 
-    def _prior(self, state: State, design: Array, geometry: bool) -> tuple[Array, Array]:
+    def _prior(
+        self, state: State, blocks: list[Array], shared: int, geometry: bool
+    ) -> tuple[Array, Array]:
         """Precision (B, u, u) and pull (B, u) of the parameters and the shared unknowns.
 
         `geometry` asks which directions of the parameters have a prior, not how precise it is.
         """
         p, constants = state.params.shape[-1], self.evidence.constants
-        pull = np.zeros((len(design), design.shape[-1]))
+        pull = np.zeros((len(state.params), p + shared))
         pull[:, :p] = state.params - self.prior.expected
         own = np.full(pull.shape, UNKNOWN**-2)
         for index, constant in enumerate(constants):
@@ -342,7 +370,8 @@ class Problem:
         precision = own[..., None] * np.eye(own.shape[-1])
         known = self.prior.precision
         if geometry and known.any():
-            known = self.prior.informed(np.sqrt(np.sum(design[..., :p] ** 2, (1, 2))))
+            norms = [np.sqrt(np.sum(block**2, (1, 2))) for block in blocks]
+            known = self.prior.informed(np.concatenate(norms, -1))
         precision[:, :p, :p] = known
         return precision, pull
 
@@ -455,15 +484,3 @@ class Problem:
             for w in self.slices()
         ]
         return np.concatenate(parts, -1)
-
-
-def _side_by_side(blocks: list[Array]) -> Array:
-    """Block-diagonal columns: each triad's rows depend on its own parameters only."""
-    width = sum(block.shape[-1] for block in blocks)
-    rows, start = [], 0
-    for block in blocks:
-        padded = np.zeros((*block.shape[:-1], width))
-        padded[..., start : start + block.shape[-1]] = block
-        rows.append(padded)
-        start += block.shape[-1]
-    return np.concatenate(rows, -2)

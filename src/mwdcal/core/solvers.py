@@ -12,12 +12,15 @@ Shared unknowns (field strength, dip, group directions) are eliminated by a Schu
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import IntEnum
+from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
 
+from mwdcal.core import fast
 from mwdcal.core.vectors import Array, Bools, Ints, inverse
 
 RANK_TOLERANCE = 2e-2
@@ -48,22 +51,85 @@ _MESSAGES = {
 
 @dataclass(frozen=True)
 class Linear:
-    """A problem at one state: ρ (B, n, m), X (B, n, m, u), own (B, n, m, 3), prior (B, u, u).
+    """A problem at one state: ρ (B, n, m) and its columns X by u unknowns, private ones apart.
 
-    The u unknowns of X are p = `size` model parameters, then s shared ones. `prior` is their
-    precision matrix, `pull` (B, u) their departure from the prior value (zero where unknown).
+    X has the columns of each triad's parameters in `blocks`, (B, n, m_t, p_t) for the rows of that
+    triad alone, then `shared` (B, n, m, s). `own` (B, n, m, a) are the private unknowns. `prior`
+    (B, u, u) is the precision of X's unknowns, `pull` (B, u) their departure from the prior value
+    (zero where unknown).
     """
 
     residual: Array
-    design: Array
+    blocks: tuple[Array, ...]
+    shared: Array
     own: Array
     prior: Array
     pull: Array
-    size: int
+
+    @property
+    def size(self) -> int:
+        """Number p of model parameters, at the head of X."""
+        return sum(block.shape[-1] for block in self.blocks)
+
+    @cached_property
+    def design(self) -> Array:
+        """X (B, n, m, u) as one array."""
+        rows = sum(block.shape[-2] for block in self.blocks)
+        lead = self.residual.shape[:-1]
+        whole = np.zeros((*lead, rows, self.size + self.shared.shape[-1]))
+        row = column = 0
+        for block in self.blocks:
+            height, width = block.shape[-2:]
+            whole[..., row : row + height, column : column + width] = block
+            row, column = row + height, column + width
+        whole[..., self.size :] = self.shared
+        return whole
+
+    def take(self, index: Ints) -> Linear:
+        """That of some members of the batch."""
+        return self._mapped(lambda mine: mine[index])
+
+    def put(self, index: Ints, other: Linear) -> Linear:
+        """Ours with some members replaced."""
+
+        def replaced(mine: Array, theirs: Array) -> Array:
+            changed = mine.copy()
+            changed[index] = theirs
+            return changed
+
+        return self._mapped(replaced, other)
+
+    def _mapped(self, change: Callable[..., Array], *others: Linear) -> Linear:
+        """A change of every array, given the same ones of others."""
+
+        def every(name: str) -> Array:
+            return change(getattr(self, name), *(getattr(other, name) for other in others))
+
+        pairs = zip(self.blocks, *(other.blocks for other in others), strict=True)
+        return Linear(
+            every("residual"),
+            tuple(change(*pair) for pair in pairs),
+            every("shared"),
+            every("own"),
+            every("prior"),
+            every("pull"),
+        )
+
+    @property
+    def norms(self) -> Array:
+        """Column norms (B, p) of the parameters, the scale in which rank is counted."""
+        return np.concatenate([np.sqrt(np.sum(b**2, (-3, -2))) for b in self.blocks], -1)
+
+    @property
+    def cost(self) -> Array:
+        """ρᵀC⁻¹ρ over all stations, and the prior's part (B,)."""
+        weighed = self.weigh(self.residual[..., None])[..., 0]
+        pulled = np.einsum("...i,...ij,...j->...", self.pull, self.prior, self.pull)
+        return np.asarray(np.sum(self.residual * weighed, (-1, -2)) + pulled)
 
     @property
     def core(self) -> Array:
-        """(I + GᵀG)⁻¹ (B, n, 3, 3)."""
+        """(I + GᵀG)⁻¹ (B, n, a, a)."""
         gram = np.swapaxes(self.own, -1, -2) @ self.own
         return np.asarray(inverse(np.eye(gram.shape[-1]) + gram))
 
@@ -74,8 +140,14 @@ class Linear:
         )
 
     def private(self, step: Array) -> Array:
-        """Private unknowns (B, n, 3), in their prior's units, after a step of X's unknowns."""
-        moved = self.residual + np.einsum("...nmk,...k->...nm", self.design, step)
+        """Private unknowns (B, n, a), in their prior's units, after a step of X's unknowns."""
+        moved = self.residual + np.einsum("bnms,bs->bnm", self.shared, step[:, self.size :])
+        row = column = 0
+        for block in self.blocks:
+            height, width = block.shape[-2:]
+            part = np.einsum("bnmp,bp->bnm", block, step[:, column : column + width])
+            moved[..., row : row + height] += part
+            row, column = row + height, column + width
         pulled = np.swapaxes(self.own, -1, -2) @ moved[..., None]
         return np.asarray(-(self.core @ pulled)[..., 0])
 
@@ -92,9 +164,12 @@ class Normal:
     @classmethod
     def of(cls, linear: Linear) -> Normal:
         """Sum over stations, priors included."""
-        columns = np.concatenate([linear.design, linear.residual[..., None]], -1)
-        weighed = linear.weigh(columns)
-        whole = np.einsum("...nmi,...nmj->...ij", columns, weighed, optimize=True)
+        if fast.pays(linear.residual):
+            whole = fast.gram(linear.residual, linear.blocks, linear.shared, linear.own)
+        else:
+            columns = np.concatenate([linear.design, linear.residual[..., None]], -1)
+            weighed = linear.weigh(columns)
+            whole = np.einsum("...nmi,...nmj->...ij", columns, weighed, optimize=True)
         information, gradient = whole[..., :-1, :-1].copy(), whole[..., :-1, -1].copy()
         pulled = (linear.prior @ linear.pull[..., None])[..., 0]
         information += linear.prior
@@ -115,19 +190,14 @@ class Normal:
         offset = np.swapaxes(eliminate, -1, -2) @ self.gradient[..., p:, None]
         return reduced, self.gradient[..., :p] - offset[..., 0], eliminate
 
-    def norms(self) -> Array:
-        """Column norms (B, p) of the parameters, the scale in which rank is counted."""
-        diagonal = np.diagonal(self.information, axis1=-2, axis2=-1)[..., : self.size]
-        return np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
-
 
 @dataclass(frozen=True)
 class Determined:
     """Which directions of parameter space the evidence determines.
 
     `basis` (B, p, p): orthonormal directions in normalised columns, largest singular value
-    first; `values` (B, p): singular values as a share of the largest; `norms` (B, p): column
-    norms; `keep` (B, p): which are determined.
+    first; `values` (B, p): singular values as a share of the largest; `norms` (B, p): norms of
+    the whole columns, private unknowns in; `keep` (B, p): which are determined.
     """
 
     basis: Array
@@ -136,15 +206,39 @@ class Determined:
     keep: Bools
 
     @classmethod
-    def by(cls, geometry: Normal, tolerance: float = RANK_TOLERANCE) -> Determined:
-        """From the evidence's geometry: what is known, not how precisely."""
-        norms = geometry.norms()
+    def by(cls, geometry: Normal, norms: Array, tolerance: float = RANK_TOLERANCE) -> Determined:
+        """From the evidence's geometry: what is known, not how precisely.
+
+        `norms` (B, p) are those of the whole columns. What is left of a column when private
+        unknowns are taken out may be noise alone: its own norm would make much of that.
+        """
+        norms = np.where(norms > 0, norms, 1.0)
         reduced, _, _ = geometry.reduced()
         scaled = np.nan_to_num(reduced / (norms[..., :, None] * norms[..., None, :]))
         values, basis = np.linalg.eigh(scaled)
         values = np.sqrt(np.clip(values[..., ::-1], 0, None))
         values = values / np.maximum(values[..., :1], 1e-300)
         return cls(basis[..., ::-1], values, norms, values > tolerance)
+
+    @classmethod
+    def of(cls, problem: Problem, state: Any) -> Determined:
+        """Of a problem at a state."""
+        linear = problem.linear(state, geometry=True)
+        return cls.by(Normal.of(linear), linear.norms)
+
+    def take(self, index: Ints) -> Determined:
+        """That of some members of the batch."""
+        return Determined(
+            self.basis[index], self.values[index], self.norms[index], self.keep[index]
+        )
+
+    def put(self, index: Ints, other: Determined) -> Determined:
+        """Ours with some members replaced."""
+        basis, values, norms = self.basis.copy(), self.values.copy(), self.norms.copy()
+        keep = self.keep.copy()
+        basis[index], values[index], norms[index] = other.basis, other.values, other.norms
+        keep[index] = other.keep
+        return Determined(basis, values, norms, keep)
 
     @property
     def rank(self) -> Ints:
@@ -185,34 +279,78 @@ class Problem(Protocol):
 
 @dataclass
 class _Descent:
-    """Damped steps of one batch until every member has stopped."""
+    """Damped steps of one batch until every member has stopped.
+
+    All are of the members still `active`; `linear` is taken at `state`.
+    """
 
     problem: Problem
     state: Any
+    linear: Linear
+    determined: Determined
     damping: Array
-    iterations: Ints
+    active: Ints
 
-    def step(self, active: Ints) -> tuple[Bools, Bools]:
-        """One iteration of the active members: which converged, which are not finite."""
-        problem, state = self.problem.take(active), self.state.take(active)
+    @classmethod
+    def at(cls, problem: Problem, state: Any) -> _Descent:
+        """At the start."""
+        count = len(state.params)
+        determined = Determined.of(problem, state)
         linear = problem.linear(state)
+        return cls(problem, state, linear, determined, np.zeros(count), np.arange(count))
+
+    def step(self) -> tuple[Bools, Bools]:
+        """One iteration: which active members are at a minimum, and which are not finite."""
+        problem, linear = self.problem, self.linear
         normal = Normal.of(linear)
         finite = np.isfinite(normal.cost) & np.isfinite(normal.information).all((-1, -2))
         if not finite.all():
             return np.zeros_like(finite), ~finite
-        determined = Determined.by(Normal.of(problem.linear(state, geometry=True)))
-        step = _step(normal, determined, self.damping[active])
-        trial = problem.move(state, linear, step)
+        step = _step(normal, self.determined, self.damping)
+        trial = problem.move(self.state, linear, step)
+        after = problem.linear(trial)
         # the gradient holds the weights fixed, and so must the cost that judges the step
-        cost = Normal.of(replace(problem.linear(trial), own=linear.own)).cost
-        small = _small(normal, step, problem.size_of(state))
+        cost = replace(after, own=linear.own).cost
+        small = _small(normal, step, problem.size_of(self.state))
         with np.errstate(invalid="ignore"):
             better = (cost <= normal.cost * (1 + 1e-9) + 1e-9) | small
-        self.state = self.state.put(active[better], trial.take(np.flatnonzero(better)))
-        calmer = np.where(self.damping[active] < 1e-6, 0.0, self.damping[active] / 10)
-        self.damping[active] = np.where(better, calmer, np.maximum(10 * self.damping[active], 1e-3))
-        self.iterations[active] += 1
+        self._accept(trial, after, better)
+        calmer = np.where(self.damping < 1e-6, 0.0, self.damping / 10)
+        self.damping = np.where(better, calmer, np.maximum(10 * self.damping, 1e-3))
         return small & better, ~finite
+
+    def _accept(self, trial: Any, after: Linear, better: Bools) -> None:
+        if better.all():
+            self.state, self.linear = trial, after
+            return
+        which = np.flatnonzero(better)
+        self.state = self.state.put(which, trial.take(which))
+        self.linear = self.linear.put(which, after.take(which))
+
+    def settled(self, converged: Bools) -> Bools:
+        """Which converged members still have the rank that their steps were taken with.
+
+        The others go on, with the directions that are determined where they are now.
+        """
+        if not converged.any():
+            return converged
+        which = np.flatnonzero(converged)
+        now = Determined.of(self.problem.take(which), self.state.take(which))
+        same = now.rank == self.determined.rank[which]
+        if not same.all():
+            self.determined = self.determined.put(which, now)
+        settled = converged.copy()
+        settled[which] = same
+        return settled
+
+    def drop(self, stopped: Bools) -> None:
+        """Go on without some members."""
+        if not stopped.any():
+            return
+        rest = np.flatnonzero(~stopped)
+        self.problem, self.state = self.problem.take(rest), self.state.take(rest)
+        self.linear, self.determined = self.linear.take(rest), self.determined.take(rest)
+        self.damping, self.active = self.damping[rest], self.active[rest]
 
 
 def _step(normal: Normal, determined: Determined, damping: Array) -> Array:
@@ -233,14 +371,18 @@ def _small(normal: Normal, step: Array, size: Array) -> Bools:
 def gauss_newton(problem: Problem, state: Any, limit: int = 60) -> tuple[Any, Ints, Ints]:
     """Minimise a batch of problems; returns states, `Status` codes and iteration counts."""
     count = len(state.params)
-    descent = _Descent(problem, state, np.zeros(count), np.zeros(count, int))
     status = np.full(count, int(Status.NOT_CONVERGED))
-    active = np.arange(count)
+    iterations = np.zeros(count, int)
+    descent = _Descent.at(problem, state)
     for _ in range(limit):
-        converged, broken = descent.step(active)
-        status[active[converged]] = Status.OK
-        status[active[broken]] = Status.NOT_FINITE
-        active = active[~(converged | broken)]
-        if not active.size:
+        if not descent.active.size:
             break
-    return descent.state, status, descent.iterations
+        converged, broken = descent.step()
+        iterations[descent.active[~broken]] += 1
+        settled = descent.settled(converged)
+        status[descent.active[settled]] = Status.OK
+        status[descent.active[broken]] = Status.NOT_FINITE
+        stopped = settled | broken
+        state = state.put(descent.active[stopped], descent.state.take(np.flatnonzero(stopped)))
+        descent.drop(stopped)
+    return state.put(descent.active, descent.state), status, iterations

@@ -170,6 +170,8 @@ def activity(channels: Sequence[tuple[Array, Array]]) -> Activity:
     for own in cells:
         ranges = quietest_range(own.level)
         floor = noise_floor(ranges)
+        if np.quantile(ranges, QUIET) == 0:  # coarse steps: one up or down is no movement
+            ranges = np.where(ranges <= floor, 0.0, ranges)
         ranges = np.where(_torn(own), np.inf, ranges)
         value = np.maximum(value, _on_grid(edge, own, ranges) / floor)
         floors.append(floor)
@@ -282,8 +284,8 @@ def standstills(
 def summarise(time: Array, value: Array, resolution: float) -> Summary:
     """What a channel read: `time` and `value` (n,) of the samples of one standstill, n >= 2.
 
-    `resolution` is the smallest step of the channel: where noise is less than half of it, the
-    mean is known no better than to resolution/√12.
+    `resolution` is the smallest step of the channel: samples with less noise than half of
+    it hide the mean between two steps, which is then known to resolution/√12.
     """
     middle = np.median(value)
     distance = np.abs(value - middle)
@@ -296,12 +298,13 @@ def summarise(time: Array, value: Array, resolution: float) -> Summary:
     slope = float(clock @ value) / square if square > 0 else 0.0
     drift = slope * float(time[-1] - time[0])
     _, sd_steady, freedom = long_run(value - slope * clock)
+    steady = _drift_limit(freedom) * np.sqrt(12) * sd_steady
     return Summary(
         mean=mean,
-        sd=sd if float(value.std()) > resolution / 2 else float(np.hypot(sd, resolution / 12**0.5)),
+        sd=sd if value.std() > resolution / 3**0.5 else float(np.hypot(sd, resolution / 12**0.5)),
         spread=spread,
         drift=drift,
-        drifts=bool(abs(drift) > _drift_limit(freedom) * np.sqrt(12) * max(sd_steady, 0.0)),
+        drifts=abs(drift) > max(steady, resolution, 1e-12 * abs(mean)),
         used=len(value),
         spikes=len(kept) - len(value),
     )

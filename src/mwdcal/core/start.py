@@ -15,6 +15,8 @@ from mwdcal.core import observables
 from mwdcal.core.problem import Problem, State, Triad
 from mwdcal.core.vectors import Array, Bools, earth_field, earth_gravity, rotation, tool_from_earth
 
+SPANNED = 2e-3
+"""Columns of the ellipsoid with a singular value below this share of the largest are noise."""
 ANGLES = ("inclination", "azimuth", "toolface")
 
 
@@ -55,8 +57,10 @@ def _ellipsoid(x: Array, strength: Array, include: Array) -> tuple[Array, Array]
     features = np.concatenate([x[..., i] * x[..., j] * np.where(i == j, 1.0, 2.0), 2 * x], -1)
     weighed = features * include[..., None]
     gram = np.swapaxes(weighed, -1, -2) @ features
-    gram = gram + (1e-9 * np.trace(gram, axis1=-2, axis2=-1)[:, None, None] + 1e-30) * np.eye(9)
-    solution = np.linalg.solve(gram, np.sum(weighed, -2)[..., None])[..., 0]
+    size = np.sum(x * x * include[..., None], (-2, -1)) / np.sum(include, -1)
+    sphere = np.concatenate([np.eye(3)[i, j], np.zeros(3)]) / np.maximum(size, 1e-300)[:, None]
+    left = np.sum(weighed, -2) - np.einsum("bij,bj->bi", gram, sphere)
+    solution = sphere + _where_determined(gram, left)
     quadric = np.zeros((len(x), 3, 3))
     quadric[:, i, j] = solution[:, :6]
     quadric[:, j, i] = solution[:, :6]
@@ -71,6 +75,19 @@ def _ellipsoid(x: Array, strength: Array, include: Array) -> tuple[Array, Array]
     scale = np.sum(strength * include, -1) / np.maximum(np.sum(mapped * include, -1), 1e-30)
     matrix = root * scale[:, None, None]
     return matrix, -np.einsum("bij,bj->bi", matrix, centre)
+
+
+def _where_determined(gram: Array, right: Array) -> Array:
+    """Solution (B, k) of gram · x = right, zero in directions that the columns hardly span.
+
+    Noise alone would set those, and a start that is far off there looks as if it determined them.
+    The columns are of size one as they come: one that is noise alone must not be scaled up.
+    """
+    values, vectors = np.linalg.eigh(gram)
+    kept = values > SPANNED**2 * values[:, -1:]
+    along = np.einsum("bij,bi->bj", vectors, right)
+    along = np.where(kept, along / np.where(kept, values, 1.0), 0.0)
+    return np.asarray(np.einsum("bij,bj->bi", vectors, along))
 
 
 def _linear(

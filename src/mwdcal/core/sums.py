@@ -2,7 +2,7 @@
 
     E = Σ_n Σ_o w_no (o(field_n) - reference_no)²
 
-Minimised, this is no maximum of likelihood: its covariance is a sandwich (`Sums.covariance`).
+Minimised, this is no maximum of likelihood: its covariance is a sandwich (`core.uncertainty.sandwich`).
 
 "strength-squared" is |v|² of either triad, "inclination" and "toolface" are the
 accelerometer's. Shapes: batch axis B, n stations, m observables, p parameters. Singular:
@@ -42,16 +42,12 @@ class Params:
 
 @dataclass(frozen=True)
 class Sums:
-    """One triad, the observables compared with `reference` (B, n, m), and their `weights`.
-
-    `sd` (B, n, m) are the references' standard uncertainties, used for the covariance only.
-    """
+    """One triad, the observables compared with `reference` (B, n, m), and their `weights`."""
 
     triad: Triad
     temperature: Array
     names: tuple[str, ...]
     reference: Array
-    sd: Array
     weights: Array
 
     def take(self, index: Ints) -> Sums:
@@ -62,13 +58,15 @@ class Sums:
             triad=triad,
             temperature=self.temperature[index],
             reference=self.reference[index],
-            sd=self.sd[index],
             weights=self.weights[index],
         )
 
     def compared(self, params: Array) -> tuple[Array, Array, Bools]:
         """Differences (B, n, m), gradients (B, n, m, 3) by the field, and whether each counts."""
-        field = self.triad.model.fields(params, self.triad.raw, self.temperature)
+        return self.at(self.triad.model.fields(params, self.triad.raw, self.temperature))
+
+    def at(self, field: Array) -> tuple[Array, Array, Bools]:
+        """The same for given vectors (B, n, 3)."""
         errors, gradients, counts = [], [], []
         for index, name in enumerate(self.names):
             if name == STRENGTH:
@@ -97,11 +95,11 @@ class Sums:
         size = state.params.shape[-1]
         return Linear(
             error * root,
-            gradient @ jacobian * root[..., None],
+            (gradient @ jacobian * root[..., None],),
+            np.zeros((*error.shape, 0)),
             np.zeros((*error.shape, 1)),
             np.zeros((len(error), size, size)),
             np.zeros((len(error), size)),
-            size,
         )
 
     def move(self, state: Params, linear: Linear, step: Array) -> Params:
@@ -113,20 +111,21 @@ class Sums:
         largest = np.max(np.abs(state.params), -1, keepdims=True)
         return np.broadcast_to(largest, state.params.shape)
 
-    def covariance(self, params: Array) -> Array:
-        """Covariance (B, p, p) of the minimum on the determined subspace: A⁻¹ (Σ JᵀwVwJ) A⁻¹.
+    def information(self, params: Array) -> Array:
+        """Information (B, p, p) of the observables, in relative units and radians."""
+        return Normal.of(self.linear(Params(params), geometry=True)).information
 
-        V (m, m) per station is the spread of its observables, from the noise of the reading
-        and the uncertainty of the references.
+    def pulls(self, params: Array, target: Array) -> Array:
+        """Change (B, n, p, 3) of the minimum by an error of each station's whitened reading.
+
+        On the determined subspace. The observables' gradients are taken at `target` (B, n, 3), the
+        vectors that a perfect tool reads: along an unknown turn they are then exactly zero.
         """
         state = Params(params)
-        determined = Determined.by(Normal.of(self.linear(state, geometry=True)))
+        determined = Determined.of(self, state)
         bread = determined.inverse(Normal.of(self.linear(state)).information)
-        _, gradient, counted = self.compared(params)
         model, raw = self.triad.model, self.triad.raw
+        _, gradient, _ = self.at(target)
         noise = gradient @ model.slope(params, raw, self.temperature) * self.triad.sd[..., None, :]
-        own = (self.sd**2 * counted)[..., None] * np.eye(len(self.names))
-        spread = noise @ np.swapaxes(noise, -1, -2) + own
         rows = gradient @ model.jacobian(params, raw, self.temperature) * self.weights[..., None]
-        filling = np.einsum("bnip,bnij,bnjq->bpq", rows, spread, rows, optimize=True)
-        return np.asarray(bread @ filling @ bread)
+        return -bread[:, None] @ np.swapaxes(rows, -1, -2) @ noise

@@ -9,8 +9,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mwdcal.core.problem import Problem, State
-from mwdcal.core.solvers import Determined, Linear, Normal
+from mwdcal.core import fast
+from mwdcal.core.problem import GEOMETRIC_NOISE, Problem, State
+from mwdcal.core.solvers import RANK_TOLERANCE, Determined, Linear, Normal
 from mwdcal.core.vectors import AnyArray, Array, Bools, Ints, inverse, rotation
 
 SEEN = 0.05
@@ -41,17 +42,12 @@ class Analysis:
     constants: Array
 
 
-def analyse(problem: Problem, state: State) -> Analysis:
-    """Covariance, rank and residuals at a state."""
+def analyse(problem: Problem, state: State, determined: Determined | None = None) -> Analysis:
+    """Covariance, rank and residuals at a state; `determined` if it is known there already."""
     linear = problem.linear(state)
-    determined = Determined.by(Normal.of(problem.linear(state, geometry=True)))
+    determined = determined or Determined.of(problem, state)
     whole = _whole_covariance(linear, determined)
-    weighed_design = linear.weigh(linear.design)
-    residual = linear.weigh(linear.residual[..., None])[..., 0]
-    spread = linear.weigh(
-        np.broadcast_to(np.eye(residual.shape[-1]), (*residual.shape, residual.shape[-1]))
-    )
-    spread = spread - weighed_design @ whole[:, None] @ np.swapaxes(weighed_design, -1, -2)
+    residual, spread = _remaining(linear, whole)
     spread = spread * problem.evidence.include[..., None, None]
     factor, freedom = _variance_factors(residual, spread)
     p, q = linear.size, len(problem.evidence.constants)
@@ -64,6 +60,88 @@ def analyse(problem: Problem, state: State) -> Analysis:
         spread,
         whole[:, p : p + q, p : p + q],
     )
+
+
+def _remaining(linear: Linear, covariance: Array) -> tuple[Array, Array]:
+    """Whitened residuals C⁻¹ρ (B, n, m), and their covariance C⁻¹ - C⁻¹X V XᵀC⁻¹ (B, n, m, m)."""
+    if fast.pays(linear.residual):
+        parts = (linear.residual, linear.blocks, linear.shared, linear.own)
+        return fast.remaining(*parts, covariance)
+    weighed = linear.weigh(linear.design)
+    left = linear.weigh(linear.residual[..., None])[..., 0]
+    spread = linear.weigh(np.broadcast_to(np.eye(left.shape[-1]), (*left.shape, left.shape[-1])))
+    return left, spread - weighed @ covariance[:, None] @ np.swapaxes(weighed, -1, -2)
+
+
+def determined_apart(problem: Problem, state: State, own: dict[int, Array]) -> Determined:
+    """Which directions are determined when some triads are fitted to less than all evidence.
+
+    `own` (B, p_t, p_t), by triad, is the information of what those are fitted to, in relative
+    units and radians. The other triad follows them: what is free in them is free in both, however
+    much its own evidence would say of it.
+    """
+    linear = problem.linear(state, geometry=True)
+    whole, _, _ = Normal.of(linear).reduced()
+    slices, found = problem.slices(), np.zeros_like(whole)
+    for index, where in enumerate(slices):
+        ours = own.get(index)
+        found[:, where, where] = (
+            whole[:, where, where] if ours is None else ours / GEOMETRIC_NOISE**2
+        )
+    if len(own) < len(slices):
+        (first, second), norms = slices, linear.norms
+        outer = norms[:, :, None] * norms[:, None, :]
+        scaled = whole / np.where(outer > 0, outer, 1.0)
+        cross, block = scaled[:, second, first], scaled[:, second, second]
+        back = np.linalg.pinv(block, rcond=RANK_TOLERANCE**2, hermitian=True)
+        follow = np.swapaxes(cross, -1, -2) @ back
+        found[:, first, first] += follow @ cross * outer[:, first, first]
+        found[:, second, first] = follow_back = block @ back @ cross * outer[:, second, first]
+        found[:, first, second] = np.swapaxes(follow_back, -1, -2)
+    nothing = np.zeros_like(state.params)
+    return Determined.by(Normal(found, nothing, nothing[:, 0], linear.size), linear.norms)
+
+
+def sandwich(problem: Problem, state: State, pulls: dict[int, Array]) -> tuple[Array, Array]:
+    """Covariance (B, p, p) and that of the constants (B, q, q) when triads minimise sums of their own.
+
+    `pulls` (B, n, p_t, 3), by triad, is how an error of a station's whitened reading moves those.
+    All other unknowns then follow as in the likelihood, those being held. Every error is counted
+    with all that it does: of the readings, of the stand (in C = I + GGᵀ), of common references.
+    """
+    linear = problem.linear(state)
+    design, weighed, u = linear.design, linear.weigh(linear.design), linear.prior.shape[-1]
+    moved = np.zeros((*design.shape[:2], u, design.shape[2]))
+    fixed = np.zeros(u, bool)
+    for index, pull in pulls.items():
+        where = problem.slices()[index]
+        moved[:, :, where, 3 * index : 3 * index + 3] = pull
+        fixed[where] = True
+    rest = ~fixed
+    whole = np.einsum("bnmi,bnmj->bij", design, weighed, optimize=True)
+    back = _inverse_where_known((whole + linear.prior)[:, rest][:, :, rest])
+    follow = whole[:, rest][:, :, fixed]
+    own = np.swapaxes(weighed[..., rest], -1, -2)
+    moved[:, :, rest] = -back[:, None] @ (follow[:, None] @ moved[:, :, fixed] + own)
+    noise = np.eye(design.shape[2]) + linear.own @ np.swapaxes(linear.own, -1, -2)
+    covariance = np.einsum("bnim,bnmk,bnjk->bij", moved, noise, moved, optimize=True)
+    p, constants = linear.size, problem.evidence.constants
+    for column in [p + i for i, c in enumerate(constants) if not c.unknown]:
+        common = np.zeros((len(moved), u))
+        common[:, fixed] = -np.einsum("bnim,bnm->bi", moved[:, :, fixed], design[..., column])
+        pulled = np.einsum("bij,bj->bi", follow, common[:, fixed]) + linear.prior[:, rest, column]
+        common[:, rest] = -np.einsum("bij,bj->bi", back, pulled)
+        spread = common[:, :, None] * common[:, None, :]
+        covariance = covariance + spread / linear.prior[:, column, column, None, None]
+    q = len(constants)
+    return covariance[:, :p, :p], covariance[:, p : p + q, p : p + q]
+
+
+def _inverse_where_known(information: Array) -> Array:
+    """Inverse (B, k, k) of an information matrix, zero along directions that it says nothing of."""
+    scale = np.sqrt(np.maximum(np.diagonal(information, axis1=-2, axis2=-1), 1e-300))
+    outer = scale[:, :, None] * scale[:, None, :]
+    return np.asarray(np.linalg.pinv(information / outer, rcond=1e-12, hermitian=True) / outer)
 
 
 def _whole_covariance(linear: Linear, determined: Determined) -> Array:
@@ -176,15 +254,12 @@ def marginal_rank(determined: Determined, where: slice) -> Ints:
     return np.asarray(where.stop - where.start - np.sum(seen > SEEN, -1))
 
 
-def settle_gauge(problem: Problem, state: State) -> State:
+def settle_gauge(problem: Problem, state: State, determined: Determined) -> State:
     """Put free directions where they belong by convention, whatever solver or model came here.
 
     Free rotation: the gain's polar factor has none. Free scale: the mean strength of the field
     is the nominal one.
     """
-    if not len(state.params):
-        return state
-    determined = Determined.by(Normal.of(problem.linear(state, geometry=True)))
     every = list(range(len(problem.triads)))
     for triads in [every] + [[t] for t in every if len(every) > 1]:
         named = candidates(problem, state, triads)

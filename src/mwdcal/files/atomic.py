@@ -5,18 +5,30 @@ from __future__ import annotations
 import contextlib
 import os
 import secrets
+from collections.abc import Iterator
 from pathlib import Path
+from typing import IO
 
 from mwdcal.errors import InputError
 
 
 def write(path: str | os.PathLike[str], data: bytes | str) -> None:
     """Write `data` (text as UTF-8) to `path`, which is replaced as a whole or not at all."""
-    file = target(path)
     content = data.encode("utf-8", "backslashreplace") if isinstance(data, str) else data
+    with replacing(path) as stream:
+        stream.write(content)
+
+
+@contextlib.contextmanager
+def replacing(path: str | os.PathLike[str]) -> Iterator[IO[bytes]]:
+    """A new file to write to, which replaces `path` when the block ends without an error."""
+    file = target(path)
     temporary = file.with_name(f".mwdcal-{secrets.token_hex(8)}.tmp")
     try:
-        _write_through(temporary, content)
+        with temporary.open("xb") as stream:
+            yield stream
+            stream.flush()
+            os.fsync(stream.fileno())  # wait until it is on the disk
         temporary.replace(file)
     except OSError as error:
         raise _refusal(path, error) from error
@@ -40,14 +52,6 @@ def target(path: str | os.PathLike[str]) -> Path:
             "Create it, or name another folder."
         )
     return file
-
-
-def _write_through(path: Path, content: bytes) -> None:
-    """Write a new file and wait until it is on the disk."""
-    with path.open("xb") as stream:
-        stream.write(content)
-        stream.flush()
-        os.fsync(stream.fileno())
 
 
 def _remove(path: Path) -> None:

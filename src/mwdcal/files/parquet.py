@@ -12,19 +12,19 @@ import numpy as np
 from mwdcal.errors import InputError
 from mwdcal.files.columns import LABELS, Column, Parts, as_text, check_names, no_stations
 
-_KEY = b"mwdcal"
+KEY = b"mwdcal"
 _MAX_CELLS = 100_000_000
 _PANDAS_INDEX = re.compile(r"__index_level_\d+__")
 
 
 def parse(data: bytes, source: str, delimiter: str | None = None) -> Parts:
     """The table in the bytes of a Parquet file; `delimiter` has no meaning here."""
-    arrow, parquet = _modules(source)
+    arrow, parquet = modules(source)
     try:
         file = parquet.ParquetFile(arrow.BufferReader(data))
         rows, names = file.metadata.num_rows, list(file.schema_arrow.names)
     except Exception as error:
-        raise _unreadable(source, error) from error
+        raise unreadable(source, error) from error
     check_names(names, source)
     if rows == 0:
         raise no_stations(source)
@@ -36,27 +36,28 @@ def parse(data: bytes, source: str, delimiter: str | None = None) -> Parts:
     try:
         table = file.read(use_pandas_metadata=False)
         columns = {
-            name: _column(name, table.column(name), arrow)
+            name: as_column(name, table.column(name), arrow)
             for name in names
             if not _PANDAS_INDEX.fullmatch(name)
         }
     except Exception as error:
-        raise _unreadable(source, error) from error
-    return Parts(columns, _metadata(table.schema.metadata, source), range(1, rows + 1))
+        raise unreadable(source, error) from error
+    return Parts(columns, metadata_of(table.schema.metadata, source), range(1, rows + 1))
 
 
 def render(columns: Mapping[str, Column], metadata: Mapping[str, object], source: str) -> bytes:
     """The bytes that `parse` turns back into the same columns and metadata."""
-    arrow, parquet = _modules(source)
+    arrow, parquet = modules(source)
     arrays = {name: _array(column, arrow) for name, column in columns.items()}
-    described = {_KEY: msgspec.json.encode(metadata, enc_hook=str)}
+    described = {KEY: msgspec.json.encode(metadata, enc_hook=str)}
     table = arrow.table(arrays).replace_schema_metadata(described)
     stream = arrow.BufferOutputStream()
     parquet.write_table(table, stream)
     return bytes(stream.getvalue())
 
 
-def _modules(source: str) -> tuple[Any, Any]:
+def modules(source: str) -> tuple[Any, Any]:
+    """PyArrow and its Parquet module, or what to install."""
     try:
         import pyarrow
         import pyarrow.parquet
@@ -68,7 +69,7 @@ def _modules(source: str) -> tuple[Any, Any]:
     return pyarrow, pyarrow.parquet
 
 
-def _unreadable(source: str, error: Exception) -> InputError:
+def unreadable(source: str, error: Exception) -> InputError:
     """Whatever the reader raises on a foreign or damaged file means the same to the user."""
     reason = (str(error).strip() or type(error).__name__).splitlines()[0][:120]
     return InputError(
@@ -77,7 +78,7 @@ def _unreadable(source: str, error: Exception) -> InputError:
     )
 
 
-def _column(name: str, cells: Any, arrow: Any) -> Column:
+def as_column(name: str, cells: Any, arrow: Any) -> Column:
     """A column as floats (blank: NaN) where it is numeric, else as text."""
     if arrow.types.is_dictionary(cells.type):
         cells = cells.cast(cells.type.value_type)
@@ -95,9 +96,10 @@ def _array(column: Column, arrow: Any) -> Any:
     return arrow.array(column, arrow.float64(), from_pandas=True)
 
 
-def _metadata(schema: Mapping[bytes, bytes] | None, source: str) -> dict[str, object]:
+def metadata_of(schema: Mapping[bytes, bytes] | None, source: str) -> dict[str, object]:
+    """What a file's schema says of it."""
     try:
-        return msgspec.json.decode((schema or {}).get(_KEY, b"{}"), type=dict[str, object])
+        return msgspec.json.decode((schema or {}).get(KEY, b"{}"), type=dict[str, object])
     except (ValueError, RecursionError) as error:
         raise InputError(
             f"{source}: the metadata under the schema key 'mwdcal' must be a JSON object "

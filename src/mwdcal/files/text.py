@@ -5,11 +5,12 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import takewhile
+from itertools import chain, takewhile
+from typing import NamedTuple
 
 from mwdcal.errors import InputError
 from mwdcal.files import metadata as meta
-from mwdcal.files.columns import Column, Parts, assemble, number
+from mwdcal.files.columns import Column, Parts, assemble, check_names, number
 
 _LONGEST_LINE = 100_000
 _MAX_LINES = 1_000_000
@@ -44,6 +45,41 @@ def parse(data: bytes, source: str, delimiter: str | None = None) -> Parts:
     return Parts(columns, metadata, numbers)
 
 
+class Head(NamedTuple):
+    """What stands above the rows of a text table, and the rest of the piece it was read from."""
+
+    names: list[str]
+    metadata: dict[str, object]
+    delimiter: str
+    lines: int
+    body: bytes
+
+
+def head(data: bytes, source: str, delimiter: str | None = None) -> Head:
+    """The head of a text table of which `data` is the beginning, whole lines."""
+    lines = _lines(data, source)
+    comments = list(takewhile(_is_preamble, lines))
+    metadata = meta.parse([(i, _comment(line)) for i, line in enumerate(comments, 1)], source)
+    start = len(comments)
+    header = lines[start : start + 1]
+    delimiter = delimiter or (_delimiter(header[0], source) if header else ",")
+    cells = next(_rows(header, start, delimiter, source), (start + 1, ()))[1]
+    names = [str(cell).strip() for cell in cells]
+    check_names(names, f"{source}, line {start + 1}")
+    return Head(names, metadata, delimiter, start + 1, "\n".join(lines[start + 1 :]).encode())
+
+
+def rows(data: bytes, top: Head, above: int, source: str) -> Parts:
+    """The rows of a piece of a text table, whole lines with `above` lines of the file before."""
+    columns: dict[str, Column] = {name: [] for name in top.names}
+    if not data.strip(top.delimiter.encode() + b" \t\r\n"):
+        return Parts(columns, {}, ())
+    entries = _rows(_lines(data, source, above), above, top.delimiter, source)
+    _, cells, numbers = assemble(chain([(above, top.names)], entries), source, "line")
+    texts = [[str(cell) for cell in column] for column in zip(*cells, strict=True)]
+    return Parts(dict(zip(columns, texts, strict=True)), {}, numbers)
+
+
 def render(columns: Mapping[str, Column], metadata: Mapping[str, object], delimiter: str) -> str:
     """The text that `parse` turns back into the same columns and metadata."""
     stream = io.StringIO()
@@ -66,10 +102,11 @@ def _cells(name: str, column: Column) -> list[str]:
     return column
 
 
-def _lines(data: bytes, source: str) -> list[str]:
-    """The lines of the file, without their ends, blank lines at the end left out."""
-    _refuse_foreign(data, source)
-    content = _decoded(data, source).replace("\r\n", "\n").replace("\r", "\n").rstrip("\n")
+def _lines(data: bytes, source: str, above: int = 0) -> list[str]:
+    """The lines without their ends, blank ones at the end left out; `above` lines came before."""
+    if not above:
+        _refuse_foreign(data, source)
+    content = _decoded(data, source, above).replace("\r\n", "\n").replace("\r", "\n").rstrip("\n")
     if not content.strip():
         raise InputError(
             f"{source}: the file is empty. A run file needs a line with the column names, "
@@ -82,7 +119,7 @@ def _lines(data: bytes, source: str) -> list[str]:
             "Split it, or write long tables as Parquet."
         )
     lines = content.split("\n")
-    for position, line in enumerate(lines, 1):
+    for position, line in enumerate(lines, above + 1):
         if len(line) > _LONGEST_LINE:
             raise InputError(
                 f"{source}, line {position}: a line must have at most {_LONGEST_LINE} "
@@ -97,19 +134,19 @@ def _refuse_foreign(data: bytes, source: str) -> None:
             raise InputError(f"{source}: expected a text table; the file is {kind}. {advice}")
 
 
-def _decoded(data: bytes, source: str) -> str:
+def _decoded(data: bytes, source: str, above: int) -> str:
     """The text; every refusal names the line of the first offending byte."""
     position = data.find(b"\0")
     if position >= 0:
         raise InputError(
-            f"{source}, line {_line_of(data, position)}: expected text; got a NUL byte. The "
+            f"{source}, line {above + _line_of(data, position)}: expected text; got a NUL byte. The "
             "file is binary or UTF-16: save the table as UTF-8 text."
         )
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(
-            f"{source}, line {_line_of(data, error.start)}: expected UTF-8 text; got byte "
+            f"{source}, line {above + _line_of(data, error.start)}: expected UTF-8 text; got byte "
             f"0x{data[error.start]:02X}. Save the file as UTF-8 (in Excel: 'CSV UTF-8')."
         ) from None
 

@@ -1,0 +1,119 @@
+"""`mwdcal calibrate`, step by step: read, choose, fit, write, and what is said of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypedDict
+
+import msgspec
+import numpy as np
+
+from mwdcal.app import text
+from mwdcal.app.choices import Chosen, Typed, choose
+from mwdcal.calibrate import calibrate
+from mwdcal.calibration import Calibration
+from mwdcal.errors import InputError
+from mwdcal.files import documents, profiles, runs, table
+from mwdcal.predict import typical_accuracy
+from mwdcal.profile import Profile
+from mwdcal.readings import Readings
+
+
+class Digests(TypedDict):
+    """What the calibration file says about its sources."""
+
+    profile_sha256: str
+    run_sha256: str
+
+
+def load(run: Path, tool: str | None, decimal: str) -> tuple[Readings, Profile, Digests]:
+    """A run with its tool profile, and the digests of both files."""
+    profile, profile_sha256 = profiles.load_profile(tool)
+    read = table.read(run, decimal=decimal)
+    readings, profile = runs.to_readings(read, profile)
+    digests = Digests(profile_sha256=profile_sha256, run_sha256=read.digest)
+    return readings, profile, digests
+
+
+def run(
+    source: Path,
+    tool: str | None,
+    exclude: tuple[str, ...],
+    decimal: str,
+    typed: Typed,
+    say: Callable[[str], None],
+) -> tuple[Chosen, Calibration]:
+    """What was chosen for a run, and its calibration."""
+    readings, profile, digests = load(source, tool, decimal)
+    readings = without(readings, exclude)
+    chosen = choose(readings, profile, typed, say)
+    return chosen, calibrate(readings, profile, chosen.options, orders=chosen.orders, **digests)
+
+
+def without(readings: Readings, exclude: tuple[str, ...]) -> Readings:
+    """The readings less the stations of these labels."""
+    twice = [label for label in exclude if readings.station.count(label) > 1]
+    if twice:
+        raise InputError(
+            f"--exclude {twice[0]}: {readings.station.count(twice[0])} stations of {readings.source} "
+            "have this label. Give each its own in the column 'station'."
+        )
+    missing = [label for label in exclude if label not in readings.station]
+    if missing:
+        raise InputError(
+            f"--exclude {missing[0]}: no such station in {readings.source}; "
+            f"stations are {readings.station[0]} … {readings.station[-1]}."
+        )
+    return readings.select(np.array([label not in exclude for label in readings.station]))
+
+
+def write(made: Calibration, output: Path, report: Path | None) -> None:
+    """The report, if asked for, then the calibration file."""
+    if report:
+        from mwdcal.app.report import write_report
+
+        write_report(report, made)
+    documents.write(output, made)
+
+
+def summary(made: Calibration, chosen: Chosen, output: Path, report: Path | None) -> dict[str, Any]:
+    """The result for machines."""
+    named = ("rank", "size", "undetermined", "variance_factor")
+    return {
+        "run": made.run,
+        "stations": made.stations,
+        "method": made.method,
+        "triads": {t.name: {n: getattr(t, n) for n in named} for t in made.triads},
+        "errors": made.errors,
+        "accuracy_1sigma_deg": typical_accuracy(made),
+        "constants": made.constants,
+        "stand": made.stand,
+        "findings": made.findings,
+        "orders": made.orders,
+        "nonlinearity": [msgspec.to_builtins(score) for score in chosen.curves],
+        "calibration": str(output),
+        "report": str(report or ""),
+    }
+
+
+def screen(made: Calibration, chosen: Chosen, output: Path, report: Path | None) -> str:
+    """The result for people."""
+    tables = [
+        text.heading(made),
+        *([text.orders(made.orders)] if made.orders else []),
+        *([text.curves(chosen.curves)] if chosen.curves else []),
+        text.errors(made.errors),
+    ]
+    accuracy = "  ".join(
+        f"{n} {text.number(v)}{'°' if v is not None else ''}"
+        for n, v in typical_accuracy(made).items()
+    )
+    lines = [f"accuracy to expect (1σ, calibration alone, typical): {accuracy}"]
+    for constant in made.constants:
+        value = f"{constant.value:.6g} ± {constant.standard_uncertainty:.2g} {constant.unit}"
+        lines.append(f"estimated constant of the run: {constant.name} {value}")
+    lines += text.stand(made.stand) + text.findings(made.findings)
+    wrote = f"wrote {output} (calibration)" + (f"   {report} (report)" if report else "")
+    lines.append(f"{wrote}   next: mwdcal verify {output} ROLLTEST.csv")
+    return "\n\n".join([*tables, "\n".join(lines)])

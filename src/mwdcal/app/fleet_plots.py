@@ -1,0 +1,83 @@
+"""Figures of a fleet's summary page: distributions of parameters, residuals and accuracy."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mwdcal.app import plots
+from mwdcal.core.vectors import Array
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#4b5563")
+DASHES: tuple[Any, ...] = ("-", "--", ":", "-.", (0, (5, 1)), (0, (1, 1)))
+BINS = (12, 40)
+"""Fewest and most bins: as many as half the root of the number of tools."""
+KINDS = {
+    "gain": ("own-axis gain", "cross-axis gain"),
+    "scale": ("scale", ""),
+    "misalignment": ("", "misalignment"),
+    "offset": ("offset", ""),
+    "bias": ("bias", ""),
+}
+"""Titles of panels: of one axis, and of two."""
+
+
+def parameters(found: Sequence[Any]) -> str:
+    """Number of tools by value of each steady parameter: a row of panels for each triad."""
+    panels: dict[str, dict[str, list[Any]]] = {}
+    for each in found:
+        kind, _, axes = each.title.partition(" ")
+        title = KINDS[kind][len(set(axes)) > 1]
+        panels.setdefault(each.triad, {}).setdefault(title, []).append(each)
+    with plots._style():
+        figure = plots._figure(2.1 * len(panels))
+        columns = max(len(own) for own in panels.values())
+        grid = figure.subplots(len(panels), columns, squeeze=False)
+        for row, (triad, own) in zip(grid, panels.items(), strict=True):
+            row[0].set_ylabel("tools")
+            for axes, (title, members) in zip(row, own.items(), strict=False):
+                axes.set_title(f"{triad}: {title}")
+                _steps(axes, {m.title.partition(" ")[2]: m.values for m in members})
+                unit = members[0].unit
+                axes.set_xlabel(unit or "share of nominal")
+        return plots._svg(figure, "parameters", "Distributions of the fleet's parameters")
+
+
+def quality(residuals: Mapping[str, Array], accuracy: Mapping[str, Array]) -> str:
+    """Number of tools by residuals over noise, and by 1σ of each angle."""
+    with plots._style():
+        figure = plots._figure(2.2)
+        left, right = figure.subplots(1, 2)
+        left.set_ylabel("tools")
+        left.set_title("residuals ÷ what the noise lets one expect, s")
+        left.set_xlabel("s")
+        _steps(left, residuals)
+        right.set_title("1σ of the calibration at 45° inclination")
+        right.set_xlabel("1σ, °")
+        _steps(right, accuracy)
+        return plots._svg(figure, "quality", "Distributions of residuals and accuracy")
+
+
+def _steps(axes: Axes, series: Mapping[str, Array]) -> None:
+    """Step histograms over common bins, each with its own colour and dash."""
+    usable = {name: values[np.isfinite(values)] for name, values in series.items()}
+    usable = {name: values for name, values in usable.items() if values.size}
+    if not usable:
+        axes.text(0.5, 0.5, "undetermined", ha="center", va="center", transform=axes.transAxes)
+        return
+    every = np.concatenate(list(usable.values()))
+    low, high = np.quantile(every, (0.001, 0.999))
+    margin = 0.05 * (high - low) or max(abs(high), 1e-9) * 1e-3
+    most = max(values.size for values in usable.values())
+    edges = np.linspace(low - margin, high + margin, int(np.clip(most**0.5 / 2, *BINS)) + 1)
+    for (name, values), colour, dash in zip(usable.items(), COLOURS, DASHES, strict=False):
+        counts, _ = np.histogram(values, edges)
+        axes.stairs(counts, edges, label=name, color=colour, ls=dash, lw=1.0)
+    rows = -(-len(usable) // 3)
+    axes.legend(ncols=3, loc="upper left", handlelength=2.2, columnspacing=1.0)
+    axes.set_ylim(bottom=0, top=axes.get_ylim()[1] * (1.1 + 0.15 * rows))

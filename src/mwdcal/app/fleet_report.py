@@ -1,0 +1,226 @@
+"""The summary page of a fleet: statuses, distributions, outliers, in one HTML file.
+
+It reads the table of calibrations column by column, whatever its length.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mwdcal.app import fleet_plots, report
+from mwdcal.app.fleet_summary import Summary, column
+from mwdcal.core.vectors import Array, Ints
+from mwdcal.files import atomic, parquet
+from mwdcal.files.fleet_tables import SERIAL
+from mwdcal.fleet import FACTS, OK
+from mwdcal.readings import TRIADS
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
+
+FAR = 6.0
+"""Robust standard deviations from the fleet's median beyond which a tool is an outlier."""
+FEWEST = 20
+"""Sound tools without which there is no fleet to be an outlier of."""
+SPREAD = 1.4826
+"""Standard deviation of a normal variable by its median absolute deviation."""
+SUSPECT = 3.0
+"""Residuals of more than this many times the noise are worth a look."""
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A column of parameters over the sound tools."""
+
+    triad: str
+    title: str
+    unit: str
+    values: Array
+    sd: float
+
+    @property
+    def quantiles(self) -> tuple[float, float, float]:
+        """1 %, median and 99 %."""
+        low, middle, high = np.quantile(self.values, (0.01, 0.5, 0.99))
+        return float(low), float(middle), float(high)
+
+
+@dataclass(frozen=True)
+class Outlier:
+    """A tool far from the fleet: its farthest column."""
+
+    serial: Any
+    title: str
+    value: float
+    median: float
+    unit: str
+    distance: float
+
+
+def environment() -> Environment:
+    """The templates; refuses, before any work, where what draws the page is missing."""
+    return report._environment()
+
+
+def write_report(path: str | os.PathLike[str], calibrations: Path, summary: Summary) -> None:
+    """Write the page; the old file or the new one exists at any moment, never a part."""
+    atomic.write(path, render(calibrations, summary))
+
+
+def render(calibrations: Path, summary: Summary) -> str:
+    """The page as HTML: the same table gives the same text but for the time it took."""
+    template = environment().get_template("fleet.html")
+    metadata = _metadata(calibrations)
+    sound = np.flatnonzero(_text(calibrations, "status") == OK)
+    units = _text(calibrations, "field_unit")[sound]
+    field = "nT" if (units == "nT").all() else "nT or field = 1"
+    parameters = _parameters(calibrations, sound, field) if sound.size else []
+    return template.render(
+        found=summary,
+        metadata=metadata,
+        simulated=str(metadata.get("simulated", "")).lower() not in ("", "0", "false", "no"),
+        banner=_banner(summary),
+        facts=_facts(summary, metadata),
+        figures=_figures(calibrations, parameters, sound),
+        parameters=parameters,
+        outliers=_outliers(calibrations, parameters, sound),
+        suspects=_suspects(calibrations, sound),
+        far=FAR,
+        fewest=FEWEST,
+        suspect=SUSPECT,
+    )
+
+
+def _metadata(path: Path) -> Mapping[str, object]:
+    _, pq = parquet.modules(path.name)
+    return parquet.metadata_of(pq.read_schema(path).metadata, path.name)
+
+
+def _text(path: Path, name: str) -> Any:
+    _, pq = parquet.modules(path.name)
+    return np.array(pq.read_table(path, columns=[name]).column(0).to_pylist(), object)
+
+
+def _banner(summary: Summary) -> dict[str, str]:
+    """The result in one sentence."""
+    refused = summary.tools - summary.sound
+    level = "good" if not refused else "attention" if summary.sound else "bad"
+    word = {"good": "All calibrated", "attention": "Some refused", "bad": "None calibrated"}[level]
+    after = "Every tool has parameters with their uncertainty."
+    if refused:
+        after = f"{report.plural(refused, 'tool')} without a result: see the reasons below."
+    headline = f"{summary.sound} of {report.plural(summary.tools, 'tool')} calibrated"
+    return {"level": level, "word": word, "headline": headline, "after": after}
+
+
+def _facts(summary: Summary, metadata: Mapping[str, object]) -> list[tuple[str, str]]:
+    profile = str(metadata.get("profile", ""))
+    found = [
+        ("method", summary.method),
+        ("stations", str(summary.stations)),
+        ("order", str(summary.order)),
+        ("profile", profile),
+    ]
+    if summary.order:
+        found.append(("τ", f"temperature − {metadata.get('reference_temperature_c')} °C"))
+    return found
+
+
+def _parameters(path: Path, sound: Ints, field: str) -> list[Parameter]:
+    """All columns of parameters, with units that people use."""
+    _, pq = parquet.modules(path.name)
+    found = []
+    for name in pq.read_schema(path).names:
+        triad = next((t for t in TRIADS if name.startswith(f"{t}_")), "")
+        rest = name.removeprefix(f"{triad}_")
+        if not triad or rest.endswith("_sd") or rest in (*FACTS, "undetermined"):
+            continue
+        sd = column(path, f"{name}_sd")[sound]
+        unit, factor = _unit(rest, triad, field)
+        middle = float(np.nanmedian(sd)) * factor if not np.isnan(sd).all() else float("nan")
+        found.append(
+            Parameter(triad, _title(rest), unit, column(path, name)[sound] * factor, middle)
+        )
+    return found
+
+
+def _unit(name: str, triad: str, field: str) -> tuple[str, float]:
+    """Unit and factor of a parameter: offsets in mg or nT, the rest as shares of nominal."""
+    kind, _, rest = name.partition("_")
+    power = rest.partition("_t")[2]
+    per = f"/°C{power if int(power) > 1 else ''}" if power else ""
+    if kind in ("offset", "bias"):
+        return (f"mg{per}", 1e3) if triad == TRIADS[0] else (f"{field}{per}", 1.0)
+    return per.replace("/", "1/"), 1.0
+
+
+def _title(name: str) -> str:
+    """The parameter as its calibration file calls it.
+
+    >>> _title("gain_xy_t1")
+    'gain xy·τ'
+    """
+    steady, _, power = name.partition("_t")
+    course = f"·τ{power if power > '1' else ''}" if power else ""
+    return steady.replace("_", " ") + course
+
+
+def _figures(path: Path, parameters: list[Parameter], sound: Ints) -> dict[str, str]:
+    if not sound.size:
+        return {}
+    quality = {}
+    for triad in dict.fromkeys(p.triad for p in parameters):
+        quality[f"{triad} s"] = np.sqrt(column(path, f"{triad}_variance_factor")[sound])
+    accuracy = {
+        angle: column(path, f"{angle}_sd_deg")[sound]
+        for angle in ("inclination", "toolface", "azimuth")
+        if angle != "azimuth" or len(quality) > 1
+    }
+    steady = [p for p in parameters if "τ" not in p.title]
+    return {
+        "parameters": fleet_plots.parameters(steady),
+        "quality": fleet_plots.quality(quality, accuracy),
+    }
+
+
+def _outliers(path: Path, parameters: list[Parameter], sound: Ints) -> list[Outlier]:
+    """Tools of which some parameter is far from the fleet's, the farthest first."""
+    if len(sound) < FEWEST:
+        return []
+    distance, which = np.zeros(len(sound)), np.zeros(len(sound), int)
+    for index, each in enumerate(parameters):
+        away = np.abs(each.values - np.median(each.values))
+        spread = SPREAD * np.median(away)
+        mine = away / spread if spread > 0 else np.zeros(len(sound))
+        which = np.where(mine > distance, index, which)
+        distance = np.maximum(mine, distance)
+    far = np.argsort(-distance, kind="stable")[: int(np.sum(distance > FAR))]
+    serials = _text(path, SERIAL)
+    found = []
+    for place in far:
+        each = parameters[which[place]]
+        title = f"{each.triad} {each.title}"
+        middle = float(np.median(each.values))
+        value = float(each.values[place])
+        serial = serials[sound[place]]
+        found.append(Outlier(serial, title, value, middle, each.unit, float(distance[place])))
+    return found
+
+
+def _suspects(path: Path, sound: Ints) -> list[tuple[Any, str, float]]:
+    """Sound tools with large residuals: serial, triad, s; the largest first."""
+    serials = _text(path, SERIAL)
+    _, pq = parquet.modules(path.name)
+    names = pq.read_schema(path).names
+    found = []
+    for triad in TRIADS:
+        if f"{triad}_variance_factor" in names:
+            s = np.sqrt(column(path, f"{triad}_variance_factor")[sound])
+            found += [(serials[sound[i]], triad, float(s[i])) for i in np.flatnonzero(s > SUSPECT)]
+    return sorted(found, key=lambda row: -row[2])

@@ -1,0 +1,181 @@
+"""What came of a fleet: counts, spreads and undetermined directions, for people and machines.
+
+The table of calibrations is read column by column, whatever its length.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from mwdcal.app.fleet_asked import Asked
+from mwdcal.app.text import number, table
+from mwdcal.core.vectors import Array
+from mwdcal.files import parquet
+from mwdcal.files.fleet_tables import SERIAL
+from mwdcal.fleet import OK
+
+SHOWN = 5
+"""Most serials that a line names."""
+SPAN = 10.0
+"""A run that spans more without temperature terms is mentioned, °C."""
+
+
+@dataclass(frozen=True)
+class Kind:
+    """Tools of one status: how many, the first serials, and one message."""
+
+    status: str
+    tools: int
+    serials: list[Any]
+    message: str
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What came of a fleet. `spread` has the 1 %, 50 % and 99 % point of columns of sound tools."""
+
+    runs: str
+    output: str
+    tools: int
+    stations: int
+    method: str
+    order: int
+    statuses: list[Kind]
+    spread: dict[str, list[float]]
+    undetermined: dict[str, int]
+    parts: int
+    parts_done_before: int
+    seconds: float
+    notes: list[str]
+
+    @property
+    def sound(self) -> int:
+        """Number of calibrated tools."""
+        return sum(kind.tools for kind in self.statuses if kind.status == OK)
+
+
+def summarise(
+    asked: Asked, target: Path, stations: int, parts: int, before: int, seconds: float
+) -> Summary:
+    """What the output says, read column by column."""
+    _, pq = parquet.modules(target.name)
+    head = pq.read_table(target, columns=[SERIAL, "status", "message"])
+    names = pq.read_schema(target).names
+    ends = ("_sd_deg", "_variance_factor")
+    spread = {n: _quantiles(column(target, n)) for n in names if n.endswith(ends)}
+    notes = []
+    if asked["order"] == 0:
+        span = column(target, "temperature_max_c") - column(target, "temperature_min_c")
+        wide = int(np.sum(span > SPAN))
+        if wide:
+            notes.append(
+                f"{wide} tools span more than {SPAN:g} °C, and --order 0 has no temperature terms."
+            )
+    return Summary(
+        runs=asked["runs"].name,
+        output=str(asked["output"]),
+        tools=head.num_rows,
+        stations=stations,
+        method=asked["method"],
+        order=asked["order"],
+        statuses=_kinds(head),
+        spread=spread,
+        undetermined=_undetermined(target, names),
+        parts=parts,
+        parts_done_before=before,
+        seconds=round(seconds, 3),
+        notes=notes,
+    )
+
+
+def column(path: Path, name: str) -> Array:
+    """One column of numbers of a table of calibrations, NaN where there is none."""
+    arrow, pq = parquet.modules(path.name)
+    cells = pq.read_table(path, columns=[name]).column(0)
+    return np.asarray(cells.cast(arrow.float64()).to_numpy(), float)
+
+
+def _quantiles(values: Array) -> list[float]:
+    if np.isnan(values).all():
+        return []
+    return [float(v) for v in np.nanquantile(values, (0.01, 0.5, 0.99))]
+
+
+def _kinds(head: Any) -> list[Kind]:
+    """Statuses with their tools, sound ones first, then by number."""
+    counted = head.column("status").value_counts().to_pylist()
+    found = []
+    for each in sorted(counted, key=lambda c: (c["values"] != OK, -c["counts"])):
+        own = head.filter(_equal(head.column("status"), each["values"])).slice(0, SHOWN).to_pydict()
+        found.append(Kind(each["values"], each["counts"], own[SERIAL], own["message"][0]))
+    return found
+
+
+def _equal(cells: Any, value: str) -> Any:
+    from pyarrow import compute
+
+    return compute.equal(cells, value)
+
+
+def _undetermined(path: Path, names: list[str]) -> dict[str, int]:
+    """Tools by triad and direction that nothing determines."""
+    _, pq = parquet.modules(path.name)
+    found: dict[str, int] = {}
+    for name in names:
+        if name.endswith("_undetermined"):
+            cells = pq.read_table(path, columns=[name]).column(0).combine_chunks()
+            flat = cells.flatten() if hasattr(cells, "flatten") else cells
+            for each in flat.value_counts().to_pylist():
+                value, count = each["values"], each["counts"]
+                found[f"{name.removesuffix('_undetermined')}: {value}"] = count
+    return found
+
+
+def document(summary: Summary, report: Path | None) -> dict[str, Any]:
+    """The summary for machines."""
+    found: dict[str, Any] = msgspec.to_builtins(summary)
+    found["tools_per_second"] = round(summary.tools / summary.seconds, 1)
+    return {**found, "calibrated": summary.sound, "report": str(report or "")}
+
+
+def text(summary: Summary, report: Path | None) -> str:
+    """The summary for people: about one screen."""
+    heading = (
+        f"{summary.runs}   {summary.tools} tools   {summary.stations} stations   "
+        f"method {summary.method}   order {summary.order}"
+    )
+    rows = [[k.status, str(k.tools), _serials(k)] for k in summary.statuses]
+    lines = [heading, "", table(rows, ["status", "tools", "serials"])]
+    refused = [kind for kind in summary.statuses if kind.status != OK]
+    lines += [f"! {kind.status}, for example: {kind.message}" for kind in refused]
+    spread = [
+        [_title(name), *(number(v) for v in values)]
+        for name, values in summary.spread.items()
+        if values
+    ]
+    if spread:
+        lines += ["", table(spread, ["of sound tools", "1 %", "median", "99 %"])]
+    for name, count in summary.undetermined.items():
+        lines.append(f"undetermined in {count} tools: {name}")
+    lines += [f"! {note}" for note in summary.notes]
+    rate = summary.tools / summary.seconds
+    wrote = f"wrote {summary.output} (calibrations)" + (f"   {report} (report)" if report else "")
+    return "\n".join([*lines, "", f"{wrote}   {summary.seconds:.1f} s, {rate:.0f} tools/s"])
+
+
+def _serials(kind: Kind) -> str:
+    if kind.status == OK:
+        return ""
+    return ", ".join(map(str, kind.serials)) + (" …" if kind.tools > len(kind.serials) else "")
+
+
+def _title(name: str) -> str:
+    """A column as people call it."""
+    if name.endswith("_variance_factor"):
+        return f"{name.removesuffix('_variance_factor')} s²"
+    return f"1σ {name.removesuffix('_sd_deg')} at 45°, °"

@@ -1,0 +1,179 @@
+"""`mwdcal fleet`: a table of many tools to a table of calibrations, in parts that are kept."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from mwdcal import __version__
+from mwdcal.app import pool
+from mwdcal.app.fleet_asked import Asked
+from mwdcal.app.fleet_summary import Summary, document, summarise, text
+from mwdcal.checks import check_options
+from mwdcal.errors import FitError, InputError
+from mwdcal.files import atomic, parquet, profiles
+from mwdcal.files.fleet_parts import Plan, work
+from mwdcal.files.fleet_tables import (
+    SERIAL,
+    Partition,
+    find_tools,
+    open_source,
+    partitions,
+)
+from mwdcal.options import Options
+
+REFUSED = 3
+"""Exit code where not a single tool could be calibrated."""
+EVERY = 5.0
+"""Seconds between two lines of progress."""
+
+
+def run(asked: Asked, say: Callable[[str], None]) -> tuple[int, Any]:
+    """Number of calibrated tools, and what to print: a document, or text."""
+    report = asked["report"]
+    if report:
+        from mwdcal.app.fleet_report import environment, write_report
+
+        environment()
+    found = calibrate_table(asked, say)
+    if report:
+        write_report(report, asked["output"], found)
+    return found.sound, (document if asked["as_json"] else text)(found, report)
+
+
+def calibrate_table(asked: Asked, say: Callable[[str], None]) -> Summary:
+    """Calibrate every tool of the table; the output is written at the end, as a whole."""
+    begun = time.perf_counter()
+    options = _options(asked)
+    profile, digest = profiles.load_profile(asked["tool"])
+    source = open_source(asked["runs"])
+    if options.order and "temperature_c" not in source.columns:
+        raise InputError(
+            f"--order {options.order} needs the column 'temperature_c'; use --order 0."
+        )
+    target = atomic.target(asked["output"])
+    _check_target(target, asked["runs"])
+    folder = target.with_name(target.name + ".parts")
+    tools = find_tools(source)
+    if not tools.together:
+        say("the rows of a tool are not together: dealing them into files of whole tools first")
+    parts = partitions(source, tools, folder)
+    plan = Plan.of(source, profile, options)
+    paths = [folder / f"{plan.key(part)}.arrow" for part in parts]
+    before = sum(path.is_file() for path in paths)
+    say(f"{tools.count} tools, {source.rows} stations, {len(parts)} parts, {before} done before")
+    _make_parts(plan, parts, paths, asked, say)
+    metadata = {
+        **{k: v for k, v in source.metadata.items() if k != SERIAL},
+        "fleet": source.name,
+        "software": f"mwdcal {__version__}",
+        "profile": profile.name,
+        "profile_sha256": digest,
+        "reference_temperature_c": profile.reference_temperature_c,
+    }
+    _merge(paths, target, metadata)
+    _tidy(folder)
+    return summarise(asked, target, source.rows, len(parts), before, time.perf_counter() - begun)
+
+
+def _options(asked: Asked) -> Options:
+    """Options of every fit; refuses what could be right for no tool."""
+    options = Options(
+        method=asked["method"],
+        model=asked["model"],
+        order=asked["order"],
+        nonlinearity={},
+        seed=asked["seed"],
+    )
+    check_options(options)
+    if options.method == "swarm" and options.order:
+        raise FitError(
+            "method swarm finds the 12 parameters of one temperature: use --order 0 for it, or "
+            "--method joint for temperature terms."
+        )
+    return options
+
+
+def _check_target(target: Path, runs: Path) -> None:
+    """Refuse an output that is no Parquet file or would become part of the input."""
+    if target.suffix.lower() != ".parquet":
+        raise InputError(
+            f"cannot write '{target}': a fleet's calibrations are a Parquet table. Name a file "
+            "that ends in .parquet."
+        )
+    if runs.is_dir() and runs.resolve() in target.parents:
+        raise InputError(
+            f"cannot write '{target}': it would become part of the input folder. Name a file "
+            "outside it."
+        )
+
+
+def _make_parts(
+    plan: Plan,
+    parts: list[Partition],
+    paths: list[Path],
+    asked: Asked,
+    say: Callable[[str], None],
+) -> None:
+    """Do the parts that are not there yet; each is written when it is whole."""
+    missing = [index for index, path in enumerate(paths) if not path.is_file()]
+    if not missing:
+        return
+    paths[0].parent.mkdir(exist_ok=True)
+    workers = asked["workers"] or pool.cores()
+    begun = told = time.perf_counter()
+    tools = 0
+    tasks = [parts[index] for index in missing]
+    found = pool.results(partial(work, plan), tasks, workers, asked["scheduler"])
+    for count, (index, content) in enumerate(found, 1):
+        atomic.write(paths[missing[index]], content)
+        tools += tasks[index].tools
+        now = time.perf_counter()
+        if now - told > EVERY:
+            told = now
+            say(f"part {count} of {len(missing)}   {tools / (now - begun):.0f} tools/s")
+
+
+def _merge(paths: list[Path], target: Path, metadata: dict[str, object]) -> None:
+    """One Parquet table of all parts, in their order; one part in memory at a time."""
+    arrow, pq = parquet.modules(target.name)
+    whole = paths[0].with_name("whole.parquet")
+    described = {parquet.KEY: msgspec.json.encode(metadata, enc_hook=str)}
+    writer = None
+    try:
+        for path in paths:
+            with arrow.memory_map(str(path)) as file:
+                part = arrow.ipc.open_stream(file).read_all()
+                if writer is None:
+                    schema = part.schema.with_metadata(described)
+                    texts = [f.name for f in schema if not arrow.types.is_floating(f.type)]
+                    writer = pq.ParquetWriter(whole, schema, use_dictionary=texts)
+                writer.write_table(part.cast(writer.schema))
+        if writer is not None:
+            writer.close()
+        with whole.open("rb+") as stream:
+            os.fsync(stream.fileno())
+        whole.replace(target)
+    except OSError as error:
+        raise InputError(
+            f"cannot write '{target}': {error.strerror or error}. Finished parts are kept: make room, "
+            "or choose another place, and run the same command again."
+        ) from error
+
+
+def _tidy(folder: Path) -> None:
+    """Remove what was kept for a restart, and nothing that is not ours."""
+    for path in [*folder.glob("*.arrow"), *folder.glob("whole.parquet")]:
+        path.unlink()
+    for path in folder.glob("sorted-*"):
+        shutil.rmtree(path)
+    with contextlib.suppress(OSError):
+        folder.rmdir()

@@ -1,0 +1,152 @@
+"""One partition of a fleet: the same function for every worker, on this machine or another."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from mwdcal import __version__
+from mwdcal.core.vectors import AnyArray, Array
+from mwdcal.errors import InputError
+from mwdcal.files import parquet
+from mwdcal.files.contract import CHANNELS, COLUMNS
+from mwdcal.files.fleet_runs import Batch, Rows, batches, refused_tools
+from mwdcal.files.fleet_tables import SERIAL, Partition, Source, read
+from mwdcal.fleet import BAD_INPUT, OK, Outcome, calibrate_batch, names
+from mwdcal.options import Options
+from mwdcal.profile import Profile
+from mwdcal.readings import TRIADS
+
+HEAD = (SERIAL, "status", "message", "stations", "temperature_min_c", "temperature_max_c")
+WHOLE = ("rank", "size", "stations")
+"""Ends of the names of columns of whole numbers."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is to be done to every partition."""
+
+    source: str
+    metadata: Mapping[str, object]
+    columns: tuple[str, ...]
+    profile: Profile
+    options: Options
+    version: str = __version__
+
+    @classmethod
+    def of(cls, source: Source, profile: Profile, options: Options) -> Plan:
+        """For a table: of its columns those that a run file has."""
+        wanted = [n for n in source.columns if n in COLUMNS or n == SERIAL]
+        return cls(source.name, source.metadata, tuple(wanted), profile, options)
+
+    @property
+    def triads(self) -> tuple[str, ...]:
+        """The triads that the table has columns for."""
+        return TRIADS[: 1 + (CHANNELS["magnetometer"][0] in self.columns)]
+
+    def key(self, partition: Partition) -> str:
+        """Name of the partition's result: another input, option or version has another."""
+        return hashlib.sha256(msgspec.json.encode([self, partition])).hexdigest()[:32]
+
+
+def work(plan: Plan, partition: Partition) -> bytes:
+    """Calibrate the tools of a partition: a table in Arrow's stream format, one row per tool."""
+    if plan.version != __version__:
+        raise InputError(
+            f"the worker has mwdcal {__version__}, the command is of {plan.version}. Install the "
+            "same version everywhere."
+        )
+    arrow, _ = parquet.modules(plan.source)
+    table = read(partition, plan.columns)
+    rows = Rows.of(table, plan.source, plan.metadata, plan.profile)
+    result = _result(rows, plan)
+    stream = arrow.BufferOutputStream()
+    with arrow.ipc.new_stream(stream, result.schema) as writer:
+        writer.write_table(result)
+    return bytes(stream.getvalue())
+
+
+def _result(rows: Rows, plan: Plan) -> Any:
+    """The result table of some tools."""
+    count = len(rows.counts)
+    filled = {name: np.full(count, np.nan) for name in names(plan.options, plan.triads)}
+    status, message = np.full(count, OK, object), np.full(count, "", object)
+    unit = np.full(count, None, object)
+    free: list[tuple[list[str], ...]] = [([], [])] * count
+    for tool, text in refused_tools(rows).items():
+        status[tool], message[tool] = BAD_INPUT, text
+    for batch in batches(rows, np.flatnonzero(status == OK)):
+        outcome = _calibrated(rows, batch, plan)
+        status[batch.tools], message[batch.tools] = outcome.status, outcome.message
+        unit[batch.tools] = _field_unit(batch)
+        for name, values in filled.items():
+            values[batch.tools] = outcome.columns[name]
+        for tool, each in zip(batch.tools, outcome.free, strict=True):
+            free[tool] = each
+    unit[status != OK] = None
+    return _table(rows, plan, (status, message, unit), filled, free)
+
+
+def _calibrated(rows: Rows, batch: Batch, plan: Plan) -> Outcome:
+    reference = plan.profile.reference_temperature_c
+    return calibrate_batch(
+        batch.readings, plan.options, reference, lambda i: rows.alone(int(batch.tools[i]))
+    )
+
+
+def _field_unit(batch: Batch) -> AnyArray:
+    """Unit of the calibrated field: "nT", or "relative (field = 1)"; None without magnetometer."""
+    none = np.full(len(batch.tools), None, object)
+    if batch.readings.magnetometer is None:
+        return none
+    unknown = np.isnan(batch.readings.reference("field")).all(-1)
+    return np.where(unknown, "relative (field = 1)", "nT").astype(object)
+
+
+def _table(
+    rows: Rows,
+    plan: Plan,
+    texts: tuple[AnyArray, AnyArray, AnyArray],
+    filled: dict[str, Array],
+    free: list[tuple[list[str], ...]],
+) -> Any:
+    """The Arrow table of results, in the order of the columns."""
+    arrow, _ = parquet.modules(plan.source)
+    status, message, unit = texts
+    count, good = len(status), status == OK
+    options, columns = plan.options, {}
+    low, high = _temperatures(rows)
+    columns[SERIAL] = rows.serials
+    columns["status"] = arrow.array(status, arrow.string())
+    columns["message"] = arrow.array(message, arrow.string())
+    columns["stations"] = arrow.array(rows.counts, arrow.int32())
+    columns["temperature_min_c"] = arrow.array(low, mask=np.isnan(low))
+    columns["temperature_max_c"] = arrow.array(high, mask=np.isnan(high))
+    for name, values in filled.items():
+        whole = name.rpartition("_")[2] in WHOLE
+        numbers = np.nan_to_num(values).astype(np.int32) if whole else values
+        columns[name] = arrow.array(numbers, mask=np.isnan(values))
+    for index, triad in enumerate(plan.triads):
+        ids = [each[index] if ok else None for each, ok in zip(free, good, strict=True)]
+        columns[f"{triad}_undetermined"] = arrow.array(ids, arrow.list_(arrow.string()))
+    columns["field_unit"] = arrow.array(unit, arrow.string())
+    same = {"method": options.method, "model": options.kind(max(options.orders))}
+    for name, value in same.items():
+        columns[name] = arrow.array([value] * count, arrow.string())
+    columns["order"] = arrow.array(np.full(count, max(options.orders)), arrow.int32())
+    return arrow.table(columns)
+
+
+def _temperatures(rows: Rows) -> tuple[Array, Array]:
+    """Coldest and hottest station (T,) of each tool; NaN where there is no temperature."""
+    values = rows.numbers.get("temperature_c")
+    if values is None:
+        none = np.full(len(rows.counts), np.nan)
+        return none, none
+    first = rows.starts[:-1]
+    return np.minimum.reduceat(values, first), np.maximum.reduceat(values, first)

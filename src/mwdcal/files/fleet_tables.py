@@ -1,0 +1,409 @@
+"""Tables of many tools: which rows belong to which tool, and partitions of whole tools.
+
+A fleet is one Parquet file, or a folder of them (also `name=value` folders). One pass over
+the serial column finds the tools; memory holds their serials, never the readings. Where the
+rows of a tool are not together, the rows are dealt once into files of whole tools.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from mwdcal.core.vectors import Ints
+from mwdcal.errors import InputError
+from mwdcal.files import contract, parquet
+
+SERIAL = "serial"
+TOOL = "#tool"
+"""Column of dealt rows: number of the tool, in order of first appearance."""
+LABELS = ("station", "group", SERIAL)
+ROWS = (6_000, 250_000)
+"""Fewest and most rows of a partition that is not a single tool…"""
+SHARES = 32
+"""…and into how many a fleet between these is divided."""
+LARGEST_GROUP = 20_000_000
+"""Rows of the largest row group that is read; it is read as a whole."""
+MOST_FILES = 200
+"""Files of dealt rows that are written at once."""
+
+
+@dataclass(frozen=True)
+class Piece:
+    """One row group of a Parquet file, with the values that its folder names state."""
+
+    path: str
+    stamp: tuple[int, int]
+    group: int
+    rows: int
+    keys: tuple[tuple[str, str], ...]
+
+
+@dataclass(frozen=True)
+class Partition:
+    """Whole tools: `rows` rows of some pieces after the first `skip`.
+
+    `first` is the number of the first row in the whole table; `dealt` says that the rows are
+    not in order of tools.
+    """
+
+    pieces: tuple[Piece, ...]
+    skip: int
+    rows: int
+    first: int
+    tools: int
+    dealt: bool = False
+
+
+@dataclass(frozen=True)
+class Source:
+    """A fleet's table: its pieces, columns and metadata."""
+
+    name: str
+    pieces: tuple[Piece, ...]
+    columns: tuple[str, ...]
+    metadata: dict[str, object]
+
+    @property
+    def rows(self) -> int:
+        """Number of stations of all tools."""
+        return sum(piece.rows for piece in self.pieces)
+
+    @property
+    def fingerprint(self) -> str:
+        """What changes when a file of the table does."""
+        parts = [(Path(p.path).name, p.stamp, p.group, p.rows, p.keys) for p in self.pieces]
+        return hashlib.sha256(msgspec.json.encode([parts, self.metadata])).hexdigest()
+
+
+def open_source(path: Path) -> Source:
+    """The table at `path`, its columns checked; refuses what is no table of many tools."""
+    files = _files(path)
+    pieces: list[Piece] = []
+    columns: tuple[str, ...] = ()
+    metadata: dict[str, object] = {}
+    for file in files:
+        own, names, described = _look(file, path)
+        if columns and set(names) != set(columns):
+            odd = sorted(set(names) ^ set(columns))[0]
+            raise InputError(
+                f"{file}: all files of '{path.name}' must have the same columns; '{odd}' is in some "
+                f"and not in others ({files[0].name} …). Write the table again."
+            )
+        columns, metadata = columns or names, metadata or described
+        pieces += own
+    _check_columns(columns, path.name)
+    source = Source(path.name, tuple(pieces), columns, metadata)
+    if source.rows == 0:
+        raise InputError(f"{path.name}: the table has no rows. Add one row per station.")
+    largest = max(piece.rows for piece in pieces)
+    if largest > LARGEST_GROUP:
+        raise InputError(
+            f"{path.name}: a row group must have at most {LARGEST_GROUP} rows; got {largest}. Write "
+            "the table again with row groups of about a million rows (`row_group_size`)."
+        )
+    return source
+
+
+def _files(path: Path) -> list[Path]:
+    """The Parquet files of a table: itself, or all in a folder, in order of their names."""
+    if path.is_dir():
+        hidden = ("_", ".")
+        found = sorted(
+            file
+            for file in path.rglob("*.parquet")
+            if not any(part.startswith(hidden) for part in file.relative_to(path).parts)
+        )
+        if not found:
+            raise InputError(f"'{path}' is a folder without .parquet files. Name a Parquet table.")
+        return found
+    if not path.exists():
+        raise InputError(f"'{path}': no such file. Check the name and the folder.")
+    if path.suffix.lower() != ".parquet":
+        raise InputError(
+            f"'{path}': a fleet is read from a Parquet file or a folder of them; got "
+            f"'{path.suffix or 'no suffix'}'. Convert the table, with a column 'serial'."
+        )
+    return [path]
+
+
+def _look(file: Path, root: Path) -> tuple[list[Piece], tuple[str, ...], dict[str, object]]:
+    """Pieces, columns and metadata of one file."""
+    _, pq = parquet.modules(str(file))
+    try:
+        opened = pq.ParquetFile(file)
+    except Exception as error:
+        raise parquet.unreadable(str(file), error) from error
+    with opened:
+        schema, about = opened.schema_arrow, opened.metadata
+        folders = file.relative_to(root).parent.parts if root.is_dir() else ()
+        keys = tuple((n, v) for n, eq, v in (part.partition("=") for part in folders) if eq)
+        names = tuple(n for n in (*schema.names, *dict(keys)) if not n.startswith("__index"))
+        contract_columns = set(contract.COLUMNS) - set(LABELS)
+        for name in contract_columns.intersection(schema.names):
+            _check_numeric(schema.field(name).type, name, file)
+        status = file.stat()
+        stamp = (status.st_size, status.st_mtime_ns)
+        pieces = [
+            Piece(str(file.resolve()), stamp, group, about.row_group(group).num_rows, keys)
+            for group in range(about.num_row_groups)
+        ]
+        return pieces, names, parquet.metadata_of(schema.metadata, str(file))
+
+
+def _check_numeric(kind: Any, name: str, file: Path) -> None:
+    """Refuse a column of text where numbers belong."""
+    arrow, _ = parquet.modules(str(file))
+    types = arrow.types
+    fine = (types.is_integer, types.is_floating, types.is_decimal, types.is_null)
+    if not any(test(kind) for test in fine):
+        raise InputError(
+            f"{file.name}, column '{name}': expected numbers; the column has the type {kind}. "
+            "Write it as numbers, with empty cells where a value is unknown."
+        )
+
+
+def _check_columns(names: Sequence[str], source: str) -> None:
+    """Refuse a table that does not tell its tools apart, or lacks the channels."""
+    if SERIAL not in names:
+        near = [n for n in names if n.strip().lower().replace("_", " ") in _NEAR]
+        hint = f" Is it '{near[0]}'? Rename it." if near else " Add it."
+        raise InputError(
+            f"{source}: a fleet needs the column '{SERIAL}', which tells its tools apart; found "
+            f"{', '.join(repr(n) for n in names[:20])}.{hint}"
+        )
+    contract.check_columns(list(names), source)
+
+
+_NEAR = (
+    "sn",
+    "serial no",
+    "serial number",
+    "serialno",
+    "serialnumber",
+    "serial",
+    "tool",
+    "tool id",
+)
+
+
+@dataclass(frozen=True)
+class Tools:
+    """The tools of a table, in order of first appearance.
+
+    `runs` are the first rows (r,) of stretches of one tool, `tool` (r,) whose each is.
+    """
+
+    serials: Any
+    runs: Ints
+    tool: Ints
+
+    @property
+    def count(self) -> int:
+        """Number of tools."""
+        return len(self.serials)
+
+    @property
+    def together(self) -> bool:
+        """Whether the rows of every tool are next to each other."""
+        return len(self.runs) == self.count
+
+
+def find_tools(source: Source) -> Tools:
+    """One pass over the serials."""
+    arrow, _ = parquet.modules(source.name)
+    starts: list[Ints] = []
+    heads: list[Any] = []
+    row, last = 0, None
+    for values in _serials(source):
+        codes = values.indices.to_numpy(zero_copy_only=False)
+        change = np.flatnonzero(np.diff(codes, prepend=codes[0] - 1))
+        own = values.dictionary.take(arrow.array(codes[change]))
+        if last is not None and own[0].as_py() == last:
+            change, own = change[1:], own[1:]
+        starts.append(change + row)
+        heads.append(own)
+        row, last = row + len(codes), values[-1].as_py()
+    every = arrow.concat_arrays(heads).dictionary_encode()
+    return Tools(
+        every.dictionary,
+        np.concatenate(starts),
+        every.indices.to_numpy(zero_copy_only=False).astype(int),
+    )
+
+
+def _serials(source: Source) -> Iterator[Any]:
+    """The serial column, in dictionary-encoded stretches; whole numbers stay numbers."""
+    arrow, pq = parquet.modules(source.name)
+    row = 0
+    for piece in source.pieces:
+        stated = dict(piece.keys).get(SERIAL)
+        if stated is not None:
+            if piece.rows:
+                yield (
+                    arrow.array([stated])
+                    .dictionary_encode()
+                    .take(arrow.array(np.zeros(piece.rows, int)))
+                )
+            row += piece.rows
+            continue
+        with pq.ParquetFile(piece.path) as file:
+            for batch in file.iter_batches(500_000, row_groups=[piece.group], columns=[SERIAL]):
+                column = _plain(batch.column(0), source.name)
+                if column.null_count:
+                    blank = row + int(
+                        np.flatnonzero(column.is_null().to_numpy(zero_copy_only=False))[0]
+                    )
+                    raise InputError(
+                        f"{source.name}, row {blank + 1}, column '{SERIAL}': must be filled in; got a "
+                        "blank cell. Say which tool the station belongs to."
+                    )
+                row += len(column)
+                if len(column):
+                    yield column.dictionary_encode()
+
+
+def _plain(column: Any, source: str) -> Any:
+    """Serials as 64-bit whole numbers or text."""
+    arrow, _ = parquet.modules(source)
+    if arrow.types.is_dictionary(column.type):
+        column = column.cast(column.type.value_type)
+    if arrow.types.is_integer(column.type):
+        return column.cast(arrow.int64())
+    if arrow.types.is_string(column.type) or arrow.types.is_large_string(column.type):
+        return column.cast(arrow.string())
+    raise InputError(
+        f"{source}, column '{SERIAL}': must be text or whole numbers; the column has the type "
+        f"{column.type}. Write it as text."
+    )
+
+
+def partitions(source: Source, tools: Tools, folder: Path) -> list[Partition]:
+    """The table in partitions of whole tools; dealt into files in `folder` where it must be."""
+    size = int(np.clip(source.rows // SHARES, *ROWS))
+    if not tools.together:
+        return _dealt(source, tools, folder, size)
+    ends = np.append(tools.runs[1:], source.rows)
+    cuts = _cuts(ends, size)
+    found, before = [], 0
+    for cut in cuts:
+        first = int(tools.runs[before])
+        found.append(_part(source, first, int(ends[cut]), cut + 1 - before))
+        before = cut + 1
+    return found
+
+
+def _cuts(ends: Ints, size: int) -> list[int]:
+    """Last tool of each partition: as soon as `size` rows are full."""
+    last = np.searchsorted(ends, np.arange(size, int(ends[-1]) + size, size))
+    return sorted({min(int(i), len(ends) - 1) for i in last} | {len(ends) - 1})
+
+
+def _part(source: Source, first: int, stop: int, tools: int) -> Partition:
+    """The partition of rows `first` to `stop`."""
+    bounds = np.cumsum([0, *(piece.rows for piece in source.pieces)])
+    low = int(np.searchsorted(bounds, first, "right")) - 1
+    high = int(np.searchsorted(bounds, stop, "left"))
+    return Partition(source.pieces[low:high], first - int(bounds[low]), stop - first, first, tools)
+
+
+def _dealt(source: Source, tools: Tools, folder: Path, size: int) -> list[Partition]:
+    """Rows dealt into files by tool; done once, whatever interrupts it."""
+    rows = np.bincount(tools.tool, np.diff(tools.runs, append=source.rows), tools.count)
+    share = max(size, -(-source.rows // MOST_FILES))
+    number = np.cumsum(rows).astype(int) // share
+    number = np.minimum(number, MOST_FILES - 1)
+    done = folder / f"sorted-{source.fingerprint[:16]}"
+    if not done.is_dir():
+        unfinished = done.with_suffix(".tmp")
+        shutil.rmtree(unfinished, ignore_errors=True)
+        unfinished.mkdir(parents=True)
+        _deal(source, tools, number, unfinished)
+        unfinished.rename(done)
+    found = []
+    for each in np.unique(number):
+        file = done / f"{each:04d}.parquet"
+        pieces, _, _ = _look(file, file)
+        total = sum(piece.rows for piece in pieces)
+        count = int(np.sum(number == each))
+        stamped = tuple(
+            Piece(p.path, (0, 0), p.group, p.rows, (("", source.fingerprint),)) for p in pieces
+        )
+        found.append(Partition(stamped, 0, total, 0, count, dealt=True))
+    return found
+
+
+def _deal(source: Source, tools: Tools, number: Ints, folder: Path) -> None:
+    """Write the rows of every piece into the file of their tool."""
+    arrow, pq = parquet.modules(source.name)
+    writers: dict[int, Any] = {}
+    row = 0
+    try:
+        for piece in source.pieces:
+            table = _row_group(piece, source.columns)
+            rows = np.arange(row, row + piece.rows)
+            tool = tools.tool[np.searchsorted(tools.runs, rows, "right") - 1]
+            table = table.append_column(TOOL, arrow.array(tool))
+            table = table.append_column("#row", arrow.array(rows))
+            own = number[tool]
+            order = np.argsort(own, kind="stable")
+            sorted_own = own[order]
+            table = table.take(arrow.array(order))
+            bounds = np.flatnonzero(np.diff(sorted_own, prepend=-1))
+            for start, stop in zip(bounds, [*bounds[1:], len(own)], strict=True):
+                key = int(sorted_own[start])
+                if key not in writers:
+                    path = folder / f"{key:04d}.parquet"
+                    writers[key] = pq.ParquetWriter(path, table.schema, compression="lz4")
+                writers[key].write_table(table.slice(start, stop - start))
+            row += piece.rows
+    finally:
+        for writer in writers.values():
+            writer.close()
+
+
+def read(partition: Partition, columns: Sequence[str]) -> Any:
+    """The rows of a partition as an Arrow table, in order of tools, with their row numbers."""
+    arrow, _ = parquet.modules("fleet")
+    names = [*columns, TOOL, "#row"] if partition.dealt else list(columns)
+    tables = [_row_group(piece, tuple(names)) for piece in partition.pieces]
+    table = arrow.concat_tables(tables, promote_options="permissive")
+    table = table.slice(partition.skip, partition.rows)
+    if not partition.dealt:
+        rows = np.arange(partition.first, partition.first + partition.rows)
+        return table.append_column("#row", arrow.array(rows))
+    order = np.argsort(table.column(TOOL).to_numpy(), kind="stable")
+    return table.take(arrow.array(order)).drop_columns([TOOL])
+
+
+@lru_cache(maxsize=1)
+def _row_group(piece: Piece, columns: tuple[str, ...]) -> Any:
+    """One row group: kept, because partitions next to each other share it."""
+    arrow, pq = parquet.modules(piece.path)
+    keys = dict(piece.keys)
+    wanted = [name for name in columns if name not in keys]
+    try:
+        with pq.ParquetFile(piece.path, memory_map=True) as file:
+            table = file.read_row_group(piece.group, wanted, use_threads=False)
+    except FileNotFoundError:
+        raise InputError(
+            f"'{piece.path}': no such file on this machine. Workers on other machines must see "
+            "the table, and the folder of the output, under the same paths."
+        ) from None
+    except OSError as error:
+        raise parquet.unreadable(piece.path, error) from error
+    for name in columns:
+        if name in keys:
+            value = arrow.array([keys[name]]).take(arrow.array(np.zeros(piece.rows, int)))
+            table = table.append_column(name, value)
+    place = table.column_names.index(SERIAL)
+    table = table.set_column(place, SERIAL, _plain(table.column(SERIAL), piece.path))
+    return table.select(list(columns))

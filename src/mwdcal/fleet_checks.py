@@ -1,0 +1,205 @@
+"""Which members of a batch a check of a single run may refuse: found by arrays, all at once.
+
+The suspects of each kind come under the name of its status, in the order in which the checks
+of a single run are made. To suspect a sound tool costs time and nothing else: `checks` decides.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mwdcal.checks import ABSURD, COARSE, GAIN, MOTION, NEEDS
+from mwdcal.core.observability import EXACT, Free, free_directions
+from mwdcal.core.problem import Problem, State
+from mwdcal.core.solvers import Determined, Status
+from mwdcal.core.uncertainty import COUPLED, candidates
+from mwdcal.core.vectors import Array, Bools, Ints
+from mwdcal.estimate import Fit
+from mwdcal.options import Options
+from mwdcal.readings import TRIADS, Readings
+from mwdcal.selection import GAP
+
+NOT_CONVERGED, NOT_FINITE = "not-converged", "not-finite"
+BENIGN = ("rotation-x", "rotation-y", "toolface-zero", "scale")
+"""Directions that may stay free."""
+
+
+def suspect_readings(readings: Readings, options: Options) -> dict[str, Bools]:
+    """Suspects (B,) before the fit: too few stations, channels, temperatures, references."""
+    count, method, highest = len(readings.accelerometer), options.method, max(options.orders)
+    none = np.zeros(count, bool)
+    few = 3 * readings.count < _size(options)
+    channels = none.copy()
+    for triad in TRIADS:
+        channels |= _odd_channels(readings, triad)
+    return {
+        "too-few-stations": none | few,
+        "channel": channels,
+        "temperature-span": _short_span(readings, highest) if highest else none,
+        "missing-reference": none | _lacking(readings, method),
+    }
+
+
+def _size(options: Options) -> int:
+    """Parameters of a triad."""
+    highest = max(options.orders)
+    return 6 * (highest + 1) + 6 if options.kind(highest) == "factors" else 12 * (highest + 1)
+
+
+def _odd_channels(readings: Readings, triad: str) -> Bools:
+    """Where (B,) a channel moves by less, or more, than a field of that strength allows."""
+    values = getattr(readings, triad)
+    if values is None:
+        return np.zeros(len(readings.accelerometer), bool)
+    spread = values.max(-2) - values.min(-2)
+    dead = spread <= 1e-12 * np.abs(values).max((-1, -2))[:, None]
+    known = readings.reference("gravity" if triad == "accelerometer" else "field")
+    given = ~np.isnan(known)
+    mean = np.nan_to_num(known).sum(-1) / np.maximum(given.sum(-1), 1)
+    mean = np.asarray(np.where(mean > 0, mean, 1.0))
+    share = spread / mean[:, None]
+    odd = np.any((share < MOTION[0]) | (share > MOTION[1]), -1) & given.any(-1)
+    return np.asarray(dead.any(-1) | odd)
+
+
+def _short_span(readings: Readings, order: int) -> Bools:
+    """Where (B,) the temperatures are too few or too close together for the order."""
+    if readings.temperature is None:
+        return np.ones(len(readings.accelerometer), bool)
+    steps = np.diff(np.sort(readings.temperature, -1), axis=-1)
+    levels = 1 + np.sum(steps > GAP, -1)
+    span = readings.temperature.max(-1) - readings.temperature.min(-1)
+    return np.asarray((levels < order + 1) | (span < 10 * order))
+
+
+def _lacking(readings: Readings, method: str) -> Bools:
+    """Where (B,) a station lacks a reference that the method may need."""
+    needed = list(NEEDS.get(method, ()))
+    if method in ("least-squares", "swarm") and readings.magnetometer is not None:
+        needed += ["azimuth", "dip"]
+    blank = [np.isnan(readings.reference(name)).any(-1) for name in needed]
+    return np.asarray(np.any(blank, axis=0)) if blank else np.zeros(1, bool)
+
+
+def suspect_fits(result: Fit, free: list[list[Free]]) -> dict[str, Bools]:
+    """Suspects (B,) after the fit: not settled, too weak, without redundancy, absurd."""
+    analysis, noise = result.analysis, result.noise
+    weak = [any(f.id.partition("-temperature-")[0] not in BENIGN for f in each) for each in free]
+    return {
+        NOT_CONVERGED: result.status == int(Status.NOT_CONVERGED),
+        NOT_FINITE: result.status == int(Status.NOT_FINITE),
+        "weak-geometry": np.array(weak, bool),
+        "no-redundancy": np.any(np.isfinite(noise) & (analysis.freedom < 1), -1),
+        "gain": _odd_gains(result),
+        "residuals": _absurd(result),
+    }
+
+
+def _odd_gains(result: Fit) -> Bools:
+    """Where (B,) an own-axis gain is not near nominal, or not near the others."""
+    found = np.zeros(len(result.status), bool)
+    problem = result.problem
+    for triad, where in zip(problem.triads, problem.slices(), strict=True):
+        params = result.state.params[:, where]
+        slope = triad.model.slope(params, triad.raw, problem.temperature).mean(1)
+        gain = np.diagonal(slope, axis1=-2, axis2=-1)
+        middle = np.median(np.abs(gain), -1, keepdims=True)
+        inside = [
+            (share >= GAIN[0]) & (share <= GAIN[1]) for share in (gain, gain / np.abs(middle))
+        ]
+        found |= ~np.all(inside, (0, -1))
+    return found
+
+
+def _absurd(result: Fit) -> Bools:
+    """Where (B,) residuals are larger than any error of a sensor."""
+    problem, analysis = result.problem, result.analysis
+    found = np.zeros(len(result.status), bool)
+    for index, triad in enumerate(problem.triads):
+        noise, factor = result.noise[:, index], analysis.variance_factor[:, index]
+        strength = np.linalg.norm(triad.raw, axis=-1).mean(-1)
+        size = np.minimum(strength, 2 * triad.raw.std(axis=1).max(-1))
+        found |= np.isnan(noise) & (factor > ABSURD**2) & (analysis.freedom[:, index] >= 1)
+        found |= np.nan_to_num(noise) > COARSE * size
+    return found
+
+
+def free_of_batch(result: Fit) -> list[list[Free]]:
+    """The free directions of every member by name, as `free_directions` has them for one."""
+    determined = result.analysis.determined
+    found: list[list[Free]] = [[] for _ in result.status]
+    settled = result.status == int(Status.OK)
+    missing = np.sum(~determined.keep, -1)
+    for count in np.unique(missing[settled & (missing > 0)]):
+        which = np.flatnonzero(settled & (missing == count))
+        problem, state = result.problem.take(which), result.state.take(which)
+        own = determined.take(which)
+        named, odd = _named(problem, state, own, int(count))
+        for place, index in enumerate(which):
+            one = np.array([place])
+            found[index] = (
+                free_directions(problem.take(one), state.take(one), own.take(one))
+                if odd[place]
+                else named[place]
+            )
+    return found
+
+
+def _named(
+    problem: Problem, state: State, determined: Determined, count: int
+) -> tuple[list[list[Free]], Bools]:
+    """Names of `count` free directions of each member, and members (B,) that need another look.
+
+    The best candidate is taken in turn, and the null space goes on without it.
+    """
+    ids, directions = _candidates(problem, state)
+    norms, members = determined.norms, np.arange(len(state.params))
+    scaled = directions * norms[:, None]
+    length = np.sum(scaled**2, -1)
+    null = determined.basis[..., -count:]
+    found: list[list[Free]] = [[] for _ in members]
+    odd = np.zeros(len(members), bool)
+    used = np.zeros(length.shape, bool)
+    for _ in range(count):
+        inside = np.sum((scaled @ null) ** 2, -1) / np.where(length > 0, length, 1.0)
+        scores = np.where(used, -1.0, np.round(inside, 3))
+        best = np.argmax(scores, -1)
+        score = inside[members, best]
+        odd |= score <= COUPLED
+        used[members, best] = True
+        chosen = directions[members, best]
+        part = np.einsum("bpk,bqk,bq->bp", null, null, scaled[members, best]) / norms
+        chosen = np.where((score < EXACT)[:, None], part, chosen)
+        for place, index in enumerate(best):
+            found[place].append(Free(ids[index][0], ids[index][1], chosen[place]))
+        null = _without(null, chosen * norms)
+    return found, odd
+
+
+def _candidates(problem: Problem, state: State) -> tuple[list[tuple[str, tuple[int, ...]]], Array]:
+    """Directions (B, c, p) that have a name, and their names and triads, in order of preference."""
+    every = tuple(range(len(problem.triads)))
+    ids: list[tuple[str, tuple[int, ...]]] = []
+    directions = []
+    for group in [(t,) for t in every] + ([every] if len(every) > 1 else []):
+        for name, direction in candidates(problem, state, list(group)).items():
+            ids.append((name, group))
+            directions.append(direction)
+    names = [name for triad in problem.triads for name in triad.model.names]
+    unit = np.eye(len(names))
+    for triad, where in enumerate(problem.slices()):
+        for index in range(where.start, where.stop):
+            ids.append((names[index], (triad,)))
+            directions.append(np.broadcast_to(unit[index], state.params.shape))
+    return ids, np.stack(directions, 1)
+
+
+def _without(null: Array, direction: Array) -> Array:
+    """Null spaces (B, p, k) less their part along a direction (B, p), as orthonormal bases."""
+    inside = np.einsum("bpk,bp->bk", null, direction)
+    length = np.linalg.norm(inside, axis=-1, keepdims=True)
+    inside = inside / np.where(length > 0, length, 1.0)
+    size: Ints | int = null.shape[-1]
+    unit = np.broadcast_to(np.eye(int(size)), (len(null), int(size), int(size)))
+    whole = np.linalg.qr(np.concatenate([inside[..., None], unit], -1))[0]
+    return np.asarray(null @ whole[..., 1:size])

@@ -1,0 +1,652 @@
+"""Many tools in one table: as `calibrate` has each alone, bad ones too; parts, restart, cluster."""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cli_support import (
+    SERVO_NOISE,
+    channels,
+    mwdcal,
+    process,
+    refused,
+    servo_run,
+    stations,
+)
+from mwdcal.calibrate import calibrate
+from mwdcal.core.observability import free_directions
+from mwdcal.errors import InputError, MwdcalError
+from mwdcal.estimate import fit
+from mwdcal.files import table as tables
+from mwdcal.files.profiles import load_profile
+from mwdcal.files.runs import to_readings
+from mwdcal.fleet import column, names, taken
+from mwdcal.fleet_checks import free_of_batch
+from mwdcal.options import Options
+from mwdcal.predict import typical_accuracy
+from mwdcal.readings import Readings
+from simulation import DEG, Tool, attitude, plan
+
+pa = pytest.importorskip("pyarrow")
+pq = pytest.importorskip("pyarrow.parquet")
+
+from mwdcal.app import pool  # noqa: E402
+from mwdcal.files import fleet_tables  # noqa: E402
+from mwdcal.files.fleet_parts import Plan, work  # noqa: E402
+
+ANGLES = ("inclination", "azimuth", "toolface")
+
+
+def short_run(seed, **changes):
+    """A run of 28 stations with its temperature, and some columns changed or left out (None)."""
+    columns = servo_run(seed, inclinations=(10, 60, 90, 130), toolfaces=7)
+    columns |= {name: value for name, value in changes.items() if value is not None}
+    return {k: v for k, v in columns.items() if k not in changes or changes[k] is not None}
+
+
+def warm_run(seed):
+    return servo_run(seed, (10, 60, 90, 130), 6, temperatures=(20.0, 60.0, 100.0, 140.0))
+
+
+def write_fleet(path, tools, metadata=None, **options):
+    """A Parquet table of runs by serial; columns that a run lacks are blank."""
+    every = list(dict.fromkeys(name for columns in tools.values() for name in columns))
+    parts = {"serial": [], **{name: [] for name in every}}
+    for serial, columns in tools.items():
+        count = len(columns["ax"])
+        parts["serial"] += [serial] * count
+        for name in every:
+            blank = [None] * count
+            cells = columns.get(name, blank)
+            text = name in ("station", "group")
+            parts[name] += [None if c is None else str(c) if text else float(c) for c in cells]
+    arrays = {name: pa.array(cells, from_pandas=True) for name, cells in parts.items()}
+    table = pa.table(arrays)
+    if metadata:
+        table = table.replace_schema_metadata({b"mwdcal": json.dumps(metadata).encode()})
+    pq.write_table(table, path, **options)
+    return path
+
+
+def calibrated(path, *options, tool="servo", code=0):
+    """The table of calibrations as rows by serial."""
+    output = path.with_name("cals.parquet")
+    ran = mwdcal("fleet", path, "-o", output, "--tool", tool, "--workers", 1, *options)
+    assert ran.code == code, ran
+    return {row["serial"]: row for row in pq.read_table(output).to_pylist()}
+
+
+def alone(columns, source, first=1, metadata=None, tool="servo", **options):
+    """The calibration of one run by itself, or the error that refuses it."""
+    cells = {
+        name: [str(v) for v in values]
+        if name in ("station", "group")
+        else np.asarray(values, float)
+        for name, values in columns.items()
+    }
+    lines = range(first, first + len(columns["ax"]))
+    table = tables.Table(cells, metadata or {}, source, lines)
+    try:
+        readings, profile = to_readings(table, load_profile(tool)[0])
+        return calibrate(readings, profile, Options(nonlinearity={}, **options))
+    except MwdcalError as error:
+        return error
+
+
+def check_same(row, made, tolerance=1e-9):
+    """The row of a tool says what its calibration file says."""
+    assert row["status"] == "ok", row["message"]
+    assert row["stations"] == made.stations
+    assert row["field_unit"] == (made.field_unit if made.has_field else None)
+    for triad in made.triads:
+        assert row[f"{triad.name}_rank"] == triad.rank
+        assert row[f"{triad.name}_size"] == triad.size
+        assert row[f"{triad.name}_undetermined"] == [u.id for u in triad.undetermined]
+        for name in ("noise", "variance_factor", "degrees_of_freedom"):
+            assert row[f"{triad.name}_{name}"] == pytest.approx(getattr(triad, name), tolerance)
+        for name, value, sd in zip(
+            triad.parameter_names, triad.parameters, triad.standard_uncertainties, strict=True
+        ):
+            own = column(triad.name, name)
+            assert row[own] == pytest.approx(value, tolerance, tolerance * (sd or 1e-3))
+            expected = sd if sd is None else pytest.approx(sd, tolerance)
+            assert row[f"{own}_sd"] == expected
+    for angle, sd in typical_accuracy(made).items():
+        expected = sd if sd is None else pytest.approx(sd, tolerance)
+        assert row[f"{angle}_sd_deg"] == expected
+    earth = {"gravity_g": 1e-9, "field": 1e-9, "dip_deg": 1e-9}
+    for name in earth:
+        if name in made.earth:
+            assert row[name] == pytest.approx(made.earth[name], tolerance)
+
+
+# Agreement with `calibrate`
+
+
+@pytest.mark.parametrize("method", ["joint", "least-squares", "scalar", "newton"])
+@pytest.mark.parametrize("order", [0, 1])
+def test_each_tool_is_calibrated_as_it_is_alone(tmp_path, method, order):
+    runs = {f"T{seed}": (warm_run if order else short_run)(seed) for seed in range(4)}
+    rows = calibrated(
+        write_fleet(tmp_path / "runs.parquet", runs), "--method", method, "--order", order
+    )
+    assert list(rows) == list(runs)
+    for serial, columns in runs.items():
+        check_same(rows[serial], alone(columns, "x", method=method, order=order))
+
+
+def roll_run(seed, alone=0):
+    """Four roll sets of unknown directions, and some stations without a set."""
+    inc = np.repeat([5.0, 45.0, 95.0, 140.0], 7) * DEG
+    azi = np.repeat([10.0, 100.0, 190.0, 280.0], 7) * DEG
+    face = np.tile(np.arange(7) * 2 * np.pi / 7, 4)
+    tool = Tool.random(seed, noise=SERVO_NOISE)
+    g, b = (v[0] for v in tool.readings(np.random.default_rng(seed), 1, inc, azi, face))
+    group = [f" {chr(100 - i // 7)} " if i >= alone else "" for i in range(28)]
+    columns = stations(inc, azi, face, earth=(1.0, 5e4, tool.dip / DEG), group=group)
+    columns |= {f"ref_{a}_deg": np.full(28, np.nan) for a in ANGLES}
+    return {**columns, **channels(g, b)}
+
+
+def evidence_patterns():
+    """Runs that know different things, two of each kind."""
+    blank = np.full(28, np.nan)
+    half = np.where(np.arange(28) % 2, np.nan, 1.0)
+    noise = {f"sd_{c}": np.full(28, 2e-4) for c in ("ax", "ay", "az")}
+    angles = {f"ref_{a}_deg": blank for a in ANGLES}
+    kinds = {
+        "whole": {},
+        "no-azimuth": {"ref_azimuth_deg": blank, "ref_dip_deg": None},
+        "no-field": {"ref_field_nt": blank},
+        "half": {"ref_inclination_deg": short_run(1)["ref_inclination_deg"] * half},
+        "noise": noise,
+        "uncertain": {"sd_ref_field_nt": np.full(28, 30.0), "sd_ref_dip_deg": np.full(28, 0.1)},
+        "alone": dict.fromkeys(("mx", "my", "mz")),
+        "cold": {"temperature_c": None},
+        "free": angles,
+    }
+    found = {
+        f"{name}-{seed}": short_run(seed, **changes)
+        for seed in (1, 2)
+        for name, changes in kinds.items()
+    }
+    return found | {"rolls-1": roll_run(1), "rolls-2": roll_run(2, alone=1)}
+
+
+def test_tools_of_different_evidence_are_calibrated_as_they_are_alone(tmp_path):
+    runs = evidence_patterns()
+    rows = calibrated(write_fleet(tmp_path / "runs.parquet", runs))
+    for serial, columns in runs.items():
+        check_same(rows[serial], alone(columns, "x"), 1e-8)
+
+
+def test_a_profile_without_scale_or_noise_is_filled_in_per_tool(tmp_path):
+    runs = {f"T{seed}": short_run(seed) for seed in range(3)}
+    rows = calibrated(write_fleet(tmp_path / "runs.parquet", runs), tool="generic")
+    for serial, columns in runs.items():
+        check_same(rows[serial], alone(columns, "x", tool="generic"), 1e-6)
+
+
+def test_factors_and_true_azimuths(tmp_path):
+    metadata = {"azimuth_reference": "true", "declination_deg": 7.5}
+    runs = {f"T{seed}": short_run(seed) for seed in range(3)}
+    for columns in runs.values():
+        columns["ref_azimuth_deg"] = (columns["ref_azimuth_deg"] + 7.5) % 360
+    path = write_fleet(tmp_path / "runs.parquet", runs, metadata)
+    rows = calibrated(path, "--model", "factors")
+    for serial, columns in runs.items():
+        check_same(rows[serial], alone(columns, "x", metadata=metadata, model="factors"))
+
+
+def test_ragged_runs_in_any_order_of_rows(tmp_path):
+    runs = {f"T{i}": short_run(i) for i in range(6)}
+    runs = {s: {k: v[: 28 - i % 3] for k, v in c.items()} for i, (s, c) in enumerate(runs.items())}
+    path = write_fleet(tmp_path / "runs.parquet", runs)
+    expected = calibrated(path)
+    assert [row["stations"] for row in expected.values()] == [28, 27, 26, 28, 27, 26]
+    table = pq.read_table(path)
+    order = np.random.default_rng(0).permutation(table.num_rows)
+    pq.write_table(table.take(pa.array(order)), path, row_group_size=50)
+    mixed = calibrated(path)
+    assert set(mixed) == set(expected)
+    for serial, row in mixed.items():
+        for name, value in row.items():
+            same = pytest.approx(value, 1e-9, 1e-12) if isinstance(value, float) else value
+            assert expected[serial][name] == same
+
+
+def test_serials_may_be_numbers_and_stay_so(tmp_path):
+    runs = {7: short_run(7), 3: short_run(3)}
+    rows = calibrated(write_fleet(tmp_path / "runs.parquet", runs))
+    assert list(rows) == [7, 3]
+
+
+def test_a_folder_with_one_tool_in_each_part(tmp_path):
+    runs = {f"T{seed}": short_run(seed) for seed in range(3)}
+    expected = calibrated(write_fleet(tmp_path / "runs.parquet", runs))
+    folder = tmp_path / "runs"
+    for serial, columns in runs.items():
+        part = folder / f"serial={serial}"
+        part.mkdir(parents=True)
+        whole = pq.read_table(write_fleet(tmp_path / "one.parquet", {serial: columns}))
+        pq.write_table(whole.drop_columns(["serial"]), part / "0.parquet")
+    assert calibrated(folder) == expected
+
+
+def test_the_table_says_what_it_is(tmp_path):
+    path = write_fleet(tmp_path / "runs.parquet", {"T1": short_run(1)}, {"simulated": True})
+    calibrated(path)
+    made = tables.read(tmp_path / "cals.parquet")
+    assert made.metadata["simulated"] is True
+    assert made.metadata["profile"] == load_profile("servo")[0].name
+    assert list(made.columns)[:4] == ["serial", "status", "message", "stations"]
+    assert set(names(Options())) <= set(made.columns)
+
+
+# Bad tools
+
+
+def bad_tools():
+    """Runs that `calibrate` refuses, by the status that a fleet gives them."""
+    good = short_run(1)
+    blank = good["ay"].copy()
+    blank[3] = np.nan
+    far = good["ref_inclination_deg"].copy()
+    far[5] = 400.0
+    scattered = good["ax"] + np.random.default_rng(1).normal(0, 0.5, 28)
+    return {
+        "bad-input": {**good, "ay": blank},
+        "bad-input-range": {**good, "ref_inclination_deg": far},
+        "bad-input-temperature": {**good, "temperature_c": np.where(blank == blank, 20.0, np.nan)},
+        "too-few-stations": {n: v[:3] for n, v in good.items()},
+        "channel": {**good, "mz": np.full(28, 2.0)},
+        "channel-scale": {**good, "mx": good["mx"] * 1e6},
+        "gain": {**good, "mx": -good["mx"]},
+        "gain-unit": {n: v * 9.81 if n in ("ax", "ay", "az") else v for n, v in good.items()},
+        "residuals": {**good, "ax": scattered},
+        "weak-geometry": servo_run(1, inclinations=(5, 45, 90), toolfaces=4),
+    }
+
+
+def statuses(serial):
+    return serial.removesuffix("-range").removesuffix("-temperature").removesuffix("-scale")
+
+
+@pytest.mark.parametrize("method", ["joint", "scalar"])
+def test_what_calibrate_refuses_is_refused_for_the_same_reason(tmp_path, method):
+    runs = {"good": short_run(2), **bad_tools(), "good-too": short_run(3)}
+    path = write_fleet(tmp_path / "runs.parquet", runs)
+    rows = calibrated(path, "--method", method)
+    first, seen = 1, set()
+    for serial, columns in runs.items():
+        expected = alone(columns, f"runs.parquet, serial {serial}", first, method=method)
+        first += len(columns["ax"])
+        if isinstance(expected, MwdcalError):
+            assert rows[serial]["message"] == str(expected), serial
+            assert rows[serial]["status"] != "ok"
+            assert rows[serial]["accelerometer_gain_xx"] is None
+            assert isinstance(expected, InputError) == (rows[serial]["status"] == "bad-input")
+            seen.add(rows[serial]["status"])
+            if method == "joint":
+                assert rows[serial]["status"] == statuses(serial).removesuffix("-unit")
+        else:
+            check_same(rows[serial], expected)
+    assert len(seen) == 5 + (method == "scalar"), seen
+    assert ("weak-geometry" in seen) == (method == "scalar")
+
+
+def test_references_that_a_method_needs(tmp_path):
+    runs = {"whole": short_run(1), "lacking": short_run(2, ref_toolface_deg=np.full(28, np.nan))}
+    path = write_fleet(tmp_path / "runs.parquet", runs)
+    rows = calibrated(path, "--method", "least-squares")
+    assert [row["status"] for row in rows.values()] == ["ok", "missing-reference"]
+    expected = alone(runs["lacking"], "x", method="least-squares")
+    assert rows["lacking"]["message"] == str(expected)
+
+
+def test_temperatures_that_an_order_needs(tmp_path):
+    runs = {"warm": warm_run(1), "cold": short_run(2), "none": short_run(3, temperature_c=None)}
+    rows = calibrated(write_fleet(tmp_path / "runs.parquet", runs), "--order", 1)
+    assert [row["status"] for row in rows.values()] == ["ok", *["temperature-span"] * 2]
+    for serial in ("cold", "none"):
+        assert rows[serial]["message"] == str(alone(runs[serial], f"serial {serial}", order=1))
+
+
+def test_one_member_that_stops_the_batch_does_not_stop_the_others(tmp_path, monkeypatch):
+    def fragile(readings, options):
+        if readings.accelerometer[..., 0, 0].max() > 5:
+            raise np.linalg.LinAlgError("no convergence")
+        return fit(readings, options)
+
+    monkeypatch.setattr("mwdcal.fleet.fit", fragile)
+    runs = {f"T{seed}": short_run(seed) for seed in range(5)}
+    runs["T3"]["ax"][0] = 50.0
+    rows = calibrated(write_fleet(tmp_path / "runs.parquet", runs))
+    assert [row["status"] for row in rows.values()] == ["ok"] * 3 + ["failed", "ok"]
+    assert "alone" in rows["T3"]["message"]
+
+
+def test_no_tool_calibrated_is_exit_3(tmp_path):
+    runs = {"a": bad_tools()["gain"], "b": bad_tools()["channel"]}
+    path = write_fleet(tmp_path / "runs.parquet", runs)
+    report = tmp_path / "fleet.html"
+    rows = calibrated(path, "--report", report, code=3)
+    assert {row["status"] for row in rows.values()} == {"gain", "channel"}
+    assert "None calibrated" in report.read_text("utf-8")
+
+
+@pytest.mark.parametrize("method", ["joint", "scalar", "newton", "toolface-inclination"])
+def test_free_directions_of_a_batch_are_those_of_each_member(method):
+    inc, azi, face = plan((10, 60, 130), 6)
+    rng = np.random.default_rng(5)
+    g, b = attitude(inc, azi, face)(1.0, 5e4, 60 * DEG)
+    gain = np.eye(3) + 0.02 * rng.normal(size=(2, 6, 1, 3, 3))
+    a, m = (
+        np.einsum("bnij,nj->bni", gain[t], v) + s * rng.normal(size=(6, 18, 3))
+        for t, (v, s) in enumerate(((g, 1e-4), (b, 5.0)))
+    )
+    known = {"inclination": inc, "azimuth": azi, "toolface": face}
+    known |= {"gravity": np.ones(18), "field": np.full(18, 5e4), "dip": np.full(18, 60 * DEG)}
+    known = {n: np.broadcast_to(v, (6, 18)) for n, v in known.items()}
+    sd = {"accelerometer": np.full((6, 18, 3), 1e-4), "magnetometer": np.full((6, 18, 3), 5.0)}
+    readings = Readings(a, m, known=known, sd=sd)
+    result = fit(readings, Options(method=method))
+    found = free_of_batch(result)
+    for index in range(6):
+        one = np.array([index])
+        part = [v.take(one) for v in (result.problem, result.state, result.analysis.determined)]
+        expected = free_directions(*part)
+        assert [(f.id, f.triads) for f in found[index]] == [(f.id, f.triads) for f in expected]
+        for ours, theirs in zip(found[index], expected, strict=True):
+            assert ours.direction == pytest.approx(theirs.direction, 1e-6, 1e-9)
+    some = taken(readings, np.array([4, 1]))
+    assert (some.accelerometer == a[[4, 1]]).all()
+
+
+# Wrong inputs
+
+
+def test_wrong_inputs(tmp_path):
+    good = write_fleet(tmp_path / "runs.parquet", {"T1": short_run(1)})
+    table = pq.read_table(good)
+    output = tmp_path / "out.parquet"
+
+    def message(changed, *options, code=2):
+        pq.write_table(changed, good)
+        return refused(mwdcal("fleet", good, "-o", output, "--tool", "servo", *options), code)
+
+    bare = table.drop_columns(["serial"])
+    assert "'serial'" in message(bare)
+    assert "Is it 'SN'?" in message(bare.append_column("SN", table.column("serial")))
+    assert "ax, ay, az must be present" in message(table.drop_columns(["ax"]))
+    assert "Did you mean" in message(
+        table.rename_columns(["AX" if n == "ax" else n for n in table.column_names])
+    )
+    assert "no rows" in message(table.slice(0, 0))
+    blank = pa.array([None, *table.column("serial").to_pylist()[1:]])
+    assert "row 1, column 'serial'" in message(table.set_column(0, "serial", blank))
+    text = pa.array(["x"] * table.num_rows)
+    place = table.column_names.index("ax")
+    assert "column 'ax': expected numbers" in message(table.set_column(place, "ax", text))
+    assert "--order 1 needs" in message(table.drop_columns(["temperature_c"]), "--order", 1)
+    assert "--method" in message(table, "--method", "best")
+    assert "swarm" in message(table, "--method", "swarm", "--order", 1, code=3)
+    assert not output.exists()
+
+
+def test_wrong_paths(tmp_path):
+    good = write_fleet(tmp_path / "runs.parquet", {"T1": short_run(1)})
+    output = tmp_path / "out.parquet"
+    assert "no such file" in refused(mwdcal("fleet", tmp_path / "no.parquet", "-o", output), 2)
+    assert "Parquet" in refused(mwdcal("fleet", good, "-o", tmp_path / "out.csv"), 2)
+    assert "named twice" in refused(mwdcal("fleet", good, "-o", good), 2)
+    assert "folder without" in refused(mwdcal("fleet", _empty(tmp_path), "-o", output), 2)
+    inside = mwdcal("fleet", tmp_path, "-o", tmp_path / "out.parquet")
+    assert "part of the input" in refused(inside, 2)
+    csv = tmp_path / "runs.csv"
+    csv.write_text("serial,ax,ay,az\n")
+    assert "Convert" in refused(mwdcal("fleet", csv, "-o", output), 2)
+    good.write_bytes(b"PAR1 and nothing")
+    assert "complete Parquet file" in refused(mwdcal("fleet", good, "-o", output), 2)
+
+
+def _empty(folder):
+    found = folder / "empty"
+    found.mkdir()
+    return found
+
+
+def test_files_of_a_folder_that_do_not_match(tmp_path):
+    folder = _empty(tmp_path)
+    write_fleet(folder / "a.parquet", {"T1": short_run(1)})
+    write_fleet(folder / "b.parquet", {"T2": short_run(2, ref_dip_deg=None)})
+    message = refused(mwdcal("fleet", folder, "-o", tmp_path / "out.parquet"), 2)
+    assert "'ref_dip_deg' is in some" in message
+
+
+def test_order_0_on_a_wide_span_is_mentioned(tmp_path):
+    path = write_fleet(tmp_path / "runs.parquet", {"T1": warm_run(1), "T2": short_run(2)})
+    ran = mwdcal("fleet", path, "-o", tmp_path / "out.parquet", "--tool", "servo")
+    assert "1 tools span more than 10 °C" in ran.out
+
+
+# Parts, restart, cluster
+
+
+def many(path, tools=1200, stations=20, seed=0):
+    """A table of simple tools, made by arrays: four parts."""
+    rng = np.random.default_rng(seed)
+    inc, azi, face = plan((10, 60, 90, 130), stations // 4)
+    g, b = attitude(inc, azi, face)(1.0, 5e4, 60 * DEG)
+    gain = np.eye(3) + 0.01 * rng.normal(size=(2, tools, 3, 3))
+    raw = [
+        (np.einsum("tij,nj->tni", gain[i], v) + s * rng.normal(size=(tools, stations, 3))) * k
+        for i, (v, s, k) in enumerate(((g, 1e-4, 3.0), (b, 15.0, 5e-5)))
+    ]
+    serial = pa.array([f"T{i:05d}" for i in range(tools)])
+    columns = {"serial": serial.take(pa.array(np.repeat(np.arange(tools), stations)))}
+    flat = np.concatenate(raw, -1).reshape(-1, 6)
+    columns |= dict(zip(("ax", "ay", "az", "mx", "my", "mz"), flat.transpose(), strict=True))
+    angles = dict(zip(ANGLES, (inc, azi, face), strict=True))
+    columns |= {f"ref_{n}_deg": np.tile(np.degrees(v), tools) for n, v in angles.items()}
+    for name, value in (("ref_gravity_g", 1.0), ("ref_field_nt", 5e4), ("ref_dip_deg", 60.0)):
+        columns[name] = np.full(tools * stations, value)
+    pq.write_table(pa.table(columns), path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory):
+    """A fleet of four parts and its calibrations."""
+    folder = tmp_path_factory.mktemp("fleet")
+    path = many(folder / "runs.parquet")
+    ran = mwdcal("fleet", path, "-o", folder / "cals.parquet", "--tool", "servo", "--workers", 1)
+    assert ran.code == 0, ran
+    assert not (folder / "cals.parquet.parts").exists()
+    return path, (folder / "cals.parquet").read_bytes()
+
+
+def test_a_pool_of_processes_writes_the_same_bytes(fleet, tmp_path):
+    path, expected = fleet
+    output = tmp_path / "cals.parquet"
+    ran = mwdcal(
+        "fleet", path, "-o", output, "--tool", "servo", "--workers", 2, "--json",
+        "--report", tmp_path / "fleet.html",
+    )  # fmt: skip
+    assert ran.code == 0, ran
+    assert output.read_bytes() == expected
+    assert ran.json["calibrated"] == ran.json["tools"] == 1200
+    assert ran.json["parts"] == 4
+    page = (tmp_path / "fleet.html").read_text("utf-8")
+    assert page.count("<svg") == 2
+    for text in ("All calibrated", "1200 of 1200 tools", "own-axis gain", "nan"):
+        assert (text in page) == (text not in ("own-axis gain", "nan"))
+
+
+def test_an_interrupted_fleet_goes_on_where_it_was(fleet, tmp_path):
+    path, expected = fleet
+    output = tmp_path / "cals.parquet"
+    folder = tmp_path / "cals.parquet.parts"
+    command = ["fleet", path, "-o", output, "--tool", "servo", "--workers", 1]
+    code = "from mwdcal.app.cli import main; main()"
+    first = subprocess.Popen(
+        [sys.executable, "-c", code, *map(str, command)],
+        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+    )  # fmt: skip
+    limit = time.monotonic() + 60
+    while not list(folder.glob("*.arrow")) and time.monotonic() < limit:
+        time.sleep(0.005)
+    first.kill()
+    first.wait()
+    done = {part: part.stat().st_mtime_ns for part in folder.glob("*.arrow")}
+    assert 1 <= len(done) < 4
+    assert not output.exists()
+    touched = {}
+
+    def watch(work, tasks, workers, scheduler):
+        touched["tasks"] = len(tasks)
+        yield from ((i, work(task)) for i, task in enumerate(tasks))
+        touched["times"] = {part: part.stat().st_mtime_ns for part in done}
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pool, "results", watch)
+        ran = mwdcal(*command)
+    assert ran.code == 0
+    assert f"{len(done)} done before" in ran.err
+    assert touched == {"tasks": 4 - len(done), "times": done}
+    assert output.read_bytes() == expected
+    assert not folder.exists()
+
+
+def test_other_options_or_input_are_other_parts(fleet):
+    path, _ = fleet
+    source = fleet_tables.open_source(path)
+    part = fleet_tables.partitions(source, fleet_tables.find_tools(source), path.parent)[0]
+    profile = load_profile("servo")[0]
+    plan = Plan.of(source, profile, Options())
+    others = [
+        replace(plan, options=Options(order=1)),
+        replace(plan, profile=load_profile("generic")[0]),
+        replace(plan, version="0"),
+        replace(plan, metadata={"declination_deg": 1.0}),
+    ]
+    keys = [each.key(part) for each in (plan, *others)]
+    piece = replace(part.pieces[0], stamp=(1, 1))
+    keys.append(plan.key(replace(part, pieces=(piece,))))
+    assert len(set(keys)) == len(keys)
+    with pytest.raises(InputError, match="same version"):
+        work(replace(plan, version="0"), part)
+
+
+def _die_once(mark, task):
+    if not os.path.exists(mark):
+        with open(mark, "w"):
+            os.kill(os.getpid(), signal.SIGKILL)
+    return bytes([task])
+
+
+def _die(task):
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_a_process_that_dies_loses_nothing(tmp_path):
+    from functools import partial
+
+    if not hasattr(signal, "SIGKILL"):
+        pytest.skip("no SIGKILL on this system")
+    work_once = partial(_die_once, str(tmp_path / "mark"))
+    found = dict(pool.results(work_once, list(range(6)), 2, None))
+    assert found == {i: bytes([i]) for i in range(6)}
+    with pytest.raises(InputError, match="fewer --workers"):
+        list(pool.results(_die, [0, 1], 2, None))
+
+
+def test_partitions_are_of_whole_tools_and_bounded(tmp_path, monkeypatch):
+    monkeypatch.setattr(fleet_tables, "ROWS", (50, 100))
+    path = write_fleet(
+        tmp_path / "runs.parquet", {i: short_run(i) for i in range(9)}, row_group_size=37
+    )
+    source = fleet_tables.open_source(path)
+    tools = fleet_tables.find_tools(source)
+    assert tools.count == 9
+    assert tools.together
+    parts = fleet_tables.partitions(source, tools, tmp_path)
+    assert [part.rows for part in parts] == [56, 56, 56, 56, 28]
+    whole = pq.read_table(path)
+    at = 0
+    for part in parts:
+        own = fleet_tables.read(part, ["serial", "ax"])
+        assert own.column("ax").to_pylist() == whole.column("ax").slice(at, part.rows).to_pylist()
+        assert own.column("#row").to_pylist() == list(range(at, at + part.rows))
+        at += part.rows
+
+
+@contextmanager
+def cluster(folder, workers=2):
+    """A Dask scheduler and workers on this machine: its address and their processes."""
+    pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"tcp://127.0.0.1:{free.getsockname()[1]}"
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "PYTHONWARNINGS": "ignore"}
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "env": env, "cwd": folder}
+    dask = [sys.executable, "-m", "dask"]
+    running = [
+        subprocess.Popen(
+            [*dask, "scheduler", "--host", address, "--no-dashboard", "--no-show"], **quiet
+        )
+    ]
+    one = ["worker", address, "--nthreads", "1", "--no-nanny", "--no-dashboard"]
+    try:
+        running += [subprocess.Popen([*dask, *one], **quiet) for _ in range(workers)]
+        yield address, running[1:]
+    finally:
+        for each in reversed(running):
+            each.kill()
+            each.wait()
+
+
+def test_a_cluster_of_two_of_which_one_dies_half_way(tmp_path):
+    path = many(tmp_path / "runs.parquet", tools=4800)
+    output, folder = tmp_path / "cals.parquet", tmp_path / "cals.parquet.parts"
+    with cluster(tmp_path) as (address, workers):
+        command = ["fleet", path, "-o", output, "--tool", "servo", "--scheduler", address]
+        client = subprocess.Popen(
+            [sys.executable, "-c", "from mwdcal.app.cli import main; main()", *map(str, command)],
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        limit = time.monotonic() + 120
+        while len(list(folder.glob("*.arrow"))) < 4 and time.monotonic() < limit:
+            assert client.poll() is None, client.communicate()
+            time.sleep(0.01)
+        before = len(list(folder.glob("*.arrow")))
+        workers[0].kill()
+        out, err = client.communicate(timeout=300)
+    assert client.returncode == 0, err
+    assert "Traceback" not in err
+    assert before < 16
+    assert "4800 tools" in out
+    local = tmp_path / "local.parquet"
+    assert mwdcal("fleet", path, "-o", local, "--tool", "servo", "--workers", 1).code == 0
+    assert output.read_bytes() == local.read_bytes()
+
+
+def test_no_cluster_there(fleet, tmp_path, monkeypatch):
+    pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
+    path, _ = fleet
+    monkeypatch.setattr(pool, "PATIENCE", "1s")
+    ran = process(
+        "fleet", path, "-o", tmp_path / "o.parquet", "--scheduler", "nonsense", timeout=90
+    )
+    assert ran.returncode == 2
+    assert "Traceback" not in ran.stderr
+    assert "no Dask scheduler answers" in ran.stderr

@@ -1,0 +1,109 @@
+"""Refusals that name cause and remedy.
+
+Elsewhere: unknown method, model, order and tool, orders without temperatures, contradicting
+references, dead and swapped channels (test_cli_ugly); few stations, no redundancy, gains
+(test_calibrate); stand errors that cannot be told apart (test_stand); a singular design that is
+accepted, and what its message names (test_ranks).
+"""
+
+import numpy as np
+import pytest
+
+from cli_support import RAW, SCALE, SERVO_NOISE, mwdcal, refused, servo_run, write_csv
+
+METHODS = ("joint", "least-squares", "swarm", "newton", "toolface-inclination", "scalar")
+
+
+def calibrate(folder, run, *options):
+    path = write_csv(folder / "run.csv", run)
+    return mwdcal("calibrate", path, "--tool", "servo", "-o", folder / "cal.json", *options)
+
+
+def said(folder, run, *options):
+    """The message of a refusal that leaves no calibration behind."""
+    message = refused(calibrate(folder, run, *options), 3)
+    assert not (folder / "cal.json").exists()
+    return message
+
+
+def one_attitude(station=20):
+    """Forty-eight noisy readings of one and the same station."""
+    run = servo_run()
+    rng = np.random.default_rng(0)
+    noise = np.repeat(np.multiply(SCALE, SERVO_NOISE), 3)
+    for name, sd in zip(RAW, noise, strict=True):
+        run[name] = np.full(48, run[name][station]) + sd * rng.normal(size=48)
+    for name in (n for n in run if n.startswith("ref_")):
+        run[name] = np.full(48, run[name][station])
+    return run
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_one_attitude_does_not_move_the_channels(tmp_path, method):
+    message = said(tmp_path, one_attitude(), "--method", method)
+    assert "accelerometer channel on tool axis x moves by 0.0" in message
+    assert "too little to calibrate it. Add stations at other inclinations" in message
+
+
+@pytest.mark.parametrize("model", ["polynomial", "factors"])
+@pytest.mark.parametrize("inclinations", [(5, 45, 90), (45, 90, 135), (20, 45, 70)])
+def test_three_inclinations_by_four_toolfaces_are_too_weak_for_strengths(
+    tmp_path, inclinations, model
+):
+    run = servo_run(inclinations=inclinations, toolfaces=4)
+    message = said(tmp_path, run, "--method", "scalar", "--model", model)
+    assert "too weak to fit the model: nothing determines accelerometer" in message
+    assert "Add stations at other inclinations" in message
+    assert "six or more toolfaces" in message
+
+
+def test_the_same_stations_with_all_references_are_enough(tmp_path):
+    for inclinations in ((5, 45, 90), (45, 90, 135), (20, 45, 70)):
+        run = servo_run(inclinations=inclinations, toolfaces=4)
+        assert calibrate(tmp_path, run).code == 0
+
+
+def blank_toolface(place=17):
+    run = servo_run()
+    return {
+        **run,
+        "ref_toolface_deg": np.where(np.arange(48) == place, np.nan, run["ref_toolface_deg"]),
+    }
+
+
+@pytest.mark.parametrize("method", ["least-squares", "swarm", "toolface-inclination"])
+def test_one_missing_toolface_stops_what_needs_it(tmp_path, method):
+    message = said(tmp_path, blank_toolface(), "--method", method)
+    assert f"method {method} needs inclination, toolface" in message
+    assert "'ref_toolface_deg' is blank at 1 of 48 (first: station 18)" in message
+    assert "Fill it in, or use --method joint" in message
+
+
+@pytest.mark.parametrize(("method", "rank"), [("joint", 12), ("newton", 11), ("scalar", 9)])
+def test_one_missing_toolface_stops_nothing_else(tmp_path, method, rank):
+    made = calibrate(tmp_path, blank_toolface(), "--method", method, "--json")
+    assert made.code == 0
+    assert [t["rank"] for t in made.json["triads"].values()] == [rank, rank]
+
+
+@pytest.mark.parametrize("temperatures", [(20, 25), (20, 21, 23, 25), np.linspace(20, 25, 8)])
+def test_order_3_over_five_degrees(tmp_path, temperatures):
+    message = said(tmp_path, servo_run(temperatures=temperatures), "--order", 3)
+    assert "spans 5.0 °C" in message
+    assert "--order 3, which needs 4 of them over 30 °C or more" in message
+    assert "Add temperatures, or lower --order." in message
+
+
+@pytest.mark.parametrize("order", [1, 2, 3])
+def test_the_swarm_knows_no_temperature(tmp_path, order):
+    run = servo_run(temperatures=(20.0, 60.0, 100.0, 140.0))
+    message = said(tmp_path, run, "--order", order, "--method", "swarm")
+    assert "swarm finds the 12 parameters of one temperature" in message
+    assert "use --order 0 for it, or --method joint" in message
+
+
+@pytest.mark.parametrize("names", ["toolface-zero", "azimuth-zero,toolface-zero,tilt"])
+def test_toolface_zero_is_not_to_be_had(tmp_path, names):
+    message = said(tmp_path, servo_run(), "--estimate", names)
+    assert "can never be told from a rotation of the sensors in the tool" in message
+    assert "Set it by an index mark." in message
