@@ -59,6 +59,7 @@ LAYERS = (
         "app.fleets",
         "app.plots",
         "app.pool",
+        "app.worker",
         "app.report",
         "app.report.*",
         "app.standstills",

@@ -41,7 +41,7 @@ pq = pytest.importorskip("pyarrow.parquet")
 
 from mwdcal.app import pool  # noqa: E402
 from mwdcal.files import fleet_tables  # noqa: E402
-from mwdcal.files.fleet_parts import Plan, work  # noqa: E402
+from mwdcal.files.fleet_parts import Plan, load, solve  # noqa: E402
 
 ANGLES = ("inclination", "azimuth", "toolface")
 
@@ -222,6 +222,25 @@ def test_ragged_runs_in_any_order_of_rows(tmp_path):
         for name, value in row.items():
             same = pytest.approx(value, 1e-9, 1e-12) if isinstance(value, float) else value
             assert expected[serial][name] == same
+
+
+def test_serials_may_be_categories_in_another_order(tmp_path):
+    runs = {f"T{seed}": short_run(seed) for seed in (2, 0, 1)}
+    path = write_fleet(tmp_path / "runs.parquet", runs)
+    expected = calibrated(path)
+    table = pq.read_table(path)
+    codes = [int(serial[1:]) for serial in table.column("serial").to_pylist()]
+    names = pa.array(["T0", "T1", "T2", "nobody"])
+    coded = pa.DictionaryArray.from_arrays(pa.array(codes, pa.int8()), names)
+    pq.write_table(table.set_column(0, "serial", coded), path, row_group_size=30)
+    assert calibrated(path) == expected
+
+
+def test_rows_that_are_mixed_too_much_are_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(fleet_tables, "MOST_STRETCHES", 2)
+    path = write_fleet(tmp_path / "runs.parquet", {i: short_run(i) for i in range(3)})
+    ran = mwdcal("fleet", path, "-o", tmp_path / "out.parquet")
+    assert "Sort the table by 'serial'" in refused(ran, 2)
 
 
 def test_serials_may_be_numbers_and_stay_so(tmp_path):
@@ -512,9 +531,9 @@ def test_an_interrupted_fleet_goes_on_where_it_was(fleet, tmp_path):
     assert not output.exists()
     touched = {}
 
-    def watch(work, tasks, workers, scheduler):
+    def watch(steps, tasks, workers, scheduler):
         touched["tasks"] = len(tasks)
-        yield from ((i, work(task)) for i, task in enumerate(tasks))
+        yield from ((i, steps(task)) for i, task in enumerate(tasks))
         touched["times"] = {part: part.stat().st_mtime_ns for part in done}
 
     with pytest.MonkeyPatch.context() as patch:
@@ -525,6 +544,27 @@ def test_an_interrupted_fleet_goes_on_where_it_was(fleet, tmp_path):
     assert touched == {"tasks": 4 - len(done), "times": done}
     assert output.read_bytes() == expected
     assert not folder.exists()
+
+
+@pytest.mark.skipif(not hasattr(os, "killpg"), reason="no process groups on this system")
+def test_an_interruption_from_the_keyboard_leaves_parts_and_no_traceback(tmp_path):
+    path = many(tmp_path / "runs.parquet", tools=6000)
+    output, folder = tmp_path / "cals.parquet", tmp_path / "cals.parquet.parts"
+    command = ["fleet", path, "-o", output, "--tool", "servo", "--workers", 2]
+    running = subprocess.Popen(
+        [sys.executable, "-c", "from mwdcal.app.cli import main; main()", *map(str, command)],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
+    )  # fmt: skip
+    limit = time.monotonic() + 60
+    while not list(folder.glob("*.arrow")) and time.monotonic() < limit:
+        time.sleep(0.005)
+    os.killpg(running.pid, signal.SIGINT)
+    out, err = running.communicate(timeout=60)
+    assert (running.returncode, out) == (130, "")
+    assert "Traceback" not in err
+    assert err.splitlines()[-1].startswith("mwdcal: interrupted")
+    assert list(folder.glob("*.arrow"))
+    assert not output.exists()
 
 
 def test_other_options_or_input_are_other_parts(fleet):
@@ -544,7 +584,7 @@ def test_other_options_or_input_are_other_parts(fleet):
     keys.append(plan.key(replace(part, pieces=(piece,))))
     assert len(set(keys)) == len(keys)
     with pytest.raises(InputError, match="same version"):
-        work(replace(plan, version="0"), part)
+        solve(replace(plan, version="0"), load(plan, part))
 
 
 def _die_once(mark, task):
@@ -563,11 +603,11 @@ def test_a_process_that_dies_loses_nothing(tmp_path):
 
     if not hasattr(signal, "SIGKILL"):
         pytest.skip("no SIGKILL on this system")
-    work_once = partial(_die_once, str(tmp_path / "mark"))
-    found = dict(pool.results(work_once, list(range(6)), 2, None))
+    once = pool.Steps(int, partial(_die_once, str(tmp_path / "mark")))
+    found = dict(pool.results(once, list(range(6)), 2, None))
     assert found == {i: bytes([i]) for i in range(6)}
     with pytest.raises(InputError, match="fewer --workers"):
-        list(pool.results(_die, [0, 1], 2, None))
+        list(pool.results(pool.Steps(int, _die), [0, 1], 2, None))
 
 
 def test_partitions_are_of_whole_tools_and_bounded(tmp_path, monkeypatch):

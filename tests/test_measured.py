@@ -58,7 +58,7 @@ def test_distox_scatter_below_the_peers_coefficients(name):
     assert peer < measured.figures(name, LINEAR).scatter < 1.02 * peer
 
 
-@pytest.mark.parametrize("words", ["", LINEAR, "--method scalar", f"{LINEAR} --robust student-t"])
+@pytest.mark.parametrize("words", ["", LINEAR, "--method scalar"])
 def test_xsens_meets_the_published_calibration(words):
     found = measured.xsens(words)
     assert found["bias, counts"] < 1
@@ -67,7 +67,7 @@ def test_xsens_meets_the_published_calibration(words):
     assert found["residual of |g|, %"] <= 0.015
 
 
-@pytest.mark.parametrize("words", ["", LINEAR, "--method scalar", f"{LINEAR} --robust huber"])
+@pytest.mark.parametrize("words", ["", LINEAR, "--method scalar"])
 def test_mikov_meets_the_publication_within_its_uncertainty(words):
     assert max(worst for worst, _ in measured.mikov(words).values()) < 1.5
 
@@ -125,7 +125,7 @@ def test_strengths_alone_make_joint_and_scalar_one_estimator(name):
     assert parameters(name, "--method scalar --paper-weights") == pytest.approx(joint, abs=1e-5)
 
 
-@pytest.mark.parametrize("name", ["xsens", *measured.MIKOV])
+@pytest.mark.parametrize("name", ["xsens", "imu0"])
 def test_fewer_parameters_fit_no_better(name):
     """Nine leave out just the rotations that the strength cannot see, six more than that."""
     ladder = ("--parameters 6", "--parameters 9", "", "--nonlinearity accelerometer")
@@ -169,11 +169,9 @@ def test_robust_weights_do_not_spoil_clean_sets(name, loss):
 
 def test_robust_weights_do_not_spoil_a_roll_set():
     """Scatter of a set without bad shots within 5 % of that with full weights."""
-    for loss in ("huber", "student-t"):
-        plain, robust = (
-            measured.figures("sap5/ai", words) for words in (LINEAR, f"{LINEAR} --robust {loss}")
-        )
-        assert robust.scatter_left_out < 1.05 * plain.scatter_left_out
+    words = (LINEAR, f"{LINEAR} --robust student-t")
+    plain, robust = (measured.figures("sap5/ai", w).scatter_left_out for w in words)
+    assert robust < 1.05 * plain
 
 
 # ── Page ─────────────────────────────────────────────────────────────────────────────────────
@@ -185,13 +183,11 @@ def test_rows_with_equal_figures_are_one():
     assert {row.count("|") for row in text} == {4}
 
 
-def test_refusals_of_the_lone_accelerometers_differ_in_numbers_alone():
-    xsens, mikov = (
-        measured.refusals(names, "accelerometer") for names in (["xsens"], measured.MIKOV)
-    )
-    assert [row.replace("38", "22") for row in xsens] == mikov
-    for method in NEEDY:
-        assert any(row.startswith(f"- `--method {method}` in every form: ") for row in xsens)
+@pytest.mark.parametrize("method", NEEDY)
+def test_refusals_of_the_lone_accelerometers_differ_in_numbers_alone(method):
+    names = ("xsens", *measured.MIKOV)
+    reasons = {measured.trial(name, f"--method {method}").refused for name in names}
+    assert len({"".join(c for c in reason if not c.isdigit()) for reason in reasons}) == 1
 
 
 def test_labels_name_each_method_once():

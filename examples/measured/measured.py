@@ -480,8 +480,9 @@ def refusals(names: Sequence[str], curved: str) -> list[str]:
     for words in ways(curved):
         reasons = [t.refused for t in (trial(name, words) for name in names) if t.refused]
         if reasons:
-            found.setdefault(reasons[0], []).append(words)
-    return ["Refused:", "", *(f"- {label(group)}: *{reason}*" for reason, group in found.items())]
+            some = f" (on {len(reasons)} of {len(names)} sets)" if len(reasons) < len(names) else ""
+            found.setdefault(f"*{reasons[0]}*{some}", []).append(words)
+    return ["Refused:", "", *(f"- {label(group)}: {reason}" for reason, group in found.items())]
 
 
 def roll_table(names: Sequence[str], curved: str) -> list[str]:

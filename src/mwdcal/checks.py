@@ -137,7 +137,7 @@ def _check_temperature(readings: Readings, order: int) -> None:
     span = float(np.ptp(readings.temperature))
     if levels < order + 1 or span < 10 * order:
         raise FitError(
-            f"the run spans {span:.1f} °C at {levels} temperatures more than 5 °C apart: too little "
+            f"the run spans {span:.1f} °C with {levels} temperature{'s' * (levels > 1)} more than 5 °C apart: too little "
             f"for --order {order}, which needs {order + 1} of them over {10 * order} °C or more. "
             "Add temperatures, or lower --order."
         )

@@ -145,6 +145,7 @@ def _fit(readings: Readings, options: Options, include: Array | None) -> Fit:
         for t, k in zip(problem.triads, declared, strict=True)
     ]
     analysis = _analysed(analyse(trusted, state, determined), trusted, state, solved, options)
+    trusted.memo.at(None)
     return Fit(trusted, state, status, iterations, np.stack(noise, -1), trust, analysis)
 
 

@@ -101,7 +101,8 @@ def _odd_gains(result: Fit) -> Bools:
     problem = result.problem
     for triad, where in zip(problem.triads, problem.slices(), strict=True):
         params = result.state.params[:, where]
-        slope = triad.model.slope(params, triad.raw, problem.temperature).mean(1)
+        some = slice(None if triad.model.basis.order else 1)
+        slope = triad.model.slope(params, triad.raw[:, some], problem.temperature[:, some]).mean(1)
         gain = np.diagonal(slope, axis1=-2, axis2=-1)
         middle = np.median(np.abs(gain), -1, keepdims=True)
         inside = [
@@ -117,10 +118,11 @@ def _absurd(result: Fit) -> Bools:
     found = np.zeros(len(result.status), bool)
     for index, triad in enumerate(problem.triads):
         noise, factor = result.noise[:, index], analysis.variance_factor[:, index]
-        strength = np.linalg.norm(triad.raw, axis=-1).mean(-1)
-        size = np.minimum(strength, 2 * triad.raw.std(axis=1).max(-1))
         found |= np.isnan(noise) & (factor > ABSURD**2) & (analysis.freedom[:, index] >= 1)
-        found |= np.nan_to_num(noise) > COARSE * size
+        if np.isfinite(noise).any():
+            strength = np.linalg.norm(triad.raw, axis=-1).mean(-1)
+            size = np.minimum(strength, 2 * triad.raw.std(axis=1).max(-1))
+            found |= np.nan_to_num(noise) > COARSE * size
     return found
 
 

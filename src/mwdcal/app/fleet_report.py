@@ -154,7 +154,7 @@ def _unit(name: str, triad: str, field: str) -> tuple[str, float]:
     """Unit and factor of a parameter: offsets in mg or nT, the rest as shares of nominal."""
     kind, _, rest = name.partition("_")
     power = rest.partition("_t")[2]
-    per = f"/°C{power if int(power) > 1 else ''}" if power else ""
+    per = f"/°C{_raised(power)}" if power else ""
     if kind in ("offset", "bias"):
         return (f"mg{per}", 1e3) if triad == TRIADS[0] else (f"{field}{per}", 1.0)
     return per.replace("/", "1/"), 1.0
@@ -167,8 +167,13 @@ def _title(name: str) -> str:
     'gain xy·τ'
     """
     steady, _, power = name.partition("_t")
-    course = f"·τ{power if power > '1' else ''}" if power else ""
+    course = f"·τ{_raised(power)}" if power else ""
     return steady.replace("_", " ") + course
+
+
+def _raised(power: str) -> str:
+    """An exponent, none for the first power."""
+    return power.translate(report.SUPERSCRIPT) if power != "1" else ""
 
 
 def _figures(path: Path, parameters: list[Parameter], sound: Ints) -> dict[str, str]:

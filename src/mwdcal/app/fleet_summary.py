@@ -128,9 +128,8 @@ def _undetermined(path: Path, names: list[str]) -> dict[str, int]:
     found: dict[str, int] = {}
     for name in names:
         if name.endswith("_undetermined"):
-            cells = pq.read_table(path, columns=[name]).column(0).combine_chunks()
-            flat = cells.flatten() if hasattr(cells, "flatten") else cells
-            for each in flat.value_counts().to_pylist():
+            cells = pq.read_table(path, columns=[name]).column(0)
+            for each in cells.combine_chunks().flatten().value_counts().to_pylist():
                 value, count = each["values"], each["counts"]
                 found[f"{name.removesuffix('_undetermined')}: {value}"] = count
     return found

@@ -20,7 +20,7 @@ from mwdcal.app.fleet_summary import Summary, document, summarise, text
 from mwdcal.checks import check_options
 from mwdcal.errors import FitError, InputError
 from mwdcal.files import atomic, parquet, profiles
-from mwdcal.files.fleet_parts import Plan, work
+from mwdcal.files.fleet_parts import Plan, load, solve
 from mwdcal.files.fleet_tables import (
     SERIAL,
     Partition,
@@ -132,7 +132,8 @@ def _make_parts(
     begun = told = time.perf_counter()
     tools = 0
     tasks = [parts[index] for index in missing]
-    found = pool.results(partial(work, plan), tasks, workers, asked["scheduler"])
+    steps = pool.Steps(partial(load, plan), partial(solve, plan))
+    found = pool.results(steps, tasks, workers, asked["scheduler"])
     for count, (index, content) in enumerate(found, 1):
         atomic.write(paths[missing[index]], content)
         tools += tasks[index].tools

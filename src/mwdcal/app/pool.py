@@ -1,42 +1,58 @@
-"""Partitions done by many workers: processes of this machine, or a Dask cluster.
+"""Parts of a fleet done by many workers: processes of this machine, or a Dask cluster.
 
-Both run the same function and hand its results over as they come; a result is only counted
-when it has arrived, so a worker that dies costs the partitions it had in hand, which are done
-again by others.
+Both run the same two steps, `load` and `solve`, and hand results over as they come. Processes
+get what was loaded here, where a row group is decoded once; workers of a cluster load for
+themselves. A result only counts when it has arrived, so a worker that dies costs what it had
+in hand, which is done again by others.
 """
 
 from __future__ import annotations
 
 import os
+import signal
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
-from multiprocessing import get_context
+from multiprocessing import get_all_start_methods, get_context
+from multiprocessing.context import BaseContext
 from typing import Any
 
 from mwdcal.errors import InputError
 
 ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 ATTEMPTS = 3
-"""How often a partition whose worker died is given to another."""
+"""How often a part whose worker died is given to another."""
 PATIENCE = "30s"
 """How long a cluster may take to answer and to have a worker."""
+WORKER = "mwdcal.app.worker"
+"""Module that a worker process has loaded before it is given anything."""
 
-Work = Callable[[Any], bytes]
+
+@dataclass(frozen=True)
+class Steps:
+    """What is done to a task: `solve(load(task))`; both can be sent to another process."""
+
+    load: Callable[[Any], Any]
+    solve: Callable[[Any], bytes]
+
+    def __call__(self, task: Any) -> bytes:
+        """Both steps at one place."""
+        return self.solve(self.load(task))
 
 
 def results(
-    work: Work, tasks: Sequence[Any], workers: int, scheduler: str | None
+    steps: Steps, tasks: Sequence[Any], workers: int, scheduler: str | None
 ) -> Iterator[tuple[int, bytes]]:
     """Index and result of each task, in the order in which they are ready."""
     if scheduler:
-        return _on_cluster(work, tasks, scheduler)
+        return _on_cluster(steps, tasks, scheduler)
     if workers == 1 or len(tasks) == 1:
-        return ((index, work(task)) for index, task in enumerate(tasks))
-    return _on_cores(work, tasks, min(workers, len(tasks)))
+        return ((index, steps(task)) for index, task in enumerate(tasks))
+    return _on_cores(steps, tasks, min(workers, len(tasks)))
 
 
 def cores() -> int:
@@ -60,12 +76,26 @@ def _one_thread_each() -> Iterator[None]:
                 os.environ[name] = value
 
 
-def _on_cores(work: Work, tasks: Sequence[Any], workers: int) -> Iterator[tuple[int, bytes]]:
+def _context() -> BaseContext:
+    """Clean processes; where the system can, copies of one that has loaded everything."""
+    if "forkserver" not in get_all_start_methods():
+        return get_context("spawn")
+    context = get_context("forkserver")
+    context.set_forkserver_preload([WORKER])
+    return context
+
+
+def _leave_interrupts() -> None:
+    """An interruption from the keyboard reaches all processes: the first one deals with it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _on_cores(steps: Steps, tasks: Sequence[Any], workers: int) -> Iterator[tuple[int, bytes]]:
     """By a pool of processes; a new pool where a process died."""
     left = list(range(len(tasks)))
     for _ in range(ATTEMPTS):
         try:
-            for index, result in _by_pool(work, tasks, left, workers):
+            for index, result in _by_pool(steps, tasks, left, workers):
                 left.remove(index)
                 yield index, result
         except BrokenProcessPool:
@@ -78,16 +108,19 @@ def _on_cores(work: Work, tasks: Sequence[Any], workers: int) -> Iterator[tuple[
 
 
 def _by_pool(
-    work: Work, tasks: Sequence[Any], left: Sequence[int], workers: int
+    steps: Steps, tasks: Sequence[Any], left: Sequence[int], workers: int
 ) -> Iterator[tuple[int, bytes]]:
-    """Results of one pool; no more tasks are handed out than keep it busy."""
+    """Results of one pool; no more tasks are loaded than keep it busy."""
     waiting = iter(tuple(left))
-    with _one_thread_each(), ProcessPoolExecutor(workers, get_context("spawn")) as pool:
+    with (
+        _one_thread_each(),
+        ProcessPoolExecutor(workers, _context(), _leave_interrupts) as pool,
+    ):
         running: dict[Future[bytes], int] = {}
         try:
             while True:
                 for index in waiting:
-                    running[pool.submit(work, tasks[index])] = index
+                    running[pool.submit(steps.solve, steps.load(tasks[index]))] = index
                     if len(running) >= 2 * workers:
                         break
                 if not running:
@@ -99,17 +132,18 @@ def _by_pool(
             pool.shutdown(wait=False, cancel_futures=True)
 
 
-def _on_cluster(work: Work, tasks: Sequence[Any], address: str) -> Iterator[tuple[int, bytes]]:
+def _on_cluster(steps: Steps, tasks: Sequence[Any], address: str) -> Iterator[tuple[int, bytes]]:
     """By the workers of a Dask scheduler, which gives a dead worker's tasks to others."""
     try:
         distributed: Any = import_module("distributed")
     except ImportError:
         raise InputError(
             "--scheduler needs the extra 'cluster'. Install it, here and on every worker: "
-            "pip install 'mwdcal[all,cluster]'"
+            "pip install 'mwdcal[parquet,cluster]'"
         ) from None
-    with _connected(partial(distributed.Client, address, timeout=PATIENCE), address) as client:
-        futures = client.map(work, tasks, pure=False, retries=ATTEMPTS)
+    client_of = partial(distributed.Client, address, timeout=PATIENCE)
+    with _connected(client_of, address) as client:
+        futures = client.map(steps, tasks, pure=False, retries=ATTEMPTS)
         places = {future.key: index for index, future in enumerate(futures)}
         arriving = distributed.as_completed(futures)
         del futures
@@ -126,7 +160,7 @@ def _on_cluster(work: Work, tasks: Sequence[Any], address: str) -> Iterator[tupl
         except ModuleNotFoundError as error:
             raise InputError(
                 f"a worker of {address} has no {error.name}. Install mwdcal there: pip install "
-                "'mwdcal[all,cluster]'"
+                "'mwdcal[parquet,cluster]'"
             ) from error
 
 

@@ -182,10 +182,17 @@ class Prior:
 
 @dataclass
 class Memo:
-    """The last state that was predicted, and the answer: rank and step ask at the same one."""
+    """What was found at the last state: rank, step and analysis ask at the same one."""
 
     state: State | None = None
     predictions: list[Prediction] = field(default_factory=list)
+    linear: dict[bool, Linear] = field(default_factory=dict)
+
+    def at(self, state: State | None) -> Memo:
+        """Ours, emptied if it is of another state."""
+        if self.state is not state or state is None:
+            self.state, self.predictions, self.linear = state, [], {}
+        return self
 
 
 @dataclass(frozen=True)
@@ -256,9 +263,9 @@ class Problem:
 
     def predictions(self, state: State) -> list[Prediction]:
         """Compare each triad's readings with the reference vectors; the last answer is kept."""
-        if self.memo.state is not state:
-            self.memo.state, self.memo.predictions = state, self._predictions(state)
-        return self.memo.predictions
+        memo = self.memo.at(state)
+        memo.predictions = memo.predictions or self._predictions(state)
+        return memo.predictions
 
     def _predictions(self, state: State) -> list[Prediction]:
         vectors, slopes = self.earth(state)
@@ -291,7 +298,16 @@ class Problem:
         return result
 
     def linear(self, state: State, geometry: bool = False) -> Linear:
-        """Linearise at a state; `geometry` takes references as exact and noise as uniform."""
+        """Linearise at a state; `geometry` takes references as exact and noise as uniform.
+
+        The last answers are kept.
+        """
+        memo = self.memo.at(state)
+        if geometry not in memo.linear:
+            memo.linear[geometry] = self._linear(state, geometry)
+        return memo.linear[geometry]
+
+    def _linear(self, state: State, geometry: bool) -> Linear:
         predictions = self.predictions(state)
         weights = self._weights(predictions, geometry)
         residual = np.concatenate(

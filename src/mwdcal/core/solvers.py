@@ -120,6 +120,16 @@ class Linear:
         """Column norms (B, p) of the parameters, the scale in which rank is counted."""
         return np.concatenate([np.sqrt(np.sum(b**2, (-3, -2))) for b in self.blocks], -1)
 
+    @cached_property
+    def normal(self) -> Normal:
+        """Its normal equations."""
+        return Normal.of(self)
+
+    @cached_property
+    def determined(self) -> Determined:
+        """Which directions it determines, if it is of the geometry."""
+        return Determined.by(self.normal, self.norms)
+
     @property
     def cost(self) -> Array:
         """ρᵀC⁻¹ρ over all stations, and the prior's part (B,)."""
@@ -224,7 +234,7 @@ class Determined:
     def of(cls, problem: Problem, state: Any) -> Determined:
         """Of a problem at a state."""
         linear = problem.linear(state, geometry=True)
-        return cls.by(Normal.of(linear), linear.norms)
+        return linear.determined
 
     def take(self, index: Ints) -> Determined:
         """That of some members of the batch."""
@@ -302,7 +312,7 @@ class _Descent:
     def step(self) -> tuple[Bools, Bools]:
         """One iteration: which active members are at a minimum, and which are not finite."""
         problem, linear = self.problem, self.linear
-        normal = Normal.of(linear)
+        normal = linear.normal
         finite = np.isfinite(normal.cost) & np.isfinite(normal.information).all((-1, -2))
         if not finite.all():
             return np.zeros_like(finite), ~finite
@@ -335,7 +345,10 @@ class _Descent:
         if not converged.any():
             return converged
         which = np.flatnonzero(converged)
-        now = Determined.of(self.problem.take(which), self.state.take(which))
+        if converged.all():
+            now = Determined.of(self.problem, self.state)
+        else:
+            now = Determined.of(self.problem.take(which), self.state.take(which))
         same = now.rank == self.determined.rank[which]
         if not same.all():
             self.determined = self.determined.put(which, now)
@@ -383,6 +396,8 @@ def gauss_newton(problem: Problem, state: Any, limit: int = 60) -> tuple[Any, In
         status[descent.active[settled]] = Status.OK
         status[descent.active[broken]] = Status.NOT_FINITE
         stopped = settled | broken
+        if len(stopped) == count and stopped.all():
+            return descent.state, status, iterations
         state = state.put(descent.active[stopped], descent.state.take(np.flatnonzero(stopped)))
         descent.drop(stopped)
     return state.put(descent.active, descent.state), status, iterations

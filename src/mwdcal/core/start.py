@@ -13,7 +13,15 @@ import numpy as np
 
 from mwdcal.core import observables
 from mwdcal.core.problem import Problem, State, Triad
-from mwdcal.core.vectors import Array, Bools, earth_field, earth_gravity, rotation, tool_from_earth
+from mwdcal.core.vectors import (
+    Array,
+    Bools,
+    earth_field,
+    earth_gravity,
+    inverse,
+    rotation,
+    tool_from_earth,
+)
 
 SPANNED = 2e-3
 """Columns of the ellipsoid with a singular value below this share of the largest are noise."""
@@ -116,8 +124,25 @@ def _linear(
         unknown = _unknown_dip(attitude, field, terms, weight, regress)
         blank = ~evidence.is_known("dip")
         earth = earth_field(field, np.where(blank, unknown[:, None], dip))
-    solution = regress(np.einsum("bnij,bnj->bni", attitude, earth))
-    return np.swapaxes(solution[:, :3], -1, -2), solution[:, 3], np.asarray(usable)
+    forward = _forward(np.einsum("bnij,bnj->bni", attitude, earth), x, weight)
+    usable = usable & np.isfinite(forward).all((-1, -2))
+    forward = np.where(usable[:, None, None], forward, np.eye(4)[:, :3])
+    back = inverse(np.swapaxes(forward[:, :3], -1, -2))
+    return back, -np.einsum("bij,bj->bi", back, forward[:, 3]), np.asarray(usable)
+
+
+def _forward(field: Array, x: Array, weight: Array) -> Array:
+    """Readings as a linear function (B, 4, 3) of the field and one: noise is in the readings alone.
+
+    With exact references this is the minimum itself.
+    """
+    terms = np.concatenate([field, np.ones_like(field[..., :1])], -1)
+    size = np.sqrt(np.einsum("bn,bni->bi", weight, terms**2))
+    size = np.where(size > 0, size, 1.0)
+    scaled = terms / size[:, None]
+    gram = np.einsum("bn,bni,bnj->bij", weight, scaled, scaled, optimize=True)
+    crossed = np.einsum("bn,bni,bnj->bij", weight, scaled, x, optimize=True)
+    return np.asarray(inverse(gram) @ crossed / size[..., None])
 
 
 def _unknown_dip(

@@ -81,7 +81,7 @@ def determined_apart(problem: Problem, state: State, own: dict[int, Array]) -> D
     much its own evidence would say of it.
     """
     linear = problem.linear(state, geometry=True)
-    whole, _, _ = Normal.of(linear).reduced()
+    whole, _, _ = linear.normal.reduced()
     slices, found = problem.slices(), np.zeros_like(whole)
     for index, where in enumerate(slices):
         ours = own.get(index)
@@ -146,7 +146,7 @@ def _inverse_where_known(information: Array) -> Array:
 
 def _whole_covariance(linear: Linear, determined: Determined) -> Array:
     """Covariance (B, p + s, p + s) of parameters and shared unknowns."""
-    normal = Normal.of(linear)
+    normal = linear.normal
     reduced, _, eliminate = normal.reduced()
     own = determined.inverse(reduced)
     cross = -own @ np.swapaxes(eliminate, -1, -2)
@@ -277,7 +277,7 @@ def readjusted(problem: Problem, state: State) -> State:
     """The state with stations' and groups' own unknowns at their best for the parameters."""
     for _ in range(4):
         linear = problem.linear(state)
-        normal = Normal.of(linear)
+        normal = linear.normal
         fixed = linear.size + len(problem.evidence.constants)
         step = np.zeros((len(state.params), linear.design.shape[-1]))
         groups = inverse(normal.information[:, fixed:, fixed:])

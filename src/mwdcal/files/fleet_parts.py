@@ -1,4 +1,4 @@
-"""One partition of a fleet: the same function for every worker, on this machine or another."""
+"""One partition of a fleet: the same two steps for every worker, on this machine or another."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mwdcal import __version__
 from mwdcal.core.vectors import AnyArray, Array
 from mwdcal.errors import InputError
 from mwdcal.files import parquet
-from mwdcal.files.contract import CHANNELS, COLUMNS
+from mwdcal.files.contract import CHANNELS
 from mwdcal.files.fleet_runs import Batch, Rows, batches, refused_tools
 from mwdcal.files.fleet_tables import SERIAL, Partition, Source, read
 from mwdcal.fleet import BAD_INPUT, OK, Outcome, calibrate_batch, names
@@ -41,8 +41,7 @@ class Plan:
     @classmethod
     def of(cls, source: Source, profile: Profile, options: Options) -> Plan:
         """For a table: of its columns those that a run file has."""
-        wanted = [n for n in source.columns if n in COLUMNS or n == SERIAL]
-        return cls(source.name, source.metadata, tuple(wanted), profile, options)
+        return cls(source.name, source.metadata, source.used, profile, options)
 
     @property
     def triads(self) -> tuple[str, ...]:
@@ -54,20 +53,29 @@ class Plan:
         return hashlib.sha256(msgspec.json.encode([self, partition])).hexdigest()[:32]
 
 
-def work(plan: Plan, partition: Partition) -> bytes:
-    """Calibrate the tools of a partition: a table in Arrow's stream format, one row per tool."""
+def load(plan: Plan, partition: Partition) -> bytes:
+    """The rows of a partition, in Arrow's stream format."""
+    return _stream(read(partition, plan.columns))
+
+
+def solve(plan: Plan, loaded: bytes) -> bytes:
+    """Calibrate the tools of loaded rows: a table in Arrow's stream format, one row per tool."""
     if plan.version != __version__:
         raise InputError(
             f"the worker has mwdcal {__version__}, the command is of {plan.version}. Install the "
             "same version everywhere."
         )
     arrow, _ = parquet.modules(plan.source)
-    table = read(partition, plan.columns)
+    table = arrow.ipc.open_stream(loaded).read_all()
     rows = Rows.of(table, plan.source, plan.metadata, plan.profile)
-    result = _result(rows, plan)
+    return _stream(_result(rows, plan))
+
+
+def _stream(table: Any) -> bytes:
+    arrow, _ = parquet.modules("fleet")
     stream = arrow.BufferOutputStream()
-    with arrow.ipc.new_stream(stream, result.schema) as writer:
-        writer.write_table(result)
+    with arrow.ipc.new_stream(stream, table.schema) as writer:
+        writer.write_table(table)
     return bytes(stream.getvalue())
 
 

@@ -26,7 +26,7 @@ from mwdcal.files.contract import (
     TEMPERATURE,
     Range,
 )
-from mwdcal.files.fleet_tables import SERIAL
+from mwdcal.files.fleet_tables import SERIAL, one_chunk
 from mwdcal.files.runs import to_readings
 from mwdcal.files.table import Table
 from mwdcal.profile import Profile, TriadProfile
@@ -48,17 +48,15 @@ class Rows:
     @classmethod
     def of(cls, table: Any, source: str, metadata: Mapping[str, object], profile: Profile) -> Rows:
         """From a table whose rows are in order of tools."""
-        serial = table.column(SERIAL).combine_chunks()
-        if hasattr(serial, "chunks"):
-            serial = serial.chunk(0)
-        codes = serial.dictionary_encode().indices.to_numpy(zero_copy_only=False)
+        codes = one_chunk(table.column(SERIAL)).indices.to_numpy(zero_copy_only=False)
         starts = np.append(np.flatnonzero(np.diff(codes, prepend=codes[0] - 1)), len(codes))
         return cls(table, starts, source, metadata, profile)
 
     @property
     def serials(self) -> Any:
         """The serial of each tool (T,)."""
-        return self.table.column(SERIAL).take(self.starts[:-1])
+        serial = one_chunk(self.table.column(SERIAL))
+        return serial.dictionary.take(serial.indices.take(self.starts[:-1]))
 
     @property
     def counts(self) -> Ints:

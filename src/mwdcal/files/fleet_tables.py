@@ -26,12 +26,14 @@ SERIAL = "serial"
 TOOL = "#tool"
 """Column of dealt rows: number of the tool, in order of first appearance."""
 LABELS = ("station", "group", SERIAL)
-ROWS = (6_000, 250_000)
+ROWS = (6_000, 100_000)
 """Fewest and most rows of a partition that is not a single tool…"""
 SHARES = 32
 """…and into how many a fleet between these is divided."""
 LARGEST_GROUP = 20_000_000
 """Rows of the largest row group that is read; it is read as a whole."""
+MOST_STRETCHES = 50_000_000
+"""Most stretches of rows of one tool in a table."""
 MOST_FILES = 200
 """Files of dealt rows that are written at once."""
 
@@ -76,6 +78,11 @@ class Source:
     def rows(self) -> int:
         """Number of stations of all tools."""
         return sum(piece.rows for piece in self.pieces)
+
+    @property
+    def used(self) -> tuple[str, ...]:
+        """The columns that a run has, and the serial."""
+        return tuple(n for n in self.columns if n in contract.COLUMNS or n == SERIAL)
 
     @property
     def fingerprint(self) -> str:
@@ -226,18 +233,35 @@ def find_tools(source: Source) -> Tools:
     for values in _serials(source):
         codes = values.indices.to_numpy(zero_copy_only=False)
         change = np.flatnonzero(np.diff(codes, prepend=codes[0] - 1))
-        own = values.dictionary.take(arrow.array(codes[change]))
-        if last is not None and own[0].as_py() == last:
-            change, own = change[1:], own[1:]
+        if values[0].as_py() == last:
+            change = change[1:]
         starts.append(change + row)
-        heads.append(own)
+        heads.append(values.take(arrow.array(change)))
         row, last = row + len(codes), values[-1].as_py()
-    every = arrow.concat_arrays(heads).dictionary_encode()
-    return Tools(
-        every.dictionary,
-        np.concatenate(starts),
-        every.indices.to_numpy(zero_copy_only=False).astype(int),
-    )
+        _check_stretches(sum(map(len, starts)), source.name)
+    every = one_chunk(arrow.chunked_array(heads))
+    codes = every.indices.to_numpy(zero_copy_only=False)
+    used, first, number = np.unique(codes, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    rank = np.empty(len(order), int)
+    rank[order] = np.arange(len(order))
+    serials = every.dictionary.take(arrow.array(used[order]))
+    return Tools(serials, np.concatenate(starts), rank[number])
+
+
+def one_chunk(column: Any) -> Any:
+    """A dictionary-encoded column as one array."""
+    joined = column.unify_dictionaries().combine_chunks()
+    return joined.chunk(0) if hasattr(joined, "chunks") else joined
+
+
+def _check_stretches(count: int, source: str) -> None:
+    """Refuse rows so mixed that to remember where the tools are would fill the memory."""
+    if count > MOST_STRETCHES:
+        raise InputError(
+            f"{source}: the rows change from tool to tool more than {MOST_STRETCHES} times. Sort the "
+            f"table by '{SERIAL}'."
+        )
 
 
 def _serials(source: Source) -> Iterator[Any]:
@@ -255,9 +279,9 @@ def _serials(source: Source) -> Iterator[Any]:
                 )
             row += piece.rows
             continue
-        with pq.ParquetFile(piece.path) as file:
+        with pq.ParquetFile(piece.path, read_dictionary=[SERIAL]) as file:
             for batch in file.iter_batches(500_000, row_groups=[piece.group], columns=[SERIAL]):
-                column = _plain(batch.column(0), source.name)
+                column = _encoded(batch.column(0), source.name)
                 if column.null_count:
                     blank = row + int(
                         np.flatnonzero(column.is_null().to_numpy(zero_copy_only=False))[0]
@@ -268,22 +292,26 @@ def _serials(source: Source) -> Iterator[Any]:
                     )
                 row += len(column)
                 if len(column):
-                    yield column.dictionary_encode()
+                    yield column
 
 
-def _plain(column: Any, source: str) -> Any:
-    """Serials as 64-bit whole numbers or text."""
+def _encoded(column: Any, source: str) -> Any:
+    """Serials, 64-bit whole numbers or text, as a dictionary and the place of each in it."""
     arrow, _ = parquet.modules(source)
-    if arrow.types.is_dictionary(column.type):
-        column = column.cast(column.type.value_type)
-    if arrow.types.is_integer(column.type):
-        return column.cast(arrow.int64())
-    if arrow.types.is_string(column.type) or arrow.types.is_large_string(column.type):
-        return column.cast(arrow.string())
-    raise InputError(
-        f"{source}, column '{SERIAL}': must be text or whole numbers; the column has the type "
-        f"{column.type}. Write it as text."
-    )
+    types = arrow.types
+    kind = column.type.value_type if types.is_dictionary(column.type) else column.type
+    if types.is_integer(kind):
+        plain = arrow.int64()
+    elif types.is_string(kind) or types.is_large_string(kind):
+        plain = arrow.string()
+    else:
+        raise InputError(
+            f"{source}, column '{SERIAL}': must be text or whole numbers; the column has the type "
+            f"{kind}. Write it as text."
+        )
+    if kind == column.type:
+        return column.cast(plain).dictionary_encode()
+    return column.cast(arrow.dictionary(arrow.int32(), plain))
 
 
 def partitions(source: Source, tools: Tools, folder: Path) -> list[Partition]:
@@ -348,7 +376,7 @@ def _deal(source: Source, tools: Tools, number: Ints, folder: Path) -> None:
     row = 0
     try:
         for piece in source.pieces:
-            table = _row_group(piece, source.columns)
+            table = _row_group(piece, source.used)
             rows = np.arange(row, row + piece.rows)
             tool = tools.tool[np.searchsorted(tools.runs, rows, "right") - 1]
             table = table.append_column(TOOL, arrow.array(tool))
@@ -375,7 +403,7 @@ def read(partition: Partition, columns: Sequence[str]) -> Any:
     arrow, _ = parquet.modules("fleet")
     names = [*columns, TOOL, "#row"] if partition.dealt else list(columns)
     tables = [_row_group(piece, tuple(names)) for piece in partition.pieces]
-    table = arrow.concat_tables(tables, promote_options="permissive")
+    table = arrow.concat_tables(tables, promote_options="permissive").unify_dictionaries()
     table = table.slice(partition.skip, partition.rows)
     if not partition.dealt:
         rows = np.arange(partition.first, partition.first + partition.rows)
@@ -390,9 +418,10 @@ def _row_group(piece: Piece, columns: tuple[str, ...]) -> Any:
     arrow, pq = parquet.modules(piece.path)
     keys = dict(piece.keys)
     wanted = [name for name in columns if name not in keys]
+    labels = [name for name in LABELS if name in wanted]
     try:
-        with pq.ParquetFile(piece.path, memory_map=True) as file:
-            table = file.read_row_group(piece.group, wanted, use_threads=False)
+        with pq.ParquetFile(piece.path, memory_map=True, read_dictionary=labels) as file:
+            table = file.read_row_group(piece.group, wanted)
     except FileNotFoundError:
         raise InputError(
             f"'{piece.path}': no such file on this machine. Workers on other machines must see "
@@ -405,5 +434,5 @@ def _row_group(piece: Piece, columns: tuple[str, ...]) -> Any:
             value = arrow.array([keys[name]]).take(arrow.array(np.zeros(piece.rows, int)))
             table = table.append_column(name, value)
     place = table.column_names.index(SERIAL)
-    table = table.set_column(place, SERIAL, _plain(table.column(SERIAL), piece.path))
+    table = table.set_column(place, SERIAL, _encoded(table.column(SERIAL), piece.path))
     return table.select(list(columns))
