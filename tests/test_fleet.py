@@ -680,6 +680,15 @@ def test_a_cluster_of_two_of_which_one_dies_half_way(tmp_path):
     assert output.read_bytes() == local.read_bytes()
 
 
+def test_a_cluster_without_its_extra(fleet, tmp_path, monkeypatch):
+    def absent(name):
+        raise ImportError(name)
+
+    monkeypatch.setattr(pool, "import_module", absent)
+    ran = mwdcal("fleet", fleet[0], "-o", tmp_path / "o.parquet", "--scheduler", "tcp://host:8786")
+    assert "pip install 'mwdcal[parquet,cluster]'" in refused(ran, 2)
+
+
 def test_no_cluster_there(fleet, tmp_path, monkeypatch):
     pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
     path, _ = fleet

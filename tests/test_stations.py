@@ -5,15 +5,18 @@ from what was published of the measured sets; never from our own output.
 """
 
 import os
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.signal import lfilter
 
 from cli_support import mwdcal, numbers, read_csv, refused, write_csv
+from mwdcal.calibrate import calibrate
 from mwdcal.core import standstill
 from mwdcal.files import logs
 from mwdcal.files.table import Table
+from mwdcal.notation import convert
 from mwdcal.stations import find_stations
 
 ACC, MAG = ("ax", "ay", "az"), ("mx", "my", "mz")
@@ -554,10 +557,10 @@ def xsens_differences(run):
     skew, scale = np.array(values[:9]).reshape(3, 3), np.array(values[9:18]).reshape(3, 3)
     gravity = 9.81744
     sd = np.stack([numbers(run[f"sd_{n}"]) for n in ACC], -1)
-    readings, profile = measured.accelerometer_only(raw, gravity / np.diag(scale).mean(), sd)
-    found = measured.convert(measured.calibrate(readings, profile), "affine")[
-        "accelerometer"
-    ].values
+    nominal = gravity / np.diag(scale).mean()
+    readings, profile = measured.accelerometer_only(raw, nominal, None)
+    readings = replace(readings, sd={"accelerometer": sd / nominal})
+    found = convert(calibrate(readings, profile), "affine")["accelerometer"].values
     upper = measured.triangular(found["M"]) * gravity
     bias = -np.linalg.solve(found["M"], found["b"]) - values[18:21]
     field = np.linalg.norm(raw @ found["M"].T + found["b"], axis=-1)
@@ -606,8 +609,9 @@ def test_mikov_22_standstills_and_the_published_calibration(tmp_path, unit, seed
     run = stations_of(log if seed is None else spiked(log, seed), tmp_path, "--sampling-hz", 100)
     assert 22 <= len(run["ax"]) <= 24
     raw = np.stack([numbers(run[n]) for n in ACC], -1)
-    readings, _ = measured.accelerometer_only(raw, 9.81)
-    ours, sd = measured.mikov_parameters(measured.fit(readings))
+    made = calibrate(*measured.accelerometer_only(raw, 9.81, None))
+    found = convert(made, "affine")["accelerometer"]
+    ours, sd = measured.mikov_form(**found.values), measured.mikov_spread(found)
     rows = measured.fetch("mikov/published.csv").read_text().splitlines()
     names, column = rows[0].split(","), rows[0].split(",").index(unit)
     assert names[0] == "param"

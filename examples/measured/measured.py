@@ -30,7 +30,7 @@ from mwdcal.files.profiles import load_profile
 from mwdcal.files.runs import read_run, to_readings
 from mwdcal.files.table import Table
 from mwdcal.methods import EVIDENCE
-from mwdcal.notation import convert
+from mwdcal.notation import Notation, convert
 from mwdcal.options import Options
 from mwdcal.profile import Profile, TriadProfile
 from mwdcal.readings import TRIADS, Readings
@@ -352,23 +352,27 @@ def mikov(words: str = "") -> dict[str, tuple[float, float]]:
     for unit in MIKOV:
         theirs = np.array([float(published[f"acc_{n}"][unit]) for n in names])
         found = affine(unit, words)
-        ratio = (mikov_form(found["M"], found["b"]) - theirs) / mikov_uncertainty(unit)
+        ratio = (mikov_form(**found) - theirs) / mikov_uncertainty(unit)
         result[unit] = (float(np.abs(ratio).max()), float(np.sqrt(np.mean(ratio**2))))
     return result
 
 
-def mikov_form(matrix: np.ndarray, offset: np.ndarray) -> np.ndarray:
-    """Scales in %, misalignments in degrees, biases in m/s² of raw = M a + b, M upper triangular."""
-    upper = np.linalg.inv(triangular(matrix) * 9.81)
+def mikov_form(M: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """The published form of field = M raw + b: scales in %, misalignments in degrees, biases in m/s²."""
+    upper = np.linalg.inv(triangular(M) * 9.81)
     angle = np.degrees([upper[1, 2], upper[0, 1], upper[0, 2]])
-    bias = -np.linalg.solve(matrix, offset)
+    bias = -np.linalg.solve(M, b)
     return np.concatenate([100 * (np.diag(upper) - 1), angle, bias])
 
 
 @cache
 def mikov_uncertainty(unit: str) -> np.ndarray:
     """Standard uncertainty of `mikov_form` with the linear model."""
-    found = convert(trial(unit, LINEAR).made, "affine")["accelerometer"]
+    return mikov_spread(convert(trial(unit, LINEAR).made, "affine")["accelerometer"])
+
+
+def mikov_spread(found: Notation) -> np.ndarray:
+    """Standard uncertainty of `mikov_form` of a calibration in affine notation."""
     values = np.concatenate([found.values["M"].ravel(), found.values["b"]])
     steps = 1e-6 * np.eye(12)
 

@@ -53,19 +53,28 @@ def check_options(options: Options) -> None:
         raise InputError(f"--parameters must be 6, 9 or 12; got {options.parameters}.")
     if options.robust not in (None, *LOSSES):
         raise InputError(f"--robust must be one of {', '.join(LOSSES)}; got {options.robust!r}.")
-    own = method in ("newton", "swarm") or options.paper_weights
-    if own and options.robust:
+    own = "the paper's weights" if options.paper_weights else f"method {method}"
+    if options.own_solver and options.robust:
         raise InputError(
-            f"--robust cannot weigh the stations of {'unweighted sums' if options.paper_weights else method}. "
-            "Use --method joint with it."
+            f"--robust cannot weigh the stations of {own}. Use --method joint with it."
+        )
+    if options.own_solver and options.nonlinearity:
+        raise InputError(
+            f"--nonlinearity cannot be combined with {own}: own-axis terms need their prior. Use "
+            "--method joint, or --nonlinearity none."
+        )
+    if method == "swarm" and options.parameters < 12:
+        raise InputError(
+            f"--parameters {options.parameters} cannot be combined with method swarm, which finds all "
+            "twelve. Use --method least-squares: both meet on the same cost."
         )
     if options.paper_weights and method == "joint":
         raise InputError(
             "--paper-weights: method joint is of no paper. Name the paper's method: least-squares, "
             "swarm, newton, toolface-inclination or scalar."
         )
-    if options.prior and (own or options.nonlinearity):
-        what = "own-axis nonlinearity" if options.nonlinearity else f"method {method}"
+    if options.prior and (options.own_solver or options.nonlinearity):
+        what = "own-axis nonlinearity" if options.nonlinearity else own
         raise InputError(
             f"--prior cannot be combined with {what}. Use --method joint, without "
             "--paper-weights and with --nonlinearity none."

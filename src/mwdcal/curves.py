@@ -36,9 +36,11 @@ class CurveScore:
 def declared(profile: Profile, options: Options) -> dict[str, float]:
     """Triads whose profile declares a nonlinearity and whose model can have it, with its prior.
 
-    Only the polynomial model has such terms.
+    Only the polynomial model has such terms, and only the common estimator their prior.
     """
-    found = {}
+    found: dict[str, float] = {}
+    if options.own_solver:
+        return found
     for name, order in zip(TRIADS, options.orders, strict=True):
         value = getattr(profile, name).nonlinearity
         if value and options.kind(order) == "polynomial":

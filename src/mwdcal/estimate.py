@@ -245,7 +245,9 @@ def _typical(square: Array, freedom: Array) -> Array:
     from scipy.special import chdtri
 
     ratio = square / chdtri(np.maximum(freedom, 1.0), 0.5)
-    return np.asarray(np.nanmedian(np.where(freedom > 0, ratio, np.nan), -1))
+    ratio = np.where(freedom > 0, ratio, np.nan)
+    nothing = np.isnan(ratio).all(-1, keepdims=True)
+    return np.asarray(np.nanmedian(np.where(nothing, 1.0, ratio), -1))
 
 
 def _tested(freedom: Array) -> float:

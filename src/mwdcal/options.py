@@ -47,6 +47,11 @@ class Options:
         """Temperature order of accelerometer and magnetometer."""
         return (self.order, self.order) if isinstance(self.order, int) else self.order
 
+    @property
+    def own_solver(self) -> bool:
+        """Whether the method minimises by its own means: no weights, priors or own-axis terms."""
+        return self.paper_weights or self.method in ("newton", "swarm")
+
     def kind(self, order: int) -> str:
         """The model of a triad: at order 0 both are the same, and the linear one is simpler."""
         return self.model or ("factors" if order else "polynomial")

@@ -156,7 +156,7 @@ def _with_curves(
         return options, []
     offered = declared(profile, options)
     if asked == "auto":
-        if not offered or options.prior or options.method == "swarm":
+        if not offered or options.prior:
             return options, []
         check_readings(readings, options)
         say("own-axis nonlinearity: leaving stations out, with and without it")

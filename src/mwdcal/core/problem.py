@@ -31,6 +31,7 @@ from mwdcal.core.vectors import (
     Ints,
     earth_field,
     earth_gravity,
+    eigen,
     inverse,
     rotation,
     skew,
@@ -174,7 +175,7 @@ class Prior:
         those of the data's columns.
         """
         outer = norms[:, :, None] * norms[:, None, :]
-        values, vectors = np.linalg.eigh(self.precision / outer)
+        values, vectors = eigen(self.precision / outer)
         known = values > INFORMED * np.maximum(values[:, -1:], 1e-300)
         known = vectors * known[:, None, :]
         return np.asarray(known @ np.swapaxes(known, -1, -2) * outer)

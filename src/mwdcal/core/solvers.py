@@ -21,7 +21,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from mwdcal.core import fast
-from mwdcal.core.vectors import Array, Bools, Ints, inverse
+from mwdcal.core.vectors import Array, Bools, Ints, eigen, inverse
 
 RANK_TOLERANCE = 2e-2
 """Singular values of the column-normalised design below this share of the largest are free."""
@@ -225,7 +225,7 @@ class Determined:
         norms = np.where(norms > 0, norms, 1.0)
         reduced, _, _ = geometry.reduced()
         scaled = np.nan_to_num(reduced / (norms[..., :, None] * norms[..., None, :]))
-        values, basis = np.linalg.eigh(scaled)
+        values, basis = eigen(scaled)
         values = np.sqrt(np.clip(values[..., ::-1], 0, None))
         values = values / np.maximum(values[..., :1], 1e-300)
         return cls(basis[..., ::-1], values, norms, values > tolerance)

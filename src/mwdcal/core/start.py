@@ -18,6 +18,7 @@ from mwdcal.core.vectors import (
     Bools,
     earth_field,
     earth_gravity,
+    eigen,
     inverse,
     rotation,
     tool_from_earth,
@@ -72,7 +73,7 @@ def _ellipsoid(x: Array, strength: Array, include: Array) -> tuple[Array, Array]
     quadric = np.zeros((len(x), 3, 3))
     quadric[:, i, j] = solution[:, :6]
     quadric[:, j, i] = solution[:, :6]
-    values, vectors = np.linalg.eigh(quadric)
+    values, vectors = eigen(quadric)
     sound = values[:, 0] > 1e-3 * values[:, 2]
     values = np.where(sound[:, None], values, 1.0)
     half = np.einsum("bij,bj,bkj->bik", vectors, values, vectors)
@@ -91,7 +92,7 @@ def _where_determined(gram: Array, right: Array) -> Array:
     Noise alone would set those, and a start that is far off there looks as if it determined them.
     The columns are of size one as they come: one that is noise alone must not be scaled up.
     """
-    values, vectors = np.linalg.eigh(gram)
+    values, vectors = eigen(gram)
     kept = values > SPANNED**2 * values[:, -1:]
     along = np.einsum("bij,bi->bj", vectors, right)
     along = np.where(kept, along / np.where(kept, values, 1.0), 0.0)
@@ -161,7 +162,7 @@ def _unknown_dip(
     gram = np.stack(
         [np.stack([np.einsum("bn,bni,bni->b", weight, p, q) for q in left], -1) for p in left], -2
     )
-    _, vectors = np.linalg.eigh(gram)
+    _, vectors = eigen(gram)
     north, down = vectors[:, 0, 0], vectors[:, 1, 0]
     gains = [np.trace(regress(part)[:, :3], axis1=-2, axis2=-1) for part in parts]
     sign = np.where(north * gains[0] + down * gains[1] < 0, -1.0, 1.0)

@@ -12,7 +12,7 @@ import numpy as np
 from mwdcal.core import fast
 from mwdcal.core.problem import GEOMETRIC_NOISE, Problem, State
 from mwdcal.core.solvers import RANK_TOLERANCE, Determined, Linear, Normal
-from mwdcal.core.vectors import AnyArray, Array, Bools, Ints, inverse, rotation
+from mwdcal.core.vectors import AnyArray, Array, Bools, Ints, eigen, inverse, rotation
 
 SEEN = 0.05
 """A free direction with less than this share on a triad does not move the triad."""
@@ -170,7 +170,7 @@ def station_misfit(analysis: Analysis) -> tuple[Array, Array]:
 
     Directions of a station's readings that nothing tests (share below `TESTED`) do not count.
     """
-    values, vectors = np.linalg.eigh(analysis.spread)
+    values, vectors = eigen(analysis.spread)
     tested = values > TESTED
     along = np.einsum("bnij,bni->bnj", vectors, analysis.residual) ** 2
     square = np.sum(np.where(tested, along / np.where(tested, values, 1.0), 0.0), -1)
@@ -185,7 +185,7 @@ def without_station(problem: Problem, state: State, analysis: Analysis) -> Array
     """
     linear = problem.linear(state)
     whole = _whole_covariance(linear, analysis.determined)[:, : linear.size]
-    values, vectors = np.linalg.eigh(analysis.spread)
+    values, vectors = eigen(analysis.spread)
     tested = values > TESTED
     along = np.einsum("bnij,bni->bnj", vectors, analysis.residual)
     along = np.where(tested, along / np.where(tested, values, 1.0), 0.0)

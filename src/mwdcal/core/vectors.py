@@ -104,3 +104,9 @@ def inverse(matrix: Array) -> Array:
         sound = np.linalg.slogdet(matrix)[0] != 0
         whole = np.where(sound[..., None, None], matrix, np.eye(matrix.shape[-1]))
         return np.where(sound[..., None, None], np.linalg.inv(whole), np.nan)
+
+
+def eigen(matrix: Array) -> tuple[Array, Array]:
+    """Eigenvalues (..., k), smallest first, and vectors of symmetric matrices; zero for not finite."""
+    values, vectors = np.linalg.eigh(np.nan_to_num(matrix, posinf=0.0, neginf=0.0))
+    return np.asarray(values), np.asarray(vectors)
