@@ -44,7 +44,7 @@ STEPS = 16
 REACH = 8
 """Lag in averaging factors beyond which covariances of second differences are left out."""
 APART = 128
-"""Ratio of averaging factors above which only quantisation correlates their variances."""
+"""Ratio of averaging factors above which only quantisation and random walk correlate variances."""
 LONG = 64
 """Averages in a record above which their centring no longer counts in covariances."""
 
@@ -234,18 +234,17 @@ def _pair(count: int, m: int, k: int) -> tuple[Array, Array]:
     first, second = count - 2 * m + 1, count - 2 * k + 1
     spikes = np.unique([q * k - p * m for p in range(3) for q in range(3)])
     square, total = _summed(_between(m, k, spikes), _pairs(first, second, spikes))
-    square[1:, 1:] = total[1:] = 0.0
-    if k <= APART * m:
-        step = max(1, m // STEPS)
-        lags = step * np.arange(
-            -min(second - 1, REACH * k) // step, min(first - 1, REACH * k) // step + 1
-        )
-        smooth = _between(m, k, lags)[1:]
-        more, mean = _summed(smooth, step * _pairs(first, second, lags))
-        if first < LONG * k:
-            more = more - _rows(smooth, lags, step, first, second)
-            more = more + np.outer(mean, mean) / (first * second)
-        square[1:, 1:], total[1:] = more, mean
+    square[1:, 1:], total[1:] = 0.0, 0.0
+    smooth = slice(1, 4) if k <= APART * m else slice(3, 4)
+    step = max(1, (m if k <= APART * m else k) // STEPS)
+    low, high = -min(second - 1, REACH * k) // step, min(first - 1, REACH * k) // step
+    lags = step * np.arange(low, high + 1)
+    between = _between(m, k, lags)[smooth]
+    more, mean = _summed(between, step * _pairs(first, second, lags))
+    if first < LONG * k:
+        more = more - _rows(between, lags, step, first, second)
+        more = more + np.outer(mean, mean) / (first * second)
+    square[smooth, smooth], total[smooth] = more, mean
     return square / (2.0 * first * second), total / (1.0 * first * second)
 
 
