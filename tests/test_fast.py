@@ -1,9 +1,11 @@
 """Compiled loops give what NumPy gives, for every model and every kind of evidence."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from mwdcal.core import fast
+from mwdcal.core import exact, fast
 from mwdcal.estimate import fit
 from mwdcal.options import Options
 from mwdcal.readings import Readings
@@ -62,9 +64,7 @@ def test_a_large_batch_is_fitted_as_a_small_one(case, monkeypatch):
     monkeypatch.setattr(fast, "ENOUGH", 1)
     compiled = fit(data, options)
     np.testing.assert_array_equal(plain.status, compiled.status)
-    np.testing.assert_array_equal(
-        plain.analysis.determined.rank, compiled.analysis.determined.rank
-    )
+    np.testing.assert_array_equal(plain.analysis.determined.rank, compiled.analysis.determined.rank)
     for ours, theirs in zip(
         compiled.problem.fields(compiled.state), plain.problem.fields(plain.state), strict=True
     ):
@@ -82,3 +82,56 @@ def test_loops_can_be_turned_off(monkeypatch):
     monkeypatch.delenv("MWDCAL_NUMPY")
     assert fast.pays(np.zeros((10_000, 48)))
     assert not fast.pays(np.zeros((1, 48)))
+
+
+EXACT = {
+    "all exact": (Options(), ()),
+    "noise estimated": (Options(), ("noise",)),
+    "accelerometer alone": (Options(), ("magnetometer", "azimuth")),
+    "least-squares, uncertain stand": (Options("least-squares"), ("angles",)),
+    "noise by axis and station": (Options(), ("uneven",)),
+}
+
+
+@pytest.mark.parametrize("part", [1, 40], ids=["one", "many"])
+@pytest.mark.parametrize("case", EXACT)
+def test_the_closed_form_is_the_general_minimum(case, part, monkeypatch):
+    options, lacking = EXACT[case]
+    data = runs(lacking, part)
+    if "angles" in lacking:
+        sd = {n: np.full(48, 3e-4) for n in ("inclination", "azimuth", "toolface")}
+        data = replace(data, sd={**data.sd, **sd})
+    if "uneven" in lacking:
+        rng = np.random.default_rng(3)
+        uneven = {n: sd * rng.uniform(0.5, 2.0, (48, 3)) for n, sd in NOISE.items()}
+        data = replace(data, sd=uneven)
+    include = np.ones((part, 48))
+    include[:, 5] = 0
+    assert exact.applies(fit(data, options, include).problem)
+    closed = fit(data, options, include)
+    monkeypatch.setattr(exact, "applies", lambda problem: False)
+    general = fit(data, options, include)
+    np.testing.assert_array_equal(closed.status, general.status)
+    scale = np.sqrt(np.diagonal(general.analysis.covariance, axis1=-2, axis2=-1))
+    assert (np.abs(closed.state.params - general.state.params) < 1e-5 * scale).all()
+    np.testing.assert_allclose(closed.noise, general.noise, rtol=1e-3)
+    for name in ("covariance", "variance_factor", "freedom", "residual", "spread"):
+        ours, theirs = (getattr(f.analysis, name) for f in (closed, general))
+        if name == "covariance":
+            ours, theirs = (m / (scale[:, :, None] * scale[:, None, :]) for m in (ours, theirs))
+        loose = 3e-3 if "noise" in lacking else 1e-6
+        np.testing.assert_allclose(ours, theirs, atol=loose * np.abs(theirs).max(), err_msg=name)
+    ours, theirs = closed.analysis.determined, general.analysis.determined
+    np.testing.assert_allclose(ours.values, theirs.values, rtol=2e-3)
+    np.testing.assert_allclose(ours.norms, theirs.norms, rtol=2e-3)
+    columns = ours.basis * ours.values[:, None, :]
+    gram = columns @ np.swapaxes(columns, -1, -2)
+    columns = theirs.basis * theirs.values[:, None, :]
+    np.testing.assert_allclose(gram, columns @ np.swapaxes(columns, -1, -2), atol=3e-3)
+
+
+def test_the_closed_form_is_not_taken_where_stations_are_too_few():
+    data = runs(())
+    few = np.zeros(48)
+    few[:3] = 1
+    assert not fit(data, include=np.tile(few, (90, 1))).analysis.determined.keep.all()

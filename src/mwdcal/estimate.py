@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from mwdcal.core import exact
 from mwdcal.core.models import Basis, Factors, Polynomial, Restricted, Whole, restricted
 from mwdcal.core.problem import Evidence, Problem, State, Triad
 from mwdcal.core.robust import LOSSES, consistency, inflation, weight
@@ -126,6 +127,9 @@ def _fit(readings: Readings, options: Options, include: Array | None) -> Fit:
     lead = np.broadcast_shapes(readings.accelerometer.shape[:-1], include.shape)
     problem, declared = _problem(readings, evidence, lead, options)
     problem, finite = _without_broken(problem)
+    closed = _closed(problem, declared, options, finite)
+    if closed is not None:
+        return closed
     solved = solve(problem, start(problem), options)
     iterations = solved.iterations
     if not all(declared):
@@ -140,13 +144,39 @@ def _fit(readings: Readings, options: Options, include: Array | None) -> Fit:
         state = settle_gauge(trusted, state, determined)
         determined = _determined(trusted, state, solved)
     status = np.where(finite, solved.status, int(Status.NOT_FINITE))
-    noise = [
-        np.full(len(status), np.nan) if k else t.sd[:, 0, 0]
-        for t, k in zip(problem.triads, declared, strict=True)
-    ]
+    noise = _noise(problem, declared)
     analysis = _analysed(analyse(trusted, state, determined), trusted, state, solved, options)
     trusted.memo.at(None)
-    return Fit(trusted, state, status, iterations, np.stack(noise, -1), trust, analysis)
+    return Fit(trusted, state, status, iterations, noise, trust, analysis)
+
+
+def _closed(problem: Problem, declared: list[bool], options: Options, finite: Bools) -> Fit | None:
+    """The fit in closed form, where all references are exact and the stations span all directions."""
+    if options.robust or options.own_solver or not exact.applies(problem):
+        return None
+    halfs = exact.halves(problem)
+    if halfs is None:
+        return None
+    state, analysis = exact.solution(problem, halfs)
+    if not analysis.determined.keep.all():
+        return None
+    if not all(declared):
+        problem = _rescaled(problem, np.sqrt(analysis.variance_factor), declared)
+        state, analysis = exact.solution(problem, exact.halves(problem) or halfs)
+    sound = finite & np.isfinite(state.params).all(-1)
+    status = np.where(sound, int(Status.OK), int(Status.NOT_FINITE))
+    trust = np.ones(problem.evidence.include.shape)
+    once = np.ones(len(status), int)
+    return Fit(problem, state, status, once, _noise(problem, declared), trust, analysis)
+
+
+def _noise(problem: Problem, declared: list[bool]) -> Array:
+    """Estimated noise (B, triads) of one reading, NaN where it was declared."""
+    noise = [
+        np.full(len(t.sd), np.nan) if k else t.sd[:, 0, 0]
+        for t, k in zip(problem.triads, declared, strict=True)
+    ]
+    return np.stack(noise, -1)
 
 
 def _determined(problem: Problem, state: State, solved: Solved) -> Determined:
