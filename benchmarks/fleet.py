@@ -129,13 +129,16 @@ def against_scipy(tools: int = 20_000, cores: int = 4, sample: int = SAMPLE) -> 
     with TemporaryDirectory() as folder:
         runs, output = Path(folder) / "runs.parquet", Path(folder) / "cals.parquet"
         simulate(runs, tools)
-        ours, _ = command(runs, output, "--workers", str(cores))
+        options = ("--workers", str(cores), "--method")
+        same, _ = command(runs, output, *options, "least-squares")
+        joint, _ = command(runs, output, *options, "joint")
     theirs = scipy_seconds(sample) * tools
-    name = f"fleet, {tools} tools x 48 stations x 24 parameters, {cores} cores; SciPy loop"
-    scaled = f"({sample} tools, scaled)"
+    name = f"fleet, {tools} tools x 48 stations x 24 parameters, {cores} cores"
+    loop = f"SciPy loop ({sample} tools, scaled)"
     return [
-        Row(f"{name} {scaled}", ours, theirs, theirs / ours),
-        Row(f"{name} on {cores} cores {scaled}", ours, theirs / cores, theirs / cores / ours),
+        Row(f"{name}, least-squares; {loop}", same, theirs, theirs / same),
+        Row(f"the same; {loop} on {cores} cores", same, theirs / cores, theirs / cores / same),
+        Row(f"{name}, joint with an uncertain stand; the same loop", joint, theirs, theirs / joint),
     ]
 
 

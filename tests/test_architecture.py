@@ -32,6 +32,8 @@ LAYERS = (
         "core.uncertainty",
         "core.observability",
         "core.standstill",
+        "core.allan",
+        "core.noise_terms",
         "core.start",
         "core.exact",
         "core",
@@ -45,7 +47,7 @@ LAYERS = (
     ("calibrate", "compare", "gauge", "predict", "quality", "simulate"),
     ("fleet", "fleet_accuracy", "fleet_checks"),
     ("files", "files.*"),
-    ("registry", "registry.*", "datasets", "stations"),
+    ("registry", "registry.*", "datasets", "stations", "noise"),
     ("",),  # the package itself: its public names
     (
         "app",
@@ -59,6 +61,9 @@ LAYERS = (
         "app.fleet_report",
         "app.fleet_summary",
         "app.fleets",
+        "app.noise_asked",
+        "app.noise_plots",
+        "app.noises",
         "app.plots",
         "app.pool",
         "app.worker",

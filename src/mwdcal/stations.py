@@ -92,7 +92,7 @@ def find_stations(
     _check("trim-seconds", trim_seconds)
     _check("threshold", threshold)
     findings: list[Finding] = []
-    time = _time(log, sampling_hz)
+    time = row_times(log, sampling_hz)
     traces, temperature = _traces(log, time, findings)
     findings += _time_findings(log, time, traces)
     say(f"looking for standstills in {len(time)} rows")
@@ -148,7 +148,7 @@ def _none(log: Table, found: Standstills, shortest: float) -> InputError:
     )
 
 
-def _time(log: Table, sampling_hz: float | None) -> Array:
+def row_times(log: Table, sampling_hz: float | None) -> Array:
     """Seconds of each row: the column `time_s`, else from the rate of sampling."""
     stated = log.metadata.get("sampling_hz") if sampling_hz is None else sampling_hz
     if TIME in log.columns:

@@ -170,19 +170,19 @@ def apply(
     Example: mwdcal apply tool.json surveys.csv -o corrected.csv
     Exit: 0 written, 2 input cannot be read.
     """
-    from mwdcal.app.tables import apply_to_table
-    from mwdcal.files import documents, table
+    from mwdcal.app.progress import bar
+    from mwdcal.app.tables import apply_to_any
+    from mwdcal.files import documents
 
-    _check_outputs([output], [calibration])
+    _check_outputs([output], [calibration, readings])
     made = documents.read(calibration)
-    source = table.read(readings, decimal=decimal)
-    result, findings = apply_to_table(made, source, outside)
-    table.write(output, result)
+    with bar("correcting") as advance:
+        count, findings = apply_to_any(made, readings, output, outside, decimal, advance)
     tell(findings)
     if as_json:
-        print_json({"rows": source.count, "output": str(output), "findings": findings})
+        print_json({"rows": count, "output": str(output), "findings": findings})
     else:
-        click.echo(f"{source.count} rows corrected   wrote {output}")
+        click.echo(f"{count} rows corrected   wrote {output}")
 
 
 @cli.command()

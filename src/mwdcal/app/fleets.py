@@ -20,7 +20,7 @@ from mwdcal.app.fleet_summary import Summary, document, summarise, text
 from mwdcal.checks import check_options
 from mwdcal.errors import FitError, InputError
 from mwdcal.files import atomic, parquet, profiles
-from mwdcal.files.fleet_parts import Plan, load, solve
+from mwdcal.files.fleet_parts import Plan, is_whole, load, solve
 from mwdcal.files.fleet_tables import (
     SERIAL,
     Partition,
@@ -68,7 +68,7 @@ def calibrate_table(asked: Asked, say: Callable[[str], None]) -> Summary:
     parts = partitions(source, tools, folder)
     plan = Plan.of(source, profile, options)
     paths = [folder / f"{plan.key(part)}.arrow" for part in parts]
-    before = sum(path.is_file() for path in paths)
+    before = sum(map(is_whole, paths))
     say(f"{tools.count} tools, {source.rows} stations, {len(parts)} parts, {before} done before")
     _make_parts(plan, parts, paths, asked, say)
     metadata = {
@@ -124,7 +124,7 @@ def _make_parts(
     say: Callable[[str], None],
 ) -> None:
     """Do the parts that are not there yet; each is written when it is whole."""
-    missing = [index for index, path in enumerate(paths) if not path.is_file()]
+    missing = [index for index, path in enumerate(paths) if not is_whole(path)]
     if not missing:
         return
     paths[0].parent.mkdir(exist_ok=True)
@@ -135,7 +135,7 @@ def _make_parts(
     steps = pool.Steps(partial(load, plan), partial(solve, plan))
     found = pool.results(steps, tasks, workers, asked["scheduler"])
     for count, (index, content) in enumerate(found, 1):
-        atomic.write(paths[missing[index]], content)
+        atomic.write(paths[missing[index]], content, durable=False)
         tools += tasks[index].tools
         now = time.perf_counter()
         if now - told > EVERY:

@@ -53,7 +53,7 @@ class Moments(NamedTuple):
     """What unit noise of the four terms makes of the variances at m averaging factors.
 
     Attributes:
-        count: samples of the record.
+        samples: of the record.
         averaging: the factors (m,).
         mean: expected centred overlapping variance (m, 4).
         covariance: of the same (m, m, 4, 4): that of noise θ (squares) is θᵀ C θ.
@@ -62,7 +62,7 @@ class Moments(NamedTuple):
         plain_drift: part of its variance per unit noise and unit drift² (m, 4).
     """
 
-    count: int
+    samples: int
     averaging: Array
     mean: Array
     covariance: Array
@@ -126,6 +126,12 @@ def _variance(phase: Array, m: int, kind: Kind, centred: bool) -> Array:
     if centred:
         step = step - step.mean(-1, keepdims=True)
     return np.asarray(np.mean(step**2, -1) / (2.0 * m * m))
+
+
+def differences(values: Array, m: int) -> Array:
+    """Differences (..., n - 2m + 1) of averages over m samples that follow each other."""
+    phase = _phase(values)
+    return np.asarray((phase[..., 2 * m :] - 2 * phase[..., m:-m] + phase[..., : -2 * m]) / m)
 
 
 def drift(values: Array) -> Array:
@@ -221,24 +227,24 @@ def _between(m: int, k: int, lags: Array) -> Array:
 
 def _pairs(first: int, second: int, lags: Array) -> Array:
     """How many of `first` times `second` terms are each of `lags` (l,) apart."""
-    return np.clip(np.minimum(first, second + lags) - np.maximum(0, lags), 0, None)
+    return np.asarray(np.clip(np.minimum(first, second + lags) - np.maximum(0, lags), 0, None))
 
 
 def _pair(count: int, m: int, k: int) -> tuple[Array, Array]:
-    """Covariance (4, 4) of two centred variances, m <= k, and mean square (4,) of the mean
-    difference (of use where m = k).
+    """Covariance (4, 4) of two centred variances, m <= k, and for m = k what centring takes off.
 
-    With C the covariance matrix of the two sets of differences, the first is half the mean
-    square of C, of which rows and columns are centred; here it is summed along its diagonals.
+    That is the mean square (4,) of the mean difference. With C the covariance matrix of the two
+    sets of differences, its rows and columns centred, the covariance of the variances is half
+    the mean square of C; here it is summed along its diagonals.
     """
     first, second = count - 2 * m + 1, count - 2 * k + 1
-    spikes = np.unique([q * k - p * m for p in range(3) for q in range(3)])
+    spikes = np.unique([float(q * k - p * m) for p in range(3) for q in range(3)])
     square, total = _summed(_between(m, k, spikes), _pairs(first, second, spikes))
     square[1:, 1:], total[1:] = 0.0, 0.0
     smooth = slice(1, 4) if k <= APART * m else slice(3, 4)
     step = max(1, (m if k <= APART * m else k) // STEPS)
     low, high = -min(second - 1, REACH * k) // step, min(first - 1, REACH * k) // step
-    lags = step * np.arange(low, high + 1)
+    lags = step * np.arange(low, high + 1, dtype=float)
     between = _between(m, k, lags)[smooth]
     more, mean = _summed(between, step * _pairs(first, second, lags))
     if first < LONG * k:
@@ -283,13 +289,13 @@ def _plain(count: int, m: int, kind: Kind) -> tuple[Array, Array, Array]:
     step = max(1, m // STEPS)
     reach = min(terms - 1, REACH * m) // step * step
     pad = m if modified else 0
-    lags = np.arange(-reach - pad, reach + pad + 1, step)
+    lags = np.arange(-reach - pad, reach + pad + 1, step, dtype=float)
     covariance = _between(m, m, lags)
     weights = np.full((4, 1), step, float)
     weights[0] = 1.0
     if modified:
         covariance = _smoothed(covariance, lags, m, step)
-        lags, weights[0] = np.arange(-reach, reach + 1, step), step
+        lags, weights[0] = lags[pad // step : len(lags) - pad // step], step
     pairs = _pairs(terms, terms, lags)
     joint = np.minimum(weights, np.swapaxes(weights, -1, -2))
     square, total = _summed(covariance, pairs)

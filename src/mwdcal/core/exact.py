@@ -104,7 +104,9 @@ def solution(problem: Problem, halfs: list[Half]) -> tuple[State, Analysis]:
     for half, where in zip(halfs, problem.slices(), strict=True):
         covariance[:, where, where] = half.covariance
     left, free = (np.concatenate([getattr(h, n) for h in halfs], -1) for n in ("left", "open"))
-    spread = free[..., None] * np.eye(free.shape[-1])
+    spread = np.zeros((*free.shape, free.shape[-1]))
+    diagonal = np.arange(free.shape[-1])
+    spread[..., diagonal, diagonal] = free
     squares, freedom = (
         np.stack([np.sum(getattr(h, n) ** k, (1, 2)) for h in halfs], -1)
         for n, k in (("left", 2), ("open", 1))
@@ -129,7 +131,8 @@ def _half(triad: Triad, target: Array, include: Array) -> Half | None:
     crossed = across @ (weight * triad.raw)[:, None]
     forward = np.einsum("bajk,baka->baj", spread, np.broadcast_to(crossed, (*spread.shape[:3], 3)))
     left = (triad.raw - terms @ np.swapaxes(forward, -1, -2)) * np.sqrt(weight)
-    share = np.einsum("bnj,bajk,bnk->bna", terms, spread, terms, optimize=True) * weight
+    share = np.sum((terms[:, None] @ spread) * terms[:, None], -1)
+    share = np.swapaxes(share, -1, -2) * weight
     return Half(terms, forward, spread, *_own(triad, forward), left, include - share)
 
 

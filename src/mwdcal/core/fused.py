@@ -2,7 +2,7 @@
 
 The same formulas as `core.models` and `core.observables`, which are the reference: both
 agree to 1e-12 (`tests/test_fused.py`; reasons and timings: `design/kernels.md`). Numba is
-imported when rows are first computed, never before.
+imported when rows are first computed, never before; MWDCAL_NUMPY=1 turns it off.
 """
 
 from __future__ import annotations
@@ -10,13 +10,15 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from importlib.util import find_spec
 from typing import NamedTuple
 
 import numpy as np
 
+from mwdcal.core.fast import available
 from mwdcal.core.models import OFF_DIAGONAL, Factors, Model, Polynomial
 from mwdcal.core.vectors import AnyArray, Array
+
+__all__ = ["available", "cores", "numbers", "run"]
 
 HIGHEST = 3
 """Highest order in temperature that the loops know."""
@@ -60,11 +62,6 @@ class Found(NamedTuple):
     unsound: int
     beyond: int
     empty: int
-
-
-def available() -> bool:
-    """Whether Numba is installed, and not ruled out by MWDCAL_NUMPY in the environment."""
-    return not os.environ.get("MWDCAL_NUMPY") and find_spec("numba") is not None
 
 
 def cores() -> int:

@@ -38,10 +38,14 @@ DETECTED = 0.005
 """Chance under which a term is no longer taken for absent."""
 LEVEL = 0.95
 """Probability of the intervals."""
-CONTRADICTED = 1e-3
+CONTRADICTED = 1e-4
 """Chance of a misfit below which the shortest averages are left out, or the fit is in doubt."""
 HALVINGS = 60
 """Of an interval's limit: to the last digits of a number."""
+ALONE = 1e-9
+"""Share of its own variance that a term keeps where it is absent and so are all others."""
+SMALLEST = 1e-4
+"""Eigenvalue of the correlation between averaging factors below which rounding decides."""
 SUBSETS = [s for size in range(1, 5) for s in combinations(range(4), size)]
 """Which terms are present."""
 
@@ -104,7 +108,7 @@ def _fit(variance: Array, slope: Array, moments: Moments, start: int) -> Terms:
     """The same on the averaging factors from `start` on."""
     variance, mean = variance[:, start:], moments.mean[start:]
     unit = moments.covariance[start:, start:]
-    bounded = _rough(variance, mean, moments.averaging[start:] / moments.count)
+    bounded = _rough(variance, mean, moments.averaging[start:] / moments.samples)
     for _ in range(ITERATIONS):
         whiten = _whitening(unit, bounded)
         design, data = whiten @ mean, np.einsum("bij,bj->bi", whiten, variance)
@@ -119,7 +123,7 @@ def _fit(variance: Array, slope: Array, moments: Moments, start: int) -> Terms:
     absent = _chance(square, np.zeros_like(square), _spread(each, bounded))
     determined = 1 - absent < DETECTED
     lower, upper = _interval(square, _spread(each, bounded), determined)
-    weight = drift_variance(moments.count)
+    weight = drift_variance(moments.samples)
     doubt = np.sqrt(np.einsum("a,bac,c->b", weight, covariance, weight))
     count = len(variance)
     return Terms(
@@ -139,8 +143,9 @@ def _whitening(unit: Array, squares: Array) -> Array:
     """Matrix (B, m, m) that makes the variances of noise (B, 4) independent, each of variance 1."""
     joint = np.einsum("mnac,ba,bc->bmn", unit, squares, squares, optimize=True)
     scale = 1 / np.sqrt(np.einsum("bmm->bm", joint))
-    factor = np.linalg.cholesky(joint * scale[:, :, None] * scale[:, None, :])
-    return np.asarray(np.linalg.inv(factor) * scale[:, None, :])
+    size, axes = np.linalg.eigh(joint * scale[:, :, None] * scale[:, None, :])
+    whiten = np.swapaxes(axes, -1, -2) / np.sqrt(np.maximum(size, SMALLEST))[..., None]
+    return np.asarray(whiten * scale[:, None, :])
 
 
 def _inverse(design: Array) -> Array:
@@ -150,8 +155,9 @@ def _inverse(design: Array) -> Array:
 
 
 def _nonnegative(design: Array, data: Array) -> Array:
-    """Solution (B, 4) without negative entries of design (B, m, 4) · x = data (B, m): the best of
-    all choices of entries that are not zero.
+    """Least-squares solution (B, 4) without negative entries of design (B, m, 4) · x = data (B, m).
+
+    The best of all choices of entries that are not zero.
     """
     best = np.zeros((len(data), 4))
     cost = np.sum(data**2, -1)
@@ -173,9 +179,10 @@ def _spread(each: Array, bounded: Array) -> Array:
     `each` (B, 4, 4, 4) is that variance for unit noise; the other terms are as bounded.
     """
     others = bounded[:, None, :] * (1 - np.eye(4))
+    own = np.einsum("bjjj->bj", each)
     constant = np.einsum("bja,bjac,bjc->bj", others, each, others)
     linear = 2 * np.einsum("bjjc,bjc->bj", each, others)
-    return np.stack([constant, linear, np.einsum("bjjj->bj", each)])
+    return np.stack([np.maximum(constant, ALONE * own * bounded**2), linear, own])
 
 
 def _chance(observed: Array, value: Array, spread: Array) -> Array:
@@ -205,7 +212,7 @@ def _limit(observed: Array, spread: Array, chance: Array) -> Array:
     """The value (B, 4) of a term that leaves `observed` or less this chance, by bisection."""
     low = np.zeros_like(observed)
     high = np.maximum(observed, 0) + 10 * np.sqrt(spread[0])
-    high = high * (1 + 10 * spread[2]) + 100 * spread[1]
+    high = high * (1 + 10 * np.sqrt(spread[2]) + 10 * spread[2]) + 100 * spread[1]
     for _ in range(HALVINGS):
         middle = (low + high) / 2
         above = _chance(observed, middle, spread) > chance

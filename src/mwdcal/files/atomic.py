@@ -12,15 +12,18 @@ from typing import IO
 from mwdcal.errors import InputError
 
 
-def write(path: str | os.PathLike[str], data: bytes | str) -> None:
-    """Write `data` (text as UTF-8) to `path`, which is replaced as a whole or not at all."""
+def write(path: str | os.PathLike[str], data: bytes | str, durable: bool = True) -> None:
+    """Write `data` (text as UTF-8) to `path`, which is replaced as a whole or not at all.
+
+    Not `durable`: a loss of power may leave a part of the new file; a killed program does not.
+    """
     content = data.encode("utf-8", "backslashreplace") if isinstance(data, str) else data
-    with replacing(path) as stream:
+    with replacing(path, durable) as stream:
         stream.write(content)
 
 
 @contextlib.contextmanager
-def replacing(path: str | os.PathLike[str]) -> Iterator[IO[bytes]]:
+def replacing(path: str | os.PathLike[str], durable: bool = True) -> Iterator[IO[bytes]]:
     """A new file to write to, which replaces `path` when the block ends without an error."""
     file = target(path)
     temporary = file.with_name(f".mwdcal-{secrets.token_hex(8)}.tmp")
@@ -28,7 +31,8 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[IO[bytes]]:
         with temporary.open("xb") as stream:
             yield stream
             stream.flush()
-            os.fsync(stream.fileno())  # wait until it is on the disk
+            if durable:
+                os.fsync(stream.fileno())  # wait until it is on the disk
         temporary.replace(file)
     except OSError as error:
         raise _refusal(path, error) from error

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -25,6 +26,9 @@ from mwdcal.readings import TRIADS
 HEAD = (SERIAL, "status", "message", "stations", "temperature_min_c", "temperature_max_c")
 WHOLE = ("rank", "size", "stations")
 """Ends of the names of columns of whole numbers."""
+
+END = b"\xff\xff\xff\xff\x00\x00\x00\x00"
+"""End of a stream in Arrow's format."""
 
 
 @dataclass(frozen=True)
@@ -69,6 +73,15 @@ def solve(plan: Plan, loaded: bytes) -> bytes:
     table = arrow.ipc.open_stream(loaded).read_all()
     rows = Rows.of(table, plan.source, plan.metadata, plan.profile)
     return _stream(_result(rows, plan))
+
+
+def is_whole(path: Path) -> bool:
+    """Whether a finished part is there: Arrow's stream ends with its own mark."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as stream:
+        stream.seek(max(path.stat().st_size - len(END), 0))
+        return stream.read() == END
 
 
 def _stream(table: Any) -> bytes:

@@ -38,7 +38,7 @@ def parse(data: bytes, source: str, delimiter: str | None = None) -> Parts:
         columns = {
             name: as_column(name, table.column(name), arrow)
             for name in names
-            if not _PANDAS_INDEX.fullmatch(name)
+            if not is_index(name)
         }
     except Exception as error:
         raise unreadable(source, error) from error
@@ -76,6 +76,11 @@ def unreadable(source: str, error: Exception) -> InputError:
         f"{source}: expected a complete Parquet file; reading it failed ({reason}). "
         "Copy or export it again."
     )
+
+
+def is_index(name: str) -> bool:
+    """Whether a column is the numbering of rows that pandas adds."""
+    return _PANDAS_INDEX.fullmatch(name) is not None
 
 
 def as_column(name: str, cells: Any, arrow: Any) -> Column:

@@ -63,7 +63,7 @@ def to_readings(table: Table, profile: Profile) -> tuple[Readings, Profile]:
     known = _known(table)
     profile = _with_scales(profile, raw, known)
     triads = {kind: values for kind, values in raw.items() if values is not None}
-    nominal = {kind: _nominal(triads[kind], _triad(profile, kind)) for kind in triads}
+    nominal = {kind: to_nominal(triads[kind], _triad(profile, kind)) for kind in triads}
     temperature = _temperature(table)
     readings = Readings(
         accelerometer=nominal["accelerometer"],
@@ -78,6 +78,11 @@ def to_readings(table: Table, profile: Profile) -> tuple[Readings, Profile]:
         source=table.source,
     )
     return readings, profile
+
+
+def check_references(table: Table, profile: Profile, kinds: list[str]) -> None:
+    """Refuse what `to_readings` refuses in references and uncertainties of triads `kinds`."""
+    _uncertainties(table, profile, kinds, list(_known(table)))
 
 
 def from_readings(
@@ -176,7 +181,7 @@ def _turned(angle: Array) -> Array:
     return np.where(outside, np.mod(angle, _TURN), angle)
 
 
-def _nominal(raw: Array, triad: TriadProfile) -> Array:
+def to_nominal(raw: Array, triad: TriadProfile) -> Array:
     """Nominal field along the tool axes (n, 3) of raw channels (n, 3)."""
     return (raw / (triad.scale or 1.0)) @ triad.permutation.T
 

@@ -1,0 +1,71 @@
+"""What `mwdcal noise` asks for: kept apart from the work, so that help is quick."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypedDict
+
+import click
+
+
+class Asked(TypedDict):
+    """What was typed."""
+
+    log: Path
+    tool: str | None
+    columns: str
+    sampling_hz: float | None
+    start: float | None
+    end: float | None
+    station_seconds: float | None
+    modified: bool
+    plot: Path | None
+    report: Path | None
+    decimal: str
+    as_json: bool
+
+
+_FILE = click.Path(path_type=Path)
+_OPTIONS = (
+    click.argument("log", type=_FILE),
+    click.option(
+        "--tool", metavar="NAME|FILE",
+        help="Tool profile with the scales: figures also in g and nT.",
+    ),
+    click.option(
+        "--columns", default="", metavar="NAMES",
+        help="Columns of a text log without column names, such as time_s,ax,ay,az.",
+    ),
+    click.option(
+        "--sampling-hz", type=float, metavar="HZ",
+        help="Rate of a log without a column time_s; comes before that column.",
+    ),
+    click.option(
+        "--from", "start", type=float, metavar="S", help="Use the log from so many seconds on."
+    ),
+    click.option("--to", "end", type=float, metavar="S", help="Use it up to so many seconds."),
+    click.option(
+        "--station-seconds", type=float, metavar="S",
+        help="Duration of a station. Default: 30, or a quarter of a shorter log.",
+    ),
+    click.option("--modified", is_flag=True, help="Show modified Allan deviations."),
+    click.option(
+        "--plot", type=_FILE, metavar="FILE.png|svg", help="Also draw the Allan deviations."
+    ),
+    click.option(
+        "--report", type=_FILE, metavar="R.html", help="Also write a self-contained HTML report."
+    ),
+    click.option(
+        "--decimal", default=".", show_default=True, metavar="SIGN",
+        help="Decimal sign of numbers in text files.",
+    ),
+    click.option("--json", "as_json", is_flag=True, help="Print the result as JSON."),
+)  # fmt: skip
+
+
+def noise_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """The command `noise` with its argument and options, in this order."""
+    for option in reversed(_OPTIONS):
+        command = option(command)
+    return command

@@ -1,0 +1,41 @@
+"""A progress bar on stderr, where that is a terminal and the work takes more than two seconds."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+PATIENCE = 2.0
+"""Seconds before there is anything to see."""
+
+
+@contextmanager
+def bar(label: str) -> Iterator[Callable[[int, int], None]]:
+    """A function to call with how much is done, and of how much."""
+    start, shown = time.monotonic(), None
+
+    def advance(done: int, total: int) -> None:
+        nonlocal shown
+        if shown is None and sys.stderr.isatty() and time.monotonic() - start > PATIENCE:
+            shown = _started(label)
+        if shown is not None:
+            shown.update(shown.task_ids[0], completed=done, total=total)
+
+    try:
+        yield advance
+    finally:
+        if shown is not None:
+            shown.stop()
+
+
+def _started(label: str) -> Any:
+    from rich.console import Console
+    from rich.progress import Progress
+
+    shown = Progress(console=Console(stderr=True), transient=True)
+    shown.add_task(label, total=None)
+    shown.start()
+    return shown

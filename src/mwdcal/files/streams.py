@@ -1,0 +1,221 @@
+"""Long tables in parts: Parquet and text of any length, read in bounded memory.
+
+A source hands out pieces in order, which are cheap to make, and loads a piece, which may be
+done by several threads at once. Needs PyArrow. Text that is not plain (quotes, blanks before a
+cell, numbers in unusual spelling) and everything that is refused goes through the parser of
+`files.text`, piece by piece: one place decides what is accepted, and words it.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from mwdcal.errors import InputError
+from mwdcal.files import parquet, text
+from mwdcal.files.columns import LABELS, Column, check_names, no_stations
+from mwdcal.files.contract import COLUMNS, RAW
+from mwdcal.files.table import Table, numbers
+
+ROWS = 1 << 17
+"""Most rows of a part of a Parquet table."""
+PART = 24 << 20
+"""Bytes that the numbers of such a part may take, results included."""
+PIECE = 4 << 20
+"""Bytes of a piece of text."""
+_RESULTS = 13
+_LONGEST = 1 << 20
+_NUMERIC = tuple(name for name in COLUMNS if name not in LABELS)
+
+
+class Part(NamedTuple):
+    """Some rows: `carried` is the Arrow table to pass on, `table` its columns of the contract."""
+
+    carried: Any
+    table: Table
+    size: int
+
+
+@dataclass(frozen=True)
+class Source:
+    """A long table, not yet read.
+
+    Attributes:
+        name: of the file.
+        names: of its columns, in order.
+        metadata: what the file says about itself.
+        schema: Arrow schema of what is carried.
+        size: sum of the sizes of all parts, whatever they count.
+        pieces: an iterator over the pieces, in order.
+        load: a piece to a `Part`; the second argument asks for the lines of text exactly.
+    """
+
+    name: str
+    names: list[str]
+    metadata: dict[str, object]
+    schema: Any
+    size: int
+    pieces: Callable[[], Iterator[Any]]
+    load: Callable[[Any, bool], Part]
+
+
+def open_parquet(path: Path, rows: int = 0) -> Source:
+    """A Parquet file in parts of `rows` rows; by default as many as memory bears."""
+    arrow, parquets = parquet.modules(path.name)
+    try:
+        file = parquets.ParquetFile(path, buffer_size=1 << 20, pre_buffer=False)
+        stored, count = file.schema_arrow, file.metadata.num_rows
+    except Exception as error:
+        raise parquet.unreadable(path.name, error) from error
+    check_names(list(stored.names), path.name)
+    if count == 0:
+        raise no_stations(path.name)
+    names = [name for name in stored.names if not parquet.is_index(name)]
+    metadata = parquet.metadata_of(file.metadata.metadata, path.name)
+    step = rows or max(1, min(ROWS, PART // (8 * (len(names) + _RESULTS))))
+
+    def pieces() -> Iterator[Any]:
+        first = 1
+        batches = file.iter_batches(step, use_threads=True)
+        try:
+            for batch in batches:
+                yield first, batch
+                first += len(batch)
+        except OSError as error:
+            raise parquet.unreadable(path.name, error) from error
+
+    def load(piece: Any, exact: bool) -> Part:
+        first, batch = piece
+        carried = arrow.Table.from_batches([batch]).select(names)
+        wanted = [name for name in names if name in _NUMERIC]
+        columns = {n: parquet.as_column(n, carried.column(n), arrow) for n in wanted}
+        lines = range(first, first + len(batch))
+        return Part(carried, Table(columns, metadata, path.name, lines), len(batch))
+
+    schema = arrow.schema([stored.field(name) for name in names])
+    return Source(path.name, names, metadata, schema, count, pieces, load)
+
+
+def open_text(path: Path, delimiter: str | None = None, typed: bool = False) -> Source:
+    """A text table in pieces; `typed`: the contract's columns of numbers are carried as numbers."""
+    arrow, _ = parquet.modules(path.name)
+    try:
+        with path.open("rb") as stream:
+            first = next(_pieces(stream), b"")
+    except OSError as error:
+        raise InputError(f"cannot read '{path}': {error.strerror}.") from error
+    top = text.head(_newlines(first), path.name, delimiter)
+    numeric = [name for name in top.names if typed and name in _NUMERIC]
+    types = {n: arrow.float64() if n in numeric else arrow.string() for n in top.names}
+
+    def pieces() -> Iterator[Any]:
+        yield top.body, top.lines, len(first)
+        above = top.lines + top.body.count(b"\n")
+        with path.open("rb") as stream:
+            stream.seek(len(first))
+            for data in _pieces(stream):
+                plain = _newlines(data)
+                yield plain, above, len(data)
+                above += plain.count(b"\n")
+
+    def load(piece: Any, exact: bool) -> Part:
+        data, above, size = piece
+        found = None if exact else _plain(data, top, arrow)
+        if found is None:
+            parts = text.rows(data, top, above, path.name)
+            table = Table(parts.columns, top.metadata, path.name, parts.lines)
+            strings = {n: arrow.array(c, arrow.string()) for n, c in parts.columns.items()}
+            found = arrow.table(strings), table
+        carried, table = found
+        if typed:
+            carried = _typed(carried, table, numeric, arrow)
+        kept = {n: c for n, c in table.columns.items() if n in _NUMERIC}
+        return Part(carried, Table(kept, top.metadata, path.name, table.lines), size)
+
+    schema = arrow.schema(list(types.items()))
+    total = path.stat().st_size
+    return Source(path.name, top.names, top.metadata, schema, total, pieces, load)
+
+
+def _pieces(stream: Any) -> Iterator[bytes]:
+    """The bytes of a file in pieces of whole lines."""
+    rest = b""
+    while chunk := stream.read(PIECE):
+        data = rest + chunk
+        cut = data.rfind(b"\n") + 1 or data.rfind(b"\r", 0, -1) + 1
+        if not cut and len(data) > _LONGEST:  # no line of a table: for the parser to refuse
+            cut = len(data)
+        if cut:
+            yield data[:cut]
+        rest = data[cut:]
+    if rest:
+        yield rest
+
+
+def _newlines(data: bytes) -> bytes:
+    """The piece with every line ended by a line feed."""
+    if b"\r" in data:
+        data = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+    return data if data.endswith(b"\n") else data + b"\n"
+
+
+def _plain(data: bytes, top: text.Head, arrow: Any) -> tuple[Any, Table] | None:
+    """Strings and table of a piece without anything unusual; None where there may be."""
+    from pyarrow import csv
+
+    delimiter = top.delimiter.encode()
+    unusual = (b'"', b"\0", delimiter + b" ", b"\n ")
+    if data.startswith(b" ") or not data.strip() or any(mark in data for mark in unusual):
+        return None
+    strings = {name: arrow.string() for name in top.names}
+    try:
+        carried = csv.read_csv(
+            arrow.BufferReader(data),
+            csv.ReadOptions(column_names=top.names, use_threads=False, block_size=len(data) + 1),
+            csv.ParseOptions(delimiter=top.delimiter, quote_char=False),
+            csv.ConvertOptions(column_types=strings, strings_can_be_null=False),
+        )
+        columns = {n: _numbers(n, carried.column(n), arrow) for n in top.names if n in _NUMERIC}
+    except (arrow.ArrowInvalid, arrow.ArrowKeyError):
+        return None
+    return carried, Table(columns, {}, "", range(carried.num_rows))
+
+
+def _numbers(name: str, cells: Any, arrow: Any) -> Column:
+    """Readings as numbers, other columns as text, which may have blank cells."""
+    if name not in (*RAW, "temperature_c"):
+        return [str(cell) for cell in cells.to_pylist()]
+    if cells[0].as_py() == "" and cells.unique().to_pylist() == [""]:
+        return np.full(len(cells), np.nan)
+    return np.asarray(cells.cast(arrow.float64()).to_numpy(), float)
+
+
+def _typed(carried: Any, table: Table, numeric: list[str], arrow: Any) -> Any:
+    """The strings, blank ones as null, with the contract's columns of numbers as numbers."""
+    import pyarrow.compute as compute
+
+    arrays = {
+        name: arrow.array(numbers(table, name), arrow.float64(), from_pandas=True)
+        if name in numeric
+        else compute.if_else(compute.equal(cells, ""), None, cells)
+        for name, cells in zip(carried.column_names, carried.columns, strict=True)
+    }
+    return arrow.table(arrays)
+
+
+def is_long(path: str | os.PathLike[str], least: tuple[int, int]) -> bool:
+    """Whether the file is worth streaming: at least so many rows (Parquet) or bytes (text)."""
+    file = Path(path)
+    suffix = file.suffix.lower()
+    if suffix == ".parquet":
+        try:
+            _, parquets = parquet.modules(file.name)
+            return bool(parquets.read_metadata(file).num_rows >= least[0])
+        except Exception:  # refused with its reason where it is read
+            return False
+    return suffix in (".csv", ".tsv") and file.is_file() and file.stat().st_size >= least[1]
