@@ -48,35 +48,62 @@ class Swarm:
     iterations: int
 
 
-@dataclass
 class _Flight:
-    """Particles in units of the box, -1 to 1: places and best places (..., particles, p)."""
+    """Particles in units of the box, -1 to 1; all arrays are changed in place.
 
-    cost: Cost
-    place: Array
-    velocity: Array
-    best: Array
-    best_cost: Array
+    Attributes:
+        aims: what pulls the particles (2, tools, particles, p): own best places, and the swarm's.
+        best_cost: cost (tools, particles) of the own best places.
+        lowest: that of the swarm's best place (tools,).
+    """
 
-    @property
-    def leader(self) -> Array:
-        """Best place of the whole swarm (..., 1, p)."""
-        first = np.argmin(self.best_cost, -1)[..., None, None]
-        return np.asarray(np.take_along_axis(self.best, first, -2))
+    def __init__(self, cost: Cost, place: Array, velocity: Array) -> None:
+        first = cost(place)
+        self.lead, shape = first.shape[:-1], place.shape
+        self.best_cost = np.where(np.isfinite(first), first, np.inf).reshape(-1, len(place))
+        self.tools = np.arange(len(self.best_cost))
+        self.place, self.velocity = (
+            np.broadcast_to(x, (len(self.tools), *shape)).copy() for x in (place, velocity)
+        )
+        self.seen = self.place.reshape(*self.lead, *shape)
+        self.cost = cost
+        self.aims = np.stack([self.place, self.place])
+        self.pull, self.draws = np.empty_like(self.aims), np.empty((2, 1, *shape))
+        self._lead_on()
 
-    def step(self, own: Array, social: Array) -> None:
-        """Move all particles once; `own` and `social` are draws from 0 to 1."""
-        pull = own * (self.best - self.place) + social * (self.leader - self.place)
-        velocity = CONSTRICTION * (self.velocity + ACCELERATION * pull)
-        velocity = np.clip(velocity, -FASTEST, FASTEST)
-        place = self.place + velocity
-        outside = np.abs(place) > 1
-        self.place = np.where(outside, np.sign(place) * 2 - place, place)
-        self.velocity = np.where(outside, -velocity, velocity)
-        cost = self.cost(self.place)
-        better = cost < self.best_cost
-        self.best = np.where(better[..., None], self.place, self.best)
-        self.best_cost = np.where(better, cost, self.best_cost)
+    def _lead_on(self) -> None:
+        """Note the lowest cost and aim all particles at its place."""
+        leader = self.best_cost.argmin(-1)
+        self.lowest = self.best_cost[self.tools, leader]
+        self.aims[1] = self.aims[0, self.tools, leader][:, None]
+
+    def step(self, random: np.random.Generator) -> None:
+        """Move all particles once."""
+        place, velocity, pull = self.place, self.velocity, self.pull
+        random.random(out=self.draws)
+        self.draws *= CONSTRICTION * ACCELERATION
+        np.subtract(self.aims, place, out=pull)
+        pull *= self.draws
+        velocity *= CONSTRICTION
+        velocity += pull[0]
+        velocity += pull[1]
+        np.minimum(velocity, FASTEST, out=velocity)
+        np.maximum(velocity, -FASTEST, out=velocity)
+        place += velocity
+        self._reflect(np.abs(place, out=pull[0]))
+        cost = self.cost(self.seen).reshape(self.best_cost.shape)
+        better = (cost < self.best_cost) & (cost > -np.inf)
+        if better.any():
+            np.copyto(self.best_cost, cost, where=better)
+            np.copyto(self.aims[0], place, where=better[..., None])
+            self._lead_on()
+
+    def _reflect(self, size: Array) -> None:
+        """Turn back at the bounds those that would pass them; `size` is |place|."""
+        if size.max() > 1:
+            outside = size > 1
+            np.subtract(2 * np.sign(self.place), self.place, out=self.place, where=outside)
+            np.negative(self.velocity, out=self.velocity, where=outside)
 
 
 def swarm(
@@ -109,21 +136,22 @@ def swarm(
     middle, half = (low + high)[..., None, :] / 2, (high - low)[..., None, :] / 2
 
     def boxed(place: Array) -> Array:
-        value = cost(middle + half * place)
-        return np.where(np.isfinite(value), value, np.inf)
+        return cost(middle + half * place)
 
     random = np.random.default_rng(seed)
     shape = (particles, low.shape[-1])
-    place, velocity = random.uniform(-1, 1, (2, *shape)) * np.array([1, FASTEST / 2])[:, None, None]
-    first = boxed(place)
-    place = np.broadcast_to(place, (*first.shape[:-1], *shape))
-    flight = _Flight(boxed, place, np.broadcast_to(velocity, place.shape), place, first)
-    history = np.empty((*first.shape[:-1], iterations))
+    place, velocity = random.uniform(-1, 1, (2, *shape))
+    flight = _Flight(boxed, place, velocity * FASTEST / 2)
+    history = np.empty((len(flight.tools), iterations))
     for index in range(iterations):
-        flight.step(*random.uniform(size=(2, *shape)))
-        history[..., index] = flight.best_cost.min(-1)
-    position = (middle + half * flight.leader)[..., 0, :]
-    return Swarm(position, flight.best_cost.min(-1), history, iterations)
+        flight.step(random)
+        history[:, index] = flight.lowest
+    lead = flight.lead
+    found = flight.aims[1].reshape(*lead, *shape)[..., :1, :]
+    position = (middle + half * found)[..., 0, :]
+    return Swarm(
+        position, flight.lowest.reshape(lead), history.reshape(*lead, iterations), iterations
+    )
 
 
 def forward_parts(params: Array) -> tuple[Array, Array]:
@@ -240,9 +268,35 @@ class Coordinates:
         matrix = matrix + self.gain[..., None, None, None] * np.eye(3)
         return matrix, self.mean_target + spread * shift
 
+    def cost(self, target: Array, terms: Array) -> Cost:
+        """Mean squared error of the targets as a function of u (..., particles, 12).
 
-def _field_search(raw: Array, reference: Array) -> Callable[[Array], Array]:
-    """Forward parameters at coordinates of field = M (reading - mean) + middle, S = M⁻¹."""
+        Stations count by their second moments alone: up to six that have the same, rows of the
+        triangular factor of all, take their place, however many there are.
+        """
+        both = np.broadcast_arrays(terms - self.mean_terms, target - self.mean_target)
+        rows = np.concatenate(both, -1)
+        few = np.linalg.qr(rows / np.sqrt(rows.shape[-2]))[1]
+        few = np.swapaxes(few, -1, -2)
+        few_terms, few_target = few[..., :3, :], few[..., 3:, :]
+        spread, lead, size = self.spread[..., None, None], few.shape[:-2], 3 * few.shape[-1]
+        turned = np.einsum("ij,...ab->...iajb", np.eye(3), spread * (self.whiten @ few_terms))
+        slope, zero = np.zeros((*lead, 12, size + 3)), np.zeros((*lead, 1, size + 3))
+        slope[..., :9, :size] = turned.reshape(*lead, 9, size)
+        slope[..., 9:, size:] = spread * np.eye(3)
+        rest = self.gain[..., None, None] * few_terms - few_target
+        zero[..., 0, :size] = rest.reshape(*lead, size)
+
+        def mean_square(place: Array) -> Array:
+            error = place @ slope
+            error += zero
+            return np.asarray(np.vecdot(error, error))
+
+        return mean_square
+
+
+def _field_search(raw: Array, reference: Array) -> tuple[Cost, Callable[[Array], Array]]:
+    """Cost and forward parameters by u of field = M (reading - mean) + middle, S = M⁻¹."""
     coordinates = Coordinates.of(reference, raw)
 
     def params(place: Array) -> Array:
@@ -250,11 +304,11 @@ def _field_search(raw: Array, reference: Array) -> Callable[[Array], Array]:
         back = inverse(matrix)
         return _joined(back, coordinates.mean_terms - np.einsum("...ij,...j->...i", back, middle))
 
-    return params
+    return coordinates.cost(reference, raw), params
 
 
-def _reading_search(raw: Array, reference: Array) -> Callable[[Array], Array]:
-    """Forward parameters at coordinates of reading = S (reference - mean) + middle."""
+def _reading_search(raw: Array, reference: Array) -> tuple[Cost, Callable[[Array], Array]]:
+    """Cost and forward parameters by u of reading = S (reference - mean) + middle."""
     coordinates = Coordinates.of(raw, reference)
 
     def params(place: Array) -> Array:
@@ -262,7 +316,7 @@ def _reading_search(raw: Array, reference: Array) -> Callable[[Array], Array]:
         mean = np.einsum("...ij,...j->...i", matrix, coordinates.mean_terms)
         return _joined(matrix, middle - mean)
 
-    return params
+    return coordinates.cost(raw, reference), params
 
 
 _SEARCHES = {"field": _field_search, "reading": _reading_search}
@@ -292,9 +346,9 @@ def swarm_forward(
     Accuracy: a cost is seen to 16 digits, hence the position to 8 digits of the residual.
     Singular: as `least_squares_forward`.
     """
-    params, cost = _SEARCHES[error](raw, reference), vector_cost(raw, reference, error)
+    cost, params = _SEARCHES[error](raw, reference)
     found = swarm(
-        lambda place: cost(params(place)),
+        cost,
         np.full(12, -reach),
         np.full(12, reach),
         particles=particles,
