@@ -162,7 +162,9 @@ def main() -> None:
     with TemporaryDirectory() as folder:
         for rows in (in_memory(memory), *(in_files(n, Path(folder)) for n in files)):
             for row in rows:
-                print(f"{row.name:<44}{row.ours:>10.4g}{row.theirs:>10.4g}{row.ratio:>8.2f}  {row.unit}")
+                print(
+                    f"{row.name:<44}{row.ours:>10.4g}{row.theirs:>10.4g}{row.ratio:>8.2f}  {row.unit}"
+                )
 
 
 if __name__ == "__main__":

@@ -109,7 +109,8 @@ def test_what_rests_on_the_prior_alone_is_said():
     record = calibrate(data, SHEET, Options(prior=from_datasheet(SHEET)))
     assert record.accelerometer.rank == record.accelerometer.size
     found = {f.id: f.text for f in record.findings}
-    assert "datasheet" in found["prior-toolface-zero"]
+    assert "toolface-zero" in found["prior-only"]
+    assert "datasheet" in found["prior-only"]
     width = record.expanded_uncertainty("toolface", probe(Tool.random(7))[0])
     assert (width > np.radians(0.1)).all()  # six misalignments of 0.1 degree share it
     without = calibrate(data, SHEET)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cached_property
 from itertools import pairwise
@@ -25,7 +25,7 @@ from mwdcal.calibration import (
 from mwdcal.checks import check_fit, check_readings
 from mwdcal.core.observability import Free, free_directions
 from mwdcal.core.problem import STAND
-from mwdcal.core.uncertainty import marginal_rank
+from mwdcal.core.uncertainty import analyse, marginal_rank
 from mwdcal.core.vectors import Array
 from mwdcal.curves import with_nonlinearity
 from mwdcal.estimate import Fit, fit
@@ -112,6 +112,7 @@ class _Record:
             errors=error_rows(readings, result),
             measures=measure_rows(readings, result),
             station_rows=stations,
+            inherited=list(options.prior.stations) if options.prior else [],
             findings=Findings(readings, self.profile, options, result, self.free).all(
                 [self.triad(i) for i in range(len(result.problem.triads))], stations
             ),
@@ -119,9 +120,13 @@ class _Record:
 
     @property
     def temperatures(self) -> tuple[float, float] | None:
-        """Coldest and hottest station, °C."""
-        temperature = self.readings.temperature
-        return None if temperature is None else (float(temperature.min()), float(temperature.max()))
+        """Coldest and hottest station, °C; those behind the prior count too."""
+        temperature, prior = self.readings.temperature, self.options.prior
+        if temperature is None:
+            return None
+        low, high = float(temperature.min()), float(temperature.max())
+        known = (prior.temperature if prior else None) or (low, high)
+        return min(low, known[0]), max(high, known[1])
 
     @property
     def relative(self) -> bool:
@@ -155,11 +160,20 @@ class _Record:
 
     @cached_property
     def covariance(self) -> Array:
-        """Covariance (p, p) of the file's parameters, scaled by s²."""
-        sizes = [t.model.size for t in self.result.problem.triads]
-        spread = np.sqrt(np.repeat(self.factors, sizes))
-        scaled = self.result.analysis.covariance[0] * np.outer(spread, spread)
-        return np.asarray(self.map @ scaled @ self.map.transpose())
+        """Covariance (p, p) of the file's parameters; what the data say is scaled by s²."""
+        return np.asarray(self.map @ self._scaled @ self.map.transpose())
+
+    @cached_property
+    def _scaled(self) -> Array:
+        """Covariance (p, p) of the fit's parameters, scaled by s²; a prior is not."""
+        problem, analysis = self.result.problem, self.result.analysis
+        grown = np.sqrt(self.factors)
+        if self.options.prior is not None:
+            pairs = zip(problem.triads, grown, strict=True)
+            noisy = replace(problem, triads=tuple(replace(t, sd=t.sd * s) for t, s in pairs))
+            return np.asarray(analyse(noisy, self.result.state, analysis.determined).covariance[0])
+        spread = np.repeat(grown, [t.model.size for t in problem.triads])
+        return np.asarray(analysis.covariance[0] * np.outer(spread, spread))
 
     @cached_property
     def directions(self) -> list[Array]:

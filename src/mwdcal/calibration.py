@@ -192,6 +192,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
 
     `covariance` is of the parameters of all triads in order, scaled by s² where that is
     estimated; `free` are directions (rows) of parameter space that no evidence determines.
+    `inherited` are the fingerprints of the stations behind the prior, if there was one.
     """
 
     schema_version: int = SCHEMA_VERSION
@@ -220,6 +221,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
     measures: list[Measures]
     orders: list[OrderScore] = []
     station_rows: list[StationRow]
+    inherited: list[str] = []
     findings: list[Finding]
 
     @property
@@ -229,7 +231,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
 
     def used(self, digests: Iterable[str]) -> list[bool]:
         """Which stations, by their fingerprints, were in the fit; by the triads both have."""
-        fitted = {row.digest for row in self.station_rows}
+        fitted = {row.digest for row in self.station_rows} | set(self.inherited)
         first = {digest.partition("-")[0] for digest in fitted}
         whole = self.has_field
         return [

@@ -19,7 +19,7 @@ from mwdcal.selection import soaks
 
 GAIN = (0.3, 3.0)
 """An own-axis gain outside this share of nominal is a wrong profile, not a sensor error."""
-MOTION = (1e-2, 1e3)
+MOTION = (1e-2, 30.0)
 """A channel that moves by less or more than this share of the field has not seen the field."""
 
 
@@ -96,7 +96,8 @@ def check_readings(readings: Readings, options: Options) -> None:
         )
     for triad in TRIADS:
         _check_channels(readings, triad, options.prior is not None)
-    _check_temperature(readings, highest)
+    if options.prior is None or options.prior.temperature is None:
+        _check_temperature(readings, highest)
     _check_needs(readings, method)
     if method == "swarm" and highest:
         raise FitError(
@@ -146,8 +147,8 @@ def _check_temperature(readings: Readings, order: int) -> None:
     span = float(np.ptp(readings.temperature))
     if levels < order + 1 or span < 10 * order:
         raise FitError(
-            f"the run spans {span:.1f} °C with {levels} temperature{'s' * (levels > 1)} more than 5 °C apart: too little "
-            f"for --order {order}, which needs {order + 1} of them over {10 * order} °C or more. "
+            f"the run spans {span:.1f} °C with {levels} temperature{'s' * (levels > 1)} more than 5 °C "
+            f"apart: too little for --order {order}, which needs {order + 1} of them over {10 * order} °C or more. "
             "Add temperatures, or lower --order."
         )
 

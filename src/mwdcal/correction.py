@@ -28,7 +28,7 @@ NAMES = (
     "magnetic_toolface_deg",
 )
 """The output columns, in their order."""
-MANY = 100_000
+MANY = 300_000
 """From this number of rows on the compiled loops are worth their start."""
 
 
@@ -84,13 +84,14 @@ def reference(calibration: Calibration, readings: Readings) -> dict[str, Array]:
 
 
 def compiled(
-    calibration: Calibration, readings: Readings, least: int = MANY
+    calibration: Calibration, readings: Readings, least: int | None = None
 ) -> dict[str, Array] | None:
-    """The same columns by the compiled loops; None below `least` rows, or where they cannot."""
+    """The same columns by the compiled loops; None for few rows, or where they cannot."""
     shape = readings.accelerometer.shape[:-1]
     triads = numbers(calibration)
     unknown = readings.temperature is None and any(t.order for t in calibration.triads)
-    if np.prod(shape) < least or triads is None or unknown or not fused.available():
+    few = np.prod(shape) < (MANY if least is None else least)
+    if few or triads is None or unknown or not fused.available():
         return None
     zero = calibration.reference_temperature
     warmth = zero if readings.temperature is None else readings.temperature

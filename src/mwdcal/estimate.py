@@ -190,22 +190,29 @@ def _analysed(
     found: Analysis, problem: Problem, state: State, solved: Solved, options: Options
 ) -> Analysis:
     """The analysis of the estimator that was used: not every one is the likelihood's."""
-    robust = options.robust
-    if solved.sums:
-        pairs = zip(problem.slices(), problem.targets(state), strict=False)
-        where = {index: pair for index, pair in enumerate(pairs) if index in solved.sums}
-        pulls = {i: solved.sums[i].pulls(state.params[:, w], t) for i, (w, t) in where.items()}
-        covariance, constants = sandwich(problem, state, pulls)
-        found = replace(found, covariance=covariance, constants=constants)
-    if robust:
-        freedom = _tested(station_misfit(found)[1])
-        found = replace(
-            found,
-            covariance=found.covariance * inflation(robust, freedom),
-            constants=found.constants * inflation(robust, freedom),
-            variance_factor=found.variance_factor / consistency(robust, freedom),
-        )
+    pulls = solved.pulls(problem, state)
+    if pulls:
+        found = sandwich(found, problem, state, pulls)
+    if options.robust:
+        found = _robustly(found, problem, state, options.robust)
     return found
+
+
+def _robustly(found: Analysis, problem: Problem, state: State, loss: str) -> Analysis:
+    """The analysis of a fit with station weights: the data say less than they seem to, a prior does not."""
+    freedom = _tested(station_misfit(found)[1])
+    louder = np.sqrt([inflation(loss, k) for k in freedom])[:, None, None]
+    triads = tuple(replace(t, sd=t.sd * louder) for t in problem.triads)
+    sd = {n: s * louder[..., 0] if n in ANGLES else s for n, s in problem.evidence.sd.items()}
+    evidence = replace(problem.evidence, sd=sd)
+    wider = analyse(replace(problem, triads=triads, evidence=evidence), state, found.determined)
+    share = np.array([consistency(loss, k) for k in freedom])[:, None]
+    return replace(
+        found,
+        covariance=wider.covariance,
+        constants=wider.constants,
+        variance_factor=found.variance_factor / share,
+    )
 
 
 def _without_broken(problem: Problem) -> tuple[Problem, Bools]:
@@ -240,7 +247,7 @@ def _estimate_noise(
     for _ in range(options.rounds):
         scale = np.sqrt(analyse(problem, solved.state).variance_factor)
         problem = _rescaled(problem, scale, declared)
-        if options.method not in ("swarm", "newton"):
+        if options.method != "swarm":
             solved = solve(problem, solved.state, options)
         free = [i for i, known in enumerate(declared) if not known]
         if np.all(np.abs(scale[:, free] - 1) < 1e-3):
@@ -262,7 +269,7 @@ def _downweigh(
         excess = np.maximum(excess, 1.0) if all(declared) else excess
         before, trust = trust, weight(loss, square / excess[:, None], freedom)
         if not all(declared):
-            share = consistency(loss, _tested(freedom))
+            share = np.array([consistency(loss, k) for k in _tested(freedom)])[:, None]
             problem = _rescaled(problem, np.sqrt(analysis.variance_factor / share), declared)
         solved = solve(_trusting(problem, trust), solved.state, options)
         if np.all(np.abs(trust / before - 1) < SETTLED):
@@ -280,9 +287,10 @@ def _typical(square: Array, freedom: Array) -> Array:
     return np.asarray(np.nanmedian(np.where(nothing, 1.0, ratio), -1))
 
 
-def _tested(freedom: Array) -> float:
-    """Mean degrees of freedom of the stations that anything tests."""
-    return float(freedom.sum() / max(np.count_nonzero(freedom), 1))
+def _tested(freedom: Array) -> Array:
+    """Mean degrees of freedom (B,) of the stations that anything tests, to a tenth."""
+    mean = freedom.sum(-1) / np.maximum(np.count_nonzero(freedom, axis=-1), 1)
+    return np.asarray(np.maximum(np.round(mean, 1), 1.0))
 
 
 def _trusting(problem: Problem, trust: Array) -> Problem:

@@ -20,6 +20,8 @@ SUSPECT = 3.0
 """A fit whose residuals exceed the declared noise this many times is reported."""
 UNLIKELY = 1e-3
 """Chance of so large a departure from the prior, below which it is reported."""
+LARGEST = 37.0
+"""Deviations are not told apart beyond this: a normal variable's chance is then below 1e-300."""
 DISTRUSTED = 0.1
 """A station of less weight than this in a robust fit is reported."""
 
@@ -129,16 +131,16 @@ class Findings:
             return []
         bare = replace(problem, prior=Prior(0 * problem.prior.precision, problem.prior.expected))
         determined = Determined.of(bare, self.result.state)
-        found = []
-        for entry in free_directions(bare, self.result.state, determined):
-            names = " and ".join(TRIADS[t] for t in entry.triads)
-            if entry.id not in [f.id for f in self.free]:
-                text = (
-                    f"{names}: {entry.id.removeprefix('weak-')} is not determined by this run: value "
-                    f"and uncertainty are those of the prior ({knowledge.source})."
-                )
-                found.append(Finding(id=f"prior-{entry.id}", text=text))
-        return found + self._conflict(knowledge.source)
+        named = free_directions(bare, self.result.state, determined)
+        free = [entry.id for entry in self.free]
+        only = [e.id.removeprefix("weak-") for e in named if e.id not in free]
+        if not only:
+            return self._conflict(knowledge.source)
+        text = (
+            f"this run does not determine {', '.join(dict.fromkeys(only))}: there values and uncertainties "
+            f"rest on the prior ({knowledge.source})."
+        )
+        return [Finding(id="prior-only", text=text), *self._conflict(knowledge.source)]
 
     def _conflict(self, source: str) -> list[Finding]:
         """The χ² of the departure from the prior, Λd with covariance Λ - ΛCΛ, if it is unlikely."""
@@ -168,9 +170,10 @@ class Findings:
         _, unit = shown_in(worst, is_relative(self.readings))
         gap = "" if unit == "°" else " "
         value = row.errors.get(worst, float("nan"))
+        size = f"{row.deviation:.1f}" if row.deviation < LARGEST else f"more than {LARGEST:.0f}"
         alone, moves = (d.get(worst, 0.0) for d in (row.errors_left_out, row.influence))
         text = (
-            f"station {row.station}: residual {row.deviation:.1f}σ, most in {worst} "
+            f"station {row.station}: residual {size}σ, most in {worst} "
             f"({value:+.3g}{gap}{unit}; {alone:+.3g}{gap}{unit} if left out of the fit, which it moves "
             f"by up to {moves:.2g}{gap}{unit}): {REASONS[worst]} Re-shoot it, or --exclude {row.station}"
         )

@@ -16,7 +16,7 @@ from mwdcal.core.problem import UNKNOWN, Constant, Evidence, Prior, Problem, Sta
 from mwdcal.core.solvers import Status, gauss_newton
 from mwdcal.core.sums import STRENGTH, Params, Sums
 from mwdcal.core.swarm import forward_parts, swarm_forward
-from mwdcal.core.uncertainty import readjusted
+from mwdcal.core.uncertainty import readjusted, unweighted_pulls
 from mwdcal.core.vectors import Array, Bools, Ints, inverse
 from mwdcal.evidence import constants
 from mwdcal.options import Options
@@ -95,7 +95,8 @@ class Solved:
     """A minimum: state, `Status` codes and iterations (B,), and the sums it minimises, by triad.
 
     Triads without an entry in `sums` have the likelihood of their readings at its largest; for
-    the others `known` (B, p_t, p_t) is the information of what they are fitted to.
+    the others `known` (B, p_t, p_t) is the information of what they are fitted to. `unweighted`:
+    least squares with all readings of a triad alike, whatever their noise.
     """
 
     state: State
@@ -103,6 +104,21 @@ class Solved:
     iterations: Ints
     sums: dict[int, Sums] = field(default_factory=dict)
     known: dict[int, Array] = field(default_factory=dict)
+    unweighted: bool = False
+
+    def pulls(self, problem: Problem, state: State) -> dict[int, Array]:
+        """How an error of a station's whitened reading moves the triads that have sums of their own.
+
+        (B, n, p_t, 3) by triad; none where the likelihood is at its largest.
+        """
+        if self.unweighted:
+            return unweighted_pulls(problem, _alike(problem), state)
+        triples = zip(problem.triads, problem.slices(), problem.targets(state), strict=False)
+        return {
+            index: replace(self.sums[index], triad=triad).pulls(state.params[:, where], target)
+            for index, (triad, where, target) in enumerate(triples)
+            if index in self.sums
+        }
 
 
 def solve(problem: Problem, state: State, options: Options) -> Solved:
@@ -114,13 +130,16 @@ def solve(problem: Problem, state: State, options: Options) -> Solved:
     if options.paper_weights and options.method in ("toolface-inclination", "scalar"):
         return _by_sums(problem, state, options.method)
     if options.paper_weights:
-        problem = _alike(problem)
+        return Solved(*gauss_newton(_alike(problem), state), unweighted=True)
     return Solved(*gauss_newton(problem, state))
 
 
 def _alike(problem: Problem) -> Problem:
     """The problem with one noise for all readings of a triad, as an unweighted sum has it."""
-    triads = [replace(t, sd=np.sqrt(np.mean(t.sd**2)) + 0 * t.sd) for t in problem.triads]
+    triads = [
+        replace(t, sd=np.sqrt(np.mean(t.sd**2, (1, 2), keepdims=True)) + 0 * t.sd)
+        for t in problem.triads
+    ]
     return replace(problem, triads=tuple(triads))
 
 
@@ -136,7 +155,8 @@ def _swarmed(problem: Problem, state: State, seed: int) -> Solved:
     params = np.concatenate(parts, -1)
     finite = np.isfinite(params).all(-1)
     status = np.where(finite, int(Status.OK), int(Status.NOT_FINITE))
-    return Solved(replace(state, params=params), status, np.full(len(params), ITERATIONS))
+    flown = np.full(len(params), ITERATIONS)
+    return Solved(replace(state, params=params), status, flown, unweighted=True)
 
 
 def _swarm_forward(raw: Array, target: Array, include: Bools, seed: int) -> Array:

@@ -33,6 +33,8 @@ STATION_SECONDS = 30.0
 """Duration of a station, unless the log is too short for it."""
 AVERAGES = 4
 """Stations that a log has to hold at least."""
+SOUND = 10
+"""Stations that a log holds where their duration is chosen for it."""
 JITTER = 0.5
 """Share of the sampling interval by which one may differ: more is a gap."""
 EVENT = 8.0
@@ -45,6 +47,8 @@ COARSE = 0.5
 """Noise of one sample, in steps of the converter, below which the steps hide it."""
 RATE = 0.01
 """Share by which a given rate of sampling may differ from that of the log."""
+NOT_SIMULATED = ("", "0", "false", "no")
+"""What metadata `simulated` say of a real tool."""
 UNITS = {
     "quantisation": "·s",
     "white": "·√s",
@@ -117,6 +121,7 @@ class Noise(msgspec.Struct, frozen=True, kw_only=True):
     seconds: float
     kind: Kind
     station_seconds: float
+    simulated: bool
     channels: dict[str, ChannelNoise]
     profile: dict[str, float]
     findings: list[Finding]
@@ -139,7 +144,7 @@ def find_noise(
     """The noise of each raw channel of a log (`files.logs.read`) of a tool at rest.
 
     `sampling_hz` comes before a column `time_s`; `between` are the first and last second to be
-    used; `station_seconds` by default 30, or a quarter of a shorter log.
+    used; `station_seconds` by default 30, or a tenth of a shorter log.
     Errors: a log without time, with gaps, too short, or without a channel that can be used.
     """
     findings: list[Finding] = []
@@ -163,6 +168,7 @@ def find_noise(
         seconds=seconds,
         kind=kind,
         station_seconds=station,
+        simulated=str(log.metadata.get("simulated", "")).lower() not in NOT_SIMULATED,
         channels=found,
         profile=_recommended(found, findings),
         findings=findings,
@@ -224,7 +230,7 @@ def _compare_rates(
 def _station_seconds(given: float | None, seconds: float, rate: float, source: str) -> float:
     longest = seconds / AVERAGES
     if given is None:
-        return min(STATION_SECONDS, longest)
+        return min(STATION_SECONDS, seconds / SOUND)
     if not 1 / rate <= given <= longest:
         raise InputError(
             f"--station-seconds must be from one sample, {1 / rate:g} s, to a quarter of the log, "
@@ -270,7 +276,7 @@ def _channel(
     terms = noise_terms.fit(centred[None], slope[None], moments)
     steady = np.where(_drifts(terms), terms.slope, 0.0)
     plain = allan.deviation(value, factors, kind)
-    freedom = allan.freedom(asked, terms.bounded, steady)[0]
+    freedom = allan.freedom(asked, terms.bounded, steady, terms.covariance)[0]
     lower, upper = allan.band(plain, freedom)
     fitted = terms.bounded @ np.swapaxes(asked.plain_mean, -1, -2)
     fitted = np.sqrt(fitted[0] + (steady * moments.averaging) ** 2 / 2)
@@ -347,7 +353,7 @@ def _station(
     freedom = 2 * variance**2 / float(weight @ terms.covariance[0] @ weight)
     deviation, source = np.sqrt(variance), "terms"
     whole = max(round(length), 1)
-    own = allan.freedom(moments, terms.bounded, steady)[0]
+    own = allan.freedom(moments, terms.bounded, steady, terms.covariance)[0]
     measured = float(np.interp(np.log(whole), np.log(moments.averaging), own))
     described = terms.chance[0] >= noise_terms.CONTRADICTED
     if not (described and length >= moments.averaging[terms.start[0]]) or measured > freedom:

@@ -29,7 +29,8 @@ class Knowledge:
 
     Names are "accelerometer scale-x" and so on, in nominal units and tool axes, of powers of
     T - `reference`. A direction without precision is not known. `loose`: names that a model
-    does not have are of no account; else they are an error.
+    does not have are of no account; else they are an error. `stations` are the fingerprints of
+    those that the knowledge comes from, `temperature` their range, °C.
     """
 
     source: str
@@ -38,6 +39,8 @@ class Knowledge:
     expected: Array
     precision: Array
     loose: bool = False
+    stations: tuple[str, ...] = ()
+    temperature: tuple[float, float] | None = None
 
 
 def prior_of(knowledge: Knowledge | None, models: Sequence[Model], batch: int) -> Prior:
@@ -128,6 +131,8 @@ def from_calibration(previous: Calibration, relative: bool = False) -> Knowledge
         tuple(names[i] for i in moving),
         expected[moving],
         _precision(covariance[np.ix_(moving, moving)], free[:, moving]),
+        stations=(*(row.digest for row in previous.station_rows), *previous.inherited),
+        temperature=previous.temperature_c,
     )
 
 

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
 from mwdcal.calibration import ErrorRow, Measures, StationRow
 from mwdcal.core.observables import OBSERVABLES
-from mwdcal.core.uncertainty import station_misfit, without_station
+from mwdcal.core.uncertainty import Analysis, station_misfit, without_station
 from mwdcal.core.vectors import Array, centred
 from mwdcal.estimate import Fit
 from mwdcal.readings import TRIADS, Readings
@@ -219,12 +219,30 @@ def measure_rows(readings: Readings, fit: Fit) -> list[Measures]:
     return rows
 
 
+def _judged(fit: Fit) -> Analysis:
+    """The analysis by which stations are judged: in a robust fit their own errors are whole.
+
+    A weight w takes a station's pull on the fit, not its noise: with V = C⁻¹ the residual V ρ has
+    the covariance V + (1 - 2 w) V X Cov XᵀV, from V - … at w = 1 to V + … where it is left out.
+    """
+    trust, found = fit.trust[..., None, None], fit.analysis
+    if (trust == 1).all():
+        return found
+    linear = fit.problem.linear(fit.state)
+    count = found.residual.shape[-1]
+    weight = linear.weigh(np.broadcast_to(np.eye(count), (*found.residual.shape, count)))
+    pulled = (weight - found.spread) / trust
+    include = fit.problem.evidence.include[..., None, None]
+    spread = (weight + (1 - 2 * trust) * pulled) * include
+    return replace(found, residual=found.residual / np.sqrt(fit.trust[..., None]), spread=spread)
+
+
 def deviations(fit: Fit) -> Array:
     """Each station's misfit (n,) as standard deviations of one normal variable."""
     from scipy.special import chdtrc, ndtri
 
-    square, freedom = station_misfit(fit.analysis)
-    chi, count = square[0] / fit.trust[0], freedom[0]
+    square, freedom = station_misfit(_judged(fit))
+    chi, count = square[0], freedom[0]
     others = np.maximum(count.sum() - count, 1)
     variance = np.maximum((chi.sum() - chi) / others, 1e-30)
     declared = np.isnan(fit.noise[0]).all()

@@ -117,8 +117,8 @@ _CALIBRATE = (
         help="Default: polynomial at order 0, factors above.",
     ),
     click.option(
-        "--parameters", type=click.Choice(["12", "9", "6"]), default="12", show_default=True,
-        help="Per triad at one temperature. 9: the sensor frame, without mounting rotation. "
+        "--parameters", type=click.Choice(["12", "9", "6"]),
+        help="Per triad at one temperature; default 12. 9: the sensor frame, without mounting rotation. "
         "6: scale and bias alone.",
     ),
     click.option(

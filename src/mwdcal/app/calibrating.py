@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 
 from mwdcal.app import text
-from mwdcal.app.choices import Chosen, Typed, choose
+from mwdcal.app.choices import Chosen, Typed, choose, prior_profile
 from mwdcal.calibrate import calibrate
 from mwdcal.calibration import Calibration
 from mwdcal.errors import InputError
@@ -27,9 +27,12 @@ class Digests(TypedDict):
     run_sha256: str
 
 
-def load(run: Path, tool: str | None, decimal: str) -> tuple[Readings, Profile, Digests]:
+def load(
+    run: Path, tool: str | None, decimal: str, prior: str | None = None
+) -> tuple[Readings, Profile, Digests]:
     """A run with its tool profile, and the digests of both files."""
     profile, profile_sha256 = profiles.load_profile(tool)
+    profile = prior_profile(prior, profile)
     read = table.read(run, decimal=decimal)
     readings, profile = runs.to_readings(read, profile)
     digests = Digests(profile_sha256=profile_sha256, run_sha256=read.digest)
@@ -45,7 +48,7 @@ def run(
     say: Callable[[str], None],
 ) -> tuple[Chosen, Calibration]:
     """What was chosen for a run, and its calibration."""
-    readings, profile, digests = load(source, tool, decimal)
+    readings, profile, digests = load(source, tool, decimal, typed["prior"])
     readings = without(readings, exclude)
     chosen = choose(readings, profile, typed, say)
     return chosen, calibrate(readings, profile, chosen.options, orders=chosen.orders, **digests)
@@ -79,13 +82,17 @@ def write(made: Calibration, output: Path, report: Path | None) -> None:
 
 def summary(made: Calibration, chosen: Chosen, output: Path, report: Path | None) -> dict[str, Any]:
     """The result for machines."""
-    named = ("rank", "size", "undetermined", "variance_factor")
+    named = ("model", "order", "rank", "size", "undetermined", "variance_factor")
     return {
         "run": made.run,
         "stations": made.stations,
+        "temperature_c": made.temperature_c,
         "method": made.method,
+        "options": made.options,
+        "seed": made.seed,
         "triads": {t.name: {n: getattr(t, n) for n in named} for t in made.triads},
         "errors": made.errors,
+        "measures": made.measures,
         "accuracy_1sigma_deg": typical_accuracy(made),
         "constants": made.constants,
         "stand": made.stand,

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TypedDict
 
 import numpy as np
+from msgspec.structs import replace as replace_struct
 
 from mwdcal.calibration import Calibration, OrderScore
 from mwdcal.checks import check_readings
@@ -30,7 +31,7 @@ class Typed(TypedDict):
     method: str
     model: str | None
     order: str
-    parameters: str
+    parameters: str | None
     nonlinearity: str
     estimate: str
     robust: str | None
@@ -55,7 +56,7 @@ def choose(
     options = Options(
         method=typed["method"],
         model=typed["model"],
-        parameters=int(typed["parameters"]),
+        parameters=int(typed["parameters"] or 12),
         nonlinearity={},
         estimate=tuple(names(typed["estimate"])),
         robust=typed["robust"],
@@ -65,7 +66,7 @@ def choose(
     check_names(options.estimate, options.method)
     order = typed["order"]
     if typed["prior"]:
-        options, order = _with_prior(options, order, typed["prior"], readings, profile)
+        options, order = _with_prior(options, order, typed, readings, profile)
     options, orders = _with_order(options, order, readings, say)
     options, curves = _with_curves(options, typed["nonlinearity"], readings, profile, say)
     if not orders:
@@ -76,20 +77,52 @@ def choose(
 
 def names(text: str) -> list[str]:
     """The words of a list with commas."""
-    return [name.strip() for name in text.split(",") if name.strip()]
+    return list(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
 
 
-def _with_prior(
-    options: Options, order: str, prior: str, readings: Readings, profile: Profile
-) -> tuple[Options, str]:
-    """What is known beforehand; a previous calibration brings its model and order along."""
-    relative = bool(np.isnan(readings.reference("field")).all())
+def prior_profile(prior: str | None, profile: Profile) -> Profile:
+    """The profile with what a prior needs of it: a previous calibration's scale where it has none.
+
+    Knowledge is of readings in nominal units: guessed from the run, these would be others.
+    """
+    if not prior:
+        return profile
     if prior == DATASHEET:
-        if profile.accelerometer.datasheet is None and profile.magnetometer.datasheet is None:
+        sheets = [t for t in TRIADS if getattr(profile, t).datasheet is not None]
+        if not sheets:
             raise InputError(
                 f"--prior datasheet: the tool profile '{profile.name}' has none. Add a section "
                 "[accelerometer.datasheet] with scale, bias and misalignment_deg (1 sigma)."
             )
+        bare = [t for t in sheets if getattr(profile, t).scale is None]
+        if bare:
+            raise InputError(
+                f"--prior datasheet: the tool profile '{profile.name}' has no 'scale' in [{bare[0]}], "
+                "which the tolerances are a share of. Add it."
+            )
+        return profile
+    previous = documents.read(Path(prior)).profile
+    found = {}
+    for name in TRIADS:
+        ours, theirs = getattr(profile, name), getattr(previous, name)
+        known = replace_struct(ours, scale=theirs.scale if ours.scale is None else ours.scale)
+        found[name] = known
+        if theirs.scale is not None and (known.axes, known.scale) != (theirs.axes, theirs.scale):
+            raise InputError(
+                f"--prior {prior} was made with {name} axes {list(theirs.axes)} and scale "
+                f"{theirs.scale:g}; the tool profile '{profile.name}' has {list(known.axes)} and "
+                f"{known.scale:g}. Use the tool profile that the previous calibration had."
+            )
+    return replace_struct(profile, **found)
+
+
+def _with_prior(
+    options: Options, order: str, typed: Typed, readings: Readings, profile: Profile
+) -> tuple[Options, str]:
+    """What is known beforehand; a previous calibration brings its model and order along."""
+    relative = bool(np.isnan(readings.reference("field")).all())
+    prior = str(typed["prior"])
+    if prior == DATASHEET:
         return replace(options, prior=from_datasheet(profile, relative)), order
     previous = documents.read(Path(prior))
     other = previous.other_tool(readings)
@@ -102,6 +135,11 @@ def _with_prior(
         raise InputError(
             f"--prior {prior} was made from stations of this run, which would count twice. Give a "
             "calibration from an earlier run."
+        )
+    if typed["parameters"] and options.parameters != previous.options.parameters:
+        raise InputError(
+            f"--prior {prior} has {previous.options.parameters} parameters per triad, not "
+            f"{options.parameters}. Leave --parameters out, or calibrate without --prior."
         )
     kinds = {triad.model for triad in previous.triads}
     options = replace(
@@ -163,10 +201,15 @@ def _with_curves(
         found, scores = choose_curves(readings, options, offered)
         return replace(options, nonlinearity=found), scores
     wanted = names(asked)
-    if not set(wanted) <= set(TRIADS):
+    if not wanted or not set(wanted) <= set(TRIADS):
         raise InputError(
             f"--nonlinearity must be auto, none, {' or '.join(TRIADS)}; got {asked!r}."
         )
+    for name in wanted:
+        if getattr(readings, name) is None:
+            raise InputError(
+                f"--nonlinearity {name}: {readings.source} has no {name}. Leave it out."
+            )
     for name, order in zip(TRIADS, options.orders, strict=True):
         if name in wanted and options.kind(order) != "polynomial":
             raise InputError(

@@ -19,6 +19,8 @@ from mwdcal.app.asked import (
 )
 from mwdcal.app.fleet_asked import Asked as FleetAsked
 from mwdcal.app.fleet_asked import fleet_options
+from mwdcal.app.noise_asked import Asked as AskedForNoise
+from mwdcal.app.noise_asked import noise_options
 from mwdcal.errors import InputError, MwdcalError
 
 if TYPE_CHECKING:
@@ -326,6 +328,24 @@ def fleet(**asked: Unpack[FleetAsked]) -> None:
     sound, result = fleets.run(asked, say)
     (print_json if asked["as_json"] else click.echo)(result)
     sys.exit(0 if sound else fleets.REFUSED)
+
+
+@cli.command()
+@noise_options
+def noise(**asked: Unpack[AskedForNoise]) -> None:
+    """Noise of every raw channel of a LOG of a tool at rest, by Allan deviation.
+
+    \b
+    Example: mwdcal noise static.csv --tool servo --plot noise.png
+    Exit: 0 found, 2 input cannot be read or used.
+    """
+    from mwdcal.app import noises
+
+    inputs = [asked["log"], Path(asked["tool"] or "")]
+    _check_outputs([asked["plot"], asked["report"]], inputs)
+    findings, result = noises.run(asked, say)
+    tell(findings)
+    (print_json if asked["as_json"] else click.echo)(result)
 
 
 @cli.command()

@@ -54,13 +54,22 @@ def text(found: Comparison, parameters: bool = False) -> str:
     if rows:
         lines += ["", _table(figures(found), ["", "before", *methods]), ""]
     lines += notes(found)
-    lines += [f"{row.method} refused: {row.refused}" for row in found.rows if row.refused]
+    lines += [f"{who} refused: {why}" for who, why in refusals(found)]
     if parameters and rows:
         lines += ["", gauge(found) + " In parentheses: 1σ of the last digits."]
         for name, own in parameter_pairs(found).items():
             joined = [(what, unit, [_joined(*pair) for pair in pairs]) for what, unit, pairs in own]
             lines += ["", _table(joined, [name, *methods])]
     return "\n".join(lines)
+
+
+def refusals(found: Comparison) -> list[tuple[str, str]]:
+    """Who was refused, and why: once where all methods were for the same reason."""
+    refused = [(row.method, row.refused) for row in found.rows if row.refused]
+    reasons = {why for _, why in refused}
+    if len(refused) == len(found.rows) > 1 and len(reasons) == 1:
+        return [("every method", *reasons)]
+    return refused
 
 
 def _table(lines: list[Line], header: list[str]) -> str:
@@ -236,7 +245,7 @@ def render(found: Comparison, trace: Sequence[tuple[str, str, str]] = ()) -> str
         headline=headline,
         why=why,
         rows=rows,
-        refused=[row for row in found.rows if row.refused],
+        refused=refusals(found),
         heading=heading(found)[1:],
         errors=[errors(found, kind) for kind in ("held_out", "in_sample")] if rows else [],
         measures=measures(found) if rows else [],

@@ -47,7 +47,7 @@ _OPTIONS = (
     click.option("--to", "end", type=float, metavar="S", help="Use it up to so many seconds."),
     click.option(
         "--station-seconds", type=float, metavar="S",
-        help="Duration of a station. Default: 30, or a quarter of a shorter log.",
+        help="Duration of a station. Default: 30, or a tenth of a shorter log.",
     ),
     click.option("--modified", is_flag=True, help="Show modified Allan deviations."),
     click.option(

@@ -15,7 +15,8 @@ PATIENCE = 2.0
 @contextmanager
 def bar(label: str) -> Iterator[Callable[[int, int], None]]:
     """A function to call with how much is done, and of how much."""
-    start, shown = time.monotonic(), None
+    start = time.monotonic()
+    shown: Any = None
 
     def advance(done: int, total: int) -> None:
         nonlocal shown

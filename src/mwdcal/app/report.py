@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mwdcal.app import plots
+from mwdcal.app.text import HELD, choices, is_held
+from mwdcal.app.text import model as model_of
 from mwdcal.calibration import Calibration, TriadCalibration
 from mwdcal.core.solvers import RANK_TOLERANCE
 from mwdcal.errors import InputError
@@ -56,8 +58,10 @@ def render(calibration: Calibration, verdict: Verdict | None = None) -> str:
         figures=_figures(calibration),
         limit=_limit(calibration),
         decimals=_decimals(calibration),
+        left_out=any(row.errors_left_out for row in calibration.station_rows),
         annex=len(calibration.station_rows) > LONG_TABLE,
         parameters=_parameters(calibration),
+        held=HELD,
         accuracy=_accuracy(calibration),
         titles=plots.TITLES,
         tolerance=RANK_TOLERANCE,
@@ -229,8 +233,8 @@ def _when(time: str) -> str:
 
 def _facts(calibration: Calibration) -> list[tuple[str, str]]:
     """What was calibrated, with what."""
-    tool, profile, triad = calibration.tool, calibration.profile, calibration.accelerometer
-    model = f"{triad.model} model" + (f", temperature order {triad.order}" if triad.order else "")
+    tool, profile = calibration.tool, calibration.profile
+    method = [calibration.method, model_of(calibration), *choices(calibration.options)]
     facts = [
         ("Tool", tool.get("serial") or "no serial given"),
         ("Type", tool.get("tool", profile.name)),
@@ -240,7 +244,7 @@ def _facts(calibration: Calibration) -> list[tuple[str, str]]:
         ("Run file", calibration.run or "not named"),
         ("Stations", _attitudes(calibration)),
         ("Temperature", _temperatures(calibration)),
-        ("Method", f"{calibration.method}; {model}"),
+        ("Method", "; ".join(method)),
         ("Stand", tool.get("stand", "")),
         ("Laboratory", tool.get("lab", "")),
         ("Operator", tool.get("operator", "")),
@@ -312,7 +316,7 @@ def _parameters(calibration: Calibration) -> dict[str, Any]:
 
 def _row(name: str, index: str, power: int, value: float, sd: float | None, symbol: str) -> Any:
     per = "" if power == 0 else "/°C" + (str(power).translate(SUPERSCRIPT) if power > 1 else "")
-    shown = measured(value, sd)
+    shown = ("0", HELD) if is_held(value, sd) else measured(value, sd)
     course = "" if power == 0 else "τ" + (str(power).translate(SUPERSCRIPT) if power > 1 else "")
     return {
         "name": name,

@@ -9,7 +9,6 @@ compared with others of their part.
 
 from __future__ import annotations
 
-import os
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -41,10 +40,15 @@ from mwdcal.files.sinks import ParquetSink, Sink, TextSink
 from mwdcal.files.streams import Part, Source
 from mwdcal.files.table import Table, cell_error
 from mwdcal.files.table import numbers as as_numbers
+from mwdcal.profile import TriadProfile
 from mwdcal.readings import TRIADS, Readings
 
 LONG = (200_000, 16_000_000)
 """Rows of a Parquet table, bytes of a text table, from which it is streamed."""
+MANY = 3_000_000
+"""Rows from which the compiled loops are worth their start: until then the writer is the slowest."""
+LINES = 1 << 14
+"""Rows of a part that becomes text."""
 WORKERS = 4
 """Most parts that are computed at once: more would wait for the writer."""
 SAMPLE = 1024
@@ -53,6 +57,11 @@ BLOCK = 1 << 14
 """Rows that plain NumPy takes at a time."""
 MARGIN = 1.0
 """Degrees by which a temperature may lie outside the calibrated range."""
+OPTIONAL = {
+    CHANNELS["magnetometer"]: "Fill it in, or remove the station.",
+    ("temperature_c",): "Fill it in, or leave the whole column blank.",
+}
+"""Columns that are blank on all rows or on none, and what to do where they are neither."""
 _MOST = 10**15
 
 Item = TypeVar("Item")
@@ -81,11 +90,12 @@ def apply_to_file(
     outside: str,
     advance: Callable[[int, int], None] = lambda done, total: None,
     rows: int = 0,
+    least: int = MANY,
 ) -> tuple[int, list[Finding]]:
     """Correct a file into another; number of rows, and what the reader should know.
 
-    `advance` is told how much of the whole is done. `rows` of a part, by default as many as
-    memory bears.
+    `advance` is told how much of the whole is done. `rows` of a part of a Parquet table, by
+    default as many as memory bears; `least` rows of the whole from which loops are compiled.
     """
     check_outside(outside)
     source = _source(readings, output, rows)
@@ -94,7 +104,7 @@ def apply_to_file(
     first = next((piece for piece in pieces if _loaded(source, piece).table.count), None)
     if first is None:
         raise no_stations(source.name)
-    worker = _Worker.of(calibration, source, first, outside)
+    worker = _Worker.of(calibration, source, first, outside, source.rows >= least)
     done, tallies = 0, []
     with atomic.replacing(output) as stream:
         sink = worker.sink(stream, output)
@@ -129,9 +139,10 @@ def overlapped(items: Iterator[Item], work: Callable[[Item], Made]) -> Iterator[
 
 
 def _source(readings: Path, output: Path, rows: int) -> Source:
+    typed = output.suffix.lower() == ".parquet"
     if readings.suffix.lower() == ".parquet":
-        return streams.open_parquet(readings, rows)
-    return streams.open_text(readings, typed=output.suffix.lower() == ".parquet")
+        return streams.open_parquet(readings, rows or (0 if typed else LINES))
+    return streams.open_text(readings, typed=typed)
 
 
 def _check_header(source: Source) -> None:
@@ -157,7 +168,7 @@ def _loaded(source: Source, piece: Any) -> Part:
 
 def _total(tallies: Sequence[Tally]) -> Tally:
     moved = {name for tally in tallies for name in tally.moved}
-    rows, beyond = (sum(tally[i] for tally in tallies) for i in (0, 1))
+    rows, beyond = (sum(counts) for counts in zip(*(t[:2] for t in tallies), strict=True))
     return Tally(rows, beyond, tuple(name for name in JUDGED if name in moved))
 
 
@@ -185,11 +196,13 @@ class _Worker:
     moved: set[str] = field(default_factory=set)
 
     @classmethod
-    def of(cls, calibration: Calibration, source: Source, first: Any, outside: str) -> _Worker:
+    def of(
+        cls, calibration: Calibration, source: Source, first: Any, outside: str, many: bool
+    ) -> _Worker:
         """What the first piece says about all."""
         part = _loaded(source, first)
         columns = part.table.columns
-        groups = [g for g in (CHANNELS["magnetometer"], ("temperature_c",)) if g[0] in columns]
+        groups = [group for group in OPTIONAL if group[0] in columns]
         absent = tuple(g for g in groups if all(_is_blank(part.table, name) for name in g))
         kept = [g[0] for g in groups if g not in absent]
         empty = np.empty((0, 3))
@@ -201,7 +214,7 @@ class _Worker:
             source=source.name,
         )
         reference(calibration, said)  # refuses a calibration with temperature terms without any
-        triads = numbers(calibration) if fused.available() else None
+        triads = numbers(calibration) if many and fused.available() else None
         tool = tuple(_tool(calibration, triad) for triad in TRIADS)
         return cls(calibration, source, outside, first, absent, said, triads, tool)
 
@@ -246,7 +259,7 @@ class _Worker:
             lacking = names in self.absent or names[0] not in table.columns
             found[kind] = None if lacking else [_column(table, name) for name in names]
             if names in self.absent and not all(_is_blank(table, name) for name in names):
-                raise _blank(self.source.load(self.first, True).table, names[0])
+                raise _blank(self.source.load(self.first, True).table, names)
         return found
 
     def _limits(self) -> fused.Limits:
@@ -271,19 +284,15 @@ class _Worker:
 
     def _plain(self, channels: Mapping[str, list[Array] | None], count: int) -> fused.Found:
         """The same by plain NumPy, a block at a time."""
-        limits = self._limits()
-        out = np.empty((len(NAMES), count))
-        unsound = beyond = 0
-        for start in range(0, count, BLOCK):
+        limits, out = self._limits(), np.empty((len(NAMES), count))
+        beyond = unsound = 0
+        for kind, columns in channels.items():
+            low, high = limits.temperature if kind == "temperature" else limits.raw
+            unsound += sum(int((~((c >= low) & (c <= high))).sum()) for c in columns or [])
+        for start in range(0, 0 if unsound else count, BLOCK):
             rows = slice(start, start + BLOCK)
             readings = self._readings(channels, rows)
-            for kind, columns in channels.items():
-                low, high = limits.temperature if kind == "temperature" else limits.raw
-                unsound += sum(
-                    int((~((c[rows] >= low) & (c[rows] <= high))).sum()) for c in columns or []
-                )
-            with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-                out[:, rows] = [*reference(self.calibration, readings).values()]
+            out[:, rows] = [*reference(self.calibration, readings).values()]
             hot = self.calibration.outside(readings)
             beyond += int(hot.sum())
             if limits.blank:
@@ -292,15 +301,14 @@ class _Worker:
 
     def _readings(self, channels: Mapping[str, list[Array] | None], rows: slice) -> Readings:
         """Some rows as `Readings`, without labels and references."""
-        profile = self.calibration.profile
-        triads = {
-            kind: runs.to_nominal(np.stack([c[rows] for c in three], -1), getattr(profile, kind))
-            for kind in TRIADS
-            if (three := channels[kind]) is not None
-        }
+        profile, magnetic = self.calibration.profile, channels["magnetometer"]
         warmth = channels["temperature"]
-        temperature = None if warmth is None else warmth[0][rows]
-        return replace(self.said, **triads, temperature=temperature)
+        return replace(
+            self.said,
+            accelerometer=_nominal(channels["accelerometer"] or [], rows, profile.accelerometer),
+            magnetometer=_nominal(magnetic, rows, profile.magnetometer) if magnetic else None,
+            temperature=warmth[0][rows] if warmth else None,
+        )
 
     def _undetermined(
         self, channels: Mapping[str, list[Array] | None], count: int
@@ -316,9 +324,10 @@ class _Worker:
     def _refuse(self, table: Table) -> None:
         """Say what is wrong with a part, in the words of a run file."""
         runs.to_readings(table, self.calibration.profile)
-        for names in (CHANNELS["magnetometer"], ("temperature_c",)):
-            if names[0] in table.columns and names not in self.absent and _is_blank(table, names[0]):
-                raise _blank(table, names[0])
+        for names in OPTIONAL:
+            present = names[0] in table.columns and names not in self.absent
+            if present and _is_blank(table, names[0]):
+                raise _blank(table, names)
 
 
 def described(calibration: Calibration) -> dict[str, object]:
@@ -331,15 +340,19 @@ def described(calibration: Calibration) -> dict[str, object]:
     }
 
 
-def _blank(table: Table, name: str) -> InputError:
-    problem = "must be filled in; got a blank cell. Fill it in, or leave the whole column blank."
-    return cell_error(table, name, 0, problem)
+def _blank(table: Table, names: tuple[str, ...]) -> InputError:
+    problem = f"must be filled in; got a blank cell. {OPTIONAL[names]}"
+    return cell_error(table, names[0], 0, problem)
 
 
 def _column(table: Table, name: str) -> Array:
     """The column as numbers; what they may be is checked with all the rest."""
     column = table.columns[name]
     return as_numbers(table, name) if isinstance(column, list) else column
+
+
+def _nominal(channels: Sequence[Array], rows: slice, triad: TriadProfile) -> Array:
+    return runs.to_nominal(np.stack([channel[rows] for channel in channels], -1), triad)
 
 
 def _is_blank(table: Table, name: str) -> bool:

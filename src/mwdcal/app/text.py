@@ -21,15 +21,20 @@ WEIGHED = {
 SUPERSCRIPT = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
+HELD = "held"
+"""In place of the uncertainty of a parameter that a model of 9 or 6 keeps at zero."""
+
+
+def is_held(value: float, uncertainty: float | None) -> bool:
+    """Whether a parameter was not fitted but kept at zero."""
+    return value == 0 and uncertainty == 0
+
+
 def number(value: float | None) -> str:
     """Three significant digits, or a dash."""
-    return (
-        "–"
-        if value is None or np.isnan(value)
-        else f"{value:.3g}"
-        if abs(value) < 100
-        else f"{value:.0f}"
-    )
+    if value is None or np.isnan(value):
+        return "–"
+    return f"{value + 0.0:.3g}" if abs(value) < 100 else f"{value:.0f}"
 
 
 def quantity(value: float | None, unit: str) -> str:
@@ -67,10 +72,16 @@ def heading(calibration: Calibration) -> str:
     if "simulated" in calibration.tool:
         parts.append("SIMULATED DATA")
     ranks = [f"{t.name} {t.rank} of {t.size} determined" for t in calibration.triads]
-    models = dict.fromkeys(f"{t.model} of order {t.order}" for t in calibration.triads)
-    model = " and ".join(models)
-    how = ", ".join([f"method {calibration.method}", model, *choices(calibration.options)])
+    how = ", ".join([f"method {calibration.method}", model(calibration), *choices(calibration.options)])
     return "   ".join(parts) + "\n" + "   ".join([how, *ranks])
+
+
+def model(calibration: Calibration) -> str:
+    """Model and temperature order, of each triad where they differ."""
+    found = {t.name: f"{t.model} of order {t.order}" for t in calibration.triads}
+    if len(set(found.values())) == 1:
+        return found["accelerometer"]
+    return ", ".join(f"{name}: {how}" for name, how in found.items())
 
 
 def choices(made: Choices) -> list[str]:
@@ -174,8 +185,11 @@ def notation(found: dict[str, Notation], reference: float | None = None) -> str:
             for index in np.ndindex(value.shape):
                 label = _label(name, index, None if reference is None else int(power[index]))
                 sd = float(item.uncertainty[name][index])
+                own = name == "m" and index[0] == index[1]  # zero in every model
                 stated = "undetermined" if np.isnan(sd) else f"{sd:.2g}"
-                rows.append([label, f"{value[index]:.12g}", stated])
+                if is_held(float(value[index]), sd) and not own:
+                    stated = HELD
+                rows.append([label, f"{value[index] + 0.0:.12g}", stated])
         blocks.append(f"{triad}\n" + table(rows, ["", "value", "1σ"]))
     return "\n\n".join(blocks)
 

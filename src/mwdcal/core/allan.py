@@ -29,7 +29,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from mwdcal.core.vectors import Array
+from mwdcal.core.vectors import Array, ArrayLike
 
 Kind = Literal["overlapping", "modified", "standard"]
 
@@ -185,16 +185,20 @@ def moments(count: int, averaging: Sequence[int], kind: Kind = "overlapping") ->
     )
 
 
-def freedom(moments: Moments, squares: Array, slope: Array) -> Array:
+def freedom(moments: Moments, squares: Array, slope: Array, covariance: ArrayLike = 0.0) -> Array:
     """Equivalent degrees of freedom (..., m) of the plain variances, 2 mean²/variance.
 
-    `squares` (..., 4) are the terms of the noise, `slope` (...) its drift per sample.
+    `squares` (..., 4) are the terms of the noise, `slope` (...) its drift per sample. What the
+    slow terms add to a drift is taken larger by its standard uncertainty, from the `covariance`
+    (..., 4, 4) of the squares: just there it is known least.
     """
-    steady = (moments.averaging * slope[..., None]) ** 2
+    steady = (moments.averaging * np.asarray(slope)[..., None]) ** 2
     mean = squares @ np.swapaxes(moments.plain_mean, -1, -2) + steady / 2
     spread = np.einsum("...a,mab,...b->...m", squares, moments.plain_variance, squares)
-    spread = spread + steady * (squares @ np.swapaxes(moments.plain_drift, -1, -2))
-    return np.asarray(2 * mean**2 / spread)
+    added = squares @ np.swapaxes(moments.plain_drift, -1, -2)
+    weight, doubt = moments.plain_drift, np.broadcast_to(covariance, (*squares.shape, 4))
+    added = added + np.sqrt(np.einsum("ma,...ab,mb->...m", weight, doubt, weight))
+    return np.asarray(2 * mean**2 / (spread + steady * added))
 
 
 def band(value: Array, freedom: Array, level: float = 0.95) -> tuple[Array, Array]:

@@ -51,6 +51,9 @@ class Limits(NamedTuple):
     blank: bool = False
 
 
+ANYTHING = Limits()
+
+
 class Found(NamedTuple):
     """Results (rows of output, n), and how many cells and rows were remarkable.
 
@@ -117,7 +120,7 @@ def run(
     triads: tuple[Numbers, Numbers],
     reference: float,
     units: Sequence[float] = (1.0,) * 6,
-    limits: Limits = Limits(),
+    limits: Limits = ANYTHING,
     out: Array | None = None,
     workers: int | None = None,
 ) -> Found:
@@ -134,12 +137,11 @@ def run(
     settings = (
         *(tuple(columns[:3]), tuple(columns[3:6]), columns[6], tuple(map(float, units))),
         (*limits.raw, reference, *limits.temperature, *limits.calibrated, float(limits.blank)),
-        *(triad[:2] for triad in triads),
-        tuple(triad.curved for triad in triads),
+        *(triads[0][:2], triads[1][:2], (triads[0].curved, triads[1].curved)),
     )
 
     def piece(start: int, stop: int) -> tuple[int, int, int]:
-        return tuple(kernels.rows(*settings, out, start, stop))
+        return kernels.rows(*settings, out, start, stop)
 
     workers = workers or cores()
     step = max(_PIECE, -(-count // workers))

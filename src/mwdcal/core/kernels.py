@@ -9,14 +9,17 @@ digits wherever it stands. Importing this module needs Numba.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TypeVar
+from typing import TypeVar, cast
 
 import numpy as np
 from numba import njit
 
 from mwdcal.core.observables import VERTICAL
+from mwdcal.core.vectors import AnyArray, Array
 
 _F = TypeVar("_F", bound=Callable[..., object])
+Floats = tuple[float, ...]
+Courses = tuple[Floats, ...]
 
 TILE = 128
 DEGREES = 180.0 / np.pi
@@ -33,14 +36,14 @@ _ACROSS, _EAST, _NORTH, _DOWN, _CROSS, _TAU, _ROWS = 14, 15, 16, 17, 18, 19, 20
 def compiled(function: _F) -> _F:
     """The function as machine code, kept on disk where a folder for it can be written."""
     try:
-        made: _F = njit(nogil=True, cache=True, error_model="numpy")(function)
+        made = njit(nogil=True, cache=True, error_model="numpy")(function)
     except RuntimeError:  # no such folder
         made = njit(nogil=True, error_model="numpy")(function)
-    return made
+    return cast(_F, made)
 
 
 @compiled
-def angle(y, x):  # type: ignore[no-untyped-def]
+def angle(y: float, x: float) -> float:
     """atan2 without branches, after Cephes `atan` (S. L. Moshier): within 2 units of the last digit."""
     across, along = abs(y), abs(x)
     steep = across > along
@@ -66,17 +69,26 @@ def angle(y, x):  # type: ignore[no-untyped-def]
     found = found + 0.25 * np.pi if fold else found
     found = 0.5 * np.pi - found if steep else found
     found = np.pi - found if np.copysign(1.0, x) < 0.0 else found
-    return np.copysign(found, y)
+    return float(np.copysign(found, y))
 
 
 @compiled
-def cubic(c, t):  # type: ignore[no-untyped-def]
+def cubic(c: Floats, t: float) -> float:
     """Σ c[k] tᵏ, k = 0…3."""
     return ((c[3] * t + c[2]) * t + c[1]) * t + c[0]
 
 
 @compiled
-def field(t, x, y, z, count, courses, shape, curved):  # type: ignore[no-untyped-def]
+def field(
+    t: Array,
+    x: Array,
+    y: Array,
+    z: Array,
+    count: int,
+    courses: Courses,
+    shape: Floats,
+    curved: bool,
+) -> None:
     """Nominal readings x, y, z become the field, in place; see `core.fused.Numbers`."""
     c = courses
     for i in range(count):
@@ -97,7 +109,7 @@ def field(t, x, y, z, count, courses, shape, curved):  # type: ignore[no-untyped
 
 
 @compiled
-def parts(s, count):  # type: ignore[no-untyped-def]
+def parts(s: Array, count: int) -> None:
     """Strengths, and the two legs of every angle, from the vectors in the scratch array."""
     for i in range(count):
         gx, gy, gz = s[_G, i], s[_G + 1, i], s[_G + 2, i]
@@ -115,7 +127,7 @@ def parts(s, count):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def angles(s, count):  # type: ignore[no-untyped-def]
+def angles(s: Array, count: int) -> None:
     """The five angles in degrees; NaN where a direction does not exist."""
     for i in range(count):
         s[_INC, i] = DEGREES * angle(s[_ACROSS, i], s[_G + 2, i])
@@ -142,7 +154,16 @@ def angles(s, count):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def load(s, row, column, start, count, unit, low, high):  # type: ignore[no-untyped-def]
+def load(
+    s: Array,
+    row: int,
+    column: AnyArray,
+    start: int,
+    count: int,
+    unit: float,
+    low: float,
+    high: float,
+) -> int:
     """Copy a piece of a column, in its unit, into a scratch row; the number of values in range."""
     sound = 0
     for i in range(count):
@@ -153,7 +174,7 @@ def load(s, row, column, start, count, unit, low, high):  # type: ignore[no-unty
 
 
 @compiled
-def mask(s, count, low, high, blank, last):  # type: ignore[no-untyped-def]
+def mask(s: Array, count: int, low: float, high: float, blank: bool, last: int) -> int:
     """Number of rows whose temperature is beyond low…high; their results become NaN if asked."""
     beyond = 0
     for i in range(count):
@@ -167,9 +188,19 @@ def mask(s, count, low, high, blank, last):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def rows(  # type: ignore[no-untyped-def]
-    gravity, magnetic, temperature, units, limits, first, second, curved, out, start, stop
-):
+def rows(
+    gravity: tuple[AnyArray, ...],
+    magnetic: tuple[AnyArray, ...],
+    temperature: AnyArray,
+    units: Floats,
+    limits: Floats,
+    first: tuple[Courses, Floats],
+    second: tuple[Courses, Floats],
+    curved: tuple[bool, bool],
+    out: Array,
+    start: int,
+    stop: int,
+) -> tuple[int, int, int]:
     """Fill rows start…stop of `out`; unsound cells, rows beyond the temperatures, NaN results.
 
     See `core.fused.run`. `limits`: accepted raw values, reference temperature, accepted and

@@ -38,7 +38,7 @@ DETECTED = 0.005
 """Chance under which a term is no longer taken for absent."""
 LEVEL = 0.95
 """Probability of the intervals."""
-CONTRADICTED = 1e-4
+CONTRADICTED = 1e-3
 """Chance of a misfit below which the shortest averages are left out, or the fit is in doubt."""
 HALVINGS = 60
 """Of an interval's limit: to the last digits of a number."""
@@ -60,7 +60,7 @@ class Terms(NamedTuple):
         lower, upper: limits of the intervals; where `determined` is false 0 and a bound.
         determined: whether a term cannot be absent.
         slope, slope_sd: drift per sample (...) and its standard uncertainty.
-        misfit, freedom: χ² of the fit (...) and its degrees of freedom.
+        misfit, freedom: χ² (...) of the bounded fit, and its degrees of freedom.
         start: index of the first averaging factor used (...).
     """
 
@@ -119,17 +119,16 @@ def _fit(variance: Array, slope: Array, moments: Moments, start: int) -> Terms:
     each = np.einsum("bjm,bjn,mnac->bjac", gain, gain, unit, optimize=True)
     joint = np.einsum("mnac,ba,bc->bmn", unit, bounded, bounded, optimize=True)
     covariance = gain @ joint @ np.swapaxes(gain, -1, -2)
-    rest = np.einsum("bij,bj->bi", whiten, variance - square @ np.swapaxes(mean, -1, -2))
+    rest = np.einsum("bij,bj->bi", whiten, variance - bounded @ np.swapaxes(mean, -1, -2))
     absent = _chance(square, np.zeros_like(square), _spread(each, bounded))
     determined = 1 - absent < DETECTED
     lower, upper = _interval(square, _spread(each, bounded), determined)
     weight = drift_variance(moments.samples)
     doubt = np.sqrt(np.einsum("a,bac,c->b", weight, covariance, weight))
-    count = len(variance)
     return Terms(
         square, bounded, covariance, lower, upper, determined,
         slope.copy(), np.sqrt(bounded @ weight + doubt),
-        np.sum(rest**2, -1), np.full(count, len(mean) - 4), np.full(count, start),
+        np.sum(rest**2, -1), len(mean) - np.sum(bounded > 0, -1), np.full(len(variance), start),
     )  # fmt: skip
 
 

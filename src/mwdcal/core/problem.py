@@ -174,6 +174,7 @@ class Prior:
         It tells which directions a prior determines, however loosely; `norms` (B, p) are
         those of the data's columns.
         """
+        norms = np.where(norms > 0, norms, 1.0)  # of what the data say nothing of
         outer = norms[:, :, None] * norms[:, None, :]
         values, vectors = eigen(self.precision / outer)
         known = values > INFORMED * np.maximum(values[:, -1:], 1e-300)

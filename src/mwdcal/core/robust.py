@@ -15,6 +15,8 @@ J. M. G. Taylor, J. Am. Stat. Assoc. 84, 881 (1989).
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 
 from mwdcal.core.vectors import Array
@@ -56,6 +58,7 @@ def _slope(loss: str, square: Array, k: float) -> Array:
     return -2 * square * (FREEDOM + k) / (FREEDOM + square) ** 2
 
 
+@cache
 def _moments(loss: str, k: float) -> tuple[float, float, float, float]:
     """E[w], E[w d²]/k, E[w² d²]/k and E[w + d w'/k], d² being χ²_k: by quantiles of d²."""
     from scipy.special import chdtri

@@ -117,8 +117,10 @@ class Linear:
 
     @property
     def norms(self) -> Array:
-        """Column norms (B, p) of the parameters, the scale in which rank is counted."""
-        return np.concatenate([np.sqrt(np.sum(b**2, (-3, -2))) for b in self.blocks], -1)
+        """Column norms (B, p) of the parameters, prior in: the scale in which rank is counted."""
+        squares = np.concatenate([np.sum(b**2, (-3, -2)) for b in self.blocks], -1)
+        own = np.diagonal(self.prior, axis1=-2, axis2=-1)[..., : self.size]
+        return np.asarray(np.sqrt(squares + own))
 
     @cached_property
     def normal(self) -> Normal:

@@ -40,7 +40,12 @@ def start(problem: Problem) -> State:
         np.zeros((batch, count, len(problem.evidence.absent))),
     )
     params = [_triad_start(problem, empty, index) for index in range(len(problem.triads))]
-    state = replace(empty, params=np.concatenate(params, -1))
+    found = np.concatenate(params, -1)
+    for where in problem.slices():
+        known = np.diagonal(problem.prior.precision[:, where, where], axis1=-2, axis2=-1) > 0
+        whole = known.all(-1, keepdims=True)
+        found[:, where] = np.where(whole, problem.prior.expected[:, where], found[:, where])
+    state = replace(empty, params=found)
     return _attitudes(problem, state)
 
 

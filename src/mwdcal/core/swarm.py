@@ -29,6 +29,8 @@ CONSTRICTION = 2 / (2 * ACCELERATION - 2 + np.sqrt((2 * ACCELERATION) ** 2 - 8 *
 """Factor on every velocity: 0.7298 (Clerc and Kennedy 2002, κ = 1)."""
 FASTEST = 1.0
 """Largest velocity along an axis, in half widths of the box."""
+DRAWN = 50
+"""Iterations whose random numbers are drawn at once."""
 
 Cost = Callable[[Array], Array]
 """Takes places (..., particles, p) to their costs (..., particles)."""
@@ -68,7 +70,7 @@ class _Flight:
         self.seen = self.place.reshape(*self.lead, *shape)
         self.cost = cost
         self.aims = np.stack([self.place, self.place])
-        self.pull, self.draws = np.empty_like(self.aims), np.empty((2, 1, *shape))
+        self.pull = np.empty_like(self.aims)
         self._lead_on()
 
     def _lead_on(self) -> None:
@@ -77,13 +79,11 @@ class _Flight:
         self.lowest = self.best_cost[self.tools, leader]
         self.aims[1] = self.aims[0, self.tools, leader][:, None]
 
-    def step(self, random: np.random.Generator) -> None:
-        """Move all particles once."""
+    def step(self, strength: Array) -> None:
+        """Move all particles once, pulled to either aim with a strength (2, 1, particles, p)."""
         place, velocity, pull = self.place, self.velocity, self.pull
-        random.random(out=self.draws)
-        self.draws *= CONSTRICTION * ACCELERATION
         np.subtract(self.aims, place, out=pull)
-        pull *= self.draws
+        pull *= strength
         velocity *= CONSTRICTION
         velocity += pull[0]
         velocity += pull[1]
@@ -143,9 +143,12 @@ def swarm(
     place, velocity = random.uniform(-1, 1, (2, *shape))
     flight = _Flight(boxed, place, velocity * FASTEST / 2)
     history = np.empty((len(flight.tools), iterations))
-    for index in range(iterations):
-        flight.step(random)
-        history[:, index] = flight.lowest
+    for first in range(0, iterations, DRAWN):
+        strength = random.random((min(DRAWN, iterations - first), 2, 1, *shape))
+        strength *= CONSTRICTION * ACCELERATION
+        for index, one in enumerate(strength, first):
+            flight.step(one)
+            history[:, index] = flight.lowest
     lead = flight.lead
     found = flight.aims[1].reshape(*lead, *shape)[..., :1, :]
     position = (middle + half * found)[..., 0, :]

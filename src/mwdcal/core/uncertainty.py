@@ -30,7 +30,9 @@ class Analysis:
     `variance_factor` (B, t) is s² and `freedom` (B, t) its degrees of freedom;
     `residual` (B, n, m) are whitened residuals left on the readings, and `spread`
     (B, n, m, m) their expected covariance, so that residual · spread⁺ · residual is χ²;
-    `constants` (B, q, q) is the covariance of the constants of the run.
+    `constants` (B, q, q) is the covariance of the constants of the run. `influence` (B, n, u, m) is
+    how an error of a station's whitened reading moves X's unknowns, where that is not as the
+    likelihood has it.
     """
 
     covariance: Array
@@ -40,6 +42,7 @@ class Analysis:
     residual: Array
     spread: Array
     constants: Array
+    influence: Array | None = None
 
 
 def analyse(problem: Problem, state: State, determined: Determined | None = None) -> Analysis:
@@ -102,14 +105,53 @@ def determined_apart(problem: Problem, state: State, own: dict[int, Array]) -> D
     return Determined.by(Normal(found, nothing, nothing[:, 0], linear.size), linear.norms)
 
 
-def sandwich(problem: Problem, state: State, pulls: dict[int, Array]) -> tuple[Array, Array]:
-    """Covariance (B, p, p) and that of the constants (B, q, q) when triads minimise sums of their own.
+def sandwich(found: Analysis, problem: Problem, state: State, pulls: dict[int, Array]) -> Analysis:
+    """The analysis when triads minimise sums of their own: covariance, residuals' spread and s².
 
     `pulls` (B, n, p_t, 3), by triad, is how an error of a station's whitened reading moves those.
     All other unknowns then follow as in the likelihood, those being held. Every error is counted
     with all that it does: of the readings, of the stand (in C = I + GGᵀ), of common references.
     """
     linear = problem.linear(state)
+    design, u = linear.design, linear.prior.shape[-1]
+    moved, follow, back, fixed = _followed(problem, linear, pulls)
+    noise = np.eye(design.shape[2]) + linear.own @ np.swapaxes(linear.own, -1, -2)
+    covariance = np.einsum("bnim,bnmk,bnjk->bij", moved, noise, moved, optimize=True)
+    own = covariance
+    p, constants, rest = linear.size, problem.evidence.constants, ~fixed
+    for column in [p + i for i, c in enumerate(constants) if not c.unknown]:
+        common = np.zeros((len(moved), u))
+        common[:, fixed] = -np.einsum("bnim,bnm->bi", moved[:, :, fixed], design[..., column])
+        pulled = np.einsum("bij,bj->bi", follow, common[:, fixed]) + linear.prior[:, rest, column]
+        common[:, rest] = -np.einsum("bij,bj->bi", back, pulled)
+        outer = common[:, :, None] * common[:, None, :]
+        covariance = covariance + outer / linear.prior[:, column, column, None, None]
+    crossed = design @ moved @ noise
+    left = noise + design @ own[:, None] @ np.swapaxes(design, -1, -2)
+    left = left + crossed + np.swapaxes(crossed, -1, -2)
+    weight = linear.weigh(np.broadcast_to(np.eye(noise.shape[-1]), noise.shape))
+    spread = weight @ left @ weight * problem.evidence.include[..., None, None]
+    factor, freedom = _variance_factors(found.residual, spread)
+    q = len(constants)
+    return replace(
+        found,
+        covariance=covariance[:, :p, :p],
+        variance_factor=factor,
+        freedom=freedom,
+        spread=spread,
+        constants=covariance[:, p : p + q, p : p + q],
+        influence=moved,
+    )
+
+
+def _followed(
+    problem: Problem, linear: Linear, pulls: dict[int, Array]
+) -> tuple[Array, Array, Array, Bools]:
+    """Influence (B, n, u, m) of errors on all unknowns when some triads have their own `pulls`.
+
+    Also how the gradient of the others follows those, the inverse of their information, and which
+    unknowns (u,) are fixed by pulls.
+    """
     design, weighed, u = linear.design, linear.weigh(linear.design), linear.prior.shape[-1]
     moved = np.zeros((*design.shape[:2], u, design.shape[2]))
     fixed = np.zeros(u, bool)
@@ -123,18 +165,24 @@ def sandwich(problem: Problem, state: State, pulls: dict[int, Array]) -> tuple[A
     follow = whole[:, rest][:, :, fixed]
     own = np.swapaxes(weighed[..., rest], -1, -2)
     moved[:, :, rest] = -back[:, None] @ (follow[:, None] @ moved[:, :, fixed] + own)
-    noise = np.eye(design.shape[2]) + linear.own @ np.swapaxes(linear.own, -1, -2)
-    covariance = np.einsum("bnim,bnmk,bnjk->bij", moved, noise, moved, optimize=True)
-    p, constants = linear.size, problem.evidence.constants
-    for column in [p + i for i, c in enumerate(constants) if not c.unknown]:
-        common = np.zeros((len(moved), u))
-        common[:, fixed] = -np.einsum("bnim,bnm->bi", moved[:, :, fixed], design[..., column])
-        pulled = np.einsum("bij,bj->bi", follow, common[:, fixed]) + linear.prior[:, rest, column]
-        common[:, rest] = -np.einsum("bij,bj->bi", back, pulled)
-        spread = common[:, :, None] * common[:, None, :]
-        covariance = covariance + spread / linear.prior[:, column, column, None, None]
-    q = len(constants)
-    return covariance[:, :p, :p], covariance[:, p : p + q, p : p + q]
+    return moved, follow, back, fixed
+
+
+def unweighted_pulls(problem: Problem, even: Problem, state: State) -> dict[int, Array]:
+    """Pulls (B, n, p_t, 3) of least squares with the noise of `even`, all references being exact."""
+    linear = even.linear(state)
+    determined = Determined.of(even, state)
+    reduced, _, eliminate = linear.normal.reduced()
+    p = linear.size
+    rows = linear.design[..., :p] - linear.design[..., p:] @ eliminate[:, None]
+    moved = -determined.inverse(reduced)[:, None] @ np.swapaxes(rows, -1, -2)
+    found = {}
+    for index, (triad, alike, where) in enumerate(
+        zip(problem.triads, even.triads, problem.slices(), strict=True)
+    ):
+        ratio = (triad.sd / alike.sd)[..., None, :]
+        found[index] = moved[:, :, where, 3 * index : 3 * index + 3] * ratio
+    return found
 
 
 def _inverse_where_known(information: Array) -> Array:
@@ -184,6 +232,11 @@ def without_station(problem: Problem, state: State, analysis: Analysis) -> Array
     Directions of a station's readings that nothing else tests are left as they are.
     """
     linear = problem.linear(state)
+    if analysis.influence is not None:
+        p = linear.size
+        own = linear.design @ analysis.influence
+        stay = inverse(np.eye(own.shape[-1]) + own) @ linear.residual[..., None]
+        return np.asarray(-(analysis.influence[:, :, :p] @ stay)[..., 0])
     whole = _whole_covariance(linear, analysis.determined)[:, : linear.size]
     values, vectors = eigen(analysis.spread)
     tested = values > TESTED

@@ -36,9 +36,7 @@ def parse(data: bytes, source: str, delimiter: str | None = None) -> Parts:
     try:
         table = file.read(use_pandas_metadata=False)
         columns = {
-            name: as_column(name, table.column(name), arrow)
-            for name in names
-            if not is_index(name)
+            name: as_column(name, table.column(name), arrow) for name in names if not is_index(name)
         }
     except Exception as error:
         raise unreadable(source, error) from error

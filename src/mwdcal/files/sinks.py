@@ -100,7 +100,9 @@ class TextSink:
         """The lines of the part."""
         from pyarrow import csv as arrow_csv
 
-        plain = {n: self._spelt(c) for n, c in zip(carried.column_names, carried.columns, strict=True)}
+        plain = {
+            n: self._spelt(c) for n, c in zip(carried.column_names, carried.columns, strict=True)
+        }
         plain |= {
             name: self._arrow.array(values, from_pandas=blank)
             for name, values in zip(self._names, results, strict=True)

@@ -22,11 +22,11 @@ from mwdcal.files.columns import LABELS, Column, check_names, no_stations
 from mwdcal.files.contract import COLUMNS, RAW
 from mwdcal.files.table import Table, numbers
 
-ROWS = 1 << 17
+ROWS = 1 << 16
 """Most rows of a part of a Parquet table."""
-PART = 24 << 20
+PART = 16 << 20
 """Bytes that the numbers of such a part may take, results included."""
-PIECE = 4 << 20
+PIECE = 1 << 20
 """Bytes of a piece of text."""
 _RESULTS = 13
 _LONGEST = 1 << 20
@@ -51,6 +51,7 @@ class Source:
         metadata: what the file says about itself.
         schema: Arrow schema of what is carried.
         size: sum of the sizes of all parts, whatever they count.
+        rows: number of rows, of text a guess.
         pieces: an iterator over the pieces, in order.
         load: a piece to a `Part`; the second argument asks for the lines of text exactly.
     """
@@ -60,6 +61,7 @@ class Source:
     metadata: dict[str, object]
     schema: Any
     size: int
+    rows: int
     pieces: Callable[[], Iterator[Any]]
     load: Callable[[Any, bool], Part]
 
@@ -98,7 +100,7 @@ def open_parquet(path: Path, rows: int = 0) -> Source:
         return Part(carried, Table(columns, metadata, path.name, lines), len(batch))
 
     schema = arrow.schema([stored.field(name) for name in names])
-    return Source(path.name, names, metadata, schema, count, pieces, load)
+    return Source(path.name, names, metadata, schema, count, count, pieces, load)
 
 
 def open_text(path: Path, delimiter: str | None = None, typed: bool = False) -> Source:
@@ -109,13 +111,14 @@ def open_text(path: Path, delimiter: str | None = None, typed: bool = False) -> 
             first = next(_pieces(stream), b"")
     except OSError as error:
         raise InputError(f"cannot read '{path}': {error.strerror}.") from error
-    top = text.head(_newlines(first), path.name, delimiter)
+    start = _newlines(first)
+    top = text.head(start, path.name, delimiter)
     numeric = [name for name in top.names if typed and name in _NUMERIC]
     types = {n: arrow.float64() if n in numeric else arrow.string() for n in top.names}
 
     def pieces() -> Iterator[Any]:
         yield top.body, top.lines, len(first)
-        above = top.lines + top.body.count(b"\n")
+        above = start.count(b"\n")
         with path.open("rb") as stream:
             stream.seek(len(first))
             for data in _pieces(stream):
@@ -137,9 +140,9 @@ def open_text(path: Path, delimiter: str | None = None, typed: bool = False) -> 
         kept = {n: c for n, c in table.columns.items() if n in _NUMERIC}
         return Part(carried, Table(kept, top.metadata, path.name, table.lines), size)
 
-    schema = arrow.schema(list(types.items()))
-    total = path.stat().st_size
-    return Source(path.name, top.names, top.metadata, schema, total, pieces, load)
+    schema, total = arrow.schema(list(types.items())), path.stat().st_size
+    guess = total * top.body.count(b"\n") // len(first)
+    return Source(path.name, top.names, top.metadata, schema, total, guess, pieces, load)
 
 
 def _pieces(stream: Any) -> Iterator[bytes]:

@@ -1,0 +1,510 @@
+"""Long tables, part by part: the same results, findings and refusals as when they are read whole."""
+
+import decimal
+import io
+import json
+import signal
+import subprocess
+import sys
+import time
+from datetime import datetime
+
+import numpy as np
+import pytest
+
+from cli_support import calibrated, channels, mwdcal, read_csv, refused, servo_run, write_csv
+from mwdcal.app import progress, streaming
+from mwdcal.app.tables import apply_to_table
+from mwdcal.correction import NAMES
+from mwdcal.errors import InputError
+from mwdcal.files import documents, streams, table
+from simulation import Tool
+
+arrow = pytest.importorskip("pyarrow")
+parquet = pytest.importorskip("pyarrow.parquet")
+
+TOOL = Tool.random(4, noise=(1e-12, 1e-7))
+PARTS = {"numpy": sys.maxsize, "compiled": 0}
+
+
+@pytest.fixture(scope="module")
+def warm(tmp_path_factory):
+    """A calibration of order 1 over 0…50 °C."""
+    run = servo_run(tool=TOOL, temperatures=(0.0, 50.0))
+    path = calibrated(tmp_path_factory.mktemp("warm"), run, "--order", 1)
+    return path, documents.read(path)
+
+
+@pytest.fixture(scope="module")
+def cold(tmp_path_factory):
+    """A calibration without temperature terms."""
+    path = calibrated(tmp_path_factory.mktemp("cold"), servo_run(tool=TOOL))
+    return path, documents.read(path)
+
+
+@pytest.fixture
+def small_pieces(monkeypatch):
+    """Every table is long, and text is read in pieces of a few lines."""
+    monkeypatch.setattr(streaming, "LONG", (0, 0))
+    monkeypatch.setattr(streams, "PIECE", 3000)
+
+
+def log(count=5000, seed=0, low=-5.0, high=55.0):
+    """Columns of a log, some of it outside the calibrated temperatures, some of it vertical."""
+    rng = np.random.default_rng(seed)
+    inc, azi, face = np.arccos(rng.uniform(-1, 1, count)), *rng.uniform(0, 2 * np.pi, (2, count))
+    inc[:3] = 0.0
+    g, b = TOOL.clean(inc, azi, face)
+    time_s = np.arange(count) * 0.01
+    warmth = rng.uniform(low, high, count)
+    return {"time_s": time_s, "temperature_c": warmth, **channels(g, b)}
+
+
+def write_parquet(path, columns, metadata=None, **options):
+    described = {b"mwdcal": json.dumps(metadata or {}).encode()}
+    found = arrow.table(dict(columns)).replace_schema_metadata(described)
+    parquet.write_table(found, path, **options)
+    return path
+
+
+def whole(calibration, path, outside="blank"):
+    """What the small path makes of the file."""
+    return apply_to_table(calibration, table.read(path), outside)
+
+
+def assert_same(path, wanted):
+    """The file has the columns of a corrected table, input to the digit and results to 1e-12."""
+    found = table.read(path)
+    assert list(found.columns) == list(wanted.columns)
+    assert {**found.metadata, "findings": 0} == {**wanted.metadata, "findings": 0}
+    assert found.metadata.get("findings", []) == wanted.metadata.get("findings", [])
+    for name in wanted.columns:
+        if name in NAMES or not isinstance(wanted.columns[name], list):
+            theirs, ours = table.numbers(wanted, name), table.numbers(found, name)
+            np.testing.assert_array_equal(np.isnan(ours), np.isnan(theirs), err_msg=name)
+            size = 1e5 if name.endswith("_nt") else 360.0
+            np.testing.assert_allclose(ours, theirs, rtol=1e-12, atol=1e-9 * size, err_msg=name)
+        else:
+            assert found.columns[name] == wanted.columns[name]
+
+
+@pytest.mark.parametrize("least", PARTS.values(), ids=PARTS)
+@pytest.mark.parametrize("group", [7, 1000, 10**6])
+def test_parts_of_any_size_give_the_whole(tmp_path, warm, least, group):
+    made = warm[1]
+    metadata = {"serial": "X1", "note": "täst"}
+    source = write_parquet(tmp_path / "log.parquet", log(), metadata, row_group_size=group)
+    wanted, findings = whole(made, source)
+    out = tmp_path / "out.parquet"
+    seen = []
+    told = streaming.apply_to_file(
+        made, source, out, "blank", lambda *done: seen.append(done), rows=321, least=least
+    )
+    assert told == (5000, findings)
+    assert [f.id for f in findings] == ["outside-temperature"]
+    assert seen[-1] == (5000, 5000)
+    assert_same(out, wanted)
+    assert out.stat().st_size < 2 * 5000 * 8 * 21 + 50_000
+    assert parquet.read_table(out).schema.metadata[b"mwdcal"]  # for readers that are not ours
+
+
+@pytest.mark.parametrize("outside", ["extrapolate", "refuse"])
+@pytest.mark.parametrize("least", PARTS.values(), ids=PARTS)
+def test_rows_outside_the_temperatures(tmp_path, warm, outside, least):
+    source, out = write_parquet(tmp_path / "log.parquet", log()), tmp_path / "out.parquet"
+    arguments = (warm[1], source, out, outside)
+    if outside == "refuse":
+        with pytest.raises(InputError) as wanted:
+            whole(warm[1], source, outside)
+        with pytest.raises(InputError) as found:
+            streaming.apply_to_file(*arguments, rows=300, least=least)
+        assert str(found.value) == str(wanted.value)
+        assert [f.name for f in tmp_path.iterdir()] == ["log.parquet"]
+    else:
+        streaming.apply_to_file(*arguments, rows=300, least=least)
+        assert_same(out, whole(warm[1], source, outside)[0])
+
+
+def test_columns_of_every_type_are_carried_through(tmp_path, cold):
+    columns = log(600, low=10, high=40)
+    strings = arrow.array([None if i % 5 == 0 else f"S {i}" for i in range(600)])
+    kinds = {
+        "ax": arrow.array(columns["ax"], arrow.float32()),
+        "az": arrow.array([decimal.Decimal(f"{v:.6f}") for v in columns["az"]]),
+        "my": arrow.array([f"{v:.9e}" for v in columns["my"]]),
+        "mz": arrow.array(columns["mz"], arrow.float64()).dictionary_encode(),
+        "temperature_c": arrow.array(columns["temperature_c"].astype(int), arrow.int16()),
+        "count": arrow.array(2**60 + np.arange(600)),
+        "depth": arrow.array([None, 1.5] * 300),
+        "place": strings.dictionary_encode(),
+        "label": strings,
+        "when": arrow.array([datetime(2026, 1, 2, 3, 4, 5)] * 600),
+        "good": arrow.array([True, None, False] * 200),
+        "list.of": arrow.array([[1, 2], []] * 300),
+        "none": arrow.nulls(600),
+    }
+    columns = {**{k: arrow.array(v) for k, v in columns.items()}, **kinds}
+    source = write_parquet(tmp_path / "log.parquet", columns, row_group_size=100)
+    for least in PARTS.values():
+        out = tmp_path / "out.parquet"
+        streaming.apply_to_file(cold[1], source, out, "blank", rows=64, least=least)
+        before, after = parquet.read_table(source), parquet.read_table(out)
+        assert after.schema.names == [*columns, *NAMES]
+        for name in columns:
+            assert after.schema.field(name).type == before.schema.field(name).type
+            assert after.column(name).to_pylist() == before.column(name).to_pylist()
+        wanted, _ = whole(cold[1], source)
+        for name in NAMES:
+            np.testing.assert_allclose(after[name].to_numpy(), wanted.columns[name], atol=1e-6)
+    text = tmp_path / "out.csv"
+    streaming.apply_to_file(cold[1], source, text, "blank", rows=64)
+    table.write(tmp_path / "whole.csv", wanted)
+    ours, theirs = (read_csv(p) for p in (text, tmp_path / "whole.csv"))
+    for name in ("label", "place", "when", "good", "none"):
+        assert ours[name] == theirs[name]
+    assert ours["count"][1] == str(2**60 + 1)
+
+
+def test_the_index_of_pandas_is_left_out(tmp_path, cold):
+    source = write_parquet(tmp_path / "l.parquet", {**log(50), "__index_level_0__": np.arange(50)})
+    streaming.apply_to_file(cold[1], source, tmp_path / "out.parquet", "blank")
+    assert "__index_level_0__" not in parquet.read_schema(tmp_path / "out.parquet").names
+
+
+def spoilt(column, row, value, count=80_000):
+    columns = log(count, low=10, high=40)
+    columns[column][row] = value
+    return columns
+
+
+WRONG = {
+    "blank reading": ("ax", 70_000, np.nan),
+    "endless reading": ("mz", 70_000, np.inf),
+    "huge reading": ("ay", 70_000, 1e300),
+    "blank temperature": ("temperature_c", 70_000, np.nan),
+    "impossible temperature": ("temperature_c", 70_000, -400.0),
+}
+
+
+@pytest.mark.parametrize("least", PARTS.values(), ids=PARTS)
+@pytest.mark.parametrize("wrong", WRONG.values(), ids=WRONG)
+def test_one_wrong_cell_far_down_is_named_and_nothing_is_left(tmp_path, warm, wrong, least):
+    source = write_parquet(tmp_path / "log.parquet", spoilt(*wrong))
+    with pytest.raises(InputError) as wanted:
+        whole(warm[1], source)
+    out = tmp_path / "out.parquet"
+    out.write_bytes(b"old")
+    with pytest.raises(InputError) as found:
+        streaming.apply_to_file(warm[1], source, out, "blank", least=least)
+    assert str(found.value) == str(wanted.value)
+    assert f"row 70001, column '{wrong[0]}'" in str(found.value)
+    assert out.read_bytes() == b"old"
+    assert {f.name for f in tmp_path.iterdir()} == {"log.parquet", "out.parquet"}
+
+
+@pytest.mark.parametrize("names", [("mx", "my", "mz"), ("temperature_c",)], ids=lambda n: n[0])
+@pytest.mark.parametrize("how", ["all", "beginning", "end"])
+def test_columns_that_are_blank_for_a_while(tmp_path, cold, names, how):
+    columns = log(3000, low=10, high=40)
+    rows = {"all": slice(None), "beginning": slice(0, 2000), "end": slice(2000, None)}[how]
+    for name in names:
+        columns[name][rows] = np.nan
+    source = write_parquet(tmp_path / "log.parquet", columns)
+    out = tmp_path / "out.parquet"
+    for least in PARTS.values():
+        if how == "all":
+            told = streaming.apply_to_file(cold[1], source, out, "blank", rows=500, least=least)
+            assert told[1] == whole(cold[1], source)[1]
+            assert_same(out, whole(cold[1], source)[0])
+        else:
+            with pytest.raises(InputError) as wanted:
+                whole(cold[1], source)
+            with pytest.raises(InputError) as found:
+                streaming.apply_to_file(cold[1], source, out, "blank", rows=500, least=least)
+            assert str(found.value) == str(wanted.value)
+
+
+@pytest.mark.parametrize(("column", "value"), [("ref_dip_deg", 200.0), ("sd_ax", -1.0)])
+def test_references_are_checked_too(tmp_path, cold, column, value):
+    columns = log(3000, low=10, high=40)
+    columns[column] = np.full(3000, 0.5)
+    columns[column][2500] = value
+    source = write_parquet(tmp_path / "log.parquet", columns)
+    with pytest.raises(InputError) as wanted:
+        whole(cold[1], source)
+    with pytest.raises(InputError) as found:
+        streaming.apply_to_file(cold[1], source, tmp_path / "o.parquet", "blank", rows=500)
+    assert str(found.value) == str(wanted.value)
+
+
+REFUSED = {
+    "no temperature": lambda c: c.pop("temperature_c"),
+    "half a magnetometer": lambda c: c.pop("my"),
+    "no ax": lambda c: c.pop("ax"),
+    "near miss": lambda c: c.update(Temperature=c.pop("temperature_c")),
+    "taken": lambda c: c.update(dip_deg=c["ax"]),
+}
+
+
+@pytest.mark.parametrize("change", REFUSED.values(), ids=REFUSED)
+@pytest.mark.parametrize("suffix", [".parquet", ".csv"])
+def test_headers_that_are_refused(tmp_path, warm, small_pieces, change, suffix):
+    columns = log(50)
+    change(columns)
+    source = tmp_path / f"log{suffix}"
+    (write_parquet if suffix == ".parquet" else write_csv)(source, columns)
+    with pytest.raises(InputError) as wanted:
+        whole(warm[1], source)
+    out = tmp_path / "out.csv"
+    assert refused(mwdcal("apply", warm[0], source, "-o", out), 2) == f"mwdcal: {wanted.value}"
+    assert not out.exists()
+
+
+def test_files_that_cannot_be_read_or_written(tmp_path, warm, small_pieces):
+    source = write_parquet(tmp_path / "log.parquet", log(50))
+    before = source.read_bytes()
+    for out in (source, warm[0], tmp_path / "no" / "out.parquet", tmp_path):
+        refused(mwdcal("apply", warm[0], source, "-o", out), 2)
+    (tmp_path / "cut.parquet").write_bytes(before[:-100])
+    (tmp_path / "torn.parquet").write_bytes(before[:20] + bytes(2000) + before[2020:])
+    write_parquet(tmp_path / "empty.parquet", log(50) and {k: v[:0] for k, v in log(50).items()})
+    for name in ("cut", "torn", "empty"):
+        out = tmp_path / "out.parquet"
+        refused(mwdcal("apply", warm[0], tmp_path / f"{name}.parquet", "-o", out), 2)
+        assert not out.exists()
+    assert source.read_bytes() == before
+
+
+@pytest.mark.parametrize("when", ["write", "finish"])
+def test_interrupted_it_leaves_the_old_file(tmp_path, warm, monkeypatch, small_pieces, when):
+    source, out = write_parquet(tmp_path / "log.parquet", log()), tmp_path / "out.parquet"
+    out.write_bytes(b"old")
+
+    def interrupt(*given):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(streaming.ParquetSink, when, interrupt)
+    assert mwdcal("apply", warm[0], source, "-o", out).code == 130
+    assert out.read_bytes() == b"old"
+    assert {f.name for f in tmp_path.iterdir()} == {"log.parquet", "out.parquet"}
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
+def test_ctrl_c_in_the_middle_of_a_long_table(tmp_path, warm):
+    write_parquet(tmp_path / "log.parquet", log(250_000))
+    slow = (
+        "import sys, time\nfrom mwdcal.app import streaming\nfrom mwdcal.app.cli import main\n"
+        "def write(*given):\n    print('writing', flush=True); time.sleep(20)\n"
+        "streaming.ParquetSink.write = write\nmain(sys.argv[1:])\n"
+    )
+    names = [str(tmp_path / name) for name in ("log.parquet", "out.parquet")]
+    command = [sys.executable, "-c", slow, "apply", str(warm[0]), names[0], "-o", names[1]]
+    child = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert child.stdout.readline() == "writing\n"
+    child.send_signal(signal.SIGINT)
+    _, err = child.communicate(timeout=15)
+    assert child.returncode == 130
+    assert err.strip() == "mwdcal: interrupted. Files are as they were before."
+    assert [f.name for f in tmp_path.iterdir()] == ["log.parquet"]
+
+
+TEXTS = {
+    "plain": lambda s: s,
+    "carriage returns": lambda s: s.replace("\n", "\r\n"),
+    "old Macintosh": lambda s: s.replace("\n", "\r"),
+    "no last line end": lambda s: s.rstrip("\n"),
+    "byte order mark": lambda s: "\ufeff" + s,
+    "quotes": lambda s: s.replace("S 77,", '"S, ""77""",'),
+    "blanks before cells": lambda s: s.replace("S 77,", "S 77,   "),
+    "blank before a line": lambda s: s.replace("S 77,", "  S 77,"),
+    "blank rows": lambda s: s.replace("S 77,", ",,,,,,,,\n\nS 77,") + "\n,,,,,,,,\n",
+    "semicolons": lambda s: s.replace(",", ";"),
+    "cells with the other delimiter": lambda s: s.replace(",", ";").replace("S 77;", "S, 77;"),
+    "no cell in the first column": lambda s: s.replace("S 77,", ","),
+    "signs and blanks": lambda s: s.replace("S 77,0.77,", "S 77,+7.7e-1 ,"),
+}
+
+
+def text(folder, change=lambda s: s, count=120):
+    """A text table, written by the standard library and then changed."""
+    columns = {"station": [f"S {i}" for i in range(count)], **log(count)}
+    path = write_csv(folder / "log.csv", columns, 'serial = "A 7"', "note = 1.5")
+    path.write_bytes(change(path.read_text("utf-8")).encode())
+    return path
+
+
+@pytest.mark.parametrize("least", PARTS.values(), ids=PARTS)
+@pytest.mark.parametrize("change", TEXTS.values(), ids=TEXTS)
+@pytest.mark.parametrize("suffix", [".csv", ".tsv", ".parquet"])
+def test_text_in_pieces_gives_the_whole(tmp_path, warm, small_pieces, change, suffix, least):
+    source, out = text(tmp_path, change), tmp_path / f"out{suffix}"
+    wanted, findings = whole(warm[1], source)
+    told = streaming.apply_to_file(warm[1], source, out, "blank", least=least)
+    assert told == (120, findings)
+    table.write(tmp_path / f"whole{suffix}", wanted)
+    found = table.read(out)
+    for name, cells in table.read(tmp_path / f"whole{suffix}").columns.items():
+        if name in ("station", "time_s") or (name in wanted.columns and name not in NAMES):
+            ours = found.columns[name]
+            if isinstance(ours, list) == isinstance(cells, list):
+                np.testing.assert_array_equal(ours, cells)
+    if suffix != ".parquet":
+        assert_same(out, wanted)
+
+
+def line(number, old, new):
+    def change(content):
+        lines = content.split("\n")
+        lines[number - 1] = lines[number - 1].replace(old, new, 1)
+        return "\n".join(lines)
+
+    return change
+
+
+BAD_TEXTS = {
+    "word": line(80, ",0.7", ",x0.7"),
+    "reading is a word": line(80, "S 76,0.76,", "S 76,0.76,hot,"),
+    "nan": line(80, "S 76,0.76,", "S 76,0.76,nan,"),
+    "decimal comma": line(80, "S 76,0.76,", 'S 76,0.76,"1,5",'),
+    "ragged": line(80, "S 76,0.76,", "S 76,0.76,1,"),
+    "short": line(80, "S 76,0.76,", "S 76,"),
+    "comment": line(80, "S 76", "# S 76"),
+    "NUL": line(80, "S 76", "S\0 76"),
+    "open quote": line(80, "S 76", '"S 76'),
+    "blank cell": lambda s: s.replace("\n", "\n\n") + "1,1,1,,1,1,1,1,1\n",
+    "quote": line(80, "S 76", 'S "76"'),
+}
+
+
+@pytest.mark.parametrize("least", PARTS.values(), ids=PARTS)
+@pytest.mark.parametrize("change", BAD_TEXTS.values(), ids=BAD_TEXTS)
+def test_text_that_is_refused_is_refused_alike(tmp_path, warm, small_pieces, change, least):
+    source = text(tmp_path, change)
+    outcomes = []
+    for run in (
+        lambda: whole(warm[1], source),
+        lambda: streaming.apply_to_file(warm[1], source, tmp_path / "o.csv", "blank", least=least),
+    ):
+        try:
+            run()
+            outcomes.append("accepted")
+        except InputError as error:
+            outcomes.append(str(error))
+    assert outcomes[0] == outcomes[1]
+    assert (tmp_path / "o.csv").exists() == (outcomes[0] == "accepted")
+    assert not list(tmp_path.glob(".mwdcal-*"))
+
+
+def test_a_byte_that_is_no_text_is_named_with_its_line(tmp_path, warm, small_pieces):
+    source = text(tmp_path)
+    lines = source.read_bytes().split(b"\n")
+    lines[79] = b"\xb0" + lines[79]
+    source.write_bytes(b"\n".join(lines))
+    message = refused(mwdcal("apply", warm[0], source, "-o", tmp_path / "o.csv"), 2)
+    assert "log.csv, line 80: expected UTF-8 text; got byte 0xB0" in message
+
+
+def test_text_without_stations_and_without_lines(tmp_path, warm, small_pieces):
+    header = ",".join(log(1))
+    source = tmp_path / "log.csv"
+    for content in ("", "\n\n", header, f"{header}\n\n,,,,,,,\n", header + "\n" + "\n" * 9000):
+        source.write_text(content)
+        refused(mwdcal("apply", warm[0], source, "-o", tmp_path / "o.csv"), 2)
+    source.write_text(header + "\n" + "1," * 3_000_000)
+    refused(mwdcal("apply", warm[0], source, "-o", tmp_path / "o.csv"), 2)
+    assert not (tmp_path / "o.csv").exists()
+
+
+def test_findings_of_a_long_text_table_stand_above_its_header(tmp_path, small_pieces):
+    run = servo_run(tool=TOOL)
+    del run["ref_toolface_deg"]
+    calibration = calibrated(tmp_path, run)
+    source = write_csv(tmp_path / "log.csv", {k: v for k, v in log().items() if k[0] != "m"})
+    ran = mwdcal("apply", calibration, source, "-o", tmp_path / "out.csv", "--json")
+    assert [f["id"] for f in ran.json["findings"]] == [
+        *("no-magnetometer", "outside-temperature", "undetermined"),
+    ]
+    found = table.read(tmp_path / "out.csv")
+    assert found.metadata["findings"] == [f["text"] for f in ran.json["findings"]]
+    assert list(found.columns)[-13:] == list(NAMES)
+
+
+def test_only_long_tables_of_fit_formats_are_streamed(tmp_path, monkeypatch):
+    short = write_csv(tmp_path / "a.csv", log(50))
+    packed = write_parquet(tmp_path / "a.parquet", log(50))
+    monkeypatch.setattr(streaming, "LONG", (51, 10**5))
+    assert not streaming.is_long(short, tmp_path / "o.csv", ".")
+    assert not streaming.is_long(packed, tmp_path / "o.csv", ".")
+    monkeypatch.setattr(streaming, "LONG", (50, 100))
+    for source in (short, packed):
+        assert streaming.is_long(source, tmp_path / "o.csv", ".")
+        assert not streaming.is_long(source, tmp_path / "o.csv", ",")
+        assert not streaming.is_long(source, tmp_path / "o.xlsx", ".")
+    assert not streaming.is_long(tmp_path / "none.parquet", tmp_path / "o.csv", ".")
+    assert not streaming.is_long(tmp_path, tmp_path / "o.csv", ".")
+
+
+def test_work_overlaps_keeps_its_order_and_stops_at_an_error():
+    taken, alive = [], []
+
+    def items():
+        for i in range(50):
+            taken.append(i)
+            yield i
+
+    def work(i):
+        alive.append(i)
+        time.sleep(0.001 * (i % 3))
+        if i == 30:
+            raise InputError("thirty")
+        return i * i
+
+    found = []
+    with pytest.raises(InputError, match="thirty"):
+        found.extend(streaming.overlapped(items(), work))
+    assert found == [] or found == [i * i for i in range(30)]
+    assert max(taken) < 45
+    stopped = streaming.overlapped(items(), work)
+    assert [next(stopped), next(stopped)] == [0, 1]
+    stopped.close()
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+@pytest.mark.parametrize(("stream", "patience", "seen"), [
+    (Terminal, 0.0, True), (Terminal, 60.0, False), (io.StringIO, 0.0, False),
+])  # fmt: skip
+def test_progress_is_shown_on_a_terminal_and_only_to_the_patient(
+    monkeypatch, stream, patience, seen
+):
+    monkeypatch.setattr(progress, "PATIENCE", patience)
+    monkeypatch.setattr(sys, "stderr", shown := stream())
+    with progress.bar("correcting") as advance:
+        advance(1, 4)
+        advance(2, 4)
+    assert ("correcting" in shown.getvalue()) == seen
+
+
+def test_memory_does_not_grow_with_the_table(tmp_path, warm):
+    resource = pytest.importorskip("resource")
+    part = arrow.table(log(250_000, low=10, high=40))
+    with parquet.ParquetWriter(tmp_path / "log.parquet", part.schema) as writer:
+        for _ in range(12):
+            writer.write_table(part)
+    code = (
+        "import resource, sys\nfrom mwdcal.app.cli import cli\n"
+        "cli(sys.argv[1:], standalone_mode=False)\n"
+        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, file=sys.stderr)\n"
+    )
+    out = tmp_path / "out.parquet"
+    arguments = ["apply", str(warm[0]), str(tmp_path / "log.parquet"), "-o", str(out)]
+    done = subprocess.run(
+        [sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=True
+    )
+    assert parquet.read_metadata(out).num_rows == 3_000_000
+    unit = 1 if sys.platform == "darwin" else 1024
+    assert int(done.stderr.split()[-1]) * unit < 600e6
+    assert resource is not None
