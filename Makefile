@@ -9,6 +9,8 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
+BENCH := build/bench-venv/bin
+MEASURED := build/bench-venv/.installed
 
 # The measured data sets are optional: tests that need them skip without them.
 ifeq ($(MWDCAL_DATA),)
@@ -48,8 +50,9 @@ check: $(INSTALLED) ## lint, format, types, architecture, doctests, docs
 		--doctest-glob='*.md' docs; \
 	echo "docs"; $(BIN)/sphinx-build -q -W --keep-going -b html docs build/docs
 
-bench: $(INSTALLED) ## time the commands against a bare import of SciPy
-	@$(CLOCK); $(ONE_THREAD) $(BIN)/python benchmarks/bench.py
+bench: $(MEASURED) ## time mwdcal against SciPy and other packages, write docs/benchmarks.md (QUICK=1: two minutes)
+	@$(CLOCK); $(ONE_THREAD) PYTHONPATH=tests $(BENCH)/python benchmarks/bench.py \
+		$(if $(QUICK),--quick --output build/benchmarks)
 
 measured: $(INSTALLED) ## calibrate the measured sets (MWDCAL_DATA) and rewrite docs/measured.md
 	@$(CLOCK); $(ONE_THREAD) $(BIN)/python examples/measured/measured.py
@@ -75,4 +78,11 @@ $(INSTALLED): pyproject.toml constraints.txt
 	set -e; echo "installing into $(VENV)"; \
 	$(PYTHON) -m venv $(VENV); \
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[all,dev]'; \
+	touch $@; echo "installed: $$(($$(date +%s) - start)) s"
+
+$(MEASURED): pyproject.toml constraints.txt benchmarks/requirements.txt
+	@start=$$(date +%s); set -e; echo "installing the alternatives into build/bench-venv"; \
+	$(PYTHON) -m venv build/bench-venv; \
+	$(BENCH)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt \
+		-e '.[all]' -r benchmarks/requirements.txt; \
 	touch $@; echo "installed: $$(($$(date +%s) - start)) s"

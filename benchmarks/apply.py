@@ -1,12 +1,11 @@
 """`mwdcal apply` against plain NumPy: in memory, Parquet to Parquet, and in bytes of memory.
 
 Every comparison is made in one process or with commands in turn, so that what else the machine
-does is shared. Usage: python benchmarks/apply.py [rows in memory] [rows in files ...]
+does is shared; times are the best of several, memory is the worst. Usage: python benchmarks/apply.py [rows in memory] [rows in files ...]
 """
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 import time
@@ -50,6 +49,16 @@ pyarrow.parquet.write_table(table, sys.argv[3])
 """
 """What one would write without mwdcal's loops: whole columns, plain NumPy, default Parquet."""
 
+LAUNCH = """
+import os, subprocess, sys, time
+start = time.perf_counter()
+process = subprocess.Popen(sys.argv[1:], stdout=subprocess.DEVNULL)
+_, status, usage = os.wait4(process.pid, 0)
+print(time.perf_counter() - start, usage.ru_maxrss)
+sys.exit(status != 0)
+"""
+"""Starts a command from a small process: its peak memory begins with that of who starts it."""
+
 
 class Row(NamedTuple):
     """One comparison: ours and theirs in the unit, and how many times better ours is."""
@@ -78,10 +87,10 @@ def log(rows: int, seed: int = 1) -> Readings:
     return Readings(g, 3e4 * rng.normal(size=(rows, 3)), rng.uniform(0.0, 110.0, rows))
 
 
-def seconds(*calls: Callable[[], object], repeats: int = 7) -> list[float]:
-    """Median time of each call; the calls take turns, after one round that does not count."""
+def seconds(*calls: Callable[[], object], repeats: int = 9) -> list[float]:
+    """Best time of each call; the calls take turns, after one round that does not count."""
     rounds = [[_seconds(call) for call in calls] for _ in range(repeats + 1)]
-    return np.median(rounds[1:], axis=0).tolist()
+    return np.min(rounds[1:], axis=0).tolist()
 
 
 def _seconds(call: Callable[[], object]) -> float:
@@ -124,7 +133,8 @@ def in_files(rows: int, folder: Path, repeats: int = 3) -> Iterator[Row]:
         [sys.executable, "-c", PLAIN, *names],
     ]
     rounds = np.array([[child(command) for command in commands] for _ in range(repeats)])
-    (ours, our_peak), (theirs, their_peak) = np.median(rounds, axis=0).tolist()
+    (ours, _), (theirs, _) = rounds.min(axis=0).tolist()
+    (_, our_peak), (_, their_peak) = rounds.max(axis=0).tolist()
     yield Row(f"Parquet to Parquet, {rows} rows", ours, theirs, theirs / ours)
     yield Row(f"peak memory, {rows} rows", our_peak, their_peak, their_peak / our_peak, "MB")
 
@@ -147,13 +157,13 @@ def write_log(path: Path, rows: int) -> None:
 
 def child(command: list[str]) -> tuple[float, float]:
     """Wall time (s) and peak memory (MB) of a command; stops the benchmark when it fails."""
-    start = time.perf_counter()
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
-    _, status, usage = os.wait4(process.pid, 0)
-    if status:
-        sys.exit(f"{' '.join(command)} ended with {os.waitstatus_to_exitcode(status)}")
-    unit = 1.0 if sys.platform == "darwin" else 1024.0
-    return time.perf_counter() - start, usage.ru_maxrss * unit / 1e6
+    done = subprocess.run(
+        [sys.executable, "-c", LAUNCH, *command], capture_output=True, text=True, check=False
+    )
+    if done.returncode:
+        sys.exit(f"{' '.join(command)} failed:\n{done.stderr.strip()}")
+    wall, peak = map(float, done.stdout.split()[-2:])
+    return wall, peak * (1.0 if sys.platform == "darwin" else 1024.0) / 1e6
 
 
 def main() -> None:

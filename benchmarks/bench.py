@@ -1,61 +1,271 @@
-"""Times the commands against a bare import of SciPy, interleaved in one run.
+"""Every benchmark side by side in one run, and the page of the ratios.
 
-The ratio to the import is what to watch: it hardly depends on the machine.
+    make bench            (writes docs/benchmarks.md and docs/benchmarks.svg; a quarter of an hour)
+    make bench QUICK=1    (smaller sizes, under two minutes, into build/benchmarks)
+
+All comparisons are made in one environment, in which mwdcal and the alternatives are installed.
+A module of GROUPS that is missing, or an alternative that does not run, is named on the page.
 """
 
 from __future__ import annotations
 
-import statistics
-import subprocess
+import argparse
+import os
+import platform
 import sys
 import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from importlib import import_module
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import measuring
+from measuring import Row
+
 ROOT = Path(__file__).resolve().parents[1]
-MWDCAL = Path(sys.executable).with_name("mwdcal")
-EXAMPLE = ROOT / "examples" / "servo"
-REPEATS = 7
-REFERENCE = "import scipy.optimize"
+TEXTS = Path(__file__).with_name("benchmarks.md")
+"""The page without its figures: a paragraph per group under its heading."""
+PACKAGES = (
+    "mwdcal", "numpy", "scipy", "numba", "pyarrow", "pyswarms", "AllanTools",
+    "circuitpython-mag-cal", "imucal", "pandas",
+)  # fmt: skip
+ORDER = ("fleet", "apply", "fits", "swarms", "peers", "allan", "commands")
+"""Order of the runs: the memory of a fleet is that of the largest process so far."""
+GOALS = {
+    "swarms": (("60 particles x 600 iterations x 12, from the readings", 3.0, 6.0),),
+    "fits": (
+        ("60 factors, 180 stations; SciPy, numeric Jacobian", 10.0, None),
+        ("60 factors, 180 stations, uncertain stand", 10.0, None),
+    ),
+}
+"""What was aimed at: how the name of the row begins, the ratio at least, and the one hoped for."""
+ENOUGH = 1.0
+UNITS = {"s": ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs")), "MB": ((1.0, "MB"),)}
 
 
-def cases(folder: Path) -> dict[str, list[str]]:
-    """The commands to time, by the name in the table; the reference comes first."""
-    calibrate = [
-        *(str(MWDCAL), "calibrate", str(EXAMPLE / "run.csv")),
-        *("--tool", str(EXAMPLE / "tool.toml"), "-o", str(folder / "tool.json")),
+@dataclass
+class Group:
+    """What one module measured; `growth` are tools, seconds and memory (MB)."""
+
+    rows: list[Row] = field(default_factory=list)
+    growth: list[tuple[int, float, float]] = field(default_factory=list)
+    missing: str = ""
+
+
+def fleet(quick: bool) -> Group:
+    """Growth with the number of tools, and a SciPy loop."""
+    module, cores = import_module("fleet"), count_cores()
+    sizes = [10**k for k in range(2, 5 if quick else 7)]
+    grown = list(module.growth(sizes, cores))
+    return Group(module.against_scipy(2_000 if quick else 20_000, cores), grown)
+
+
+def apply(quick: bool) -> Group:
+    """In memory, and from file to file."""
+    module, rows = import_module("apply"), 10**5 if quick else 10**6
+    found = list(module.in_memory(rows))
+    with TemporaryDirectory() as folder:
+        for count in (rows,) if quick else (rows, 10 * rows):
+            found += module.in_files(count, Path(folder))
+    return Group(found)
+
+
+OWN = {"fleet": fleet, "apply": apply}
+
+
+def measured(name: str, quick: bool) -> Group:
+    """One group; what cannot be measured says why."""
+    begun = time.perf_counter()
+    try:
+        group = OWN[name](quick) if name in OWN else Group(import_module(name).rows())
+    except ImportError as error:
+        group = Group(missing=f"Not measured: {error}.")
+    print(f"{name}: {time.perf_counter() - begun:.0f} s", flush=True)
+    for row in group.rows:
+        print(f"  {row.ratio:>8.2f} x  {row.name}", flush=True)
+    return group
+
+
+# ── The page ─────────────────────────────────────────────────────────────────────────────────
+
+
+def shown(value: float, unit: str) -> str:
+    """A value with three digits and a unit that suits it."""
+    for size, name in UNITS.get(unit, ((1.0, unit),)):
+        if value >= size:
+            break
+    return f"{digits(value / size)} {name}"
+
+
+def digits(value: float) -> str:
+    """Three digits, and never an exponent."""
+    return f"{value:.0f}" if value >= 100 else f"{value:.3g}"
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A Markdown table."""
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join("| " + " | ".join(line).replace("\n", " ") + " |" for line in lines)
+
+
+def group_table(rows: Sequence[Row]) -> str:
+    """Ours, theirs and the ratio of each row."""
+    cells = []
+    for row in rows:
+        same, memory = getattr(row, "same", ""), getattr(row, "memory", None)
+        unit = getattr(row, "unit", "s")
+        what, _, other = row.name.partition("; ")
+        peak = " / ".join(digits(m) for m in memory) if memory else ""
+        values = [shown(v, unit) for v in (row.ours, row.theirs)]
+        cells.append([what, other, *values, f"**{digits(row.ratio)}**", peak, same])
+    head = ["what", "against", "ours", "theirs", "ratio", "peak MB, ours / theirs", "equal result"]
+    kept = [i for i, name in enumerate(head) if i < 5 and i != 1 or any(c[i] for c in cells)]
+    return table([head[i] for i in kept], [[c[i] for i in kept] for c in cells])
+
+
+def growth_table(grown: Sequence[tuple[int, float, float]]) -> str:
+    """Time and memory against the number of tools."""
+    rows = [
+        [f"{tools:,}".replace(",", " "), shown(s, "s"), digits(tools / s), digits(memory)]
+        for tools, s, memory in grown
     ]
-    return {
-        REFERENCE: [sys.executable, "-c", "import numpy, scipy.optimize"],
-        "mwdcal --help": [str(MWDCAL), "--help"],
-        "mwdcal calibrate": calibrate,
+    return table(["tools", "time", "tools per second", "largest process, MB"], rows)
+
+
+def goals(groups: dict[str, Group]) -> Iterator[str]:
+    """What was aimed at and what came out."""
+    for name, wanted in GOALS.items():
+        for start, least, hoped in wanted:
+            for row in groups[name].rows:
+                if row.name.startswith(start):
+                    aim = f"{least:g}" + (f", hoped for {hoped:g}" if hoped else "")
+                    high, low = row.ratio >= (hoped or least), row.ratio < least
+                    verdict = (
+                        "**short of it**" if low else "reached" if high else "reached, not the hope"
+                    )
+                    yield f"- {row.name}: {digits(row.ratio)} x; aimed at: {aim} x: {verdict}."
+                    break
+
+
+def machine() -> str:
+    """Processor and cores."""
+    model = platform.processor() or platform.machine()
+    info = Path("/proc/cpuinfo")
+    if info.exists():
+        names = [
+            x.partition(":")[2].strip()
+            for x in info.read_text().splitlines()
+            if x[:10] == "model name"
+        ]
+        model = names[0] if names else model
+    return (
+        f"{model}, {count_cores()} cores; {platform.system()}, Python {platform.python_version()}"
+    )
+
+
+def count_cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def versions() -> str:
+    """What was measured, and against what."""
+    found = []
+    for name in PACKAGES:
+        try:
+            found.append(f"{name} {version(name)}")
+        except PackageNotFoundError:
+            found.append(f"{name} not installed")
+    return ", ".join(found)
+
+
+def page(groups: dict[str, Group], quick: bool) -> str:
+    """The text with its figures in place."""
+    text = TEXTS.read_text("utf-8")
+    sizes = "`make bench QUICK=1`: small sizes and few rounds" if quick else "`make bench`"
+    parts = {
+        "machine": machine(),
+        "versions": versions(),
+        "date": f"{datetime.now(UTC).date()}",
+        "made": sizes,
+        "goals": "\n".join(goals(groups)),
+        "growth": growth_table(groups["fleet"].growth) if groups["fleet"].growth else "",
     }
+    for name, group in groups.items():
+        parts[name] = group.missing or group_table(group.rows)
+    for name, value in parts.items():
+        text = text.replace("{" + name + "}", value)
+    return text
 
 
-def seconds(command: list[str]) -> float:
-    """Wall time of one run of a command; stops the benchmark when it fails."""
-    start = time.perf_counter()
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    elapsed = time.perf_counter() - start
-    if done.returncode != 0:
-        sys.exit(f"{' '.join(command)} ended with {done.returncode}:\n{done.stderr.strip()}")
-    return elapsed
+def plot(groups: dict[str, Group], path: Path) -> None:
+    """All ratios of time on one logarithmic axis, the groups apart."""
+    import matplotlib as mpl
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import FuncFormatter
 
-
-def medians(commands: dict[str, list[str]]) -> dict[str, float]:
-    """Median wall time per command over interleaved rounds, after one unmeasured round."""
-    rounds = [
-        {name: seconds(command) for name, command in commands.items()} for _ in range(REPEATS + 1)
-    ]
-    return {name: statistics.median(r[name] for r in rounds[1:]) for name in commands}
+    lines: list[tuple[str, float | None]] = []
+    for name in (
+        n
+        for n in ("fits", "swarms", "peers", "allan", "fleet", "apply", "commands")
+        if groups[n].rows
+    ):
+        rows = [row for row in groups[name].rows if getattr(row, "unit", "s") == "s"]
+        lines += [(name, None), *((row.name, row.ratio) for row in rows)]
+    style = {
+        "font.size": 8,
+        "svg.hashsalt": "mwdcal",
+        "font.family": "sans-serif",
+        "svg.fonttype": "path",
+    }
+    with mpl.rc_context(style):
+        figure = Figure(figsize=(9.5, 0.2 * len(lines) + 0.8), layout="constrained")
+        axes = figure.add_subplot()
+        for place, (label, ratio) in enumerate(lines):
+            if ratio is None:
+                continue
+            color = "#2a6f97" if ratio >= ENOUGH else "#b5533c"
+            axes.plot([1, ratio], [place, place], color=color, linewidth=4, solid_capstyle="butt")
+            side = "left" if ratio >= ENOUGH else "right"
+            axes.annotate(f"{digits(ratio)}", (ratio, place), (4 if side == "left" else -4, 0),
+                          textcoords="offset points", ha=side, va="center", color=color)  # fmt: skip
+        axes.axvline(1, color="black", linewidth=0.8)
+        axes.set_xscale("log")
+        low = min(r for _, r in lines if r is not None)
+        high = max(r for _, r in lines if r is not None)
+        axes.set_xlim(low / 3, high * 3)
+        axes.set_ylim(len(lines) - 0.3, -0.7)
+        axes.set_yticks(range(len(lines)), [label for label, _ in lines])
+        for tick, (_, ratio) in zip(axes.get_yticklabels(), lines, strict=True):
+            tick.set_fontweight("bold" if ratio is None else "normal")
+        axes.tick_params(axis="y", length=0)
+        axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
+        axes.set_xlabel("how many times faster mwdcal is (left of 1: slower)")
+        axes.grid(axis="x", color="#dddddd", linewidth=0.6)
+        axes.set_axisbelow(True)
+        axes.spines[["top", "right", "left"]].set_visible(False)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(path, metadata={"Date": None} if path.suffix == ".svg" else None)
 
 
 def main() -> None:
-    with TemporaryDirectory() as folder:
-        times = medians(cases(Path(folder)))
-    print(f"{'command':<24}{'median s':>10}{'ratio':>8}   ({REPEATS} rounds, interleaved)")
-    for name, value in times.items():
-        print(f"{name:<24}{value:>10.3f}{value / times[REFERENCE]:>8.2f}")
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--output", type=Path, default=ROOT / "docs")
+    asked = parser.parse_args()
+    if os.environ.get("OMP_NUM_THREADS") != "1":
+        sys.exit("set OMP_NUM_THREADS=1 and OPENBLAS_NUM_THREADS=1, or use `make bench`")
+    if asked.quick:
+        measuring.BUDGET["seconds"] = 0.5
+    groups = {name: measured(name, asked.quick) for name in ORDER}
+    asked.output.mkdir(parents=True, exist_ok=True)
+    (asked.output / "benchmarks.md").write_text(page(groups, asked.quick), "utf-8")
+    plot(groups, asked.output / "benchmarks.svg")
+    plot(groups, ROOT / "build" / "benchmarks" / "benchmarks.png")
+    print(f"wrote {asked.output / 'benchmarks.md'}")
 
 
 if __name__ == "__main__":

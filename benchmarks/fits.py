@@ -193,7 +193,9 @@ def equal(forward: Forward, ours: Fit, theirs: OptimizeResult) -> str:
 
 def agreement(apart: float, theirs: OptimizeResult) -> str:
     """How equal two results are, and what it took SciPy."""
-    return f"corrected readings within {apart:.0e} of the noise; SciPy took {theirs.nfev} iterations"
+    return (
+        f"corrected readings within {apart:.0e} of the noise; SciPy took {theirs.nfev} iterations"
+    )
 
 
 def exact_stand(triads: int, order: int) -> list[Row]:

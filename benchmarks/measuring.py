@@ -55,7 +55,9 @@ def peak(call: Call) -> float:
     return most / 1e6
 
 
-def against(name: str, ours: Call, theirs: Mapping[str, Call], same: Mapping[str, str]) -> list[Row]:
+def against(
+    name: str, ours: Call, theirs: Mapping[str, Call], same: Mapping[str, str]
+) -> list[Row]:
     """One row for each of theirs; all take turns. `same` says how equal the results are."""
     times = medians({"": ours, **theirs})
     mine = peak(ours)

@@ -101,7 +101,9 @@ def rows() -> list[Row]:
 def _rows() -> list[Row]:
     many, reference = simulated(TOOLS)
     raw, cost = many[0], plain_cost(many[0], reference)
-    least = float(vector_cost(raw, reference, "reading")(least_squares_forward(raw, reference)[None])[0])
+    least = float(
+        vector_cost(raw, reference, "reading")(least_squares_forward(raw, reference)[None])[0]
+    )
     size = {"particles": PARTICLES, "iterations": ITERATIONS}
 
     def ours(seed: int = 0) -> float:
@@ -121,12 +123,19 @@ def _rows() -> list[Row]:
     word = "pyswarms GlobalBestPSO"
     batch = partial(swarm_forward, many, reference, "reading", **size)
     return [
-        *against(f"{name}, from the readings", ours, {word: theirs}, {word: reached(ours, theirs, least)}),
+        *against(
+            f"{name}, from the readings", ours, {word: theirs}, {word: reached(ours, theirs, least)}
+        ),
         *against(
             f"{name}, minimiser alone: the NumPy cost of the other side in both",
             handed,
             {word: theirs},
             {word: reached(handed, theirs, least)},
         ),
-        *against(f"{name}, {TOOLS} tools", batch, {f"{word}, one after the other": each}, {f"{word}, one after the other": ""}),
+        *against(
+            f"{name}, {TOOLS} tools",
+            batch,
+            {f"{word}, one after the other": each},
+            {f"{word}, one after the other": ""},
+        ),
     ]

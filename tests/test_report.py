@@ -14,11 +14,13 @@ import numpy as np
 import pytest
 
 from mwdcal import simulate
-from mwdcal.app import plots, report
+from mwdcal.app import calibrating, plots, report, text
+from mwdcal.app.choices import Chosen
 from mwdcal.app.report import css_string, measured, number, render, signed, write_report
 from mwdcal.calibrate import calibrate
 from mwdcal.core.vectors import reference_vectors
 from mwdcal.errors import InputError
+from mwdcal.notation import convert
 from mwdcal.options import Options
 from mwdcal.predict import accuracy_at, accuracy_map, readings_at, typical_accuracy
 from mwdcal.profile import Profile, TriadProfile
@@ -175,11 +177,11 @@ def test_self_contained_and_well_formed(page):
 
 def test_every_section_is_present(page):
     assert set(SECTIONS) <= set(parsed(page).ids)
-    for text in (
+    for words in (
         "MWD-123", "run.csv", "2025-01-02 03:04 UTC", "12 of 12", "ab" * 32, "Not verified",
         "Approved by", "degrees of freedom", "RMSE", "toolface·sin I", "Accuracy to expect",
     ):  # fmt: skip
-        assert text in page
+        assert words in page
 
 
 def test_same_input_same_bytes(whole, page, tmp_path):
@@ -301,9 +303,9 @@ def test_errors_at_left_out_temperatures(words, monkeypatch):
             assert f">{number(value)}<" in row
         assert f">{number(score.error_ends_deg, 2)}<" in row
         assert ("chosen" in row) == score.chosen
-    for text in ("interpolation", "extrapolation", "within 2 % of the best", "25.0 to 105.0 °C",
+    for said in ("interpolation", "extrapolation", "within 2 % of the best", "25.0 to 105.0 °C",
                  "--outside refuse", "--outside extrapolate", "The course with temperature is simulated"):  # fmt: skip
-        assert text in page
+        assert said in page
 
 
 def test_a_given_order_has_errors_but_nothing_to_compare(words):
@@ -334,6 +336,94 @@ def test_picture_of_the_orders_has_both_triads():
     assert len(alone) < len(plots.order_errors(scores))
     blank = [msgspec.structs.replace(s, error_inside=None) for s in scores]
     parsed(plots.order_errors(blank))
+
+
+@cache
+def asked(parameters=9, robust="huber"):
+    return calibrate(run(moved=False), SERVO, Options(parameters=parameters, robust=robust))
+
+
+def test_what_was_asked_for_stands_in_the_method_line(words, whole):
+    page = words(asked())
+    assert "joint; polynomial of order 0; 9 parameters; robust (huber)" in page
+    assert "<dd>joint; polynomial of order 0</dd>" in words(whole)
+
+
+def test_different_orders_name_their_triad(words):
+    made = heated()
+    other = msgspec.structs.replace(made.magnetometer, order=2)
+    made = msgspec.structs.replace(made, magnetometer=other)
+    wanted = "accelerometer: factors of order 1, magnetometer: factors of order 2"
+    assert text.model(made) == wanted
+    assert wanted in text.heading(made)
+    assert ("Method", f"joint; {wanted}") in report._facts(made)
+    assert "factors of order 1   " in text.heading(heated())
+
+
+def left_out_rows(page):
+    table = page[page.index('id="left-out"') :]
+    table = table[: table.index("</table>")]
+    return [re.findall(r"<td>([^<]*)</td>", row) for row in table.split("<tr")[3:]]
+
+
+def test_every_station_shows_its_error_left_out_and_what_it_does(words, whole):
+    page = words(whole)
+    assert parsed(page).ids.count("left-out") == 1
+    decimals = report._decimals(whole)
+    names = [row.observable for row in whole.errors]
+    rows = left_out_rows(page)
+    assert len(rows) == 48
+    for cells, station in zip(rows, whole.station_rows, strict=True):
+        alone = [signed(station.errors_left_out[n], decimals[n]) for n in names]
+        moves = [report.fixed(station.influence[n], decimals[n] + 1) for n in names]
+        assert cells == [station.station, *alone, *moves]
+    assert "weight</th>" not in page
+
+
+def test_the_weight_of_a_station_is_shown_where_the_fit_was_robust(words):
+    made = asked()
+    page = words(made)
+    assert "weight</th>" in page
+    shown = [cells[-1] for cells in left_out_rows(page)]
+    assert shown == [report.fixed(row.weight, 2) for row in made.station_rows]
+
+
+def test_a_record_without_errors_left_out_has_no_such_table(words, whole):
+    rows = [
+        msgspec.structs.replace(r, errors_left_out={}, influence={}) for r in whole.station_rows
+    ]
+    page = words(msgspec.structs.replace(whole, station_rows=rows))
+    assert "left-out" not in parsed(page).ids
+
+
+@pytest.mark.parametrize("parameters", [12, 9, 6])
+def test_held_parameters_are_said_to_be_held(words, parameters):
+    made = asked(parameters)
+    page = words(made)
+    count = 2 * (12 - parameters)
+    assert page.count("<td>0</td><td>held</td>") == count
+    assert ("A held parameter" in page) == (parameters != 12)
+    for notation in ("factors", "forward", "affine"):
+        shown = text.notation(convert(made, notation))
+        assert len(re.findall(r" 0 +held$", shown, re.MULTILINE)) == count
+        assert not re.search(r" -0( |$)", shown, re.MULTILINE)
+
+
+def test_zero_has_no_sign():
+    assert text.number(-0.0) == "0"
+
+
+def test_summary_says_what_was_asked_for(tmp_path):
+    made = asked()
+    found = calibrating.summary(made, Chosen(Options(), [], []), tmp_path / "tool.json", None)
+    found = msgspec.to_builtins(found)
+    assert found["options"]["parameters"] == 9
+    assert found["options"]["robust"] == "huber"
+    for triad in found["triads"].values():
+        assert (triad["model"], triad["order"]) == ("polynomial", 0)
+    assert {row["when"] for row in found["measures"]} == {"before", "after"}
+    assert found["temperature_c"] is None
+    assert "seed" in found
 
 
 def test_curved_axes_have_the_parameters_of_the_record(words):

@@ -68,7 +68,7 @@ def refusals(found: Comparison) -> list[tuple[str, str]]:
     refused = [(row.method, row.refused) for row in found.rows if row.refused]
     reasons = {why for _, why in refused}
     if len(refused) == len(found.rows) > 1 and len(reasons) == 1:
-        return [("every method", *reasons)]
+        return [("every method", reasons.pop())]
     return refused
 
 

@@ -72,7 +72,9 @@ def heading(calibration: Calibration) -> str:
     if "simulated" in calibration.tool:
         parts.append("SIMULATED DATA")
     ranks = [f"{t.name} {t.rank} of {t.size} determined" for t in calibration.triads]
-    how = ", ".join([f"method {calibration.method}", model(calibration), *choices(calibration.options)])
+    how = ", ".join(
+        [f"method {calibration.method}", model(calibration), *choices(calibration.options)]
+    )
     return "   ".join(parts) + "\n" + "   ".join([how, *ranks])
 
 
