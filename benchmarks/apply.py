@@ -1,7 +1,9 @@
 """`mwdcal apply` against plain NumPy: in memory, Parquet to Parquet, and in bytes of memory.
 
 Every comparison is made in one process or with commands in turn, so that what else the machine
-does is shared; times are the best of several, memory is the worst. Usage: python benchmarks/apply.py [rows in memory] [rows in files ...]
+does is shared; times are the best of several, memory is the worst.
+
+    python benchmarks/apply.py [rows in memory] [rows in files ...]
 """
 
 from __future__ import annotations

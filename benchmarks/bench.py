@@ -94,9 +94,8 @@ def measured(name: str, quick: bool) -> Group:
 
 def shown(value: float, unit: str) -> str:
     """A value with three digits and a unit that suits it."""
-    for size, name in UNITS.get(unit, ((1.0, unit),)):
-        if value >= size:
-            break
+    scales = UNITS.get(unit, ((1.0, unit),))
+    size, name = next((pair for pair in scales if value >= pair[0]), scales[-1])
     return f"{digits(value / size)} {name}"
 
 
@@ -122,7 +121,7 @@ def group_table(rows: Sequence[Row]) -> str:
         values = [shown(v, unit) for v in (row.ours, row.theirs)]
         cells.append([what, other, *values, f"**{digits(row.ratio)}**", peak, same])
     head = ["what", "against", "ours", "theirs", "ratio", "peak MB, ours / theirs", "equal result"]
-    kept = [i for i, name in enumerate(head) if i < 5 and i != 1 or any(c[i] for c in cells)]
+    kept = [i for i, name in enumerate(head) if (i < 5 and i != 1) or any(c[i] for c in cells)]
     return table([head[i] for i in kept], [[c[i] for i in kept] for c in cells])
 
 
@@ -224,7 +223,7 @@ def plot(groups: dict[str, Group], path: Path) -> None:
     with mpl.rc_context(style):
         figure = Figure(figsize=(9.5, 0.2 * len(lines) + 0.8), layout="constrained")
         axes = figure.add_subplot()
-        for place, (label, ratio) in enumerate(lines):
+        for place, (_label, ratio) in enumerate(lines):
             if ratio is None:
                 continue
             color = "#2a6f97" if ratio >= ENOUGH else "#b5533c"

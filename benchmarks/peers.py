@@ -17,7 +17,7 @@ from mwdcal.estimate import Fit, fit
 from mwdcal.options import Options
 from mwdcal.readings import Readings
 from mwdcal.scatter import directions
-from simulation import DEG, Tool, plan
+from simulation import DEG, Tool
 
 TOOL = Tool.random(7)
 SD = {"accelerometer": np.full(3, TOOL.noise[0]), "magnetometer": np.full(3, TOOL.noise[1])}

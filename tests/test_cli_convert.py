@@ -281,7 +281,7 @@ def test_the_text_holds_the_numbers_of_the_json(case, notation):
         names = [k for k in entry if k in ("S", "o", "M", "b", "SF", "B", "m")]
         values = np.concatenate([np.ravel(entry[n]) for n in names])
         spread = np.concatenate([np.ravel(entry["standard_uncertainty"][n]) for n in names])
-        assert [row[1] for row in rows] == [f"{v:.12g}" for v in values]
+        assert [row[1] for row in rows] == [f"{v + 0.0:.12g}" for v in values]
         assert [row[2] for row in rows] == [f"{s:.2g}" for s in spread]
 
 

@@ -254,6 +254,8 @@ def test_a_run_that_nothing_can_calibrate():
     page = comparison.render(found)
     assert all(row.refused.split("'")[0] in page for row in found.rows)
     assert "before" not in comparison.text(found)
+    assert comparison.text(found).count("refused: ") == page.count("refused:</b>") == 1
+    assert "every method refused: " in comparison.text(found)
 
 
 def test_a_failing_part_is_counted_and_its_method_not_preferred(monkeypatch):

@@ -145,8 +145,8 @@ def test_what_does_not_fit_together_is_refused():
     relative = calibrate(make(1, unknown=("field",)), PROFILE)
     with pytest.raises(InputError, match="ref_field_nt"):
         from_calibration(relative)
+    previous = from_calibration(calibrate(make(1), PROFILE))
     with pytest.raises(FitError, match="--parameters"):
-        previous = from_calibration(calibrate(make(1), PROFILE))
         calibrate(make(2), PROFILE, Options(prior=previous, parameters=9))
     with pytest.raises(InputError, match="--prior"):
         calibrate(make(2), PROFILE, Options("newton", prior=previous))

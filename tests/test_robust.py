@@ -136,7 +136,8 @@ def test_a_misread_station_is_named_with_its_left_out_error_and_gets_no_weight()
     plain = calibrate(data, PROFILE)
     found = [f for f in plain.findings if f.id == "reshoot" and f.station == "21"]
     row = plain.station_rows[20]
-    assert found and "left out of the fit" in found[0].text
+    assert found
+    assert "left out of the fit" in found[0].text
     assert abs(row.errors_left_out["toolface"]) > abs(row.errors["toolface"])
     robust = calibrate(data, PROFILE, Options(robust="student-t"))
     assert robust.station_rows[20].weight < 1e-3

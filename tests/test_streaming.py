@@ -442,6 +442,8 @@ def test_only_long_tables_of_fit_formats_are_streamed(tmp_path, monkeypatch):
         assert not streaming.is_long(source, tmp_path / "o.xlsx", ".")
     assert not streaming.is_long(tmp_path / "none.parquet", tmp_path / "o.csv", ".")
     assert not streaming.is_long(tmp_path, tmp_path / "o.csv", ".")
+    monkeypatch.setattr(streams, "find_spec", lambda name: None)  # without PyArrow
+    assert not streaming.is_long(short, tmp_path / "o.csv", ".")
 
 
 def test_work_overlaps_keeps_its_order_and_stops_at_an_error():

@@ -213,7 +213,7 @@ class Factors:
 
     @property
     def size(self) -> int:
-        """Number of parameters: 12 at order 0, 30 at order 3."""
+        """Number of parameters, 12 at order 0 and 30 at order 3."""
         return 6 * (self.basis.order + 1) + 6
 
     def _split(self, params: Array, temperature: Array) -> tuple[Array, Array, Array]:

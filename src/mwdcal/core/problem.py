@@ -177,8 +177,8 @@ class Prior:
         norms = np.where(norms > 0, norms, 1.0)  # of what the data say nothing of
         outer = norms[:, :, None] * norms[:, None, :]
         values, vectors = eigen(self.precision / outer)
-        known = values > INFORMED * np.maximum(values[:, -1:], 1e-300)
-        known = vectors * known[:, None, :]
+        informed = values > INFORMED * np.maximum(values[:, -1:], 1e-300)
+        known = vectors * informed[:, None, :]
         return np.asarray(known @ np.swapaxes(known, -1, -2) * outer)
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -215,6 +216,8 @@ def is_long(path: str | os.PathLike[str], least: tuple[int, int]) -> bool:
     """Whether the file is worth streaming: at least so many rows (Parquet) or bytes (text)."""
     file = Path(path)
     suffix = file.suffix.lower()
+    if find_spec("pyarrow") is None:
+        return False
     if suffix == ".parquet":
         try:
             _, parquets = parquet.modules(file.name)
