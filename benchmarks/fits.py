@@ -193,9 +193,7 @@ def equal(forward: Forward, ours: Fit, theirs: OptimizeResult) -> str:
 
 def agreement(apart: float, theirs: OptimizeResult) -> str:
     """How equal two results are, and what it took SciPy."""
-    return (
-        f"corrected readings within {apart:.0e} of the noise; SciPy took {theirs.nfev} iterations"
-    )
+    return f"corrected readings within {apart:.0e} of the noise; SciPy: {theirs.nfev} iterations"
 
 
 def exact_stand(triads: int, order: int) -> list[Row]:
@@ -212,9 +210,9 @@ def exact_stand(triads: int, order: int) -> list[Row]:
     whole = partial(fit, case.readings, case.options)
     mine = whole()
     same = {words: equal(forward, mine, job()) for words, job in jobs.items()}
-    rows = against(f"{name}, {len(case.warmth)} stations", whole, jobs, same)
+    rows = against(name, whole, jobs, same)
     if triads * order == 6:
-        alone = f"{name}, the minimum alone, from the same start"
+        alone = f"{name}, the minimum alone"
         rows += against(alone, from_nominal(case), jobs, same)
     return rows
 
@@ -230,8 +228,8 @@ def as_printed() -> list[Row]:
         return ((factor_readings(params, case.warmth, known) - case.raw) / NOISE).ravel()
 
     jobs = {
-        "SciPy in powers of T and nT, numeric Jacobian": partial(scipy_fit, misfit, start),
-        "SciPy in powers of T and nT, numeric Jacobian, x_scale=jac": partial(
+        "SciPy in powers of T, numeric Jacobian": partial(scipy_fit, misfit, start),
+        "SciPy in powers of T, numeric Jacobian, x_scale=jac": partial(
             scipy_fit, misfit, start, x_scale="jac"
         ),
     }
@@ -242,7 +240,7 @@ def as_printed() -> list[Row]:
         theirs = job()
         apart = np.abs(fields - factor_fields(theirs.x, case.warmth, case.raw)) / NOISE
         same[words] = agreement(apart.max(), theirs)
-    return against("60 factors, 180 stations", whole, jobs, same)
+    return against("60 factors", whole, jobs, same)
 
 
 def uncertain_stand() -> list[Row]:
@@ -251,17 +249,15 @@ def uncertain_stand() -> list[Row]:
     forward = Forward(case)
     start = np.concatenate([forward.start, np.zeros(case.angles.size)])
     jobs = {
-        "SciPy with 540 angles besides, numeric Jacobian": partial(
-            scipy_fit, forward.whole_misfit, start
-        ),
-        "SciPy with 540 angles besides, numeric Jacobian, x_scale=jac": partial(
+        "SciPy, 600 unknowns, numeric Jacobian": partial(scipy_fit, forward.whole_misfit, start),
+        "SciPy, 600 unknowns, numeric Jacobian, x_scale=jac": partial(
             scipy_fit, forward.whole_misfit, start, x_scale="jac"
         ),
     }
     whole = partial(fit, case.readings, case.options)
     mine = whole()
     same = {words: equal(forward, mine, job()) for words, job in jobs.items()}
-    return against("60 factors, 180 stations, uncertain stand", whole, jobs, same)
+    return against("60 factors, uncertain stand", whole, jobs, same)
 
 
 def rows() -> list[Row]:

@@ -104,7 +104,7 @@ def mag_cal() -> list[Row]:
     found = []
     for name, judge, ours, theirs in (
         (
-            "24 shots by |g| and |b|; circuitpython-mag-cal, ellipsoid",
+            "24 shots by strength alone; circuitpython-mag-cal, ellipsoid",
             lengths,
             partial(fit, alone, Options("scalar")),
             partial(ellipsoid, g, b),
@@ -117,7 +117,7 @@ def mag_cal() -> list[Row]:
         ),
     ):
         words = [judge(by_us(ours())), judge(by_mag_cal(theirs()))]
-        what = "spread of |g| and |b|" if judge is lengths else "direction, rms"
+        what = "spread of corrected strengths" if judge is lengths else "direction, rms"
         same = f"{what}: ours {words[0]}, theirs {words[1]}"
         name, _, other = name.partition("; ")
         found += against(name, ours, {other: theirs}, {other: same})

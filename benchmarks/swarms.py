@@ -89,7 +89,7 @@ def reached(ours: Callable[[int], float], theirs: Callable[[int], float], least:
     """Worst cost of some seeds."""
     worst = [max(each(seed) for seed in range(SEEDS)) for each in (ours, theirs)]
     words = [excess(cost, least) for cost in worst]
-    return f"worst cost of {SEEDS} seeds: ours {words[0]}, theirs {words[1]}"
+    return f"worst of {SEEDS} seeds: ours {words[0]}, theirs {words[1]}"
 
 
 def rows() -> list[Row]:
@@ -119,15 +119,14 @@ def _rows() -> list[Row]:
         for one in many:
             fly(plain_cost(one, reference))
 
-    name = f"{PARTICLES} particles x {ITERATIONS} iterations x 12"
-    word = "pyswarms GlobalBestPSO"
+    name, word = f"{PARTICLES} x {ITERATIONS} x 12", "pyswarms"
     batch = partial(swarm_forward, many, reference, "reading", **size)
     return [
         *against(
             f"{name}, from the readings", ours, {word: theirs}, {word: reached(ours, theirs, least)}
         ),
         *against(
-            f"{name}, minimiser alone: the NumPy cost of the other side in both",
+            f"{name}, the same NumPy cost in both",
             handed,
             {word: theirs},
             {word: reached(handed, theirs, least)},
@@ -135,7 +134,7 @@ def _rows() -> list[Row]:
         *against(
             f"{name}, {TOOLS} tools",
             batch,
-            {f"{word}, one after the other": each},
-            {f"{word}, one after the other": ""},
+            {f"{word}, one by one": each},
+            {f"{word}, one by one": ""},
         ),
     ]

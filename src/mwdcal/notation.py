@@ -249,7 +249,7 @@ _COURSES: dict[str, _Form] = {"affine": _affine_course, "forward": _forward_cour
 def _propagate(values: Callable[[AnyArray], dict[str, AnyArray]], part: _Part) -> Notation:
     """Values and covariance; derivatives by complex step, exact to rounding."""
     params = np.array(part.triad.parameters)
-    found = {name: np.asarray(value.real) for name, value in values(params).items()}
+    found = {name: np.asarray(value.real) + 0.0 for name, value in values(params).items()}
     columns = []
     for index in range(len(params)):
         step = np.zeros(len(params), complex)
