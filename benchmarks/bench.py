@@ -221,7 +221,7 @@ def plot(groups: dict[str, Group], path: Path) -> None:
     lines: list[tuple[str, float | None]] = []
     for name in (name for name in PLOTTED if groups[name].rows):
         rows = [row for row in groups[name].rows if getattr(row, "unit", "s") == "s"]
-        lines += [(name, None), *((fill(row.name, 62), row.ratio) for row in rows)]
+        lines += [(name, None), *((fill(row.name, 74), row.ratio) for row in rows)]
     ratios = [ratio for _, ratio in lines if ratio is not None]
     style = {"font.size": 8, "svg.hashsalt": "mwdcal", "svg.fonttype": "path"}
     with mpl.rc_context(style):
