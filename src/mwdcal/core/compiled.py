@@ -14,9 +14,12 @@ _F = TypeVar("_F", bound=Callable[..., object])
 
 
 def compiled(function: _F) -> _F:
-    """The function as machine code; sums may be taken in any order, NaN stays NaN."""
-    made = njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"})(function)
-    return cast(_F, made)
+    """The function as machine code, in plain IEEE arithmetic.
+
+    So the digits do not depend on how the compiler unrolled a loop: a result is the same bytes
+    from code compiled just now and from code kept on disk.
+    """
+    return cast(_F, njit(cache=True, nogil=True)(function))
 
 
 @compiled
