@@ -189,7 +189,13 @@ def test_choices_reach_the_file_and_the_screen(tmp_path):
     assert "9 parameters" in first.out
     assert "robust (huber)" in first.out
     options = json.loads((tmp_path / "a.json").read_text("utf-8"))["options"]
-    assert options == {"parameters": 9, "robust": "huber", "paper_weights": False, "prior": None}
+    assert options == {
+        "parameters": 9,
+        "ignore": [],
+        "robust": "huber",
+        "paper_weights": False,
+        "prior": None,
+    }
 
 
 @pytest.mark.parametrize(

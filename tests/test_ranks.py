@@ -3,7 +3,7 @@
 import csv
 import os
 import re
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import msgspec
@@ -12,12 +12,9 @@ import pytest
 
 from cli_support import SERVO_NOISE, channels, mwdcal, refused, write_csv
 from cli_support import stations as references
-from mwdcal import methods
-from mwdcal.calibrate import calibrate
 from mwdcal.calibration import Calibration
 from mwdcal.core.uncertainty import marginal_rank
 from mwdcal.estimate import fit
-from mwdcal.evidence import constants
 from mwdcal.files.profiles import load_profile
 from mwdcal.files.runs import read_run
 from mwdcal.options import Options
@@ -52,7 +49,7 @@ class Evidence:
 
     `known` are the observables of the formula. `blank` are reference columns left empty in the run
     file, `lone` leaves the magnetometer out. Where no method uses this evidence alone, `absent`
-    are the strengths (and dip) that the core is told not to use.
+    are the strengths (and dip) that the command is told to ignore.
     """
 
     known: tuple[str, ...]
@@ -168,24 +165,11 @@ def run_file(folder, tool, temperatures, angles=ATTITUDES, blank=(), lone=False,
     return write_csv(folder / "run.csv", {k: v for k, v in run.items() if k not in lost})
 
 
-def using(absent):
-    """A method that uses all evidence but these strengths (and dip)."""
-
-    def evidence(whole):
-        bare = replace(whole, absent=absent, constants=())
-        return replace(bare, constants=constants(bare))
-
-    return evidence
-
-
-def calibrated(folder, monkeypatch, evidence, tool, order):
-    """The calibration by one row's evidence: by the command, or where it has no method in Python."""
+def calibrated(folder, evidence, tool, order):
+    """The calibration by one row's evidence, as the command makes it."""
     run = run_file(folder, tool, SOAKS[order], blank=evidence.blank, lone=evidence.lone)
-    if evidence.absent:
-        monkeypatch.setitem(methods.EVIDENCE, "alone", using(evidence.absent))
-        readings, profile = read_run(run, load_profile("servo")[0])
-        return calibrate(readings, profile, Options("alone", order=order))
-    options = ("--method", evidence.method, "--order", order, "-o", folder / "cal.json")
+    options = ["--method", evidence.method, "--order", order, "-o", folder / "cal.json"]
+    options += ["--ignore", ",".join(evidence.absent)] if evidence.absent else []
     ran = mwdcal("calibrate", run, "--tool", "servo", *options)
     assert ran.code == 0, ran
     name, size = TRIADS[evidence.triad], (12, 30)[order > 0]
@@ -199,8 +183,8 @@ def read(path):
 
 @ORDERS
 @ROWS
-def test_the_command_gives_the_table_and_names_what_is_free(tmp_path, monkeypatch, evidence, order):
-    record = calibrated(tmp_path, monkeypatch, evidence, IDEAL, order)
+def test_the_command_gives_the_table_and_names_what_is_free(tmp_path, evidence, order):
+    record = calibrated(tmp_path, evidence, IDEAL, order)
     triad, rank = record.triads[evidence.triad], evidence.ranks[order > 0]
     free = {name for name in evidence.free if order or "temperature" not in name}
     assert (triad.rank, triad.size) == (rank, (12, 30)[order > 0])
@@ -215,9 +199,7 @@ USELESS = ("inclination", "toolface + inclination", "|g| + inclination")
 
 
 @pytest.mark.parametrize("name", USELESS)
-def test_a_drifting_tool_has_no_more_and_nothing_is_quoted_for_what_is_free(
-    tmp_path, monkeypatch, name
-):
+def test_a_drifting_tool_has_no_more_and_nothing_is_quoted_for_what_is_free(tmp_path, name):
     """Formally more is determined, by values of 5e-6 to 5e-3: no uncertainty rests on them."""
     evidence = TABLE[name]
     values = singular_values(evidence.known, 0, DRIFTING, 3)
@@ -225,7 +207,7 @@ def test_a_drifting_tool_has_no_more_and_nothing_is_quoted_for_what_is_free(
     print(name, values[rank - 1 :])
     assert np.sum(values > TOLERANCE) == rank
     assert (values[rank:] < 5e-3).all()
-    record = calibrated(tmp_path, monkeypatch, evidence, DRIFTING, 3)
+    record = calibrated(tmp_path, evidence, DRIFTING, 3)
     triad = record.accelerometer
     assert triad.rank == rank
     assert {u.id for u in triad.undetermined} == set(evidence.free)

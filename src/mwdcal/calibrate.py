@@ -92,6 +92,7 @@ class _Record:
             method=options.method,
             options=Choices(
                 parameters=options.parameters,
+                ignore=list(options.ignore),
                 robust=options.robust,
                 paper_weights=options.paper_weights,
                 prior=options.prior.source if options.prior else None,

@@ -119,6 +119,7 @@ class Choices(msgspec.Struct, frozen=True, kw_only=True):
     """How the fit was asked for, beyond method, model and order; see `mwdcal.options.Options`."""
 
     parameters: int = 12
+    ignore: list[str] = []
     robust: str | None = None
     paper_weights: bool = False
     prior: str | None = None

@@ -14,7 +14,7 @@ from mwdcal.estimate import Fit
 from mwdcal.methods import EVIDENCE
 from mwdcal.options import Options
 from mwdcal.profile import Profile
-from mwdcal.readings import TRIADS, Readings
+from mwdcal.readings import CONSTANTS, TRIADS, Readings
 from mwdcal.selection import soaks
 
 GAIN = (0.3, 3.0)
@@ -53,6 +53,7 @@ def check_options(options: Options) -> None:
         raise InputError(f"--parameters must be 6, 9 or 12; got {options.parameters}.")
     if options.robust not in (None, *LOSSES):
         raise InputError(f"--robust must be one of {', '.join(LOSSES)}; got {options.robust!r}.")
+    _check_ignored(options)
     own = "the paper's weights" if options.paper_weights else f"method {method}"
     if options.own_solver and options.robust:
         raise InputError(
@@ -78,6 +79,17 @@ def check_options(options: Options) -> None:
         raise InputError(
             f"--prior cannot be combined with {what}. Use --method joint, without "
             "--paper-weights and with --nonlinearity none."
+        )
+
+
+def _check_ignored(options: Options) -> None:
+    """Refuse to ignore what is no strength, or with a method that says itself what it uses."""
+    unknown = [name for name in options.ignore if name not in CONSTANTS]
+    if unknown:
+        raise InputError(f"--ignore must be of {', '.join(CONSTANTS)}; got {unknown[0]!r}.")
+    if options.ignore and options.method != "joint":
+        raise InputError(
+            f"--ignore needs --method joint; got {options.method!r}, which says itself what it uses."
         )
 
 

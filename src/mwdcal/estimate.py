@@ -23,7 +23,7 @@ from mwdcal.core.uncertainty import (
 )
 from mwdcal.core.vectors import Array, Bools, Ints
 from mwdcal.evidence import evidence_of, flat
-from mwdcal.methods import EVIDENCE, Solved, solve, with_stand_errors
+from mwdcal.methods import EVIDENCE, Solved, solve, with_stand_errors, without
 from mwdcal.options import Options
 from mwdcal.prior import prior_of
 from mwdcal.readings import ANGLES, TRIADS, Readings
@@ -123,6 +123,7 @@ def fit(readings: Readings, options: Options | None = None, include: Array | Non
 def _fit(readings: Readings, options: Options, include: Array | None) -> Fit:
     include = np.ones(readings.count) if include is None else np.asarray(include, float)
     evidence = EVIDENCE[options.method](evidence_of(readings, include))
+    evidence = without(evidence, options.ignore)
     evidence = with_stand_errors(evidence, options.estimate)
     lead = np.broadcast_shapes(readings.accelerometer.shape[:-1], include.shape)
     problem, declared = _problem(readings, evidence, lead, options)

@@ -68,6 +68,13 @@ def with_stand_errors(evidence: Evidence, names: tuple[str, ...]) -> Evidence:
     return replace(evidence, constants=tuple(found))
 
 
+def without(evidence: Evidence, names: tuple[str, ...]) -> Evidence:
+    """The evidence without some strengths or the dip: every station has its own."""
+    if not names:
+        return evidence
+    return _reset(evidence, tuple(dict.fromkeys((*evidence.absent, *names))))
+
+
 def inclination_and_strength(evidence: Evidence) -> Evidence:
     """|g| and inclination of the accelerometer (Moosavi); azimuth, |b| and dip of the magnetometer."""
     known = {**evidence.known, "toolface": np.full_like(evidence.known["toolface"], np.nan)}

@@ -23,6 +23,8 @@ class Options:
         nonlinearity: triads with own-axis quadratic and cubic terms, and their prior as a share
             of the field; None: what the profile declares.
         estimate: errors of the stand to find as well: "azimuth-zero", "tilt".
+        ignore: what may not be used at any station, of "gravity", "field", "dip": each station then
+            has its own.
         robust: None, "huber" or "student-t": weights that bound what a bad station can do.
         paper_weights: sum the squares as the method's paper does, unweighted.
         prior: what is known of the parameters beforehand.
@@ -36,6 +38,7 @@ class Options:
     parameters: int = 12
     nonlinearity: Mapping[str, float] | None = None
     estimate: tuple[str, ...] = ()
+    ignore: tuple[str, ...] = ()
     robust: str | None = None
     paper_weights: bool = False
     prior: Knowledge | None = None

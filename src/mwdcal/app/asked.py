@@ -108,6 +108,10 @@ _CALIBRATE = (
         "the tolerances in the tool profile.",
     ),
     click.option(
+        "--ignore", default="", metavar="NAMES",
+        help="What may not be used at any station: gravity, field, dip, or several with commas.",
+    ),
+    click.option(
         "--estimate", default="", metavar="NAMES",
         help="Errors of the stand to find as well: azimuth-zero, tilt, or both with a comma.",
     ),

@@ -34,6 +34,7 @@ class Typed(TypedDict):
     parameters: str | None
     nonlinearity: str
     estimate: str
+    ignore: str
     robust: str | None
     paper_weights: bool
     prior: str | None
@@ -59,6 +60,7 @@ def choose(
         parameters=int(typed["parameters"] or 12),
         nonlinearity={},
         estimate=tuple(names(typed["estimate"])),
+        ignore=tuple(names(typed["ignore"])),
         robust=typed["robust"],
         paper_weights=typed["paper_weights"],
         seed=typed["seed"],

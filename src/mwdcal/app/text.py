@@ -90,6 +90,7 @@ def choices(made: Choices) -> list[str]:
     """What was asked for beyond method, model and order."""
     return [
         *([f"{made.parameters} parameters"] if made.parameters != 12 else []),
+        *([f"without {' and '.join(made.ignore)}"] if made.ignore else []),
         *([f"robust ({made.robust})"] if made.robust else []),
         *(["the paper's weights"] if made.paper_weights else []),
         *([f"prior {made.prior}"] if made.prior else []),
