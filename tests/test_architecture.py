@@ -20,7 +20,7 @@ SOURCE = ROOT / "src" / "mwdcal"
 LAYERS = (
     ("errors", "core.vectors"),
     ("core.observables", "core.models"),
-    ("core.fast", "core.compiled"),
+    ("core.fast", "core.machine", "core.compiled"),
     ("core.fused", "core.kernels"),
     ("core.solvers",),
     (

@@ -135,3 +135,18 @@ def test_the_closed_form_is_not_taken_where_stations_are_too_few():
     few = np.zeros(48)
     few[:3] = 1
     assert not fit(data, include=np.tile(few, (90, 1))).analysis.determined.keep.all()
+
+
+@pytest.mark.parametrize("kind", ["polynomial", "factors"])
+def test_a_dead_member_does_not_stop_the_others(kind, monkeypatch):
+    monkeypatch.setattr(fast, "ENOUGH", 1)
+    data, options = runs(("sd",), 20), Options(model=kind)
+    raw = data.accelerometer.copy()
+    raw[3] = 0.0
+    broken = fit(replace(data, accelerometer=raw), options)
+    whole = fit(data, options)
+    others = np.arange(20) != 3
+    assert (broken.status[others] == 0).all()
+    np.testing.assert_allclose(
+        broken.state.params[others], whole.state.params[others], rtol=1e-9, atol=1e-9
+    )

@@ -272,10 +272,7 @@ class _Record:
 
 def _own_values(result: Fit, where: slice) -> Array:
     """Singular values of one triad when all that is shared with the other is free."""
-    from mwdcal.core.solvers import Normal
-
-    normal = Normal.of(result.problem.linear(result.state, geometry=True))
-    reduced, _, _ = normal.reduced()
+    reduced, _, _ = result.problem.linear(result.state, geometry=True).normal.reduced()
     norms = result.analysis.determined.norms[0]
     scaled = reduced[0] / np.outer(norms, norms)
     other = np.ones(len(norms), bool)

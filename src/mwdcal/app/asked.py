@@ -37,16 +37,16 @@ class AskedToCompare(TypedDict):
     as_json: bool
 
 
-_FILE = click.Path(path_type=Path)
-_DECIMAL = click.option(
+FILE = click.Path(path_type=Path)
+DECIMAL = click.option(
     "--decimal", default=".", show_default=True, metavar="SIGN",
     help="Decimal sign of numbers in text files.",
 )  # fmt: skip
-_JSON = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
+JSON = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
 _OPTIONS = (
-    click.argument("log", type=_FILE),
+    click.argument("log", type=FILE),
     click.option(
-        "-o", "--output", type=_FILE, required=True, metavar="STATIONS.csv",
+        "-o", "--output", type=FILE, required=True, metavar="STATIONS.csv",
         help="Run file to write; format by suffix.",
     ),
     click.option(
@@ -69,17 +69,17 @@ _OPTIONS = (
         help="Movement that is still rest, in noise floors. Default: found from the log.",
     ),
     click.option(
-        "--plot", type=_FILE, metavar="FILE.png|svg", help="Also draw what was taken and left."
+        "--plot", type=FILE, metavar="FILE.png|svg", help="Also draw what was taken and left."
     ),
-    _DECIMAL,
-    _JSON,
+    DECIMAL,
+    JSON,
 )  # fmt: skip
 _CALIBRATE = (
-    click.argument("run", type=_FILE),
+    click.argument("run", type=FILE),
     click.option(
         "-o",
         "--output",
-        type=_FILE,
+        type=FILE,
         required=True,
         metavar="CAL.json",
         help="Calibration file to write.",
@@ -141,13 +141,13 @@ _CALIBRATE = (
         "--exclude", multiple=True, metavar="STATION", help="Leave a station out; may be repeated."
     ),
     click.option(
-        "--report", type=_FILE, metavar="R.html", help="Also write a self-contained HTML report."
+        "--report", type=FILE, metavar="R.html", help="Also write a self-contained HTML report."
     ),
-    _DECIMAL,
-    _JSON,
+    DECIMAL,
+    JSON,
 )  # fmt: skip
 _COMPARE = (
-    click.argument("run", type=_FILE),
+    click.argument("run", type=FILE),
     click.option(
         "--tool", metavar="NAME|FILE", help="Tool profile: a shipped name or a TOML file."
     ),
@@ -162,29 +162,32 @@ _COMPARE = (
         "--parameters", is_flag=True, help="Print the parameters of every method as well."
     ),
     click.option(
-        "--report", type=_FILE, metavar="R.html", help="Also write a self-contained HTML report."
+        "--report", type=FILE, metavar="R.html", help="Also write a self-contained HTML report."
     ),
-    _DECIMAL,
-    _JSON,
+    DECIMAL,
+    JSON,
 )  # fmt: skip
 
 
 def calibration_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """The command `calibrate` with its argument and options, in this order."""
-    return _with(_CALIBRATE, command)
+    return taking(_CALIBRATE, command)
 
 
 def standstill_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """The command `stations` with its argument and options, in this order."""
-    return _with(_OPTIONS, command)
+    return taking(_OPTIONS, command)
 
 
 def comparison_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """The command `compare` with its argument and options, in this order."""
-    return _with(_COMPARE, command)
+    return taking(_COMPARE, command)
 
 
-def _with(options: Sequence[Callable[..., Any]], command: Callable[..., Any]) -> Callable[..., Any]:
+def taking(
+    options: Sequence[Callable[..., Any]], command: Callable[..., Any]
+) -> Callable[..., Any]:
+    """A command with its arguments and options, in this order."""
     for option in reversed(options):
         command = option(command)
     return command

@@ -11,6 +11,9 @@ import click
 
 from mwdcal import __version__
 from mwdcal.app.asked import (
+    DECIMAL,
+    FILE,
+    JSON,
     Asked,
     AskedToCompare,
     calibration_options,
@@ -31,17 +34,6 @@ if TYPE_CHECKING:
 INTERNAL = 70
 INTERRUPTED = 130
 COLDEST, HOTTEST = -273.15, 1000.0
-
-
-FILE = click.Path(path_type=Path)
-as_json = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
-decimal_sign = click.option(
-    "--decimal",
-    default=".",
-    show_default=True,
-    metavar="SIGN",
-    help="Decimal sign of numbers in text files.",
-)
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
@@ -161,8 +153,8 @@ def stations(**asked: Unpack[Asked]) -> None:
     "--outside", type=click.Choice(["blank", "refuse", "extrapolate"]), default="blank", show_default=True,
     help="Rows outside the calibrated temperature range.",
 )  # fmt: skip
-@decimal_sign
-@as_json
+@DECIMAL
+@JSON
 def apply(
     calibration: Path, readings: Path, output: Path, outside: str, decimal: str, as_json: bool
 ) -> None:
@@ -196,8 +188,8 @@ def apply(
 @click.option(
     "--report", type=FILE, metavar="R.html", help="Also write the report, with this verdict."
 )
-@decimal_sign
-@as_json
+@DECIMAL
+@JSON
 def verify(
     calibration: Path, run: Path, limits: str, report: Path | None, decimal: str, as_json: bool
 ) -> None:
@@ -245,7 +237,7 @@ def verify(
 @click.option(
     "-o", "--output", type=FILE, metavar="OUT.json", help="Write JSON here instead of printing."
 )
-@as_json
+@JSON
 def convert(
     calibration: Path, notation: str, temperature: str | None, output: Path | None, as_json: bool
 ) -> None:

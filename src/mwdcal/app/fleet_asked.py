@@ -8,6 +8,8 @@ from typing import Any, TypedDict
 
 import click
 
+from mwdcal.app.asked import FILE, JSON, taking
+
 
 class Asked(TypedDict):
     """What was typed."""
@@ -25,11 +27,10 @@ class Asked(TypedDict):
     as_json: bool
 
 
-_FILE = click.Path(path_type=Path)
 _OPTIONS = (
-    click.argument("runs", type=_FILE),
+    click.argument("runs", type=FILE),
     click.option(
-        "-o", "--output", type=_FILE, required=True, metavar="CALS.parquet",
+        "-o", "--output", type=FILE, required=True, metavar="CALS.parquet",
         help="Table of calibrations to write, one row per tool.",
     ),
     click.option(
@@ -58,14 +59,12 @@ _OPTIONS = (
         help="Use the workers of this Dask scheduler instead, such as tcp://host:8786.",
     ),
     click.option(
-        "--report", type=_FILE, metavar="FLEET.html", help="Also write a summary page of the fleet."
+        "--report", type=FILE, metavar="FLEET.html", help="Also write a summary page of the fleet."
     ),
-    click.option("--json", "as_json", is_flag=True, help="Print the result as JSON."),
+    JSON,
 )  # fmt: skip
 
 
 def fleet_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """The command with its argument and options, in this order."""
-    for option in reversed(_OPTIONS):
-        command = option(command)
-    return command
+    return taking(_OPTIONS, command)

@@ -18,6 +18,7 @@ from mwdcal.app import pool
 from mwdcal.app.fleet_asked import Asked
 from mwdcal.app.fleet_summary import Summary, document, summarise, text
 from mwdcal.checks import check_options
+from mwdcal.core.fused import cores
 from mwdcal.errors import FitError, InputError
 from mwdcal.files import atomic, parquet, profiles
 from mwdcal.files.fleet_parts import Plan, is_whole, load, solve
@@ -128,7 +129,7 @@ def _make_parts(
     if not missing:
         return
     paths[0].parent.mkdir(exist_ok=True)
-    workers = asked["workers"] or pool.cores()
+    workers = asked["workers"] or cores()
     begun = told = time.perf_counter()
     tools = 0
     tasks = [parts[index] for index in missing]

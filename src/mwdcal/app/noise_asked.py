@@ -8,6 +8,8 @@ from typing import Any, TypedDict
 
 import click
 
+from mwdcal.app.asked import DECIMAL, FILE, JSON, taking
+
 
 class Asked(TypedDict):
     """What was typed."""
@@ -26,9 +28,8 @@ class Asked(TypedDict):
     as_json: bool
 
 
-_FILE = click.Path(path_type=Path)
 _OPTIONS = (
-    click.argument("log", type=_FILE),
+    click.argument("log", type=FILE),
     click.option(
         "--tool", metavar="NAME|FILE",
         help="Tool profile with the scales: figures also in g and nT.",
@@ -51,21 +52,16 @@ _OPTIONS = (
     ),
     click.option("--modified", is_flag=True, help="Show modified Allan deviations."),
     click.option(
-        "--plot", type=_FILE, metavar="FILE.png|svg", help="Also draw the Allan deviations."
+        "--plot", type=FILE, metavar="FILE.png|svg", help="Also draw the Allan deviations."
     ),
     click.option(
-        "--report", type=_FILE, metavar="R.html", help="Also write a self-contained HTML report."
+        "--report", type=FILE, metavar="R.html", help="Also write a self-contained HTML report."
     ),
-    click.option(
-        "--decimal", default=".", show_default=True, metavar="SIGN",
-        help="Decimal sign of numbers in text files.",
-    ),
-    click.option("--json", "as_json", is_flag=True, help="Print the result as JSON."),
+    DECIMAL,
+    JSON,
 )  # fmt: skip
 
 
 def noise_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """The command `noise` with its argument and options, in this order."""
-    for option in reversed(_OPTIONS):
-        command = option(command)
-    return command
+    return taking(_OPTIONS, command)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ import msgspec
 import numpy as np
 
 from mwdcal import __version__
-from mwdcal.app import noise_plots, plots, report
+from mwdcal.app import noise_plots, plots, progress, report
 from mwdcal.app.noise_asked import Asked
 from mwdcal.app.noise_plots import scaled
 from mwdcal.app.text import table
@@ -22,8 +21,6 @@ from mwdcal.files.contract import CHANNELS
 from mwdcal.files.profiles import load_profile
 from mwdcal.noise import ChannelNoise, Noise, Term, find_noise
 
-PATIENCE = 2.0
-"""Seconds between two words on progress."""
 ROWS = {
     "white": ("white noise N", "·√s"),
     "quantisation": ("quantisation Q", "·s"),
@@ -72,7 +69,7 @@ def find(asked: Asked, say: Callable[[str], None]) -> Noise:
     """The noise of a log file; says how far it is where it takes long."""
     names = [name.strip() for name in asked["columns"].split(",")] if asked["columns"] else []
     profile = load_profile(asked["tool"])[0] if asked["tool"] else None
-    slowly = _slowly(say)
+    slowly = progress.slowly(say)
     start, end = asked["start"], asked["end"]
     return find_noise(
         logs.read(asked["log"], names, decimal=asked["decimal"], say=slowly),
@@ -83,19 +80,6 @@ def find(asked: Asked, say: Callable[[str], None]) -> Noise:
         kind="modified" if asked["modified"] else "overlapping",
         say=slowly,
     )
-
-
-def _slowly(say: Callable[[str], None]) -> Callable[[str], None]:
-    """The same voice, silent for the first seconds and between two words."""
-    spoken = time.monotonic()
-
-    def say_slowly(text: str) -> None:
-        nonlocal spoken
-        if time.monotonic() - spoken >= PATIENCE:
-            spoken = time.monotonic()
-            say(text)
-
-    return say_slowly
 
 
 def _files(asked: Asked, found: Noise) -> list[tuple[Path, bytes | str]]:

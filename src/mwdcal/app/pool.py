@@ -55,13 +55,6 @@ def results(
     return _on_cores(steps, tasks, min(workers, len(tasks)))
 
 
-def cores() -> int:
-    """Cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
 @contextmanager
 def _one_thread_each() -> Iterator[None]:
     """Processes started here compute with one thread: there is one of them per core."""

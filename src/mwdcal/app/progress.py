@@ -1,4 +1,4 @@
-"""A progress bar on stderr, where that is a terminal and the work takes more than two seconds."""
+"""Progress of work that takes more than two seconds: a bar where stderr is a terminal, or words."""
 
 from __future__ import annotations
 
@@ -30,6 +30,19 @@ def bar(label: str) -> Iterator[Callable[[int, int], None]]:
     finally:
         if shown is not None:
             shown.stop()
+
+
+def slowly(say: Callable[[str], None]) -> Callable[[str], None]:
+    """The same voice, silent for the first seconds and between two words."""
+    spoken = time.monotonic()
+
+    def say_slowly(text: str) -> None:
+        nonlocal spoken
+        if time.monotonic() - spoken >= PATIENCE:
+            spoken = time.monotonic()
+            say(text)
+
+    return say_slowly
 
 
 def _started(label: str) -> Any:

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import io
-import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mwdcal.app import plots
+from mwdcal.app import plots, progress
 from mwdcal.app.asked import Asked
 from mwdcal.app.text import table
 from mwdcal.calibration import Finding
@@ -23,8 +22,6 @@ from mwdcal.stations import Stations, find_stations
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-PATIENCE = 2.0
-"""Seconds between two words on progress."""
 MOST_LINES = 40
 """Stations of a table on screen."""
 POINTS = 2000
@@ -51,7 +48,7 @@ def run(asked: Asked, say: Callable[[str], None]) -> tuple[list[Finding], Any]:
 
 def find(asked: Asked, say: Callable[[str], None]) -> Stations:
     """The standstills of a log file; says how far it is where it takes long."""
-    slowly = _slowly(say)
+    slowly = progress.slowly(say)
     names = [name.strip() for name in asked["columns"].split(",")] if asked["columns"] else []
     read = logs.read(asked["log"], names, decimal=asked["decimal"], say=slowly)
     return find_stations(
@@ -62,19 +59,6 @@ def find(asked: Asked, say: Callable[[str], None]) -> Stations:
         threshold=asked["threshold"],
         say=slowly,
     )
-
-
-def _slowly(say: Callable[[str], None]) -> Callable[[str], None]:
-    """The same voice, silent for the first seconds and between two words."""
-    spoken = time.monotonic()
-
-    def say_slowly(text: str) -> None:
-        nonlocal spoken
-        if time.monotonic() - spoken >= PATIENCE:
-            spoken = time.monotonic()
-            say(text)
-
-    return say_slowly
 
 
 def summary(made: Stations) -> dict[str, Any]:

@@ -2,24 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import TypeVar, cast
-
 import numpy as np
-from numba import njit
 
+from mwdcal.core.machine import compiled
 from mwdcal.core.vectors import Array
-
-_F = TypeVar("_F", bound=Callable[..., object])
-
-
-def compiled(function: _F) -> _F:
-    """The function as machine code, in plain IEEE arithmetic.
-
-    So the digits do not depend on how the compiler unrolled a loop: a result is the same bytes
-    from code compiled just now and from code kept on disk.
-    """
-    return cast(_F, njit(cache=True, nogil=True)(function))
 
 
 @compiled

@@ -8,16 +8,12 @@ digits wherever it stands. Importing this module needs Numba.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import TypeVar, cast
-
 import numpy as np
-from numba import njit
 
+from mwdcal.core.machine import compiled
 from mwdcal.core.observables import VERTICAL
 from mwdcal.core.vectors import AnyArray, Array
 
-_F = TypeVar("_F", bound=Callable[..., object])
 Floats = tuple[float, ...]
 Courses = tuple[Floats, ...]
 
@@ -31,15 +27,6 @@ VECTORS = 6
 _T, _G, _B = 0, 1, 4
 _INC, _AZI, _FACE, _GRAVITY, _FIELD, _DIP, _MAGNETIC = 7, 8, 9, 10, 11, 12, 13
 _ACROSS, _EAST, _NORTH, _DOWN, _CROSS, _TAU, _ROWS = 14, 15, 16, 17, 18, 19, 20
-
-
-def compiled(function: _F) -> _F:
-    """The function as machine code, kept on disk where a folder for it can be written."""
-    try:
-        made = njit(nogil=True, cache=True, error_model="numpy")(function)
-    except RuntimeError:  # no such folder
-        made = njit(nogil=True, error_model="numpy")(function)
-    return cast(_F, made)
 
 
 @compiled

@@ -99,8 +99,8 @@ def determined_apart(problem: Problem, state: State, own: dict[int, Array]) -> D
         back = np.linalg.pinv(block, rcond=RANK_TOLERANCE**2, hermitian=True)
         follow = np.swapaxes(cross, -1, -2) @ back
         found[:, first, first] += follow @ cross * outer[:, first, first]
-        found[:, second, first] = follow_back = block @ back @ cross * outer[:, second, first]
-        found[:, first, second] = np.swapaxes(follow_back, -1, -2)
+        found[:, second, first] = block @ back @ cross * outer[:, second, first]
+        found[:, first, second] = np.swapaxes(found[:, second, first], -1, -2)
     nothing = np.zeros_like(state.params)
     return Determined.by(Normal(found, nothing, nothing[:, 0], linear.size), linear.norms)
 
