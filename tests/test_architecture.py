@@ -36,6 +36,7 @@ LAYERS = (
         "core.noise_terms",
         "core.start",
         "core.exact",
+        "core.separable",
         "core",
     ),
     ("readings", "profile", "profiles"),

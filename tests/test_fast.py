@@ -45,10 +45,13 @@ def runs(lacking, count=90):
     if "sd" in lacking:
         sd |= {n: np.full(48, 3e-4) for n in ("inclination", "azimuth", "toolface")}
         sd |= {"field": np.full(48, 20.0), "dip": np.full(48, 1e-4)}
+    warmth = np.tile([20.0, 60.0, 100.0], 16) if "temperature" in lacking else None
+    if "soaks" in lacking:
+        warmth = np.random.default_rng(4).permutation(np.repeat([20.0, 60.0, 100.0, 140.0], 12))
     return Readings(
         a,
         None if "magnetometer" in lacking else m,
-        np.tile([20.0, 60.0, 100.0], 16) if "temperature" in lacking else None,
+        warmth,
         {k: v for k, v in known.items() if k not in lacking},
         sd,
         np.repeat(np.arange(4), 12) if "group" in lacking else None,
@@ -90,6 +93,11 @@ EXACT = {
     "accelerometer alone": (Options(), ("magnetometer", "azimuth")),
     "least-squares, uncertain stand": (Options("least-squares"), ("angles",)),
     "noise by axis and station": (Options(), ("uneven",)),
+    "factors": (Options(model="factors"), ()),
+    "factors of order 2 and 1": (Options(order=(2, 1)), ("soaks",)),
+    "factors of order 3": (Options(order=3), ("soaks", "uneven")),
+    "factors, noise estimated": (Options(order=1), ("soaks", "noise")),
+    "gains of order 0 and factors": (Options(order=(0, 2)), ("soaks",)),
 }
 
 
@@ -109,6 +117,7 @@ def test_the_closed_form_is_the_general_minimum(case, part, monkeypatch):
     include[:, 5] = 0
     assert exact.applies(fit(data, options, include).problem)
     closed = fit(data, options, include)
+    assert (closed.iterations == 1).all()
     monkeypatch.setattr(exact, "applies", lambda problem: False)
     general = fit(data, options, include)
     np.testing.assert_array_equal(closed.status, general.status)
@@ -128,6 +137,27 @@ def test_the_closed_form_is_the_general_minimum(case, part, monkeypatch):
     gram = columns @ np.swapaxes(columns, -1, -2)
     columns = theirs.basis * theirs.values[:, None, :]
     np.testing.assert_allclose(gram, columns @ np.swapaxes(columns, -1, -2), atol=3e-3)
+
+
+def test_factors_are_found_from_readings_of_other_scales():
+    data, scale = runs(("soaks",)), np.array([0.3, 2.0, 1.4])
+    sd = {**data.sd, "accelerometer": data.sd["accelerometer"] * scale}
+    far = fit(replace(data, accelerometer=data.accelerometer * scale, sd=sd), Options(order=2))
+    near = fit(data, Options(order=2))
+    assert (far.iterations == 1).all()
+    ours, theirs = (f.problem.fields(f.state)[0] for f in (far, near))
+    np.testing.assert_allclose(ours, theirs, atol=1e-10)
+
+
+def test_factors_are_found_under_offsets_of_several_fields(monkeypatch):
+    data = runs(("soaks",), 20)
+    data = replace(data, accelerometer=data.accelerometer + np.array([3.0, -5.0, 0.0]))
+    closed = fit(data, Options(order=2))
+    assert (closed.iterations == 1).all()
+    monkeypatch.setattr(exact, "applies", lambda problem: False)
+    general = fit(data, Options(order=2))
+    ours, theirs = (f.problem.fields(f.state)[0] for f in (closed, general))
+    np.testing.assert_allclose(ours, theirs, atol=1e-9)
 
 
 def test_the_closed_form_is_not_taken_where_stations_are_too_few():

@@ -155,15 +155,16 @@ def _closed(problem: Problem, declared: list[bool], options: Options, finite: Bo
     """The fit in closed form, where all references are exact and the stations span all directions."""
     if options.robust or options.own_solver or not exact.applies(problem):
         return None
-    halfs = exact.halves(problem)
+    at = exact.start(problem)
+    halfs = exact.halves(problem, at)
     if halfs is None:
         return None
-    state, analysis = exact.solution(problem, halfs)
+    state, analysis = exact.solution(problem, at, halfs)
     if not analysis.determined.keep.all():
         return None
     if not all(declared):
         problem = _rescaled(problem, np.sqrt(analysis.variance_factor), declared)
-        state, analysis = exact.solution(problem, exact.halves(problem) or halfs)
+        state, analysis = exact.solution(problem, at, exact.halves(problem, at) or halfs)
     sound = finite & np.isfinite(state.params).all(-1)
     status = np.where(sound, int(Status.OK), int(Status.NOT_FINITE))
     trust = np.ones(problem.evidence.include.shape)

@@ -6,7 +6,8 @@ linear in Φ = [S o], separately for each axis, and the model's own parameters �
     δΘ = -M δΦ T,     M = S⁻¹,  T = [A c; 0 1],  field = A x + c,  x = (raw - centre) / scale
 
 so that all covariances and ranks are products of 3 × 3 and 4 × 4 matrices. These are the same
-figures as the general way gives, for a hundredth of the work; they are tested against it.
+figures as the general way gives, for a hundredth of the work; they are tested against it. Moosavi's
+factors come apart by axis as well: `separable` has them.
 """
 
 from __future__ import annotations
@@ -15,7 +16,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mwdcal.core.models import Polynomial
+from mwdcal.core import separable
+from mwdcal.core.models import Factors, Polynomial
 from mwdcal.core.problem import GEOMETRIC_NOISE, Problem, State, Triad
 from mwdcal.core.solvers import RANK_TOLERANCE, Determined
 from mwdcal.core.uncertainty import Analysis
@@ -28,11 +30,11 @@ SPANNED = 1e-6
 
 
 def applies(problem: Problem) -> bool:
-    """Whether all that the triads should read is exactly known, and the model is linear."""
+    """Whether all that the triads should read is exactly known, and the models come apart by axis."""
     evidence = problem.evidence
     angles = ("inclination", "toolface", "azimuth")[: 1 + len(problem.triads)]
     return (
-        all(_is_plain(triad) for triad in problem.triads)
+        all(_is_closed(triad) for triad in problem.triads)
         and not evidence.constants
         and not evidence.absent
         and all(evidence.is_known(name).all() for name in angles)
@@ -41,18 +43,22 @@ def applies(problem: Problem) -> bool:
     )
 
 
-def _is_plain(triad: Triad) -> bool:
+def _is_closed(triad: Triad) -> bool:
     model = triad.model
-    return isinstance(model, Polynomial) and model.basis.order == 0 and not model.curved
+    if isinstance(model, Polynomial):
+        return model.basis.order == 0 and not model.curved
+    return isinstance(model, Factors)
 
 
 @dataclass(frozen=True)
 class Half:
     """One triad: terms f̃ = [f 1] (B, n, 4), Φ (B, 3, 4), F⁻¹ by axis (B, 3, 4, 4), M and T.
 
-    `left` (B, n, 3) are whitened residuals, `open` (B, n, 3) their expected variances.
+    `include` (B, n, 1) is 1 for stations that count; `left` (B, n, 3) are whitened residuals, `open`
+    (B, n, 3) their expected variances.
     """
 
+    include: Array
     terms: Array
     forward: Array
     spread: Array
@@ -73,16 +79,47 @@ class Half:
         whole = np.einsum("bia,bka,bajl->bijkl", self.back, self.back, inner, optimize=True)
         return np.asarray(whole.reshape(-1, 12, 12)[:, ORDER][:, :, ORDER])
 
+    @property
+    def known(self) -> tuple[Array, Array, Array]:
+        """Singular values (B, 12) and directions (B, 12, 12) of the evidence, norms of its columns.
 
-def halves(problem: Problem) -> list[Half] | None:
-    """The minimum of each triad; None where the stations do not span what a model needs."""
-    include, found = problem.evidence.include[..., None], []
-    for triad, target in zip(problem.triads, problem.targets(start(problem)), strict=False):
-        half = _half(triad, target, include)
-        if half is None:
-            return None
-        found.append(half)
-    return found
+        Normalised, the information is a Kronecker product.
+        """
+        gain, batch = self.forward[..., :3], len(self.forward)
+        read = self.terms[..., :3] @ np.swapaxes(gain, -1, -2)
+        size = np.sqrt(np.einsum("bni,bni->bn", read, read))[..., None]
+        rows = self.terms * (self.include / (GEOMETRIC_NOISE * size))
+        undo = inverse(self.turn)
+        parts = [
+            np.swapaxes(gain, -1, -2) @ gain,
+            undo @ np.swapaxes(rows, -1, -2) @ rows @ np.swapaxes(undo, -1, -2),
+        ]
+        sizes = [np.sqrt(np.diagonal(part, axis1=-2, axis2=-1)) for part in parts]
+        pairs = [
+            eigen(m / (s[:, :, None] * s[:, None, :])) for m, s in zip(parts, sizes, strict=True)
+        ]
+        squares = np.einsum("bi,bj->bij", pairs[0][0], pairs[1][0]).reshape(batch, 12)
+        vectors = np.einsum("bip,bjq->bijpq", pairs[0][1], pairs[1][1]).reshape(batch, 12, 12)
+        norms = np.einsum("bi,bj->bij", *sizes).reshape(batch, 12)
+        return np.sqrt(np.clip(squares, 0, None)), vectors[:, ORDER], norms[:, ORDER]
+
+
+Halves = list[Half | separable.Half]
+
+
+def halves(problem: Problem, at: State) -> Halves | None:
+    """The minimum of each triad at known attitudes; None where the stations do not span what a model needs."""
+    include = problem.evidence.include
+    pairs = list(zip(problem.triads, problem.targets(at), strict=False))
+    factored = [pair for pair in pairs if isinstance(pair[0].model, Factors)]
+    apart = iter(separable.halves(factored, problem.temperature, include))
+    found = [
+        next(apart)
+        if isinstance(triad.model, Factors)
+        else _half(triad, target, include[..., None])
+        for triad, target in pairs
+    ]
+    return [half for half in found if half] if all(found) else None
 
 
 def start(problem: Problem) -> State:
@@ -95,24 +132,23 @@ def start(problem: Problem) -> State:
     return State(np.zeros((batch, size)), tool_from_earth(*angles), nothing, own)
 
 
-def solution(problem: Problem, halfs: list[Half]) -> tuple[State, Analysis]:
+def solution(problem: Problem, at: State, halfs: Halves) -> tuple[State, Analysis]:
     """State and analysis at the minimum."""
     include = problem.evidence.include
-    state = replace(start(problem), params=np.concatenate([h.params for h in halfs], -1))
+    state = replace(at, params=np.concatenate([h.params for h in halfs], -1))
     p = state.params.shape[-1]
     covariance = np.zeros((len(include), p, p))
     for half, where in zip(halfs, problem.slices(), strict=True):
         covariance[:, where, where] = half.covariance
     left, free = (np.concatenate([getattr(h, n) for h in halfs], -1) for n in ("left", "open"))
     spread = np.zeros((*free.shape, free.shape[-1]))
-    diagonal = np.arange(free.shape[-1])
-    spread[..., diagonal, diagonal] = free
+    np.einsum("...ii->...i", spread)[...] = free
     squares, freedom = (
         np.stack([np.sum(getattr(h, n) ** k, (1, 2)) for h in halfs], -1)
         for n, k in (("left", 2), ("open", 1))
     )
     factor = squares / np.where(freedom > 1e-9, freedom, np.nan)
-    known = determined(halfs, include)
+    known = determined(halfs)
     constants = np.zeros((len(include), 0, 0))
     return state, Analysis(covariance, known, factor, freedom, left, spread, constants)
 
@@ -120,20 +156,20 @@ def solution(problem: Problem, halfs: list[Half]) -> tuple[State, Analysis]:
 def _half(triad: Triad, target: Array, include: Array) -> Half | None:
     terms = np.concatenate([target, np.ones_like(target[..., :1])], -1)
     weight = include / triad.sd**2
-    across = np.swapaxes(terms, -1, -2)[:, None]
-    information = (across * np.swapaxes(weight, -1, -2)[:, :, None]) @ terms[:, None]
+    alike = bool((weight == weight[..., :1]).all())
+    across, unlike = np.swapaxes(terms, -1, -2), weight[..., :1] if alike else weight
+    information = (across[:, None] * np.swapaxes(unlike, -1, -2)[:, :, None]) @ terms[:, None]
     size = np.sqrt(np.maximum(np.diagonal(information, axis1=-2, axis2=-1), 1e-300))
     outer = size[..., :, None] * size[..., None, :]
     values, vectors = eigen(information / outer)
     if not (values[..., 0] > SPANNED).all():
         return None
-    spread = (vectors / values[..., None, :]) @ np.swapaxes(vectors, -1, -2) / outer
-    crossed = across @ (weight * triad.raw)[:, None]
-    forward = np.einsum("bajk,baka->baj", spread, np.broadcast_to(crossed, (*spread.shape[:3], 3)))
+    apart = (vectors / values[..., None, :]) @ np.swapaxes(vectors, -1, -2) / outer
+    spread = np.broadcast_to(apart, (len(terms), 3, 4, 4))
+    forward = np.einsum("bajk,bka->baj", spread, across @ (weight * triad.raw))
     left = (triad.raw - terms @ np.swapaxes(forward, -1, -2)) * np.sqrt(weight)
-    share = np.sum((terms[:, None] @ spread) * terms[:, None], -1)
-    share = np.swapaxes(share, -1, -2) * weight
-    return Half(terms, forward, spread, *_own(triad, forward), left, include - share)
+    share = np.einsum("banj,bnj->bna", terms[:, None] @ apart, terms) * weight
+    return Half(include, terms, forward, spread, *_own(triad, forward), left, include - share)
 
 
 def _own(triad: Triad, forward: Array) -> tuple[Array, Array]:
@@ -148,32 +184,18 @@ def _own(triad: Triad, forward: Array) -> tuple[Array, Array]:
     return back, turn
 
 
-def determined(halfs: list[Half], include: Array) -> Determined:
-    """Which directions are determined: normalised, each triad's information is a Kronecker product."""
-    batch, p = len(include), 12 * len(halfs)
-    basis, values, norms = np.zeros((batch, p, p)), np.zeros((batch, p)), np.zeros((batch, p))
-    for index, half in enumerate(halfs):
-        where = slice(12 * index, 12 * index + 12)
-        gain = half.forward[..., :3]
-        read = np.einsum("bij,bnj->bni", gain, half.terms[..., :3])
-        noise = GEOMETRIC_NOISE * np.linalg.norm(read, axis=-1, keepdims=True)
-        rows = half.terms * (include[..., None] / noise)
-        undo = inverse(half.turn)
-        parts = [
-            np.swapaxes(gain, -1, -2) @ gain,
-            undo @ np.swapaxes(rows, -1, -2) @ rows @ np.swapaxes(undo, -1, -2),
-        ]
-        sizes = [np.sqrt(np.diagonal(part, axis1=-2, axis2=-1)) for part in parts]
-        pairs = [
-            eigen(m / (s[:, :, None] * s[:, None, :])) for m, s in zip(parts, sizes, strict=True)
-        ]
-        squares = np.einsum("bi,bj->bij", pairs[0][0], pairs[1][0]).reshape(batch, 12)
-        vectors = np.einsum("bip,bjq->bijpq", pairs[0][1], pairs[1][1]).reshape(batch, 12, 12)
-        values[:, where] = np.sqrt(np.clip(squares, 0, None))
-        basis[:, where, where] = vectors[:, ORDER]
-        norms[:, where] = np.einsum("bi,bj->bij", *sizes).reshape(batch, 12)[:, ORDER]
+def determined(halfs: Halves) -> Determined:
+    """Which directions of all triads' parameters are determined, most so first."""
+    found = [half.known for half in halfs]
+    values, norms = (np.concatenate([each[k] for each in found], -1) for k in (0, 2))
+    basis = np.zeros((*values.shape, values.shape[-1]))
+    first = 0
+    for _, directions, _ in found:
+        where = slice(first, first + directions.shape[-1])
+        basis[:, where, where] = np.swapaxes(directions, -1, -2)
+        first = where.stop
     order = np.argsort(-values, -1)
     values = np.take_along_axis(values, order, -1)
     values = values / np.maximum(values[:, :1], 1e-300)
-    basis = np.take_along_axis(basis, order[:, None, :], -1)
+    basis = np.swapaxes(basis[np.arange(len(basis))[:, None], order], -1, -2)
     return Determined(basis, values, norms, values > RANK_TOLERANCE)

@@ -1,0 +1,207 @@
+"""Factors at exactly known references: least squares axis by axis.
+
+Moosavi's model of one triad,
+
+    raw = SF(τ) [(I - m)⁻¹ v + B(τ)],
+
+comes apart by axis. With N = (I - m)⁻¹ and all shares of its diagonal element Nᵢᵢ,
+
+    rawᵢ = sᵢ(τ) [vᵢ + Σⱼ uᵢⱼ vⱼ + bᵢ(τ)],    s = SF Nᵢᵢ,  u = Nᵢⱼ / Nᵢᵢ,  b = B / Nᵢᵢ
+
+which is one small bilinear problem for each axis: a few Gauss-Newton steps for 10 unknowns in place
+of 30 or 60. The factors follow, and their covariance by the slope ∂(s, u, b)/∂(SF, B, m).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from mwdcal.core.models import OFF_DIAGONAL
+from mwdcal.core.problem import GEOMETRIC_NOISE, Triad
+from mwdcal.core.vectors import Array, eigen, inverse
+
+OTHERS = np.array([[1, 2], [0, 2], [0, 1]])
+"""The two axes that an axis is misaligned with."""
+STEPS = 12
+"""Most steps to the minimum; a sound run takes three to five."""
+SMALL = 1e-12
+"""Step, squared and in standard uncertainties, that ends the search."""
+
+
+@dataclass(frozen=True)
+class Axes:
+    """Runs of one triad (B), axis by axis: readings, vectors and √weights (B, 3, n).
+
+    `phi` (B, 1, K, n) are the polynomials of temperature; `beside` (B, 3, K + 2, n) are the vector
+    along the two other axes and φ.
+    """
+
+    phi: Array
+    beside: Array
+    along: Array
+    raw: Array
+    root: Array
+
+    @classmethod
+    def of(cls, phi: Array, target: Array, raw: Array, root: Array) -> Axes:
+        """From φ (B, n, K), and vectors, readings and √weights (B, n, 3)."""
+        phi, along = np.swapaxes(phi, -1, -2)[:, None], np.swapaxes(target, -1, -2)
+        every = np.broadcast_to(phi, (len(raw), 3, *phi.shape[2:]))
+        beside = np.concatenate([along[:, OTHERS], every], -2)
+        return cls(phi, beside, along, np.swapaxes(raw, -1, -2), np.swapaxes(root, -1, -2))
+
+    def predicted(self, unknowns: Array) -> tuple[Array, Array]:
+        """Scale s(τ) and what it multiplies, v + uv + b(τ), each (B, 3, n)."""
+        count = self.phi.shape[-2]
+        scale = (unknowns[..., None, :count] @ self.phi)[..., 0, :]
+        return scale, self.along + (unknowns[..., None, count:] @ self.beside)[..., 0, :]
+
+    def slopes(self, scale: Array, unit: Array) -> Array:
+        """Derivatives (B, 3, 2K + 2, n) of the reading by s, u and b."""
+        by = (unit[..., None, :] * self.phi, scale[..., None, :] * self.beside)
+        return np.concatenate(by, -2)
+
+
+def minimum(axes: Axes) -> Array | None:
+    """Unknowns s, u, b (B, 3, 2K + 2) of every axis; None where one does not settle."""
+    count = axes.phi.shape[-2]
+    unknowns = np.zeros((len(axes.raw), 3, 2 * count + 2))
+    unknowns[..., 0] = 1.0
+    for turn in range(STEPS):
+        scale, unit = axes.predicted(unknowns)
+        rows = axes.slopes(scale, unit) * axes.root[..., None, :]
+        gradient = rows @ ((axes.raw - scale * unit) * axes.root)[..., None]
+        step = _solved(rows @ np.swapaxes(rows, -1, -2), gradient)
+        unknowns = unknowns + step[..., 0]
+        if turn == 0:  # linear so far: what goes with the scale is still times it
+            unknowns[..., count:] /= unknowns[..., :1]
+        elif (np.sum(step * gradient, (-1, -2)) < SMALL).all():
+            return unknowns
+    return None
+
+
+def _solved(matrix: Array, column: Array) -> Array:
+    try:
+        return np.asarray(np.linalg.solve(matrix, column))
+    except np.linalg.LinAlgError:
+        return inverse(matrix) @ column
+
+
+@dataclass(frozen=True)
+class Half:
+    """One triad at its minimum: factors (B, 6K + 6), their covariance, and what stations show.
+
+    `left` (B, n, 3) are whitened residuals, `open` (B, n, 3) their expected variances; `values`
+    (B, p) and `basis` (B, p, p) are singular values and directions of the evidence, `norms` (B, p)
+    those of its columns.
+    """
+
+    params: Array
+    covariance: Array
+    left: Array
+    open: Array
+    values: Array
+    basis: Array
+    norms: Array
+
+    @property
+    def known(self) -> tuple[Array, Array, Array]:
+        """Singular values and directions of the evidence, and the norms of its columns."""
+        return self.values, self.basis, self.norms
+
+    def parted(self, count: int) -> list[Half]:
+        """As many triads as were put together along the batch axis."""
+        parts = [np.split(getattr(self, field.name), count) for field in fields(self)]
+        return [Half(*each) for each in zip(*parts, strict=True)]
+
+
+def halves(
+    triads: Sequence[tuple[Triad, Array]], temperature: Array, include: Array
+) -> list[Half | None]:
+    """Every triad, with the vectors it should read, at its minimum; None where one does not settle.
+
+    Triads of one order are done together.
+    """
+    if len({triad.model.basis.order for triad, _ in triads}) > 1:
+        return [halves([pair], temperature, include)[0] for pair in triads]
+    if not triads:
+        return []
+    count, phi = len(triads), triads[0][0].model.basis(temperature)
+    axes = Axes.of(
+        np.concatenate([phi] * count),
+        np.concatenate([target for _, target in triads]),
+        np.concatenate([triad.raw for triad, _ in triads]),
+        np.concatenate([include[..., None] / triad.sd for triad, _ in triads]),
+    )
+    unknowns = minimum(axes)
+    if unknowns is None:
+        return [None] * count
+    return list(_half(axes, unknowns, np.concatenate([include] * count)).parted(count))
+
+
+def _half(axes: Axes, unknowns: Array, include: Array) -> Half:
+    """The analysis at the minimum."""
+    scale, unit = axes.predicted(unknowns)
+    slopes = axes.slopes(scale, unit)
+    rows = slopes * axes.root[..., None, :]
+    spread = inverse(rows @ np.swapaxes(rows, -1, -2))
+    left = (axes.raw - scale * unit) * axes.root
+    share = np.sum((spread @ rows) * rows, -2)
+    params, slope = factors(unknowns)
+    batch, _, _, size = slope.shape
+    back = inverse(slope.reshape(batch, size, size))
+    by_axis = np.swapaxes(back.reshape(batch, size, 3, -1), 1, 2)
+    moved = np.swapaxes(by_axis @ spread, 1, 2).reshape(batch, size, size)
+    return Half(
+        params,
+        moved @ np.swapaxes(back, -1, -2),
+        np.swapaxes(left, -1, -2),
+        np.swapaxes(include[:, None] - share, -1, -2),
+        *_evidence(axes, unknowns, slopes, slope, include),
+    )
+
+
+def _evidence(
+    axes: Axes, unknowns: Array, slopes: Array, slope: Array, include: Array
+) -> tuple[Array, Array, Array]:
+    """Singular values, directions and norms (see `Half`), at uniform relative noise."""
+    count = axes.phi.shape[-2]
+    scale, unit = axes.predicted(unknowns)
+    bias = (unknowns[..., None, count + 2 :] @ axes.phi)[..., 0, :]
+    noise = GEOMETRIC_NOISE * np.linalg.norm(scale * (unit - bias), axis=-2)
+    rows = slopes * (include / noise)[:, None, None]
+    own = rows @ np.swapaxes(rows, -1, -2)
+    information = (np.swapaxes(slope, -1, -2) @ own @ slope).sum(1)
+    norms = np.sqrt(np.diagonal(information, axis1=-2, axis2=-1))
+    norms = np.where(norms > 0, norms, 1.0)
+    values, basis = eigen(information / (norms[:, :, None] * norms[:, None, :]))
+    return np.sqrt(np.clip(values, 0, None)), basis, norms
+
+
+def factors(unknowns: Array) -> tuple[Array, Array]:
+    """Factors (B, 6K + 6) of s, u, b (B, 3, 2K + 2), and ∂(s, u, b)/∂(SF, B, m)."""
+    batch, count = len(unknowns), unknowns.shape[-1] // 2 - 1
+    scale, cross, bias = np.split(unknowns, [count, count + 2], axis=-1)
+    shares = np.broadcast_to(np.eye(3), (batch, 3, 3)).copy()
+    shares[:, np.arange(3)[:, None], OTHERS] = cross
+    back = inverse(shares)
+    own = np.diagonal(back, axis1=-2, axis2=-1)
+    i, j = np.array(OFF_DIAGONAL).transpose()
+    linear = np.concatenate([scale / own[..., None], bias * own[..., None]], 1)
+    params = np.concatenate([linear.reshape(batch, -1), -back[:, i, j] / own[:, j]], -1)
+    slope = np.zeros((batch, 3, 2 * count + 2, 6 * count + 6))
+    at, k = np.arange(3)[:, None], np.arange(count)
+    slope[:, at, k, at * count + k] = own[..., None]
+    slope[:, at, count + 2 + k, (3 + at) * count + k] = 1 / own[..., None]
+    turn = shares * own[..., None]  # N; dN = N dm N
+    pulled, moved = turn[:, :, i] / own[..., None], turn[:, j]
+    grown = (pulled * np.swapaxes(moved, -1, -2))[:, :, None]
+    by_mixing = slope[..., 6 * count :]
+    by_mixing[:, :, :count] = scale[..., None] * grown
+    by_mixing[:, :, count + 2 :] = -bias[..., None] * grown
+    each = pulled[:, :, None] * moved[:, :, OTHERS].transpose(0, 2, 3, 1)
+    by_mixing[:, :, count : count + 2] = each - cross[..., None] * grown
+    return params, slope
