@@ -41,6 +41,9 @@ ORDER = ("fleet", "apply", "fits", "swarms", "peers", "allan", "commands")
 """Order of the runs: the memory of a fleet is that of the largest process so far."""
 PLOTTED = ("fits", "swarms", "peers", "allan", "fleet", "apply", "commands")
 GOALS = {
+    "fleet": (
+        ("fleet, 20000 tools x 48 stations x 24 parameters, 4 cores, least-squares", 100.0, 500.0),
+    ),
     "swarms": (
         ("60 x 600 x 12, from the readings", 3.0, 6.0),
         ("60 x 600 x 12, the same NumPy cost in both", 3.0, 6.0),
@@ -48,6 +51,12 @@ GOALS = {
     "fits": (
         ("60 factors; SciPy, numeric Jacobian", 10.0, None),
         ("60 factors, uncertain stand; SciPy, 600 unknowns, numeric Jacobian", 10.0, None),
+    ),
+    "apply": (
+        ("60 factors, all angles, 1000000 rows", 10.0, 20.0),
+        ("vectors alone, against a copy of them", 0.5, None),
+        ("Parquet to Parquet, 1000000 rows", 1.5, 4.0),
+        ("Parquet to Parquet, 10000000 rows", 1.5, 4.0),
     ),
 }
 """What was aimed at: how the name of the row begins, the ratio at least, and the one hoped for."""

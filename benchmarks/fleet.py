@@ -17,6 +17,7 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from statistics import median
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
@@ -130,9 +131,11 @@ def against_scipy(tools: int = 20_000, cores: int = 4, sample: int = SAMPLE) -> 
         runs, output = Path(folder) / "runs.parquet", Path(folder) / "cals.parquet"
         simulate(runs, tools)
         options = ("--workers", str(cores), "--method")
-        same, _ = command(runs, output, *options, "least-squares")
-        joint, _ = command(runs, output, *options, "joint")
-    theirs = scipy_seconds(sample) * tools
+        same, joint = (
+            median(command(runs, output, *options, method)[0] for _ in range(rounds))
+            for method, rounds in (("least-squares", 5), ("joint", 3))
+        )
+        theirs = median(scipy_seconds(sample) for _ in range(3)) * tools
     name = f"fleet, {tools} tools x 48 stations x 24 parameters, {cores} cores"
     loop = f"SciPy loop ({sample} tools, scaled)"
     return [
