@@ -474,6 +474,8 @@ class Problem:
 
     def _turn_groups(self, state: State, turns: Array) -> Array:
         half = turns.shape[-1] // 2
+        if not half:
+            return state.attitude
         first, second = self._group_axes(state)
         attitude = state.attitude
         for axis, name, turn in (
@@ -486,6 +488,8 @@ class Problem:
 
     def _turn_stations(self, state: State, attitude: Array, private: Array) -> Array:
         own = self._own_turns(state, geometry=True)
+        if not own.any():
+            return attitude
         turn = own * private[..., None, :]
         free = rotation(np.sum(turn, -1)) @ attitude
         about_down = np.zeros_like(turn[..., 0])

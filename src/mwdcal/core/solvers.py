@@ -13,7 +13,7 @@ Shared unknowns (field strength, dip, group directions) are eliminated by a Schu
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property
 from typing import Any, Protocol
@@ -132,14 +132,13 @@ class Linear:
         """Which directions it determines, if it is of the geometry."""
         return Determined.by(self.normal, self.norms)
 
-    @property
-    def cost(self) -> Array:
-        """ρᵀC⁻¹ρ over all stations, and the prior's part (B,)."""
-        weighed = self.weigh(self.residual[..., None])[..., 0]
-        pulled = np.einsum("...i,...ij,...j->...", self.pull, self.prior, self.pull)
-        return np.asarray(np.sum(self.residual * weighed, (-1, -2)) + pulled)
+    def cost(self, at: Linear) -> Array:
+        """ρᵀC⁻¹ρ over all stations, and the prior's part (B,), of residuals `at` a state; C is ours."""
+        weighed = self.weigh(at.residual[..., None])[..., 0]
+        pulled = np.einsum("...i,...ij,...j->...", at.pull, at.prior, at.pull)
+        return np.asarray(np.sum(at.residual * weighed, (-1, -2)) + pulled)
 
-    @property
+    @cached_property
     def core(self) -> Array:
         """(I + GᵀG)⁻¹ (B, n, a, a)."""
         gram = np.swapaxes(self.own, -1, -2) @ self.own
@@ -322,7 +321,7 @@ class _Descent:
         trial = problem.move(self.state, linear, step)
         after = problem.linear(trial)
         # the gradient holds the weights fixed, and so must the cost that judges the step
-        cost = replace(after, own=linear.own).cost
+        cost = linear.cost(after)
         small = _small(normal, step, problem.size_of(self.state))
         with np.errstate(invalid="ignore"):
             better = (cost <= normal.cost * (1 + 1e-9) + 1e-9) | small
