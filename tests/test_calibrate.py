@@ -329,6 +329,19 @@ def test_no_redundancy_is_a_finding():
     assert any(f.id == "no-redundancy" for f in record.findings)
 
 
+def test_stations_that_are_copies_are_named():
+    data = make()
+    assert not any(f.id == "repeated-readings" for f in calibrate(data, PROFILE).findings)
+    place = np.arange(48)
+    place[[9, 20]] = 2
+    a, m = data.accelerometer[place], data.magnetometer[place]
+    known = {name: values[place] for name, values in data.known.items()}
+    copied = msgspec_replace(data, accelerometer=a, magnetometer=m, known=known)
+    found = calibrate(copied, PROFILE).findings
+    [copies] = [f.text for f in found if f.id == "repeated-readings"]
+    assert copies.startswith("station 10, 21: the very readings of an earlier station")
+
+
 def test_free_turn_and_its_course_with_temperature_are_named_simulated():
     _, data = hot(8)
     blank = np.full(data.count, np.nan)

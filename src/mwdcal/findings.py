@@ -62,6 +62,7 @@ class Findings:
         """All of them, in order of weight."""
         return [
             *self.residuals(triads),
+            *self.repeated(stations),
             *self.undetermined(),
             *self.prior(),
             *self.model(triads),
@@ -86,6 +87,26 @@ class Findings:
             text = f"{' and '.join(bare)}: no redundancy, so nothing in this run checks the fit. Add stations."
             found.append(Finding(id="no-redundancy", text=text))
         return found
+
+    def repeated(self, stations: list[StationRow]) -> list[Finding]:
+        """Stations whose readings are another's to the last digit."""
+        columns = (
+            self.readings.accelerometer,
+            self.readings.magnetometer,
+            self.readings.temperature,
+        )
+        rows = np.column_stack([c for c in columns if c is not None])
+        _, first, place = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+        copies = np.flatnonzero(first[place.ravel()] != np.arange(len(rows)))
+        if not copies.size:
+            return []
+        names = ", ".join(stations[i].station for i in copies[:8])
+        more = f" and {len(copies) - 8} more" if len(copies) > 8 else ""
+        text = (
+            f"station {names}{more}: the very readings of an earlier station. Copies count as "
+            "measurements of their own, and uncertainties come out too small. Remove them."
+        )
+        return [Finding(id="repeated-readings", text=text)]
 
     def undetermined(self) -> list[Finding]:
         """Directions that nothing determines."""
