@@ -32,6 +32,7 @@ LAYERS = (
         "core.uncertainty",
         "core.observability",
         "core.standstill",
+        "core.station_means",
         "core.allan",
         "core.noise_terms",
         "core.start",
@@ -46,9 +47,9 @@ LAYERS = (
     ("checks", "curves", "correction", "residuals", "scatter", "selection", "stand"),
     ("findings",),
     ("calibrate", "compare", "gauge", "predict", "quality", "simulate"),
-    ("fleet", "fleet_accuracy", "fleet_checks"),
+    ("fleet", "fleet_accuracy", "fleet_checks", "fleet_choices", "fleet_curves"),
     ("files", "files.*"),
-    ("registry", "registry.*", "datasets", "stations", "noise"),
+    ("registry", "registry.*", "datasets", "station_findings", "stations", "noise"),
     ("",),  # the package itself: its public names
     (
         "app",

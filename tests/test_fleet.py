@@ -594,6 +594,10 @@ def _die_once(mark, task):
     return bytes([task])
 
 
+def _tripled(task):
+    return bytes([3 * task])
+
+
 def _die(task):
     os.kill(os.getpid(), signal.SIGKILL)
 
@@ -610,8 +614,21 @@ def test_a_process_that_dies_loses_nothing(tmp_path):
         list(pool.results(pool.Steps(int, _die), [0, 1], 2, None))
 
 
-def test_partitions_are_of_whole_tools_and_bounded(tmp_path, monkeypatch):
+def test_workers_are_prepared_with_settings_of_their_own(monkeypatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", "3")
+    monkeypatch.delenv("MKL_NUM_THREADS", raising=False)
+    before = dict(os.environ)
+    with pool.preparing(2):
+        assert os.environ["OMP_NUM_THREADS"] == os.environ["MKL_NUM_THREADS"] == "1"
+    assert dict(os.environ) == before
+    tripled = pool.Steps(int, _tripled)
+    assert dict(pool.results(tripled, [1, 2, 3], 2, None)) == {0: b"\3", 1: b"\6", 2: b"\t"}
+
+
+@pytest.mark.parametrize("batch", [5, 32_768])
+def test_partitions_are_of_whole_tools_and_bounded(tmp_path, monkeypatch, batch):
     monkeypatch.setattr(fleet_tables, "ROWS", (50, 100))
+    monkeypatch.setattr(fleet_tables, "BATCH", batch)
     path = write_fleet(
         tmp_path / "runs.parquet", {i: short_run(i) for i in range(9)}, row_group_size=37
     )
@@ -622,12 +639,12 @@ def test_partitions_are_of_whole_tools_and_bounded(tmp_path, monkeypatch):
     parts = fleet_tables.partitions(source, tools, tmp_path)
     assert [part.rows for part in parts] == [56, 56, 56, 56, 28]
     whole = pq.read_table(path)
-    at = 0
-    for part in parts:
+    starts = [sum(part.rows for part in parts[:i]) for i in range(len(parts))]
+    for index in (0, 1, 2, 3, 4, 2, 0, 0, 4, 1):
+        part, at = parts[index], starts[index]
         own = fleet_tables.read(part, ["serial", "ax"])
         assert own.column("ax").to_pylist() == whole.column("ax").slice(at, part.rows).to_pylist()
         assert own.column("#row").to_pylist() == list(range(at, at + part.rows))
-        at += part.rows
 
 
 @contextmanager

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from mwdcal.core.observability import Free
@@ -15,7 +17,7 @@ from mwdcal.methods import EVIDENCE
 from mwdcal.options import Options
 from mwdcal.profile import Profile
 from mwdcal.readings import CONSTANTS, TRIADS, Readings
-from mwdcal.selection import soaks
+from mwdcal.selection import HIGHEST, soaks
 
 GAIN = (0.3, 3.0)
 """An own-axis gain outside this share of nominal is a wrong profile, not a sensor error."""
@@ -54,6 +56,7 @@ def check_options(options: Options) -> None:
     if options.robust not in (None, *LOSSES):
         raise InputError(f"--robust must be one of {', '.join(LOSSES)}; got {options.robust!r}.")
     _check_ignored(options)
+    _check_curved_models(options)
     own = "the paper's weights" if options.paper_weights else f"method {method}"
     if options.own_solver and options.robust:
         raise InputError(
@@ -80,6 +83,39 @@ def check_options(options: Options) -> None:
             f"--prior cannot be combined with {what}. Use --method joint, without "
             "--paper-weights and with --nonlinearity none."
         )
+
+
+def _check_curved_models(options: Options) -> None:
+    """Refuse own-axis terms of a model that has none."""
+    for name, order in zip(TRIADS, options.orders, strict=True):
+        if name in (options.nonlinearity or {}) and options.kind(order) != "polynomial":
+            raise InputError(
+                f"--nonlinearity {name}: the model of factors has no own-axis terms. Use "
+                "--model polynomial with it."
+            )
+
+
+def check_order(asked: str) -> None:
+    """Refuse what is no temperature order."""
+    if asked not in ("auto", *map(str, range(HIGHEST + 1))):
+        raise InputError(f"--order must be 0, 1, 2, 3 or auto; got {asked!r}.")
+
+
+def check_curve_names(asked: str, wanted: Sequence[str]) -> None:
+    """Refuse own-axis terms of what is no triad."""
+    if not wanted or not set(wanted) <= set(TRIADS):
+        raise InputError(
+            f"--nonlinearity must be auto, none, {' or '.join(TRIADS)}; got {asked!r}."
+        )
+
+
+def check_curves(readings: Readings, wanted: Sequence[str]) -> None:
+    """Refuse own-axis terms of a triad that the run does not have."""
+    for name in wanted:
+        if getattr(readings, name) is None:
+            raise InputError(
+                f"--nonlinearity {name}: {readings.source} has no {name}. Leave it out."
+            )
 
 
 def _check_ignored(options: Options) -> None:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -21,7 +22,7 @@ from mwdcal.core.uncertainty import (
     settle_gauge,
     station_misfit,
 )
-from mwdcal.core.vectors import Array, Bools, Ints
+from mwdcal.core.vectors import AnyArray, Array, Bools, Ints
 from mwdcal.evidence import evidence_of, flat
 from mwdcal.methods import EVIDENCE, Solved, solve, with_stand_errors, without
 from mwdcal.options import Options
@@ -30,9 +31,11 @@ from mwdcal.readings import ANGLES, TRIADS, Readings
 
 FLOOR = 1e-9
 """Smallest noise, as a share of the signal, that an estimate from residuals may reach."""
+STEP = 10.0
+"""The range of temperatures that a model is conditioned for ends at multiples of this, °C."""
 ROBUST_ROUNDS = 40
 SETTLED = 1e-3
-"""Change of the stations' weights, as a share, at which weighing and fitting in turn ends."""
+"""Change of noise and station weights, as a share, at which weighing and fitting in turn ends."""
 
 
 @dataclass(frozen=True)
@@ -55,8 +58,12 @@ class Fit:
 def model_of(
     kind: str, order: int, raw: Array, temperature: Array, include: Array, curved: bool = False
 ) -> Whole:
-    """A conditioned model for readings (B, n, 3): centred, scaled, Chebyshev in temperature."""
-    low, high = float(temperature.min()), float(temperature.max())
+    """A conditioned model for readings (B, n, 3): centred, scaled, Chebyshev in temperature.
+
+    The range of temperatures is common to the batch: see `temperature_ranges`.
+    """
+    ranges = temperature_ranges(temperature)
+    low, high = float(ranges[:, 0].min()), float(ranges[:, 1].max())
     half = (high - low) / 2 or 1.0
     basis = Basis(order, (low + high) / 2, half, chebyshev=True)
     if kind == "factors":
@@ -68,6 +75,15 @@ def model_of(
     return Polynomial(
         basis, centre, np.broadcast_to(radius[:, None, None], centre.shape).copy(), curved
     )
+
+
+def temperature_ranges(temperature: Array) -> Array:
+    """Range (B, 2) of each member's temperatures (B, n), widened to multiples of `STEP`.
+
+    Members of one range are fitted together as each would be alone.
+    """
+    low, high = np.floor(temperature.min(-1) / STEP), np.ceil(temperature.max(-1) / STEP)
+    return np.stack([low, high], -1) * STEP
 
 
 def _problem(
@@ -133,11 +149,12 @@ def _fit(readings: Readings, options: Options, include: Array | None) -> Fit:
         return closed
     solved = solve(problem, start(problem), options)
     iterations = solved.iterations
+    stage = _Stage(problem, solved, np.ones(problem.evidence.include.shape))
     if not all(declared):
-        problem, solved = _estimate_noise(problem, solved, declared, options)
-    trust = np.ones(problem.evidence.include.shape)
+        stage = _estimate_noise(stage, declared, options)
     if options.robust:
-        problem, solved, trust = _downweigh(problem, solved, declared, options)
+        stage = _downweigh(stage, declared, options)
+    problem, solved, trust = stage.problem, stage.solved, stage.trust
     trusted = _trusting(problem, trust)
     state = solved.state
     determined = _determined(trusted, state, solved)
@@ -242,41 +259,104 @@ def _finite_model(model: Whole) -> Whole:
     return replace(model, centre=centre, scale=np.where(np.isfinite(model.scale), model.scale, 1.0))
 
 
-def _estimate_noise(
-    problem: Problem, solved: Solved, declared: list[bool], options: Options
-) -> tuple[Problem, Solved]:
+@dataclass(frozen=True)
+class _Stage:
+    """Where weighing and fitting in turn have come to: problem, solution, station weights (B, n)."""
+
+    problem: Problem
+    solved: Solved
+    trust: Array
+
+    def take(self, index: Ints) -> _Stage:
+        """Some members of the batch."""
+        solved = replace(
+            self.solved,
+            state=self.solved.state.take(index),
+            status=self.solved.status[index],
+            iterations=self.solved.iterations[index],
+            sums={k: v.take(index) for k, v in self.solved.sums.items()},
+            known={k: v[index] for k, v in self.solved.known.items()},
+        )
+        return _Stage(self.problem.take(index), solved, self.trust[index])
+
+    def put(self, index: Ints, other: _Stage) -> _Stage:
+        """Ours with some members replaced; of their problem only the noise is other than ours."""
+
+        def placed(mine: AnyArray, theirs: AnyArray) -> Any:
+            changed = mine.copy()
+            changed[index] = theirs
+            return changed
+
+        ours, new = self.solved, other.solved
+        pairs = zip(self.problem.triads, other.problem.triads, strict=True)
+        triads = tuple(replace(t, sd=placed(t.sd, o.sd)) for t, o in pairs)
+        sums = {
+            k: replace(
+                v,
+                reference=placed(v.reference, new.sums[k].reference),
+                weights=placed(v.weights, new.sums[k].weights),
+            )
+            for k, v in ours.sums.items()
+        }
+        solved = replace(
+            ours,
+            state=ours.state.put(index, new.state),
+            status=placed(ours.status, new.status),
+            iterations=placed(ours.iterations, new.iterations),
+            sums=sums,
+            known={k: placed(v, new.known[k]) for k, v in ours.known.items()},
+        )
+        return _Stage(replace(self.problem, triads=triads), solved, placed(self.trust, other.trust))
+
+
+def _in_turn(stage: _Stage, rounds: int, turn: Callable[[_Stage], tuple[_Stage, Bools]]) -> _Stage:
+    """The stage after turns that also say who has settled: each member ends as if it were alone."""
+    whole, active = stage, np.arange(len(stage.trust))
+    for _ in range(rounds):
+        stage, settled = turn(stage)
+        if settled.all():
+            break
+        if settled.any():
+            done, rest = np.flatnonzero(settled), np.flatnonzero(~settled)
+            whole = whole.put(active[done], stage.take(done))
+            stage, active = stage.take(rest), active[rest]
+    return stage if len(active) == len(whole.trust) else whole.put(active, stage)
+
+
+def _estimate_noise(stage: _Stage, declared: list[bool], options: Options) -> _Stage:
     """Variance per triad by restricted maximum likelihood, fit and estimate in turn."""
-    for _ in range(options.rounds):
-        scale = np.sqrt(analyse(problem, solved.state).variance_factor)
-        problem = _rescaled(problem, scale, declared)
+    free = [i for i, known in enumerate(declared) if not known]
+
+    def turn(now: _Stage) -> tuple[_Stage, Bools]:
+        scale = np.sqrt(analyse(now.problem, now.solved.state).variance_factor)
+        problem, solved = _rescaled(now.problem, scale, declared), now.solved
         if options.method != "swarm":
             solved = solve(problem, solved.state, options)
-        free = [i for i, known in enumerate(declared) if not known]
-        if np.all(np.abs(scale[:, free] - 1) < 1e-3):
-            break
-    return problem, solved
+        change = np.abs(scale[:, free] - 1)
+        return replace(now, problem=problem, solved=solved), ~np.any(change >= SETTLED, -1)
+
+    return _in_turn(stage, options.rounds, turn)
 
 
-def _downweigh(
-    problem: Problem, solved: Solved, declared: list[bool], options: Options
-) -> tuple[Problem, Solved, Array]:
-    """Weigh the stations by their misfit and fit in turn; also the weights (B, n) that result."""
+def _downweigh(stage: _Stage, declared: list[bool], options: Options) -> _Stage:
+    """Weigh the stations by their misfit and fit in turn."""
     loss = options.robust or LOSSES[0]
-    trust = np.ones(problem.evidence.include.shape)
-    for _ in range(ROBUST_ROUNDS):
-        analysis = analyse(_trusting(problem, trust), solved.state)
+
+    def turn(now: _Stage) -> tuple[_Stage, Bools]:
+        problem, solved = now.problem, now.solved
+        analysis = analyse(_trusting(problem, now.trust), solved.state)
         square, freedom = station_misfit(analysis)
-        square = square / trust
+        square = square / now.trust
         excess = _typical(square, freedom)
         excess = np.maximum(excess, 1.0) if all(declared) else excess
-        before, trust = trust, weight(loss, square / excess[:, None], freedom)
+        trust = weight(loss, square / excess[:, None], freedom)
         if not all(declared):
             share = np.array([consistency(loss, k) for k in _tested(freedom)])[:, None]
             problem = _rescaled(problem, np.sqrt(analysis.variance_factor / share), declared)
         solved = solve(_trusting(problem, trust), solved.state, options)
-        if np.all(np.abs(trust / before - 1) < SETTLED):
-            break
-    return problem, solved, trust
+        return _Stage(problem, solved, trust), ~np.any(np.abs(trust / now.trust - 1) >= SETTLED, -1)
+
+    return _in_turn(stage, ROBUST_ROUNDS, turn)
 
 
 def _typical(square: Array, freedom: Array) -> Array:
@@ -319,4 +399,4 @@ def _scaled_noise(triad: Triad, scale: Array) -> Array:
     return np.maximum(triad.sd * factor, FLOOR * _size(triad.raw))
 
 
-__all__ = ["Fit", "Status", "fit", "model_of"]
+__all__ = ["Fit", "Status", "fit", "model_of", "temperature_ranges"]

@@ -34,6 +34,8 @@ def evidence_of(readings: Readings, include: Array) -> Evidence:
 
 def _shared_groups(group: Ints) -> Ints:
     """Group numbers (B, n) without gaps, -1 where a station is alone in its group."""
+    if (group < 0).all():
+        return np.full(group.shape, -1)
     labels, compact = np.unique(group, return_inverse=True)
     keys = compact.reshape(group.shape) + len(labels) * np.arange(len(group))[:, None]
     _, where, counts = np.unique(keys, return_inverse=True, return_counts=True)
@@ -49,6 +51,8 @@ def _share_known(evidence: Evidence) -> tuple[dict[str, Array], dict[str, Array]
     uncertain as the mean of its k filled cells, σ √(members / k).
     """
     known, spread = dict(evidence.known), dict(evidence.sd)
+    if (evidence.group < 0).all():
+        return known, spread
     for name in ("inclination", "azimuth"):
         given = evidence.is_known(name)
         filled = evidence.members * given[..., None]

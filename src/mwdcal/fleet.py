@@ -2,41 +2,52 @@
 
 Every tool of a `Batch` has the same number of stations and the same kinds of evidence. What
 `calibrate` would refuse is refused here with the same words: a screen of array operations
-picks the suspects, and the check of a single run decides and speaks. Results are columns, not
-objects: `names` says which.
+picks the suspects, and the check of a single run decides and speaks. What `calibrate` leaves to
+the data is decided for each tool (`fleet_choices`). Results are columns, not objects: `names`
+says which.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
 
-from mwdcal.calibration import FREE_SHARE
+from mwdcal.calibration import FREE_SHARE, StandErrors
 from mwdcal.checks import check_fit, check_readings
 from mwdcal.core.models import Basis, Factors, Polynomial, Whole
 from mwdcal.core.observability import Free
-from mwdcal.core.uncertainty import marginal_rank
+from mwdcal.core.uncertainty import analyse, marginal_rank
 from mwdcal.core.vectors import AnyArray, Array, Ints
 from mwdcal.errors import MwdcalError
 from mwdcal.estimate import Fit, fit
 from mwdcal.fleet_accuracy import ANGLES, typical_sd
 from mwdcal.fleet_checks import free_of_batch, suspect_fits, suspect_readings
+from mwdcal.fleet_choices import CHUNK, Alone, PerTool, halved, with_curves, with_orders
+from mwdcal.fleet_curves import curved_sd
+from mwdcal.methods import ESTIMABLE
 from mwdcal.options import Options
 from mwdcal.profile import Profile
 from mwdcal.readings import TRIADS, Readings
+from mwdcal.selection import mapped
+from mwdcal.stand import check_separable, stand_errors
 
-CHUNK = 256
-"""Tools fitted in one call: few enough for the cache, many enough for NumPy."""
 OK, BAD_INPUT, FAILED = "ok", "bad-input", "failed"
+ALIKE = PerTool()
+"""Nothing is left to each tool."""
 FACTS = ("rank", "size", "noise", "variance_factor", "degrees_of_freedom")
 """Columns of a triad besides its parameters and their standard uncertainties."""
 EARTH = ("gravity_g", "field", "dip_deg")
 
-Alone = Callable[[int], tuple[Readings, Profile]]
-"""Readings and profile of one tool of a batch by themselves, as `calibrate` takes them."""
+CENTRES = tuple(f"centre_{axis}" for axis in "xyz")
+"""Columns of a triad with own-axis terms, and `radius`: its terms are of (reading - centre) / radius."""
+STAND = {
+    name: tuple(f for f in StandErrors.__struct_fields__ if f.startswith(name.replace("-", "_")))
+    for name in ESTIMABLE
+}
+"""Columns of each error of the stand that may be asked for."""
 
 
 @dataclass(frozen=True)
@@ -52,13 +63,21 @@ class Outcome:
     columns: dict[str, Array]
     free: list[tuple[list[str], ...]]
 
+    def sound(self, tools: Ints) -> Ints:
+        """Those of the given tools that nothing has refused."""
+        return np.asarray(tools[self.status[tools] == OK])
 
-def model_parameters(options: Options, triad: int) -> tuple[str, ...]:
-    """Names of a triad's parameters, as in its calibration file."""
-    order = options.orders[triad]
-    basis = Basis(order)
-    model: Whole = Factors(basis) if options.kind(order) == "factors" else Polynomial(basis)
-    return model.names
+
+def model_parameters(options: Options, triad: int, per_tool: PerTool = ALIKE) -> tuple[str, ...]:
+    """Names of the parameters that a triad may have, as in its calibration file."""
+    found: dict[str, None] = {}
+    highest = {options.kind(order): order for order in per_tool.orders(options, triad)}
+    for kind, order in highest.items():
+        curved = kind == "polynomial" and per_tool.curved(options, triad)
+        basis = Basis(order)
+        model: Whole = Factors(basis) if kind == "factors" else Polynomial(basis, curved=curved)
+        found |= dict.fromkeys(model.names)
+    return tuple(found)
 
 
 def column(triad: str, parameter: str) -> str:
@@ -70,78 +89,96 @@ def column(triad: str, parameter: str) -> str:
     return f"{triad}_{parameter}".replace("-", "_").replace("·", "_t")
 
 
-def names(options: Options, triads: Sequence[str] = TRIADS) -> list[str]:
+def names(options: Options, triads: Sequence[str] = TRIADS, per_tool: PerTool = ALIKE) -> list[str]:
     """The columns of results, in order."""
     found: list[str] = []
     for index, triad in enumerate(triads):
-        own = [column(triad, name) for name in model_parameters(options, index)]
-        found += [f"{triad}_{fact}" for fact in FACTS]
+        own = [column(triad, name) for name in model_parameters(options, index, per_tool)]
+        found += [f"{triad}_{fact}" for fact in (*FACTS, "order")]
+        if per_tool.curved(options, index):
+            found += [f"{triad}_{name}" for name in (*CENTRES, "radius")]
         found += [name for pair in zip(own, (f"{n}_sd" for n in own), strict=True) for name in pair]
     last = (ANGLES, EARTH) if len(triads) > 1 else (ANGLES[:2], EARTH[:1])
-    return [*found, *(f"{angle}_sd_deg" for angle in last[0]), *last[1]]
+    stand = [name for error in options.estimate for name in STAND[error]]
+    return [*found, *(f"{angle}_sd_deg" for angle in last[0]), *last[1], *stand]
 
 
 def calibrate_batch(
-    readings: Readings, options: Options, reference: float, alone: Alone
+    readings: Readings,
+    options: Options,
+    profile: Profile,
+    alone: Alone,
+    per_tool: PerTool = ALIKE,
 ) -> Outcome:
-    """Calibrate tools of the same shape: readings (B, n, ...), parameters at `reference` °C.
+    """Calibrate tools of the same shape: readings (B, n, ...), at the profile's temperature.
 
     `alone` gives one tool's own readings where a check needs words for it.
     """
     count = len(readings.accelerometer)
-    blank = {name: np.full(count, np.nan) for name in names(options)}
+    blank = {name: np.full(count, np.nan) for name in names(options, per_tool=per_tool)}
     free: list[tuple[list[str], ...]] = [([], []) for _ in range(count)]
     status, message = np.full(count, OK, object), np.full(count, "", object)
     outcome = Outcome(status, message, blank, free)
-    _refuse(outcome, suspect_readings(readings, options), alone, options)
-    sound = np.flatnonzero(status == OK)
-    for start in range(0, len(sound), CHUNK):
-        members = sound[start : start + CHUNK]
-        for which, result in fitted(taken(readings, members), options):
-            _record(outcome, members[which], result, options, reference, alone)
+    options = per_tool.known(options, readings, profile)
+    first, every = per_tool.before(options), np.arange(count)
+    _refuse(outcome, every, suspect_readings(readings, first), alone, first)
+    for some, chosen in with_orders(readings, outcome.sound(every), options, per_tool):
+        if isinstance(chosen, Exception):
+            _fail(outcome, some, chosen)
+            continue
+        if chosen != first:
+            suspects = suspect_readings(taken(readings, some), chosen)
+            _refuse(outcome, some, suspects, alone, chosen)
+        for part, final in with_curves(outcome.sound(some), chosen, readings, per_tool, alone):
+            if isinstance(final, Exception):
+                _fail(outcome, part, final)
+            else:
+                _fit(outcome, readings, part, final, alone, profile.reference_temperature_c)
     return outcome
 
 
-def _refuse(outcome: Outcome, suspects: dict[str, Any], alone: Alone, options: Options) -> None:
+def _fit(
+    outcome: Outcome,
+    readings: Readings,
+    tools: Ints,
+    options: Options,
+    alone: Alone,
+    reference: float,
+) -> None:
+    """Fit the given tools, and write down what came of it."""
+    for start in range(0, len(tools), CHUNK):
+        part = tools[start : start + CHUNK]
+        for which, result in halved(readings, part, lambda r: fit(r, options)):
+            if isinstance(result, Exception):
+                _fail(outcome, which, result)
+            else:
+                _record(outcome, which, result, options, reference, alone)
+
+
+def _fail(outcome: Outcome, tools: Ints, error: Exception) -> None:
+    """Give tools the status and message of an error: of what was asked, or of arithmetic."""
+    if isinstance(error, MwdcalError):
+        outcome.status[tools], outcome.message[tools] = BAD_INPUT, str(error)
+        return
+    outcome.status[tools] = FAILED
+    outcome.message[tools] = f"the fit failed: {error}. Calibrate this tool alone to see why."
+
+
+def _refuse(
+    outcome: Outcome, tools: Ints, suspects: dict[str, Any], alone: Alone, options: Options
+) -> None:
     """Give the suspects that the check of a single run refuses their status and message."""
     for name, flags in suspects.items():
-        for index in np.flatnonzero(flags & (outcome.status == OK)):
+        for tool in outcome.sound(tools[flags & (outcome.status[tools] == OK)]):
             try:
-                check_readings(alone(int(index))[0], options)
+                check_readings(alone(int(tool))[0], options)
             except MwdcalError as error:
-                outcome.status[index], outcome.message[index] = name, str(error)
+                outcome.status[tool], outcome.message[tool] = name, str(error)
 
 
 def taken(readings: Readings, index: Ints) -> Readings:
     """Some members of a batch."""
-
-    def rows(value: AnyArray | None) -> Any:
-        return None if value is None else value[index]
-
-    return replace(
-        readings,
-        accelerometer=readings.accelerometer[index],
-        magnetometer=rows(readings.magnetometer),
-        temperature=rows(readings.temperature),
-        known={k: v[index] for k, v in readings.known.items()},
-        sd={k: v[index] for k, v in readings.sd.items()},
-        group=rows(readings.group),
-    )
-
-
-def fitted(readings: Readings, options: Options) -> Iterator[tuple[Ints, Fit | Exception]]:
-    """Fits of a batch, with the members of each; halved where one member stops the whole."""
-    count = len(readings.accelerometer)
-    every = np.arange(count)
-    try:
-        yield every, fit(readings, options)
-    except (ArithmeticError, ValueError, np.linalg.LinAlgError) as error:
-        if count == 1:
-            yield every, error
-            return
-        for part in (every[: count // 2], every[count // 2 :]):
-            for which, result in fitted(taken(readings, part), options):
-                yield part[which], result
+    return mapped(readings, lambda value: value[index])
 
 
 def member(result: Fit, index: Ints) -> Fit:
@@ -171,39 +208,97 @@ def member(result: Fit, index: Ints) -> Fit:
 def _record(
     outcome: Outcome,
     members: Ints,
-    result: Fit | Exception,
+    result: Fit,
     options: Options,
     reference: float,
     alone: Alone,
 ) -> None:
     """Check a fit of some tools and write down the results of the sound ones."""
-    if isinstance(result, Exception):
-        outcome.status[members] = FAILED
-        outcome.message[members] = (
-            f"the fit failed: {result}. Calibrate this tool alone to see why."
-        )
-        return
     free = free_of_batch(result)
-    for name, flags in suspect_fits(result, free).items():
-        for index in np.flatnonzero(flags & (outcome.status[members] == OK)):
-            tool = int(members[index])
-            readings, profile = alone(tool)
-            try:
-                check_fit(member(result, np.array([index])), free[index], profile, readings)
-            except MwdcalError as error:
-                outcome.status[tool], outcome.message[tool] = name, str(error)
+    _doubt(outcome, members, result, free, options, alone)
     good = np.flatnonzero(outcome.status[members] == OK)
     if not good.size:
         return
     if good.size < len(members):
         result, free = member(result, good), [free[index] for index in good]
-    for name, values in _columns(result, free, reference).items():
+    if options.prior:
+        result = _with_prior_apart(result)
+    found = _columns(result, free, reference) | _besides(result, free, options, reference)
+    for name, values in found.items():
         outcome.columns[name][members[good]] = values
     for place, each in zip(members[good], free, strict=True):
         if each:
             outcome.free[place] = tuple(
                 [f.id for f in each if triad in f.triads] for triad in range(len(TRIADS))
             )
+
+
+def _doubt(
+    outcome: Outcome,
+    members: Ints,
+    result: Fit,
+    free: list[list[Free]],
+    options: Options,
+    alone: Alone,
+) -> None:
+    """Give the suspects that the checks of a single fit refuse their status and message."""
+    for name, flags in suspect_fits(result, free, options).items():
+        for index in np.flatnonzero(flags & (outcome.status[members] == OK)):
+            tool = int(members[index])
+            readings, profile = alone(tool)
+            own = member(result, np.array([index]))
+            try:
+                if options.estimate:
+                    check_separable(own, options.estimate)
+                check_fit(own, free[index], profile, readings)
+            except MwdcalError as error:
+                outcome.status[tool], outcome.message[tool] = name, str(error)
+
+
+def _grown(result: Fit) -> Array:
+    """What scales each triad's noise (B, t): s, or 1 where there is no redundancy."""
+    usable = result.analysis.freedom >= 1
+    factors = np.nan_to_num(result.analysis.variance_factor, nan=1.0)
+    return np.sqrt(np.where(usable, factors, 1.0))
+
+
+def _with_prior_apart(result: Fit) -> Fit:
+    """The fit with a covariance that is right once scaled by s²: what a prior says is not."""
+    problem, grown = result.problem, _grown(result)
+    triads = [
+        replace(triad, sd=triad.sd * grown[:, index, None, None])
+        for index, triad in enumerate(problem.triads)
+    ]
+    noisy = replace(problem, triads=tuple(triads))
+    covariance = analyse(noisy, result.state, result.analysis.determined).covariance
+    spread = np.repeat(grown, [t.model.size for t in problem.triads], axis=-1)
+    covariance = covariance / (spread[:, :, None] * spread[:, None, :])
+    return replace(result, analysis=replace(result.analysis, covariance=covariance))
+
+
+def _besides(
+    result: Fit, free: list[list[Free]], options: Options, reference: float
+) -> dict[str, Array]:
+    """Columns of what was chosen for these tools, and of what they were asked for besides."""
+    count, found = len(result.status), {}
+    for index, (name, triad) in enumerate(zip(TRIADS, result.problem.triads, strict=False)):
+        found[f"{name}_order"] = np.full(count, float(options.orders[index]))
+        model, _ = triad.model.finished(reference)
+        if isinstance(model, Polynomial) and model.curved:
+            ends = zip(CENTRES, model.centre[:, 0].transpose(), strict=True)
+            found |= {f"{name}_{end}": values for end, values in ends}
+            found[f"{name}_radius"] = model.scale[:, 0, 0]
+    if any(f"{name}_radius" in found for name in TRIADS):
+        rows = free_rows(free, result.state.params.shape[-1])
+        found |= curved_sd(result, _grown(result), rows, reference)
+    if options.estimate:
+        scale = _grown(result).max(-1)
+        errors = [
+            stand_errors(member(result, np.array([i])), float(scale[i])) for i in range(count)
+        ]
+        for name in (name for error in options.estimate for name in STAND[error]):
+            found[name] = np.array([getattr(each, name) for each in errors])
+    return found
 
 
 def _columns(result: Fit, free: list[list[Free]], reference: float) -> dict[str, Array]:

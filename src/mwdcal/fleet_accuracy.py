@@ -7,6 +7,8 @@ the strength along each axis. The mean variance over attitudes is then one weigh
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from mwdcal.calibration import FREE_SHARE
@@ -38,10 +40,9 @@ def typical_sd(result: Fit, covariance: Array, free: Array, reference: float) ->
     both = np.stack(earth, -1)
     unlike, number = np.unique(both, axis=0, return_inverse=True)
     found = {}
-    for name in ANGLES[: 1 + len(blocks)]:
-        rows = _rows(name, unlike, len(blocks))
-        weights = np.einsum("uai,uaj->uij", rows, rows) / rows.shape[1]
-        variance = np.sum(weights[number] * spread, (-1, -2))
+    for name, rows in _rows(ANGLES[: 1 + len(blocks)], unlike, len(blocks)).items():
+        weights = np.swapaxes(rows, -1, -2) @ rows / rows.shape[1]
+        variance = np.einsum("bij,bij->b", weights[number], spread)
         sd = np.degrees(np.sqrt(np.maximum(variance, 0.0)))
         if free.size:
             turned = np.abs(np.einsum("bai,bki->bak", rows[number], moved)).max((-1, -2))
@@ -73,22 +74,22 @@ def _diagonal(blocks: list[Array]) -> Array:
     return whole
 
 
-def _rows(name: str, earth: Array, triads: int) -> Array:
-    """Change of an angle (E, attitudes, 12 or 24) by the fields at the four of each triad."""
+def _rows(names: Sequence[str], earth: Array, triads: int) -> dict[str, Array]:
+    """Change of angles (E, attitudes, 12 or 24) by the fields at the four of each triad."""
     azimuth, toolface = np.meshgrid(np.arange(12) * np.pi / 6, TOOLFACES, indexing="ij")
     gravity, field, dip = (earth[:, i, None] for i in range(3))
     angles = (np.broadcast_to(TYPICAL, (1, azimuth.size)), azimuth.reshape(1, -1))
     vectors = reference_vectors(*angles, toolface.reshape(1, -1), gravity, field, dip)
-    gradient = OBSERVABLES[name].gradient(*vectors)
-    parts = []
-    for index, (vector, strength) in enumerate(zip(vectors, (gravity, field), strict=True)):
-        if index < triads:
-            unit = vector / strength[..., None]
-            shares = np.concatenate([np.ones_like(unit[..., :1]), unit], -1) @ MIXED.transpose()
-            slope = gradient[..., 3 * index : 3 * index + 3]
-            outer = shares[..., :, None] * slope[..., None, :]
-            parts.append(outer.reshape(*outer.shape[:-2], 12))
-    return np.concatenate(parts, -1)
+    shares = []
+    for vector, strength in zip(vectors[:triads], (gravity, field), strict=False):
+        unit = vector / strength[..., None]
+        shares.append(np.concatenate([np.ones_like(unit[..., :1]), unit], -1) @ MIXED.transpose())
+    share, found = np.stack(shares, -2)[..., None], {}
+    for name in names:
+        gradient = OBSERVABLES[name].gradient(*vectors)[..., : 3 * triads]
+        slope = gradient.reshape(*gradient.shape[:-1], triads, 1, 3)
+        found[name] = (share * slope).reshape(*gradient.shape[:-1], 12 * triads)
+    return found
 
 
 __all__ = ["ANGLES", "typical_sd"]

@@ -10,7 +10,7 @@ import numpy as np
 
 from mwdcal.checks import ABSURD, COARSE, GAIN, MOTION, NEEDS
 from mwdcal.core.observability import EXACT, Free, free_directions
-from mwdcal.core.problem import Problem, State
+from mwdcal.core.problem import STAND, UNKNOWN, Problem, State
 from mwdcal.core.solvers import Determined, Status
 from mwdcal.core.uncertainty import COUPLED, candidates
 from mwdcal.core.vectors import Array, Bools, Ints
@@ -18,6 +18,7 @@ from mwdcal.estimate import Fit
 from mwdcal.options import Options
 from mwdcal.readings import TRIADS, Readings
 from mwdcal.selection import GAP
+from mwdcal.stand import LOOSE
 
 NOT_CONVERGED, NOT_FINITE = "not-converged", "not-finite"
 BENIGN = ("rotation-x", "rotation-y", "toolface-zero", "scale")
@@ -35,15 +36,20 @@ def suspect_readings(readings: Readings, options: Options) -> dict[str, Bools]:
     return {
         "too-few-stations": none | few,
         "channel": channels,
-        "temperature-span": _short_span(readings, highest) if highest else none,
+        "temperature-span": _short_span(readings, highest, method) if highest else none,
         "missing-reference": none | _lacking(readings, method),
     }
 
 
 def _size(options: Options) -> int:
-    """Parameters of a triad."""
+    """Parameters of a triad that stations must determine: with a prior, none."""
+    if options.prior is not None:
+        return 0
     highest = max(options.orders)
-    return 6 * (highest + 1) + 6 if options.kind(highest) == "factors" else 12 * (highest + 1)
+    factors, fewer = options.kind(highest) == "factors", 12 - options.parameters
+    if factors:
+        return 6 * (highest + 1) + 6 - fewer
+    return (12 - fewer) * (highest + 1)
 
 
 def _odd_channels(readings: Readings, triad: str) -> Bools:
@@ -62,9 +68,9 @@ def _odd_channels(readings: Readings, triad: str) -> Bools:
     return np.asarray(dead.any(-1) | odd)
 
 
-def _short_span(readings: Readings, order: int) -> Bools:
-    """Where (B,) the temperatures are too few or too close together for the order."""
-    if readings.temperature is None:
+def _short_span(readings: Readings, order: int, method: str) -> Bools:
+    """Where (B,) temperatures are too few or too close for the order, or the method has none."""
+    if readings.temperature is None or method == "swarm":
         return np.ones(len(readings.accelerometer), bool)
     steps = np.diff(np.sort(readings.temperature, -1), axis=-1)
     levels = 1 + np.sum(steps > GAP, -1)
@@ -81,11 +87,12 @@ def _lacking(readings: Readings, method: str) -> Bools:
     return np.asarray(np.any(blank, axis=0)) if blank else np.zeros(1, bool)
 
 
-def suspect_fits(result: Fit, free: list[list[Free]]) -> dict[str, Bools]:
+def suspect_fits(result: Fit, free: list[list[Free]], options: Options) -> dict[str, Bools]:
     """Suspects (B,) after the fit: not settled, too weak, without redundancy, absurd."""
     analysis, noise = result.analysis, result.noise
     weak = [any(f.id.partition("-temperature-")[0] not in BENIGN for f in each) for each in free]
-    return {
+    first = {"inseparable": _inseparable(result)} if options.estimate else {}
+    return first | {
         NOT_CONVERGED: result.status == int(Status.NOT_CONVERGED),
         NOT_FINITE: result.status == int(Status.NOT_FINITE),
         "weak-geometry": np.array(weak, bool),
@@ -93,6 +100,15 @@ def suspect_fits(result: Fit, free: list[list[Free]]) -> dict[str, Bools]:
         "gain": _odd_gains(result),
         "residuals": _absurd(result),
     }
+
+
+def _inseparable(result: Fit) -> Bools:
+    """Where (B,) errors of the stand may not be told from those of the sensors."""
+    constants = result.problem.evidence.constants
+    stand = [i for i, constant in enumerate(constants) if constant.name in STAND]
+    variance = np.diagonal(result.analysis.constants, axis1=-2, axis2=-1)[:, stand]
+    loose = np.any(~(np.sqrt(variance) <= LOOSE * UNKNOWN), -1)
+    return np.asarray(loose | ~result.analysis.determined.keep.all(-1))
 
 
 def _odd_gains(result: Fit) -> Bools:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from mwdcal.calibration import OrderScore
 from mwdcal.core.problem import Problem, State
 from mwdcal.core.solvers import Linear
 from mwdcal.core.uncertainty import TESTED, marginal_rank, readjusted
-from mwdcal.core.vectors import Array, Ints
+from mwdcal.core.vectors import AnyArray, Array, Bools, Ints
 from mwdcal.estimate import Fit, fit
 from mwdcal.options import Options, Orders
 from mwdcal.readings import TRIADS, Readings
@@ -32,11 +33,12 @@ NEAR_BEST = 1.02
 
 
 def soaks(temperature: Array) -> Ints:
-    """Number (n,) of the soak that each station belongs to, coldest first."""
-    order = np.argsort(temperature, kind="stable")
-    steps = np.cumsum(np.diff(temperature[order], prepend=temperature[order[0]]) > GAP)
-    numbers = np.empty(len(order), int)
-    numbers[order] = steps
+    """Number (..., n) of the soak that each station belongs to, coldest first."""
+    order = np.argsort(temperature, -1, kind="stable")
+    ascending = np.take_along_axis(temperature, order, -1)
+    steps = np.cumsum(np.diff(ascending, prepend=ascending[..., :1], axis=-1) > GAP, -1)
+    numbers = np.empty(order.shape, int)
+    np.put_along_axis(numbers, order, steps, -1)
     return numbers
 
 
@@ -47,18 +49,39 @@ def choose_order(
 
     Order 0 without a table where there is no temperature, or too short a span of it.
     """
-    numbers = _usable_soaks(readings)
-    levels = _count(numbers)
-    if levels < 2 or _hopeless(readings, options):
+    batch = _batch_of_one(readings)
+    levels = int(judged_soaks(batch, options)[0])
+    if levels < 2:
         return 0, []
     if levels < FEWEST:
-        return _linear_if_needed(readings, options, progress), []
-    highest = _highest(options, levels)
-    readings = _with_noise(readings, replace(options, order=highest))
-    orders = [(order, order) for order in range(highest + 1)]
-    tables = _tables(readings, options, orders, numbers, progress)
-    chosen = [next(s.order for s in table if s.chosen) for table in tables]
-    return (chosen[0], chosen[-1]), [score for table in tables for score in table]
+        return _linear_if_needed(batch, options, progress), []
+    orders, found = _every_order(batch, options, progress)
+    chosen = _best(found)[0]
+    return (int(chosen[0]), int(chosen[-1])), _tables(readings, orders, found)
+
+
+def judged_soaks(readings: Readings, options: Options) -> Ints:
+    """Soaks (B,) by which the order of each member is judged; 1: it has order 0 without a trial."""
+    levels = _usable_soaks(readings).max(-1) + 1
+    wide = np.flatnonzero(levels > 1)
+    if wide.size:
+        levels = np.where(_hopeless(readings, options), 1, levels)
+    return np.asarray(levels)
+
+
+def choose_orders(readings: Readings, options: Options, levels: int) -> Ints:
+    """Orders (B, 2) of accelerometer and magnetometer, as `choose_order` has them for each alone.
+
+    All members have the same number of `judged_soaks`.
+    """
+    count = len(readings.accelerometer)
+    if levels < 2:
+        return np.zeros((count, 2), int)
+    if levels < FEWEST:
+        chosen = (_without_course(readings, options) > EXCESS).astype(int)
+    else:
+        chosen = _best(_every_order(readings, options, lambda text: None)[1])
+    return chosen[:, [0, -1]]
 
 
 def order_errors(
@@ -68,25 +91,45 @@ def order_errors(
 
     None where there are too few soaks to leave one out.
     """
-    numbers = _usable_soaks(readings)
-    levels = _count(numbers)
-    if levels < max(FEWEST, max(options.orders) + 2) or _hopeless(readings, options):
+    batch = _batch_of_one(readings)
+    levels = int(judged_soaks(batch, options)[0])
+    if levels < max(FEWEST, max(options.orders) + 2):
         return []
     yardstick = options.order if options.prior else _highest(options, levels)
-    readings = _with_noise(readings, replace(options, order=yardstick))
-    tables = _tables(readings, options, [options.orders], numbers, progress)
-    return [score for table in tables for score in table]
+    batch = _with_noise(batch, replace(options, order=yardstick))
+    found = _compared(batch, options, [options.orders], progress)
+    return _tables(readings, [options.orders], found)
+
+
+def _batch_of_one(readings: Readings) -> Readings:
+    """A run without leading axes as a batch."""
+    return mapped(readings, lambda value: np.asarray(value)[None])
+
+
+def mapped(readings: Readings, change: Callable[[AnyArray], AnyArray]) -> Readings:
+    """The readings with every array changed."""
+
+    def own(value: AnyArray | None) -> Any:
+        return None if value is None else change(value)
+
+    return replace(
+        readings,
+        accelerometer=change(readings.accelerometer),
+        magnetometer=own(readings.magnetometer),
+        temperature=own(readings.temperature),
+        known={k: change(v) for k, v in readings.known.items()},
+        sd={k: change(v) for k, v in readings.sd.items()},
+        group=own(readings.group),
+    )
 
 
 def _usable_soaks(readings: Readings) -> Ints:
-    """Number (n,) of each station's soak: all 0 without temperatures, or with too short a span."""
-    if readings.temperature is None or np.ptp(readings.temperature) < SPAN:
-        return np.zeros(readings.count, int)
-    return soaks(readings.temperature)
-
-
-def _count(numbers: Ints) -> int:
-    return int(numbers.max()) + 1
+    """Number (B, n) of each station's soak: all 0 without temperatures, or with too short a span."""
+    temperature = readings.temperature
+    if temperature is None:
+        return np.zeros(readings.accelerometer.shape[:-1], int)
+    wide = np.ptp(temperature, axis=-1, keepdims=True) >= SPAN
+    return np.where(wide, soaks(temperature), 0)
 
 
 def _highest(options: Options, levels: int) -> int:
@@ -94,33 +137,55 @@ def _highest(options: Options, levels: int) -> int:
     return 0 if options.method == "swarm" else min(HIGHEST, levels - 2)
 
 
-def _tables(
+def _every_order(
+    readings: Readings, options: Options, progress: Callable[[str], None]
+) -> tuple[list[tuple[int, int]], Array]:
+    """The orders that the soaks can judge, and what `_compared` says of them."""
+    highest = _highest(options, int(_usable_soaks(readings)[0].max()) + 1)
+    orders = [(order, order) for order in range(highest + 1)]
+    readings = _with_noise(readings, replace(options, order=highest))
+    return orders, _compared(readings, options, orders, progress)
+
+
+def _compared(
     readings: Readings,
     options: Options,
     orders: Sequence[tuple[int, int]],
-    numbers: Ints,
     progress: Callable[[str], None],
-) -> list[list[OrderScore]]:
-    """The table of each triad over some orders."""
-    found = []
+) -> Array:
+    """Mean squares (orders, B, triads, 5, soaks) of `_held_out` at some orders."""
+    numbers, found = _usable_soaks(readings), []
     for pair in orders:
         name = " and ".join(str(order) for order in dict.fromkeys(pair))
-        progress(f"order {name}: leaving out each of {_count(numbers)} temperatures")
+        progress(f"order {name}: leaving out each of {int(numbers.max()) + 1} temperatures")
         found.append(_held_out(readings, replace(options, order=pair), numbers))
+    return np.stack(found)
+
+
+def _best(found: Array) -> Ints:
+    """The first of some orders (B, triads) that is within 2 % of the best, from `_compared`."""
+    totals = found[..., 0, :].mean(-1)
+    return np.asarray(np.argmax(totals <= NEAR_BEST * np.fmin.reduce(totals), axis=0))
+
+
+def _tables(
+    readings: Readings, orders: Sequence[tuple[int, int]], found: Array
+) -> list[OrderScore]:
+    """The tables of all triads over some orders, from `_compared` of a batch of one."""
     relative = bool(np.isnan(readings.reference("field")).all())
     shown = [shown_in("gravity"), shown_in("field", relative)]
+    chosen = _best(found)[0]
     return [
-        _scored(name, [pair[t] for pair in orders], np.stack([f[t] for f in found]), shown[t])
-        for t, name in enumerate(TRIADS[: len(found[0])])
+        score
+        for t, name in enumerate(TRIADS[: len(chosen)])
+        for score in _scored(name, [p[t] for p in orders], int(chosen[t]), found[:, 0, t], shown[t])
     ]
 
 
 def _scored(
-    triad: str, orders: Sequence[int], found: Array, shown: tuple[float, str]
+    triad: str, orders: Sequence[int], best: int, found: Array, shown: tuple[float, str]
 ) -> list[OrderScore]:
     """The table of one triad from the mean squares (orders, 5, soaks) of `_held_out`."""
-    totals = found[:, 0].mean(-1)
-    best = int(np.argmax(totals <= NEAR_BEST * np.fmin.reduce(totals)))
     means = np.stack([f.mean(-1) for f in (found, found[..., 1:-1], found[..., [0, -1]])], -1)
     scale, degree = shown[0], float(np.degrees(1))
     means[:, 1:] = np.sqrt(means[:, 1:]) * np.array([scale, scale, degree, degree])[:, None]
@@ -151,8 +216,7 @@ def _linear_if_needed(
     readings: Readings, options: Options, progress: Callable[[str], None]
 ) -> Orders:
     """Between two temperatures: order 1 where order 0 leaves clearly more than its noise."""
-    readings = _with_noise(readings, replace(options, order=1))
-    factor = fit(readings, replace(options, order=0)).analysis.variance_factor[0]
+    factor = _without_course(readings, options)[0]
     wanted = [int(value > EXCESS) for value in factor]
     progress(
         "two temperatures cannot be left out in turn: order 1 is taken where order 0 leaves "
@@ -162,33 +226,46 @@ def _linear_if_needed(
     return wanted[0], wanted[-1]
 
 
-def _hopeless(readings: Readings, options: Options) -> bool:
-    """Whether the stations cannot even determine what all temperatures have in common."""
+def _without_course(readings: Readings, options: Options) -> Array:
+    """Residual variance (B, triads) of order 0, in units of the noise that order 1 leaves."""
+    readings = _with_noise(readings, replace(options, order=1))
+    return fit(readings, replace(options, order=0)).analysis.variance_factor
+
+
+def _hopeless(readings: Readings, options: Options) -> Bools:
+    """Whether (B,) the stations cannot even determine what all temperatures have in common."""
     result = fit(readings, Options(method=options.method))
-    ranks = [marginal_rank(result.analysis.determined, w)[0] for w in result.problem.slices()]
-    return bool(min(ranks) < LOWEST_RANK)
+    ranks = [marginal_rank(result.analysis.determined, w) for w in result.problem.slices()]
+    return np.asarray(np.min(ranks, 0) < LOWEST_RANK)
 
 
 def _with_noise(readings: Readings, options: Options) -> Readings:
-    """The readings with noise declared: where it was not, as a fit leaves it.
+    """The readings (B, n) with noise declared: where it was not, as a fit leaves it.
 
     Every order is then judged by the same yardstick.
     """
-    result = fit(readings, options)
-    noise = dict(zip(TRIADS, result.noise[0], strict=False))
-    found = {name: np.array(sd) for name, sd in noise.items() if np.isfinite(sd)}
+    names = [name for name in TRIADS if getattr(readings, name) is not None]
+    if all(name in readings.sd for name in names):
+        return readings
+    noise = fit(readings, options).noise
+    found = {
+        name: noise[:, index, None, None]
+        for index, name in enumerate(names)
+        if name not in readings.sd
+    }
     return replace(readings, sd={**readings.sd, **found})
 
 
 def _held_out(readings: Readings, options: Options, numbers: Ints) -> Array:
-    """Mean squares (triads, 5, parts) of each part of the stations, fitted without it.
+    """Mean squares (B, triads, 5, soaks) of each soak's stations, fitted without them.
 
     Of the reading, in units of its noise (χ²); then of noise and error per axis of the vector
     (g, nT), and of noise and error across the field (rad).
     """
-    include = (np.arange(_count(numbers))[:, None] != numbers).astype(float)
-    result = fit(readings, options, include)
-    held = 1 - include
+    soak = np.arange(int(numbers.max()) + 1)
+    include = (soak[:, None] != numbers[:, None, :]).astype(float)
+    result = fit(mapped(readings, lambda v: np.expand_dims(v, 1)), options, include)
+    held = 1 - include.reshape(-1, readings.count)
     problem, state = _everyone(result)
     linear = problem.linear(state)
     chi = np.sum(_chi(linear) * held[..., None], 1) / (3 * held.sum(1))[:, None]
@@ -208,7 +285,8 @@ def _held_out(readings: Readings, options: Options, numbers: Ints) -> Array:
         found.append(
             np.stack([chi[:, index], *_squares(slope, *parts, 3), *_squares(across, *parts, 2)])
         )
-    return np.stack(found)
+    whole = np.stack(found).reshape(len(found), 5, len(numbers), len(soak))
+    return np.moveaxis(whole, 2, 0)
 
 
 def _squares(

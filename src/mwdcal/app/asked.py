@@ -37,12 +37,82 @@ class AskedToCompare(TypedDict):
     as_json: bool
 
 
+Option = Callable[[Callable[..., Any]], Callable[..., Any]]
 FILE = click.Path(path_type=Path)
 DECIMAL = click.option(
     "--decimal", default=".", show_default=True, metavar="SIGN",
     help="Decimal sign of numbers in text files.",
 )  # fmt: skip
 JSON = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
+TOOL = click.option(
+    "--tool", metavar="NAME|FILE", help="Tool profile: a shipped name or a TOML file."
+)
+SEED = click.option(
+    "--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of the swarm."
+)
+REPORT = click.option(
+    "--report", type=FILE, metavar="R.html", help="Also write a self-contained HTML report."
+)
+
+
+_FIT: tuple[Option, ...] = (
+    TOOL,
+    click.option(
+        "--method", default="joint", show_default=True, metavar="METHOD",
+        help="joint: all evidence, weighted. least-squares: reference vectors only. swarm: the same "
+        "by particle swarm. newton: Newton-Raphson on |g| and inclination. toolface-inclination: the "
+        "accelerometer by angles alone. scalar: |g| and |b| alone.",
+    ),
+    SEED,
+    click.option(
+        "--paper-weights", is_flag=True,
+        help="Sum the squares as the method's paper does, unweighted, instead of by their uncertainty.",
+    ),
+    click.option(
+        "--robust", type=click.Choice(["huber", "student-t"]),
+        help="Bound what a bad station can do: huber keeps a little of its pull, student-t loses it.",
+    ),
+    click.option(
+        "--ignore", default="", metavar="NAMES",
+        help="What may not be used at any station: gravity, field, dip, or several with commas.",
+    ),
+    click.option(
+        "--estimate", default="", metavar="NAMES",
+        help="Errors of the stand to find as well: azimuth-zero, tilt, or both with a comma.",
+    ),
+    click.option(
+        "--model", type=click.Choice(["polynomial", "factors"]),
+        help="Default: polynomial at order 0, factors above.",
+    ),
+    click.option(
+        "--parameters", type=click.Choice(["12", "9", "6"]),
+        help="Per triad at one temperature; default 12. 9: the sensor frame, without mounting rotation. "
+        "6: scale and bias alone.",
+    ),
+)  # fmt: skip
+
+
+def fit_options(order: str, nonlinearity: str, prior: str, known: str) -> tuple[Option, ...]:
+    """The options of `calibrate` and `fleet` that say how to fit.
+
+    With the defaults of two of them, and what a prior may be, as metavar and in words.
+    """
+    return (
+        *_FIT,
+        click.option("--prior", metavar=prior, help=f"What is known beforehand: {known}."),
+        click.option(
+            "--order", default=order, show_default=True, metavar="0…3|auto",
+            help="Order of temperature terms. auto: of each triad, by temperatures left out.",
+        ),
+        click.option(
+            "--nonlinearity", default=nonlinearity, show_default=True, metavar="auto|none|NAMES",
+            help="Own-axis quadratic and cubic terms. auto: of the triads whose profile declares "
+            "them, where left-out stations improve. NAMES: accelerometer, magnetometer, or both with "
+            "a comma.",
+        ),
+    )  # fmt: skip
+
+
 _OPTIONS = (
     click.argument("log", type=FILE),
     click.option(
@@ -74,96 +144,35 @@ _OPTIONS = (
     DECIMAL,
     JSON,
 )  # fmt: skip
-_CALIBRATE = (
+_CALIBRATE: tuple[Option, ...] = (
     click.argument("run", type=FILE),
     click.option(
-        "-o",
-        "--output",
-        type=FILE,
-        required=True,
-        metavar="CAL.json",
+        "-o", "--output", type=FILE, required=True, metavar="CAL.json",
         help="Calibration file to write.",
     ),
-    click.option("--tool", metavar="NAME|FILE", help="Tool profile: a shipped name or a TOML file."),
-    click.option(
-        "--method", default="joint", show_default=True, metavar="METHOD",
-        help="joint: all evidence, weighted. least-squares: reference vectors only. swarm: the same "
-        "by particle swarm. newton: Newton-Raphson on |g| and inclination. toolface-inclination: the "
-        "accelerometer by angles alone. scalar: |g| and |b| alone.",
-    ),
-    click.option(
-        "--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of the swarm."
-    ),
-    click.option(
-        "--paper-weights", is_flag=True,
-        help="Sum the squares as the method's paper does, unweighted, instead of by their uncertainty.",
-    ),
-    click.option(
-        "--robust", type=click.Choice(["huber", "student-t"]),
-        help="Bound what a bad station can do: huber keeps a little of its pull, student-t loses it.",
-    ),
-    click.option(
-        "--prior", metavar="CAL.json|datasheet",
-        help="What is known beforehand: a previous calibration of this tool, with its covariance, or "
-        "the tolerances in the tool profile.",
-    ),
-    click.option(
-        "--ignore", default="", metavar="NAMES",
-        help="What may not be used at any station: gravity, field, dip, or several with commas.",
-    ),
-    click.option(
-        "--estimate", default="", metavar="NAMES",
-        help="Errors of the stand to find as well: azimuth-zero, tilt, or both with a comma.",
-    ),
-    click.option(
-        "--model",
-        type=click.Choice(["polynomial", "factors"]),
-        help="Default: polynomial at order 0, factors above.",
-    ),
-    click.option(
-        "--parameters", type=click.Choice(["12", "9", "6"]),
-        help="Per triad at one temperature; default 12. 9: the sensor frame, without mounting rotation. "
-        "6: scale and bias alone.",
-    ),
-    click.option(
-        "--order",
-        default="auto",
-        show_default=True,
-        metavar="0…3|auto",
-        help="Order of temperature terms.",
-    ),
-    click.option(
-        "--nonlinearity", default="auto", show_default=True, metavar="auto|none|NAMES",
-        help="Own-axis quadratic and cubic terms. auto: of the triads whose profile declares them, "
-        "where left-out stations improve. NAMES: accelerometer, magnetometer, or both with a comma.",
+    *fit_options(
+        "auto", "auto", "CAL.json|datasheet",
+        "a previous calibration of this tool, with its covariance, or the tolerances in the tool profile",
     ),
     click.option(
         "--exclude", multiple=True, metavar="STATION", help="Leave a station out; may be repeated."
     ),
-    click.option(
-        "--report", type=FILE, metavar="R.html", help="Also write a self-contained HTML report."
-    ),
+    REPORT,
     DECIMAL,
     JSON,
 )  # fmt: skip
 _COMPARE = (
     click.argument("run", type=FILE),
-    click.option(
-        "--tool", metavar="NAME|FILE", help="Tool profile: a shipped name or a TOML file."
-    ),
+    TOOL,
     click.option(
         "--order", type=click.Choice(["0", "1", "2", "3", "auto"]), default="auto",
         show_default=True, help="Order of temperature terms, the same for all methods.",
     ),
-    click.option(
-        "--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of the swarm."
-    ),
+    SEED,
     click.option(
         "--parameters", is_flag=True, help="Print the parameters of every method as well."
     ),
-    click.option(
-        "--report", type=FILE, metavar="R.html", help="Also write a self-contained HTML report."
-    ),
+    REPORT,
     DECIMAL,
     JSON,
 )  # fmt: skip

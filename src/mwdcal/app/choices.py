@@ -11,7 +11,7 @@ import numpy as np
 from msgspec.structs import replace as replace_struct
 
 from mwdcal.calibration import Calibration, OrderScore
-from mwdcal.checks import check_readings
+from mwdcal.checks import check_curve_names, check_curves, check_order, check_readings
 from mwdcal.curves import USUAL, CurveScore, choose_curves, declared
 from mwdcal.errors import InputError
 from mwdcal.files import documents
@@ -54,6 +54,20 @@ def choose(
     readings: Readings, profile: Profile, typed: Typed, say: Callable[[str], None]
 ) -> Chosen:
     """Options as typed; what was left to the data is decided by stations left out of the fit."""
+    options, order = stated(typed), typed["order"]
+    if typed["prior"]:
+        options, order = _with_prior(options, order, typed, readings, profile)
+    options, orders = _with_order(options, order, readings, say)
+    options, curves = _with_curves(options, typed["nonlinearity"], readings, profile, say)
+    if not orders:
+        check_readings(readings, options)
+        orders = order_errors(readings, options, say)
+    return Chosen(options, orders, curves)
+
+
+def stated(typed: Typed) -> Options:
+    """The options as typed, at order 0 and without own-axis terms."""
+    check_order(typed["order"])
     options = Options(
         method=typed["method"],
         model=typed["model"],
@@ -66,15 +80,7 @@ def choose(
         seed=typed["seed"],
     )
     check_names(options.estimate, options.method)
-    order = typed["order"]
-    if typed["prior"]:
-        options, order = _with_prior(options, order, typed, readings, profile)
-    options, orders = _with_order(options, order, readings, say)
-    options, curves = _with_curves(options, typed["nonlinearity"], readings, profile, say)
-    if not orders:
-        check_readings(readings, options)
-        orders = order_errors(readings, options, say)
-    return Chosen(options, orders, curves)
+    return options
 
 
 def names(text: str) -> list[str]:
@@ -179,8 +185,6 @@ def _with_order(
         check_readings(readings, replace(options, model=options.model or "polynomial"))
         chosen, scores = choose_order(readings, options, say)
         return replace(options, order=chosen), scores
-    if order not in ("0", "1", "2", "3"):
-        raise InputError(f"--order must be 0, 1, 2, 3 or auto; got {order!r}.")
     return replace(options, order=int(order)), []
 
 
@@ -203,19 +207,6 @@ def _with_curves(
         found, scores = choose_curves(readings, options, offered)
         return replace(options, nonlinearity=found), scores
     wanted = names(asked)
-    if not wanted or not set(wanted) <= set(TRIADS):
-        raise InputError(
-            f"--nonlinearity must be auto, none, {' or '.join(TRIADS)}; got {asked!r}."
-        )
-    for name in wanted:
-        if getattr(readings, name) is None:
-            raise InputError(
-                f"--nonlinearity {name}: {readings.source} has no {name}. Leave it out."
-            )
-    for name, order in zip(TRIADS, options.orders, strict=True):
-        if name in wanted and options.kind(order) != "polynomial":
-            raise InputError(
-                f"--nonlinearity {name}: the model of factors has no own-axis terms. Use "
-                "--model polynomial with it."
-            )
+    check_curve_names(asked, wanted)
+    check_curves(readings, wanted)
     return replace(options, nonlinearity={n: offered.get(n, USUAL) for n in wanted}), []

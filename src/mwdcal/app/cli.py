@@ -314,7 +314,10 @@ def fleet(**asked: Unpack[FleetAsked]) -> None:
     Example: mwdcal fleet runs.parquet -o cals.parquet --tool servo --report fleet.html
     Exit: 0 at least one tool calibrated, 2 input cannot be read, 3 not a single one.
     """
-    from mwdcal.app import fleets
+    from mwdcal.app import pool
+
+    with pool.preparing(1 if asked["scheduler"] else asked["workers"]):
+        from mwdcal.app import fleets
 
     _check_outputs([asked["output"], asked["report"]], [asked["runs"], Path(asked["tool"] or "")])
     sound, result = fleets.run(asked, say)

@@ -8,7 +8,7 @@ from typing import Any, TypedDict
 
 import click
 
-from mwdcal.app.asked import FILE, JSON, taking
+from mwdcal.app.asked import FILE, JSON, Option, fit_options, taking
 
 
 class Asked(TypedDict):
@@ -18,38 +18,29 @@ class Asked(TypedDict):
     output: Path
     tool: str | None
     method: str
-    order: int
-    model: str | None
     seed: int
+    paper_weights: bool
+    robust: str | None
+    prior: str | None
+    ignore: str
+    estimate: str
+    model: str | None
+    parameters: str | None
+    order: str
+    nonlinearity: str
     workers: int | None
     scheduler: str | None
     report: Path | None
     as_json: bool
 
 
-_OPTIONS = (
+_OPTIONS: tuple[Option, ...] = (
     click.argument("runs", type=FILE),
     click.option(
         "-o", "--output", type=FILE, required=True, metavar="CALS.parquet",
         help="Table of calibrations to write, one row per tool.",
     ),
-    click.option(
-        "--tool", metavar="NAME|FILE", help="Tool profile: a shipped name or a TOML file."
-    ),
-    click.option(
-        "--method", default="joint", show_default=True, metavar="METHOD", help="As of `calibrate`."
-    ),
-    click.option(
-        "--order", type=click.IntRange(0, 3), default=0, show_default=True,
-        help="Order of temperature terms, the same for all tools.",
-    ),
-    click.option(
-        "--model", type=click.Choice(["polynomial", "factors"]),
-        help="Default: polynomial at order 0, factors above.",
-    ),
-    click.option(
-        "--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of the swarm."
-    ),
+    *fit_options("0", "none", "datasheet", "the tolerances in the tool profile"),
     click.option(
         "--workers", type=click.IntRange(1), metavar="N",
         help="Processes on this machine. Default: one per core.",

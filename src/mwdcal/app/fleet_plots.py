@@ -17,12 +17,16 @@ COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#4b5563")
 DASHES: tuple[Any, ...] = ("-", "--", ":", "-.", (0, (5, 1)), (0, (1, 1)))
 BINS = (12, 40)
 """Fewest and most bins: as many as half the root of the number of tools."""
+ABREAST = 3
+"""Most panels in a row."""
 KINDS = {
     "gain": ("own-axis gain", "cross-axis gain"),
     "scale": ("scale", ""),
     "misalignment": ("", "misalignment"),
     "offset": ("offset", ""),
     "bias": ("bias", ""),
+    "square": ("own-axis square", ""),
+    "cube": ("own-axis cube", ""),
 }
 """Titles of panels: of one axis, and of two."""
 
@@ -35,12 +39,19 @@ def parameters(found: Sequence[Any]) -> str:
         title = KINDS[kind][len(set(axes)) > 1]
         panels.setdefault(each.triad, {}).setdefault(title, []).append(each)
     with plots._style():
-        figure = plots._figure(2.1 * len(panels))
-        columns = max(len(own) for own in panels.values())
-        grid = figure.subplots(len(panels), columns, squeeze=False)
-        for row, (triad, own) in zip(grid, panels.items(), strict=True):
+        lines = [
+            (triad, list(own.items())[first : first + ABREAST])
+            for triad, own in panels.items()
+            for first in range(0, len(own), ABREAST)
+        ]
+        figure = plots._figure(2.1 * len(lines))
+        columns = max(len(line) for _, line in lines)
+        grid = figure.subplots(len(lines), columns, squeeze=False)
+        for row, (triad, line) in zip(grid, lines, strict=True):
             row[0].set_ylabel("tools")
-            for axes, (title, members) in zip(row, own.items(), strict=False):
+            for axes in row[len(line) :]:
+                axes.set_axis_off()
+            for axes, (title, members) in zip(row, line, strict=False):
                 axes.set_title(f"{triad}: {title}")
                 _steps(axes, {m.title.partition(" ")[2]: m.values for m in members})
                 unit = members[0].unit

@@ -18,7 +18,7 @@ from mwdcal.app.fleet_summary import Summary, column
 from mwdcal.core.vectors import Array, Ints
 from mwdcal.files import atomic, parquet
 from mwdcal.files.fleet_tables import SERIAL
-from mwdcal.fleet import FACTS, OK
+from mwdcal.fleet import OK
 from mwdcal.readings import TRIADS
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ SUSPECT = 3.0
 
 @dataclass(frozen=True)
 class Parameter:
-    """A column of parameters over the sound tools."""
+    """A column of parameters over the sound tools, NaN where a tool does not have it."""
 
     triad: str
     title: str
@@ -47,7 +47,7 @@ class Parameter:
     @property
     def quantiles(self) -> tuple[float, float, float]:
         """1 %, median and 99 %."""
-        low, middle, high = np.quantile(self.values, (0.01, 0.5, 0.99))
+        low, middle, high = np.nanquantile(self.values, (0.01, 0.5, 0.99))
         return float(low), float(middle), float(high)
 
 
@@ -124,7 +124,7 @@ def _facts(summary: Summary, metadata: Mapping[str, object]) -> list[tuple[str, 
     found = [
         ("method", summary.method),
         ("stations", str(summary.stations)),
-        ("order", str(summary.order)),
+        ("order", ", ".join([str(summary.order), *map(_count, summary.orders.items())])),
         ("profile", profile),
     ]
     if summary.order:
@@ -132,22 +132,35 @@ def _facts(summary: Summary, metadata: Mapping[str, object]) -> list[tuple[str, 
     return found
 
 
+def _count(chosen: tuple[str, int]) -> str:
+    """How many tools were given an order."""
+    return f"{chosen[0]} in {report.plural(chosen[1], 'tool')}"
+
+
 def _parameters(path: Path, sound: Ints, field: str) -> list[Parameter]:
     """All columns of parameters, with units that people use."""
     _, pq = parquet.modules(path.name)
-    found = []
-    for name in pq.read_schema(path).names:
+    found, names = [], pq.read_schema(path).names
+    for name in names:
         triad = next((t for t in TRIADS if name.startswith(f"{t}_")), "")
         rest = name.removeprefix(f"{triad}_")
-        if not triad or rest.endswith("_sd") or rest in (*FACTS, "undetermined"):
+        if not triad or f"{name}_sd" not in names:
+            continue
+        values = _comparable(path, triad, rest, column(path, name), names)[sound]
+        if np.isnan(values).all():
             continue
         sd = column(path, f"{name}_sd")[sound]
         unit, factor = _unit(rest, triad, field)
         middle = float(np.nanmedian(sd)) * factor if not np.isnan(sd).all() else float("nan")
-        found.append(
-            Parameter(triad, _title(rest), unit, column(path, name)[sound] * factor, middle)
-        )
+        found.append(Parameter(triad, _title(rest), unit, values * factor, middle))
     return found
+
+
+def _comparable(path: Path, triad: str, name: str, values: Array, names: list[str]) -> Array:
+    """Values but for tools with own-axis terms, whose other parameters are of scaled readings."""
+    if f"{triad}_radius" not in names or name.startswith(("square", "cube")):
+        return values
+    return np.where(np.isnan(column(path, f"{triad}_radius")), values, np.nan)
 
 
 def _unit(name: str, triad: str, field: str) -> tuple[str, float]:
@@ -155,7 +168,7 @@ def _unit(name: str, triad: str, field: str) -> tuple[str, float]:
     kind, _, rest = name.partition("_")
     power = rest.partition("_t")[2]
     per = f"/°C{_raised(power)}" if power else ""
-    if kind in ("offset", "bias"):
+    if kind in ("offset", "bias", "square", "cube"):
         return (f"mg{per}", 1e3) if triad == TRIADS[0] else (f"{field}{per}", 1.0)
     return per.replace("/", "1/"), 1.0
 
@@ -200,18 +213,20 @@ def _outliers(path: Path, parameters: list[Parameter], sound: Ints) -> list[Outl
         return []
     distance, which = np.zeros(len(sound)), np.zeros(len(sound), int)
     for index, each in enumerate(parameters):
-        away = np.abs(each.values - np.median(each.values))
-        spread = SPREAD * np.median(away)
+        if np.sum(~np.isnan(each.values)) < FEWEST:
+            continue
+        away = np.abs(each.values - np.nanmedian(each.values))
+        spread = SPREAD * np.nanmedian(away)
         mine = away / spread if spread > 0 else np.zeros(len(sound))
         which = np.where(mine > distance, index, which)
-        distance = np.maximum(mine, distance)
+        distance = np.fmax(mine, distance)
     far = np.argsort(-distance, kind="stable")[: int(np.sum(distance > FAR))]
     serials = _text(path, SERIAL)
     found = []
     for place in far:
         each = parameters[which[place]]
         title = f"{each.triad} {each.title}"
-        middle = float(np.median(each.values))
+        middle = float(np.nanmedian(each.values))
         value = float(each.values[place])
         serial = serials[sound[place]]
         found.append(Outlier(serial, title, value, middle, each.unit, float(distance[place])))

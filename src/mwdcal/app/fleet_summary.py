@@ -18,6 +18,7 @@ from mwdcal.core.vectors import Array
 from mwdcal.files import parquet
 from mwdcal.files.fleet_tables import SERIAL
 from mwdcal.fleet import OK
+from mwdcal.readings import TRIADS
 
 SHOWN = 5
 """Most serials that a line names."""
@@ -44,7 +45,8 @@ class Summary:
     tools: int
     stations: int
     method: str
-    order: int
+    order: int | str
+    orders: dict[str, int]
     statuses: list[Kind]
     spread: dict[str, list[float]]
     undetermined: dict[str, int]
@@ -69,7 +71,7 @@ def summarise(
     ends = ("_sd_deg", "_variance_factor")
     spread = {n: _quantiles(column(target, n)) for n in names if n.endswith(ends)}
     notes = []
-    if asked["order"] == 0:
+    if asked["order"] == "0":
         span = column(target, "temperature_max_c") - column(target, "temperature_min_c")
         wide = int(np.sum(span > SPAN))
         if wide:
@@ -82,7 +84,8 @@ def summarise(
         tools=head.num_rows,
         stations=stations,
         method=asked["method"],
-        order=asked["order"],
+        order=asked["order"] if asked["order"] == "auto" else int(asked["order"]),
+        orders=_orders(target, names) if asked["order"] == "auto" else {},
         statuses=_kinds(head),
         spread=spread,
         undetermined=_undetermined(target, names),
@@ -113,6 +116,18 @@ def _kinds(head: Any) -> list[Kind]:
     for each in sorted(counted, key=lambda c: (c["values"] != OK, -c["counts"])):
         own = head.filter(_equal(head.column("status"), each["values"])).slice(0, SHOWN).to_pydict()
         found.append(Kind(each["values"], each["counts"], own[SERIAL], own["message"][0]))
+    return found
+
+
+def _orders(path: Path, names: list[str]) -> dict[str, int]:
+    """Tools by triad and the order that was chosen."""
+    found: dict[str, int] = {}
+    for triad in TRIADS:
+        if f"{triad}_order" in names:
+            values = column(path, f"{triad}_order")
+            orders, counts = np.unique(values[~np.isnan(values)], return_counts=True)
+            pairs = zip(orders, counts, strict=True)
+            found |= {f"{triad}: order {order:.0f}": int(count) for order, count in pairs}
     return found
 
 
@@ -159,6 +174,8 @@ def text(summary: Summary, report: Path | None) -> str:
     ]
     if spread:
         lines += ["", table(spread, ["of sound tools", "1 %", "median", "99 %"])]
+    for name, count in summary.orders.items():
+        lines.append(f"chosen for {count} tools: {name}")
     for name, count in summary.undetermined.items():
         lines.append(f"undetermined in {count} tools: {name}")
     lines += [f"! {note}" for note in summary.notes]

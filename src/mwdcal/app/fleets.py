@@ -6,7 +6,8 @@ import contextlib
 import os
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Generator, Iterator
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,10 +16,12 @@ import msgspec
 
 from mwdcal import __version__
 from mwdcal.app import pool
+from mwdcal.app.choices import DATASHEET, names, prior_profile, stated
 from mwdcal.app.fleet_asked import Asked
 from mwdcal.app.fleet_summary import Summary, document, summarise, text
-from mwdcal.checks import check_options
+from mwdcal.checks import check_curve_names, check_options
 from mwdcal.core.fused import cores
+from mwdcal.curves import USUAL, declared
 from mwdcal.errors import FitError, InputError
 from mwdcal.files import atomic, parquet, profiles
 from mwdcal.files.fleet_parts import Plan, is_whole, load, solve
@@ -29,7 +32,10 @@ from mwdcal.files.fleet_tables import (
     open_source,
     partitions,
 )
+from mwdcal.fleet_choices import PerTool
 from mwdcal.options import Options
+from mwdcal.prior import from_datasheet
+from mwdcal.profile import Profile
 
 REFUSED = 3
 """Exit code where not a single tool could be calibrated."""
@@ -53,8 +59,8 @@ def run(asked: Asked, say: Callable[[str], None]) -> tuple[int, Any]:
 def calibrate_table(asked: Asked, say: Callable[[str], None]) -> Summary:
     """Calibrate every tool of the table; the output is written at the end, as a whole."""
     begun = time.perf_counter()
-    options = _options(asked)
     profile, digest = profiles.load_profile(asked["tool"])
+    options, per_tool = _options(asked, profile)
     source = open_source(asked["runs"])
     if options.order and "temperature_c" not in source.columns:
         raise InputError(
@@ -67,11 +73,10 @@ def calibrate_table(asked: Asked, say: Callable[[str], None]) -> Summary:
     if not tools.together:
         say("the rows of a tool are not together: dealing them into files of whole tools first")
     parts = partitions(source, tools, folder)
-    plan = Plan.of(source, profile, options)
+    plan = Plan.of(source, profile, options, per_tool)
     paths = [folder / f"{plan.key(part)}.arrow" for part in parts]
     before = sum(map(is_whole, paths))
     say(f"{tools.count} tools, {source.rows} stations, {len(parts)} parts, {before} done before")
-    _make_parts(plan, parts, paths, asked, say)
     metadata = {
         **{k: v for k, v in source.metadata.items() if k != SERIAL},
         "fleet": source.name,
@@ -80,27 +85,46 @@ def calibrate_table(asked: Asked, say: Callable[[str], None]) -> Summary:
         "profile_sha256": digest,
         "reference_temperature_c": profile.reference_temperature_c,
     }
-    _merge(paths, target, metadata)
+    with contextlib.closing(_parts_made(plan, parts, paths, asked, say)) as made:
+        _merge(paths, made, target, metadata)
     _tidy(folder)
     return summarise(asked, target, source.rows, len(parts), before, time.perf_counter() - begun)
 
 
-def _options(asked: Asked) -> Options:
-    """Options of every fit; refuses what could be right for no tool."""
-    options = Options(
-        method=asked["method"],
-        model=asked["model"],
-        order=asked["order"],
-        nonlinearity={},
-        seed=asked["seed"],
-    )
-    check_options(options)
+def _options(asked: Asked, profile: Profile) -> tuple[Options, PerTool]:
+    """Options of every fit, and what is left to each tool; refuses what could be right for none."""
+    _check_prior(asked["prior"], profile)
+    auto = asked["order"] == "auto"
+    options = replace(stated(asked), order=0 if auto else int(asked["order"]))
+    options, tried = _curves(options, asked["nonlinearity"], profile)
+    per_tool = PerTool(auto, () if asked["prior"] else tried, bool(asked["prior"]))
+    check_options(replace(options, prior=from_datasheet(profile) if asked["prior"] else None))
     if options.method == "swarm" and options.order:
         raise FitError(
             "method swarm finds the 12 parameters of one temperature: use --order 0 for it, or "
             "--method joint for temperature terms."
         )
-    return options
+    return options, per_tool
+
+
+def _check_prior(prior: str | None, profile: Profile) -> None:
+    """Refuse a prior that is of one tool, or that the profile does not have."""
+    if prior and prior != DATASHEET:
+        raise InputError(
+            f"--prior {prior}: the prior of a fleet is 'datasheet', the tolerances in the tool profile. "
+            "A previous calibration is of one tool: use it with mwdcal calibrate."
+        )
+    prior_profile(prior, profile)
+
+
+def _curves(options: Options, asked: str, profile: Profile) -> tuple[Options, tuple[str, ...]]:
+    """The options with the own-axis terms asked for, or the triads of which each tool tries them."""
+    offered = declared(profile, options)
+    if asked in ("auto", "none"):
+        return options, tuple(offered) if asked == "auto" else ()
+    wanted = names(asked)
+    check_curve_names(asked, wanted)
+    return replace(options, nonlinearity={n: offered.get(n, USUAL) for n in wanted}), ()
 
 
 def _check_target(target: Path, runs: Path) -> None:
@@ -117,14 +141,14 @@ def _check_target(target: Path, runs: Path) -> None:
         )
 
 
-def _make_parts(
+def _parts_made(
     plan: Plan,
     parts: list[Partition],
     paths: list[Path],
     asked: Asked,
     say: Callable[[str], None],
-) -> None:
-    """Do the parts that are not there yet; each is written when it is whole."""
+) -> Generator[Path, None, None]:
+    """Do the parts that are not there yet, one by one; each is written when it is whole."""
     missing = [index for index, path in enumerate(paths) if not is_whole(path)]
     if not missing:
         return
@@ -142,16 +166,24 @@ def _make_parts(
         if now - told > EVERY:
             told = now
             say(f"part {count} of {len(missing)}   {tools / (now - begun):.0f} tools/s")
+        yield paths[missing[index]]
 
 
-def _merge(paths: list[Path], target: Path, metadata: dict[str, object]) -> None:
-    """One Parquet table of all parts, in their order; one part in memory at a time."""
+def _merge(
+    paths: list[Path], made: Iterator[Path], target: Path, metadata: dict[str, object]
+) -> None:
+    """One Parquet table of all parts, in their order; one part in memory at a time.
+
+    A part is added when it and all before it are `made`, while workers go on with others.
+    """
     arrow, pq = parquet.modules(target.name)
     whole = paths[0].with_name("whole.parquet")
     described = {parquet.KEY: msgspec.json.encode(metadata, enc_hook=str)}
     writer = None
     try:
         for path in paths:
+            while not is_whole(path) and next(made, None):
+                continue
             with arrow.memory_map(str(path)) as file:
                 part = arrow.ipc.open_stream(file).read_all()
                 if writer is None:
@@ -159,6 +191,8 @@ def _merge(paths: list[Path], target: Path, metadata: dict[str, object]) -> None
                     texts = [f.name for f in schema if not arrow.types.is_floating(f.type)]
                     writer = pq.ParquetWriter(whole, schema, use_dictionary=texts)
                 writer.write_table(part.cast(writer.schema))
+        for _ in made:
+            pass
         if writer is not None:
             writer.close()
         with whole.open("rb+") as stream:

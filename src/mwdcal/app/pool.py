@@ -8,6 +8,7 @@ in hand, which is done again by others.
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 from collections.abc import Callable, Iterator, Sequence
@@ -17,19 +18,25 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
-from multiprocessing import get_all_start_methods, get_context
+from multiprocessing import forkserver, get_all_start_methods, get_context
 from multiprocessing.context import BaseContext
 from typing import Any
 
 from mwdcal.errors import InputError
 
 ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+SETTINGS = {
+    **dict.fromkeys(ONE_THREAD, "1"),
+    "MALLOC_MMAP_THRESHOLD_": str(2**25),
+    "MALLOC_TRIM_THRESHOLD_": str(2**26),
+}
+"""Environment of a worker: there is one per core, and it keeps the memory that it will need again."""
 ATTEMPTS = 3
 """How often a part whose worker died is given to another."""
 PATIENCE = "30s"
 """How long a cluster may take to answer and to have a worker."""
-WORKER = "mwdcal.app.worker"
-"""Module that a worker process has loaded before it is given anything."""
+COMMAND, WORKER = "mwdcal.app.cli", "mwdcal.app.worker"
+"""Modules that a worker process has loaded before it is given anything."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +51,24 @@ class Steps:
         return self.solve(self.load(task))
 
 
+@contextmanager
+def preparing(workers: int | None) -> Iterator[None]:
+    """While the command is loaded, so is the process that its workers will be copies of.
+
+    `workers`: None for one per core. The command computes with one thread, as they do.
+    """
+    context = _context()
+    with _settings_of_workers():
+        if (workers or os.cpu_count() or 1) > 1 and context.get_start_method() == "forkserver":
+            before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+            try:
+                forkserver.ensure_running()
+            finally:
+                signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        yield
+    gc.freeze()  # what is loaded stays: looking through it again takes long, at the end above all
+
+
 def results(
     steps: Steps, tasks: Sequence[Any], workers: int, scheduler: str | None
 ) -> Iterator[tuple[int, bytes]]:
@@ -56,10 +81,10 @@ def results(
 
 
 @contextmanager
-def _one_thread_each() -> Iterator[None]:
-    """Processes started here compute with one thread: there is one of them per core."""
-    before = {name: os.environ.get(name) for name in ONE_THREAD}
-    os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
+def _settings_of_workers() -> Iterator[None]:
+    """The environment of processes that are started here."""
+    before = {name: os.environ.get(name) for name in SETTINGS}
+    os.environ.update(SETTINGS)
     try:
         yield
     finally:
@@ -74,7 +99,7 @@ def _context() -> BaseContext:
     if "forkserver" not in get_all_start_methods():
         return get_context("spawn")
     context = get_context("forkserver")
-    context.set_forkserver_preload([WORKER])
+    context.set_forkserver_preload([COMMAND, WORKER])
     return context
 
 
@@ -106,7 +131,7 @@ def _by_pool(
     """Results of one pool; no more tasks are loaded than keep it busy."""
     waiting = iter(tuple(left))
     with (
-        _one_thread_each(),
+        _settings_of_workers(),
         ProcessPoolExecutor(workers, _context(), _leave_interrupts) as pool,
     ):
         running: dict[Future[bytes], int] = {}

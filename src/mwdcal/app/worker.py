@@ -1,31 +1,45 @@
 """What a worker process has loaded: imported once by a process that is then copied.
 
-A small fit brings in what is loaded at first use.
+A small part brings in what is loaded at first use.
 """
 
 from __future__ import annotations
 
 import contextlib
+import gc
 
 import numpy as np
 
 from mwdcal.core.vectors import reference_vectors
-from mwdcal.estimate import fit
-from mwdcal.files.fleet_parts import solve
-from mwdcal.readings import Readings
+from mwdcal.files import parquet
+from mwdcal.files.contract import CHANNELS, REFERENCES
+from mwdcal.files.fleet_parts import Plan, packed, solve
+from mwdcal.files.fleet_tables import SERIAL
+from mwdcal.options import Options
+from mwdcal.profile import Profile, StandProfile, TriadProfile
 
 
 def warm() -> None:
-    """Fit a perfect tool at twelve attitudes."""
+    """Calibrate a perfect tool at twelve attitudes: on an exact stand, and on an uncertain one."""
     place = np.arange(12.0)
-    angles = {"inclination": 0.3 + 0.2 * place, "azimuth": place, "toolface": 2.0 * place}
-    known = {**angles, **{n: np.full(12, v) for n, v in (("gravity", 1), ("field", 1), ("dip", 1))}}
-    g, b = reference_vectors(**angles, dip=1.0)
-    sd = {name: np.full((12, 3), 1e-3) for name in ("accelerometer", "magnetometer")}
+    angles = {"inclination": 0.3 + 0.2 * place, "azimuth": place % 6, "toolface": 2.0 * place % 6}
+    known = {**angles, **dict.fromkeys(("gravity", "field", "dip"), np.ones(12))}
+    vectors = reference_vectors(**angles, dip=1.0)
+    columns = {REFERENCES[n].column: v / REFERENCES[n].factor for n, v in known.items()}
+    for names, vector in zip(CHANNELS.values(), vectors, strict=True):
+        columns |= dict(zip(names, vector.transpose(), strict=True))
+    triad = TriadProfile(scale=1.0, noise=1e-3)
     with contextlib.suppress(Exception):
-        fit(Readings(g, b, known=known, sd=sd))
+        arrow, _ = parquet.modules("")
+        serial = arrow.array(["1"] * 12).dictionary_encode()
+        loaded = packed(arrow.table({SERIAL: serial, **columns, "#row": np.arange(12)}))
+        for sd in (0.0, 0.1):
+            stand = StandProfile(inclination_deg=sd, azimuth_deg=sd, toolface_deg=sd)
+            profile = Profile(name="", accelerometer=triad, magnetometer=triad, stand=stand)
+            solve(Plan("", {}, tuple(columns), profile, Options(nonlinearity={})), loaded)
 
 
 warm()
+gc.freeze()  # copies then share this memory: collecting garbage would write to all of it
 
 __all__ = ["solve", "warm"]

@@ -76,8 +76,10 @@ class Half:
     def covariance(self) -> Array:
         """Covariance (B, 12, 12) of the parameters."""
         inner = np.swapaxes(self.turn, -1, -2)[:, None] @ self.spread @ self.turn[:, None]
-        whole = np.einsum("bia,bka,bajl->bijkl", self.back, self.back, inner, optimize=True)
-        return np.asarray(whole.reshape(-1, 12, 12)[:, ORDER][:, :, ORDER])
+        outer = self.back[:, :, None] * self.back[:, None]
+        whole = outer.reshape(-1, 9, 3) @ inner.reshape(-1, 3, 16)
+        whole = np.swapaxes(whole.reshape(-1, 3, 3, 4, 4), 2, 3).reshape(-1, 12, 12)
+        return np.asarray(whole[:, ORDER[:, None], ORDER])
 
     @property
     def known(self) -> tuple[Array, Array, Array]:

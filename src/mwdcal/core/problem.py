@@ -251,7 +251,7 @@ class Problem:
     def earth(self, state: State) -> tuple[list[Array], list[Array]]:
         """Earth vectors (B, n, 3) of each triad, and (B, n, 3, 3) by gravity, field and dip."""
         gravity, field, dip = (self.constant(state, c) for c in EARTH)
-        vectors = [earth_gravity(gravity), earth_field(field, dip)]
+        vectors = self.vectors(state)
         zero = np.zeros_like(vectors[0])
         slopes = [
             [earth_gravity(np.ones_like(gravity)), zero, zero],
@@ -259,9 +259,14 @@ class Problem:
         ]
         return vectors, [np.stack(columns, -1) for columns in slopes]
 
+    def vectors(self, state: State) -> list[Array]:
+        """Earth vectors (B, n, 3) of each triad: gravity, then the field."""
+        gravity, field, dip = (self.constant(state, c) for c in EARTH)
+        return [earth_gravity(gravity), earth_field(field, dip)]
+
     def targets(self, state: State) -> list[Array]:
         """Vectors (B, n, 3) that perfect triads would read: gravity, then the field."""
-        return [np.einsum("bnij,bnj->bni", state.attitude, e) for e in self.earth(state)[0]]
+        return [np.einsum("bnij,bnj->bni", state.attitude, e) for e in self.vectors(state)]
 
     def predictions(self, state: State) -> list[Prediction]:
         """Compare each triad's readings with the reference vectors; the last answer is kept."""

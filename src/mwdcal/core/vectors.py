@@ -41,11 +41,11 @@ def tool_from_earth(inclination: ArrayLike, azimuth: ArrayLike, toolface: ArrayL
     ci, si, ca, sa = np.cos(inc), np.sin(inc), np.cos(azi), np.sin(azi)
     ct, st = np.cos(tool), np.sin(tool)
     rows = [
-        [ci * ca * st + sa * ct, ci * sa * st - ca * ct, -si * st],
-        [ci * ca * ct - sa * st, ci * sa * ct + ca * st, -si * ct],
-        [si * ca, si * sa, ci],
+        *(ci * ca * st + sa * ct, ci * sa * st - ca * ct, -si * st),
+        *(ci * ca * ct - sa * st, ci * sa * ct + ca * st, -si * ct),
+        *(si * ca, si * sa, ci),
     ]
-    return np.stack([np.stack(row, -1) for row in rows], -2)
+    return np.stack(rows, -1).reshape(*inc.shape, 3, 3)
 
 
 def earth_gravity(gravity: ArrayLike) -> Array:

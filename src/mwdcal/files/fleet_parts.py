@@ -18,13 +18,15 @@ from mwdcal.files import parquet
 from mwdcal.files.contract import CHANNELS
 from mwdcal.files.fleet_runs import Batch, Rows, batches, refused_tools
 from mwdcal.files.fleet_tables import SERIAL, Partition, Source, read
-from mwdcal.fleet import BAD_INPUT, OK, Outcome, calibrate_batch, names
+from mwdcal.fleet import ALIKE, BAD_INPUT, OK, Outcome, calibrate_batch, names
+from mwdcal.fleet_choices import PerTool
 from mwdcal.options import Options
 from mwdcal.profile import Profile
 from mwdcal.readings import TRIADS
+from mwdcal.selection import HIGHEST
 
 HEAD = (SERIAL, "status", "message", "stations", "temperature_min_c", "temperature_max_c")
-WHOLE = ("rank", "size", "stations")
+WHOLE = ("rank", "size", "order", "stations")
 """Ends of the names of columns of whole numbers."""
 
 END = b"\xff\xff\xff\xff\x00\x00\x00\x00"
@@ -40,12 +42,15 @@ class Plan:
     columns: tuple[str, ...]
     profile: Profile
     options: Options
+    per_tool: PerTool = ALIKE
     version: str = __version__
 
     @classmethod
-    def of(cls, source: Source, profile: Profile, options: Options) -> Plan:
+    def of(
+        cls, source: Source, profile: Profile, options: Options, per_tool: PerTool = ALIKE
+    ) -> Plan:
         """For a table: of its columns those that a run file has."""
-        return cls(source.name, source.metadata, source.used, profile, options)
+        return cls(source.name, source.metadata, source.used, profile, options, per_tool)
 
     @property
     def triads(self) -> tuple[str, ...]:
@@ -59,7 +64,7 @@ class Plan:
 
 def load(plan: Plan, partition: Partition) -> bytes:
     """The rows of a partition, in Arrow's stream format."""
-    return _stream(read(partition, plan.columns))
+    return packed(read(partition, plan.columns))
 
 
 def solve(plan: Plan, loaded: bytes) -> bytes:
@@ -72,7 +77,7 @@ def solve(plan: Plan, loaded: bytes) -> bytes:
     arrow, _ = parquet.modules(plan.source)
     table = arrow.ipc.open_stream(loaded).read_all()
     rows = Rows.of(table, plan.source, plan.metadata, plan.profile)
-    return _stream(_result(rows, plan))
+    return packed(_result(rows, plan))
 
 
 def is_whole(path: Path) -> bool:
@@ -84,7 +89,8 @@ def is_whole(path: Path) -> bool:
         return stream.read() == END
 
 
-def _stream(table: Any) -> bytes:
+def packed(table: Any) -> bytes:
+    """A table in Arrow's stream format."""
     arrow, _ = parquet.modules("fleet")
     stream = arrow.BufferOutputStream()
     with arrow.ipc.new_stream(stream, table.schema) as writer:
@@ -95,7 +101,8 @@ def _stream(table: Any) -> bytes:
 def _result(rows: Rows, plan: Plan) -> Any:
     """The result table of some tools."""
     count = len(rows.counts)
-    filled = {name: np.full(count, np.nan) for name in names(plan.options, plan.triads)}
+    every = names(plan.options, plan.triads, plan.per_tool)
+    filled = {name: np.full(count, np.nan) for name in every}
     status, message = np.full(count, OK, object), np.full(count, "", object)
     unit = np.full(count, None, object)
     free: list[tuple[list[str], ...]] = [([], [])] * count
@@ -114,9 +121,12 @@ def _result(rows: Rows, plan: Plan) -> Any:
 
 
 def _calibrated(rows: Rows, batch: Batch, plan: Plan) -> Outcome:
-    reference = plan.profile.reference_temperature_c
     return calibrate_batch(
-        batch.readings, plan.options, reference, lambda i: rows.alone(int(batch.tools[i]))
+        batch.readings,
+        plan.options,
+        plan.profile,
+        lambda i: rows.alone(int(batch.tools[i])),
+        plan.per_tool,
     )
 
 
@@ -156,10 +166,14 @@ def _table(
         ids = [each[index] if ok else None for each, ok in zip(free, good, strict=True)]
         columns[f"{triad}_undetermined"] = arrow.array(ids, arrow.list_(arrow.string()))
     columns["field_unit"] = arrow.array(unit, arrow.string())
-    same = {"method": options.method, "model": options.kind(max(options.orders))}
-    for name, value in same.items():
-        columns[name] = arrow.array([value] * count, arrow.string())
-    columns["order"] = arrow.array(np.full(count, max(options.orders)), arrow.int32())
+    columns["method"] = arrow.array([options.method] * count, arrow.string())
+    order = np.max([filled[f"{triad}_order"] for triad in plan.triads], 0)
+    if not plan.per_tool.order:
+        order = np.full(count, float(max(options.orders)))
+    kinds = np.array([None, *(options.kind(k) for k in range(HIGHEST + 1))], object)
+    model = kinds[np.nan_to_num(order + 1).astype(int)]
+    columns["model"] = arrow.array(model, arrow.string())
+    columns["order"] = arrow.array(np.nan_to_num(order).astype(np.int32), mask=np.isnan(order))
     return arrow.table(columns)
 
 

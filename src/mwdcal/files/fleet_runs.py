@@ -170,6 +170,8 @@ def batches(rows: Rows, tools: Ints) -> list[Batch]:
     if not tools.size:
         return []
     keys = _kinds(rows)[tools]
+    if (keys == keys[0]).all():
+        return [Batch(_readings(rows, tools), tools)]
     _, number = np.unique(keys, axis=0, return_inverse=True)
     order = np.argsort(number, kind="stable")
     bounds = np.flatnonzero(np.diff(number[order], prepend=-1))
@@ -252,7 +254,8 @@ def _known(rows: Rows, cells: Any) -> dict[str, Array]:
             values = values - magnetic_offset(rows.metadata, rows.source)
         if name in ("azimuth", "toolface"):
             outside = (values < 0.0) | (values >= 360.0)
-            values = np.where(outside, np.mod(values, 360.0), values)
+            if outside.any():
+                values = np.where(outside, np.mod(values, 360.0), values)
         found[name] = values * reference.factor
     return found
 
@@ -279,6 +282,9 @@ def _strength(known: Mapping[str, Array], kind: str, shape: tuple[int, ...]) -> 
 
 def _spread(triad: TriadProfile, cells: Sequence[Array | None], raw: Array) -> Array | None:
     """Standard uncertainty (B, n, 3) of raw readings; None where nothing is stated."""
+    if all(c is None for c in cells):
+        common = triad.noise
+        return None if common is None else np.full(raw.shape, np.hypot(common, triad.repeatability))
     stated = [np.full(raw.shape[:-1], np.nan) if c is None else c for c in cells]
     noise = np.stack(stated, -1)
     if triad.noise is not None:

@@ -13,6 +13,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import msgspec
@@ -31,7 +32,9 @@ ROWS = (6_000, 100_000)
 SHARES = 32
 """…and into how many a fleet between these is divided."""
 LARGEST_GROUP = 20_000_000
-"""Rows of the largest row group that is read; it is read as a whole."""
+"""Rows of the largest row group that is read; it is dealt as a whole."""
+BATCH = 32_768
+"""Rows that are read at once."""
 MOST_STRETCHES = 50_000_000
 """Most stretches of rows of one tool in a table."""
 MOST_FILES = 200
@@ -204,19 +207,14 @@ _NEAR = (
 
 @dataclass(frozen=True)
 class Tools:
-    """The tools of a table, in order of first appearance.
+    """The `count` tools of a table, in order of first appearance.
 
     `runs` are the first rows (r,) of stretches of one tool, `tool` (r,) whose each is.
     """
 
-    serials: Any
+    count: int
     runs: Ints
     tool: Ints
-
-    @property
-    def count(self) -> int:
-        """Number of tools."""
-        return len(self.serials)
 
     @property
     def together(self) -> bool:
@@ -236,7 +234,8 @@ def find_tools(source: Source) -> Tools:
         if values[0].as_py() == last:
             change = change[1:]
         starts.append(change + row)
-        heads.append(values.take(arrow.array(change)))
+        indices = arrow.array(codes[change], values.indices.type)
+        heads.append(arrow.DictionaryArray.from_arrays(indices, values.dictionary))
         row, last = row + len(codes), values[-1].as_py()
         _check_stretches(sum(map(len, starts)), source.name)
     every = one_chunk(arrow.chunked_array(heads))
@@ -245,8 +244,7 @@ def find_tools(source: Source) -> Tools:
     order = np.argsort(first)
     rank = np.empty(len(order), int)
     rank[order] = np.arange(len(order))
-    serials = every.dictionary.take(arrow.array(used[order]))
-    return Tools(serials, np.concatenate(starts), rank[number])
+    return Tools(len(used), np.concatenate(starts), rank[number])
 
 
 def one_chunk(column: Any) -> Any:
@@ -311,7 +309,8 @@ def _encoded(column: Any, source: str) -> Any:
         )
     if kind == column.type:
         return column.cast(plain).dictionary_encode()
-    return column.cast(arrow.dictionary(arrow.int32(), plain))
+    encoded = arrow.dictionary(arrow.int32(), plain)
+    return column if column.type == encoded else column.cast(encoded)
 
 
 def partitions(source: Source, tools: Tools, folder: Path) -> list[Partition]:
@@ -375,8 +374,8 @@ def _deal(source: Source, tools: Tools, number: Ints, folder: Path) -> None:
     writers: dict[int, Any] = {}
     row = 0
     try:
-        for piece in source.pieces:
-            table = _row_group(piece, source.used)
+        for piece in filter(lambda p: p.rows, source.pieces):
+            table = arrow.concat_tables(_batches(piece, source.used)).unify_dictionaries()
             rows = np.arange(row, row + piece.rows)
             tool = tools.tool[np.searchsorted(tools.runs, rows, "right") - 1]
             table = table.append_column(TOOL, arrow.array(tool))
@@ -401,27 +400,72 @@ def _deal(source: Source, tools: Tools, number: Ints, folder: Path) -> None:
 def read(partition: Partition, columns: Sequence[str]) -> Any:
     """The rows of a partition as an Arrow table, in order of tools, with their row numbers."""
     arrow, _ = parquet.modules("fleet")
-    names = [*columns, TOOL, "#row"] if partition.dealt else list(columns)
-    tables = [_row_group(piece, tuple(names)) for piece in partition.pieces]
+    names = (*columns, TOOL, "#row") if partition.dealt else tuple(columns)
+    tables, start, rows = [], partition.skip, partition.rows
+    for piece in partition.pieces:
+        stop = min(piece.rows, start + rows)
+        tables += _rows(piece, names, start, stop) if stop > start else []
+        start, rows = 0, rows - (stop - start)
     table = arrow.concat_tables(tables, promote_options="permissive").unify_dictionaries()
-    table = table.slice(partition.skip, partition.rows)
     if not partition.dealt:
-        rows = np.arange(partition.first, partition.first + partition.rows)
-        return table.append_column("#row", arrow.array(rows))
+        numbers = np.arange(partition.first, partition.first + partition.rows)
+        return table.append_column("#row", arrow.array(numbers))
     order = np.argsort(table.column(TOOL).to_numpy(), kind="stable")
     return table.take(arrow.array(order)).drop_columns([TOOL])
 
 
+@dataclass
+class _Reading:
+    """A row group that is being read: `held` is the batch of rows that has come, `row` its first."""
+
+    batches: Iterator[Any]
+    held: Any
+    row: int = 0
+
+    def rows(self, start: int, stop: int) -> list[Any]:
+        """The rows `start` to `stop`, in stretches; those before are passed over."""
+        found = []
+        while True:
+            end = self.row + len(self.held)
+            if end > start:
+                first = max(start - self.row, 0)
+                found.append(self.held.slice(first, min(stop, end) - self.row - first))
+            if end >= stop:
+                return found
+            self.row, self.held = end, next(self.batches)
+
+
+_ONE_AT_A_TIME = Lock()
+
+
+def _rows(piece: Piece, columns: tuple[str, ...], start: int, stop: int) -> list[Any]:
+    """Rows of a row group; partitions next to each other go on where the last one ended."""
+    with _ONE_AT_A_TIME:
+        try:
+            if _reading(piece, columns).row > start:
+                _reading.cache_clear()
+            return _reading(piece, columns).rows(start, stop)
+        except Exception:
+            _reading.cache_clear()
+            raise
+
+
 @lru_cache(maxsize=1)
-def _row_group(piece: Piece, columns: tuple[str, ...]) -> Any:
-    """One row group: kept, because partitions next to each other share it."""
+def _reading(piece: Piece, columns: tuple[str, ...]) -> _Reading:
+    batches = _batches(piece, columns)
+    return _Reading(batches, next(batches))
+
+
+def _batches(piece: Piece, columns: tuple[str, ...]) -> Iterator[Any]:
+    """The rows of a row group in tables, with the values that its folder names state."""
     arrow, pq = parquet.modules(piece.path)
     keys = dict(piece.keys)
     wanted = [name for name in columns if name not in keys]
     labels = [name for name in LABELS if name in wanted]
     try:
         with pq.ParquetFile(piece.path, memory_map=True, read_dictionary=labels) as file:
-            table = file.read_row_group(piece.group, wanted)
+            for batch in file.iter_batches(BATCH, [piece.group], wanted):
+                yield _complete(arrow.Table.from_batches([batch]), piece, columns)
     except FileNotFoundError:
         raise InputError(
             f"'{piece.path}': no such file on this machine. Workers on other machines must see "
@@ -429,9 +473,15 @@ def _row_group(piece: Piece, columns: tuple[str, ...]) -> Any:
         ) from None
     except OSError as error:
         raise parquet.unreadable(piece.path, error) from error
+
+
+def _complete(table: Any, piece: Piece, columns: tuple[str, ...]) -> Any:
+    """Rows with the columns of their folder's names, and the serials encoded."""
+    arrow, _ = parquet.modules(piece.path)
+    keys = dict(piece.keys)
     for name in columns:
         if name in keys:
-            value = arrow.array([keys[name]]).take(arrow.array(np.zeros(piece.rows, int)))
+            value = arrow.array([keys[name]]).take(arrow.array(np.zeros(len(table), int)))
             table = table.append_column(name, value)
     place = table.column_names.index(SERIAL)
     table = table.set_column(place, SERIAL, _encoded(table.column(SERIAL), piece.path))
