@@ -12,6 +12,7 @@ import time
 import pytest
 
 from cli_support import EXAMPLE, mwdcal, process
+from mwdcal.app import cli, fleets
 
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="POSIX signals")
 
@@ -107,7 +108,8 @@ def test_a_killed_first_run_leaves_no_file_of_that_name(tmp_path):
 def test_ctrl_c_ends_with_130_and_one_line(tmp_path, when):
     target = tmp_path / "cal.json"
     fitting = "import mwdcal.estimate as e, time\nreal = e.start\ndef slow(p):\n" + (
-        "    print('writing', flush=True); time.sleep(20); return real(p)\ne.start = slow\n"
+        "    print('writing', flush=True)\n    for _ in range(2000):\n        time.sleep(0.01)\n"
+        "    return real(p)\ne.start = slow\n"
     )
     child = started(("" if when == "writing" else fitting) + SLOW_WRITE, *CALIBRATE, target)
     assert child.stdout.readline() == "writing\n"
@@ -116,6 +118,46 @@ def test_ctrl_c_ends_with_130_and_one_line(tmp_path, when):
     assert child.returncode == 130
     assert err.strip() == "mwdcal: interrupted. Files are as they were before."
     assert not list(tmp_path.iterdir())
+
+
+ENDINGS = {"SIGTERM": "terminated", "SIGHUP": "terminated", "SIGINT": "interrupted"}
+
+
+@pytest.mark.parametrize(("name", "word"), ENDINGS.items())
+def test_every_orderly_end_tells_its_status_and_leaves_nothing(tmp_path, name, word):
+    number = getattr(signal, name)
+    child = started(SLOW_WRITE, *CALIBRATE, tmp_path / "cal.json")
+    assert child.stdout.readline() == "writing\n"
+    child.send_signal(number)
+    _, err = child.communicate(timeout=10)
+    assert child.returncode == 128 + number
+    assert err.strip() == f"mwdcal: {word}. Files are as they were before."
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_ignored_hang_up_stays_ignored(tmp_path):
+    """As `nohup` asks for."""
+    ignoring = "import signal; signal.signal(signal.SIGHUP, signal.SIG_IGN)\n" + SLOW_WRITE
+    child = started(ignoring, *CALIBRATE, tmp_path / "cal.json")
+    assert child.stdout.readline() == "writing\n"
+    child.send_signal(signal.SIGHUP)
+    child.communicate(timeout=20)
+    assert child.returncode == 0
+    assert (tmp_path / "cal.json").exists()
+
+
+@pytest.mark.parametrize("stop", [KeyboardInterrupt(), cli.Ended(signal.SIGTERM)], ids=repr)
+def test_an_interrupted_fleet_says_that_finished_parts_are_kept(tmp_path, monkeypatch, stop):
+    def interrupt(*given):
+        raise stop
+
+    monkeypatch.setattr(fleets, "run", interrupt)
+    before = [signal.getsignal(getattr(signal, name)) for name in ENDINGS]
+    ran = mwdcal("fleet", tmp_path / "runs.parquet", "-o", tmp_path / "cals.parquet")
+    assert ran.code == 128 + (signal.SIGTERM if isinstance(stop, cli.Ended) else signal.SIGINT)
+    word = ran.err.strip().removeprefix("mwdcal: ")
+    assert word.endswith("ed. Finished parts are kept: the same command goes on from there.")
+    assert [signal.getsignal(getattr(signal, name)) for name in ENDINGS] == before
 
 
 def without_time(path):

@@ -96,6 +96,12 @@ def test_completion_completes():
     assert done.stdout.splitlines() == ["plain,calibrate"]
 
 
+def test_the_package_runs_as_the_command():
+    command = [sys.executable, "-m", "mwdcal", "--version"]
+    done = subprocess.run(command, capture_output=True, encoding="utf-8", check=True)
+    assert done.stdout == mwdcal("--version").out
+
+
 def test_help_imports_neither_numpy_nor_scipy():
     script = (
         "import sys\nfrom mwdcal.app.cli import main\n"
@@ -112,7 +118,7 @@ def test_help_imports_neither_numpy_nor_scipy():
 @pytest.mark.skipif(os.name == "nt", reason="POSIX pipes")
 @pytest.mark.parametrize("reader", ["head -1", "true"])
 def test_a_reader_that_leaves_early_sees_no_traceback(files, reader):
-    mine = f"'{sys.executable}' -c 'from mwdcal.app.cli import main; main()'"
+    mine = f"'{sys.executable}' -m mwdcal"
     line = f"{mine} convert '{files[0]}' --notation forward --json | {reader}"
     done = subprocess.run(line, shell=True, capture_output=True, encoding="utf-8", check=False)
     assert done.returncode == 0
@@ -122,7 +128,7 @@ def test_a_reader_that_leaves_early_sees_no_traceback(files, reader):
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")
 def test_a_full_disk_behind_stdout_is_told(files):
     with open("/dev/full", "w") as full:
-        arguments = (sys.executable, "-c", "from mwdcal.app.cli import main; main()")
+        arguments = (sys.executable, "-m", "mwdcal")
         done = subprocess.run(
             [*arguments, "convert", str(files[0]), "--notation", "forward"],
             stdout=full,

@@ -1,6 +1,10 @@
 """Atomic writing: the whole file or the old one, and no temporary file left behind."""
 
 import os
+import subprocess
+import sys
+import threading
+import time
 
 import pytest
 
@@ -95,3 +99,86 @@ def test_a_refused_permission_is_an_input_error(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "fsync", refuse)
     with pytest.raises(InputError, match="choose a folder you may write to"):
         atomic.write(tmp_path / "cal.json", "new")
+
+
+KILLED = """
+import os, sys
+from mwdcal.files import atomic
+with atomic.replacing(sys.argv[1]) as stream:
+    stream.write(b"half")
+    stream.flush()
+    os._exit(9)
+"""
+
+
+def left_behind(folder):
+    """What a process that was killed while writing left, and a folder that was not yet looked at."""
+    subprocess.run([sys.executable, "-c", KILLED, str(folder / "a.txt")], check=False)
+    (left,) = folder.glob(".mwdcal-*.tmp")
+    assert left.read_bytes() == b"half"
+    atomic.sweep.cache_clear()
+    return left
+
+
+def test_what_a_killed_writer_left_is_removed_by_the_next(tmp_path):
+    left = left_behind(tmp_path)
+    with atomic.replacing(tmp_path / "b.txt") as stream:
+        assert not left.exists()  # there is room for the new file
+        stream.write(b"new")
+    assert [file.name for file in tmp_path.iterdir()] == ["b.txt"]
+
+
+def test_what_is_being_written_is_never_removed(tmp_path):
+    with atomic.replacing(tmp_path / "a.txt") as stream:
+        os.utime(stream.name, (0, 0))  # however long it takes
+        atomic.sweep.cache_clear()
+        atomic.write(tmp_path / "b.txt", "new")
+        stream.write(b"done")
+    assert (tmp_path / "a.txt").read_bytes() == b"done"
+
+
+def test_many_writers_and_sweeps_at_once_lose_nothing(tmp_path):
+    def write(number):
+        for i in range(40):
+            atomic.sweep.cache_clear()
+            atomic.write(tmp_path / f"{number}-{i}", "x", durable=False)
+
+    threads = [threading.Thread(target=write, args=(n,)) for n in range(6)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(list(tmp_path.iterdir())) == 240
+
+
+@pytest.mark.skipif(os.name == "nt", reason="an open file cannot be removed there")
+def test_files_of_another_machine_are_left_for_a_day(tmp_path, monkeypatch):
+    left = left_behind(tmp_path)
+    other = left.with_name(".mwdcal-00000000-" + left.name.partition("-")[2].partition("-")[2])
+    left.rename(other)
+    atomic.write(tmp_path / "b.txt", "new")
+    assert other.exists()
+    os.utime(other, (time.time() - 90_000,) * 2)
+    atomic.sweep.cache_clear()
+    atomic.write(tmp_path / "b.txt", "new")
+    assert not other.exists()
+
+
+@pytest.mark.skipif(os.name == "nt", reason="POSIX locks")
+def test_a_disk_without_locks_is_written_to_and_not_swept(tmp_path, monkeypatch):
+    left = left_behind(tmp_path)
+
+    def refuse(*given):
+        raise OSError(38, "Function not implemented")
+
+    monkeypatch.setattr(atomic.fcntl, "flock", refuse)
+    atomic.write(tmp_path / "b.txt", "new")
+    assert left.exists()
+    assert (tmp_path / "b.txt").read_text() == "new"
+
+
+def test_what_only_looks_like_a_temporary_file_stays(tmp_path):
+    (tmp_path / ".mwdcal-folder.tmp").mkdir()
+    atomic.sweep.cache_clear()
+    atomic.write(tmp_path / "b.txt", "new")
+    assert (tmp_path / ".mwdcal-folder.tmp").is_dir()

@@ -1,4 +1,4 @@
-"""Long tables, part by part: the same results, findings and refusals as when they are read whole."""
+"""Tables part by part: the same results, findings and refusals as when they are read whole."""
 
 import decimal
 import io
@@ -6,16 +6,27 @@ import json
 import signal
 import subprocess
 import sys
+import threading
 import time
-from datetime import datetime
+from datetime import date, datetime
 
 import numpy as np
 import pytest
 
-from cli_support import calibrated, channels, mwdcal, read_csv, refused, servo_run, write_csv
+from cli_support import (
+    calibrated,
+    channels,
+    mwdcal,
+    numbers,
+    process,
+    read_csv,
+    refused,
+    servo_run,
+    write_csv,
+)
 from mwdcal.app import progress, streaming
 from mwdcal.app.tables import apply_to_table
-from mwdcal.correction import NAMES
+from mwdcal.correction import MARK, NAMES
 from mwdcal.errors import InputError
 from mwdcal.files import documents, streams, table
 from simulation import Tool
@@ -44,8 +55,8 @@ def cold(tmp_path_factory):
 
 @pytest.fixture
 def small_pieces(monkeypatch):
-    """Every table is long, and text is read in pieces of a few lines."""
-    monkeypatch.setattr(streaming, "LONG", (0, 0))
+    """Every text table is long, and read in pieces of a few lines."""
+    monkeypatch.setattr(streaming, "LONG", dict.fromkeys(streaming.LONG, 0))
     monkeypatch.setattr(streams, "PIECE", 3000)
 
 
@@ -67,9 +78,9 @@ def write_parquet(path, columns, metadata=None, **options):
     return path
 
 
-def whole(calibration, path, outside="blank"):
+def whole(calibration, path, outside="blank", missing="refuse"):
     """What the small path makes of the file."""
-    return apply_to_table(calibration, table.read(path), outside)
+    return apply_to_table(calibration, table.read(path), outside, missing)
 
 
 def assert_same(path, wanted):
@@ -79,7 +90,9 @@ def assert_same(path, wanted):
     assert {**found.metadata, "findings": 0} == {**wanted.metadata, "findings": 0}
     assert found.metadata.get("findings", []) == wanted.metadata.get("findings", [])
     for name in wanted.columns:
-        if name in NAMES or not isinstance(wanted.columns[name], list):
+        if name == MARK:
+            assert found.columns[name] == [str(mark).lower() for mark in wanted.columns[name]]
+        elif name in NAMES or not isinstance(wanted.columns[name], list):
             theirs, ours = table.numbers(wanted, name), table.numbers(found, name)
             np.testing.assert_array_equal(np.isnan(ours), np.isnan(theirs), err_msg=name)
             size = 1e5 if name.endswith("_nt") else 360.0
@@ -163,6 +176,195 @@ def test_columns_of_every_type_are_carried_through(tmp_path, cold):
     for name in ("label", "place", "when", "good", "none"):
         assert ours[name] == theirs[name]
     assert ours["count"][1] == str(2**60 + 1)
+
+
+def carried(count):
+    """Columns of every type that a user's own columns may have, some cells null."""
+    holes = np.arange(count) % 3 == 1
+    ids = 2**60 + 1 + np.arange(count)
+    steps = arrow.array(np.arange(count) * 10**9 + 7)
+    texts = [("", "007", "1e5", None, "x")[i % 5] for i in range(count)]
+    return {
+        "id": arrow.array(ids),
+        "serial": arrow.array(ids.astype("u8") + 2**63),
+        "flag": arrow.array(holes, mask=~holes),
+        "count": arrow.array(np.arange(count, dtype="i4"), mask=holes),
+        "single": arrow.array(np.arange(count, dtype="f4") / 10, mask=holes),
+        "price": arrow.array([decimal.Decimal("1.10")] * count, arrow.decimal128(9, 2)),
+        "when": steps.cast(arrow.timestamp("ns", "Europe/Oslo")),
+        "day": arrow.array([date(2026, 1, 2)] * count),
+        "note": arrow.array(texts),
+        "long": arrow.array(texts, arrow.large_string()),
+        "lot": arrow.array(texts).dictionary_encode(),
+        "bytes": arrow.array([b"\xff\x00", None, b""] * count, arrow.binary())[:count],
+        "list": arrow.array([[1, None], [], None] * count)[:count],
+        "record": arrow.array([{"a": 1, "b": ["x"]}] * count),
+        "none": arrow.nulls(count),
+    }
+
+
+@pytest.mark.parametrize("count", [1, 5, 1000, 300_000])
+def test_what_is_carried_along_is_untouched_at_any_length(tmp_path, cold, count):
+    own = carried(count)
+    schema = arrow.schema([arrow.field(n, c.type, nullable=n != "id") for n, c in own.items()])
+    columns = {**own, **{k: arrow.array(v) for k, v in log(count, low=10, high=40).items()}}
+    schema = arrow.schema([*schema, *((n, arrow.float64()) for n in log(1))])
+    parquet.write_table(arrow.table(columns, schema=schema), tmp_path / "log.parquet")
+    before = parquet.read_table(tmp_path / "log.parquet")
+    for decimal_sign in ".,":
+        options = ("-o", tmp_path / "out.parquet", "--decimal", decimal_sign)
+        assert mwdcal("apply", cold[0], tmp_path / "log.parquet", *options).code == 0
+        after = parquet.read_table(tmp_path / "out.parquet").select(before.column_names)
+        assert after.schema.equals(before.schema)
+        assert after.equals(before)
+
+
+def test_a_short_table_that_becomes_text_keeps_every_digit(tmp_path, cold):
+    columns = {"id": arrow.array(2**60 + np.arange(4)), **log(4, low=10, high=40)}
+    source = write_parquet(tmp_path / "log.parquet", columns, {"serial": "X1"})
+    assert mwdcal("apply", cold[0], source, "-o", tmp_path / "out.csv").code == 0
+    assert read_csv(tmp_path / "out.csv")["id"] == [str(2**60 + i) for i in range(4)]
+    lines = (tmp_path / "out.csv").read_text().splitlines()
+    assert all(line.rstrip("# ") for line in lines)  # no room is left where nothing is told
+
+
+def test_nanoseconds_become_text(tmp_path, cold):
+    when = arrow.array([1, 1_000_000_000, None], arrow.int64())
+    zones = {"when": None, "there": "UTC"}
+    times = {name: when.cast(arrow.timestamp("ns", zone)) for name, zone in zones.items()}
+    source = write_parquet(tmp_path / "log.parquet", {**times, **log(3, low=10, high=40)})
+    for out in ("out.csv", "out.xlsx"):
+        assert mwdcal("apply", cold[0], source, "-o", tmp_path / out).code == 0
+        found = table.read(tmp_path / out).columns
+        assert found["when"] == [
+            "1970-01-01T00:00:00.000000001",
+            "1970-01-01T00:00:01.000000000",
+            "",
+        ]
+        assert [cell.removesuffix("Z") for cell in found["there"]] == found["when"]
+
+
+def gappy(count, holes):
+    """A log with blank cells: of each column some rows; and which rows are whole."""
+    columns, sound = log(count), np.ones(count, bool)
+    for name, rows in holes.items():
+        columns[name] = columns[name].copy()
+        columns[name][rows] = np.nan
+        sound[rows] = False
+    return columns, sound
+
+
+HOLES = {
+    "here and there": {"ax": [5, 700, 701], "mz": [701, 2000], "temperature_c": [0, 2999]},
+    "a whole part": {"my": slice(1000, 1500)},
+    "the first part": {"mx": slice(0, 600), "my": slice(0, 600), "mz": slice(0, 600)},
+    "its temperatures": {"temperature_c": slice(0, 600)},
+}
+
+
+@pytest.mark.parametrize("suffix", [".parquet", ".csv"])
+@pytest.mark.parametrize("outside", ["blank", "extrapolate"])
+@pytest.mark.parametrize("least", PARTS.values(), ids=PARTS)
+@pytest.mark.parametrize("holes", HOLES.values(), ids=HOLES)
+def test_rows_that_lack_a_reading(tmp_path, warm, small_pieces, holes, least, outside, suffix):
+    columns, sound = gappy(3000, holes)
+    source = (write_parquet if suffix == ".parquet" else write_csv)(
+        tmp_path / f"l{suffix}", columns
+    )
+    out, options = tmp_path / f"out{suffix}", {"rows": 500, "least": least}
+    with pytest.raises(InputError, match="blank"):
+        streaming.apply_to_file(warm[1], source, out, outside, **options)
+    told = streaming.apply_to_file(warm[1], source, out, outside, missing="blank", **options)
+    wanted, findings = whole(warm[1], source, outside, "blank")
+    assert told == (3000, findings)
+    assert_same(out, wanted)
+    text = f"{(~sound).sum()} of 3000 rows lack a reading: their results are blank."
+    assert text in [finding.text for finding in findings]
+    # the rest is what it is without the others
+    alone = {name: values[sound] for name, values in columns.items()}
+    rest, _ = whole(warm[1], write_csv(tmp_path / "rest.csv", alone), outside)
+    hot = (alone["temperature_c"] < -1) | (alone["temperature_c"] > 51)
+    for name in NAMES:
+        found = table.numbers(wanted, name)
+        assert np.isnan(found[~sound]).all()
+        np.testing.assert_array_equal(found[sound], rest.columns[name])
+        assert np.isnan(found[sound][hot]).all() == (outside == "blank")
+    if outside == "extrapolate":
+        np.testing.assert_array_equal(wanted.columns[MARK][sound], hot)
+        assert not wanted.columns[MARK][~sound].any()
+
+
+@pytest.mark.parametrize("suffix", [".parquet", ".csv", ".xlsx"])
+def test_missing_readings_by_the_command(tmp_path, cold, suffix):
+    columns, sound = gappy(40, {"ay": [3], "mx": [3, 8]})
+    text = write_csv(tmp_path / "log.csv", columns)
+    source = tmp_path / f"log{suffix}"
+    if suffix != ".csv":
+        table.write(source, table.read(text))
+    command = ("apply", cold[0], source, "-o", tmp_path / "out.csv")
+    assert "column 'ay': must be filled in; got a blank cell." in refused(mwdcal(*command), 2)
+    ran = mwdcal(*command, "--missing", "blank", "--outside", "extrapolate", "--json")
+    assert [f["id"] for f in ran.json["findings"]] == ["missing-reading", "outside-temperature"]
+    found = read_csv(tmp_path / "out.csv")
+    np.testing.assert_array_equal(np.isnan(numbers(found["gz_g"])), ~sound)
+    assert list(found)[-2:] == ["magnetic_toolface_deg", "extrapolated"]
+    low, high = cold[1].temperature_c
+    hot = (columns["temperature_c"] < low - 1) | (columns["temperature_c"] > high + 1)
+    assert found["extrapolated"] == [str(mark).lower() for mark in hot & sound]
+
+
+@pytest.mark.parametrize("suffix", [".parquet", ".csv"])
+def test_what_is_wrong_is_not_missing(tmp_path, warm, small_pieces, suffix):
+    columns, _ = gappy(3000, {"ax": [2500, 2510]})
+    columns["az"][2600] = np.inf if suffix == ".parquet" else 1e300
+    write = write_parquet if suffix == ".parquet" else write_csv
+    source, out = write(tmp_path / f"log{suffix}", columns), tmp_path / "out.parquet"
+    with pytest.raises(InputError) as found:
+        streaming.apply_to_file(warm[1], source, out, "blank", rows=500, missing="blank")
+    with pytest.raises(InputError) as wanted:
+        whole(warm[1], source, "blank", "blank")
+    assert str(found.value) == str(wanted.value)
+    assert "column 'az'" in str(found.value)
+
+
+def test_where_every_row_lacks_a_reading_nothing_is_written(tmp_path, warm):
+    columns, _ = gappy(30, {"ax": slice(0, 20), "mz": slice(20, 30)})
+    for source in (
+        write_csv(tmp_path / "log.csv", columns),
+        write_parquet(tmp_path / "log.parquet", columns),
+    ):
+        out = tmp_path / "out.csv"
+        message = refused(mwdcal("apply", warm[0], source, "-o", out, "--missing", "blank"), 2)
+        assert "every row lacks a reading" in message
+        assert not out.exists()
+
+
+def test_wholly_blank_columns_are_absent_and_not_missing(tmp_path, cold):
+    names = ("mx", "my", "mz", "temperature_c")
+    columns, _ = gappy(3000, dict.fromkeys(names, slice(0, 3000)))
+    source, out = write_parquet(tmp_path / "log.parquet", columns), tmp_path / "out.parquet"
+    ran = mwdcal("apply", cold[0], source, "-o", out, "--missing", "blank", "--json")
+    assert [f["id"] for f in ran.json["findings"]] == ["no-magnetometer"]
+    assert_same(out, whole(cold[1], source)[0])
+
+
+@pytest.mark.parametrize("suffix", [".parquet", ".xlsx"])
+def test_marks_are_truth_values_where_the_format_has_them(tmp_path, warm, suffix):
+    out = tmp_path / "out.parquet"
+    text = write_csv(tmp_path / "log.csv", log(50))
+    source = tmp_path / f"log{suffix}"
+    table.write(source, table.read(text))
+    assert mwdcal("apply", warm[0], source, "-o", out, "--outside", "extrapolate").code == 0
+    column = parquet.read_table(out)[MARK]
+    assert column.type == arrow.bool_()
+    assert 0 < sum(column.to_pylist()) < 50
+    taken = mwdcal("apply", warm[0], source, "-o", tmp_path / "b.csv")
+    assert taken.code == 0
+    write_csv(tmp_path / "taken.csv", {**log(5), MARK: ["no"] * 5})
+    again = ("apply", warm[0], tmp_path / "taken.csv", "-o", out)
+    assert mwdcal(*again).code == 0
+    message = refused(mwdcal(*again, "--outside", "extrapolate"), 2)
+    assert "the column 'extrapolated' is there already" in message
 
 
 def test_the_index_of_pandas_is_left_out(tmp_path, cold):
@@ -289,23 +491,53 @@ def test_interrupted_it_leaves_the_old_file(tmp_path, warm, monkeypatch, small_p
     assert {f.name for f in tmp_path.iterdir()} == {"log.parquet", "out.parquet"}
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
-def test_ctrl_c_in_the_middle_of_a_long_table(tmp_path, warm):
-    write_parquet(tmp_path / "log.parquet", log(250_000))
+def caught_writing(folder, calibration):
+    """A process that applies `log.parquet` and sleeps before it writes the first part.
+
+    In many short sleeps: a signal that comes just before one does not wake from it.
+    """
     slow = (
         "import sys, time\nfrom mwdcal.app import streaming\nfrom mwdcal.app.cli import main\n"
-        "def write(*given):\n    print('writing', flush=True); time.sleep(20)\n"
+        "def write(*given):\n    print('writing', flush=True)\n"
+        "    for _ in range(2000):\n        time.sleep(0.01)\n"
         "streaming.ParquetSink.write = write\nmain(sys.argv[1:])\n"
     )
-    names = [str(tmp_path / name) for name in ("log.parquet", "out.parquet")]
-    command = [sys.executable, "-c", slow, "apply", str(warm[0]), names[0], "-o", names[1]]
+    names = [str(folder / name) for name in ("log.parquet", "out.parquet")]
+    command = [sys.executable, "-c", slow, "apply", str(calibration), names[0], "-o", names[1]]
     child = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert child.stdout.readline() == "writing\n"
-    child.send_signal(signal.SIGINT)
+    return child
+
+
+ENDED = {"SIGINT": "interrupted", "SIGTERM": "terminated", "SIGHUP": "terminated"}
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
+@pytest.mark.parametrize(("name", "word"), ENDED.items())
+def test_ended_in_the_middle_of_a_long_table(tmp_path, warm, name, word):
+    number = getattr(signal, name)
+    write_parquet(tmp_path / "log.parquet", log(250_000))
+    child = caught_writing(tmp_path, warm[0])
+    child.send_signal(number)
     _, err = child.communicate(timeout=15)
-    assert child.returncode == 130
-    assert err.strip() == "mwdcal: interrupted. Files are as they were before."
+    assert child.returncode == 128 + number
+    assert err.strip() == f"mwdcal: {word}. Files are as they were before."
     assert [f.name for f in tmp_path.iterdir()] == ["log.parquet"]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
+def test_what_a_killed_command_left_is_removed_by_the_next_one(tmp_path, warm):
+    write_parquet(tmp_path / "log.parquet", log(250))
+    killed, alive = (caught_writing(tmp_path, warm[0]) for _ in range(2))
+    killed.kill()
+    killed.communicate()
+    assert len(list(tmp_path.glob(".mwdcal-*.tmp"))) == 2
+    done = process("apply", warm[0], tmp_path / "log.parquet", "-o", tmp_path / "new.parquet")
+    assert done.returncode == 0, done
+    (left,) = tmp_path.glob(".mwdcal-*.tmp")
+    alive.terminate()
+    alive.communicate(timeout=15)
+    assert not left.exists()
 
 
 TEXTS = {
@@ -429,21 +661,20 @@ def test_findings_of_a_long_text_table_stand_above_its_header(tmp_path, small_pi
     assert list(found.columns)[-13:] == list(NAMES)
 
 
-def test_only_long_tables_of_fit_formats_are_streamed(tmp_path, monkeypatch):
+def test_parquet_and_long_text_are_taken_in_parts_where_the_formats_allow_it(tmp_path, monkeypatch):
     short = write_csv(tmp_path / "a.csv", log(50))
-    packed = write_parquet(tmp_path / "a.parquet", log(50))
-    monkeypatch.setattr(streaming, "LONG", (51, 10**5))
-    assert not streaming.is_long(short, tmp_path / "o.csv", ".")
-    assert not streaming.is_long(packed, tmp_path / "o.csv", ".")
-    monkeypatch.setattr(streaming, "LONG", (50, 100))
+    packed = write_parquet(tmp_path / "a.parquet", log(1))
+    assert not streaming.in_parts(short, tmp_path / "o.csv", ".")
+    assert streaming.in_parts(packed, tmp_path / "o.csv", ",")
+    monkeypatch.setattr(streaming, "LONG", dict.fromkeys(streaming.LONG, 100))
+    assert not streaming.in_parts(short, tmp_path / "o.csv", ",")
     for source in (short, packed):
-        assert streaming.is_long(source, tmp_path / "o.csv", ".")
-        assert not streaming.is_long(source, tmp_path / "o.csv", ",")
-        assert not streaming.is_long(source, tmp_path / "o.xlsx", ".")
-    assert not streaming.is_long(tmp_path / "none.parquet", tmp_path / "o.csv", ".")
-    assert not streaming.is_long(tmp_path, tmp_path / "o.csv", ".")
+        assert streaming.in_parts(source, tmp_path / "o.csv", ".")
+        assert not streaming.in_parts(source, tmp_path / "o.xlsx", ".")
+    assert not streaming.in_parts(tmp_path / "none.parquet", tmp_path / "o.csv", ".")
+    assert not streaming.in_parts(tmp_path, tmp_path / "o.csv", ".")
     monkeypatch.setattr(streams, "find_spec", lambda name: None)  # without PyArrow
-    assert not streaming.is_long(short, tmp_path / "o.csv", ".")
+    assert not streaming.in_parts(short, tmp_path / "o.csv", ".")
 
 
 def test_work_overlaps_keeps_its_order_and_stops_at_an_error():
@@ -484,10 +715,14 @@ def test_progress_is_shown_on_a_terminal_and_only_to_the_patient(
 ):
     monkeypatch.setattr(progress, "PATIENCE", patience)
     monkeypatch.setattr(sys, "stderr", shown := stream())
-    with progress.bar("correcting") as advance:
-        advance(1, 4)
+    limit = time.monotonic() + 20
+    with progress.bar("correcting") as advance:  # nothing is told, as while a workbook is written
+        while seen and "correcting" not in shown.getvalue() and time.monotonic() < limit:
+            time.sleep(0.01)
         advance(2, 4)
     assert ("correcting" in shown.getvalue()) == seen
+    assert ("50%" in shown.getvalue()) == seen
+    assert not any(isinstance(thread, threading.Timer) for thread in threading.enumerate())
 
 
 def test_memory_does_not_grow_with_the_table(tmp_path, warm):

@@ -10,12 +10,14 @@ import numpy as np
 from mwdcal.calibration import Calibration, Finding
 from mwdcal.core import fused
 from mwdcal.core.observables import OBSERVABLES
-from mwdcal.core.vectors import Array
+from mwdcal.core.vectors import AnyArray, Array
 from mwdcal.errors import InputError
 from mwdcal.readings import Readings
 
 ANGULAR = ("inclination", "azimuth", "toolface", "dip", "magnetic_toolface")
 OUTSIDE = ("blank", "refuse", "extrapolate")
+MARK = "extrapolated"
+"""The column that says of each row whether it was extrapolated, where that is allowed."""
 JUDGED = ("gravity", "inclination", "toolface", "azimuth", "field", "dip", "magnetic_toolface")
 DIRECTIONS = {
     "gravity_g": ("inclination_deg", "azimuth_deg", "toolface_deg", "dip_deg"),
@@ -38,25 +40,38 @@ class Tally(NamedTuple):
     rows: int
     beyond: int = 0
     moved: tuple[str, ...] = ()
+    lacking: int = 0
 
 
 def correct(
-    calibration: Calibration, readings: Readings, outside: str = "blank"
-) -> tuple[dict[str, Array], list[Finding]]:
+    calibration: Calibration, readings: Readings, outside: str = "blank", lacking: int = 0
+) -> tuple[dict[str, AnyArray], list[Finding]]:
     """Output columns (n,) by name, and what the reader should know.
+
+    `lacking` more rows were left out, for want of a reading.
 
     Singular: at exactly vertical attitudes azimuth and toolface are NaN (blank in files);
     `magnetic_toolface_deg` stands beside them. A strength of zero has no direction: NaN.
     Temperatures outside the calibrated range are blanked, refused or extrapolated as `outside` says.
     """
     check_outside(outside)
-    columns = compiled(calibration, readings) or reference(calibration, readings)
+    columns: dict[str, AnyArray] = {
+        **(compiled(calibration, readings) or reference(calibration, readings))
+    }
     beyond = calibration.outside(readings)
-    tally = Tally(readings.count, int(beyond.sum()), undetermined(calibration, readings))
+    rows, moved = readings.count + lacking, undetermined(calibration, readings)
+    tally = Tally(rows, int(beyond.sum()), moved, lacking)
     told = findings(calibration, readings, tally, outside)
     if outside == "blank" and tally.beyond:
         columns = {name: np.where(beyond, np.nan, value) for name, value in columns.items()}
+    if outside == "extrapolate":
+        columns[MARK] = beyond
     return columns, told
+
+
+def result_names(outside: str) -> tuple[str, ...]:
+    """The columns of results, in their order."""
+    return (*NAMES, MARK) if outside == "extrapolate" else NAMES
 
 
 def check_outside(outside: str) -> None:
@@ -130,6 +145,9 @@ def findings(
         text = "no columns mx, my, mz: magnetic results are blank."
         found.append(Finding(id="no-magnetometer", text=text))
     found += _other_tool(calibration, readings)
+    if tally.lacking:
+        text = f"{tally.lacking} of {tally.rows} rows lack a reading: their results are blank."
+        found.append(Finding(id="missing-reading", text=text))
     if tally.beyond:
         found.append(_outside(calibration, readings.source, outside, tally))
     if calibration.field_unit != "nT" and calibration.has_field:
@@ -163,7 +181,8 @@ def _outside(calibration: Calibration, source: str, how: str, tally: Tally) -> F
     done = (
         "their results are blank"
         if how == "blank"
-        else "their results are extrapolated, with no statement of accuracy"
+        else "their results are extrapolated, with no statement of accuracy, and marked in the "
+        f"column '{MARK}'"
     )
     return Finding(id="outside-temperature", text=f"{text}: {done}.")
 

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack
 
@@ -32,7 +35,8 @@ if TYPE_CHECKING:
     from mwdcal.notation import Notation
 
 INTERNAL = 70
-INTERRUPTED = 130
+SIGNAL = 128
+"""Exit status of an ended command, less the number of the signal that ended it."""
 COLDEST, HOTTEST = -273.15, 1000.0
 
 
@@ -151,14 +155,23 @@ def stations(**asked: Unpack[Asked]) -> None:
 )
 @click.option(
     "--outside", type=click.Choice(["blank", "refuse", "extrapolate"]), default="blank", show_default=True,
-    help="Rows outside the calibrated temperature range.",
+    help="Results of rows more than 1 °C outside the calibrated temperatures: none; refuse the file; or "
+    "extrapolated, and marked in a column 'extrapolated'.",
+)  # fmt: skip
+@click.option(
+    "--missing", type=click.Choice(["refuse", "blank"]), default="refuse", show_default=True,
+    help="Rows with a blank reading or temperature: refuse the file, or leave their results blank.",
 )  # fmt: skip
 @DECIMAL
 @JSON
 def apply(
-    calibration: Path, readings: Path, output: Path, outside: str, decimal: str, as_json: bool
-) -> None:
-    """Correct READINGS with a CALIBRATION: adds vectors, angles and strengths as columns.
+    calibration: Path, readings: Path, output: Path, outside: str, missing: str, decimal: str,
+    as_json: bool,
+) -> None:  # fmt: skip
+    """Correct READINGS (CSV, TSV, Parquet or XLSX) with the CALIBRATION of their tool.
+
+    Writes the columns of READINGS as they are and, beside them: gravity and field along the tool
+    axes, inclination, azimuth (magnetic), toolface, dip and strengths.
 
     \b
     Example: mwdcal apply tool.json surveys.csv -o corrected.csv
@@ -171,7 +184,7 @@ def apply(
     _check_outputs([output], [calibration, readings])
     made = documents.read(calibration)
     with bar("correcting") as advance:
-        count, findings = apply_to_any(made, readings, output, outside, decimal, advance)
+        count, findings = apply_to_any(made, readings, output, outside, missing, decimal, advance)
     tell(findings)
     if as_json:
         print_json({"rows": count, "output": str(output), "findings": findings})
@@ -320,7 +333,11 @@ def fleet(**asked: Unpack[FleetAsked]) -> None:
         from mwdcal.app import fleets
 
     _check_outputs([asked["output"], asked["report"]], [asked["runs"], Path(asked["tool"] or "")])
-    sound, result = fleets.run(asked, say)
+    try:
+        sound, result = fleets.run(asked, say)
+    except KeyboardInterrupt as stop:
+        stop.add_note("Finished parts are kept: the same command goes on from there.")
+        raise
     (print_json if asked["as_json"] else click.echo)(result)
     sys.exit(0 if sound else fleets.REFUSED)
 
@@ -358,16 +375,49 @@ def completion(shell: str) -> None:
         click.echo(found(cli, {}, "mwdcal", "_MWDCAL_COMPLETE").source())
 
 
+class Ended(KeyboardInterrupt):
+    """The system asks to end, as Ctrl-C does; the argument is the signal's number."""
+
+
+@contextmanager
+def _orderly_end() -> Iterator[None]:
+    """Meanwhile, signals that would end the process at once are interruptions like Ctrl-C."""
+
+    def end(number: int, frame: object) -> None:
+        signal.signal(number, signal.SIG_IGN)  # what is left to do is to tidy up
+        raise Ended(number)
+
+    asked = [getattr(signal, name, None) for name in ("SIGTERM", "SIGHUP")]
+    found = [each for each in asked if each and signal.getsignal(each) is signal.SIG_DFL]
+    try:
+        for each in found:
+            signal.signal(each, end)
+    except ValueError:  # signals belong to the main thread
+        found = []
+    try:
+        yield
+    finally:
+        for each in found:
+            signal.signal(each, signal.SIG_DFL)
+
+
+def _interrupted(stop: BaseException) -> int:
+    """Say what an interruption leaves, and which; the exit status."""
+    left = getattr(stop, "__notes__", ["Files are as they were before."])
+    say(f"mwdcal: {'terminated' if isinstance(stop, Ended) else 'interrupted'}. {' '.join(left)}")
+    return SIGNAL + (stop.args[0] if isinstance(stop, Ended) else signal.SIGINT)
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line; no traceback ever reaches the user."""
     try:
-        code = cli.main(arguments, prog_name="mwdcal", standalone_mode=False)
+        with _orderly_end():
+            code = cli.main(arguments, prog_name="mwdcal", standalone_mode=False)
     except click.ClickException as error:
         error.show()
         sys.exit(error.exit_code)
-    except click.Abort:
-        say("mwdcal: interrupted. Files are as they were before.")
-        sys.exit(INTERRUPTED)
+    except (click.Abort, KeyboardInterrupt) as stop:
+        sys.exit(_interrupted(stop.__cause__ or stop))
     except MwdcalError as error:
         say(f"mwdcal: {error}")
         sys.exit(error.exit_code)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -14,22 +15,28 @@ PATIENCE = 2.0
 
 @contextmanager
 def bar(label: str) -> Iterator[Callable[[int, int], None]]:
-    """A function to call with how much is done, and of how much."""
-    start = time.monotonic()
-    shown: Any = None
+    """A function to call with how much is done, and of how much.
+
+    The bar also moves while that is not known.
+    """
+    shown: list[Any] = []
+    if not sys.stderr.isatty():
+        yield lambda done, total: None
+        return
 
     def advance(done: int, total: int) -> None:
-        nonlocal shown
-        if shown is None and sys.stderr.isatty() and time.monotonic() - start > PATIENCE:
-            shown = _started(label)
-        if shown is not None:
-            shown.update(shown.task_ids[0], completed=done, total=total)
+        for each in shown:
+            each.update(each.task_ids[0], completed=done, total=total)
 
+    clock = threading.Timer(PATIENCE, lambda: shown.append(_started(label)))
+    clock.start()
     try:
         yield advance
     finally:
-        if shown is not None:
-            shown.stop()
+        clock.cancel()
+        clock.join()
+        for each in shown:
+            each.stop()
 
 
 def slowly(say: Callable[[str], None]) -> Callable[[str], None]:

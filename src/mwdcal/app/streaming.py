@@ -1,16 +1,17 @@
 """Tables of any length through a calibration: read, corrected and written part by part.
 
-Reading, computing and writing overlap: one thread reads, some compute, the caller writes, and
-only a few parts are in memory at any time. Results, findings and refusals are those of
-`app.tables.apply_to_table`, which is for tables that fit in memory, but for two: which outputs
-rest on undetermined directions is judged on a sample of each part, and blank `sd_` cells are
-compared with others of their part.
+Every Parquet table goes this way, so that its columns keep their types. Reading, computing and
+writing overlap: one thread reads, some compute, the caller writes, and only a few parts are in
+memory at any time. Results, findings and refusals are those of `app.tables.apply_to_table`,
+which is for short text and for workbooks, but for two: which outputs rest on undetermined
+directions is judged on a sample of each part, and blank `sd_` cells are compared with others of
+their part.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from itertools import chain
@@ -21,21 +22,23 @@ import numpy as np
 
 from mwdcal.calibration import Calibration, Finding
 from mwdcal.core import fused
-from mwdcal.core.vectors import Array
+from mwdcal.core.vectors import AnyArray, Array, Bools
 from mwdcal.correction import (
     JUDGED,
+    MARK,
     NAMES,
     Tally,
     check_outside,
     findings,
     numbers,
     reference,
+    result_names,
     undetermined,
 )
 from mwdcal.errors import InputError
-from mwdcal.files import atomic, runs, streams
+from mwdcal.files import atomic, parquet, runs, streams
 from mwdcal.files.columns import check_names, no_stations
-from mwdcal.files.contract import CHANNELS, RAW_RANGE, TEMPERATURE, check_columns
+from mwdcal.files.contract import CHANNELS, RAW, RAW_RANGE, TEMPERATURE, check_columns
 from mwdcal.files.sinks import ParquetSink, Sink, TextSink
 from mwdcal.files.streams import Part, Source
 from mwdcal.files.table import Table, cell_error
@@ -43,8 +46,11 @@ from mwdcal.files.table import numbers as as_numbers
 from mwdcal.profile import TriadProfile
 from mwdcal.readings import TRIADS, Readings
 
-LONG = (200_000, 16_000_000)
-"""Rows of a Parquet table, bytes of a text table, from which it is streamed."""
+LONG = {".csv": 1_000_000, ".tsv": 1_000_000, ".parquet": 16_000_000}
+"""Bytes of a text table from which it is taken in parts, by what it becomes.
+
+Text that becomes Parquet has numbers in fewer columns when it is.
+"""
 MANY = 3_000_000
 """Rows from which the compiled loops are worth their start: until then the writer is the slowest."""
 LINES = 1 << 14
@@ -76,11 +82,11 @@ class Corrected(NamedTuple):
     tally: Tally
 
 
-def is_long(readings: Path, output: Path, decimal: str) -> bool:
-    """Whether a table is to be streamed: it is long, and both formats and signs allow it."""
-    formats = (".parquet", ".csv", ".tsv")
-    plain = decimal == "." and output.suffix.lower() in formats
-    return plain and streams.is_long(readings, LONG)
+def in_parts(readings: Path, output: Path, decimal: str) -> bool:
+    """Whether a table is taken in parts: Parquet or long text, where format and sign allow it."""
+    least = LONG.get(output.suffix.lower())
+    plain = decimal == "." or readings.suffix.lower() == ".parquet"
+    return plain and least is not None and streams.in_parts(readings, least)
 
 
 def apply_to_file(
@@ -91,6 +97,8 @@ def apply_to_file(
     advance: Callable[[int, int], None] = lambda done, total: None,
     rows: int = 0,
     least: int = MANY,
+    missing: str = "refuse",
+    decimal: str = ".",
 ) -> tuple[int, list[Finding]]:
     """Correct a file into another; number of rows, and what the reader should know.
 
@@ -98,13 +106,14 @@ def apply_to_file(
     default as many as memory bears; `least` rows of the whole from which loops are compiled.
     """
     check_outside(outside)
-    source = _source(readings, output, rows)
-    _check_header(source)
+    source = _source(readings, output, rows, decimal)
+    _check_header(source, outside)
     pieces = source.pieces()
     first = next((piece for piece in pieces if _loaded(source, piece).table.count), None)
     if first is None:
         raise no_stations(source.name)
-    worker = _Worker.of(calibration, source, first, outside, source.rows >= least)
+    rules = Rules(outside, missing)
+    worker = _Worker.of(calibration, source, first, rules, source.rows >= least)
     done, tallies = 0, []
     with atomic.replacing(output) as stream:
         sink = worker.sink(stream, output)
@@ -114,6 +123,8 @@ def apply_to_file(
             done += part.size
             advance(done, source.size)
         total = _total(tallies)
+        if total.lacking == total.rows:
+            raise nothing(source.name)
         found = findings(calibration, worker.said, total, outside)
         sink.finish([finding.text for finding in found])
     return total.rows, found
@@ -138,25 +149,38 @@ def overlapped(items: Iterator[Item], work: Callable[[Item], Made]) -> Iterator[
             pool.shutdown(cancel_futures=True)
 
 
-def _source(readings: Path, output: Path, rows: int) -> Source:
+def _source(readings: Path, output: Path, rows: int, decimal: str) -> Source:
     typed = output.suffix.lower() == ".parquet"
     if readings.suffix.lower() == ".parquet":
-        return streams.open_parquet(readings, rows or (0 if typed else LINES))
+        return streams.open_parquet(readings, rows or (0 if typed else LINES), decimal)
     return streams.open_text(readings, typed=typed)
 
 
-def _check_header(source: Source) -> None:
+def _check_header(source: Source, outside: str) -> None:
     """Refuse columns that are missing, doubtful, or have the name of a result."""
     check_names(source.names, source.name)
     check_columns(source.names, source.name)
     if source.names[0].startswith("#"):
         raise InputError(f"{source.name}: the first column name must not start with '#'.")
-    taken = [name for name in NAMES if name in source.names]
+    check_free(source.names, result_names(outside), source.name)
+
+
+def check_free(names: Iterable[str], results: Sequence[str], source: str) -> None:
+    """Refuse a table that has a column of the name of a result."""
+    taken = [name for name in results if name in names]
     if taken:
         raise InputError(
-            f"{source.name}: the column '{taken[0]}' is there already, and would be lost under "
+            f"{source}: the column '{taken[0]}' is there already, and would be lost under "
             "the result of that name. Rename it, or correct the readings without it."
         )
+
+
+def nothing(source: str) -> InputError:
+    """A table of which no row can be corrected."""
+    return InputError(
+        f"{source}: every row lacks a reading, so that there is nothing to correct. Check the "
+        "columns of the raw channels and temperature_c."
+    )
 
 
 def _loaded(source: Source, piece: Any) -> Part:
@@ -168,8 +192,15 @@ def _loaded(source: Source, piece: Any) -> Part:
 
 def _total(tallies: Sequence[Tally]) -> Tally:
     moved = {name for tally in tallies for name in tally.moved}
-    rows, beyond = (sum(counts) for counts in zip(*(t[:2] for t in tallies), strict=True))
-    return Tally(rows, beyond, tuple(name for name in JUDGED if name in moved))
+    rows, beyond, lacking = np.sum([(t.rows, t.beyond, t.lacking) for t in tallies], 0).tolist()
+    return Tally(rows, beyond, tuple(name for name in JUDGED if name in moved), lacking)
+
+
+class Rules(NamedTuple):
+    """What is done with rows outside the calibrated temperatures, and with those lacking a reading."""
+
+    outside: str = "blank"
+    missing: str = "refuse"
 
 
 @dataclass(frozen=True)
@@ -179,6 +210,7 @@ class _Worker:
     Attributes:
         first: the first piece that has rows.
         absent: groups of columns that are wholly blank in the first part, and so everywhere.
+            Where rows may lack a reading: that are wholly blank in all parts.
         said: readings without rows: what the findings need to know of the source.
         triads: numbers for the compiled loops; None where NumPy computes.
         tool: which channel each tool axis is, and the nominal unit of it, by triad.
@@ -187,7 +219,7 @@ class _Worker:
 
     calibration: Calibration
     source: Source
-    outside: str
+    rules: Rules
     first: Any
     absent: tuple[tuple[str, ...], ...]
     said: Readings
@@ -197,14 +229,12 @@ class _Worker:
 
     @classmethod
     def of(
-        cls, calibration: Calibration, source: Source, first: Any, outside: str, many: bool
+        cls, calibration: Calibration, source: Source, first: Any, rules: Rules, many: bool
     ) -> _Worker:
         """What the first piece says about all."""
-        part = _loaded(source, first)
-        columns = part.table.columns
-        groups = [group for group in OPTIONAL if group[0] in columns]
-        absent = tuple(g for g in groups if all(_is_blank(part.table, name) for name in g))
-        kept = [g[0] for g in groups if g not in absent]
+        judged = [first] if rules.missing == "refuse" else source.pieces()
+        absent = wholly_blank(_loaded(source, piece).table for piece in judged)
+        kept = [g[0] for g in OPTIONAL if g[0] in source.names and g not in absent]
         empty = np.empty((0, 3))
         said = Readings(
             accelerometer=empty,
@@ -216,20 +246,24 @@ class _Worker:
         reference(calibration, said)  # refuses a calibration with temperature terms without any
         triads = numbers(calibration) if many and fused.available() else None
         tool = tuple(_tool(calibration, triad) for triad in TRIADS)
-        return cls(calibration, source, outside, first, absent, said, triads, tool)
+        return cls(calibration, source, rules, first, absent, said, triads, tool)
 
     def sink(self, stream: IO[bytes], output: Path) -> Sink:
         """An empty table in the format of the output's name."""
+        arrow, _ = parquet.modules(output.name)
         metadata = {**self.source.metadata, **described(self.calibration)}
-        suffix = output.suffix.lower()
+        suffix, outside = output.suffix.lower(), self.rules.outside
+        kinds = {name: arrow.float64() for name in NAMES} | {MARK: arrow.bool_()}
+        results = arrow.schema([(name, kinds[name]) for name in result_names(outside)])
         if suffix == ".parquet":
-            return ParquetSink(stream, self.source.schema, NAMES, metadata)
-        how = "extrapolate" if self.outside == "refuse" else self.outside
+            return ParquetSink(stream, self.source.schema, results, metadata)
+        how = "extrapolate" if outside == "refuse" else outside
         judged = JUDGED if self.calibration.free else ()
-        most = findings(self.calibration, self.said, Tally(_MOST, _MOST, judged), how)
+        lacking = 0 if self.rules.missing == "refuse" else _MOST
+        most = findings(self.calibration, self.said, Tally(_MOST, _MOST, judged, lacking), how)
         longest = [finding.text for finding in most]
         delimiter = "," if suffix == ".csv" else "\t"
-        return TextSink(stream, self.source.schema, NAMES, metadata, longest, delimiter)
+        return TextSink(stream, self.source.schema, results, metadata, longest, delimiter)
 
     def __call__(self, piece: Any, sink: Sink) -> Corrected:
         """A piece, corrected and rendered; text that seems wrong is looked at line by line."""
@@ -239,17 +273,38 @@ class _Worker:
             return self._corrected(self.source.load(piece, True), sink)
 
     def _corrected(self, part: Part, sink: Sink) -> Corrected:
-        count = part.table.count
-        channels = self._channels(part.table)
-        found = self._compiled(channels, count) if self.triads else self._plain(channels, count)
+        table, rows = part.table, part.table.count
+        channels, found = self._found(table)
+        whole: Bools | None = None
+        if found.unsound and self.rules.missing == "blank":
+            whole = ~lacking(table, self.absent)
+            table = chosen(table, whole)
+            channels, found = self._found(table)
         if found.unsound:
-            self._refuse(part.table)
-        if any(name.startswith(("ref_", "sd_")) for name in part.table.columns):
+            self._refuse(table)
+        if any(name.startswith(("ref_", "sd_")) for name in table.columns):
             kinds = [kind for kind in TRIADS if channels[kind] is not None]
-            runs.check_references(part.table, self.calibration.profile, kinds)
-        moved = self._undetermined(channels, count)
-        rendered = sink.render(part.carried, found.columns, bool(found.empty))
-        return Corrected(rendered, part.size, Tally(count, found.beyond, moved))
+            runs.check_references(table, self.calibration.profile, kinds)
+        moved = self._undetermined(channels, table.count)
+        results: list[AnyArray] = [*found.columns]
+        if self.rules.outside == "extrapolate":
+            results.append(self._beyond(channels, table.count))
+        if whole is not None:
+            results = [spread(values, whole) for values in results]
+        rendered = sink.render(part.carried, results, bool(found.empty) or whole is not None)
+        return Corrected(rendered, part.size, Tally(rows, found.beyond, moved, rows - table.count))
+
+    def _found(self, table: Table) -> tuple[dict[str, list[Array] | None], fused.Found]:
+        """The channels of a table, and what is made of them."""
+        channels = self._channels(table)
+        compute = self._compiled if self.triads else self._plain
+        return channels, compute(channels, table.count)
+
+    def _beyond(self, channels: Mapping[str, list[Array] | None], count: int) -> Bools:
+        """Rows (n,) outside the calibrated temperatures."""
+        low, high = self._limits().calibrated
+        warmth = channels["temperature"]
+        return (warmth[0] < low) | (warmth[0] > high) if warmth else np.zeros(count, bool)
 
     def _channels(self, table: Table) -> dict[str, list[Array] | None]:
         """Columns of each triad, and of the temperature; None where there are none."""
@@ -267,20 +322,20 @@ class _Worker:
         if self.said.temperature is None:
             low, high = -np.inf, np.inf
         accepted = (RAW_RANGE.low, RAW_RANGE.high), (TEMPERATURE.low, TEMPERATURE.high)
-        return fused.Limits(*accepted, (low - MARGIN, high + MARGIN), self.outside == "blank")
+        return fused.Limits(*accepted, (low - MARGIN, high + MARGIN), self.rules.outside == "blank")
 
     def _compiled(self, channels: Mapping[str, list[Array] | None], count: int) -> fused.Found:
         assert self.triads is not None
-        columns, units, lacking = [], [], 0
+        columns, units, blank = [], [], 0
         for kind, (order, unit) in zip(TRIADS, self.tool, strict=True):
             three = channels[kind] or [np.full(count, np.nan)] * 3
-            lacking += 0 if channels[kind] else 3
+            blank += 0 if channels[kind] else 3
             columns += [three[i] for i in order]
             units += unit
         zero = self.calibration.reference_temperature
         columns += channels["temperature"] or [np.full(count, zero)]
         found = fused.run(columns, self.triads, zero, units, self._limits(), workers=1)
-        return found._replace(unsound=found.unsound - lacking * count)
+        return found._replace(unsound=found.unsound - blank * count)
 
     def _plain(self, channels: Mapping[str, list[Array] | None], count: int) -> fused.Found:
         """The same by plain NumPy, a block at a time."""
@@ -313,7 +368,7 @@ class _Worker:
     def _undetermined(
         self, channels: Mapping[str, list[Array] | None], count: int
     ) -> tuple[str, ...]:
-        if not self.calibration.free:
+        if not self.calibration.free or not count:
             return ()
         readings = self._readings(channels, slice(0, count, max(1, count // SAMPLE)))
         names = [name for name in JUDGED if name not in self.moved]
@@ -338,6 +393,40 @@ def described(calibration: Calibration) -> dict[str, object]:
         "azimuth_out": "magnetic",
         "field_unit": calibration.field_unit,
     }
+
+
+def wholly_blank(tables: Iterable[Table]) -> tuple[tuple[str, ...], ...]:
+    """Groups of optional columns that are blank on every row of all tables; looks no further than needed."""
+    left = [*OPTIONAL]
+    for table in tables:
+        left = [g for g in left if g[0] in table.columns and all(_is_blank(table, n) for n in g)]
+        if not left:
+            break
+    return tuple(left)
+
+
+def lacking(table: Table, absent: Sequence[tuple[str, ...]]) -> Bools:
+    """Rows (n,) with a blank reading or temperature; columns `absent` on all rows do not count."""
+    without = [name for group in absent for name in group]
+    names = [n for n in (*RAW, "temperature_c") if n in table.columns and n not in without]
+    return np.asarray(np.isnan([_column(table, name) for name in names]).any(axis=0))
+
+
+def chosen(table: Table, rows: Bools) -> Table:
+    """Some rows of a table, with their places."""
+    picked = np.flatnonzero(rows).tolist()
+    columns = {
+        name: [column[i] for i in picked] if isinstance(column, list) else column[rows]
+        for name, column in table.columns.items()
+    }
+    return replace(table, columns=columns, lines=[table.lines[i] for i in picked])
+
+
+def spread(values: AnyArray, rows: Bools) -> AnyArray:
+    """Values of the chosen rows, at their places among all; others are NaN, or False."""
+    out = np.full(rows.shape, False if values.dtype == bool else np.nan, values.dtype)
+    out[rows] = values
+    return out
 
 
 def _blank(table: Table, names: tuple[str, ...]) -> InputError:

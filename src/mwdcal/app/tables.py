@@ -6,11 +6,24 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from mwdcal.app.streaming import apply_to_file, described, is_long
+import numpy as np
+
+from mwdcal.app.streaming import (
+    apply_to_file,
+    check_free,
+    chosen,
+    described,
+    in_parts,
+    lacking,
+    nothing,
+    spread,
+    wholly_blank,
+)
 from mwdcal.calibration import Calibration, Finding
-from mwdcal.correction import correct
-from mwdcal.errors import InputError
+from mwdcal.correction import MARK, correct
 from mwdcal.files import table
+from mwdcal.files.columns import as_text
+from mwdcal.files.contract import check_columns
 from mwdcal.files.runs import to_readings
 from mwdcal.files.table import Table
 
@@ -20,34 +33,43 @@ def apply_to_any(
     readings: Path,
     output: Path,
     outside: str,
+    missing: str,
     decimal: str,
     advance: Callable[[int, int], None],
 ) -> tuple[int, list[Finding]]:
-    """Correct a file into another, whole or, where it is long, part by part.
+    """Correct a file into another: part by part, or whole where it is short text or a workbook.
 
     Number of rows, and what the reader should know. `advance` is told how much of a long
     table is done, and of how much.
     """
-    if is_long(readings, output, decimal):
-        return apply_to_file(calibration, readings, output, outside, advance)
+    if in_parts(readings, output, decimal):
+        return apply_to_file(
+            calibration, readings, output, outside, advance, missing=missing, decimal=decimal
+        )
     source = table.read(readings, decimal=decimal)
-    result, findings = apply_to_table(calibration, source, outside)
+    result, findings = apply_to_table(calibration, source, outside, missing)
+    if MARK in result.columns and output.suffix.lower() != ".parquet":
+        words = [as_text(bool(mark)) for mark in result.columns[MARK]]
+        result = replace(result, columns={**result.columns, MARK: words})
     table.write(output, result)
     return source.count, findings
 
 
 def apply_to_table(
-    calibration: Calibration, source: Table, outside: str
+    calibration: Calibration, source: Table, outside: str, missing: str = "refuse"
 ) -> tuple[Table, list[Finding]]:
     """The input's columns and metadata, the results, and what the calibration was."""
-    readings, _ = to_readings(source, calibration.profile)
-    columns, findings = correct(calibration, readings, outside)
-    taken = [name for name in columns if name in source.columns]
-    if taken:
-        raise InputError(
-            f"{source.source}: the column '{taken[0]}' is there already, and would be lost under "
-            "the result of that name. Rename it, or correct the readings without it."
-        )
+    check_columns(list(source.columns), source.source)
+    whole = np.ones(source.count, bool)
+    if missing == "blank":
+        whole = ~lacking(source, wholly_blank([source]))
+    if not whole.any():
+        raise nothing(source.source)
+    kept = source if whole.all() else chosen(source, whole)
+    readings, _ = to_readings(kept, calibration.profile)
+    found, findings = correct(calibration, readings, outside, source.count - kept.count)
+    check_free(source.columns, list(found), source.source)
+    columns = found if whole.all() else {n: spread(values, whole) for n, values in found.items()}
     metadata = {**source.metadata, **described(calibration)}
     if findings:
         metadata["findings"] = [finding.text for finding in findings]

@@ -1,15 +1,32 @@
-"""Atomic writing: an interrupted command leaves the old file or none, never half of one."""
+"""Atomic writing: an interrupted command leaves the old file or none, never half of one.
+
+A file grows under a temporary name beside its target, locked as long as its writer lives. What a
+killed command left under such a name is removed by the next one that writes into the folder.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import os
 import secrets
+import time
+import zlib
 from collections.abc import Iterator
+from functools import cache
+from importlib import import_module
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 from mwdcal.errors import InputError
+
+try:
+    fcntl: Any = import_module("fcntl")
+except ImportError:  # Windows, where an open file can be neither removed nor renamed
+    fcntl = None
+
+_PATTERN = ".mwdcal-*.tmp"
+_DAY = 86_400.0
+"""Seconds after which a file of another machine counts as left behind: its locks may not reach here."""
 
 
 def write(path: str | os.PathLike[str], data: bytes | str, durable: bool = True) -> None:
@@ -26,14 +43,18 @@ def write(path: str | os.PathLike[str], data: bytes | str, durable: bool = True)
 def replacing(path: str | os.PathLike[str], durable: bool = True) -> Iterator[IO[bytes]]:
     """A new file to write to, which replaces `path` when the block ends without an error."""
     file = target(path)
-    temporary = file.with_name(f".mwdcal-{secrets.token_hex(8)}.tmp")
+    sweep(file.parent)
+    temporary = file.with_name(f".mwdcal-{_machine()}-{secrets.token_hex(8)}.tmp")
     try:
-        with temporary.open("xb") as stream:
+        with _begun(temporary) as stream:
             yield stream
             stream.flush()
             if durable:
                 os.fsync(stream.fileno())  # wait until it is on the disk
-        temporary.replace(file)
+            if fcntl:
+                temporary.replace(file)  # still locked: no sweep comes between
+        if not fcntl:
+            temporary.replace(file)
     except OSError as error:
         raise _refusal(path, error) from error
     finally:
@@ -56,6 +77,49 @@ def target(path: str | os.PathLike[str]) -> Path:
             "Create it, or name another folder."
         )
     return file
+
+
+def _begun(temporary: Path) -> IO[bytes]:
+    """The new file, locked until it is closed or its process ends, however it does."""
+    while True:
+        stream = temporary.open("xb")
+        if fcntl is None:
+            return stream
+        with contextlib.suppress(OSError):  # no locks on this disk: then nobody can sweep either
+            fcntl.flock(stream, fcntl.LOCK_EX)
+        if temporary.exists():
+            return stream
+        stream.close()  # a sweep came between the two
+
+
+@cache
+def sweep(folder: Path) -> None:
+    """Remove, once per process, temporary files whose writer was killed."""
+    with contextlib.suppress(OSError):
+        for path in folder.glob(_PATTERN):
+            with contextlib.suppress(OSError):
+                _remove_if_left(path)
+
+
+def _remove_if_left(path: Path) -> None:
+    """Remove a temporary file that nobody holds; raises OSError where one does, or may."""
+    if path.is_symlink() or not path.is_file():
+        return
+    if fcntl is None:
+        path.unlink()  # refused by the system while it is open
+        return
+    near = path.name.startswith(f".mwdcal-{_machine()}-")
+    with path.open("rb+") as stream:
+        fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if near or time.time() - os.fstat(stream.fileno()).st_mtime > _DAY:
+            path.unlink()
+
+
+@cache
+def _machine() -> str:
+    """Eight digits for the machine."""
+    name = os.uname().nodename if hasattr(os, "uname") else ""
+    return f"{zlib.crc32(name.encode()):08x}"
 
 
 def _remove(path: Path) -> None:

@@ -90,12 +90,23 @@ def as_column(name: str, cells: Any, arrow: Any) -> Column:
     if name not in LABELS and (numeric or kinds.is_decimal(cells.type)):
         values = cells.cast(arrow.float64(), safe=False).to_numpy()
         return np.array(values, float)
-    return [as_text(value) for value in cells.to_pylist()]
+    return texts(cells, arrow)
+
+
+def texts(cells: Any, arrow: Any) -> list[str]:
+    """Cells of any type as text tables have them."""
+    try:
+        values = cells.to_pylist()
+    except ValueError:  # nanoseconds, which times of Python do not have
+        return [as_text(v).replace(" ", "T", 1) for v in cells.cast(arrow.string()).to_pylist()]
+    return [as_text(value) for value in values]
 
 
 def _array(column: Column, arrow: Any) -> Any:
     if isinstance(column, list):
         return arrow.array([cell or None for cell in column], arrow.string())
+    if column.dtype == bool:
+        return arrow.array(column)
     return arrow.array(column, arrow.float64(), from_pandas=True)
 
 

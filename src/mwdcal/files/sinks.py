@@ -1,4 +1,4 @@
-"""Where parts of a long table go: Parquet or text, written as they come, metadata at the end.
+"""Where parts of a table go: Parquet or text, written as they come, metadata at the end.
 
 `render` may be called by several threads at once, `write` takes what it gave, in order.
 """
@@ -12,16 +12,16 @@ from typing import IO, Any, Protocol
 
 import msgspec
 
-from mwdcal.core.vectors import Array
+from mwdcal.core.vectors import AnyArray
 from mwdcal.files import metadata as meta
 from mwdcal.files import parquet, text
 from mwdcal.files.columns import as_text
 
 
 class Sink(Protocol):
-    """A table being written: `carried` columns, then results (results, n) beside them."""
+    """A table being written: `carried` columns, then results beside them."""
 
-    def render(self, carried: Any, results: Array, blank: bool) -> Any:
+    def render(self, carried: Any, results: Sequence[AnyArray], blank: bool) -> Any:
         """What is written of a part; without `blank` no result is NaN."""
 
     def write(self, rendered: Any) -> None:
@@ -35,13 +35,13 @@ class ParquetSink:
     """A Parquet file; results are neither compressed nor searched for repetitions: there are none."""
 
     def __init__(
-        self, stream: IO[bytes], schema: Any, names: Sequence[str], metadata: Mapping[str, object]
+        self, stream: IO[bytes], schema: Any, results: Any, metadata: Mapping[str, object]
     ) -> None:
         self._arrow, parquets = parquet.modules(stream.name)
         self._metadata = dict(metadata)
-        self._names = list(names)
+        self._names = names = results.names
         numeric = {f.name for f in schema if self._arrow.types.is_floating(f.type)}
-        schema = self._arrow.schema([*schema, *((n, self._arrow.float64()) for n in names)])
+        schema = self._arrow.schema([*schema, *results])
         schema = schema.with_metadata({parquet.KEY: self._described([])})
         self._writer = parquets.ParquetWriter(
             stream.name,
@@ -50,7 +50,7 @@ class ParquetSink:
             compression={f.name: "none" if f.name in names else "snappy" for f in schema},
         )
 
-    def render(self, carried: Any, results: Array, blank: bool) -> Any:
+    def render(self, carried: Any, results: Sequence[AnyArray], blank: bool) -> Any:
         """The Arrow table of the part; numbers are not copied where nothing is blank."""
         for name, values in zip(self._names, results, strict=True):
             carried = carried.append_column(name, self._arrow.array(values, from_pandas=blank))
@@ -72,13 +72,16 @@ class ParquetSink:
 
 
 class TextSink:
-    """A text table; room for the findings is kept above its header, as a comment line of blanks."""
+    """A text table; the findings are above its header.
+
+    From the second part on room is kept for them there, as a comment line of blanks.
+    """
 
     def __init__(
         self,
         stream: IO[bytes],
         schema: Any,
-        names: Sequence[str],
+        results: Any,
         metadata: Mapping[str, object],
         longest: Sequence[str],
         delimiter: str,
@@ -86,17 +89,16 @@ class TextSink:
         self._arrow, _ = parquet.modules(stream.name)
         self._stream = stream
         self._delimiter = delimiter
-        self._names = list(names)
+        self._names = results.names
         stream.write("".join(f"{line}\n" for line in meta.render(metadata)).encode())
         self._place = stream.tell()
         self._room = len(_line(longest)) if longest else 0
-        if self._room:
-            stream.write(b"#" + b" " * (self._room - 1) + b"\n")
         header = csv.writer(buffer := io.StringIO(), delimiter=self._delimiter, lineterminator="\n")
-        header.writerow([*schema.names, *names])
-        stream.write(buffer.getvalue().encode())
+        header.writerow([*schema.names, *results.names])
+        self._header = buffer.getvalue().encode()
+        self._first: bytes | None = None
 
-    def render(self, carried: Any, results: Array, blank: bool) -> bytes:
+    def render(self, carried: Any, results: Sequence[AnyArray], blank: bool) -> bytes:
         """The lines of the part."""
         from pyarrow import csv as arrow_csv
 
@@ -119,12 +121,23 @@ class TextSink:
         return bytes(stream.getvalue())
 
     def write(self, rendered: bytes) -> None:
-        """Append lines."""
+        """Append lines; the first ones wait, as a table of one part needs no room."""
+        if self._first is None:
+            self._first = rendered
+            return
+        if self._header:
+            self._begin(b"#".ljust(self._room) + b"\n" if self._room else b"")
         self._stream.write(rendered)
 
+    def _begin(self, comment: bytes) -> None:
+        self._stream.write(comment + self._header + (self._first or b""))
+        self._header = self._first = b""
+
     def finish(self, findings: Sequence[str]) -> None:
-        """Put the findings where their room is."""
-        if findings:
+        """Put the findings where they belong."""
+        if self._header:
+            self._begin(_line(findings) + b"\n" if findings else b"")
+        elif findings:
             self._stream.seek(self._place)
             self._stream.write(_line(findings).ljust(self._room))
 
@@ -138,7 +151,7 @@ class TextSink:
         if types.is_floating(kind) or types.is_decimal(kind):
             values = cells.cast(self._arrow.float64(), safe=False)
             return compute.if_else(compute.is_nan(values), None, values)
-        return self._arrow.array([as_text(v) for v in cells.to_pylist()], self._arrow.string())
+        return self._arrow.array(parquet.texts(cells, self._arrow), self._arrow.string())
 
 
 def _line(findings: Sequence[str]) -> bytes:

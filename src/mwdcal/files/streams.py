@@ -1,4 +1,4 @@
-"""Long tables in parts: Parquet and text of any length, read in bounded memory.
+"""Tables in parts: Parquet and text of any length, read in bounded memory.
 
 A source hands out pieces in order, which are cheap to make, and loads a piece, which may be
 done by several threads at once. Needs PyArrow. Text that is not plain (quotes, blanks before a
@@ -44,7 +44,7 @@ class Part(NamedTuple):
 
 @dataclass(frozen=True)
 class Source:
-    """A long table, not yet read.
+    """A table, not yet read.
 
     Attributes:
         name: of the file.
@@ -67,8 +67,12 @@ class Source:
     load: Callable[[Any, bool], Part]
 
 
-def open_parquet(path: Path, rows: int = 0) -> Source:
-    """A Parquet file in parts of `rows` rows; by default as many as memory bears."""
+def open_parquet(path: Path, rows: int = 0, decimal: str = ".") -> Source:
+    """A Parquet file in parts of `rows` rows; by default as many as memory bears.
+
+    What is carried has the type it has in the file, whatever it is; `decimal` is the sign in
+    columns of text that are read as numbers.
+    """
     arrow, parquets = parquet.modules(path.name)
     try:
         file = parquets.ParquetFile(path, buffer_size=1 << 20, pre_buffer=False)
@@ -98,7 +102,8 @@ def open_parquet(path: Path, rows: int = 0) -> Source:
         wanted = [name for name in names if name in _NUMERIC]
         columns = {n: parquet.as_column(n, carried.column(n), arrow) for n in wanted}
         lines = range(first, first + len(batch))
-        return Part(carried, Table(columns, metadata, path.name, lines), len(batch))
+        table = Table(columns, metadata, path.name, lines, decimal=decimal)
+        return Part(carried, table, len(batch))
 
     schema = arrow.schema([stored.field(name) for name in names])
     return Source(path.name, names, metadata, schema, count, count, pieces, load)
@@ -195,7 +200,9 @@ def _numbers(name: str, cells: Any, arrow: Any) -> Column:
     if name not in (*RAW, "temperature_c"):
         return [str(cell) for cell in cells.to_pylist()]
     if cells[0].as_py() == "" and cells.unique().to_pylist() == [""]:
-        return np.full(len(cells), np.nan)
+        blank = np.full(len(cells), np.nan)
+        blank.flags.writeable = False  # as the others are: compiled loops take columns of one type
+        return blank
     return np.asarray(cells.cast(arrow.float64()).to_numpy(), float)
 
 
@@ -212,16 +219,12 @@ def _typed(carried: Any, table: Table, numeric: list[str], arrow: Any) -> Any:
     return arrow.table(arrays)
 
 
-def is_long(path: str | os.PathLike[str], least: tuple[int, int]) -> bool:
-    """Whether the file is worth streaming: at least so many rows (Parquet) or bytes (text)."""
-    file = Path(path)
-    suffix = file.suffix.lower()
-    if find_spec("pyarrow") is None:
-        return False
+def in_parts(path: Path, least: int) -> bool:
+    """Whether a table is taken in parts: Parquet always, text from `least` bytes on."""
+    suffix = path.suffix.lower()
+    if not path.is_file() or not os.access(path, os.R_OK):
+        return False  # refused with its reason where it is read
     if suffix == ".parquet":
-        try:
-            _, parquets = parquet.modules(file.name)
-            return bool(parquets.read_metadata(file).num_rows >= least[0])
-        except Exception:  # refused with its reason where it is read
-            return False
-    return suffix in (".csv", ".tsv") and file.is_file() and file.stat().st_size >= least[1]
+        return True
+    text_table = suffix in (".csv", ".tsv") and find_spec("pyarrow") is not None
+    return text_table and path.stat().st_size >= least
