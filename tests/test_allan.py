@@ -282,6 +282,76 @@ def test_the_fit_is_not_contradicted_by_its_own_noise():
     assert np.mean(chances < 0.01) < 0.03
 
 
+@pytest.mark.parametrize(
+    ("count", "white", "walk"),
+    [(200, 1, 0.3), (1024, 1, 0.3), (COUNT, 1, 0.1)],
+)
+def test_short_averages_are_left_out_as_seldom_as_stated(count, white, walk):
+    """1 in 1000 stated, 10 in 1000 before: variances of few degrees of freedom are skew.
+
+    2000 records: at the stated rate 8 or more alarms would come with a chance of 0.1 %.
+    """
+    alarms = 0
+    for seed in range(10):
+        values = simulated(seed, count, 0, white, 0, walk, 0)
+        terms = noise_terms.fit(*observed(values), moments_of(count))
+        alarms += np.sum((terms.start > 0) | (terms.chance < noise_terms.CONTRADICTED))
+    assert alarms < 8
+
+
+def test_a_short_record_claims_no_term_that_is_absent():
+    """200 samples of white noise and random walk: bias instability in 18 % of the records before."""
+    claimed = []
+    for seed in range(10):
+        values = simulated(seed, 200, 0, 1, 0, 0.3, 0)
+        terms = noise_terms.fit(*observed(values), moments_of(200))
+        claimed.append(terms.determined)
+        inside = (terms.lower <= [0, 1, 0, 0.09]) & (terms.upper >= [0, 1, 0, 0.09])
+        assert inside.mean() > 0.95
+    assert np.mean(np.concatenate(claimed)[:, [0, 2]]) < 0.015
+
+
+def test_correlated_noise_is_no_quantisation():
+    """Gauss-Markov noise of 10 s in white noise: a quantisation in 4 of 5 records before."""
+    rng, count, decay = np.random.default_rng(4), 16384, np.exp(-0.01)
+    values = 3 * rng.normal(size=(60, count))
+    state = rng.normal(size=60)
+    for k in range(count):
+        values[:, k] += state
+        state = decay * state + np.sqrt(1 - decay**2) * rng.normal(size=60)
+    terms = noise_terms.fit(*observed(values), moments_of(count))
+    assert terms.determined[:, 0].mean() < 0.25
+    assert not terms.determined[terms.start > 0, 0].any()
+
+
+@pytest.mark.parametrize("drift", [0, 1e-5, 2e-5, 1e-4])
+def test_the_interval_of_one_station_holds_at_any_drift(drift):
+    """N 1e-3 raw·√s, K 1e-4 raw/√s at 5 Hz, station of 30 s: 61 % at 2e-5 raw/s before."""
+    rate, seconds = 5.0, 30.0
+    white, walk = 1e-3 * np.sqrt(rate), 1e-4 / np.sqrt(rate)
+    truth = np.sqrt(1e-6 / seconds + 1e-8 * seconds / 3 + (drift * seconds) ** 2 / 2)
+    inside = []
+    for seed in range(5):
+        values = simulated(100 + seed, COUNT, 0, white, 0, walk, drift / rate)
+        terms = noise_terms.fit(*observed(values), moments_of(COUNT))
+        noise, freedom, _ = noise_terms.single(values, seconds * rate, moments_of(COUNT), terms)
+        lower, upper = allan.band(noise, freedom)
+        inside.append((lower <= truth) & (truth <= upper))
+    assert 0.925 < np.mean(inside) < 0.975
+
+
+def observed(values):
+    """What a fit takes of records."""
+    return allan.variance(values, allan.octaves(values.shape[-1]), centred=True), allan.drift(
+        values
+    )
+
+
+@cache
+def moments_of(count):
+    return allan.moments(count, allan.octaves(count))
+
+
 def test_filtered_noise_is_fitted_where_the_terms_describe_it():
     rng = np.random.default_rng(3)
     values = np.convolve(rng.normal(size=20_004), np.ones(5) / 5, "valid")[None]
@@ -414,7 +484,8 @@ def test_a_channel_of_its_own_rate(tmp_path):
     [
         (lambda c: c["ay"].fill(1.5), "ay reads 1.5 from end to end"),
         (lambda c: c["ay"].fill(np.nan), "ay is blank from end to end"),
-        (lambda c: c["ay"].__setitem__(slice(70, 71), np.nan), "first in line 73"),
+        (lambda c: c["ay"].__setitem__(slice(70, 72), np.nan), "first in line 73"),
+        (lambda c: c["ay"].__setitem__(slice(70, 75, 2), np.nan), "first in line 73"),
         (lambda c: c["ay"].__setitem__(slice(50, None), np.nan), "ay has 50 samples, of 128"),
     ],
 )
@@ -426,6 +497,64 @@ def test_a_bad_channel_is_left_out_and_the_others_go_on(tmp_path, change, part):
     assert ran.code == 0
     assert part in ran.err
     assert list(ran.json["channels"]) == ["ax", "az", "mx", "my", "mz"]
+
+
+@pytest.mark.parametrize("every", [1, 3])
+def test_a_single_blank_is_the_mean_of_its_neighbours_and_told(tmp_path, every):
+    columns = static()
+    columns["ay"][np.arange(6000) % every != 0] = np.nan
+    known = {name: own.copy() for name, own in columns.items()}
+    known["ay"][300] = (known["ay"][300 - every] + known["ay"][300 + every]) / 2
+    columns["ay"][300] = np.nan
+    found = [
+        mwdcal("noise", write_csv(tmp_path / "log.csv", own, "sampling_hz = 50"), "--json").json
+        for own in (columns, known)
+    ]
+    assert found[0]["channels"] == found[1]["channels"]
+    assert [f["id"] for f in found[0]["findings"]] == ["filled"]
+    assert f"1 of {6000 // every} samples, first in line 303" in found[0]["findings"][0]["text"]
+
+
+@pytest.mark.parametrize(
+    ("change", "doubt", "words"),
+    [
+        (lambda c: c["ax"] + 0.1 * (np.arange(6000) > 3000), "event", "a spike or a move"),
+        (lambda c: c["ax"] + 3e-3 * np.sin(np.arange(6000) / 9), "misfit", "none of the five"),
+    ],
+)
+def test_what_does_not_hold_is_marked_and_not_recommended(tmp_path, change, doubt, words):
+    columns = static()
+    columns["ax"] = change(columns)
+    path = write_csv(tmp_path / "log.csv", columns, "sampling_hz = 50")
+    found = mwdcal("noise", path, "--json").json
+    assert doubt in found["channels"]["ax"]["doubts"]
+    assert found["channels"]["ay"]["doubts"] == []
+    assert list(found["profile"]) == ["magnetometer"]
+    assert words in found["withheld"]["accelerometer"]
+    out = mwdcal("noise", path, "--report", tmp_path / "r.html").out
+    header, *rows = out.splitlines()[2:]
+    assert "ax (!), 1e-" in header
+    assert "ay, 1e-" in header
+    cells = {row[:24].strip(): row[24:].split() for row in rows if row[:1].strip()}
+    assert cells["drift R, /h"][0] == "?"
+    assert next(row for row in rows if row.startswith("its 95 %")).split()[4] == "?"
+    assert doubt in next(row for row in rows if row.startswith("does not hold (!)"))
+    assert "# [accelerometer] no noise from log.csv: ax: " in out
+    assert "\n[accelerometer]" not in out
+    assert "ax (!)" in (tmp_path / "r.html").read_text("utf-8")
+
+
+def test_noise_between_two_codes_is_no_event(tmp_path):
+    """Noise of 0.3 steps on the edge of a code: most differences are 0, none is an event."""
+    rng = np.random.default_rng(3)
+    columns = {n: 1e-3 * np.round(0.5 + 0.3 * rng.normal(size=16384)) for n in ("ax", "ay", "az")}
+    path = write_csv(tmp_path / "log.csv", columns, "sampling_hz = 10")
+    assert "event" not in {f["id"] for f in mwdcal("noise", path, "--json").json["findings"]}
+    columns["ay"][9000:] += 0.006
+    path = write_csv(tmp_path / "moved.csv", columns, "sampling_hz = 10")
+    texts = {f["id"]: f["text"] for f in mwdcal("noise", path, "--json").json["findings"]}
+    assert texts["event"].startswith("ay changes by")
+    assert "about 900 s" in texts["event"]
 
 
 @pytest.mark.parametrize(
@@ -463,9 +592,14 @@ def times(rows=1000):
         (static(1000), (), (), ("log.csv", "time_s", "--sampling-hz")),
         (static(1000), ("sampling_hz = 50",), ("--sampling-hz", "0"), ("--sampling-hz", "got 0")),
         (static(100), ("sampling_hz = 50",), (), ("128", "got 100", "Record for longer")),
-        (times(), (), ("--from", "19"), ("128", "of 1000 rows", "--from")),
+        (times(), (), ("--from", "19"), ("128", "50 of 1000 rows", "lasts 19.98 s")),
         (times(), (), ("--station-seconds", "60"), ("--station-seconds", "5 s", "got 60")),
-        (times(), (), ("--station-seconds", "0.001"), ("--station-seconds", "0.02 s")),
+        (times(), (), ("--station-seconds", "0.001"), ("one sample", "0.02 s", "a longer station")),
+        (times(), (), ("--station-seconds", "nan"), ("--station-seconds", "above 0", "got nan")),
+        (times(), (), ("--station-seconds", "0"), ("--station-seconds", "above 0", "got 0")),
+        (times(), (), ("--from", "15", "--to", "5"), ("--from 15", "--to 5", "less than --to")),
+        (times(), (), ("--from", "nan"), ("--from", "got nan")),
+        (times(), (), ("--to", "nan"), ("--to", "got nan")),
         (
             {k: v[np.arange(1000) != 400] for k, v in times().items()}, (), (),
             ("log.csv, line 402, column 'time_s'", "0.04 s after 7.98 s", "--from"),

@@ -5,7 +5,8 @@ one channel leaves it out, with a finding; what is wrong with the log is an erro
 
 The noise of a station of T seconds is the Allan deviation at T: 1 σ of a mean over T, as two
 stations show it that follow each other. It is taken from the fitted terms or, where that has
-more degrees of freedom, from the variance measured at T itself.
+far more degrees of freedom or the terms do not describe the channel, from the variance measured
+at T itself.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from mwdcal.calibration import Finding
 from mwdcal.core import allan, noise_terms
 from mwdcal.core.allan import Kind, Moments
 from mwdcal.core.noise_terms import Terms
-from mwdcal.core.vectors import Array
+from mwdcal.core.vectors import Array, Ints
 from mwdcal.errors import InputError
 from mwdcal.files.contract import CHANNELS, RAW
 from mwdcal.files.logs import TIME
@@ -35,16 +36,22 @@ AVERAGES = 4
 """Stations that a log has to hold at least."""
 SOUND = 10
 """Stations that a log holds where their duration is chosen for it."""
+SPARSE = 1e-3
+"""Share of single blanks that are filled in: they change less than the noise of the noise."""
 JITTER = 0.5
 """Share of the sampling interval by which one may differ: more is a gap."""
 EVENT = 8.0
 """Size of a difference, in robust standard deviations, that no noise reaches."""
+ROUNDING = 1e-6
+"""Of a whole number of steps of the converter over another."""
 PARTS = 256
 """Averages in a log between which events are looked for."""
 UNEVEN = 2.0
 """Ratio of the noise of two channels of a triad that is worth a word."""
 COARSE = 0.5
 """Noise of one sample, in steps of the converter, below which the steps hide it."""
+DOUBTS = {"event": "a spike or a move", "misfit": "noise that is none of the five terms"}
+"""Findings after which the figures of a channel do not hold, in words."""
 RATE = 0.01
 """Share by which a given rate of sampling may differ from that of the log."""
 NOT_SIMULATED = ("", "0", "false", "no")
@@ -93,6 +100,7 @@ class ChannelNoise(msgspec.Struct, frozen=True, kw_only=True):
         white_density: one-sided density per √Hz, √2 times the white term.
         fit_from_s: shortest averaging time that the terms describe.
         chance: probability of a misfit as large, if the terms describe the noise.
+        doubts: findings (`DOUBTS`) after which terms and station do not hold.
         unit, scale: physical unit and raw units per it, where the profile says so.
     """
 
@@ -109,13 +117,17 @@ class ChannelNoise(msgspec.Struct, frozen=True, kw_only=True):
     white_density: float | None
     fit_from_s: float
     chance: float
+    doubts: list[str]
     station: StationNoise
     unit: str | None = None
     scale: float | None = None
 
 
 class Noise(msgspec.Struct, frozen=True, kw_only=True):
-    """The noise of a log; `profile` is the recommended `noise` of each triad, raw units."""
+    """The noise of a log; `profile` is the recommended `noise` of each triad, raw units.
+
+    `withheld` says why there is none for a triad whose channels do not hold.
+    """
 
     log: str
     seconds: float
@@ -124,6 +136,7 @@ class Noise(msgspec.Struct, frozen=True, kw_only=True):
     simulated: bool
     channels: dict[str, ChannelNoise]
     profile: dict[str, float]
+    withheld: dict[str, str]
     findings: list[Finding]
 
 
@@ -147,6 +160,7 @@ def find_noise(
     used; `station_seconds` by default 30, or a tenth of a shorter log.
     Errors: a log without time, with gaps, too short, or without a channel that can be used.
     """
+    check(between, station_seconds)
     findings: list[Finding] = []
     first, last, rate = _section(log, sampling_hz, between, findings)
     seconds = (last - first) / rate
@@ -163,6 +177,7 @@ def find_noise(
         )
     if profile is not None:
         found = {name: _physical(name, channel, profile) for name, channel in found.items()}
+    withheld = _withheld(found)
     return Noise(
         log=log.source,
         seconds=seconds,
@@ -170,9 +185,28 @@ def find_noise(
         station_seconds=station,
         simulated=str(log.metadata.get("simulated", "")).lower() not in NOT_SIMULATED,
         channels=found,
-        profile=_recommended(found, findings),
+        profile=_recommended(found, withheld, findings),
+        withheld=withheld,
         findings=findings,
     )
+
+
+def check(between: tuple[float, float], station_seconds: float | None) -> None:
+    """Refuse seconds that no log can have."""
+    start, end = between
+    for option, value in (("--from", start), ("--to", end)):
+        if np.isnan(value):
+            raise InputError(
+                f"{option} must be seconds from the start of the log; got nan. Correct it."
+            )
+    if not start < end:
+        raise InputError(
+            f"--from must be less than --to; got --from {start:g} and --to {end:g}. Swap them?"
+        )
+    if station_seconds is not None and not 0 < station_seconds < np.inf:
+        raise InputError(
+            f"--station-seconds must be above 0 and finite; got {station_seconds:g}. Correct it."
+        )
 
 
 def _section(
@@ -182,9 +216,13 @@ def _section(
     time = row_times(_without_time(log) if given else log, given)
     inside = np.flatnonzero((time - time[0] >= between[0]) & (time - time[0] <= between[1]))
     if len(inside) < FEWEST:
+        problem, advice = f"got {len(time)}", "Record for longer."
+        if len(time) >= FEWEST:
+            problem = f"--from and --to leave {len(inside)} of {len(time)} rows"
+            advice = f"The log lasts {time[-1] - time[0]:.4g} s: widen them."
         raise InputError(
-            f"{log.source}: at least {FEWEST} samples are needed for an Allan deviation; got "
-            f"{len(inside)} of {len(time)} rows. Record for longer, or widen --from and --to."
+            f"{log.source}: at least {FEWEST} samples are needed for an Allan deviation; {problem}. "
+            f"{advice}"
         )
     first, last = int(inside[0]), int(inside[-1]) + 1
     steps = np.diff(time[first:last])
@@ -231,11 +269,16 @@ def _station_seconds(given: float | None, seconds: float, rate: float, source: s
     longest = seconds / AVERAGES
     if given is None:
         return min(STATION_SECONDS, seconds / SOUND)
-    if not 1 / rate <= given <= longest:
+    if given < 1 / rate:
         raise InputError(
-            f"--station-seconds must be from one sample, {1 / rate:g} s, to a quarter of the log, "
-            f"{longest:.4g} s; got {given:g}. Record {source} for at least {AVERAGES * given:g} s, "
-            "better ten times that, or ask for a shorter station."
+            f"--station-seconds must be at least one sample of {source}, {1 / rate:g} s; got {given:g}. "
+            "Ask for a longer station."
+        )
+    if given > longest:
+        raise InputError(
+            f"--station-seconds must be at most a quarter of {source}, {longest:.4g} s; got {given:g}. "
+            f"Record for at least {AVERAGES * given:g} s, better {SOUND * given:g} s, or ask for a "
+            "shorter station."
         )
     return given
 
@@ -246,22 +289,42 @@ def _samples(
     """Values of a channel and samples a second; None with a finding where it cannot be used."""
     value = numbers(log, name)[first:last]
     there = np.flatnonzero(~np.isnan(value))
-    problem, steps = "", np.diff(there)
+    steps = np.diff(there)
     if not there.size:
-        problem = f"{name} is blank from end to end"
+        problem = f"{name} is blank from end to end."
     elif len(there) < FEWEST:
-        problem = f"{name} has {len(there)} samples, of {FEWEST} needed"
-    elif (odd := np.flatnonzero(steps != np.median(steps))).size:
-        row = first + int(there[odd[0]]) + 1
-        line = log.lines[row] if row < len(log.lines) else row + 1
-        problem = f"{name} is blank at irregular places, first in line {line}: fill in or cut"
+        problem = f"{name} has {len(there)} samples, of {FEWEST} needed."
     elif np.ptp(value[there]) == 0:
         problem = f"{name} reads {value[there[0]]:g} from end to end: a dead channel?"
-    if problem:
-        text = f"{problem.rstrip('?')}{'?' if problem.endswith('?') else '.'} It was left out."
-        findings.append(Finding(id="channel-left-out", text=text))
+    elif not (odd := np.flatnonzero(steps != np.median(steps))).size:
+        return value[there], rate / float(steps[0])
+    else:
+        row = first + min(there[odd[0]] + int(np.median(steps)), there[odd[0] + 1])
+        line = log.lines[row] if row < len(log.lines) else row + 1
+        filled = _filled(value, there)
+        if filled is not None:
+            text = (
+                f"{name} is blank in {len(odd)} of {len(filled)} samples, first in line {line}: taken as "
+                "the mean of the two neighbours."
+            )
+            findings.append(Finding(id="filled", text=text))
+            return filled, rate / float(np.median(steps))
+        problem = f"{name} is blank at irregular places, first in line {line}: fill in or cut."
+    findings.append(Finding(id="channel-left-out", text=f"{problem} It was left out."))
+    return None
+
+
+def _filled(value: Array, there: Ints) -> Array | None:
+    """Samples of a channel, present `there`, each single blank the mean of its neighbours.
+
+    None where others are blank, or more than `SPARSE`.
+    """
+    steps = np.diff(there)
+    step = int(np.median(steps))
+    single = steps == 2 * step
+    if np.any(~single & (steps != step)) or single.sum() > max(SPARSE * len(there), 1):
         return None
-    return value[there], rate / float(steps[0])
+    return np.asarray(np.interp(np.arange(there[0], there[-1] + 1, step), there, value[there]))
 
 
 def _channel(
@@ -274,15 +337,15 @@ def _channel(
     centred = allan.variance(value, factors, centred=True)
     slope = np.asarray(allan.drift(value))
     terms = noise_terms.fit(centred[None], slope[None], moments)
-    steady = np.where(_drifts(terms), terms.slope, 0.0)
     plain = allan.deviation(value, factors, kind)
-    freedom = allan.freedom(asked, terms.bounded, steady, terms.covariance)[0]
+    freedom = allan.freedom(asked, terms.bounded, terms.steady, terms.covariance)[0]
     lower, upper = allan.band(plain, freedom)
     fitted = terms.bounded @ np.swapaxes(asked.plain_mean, -1, -2)
-    fitted = np.sqrt(fitted[0] + (steady * moments.averaging) ** 2 / 2)
+    fitted = np.sqrt(fitted[0] + (terms.steady * moments.averaging) ** 2 / 2)
     named = _terms(terms, rate)
     white = named["white"].value
-    findings += _findings(name, value, rate, moments, terms)
+    said = _findings(name, value, rate, moments, terms)
+    findings += said
     return ChannelNoise(
         samples=len(value),
         sampling_hz=rate,
@@ -297,7 +360,8 @@ def _channel(
         white_density=None if white is None else float(np.sqrt(2)) * white,
         fit_from_s=float(moments.averaging[terms.start[0]] / rate),
         chance=float(terms.chance[0]),
-        station=_station(value, station * rate, moments, terms, steady),
+        doubts=[finding.id for finding in said if finding.id in DOUBTS],
+        station=_station(value, station * rate, moments, terms),
     )
 
 
@@ -344,24 +408,15 @@ def _drift(terms: Terms, rate: float) -> Term:
     )
 
 
-def _station(
-    value: Array, length: float, moments: Moments, terms: Terms, steady: Array
-) -> StationNoise:
-    """The noise of a mean over `length` samples: of terms or measured, whichever knows more."""
-    weight = allan.expected(np.asarray(length))
-    variance = float(terms.bounded[0] @ weight + (steady[0] * length) ** 2 / 2)
-    freedom = 2 * variance**2 / float(weight @ terms.covariance[0] @ weight)
-    deviation, source = np.sqrt(variance), "terms"
-    whole = max(round(length), 1)
-    own = allan.freedom(moments, terms.bounded, steady, terms.covariance)[0]
-    measured = float(np.interp(np.log(whole), np.log(moments.averaging), own))
-    described = terms.chance[0] >= noise_terms.CONTRADICTED
-    if not (described and length >= moments.averaging[terms.start[0]]) or measured > freedom:
-        deviation, source = allan.deviation(value, [whole])[0], "measured"
-        freedom = measured
-    lower, upper = allan.band(deviation, np.asarray(freedom))
+def _station(value: Array, length: float, moments: Moments, terms: Terms) -> StationNoise:
+    """The noise of a mean over `length` samples."""
+    noise, freedom, measured = noise_terms.single(value[None], length, moments, terms)
+    lower, upper = allan.band(noise, freedom)
     return StationNoise(
-        noise=float(deviation), lower=float(lower), upper=float(upper), source=source
+        noise=float(noise[0]),
+        lower=float(lower[0]),
+        upper=float(upper[0]),
+        source="measured" if measured[0] else "terms",
     )
 
 
@@ -369,12 +424,13 @@ def _findings(
     name: str, value: Array, rate: float, moments: Moments, terms: Terms
 ) -> list[Finding]:
     """What the reader should know about a channel."""
-    texts = {"event": _event(name, value, rate)}
-    steps = np.diff(np.unique(value))
+    step = float(np.diff(np.unique(value)).min())
     sample = float(np.std(np.diff(value)) / np.sqrt(2))
-    if sample < COARSE * float(steps.min()):
+    coarse = sample < COARSE * step
+    texts = {"event": _event(name, value, rate, COARSE * step, coarse)}
+    if coarse:
         texts["coarse"] = (
-            f"{name} is read in steps of {steps.min():.3g}, above its noise of {sample:.2g}: the figures "
+            f"{name} is read in steps of {step:.3g}, above its noise of {sample:.2g}: the figures "
             "are those of the rounding. Read it with more digits."
         )
     start = moments.averaging[terms.start[0]] / rate
@@ -387,18 +443,22 @@ def _findings(
     elif terms.start[0]:
         texts["filtered"] = (
             f"{name}: below {start:.3g} s its noise is not that of the five terms (a filter, a vibration, "
-            "or repeated samples); they hold from there on."
+            "or repeated samples); from there on they hold, without a quantisation."
         )
     return [Finding(id=key, text=text) for key, text in texts.items() if text]
 
 
-def _event(name: str, value: Array, rate: float) -> str:
-    """A word on a difference between averages that is no noise: a spike, or a move."""
+def _event(name: str, value: Array, rate: float, least: float, coarse: bool) -> str:
+    """A word on a difference between averages that is no noise: a spike, or a move.
+
+    `least` is the noise that the steps of the converter can hide: in single samples, and if they
+    are `coarse` in averages.
+    """
     for m in sorted({1, max(len(value) // PARTS, 1)}):
         size = np.abs(allan.differences(value, m))
-        usual = 1.4826 * float(np.median(size))
+        usual = max(1.4826 * float(np.median(size)), least if coarse or m == 1 else 0.0)
         worst = int(np.argmax(size))
-        if usual > 0 and size[worst] > EVENT * usual:
+        if usual > 0 and size[worst] / usual > EVENT + ROUNDING:
             return (
                 f"{name} changes by {size[worst]:.3g} about {(worst + m) / rate:.4g} s after the start, "
                 f"{size[worst] / usual:.0f} times what is usual within {m / rate:.2g} s: a spike or a move. "
@@ -416,12 +476,27 @@ def _physical(name: str, channel: ChannelNoise, profile: Profile) -> ChannelNois
     return msgspec.structs.replace(channel, unit=PHYSICAL[kind], scale=float(scale))
 
 
-def _recommended(found: dict[str, ChannelNoise], findings: list[Finding]) -> dict[str, float]:
-    """The noise of one station for each triad: root mean square of its channels."""
+def _withheld(found: dict[str, ChannelNoise]) -> dict[str, str]:
+    """Why there is no noise to recommend, for each triad where that is so."""
+    reasons = {}
+    for kind, names in CHANNELS.items():
+        own: dict[str, list[str]] = {}
+        for name in (name for name in names if name in found and found[name].doubts):
+            reason = " and ".join(DOUBTS[doubt] for doubt in found[name].doubts)
+            own.setdefault(reason, []).append(name)
+        if own:
+            reasons[kind] = "; ".join(f"{', '.join(who)}: {why}" for why, who in own.items())
+    return reasons
+
+
+def _recommended(
+    found: dict[str, ChannelNoise], withheld: dict[str, str], findings: list[Finding]
+) -> dict[str, float]:
+    """The noise of one station for each triad that holds: root mean square of its channels."""
     profile = {}
     for kind, names in CHANNELS.items():
         own = {name: found[name].station.noise for name in names if name in found}
-        if not own:
+        if not own or kind in withheld:
             continue
         profile[kind] = root_mean_square(list(own.values()))
         noisy, quiet = max(own, key=lambda n: own[n]), min(own, key=lambda n: own[n])

@@ -29,6 +29,14 @@ LOOKS = {
 SHOWN = {"g": ("µg", 1e6), "nT": ("nT", 1.0)}
 """How physical units are written, and their number in one of them."""
 
+MARK = " (!)"
+"""Behind the name of a channel whose figures do not hold."""
+
+
+def marked(name: str, channel: ChannelNoise) -> str:
+    """The name of a channel, with a mark where its figures do not hold."""
+    return name + MARK if channel.doubts else name
+
 
 def scaled(channel: ChannelNoise) -> tuple[str, float]:
     """The unit in which a channel is best read, and how many of it a raw unit is."""
@@ -94,7 +102,16 @@ def _draw(axes: Axes, found: Noise, names: list[str]) -> None:
             for v in (channel.lower, channel.deviation, channel.upper, channel.fitted)
         )
         axes.fill_between(tau, low, high, color=colour, alpha=0.13, lw=0)
-        axes.plot(tau, middle, marker, color=colour, ms=3.6, mfc="white", mew=0.9, label=name)
+        axes.plot(
+            tau,
+            middle,
+            marker,
+            color=colour,
+            ms=3.6,
+            mfc="white",
+            mew=0.9,
+            label=marked(name, channel),
+        )
         axes.plot(tau, fitted, color=colour, ls=line, lw=1.0, label=f"{name}, terms")
     axes.axvline(found.station_seconds, color=plots.BEFORE, lw=0.7, ls=(0, (4, 3)))
     axes.annotate(

@@ -12,14 +12,14 @@ import numpy as np
 from mwdcal import __version__
 from mwdcal.app import noise_plots, plots, progress, report
 from mwdcal.app.noise_asked import Asked
-from mwdcal.app.noise_plots import scaled
+from mwdcal.app.noise_plots import marked, scaled
 from mwdcal.app.text import table
 from mwdcal.calibration import Finding
 from mwdcal.errors import InputError
 from mwdcal.files import atomic, logs
 from mwdcal.files.contract import CHANNELS
 from mwdcal.files.profiles import load_profile
-from mwdcal.noise import ChannelNoise, Noise, Term, find_noise
+from mwdcal.noise import ChannelNoise, Noise, Term, check, find_noise
 
 ROWS = {
     "white": ("white noise N", "·√s"),
@@ -59,10 +59,17 @@ def _check(asked: Asked) -> None:
         noise_plots.require()
     if asked["report"]:
         report._environment()
+    check(_between(asked), asked["station_seconds"])
     if rate is not None and not 0 < rate <= 1e9:
         raise InputError(
             f"--sampling-hz must be above 0 and at most 1e9 Hz; got {rate:g}. Correct it."
         )
+
+
+def _between(asked: Asked) -> tuple[float, float]:
+    """First and last second that were asked for."""
+    start, end = asked["start"], asked["end"]
+    return -np.inf if start is None else start, np.inf if end is None else end
 
 
 def find(asked: Asked, say: Callable[[str], None]) -> Noise:
@@ -70,12 +77,11 @@ def find(asked: Asked, say: Callable[[str], None]) -> Noise:
     names = [name.strip() for name in asked["columns"].split(",")] if asked["columns"] else []
     profile = load_profile(asked["tool"])[0] if asked["tool"] else None
     slowly = progress.slowly(say)
-    start, end = asked["start"], asked["end"]
     return find_noise(
         logs.read(asked["log"], names, decimal=asked["decimal"], say=slowly),
         profile=profile,
         sampling_hz=asked["sampling_hz"],
-        between=(-np.inf if start is None else start, np.inf if end is None else end),
+        between=_between(asked),
         station_seconds=asked["station_seconds"],
         kind="modified" if asked["modified"] else "overlapping",
         say=slowly,
@@ -129,7 +135,7 @@ def terms(found: Noise, physical: bool) -> tuple[list[str], list[Line]]:
     for name, (what, unit) in ROWS.items():
         per = HOUR if name == "drift" else 1.0
         cells = [
-            _term(c.terms[name], factor * per)
+            _term(c.terms[name], factor * per, bool(c.doubts))
             for c, (_, factor) in zip(shown.values(), units, strict=True)
         ]
         lines.append((_label(what, unit), cells))
@@ -138,12 +144,23 @@ def terms(found: Noise, physical: bool) -> tuple[list[str], list[Line]]:
         for c, (_, factor) in zip(shown.values(), units, strict=True)
     ]
     lines.insert(1, (_label("its one-sided density", "/√Hz"), density))
-    scaled_stations = [(c.station, f) for c, (_, f) in zip(shown.values(), units, strict=True)]
-    station = [_number(own.noise * f) for own, f in scaled_stations]
-    limits = [f"{_number(o.lower * f)}…{_number(o.upper * f)}" for o, f in scaled_stations]
+    pairs = [(c, factor) for c, (_, factor) in zip(shown.values(), units, strict=True)]
+    station = [_number(c.station.noise * factor) for c, factor in pairs]
+    limits = ["?" if c.doubts else _limits(c, factor) for c, factor in pairs]
     lines.append((f"one station of {found.station_seconds:.3g} s, 1σ", station))
     lines.append(("its 95 % interval", limits))
-    return [f"{n}, {unit}" for n, (unit, _) in zip(shown, units, strict=True)], lines
+    if any(c.doubts for c in shown.values()):
+        lines.append(
+            ("does not hold" + noise_plots.MARK, [", ".join(c.doubts) for c in shown.values()])
+        )
+    header = [
+        f"{marked(n, c)}, {unit}" for (n, c), (unit, _) in zip(shown.items(), units, strict=True)
+    ]
+    return header, lines
+
+
+def _limits(channel: ChannelNoise, factor: float) -> str:
+    return f"{_number(channel.station.lower * factor)}…{_number(channel.station.upper * factor)}"
 
 
 def _powers(channel: ChannelNoise) -> tuple[str, float]:
@@ -156,9 +173,11 @@ def _label(what: str, unit: str) -> str:
     return f"{what}, {unit}" if unit else what
 
 
-def _term(term: Term, factor: float) -> str:
+def _term(term: Term, factor: float, doubtful: bool) -> str:
     if term.value is None or term.standard_uncertainty is None:
-        return f"< {_number(term.upper * factor, 2)}"
+        return "?" if doubtful else f"< {_number(term.upper * factor, 2)}"
+    if doubtful:
+        return f"{_number(term.value * factor)} ± ?"
     share = 100 * term.standard_uncertainty / abs(term.value)
     return f"{_number(term.value * factor)} ± {share:.2g} %"
 
@@ -168,9 +187,11 @@ def _number(value: float, digits: int = 3) -> str:
 
 
 def profile_lines(found: Noise) -> str:
-    """The lines of a tool profile (TOML) that this log recommends."""
+    """The lines of a tool profile (TOML) that this log recommends, or in a comment why not."""
     lines = []
     for kind, names in CHANNELS.items():
+        if kind in found.withheld:
+            lines.append(f"# [{kind}] no noise from {found.log}: {found.withheld[kind]}")
         if kind not in found.profile:
             continue
         own = [

@@ -10,10 +10,12 @@ them and C(θ) (m, m) their covariance under noise of the squares θ = (Q², N²
 is what draws the curve. An interval of one term holds the values t for which θ̂ is no surprise:
 its variance under t, with the other terms as bounded, is a quadratic in t, and its law that of a
 gamma variable of that variance, as skew as the term's own share makes it. A term that might be
-absent with a chance of more than `DETECTED` has an upper bound instead.
+absent with a chance of more than `DETECTED` has an upper bound instead; so has one without which
+the others, fitted anew, do as well.
 
 Where the variances at the shortest averages contradict all five terms (a filter, a vibration),
-they are left out one after the other.
+they are left out one after the other. Quantisation, which shows nowhere else, is then not used
+to explain the rest.
 
 Reference: S. Guerrier, J. Skaloud, Y. Stebler, M.-P. Victoria-Feser, J. Am. Stat. Assoc. 108,
 1021 (2013) (moments of wavelet variances as estimator); here the weights are exact and
@@ -27,7 +29,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mwdcal.core.allan import Moments, drift_variance
+from mwdcal.core.allan import Moments, deviation, drift_variance, expected, freedom
 from mwdcal.core.vectors import Array, Bools, Ints
 
 FEWEST = 6
@@ -40,6 +42,11 @@ LEVEL = 0.95
 """Probability of the intervals."""
 CONTRADICTED = 1e-3
 """Chance of a misfit below which the shortest averages are left out, or the fit is in doubt."""
+BETTER = 1.5
+"""Ratio of degrees of freedom from which on a measured deviation comes before the terms.
+
+Near 1, where both come from the same readings, to take the larger is to take the luckier.
+"""
 HALVINGS = 60
 """Of an interval's limit: to the last digits of a number."""
 ALONE = 1e-9
@@ -60,6 +67,7 @@ class Terms(NamedTuple):
         lower, upper: limits of the intervals; where `determined` is false 0 and a bound.
         determined: whether a term cannot be absent.
         slope, slope_sd: drift per sample (...) and its standard uncertainty.
+        steady: size (...) of the drift less what noise adds to its square, unbiased but for >= 0.
         misfit, freedom: χ² (...) of the bounded fit, and its degrees of freedom.
         start: index of the first averaging factor used (...).
     """
@@ -72,6 +80,7 @@ class Terms(NamedTuple):
     determined: Bools
     slope: Array
     slope_sd: Array
+    steady: Array
     misfit: Array
     freedom: Ints
     start: Ints
@@ -98,44 +107,127 @@ def fit(variance: Array, slope: Array, moments: Moments) -> Terms:
         if not doubtful.size:
             break
         other = _fit(variance[doubtful], slope[doubtful], moments, start)
-        better = other.chance > best.chance[doubtful]
+        better = other.chance >= CONTRADICTED
         for own, new in zip(best, other, strict=True):
             own[doubtful[better]] = new[better]
     return best
 
 
+def single(
+    values: Array, length: float, moments: Moments, terms: Terms
+) -> tuple[Array, Array, Bools]:
+    """Deviation (B,) of one mean over `length` samples of records (B, n), drift included.
+
+    With its degrees of freedom (B,), and whether (B,) it was measured: the Allan deviation at
+    `length`, where the terms do not describe the record or are known by far less.
+    """
+    weight = expected(np.asarray(length))
+    variance = terms.bounded @ weight + (terms.steady * length) ** 2 / 2
+    spread = np.einsum("a,bac,c->b", weight, terms.covariance, weight)
+    doubt = terms.slope_sd**2
+    spread = spread + length**4 * doubt * (terms.steady**2 + doubt / 2)
+    known = 2 * variance**2 / spread
+    whole = max(round(length), 1)
+    own = freedom(moments, terms.bounded, terms.steady, terms.covariance)
+    places = np.log(moments.averaging)
+    own = own @ [np.interp(np.log(whole), places, one) for one in np.eye(len(places))]
+    described = (terms.chance >= CONTRADICTED) & (length >= moments.averaging[terms.start])
+    measured = ~described | (own > BETTER * known)
+    found = np.where(measured, deviation(values, [whole])[:, 0], np.sqrt(variance))
+    return found, np.where(measured, own, known), measured
+
+
 def _fit(variance: Array, slope: Array, moments: Moments, start: int) -> Terms:
-    """The same on the averaging factors from `start` on."""
-    variance, mean = variance[:, start:], moments.mean[start:]
-    unit = moments.covariance[start:, start:]
-    bounded = _rough(variance, mean, moments.averaging[start:] / moments.samples)
-    for _ in range(ITERATIONS):
-        whiten = _whitening(unit, bounded)
-        design, data = whiten @ mean, np.einsum("bij,bj->bi", whiten, variance)
-        bounded = _nonnegative(design, data)
-    whiten = _whitening(unit, bounded)
-    gain = _inverse(whiten @ mean) @ whiten
-    square = np.einsum("bjm,bm->bj", gain, variance)
-    each = np.einsum("bjm,bjn,mnac->bjac", gain, gain, unit, optimize=True)
-    joint = np.einsum("mnac,ba,bc->bmn", unit, bounded, bounded, optimize=True)
-    covariance = gain @ joint @ np.swapaxes(gain, -1, -2)
-    rest = np.einsum("bij,bj->bi", whiten, variance - bounded @ np.swapaxes(mean, -1, -2))
-    absent = _chance(square, np.zeros_like(square), _spread(each, bounded))
-    determined = 1 - absent < DETECTED
-    lower, upper = _interval(square, _spread(each, bounded), determined)
+    """The same on the averaging factors from `start` on; if not all, without quantisation."""
+    used = _Used(
+        variance[:, start:], moments.mean[start:], moments.covariance[start:, start:],
+        moments.averaging[start:] / moments.samples,
+    )  # fmt: skip
+    present = (0, 1, 2, 3) if start == 0 else (1, 2, 3)
+    bounded = _bounded(used, present)
+    square, each, covariance = _estimate(used, bounded)
+    misfit, free = _misfit(used, bounded)
+    spread = _spread(each, bounded)
+    determined = _absence(used, square, spread, misfit, present) < DETECTED
+    lower, upper = _interval(square, spread, determined)
     weight = drift_variance(moments.samples)
     doubt = np.sqrt(np.einsum("a,bac,c->b", weight, covariance, weight))
     return Terms(
         square, bounded, covariance, lower, upper, determined,
         slope.copy(), np.sqrt(bounded @ weight + doubt),
-        np.sum(rest**2, -1), len(mean) - np.sum(bounded > 0, -1), np.full(len(variance), start),
+        np.sqrt(np.maximum(slope**2 - bounded @ weight, 0.0)),
+        misfit, free, np.full(len(variance), start),
     )  # fmt: skip
 
 
-def _rough(variance: Array, mean: Array, share: Array) -> Array:
-    """Terms (B, 4) by the weights of white noise: the relative variance of V grows with m."""
-    weight = 1 / (variance * np.sqrt(share))
-    return _nonnegative(mean * weight[..., None], variance * weight)
+def _absence(
+    used: _Used, square: Array, spread: Array, misfit: Array, present: tuple[int, ...]
+) -> Array:
+    """Chance (B, 4) of as much of a term, if it is absent: the larger of two.
+
+    That of its estimate, the other terms as bounded; and that of the misfit which is added where
+    the others have to do without it, as only those that were fitted anew can take its place.
+    """
+    from scipy.special import gammaincc
+
+    chance = 1 - _chance(square, np.zeros_like(square), spread)
+    for term in range(4):
+        others = tuple(other for other in present if other != term)
+        added = np.maximum(_misfit(used, _bounded(used, others))[0] - misfit, 0.0)
+        chance[:, term] = np.maximum(chance[:, term], gammaincc(0.5, added / 2) / 2)
+    return np.asarray(chance)
+
+
+class _Used(NamedTuple):
+    """What is fitted.
+
+    Variances (B, m), their mean (m, 4) and covariance (m, m, 4, 4) under unit noise, and
+    averaging factors (m,) as shares of the record.
+    """
+
+    variance: Array
+    mean: Array
+    unit: Array
+    share: Array
+
+
+def _bounded(used: _Used, present: tuple[int, ...]) -> Array:
+    """Best fit (B, 4) without negative terms, of those `present`, under its own weights."""
+    weight = 1 / (used.variance * np.sqrt(used.share))
+    found = _nonnegative(used.mean * weight[..., None], used.variance * weight, present)
+    for _ in range(ITERATIONS):
+        whiten = _whitening(used.unit, found)
+        data = np.einsum("bij,bj->bi", whiten, used.variance)
+        better = _nonnegative(whiten @ used.mean, data, present)
+        found = np.where(better.any(-1, keepdims=True), better, found)
+    return found
+
+
+def _estimate(used: _Used, bounded: Array) -> tuple[Array, Array, Array]:
+    """Unbiased squares (B, 4) under the weights of noise `bounded`.
+
+    With their variances (B, 4, 4, 4) per unit noise, and their covariance (B, 4, 4).
+    """
+    whiten = _whitening(used.unit, bounded)
+    gain = _inverse(whiten @ used.mean) @ whiten
+    each = np.einsum("bjm,bjn,mnac->bjac", gain, gain, used.unit, optimize=True)
+    joint = np.einsum("mnac,ba,bc->bmn", used.unit, bounded, bounded, optimize=True)
+    square = np.einsum("bjm,bm->bj", gain, used.variance)
+    return square, each, gain @ joint @ np.swapaxes(gain, -1, -2)
+
+
+def _misfit(used: _Used, bounded: Array) -> tuple[Array, Ints]:
+    """χ² (B,) of the variances about noise `bounded`, and its degrees of freedom.
+
+    A variance of few degrees of freedom is skew; its cube root is normal (Wilson, Hilferty).
+    """
+    joint = np.einsum("mnac,ba,bc->bmn", used.unit, bounded, bounded, optimize=True)
+    fitted = bounded @ np.swapaxes(used.mean, -1, -2)
+    spread = np.sqrt(np.einsum("bmm->bm", joint))
+    skew = (spread / fitted) ** 2 / 9
+    normal = (np.cbrt(used.variance / fitted) - 1 + skew) / np.sqrt(skew)
+    rest = np.einsum("bij,bj->bi", _whitening(used.unit, bounded), normal * spread)
+    return np.sum(rest**2, -1), len(used.mean) - np.sum(bounded > 0, -1)
 
 
 def _whitening(unit: Array, squares: Array) -> Array:
@@ -153,14 +245,14 @@ def _inverse(design: Array) -> Array:
     return np.asarray(np.linalg.pinv(design / size) / np.swapaxes(size, -1, -2))
 
 
-def _nonnegative(design: Array, data: Array) -> Array:
+def _nonnegative(design: Array, data: Array, present: tuple[int, ...]) -> Array:
     """Least-squares solution (B, 4) without negative entries of design (B, m, 4) · x = data (B, m).
 
-    The best of all choices of entries that are not zero.
+    The best of all choices of entries, among those `present`, that are not zero.
     """
     best = np.zeros((len(data), 4))
     cost = np.sum(data**2, -1)
-    for subset in SUBSETS:
+    for subset in (s for s in SUBSETS if set(s) <= set(present)):
         part = design[..., subset]
         found = np.einsum("bjm,bm->bj", _inverse(part), data)
         rest = np.sum((data - np.einsum("bmj,bj->bm", part, found)) ** 2, -1)
