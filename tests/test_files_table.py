@@ -122,12 +122,20 @@ def test_blank_is_nan_in_every_format(tmp_path):
 
 
 def test_text_numbers_become_numbers_in_typed_formats_but_codes_do_not(tmp_path):
-    table = Table({"ax": ["1", " ", "2.5"], "badge": ["007", "8", "9"], "station": ["1", "2", "3"]})
+    table = Table(
+        {
+            "ax": ["1", " ", "2.5"],
+            "badge": ["007", "8", "9"],
+            "id": ["1152921504606846977", "8", "9"],
+            "station": ["1", "2", "3"],
+        }
+    )
     for suffix in (".parquet", ".xlsx"):
         write(tmp_path / f"out{suffix}", table)
         again = read(tmp_path / f"out{suffix}")
         np.testing.assert_array_equal(again.columns["ax"], [1.0, np.nan, 2.5])
         assert again.columns["badge"] == ["007", "8", "9"]
+        assert again.columns["id"] == ["1152921504606846977", "8", "9"]
         assert again.columns["station"] == ["1", "2", "3"]
 
 

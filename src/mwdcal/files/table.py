@@ -109,7 +109,7 @@ def labels(table: Table, name: str) -> list[str]:
 
 def cell_error(table: Table, name: str, row: int, problem: str) -> InputError:
     """The error that names file, line and column before the problem."""
-    word = "line" if table.source.lower().endswith((".csv", ".tsv")) else "row"
+    word = "row" if Path(table.source).suffix.lower() in ("", ".parquet", ".xlsx") else "line"
     number = table.lines[row] if row < len(table.lines) else row + 1
     return InputError(f"{table.source}, {word} {number}, column '{name}': {problem}")
 
@@ -243,5 +243,6 @@ def _typed_column(name: str, column: Column, decimal: str) -> Column:
 
 
 def _is_code(cell: str) -> bool:
-    """Whether the cell has leading zeros that a number would lose: '007'."""
-    return len(cell) > 1 and cell[0] == "0" and cell[1].isdigit()
+    """Whether a number would lose digits of the cell: leading zeros ('007'), or more than it holds."""
+    digits = cell.removeprefix("-")
+    return bool(re.match(r"0\d", digits)) or (len(digits) > 15 and digits.isdigit())
