@@ -7,19 +7,21 @@ slower still: it never decides what stands still. See `core.standstill` for the 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from mwdcal.calibration import Finding
 from mwdcal.core import standstill
-from mwdcal.core.standstill import Activity, Standstills, Summary
+from mwdcal.core.standstill import Activity, Slow, Standstills
+from mwdcal.core.station_means import Summary, correlated, summarise, summarise_all, widened
 from mwdcal.core.vectors import Array, Ints
 from mwdcal.errors import InputError
 from mwdcal.files.columns import Column
-from mwdcal.files.contract import CHANNELS, RAW
+from mwdcal.files.contract import CHANNELS, RAW, TEMPERATURE
 from mwdcal.files.logs import READ, TIME
 from mwdcal.files.table import Table, cell_error, numbers, shown
+from mwdcal.station_findings import about, correlated_noise, count, listed, noisy_rests
 
 MIN_SECONDS, TRIM_SECONDS = 1.0, 1.0
 """Defaults for a fast log; one sampled slowly needs a window, and a cell, respectively."""
@@ -27,10 +29,10 @@ LEAST_SAMPLES = 3
 """Samples of each channel below which there is no station."""
 GAP = 5.0
 """Times the usual step between samples that are a gap."""
-MANY_SPIKES = 0.01
-"""Share of spikes that is worth a word."""
 MOST_CELLS = 50_000_000
 """Cells of the longest log: four months at 15 samples a second or more."""
+TOLD = 1.2
+"""Times the uncertainty of most means of a triad that correlated noise adds, worth a word."""
 SMALLEST = 1e-12
 """Resolution of a channel that never changes, as a share of its reading."""
 PARTS = {"": "mean", "sd_": "sd", "spread_": "spread", "drift_": "drift", "samples_": "used"}
@@ -69,6 +71,14 @@ class Stations:
     findings: list[Finding]
 
 
+class StandstillError(InputError):
+    """A log without a standstill; `made` holds what was looked at, with an empty table."""
+
+    def __init__(self, text: str, made: Stations) -> None:
+        super().__init__(text)
+        self.made = made
+
+
 def _silent(text: str) -> None:
     """Say nothing."""
 
@@ -94,30 +104,39 @@ def find_stations(
     findings: list[Finding] = []
     time = row_times(log, sampling_hz)
     traces, temperature = _traces(log, time, findings)
-    findings += _time_findings(log, time, traces)
+    findings += _time_findings(log, time, traces, sampling_hz)
     say(f"looking for standstills in {len(time)} rows")
     activity = standstill.activity(list(traces.values()))
     if not activity.cells:
-        raise _short(log, time)
+        raise _short(log, time, traces)
     cell = float(activity.edge[1] - activity.edge[0])
     shortest = max(MIN_SECONDS, standstill.WINDOW * cell) if min_seconds is None else min_seconds
     trim = max(TRIM_SECONDS, cell) if trim_seconds is None else trim_seconds
-    limits = _limits(activity, list(traces))
+    limits, slow = _limits(activity, traces)
+    highest = float(np.min(limits / activity.floor))
     value, stretch = threshold, None
     if value is None:
-        least, highest = (shortest + 2 * trim) / cell, float(np.min(limits / activity.floor))
-        value, stretch = standstill.choose_threshold(activity.value, int(np.ceil(least)), highest)
-    found = standstill.standstills(activity, limits, value, shortest, trim)
+        least = int(np.ceil((shortest + 2 * trim) / cell))
+        value, stretch = standstill.choose_threshold(activity.value, least, highest)
+        if np.isnan(value):  # nothing lasts: what comes nearest
+            value, stretch = highest, None
+    found = standstill.standstills(activity, limits, value, shortest, trim, slow)
     found = _with_samples(found, traces, findings)
+    findings += noisy_rests(activity, limits, found, value, shortest + 2 * trim)
+    made = Stations(
+        Table({}, log.metadata, log.source), found, activity, value, stretch, shortest, trim, time,
+        traces, findings,
+    )  # fmt: skip
     if not found.taken.any():
-        raise _none(log, found, shortest)
+        raise StandstillError(_none(made), made)
     start, end = found.start[found.taken], found.end[found.taken]
-    rows = _summaries(traces, start, end, say)
-    columns = _columns(log, time, rows, start, end, temperature)
-    findings += _findings(rows, found, float(time[-1] - time[0]))
+    rows = _summaries(traces, start, end, findings, say)
+    columns = _columns(log, time, rows, start, end)
+    columns |= _temperatures(temperature, start, end, findings)
+    findings += about(rows, found, float(time[-1] - time[0]))
     metadata = {**log.metadata, "log": log.source, "log_sha256": log.digest}
-    table = Table(columns, metadata, log.source, range(1, len(start) + 1))
-    return Stations(table, found, activity, value, stretch, shortest, trim, time, traces, findings)
+    table = Table(_ordered(columns), metadata, log.source, range(1, len(start) + 1))
+    return replace(made, table=table)
 
 
 def _check(name: str, value: float | None) -> None:
@@ -125,7 +144,12 @@ def _check(name: str, value: float | None) -> None:
         raise InputError(f"--{name} must be a number of at least 0; got {shown(value)}.")
 
 
-def _short(log: Table, time: Array) -> InputError:
+def _short(log: Table, time: Array, traces: dict[str, Trace]) -> InputError:
+    if len(time) > 1 and not any(np.ptp(value) for _, value in traces.values()):
+        return InputError(
+            f"{log.source}: no channel ever changes, so that nothing tells rest from movement. "
+            "Check the logger and the order of the columns."
+        )
     window = standstill.WINDOW
     return InputError(
         f"{log.source}: too short to find standstills in; got {len(time)} rows over "
@@ -134,24 +158,28 @@ def _short(log: Table, time: Array) -> InputError:
     )
 
 
-def _none(log: Table, found: Standstills, shortest: float) -> InputError:
-    longest = float((found.end - found.start).max(initial=0.0))
-    moving = int(np.count_nonzero(~found.short))
-    seen = (
-        f"{moving} long calm intervals move on slowly by more than a standstill can"
-        if moving
-        else f"the longest calm interval lasts {longest:.3g} s"
-    )
-    return InputError(
-        f"{log.source}: no standstill of at least {shortest:g} s; {seen}. Stand still for longer, or "
-        "lower --min-seconds, or set --threshold."
+def _none(made: Stations) -> str:
+    """Why there is no station."""
+    longest = float((made.found.end - made.found.start).max(initial=0.0))
+    moving = int(np.count_nonzero(~made.found.short))
+    trimmed = f"after {made.trim_seconds:g} s trimmed off each end"
+    if moving:
+        word = "interval moves" if moving == 1 else "intervals move"
+        seen = f"{moving} long calm {word} on slowly by more than a standstill can"
+    elif longest:
+        seen = f"the longest calm interval lasts {longest:.3g} s {trimmed}"
+    else:
+        seen = f"nothing is left {trimmed}"
+    return (
+        f"{made.table.source}: no standstill of at least {made.min_seconds:g} s; {seen}. Stand still "
+        "for longer, lower --min-seconds or --trim-seconds, or set --threshold; --plot shows the log."
     )
 
 
 def row_times(log: Table, sampling_hz: float | None) -> Array:
-    """Seconds of each row: the column `time_s`, else from the rate of sampling."""
+    """Seconds of each row: from the rate of sampling if given, else the column `time_s`."""
     stated = log.metadata.get("sampling_hz") if sampling_hz is None else sampling_hz
-    if TIME in log.columns:
+    if TIME in log.columns and sampling_hz is None:
         time = numbers(log, TIME)
         for row in np.flatnonzero(np.isnan(time))[:1]:
             advice = "Fill it in, or remove the row."
@@ -205,6 +233,8 @@ def _traces(
             text = f"{name} reads {own[name][1][0]:g} from end to end: a dead channel?"
             findings.append(Finding(id="dead-channel", text=text))
     temperature = own.pop("temperature_c", None)
+    if temperature is not None:
+        temperature = _possible(temperature, findings)
     if temperature is not None and not len(temperature[0]):
         text = "temperature_c is blank from end to end: the stations have no temperature."
         findings.append(Finding(id="no-temperature", text=text))
@@ -213,14 +243,36 @@ def _traces(
 
 
 def _trace(log: Table, time: Array, name: str) -> Trace:
+    """Times and values where there are values; times that are equal are spread."""
     value = numbers(log, name)
     there = ~np.isnan(value)
-    return (time, value) if there.all() else (time[there], value[there])
+    if not there.all():
+        time, value = time[there], value[there]
+    return standstill.distinct(time), value
 
 
-def _time_findings(log: Table, time: Array, traces: dict[str, Trace]) -> list[Finding]:
-    """Gaps, times that occur twice in a channel, and columns that go nowhere."""
+def _possible(temperature: Trace, findings: list[Finding]) -> Trace:
+    """The temperatures that can be some; others, such as -999, are left out and told."""
+    time, value = temperature
+    fine = (value >= TEMPERATURE.low) & (value <= TEMPERATURE.high)
+    if not fine.all():
+        wrong = np.flatnonzero(~fine)
+        text = (
+            f"{wrong.size} of {len(value)} values of temperature_c are none between {TEMPERATURE.low:g} "
+            f"and {TEMPERATURE.high:g} °C, such as {value[wrong[0]]:g}: left out."
+        )
+        findings.append(Finding(id="impossible-temperature", text=text))
+    return time[fine], value[fine]
+
+
+def _time_findings(
+    log: Table, time: Array, traces: dict[str, Trace], sampling_hz: float | None
+) -> list[Finding]:
+    """Gaps, times that occur twice in a channel, a time not used, and columns that go nowhere."""
     findings = []
+    if TIME in log.columns and sampling_hz is not None:
+        text = f"--sampling-hz {sampling_hz:g} was given: the column '{TIME}' is not used."
+        findings.append(Finding(id="time-not-used", text=text))
     steps = np.diff(time)
     gaps = np.flatnonzero(steps > max(GAP * standstill.time_step(time), standstill.CELL))
     if gaps.size:
@@ -230,14 +282,8 @@ def _time_findings(log: Table, time: Array, traces: dict[str, Trace]) -> list[Fi
             f"{TIME} = {time[widest]:.10g} (line {log.lines[widest]}): no standstill goes across one."
         )
         findings.append(Finding(id="gaps", text=text))
-    twice = {name: int(np.count_nonzero(np.diff(t) == 0)) for name, (t, _) in traces.items()}
-    name = max(twice, key=lambda n: twice[n])
-    if twice[name]:
-        text = (
-            f"{twice[name]} samples of {name} have the time of the one before: all are used. Is the "
-            "time written with too few digits, or are rows doubled?"
-        )
-        findings.append(Finding(id="duplicate-time", text=text))
+    if not np.all(steps > 0):
+        findings += _equal_times(log, time, list(traces))
     spare = [name for name in log.columns if name not in READ]
     if spare:
         text = f"columns not used: {', '.join(spare[:10])}{' …' if spare[10:] else ''}."
@@ -245,15 +291,39 @@ def _time_findings(log: Table, time: Array, traces: dict[str, Trace]) -> list[Fi
     return findings
 
 
-def _limits(activity: Activity, names: list[str]) -> Array:
-    """The largest range of each channel that was looked at that can be rest, in its own unit."""
+def _equal_times(log: Table, time: Array, names: list[str]) -> list[Finding]:
+    """Samples of a channel at one time; rows of different channels may share theirs."""
+    there = {name: ~np.isnan(numbers(log, name)) for name in names}
+    twice = {name: int(np.count_nonzero(np.diff(time[own]) == 0)) for name, own in there.items()}
+    name = max(twice, key=lambda n: twice[n])
+    if not twice[name]:
+        return []
+    text = (
+        f"{twice[name]} samples of {name} have the time of the one before: all are used, spread "
+        "over the step. Is the time written with too few digits, or are rows doubled?"
+    )
+    return [Finding(id="duplicate-time", text=text)]
+
+
+def _limits(activity: Activity, traces: dict[str, Trace]) -> tuple[Array, list[Slow]]:
+    """The largest range that can be rest of each channel looked at, and the others that can step."""
+    names = list(traces)
     cells = dict(zip((names[i] for i in activity.channels), activity.cells, strict=True))
-    limits = []
-    for name, own in cells.items():
+    cut = {
+        name: cells[name] if name in cells else standstill.cells_of(*trace, standstill.CELL)
+        for name, trace in traces.items()
+    }
+    limits, slow = [], []
+    for name, own in cut.items():
         triad = next(kind for kind in CHANNELS.values() if name in kind)
-        size = standstill.triad_size([cells[n].level for n in triad if n in cells])
-        limits.append(standstill.rest_limit(own, size))
-    return np.array(limits)
+        levels = [cut[n].level for n in triad if n in cut and len(cut[n].level)]
+        size = standstill.triad_size(levels) if levels else 0.0
+        if name in cells:
+            limits.append(standstill.rest_limit(own, size))
+        else:
+            noise = max(own.rough, own.resolution)
+            slow.append(Slow(*traces[name], max(standstill.STEP * size, standstill.NOISE * noise)))
+    return np.array(limits), slow
 
 
 def _within(time: Array, start: Array, end: Array) -> tuple[Ints, Ints]:
@@ -272,7 +342,7 @@ def _with_samples(
     poor = int(np.count_nonzero(found.taken & ~enough))
     if poor:
         text = (
-            f"{poor} standstills left out: a channel has fewer than {LEAST_SAMPLES} samples there. "
+            f"{count(poor, 'standstill')} left out: a channel has fewer than {LEAST_SAMPLES} samples there. "
             "Stand still for longer, or sample it faster."
         )
         findings.append(Finding(id="few-samples", text=text))
@@ -280,27 +350,37 @@ def _with_samples(
 
 
 def _summaries(
-    traces: dict[str, Trace], start: Array, end: Array, say: Callable[[str], None]
-) -> dict[str, list[Summary]]:
+    traces: dict[str, Trace], start: Array, end: Array, findings: list[Finding],
+    say: Callable[[str], None],
+) -> dict[str, list[Summary]]:  # fmt: skip
     """What each channel read at each station."""
     summaries: dict[str, list[Summary]] = {}
     for name, (time, value) in traces.items():
-        steps = np.abs(np.diff(value))
-        resolution = float(np.min(steps, initial=np.inf, where=steps > 0))
-        resolution = resolution if np.isfinite(resolution) else SMALLEST * abs(value[0]) or SMALLEST
-        summaries[name] = []
-        for first, last in zip(*_within(time, start, end), strict=True):
-            own = slice(int(first), int(last))
-            summaries[name].append(standstill.summarise(time[own], value[own], resolution))
-            say(f"station {len(summaries[name])} of {len(start)}, {name}")
+        resolution = standstill.resolution(value) or SMALLEST * abs(value[0]) or SMALLEST
+        places = zip(*_within(time, start, end), strict=True)
+        rests = [(time[a:b], value[a:b]) for a, b in places]
+
+        def said(done: int, name: str = name) -> None:
+            say(f"station {done} of {len(start)}, {name}")
+
+        summaries[name] = summarise_all(rests, float(resolution), said)
+    for triad in CHANNELS.values():
+        own = [name for name in triad if name in summaries]
+        variances = correlated([summaries[name] for name in own])
+        made = {n: widened(summaries[n], float(v)) for n, v in zip(own, variances, strict=True)}
+        grown = [
+            a.sd > TOLD * b.sd for n in own for a, b in zip(made[n], summaries[n], strict=True)
+        ]
+        if 2 * sum(grown) > len(grown):
+            findings.append(correlated_noise(own))
+        summaries |= made
     return summaries
 
 
 def _columns(
-    log: Table, time: Array, rows: dict[str, list[Summary]], start: Array, end: Array,
-    temperature: Trace | None,
-) -> dict[str, Column]:  # fmt: skip
-    """The run: labels and times, temperature, means, and what is known of each mean."""
+    log: Table, time: Array, rows: dict[str, list[Summary]], start: Array, end: Array
+) -> dict[str, Column]:
+    """The run: labels and times, means, and what is known of each mean."""
     first, last = _within(time, start, end)
     columns: dict[str, Column] = {
         "station": [str(i) for i in range(1, len(start) + 1)],
@@ -308,11 +388,6 @@ def _columns(
         "end_s": time[last - 1],
         "samples": np.asarray(last - first, float),
     }
-    if temperature is not None:
-        warmth = np.array(
-            [_temperature(*temperature, *ends) for ends in zip(start, end, strict=True)]
-        )
-        columns |= {"temperature_c": warmth[:, 0], "drift_temperature_c": warmth[:, 1]}
     for prefix, part in PARTS.items():
         for name, found in rows.items():
             columns[prefix + name] = np.array([float(getattr(row, part)) for row in found])
@@ -325,54 +400,52 @@ def _columns(
     return columns
 
 
-def _temperature(time: Array, value: Array, start: float, end: float) -> tuple[float, float]:
-    """Mean over an interval and change over it; between samples along straight lines."""
+def _temperatures(
+    temperature: Trace | None, start: Array, end: Array, findings: list[Finding]
+) -> dict[str, Column]:
+    """The temperature of each station, and its change; blank where none was taken nearby."""
+    if temperature is None:
+        return {}
+    ends = zip(start, end, strict=True)
+    lag = GAP * standstill.time_step(temperature[0])
+    warmth = np.array([_temperature(*temperature, *own, lag) for own in ends])
+    blank = np.flatnonzero(np.isnan(warmth[:, 0])) + 1
+    if blank.size:
+        text = (
+            f"{count(blank.size, 'station')} without a temperature nearby ({listed(blank)}): blank "
+            "there. Fill temperature_c in, or leave these stations out."
+        )
+        findings.append(Finding(id="no-temperature-nearby", text=text))
+    return {"temperature_c": warmth[:, 0], "drift_temperature_c": warmth[:, 1]}
+
+
+def _temperature(
+    time: Array, value: Array, start: float, end: float, lag: float
+) -> tuple[float, float]:
+    """Mean over an interval and change over it; between samples along straight lines.
+
+    Singular: NaN where no sample is within the interval, or within `lag` seconds of it.
+    """
     first, last = np.searchsorted(time, [start, end])
     if last - first >= standstill.WINDOW:
-        found = standstill.summarise(time[first:last], value[first:last], 0.0)
+        found = summarise(time[first:last], value[first:last], 0.0)
         return found.mean, found.drift
+    before = time[first - 1] if first else -np.inf
+    after = time[last] if last < len(time) else np.inf
+    if last == first and min(start - before, after - end) > lag:
+        return np.nan, np.nan
     grid = np.linspace(start, end, 9)
     course = np.interp(grid, time, value)
     return float(course.mean()), float(np.polyfit(grid - start, course, 1)[0] * (end - start))
+
+
+def _ordered(columns: dict[str, Column]) -> dict[str, Column]:
+    """The columns with the temperature before the means."""
+    first = ("station", "start_s", "end_s", "samples", "temperature_c", "drift_temperature_c")
+    return {n: columns[n] for n in first if n in columns} | columns
 
 
 def _middle(value: Array) -> float:
     """The middle one of the cells that are filled in, NaN if none is."""
     there = np.sort(value[~np.isnan(value)])
     return float(there[(len(there) - 1) // 2]) if there.size else np.nan
-
-
-def _findings(rows: dict[str, list[Summary]], found: Standstills, seconds: float) -> list[Finding]:
-    """What the reader should know about the stations."""
-    findings = []
-    start, end = found.start[found.taken], found.end[found.taken]
-    creeping = ~found.taken & ~found.short
-    if creeping.any():
-        where = ", ".join(
-            f"{a:.1f}–{b:.1f} s"
-            for a, b in zip(found.start[creeping], found.end[creeping], strict=True)
-        )
-        text = f"left out, as the tool moves slowly there: {where[:200]}."
-        findings.append(Finding(id="slow-movement", text=text))
-    if len(start) == 1 and end[0] - start[0] > 0.9 * seconds:
-        text = "the log stands still from end to end: one station. A calibration needs several attitudes."
-        findings.append(Finding(id="all-still", text=text))
-    spikes = {
-        n: sum(r.spikes for r in own) / sum(r.spikes + r.used for r in own)
-        for n, own in rows.items()
-    }
-    name = max(spikes, key=lambda n: spikes[n])
-    if spikes[name] > MANY_SPIKES:
-        text = f"{100 * spikes[name]:.1f} % of the samples of {name} were left out as spikes: check the wiring."
-        findings.append(Finding(id="spikes", text=text))
-    for name, own in rows.items():
-        drifting = [i for i, row in enumerate(own) if row.drifts]
-        if drifting:
-            worst = max(drifting, key=lambda i: abs(own[i].drift))
-            text = (
-                f"{name} drifts at {len(drifting)} of {len(own)} stations, most at station {worst + 1}: by "
-                f"{own[worst].drift:.3g} over {end[worst] - start[worst]:.1f} s (noise of one sample "
-                f"{own[worst].spread:.2g}). See the columns drift_."
-            )
-            findings.append(Finding(id="drift", text=text, station=str(worst + 1)))
-    return findings

@@ -124,7 +124,7 @@ _OPTIONS = (
         help="Columns of a text log without column names, such as time_s,ax,ay,az.",
     ),
     click.option(
-        "--sampling-hz", type=float, metavar="HZ", help="Rate of a log without a column time_s."
+        "--sampling-hz", type=float, metavar="HZ", help="Rate of the log; wins over its column time_s."
     ),
     click.option(
         "--min-seconds", type=float, metavar="S",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from mwdcal.errors import InputError
 from mwdcal.files import atomic, logs
 from mwdcal.files import table as tables
 from mwdcal.files.contract import CHANNELS
-from mwdcal.stations import Stations, find_stations
+from mwdcal.stations import StandstillError, Stations, find_stations
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -36,7 +37,10 @@ def run(asked: Asked, say: Callable[[str], None]) -> tuple[list[Finding], Any]:
     plot = asked["plot"]
     if plot and plot.suffix.lower() not in PICTURES:
         raise InputError(f"--plot {plot}: the suffix must be one of {', '.join(PICTURES)}.")
-    made = find(asked, say)
+    try:
+        made = find(asked, say)
+    except StandstillError as error:
+        raise _told(error, plot) from None
     drawn = picture(made, plot.suffix.lower()) if plot else b""
     tables.write(asked["output"], made.table)
     if plot:
@@ -44,6 +48,15 @@ def run(asked: Asked, say: Callable[[str], None]) -> tuple[list[Finding], Any]:
     files = {"output": str(asked["output"]), "plot": str(plot or "")}
     shown = {**summary(made), **files} if asked["as_json"] else screen(made, files)
     return made.findings, shown
+
+
+def _told(error: StandstillError, plot: Path | None) -> InputError:
+    """The refusal with what was found out so far, and the picture, which helps most then."""
+    lines = [str(error), *(f"! {finding.text}" for finding in error.made.findings)]
+    if plot:
+        atomic.write(plot, picture(error.made, plot.suffix.lower()))
+        lines.append(f"wrote {plot} (picture)")
+    return InputError("\n".join(lines))
 
 
 def find(asked: Asked, say: Callable[[str], None]) -> Stations:
@@ -208,9 +221,14 @@ def _draw_triad(axes: Axes, made: Stations, triad: tuple[str, ...]) -> None:
 
 def _draw_activity(axes: Axes, made: Stations) -> None:
     edge, value = made.activity.edge, made.activity.value
-    shown = np.where(np.isfinite(value) & (value > 0), value, np.nan)
-    x, y = _thinned(edge[:-1], np.nan_to_num(shown, nan=np.nanmin(shown)))
-    axes.plot(x, y, color=plots.BEFORE, lw=0.7)
+    fine = np.isfinite(value) & (value > 0)
+    x, y = _thinned(edge[:-1], np.where(fine, value, value[fine].min(initial=np.inf)))
+    axes.plot(x, np.where(np.isinf(y), np.nan, y), color=plots.BEFORE, lw=0.7)
+    axes.set_yscale("log")
+    axes.set_ylabel("activity,\nnoise floors")
+    axes.set_xlabel("time, s")
+    axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    axes.yaxis.set_minor_formatter(lambda value, _: "")
     axes.axhline(made.threshold, color=plots.MARKED, lw=1, ls=(0, (5, 3)))
     axes.annotate(
         f"threshold {made.threshold:.3g}", (1.0, made.threshold), (6, 0), va="center",
@@ -218,11 +236,6 @@ def _draw_activity(axes: Axes, made: Stations) -> None:
     )  # fmt: skip
     if made.stretch:
         axes.axhspan(*made.stretch, color="#fde8d4", lw=0, zorder=0.4)
-    axes.set_yscale("log")
-    axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
-    axes.yaxis.set_minor_formatter(lambda value, _: "")
-    axes.set_ylabel("activity,\nnoise floors")
-    axes.set_xlabel("time, s")
 
 
 def _shade(axes: Axes, made: Stations) -> None:
@@ -243,7 +256,7 @@ def _shade(axes: Axes, made: Stations) -> None:
 def _number_stations(axes: Axes, made: Stations) -> None:
     found = made.found
     middle = (found.start + found.end)[found.taken] / 2
-    every = -(-len(middle) // 30)
+    every = max(1, -(-len(middle) // 30))
     for i in range(0, len(middle), every):
         place = (float(middle[i]), 1.0)
         axes.annotate(

@@ -11,15 +11,16 @@ number of standstills stays the same over the widest stretch, between noise that
 standstills up and movements that are swallowed. It is taken near the quiet end of that stretch,
 where edges are sharpest.
 
-The uncertainty of a mean is the long-run one: with correlated noise the autocovariances add up.
+A channel too slow for that, such as a magnetometer read once a second, cuts what the others call
+a standstill where its own readings step from one level to another.
 
-Reference: P. J. Huber, Robust Statistics, chapter 6 (medians, MAD); C. J. Geyer, Statistical
-Science 7, 473 (1992), section 3.3 (initial monotone sequence).
+Reference: P. J. Huber, Robust Statistics, chapter 6 (medians, MAD).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import chain, pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -36,34 +37,47 @@ QUIET = 0.05
 """Quantile of the windows' ranges that is the noise floor."""
 STEPS = 120
 """Thresholds tried."""
+CHUNK = 32
+"""Samples whose median step in time is the rate there."""
 SAME = 0.02
 """Share by which the number of standstills may change and still count as the same."""
+AGREE, SHARE = 0.03, 0.1
+"""Steps of a channel that differ by less are equal; share of equal ones that is its resolution."""
 TURN = 0.05
 """Share of a triad's size by which no channel of a tool at rest moves within a window."""
 NOISE = 8.0
 """The same in standard deviations of the difference of successive samples."""
-CLEAR = 4.0
-"""Distance from the median, in robust standard deviations, above which a sample is a spike."""
-BLOCKS = 64
-"""Blocks whose means tell the long-run variance."""
+STEP = 0.01
+"""Share of a triad's size by which no slow channel of a tool at rest steps."""
+MANY = 100_000
+"""Differences of readings that are looked at."""
 INTO = 0.15
 """How far into the stretch the threshold lies, in logarithm."""
-SIGNIFICANT = 1e-4
-"""Chance that a steady channel is said to drift."""
 
 
 class Cells(NamedTuple):
-    """One channel in short cells of equal numbers of samples (m,): start, end, median.
+    """One channel in short cells (m,): start, end, median, and whether there is a gap within.
 
     `step` is the time between samples, `rough` the robust standard deviation of a sample as
-    the difference of successive ones tells it: noise, whatever the tool does.
+    the difference of successive ones tells it: noise, whatever the tool does. `resolution` is
+    the step in which readings come.
     """
 
     start: Array
     end: Array
     level: Array
+    torn: Bools
     step: float
     rough: float
+    resolution: float
+
+
+class Slow(NamedTuple):
+    """A channel too slow for the activity: times and values (n,), and the step that is movement."""
+
+    time: Array
+    value: Array
+    limit: float
 
 
 class Activity(NamedTuple):
@@ -104,42 +118,78 @@ class Standstills(NamedTuple):
     short: Bools
 
 
-class Summary(NamedTuple):
-    """What one channel read during one standstill.
-
-    Attributes:
-        mean: of the samples that are no spikes.
-        sd: standard uncertainty of the mean, correlation of the noise included.
-        spread: robust standard deviation of one sample, from the median of deviations.
-        drift: change over the standstill by the straight line.
-        drifts: whether that is more than the noise explains.
-        used: samples in the mean.
-        spikes: samples left out.
-    """
-
-    mean: float
-    sd: float
-    spread: float
-    drift: float
-    drifts: bool
-    used: int
-    spikes: int
-
-
 def cells_of(time: Array, value: Array, length: float) -> Cells:
     """A channel in cells of about `length` seconds, but of no fewer than `FEWEST` samples.
 
-    Shapes: `time` (n,) ascending, `value` (n,) without blanks; the last, incomplete cell is
-    left out.
+    Shapes: `time` (n,) ascending, `value` (n,) without blanks. Where the rate changes, so does the
+    number of samples of a cell; what is left there belongs in time to the cell before.
     """
+    step = time_step(time)
+    rough = float(np.median(np.abs(np.diff(value)))) / 0.6745 / np.sqrt(2)
+    bounds = [*_rate_changes(time), len(time)]
+    parts = [_even(time[a:b], value[a:b], length) for a, b in pairwise(bounds)]
+    start, end, level, torn = (np.concatenate(own) for own in zip(*parts, strict=True))
+    return Cells(start, end, level, torn, step, rough, resolution(value))
+
+
+def _even(time: Array, value: Array, length: float) -> tuple[Array, Array, Array, Bools]:
+    """Start, end, median and gaps of cells of samples at one rate."""
     step = time_step(time)
     size = max(FEWEST, round(length / step)) if step > 0 else FEWEST
     count = len(time) // size
     whole = value[: count * size].reshape(count, size)
-    starts = np.arange(count) * size
-    rough = float(np.median(np.abs(np.diff(value)))) / 0.6745 / np.sqrt(2)
-    end = time[starts + size - 1] + step
-    return Cells(time[starts], end, np.median(whole, axis=-1), step, rough)
+    last = np.arange(1, count + 1) * size - 1
+    end = time[last] + step
+    start = time[last - size + 1]
+    steps = np.diff(time[: count * size + 1], append=time[-1:])[: count * size]
+    torn = np.any(steps.reshape(count, size)[:, :-1] > size * step, axis=-1)
+    if count and time[-1] - time[last[-1]] < size * step:
+        end[-1] = time[-1] + step
+    return start, end, np.asarray(np.median(whole, axis=-1), float), torn
+
+
+def _rate_changes(time: Array) -> Ints:
+    """First samples of the stretches at one rate: the rate of a chunk is that of its median step."""
+    count = (len(time) - 1) // CHUNK
+    if count < 2:
+        return np.zeros(1, int)
+    steps = np.median(np.diff(time)[: count * CHUNK].reshape(count, CHUNK), axis=-1)
+    usual = time_step(time)
+    level = np.round(np.log2(np.maximum(steps, 1e-3 * usual) / usual)) if usual else steps
+    return np.concatenate([[0], (np.flatnonzero(np.diff(level)) + 1) * CHUNK])
+
+
+def resolution(value: Array) -> float:
+    """The step in which the readings (n,) of a channel come; hardly anything where they show none.
+
+    Definition: the smallest difference of successive readings on which `SHARE` of those that
+    differ agree, but none that is far below another such one or below movements, as arises where
+    a coarse reading was rescaled by something smooth. Without one, the difference that 1 % stay
+    below: single odd readings do not make a channel fine.
+    """
+    every = max(1, len(value) // MANY)
+    steps = np.sort(np.abs(value[1::every] - value[:-1:every]))
+    steps = steps[steps > 0]
+    if not steps.size:
+        return 0.0
+    for least in (0.0, 1e-3 * float(np.quantile(steps, 0.99))):
+        own = _agreed(steps[np.searchsorted(steps, least) :])
+        if own:
+            return own
+    return float(np.quantile(steps, 0.01, method="lower"))
+
+
+def _agreed(steps: Array) -> float:
+    """The smallest of the ascending steps (n,) on which many agree and few are below; else 0."""
+    count = np.searchsorted(steps, steps * (1 + AGREE), "right") - np.arange(len(steps))
+    common = np.flatnonzero(count >= max(SHARE * len(steps), 10))
+    if not common.size:
+        return 0.0
+    first = common[np.searchsorted(steps[common], steps[common[-1]] / 20)]
+    first = first + int(np.argmax(count[first : first + count[first]]))
+    own = float(steps[first + count[first] // 2])
+    between = np.searchsorted(steps, [0.05 * own, 0.9 * own])
+    return own if between[1] - between[0] <= SHARE * count[first] else 0.0
 
 
 def time_step(time: Array) -> float:
@@ -149,16 +199,29 @@ def time_step(time: Array) -> float:
     return float(np.median(steps)) if steps.size else 0.0
 
 
+def distinct(time: Array) -> Array:
+    """The times (n,) with equal ones spread over the usual step, as a coarse clock leaves them."""
+    later = time[1:] > time[:-1]
+    if later.all() or not later.any():
+        return time
+    first = np.concatenate([[0], np.flatnonzero(later) + 1])
+    own = time[first]
+    many = np.diff(first, append=len(time))
+    room = np.minimum(np.diff(own, append=np.inf), time_step(own))
+    rank = np.arange(len(time)) - np.repeat(first, many)
+    return np.asarray(np.repeat(own, many) + rank * np.repeat(room / many, many))
+
+
 def activity(channels: Sequence[tuple[Array, Array]]) -> Activity:
     """How much each moment moves, of channels (time (n,), value (n,)) with rates of their own.
 
-    A channel too slow to have a cell within a window of the fastest is not looked at.
-    Singular: fewer samples than a window needs give no cells at all.
+    A channel too slow to have a cell within a window of the fastest is not looked at, nor one
+    that never changes. Singular: fewer samples than a window needs give no cells at all.
     """
     steps = [time_step(time) for time, _ in channels]
     length = max(CELL, FEWEST * min((s for s in steps if s > 0), default=0.0))
     fast = [i for i, s in enumerate(steps) if 0 < FEWEST * s <= WINDOW * length]
-    cut = {i: cells_of(*channels[i], length) for i in fast}
+    cut = {i: cells_of(*channels[i], length) for i in fast if np.ptp(channels[i][1]) > 0}
     cut = {i: own for i, own in cut.items() if len(own.level) >= WINDOW}
     cells = tuple(cut.values())
     if not cells:
@@ -169,11 +232,12 @@ def activity(channels: Sequence[tuple[Array, Array]]) -> Activity:
     floors, value = [], np.zeros(len(edge) - 1)
     for own in cells:
         ranges = quietest_range(own.level)
+        ranges = np.where(ranges < own.resolution / 4, 0.0, ranges)  # a median lies on half steps
         floor = noise_floor(ranges)
         if np.quantile(ranges, QUIET) == 0:  # coarse steps: one up or down is no movement
             ranges = np.where(ranges <= floor, 0.0, ranges)
-        ranges = np.where(_torn(own), np.inf, ranges)
-        value = np.maximum(value, _on_grid(edge, own, ranges) / floor)
+        ranges = np.where(own.torn, np.inf, ranges)
+        value = np.maximum(value, on_grid(edge, own, ranges) / floor)
         floors.append(floor)
     return Activity(edge, value, tuple(cut), cells, np.array(floors))
 
@@ -194,13 +258,7 @@ def noise_floor(ranges: Array) -> float:
     return float(np.quantile(alive, QUIET)) if alive.size else 1.0
 
 
-def _torn(cells: Cells) -> Bools:
-    """Cells with a gap in them: they last more than twice as long as most."""
-    length = cells.end - cells.start
-    return np.asarray(length > 2 * np.median(length))
-
-
-def _on_grid(edge: Array, cells: Cells, value: Array) -> Array:
+def on_grid(edge: Array, cells: Cells, value: Array) -> Array:
     """Each grid cell's value of the channel: that of the channel's cell at its middle."""
     middle = (edge[1:] + edge[:-1]) / 2
     place = np.searchsorted(cells.start, middle, side="right") - 1
@@ -259,86 +317,73 @@ def choose_threshold(value: Array, least: int, highest: float) -> Threshold:
     return Threshold(float(tried[chosen]), (float(tried[0]), float(tried[-1])))
 
 
-def standstills(
-    found: Activity, limits: Array, threshold: float, shortest: float, trim: float
-) -> Standstills:
-    """The intervals whose activity stays at or below the threshold, judged.
-
-    `limits` (channels,) is the largest range of each channel within a window that can be rest
-    (`rest_limit`); twice that over a whole interval is slow movement. `trim` seconds are cut
-    off each end; `shortest` seconds must remain.
-    """
+def calm(found: Activity, threshold: float, trim: float) -> tuple[Array, Array]:
+    """Start and end of the intervals whose activity stays at or below the threshold, trimmed."""
     first, last = stretches(found.value <= threshold)
     start, end = found.edge[first] + trim, found.edge[last] - trim
     some = end > start
-    start, end = start[some], end[some]
+    return start[some], end[some]
+
+
+def standstills(
+    found: Activity, limits: Array, threshold: float, shortest: float, trim: float,
+    slow: Sequence[Slow] = (),
+) -> Standstills:  # fmt: skip
+    """The intervals whose activity stays at or below the threshold, cut and judged.
+
+    `limits` (channels,) is the largest range of each channel within a window that can be rest
+    (`rest_limit`); twice that over a whole interval is slow movement. `trim` seconds are cut
+    off each end; `shortest` seconds must remain. Slow channels cut intervals where they step.
+    """
+    start, end = calm(found, threshold, trim)
+    start, end = cut_at_steps(start, end, slow, trim)
     creeps = np.zeros(len(start), bool)
     for own, limit in zip(found.cells, limits, strict=True):
-        places = np.searchsorted(own.start, np.stack([start, end], -1))
-        travels = [np.ptp(own.level[a:b]) if b > a else 0.0 for a, b in places]
-        creeps |= np.array(travels, float).reshape(-1) > 2 * limit
+        creeps |= _travels(own.start, own.level, start, end) > 2 * limit
+    for time, value, limit in slow:
+        middle = np.median(np.stack([value[:-2], value[1:-1], value[2:]]), axis=0)
+        step = time_step(time)
+        creeps |= _travels(time[1:-1], middle, start + step, end - step) > 4 * limit
     short = end - start < shortest
     return Standstills(start, end, ~short & ~creeps, short)
 
 
-def summarise(time: Array, value: Array, resolution: float) -> Summary:
-    """What a channel read: `time` and `value` (n,) of the samples of one standstill, n >= 2.
+def _travels(time: Array, level: Array, start: Array, end: Array) -> Array:
+    """Range of the levels (n,) within each interval (k,)."""
+    places = np.searchsorted(time, np.stack([start, end], -1))
+    return np.array([np.ptp(level[a:b]) if b > a else 0.0 for a, b in places], float)
 
-    `resolution` is the smallest step of the channel: samples with less noise than half of
-    it hide the mean between two steps, which is then known to resolution/√12.
+
+def cut_at_steps(
+    start: Array, end: Array, slow: Sequence[Slow], trim: float
+) -> tuple[Array, Array]:
+    """The intervals (k,), without the times at which slow channels step from one level to another."""
+    rooms = [max(trim - 2 * time_step(own.time), 0.0) for own in slow]
+    pieces = []
+    for a, b in zip(start, end, strict=True):
+        spans = [_steps(a, b, own, room) for own, room in zip(slow, rooms, strict=True)]
+        for first, last in sorted(chain.from_iterable(spans)):
+            pieces.append((a, first))
+            a = max(a, last)
+        pieces.append((a, b))
+    kept = np.array([piece for piece in pieces if piece[1] > piece[0]], float).reshape(-1, 2)
+    return kept[:, 0], kept[:, 1]
+
+
+def _steps(start: float, end: float, slow: Slow, room: float) -> list[tuple[float, float]]:
+    """When a slow channel steps within an interval: from when to when nothing is at rest.
+
+    Definition: a step is where the medians of three samples before and after differ by more than
+    the channel's limit, all of them within the interval; a spike is none. It lasts from two
+    samples before to two after, and `room` seconds more to each side.
     """
-    middle = np.median(value)
-    distance = np.abs(value - middle)
-    spread = float(1.4826 * np.median(distance))
-    kept = distance <= CLEAR * max(spread, resolution)
-    time, value = time[kept], value[kept]
-    mean, sd, _ = long_run(value)
-    clock = time - time.mean()
-    square = float(clock @ clock)
-    slope = float(clock @ value) / square if square > 0 else 0.0
-    drift = slope * float(time[-1] - time[0])
-    _, sd_steady, freedom = long_run(value - slope * clock)
-    steady = _drift_limit(freedom) * np.sqrt(12) * sd_steady
-    return Summary(
-        mean=mean,
-        sd=sd if value.std() > resolution / 3**0.5 else float(np.hypot(sd, resolution / 12**0.5)),
-        spread=spread,
-        drift=drift,
-        drifts=abs(drift) > max(steady, resolution, 1e-12 * abs(mean)),
-        used=len(value),
-        spikes=len(kept) - len(value),
-    )
-
-
-def _drift_limit(freedom: float) -> float:
-    """Two-sided Student quantile for `SIGNIFICANT`."""
-    from scipy.special import stdtrit
-
-    return float(stdtrit(freedom, 1 - SIGNIFICANT / 2))
-
-
-def long_run(value: Array) -> tuple[float, float, float]:
-    """Mean of correlated samples (n,), its standard uncertainty, and degrees of freedom.
-
-    Definition: autocovariances of the means of at most `BLOCKS` blocks are added up in pairs
-    as long as the pairs are positive, each no larger than the one before. With n' the number
-    of independent means that leaves, the variance is freed of what the mean took away, n'/(n' - 1),
-    and widened to that of Student's t, ν/(ν - 2), ν = n' - 1.
-    Errors: ±1.96 of it covers 95 to 97 % with white noise, 92 % where the standstill is only
-    15 correlation times long; a line of drift counts as noise.
-    """
-    mean = float(value.mean())
-    blocks = min(len(value), BLOCKS)
-    bounds = np.linspace(0, len(value), blocks + 1).astype(int)
-    means = np.add.reduceat(value - mean, bounds[:-1]) / np.diff(bounds)
-    means = means - means.mean()
-    products = np.correlate(means, means, "full")[blocks - 1 :] / blocks
-    pairs = products[: blocks // 4 * 2].reshape(-1, 2).sum(-1)
-    if not pairs.size:
-        pairs = products[:1]
-    pairs = np.minimum.accumulate(pairs) * np.logical_and.accumulate(pairs > 0)
-    variance = max(2 * float(pairs.sum()) - products[0], products[0]) / blocks
-    independent = max(products[0] / variance, 1.5) if variance > 0 else float(blocks)
-    freedom = max(independent - 1, 3.0)
-    widened = variance * independent / (independent - 1) * freedom / (freedom - 2)
-    return mean, float(np.sqrt(widened)), freedom
+    first, last = np.searchsorted(slow.time, [start, end])
+    time, value = slow.time[first:last], slow.value[first:last]
+    if len(time) < 2 * FEWEST:
+        return []
+    middle = np.median(np.stack([value[:-2], value[1:-1], value[2:]]), axis=0)
+    stepped = np.abs(middle[FEWEST:] - middle[:-FEWEST]) > slow.limit
+    return [
+        (float(time[i + FEWEST - 2] - room), float(time[min(j + FEWEST, len(time) - 1)] + room))
+        for i, j in zip(*stretches(stepped), strict=True)
+    ]

@@ -33,6 +33,7 @@ READ = tuple(name for name in (TIME, *COLUMNS) if name not in LABELS)
 _PIECE = 16_000_000
 _TYPED = (".parquet", ".xlsx")
 _ODD = re.compile(r"nan|inf|[\"\r]", re.IGNORECASE)
+_CLOCK = re.compile(r"\d{4}-\d{1,2}-\d{1,2}|\d{1,2}:\d{2}|\d{1,2}[./]\d{1,2}[./]\d{4}")
 _BINARY = re.compile(rb"[\x00-\x08\x0e-\x1f]")
 _EXAMPLE = "--columns time_s,ax,ay,az"
 
@@ -86,10 +87,24 @@ def _numeric(table: Table) -> Table:
     """The table with the columns that mean something as numbers, the others as they are."""
     _check(list(table.columns), table.source)
     columns: dict[str, Column] = {
-        name: tables.numbers(table, name) if name in READ else column
+        name: _numbers(table, name) if name in READ else column
         for name, column in table.columns.items()
     }
     return Table(columns, table.metadata, table.source, table.lines, table.digest, table.decimal)
+
+
+def _numbers(table: Table, name: str) -> Array:
+    """The column as numbers; dates and times of day in the place of seconds are refused as such."""
+    column = table.columns[name]
+    if name == TIME and isinstance(column, list):
+        for row, cell in enumerate(column):
+            if _CLOCK.search(cell):
+                raise tables.cell_error(
+                    table, name, row,
+                    f"expected seconds as a number; got the date or time of day {shown(cell)}. Write the "
+                    "seconds since the start, or leave the column out and add --sampling-hz.",
+                )  # fmt: skip
+    return tables.numbers(table, name)
 
 
 def _text(
@@ -218,7 +233,7 @@ def _piece(text: str, done: int, layout: _Layout) -> tuple[Array, Sequence[int],
         for name, column in zip(names, zip(*cells, strict=True), strict=True)
     }
     table = Table(columns, {}, layout.source, numbers, "", layout.decimal)
-    values = np.stack([tables.numbers(table, name) for name in _wanted(layout)], -1)
+    values = np.stack([_numbers(table, name) for name in _wanted(layout)], -1)
     return values, numbers, after
 
 

@@ -1,0 +1,149 @@
+"""How well a mean at rest is known: shares of simulated standstills that the uncertainty covers.
+
+Expected is what the statistics of white and AR(1) noise demand: 95 % within 1.96 standard
+uncertainties, whatever the number of samples, the steps of the readings and their odd ones.
+"""
+
+import numpy as np
+import pytest
+
+from mwdcal.core.standstill import resolution
+from mwdcal.core.station_means import summarise, summarise_all
+from mwdcal.stations import find_stations
+from test_stations import ACC, means, tumble, without
+
+SEED = 20261121
+
+
+def together(samples, standstills=24, logs=100, change=lambda value, rng: value):
+    """Summaries (logs, standstills) of white noise of unit variance about zero."""
+    rng = np.random.default_rng([SEED, samples])
+    time = np.arange(samples) * 1.0
+    made = []
+    for _ in range(logs):
+        values = rng.standard_normal((standstills, samples))
+        rests = [(time, change(value, rng)) for value in values]
+        made.append(summarise_all(rests, 1e-9))
+    return made
+
+
+@pytest.mark.parametrize("samples", [3, 4, 5, 6, 8, 10, 12, 15, 16, 20, 50, 200])
+def test_few_samples_know_what_they_do_not_know(samples):
+    """2400 standstills: 95 % has a standard error of 0.4 %, 10⁻⁴ is exceeded 0.2 times."""
+    made = [row for log in together(samples) for row in log]
+    misses = np.array([abs(row.mean) > 1.96 * row.sd for row in made])
+    assert 0.93 <= 1 - misses.mean() <= 0.98
+    assert sum(row.drifts for row in made) <= 2
+    assert sum(row.unsteady or row.stuck for row in made) == 0
+    assert sum(row.spikes for row in made) < 0.002 * samples * len(made)
+    weights = np.array([row.sd**-2 for row in made])
+    assert weights.max() < 15 * np.median(weights)
+
+
+@pytest.mark.parametrize("standstills", [1, 2, 3])
+@pytest.mark.parametrize("samples", [4, 6, 10])
+def test_few_standstills_know_it_too(standstills, samples):
+    made = [row for log in together(samples, standstills, 1800 // standstills) for row in log]
+    assert 0.92 <= np.mean([abs(row.mean) <= 1.96 * row.sd for row in made]) <= 0.98
+
+
+def spike(value, rng):
+    hit = rng.random(len(value)) < 0.05
+    return np.where(hit, rng.uniform(-300, 300, len(value)), value)
+
+
+def test_spikes_among_few_samples_are_seen():
+    made = [row for log in together(8, change=spike) for row in log]
+    assert 0.92 <= np.mean([abs(row.mean) <= 1.96 * row.sd for row in made]) <= 0.98
+    assert sum(row.spikes for row in made) == pytest.approx(0.05 * 8 * len(made), rel=0.1)
+
+
+@pytest.mark.parametrize("step", [0.2, 0.4, 0.8])
+@pytest.mark.parametrize("samples", [5, 20, 300])
+def test_a_quiet_standstill_is_not_stuck(step, samples):
+    """Noise that differs threefold between standstills, in steps below its usual size."""
+    rng = np.random.default_rng([SEED, samples])
+    time = np.arange(samples) * 1.0
+    stuck = 0
+    for _ in range(60):
+        sigma = rng.choice([1 / 3, 1.0, 1.0, 1.5], 24)
+        values = np.round(sigma[:, None] * rng.standard_normal((24, samples)) / step) * step
+        stuck += sum(row.stuck for row in summarise_all([(time, v) for v in values], step))
+    assert stuck == 0
+
+
+def coarse(step, sigma=1.0, count=50_000, seed=3):
+    rng = np.random.default_rng(seed)
+    level = np.cumsum(rng.uniform(-1, 1, count // 1000))
+    return (
+        np.round((np.repeat(100 * level, 1000) + sigma * rng.standard_normal(count)) / step) * step
+    )
+
+
+@pytest.mark.parametrize("step", [0.5, 1.0, 1.5, 2.0, 3.0, 5.0, 10.0])
+def test_the_step_of_readings_is_found_whatever_a_few_of_them_do(step):
+    value = coarse(step)
+    assert resolution(value) == pytest.approx(step, rel=1e-6)
+    odd = value.copy()
+    odd[::5000] += 1e-9
+    assert resolution(odd) == pytest.approx(step, rel=1e-6)
+    time = np.arange(len(value)) / 100
+    assert resolution(value * (1 + 1e-6 * time)) == pytest.approx(step, rel=1e-3)
+
+
+def test_fine_readings_have_no_step():
+    assert resolution(np.random.default_rng(1).standard_normal(50_000)) < 0.05
+    assert resolution(np.sin(np.arange(50_000) / 700)) < 1e-4
+    assert resolution(np.full(100, 7.0)) == 0.0
+
+
+def covered(log, aims, found):
+    sd = means(found, tuple(f"sd_{n}" for n in ACC))
+    return np.abs(means(found) - aims) <= 1.96 * sd
+
+
+@pytest.mark.parametrize("step", [1.5, 2.0, 3.0, 10.0])
+@pytest.mark.parametrize("change", ["odd", "rescaled"])
+def test_coarse_readings_with_odd_ones_cover(step, change):
+    """Readings in steps of some standard deviations of the noise, one of them 1e-9 off; or all
+    of them multiplied by what changes smoothly by 10⁻⁸ a second."""
+    sigma = 1e-3
+    inside = []
+    for seed in range(3):
+        log, starts, _, aims = tumble(seed, noise=sigma, stations=15)
+        read = np.stack([log.columns[n] for n in ACC], -1)
+        read = np.round(read / (step * sigma)) * step * sigma
+        if change == "odd":
+            read[5] += 1e-9
+        else:
+            read *= 1 + 1e-8 * log.columns["time_s"][:, None]
+        found = find_stations(without(log, **dict(zip(ACC, read.T, strict=True))))
+        assert found.table.count == len(starts)
+        inside.append(covered(log, aims, found))
+    assert np.mean(inside) > 0.9
+
+
+@pytest.mark.parametrize(("seconds", "least"), [(0.2, 0.9), (1.0, 0.9), (3.0, 0.88)])
+def test_noise_correlated_over_seconds(seconds, least):
+    """AR(1) noise of this correlation time, standstills of 6 to 11 s: without the others each
+    covers 91, 85 and 74 % only."""
+    inside = []
+    for seed in range(6):
+        log, *_, aims = tumble(
+            seed, stations=30, still=(8, 14), noise=1e-3, rho=np.exp(-0.01 / seconds)
+        )
+        inside.append(covered(log, aims, find_stations(log)))
+    assert least <= np.mean(inside) <= 0.98
+
+
+def test_a_line_of_drift_widens_nothing():
+    """Halves that differ by a common drift say nothing of the mean, which stands at its middle."""
+    log, *_ = tumble(1, stations=30, still=(8, 14), noise=1e-3)
+    time, value = log.columns["time_s"], log.columns["ax"] + 2e-4 * log.columns["time_s"]
+    found = find_stations(without(log, ax=value))
+    assert "correlated-noise" not in [f.id for f in found.findings]
+    columns = found.table.columns
+    for i in range(found.table.count):
+        own = (time >= columns["start_s"][i]) & (time <= columns["end_s"][i])
+        alone = summarise(time[own], value[own], 1e-9).sd
+        assert columns["sd_ax"][i] == pytest.approx(alone, rel=1e-9)
