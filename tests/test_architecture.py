@@ -47,7 +47,7 @@ LAYERS = (
     ("checks", "curves", "correction", "residuals", "scatter", "selection", "stand"),
     ("findings",),
     ("calibrate", "compare", "gauge", "predict", "quality", "simulate"),
-    ("fleet", "fleet_accuracy", "fleet_checks", "fleet_choices", "fleet_curves"),
+    ("fleet", "fleet_accuracy", "fleet_checks", "fleet_choices", "fleet_curves", "fleet_findings"),
     ("files", "files.*"),
     ("registry", "registry.*", "datasets", "station_findings", "stations", "noise"),
     ("",),  # the package itself: its public names

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -40,7 +41,7 @@ pa = pytest.importorskip("pyarrow")
 pq = pytest.importorskip("pyarrow.parquet")
 
 from mwdcal.app import pool  # noqa: E402
-from mwdcal.files import fleet_tables  # noqa: E402
+from mwdcal.files import fleet_sources, fleet_tables  # noqa: E402
 from mwdcal.files.fleet_parts import Plan, load, solve  # noqa: E402
 
 ANGLES = ("inclination", "azimuth", "toolface")
@@ -106,6 +107,9 @@ def check_same(row, made, tolerance=1e-9):
     """The row of a tool says what its calibration file says."""
     assert row["status"] == "ok", row["message"]
     assert row["stations"] == made.stations
+    free = {u.id for triad in made.triads for u in triad.undetermined}
+    assert row["findings"] == list(dict.fromkeys(f.id for f in made.findings if f.id not in free))
+    assert row["reshoot"] == [each.station for each in made.station_rows if each.reshoot]
     assert row["field_unit"] == (made.field_unit if made.has_field else None)
     for triad in made.triads:
         assert row[f"{triad.name}_rank"] == triad.rank
@@ -567,9 +571,43 @@ def test_an_interruption_from_the_keyboard_leaves_parts_and_no_traceback(tmp_pat
     assert not output.exists()
 
 
+def _of_session(leader):
+    """Processes of a session that are alive."""
+    listed = subprocess.run(
+        ["ps", "-A", "-o", "pid=,sess=,stat="], capture_output=True, text=True, check=True
+    )
+    rows = [line.split() for line in listed.stdout.splitlines()]
+    return [pid for pid, session, state in rows if session == str(leader) and state[0] != "Z"]
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="asks ps for sessions")
+@pytest.mark.skipif(not shutil.which("ps"), reason="no ps on this system")
+def test_workers_end_with_the_command_that_was_killed(tmp_path):
+    path = many(tmp_path / "runs.parquet", tools=6000)
+    output, folder = tmp_path / "cals.parquet", tmp_path / "cals.parquet.parts"
+    command = ["fleet", path, "-o", output, "--tool", "servo", "--workers", 2]
+    running = subprocess.Popen(
+        [sys.executable, "-c", "from mwdcal.app.cli import main; main()", *map(str, command)],
+        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True,
+    )  # fmt: skip
+    limit = time.monotonic() + 60
+    while not list(folder.glob("*.arrow")) and time.monotonic() < limit:
+        time.sleep(0.005)
+    assert len(_of_session(running.pid)) >= 3
+    running.kill()
+    running.wait()
+    limit = time.monotonic() + 10
+    while (left := _of_session(running.pid)) and time.monotonic() < limit:
+        time.sleep(0.05)
+    for pid in left:
+        os.kill(int(pid), signal.SIGKILL)
+    assert not left
+    assert not output.exists()
+
+
 def test_other_options_or_input_are_other_parts(fleet):
     path, _ = fleet
-    source = fleet_tables.open_source(path)
+    source = fleet_sources.open_source(path)
     part = fleet_tables.partitions(source, fleet_tables.find_tools(source), path.parent)[0]
     profile = load_profile("servo")[0]
     plan = Plan.of(source, profile, Options())
@@ -632,7 +670,7 @@ def test_partitions_are_of_whole_tools_and_bounded(tmp_path, monkeypatch, batch)
     path = write_fleet(
         tmp_path / "runs.parquet", {i: short_run(i) for i in range(9)}, row_group_size=37
     )
-    source = fleet_tables.open_source(path)
+    source = fleet_sources.open_source(path)
     tools = fleet_tables.find_tools(source)
     assert tools.count == 9
     assert tools.together

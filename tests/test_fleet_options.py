@@ -82,6 +82,9 @@ def check_all(rows, alone, tolerance=1e-7):
 
 def check(row, cal, tolerance):
     assert row["status"] == "ok", row["message"]
+    free = {u.id for triad in cal.triads for u in triad.undetermined}
+    assert row["findings"] == list(dict.fromkeys(f.id for f in cal.findings if f.id not in free))
+    assert row["reshoot"] == [each.station for each in cal.station_rows if each.reshoot]
     filled = {n for n, v in row.items() if v is not None and n.endswith(("_sd", "radius"))}
     for triad in cal.triads:
         name = triad.name

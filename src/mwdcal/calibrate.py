@@ -114,9 +114,7 @@ class _Record:
             measures=measure_rows(readings, result),
             station_rows=stations,
             inherited=list(options.prior.stations) if options.prior else [],
-            findings=Findings(readings, self.profile, options, result, self.free).all(
-                [self.triad(i) for i in range(len(result.problem.triads))], stations
-            ),
+            findings=Findings(readings, self.profile, options, result, self.free).all(stations),
         )
 
     @property

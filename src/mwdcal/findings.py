@@ -6,15 +6,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mwdcal.calibration import Finding, StationRow, TriadCalibration
+from mwdcal.calibration import Finding, StationRow
 from mwdcal.core.observability import Free, free_directions
 from mwdcal.core.problem import Prior
 from mwdcal.core.solvers import Determined
+from mwdcal.core.vectors import Array, Bools, Ints, eigen
 from mwdcal.estimate import Fit
 from mwdcal.options import Options
 from mwdcal.profile import Profile
 from mwdcal.readings import TRIADS, Readings
-from mwdcal.residuals import REASONS, shown_in
+from mwdcal.residuals import REASONS, shown_in, tail
 
 SUSPECT = 3.0
 """A fit whose residuals exceed the declared noise this many times is reported."""
@@ -48,6 +49,55 @@ def is_relative(readings: Readings) -> bool:
     return readings.magnetometer is not None and bool(np.isnan(readings.reference("field")).all())
 
 
+def excessive(result: Fit) -> Bools:
+    """Triads (B, t) whose residuals are more than `SUSPECT` times the declared noise."""
+    declared = np.isnan(result.noise) & ~unchecked(result)
+    return np.asarray(declared & (result.analysis.variance_factor > SUSPECT**2))
+
+
+def unchecked(result: Fit) -> Bools:
+    """Triads (B, t) without redundancy."""
+    return np.asarray(result.analysis.freedom < 1)
+
+
+def copies(rows: Array) -> Ints:
+    """Stations whose readings (n, k) are those of an earlier one, to the last digit."""
+    _, first, place = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+    return np.flatnonzero(first[place.ravel()] != np.arange(len(rows)))
+
+
+def distrusted(result: Fit) -> Bools:
+    """Stations (B, n) that a robust fit all but left out."""
+    return np.asarray(result.trust < DISTRUSTED)
+
+
+def without_prior(result: Fit) -> Fit:
+    """The fit with only those directions determined that the run itself determines."""
+    prior = result.problem.prior
+    bare = replace(result.problem, prior=Prior(0 * prior.precision, prior.expected))
+    determined = Determined.of(bare, result.state)
+    return replace(result, problem=bare, analysis=replace(result.analysis, determined=determined))
+
+
+def departures(result: Fit) -> tuple[Array, Ints]:
+    """The χ² (B,) of the departure from the prior, Λd with covariance Λ - ΛCΛ, and its freedom."""
+    prior, covariance = result.problem.prior, result.analysis.covariance
+    precision, away = prior.precision, result.state.params - prior.expected
+    spread = precision - precision @ covariance @ precision
+    scale = np.sqrt(np.maximum(np.diagonal(precision, axis1=-2, axis2=-1), 1e-300))
+    values, vectors = eigen(spread / (scale[:, :, None] * scale[:, None, :]))
+    pull = (precision @ away[..., None])[..., 0] / scale
+    along = np.einsum("bij,bi->bj", vectors, pull) ** 2
+    tested = values > 1e-6
+    square = np.sum(np.where(tested, along / np.where(tested, values, 1.0), 0.0), -1)
+    return square, np.sum(tested, -1)
+
+
+def conflicting(square: Array, freedom: Ints) -> Bools:
+    """Whether departures (B,) from the prior are unlikely."""
+    return np.asarray(tail(square, np.maximum(freedom, 1)) <= UNLIKELY)
+
+
 @dataclass(frozen=True)
 class Findings:
     """The findings of one fit."""
@@ -58,31 +108,30 @@ class Findings:
     result: Fit
     free: list[Free]
 
-    def all(self, triads: list[TriadCalibration], stations: list[StationRow]) -> list[Finding]:
+    def all(self, stations: list[StationRow]) -> list[Finding]:
         """All of them, in order of weight."""
         return [
-            *self.residuals(triads),
+            *self.residuals(),
             *self.repeated(stations),
             *self.undetermined(),
             *self.prior(),
-            *self.model(triads),
+            *self.model(),
             *(self.reshoot(row) for row in stations if row.reshoot),
             *self.distrusted(stations),
         ]
 
-    def residuals(self, triads: list[TriadCalibration]) -> list[Finding]:
+    def residuals(self) -> list[Finding]:
         """Residuals beyond the declared noise; no redundancy."""
         found = []
-        for triad in triads:
-            excess = triad.variance_factor
-            if triad.noise_source == "declared" and excess is not None and excess > SUSPECT**2:
-                text = (
-                    f"{triad.name}: residuals are {excess**0.5:.1f} times the declared noise: "
-                    "the noise figure, a reference, or the model is wrong. Uncertainties are "
-                    "scaled up accordingly."
-                )
-                found.append(Finding(id=f"{triad.name}-residuals", text=text))
-        bare = [t.name for t in triads if t.degrees_of_freedom < 1]
+        for index in np.flatnonzero(excessive(self.result)[0]):
+            excess = float(self.result.analysis.variance_factor[0, index])
+            text = (
+                f"{TRIADS[index]}: residuals are {excess**0.5:.1f} times the declared noise: "
+                "the noise figure, a reference, or the model is wrong. Uncertainties are "
+                "scaled up accordingly."
+            )
+            found.append(Finding(id=f"{TRIADS[index]}-residuals", text=text))
+        bare = [TRIADS[index] for index in np.flatnonzero(unchecked(self.result)[0])]
         if bare:
             text = f"{' and '.join(bare)}: no redundancy, so nothing in this run checks the fit. Add stations."
             found.append(Finding(id="no-redundancy", text=text))
@@ -95,13 +144,11 @@ class Findings:
             self.readings.magnetometer,
             self.readings.temperature,
         )
-        rows = np.column_stack([c for c in columns if c is not None])
-        _, first, place = np.unique(rows, axis=0, return_index=True, return_inverse=True)
-        copies = np.flatnonzero(first[place.ravel()] != np.arange(len(rows)))
-        if not copies.size:
+        again = copies(np.column_stack([c for c in columns if c is not None]))
+        if not again.size:
             return []
-        names = ", ".join(stations[i].station for i in copies[:8])
-        more = f" and {len(copies) - 8} more" if len(copies) > 8 else ""
+        names = ", ".join(stations[i].station for i in again[:8])
+        more = f" and {len(again) - 8} more" if len(again) > 8 else ""
         text = (
             f"station {names}{more}: the very readings of an earlier station. Copies count as "
             "measurements of their own, and uncertainties come out too small. Remove them."
@@ -116,16 +163,16 @@ class Findings:
             found.append(Finding(id=entry.id, text=f"{names}: {described(entry.id)}."))
         return found
 
-    def model(self, triads: list[TriadCalibration]) -> list[Finding]:
+    def model(self) -> list[Finding]:
         """What the chosen model cannot say."""
         found = []
         bent = self.options.nonlinearity or {}
         ignored = [
-            t.name
-            for t in triads
-            if t.name not in bent
-            and t.model == "factors"
-            and getattr(self.profile, t.name).nonlinearity
+            name
+            for name, triad in zip(TRIADS, self.result.problem.triads, strict=False)
+            if name not in bent
+            and triad.model.kind == "factors"
+            and getattr(self.profile, name).nonlinearity
         ]
         if ignored:
             text = (
@@ -147,12 +194,11 @@ class Findings:
 
     def prior(self) -> list[Finding]:
         """What rests on the prior alone, and whether run and prior agree."""
-        knowledge, problem = self.options.prior, self.result.problem
+        knowledge = self.options.prior
         if knowledge is None:
             return []
-        bare = replace(problem, prior=Prior(0 * problem.prior.precision, problem.prior.expected))
-        determined = Determined.of(bare, self.result.state)
-        named = free_directions(bare, self.result.state, determined)
+        bare = without_prior(self.result)
+        named = free_directions(bare.problem, bare.state, bare.analysis.determined)
         free = [entry.id for entry in self.free]
         only = [e.id.removeprefix("weak-") for e in named if e.id not in free]
         if not only:
@@ -164,21 +210,11 @@ class Findings:
         return [Finding(id="prior-only", text=text), *self._conflict(knowledge.source)]
 
     def _conflict(self, source: str) -> list[Finding]:
-        """The χ² of the departure from the prior, Λd with covariance Λ - ΛCΛ, if it is unlikely."""
-        from scipy.special import chdtrc
-
-        prior, analysis = self.result.problem.prior, self.result.analysis
-        precision, params = prior.precision[0], self.result.state.params[0]
-        pull = precision @ (params - prior.expected[0])
-        spread = precision - precision @ analysis.covariance[0] @ precision
-        scale = np.sqrt(np.maximum(np.diag(precision), 1e-300))
-        values, vectors = np.linalg.eigh(spread / np.outer(scale, scale))
-        tested = values > 1e-6
-        along = vectors[:, tested].transpose() @ (pull / scale)
-        square = float(np.sum(along**2 / values[tested]))
-        if chdtrc(max(int(tested.sum()), 1), square) > UNLIKELY:
+        """A departure from the prior that is unlikely."""
+        square, tested = departures(self.result)
+        if not conflicting(square, tested)[0]:
             return []
-        ratio = np.sqrt(square / tested.sum())
+        ratio = np.sqrt(square[0] / tested[0])
         text = (
             f"the run departs from the prior ({source}) by {ratio:.1f} times what both allow: the tool has "
             "changed, or the prior is too narrow. Leave --prior out, or widen it."
@@ -202,7 +238,7 @@ class Findings:
 
     def distrusted(self, stations: list[StationRow]) -> list[Finding]:
         """Stations that a robust fit all but left out."""
-        low = [row for row in stations if row.weight < DISTRUSTED]
+        low = [stations[index] for index in np.flatnonzero(distrusted(self.result)[0])]
         if not low:
             return []
         each = ", ".join(f"{row.station} ({row.weight:.1g})" for row in low[:8])

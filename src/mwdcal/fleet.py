@@ -10,7 +10,7 @@ says which.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -24,9 +24,10 @@ from mwdcal.core.vectors import AnyArray, Array, Ints
 from mwdcal.errors import MwdcalError
 from mwdcal.estimate import Fit, fit
 from mwdcal.fleet_accuracy import ANGLES, typical_sd
-from mwdcal.fleet_checks import free_of_batch, suspect_fits, suspect_readings
+from mwdcal.fleet_checks import free_of_batch, member, suspect_fits, suspect_readings
 from mwdcal.fleet_choices import CHUNK, Alone, PerTool, halved, with_curves, with_orders
 from mwdcal.fleet_curves import curved_sd
+from mwdcal.fleet_findings import findings_of_batch
 from mwdcal.methods import ESTIMABLE
 from mwdcal.options import Options
 from mwdcal.profile import Profile
@@ -55,13 +56,16 @@ class Outcome:
     """What became of B tools: a status and a message each, and columns (B,) of results.
 
     `columns` hold NaN where a tool has no result. `free` lists, for each tool and triad, the
-    ids of directions that nothing determines.
+    ids of directions that nothing determines; `findings` the ids of each tool's findings, and
+    `reshoot` the numbers of its stations to take again.
     """
 
     status: AnyArray
     message: AnyArray
     columns: dict[str, Array]
     free: list[tuple[list[str], ...]]
+    findings: list[list[str]]
+    reshoot: list[list[int]]
 
     def sound(self, tools: Ints) -> Ints:
         """Those of the given tools that nothing has refused."""
@@ -118,7 +122,8 @@ def calibrate_batch(
     blank = {name: np.full(count, np.nan) for name in names(options, per_tool=per_tool)}
     free: list[tuple[list[str], ...]] = [([], []) for _ in range(count)]
     status, message = np.full(count, OK, object), np.full(count, "", object)
-    outcome = Outcome(status, message, blank, free)
+    none: list[list[Any]] = [[] for _ in range(count)]
+    outcome = Outcome(status, message, blank, free, list(none), list(none))
     options = per_tool.known(options, readings, profile)
     first, every = per_tool.before(options), np.arange(count)
     _refuse(outcome, every, suspect_readings(readings, first), alone, first)
@@ -133,7 +138,7 @@ def calibrate_batch(
             if isinstance(final, Exception):
                 _fail(outcome, part, final)
             else:
-                _fit(outcome, readings, part, final, alone, profile.reference_temperature_c)
+                _fit(outcome, readings, part, final, alone, profile)
     return outcome
 
 
@@ -143,7 +148,7 @@ def _fit(
     tools: Ints,
     options: Options,
     alone: Alone,
-    reference: float,
+    profile: Profile,
 ) -> None:
     """Fit the given tools, and write down what came of it."""
     for start in range(0, len(tools), CHUNK):
@@ -152,7 +157,7 @@ def _fit(
             if isinstance(result, Exception):
                 _fail(outcome, which, result)
             else:
-                _record(outcome, which, result, options, reference, alone)
+                _record(outcome, which, result, options, readings, profile, alone)
 
 
 def _fail(outcome: Outcome, tools: Ints, error: Exception) -> None:
@@ -181,36 +186,13 @@ def taken(readings: Readings, index: Ints) -> Readings:
     return mapped(readings, lambda value: value[index])
 
 
-def member(result: Fit, index: Ints) -> Fit:
-    """The fit of some members of a batch."""
-
-    def part(value: Any) -> Any:
-        return value.take(index) if hasattr(value, "problem") else value[index]
-
-    analysis = result.analysis
-    changed = {
-        f.name: value.take(index) if f.name == "determined" else part(value)
-        for f in fields(analysis)
-        if (value := getattr(analysis, f.name)) is not None
-    }
-    return replace(
-        result,
-        problem=result.problem.take(index),
-        state=result.state.take(index),
-        status=result.status[index],
-        iterations=result.iterations[index],
-        noise=result.noise[index],
-        trust=result.trust[index],
-        analysis=replace(analysis, **changed),
-    )
-
-
 def _record(
     outcome: Outcome,
     members: Ints,
     result: Fit,
     options: Options,
-    reference: float,
+    readings: Readings,
+    profile: Profile,
     alone: Alone,
 ) -> None:
     """Check a fit of some tools and write down the results of the sound ones."""
@@ -221,8 +203,12 @@ def _record(
         return
     if good.size < len(members):
         result, free = member(result, good), [free[index] for index in good]
+    findings, again = findings_of_batch(readings, profile, options, result, free)
+    for place, own, stations in zip(members[good], findings, again, strict=True):
+        outcome.findings[place], outcome.reshoot[place] = own, stations
     if options.prior:
         result = _with_prior_apart(result)
+    reference = profile.reference_temperature_c
     found = _columns(result, free, reference) | _besides(result, free, options, reference)
     for name, values in found.items():
         outcome.columns[name][members[good]] = values

@@ -6,6 +6,9 @@ of a single run are made. To suspect a sound tool costs time and nothing else: `
 
 from __future__ import annotations
 
+from dataclasses import fields, replace
+from typing import Any
+
 import numpy as np
 
 from mwdcal.checks import ABSURD, COARSE, GAIN, MOTION, NEEDS
@@ -57,7 +60,8 @@ def _odd_channels(readings: Readings, triad: str) -> Bools:
     values = getattr(readings, triad)
     if values is None:
         return np.zeros(len(readings.accelerometer), bool)
-    spread = values.max(-2) - values.min(-2)
+    lines = np.ascontiguousarray(np.swapaxes(values, -1, -2))
+    spread = lines.max(-1) - lines.min(-1)
     dead = spread <= 1e-12 * np.abs(values).max((-1, -2))[:, None]
     known = readings.reference("gravity" if triad == "accelerometer" else "field")
     given = ~np.isnan(known)
@@ -221,3 +225,27 @@ def _without(null: Array, direction: Array) -> Array:
     unit = np.broadcast_to(np.eye(int(size)), (len(null), int(size), int(size)))
     whole = np.linalg.qr(np.concatenate([inside[..., None], unit], -1))[0]
     return np.asarray(null @ whole[..., 1:size])
+
+
+def member(result: Fit, index: Ints) -> Fit:
+    """The fit of some members of a batch."""
+
+    def part(value: Any) -> Any:
+        return value.take(index) if hasattr(value, "problem") else value[index]
+
+    analysis = result.analysis
+    changed = {
+        f.name: value.take(index) if f.name == "determined" else part(value)
+        for f in fields(analysis)
+        if (value := getattr(analysis, f.name)) is not None
+    }
+    return replace(
+        result,
+        problem=result.problem.take(index),
+        state=result.state.take(index),
+        status=result.status[index],
+        iterations=result.iterations[index],
+        noise=result.noise[index],
+        trust=result.trust[index],
+        analysis=replace(analysis, **changed),
+    )

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from math import erfc, gamma
 
 import numpy as np
 
 from mwdcal.calibration import ErrorRow, Measures, StationRow
 from mwdcal.core.observables import OBSERVABLES
 from mwdcal.core.uncertainty import Analysis, station_misfit, without_station
-from mwdcal.core.vectors import Array, centred
+from mwdcal.core.vectors import Array, Bools, centred
 from mwdcal.estimate import Fit
 from mwdcal.readings import TRIADS, Readings
 
@@ -237,18 +238,39 @@ def _judged(fit: Fit) -> Analysis:
     return replace(found, residual=found.residual / np.sqrt(fit.trust[..., None]), spread=spread)
 
 
-def deviations(fit: Fit) -> Array:
-    """Each station's misfit (n,) as standard deviations of one normal variable."""
-    from scipy.special import chdtrc, ndtri
-
+def chances(fit: Fit) -> Array:
+    """How likely a misfit as large as each station's (B, n) is, if only noise is in it."""
     square, freedom = station_misfit(_judged(fit))
-    chi, count = square[0], freedom[0]
-    others = np.maximum(count.sum() - count, 1)
-    variance = np.maximum((chi.sum() - chi) / others, 1e-30)
-    declared = np.isnan(fit.noise[0]).all()
-    chi = chi / (np.maximum(variance, 1.0) if declared else variance)
-    chance = np.clip(chdtrc(np.maximum(count, 1), chi), 1e-300, 1.0)
-    return np.where(count > 0, -ndtri(chance / 2), 0.0)
+    others = np.maximum(freedom.sum(-1, keepdims=True) - freedom, 1)
+    variance = np.maximum((square.sum(-1, keepdims=True) - square) / others, 1e-30)
+    declared = np.isnan(fit.noise).all(-1, keepdims=True)
+    return tail(square / np.where(declared, np.maximum(variance, 1.0), variance), freedom)
+
+
+def to_reshoot(chance: Array) -> Bools:
+    """Stations to take again, by the chances (..., n) of all."""
+    return np.asarray(chance < RESHOOT / chance.shape[-1])
+
+
+def tail(square: Array, freedom: Array) -> Array:
+    """Chance of a larger χ² with whole degrees of freedom, 1 where there are none.
+
+    In closed form: SciPy's takes as long to load as a fleet of some thousand tools to fit.
+
+    >>> tail(np.array([3.841459, 5.991465]), np.array([1, 2])).round(6)
+    array([0.05, 0.05])
+    """
+    found = np.ones(square.shape)
+    for degrees in np.unique(freedom[freedom > 0]):
+        some = freedom == degrees
+        half = np.minimum(square[some] / 2, 700)
+        power = 0.5 if degrees % 2 else 1.0
+        small = np.exp(-half)
+        total = np.vectorize(erfc)(np.sqrt(half)) if degrees % 2 else small
+        while power < degrees / 2:
+            total, power = total + half**power * small / gamma(power + 1), power + 1
+        found[some] = total
+    return found
 
 
 def station_rows(readings: Readings, fit: Fit) -> list[StationRow]:
@@ -257,8 +279,8 @@ def station_rows(readings: Readings, fit: Fit) -> list[StationRow]:
 
     residuals = Residuals(readings, fit)
     names = residuals.names()
-    deviation = deviations(fit)
-    limit = -float(ndtri(RESHOOT / readings.count / 2))
+    chance = chances(fit)[0]
+    again, deviation = to_reshoot(chance), -ndtri(np.maximum(chance, 1e-300) / 2)
     after = {n: residuals.errors(n, residuals.after) for n in names}
     before = {n: residuals.errors(n, residuals.before) for n in names}
     left_out = {n: residuals.errors(n, residuals.left_out) for n in names}
@@ -269,7 +291,7 @@ def station_rows(readings: Readings, fit: Fit) -> list[StationRow]:
     attitude = {n: np.degrees(OBSERVABLES[n].value(*residuals.after)) for n in SHOWN[1:4]}
     rows = []
     for i in range(readings.count):
-        bad = bool(deviation[i] > limit)
+        bad = bool(again[i])
         scores = {n: float(ratio[n][i]) for n in names if not np.isnan(after[n][i])}
         rows.append(
             StationRow(

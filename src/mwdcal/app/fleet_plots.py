@@ -37,7 +37,7 @@ def parameters(found: Sequence[Any]) -> str:
     for each in found:
         kind, _, axes = each.title.partition(" ")
         title = KINDS[kind][len(set(axes)) > 1]
-        panels.setdefault(each.triad, {}).setdefault(title, []).append(each)
+        panels.setdefault(each.kind or each.triad, {}).setdefault(title, []).append(each)
     with plots._style():
         lines = [
             (triad, list(own.items())[first : first + ABREAST])

@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mwdcal.app import fleet_plots, report
-from mwdcal.app.fleet_summary import Summary, column
-from mwdcal.core.vectors import Array, Ints
+from mwdcal.app.fleet_summary import Said, Summary, column, is_doubt
+from mwdcal.core.vectors import Array, Bools, Ints
 from mwdcal.files import atomic, parquet
-from mwdcal.files.fleet_tables import SERIAL
+from mwdcal.files.fleet_sources import SERIAL, is_simulated
 from mwdcal.fleet import OK
 from mwdcal.readings import TRIADS
 
@@ -36,13 +36,27 @@ SUSPECT = 3.0
 
 @dataclass(frozen=True)
 class Parameter:
-    """A column of parameters over the sound tools, NaN where a tool does not have it."""
+    """A column of parameters over the sound tools, NaN where a tool does not have it.
+
+    Magnetometers calibrated to nT and to a field of one are of different `kind`.
+    """
 
     triad: str
+    kind: str
     title: str
     unit: str
     values: Array
     sd: float
+
+    @property
+    def sensors(self) -> str:
+        """What may be compared."""
+        return f"{self.triad}, {self.kind}" if self.kind else self.triad
+
+    @property
+    def tools(self) -> int:
+        """Number of tools that have it."""
+        return int(np.sum(~np.isnan(self.values)))
 
     @property
     def quantiles(self) -> tuple[float, float, float]:
@@ -78,13 +92,11 @@ def render(calibrations: Path, summary: Summary) -> str:
     template = environment().get_template("fleet.html")
     metadata = _metadata(calibrations)
     sound = np.flatnonzero(_text(calibrations, "status") == OK)
-    units = _text(calibrations, "field_unit")[sound]
-    field = "nT" if (units == "nT").all() else "nT or field = 1"
-    parameters = _parameters(calibrations, sound, field) if sound.size else []
+    parameters = _parameters(calibrations, sound) if sound.size else []
     return template.render(
         found=summary,
         metadata=metadata,
-        simulated=str(metadata.get("simulated", "")).lower() not in ("", "0", "false", "no"),
+        simulated=is_simulated(metadata),
         banner=_banner(summary),
         facts=_facts(summary, metadata),
         figures=_figures(calibrations, parameters, sound),
@@ -110,13 +122,21 @@ def _text(path: Path, name: str) -> Any:
 def _banner(summary: Summary) -> dict[str, str]:
     """The result in one sentence."""
     refused = summary.tools - summary.sound
-    level = "good" if not refused else "attention" if summary.sound else "bad"
-    word = {"good": "All calibrated", "attention": "Some refused", "bad": "None calibrated"}[level]
+    doubts = [said for said in summary.findings if is_doubt(said.id)]
+    level = "bad" if not summary.sound else "attention" if refused or doubts else "good"
+    word = "Some refused" if refused else "Some doubtful"
+    word = {"good": "All calibrated", "attention": word, "bad": "None calibrated"}[level]
     after = "Every tool has parameters with their uncertainty."
     if refused:
         after = f"{report.plural(refused, 'tool')} without a result: see the reasons below."
+    after = "; ".join([after.rstrip("."), *map(_doubt, doubts)]) + "." if doubts else after
     headline = f"{summary.sound} of {report.plural(summary.tools, 'tool')} calibrated"
     return {"level": level, "word": word, "headline": headline, "after": after}
+
+
+def _doubt(said: Said) -> str:
+    """A finding of a doubtful fit, with the number of its tools."""
+    return f"{said.id.replace('-', ' ')} in {report.plural(said.tools, 'tool')}"
 
 
 def _facts(summary: Summary, metadata: Mapping[str, object]) -> list[tuple[str, str]]:
@@ -137,23 +157,35 @@ def _count(chosen: tuple[str, int]) -> str:
     return f"{chosen[0]} in {report.plural(chosen[1], 'tool')}"
 
 
-def _parameters(path: Path, sound: Ints, field: str) -> list[Parameter]:
+def _parameters(path: Path, sound: Ints) -> list[Parameter]:
     """All columns of parameters, with units that people use."""
     _, pq = parquet.modules(path.name)
     found, names = [], pq.read_schema(path).names
+    kinds = _kinds(path, sound)
     for name in names:
         triad = next((t for t in TRIADS if name.startswith(f"{t}_")), "")
         rest = name.removeprefix(f"{triad}_")
         if not triad or f"{name}_sd" not in names:
             continue
-        values = _comparable(path, triad, rest, column(path, name), names)[sound]
-        if np.isnan(values).all():
-            continue
-        sd = column(path, f"{name}_sd")[sound]
-        unit, factor = _unit(rest, triad, field)
-        middle = float(np.nanmedian(sd)) * factor if not np.isnan(sd).all() else float("nan")
-        found.append(Parameter(triad, _title(rest), unit, values * factor, middle))
-    return found
+        every = _comparable(path, triad, rest, column(path, name), names)[sound]
+        spread = column(path, f"{name}_sd")[sound]
+        for kind, which in kinds.items() if triad != TRIADS[0] else [("", slice(None))]:
+            values, sd = (np.full(len(sound), np.nan) for _ in range(2))
+            values[which], sd[which] = every[which], spread[which]
+            if np.isnan(values).all():
+                continue
+            unit, factor = _unit(rest, triad, bool(kind))
+            middle = float(np.nanmedian(sd)) * factor if not np.isnan(sd).all() else float("nan")
+            found.append(Parameter(triad, kind, _title(rest), unit, values * factor, middle))
+    return sorted(found, key=lambda each: each.sensors)
+
+
+def _kinds(path: Path, sound: Ints) -> dict[str, Bools]:
+    """Which tools are calibrated to nT, and which to a field of one: they do not compare."""
+    units = _text(path, "field_unit")[sound]
+    relative = np.array([unit not in (None, "nT") for unit in units])
+    found = {"": units == "nT", "field = 1": relative}
+    return {name: which for name, which in found.items() if which.any()}
 
 
 def _comparable(path: Path, triad: str, name: str, values: Array, names: list[str]) -> Array:
@@ -163,13 +195,16 @@ def _comparable(path: Path, triad: str, name: str, values: Array, names: list[st
     return np.where(np.isnan(column(path, f"{triad}_radius")), values, np.nan)
 
 
-def _unit(name: str, triad: str, field: str) -> tuple[str, float]:
+def _unit(name: str, triad: str, relative: bool) -> tuple[str, float]:
     """Unit and factor of a parameter: offsets in mg or nT, the rest as shares of nominal."""
     kind, _, rest = name.partition("_")
     power = rest.partition("_t")[2]
     per = f"/°C{_raised(power)}" if power else ""
     if kind in ("offset", "bias", "square", "cube"):
+        field = "of the field" if relative else "nT"
         return (f"mg{per}", 1e3) if triad == TRIADS[0] else (f"{field}{per}", 1.0)
+    if relative and kind in ("gain", "scale"):
+        return f"1/nT{per}", 1.0
     return per.replace("/", "1/"), 1.0
 
 
@@ -225,7 +260,7 @@ def _outliers(path: Path, parameters: list[Parameter], sound: Ints) -> list[Outl
     found = []
     for place in far:
         each = parameters[which[place]]
-        title = f"{each.triad} {each.title}"
+        title = f"{each.sensors} {each.title}"
         middle = float(np.nanmedian(each.values))
         value = float(each.values[place])
         serial = serials[sound[place]]

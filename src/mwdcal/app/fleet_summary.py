@@ -16,12 +16,15 @@ from mwdcal.app.fleet_asked import Asked
 from mwdcal.app.text import number, table
 from mwdcal.core.vectors import Array
 from mwdcal.files import parquet
-from mwdcal.files.fleet_tables import SERIAL
+from mwdcal.files.fleet_sources import SERIAL
+from mwdcal.files.fleet_tables import one_chunk
 from mwdcal.fleet import OK
 from mwdcal.readings import TRIADS
 
 SHOWN = 5
 """Most serials that a line names."""
+DOUBTS = ("no-redundancy", "repeated-readings", "prior-conflict")
+"""Findings of a doubtful fit, besides residuals beyond the declared noise."""
 SPAN = 10.0
 """A run that spans more without temperature terms is mentioned, °C."""
 
@@ -37,6 +40,15 @@ class Kind:
 
 
 @dataclass(frozen=True)
+class Said:
+    """Sound tools with one finding: how many, and the first serials."""
+
+    id: str
+    tools: int
+    serials: list[Any]
+
+
+@dataclass(frozen=True)
 class Summary:
     """What came of a fleet. `spread` has the 1 %, 50 % and 99 % point of columns of sound tools."""
 
@@ -48,6 +60,7 @@ class Summary:
     order: int | str
     orders: dict[str, int]
     statuses: list[Kind]
+    findings: list[Said]
     spread: dict[str, list[float]]
     undetermined: dict[str, int]
     parts: int
@@ -62,17 +75,23 @@ class Summary:
 
 
 def summarise(
-    asked: Asked, target: Path, stations: int, parts: int, before: int, seconds: float
+    asked: Asked,
+    target: Path,
+    stations: int,
+    parts: int,
+    before: int,
+    seconds: float,
+    notes: list[str],
 ) -> Summary:
     """What the output says, read column by column."""
     _, pq = parquet.modules(target.name)
-    head = pq.read_table(target, columns=[SERIAL, "status", "message"])
-    names = pq.read_schema(target).names
+    whole = pq.ParquetFile(target)
+    head = whole.read([SERIAL, "status", "message", "findings"])
+    names = whole.schema_arrow.names
     ends = ("_sd_deg", "_variance_factor")
-    spread = {n: _quantiles(column(target, n)) for n in names if n.endswith(ends)}
-    notes = []
+    spread = {n: _quantiles(numbers(whole, n)) for n in names if n.endswith(ends)}
     if asked["order"] == "0":
-        span = column(target, "temperature_max_c") - column(target, "temperature_min_c")
+        span = numbers(whole, "temperature_max_c") - numbers(whole, "temperature_min_c")
         wide = int(np.sum(span > SPAN))
         if wide:
             notes.append(
@@ -85,10 +104,11 @@ def summarise(
         stations=stations,
         method=asked["method"],
         order=asked["order"] if asked["order"] == "auto" else int(asked["order"]),
-        orders=_orders(target, names) if asked["order"] == "auto" else {},
+        orders=_orders(whole, names) if asked["order"] == "auto" else {},
         statuses=_kinds(head),
+        findings=_findings(head),
         spread=spread,
-        undetermined=_undetermined(target, names),
+        undetermined=_undetermined(whole, names),
         parts=parts,
         parts_done_before=before,
         seconds=round(seconds, 3),
@@ -98,8 +118,14 @@ def summarise(
 
 def column(path: Path, name: str) -> Array:
     """One column of numbers of a table of calibrations, NaN where there is none."""
-    arrow, pq = parquet.modules(path.name)
-    cells = pq.read_table(path, columns=[name]).column(0)
+    _, pq = parquet.modules(path.name)
+    return numbers(pq.ParquetFile(path), name)
+
+
+def numbers(whole: Any, name: str) -> Array:
+    """One column of numbers of an opened Parquet file, NaN where there is none."""
+    arrow, _ = parquet.modules(name)
+    cells = whole.read([name]).column(0)
     return np.asarray(cells.cast(arrow.float64()).to_numpy(), float)
 
 
@@ -119,12 +145,31 @@ def _kinds(head: Any) -> list[Kind]:
     return found
 
 
-def _orders(path: Path, names: list[str]) -> dict[str, int]:
+def _findings(head: Any) -> list[Said]:
+    """Findings with their tools: doubts of the fit first, then by number."""
+    arrow, _ = parquet.modules("findings")
+    column = one_chunk(head.column("findings"))
+    ids = column.flatten().dictionary_encode()
+    tool = np.repeat(np.arange(len(column)), column.value_lengths().fill_null(0).to_numpy())
+    found = []
+    for code, name in enumerate(ids.dictionary.to_pylist()):
+        own = tool[ids.indices.to_numpy() == code]
+        serials = head.column(SERIAL).take(arrow.array(own[:SHOWN])).to_pylist()
+        found.append(Said(name, len(own), serials))
+    return sorted(found, key=lambda said: (not is_doubt(said.id), -said.tools, said.id))
+
+
+def is_doubt(finding: str) -> bool:
+    """Whether a finding says that a fit is doubtful, not only that something was chosen or looks odd."""
+    return finding.endswith("-residuals") or finding in DOUBTS
+
+
+def _orders(whole: Any, names: list[str]) -> dict[str, int]:
     """Tools by triad and the order that was chosen."""
     found: dict[str, int] = {}
     for triad in TRIADS:
         if f"{triad}_order" in names:
-            values = column(path, f"{triad}_order")
+            values = numbers(whole, f"{triad}_order")
             orders, counts = np.unique(values[~np.isnan(values)], return_counts=True)
             pairs = zip(orders, counts, strict=True)
             found |= {f"{triad}: order {order:.0f}": int(count) for order, count in pairs}
@@ -137,13 +182,12 @@ def _equal(cells: Any, value: str) -> Any:
     return compute.equal(cells, value)
 
 
-def _undetermined(path: Path, names: list[str]) -> dict[str, int]:
+def _undetermined(whole: Any, names: list[str]) -> dict[str, int]:
     """Tools by triad and direction that nothing determines."""
-    _, pq = parquet.modules(path.name)
     found: dict[str, int] = {}
     for name in names:
         if name.endswith("_undetermined"):
-            cells = pq.read_table(path, columns=[name]).column(0)
+            cells = whole.read([name]).column(0)
             for each in cells.combine_chunks().flatten().value_counts().to_pylist():
                 value, count = each["values"], each["counts"]
                 found[f"{name.removesuffix('_undetermined')}: {value}"] = count
@@ -167,6 +211,7 @@ def text(summary: Summary, report: Path | None) -> str:
     lines = [heading, "", table(rows, ["status", "tools", "serials"])]
     refused = [kind for kind in summary.statuses if kind.status != OK]
     lines += [f"! {kind.status}, for example: {kind.message}" for kind in refused]
+    lines += [f"! {said.id} in {_count(said)}" for said in summary.findings]
     spread = [
         [_title(name), *(number(v) for v in values)]
         for name, values in summary.spread.items()
@@ -184,10 +229,18 @@ def text(summary: Summary, report: Path | None) -> str:
     return "\n".join([*lines, "", f"{wrote}   {summary.seconds:.1f} s, {rate:.0f} tools/s"])
 
 
+def _count(said: Said) -> str:
+    """How many tools have a finding, and which."""
+    return f"{said.tools} {'tool' if said.tools == 1 else 'tools'}: {_first(said)}"
+
+
 def _serials(kind: Kind) -> str:
-    if kind.status == OK:
-        return ""
-    return ", ".join(map(str, kind.serials)) + (" …" if kind.tools > len(kind.serials) else "")
+    return "" if kind.status == OK else _first(kind)
+
+
+def _first(some: Kind | Said) -> str:
+    """The first serials of some tools."""
+    return ", ".join(map(str, some.serials)) + (" …" if some.tools > len(some.serials) else "")
 
 
 def _title(name: str) -> str:

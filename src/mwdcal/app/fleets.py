@@ -25,11 +25,12 @@ from mwdcal.curves import USUAL, declared
 from mwdcal.errors import FitError, InputError
 from mwdcal.files import atomic, parquet, profiles
 from mwdcal.files.fleet_parts import Plan, is_whole, load, solve
+from mwdcal.files.fleet_sources import SERIAL, Source, open_source
 from mwdcal.files.fleet_tables import (
-    SERIAL,
     Partition,
+    Tools,
     find_tools,
-    open_source,
+    in_several_folders,
     partitions,
 )
 from mwdcal.fleet_choices import PerTool
@@ -72,6 +73,7 @@ def calibrate_table(asked: Asked, say: Callable[[str], None]) -> Summary:
     tools = find_tools(source)
     if not tools.together:
         say("the rows of a tool are not together: dealing them into files of whole tools first")
+    notes = [*source.notes, *_split(source, tools)]
     parts = partitions(source, tools, folder)
     plan = Plan.of(source, profile, options, per_tool)
     paths = [folder / f"{plan.key(part)}.arrow" for part in parts]
@@ -88,7 +90,19 @@ def calibrate_table(asked: Asked, say: Callable[[str], None]) -> Summary:
     with contextlib.closing(_parts_made(plan, parts, paths, asked, say)) as made:
         _merge(paths, made, target, metadata)
     _tidy(folder)
-    return summarise(asked, target, source.rows, len(parts), before, time.perf_counter() - begun)
+    seconds = time.perf_counter() - begun
+    return summarise(asked, target, source.rows, len(parts), before, seconds, notes)
+
+
+def _split(source: Source, tools: Tools) -> list[str]:
+    """What to say of tools of which several folders have rows."""
+    count = in_several_folders(source, tools)
+    if not count:
+        return []
+    return [
+        f"tools with rows in several folders: {count}. All rows of a serial are one run; where they are "
+        "runs of their own, calibrate folder by folder."
+    ]
 
 
 def _options(asked: Asked, profile: Profile) -> tuple[Options, PerTool]:

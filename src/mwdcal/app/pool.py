@@ -11,6 +11,7 @@ from __future__ import annotations
 import gc
 import os
 import signal
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -18,7 +19,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
-from multiprocessing import forkserver, get_all_start_methods, get_context
+from multiprocessing import forkserver, get_all_start_methods, get_context, parent_process
 from multiprocessing.context import BaseContext
 from typing import Any
 
@@ -103,9 +104,21 @@ def _context() -> BaseContext:
     return context
 
 
-def _leave_interrupts() -> None:
-    """An interruption from the keyboard reaches all processes: the first one deals with it."""
+def _follow_the_command() -> None:
+    """A worker leaves interruptions from the keyboard to the command, and ends when that is gone.
+
+    While it lives, so does the process that workers are copies of: each holds its pipe open.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """Wait for the end of the parent process, however that comes."""
+    parent = parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 def _on_cores(steps: Steps, tasks: Sequence[Any], workers: int) -> Iterator[tuple[int, bytes]]:
@@ -132,7 +145,7 @@ def _by_pool(
     waiting = iter(tuple(left))
     with (
         _settings_of_workers(),
-        ProcessPoolExecutor(workers, _context(), _leave_interrupts) as pool,
+        ProcessPoolExecutor(workers, _context(), _follow_the_command) as pool,
     ):
         running: dict[Future[bytes], int] = {}
         try:

@@ -14,7 +14,7 @@ from mwdcal.core.vectors import reference_vectors
 from mwdcal.files import parquet
 from mwdcal.files.contract import CHANNELS, REFERENCES
 from mwdcal.files.fleet_parts import Plan, packed, solve
-from mwdcal.files.fleet_tables import SERIAL
+from mwdcal.files.fleet_sources import SERIAL
 from mwdcal.options import Options
 from mwdcal.profile import Profile, StandProfile, TriadProfile
 

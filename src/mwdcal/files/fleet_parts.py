@@ -15,9 +15,10 @@ from mwdcal import __version__
 from mwdcal.core.vectors import AnyArray, Array
 from mwdcal.errors import InputError
 from mwdcal.files import parquet
-from mwdcal.files.contract import CHANNELS
+from mwdcal.files.contract import AZIMUTH_KEYS, CHANNELS
 from mwdcal.files.fleet_runs import Batch, Rows, batches, refused_tools
-from mwdcal.files.fleet_tables import SERIAL, Partition, Source, read
+from mwdcal.files.fleet_sources import SERIAL, Source
+from mwdcal.files.fleet_tables import Partition, read
 from mwdcal.fleet import ALIKE, BAD_INPUT, OK, Outcome, calibrate_batch, names
 from mwdcal.fleet_choices import PerTool
 from mwdcal.options import Options
@@ -25,7 +26,8 @@ from mwdcal.profile import Profile
 from mwdcal.readings import TRIADS
 from mwdcal.selection import HIGHEST
 
-HEAD = (SERIAL, "status", "message", "stations", "temperature_min_c", "temperature_max_c")
+LISTS = ("findings", "reshoot")
+"""Columns of lists: ids of findings, and labels of stations to take again."""
 WHOLE = ("rank", "size", "order", "stations")
 """Ends of the names of columns of whole numbers."""
 
@@ -49,8 +51,9 @@ class Plan:
     def of(
         cls, source: Source, profile: Profile, options: Options, per_tool: PerTool = ALIKE
     ) -> Plan:
-        """For a table: of its columns those that a run file has."""
-        return cls(source.name, source.metadata, source.used, profile, options, per_tool)
+        """For a table: of its columns those that a run file has; which north is one of them."""
+        metadata = {k: v for k, v in source.metadata.items() if k not in AZIMUTH_KEYS}
+        return cls(source.name, metadata, source.used, profile, options, per_tool)
 
     @property
     def triads(self) -> tuple[str, ...]:
@@ -106,6 +109,7 @@ def _result(rows: Rows, plan: Plan) -> Any:
     status, message = np.full(count, OK, object), np.full(count, "", object)
     unit = np.full(count, None, object)
     free: list[tuple[list[str], ...]] = [([], [])] * count
+    said: list[tuple[list[str], list[str]]] = [([], [])] * count
     for tool, text in refused_tools(rows).items():
         status[tool], message[tool] = BAD_INPUT, text
     for batch in batches(rows, np.flatnonzero(status == OK)):
@@ -116,8 +120,10 @@ def _result(rows: Rows, plan: Plan) -> Any:
             values[batch.tools] = outcome.columns[name]
         for tool, each in zip(batch.tools, outcome.free, strict=True):
             free[tool] = each
+        for tool, found, again in zip(batch.tools, outcome.findings, outcome.reshoot, strict=True):
+            said[tool] = found, [rows.label(int(tool), station) for station in again]
     unit[status != OK] = None
-    return _table(rows, plan, (status, message, unit), filled, free)
+    return _table(rows, plan, (status, message, unit), filled, free, said)
 
 
 def _calibrated(rows: Rows, batch: Batch, plan: Plan) -> Outcome:
@@ -145,6 +151,7 @@ def _table(
     texts: tuple[AnyArray, AnyArray, AnyArray],
     filled: dict[str, Array],
     free: list[tuple[list[str], ...]],
+    said: list[tuple[list[str], list[str]]],
 ) -> Any:
     """The Arrow table of results, in the order of the columns."""
     arrow, _ = parquet.modules(plan.source)
@@ -158,6 +165,9 @@ def _table(
     columns["stations"] = arrow.array(rows.counts, arrow.int32())
     columns["temperature_min_c"] = arrow.array(low, mask=np.isnan(low))
     columns["temperature_max_c"] = arrow.array(high, mask=np.isnan(high))
+    for index, name in enumerate(LISTS):
+        lists = [each[index] if ok else None for each, ok in zip(said, good, strict=True)]
+        columns[name] = arrow.array(lists, arrow.list_(arrow.string()))
     for name, values in filled.items():
         whole = name.rpartition("_")[2] in WHOLE
         numbers = np.nan_to_num(values).astype(np.int32) if whole else values

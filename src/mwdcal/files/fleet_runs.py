@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from mwdcal.core.vectors import AnyArray, Array, Bools, Ints
-from mwdcal.errors import MwdcalError
+from mwdcal.errors import InputError, MwdcalError
 from mwdcal.files import parquet
-from mwdcal.files.azimuths import magnetic_offset
+from mwdcal.files.columns import as_text
 from mwdcal.files.contract import (
     CHANNELS,
     COLUMNS,
@@ -26,7 +26,8 @@ from mwdcal.files.contract import (
     TEMPERATURE,
     Range,
 )
-from mwdcal.files.fleet_tables import SERIAL, one_chunk
+from mwdcal.files.fleet_sources import AZIMUTH, OFFSET, SERIAL
+from mwdcal.files.fleet_tables import one_chunk
 from mwdcal.files.runs import to_readings
 from mwdcal.files.table import Table
 from mwdcal.profile import Profile, TriadProfile
@@ -77,6 +78,17 @@ class Rows:
         return found
 
     @cached_property
+    def offsets(self) -> tuple[Array, Array]:
+        """Least and most (T,) by which a tool's stated azimuths exceed magnetic ones, °; NaN for none."""
+        count = len(self.counts)
+        if AZIMUTH not in self.numbers or OFFSET not in self.table.column_names:
+            return np.zeros(count), np.zeros(count)
+        stated = self.table.column(OFFSET).to_numpy()
+        own = np.where(np.isnan(self.numbers[AZIMUTH]), np.nan, stated)
+        first = self.starts[:-1]
+        return np.fmin.reduceat(own, first), np.fmax.reduceat(own, first)
+
+    @cached_property
     def groups(self) -> Ints:
         """Number (R,) of the group of each row within its tool, -1 for none."""
         return _groups(self)
@@ -93,8 +105,27 @@ class Rows:
             if name in COLUMNS
         }
         source = f"{self.source}, serial {serial}"
-        metadata = {**self.metadata, SERIAL: str(serial)}
+        metadata = {**self.metadata, SERIAL: str(serial), **self._north(tool, source)}
         return to_readings(Table(columns, metadata, source, lines), self.profile)
+
+    def label(self, tool: int, station: int) -> str:
+        """A station's label, as a single run has it."""
+        number = str(station + 1)
+        if STATION not in self.table.column_names:
+            return number
+        cell = self.table.column(STATION)[int(self.starts[tool]) + station].as_py()
+        return as_text(cell).strip() or number
+
+    def _north(self, tool: int, source: str) -> dict[str, object]:
+        """The metadata that say which north a tool's azimuths count from."""
+        low, high = (float(each[tool]) for each in self.offsets)
+        if high > low:
+            raise InputError(
+                f"{source}: the azimuths of a tool must count from one north; those of its files count from "
+                f"{low:g}° and {high:g}° from magnetic. Write its rows with one azimuth reference."
+            )
+        known = bool(np.nan_to_num(low))
+        return {"azimuth_reference": "true", "declination_deg": low} if known else {}
 
     def filled(self, name: str) -> Ints:
         """Number of filled cells (T,) of a column."""
@@ -150,6 +181,7 @@ def _odd_cells(rows: Rows) -> Bools:
         whole = (filled == counts).all(0)
         found |= ~whole if kind == "accelerometer" else ~whole & (filled > 0).any(0)
         found |= _odd_spread(rows, kind)
+    found |= rows.offsets[1] > rows.offsets[0]
     filled = rows.filled("temperature_c")
     return np.asarray(found | ((filled > 0) & (filled < counts)))
 
@@ -218,7 +250,7 @@ def _readings(rows: Rows, tools: Ints) -> Readings:
         found = None if values is None else values[where]
         return None if found is None or np.isnan(found).all() else found
 
-    known = _known(rows, cells)
+    known = _known(cells, rows.offsets[0][tools][:, None])
     triads, sd = {}, {}
     for kind in CHANNELS:
         raw = [cells(name) for name in CHANNELS[kind]]
@@ -243,15 +275,15 @@ def _readings(rows: Rows, tools: Ints) -> Readings:
     )
 
 
-def _known(rows: Rows, cells: Any) -> dict[str, Array]:
-    """Reference values (B, n) by name, in radians, g and nT."""
+def _known(cells: Any, offset: Array) -> dict[str, Array]:
+    """Reference values (B, n) by name, in radians, g and nT; stated azimuths less `offset` (B, 1), °."""
     found = {}
     for name, reference in REFERENCES.items():
         values = cells(reference.column)
         if values is None:
             continue
         if name == "azimuth":
-            values = values - magnetic_offset(rows.metadata, rows.source)
+            values = values - offset
         if name in ("azimuth", "toolface"):
             outside = (values < 0.0) | (values >= 360.0)
             if outside.any():

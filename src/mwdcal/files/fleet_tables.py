@@ -1,55 +1,39 @@
 """Tables of many tools: which rows belong to which tool, and partitions of whole tools.
 
-A fleet is one Parquet file, or a folder of them (also `name=value` folders). One pass over
-the serial column finds the tools; memory holds their serials, never the readings. Where the
-rows of a tool are not together, the rows are dealt once into files of whole tools.
+One pass over the serial column finds the tools; memory holds their serials, never the readings.
+Where the rows of a tool are not together, the rows are dealt once into files of whole tools.
 """
 
 from __future__ import annotations
 
-import hashlib
 import shutil
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from threading import Lock
 from typing import Any
 
-import msgspec
 import numpy as np
 
 from mwdcal.core.vectors import Ints
 from mwdcal.errors import InputError
-from mwdcal.files import contract, parquet
+from mwdcal.files import parquet
+from mwdcal.files.columns import LABELS, as_text
+from mwdcal.files.fleet_sources import OFFSET, SERIAL, Piece, Source, pieces_of
 
-SERIAL = "serial"
 TOOL = "#tool"
 """Column of dealt rows: number of the tool, in order of first appearance."""
-LABELS = ("station", "group", SERIAL)
 ROWS = (6_000, 100_000)
 """Fewest and most rows of a partition that is not a single tool…"""
 SHARES = 32
 """…and into how many a fleet between these is divided."""
-LARGEST_GROUP = 20_000_000
-"""Rows of the largest row group that is read; it is dealt as a whole."""
 BATCH = 32_768
 """Rows that are read at once."""
 MOST_STRETCHES = 50_000_000
 """Most stretches of rows of one tool in a table."""
 MOST_FILES = 200
 """Files of dealt rows that are written at once."""
-
-
-@dataclass(frozen=True)
-class Piece:
-    """One row group of a Parquet file, with the values that its folder names state."""
-
-    path: str
-    stamp: tuple[int, int]
-    group: int
-    rows: int
-    keys: tuple[tuple[str, str], ...]
 
 
 @dataclass(frozen=True)
@@ -66,143 +50,6 @@ class Partition:
     first: int
     tools: int
     dealt: bool = False
-
-
-@dataclass(frozen=True)
-class Source:
-    """A fleet's table: its pieces, columns and metadata."""
-
-    name: str
-    pieces: tuple[Piece, ...]
-    columns: tuple[str, ...]
-    metadata: dict[str, object]
-
-    @property
-    def rows(self) -> int:
-        """Number of stations of all tools."""
-        return sum(piece.rows for piece in self.pieces)
-
-    @property
-    def used(self) -> tuple[str, ...]:
-        """The columns that a run has, and the serial."""
-        return tuple(n for n in self.columns if n in contract.COLUMNS or n == SERIAL)
-
-    @property
-    def fingerprint(self) -> str:
-        """What changes when a file of the table does."""
-        parts = [(Path(p.path).name, p.stamp, p.group, p.rows, p.keys) for p in self.pieces]
-        return hashlib.sha256(msgspec.json.encode([parts, self.metadata])).hexdigest()
-
-
-def open_source(path: Path) -> Source:
-    """The table at `path`, its columns checked; refuses what is no table of many tools."""
-    files = _files(path)
-    pieces: list[Piece] = []
-    columns: tuple[str, ...] = ()
-    metadata: dict[str, object] = {}
-    for file in files:
-        own, names, described = _look(file, path)
-        if columns and set(names) != set(columns):
-            odd = sorted(set(names) ^ set(columns))[0]
-            raise InputError(
-                f"{file}: all files of '{path.name}' must have the same columns; '{odd}' is in some "
-                f"and not in others ({files[0].name} …). Write the table again."
-            )
-        columns, metadata = columns or names, metadata or described
-        pieces += own
-    _check_columns(columns, path.name)
-    source = Source(path.name, tuple(pieces), columns, metadata)
-    if source.rows == 0:
-        raise InputError(f"{path.name}: the table has no rows. Add one row per station.")
-    largest = max(piece.rows for piece in pieces)
-    if largest > LARGEST_GROUP:
-        raise InputError(
-            f"{path.name}: a row group must have at most {LARGEST_GROUP} rows; got {largest}. Write "
-            "the table again with row groups of about a million rows (`row_group_size`)."
-        )
-    return source
-
-
-def _files(path: Path) -> list[Path]:
-    """The Parquet files of a table: itself, or all in a folder, in order of their names."""
-    if path.is_dir():
-        hidden = ("_", ".")
-        found = sorted(
-            file
-            for file in path.rglob("*.parquet")
-            if not any(part.startswith(hidden) for part in file.relative_to(path).parts)
-        )
-        if not found:
-            raise InputError(f"'{path}' is a folder without .parquet files. Name a Parquet table.")
-        return found
-    if not path.exists():
-        raise InputError(f"'{path}': no such file. Check the name and the folder.")
-    if path.suffix.lower() != ".parquet":
-        raise InputError(
-            f"'{path}': a fleet is read from a Parquet file or a folder of them; got "
-            f"'{path.suffix or 'no suffix'}'. Convert the table, with a column 'serial'."
-        )
-    return [path]
-
-
-def _look(file: Path, root: Path) -> tuple[list[Piece], tuple[str, ...], dict[str, object]]:
-    """Pieces, columns and metadata of one file."""
-    _, pq = parquet.modules(str(file))
-    try:
-        opened = pq.ParquetFile(file)
-    except Exception as error:
-        raise parquet.unreadable(str(file), error) from error
-    with opened:
-        schema, about = opened.schema_arrow, opened.metadata
-        folders = file.relative_to(root).parent.parts if root.is_dir() else ()
-        keys = tuple((n, v) for n, eq, v in (part.partition("=") for part in folders) if eq)
-        names = tuple(n for n in (*schema.names, *dict(keys)) if not n.startswith("__index"))
-        contract_columns = set(contract.COLUMNS) - set(LABELS)
-        for name in contract_columns.intersection(schema.names):
-            _check_numeric(schema.field(name).type, name, file)
-        status = file.stat()
-        stamp = (status.st_size, status.st_mtime_ns)
-        pieces = [
-            Piece(str(file.resolve()), stamp, group, about.row_group(group).num_rows, keys)
-            for group in range(about.num_row_groups)
-        ]
-        return pieces, names, parquet.metadata_of(schema.metadata, str(file))
-
-
-def _check_numeric(kind: Any, name: str, file: Path) -> None:
-    """Refuse a column of text where numbers belong."""
-    arrow, _ = parquet.modules(str(file))
-    types = arrow.types
-    fine = (types.is_integer, types.is_floating, types.is_decimal, types.is_null)
-    if not any(test(kind) for test in fine):
-        raise InputError(
-            f"{file.name}, column '{name}': expected numbers; the column has the type {kind}. "
-            "Write it as numbers, with empty cells where a value is unknown."
-        )
-
-
-def _check_columns(names: Sequence[str], source: str) -> None:
-    """Refuse a table that does not tell its tools apart, or lacks the channels."""
-    if SERIAL not in names:
-        near = [n for n in names if n.strip().lower().replace("_", " ") in _NEAR]
-        hint = f" Is it '{near[0]}'? Rename it." if near else " Add it."
-        raise InputError(
-            f"{source}: a fleet needs the column '{SERIAL}', which tells its tools apart; found "
-            f"{', '.join(repr(n) for n in names[:20])}.{hint}"
-        )
-    contract.check_columns(list(names), source)
-
-
-_NEAR = (
-    "sn",
-    "serial no",
-    "serial number",
-    "serialno",
-    "serialnumber",
-    "serial",
-    "tool",
-    "tool id",
-)
 
 
 @dataclass(frozen=True)
@@ -262,55 +109,83 @@ def _check_stretches(count: int, source: str) -> None:
         )
 
 
+def in_several_folders(source: Source, tools: Tools) -> int:
+    """Number of tools with rows in folders that state different values of a column."""
+    numbers: dict[Any, int] = {}
+    own = [tuple(k for k in p.keys if k[0] not in (SERIAL, OFFSET)) for p in source.pieces]
+    folder = np.array([numbers.setdefault(keys, len(numbers)) for keys in own])
+    if len(numbers) == 1:
+        return 0
+    ends = np.cumsum([piece.rows for piece in source.pieces])
+    last = np.append(tools.runs[1:], source.rows) - 1
+    places = folder[np.searchsorted(ends, [tools.runs, last], "right")]
+    low, high = np.full(tools.count, len(numbers)), np.full(tools.count, -1)
+    np.minimum.at(low, tools.tool, places.min(0))
+    np.maximum.at(high, tools.tool, places.max(0))
+    return int(np.sum(low < high))
+
+
 def _serials(source: Source) -> Iterator[Any]:
     """The serial column, in dictionary-encoded stretches; whole numbers stay numbers."""
     arrow, pq = parquet.modules(source.name)
     row = 0
-    for piece in source.pieces:
+    for piece in filter(lambda p: p.rows, source.pieces):
         stated = dict(piece.keys).get(SERIAL)
         if stated is not None:
-            if piece.rows:
-                yield (
-                    arrow.array([stated])
-                    .dictionary_encode()
-                    .take(arrow.array(np.zeros(piece.rows, int)))
-                )
+            one = arrow.array([stated]).dictionary_encode()
+            yield one.take(arrow.array(np.zeros(piece.rows, int)))
             row += piece.rows
             continue
         with pq.ParquetFile(piece.path, read_dictionary=[SERIAL]) as file:
             for batch in file.iter_batches(500_000, row_groups=[piece.group], columns=[SERIAL]):
-                column = _encoded(batch.column(0), source.name)
-                if column.null_count:
-                    blank = row + int(
-                        np.flatnonzero(column.is_null().to_numpy(zero_copy_only=False))[0]
-                    )
-                    raise InputError(
-                        f"{source.name}, row {blank + 1}, column '{SERIAL}': must be filled in; got a "
-                        "blank cell. Say which tool the station belongs to."
-                    )
+                column = _encoded(batch.column(0), piece)
+                _check_filled(column, row, source.name)
                 row += len(column)
                 if len(column):
                     yield column
 
 
-def _encoded(column: Any, source: str) -> Any:
+def _check_filled(serials: Any, row: int, source: str) -> None:
+    """Refuse the first blank of dictionary-encoded serials; `row` is the number of their first."""
+    values = serials.indices.fill_null(-1).to_numpy(zero_copy_only=False)
+    blank = values < 0
+    if parquet.modules(source)[0].types.is_string(serials.dictionary.type):
+        blank |= values == serials.dictionary.index("").as_py()
+    if blank.any():
+        raise InputError(
+            f"{source}, row {row + int(np.argmax(blank)) + 1}, column '{SERIAL}': must be filled in; got "
+            "a blank cell. Say which tool the station belongs to."
+        )
+
+
+def _encoded(column: Any, piece: Piece) -> Any:
     """Serials, 64-bit whole numbers or text, as a dictionary and the place of each in it."""
-    arrow, _ = parquet.modules(source)
+    arrow, _ = parquet.modules(piece.path)
     types = arrow.types
     kind = column.type.value_type if types.is_dictionary(column.type) else column.type
-    if types.is_integer(kind):
-        plain = arrow.int64()
-    elif types.is_string(kind) or types.is_large_string(kind):
-        plain = arrow.string()
-    else:
+    whole = types.is_integer(kind)
+    if not (whole or types.is_string(kind) or types.is_large_string(kind)):
         raise InputError(
-            f"{source}, column '{SERIAL}': must be text or whole numbers; the column has the type "
-            f"{kind}. Write it as text."
+            f"{Path(piece.path).name}, column '{SERIAL}': must be text or whole numbers; the column has "
+            f"the type {kind}. Write it as text."
         )
-    if kind == column.type:
-        return column.cast(plain).dictionary_encode()
-    encoded = arrow.dictionary(arrow.int32(), plain)
-    return column if column.type == encoded else column.cast(encoded)
+    if piece.text or not whole:
+        return _texts(column)
+    return column.cast(kind).cast(arrow.int64()).dictionary_encode()
+
+
+def _texts(column: Any) -> Any:
+    """A column of labels as text, as a dictionary and the place of each in it."""
+    arrow, _ = parquet.modules("fleet")
+    encoded = arrow.dictionary(arrow.int32(), arrow.string())
+    if column.type == encoded:
+        return column
+    if arrow.types.is_dictionary(column.type):
+        column = column.cast(column.type.value_type)
+    column = column.dictionary_encode()
+    column = one_chunk(column) if hasattr(column, "chunks") else column
+    texts = arrow.array([as_text(v) for v in column.dictionary.to_pylist()], arrow.string())
+    return arrow.DictionaryArray.from_arrays(column.indices, texts)
 
 
 def partitions(source: Source, tools: Tools, folder: Path) -> list[Partition]:
@@ -344,6 +219,7 @@ def _part(source: Source, first: int, stop: int, tools: int) -> Partition:
 
 def _dealt(source: Source, tools: Tools, folder: Path, size: int) -> list[Partition]:
     """Rows dealt into files by tool; done once, whatever interrupts it."""
+    _, pq = parquet.modules(source.name)
     rows = np.bincount(tools.tool, np.diff(tools.runs, append=source.rows), tools.count)
     share = max(size, -(-source.rows // MOST_FILES))
     number = np.cumsum(rows).astype(int) // share
@@ -358,13 +234,13 @@ def _dealt(source: Source, tools: Tools, folder: Path, size: int) -> list[Partit
     found = []
     for each in np.unique(number):
         file = done / f"{each:04d}.parquet"
-        pieces, _, _ = _look(file, file)
+        pieces = tuple(
+            replace(piece, stamp=(0, 0), keys=(("", source.fingerprint),))
+            for piece in pieces_of(file, pq.read_metadata(file))
+        )
         total = sum(piece.rows for piece in pieces)
         count = int(np.sum(number == each))
-        stamped = tuple(
-            Piece(p.path, (0, 0), p.group, p.rows, (("", source.fingerprint),)) for p in pieces
-        )
-        found.append(Partition(stamped, 0, total, 0, count, dealt=True))
+        found.append(Partition(pieces, 0, total, 0, count, dealt=True))
     return found
 
 
@@ -476,13 +352,22 @@ def _batches(piece: Piece, columns: tuple[str, ...]) -> Iterator[Any]:
 
 
 def _complete(table: Any, piece: Piece, columns: tuple[str, ...]) -> Any:
-    """Rows with the columns of their folder's names, and the serials encoded."""
+    """Rows with the columns that their piece states: labels as text, encoded, the rest as numbers."""
     arrow, _ = parquet.modules(piece.path)
-    keys = dict(piece.keys)
+    stated = dict(piece.keys)
+    found = {}
     for name in columns:
-        if name in keys:
-            value = arrow.array([keys[name]]).take(arrow.array(np.zeros(len(table), int)))
-            table = table.append_column(name, value)
-    place = table.column_names.index(SERIAL)
-    table = table.set_column(place, SERIAL, _encoded(table.column(SERIAL), piece.path))
-    return table.select(list(columns))
+        if name in stated:
+            kind = arrow.string() if name in LABELS else arrow.float64()
+            places = arrow.array(np.zeros(len(table), int))
+            column = arrow.array([stated[name]], kind).take(places)
+        else:
+            column = table.column(name)
+        if name == SERIAL:
+            column = _encoded(column, piece)
+        elif name in LABELS:
+            column = _texts(column)
+        elif name not in (TOOL, "#row"):
+            column = column.cast(arrow.float64(), safe=False)
+        found[name] = column
+    return arrow.table(found)

@@ -1,0 +1,165 @@
+"""What `calibrate` says of a tool, said of each tool of a fleet: in its row, on screen and page."""
+
+import re
+
+import numpy as np
+import pytest
+from scipy.special import chdtrc
+
+from cli_support import mwdcal
+from mwdcal.residuals import tail
+from test_fleet import alone, calibrated, check_same, servo_run, short_run, write_fleet
+
+pq = pytest.importorskip("pyarrow.parquet")
+
+
+def spoiled(seed, station=7, by=0.05, **changes):
+    """A run with one reading that is off."""
+    columns = short_run(seed, **changes)
+    columns["az"] = columns["az"].copy()
+    columns["az"][station] += by
+    return columns
+
+
+def troubled():
+    """Runs with a finding each, some with several."""
+    whole = short_run(4)
+    again = {name: np.concatenate([v, v[3:5]]) for name, v in whole.items()}
+    return {
+        "fine": short_run(1),
+        "off": spoiled(2),
+        "a little off": spoiled(3, by=0.005),
+        "named": {**spoiled(5), "station": [f"p{i}" if i % 2 else "" for i in range(28)]},
+        "copies": again,
+        "relative": short_run(6, ref_field_nt=np.full(28, np.nan)),
+        "bare": servo_run(7, inclinations=(10, 80, 110, 140), toolfaces=1),
+        "alone": spoiled(8, mx=None, my=None, mz=None),
+    }
+
+
+@pytest.mark.parametrize("tool", ["servo", "generic"])
+@pytest.mark.parametrize("method", ["joint", "least-squares", "newton"])
+def test_findings_are_those_of_each_tool_alone(tmp_path, method, tool):
+    runs = troubled()
+    if method == "newton":
+        del runs["relative"]
+    rows = calibrated(write_fleet(tmp_path / "runs.parquet", runs), "--method", method, tool=tool)
+    seen = set()
+    for serial, columns in runs.items():
+        made = alone(columns, "x", tool=tool, method=method)
+        if isinstance(made, Exception):
+            assert rows[serial]["findings"] is None
+            continue
+        check_same(rows[serial], made, 1e-6)
+        seen |= set(rows[serial]["findings"])
+    assert {"reshoot", "repeated-readings"} <= seen
+    assert ("accelerometer-residuals" in seen) == (tool == "servo")
+    if rows["named"]["status"] == "ok":
+        assert rows["named"]["reshoot"] == ["p7"]
+
+
+@pytest.mark.parametrize(
+    "options", [{"robust": "student-t"}, {"parameters": 6}, {"parameters": 9, "model": "factors"}]
+)
+def test_findings_of_options(tmp_path, options):
+    runs = {serial: columns for serial, columns in troubled().items() if serial != "bare"}
+    asked = [part for name, value in options.items() for part in (f"--{name}", value)]
+    rows = calibrated(write_fleet(tmp_path / "runs.parquet", runs), *asked)
+    expected = "distrusted" if "robust" in options else "restricted"
+    assert any(expected in (row["findings"] or ()) for row in rows.values())
+    for serial, columns in runs.items():
+        made = alone(columns, "x", **options)
+        if isinstance(made, Exception):
+            assert rows[serial]["message"].split(":")[-1] == str(made).split(":")[-1]
+        else:
+            check_same(rows[serial], made, 1e-5)
+
+
+def test_no_station_to_reshoot_escapes_the_bound(tmp_path):
+    """Many runs of few and many stations, with errors from none to plain."""
+    runs = {f"{seed}-{by}": spoiled(seed, by=by) for seed in range(25) for by in (0.0, 3e-3, 4e-3)}
+    found = {method: calibrated(
+        write_fleet(tmp_path / "runs.parquet", runs), "--method", method
+    ) for method in ("joint", "least-squares")}  # fmt: skip
+    some = 0
+    for method, rows in found.items():
+        for serial, columns in runs.items():
+            made = alone(columns, "x", method=method)
+            assert rows[serial]["reshoot"] == [r.station for r in made.station_rows if r.reshoot]
+            some += bool(rows[serial]["reshoot"])
+    assert 10 < some < 140
+
+
+@pytest.mark.parametrize("freedom", [1, 2, 3, 4, 5, 6])
+def test_the_chance_of_a_larger_chi_square(freedom):
+    square = np.array([0.0, 1e-3, 0.5, 3.0, 10.0, 30.0, 100.0, 600.0])
+    degrees = np.full(square.shape, freedom)
+    assert tail(square, degrees) == pytest.approx(chdtrc(freedom, square), 1e-12)
+    assert (tail(square, 0 * degrees) == 1).all()
+    assert tail(np.array([np.inf]), degrees[:1]) < 1e-290
+
+
+# Screen and page
+
+
+def said(tmp_path, runs, *options):
+    path = write_fleet(tmp_path / "runs.parquet", runs)
+    page = tmp_path / "fleet.html"
+    ran = mwdcal(
+        "fleet", path, "-o", tmp_path / "o.parquet", "--tool", "servo", "--workers", 1,
+        "--report", page, *options,
+    )  # fmt: skip
+    assert ran.code == 0, ran
+    return ran, re.sub(r"<svg.*?</svg>", "", page.read_text("utf-8"), flags=re.S)
+
+
+def test_screen_and_page_name_the_doubtful_tools(tmp_path):
+    runs = troubled()
+    del runs["bare"]
+    ran, page = said(tmp_path, runs)
+    assert "! accelerometer-residuals in 3 tools: off, named, alone" in ran.out
+    assert "! repeated-readings in 1 tool: copies" in ran.out
+    assert "All calibrated" not in page
+    assert "Some doubtful" in page
+    assert "accelerometer residuals in 3 tools" in page
+    ran, _ = said(tmp_path, runs, "--json")
+    first = ran.json["findings"][0]
+    assert first == {
+        "id": "accelerometer-residuals",
+        "tools": 3,
+        "serials": ["off", "named", "alone"],
+    }
+    _, page = said(tmp_path, {"fine": short_run(1)})
+    assert "All calibrated" in page
+
+
+def parameter(page, sensors, title):
+    """Cells of a row of the page's table of parameters."""
+    cells = rf"<tr><td>{sensors}</td><td class=\"text\">{title}</td>(.*?)</tr>"
+    found = re.search(cells, page)
+    return re.findall(r"<td>(.*?)</td>", found[1]) if found else None
+
+
+def test_a_tool_without_a_magnetometer_leaves_the_table_of_the_others(tmp_path):
+    runs = {f"T{i}": short_run(i) for i in range(3)}
+    _, whole = said(tmp_path, runs)
+    _, page = said(tmp_path, {**runs, "none": short_run(9, mx=None, my=None, mz=None)})
+    expected = parameter(whole, "magnetometer", "gain xx")
+    assert expected[0] == "3"
+    assert "–" not in expected
+    assert parameter(page, "magnetometer", "gain xx") == expected
+    assert parameter(page, "magnetometer", "offset x")[-1] == "nT"
+    assert parameter(page, "accelerometer", "gain xx")[0] == "4"
+
+
+def test_relative_magnetometers_are_apart_from_those_in_nt(tmp_path):
+    runs = {f"T{i}": short_run(i) for i in range(24)}
+    _, whole = said(tmp_path, runs)
+    relative = short_run(50, ref_field_nt=np.full(28, np.nan))
+    ran, page = said(tmp_path, {**runs, "R": relative})
+    for title in ("gain xx", "offset x"):
+        assert parameter(page, "magnetometer", title) == parameter(whole, "magnetometer", title)
+    assert parameter(page, "magnetometer, field = 1", "gain xx")[0::5] == ["1", "1/nT"]
+    assert parameter(page, "magnetometer, field = 1", "offset x")[0::5] == ["1", "of the field"]
+    assert "No tool has a parameter farther" in page
+    assert "! field-unknown in 1 tool: R" in ran.out
