@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Generator, Iterator
 from dataclasses import replace
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -171,6 +172,7 @@ def _parts_made(
     begun = told = time.perf_counter()
     tools = 0
     tasks = [parts[index] for index in missing]
+    _load_what_the_end_needs()
     steps = pool.Steps(partial(load, plan), partial(solve, plan))
     found = pool.results(steps, tasks, workers, asked["scheduler"])
     for count, (index, content) in enumerate(found, 1):
@@ -181,6 +183,12 @@ def _parts_made(
             told = now
             say(f"part {count} of {len(missing)}   {tools / (now - begun):.0f} tools/s")
         yield paths[missing[index]]
+
+
+def _load_what_the_end_needs() -> None:
+    """While the workers start: at the end nothing else is left to do, and it would be waited for."""
+    for name in ("pyarrow.compute", "rich.console", "rich.table"):
+        import_module(name)
 
 
 def _merge(
