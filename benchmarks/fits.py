@@ -18,7 +18,6 @@ curvature of an angle.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -27,7 +26,6 @@ from measuring import Row, against
 from scipy.optimize import OptimizeResult, least_squares
 
 from mwdcal.core.models import OFF_DIAGONAL, Basis
-from mwdcal.core.solvers import gauss_newton
 from mwdcal.estimate import Fit, fit
 from mwdcal.options import Options
 from mwdcal.readings import ANGLES, TRIADS, Readings
@@ -170,12 +168,6 @@ class Forward:
         return np.concatenate(found, -1)
 
 
-def from_nominal(case: Case) -> Callable[[], object]:
-    """The minimum alone, from the nominal tool, without the analysis that `fit` adds."""
-    found, start = fit(case.readings, case.options), Forward(case).start[None]
-    return lambda: gauss_newton(found.problem, replace(found.state, params=start.copy()))
-
-
 def scipy_fit(
     misfit: Callable[[np.ndarray], np.ndarray], start: np.ndarray, **options: object
 ) -> OptimizeResult:
@@ -197,7 +189,7 @@ def agreement(apart: float, theirs: OptimizeResult) -> str:
 
 
 def exact_stand(triads: int, order: int) -> list[Row]:
-    """Stations of exactly known attitude: the whole fit, and the minimum alone."""
+    """Stations of exactly known attitude."""
     case = simulated(triads, order)
     forward, name = Forward(case), f"{triads * (6 * order + 12)} factors"
     jobs: dict[str, Callable[[], OptimizeResult]] = {}
@@ -210,11 +202,7 @@ def exact_stand(triads: int, order: int) -> list[Row]:
     whole = partial(fit, case.readings, case.options)
     mine = whole()
     same = {words: equal(forward, mine, job()) for words, job in jobs.items()}
-    rows = against(name, whole, jobs, same)
-    if triads * order == 6:
-        alone = f"{name}, the minimum alone"
-        rows += against(alone, from_nominal(case), jobs, same)
-    return rows
+    return against(name, whole, jobs, same)
 
 
 def as_printed() -> list[Row]:

@@ -329,6 +329,14 @@ def test_no_redundancy_is_a_finding():
     assert any(f.id == "no-redundancy" for f in record.findings)
 
 
+@pytest.mark.parametrize("times", [1.0, 10.0])
+def test_noise_declared_far_too_large_is_named(times):
+    sd = {name: times * np.asarray(value) for name, value in NOISE.items()}
+    found = {f.id for f in calibrate(make(sd=sd), PROFILE).findings}
+    named = {"accelerometer-noise", "magnetometer-noise"} & found
+    assert len(named) == (2 if times > 1 else 0)
+
+
 def test_stations_that_are_copies_are_named():
     data = make()
     assert not any(f.id == "repeated-readings" for f in calibrate(data, PROFILE).findings)

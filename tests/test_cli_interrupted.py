@@ -135,6 +135,50 @@ def test_every_orderly_end_tells_its_status_and_leaves_nothing(tmp_path, name, w
     assert not list(tmp_path.iterdir())
 
 
+TIDYING = """
+import time
+from mwdcal.app import cli
+from mwdcal.files import atomic
+real_remove = atomic._remove
+def remove(path):
+    print("tidying", flush=True)
+    time.sleep({seconds})
+    real_remove(path)
+atomic._remove, cli.PATIENCE = remove, {patience}
+"""
+
+
+def signalled_while_tidying(target, first, second, pause=0.0, **given):
+    """Status and messages of a command that a second signal meets while it tidies up."""
+    child = started(TIDYING.format(**given) + SLOW_WRITE, *CALIBRATE, target)
+    assert child.stdout.readline() == "writing\n"
+    child.send_signal(getattr(signal, first))
+    assert child.stdout.readline() == "tidying\n"
+    time.sleep(pause)
+    child.send_signal(getattr(signal, second))
+    _, err = child.communicate(timeout=10)
+    return child.returncode, err.strip()
+
+
+@pytest.mark.parametrize("second", ENDINGS)
+@pytest.mark.parametrize(("first", "word"), ENDINGS.items())
+def test_a_second_signal_does_not_disturb_the_tidying(tmp_path, first, second, word):
+    target = tmp_path / "cal.json"
+    code, err = signalled_while_tidying(target, first, second, seconds=0.2, patience=5)
+    assert code == 128 + getattr(signal, first)
+    assert err == f"mwdcal: {word}. Files are as they were before."
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("second", ENDINGS)
+def test_a_second_signal_ends_a_tidying_that_hangs(tmp_path, second):
+    target = tmp_path / "cal.json"
+    given = {"seconds": 60, "patience": 0.1}
+    code, err = signalled_while_tidying(target, "SIGINT", second, pause=0.2, **given)
+    assert (code, err) == (128 + getattr(signal, second), "")
+    assert not target.exists()
+
+
 def test_an_ignored_hang_up_stays_ignored(tmp_path):
     """As `nohup` asks for."""
     ignoring = "import signal; signal.signal(signal.SIGHUP, signal.SIG_IGN)\n" + SLOW_WRITE

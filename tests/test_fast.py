@@ -91,6 +91,7 @@ EXACT = {
     "all exact": (Options(), ()),
     "noise estimated": (Options(), ("noise",)),
     "accelerometer alone": (Options(), ("magnetometer", "azimuth")),
+    "accelerometer alone, no field": (Options(), ("magnetometer", "azimuth", "field", "dip")),
     "least-squares, uncertain stand": (Options("least-squares"), ("angles",)),
     "noise by axis and station": (Options(), ("uneven",)),
     "factors": (Options(model="factors"), ()),

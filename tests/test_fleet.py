@@ -41,7 +41,7 @@ pa = pytest.importorskip("pyarrow")
 pq = pytest.importorskip("pyarrow.parquet")
 
 from mwdcal.app import pool  # noqa: E402
-from mwdcal.files import fleet_sources, fleet_tables  # noqa: E402
+from mwdcal.files import atomic, fleet_sources, fleet_tables  # noqa: E402
 from mwdcal.files.fleet_parts import Plan, load, solve  # noqa: E402
 
 ANGLES = ("inclination", "azimuth", "toolface")
@@ -311,7 +311,7 @@ def test_what_calibrate_refuses_is_refused_for_the_same_reason(tmp_path, method)
     rows = calibrated(path, "--method", method)
     first, seen = 1, set()
     for serial, columns in runs.items():
-        expected = alone(columns, f"runs.parquet, serial {serial}", first, method=method)
+        expected = alone(columns, f"serial {serial} of runs.parquet", first, method=method)
         first += len(columns["ax"])
         if isinstance(expected, MwdcalError):
             assert rows[serial]["message"] == str(expected), serial
@@ -323,6 +323,7 @@ def test_what_calibrate_refuses_is_refused_for_the_same_reason(tmp_path, method)
                 assert rows[serial]["status"] == statuses(serial).removesuffix("-unit")
         else:
             check_same(rows[serial], expected)
+    assert "serial bad-input of runs.parquet, row 32, column" in rows["bad-input"]["message"]
     assert len(seen) == 5 + (method == "scalar"), seen
     assert ("weak-geometry" in seen) == (method == "scalar")
 
@@ -339,9 +340,12 @@ def test_references_that_a_method_needs(tmp_path):
 def test_temperatures_that_an_order_needs(tmp_path):
     runs = {"warm": warm_run(1), "cold": short_run(2), "none": short_run(3, temperature_c=None)}
     rows = calibrated(write_fleet(tmp_path / "runs.parquet", runs), "--order", 1)
-    assert [row["status"] for row in rows.values()] == ["ok", *["temperature-span"] * 2]
+    statuses = ["ok", "temperature-span", "bad-input"]
+    assert [row["status"] for row in rows.values()] == statuses
     for serial in ("cold", "none"):
-        assert rows[serial]["message"] == str(alone(runs[serial], f"serial {serial}", order=1))
+        expected = alone(runs[serial], f"serial {serial}", order=1)
+        assert rows[serial]["message"] == str(expected)
+        assert isinstance(expected, InputError) == (rows[serial]["status"] == "bad-input")
 
 
 def test_one_member_that_stops_the_batch_does_not_stop_the_others(tmp_path, monkeypatch):
@@ -459,7 +463,7 @@ def test_files_of_a_folder_that_do_not_match(tmp_path):
 def test_order_0_on_a_wide_span_is_mentioned(tmp_path):
     path = write_fleet(tmp_path / "runs.parquet", {"T1": warm_run(1), "T2": short_run(2)})
     ran = mwdcal("fleet", path, "-o", tmp_path / "out.parquet", "--tool", "servo")
-    assert "1 tools span more than 10 °C" in ran.out
+    assert "1 tool spans more than 10 °C" in ran.out
 
 
 # Parts, restart, cluster
@@ -548,6 +552,33 @@ def test_an_interrupted_fleet_goes_on_where_it_was(fleet, tmp_path):
     assert touched == {"tasks": 4 - len(done), "times": done}
     assert output.read_bytes() == expected
     assert not folder.exists()
+
+
+@pytest.mark.skipif(os.name == "nt", reason="no such locks on this system")
+def test_one_output_is_written_by_one_fleet_at_a_time(fleet, tmp_path):
+    path, expected = fleet
+    output, folder = tmp_path / "cals.parquet", tmp_path / "cals.parquet.parts"
+    command = ["fleet", path, "-o", output, "--tool", "servo", "--workers", 1]
+    with atomic.holding(folder / "lock") as ours:
+        assert ours
+        message = refused(mwdcal(*command), 2)
+        assert "another fleet is writing this output. Wait for it" in message
+        assert folder.exists()
+    assert not folder.exists()
+    code = "from mwdcal.app.cli import main; main()"
+    both = [
+        subprocess.Popen(
+            [sys.executable, "-c", code, *map(str, command)],
+            stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, encoding="utf-8",
+        )
+        for _ in range(2)
+    ]  # fmt: skip
+    said = {one.communicate()[1].splitlines()[-1]: one.returncode for one in both}
+    assert 0 in said.values()
+    for words, ended in said.items():
+        assert ended == 0 or (ended == 2 and "another fleet" in words)
+    assert output.read_bytes() == expected
+    assert {each.name for each in tmp_path.iterdir()} == {"cals.parquet"}
 
 
 @pytest.mark.skipif(not hasattr(os, "killpg"), reason="no process groups on this system")

@@ -71,7 +71,7 @@ def test_a_tool_with_rows_of_two_norths_is_refused_by_name(folder):
     write_fleet(folder / "b.parquet", {"T2": short_run(3), "T3": turned(short_run(4), 7.5)}, TRUE)
     rows = calibrated(folder)
     assert [rows[s]["status"] for s in ("T1", "T2", "T3")] == ["ok", "bad-input", "ok"]
-    assert "serial T2: the azimuths of a tool must count from one north" in rows["T2"]["message"]
+    assert "serial T2 of runs/*.parquet: the azimuths of a tool must count" in rows["T2"]["message"]
     assert "from 0° and 7.5° from magnetic" in rows["T2"]["message"]
 
 

@@ -6,9 +6,10 @@ uncertainties, whatever the number of samples, the steps of the readings and the
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 from mwdcal.core.standstill import resolution
-from mwdcal.core.station_means import summarise, summarise_all
+from mwdcal.core.station_means import correlated, hidden, summarise_all
 from mwdcal.stations import find_stations
 from test_stations import ACC, means, tumble, without
 
@@ -70,6 +71,80 @@ def test_a_quiet_standstill_is_not_stuck(step, samples):
         values = np.round(sigma[:, None] * rng.standard_normal((24, samples)) / step) * step
         stuck += sum(row.stuck for row in summarise_all([(time, v) for v in values], step))
     assert stuck == 0
+
+
+def rounded(sigma):
+    """Mean and variance of normal noise about `place`, read in whole steps, by summing them up."""
+    place = np.linspace(-0.5, 0.5, 2001)
+    level = np.arange(-12, 13)[:, None]
+    share = norm.cdf((level + 0.5 - place) / sigma) - norm.cdf((level - 0.5 - place) / sigma)
+    mean = (level * share).sum(0)
+    return mean - place, ((level - mean) ** 2 * share).sum(0)
+
+
+@pytest.mark.parametrize("sigma", [0.03, 0.1, 0.2, 0.35, 0.5, 0.7])
+def test_what_steps_hide_is_what_rounding_does(sigma):
+    error, variance = rounded(sigma)
+    spread = np.sqrt(variance.mean())
+    assert hidden(7 * spread, 7.0) == pytest.approx(
+        7 * np.sqrt(np.mean(error**2)), rel=0.01, abs=7e-5
+    )
+
+
+@pytest.mark.parametrize("sigma", [0.05, 0.1, 0.2, 0.3, 0.4, 0.45, 0.5, 0.7])
+@pytest.mark.parametrize(("standstills", "samples"), [(6, 5), (24, 20), (6, 500), (24, 500)])
+def test_coarse_steps_cover_and_weigh_alike(sigma, standstills, samples):
+    """240 standstills and more, noise of `sigma` steps: 95 % has a standard error of 1.4 %. What
+    steps hide is no normal error; it stays below 1.96 of its own standard deviation. No station
+    counts many times another of the same noise (at half a step it was a hundred times)."""
+    rng = np.random.default_rng([SEED, samples])
+    inside, time = [], np.arange(samples) * 1.0
+    for _ in range(240 // standstills):
+        place = rng.uniform(-0.5, 0.5, standstills)
+        values = np.round(place[:, None] + sigma * rng.standard_normal((standstills, samples)))
+        made = summarise_all([(time, value) for value in values], 1.0)
+        inside += [abs(m.mean - x) <= 1.96 * m.sd for m, x in zip(made, place, strict=True)]
+        if samples == 500:
+            assert max(m.sd for m in made) < 4 * min(m.sd for m in made)
+    assert np.mean(inside) > 0.91
+
+
+@pytest.mark.parametrize("sigma", [0.2, 0.3, 0.4])
+def test_coarse_steps_cover_where_noise_differs(sigma):
+    """From half to twice as much: the quieter ones must not borrow what dithers the others free."""
+    rng = np.random.default_rng(SEED)
+    inside, time = [], np.arange(500) * 1.0
+    for _ in range(10):
+        place = rng.uniform(-0.5, 0.5, 24)
+        noise = sigma * np.exp(rng.uniform(np.log(0.5), np.log(2), (24, 1)))
+        values = np.round(place[:, None] + noise * rng.standard_normal((24, 500)))
+        made = summarise_all([(time, value) for value in values], 1.0)
+        inside += [abs(m.mean - x) <= 1.96 * m.sd for m, x in zip(made, place, strict=True)]
+    assert np.mean(inside) > 0.91
+
+
+def test_samples_at_two_levels_warn_of_nothing():
+    """A channel that steps in the middle of one standstill, by much more than its noise."""
+    rng = np.random.default_rng(4)
+    for samples in (4, 6, 7):
+        values = 2e-4 * rng.standard_normal((5, samples))
+        values[2] += np.arange(samples) >= samples // 2
+        made = summarise_all([(np.arange(samples) * 1.0, value) for value in values], 1e-9)
+        assert np.isfinite([m.sd for m in made]).all()
+
+
+@pytest.mark.parametrize("noisier", [2.0, 3.0, 5.0])
+def test_a_noisier_standstill_borrows_no_calm(noisier):
+    """Two of 24, of 7 samples each."""
+    rng = np.random.default_rng(SEED)
+    loud = np.where(np.arange(24) % 12 == 5, noisier, 1.0)
+    inside = []
+    for _ in range(150):
+        values = loud[:, None] * rng.standard_normal((24, 7))
+        made = summarise_all([(np.arange(7.0), value) for value in values], 1e-9)
+        inside.append([abs(m.mean) <= 1.96 * m.sd for m in made])
+    assert np.mean(np.array(inside)[:, loud > 1]) > 0.85
+    assert 0.93 < np.mean(np.array(inside)[:, loud == 1]) < 0.98
 
 
 def coarse(step, sigma=1.0, count=50_000, seed=3):
@@ -136,14 +211,28 @@ def test_noise_correlated_over_seconds(seconds, least):
     assert least <= np.mean(inside) <= 0.98
 
 
-def test_a_line_of_drift_widens_nothing():
-    """Halves that differ by a common drift say nothing of the mean, which stands at its middle."""
+@pytest.mark.parametrize("rate", [2e-5, 2e-4, 2e-3])
+def test_a_line_of_drift_widens_nothing(rate):
+    """A drift that all standstills share says nothing of the mean, which stands at its middle."""
     log, *_ = tumble(1, stations=30, still=(8, 14), noise=1e-3)
-    time, value = log.columns["time_s"], log.columns["ax"] + 2e-4 * log.columns["time_s"]
-    found = find_stations(without(log, ax=value))
+    plain = find_stations(log)
+    drifting = {n: log.columns[n] + rate * log.columns["time_s"] for n in ACC}
+    found = find_stations(without(log, **drifting), threshold=plain.threshold)
     assert "correlated-noise" not in [f.id for f in found.findings]
-    columns = found.table.columns
-    for i in range(found.table.count):
-        own = (time >= columns["start_s"][i]) & (time <= columns["end_s"][i])
-        alone = summarise(time[own], value[own], 1e-9).sd
-        assert columns["sd_ax"][i] == pytest.approx(alone, rel=1e-9)
+    assert found.table.count == plain.table.count
+    for name in (f"sd_{n}" for n in ACC):
+        ratio = found.table.columns[name] / plain.table.columns[name]
+        assert np.sqrt(np.mean(ratio**2)) == pytest.approx(1, abs=0.1)
+
+
+@pytest.mark.parametrize("standstills", [3, 4, 8, 24])
+def test_white_noise_is_seldom_said_to_be_correlated(standstills):
+    """Three channels of 300 samples: 1 in 1000 by the halves, 1 in 100 by their growth."""
+    rng = np.random.default_rng([SEED, standstills])
+    time, told = np.arange(300) / 100, 0
+    for _ in range(1200 // standstills // 3):
+        values = rng.standard_normal((3, standstills, 300))
+        told += bool(
+            correlated([summarise_all([(time, v) for v in own], 1e-9) for own in values]).any()
+        )
+    assert told <= 0.03 * (1200 // standstills // 3) + 1

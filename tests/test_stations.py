@@ -149,12 +149,31 @@ def test_options_say_what_counts():
 
 @pytest.mark.parametrize("seed", range(5))
 def test_coarse_readings(seed):
-    """Steps of 5 mg, noise of 0.5 mg: most samples repeat the one before."""
-    log, starts, *_ = tumble(seed, noise=5e-4)
+    """Steps of 5 mg, noise of 0.5 mg: most samples repeat the one before.
+
+    Rounded noise of a tenth of a step errs by 0.19 steps in the mean: the integral over all places
+    between two steps (`test_station_means`), as far as twelve stations tell the noise.
+    """
+    log, starts, _, aims = tumble(seed, noise=5e-4)
     coarse = {n: np.round(log.columns[n] * 200) / 200 for n in ACC}
     found = find_stations(without(log, **coarse))
     assert found.table.count == len(starts)
-    assert means(found, tuple(f"sd_{n}" for n in ACC)).min() > 0.005 / 12**0.5 * 0.99
+    sd = means(found, tuple(f"sd_{n}" for n in ACC))
+    assert np.mean(np.abs(means(found) - aims) <= 1.96 * sd) > 0.95
+    assert 0.19 < np.sqrt(np.mean(sd**2)) / 0.005 < 0.29
+
+
+@pytest.mark.parametrize("noise", [0.1, 0.2, 0.3, 0.4, 0.45])
+def test_coarse_readings_lose_and_split_no_standstill(noise):
+    """Noise in steps: where a reading lies between two it goes up and down at rest."""
+    for seed in (10, 11, 13):
+        log, starts, ends, _ = tumble(seed, stations=24, still=(8, 14), noise=1e-3)
+        coarse = {n: np.round(log.columns[n] * noise / 1e-3) * 1e-3 / noise for n in ACC}
+        found = find_stations(without(log, **coarse))
+        first, last = (found.table.columns[n] for n in ("start_s", "end_s"))
+        own = np.searchsorted(ends, (first + last) / 2)
+        np.testing.assert_array_equal(own, np.arange(24))
+        assert np.all((first > starts - 0.1) & (last < ends + 0.1))
 
 
 # Uncertainty
@@ -320,6 +339,13 @@ def test_all_still():
     assert "all-still" in finding_ids(found)
 
 
+@pytest.mark.parametrize("seconds", [5, 10, 19])
+def test_all_still_for_a_short_time(seconds):
+    read = 1 + 1e-3 * np.random.default_rng(1).standard_normal((100 * seconds, 3))
+    log = Table(dict(zip(ACC, read.T, strict=True)), {}, "log.csv", range(2, 100 * seconds + 2))
+    assert "all-still" in finding_ids(find_stations(log, sampling_hz=100.0))
+
+
 @pytest.mark.parametrize("period", [3.0, 10.0, 60.0, 300.0])
 @pytest.mark.parametrize("noise", [0.0, 5e-3])
 def test_never_still(period, noise):
@@ -437,6 +463,9 @@ def test_metadata_can_hold_the_rate(tmp_path, files):
     assert "sampling_hz must be a number" in refused(
         mwdcal("stations", log, "-o", tmp_path / "r.csv"), 2
     )
+    told = refused(mwdcal("stations", log, "--sampling-hz", 0, "-o", tmp_path / "r.csv"), 2)
+    assert "--sampling-hz must be a number above 0" in told
+    assert "add --sampling-hz" not in told
     log = write_csv(tmp_path / "log.csv", columns)
     assert "--sampling-hz 100" in refused(mwdcal("stations", log, "-o", tmp_path / "r.csv"), 2)
 

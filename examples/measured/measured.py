@@ -95,7 +95,9 @@ def ways(curved: str) -> list[str]:
 
 def typed(words: str) -> Typed:
     """The options that the command line makes of these words."""
-    command = cli.calibrate.make_context("calibrate", ["-", "-o", "-", *words.split()])
+    command = cli.calibrate.make_context(
+        "calibrate", ["-", "-o", "-", *words.split()], **cli.cli.context_settings
+    )
     return Typed(**{name: command.params[name] for name in Typed.__annotations__})
 
 

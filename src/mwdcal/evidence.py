@@ -14,7 +14,9 @@ from mwdcal.readings import ANGLES, CONSTANTS, Readings
 
 def flat(value: AnyArray, lead: tuple[int, ...], *tail: int) -> AnyArray:
     """A value with one batch axis: (B, n, *tail)."""
-    whole = np.broadcast_to(np.asarray(value), (*lead, *tail))
+    whole, shape = np.asarray(value), (*lead, *tail)
+    if whole.shape != shape:
+        whole = np.broadcast_to(whole, shape)
     return np.asarray(whole.reshape(math.prod(lead[:-1]), lead[-1], *tail))
 
 
@@ -27,6 +29,9 @@ def evidence_of(readings: Readings, include: Array) -> Evidence:
     included = flat(include, lead).astype(float)
     nowhere = np.isnan(known["field"]).all(-1, keepdims=True)
     known["field"] = np.where(nowhere, 1.0, known["field"])
+    if readings.magnetometer is None:  # nothing is to be found of what nothing reads
+        known |= {name: np.nan_to_num(known[name], nan=1.0) for name in ("field", "dip")}
+        sd |= {name: np.zeros(group.shape) for name in ("field", "dip")}
     bare = Evidence(known, sd, group, included, ())
     known, sd = _share_known(bare)
     return replace(bare, known=known, sd=sd, constants=constants(bare))

@@ -19,6 +19,8 @@ from mwdcal.residuals import REASONS, shown_in, tail
 
 SUSPECT = 3.0
 """A fit whose residuals exceed the declared noise this many times is reported."""
+ENOUGH = 12.0
+"""Degrees of freedom from which residuals far below the declared noise are no chance."""
 UNLIKELY = 1e-3
 """Chance of so large a departure from the prior, below which it is reported."""
 LARGEST = 37.0
@@ -53,6 +55,12 @@ def excessive(result: Fit) -> Bools:
     """Triads (B, t) whose residuals are more than `SUSPECT` times the declared noise."""
     declared = np.isnan(result.noise) & ~unchecked(result)
     return np.asarray(declared & (result.analysis.variance_factor > SUSPECT**2))
+
+
+def calm(result: Fit) -> Bools:
+    """Triads (B, t) whose residuals are less than the declared noise over `SUSPECT`."""
+    tested = np.isnan(result.noise) & (result.analysis.freedom >= ENOUGH)
+    return np.asarray(tested & (result.analysis.variance_factor < SUSPECT**-2))
 
 
 def unchecked(result: Fit) -> Bools:
@@ -121,8 +129,16 @@ class Findings:
         ]
 
     def residuals(self) -> list[Finding]:
-        """Residuals beyond the declared noise; no redundancy."""
+        """Residuals far beyond or below the declared noise; no redundancy."""
         found = []
+        for index in np.flatnonzero(calm(self.result)[0]):
+            share = float(self.result.analysis.variance_factor[0, index]) ** 0.5
+            text = (
+                f"{TRIADS[index]}: residuals are only {share:.2f} of the declared noise: the noise of "
+                "the profile, or the columns sd_, are too large, and weigh the stations wrongly if "
+                "not all by as much. Uncertainties are scaled down accordingly."
+            )
+            found.append(Finding(id=f"{TRIADS[index]}-noise", text=text))
         for index in np.flatnonzero(excessive(self.result)[0]):
             excess = float(self.result.analysis.variance_factor[0, index])
             text = (

@@ -36,10 +36,13 @@ def suspect_readings(readings: Readings, options: Options) -> dict[str, Bools]:
     channels = none.copy()
     for triad in TRIADS:
         channels |= _odd_channels(readings, triad)
+    blank = readings.temperature is None and method != "swarm"  # as where there is no such column
     return {
         "too-few-stations": none | few,
         "channel": channels,
-        "temperature-span": _short_span(readings, highest, method) if highest else none,
+        "bad-input" if blank else "temperature-span": (
+            _short_span(readings, highest, method) if highest else none
+        ),
         "missing-reference": none | _lacking(readings, method),
     }
 

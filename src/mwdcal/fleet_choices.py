@@ -21,7 +21,7 @@ from mwdcal.profile import Profile
 from mwdcal.readings import TRIADS, Readings
 from mwdcal.selection import HIGHEST, choose_orders, judged_soaks, mapped
 
-CHUNK = 256
+CHUNK = 320
 """Tools fitted in one call: few enough for the cache, many enough for NumPy."""
 _T = TypeVar("_T")
 Alone = Callable[[int], tuple[Readings, Profile]]

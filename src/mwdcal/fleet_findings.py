@@ -17,6 +17,7 @@ from mwdcal.core.vectors import Bools, Ints
 from mwdcal.estimate import Fit
 from mwdcal.findings import (
     Findings,
+    calm,
     conflicting,
     copies,
     departures,
@@ -45,8 +46,12 @@ def findings_of_batch(
     `readings` are those of the batch, which know the same of all. Undetermined directions are not
     among the findings.
     """
-    high, again = excessive(result).transpose(), stations_to_reshoot(result)
-    flags = {f"{name}-residuals": flag for name, flag in zip(TRIADS, high, strict=False)}
+    again = stations_to_reshoot(result)
+    flags = {
+        f"{name}-{kind}": flag
+        for kind, each in (("noise", calm(result)), ("residuals", excessive(result)))
+        for name, flag in zip(TRIADS, each.transpose(), strict=False)
+    }
     flags["no-redundancy"] = np.any(unchecked(result), -1)
     flags["repeated-readings"] = _repeated(result)
     found: list[list[str]] = [[] for _ in result.status]

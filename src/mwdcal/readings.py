@@ -87,8 +87,10 @@ class Readings:
 
     def uncertainty(self, name: str) -> Array:
         """Standard uncertainty of the known value `name` (..., n); 0 where not stated."""
-        value = np.asarray(self.sd.get(name, 0.0), float)
-        return np.broadcast_to(np.nan_to_num(value), self.accelerometer.shape[:-1])
+        shape = self.accelerometer.shape[:-1]
+        if name not in self.sd:
+            return np.zeros(shape)
+        return np.broadcast_to(np.nan_to_num(np.asarray(self.sd[name], float)), shape)
 
     def select(self, keep: Bools) -> Readings:
         """The stations where `keep` (n,) is true, of a run without leading axes."""

@@ -40,7 +40,7 @@ def _between(start: Array, end: Array) -> str:
 
 
 def about(rows: Rows, found: Standstills, seconds: float) -> list[Finding]:
-    """Findings about the stations, and about what was left."""
+    """Findings about the stations, and about what was left; `seconds` lasts the log once trimmed."""
     start, end = found.start[found.taken], found.end[found.taken]
     findings = []
     creeping = ~found.taken & ~found.short

@@ -51,7 +51,7 @@ class Stations:
         found: all intervals that look still, with what became of each.
         activity: how much each moment moves, in noise floors.
         threshold: activity up to which it stands still.
-        stretch: thresholds from which to which the number of standstills is the same; None
+        stretch: thresholds from which to which the standstills are the same ones; None
             where the threshold was given.
         min_seconds, trim_seconds: as used.
         time: of each row of the log, s.
@@ -133,7 +133,7 @@ def find_stations(
     rows = _summaries(traces, start, end, findings, say)
     columns = _columns(log, time, rows, start, end)
     columns |= _temperatures(temperature, start, end, findings)
-    findings += about(rows, found, float(time[-1] - time[0]))
+    findings += about(rows, found, float(time[-1] - time[0]) - 2 * trim)
     metadata = {**log.metadata, "log": log.source, "log_sha256": log.digest}
     table = Table(_ordered(columns), metadata, log.source, range(1, len(start) + 1))
     return replace(made, table=table)
@@ -196,9 +196,11 @@ def row_times(log: Table, sampling_hz: float | None) -> Array:
             "Add --sampling-hz 100, or a line '# sampling_hz = 100' above the column names."
         )
     if isinstance(stated, bool) or not isinstance(stated, int | float) or not 0 < stated <= 1e9:
+        here, advice = f"{log.source}: sampling_hz", "Correct it, or add --sampling-hz."
+        if sampling_hz is not None:
+            here, advice = "--sampling-hz", "State the samples per second."
         raise InputError(
-            f"{log.source}: sampling_hz must be a number above 0 and at most 1e9 Hz; got "
-            f"{shown(stated)}. Correct it, or add --sampling-hz."
+            f"{here} must be a number above 0 and at most 1e9 Hz; got {shown(stated)}. {advice}"
         )
     return np.arange(len(numbers(log, RAW[0]))) / float(stated)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -37,6 +38,8 @@ if TYPE_CHECKING:
 INTERNAL = 70
 SIGNAL = 128
 """Exit status of an ended command, less the number of the signal that ended it."""
+PATIENCE = 5.0
+"""Seconds after which another signal ends at once a command that is still tidying up."""
 COLDEST, HOTTEST = -273.15, 1000.0
 
 
@@ -376,36 +379,43 @@ def completion(shell: str) -> None:
 
 
 class Ended(KeyboardInterrupt):
-    """The system asks to end, as Ctrl-C does; the argument is the signal's number."""
+    """Somebody asks to end, by Ctrl-C or otherwise; the argument is the signal's number."""
 
 
 @contextmanager
 def _orderly_end() -> Iterator[None]:
-    """Meanwhile, signals that would end the process at once are interruptions like Ctrl-C."""
+    """Meanwhile, the first signal to end is an interruption, and others do not disturb the tidying."""
+    asked: list[float] = []
 
     def end(number: int, frame: object) -> None:
-        signal.signal(number, signal.SIG_IGN)  # what is left to do is to tidy up
-        raise Ended(number)
+        if not asked:
+            asked.append(time.monotonic())
+            raise Ended(number)
+        if time.monotonic() - asked[0] > PATIENCE:
+            os._exit(SIGNAL + number)
 
-    asked = [getattr(signal, name, None) for name in ("SIGTERM", "SIGHUP")]
-    found = [each for each in asked if each and signal.getsignal(each) is signal.SIG_DFL]
+    usual = (signal.SIG_DFL, signal.default_int_handler)
+    known = [getattr(signal, name, None) for name in ("SIGINT", "SIGTERM", "SIGHUP")]
+    before = {each: signal.getsignal(each) for each in known if each}
+    found = {each: handler for each, handler in before.items() if handler in usual}
     try:
         for each in found:
             signal.signal(each, end)
     except ValueError:  # signals belong to the main thread
-        found = []
+        found = {}
     try:
         yield
     finally:
-        for each in found:
-            signal.signal(each, signal.SIG_DFL)
+        for each, handler in found.items():
+            signal.signal(each, signal.SIG_IGN if asked else handler)  # only the exit is left
 
 
 def _interrupted(stop: BaseException) -> int:
     """Say what an interruption leaves, and which; the exit status."""
     left = getattr(stop, "__notes__", ["Files are as they were before."])
-    say(f"mwdcal: {'terminated' if isinstance(stop, Ended) else 'interrupted'}. {' '.join(left)}")
-    return SIGNAL + (stop.args[0] if isinstance(stop, Ended) else signal.SIGINT)
+    number = stop.args[0] if isinstance(stop, Ended) else signal.SIGINT
+    say(f"mwdcal: {'interrupted' if number == signal.SIGINT else 'terminated'}. {' '.join(left)}")
+    return SIGNAL + int(number)
 
 
 def main(arguments: list[str] | None = None) -> None:

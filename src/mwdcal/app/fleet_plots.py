@@ -59,23 +59,25 @@ def parameters(found: Sequence[Any]) -> str:
         return plots._svg(figure, "parameters", "Distributions of the fleet's parameters")
 
 
-def quality(residuals: Mapping[str, Array], accuracy: Mapping[str, Array]) -> str:
-    """Number of tools by residuals over noise, and by 1σ of each angle."""
+def quality(panels: Sequence[tuple[str, str, Mapping[str, Array]]]) -> str:
+    """Number of tools by residuals over noise or by noise, and by 1σ of each angle.
+
+    A panel has a title, the name of its axis, and values by name.
+    """
     with plots._style():
         figure = plots._figure(2.2)
-        left, right = figure.subplots(1, 2)
-        left.set_ylabel("tools")
-        left.set_title("residuals ÷ what the noise lets one expect, s")
-        left.set_xlabel("s")
-        _steps(left, residuals)
-        right.set_title("1σ of the calibration at 45° inclination")
-        right.set_xlabel("1σ, °")
-        _steps(right, accuracy)
+        row = figure.subplots(1, len(panels), squeeze=False)[0]
+        row[0].set_ylabel("tools")
+        for axes, (title, label, series) in zip(row, panels, strict=True):
+            axes.set_title(title)
+            axes.set_xlabel(label)
+            axes.locator_params(axis="x", nbins=12 // len(panels))
+            _steps(axes, series, abreast=3 if len(panels) < 3 else 1)
         return plots._svg(figure, "quality", "Distributions of residuals and accuracy")
 
 
-def _steps(axes: Axes, series: Mapping[str, Array]) -> None:
-    """Step histograms over common bins, each with its own colour and dash."""
+def _steps(axes: Axes, series: Mapping[str, Array], abreast: int = 3) -> None:
+    """Step histograms over common bins, each with its own colour and dash; so many names in a line."""
     usable = {name: values[np.isfinite(values)] for name, values in series.items()}
     usable = {name: values for name, values in usable.items() if values.size}
     if not usable:
@@ -89,6 +91,6 @@ def _steps(axes: Axes, series: Mapping[str, Array]) -> None:
     for (name, values), colour, dash in zip(usable.items(), COLOURS, DASHES, strict=False):
         counts, _ = np.histogram(values, edges)
         axes.stairs(counts, edges, label=name, color=colour, ls=dash, lw=1.0)
-    rows = -(-len(usable) // 3)
-    axes.legend(ncols=3, loc="upper left", handlelength=2.2, columnspacing=1.0)
+    rows = -(-len(usable) // abreast)
+    axes.legend(ncols=abreast, loc="upper left", handlelength=2.2, columnspacing=1.0)
     axes.set_ylim(bottom=0, top=axes.get_ylim()[1] * (1.1 + 0.15 * rows))

@@ -14,7 +14,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mwdcal.app import fleet_plots, report
-from mwdcal.app.fleet_summary import Said, Summary, column, is_doubt
+from mwdcal.app.fleet_summary import (
+    ERRORS,
+    Said,
+    Summary,
+    column,
+    is_doubt,
+    orders_table,
+    unusual,
+)
+from mwdcal.app.text import number, plural
 from mwdcal.core.vectors import Array, Bools, Ints
 from mwdcal.files import atomic, parquet
 from mwdcal.files.fleet_sources import SERIAL, is_simulated
@@ -93,13 +102,17 @@ def render(calibrations: Path, summary: Summary) -> str:
     metadata = _metadata(calibrations)
     sound = np.flatnonzero(_text(calibrations, "status") == OK)
     parameters = _parameters(calibrations, sound) if sound.size else []
+    estimated = [triad for triad in TRIADS if triad in _list(metadata, "noise_estimated")]
     return template.render(
         found=summary,
         metadata=metadata,
         simulated=is_simulated(metadata),
         banner=_banner(summary),
         facts=_facts(summary, metadata),
-        figures=_figures(calibrations, parameters, sound),
+        orders=orders_table(summary) if summary.orders else None,
+        stand=_stand(summary),
+        estimated=estimated,
+        figures=_figures(calibrations, parameters, sound, estimated),
         parameters=parameters,
         outliers=_outliers(calibrations, parameters, sound),
         suspects=_suspects(calibrations, sound),
@@ -112,6 +125,22 @@ def render(calibrations: Path, summary: Summary) -> str:
 def _metadata(path: Path) -> Mapping[str, object]:
     _, pq = parquet.modules(path.name)
     return parquet.metadata_of(pq.read_schema(path).metadata, path.name)
+
+
+def _list(metadata: Mapping[str, object], name: str) -> list[object]:
+    """A list in the metadata, empty where there is none."""
+    found = metadata.get(name)
+    return found if isinstance(found, list) else []
+
+
+def _stand(summary: Summary) -> list[list[str]]:
+    """Rows of the table of errors of the stand: name, and three points of the sound tools."""
+    known = {name: summary.spread.get(name) for name in ERRORS}
+    return [
+        [name.removesuffix("_deg").replace("_", " "), *map(number, values)]
+        for name, values in known.items()
+        if values
+    ]
 
 
 def _text(path: Path, name: str) -> Any:
@@ -128,15 +157,15 @@ def _banner(summary: Summary) -> dict[str, str]:
     word = {"good": "All calibrated", "attention": word, "bad": "None calibrated"}[level]
     after = "Every tool has parameters with their uncertainty."
     if refused:
-        after = f"{report.plural(refused, 'tool')} without a result: see the reasons below."
+        after = f"{plural(refused, 'tool')} without a result: see the reasons below."
     after = "; ".join([after.rstrip("."), *map(_doubt, doubts)]) + "." if doubts else after
-    headline = f"{summary.sound} of {report.plural(summary.tools, 'tool')} calibrated"
+    headline = f"{summary.sound} of {plural(summary.tools, 'tool')} calibrated"
     return {"level": level, "word": word, "headline": headline, "after": after}
 
 
 def _doubt(said: Said) -> str:
     """A finding of a doubtful fit, with the number of its tools."""
-    return f"{said.id.replace('-', ' ')} in {report.plural(said.tools, 'tool')}"
+    return f"{said.id.replace('-', ' ')} in {plural(said.tools, 'tool')}"
 
 
 def _facts(summary: Summary, metadata: Mapping[str, object]) -> list[tuple[str, str]]:
@@ -144,17 +173,17 @@ def _facts(summary: Summary, metadata: Mapping[str, object]) -> list[tuple[str, 
     found = [
         ("method", summary.method),
         ("stations", str(summary.stations)),
-        ("order", ", ".join([str(summary.order), *map(_count, summary.orders.items())])),
+        ("order", str(summary.order)),
+        ("options", "; ".join(unusual(summary.options)) or "defaults"),
         ("profile", profile),
     ]
+    if summary.nonlinear:
+        pairs = summary.nonlinear.items()
+        terms = ", ".join(f"{triad} of {plural(count, 'tool')}" for triad, count in pairs)
+        found.append(("own-axis terms", terms))
     if summary.order:
         found.append(("τ", f"temperature − {metadata.get('reference_temperature_c')} °C"))
     return found
-
-
-def _count(chosen: tuple[str, int]) -> str:
-    """How many tools were given an order."""
-    return f"{chosen[0]} in {report.plural(chosen[1], 'tool')}"
 
 
 def _parameters(path: Path, sound: Ints) -> list[Parameter]:
@@ -224,22 +253,41 @@ def _raised(power: str) -> str:
     return power.translate(report.SUPERSCRIPT) if power != "1" else ""
 
 
-def _figures(path: Path, parameters: list[Parameter], sound: Ints) -> dict[str, str]:
+def _figures(
+    path: Path, parameters: list[Parameter], sound: Ints, estimated: list[str]
+) -> dict[str, str]:
     if not sound.size:
         return {}
-    quality = {}
-    for triad in dict.fromkeys(p.triad for p in parameters):
-        quality[f"{triad} s"] = np.sqrt(column(path, f"{triad}_variance_factor")[sound])
+    triads = dict.fromkeys(p.triad for p in parameters)
+    residuals = {
+        f"{triad} s": np.sqrt(column(path, f"{triad}_variance_factor")[sound])
+        for triad in triads
+        if triad not in estimated
+    }
+    panels = [("residuals ÷ what the noise lets one expect, s", "s", residuals)]
+    panels = panels if residuals else []
+    panels += [_noise(path, triad, sound) for triad in triads if triad in estimated]
     accuracy = {
         angle: column(path, f"{angle}_sd_deg")[sound]
         for angle in ("inclination", "toolface", "azimuth")
-        if angle != "azimuth" or len(quality) > 1
+        if angle != "azimuth" or len(triads) > 1
     }
+    panels.append(("1σ of the calibration at 45°", "1σ, °", accuracy))
     steady = [p for p in parameters if "τ" not in p.title]
     return {
         "parameters": fleet_plots.parameters(steady),
-        "quality": fleet_plots.quality(quality, accuracy),
+        "quality": fleet_plots.quality(panels),
     }
+
+
+def _noise(path: Path, triad: str, sound: Ints) -> tuple[str, str, dict[str, Array]]:
+    """The panel of a noise that each tool's residuals tell; of one kind of magnetometers."""
+    values = column(path, f"{triad}_noise")[sound]
+    title = f"{triad}: estimated noise"
+    if triad == TRIADS[0]:
+        return title, "1σ, mg", {triad: 1e3 * values}
+    kind, which = next(iter(_kinds(path, sound).items()))
+    return title, "1σ of the field" if kind else "1σ, nT", {triad: values[which]}
 
 
 def _outliers(path: Path, parameters: list[Parameter], sound: Ints) -> list[Outlier]:

@@ -5,6 +5,7 @@ The table of calibrations is read column by column, whatever its length.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,19 +13,24 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from mwdcal.app.choices import names
 from mwdcal.app.fleet_asked import Asked
-from mwdcal.app.text import number, table
+from mwdcal.app.text import choices, number, plural, table
+from mwdcal.calibration import Choices
 from mwdcal.core.vectors import Array
 from mwdcal.files import parquet
 from mwdcal.files.fleet_sources import SERIAL
 from mwdcal.files.fleet_tables import one_chunk
-from mwdcal.fleet import OK
+from mwdcal.fleet import OK, STAND
 from mwdcal.readings import TRIADS
+from mwdcal.selection import HIGHEST
 
 SHOWN = 5
 """Most serials that a line names."""
 DOUBTS = ("no-redundancy", "repeated-readings", "prior-conflict")
 """Findings of a doubtful fit, besides residuals beyond the declared noise."""
+ERRORS = [name for columns in STAND.values() for name in columns]
+"""Columns of errors of the stand."""
 SPAN = 10.0
 """A run that spans more without temperature terms is mentioned, °C."""
 
@@ -50,7 +56,10 @@ class Said:
 
 @dataclass(frozen=True)
 class Summary:
-    """What came of a fleet. `spread` has the 1 %, 50 % and 99 % point of columns of sound tools."""
+    """What came of a fleet. `spread` has the 1 %, 50 % and 99 % point of columns of sound tools.
+
+    `orders` and `nonlinear`: tools by triad and chosen order, and by triad with own-axis terms.
+    """
 
     runs: str
     output: str
@@ -58,7 +67,9 @@ class Summary:
     stations: int
     method: str
     order: int | str
-    orders: dict[str, int]
+    options: dict[str, Any]
+    orders: dict[str, dict[str, int]]
+    nonlinear: dict[str, int]
     statuses: list[Kind]
     findings: list[Said]
     spread: dict[str, list[float]]
@@ -87,16 +98,15 @@ def summarise(
     _, pq = parquet.modules(target.name)
     whole = pq.ParquetFile(target)
     head = whole.read([SERIAL, "status", "message", "findings"])
-    names = whole.schema_arrow.names
-    ends = ("_sd_deg", "_variance_factor")
-    spread = {n: _quantiles(numbers(whole, n)) for n in names if n.endswith(ends)}
+    columns = whole.schema_arrow.names
+    shown = [n for n in columns if n.endswith(("_sd_deg", "_variance_factor")) or n in ERRORS]
+    spread = {name: _quantiles(numbers(whole, name)) for name in shown}
     if asked["order"] == "0":
         span = numbers(whole, "temperature_max_c") - numbers(whole, "temperature_min_c")
         wide = int(np.sum(span > SPAN))
         if wide:
-            notes.append(
-                f"{wide} tools span more than {SPAN:g} °C, and --order 0 has no temperature terms."
-            )
+            spans = f"{plural(wide, 'tool')} {'spans' if wide == 1 else 'span'}"
+            notes.append(f"{spans} more than {SPAN:g} °C, and --order 0 has no temperature terms.")
     return Summary(
         runs=asked["runs"].name,
         output=str(asked["output"]),
@@ -104,16 +114,51 @@ def summarise(
         stations=stations,
         method=asked["method"],
         order=asked["order"] if asked["order"] == "auto" else int(asked["order"]),
-        orders=_orders(whole, names) if asked["order"] == "auto" else {},
+        options=options_asked(asked),
+        orders=_orders(whole, columns) if asked["order"] == "auto" else {},
+        nonlinear=_nonlinear(whole, columns),
         statuses=_kinds(head),
         findings=_findings(head),
         spread=spread,
-        undetermined=_undetermined(whole, names),
+        undetermined=_undetermined(whole, columns),
         parts=parts,
         parts_done_before=before,
         seconds=round(seconds, 3),
         notes=notes,
     )
+
+
+def options_asked(asked: Asked) -> dict[str, Any]:
+    """How a fleet was asked for, under the names that a calibration file and the command have."""
+    also = Choices(
+        parameters=int(asked["parameters"] or 12),
+        ignore=names(asked["ignore"]),
+        robust=asked["robust"],
+        paper_weights=asked["paper_weights"],
+        prior=asked["prior"],
+    )
+    return {
+        "method": asked["method"],
+        "seed": asked["seed"] if asked["method"] == "swarm" else None,
+        "model": asked["model"],
+        "order": asked["order"] if asked["order"] == "auto" else int(asked["order"]),
+        "nonlinearity": asked["nonlinearity"],
+        "estimate": names(asked["estimate"]),
+        **msgspec.to_builtins(also),
+    }
+
+
+def unusual(options: Mapping[str, Any]) -> list[str]:
+    """What was asked for beyond method and order, in words."""
+    also = Choices(**{name: options[name] for name in Choices.__struct_fields__})
+    terms, stand = options["nonlinearity"], " and ".join(options["estimate"])
+    return [
+        *([f"model {options['model']}"] if options["model"] else []),
+        *([f"own-axis terms {terms}"] if terms != "none" else []),
+        *([f"stand: {stand}"] if stand else []),
+        *choices(also),
+        *([f"seed {options['seed']}"] if options["seed"] else []),
+    ]
 
 
 def column(path: Path, name: str) -> Array:
@@ -164,16 +209,24 @@ def is_doubt(finding: str) -> bool:
     return finding.endswith("-residuals") or finding in DOUBTS
 
 
-def _orders(whole: Any, names: list[str]) -> dict[str, int]:
+def _orders(whole: Any, columns: list[str]) -> dict[str, dict[str, int]]:
     """Tools by triad and the order that was chosen."""
-    found: dict[str, int] = {}
+    found: dict[str, dict[str, int]] = {}
     for triad in TRIADS:
-        if f"{triad}_order" in names:
+        if f"{triad}_order" in columns:
             values = numbers(whole, f"{triad}_order")
-            orders, counts = np.unique(values[~np.isnan(values)], return_counts=True)
-            pairs = zip(orders, counts, strict=True)
-            found |= {f"{triad}: order {order:.0f}": int(count) for order, count in pairs}
-    return found
+            found[triad] = {str(k): int(np.sum(values == k)) for k in range(HIGHEST + 1)}
+    return {triad: own for triad, own in found.items() if any(own.values())}
+
+
+def _nonlinear(whole: Any, columns: list[str]) -> dict[str, int]:
+    """Tools by triad that have own-axis terms, where they may."""
+    radii = {triad: f"{triad}_radius" for triad in TRIADS}
+    return {
+        triad: int(np.sum(~np.isnan(numbers(whole, radius))))
+        for triad, radius in radii.items()
+        if radius in columns
+    }
 
 
 def _equal(cells: Any, value: str) -> Any:
@@ -182,10 +235,10 @@ def _equal(cells: Any, value: str) -> Any:
     return compute.equal(cells, value)
 
 
-def _undetermined(whole: Any, names: list[str]) -> dict[str, int]:
+def _undetermined(whole: Any, columns: list[str]) -> dict[str, int]:
     """Tools by triad and direction that nothing determines."""
     found: dict[str, int] = {}
-    for name in names:
+    for name in columns:
         if name.endswith("_undetermined"):
             cells = whole.read([name]).column(0)
             for each in cells.combine_chunks().flatten().value_counts().to_pylist():
@@ -204,11 +257,13 @@ def document(summary: Summary, report: Path | None) -> dict[str, Any]:
 def text(summary: Summary, report: Path | None) -> str:
     """The summary for people: about one screen."""
     heading = (
-        f"{summary.runs}   {summary.tools} tools   {summary.stations} stations   "
+        f"{summary.runs}   {plural(summary.tools, 'tool')}   {plural(summary.stations, 'station')}   "
         f"method {summary.method}   order {summary.order}"
     )
+    also = unusual(summary.options)
     rows = [[k.status, str(k.tools), _serials(k)] for k in summary.statuses]
-    lines = [heading, "", table(rows, ["status", "tools", "serials"])]
+    lines = [heading, *(["options: " + ", ".join(also)] if also else []), ""]
+    lines += [table(rows, ["status", "tools", "serials"])]
     refused = [kind for kind in summary.statuses if kind.status != OK]
     lines += [f"! {kind.status}, for example: {kind.message}" for kind in refused]
     lines += [f"! {said.id} in {_count(said)}" for said in summary.findings]
@@ -219,19 +274,28 @@ def text(summary: Summary, report: Path | None) -> str:
     ]
     if spread:
         lines += ["", table(spread, ["of sound tools", "1 %", "median", "99 %"])]
-    for name, count in summary.orders.items():
-        lines.append(f"chosen for {count} tools: {name}")
+    if summary.orders:
+        header, body = orders_table(summary)
+        lines += ["", table(body, header)]
+    for name, count in summary.nonlinear.items():
+        lines.append(f"own-axis terms in {plural(count, 'tool')}: {name}")
     for name, count in summary.undetermined.items():
-        lines.append(f"undetermined in {count} tools: {name}")
+        lines.append(f"undetermined in {plural(count, 'tool')}: {name}")
     lines += [f"! {note}" for note in summary.notes]
     rate = summary.tools / summary.seconds
     wrote = f"wrote {summary.output} (calibrations)" + (f"   {report} (report)" if report else "")
     return "\n".join([*lines, "", f"{wrote}   {summary.seconds:.1f} s, {rate:.0f} tools/s"])
 
 
+def orders_table(summary: Summary) -> tuple[list[str], list[list[str]]]:
+    """Header and rows of the tools by chosen order, a triad in each row."""
+    header = ["tools of order", *map(str, range(HIGHEST + 1))]
+    return header, [[triad, *map(str, own.values())] for triad, own in summary.orders.items()]
+
+
 def _count(said: Said) -> str:
     """How many tools have a finding, and which."""
-    return f"{said.tools} {'tool' if said.tools == 1 else 'tools'}: {_first(said)}"
+    return f"{plural(said.tools, 'tool')}: {_first(said)}"
 
 
 def _serials(kind: Kind) -> str:
@@ -247,4 +311,6 @@ def _title(name: str) -> str:
     """A column as people call it."""
     if name.endswith("_variance_factor"):
         return f"{name.removesuffix('_variance_factor')} s²"
+    if name in ERRORS:
+        return f"stand: {name.removesuffix('_deg').replace('_', ' ')}, °"
     return f"1σ {name.removesuffix('_sd_deg')} at 45°, °"

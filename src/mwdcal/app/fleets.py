@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import shutil
 import time
 from collections.abc import Callable, Generator, Iterator
@@ -19,7 +18,8 @@ from mwdcal import __version__
 from mwdcal.app import pool
 from mwdcal.app.choices import DATASHEET, names, prior_profile, stated
 from mwdcal.app.fleet_asked import Asked
-from mwdcal.app.fleet_summary import Summary, document, summarise, text
+from mwdcal.app.fleet_summary import Summary, document, options_asked, summarise, text
+from mwdcal.app.text import plural
 from mwdcal.checks import check_curve_names, check_options
 from mwdcal.core.fused import cores
 from mwdcal.curves import USUAL, declared
@@ -71,28 +71,49 @@ def calibrate_table(asked: Asked, say: Callable[[str], None]) -> Summary:
     target = atomic.target(asked["output"])
     _check_target(target, asked["runs"])
     folder = target.with_name(target.name + ".parts")
-    tools = find_tools(source)
-    if not tools.together:
-        say("the rows of a tool are not together: dealing them into files of whole tools first")
-    notes = [*source.notes, *_split(source, tools)]
-    parts = partitions(source, tools, folder)
     plan = Plan.of(source, profile, options, per_tool)
-    paths = [folder / f"{plan.key(part)}.arrow" for part in parts]
-    before = sum(map(is_whole, paths))
-    say(f"{tools.count} tools, {source.rows} stations, {len(parts)} parts, {before} done before")
-    metadata = {
+    with _alone(folder, asked["output"]):
+        tools = find_tools(source)
+        if not tools.together:
+            say("the rows of a tool are not together: dealing them into files of whole tools first")
+        notes = [*source.notes, *_split(source, tools)]
+        parts = partitions(source, tools, folder)
+        paths = [folder / f"{plan.key(part)}.arrow" for part in parts]
+        before = sum(map(is_whole, paths))
+        counts = {"tool": tools.count, "station": source.rows, "part": len(parts)}
+        counted = ", ".join(plural(count, noun) for noun, count in counts.items())
+        say(f"{counted}, {before} done before")
+        with contextlib.closing(_parts_made(plan, parts, paths, asked, say)) as made:
+            _merge(paths, made, target, _metadata(source, plan, asked, digest))
+        _tidy(folder)
+        seconds = time.perf_counter() - begun
+        return summarise(asked, target, source.rows, len(parts), before, seconds, notes)
+
+
+@contextlib.contextmanager
+def _alone(folder: Path, output: Path) -> Iterator[None]:
+    """Refuse a second command with the same output, as long as the first one lives."""
+    with atomic.holding(folder / "lock") as ours:
+        if not ours:
+            raise InputError(
+                f"cannot write '{output}': another fleet is writing this output. Wait for it, or choose "
+                "another -o."
+            )
+        yield
+
+
+def _metadata(source: Source, plan: Plan, asked: Asked, digest: str) -> dict[str, object]:
+    """What the table of calibrations says of itself: the input's own, and how it was made."""
+    return {
         **{k: v for k, v in source.metadata.items() if k != SERIAL},
         "fleet": source.name,
         "software": f"mwdcal {__version__}",
-        "profile": profile.name,
+        "options": options_asked(asked),
+        "profile": plan.profile.name,
         "profile_sha256": digest,
-        "reference_temperature_c": profile.reference_temperature_c,
+        "reference_temperature_c": plan.profile.reference_temperature_c,
+        "noise_estimated": list(plan.noise_estimated),
     }
-    with contextlib.closing(_parts_made(plan, parts, paths, asked, say)) as made:
-        _merge(paths, made, target, metadata)
-    _tidy(folder)
-    seconds = time.perf_counter() - begun
-    return summarise(asked, target, source.rows, len(parts), before, seconds, notes)
 
 
 def _split(source: Source, tools: Tools) -> list[str]:
@@ -167,7 +188,6 @@ def _parts_made(
     missing = [index for index, path in enumerate(paths) if not is_whole(path)]
     if not missing:
         return
-    paths[0].parent.mkdir(exist_ok=True)
     workers = asked["workers"] or cores()
     begun = told = time.perf_counter()
     tools = 0
@@ -199,39 +219,35 @@ def _merge(
     A part is added when it and all before it are `made`, while workers go on with others.
     """
     arrow, pq = parquet.modules(target.name)
-    whole = paths[0].with_name("whole.parquet")
     described = {parquet.KEY: msgspec.json.encode(metadata, enc_hook=str)}
     writer = None
-    try:
-        for path in paths:
-            while not is_whole(path) and next(made, None):
-                continue
-            with arrow.memory_map(str(path)) as file:
-                part = arrow.ipc.open_stream(file).read_all()
-                if writer is None:
-                    schema = part.schema.with_metadata(described)
-                    texts = [f.name for f in schema if not arrow.types.is_floating(f.type)]
-                    writer = pq.ParquetWriter(whole, schema, use_dictionary=texts)
-                writer.write_table(part.cast(writer.schema))
-        for _ in made:
-            pass
-        if writer is not None:
-            writer.close()
-        with whole.open("rb+") as stream:
-            os.fsync(stream.fileno())
-        whole.replace(target)
-    except OSError as error:
-        raise InputError(
-            f"cannot write '{target}': {error.strerror or error}. Finished parts are kept: make room, "
-            "or choose another place, and run the same command again."
-        ) from error
+    with atomic.replacing(target) as stream:
+        try:
+            for path in paths:
+                while not is_whole(path) and next(made, None):
+                    continue
+                with arrow.memory_map(str(path)) as file:
+                    part = arrow.ipc.open_stream(file).read_all()
+                    if writer is None:
+                        schema = part.schema.with_metadata(described)
+                        texts = [f.name for f in schema if not arrow.types.is_floating(f.type)]
+                        writer = pq.ParquetWriter(stream.name, schema, use_dictionary=texts)
+                    writer.write_table(part.cast(writer.schema))
+            for _ in made:
+                pass
+            if writer is not None:
+                writer.close()
+        except OSError as error:
+            raise InputError(
+                f"cannot write '{target}': {error.strerror or error}. Finished parts are kept: make "
+                "room, or choose another place, and run the same command again."
+            ) from error
 
 
 def _tidy(folder: Path) -> None:
     """Remove what was kept for a restart, and nothing that is not ours."""
-    for path in [*folder.glob("*.arrow"), *folder.glob("whole.parquet")]:
+    atomic.sweep(folder)
+    for path in folder.glob("*.arrow"):
         path.unlink()
     for path in folder.glob("sorted-*"):
         shutil.rmtree(path)
-    with contextlib.suppress(OSError):
-        folder.rmdir()

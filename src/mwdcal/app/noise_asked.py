@@ -40,7 +40,7 @@ _OPTIONS = (
     ),
     click.option(
         "--sampling-hz", type=float, metavar="HZ",
-        help="Rate of a log without a column time_s; comes before that column.",
+        help="Rate of the log; wins over its column time_s.",
     ),
     click.option(
         "--from", "start", type=float, metavar="S", help="Use the log from so many seconds on."

@@ -61,7 +61,7 @@ def preparing(workers: int | None) -> Iterator[None]:
     context = _context()
     with _settings_of_workers():
         if (workers or os.cpu_count() or 1) > 1 and context.get_start_method() == "forkserver":
-            before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+            before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGHUP})
             try:
                 forkserver.ensure_running()
             finally:

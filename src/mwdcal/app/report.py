@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mwdcal.app import plots
-from mwdcal.app.text import HELD, choices, is_held
+from mwdcal.app.text import HELD, choices, is_held, plural
 from mwdcal.app.text import model as model_of
 from mwdcal.calibration import Calibration, TriadCalibration
 from mwdcal.core.solvers import RANK_TOLERANCE
@@ -142,11 +142,6 @@ def measured(value: float, uncertainty: float | None) -> tuple[str, str]:
 
 def _exponent(value: float) -> int:
     return int(f"{value:.1e}".split("e")[1])
-
-
-def plural(count: int, noun: str) -> str:
-    """A count with its noun: 1 station, 2 stations."""
-    return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
 def unit(symbol: str) -> str:

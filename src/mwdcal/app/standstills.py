@@ -136,7 +136,7 @@ def screen(made: Stations, files: dict[str, str]) -> str:
 def _stretch(made: Stations) -> str:
     if made.stretch is None:
         return " (given)"
-    return " (as many stations from {:.3g} to {:.3g})".format(*made.stretch)
+    return " (the same stations from {:.3g} to {:.3g})".format(*made.stretch)
 
 
 def _stations_table(made: Stations) -> str:

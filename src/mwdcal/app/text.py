@@ -42,6 +42,11 @@ def quantity(value: float | None, unit: str) -> str:
     return number(value) if value is None else f"{number(value)}{'' if unit == '°' else ' '}{unit}"
 
 
+def plural(count: int, noun: str) -> str:
+    """A count with its noun: 1 station, 2 stations."""
+    return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
 def table(rows: list[list[str]], header: list[str]) -> str:
     """Columns aligned: the first to the left, the others to the right."""
     from rich import box

@@ -127,11 +127,12 @@ def halves(problem: Problem, at: State) -> Halves | None:
 def start(problem: Problem) -> State:
     """The known attitudes, with parameters of zero."""
     known, batch = problem.evidence.known, len(problem.temperature)
-    angles = (np.nan_to_num(known[name]) for name in ("inclination", "azimuth", "toolface"))
+    azimuth = known["azimuth"] if len(problem.triads) > 1 else np.zeros_like(known["azimuth"])
+    attitude = tool_from_earth(known["inclination"], azimuth, known["toolface"])
     nothing = np.zeros((batch, 0))
     size = sum(triad.model.size for triad in problem.triads)
     own = np.zeros((*problem.temperature.shape, 0))
-    return State(np.zeros((batch, size)), tool_from_earth(*angles), nothing, own)
+    return State(np.zeros((batch, size)), attitude, nothing, own)
 
 
 def solution(problem: Problem, at: State, halfs: Halves) -> tuple[State, Analysis]:

@@ -25,10 +25,12 @@ from mwdcal.core.vectors import Array, eigen, inverse
 
 OTHERS = np.array([[1, 2], [0, 2], [0, 1]])
 """The two axes that an axis is misaligned with."""
+FIRST, SECOND = np.array(OFF_DIAGONAL).transpose()
+"""The axes of each misalignment."""
 STEPS = 12
 """Most steps to the minimum; a sound run takes three to five."""
-SMALL = 1e-12
-"""Step, squared and in standard uncertainties, that ends the search."""
+SMALL = 1e-8
+"""Step, squared and in standard uncertainties, that is the last: steps shrink quadratically."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +61,10 @@ class Axes:
         scale = (unknowns[..., None, :count] @ self.phi)[..., 0, :]
         return scale, self.along + (unknowns[..., None, count:] @ self.beside)[..., 0, :]
 
+    def bias(self, unknowns: Array) -> Array:
+        """b(τ) (B, 3, n)."""
+        return (unknowns[..., None, self.phi.shape[-2] + 2 :] @ self.phi)[..., 0, :]
+
     def slopes(self, scale: Array, unit: Array) -> Array:
         """Derivatives (B, 3, 2K + 2, n) of the reading by s, u and b."""
         by = (unit[..., None, :] * self.phi, scale[..., None, :] * self.beside)
@@ -72,7 +78,8 @@ def minimum(axes: Axes) -> Array | None:
     unknowns[..., 0] = 1.0
     for turn in range(STEPS):
         scale, unit = axes.predicted(unknowns)
-        rows = axes.slopes(scale, unit) * axes.root[..., None, :]
+        rows = axes.slopes(scale, unit)
+        rows *= axes.root[..., None, :]
         gradient = rows @ ((axes.raw - scale * unit) * axes.root)[..., None]
         step = _solved(rows @ np.swapaxes(rows, -1, -2), gradient)
         unknowns = unknowns + step[..., 0]
@@ -114,8 +121,9 @@ class Half:
 
     def parted(self, count: int) -> list[Half]:
         """As many triads as were put together along the batch axis."""
-        parts = [np.split(getattr(self, field.name), count) for field in fields(self)]
-        return [Half(*each) for each in zip(*parts, strict=True)]
+        arrays, batch = [getattr(self, f.name) for f in fields(self)], len(self.params) // count
+        places = [slice(k * batch, (k + 1) * batch) for k in range(count)]
+        return [Half(*(array[place] for array in arrays)) for place in places]
 
 
 def halves(
@@ -160,20 +168,17 @@ def _half(axes: Axes, unknowns: Array, include: Array) -> Half:
         moved @ np.swapaxes(back, -1, -2),
         np.swapaxes(left, -1, -2),
         np.swapaxes(include[:, None] - share, -1, -2),
-        *_evidence(axes, unknowns, slopes, slope, include),
+        *_evidence(scale * (unit - axes.bias(unknowns)), slopes, slope, include),
     )
 
 
 def _evidence(
-    axes: Axes, unknowns: Array, slopes: Array, slope: Array, include: Array
+    vectors: Array, slopes: Array, slope: Array, include: Array
 ) -> tuple[Array, Array, Array]:
-    """Singular values, directions and norms (see `Half`), at uniform relative noise."""
-    count = axes.phi.shape[-2]
-    scale, unit = axes.predicted(unknowns)
-    bias = (unknowns[..., None, count + 2 :] @ axes.phi)[..., 0, :]
-    noise = GEOMETRIC_NOISE * np.linalg.norm(scale * (unit - bias), axis=-2)
-    rows = slopes * (include / noise)[:, None, None]
-    own = rows @ np.swapaxes(rows, -1, -2)
+    """Singular values, directions and norms (see `Half`), at noise uniform in raw vectors (B, 3, n)."""
+    noise = GEOMETRIC_NOISE * np.linalg.norm(vectors, axis=-2)
+    slopes *= (include / noise)[:, None, None]  # in place: they are large, and done with
+    own = slopes @ np.swapaxes(slopes, -1, -2)
     information = (np.swapaxes(slope, -1, -2) @ own @ slope).sum(1)
     norms = np.sqrt(np.diagonal(information, axis1=-2, axis2=-1))
     norms = np.where(norms > 0, norms, 1.0)
@@ -189,15 +194,16 @@ def factors(unknowns: Array) -> tuple[Array, Array]:
     shares[:, np.arange(3)[:, None], OTHERS] = cross
     back = inverse(shares)
     own = np.diagonal(back, axis1=-2, axis2=-1)
-    i, j = np.array(OFF_DIAGONAL).transpose()
     linear = np.concatenate([scale / own[..., None], bias * own[..., None]], 1)
-    params = np.concatenate([linear.reshape(batch, -1), -back[:, i, j] / own[:, j]], -1)
+    params = np.concatenate(
+        [linear.reshape(batch, -1), -back[:, FIRST, SECOND] / own[:, SECOND]], -1
+    )
     slope = np.zeros((batch, 3, 2 * count + 2, 6 * count + 6))
     at, k = np.arange(3)[:, None], np.arange(count)
     slope[:, at, k, at * count + k] = own[..., None]
     slope[:, at, count + 2 + k, (3 + at) * count + k] = 1 / own[..., None]
     turn = shares * own[..., None]  # N; dN = N dm N
-    pulled, moved = turn[:, :, i] / own[..., None], turn[:, j]
+    pulled, moved = turn[:, :, FIRST] / own[..., None], turn[:, SECOND]
     grown = (pulled * np.swapaxes(moved, -1, -2))[:, :, None]
     by_mixing = slope[..., 6 * count :]
     by_mixing[:, :, :count] = scale[..., None] * grown

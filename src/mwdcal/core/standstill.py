@@ -6,10 +6,10 @@ channel moves; the range of its quietest windows is its noise floor. The *activi
 that range, in noise floors, of the quietest window that covers it, in the liveliest channel.
 Where it stays below a threshold the tool stands still.
 
-The threshold is the one that matters least: counted over a geometric series of thresholds, the
-number of standstills stays the same over the widest stretch, between noise that breaks
-standstills up and movements that are swallowed. It is taken near the quiet end of that stretch,
-where edges are sharpest.
+The threshold is the one that matters least: over a geometric series of thresholds, the
+standstills stay the same ones over the widest stretch, between noise that breaks them up and
+movements that are swallowed. It is taken near the quiet end of that stretch, where edges are
+sharpest.
 
 A channel too slow for that, such as a magnetometer read once a second, cuts what the others call
 a standstill where its own readings step from one level to another.
@@ -40,7 +40,7 @@ STEPS = 120
 CHUNK = 32
 """Samples whose median step in time is the rate there."""
 SAME = 0.02
-"""Share by which the number of standstills may change and still count as the same."""
+"""Share of the standstills that may come, go or merge while they still count as the same."""
 AGREE, SHARE = 0.03, 0.1
 """Steps of a channel that differ by less are equal; share of equal ones that is its resolution."""
 TURN = 0.05
@@ -232,10 +232,8 @@ def activity(channels: Sequence[tuple[Array, Array]]) -> Activity:
     floors, value = [], np.zeros(len(edge) - 1)
     for own in cells:
         ranges = quietest_range(own.level)
-        ranges = np.where(ranges < own.resolution / 4, 0.0, ranges)  # a median lies on half steps
-        floor = noise_floor(ranges)
-        if np.quantile(ranges, QUIET) == 0:  # coarse steps: one up or down is no movement
-            ranges = np.where(ranges <= floor, 0.0, ranges)
+        # One step of the readings up or down is no movement.
+        floor = max(noise_floor(ranges), (1 + AGREE) * own.resolution)
         ranges = np.where(own.torn, np.inf, ranges)
         value = np.maximum(value, on_grid(edge, own, ranges) / floor)
         floors.append(floor)
@@ -279,7 +277,7 @@ def triad_size(levels: Sequence[Array]) -> float:
 
 def rest_limit(cells: Cells, size: float) -> float:
     """Largest range within a window that can be rest: a share of the triad's `size`, or noise."""
-    return max(TURN * size, NOISE * cells.rough)
+    return max(TURN * size, NOISE * cells.rough, 2 * cells.resolution)
 
 
 def stretches(still: Bools, least: int = 1) -> tuple[Ints, Ints]:
@@ -291,21 +289,23 @@ def stretches(still: Bools, least: int = 1) -> tuple[Ints, Ints]:
 
 
 def choose_threshold(value: Array, least: int, highest: float) -> Threshold:
-    """The threshold of the activity (m,) on which the number of standstills depends least.
+    """The threshold of the activity (m,) on which the standstills depend least.
 
-    Definition: of all stretches of thresholds over which the number of standstills of at least
-    `least` cells stays within `SAME` of what it is at their start, the longest in logarithm;
-    the first with the stretch's median number from `INTO` of it on. Tried is a geometric series
-    from the quietest cell up to `highest`.
+    Definition: of all stretches of thresholds over which no more than `SAME` of the standstills of
+    at least `least` cells come, go or merge, the longest in logarithm; the first with the
+    stretch's median number from `INTO` of it on. Tried is a geometric series from the quietest
+    cell, but no less than the noise floor, up to `highest`.
     Singular: without any standstill at any threshold the value is NaN.
     """
     alive = value[np.isfinite(value) & (value > 0)]
-    low = float(alive.min()) if alive.size else 1.0
+    low = max(float(alive.min()), 1.0) if alive.size else 1.0
     tried = np.geomspace(low, highest, STEPS) if highest >= low else np.zeros(0)
-    counts = np.array([len(stretches(value <= t, least)[0]) for t in tried], int)
+    runs = [stretches(value <= t, least)[0] for t in tried]
+    counts = np.array([len(run) for run in runs], int)
+    changes = np.cumsum([0, *(_changes(a, b) for a, b in pairwise(runs))])
     best, longest = slice(0), 0
     for first, count in enumerate(counts):
-        other = np.abs(counts[first:] - count) > SAME * count
+        other = changes[first : len(counts)] - changes[first] > SAME * count
         length = int(np.argmax(other)) if other.any() else len(other)
         if count and length > longest:
             best, longest = slice(first, first + length), length
@@ -315,6 +315,12 @@ def choose_threshold(value: Array, least: int, highest: float) -> Threshold:
     usual = (counts == np.median(counts)) & (np.arange(longest) >= INTO * (longest - 1))
     chosen = int(np.argmax(usual)) if usual.any() else longest // 2
     return Threshold(float(tried[chosen]), (float(tried[0]), float(tried[-1])))
+
+
+def _changes(before: Ints, after: Ints) -> int:
+    """Runs that came or merged as the threshold rose, by the first cells (k,) of all of them."""
+    shared = len(np.unique(np.searchsorted(after, before, side="right")))
+    return len(before) + len(after) - 2 * shared
 
 
 def calm(found: Activity, threshold: float, trim: float) -> tuple[Array, Array]:

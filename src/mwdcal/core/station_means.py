@@ -3,17 +3,21 @@
 The standstills of one channel share its noise. A long one tells its own, correlation included: the
 autocovariances add up. A short one borrows: its variance is drawn to that of all standstills, as
 if the others had given it some samples more, and its spikes are judged by the spread of all.
+A drift that all of them share is none of it. Readings in coarse steps hide the mean by what their
+noise, all together again, does not dither away.
 Whether the means then scatter as they claim is asked of the halves of all standstills of a triad:
 noise that is correlated over a second or more shows there, and not in one standstill alone.
 
 Reference: P. J. Huber, Robust Statistics, chapter 6 (medians, MAD); C. J. Geyer, Statistical
 Science 7, 473 (1992), section 3.3 (initial monotone sequence); G. K. Smyth, Statistical
-Applications in Genetics and Molecular Biology 3, 3 (2004) (moderated variances).
+Applications in Genetics and Molecular Biology 3, 3 (2004) (moderated variances); B. Widrow and
+I. Kollár, Quantization Noise (2008) (dither).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -30,12 +34,18 @@ SIGNIFICANT = 1e-4
 """Chance that a steady channel is said to drift, or to be less steady than usual."""
 UNUSUAL = 2.0
 """Times the usual spread that is worth a word."""
+LENT = 0.01
+"""Chance that a standstill of the usual noise is taken for noisier, and lent none."""
+COURSE = 0.01
+"""Chance that steady standstills are said to share a drift, which is then taken out of their noise."""
 PARTS, WANDERS = 16, 12.0
 """Blocks that tell a knock within a standstill, and their range, in their own noise, that does."""
 STUCK, QUIETER = 0.5, 5.0
 """Least share of equal readings at a limit, and times that a tool at rest may be less noisy than usual."""
 HALVES, MOST = 8, 9.0
 """Standstills of a triad whose halves can correct the uncertainty of all; most that one counts."""
+CHANCE, GROWN = 1e-3, 1e-2
+"""Chances that white noise is said to be correlated: by the halves, and by their growth."""
 LONGEST = 1.0
 """Longest correlation time, in standstills, that their halves and quarters can tell."""
 GROWTH = 2.0
@@ -51,19 +61,23 @@ class Noise(NamedTuple):
     Attributes:
         spread: robust standard deviation about the median of its standstill.
         sd: standard deviation, without spikes and without standstills that are less steady.
-        freedom: degrees of freedom of that; 0 where there is only one standstill.
+        least: the same less what the variances of standstills differ, or its standard error.
+        freedom: degrees of freedom of sd; 0 where there is only one standstill.
         rough: standard deviation of a sample as the successive means of blocks tell it.
         reach: range of the channel over all standstills.
+        course: change per second that all standstills share; 0 where none is plain.
     """
 
     spread: float
     sd: float
+    least: float
     freedom: float
     rough: float
     reach: float
+    course: float
 
 
-ALONE = Noise(np.nan, np.nan, 0.0, np.nan, np.inf)
+ALONE = Noise(np.nan, np.nan, np.nan, 0.0, np.nan, np.inf, 0.0)
 """Of a standstill without others."""
 
 
@@ -117,10 +131,12 @@ def correlated(channels: Sequence[Sequence[Summary]]) -> Array:
     """Variance of a sample's worth of mean, sd² times samples, of each channel of a triad; 0 for none.
 
     Definition: what the halves of a channel's standstills tell, times what noise that reaches
-    beyond a half hides in them (`beyond`, from the whole triad). None unless that, or its growth
-    from quarters to halves, is above what is claimed by more than chance; nor where it grows as
-    with a line of drift.
+    beyond a half hides in them (`beyond`, from the whole triad). None unless the halves tell more
+    than is claimed, or grow more from quarters to halves, than by chance (χ², F); nor where they
+    grow as with a line of drift.
     """
+    from scipy.special import chdtri, fdtri
+
     clear = [[m for m in own if not m.stuck] for own in channels]
     count = sum(map(len, clear))
     if count < HALVES or not all(clear):
@@ -129,10 +145,12 @@ def correlated(channels: Sequence[Sequence[Summary]]) -> Array:
     told = [m for own in clear for m in own if m.quarters == m.quarters]
     quarters = _typical([m.quarters * m.used for m in told]) if told else 0.0
     growth = _typical([m.halves * m.used for m in told]) / quarters if quarters else 0.5
-    claimed = sum(float(np.median([m.sd**2 * m.used for m in own])) for own in clear)
+    claimed = np.array([float(np.median([m.sd**2 * m.used for m in own])) for own in clear])
+    parts = claimed / [len(own) for own in clear]
+    freedom = claimed.sum() ** 2 / (claimed @ parts)  # Satterthwaite: a noisy channel counts most
+    plain = halves.sum() > chdtri(freedom, CHANCE) / freedom * claimed.sum()
+    plain |= growth > 0.5 * fdtri(max(len(told), 1), max(2 * len(told), 1), 1 - GROWN)
     variance = halves * beyond(growth)
-    plain = variance.sum() > (1 + 3 * (2 / count) ** 0.5) * claimed
-    plain |= growth > 0.5 * (1 + 2 * (3 / max(len(told), 1)) ** 0.5)
     return np.asarray(variance if plain and growth < GROWTH else 0 * variance, float)
 
 
@@ -171,9 +189,9 @@ def pooled(rests: Sequence[Rest], resolution: float) -> Noise:
 
     Each standstill counts with 64 samples at most. Singular: one alone has none to share.
     """
-    values = [value[:: -(-len(value) // BLOCKS)] for _, value in rests]
-    if len(values) < 2:
+    if len(rests) < 2:
         return ALONE
+    values = [value[:: -(-len(value) // BLOCKS)] for _, value in rests]
     middles = [float(np.median(value)) for value in values]
     values = [value - middle for value, middle in zip(values, middles, strict=True)]
     distances = [_distances(value) for value in values]
@@ -181,6 +199,7 @@ def pooled(rests: Sequence[Rest], resolution: float) -> Noise:
     spread = 1.4826 * float(np.median(np.concatenate(lively)))
     limit = CLEAR * max(spread, resolution)
     kept = [value[np.abs(value) <= limit] for value in values]
+    kept = [value for value in kept if len(value)]  # none where they are at two levels far apart
     square = np.array([len(value) * value.var() for value in kept])
     freedom = np.array([len(value) - 1 for value in kept], float)
     usual = square <= max(spread, resolution) ** 2 * _chi_square_limit(freedom)
@@ -189,14 +208,43 @@ def pooled(rests: Sequence[Rest], resolution: float) -> Noise:
     total = float(freedom[usual].sum())
     if not total:
         return ALONE
+    variance = float(square[usual].sum() / total)
+    some = usual & (freedom > 0)
+    differ = float(np.var(square[some] / freedom[some]))
+    by_chance = variance**2 * float(np.mean(2 / freedom[some]))
+    scatter = max(differ - by_chance, differ / max(some.sum() - 1, 1)) ** 0.5
     rough = [_rough(value) for _, value in rests if len(value) >= 3 * PARTS]
     return Noise(
         spread=spread,
-        sd=float(np.sqrt(square[usual].sum() / total)),
+        sd=variance**0.5,
+        least=max(variance - scatter, 0.0) ** 0.5,
         freedom=total,
         rough=float(np.median([r for r in rough if r > 0])) if any(rough) else 0.0,
         reach=max(middles) - min(middles),
+        course=_course(rests, middles, limit),
     )
+
+
+def _course(rests: Sequence[Rest], middles: Sequence[float], limit: float) -> float:
+    """Change per second that standstills share, 0 unless it is plain against how it scatters.
+
+    Samples further than `limit` from the middle of their standstill are left out.
+    """
+    weights, sums = np.zeros((2, len(rests)))
+    for i, ((time, value), middle) in enumerate(zip(rests, middles, strict=True)):
+        value = value - middle
+        fine = np.abs(value) <= limit
+        clock = (time - time[0])[fine]
+        clock = clock - clock.sum() / max(len(clock), 1)
+        weights[i], sums[i] = clock @ clock, clock @ value[fine]
+    some = weights > 0
+    freedom = int(some.sum()) - 1
+    if freedom < 1:
+        return 0.0
+    weights, slopes = weights[some], sums[some] / weights[some]
+    mean = float(weights @ slopes / weights.sum())
+    error = float(weights @ (slopes - mean) ** 2 / freedom / weights.sum()) ** 0.5
+    return mean if abs(mean) > student(freedom, COURSE) * error else 0.0
 
 
 def _distances(value: Array) -> Array:
@@ -232,9 +280,9 @@ def _rough(value: Array) -> float:
 def summarise(time: Array, value: Array, resolution: float, noise: Noise = ALONE) -> Summary:
     """What a channel read: `time` and `value` (n,) of the samples of one standstill, n >= 2.
 
-    `resolution` is the step of the channel: samples with less noise than half of it hide the
-    mean between two steps, which is then known to resolution/√12. A stuck channel is known to
-    its reach/√12.
+    `resolution` is the step of the channel, in which noise far below it hides the mean (`hidden`).
+    The mean is that of the middle of the standstill: the course that all share is no part of its
+    uncertainty. A stuck channel is known to its reach/√12.
     """
     distance = np.abs(value - np.median(value))
     spread = float(1.4826 * np.median(distance))
@@ -242,19 +290,19 @@ def summarise(time: Array, value: Array, resolution: float, noise: Noise = ALONE
     stuck = _is_stuck(value, distance, resolution, noise)
     unsteady = _is_unsteady(value[kept], resolution, noise)
     time, value = time[kept], value[kept]
-    mean, variance, freedom = _mean_variance(value, noise)
     clock = time - time.mean()
+    flat = value - noise.course * clock
+    mean, variance, freedom = _mean_variance(flat, noise)
     square = float(clock @ clock)
     slope = float(clock @ value) / square if square > 0 else 0.0
     drift = slope * float(time[-1] - time[0])
     _, steady, left = _mean_variance(value - slope * clock, noise, 2)
     limit = student(left, SIGNIFICANT) * np.sqrt(12 * steady)
     sd = float(np.sqrt(variance)) * student(freedom, 0.05) / student(np.inf, 0.05)
-    if value.std() <= resolution / 3**0.5:
-        sd = float(np.hypot(sd, resolution / 12**0.5))
+    sd = float(np.hypot(sd, hidden(_shared_spread(flat, resolution, noise), resolution)))
     if stuck:
         sd = noise.reach / 12**0.5
-    half = len(value) // 2
+    half = len(flat) // 2
     return Summary(
         mean=mean,
         sd=sd,
@@ -263,11 +311,59 @@ def summarise(time: Array, value: Array, resolution: float, noise: Noise = ALONE
         drifts=abs(drift) > max(limit, resolution, 1e-12 * abs(mean)),
         used=len(value),
         spikes=len(kept) - len(value),
-        halves=_halves(value),
-        quarters=(_halves(value[:half]) + _halves(value[half:])) / 2 if half >= 4 else np.nan,
+        halves=_halves(flat),
+        quarters=(_halves(flat[:half]) + _halves(flat[half:])) / 2 if half >= 4 else np.nan,
         unsteady=unsteady,
         stuck=stuck,
     )
+
+
+def hidden(spread: float, step: float) -> float:
+    """What readings in steps hide of the mean of many: its standard deviation.
+
+    `spread` is the standard deviation of the readings. Noise of σ steps leaves of the mean, which
+    lies anywhere between two steps, the variance step²/(2π²) Σ exp(-4π²k²σ²)/k² over k = 1, 2, …:
+    step²/12 without noise.
+    """
+    if spread >= 2 * step:
+        return 0.0
+    variances, lost, _ = _dither()
+    return float(step * np.interp((spread / step) ** 2, variances, lost) ** 0.5)
+
+
+@cache
+def _dither() -> tuple[Array, Array, Array]:
+    """Variance of readings, what they hide, and the least variance, in steps, for rising noise (n,).
+
+    The variance is the mean over all places between two steps; it is least on a step.
+    """
+    from scipy.special import ndtr
+
+    sigma = np.linspace(1e-6, 2.1, 401)
+    order = np.arange(1, 200)[:, None]
+    lost = np.sum(np.exp(-((2 * np.pi * order * sigma) ** 2)) / order**2, axis=0) / (2 * np.pi**2)
+    lost[0] = 1 / 12
+    away = np.arange(20)[:, None] + 0.5
+    least = 4 * np.sum(away * ndtr(-away / sigma), axis=0)
+    return sigma**2 + 1 / 12 - lost, lost, least
+
+
+def _shared_spread(value: Array, step: float, noise: Noise) -> float:
+    """Standard deviation of a reading: that of all standstills, unless its own is plainly less.
+
+    Where a standstill lies on a step its own is less anyway (`_dither`).
+    """
+    from scipy.special import chdtri
+
+    own, freedom = float(value.std()), max(len(value) - 1, 1)
+    if not noise.freedom:
+        return own
+    least = noise.least**2
+    if noise.least < 2 * step:
+        variances, _, lowest = _dither()
+        least = step**2 * float(np.interp((noise.least / step) ** 2, variances, lowest))
+    quiet = least * chdtri(freedom, 1 - SIGNIFICANT) / UNUSUAL**2
+    return own if len(value) * own**2 < quiet else noise.least
 
 
 def _spike_scale(count: int, spread: float, noise: Noise) -> float:
@@ -310,11 +406,13 @@ def _mean_variance(value: Array, noise: Noise, lost: int = 1) -> tuple[float, fl
     Fewer than `LONG` samples are taken as independent, and share the noise of all standstills
     unless theirs is plainly larger.
     """
+    from scipy.special import chdtri
+
     if len(value) >= LONG:
         return long_run(value)
     mean, square = float(value.mean()), float(len(value) * value.var())
     freedom = float(max(len(value) - lost, 1))
-    limit = float(_chi_square_limit(np.array([freedom]))[0])
+    limit = float(chdtri(freedom, LENT))
     others = min(noise.freedom - freedom, LONG)
     if others > 0 and (others < LONG or square <= noise.sd**2 * limit):
         square, freedom = square + others * noise.sd**2, freedom + others

@@ -108,5 +108,7 @@ def inverse(matrix: Array) -> Array:
 
 def eigen(matrix: Array) -> tuple[Array, Array]:
     """Eigenvalues (..., k), smallest first, and vectors of symmetric matrices; zero for not finite."""
-    values, vectors = np.linalg.eigh(np.nan_to_num(matrix, posinf=0.0, neginf=0.0))
+    if not np.isfinite(matrix).all():
+        matrix = np.nan_to_num(matrix, posinf=0.0, neginf=0.0)
+    values, vectors = np.linalg.eigh(matrix)
     return np.asarray(values), np.asarray(vectors)

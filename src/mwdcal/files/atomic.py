@@ -79,6 +79,49 @@ def target(path: str | os.PathLike[str]) -> Path:
     return file
 
 
+@contextlib.contextmanager
+def holding(path: Path) -> Iterator[bool]:
+    """Whether this process alone has the file, its folder made; both go afterwards, if that is empty."""
+    try:
+        stream = _held(path)
+    except OSError as error:
+        raise _refusal(path, error) from error
+    try:
+        yield stream is not None
+    finally:
+        if stream is not None:
+            if fcntl is None:
+                stream.close()
+            with contextlib.suppress(OSError):
+                path.unlink()
+                path.parent.rmdir()
+            stream.close()
+
+
+def _held(path: Path) -> IO[bytes] | None:
+    """The file, locked until it is closed or its process ends; None where another has it."""
+    while True:
+        with contextlib.suppress(FileExistsError):
+            path.parent.mkdir()
+        try:
+            stream = path.open("ab")
+        except FileNotFoundError:
+            continue  # its last holder came between, and has removed the folder
+        if fcntl is None:
+            return stream
+        try:
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            stream.close()
+            return None
+        except OSError:
+            return stream  # no locks on this disk
+        with contextlib.suppress(FileNotFoundError):
+            if os.path.samestat(path.stat(), os.fstat(stream.fileno())):
+                return stream
+        stream.close()  # the last holder has removed it
+
+
 def _begun(temporary: Path) -> IO[bytes]:
     """The new file, locked until it is closed or its process ends, however it does."""
     while True:

@@ -60,6 +60,14 @@ class Plan:
         """The triads that the table has columns for."""
         return TRIADS[: 1 + (CHANNELS["magnetometer"][0] in self.columns)]
 
+    @property
+    def noise_estimated(self) -> tuple[str, ...]:
+        """Triads of which neither the profile nor the table states the noise."""
+        stated = {t for t in self.triads if any(f"sd_{n}" in self.columns for n in CHANNELS[t])}
+        return tuple(
+            t for t in self.triads if t not in stated and getattr(self.profile, t).noise is None
+        )
+
     def key(self, partition: Partition) -> str:
         """Name of the partition's result: another input, option or version has another."""
         return hashlib.sha256(msgspec.json.encode([self, partition])).hexdigest()[:32]
@@ -93,12 +101,16 @@ def is_whole(path: Path) -> bool:
 
 
 def packed(table: Any) -> bytes:
-    """A table in Arrow's stream format."""
+    """A table in Arrow's stream format; measured first, as memory that grows costs most of the time."""
     arrow, _ = parquet.modules("fleet")
-    stream = arrow.BufferOutputStream()
+    size = arrow.MockOutputStream()
+    with arrow.ipc.new_stream(size, table.schema) as writer:
+        writer.write_table(table)
+    found = bytearray(size.size())
+    stream = arrow.FixedSizeBufferWriter(arrow.py_buffer(found))
     with arrow.ipc.new_stream(stream, table.schema) as writer:
         writer.write_table(table)
-    return bytes(stream.getvalue())
+    return bytes(found)
 
 
 def _result(rows: Rows, plan: Plan) -> Any:
@@ -177,7 +189,7 @@ def _table(
         columns[f"{triad}_undetermined"] = arrow.array(ids, arrow.list_(arrow.string()))
     columns["field_unit"] = arrow.array(unit, arrow.string())
     columns["method"] = arrow.array([options.method] * count, arrow.string())
-    order = np.max([filled[f"{triad}_order"] for triad in plan.triads], 0)
+    order = np.fmax.reduce([filled[f"{triad}_order"] for triad in plan.triads])
     if not plan.per_tool.order:
         order = np.full(count, float(max(options.orders)))
     kinds = np.array([None, *(options.kind(k) for k in range(HIGHEST + 1))], object)

@@ -104,7 +104,8 @@ class Rows:
             for name in part.column_names
             if name in COLUMNS
         }
-        source = f"{self.source}, serial {serial}"
+        place = self.source if self.source.endswith(".parquet") else f"{self.source}/*.parquet"
+        source = f"serial {serial} of {place}"
         metadata = {**self.metadata, SERIAL: str(serial), **self._north(tool, source)}
         return to_readings(Table(columns, metadata, source, lines), self.profile)
 
