@@ -37,6 +37,7 @@ from mwdcal.predict import typical_accuracy
 from mwdcal.readings import Readings
 from simulation import DEG, Tool, attitude, plan
 
+MWDCAL = (sys.executable, "-m", "mwdcal")
 pa = pytest.importorskip("pyarrow")
 pq = pytest.importorskip("pyarrow.parquet")
 
@@ -519,19 +520,22 @@ def test_a_pool_of_processes_writes_the_same_bytes(fleet, tmp_path):
         assert (text in page) == (text not in ("own-axis gain", "nan"))
 
 
+def _wait_for_a_part(folder):
+    limit = time.monotonic() + 60
+    while not list(folder.glob("*.arrow")) and time.monotonic() < limit:
+        time.sleep(0.005)
+
+
 def test_an_interrupted_fleet_goes_on_where_it_was(fleet, tmp_path):
     path, expected = fleet
     output = tmp_path / "cals.parquet"
     folder = tmp_path / "cals.parquet.parts"
     command = ["fleet", path, "-o", output, "--tool", "servo", "--workers", 1]
-    code = "from mwdcal.app.cli import main; main()"
     first = subprocess.Popen(
-        [sys.executable, "-c", code, *map(str, command)],
+        [*MWDCAL, *map(str, command)],
         stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
     )  # fmt: skip
-    limit = time.monotonic() + 60
-    while not list(folder.glob("*.arrow")) and time.monotonic() < limit:
-        time.sleep(0.005)
+    _wait_for_a_part(folder)
     first.kill()
     first.wait()
     done = {part: part.stat().st_mtime_ns for part in folder.glob("*.arrow")}
@@ -565,10 +569,9 @@ def test_one_output_is_written_by_one_fleet_at_a_time(fleet, tmp_path):
         assert "another fleet is writing this output. Wait for it" in message
         assert folder.exists()
     assert not folder.exists()
-    code = "from mwdcal.app.cli import main; main()"
     both = [
         subprocess.Popen(
-            [sys.executable, "-c", code, *map(str, command)],
+            [*MWDCAL, *map(str, command)],
             stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, encoding="utf-8",
         )
         for _ in range(2)
@@ -587,12 +590,10 @@ def test_an_interruption_from_the_keyboard_leaves_parts_and_no_traceback(tmp_pat
     output, folder = tmp_path / "cals.parquet", tmp_path / "cals.parquet.parts"
     command = ["fleet", path, "-o", output, "--tool", "servo", "--workers", 2]
     running = subprocess.Popen(
-        [sys.executable, "-c", "from mwdcal.app.cli import main; main()", *map(str, command)],
+        [*MWDCAL, *map(str, command)],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
     )  # fmt: skip
-    limit = time.monotonic() + 60
-    while not list(folder.glob("*.arrow")) and time.monotonic() < limit:
-        time.sleep(0.005)
+    _wait_for_a_part(folder)
     os.killpg(running.pid, signal.SIGINT)
     out, err = running.communicate(timeout=60)
     assert (running.returncode, out) == (130, "")
@@ -618,12 +619,10 @@ def test_workers_end_with_the_command_that_was_killed(tmp_path):
     output, folder = tmp_path / "cals.parquet", tmp_path / "cals.parquet.parts"
     command = ["fleet", path, "-o", output, "--tool", "servo", "--workers", 2]
     running = subprocess.Popen(
-        [sys.executable, "-c", "from mwdcal.app.cli import main; main()", *map(str, command)],
+        [*MWDCAL, *map(str, command)],
         stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True,
     )  # fmt: skip
-    limit = time.monotonic() + 60
-    while not list(folder.glob("*.arrow")) and time.monotonic() < limit:
-        time.sleep(0.005)
+    _wait_for_a_part(folder)
     assert len(_of_session(running.pid)) >= 3
     running.kill()
     running.wait()
@@ -747,7 +746,7 @@ def test_a_cluster_of_two_of_which_one_dies_half_way(tmp_path):
     with cluster(tmp_path) as (address, workers):
         command = ["fleet", path, "-o", output, "--tool", "servo", "--scheduler", address]
         client = subprocess.Popen(
-            [sys.executable, "-c", "from mwdcal.app.cli import main; main()", *map(str, command)],
+            [*MWDCAL, *map(str, command)],
             stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         )  # fmt: skip
         limit = time.monotonic() + 120

@@ -725,6 +725,17 @@ def test_progress_is_shown_on_a_terminal_and_only_to_the_patient(
     assert not any(isinstance(thread, threading.Timer) for thread in threading.enumerate())
 
 
+def test_progress_begins_with_what_was_told_before_it_was_seen(monkeypatch):
+    monkeypatch.setattr(progress, "PATIENCE", 0.1)
+    monkeypatch.setattr(sys, "stderr", shown := Terminal())
+    limit = time.monotonic() + 20
+    with progress.bar("correcting") as advance:
+        advance(2, 4)
+        while "50%" not in shown.getvalue() and time.monotonic() < limit:
+            time.sleep(0.01)
+        assert "50%" in shown.getvalue()
+
+
 def test_memory_does_not_grow_with_the_table(tmp_path, warm):
     resource = pytest.importorskip("resource")
     part = arrow.table(log(250_000, low=10, high=40))

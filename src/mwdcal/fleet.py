@@ -241,11 +241,15 @@ def _doubt(
                 outcome.status[tool], outcome.message[tool] = name, str(error)
 
 
-def _grown(result: Fit) -> Array:
-    """What scales each triad's noise (B, t): s, or 1 where there is no redundancy."""
+def _factors(result: Fit) -> Array:
+    """What scales each triad's variances (B, t): s², or 1 where there is no redundancy."""
     usable = result.analysis.freedom >= 1
-    factors = np.nan_to_num(result.analysis.variance_factor, nan=1.0)
-    return np.sqrt(np.where(usable, factors, 1.0))
+    return np.where(usable, np.nan_to_num(result.analysis.variance_factor, nan=1.0), 1.0)
+
+
+def _grown(result: Fit) -> Array:
+    """What scales each triad's noise (B, t)."""
+    return np.sqrt(_factors(result))
 
 
 def _with_prior_apart(result: Fit) -> Fit:
@@ -289,8 +293,7 @@ def _besides(
 
 def _columns(result: Fit, free: list[list[Free]], reference: float) -> dict[str, Array]:
     """Columns of the results of sound fits."""
-    usable = result.analysis.freedom >= 1
-    factors = np.where(usable, np.nan_to_num(result.analysis.variance_factor, nan=1.0), 1.0)
+    factors = _factors(result)
     found: dict[str, Array] = {}
     for index in range(len(result.problem.triads)):
         found |= _triad_columns(result, index, factors[:, index], free, reference)

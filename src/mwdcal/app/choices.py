@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypedDict
@@ -206,7 +206,13 @@ def _with_curves(
         say("own-axis nonlinearity: leaving stations out, with and without it")
         found, scores = choose_curves(readings, options, offered)
         return replace(options, nonlinearity=found), scores
+    wanted = curves_of(asked, offered)
+    check_curves(readings, tuple(wanted))
+    return replace(options, nonlinearity=wanted), []
+
+
+def curves_of(asked: str, offered: Mapping[str, float]) -> dict[str, float]:
+    """Strength of the own-axis terms of the triads named: the profile's own, or the usual one."""
     wanted = names(asked)
     check_curve_names(asked, wanted)
-    check_curves(readings, wanted)
-    return replace(options, nonlinearity={n: offered.get(n, USUAL) for n in wanted}), []
+    return {name: offered.get(name, USUAL) for name in wanted}

@@ -27,6 +27,7 @@ from mwdcal.app.text import number, plural
 from mwdcal.core.vectors import Array, Bools, Ints
 from mwdcal.files import atomic, parquet
 from mwdcal.files.fleet_sources import SERIAL, is_simulated
+from mwdcal.findings import SUSPECT
 from mwdcal.fleet import OK
 from mwdcal.readings import TRIADS
 
@@ -39,8 +40,6 @@ FEWEST = 20
 """Sound tools without which there is no fleet to be an outlier of."""
 SPREAD = 1.4826
 """Standard deviation of a normal variable by its median absolute deviation."""
-SUSPECT = 3.0
-"""Residuals of more than this many times the noise are worth a look."""
 
 
 @dataclass(frozen=True)

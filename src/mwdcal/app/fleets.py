@@ -16,13 +16,13 @@ import msgspec
 
 from mwdcal import __version__
 from mwdcal.app import pool
-from mwdcal.app.choices import DATASHEET, names, prior_profile, stated
+from mwdcal.app.choices import DATASHEET, curves_of, prior_profile, stated
 from mwdcal.app.fleet_asked import Asked
 from mwdcal.app.fleet_summary import Summary, document, options_asked, summarise, text
 from mwdcal.app.text import plural
-from mwdcal.checks import check_curve_names, check_options
+from mwdcal.checks import check_options
 from mwdcal.core.fused import cores
-from mwdcal.curves import USUAL, declared
+from mwdcal.curves import declared
 from mwdcal.errors import FitError, InputError
 from mwdcal.files import atomic, parquet, profiles
 from mwdcal.files.fleet_parts import Plan, is_whole, load, solve
@@ -158,9 +158,7 @@ def _curves(options: Options, asked: str, profile: Profile) -> tuple[Options, tu
     offered = declared(profile, options)
     if asked in ("auto", "none"):
         return options, tuple(offered) if asked == "auto" else ()
-    wanted = names(asked)
-    check_curve_names(asked, wanted)
-    return replace(options, nonlinearity={n: offered.get(n, USUAL) for n in wanted}), ()
+    return replace(options, nonlinearity=curves_of(asked, offered)), ()
 
 
 def _check_target(target: Path, runs: Path) -> None:

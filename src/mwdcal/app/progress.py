@@ -20,15 +20,22 @@ def bar(label: str) -> Iterator[Callable[[int, int], None]]:
     The bar also moves while that is not known.
     """
     shown: list[Any] = []
+    known: dict[str, int] = {}
     if not sys.stderr.isatty():
         yield lambda done, total: None
         return
 
     def advance(done: int, total: int) -> None:
+        known.update(completed=done, total=total)
         for each in shown:
-            each.update(each.task_ids[0], completed=done, total=total)
+            each.update(each.task_ids[0], **known)
 
-    clock = threading.Timer(PATIENCE, lambda: shown.append(_started(label)))
+    def begin() -> None:
+        shown.append(_bar(label))  # before what is known is read: nothing told meanwhile is lost
+        shown[0].update(shown[0].task_ids[0], **known)
+        shown[0].start()
+
+    clock = threading.Timer(PATIENCE, begin)
     clock.start()
     try:
         yield advance
@@ -52,11 +59,10 @@ def slowly(say: Callable[[str], None]) -> Callable[[str], None]:
     return say_slowly
 
 
-def _started(label: str) -> Any:
+def _bar(label: str) -> Any:
     from rich.console import Console
     from rich.progress import Progress
 
     shown = Progress(console=Console(stderr=True), transient=True)
     shown.add_task(label, total=None)
-    shown.start()
     return shown
