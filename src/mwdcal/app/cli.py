@@ -26,6 +26,7 @@ from mwdcal.app.asked import (
 )
 from mwdcal.app.fleet_asked import Asked as FleetAsked
 from mwdcal.app.fleet_asked import fleet_options
+from mwdcal.app.lean import without_pandas
 from mwdcal.app.noise_asked import Asked as AskedForNoise
 from mwdcal.app.noise_asked import noise_options
 from mwdcal.errors import InputError, MwdcalError
@@ -418,11 +419,18 @@ def _interrupted(stop: BaseException) -> int:
     return SIGNAL + int(number)
 
 
+def _run(arguments: list[str] | None) -> object:
+    """Run a command; without arguments that of this process, which is then ours alone."""
+    if arguments is None:
+        without_pandas()
+    with _orderly_end():
+        return cli.main(arguments, prog_name="mwdcal", standalone_mode=False)
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line; no traceback ever reaches the user."""
     try:
-        with _orderly_end():
-            code = cli.main(arguments, prog_name="mwdcal", standalone_mode=False)
+        code = _run(arguments)
     except click.ClickException as error:
         error.show()
         sys.exit(error.exit_code)

@@ -10,6 +10,7 @@ import gc
 
 import numpy as np
 
+from mwdcal.app.lean import without_pandas
 from mwdcal.core.vectors import reference_vectors
 from mwdcal.files import parquet
 from mwdcal.files.contract import CHANNELS, REFERENCES
@@ -39,6 +40,7 @@ def warm() -> None:
             solve(Plan("", {}, tuple(columns), profile, Options(nonlinearity={})), loaded)
 
 
+without_pandas()
 warm()
 gc.freeze()  # copies then share this memory: collecting garbage would write to all of it
 
