@@ -63,6 +63,7 @@ LAYERS = (
         "app.fleet_report",
         "app.fleet_summary",
         "app.fleets",
+        "app.lean",
         "app.noise_asked",
         "app.noise_plots",
         "app.noises",

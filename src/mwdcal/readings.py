@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from mwdcal.core.vectors import AnyArray, Array, Bools, Ints
+from mwdcal.core.vectors import AnyArray, Array, ArrayLike, Bools, Ints
 
 ANGLES = ("inclination", "azimuth", "toolface")
 TRIADS = ("accelerometer", "magnetometer")
@@ -76,21 +76,25 @@ class Readings:
 
         Blank gravity is the mean of what is given at other stations, or 1 g.
         """
-        shape = self.accelerometer.shape[:-1]
-        value = np.broadcast_to(np.asarray(self.known.get(name, np.nan), float), shape)
+        value = self._per_station(self.known.get(name, np.nan))
         if name != "gravity":
             return value
         blank = np.isnan(value)
+        if blank.all():
+            return np.ones(value.shape)
         count = np.maximum((~blank).sum(-1, keepdims=True), 1)
         mean = np.where(blank, 0.0, value).sum(-1, keepdims=True) / count
         return np.where(blank, np.where(blank.all(-1, keepdims=True), 1.0, mean), value)
 
     def uncertainty(self, name: str) -> Array:
         """Standard uncertainty of the known value `name` (..., n); 0 where not stated."""
-        shape = self.accelerometer.shape[:-1]
         if name not in self.sd:
-            return np.zeros(shape)
-        return np.broadcast_to(np.nan_to_num(np.asarray(self.sd[name], float)), shape)
+            return np.zeros(self.accelerometer.shape[:-1])
+        return self._per_station(np.nan_to_num(np.asarray(self.sd[name], float)))
+
+    def _per_station(self, value: ArrayLike) -> Array:
+        whole, shape = np.asarray(value, float), self.accelerometer.shape[:-1]
+        return whole if whole.shape == shape else np.broadcast_to(whole, shape)
 
     def select(self, keep: Bools) -> Readings:
         """The stations where `keep` (n,) is true, of a run without leading axes."""

@@ -21,7 +21,7 @@ from mwdcal.core.models import Factors, Polynomial
 from mwdcal.core.problem import GEOMETRIC_NOISE, Problem, State, Triad
 from mwdcal.core.solvers import RANK_TOLERANCE, Determined
 from mwdcal.core.uncertainty import Analysis
-from mwdcal.core.vectors import Array, eigen, inverse, tool_from_earth
+from mwdcal.core.vectors import Array, eigen, eigenvalues, inverse, tool_from_earth
 
 ORDER = np.array([4 * i + j for i in range(3) for j in range(3)] + [4 * i + 3 for i in range(3)])
 """Places of the parameters (gains row by row, then offsets) among those of Θ, row by row."""
@@ -82,8 +82,8 @@ class Half:
         return np.asarray(whole[:, ORDER[:, None], ORDER])
 
     @property
-    def known(self) -> tuple[Array, Array, Array]:
-        """Singular values (B, 12) and directions (B, 12, 12) of the evidence, norms of its columns.
+    def known(self) -> tuple[Array, Array]:
+        """Singular values (B, 12) of the evidence, and norms of its columns.
 
         Normalised, the information is a Kronecker product.
         """
@@ -97,13 +97,12 @@ class Half:
             undo @ np.swapaxes(rows, -1, -2) @ rows @ np.swapaxes(undo, -1, -2),
         ]
         sizes = [np.sqrt(np.diagonal(part, axis1=-2, axis2=-1)) for part in parts]
-        pairs = [
-            eigen(m / (s[:, :, None] * s[:, None, :])) for m, s in zip(parts, sizes, strict=True)
+        pair = [
+            eigenvalues(m / (s[:, :, None] * s[:, None, :]))
+            for m, s in zip(parts, sizes, strict=True)
         ]
-        squares = np.einsum("bi,bj->bij", pairs[0][0], pairs[1][0]).reshape(batch, 12)
-        vectors = np.einsum("bip,bjq->bijpq", pairs[0][1], pairs[1][1]).reshape(batch, 12, 12)
-        norms = np.einsum("bi,bj->bij", *sizes).reshape(batch, 12)
-        return np.sqrt(np.clip(squares, 0, None)), vectors[:, ORDER], norms[:, ORDER]
+        squares, norms = (np.einsum("bi,bj->bij", *p).reshape(batch, 12) for p in (pair, sizes))
+        return np.sqrt(np.clip(squares, 0, None)), norms[:, ORDER]
 
 
 Halves = list[Half | separable.Half]
@@ -151,9 +150,8 @@ def solution(problem: Problem, at: State, halfs: Halves) -> tuple[State, Analysi
         for n, k in (("left", 2), ("open", 1))
     )
     factor = squares / np.where(freedom > 1e-9, freedom, np.nan)
-    known = determined(halfs)
     constants = np.zeros((len(include), 0, 0))
-    return state, Analysis(covariance, known, factor, freedom, left, spread, constants)
+    return state, Analysis(covariance, determined(halfs), factor, freedom, left, spread, constants)
 
 
 def _half(triad: Triad, target: Array, include: Array) -> Half | None:
@@ -188,17 +186,12 @@ def _own(triad: Triad, forward: Array) -> tuple[Array, Array]:
 
 
 def determined(halfs: Halves) -> Determined:
-    """Which directions of all triads' parameters are determined, most so first."""
-    found = [half.known for half in halfs]
-    values, norms = (np.concatenate([each[k] for each in found], -1) for k in (0, 2))
-    basis = np.zeros((*values.shape, values.shape[-1]))
-    first = 0
-    for _, directions, _ in found:
-        where = slice(first, first + directions.shape[-1])
-        basis[:, where, where] = np.swapaxes(directions, -1, -2)
-        first = where.stop
-    order = np.argsort(-values, -1)
-    values = np.take_along_axis(values, order, -1)
+    """How well all triads' parameters are determined; the directions themselves are not worked out."""
+    values, norms = (
+        np.concatenate(each, -1) for each in zip(*(h.known for h in halfs), strict=True)
+    )
+    values = -np.sort(-values, -1)
     values = values / np.maximum(values[:, :1], 1e-300)
-    basis = np.swapaxes(basis[np.arange(len(basis))[:, None], order], -1, -2)
-    return Determined(basis, values, norms, values > RANK_TOLERANCE)
+    size = values.shape[-1]
+    directions = np.broadcast_to(np.eye(size), (*values.shape, size))
+    return Determined(directions, values, norms, values > RANK_TOLERANCE)

@@ -21,7 +21,7 @@ import numpy as np
 
 from mwdcal.core.models import OFF_DIAGONAL
 from mwdcal.core.problem import GEOMETRIC_NOISE, Triad
-from mwdcal.core.vectors import Array, eigen, inverse
+from mwdcal.core.vectors import Array, eigenvalues, inverse
 
 OTHERS = np.array([[1, 2], [0, 2], [0, 1]])
 """The two axes that an axis is misaligned with."""
@@ -35,58 +35,75 @@ SMALL = 1e-8
 
 @dataclass(frozen=True)
 class Axes:
-    """Runs of one triad (B), axis by axis: readings, vectors and √weights (B, 3, n).
+    """Runs of one triad (B), axis by axis: readings and references over the noise (B, 3, n).
 
     `phi` (B, 1, K, n) are the polynomials of temperature; `beside` (B, 3, K + 2, n) are the vector
-    along the two other axes and φ.
+    along the two other axes and φ, over the noise of the axis as `along` and `raw` are. What is left
+    out is zero in them. `vectors` and `noise` are the references and the noise themselves.
     """
 
     phi: Array
     beside: Array
     along: Array
     raw: Array
-    root: Array
+    vectors: Array
+    noise: Array
 
     @classmethod
-    def of(cls, phi: Array, target: Array, raw: Array, root: Array) -> Axes:
-        """From φ (B, n, K), and vectors, readings and √weights (B, n, 3)."""
-        phi, along = np.swapaxes(phi, -1, -2)[:, None], np.swapaxes(target, -1, -2)
-        every = np.broadcast_to(phi, (len(raw), 3, *phi.shape[2:]))
-        beside = np.concatenate([along[:, OTHERS], every], -2)
-        return cls(phi, beside, along, np.swapaxes(raw, -1, -2), np.swapaxes(root, -1, -2))
+    def of(cls, phi: Array, target: Array, raw: Array, sd: Array, include: Array) -> Axes:
+        """From φ (B, n, K), vectors, readings and their noise (B, n, 3), and what counts (B, n)."""
+        phi, along, raw, noise = (np.swapaxes(each, -1, -2) for each in (phi, target, raw, sd))
+        root = include[:, None] / noise
+        beside = np.empty((*noise.shape[:2], phi.shape[1] + 2, noise.shape[-1]))
+        np.multiply(along[:, OTHERS], root[:, :, None], out=beside[:, :, :2])
+        np.multiply(phi[:, None], root[:, :, None], out=beside[:, :, 2:])
+        return cls(phi[:, None], beside, along * root, raw * root, along, noise)
 
     def predicted(self, unknowns: Array) -> tuple[Array, Array]:
-        """Scale s(τ) and what it multiplies, v + uv + b(τ), each (B, 3, n)."""
+        """Scale s(τ), and what it multiplies, v + uv + b(τ), over the noise; each (B, 3, n)."""
         count = self.phi.shape[-2]
         scale = (unknowns[..., None, :count] @ self.phi)[..., 0, :]
         return scale, self.along + (unknowns[..., None, count:] @ self.beside)[..., 0, :]
 
-    def bias(self, unknowns: Array) -> Array:
-        """b(τ) (B, 3, n)."""
-        return (unknowns[..., None, self.phi.shape[-2] + 2 :] @ self.phi)[..., 0, :]
-
     def slopes(self, scale: Array, unit: Array) -> Array:
-        """Derivatives (B, 3, 2K + 2, n) of the reading by s, u and b."""
+        """Derivatives (B, 3, 2K + 2, n) of the reading over its noise by s, u and b."""
         by = (unit[..., None, :] * self.phi, scale[..., None, :] * self.beside)
         return np.concatenate(by, -2)
 
 
-def minimum(axes: Axes) -> Array | None:
-    """Unknowns s, u, b (B, 3, 2K + 2) of every axis; None where one does not settle."""
+@dataclass(frozen=True)
+class Point:
+    """The unknowns (B, 3, 2K + 2) after the last step, and what it began with.
+
+    It is so short that scale and `rows`, the slopes, are those of the minimum; `left` are the
+    residuals after it.
+    """
+
+    unknowns: Array
+    scale: Array
+    rows: Array
+    information: Array
+    left: Array
+
+
+def minimum(axes: Axes) -> Point | None:
+    """Every axis at its minimum; None where one does not settle."""
     count = axes.phi.shape[-2]
     unknowns = np.zeros((len(axes.raw), 3, 2 * count + 2))
     unknowns[..., 0] = 1.0
     for turn in range(STEPS):
         scale, unit = axes.predicted(unknowns)
         rows = axes.slopes(scale, unit)
-        rows *= axes.root[..., None, :]
-        gradient = rows @ ((axes.raw - scale * unit) * axes.root)[..., None]
-        step = _solved(rows @ np.swapaxes(rows, -1, -2), gradient)
+        left = axes.raw - scale * unit
+        gradient = rows @ left[..., None]
+        information = rows @ np.swapaxes(rows, -1, -2)
+        step = _solved(information, gradient)
         unknowns = unknowns + step[..., 0]
         if turn == 0:  # linear so far: what goes with the scale is still times it
             unknowns[..., count:] /= unknowns[..., :1]
         elif (np.sum(step * gradient, (-1, -2)) < SMALL).all():
-            return unknowns
+            left -= (np.swapaxes(step, -1, -2) @ rows)[..., 0, :]
+            return Point(unknowns, scale, rows, information, left)
     return None
 
 
@@ -102,8 +119,7 @@ class Half:
     """One triad at its minimum: factors (B, 6K + 6), their covariance, and what stations show.
 
     `left` (B, n, 3) are whitened residuals, `open` (B, n, 3) their expected variances; `values`
-    (B, p) and `basis` (B, p, p) are singular values and directions of the evidence, `norms` (B, p)
-    those of its columns.
+    (B, p) are singular values of the evidence, `norms` (B, p) those of its columns.
     """
 
     params: Array
@@ -111,13 +127,12 @@ class Half:
     left: Array
     open: Array
     values: Array
-    basis: Array
     norms: Array
 
     @property
-    def known(self) -> tuple[Array, Array, Array]:
-        """Singular values and directions of the evidence, and the norms of its columns."""
-        return self.values, self.basis, self.norms
+    def known(self) -> tuple[Array, Array]:
+        """Singular values of the evidence, and the norms of its columns."""
+        return self.values, self.norms
 
     def parted(self, count: int) -> list[Half]:
         """As many triads as were put together along the batch axis."""
@@ -142,52 +157,47 @@ def halves(
         np.concatenate([phi] * count),
         np.concatenate([target for _, target in triads]),
         np.concatenate([triad.raw for triad, _ in triads]),
-        np.concatenate([include[..., None] / triad.sd for triad, _ in triads]),
+        np.concatenate([triad.sd for triad, _ in triads]),
+        include := np.concatenate([include] * count),
     )
-    unknowns = minimum(axes)
-    if unknowns is None:
+    found = minimum(axes)
+    if found is None:
         return [None] * count
-    return list(_half(axes, unknowns, np.concatenate([include] * count)).parted(count))
+    return list(_half(axes, found, include).parted(count))
 
 
-def _half(axes: Axes, unknowns: Array, include: Array) -> Half:
+def _half(axes: Axes, at: Point, include: Array) -> Half:
     """The analysis at the minimum."""
-    scale, unit = axes.predicted(unknowns)
-    slopes = axes.slopes(scale, unit)
-    rows = slopes * axes.root[..., None, :]
-    spread = inverse(rows @ np.swapaxes(rows, -1, -2))
-    left = (axes.raw - scale * unit) * axes.root
-    share = np.sum((spread @ rows) * rows, -2)
-    params, slope = factors(unknowns)
+    spread = inverse(at.information)
+    share = np.sum((spread @ at.rows) * at.rows, -2)
+    params, shares, slope = factors(at.unknowns)
     batch, _, _, size = slope.shape
     back = inverse(slope.reshape(batch, size, size))
     by_axis = np.swapaxes(back.reshape(batch, size, 3, -1), 1, 2)
     moved = np.swapaxes(by_axis @ spread, 1, 2).reshape(batch, size, size)
+    strength = np.linalg.norm(at.scale * (shares @ axes.vectors), axis=-2)[:, None]
     return Half(
         params,
         moved @ np.swapaxes(back, -1, -2),
-        np.swapaxes(left, -1, -2),
+        np.swapaxes(at.left, -1, -2),
         np.swapaxes(include[:, None] - share, -1, -2),
-        *_evidence(scale * (unit - axes.bias(unknowns)), slopes, slope, include),
+        *_evidence(at.rows, axes.noise / (GEOMETRIC_NOISE * strength), slope),
     )
 
 
-def _evidence(
-    vectors: Array, slopes: Array, slope: Array, include: Array
-) -> tuple[Array, Array, Array]:
-    """Singular values, directions and norms (see `Half`), at noise uniform in raw vectors (B, 3, n)."""
-    noise = GEOMETRIC_NOISE * np.linalg.norm(vectors, axis=-2)
-    slopes *= (include / noise)[:, None, None]  # in place: they are large, and done with
-    own = slopes @ np.swapaxes(slopes, -1, -2)
+def _evidence(rows: Array, louder: Array, slope: Array) -> tuple[Array, Array]:
+    """Singular values and norms (see `Half`), at another noise: ours over it is (B, 3, n)."""
+    rows *= louder[..., None, :]  # in place: they are large, and done with
+    own = rows @ np.swapaxes(rows, -1, -2)
     information = (np.swapaxes(slope, -1, -2) @ own @ slope).sum(1)
     norms = np.sqrt(np.diagonal(information, axis1=-2, axis2=-1))
     norms = np.where(norms > 0, norms, 1.0)
-    values, basis = eigen(information / (norms[:, :, None] * norms[:, None, :]))
-    return np.sqrt(np.clip(values, 0, None)), basis, norms
+    values = eigenvalues(information / (norms[:, :, None] * norms[:, None, :]))
+    return np.sqrt(np.clip(values, 0, None)), norms
 
 
-def factors(unknowns: Array) -> tuple[Array, Array]:
-    """Factors (B, 6K + 6) of s, u, b (B, 3, 2K + 2), and ∂(s, u, b)/∂(SF, B, m)."""
+def factors(unknowns: Array) -> tuple[Array, Array, Array]:
+    """Factors (B, 6K + 6) of s, u, b (B, 3, 2K + 2), I + u (B, 3, 3), and ∂(s, u, b)/∂(SF, B, m)."""
     batch, count = len(unknowns), unknowns.shape[-1] // 2 - 1
     scale, cross, bias = np.split(unknowns, [count, count + 2], axis=-1)
     shares = np.broadcast_to(np.eye(3), (batch, 3, 3)).copy()
@@ -210,4 +220,4 @@ def factors(unknowns: Array) -> tuple[Array, Array]:
     by_mixing[:, :, count + 2 :] = -bias[..., None] * grown
     each = pulled[:, :, None] * moved[:, :, OTHERS].transpose(0, 2, 3, 1)
     by_mixing[:, :, count : count + 2] = each - cross[..., None] * grown
-    return params, slope
+    return params, shares, slope

@@ -208,7 +208,8 @@ class Determined:
 
     `basis` (B, p, p): orthonormal directions in normalised columns, largest singular value
     first; `values` (B, p): singular values as a share of the largest; `norms` (B, p): norms of
-    the whole columns, private unknowns in; `keep` (B, p): which are determined.
+    the whole columns, private unknowns in; `keep` (B, p): which are determined. Where all are,
+    `basis` may be any orthonormal one: no direction of it is of interest then.
     """
 
     basis: Array
