@@ -8,7 +8,7 @@ attitude,
 from the same start, the nominal tool. SciPy gets what does it most good: one vectorised NumPy
 function, scaled Chebyshev polynomials of temperature, the magnetometer in units of the field, so
 that all columns are of like size. `mwdcal.estimate.fit` does more than find the minimum: rank,
-free directions, the covariance of all parameters and the share of each station are in its time.
+the covariance of all parameters and the share of each station are in its time.
 
 The 60 of an uncertain stand have 540 unknowns more: three angles of every station. SciPy
 estimates them all, mwdcal takes them out of each station; the two are the same up to the
