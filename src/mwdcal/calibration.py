@@ -22,6 +22,8 @@ from mwdcal.readings import Readings
 SCHEMA_VERSION = 1
 DIGITS = 12
 """Significant digits of every number in a calibration file."""
+MARGIN = 1.0
+"""Degrees Celsius by which a temperature may lie outside the calibrated range."""
 MAGNETIC = ("azimuth", "field", "dip", "magnetic_toolface", "bx", "by", "bz")
 """Observables that need a magnetometer."""
 FREE_SHARE = 5e-2
@@ -380,14 +382,14 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
         """Free directions of all triads, each once."""
         return [entry for triad in self.triads for entry in triad.undetermined]
 
-    def outside(self, readings: Readings, margin: float = 1.0) -> Bools:
-        """Stations (…, n) outside the calibrated temperature range by more than `margin` °C."""
+    def outside(self, readings: Readings) -> Bools:
+        """Stations (…, n) outside the calibrated temperature range by more than `MARGIN`."""
         shape = readings.accelerometer.shape[:-1]
         if self.temperature_c is None or readings.temperature is None:
             return np.zeros(shape, bool)
         low, high = self.temperature_c
         return np.asarray(
-            (readings.temperature < low - margin) | (readings.temperature > high + margin)
+            (readings.temperature < low - MARGIN) | (readings.temperature > high + MARGIN)
         )
 
 

@@ -29,6 +29,8 @@ NAMED = 4
 """Most undetermined parameters that a message lists."""
 
 
+BENIGN = ("rotation-x", "rotation-y", "toolface-zero", "scale")
+"""Directions that may stay free."""
 ABSURD = 30.0
 """Residuals of more than this many times the declared noise mean that something is plain wrong."""
 MOST = 0.3
@@ -40,7 +42,7 @@ COARSE = 0.05
 def check_fit(result: Fit, free: list[Free], profile: Profile, readings: Readings) -> None:
     """Refuse a fit that did not settle, is too weak, has no redundancy, or absurd gains."""
     _check_status(result)
-    _check_geometry(result, free)
+    _check_geometry(result, free, readings)
     _check_freedom(result)
     _check_gains(result, profile, readings)
     _check_residuals(result, readings)
@@ -66,6 +68,11 @@ def check_options(options: Options) -> None:
         raise InputError(
             f"--nonlinearity cannot be combined with {own}: own-axis terms need their prior. Use "
             "--method joint, or --nonlinearity none."
+        )
+    if method == "swarm" and max(options.orders):
+        raise FitError(
+            "method swarm finds the 12 parameters of one temperature: use --order 0 for it, or "
+            "--method joint for temperature terms."
         )
     if method == "swarm" and options.parameters < 12:
         raise InputError(
@@ -147,11 +154,6 @@ def check_readings(readings: Readings, options: Options) -> None:
     if options.prior is None or options.prior.temperature is None:
         _check_temperature(readings, highest)
     _check_needs(readings, method)
-    if method == "swarm" and highest:
-        raise FitError(
-            "method swarm finds the 12 parameters of one temperature: use --order 0 for it, or "
-            "--method joint for temperature terms."
-        )
 
 
 def _check_channels(readings: Readings, triad: str, prior: bool) -> None:
@@ -186,11 +188,16 @@ def _check_channels(readings: Readings, triad: str, prior: bool) -> None:
         )
 
 
+def no_temperature(order: int) -> InputError:
+    """Of an order that needs temperatures where none are read."""
+    return InputError(f"--order {order} needs the column 'temperature_c'; use --order 0.")
+
+
 def _check_temperature(readings: Readings, order: int) -> None:
     if order == 0:
         return
     if readings.temperature is None:
-        raise InputError(f"--order {order} needs the column 'temperature_c'; use --order 0.")
+        raise no_temperature(order)
     levels = int(soaks(readings.temperature).max()) + 1
     span = float(np.ptp(readings.temperature))
     if levels < order + 1 or span < 10 * order:
@@ -231,11 +238,19 @@ def _check_status(result: Fit) -> None:
         raise FitError(f"the fit failed: {status.message}.")
 
 
-def _check_geometry(result: Fit, free: list[Free]) -> None:
-    """Rotations and scales may stay free; anything else is a design too weak to fit."""
-    benign = ("rotation-x", "rotation-y", "toolface-zero", "scale")
-    bad = [entry for entry in free if entry.id.partition("-temperature-")[0] not in benign]
+def is_bad(direction: Free) -> bool:
+    """Whether a free direction means that the design is too weak."""
+    return direction.id.partition("-temperature-")[0] not in BENIGN
+
+
+def _check_geometry(result: Fit, free: list[Free], readings: Readings) -> None:
+    """Rotations and scales may stay free; anything else is a design too weak to fit.
+
+    Where nothing fits, the state is anywhere: that, not the design, is then what is wrong.
+    """
+    bad = [entry for entry in free if is_bad(entry)]
     if bad:
+        _check_residuals(result, readings)
         each = [f"{TRIADS[t]} {e.id.removeprefix('weak-')}" for e in bad for t in e.triads]
         each = list(dict.fromkeys(each))
         more = f" and {len(each) - NAMED} more" if len(each) > NAMED else ""

@@ -25,7 +25,7 @@ from mwdcal.methods import EVIDENCE, ITERATIONS
 from mwdcal.notation import Notation
 from mwdcal.options import Options, Orders
 from mwdcal.profile import Profile
-from mwdcal.readings import TRIADS, Readings
+from mwdcal.readings import TRIADS, Readings, is_simulated
 from mwdcal.residuals import SHOWN, shown_in
 from mwdcal.scatter import directions, group_scatter
 from mwdcal.selection import choose_order
@@ -141,7 +141,7 @@ def compare(
         readings.source,
         readings.count,
         readings.labels,
-        is_simulated(readings),
+        is_simulated(readings.metadata),
         options.orders,
         tuple(options.nonlinearity or ()),
         judge.parts,
@@ -153,12 +153,6 @@ def compare(
         tuple(rows),
         advice(tuple(rows)),
     )
-
-
-def is_simulated(readings: Readings) -> bool:
-    """Whether the run says that no real tool was measured."""
-    said = str(readings.metadata.get("simulated", "")).lower()
-    return said not in ("", "0", "false", "no")
 
 
 def _options(

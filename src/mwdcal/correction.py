@@ -14,7 +14,6 @@ from mwdcal.core.vectors import AnyArray, Array
 from mwdcal.errors import InputError
 from mwdcal.readings import Readings
 
-ANGULAR = ("inclination", "azimuth", "toolface", "dip", "magnetic_toolface")
 OUTSIDE = ("blank", "refuse", "extrapolate")
 MARK = "extrapolated"
 """The column that says of each row whether it was extrapolated, where that is allowed."""

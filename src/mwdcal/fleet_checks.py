@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from mwdcal.checks import ABSURD, COARSE, GAIN, MOTION, NEEDS
+from mwdcal.checks import ABSURD, COARSE, GAIN, MOTION, NEEDS, is_bad
 from mwdcal.core.observability import EXACT, Free, free_directions
 from mwdcal.core.problem import STAND, UNKNOWN, Problem, State
 from mwdcal.core.solvers import Determined, Status
@@ -24,8 +24,6 @@ from mwdcal.selection import GAP
 from mwdcal.stand import LOOSE
 
 NOT_CONVERGED, NOT_FINITE = "not-converged", "not-finite"
-BENIGN = ("rotation-x", "rotation-y", "toolface-zero", "scale")
-"""Directions that may stay free."""
 
 
 def suspect_readings(readings: Readings, options: Options) -> dict[str, Bools]:
@@ -97,15 +95,17 @@ def _lacking(readings: Readings, method: str) -> Bools:
 def suspect_fits(result: Fit, free: list[list[Free]], options: Options) -> dict[str, Bools]:
     """Suspects (B,) after the fit: not settled, too weak, without redundancy, absurd."""
     analysis, noise = result.analysis, result.noise
-    weak = [any(f.id.partition("-temperature-")[0] not in BENIGN for f in each) for each in free]
+    weak = np.array([any(map(is_bad, each)) for each in free], bool)
+    absurd = _absurd(result)
+    clear = ~(weak & absurd)  # where nothing fits, that is said first
     first = {"inseparable": _inseparable(result)} if options.estimate else {}
     return first | {
         NOT_CONVERGED: result.status == int(Status.NOT_CONVERGED),
         NOT_FINITE: result.status == int(Status.NOT_FINITE),
-        "weak-geometry": np.array(weak, bool),
-        "no-redundancy": np.any(np.isfinite(noise) & (analysis.freedom < 1), -1),
-        "gain": _odd_gains(result),
-        "residuals": _absurd(result),
+        "weak-geometry": weak & clear,
+        "no-redundancy": np.any(np.isfinite(noise) & (analysis.freedom < 1), -1) & clear,
+        "gain": _odd_gains(result) & clear,
+        "residuals": absurd,
     }
 
 

@@ -26,6 +26,7 @@ from mwdcal.files.contract import CHANNELS, RAW
 from mwdcal.files.logs import TIME
 from mwdcal.files.table import Table, cell_error, numbers, shown
 from mwdcal.profile import Profile
+from mwdcal.readings import is_simulated
 from mwdcal.stations import row_times
 
 FEWEST = 128
@@ -54,8 +55,6 @@ DOUBTS = {"event": "a spike or a move", "misfit": "noise that is none of the fiv
 """Findings after which the figures of a channel do not hold, in words."""
 RATE = 0.01
 """Share by which a given rate of sampling may differ from that of the log."""
-NOT_SIMULATED = ("", "0", "false", "no")
-"""What metadata `simulated` say of a real tool."""
 UNITS = {
     "quantisation": "·s",
     "white": "·√s",
@@ -183,7 +182,7 @@ def find_noise(
         seconds=seconds,
         kind=kind,
         station_seconds=station,
-        simulated=str(log.metadata.get("simulated", "")).lower() not in NOT_SIMULATED,
+        simulated=is_simulated(log.metadata),
         channels=found,
         profile=_recommended(found, withheld, findings),
         withheld=withheld,
@@ -268,7 +267,7 @@ def _compare_rates(
 def _station_seconds(given: float | None, seconds: float, rate: float, source: str) -> float:
     longest = seconds / AVERAGES
     if given is None:
-        return min(STATION_SECONDS, seconds / SOUND)
+        return max(min(STATION_SECONDS, seconds / SOUND), 1 / rate)
     if given < 1 / rate:
         raise InputError(
             f"--station-seconds must be at least one sample of {source}, {1 / rate:g} s; got {given:g}. "

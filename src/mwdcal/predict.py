@@ -87,14 +87,12 @@ class AccuracyMap:
     sd: dict[str, Array]
 
 
-def accuracy_map(
-    calibration: Calibration, temperature: float | None = None, noise: bool = False
-) -> AccuracyMap:
-    """1σ of the calibration, or with `noise` of one reading, from 2 to 178° inclination."""
+def accuracy_map(calibration: Calibration) -> AccuracyMap:
+    """1σ of the calibration from 2 to 178° inclination."""
     inclination = np.radians(np.linspace(2, 178, 45))
     azimuth = np.radians(np.linspace(0, 360, 25))
     grid = np.meshgrid(inclination, azimuth, indexing="ij")
-    sd = _over_toolface(calibration, grid[0], grid[1], temperature, noise)
+    sd = _over_toolface(calibration, grid[0], grid[1])
     return AccuracyMap(inclination, azimuth, sd)
 
 
@@ -102,8 +100,8 @@ def _over_toolface(
     calibration: Calibration,
     inclination: Array,
     azimuth: Array,
-    temperature: float | None,
-    noise: bool,
+    temperature: float | None = None,
+    noise: bool = False,
 ) -> dict[str, Array]:
     """1σ (…, n) by angle, root mean square over `TOOLFACES`: one toolface at a time, for memory."""
     square = {name: np.zeros(inclination.shape) for name in angles(calibration)}

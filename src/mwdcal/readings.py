@@ -20,6 +20,11 @@ TRIADS = ("accelerometer", "magnetometer")
 CONSTANTS = ("gravity", "field", "dip")
 
 
+def is_simulated(metadata: Mapping[str, object]) -> bool:
+    """Whether what a file says of itself says that no real tool was measured."""
+    return str(metadata.get("simulated", "")).lower() not in ("", "0", "false", "no")
+
+
 @dataclass(frozen=True)
 class Readings:
     """Static stations of one tool (or of many: leading axes).

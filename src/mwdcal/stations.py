@@ -112,6 +112,7 @@ def find_stations(
     cell = float(activity.edge[1] - activity.edge[0])
     shortest = max(MIN_SECONDS, standstill.WINDOW * cell) if min_seconds is None else min_seconds
     trim = max(TRIM_SECONDS, cell) if trim_seconds is None else trim_seconds
+    findings += _torn(activity, list(traces), findings)
     limits, slow = _limits(activity, traces)
     highest = float(np.min(limits / activity.floor))
     value, stretch = threshold, None
@@ -291,6 +292,23 @@ def _time_findings(
         text = f"columns not used: {', '.join(spare[:10])}{' …' if spare[10:] else ''}."
         findings.append(Finding(id="columns-not-used", text=text))
     return findings
+
+
+def _torn(activity: Activity, names: list[str], findings: list[Finding]) -> list[Finding]:
+    """Stretches without samples that the times of the rows do not show, as gaps."""
+    if any(finding.id == "gaps" for finding in findings):
+        return []
+    torn = [int(np.count_nonzero(own.torn)) for own in activity.cells]
+    worst = int(np.argmax(torn))
+    if not torn[worst]:
+        return []
+    name, own = names[activity.channels[worst]], activity.cells[worst]
+    at = float(own.start[int(np.argmax(own.torn))])
+    text = (
+        f"{name} has {count(torn[worst], 'gap')} of several samples, the first after {at:.10g} s: no "
+        "standstill goes across one."
+    )
+    return [Finding(id="gaps", text=text)]
 
 
 def _equal_times(log: Table, time: Array, names: list[str]) -> list[Finding]:

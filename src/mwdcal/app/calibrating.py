@@ -19,6 +19,9 @@ from mwdcal.predict import typical_accuracy
 from mwdcal.profile import Profile
 from mwdcal.readings import Readings
 
+MANY = 1000
+"""Rows of a table with times from which it is a log."""
+
 
 class Digests(TypedDict):
     """What the calibration file says about its sources."""
@@ -33,10 +36,20 @@ def load(
     """A run with its tool profile, and the digests of both files."""
     profile, profile_sha256 = profiles.load_profile(tool)
     profile = prior_profile(prior, profile)
-    read = table.read(run, decimal=decimal)
+    read = runs.of_one_tool(table.read(run, decimal=decimal))
+    _check_no_log(read)
     readings, profile = runs.to_readings(read, profile)
     digests = Digests(profile_sha256=profile_sha256, run_sha256=read.digest)
     return readings, profile, digests
+
+
+def _check_no_log(read: table.Table) -> None:
+    """Refuse a continuous log, whose rows are no stations."""
+    if read.count > MANY and ("time_s" in read.columns or "sampling_hz" in read.metadata):
+        raise InputError(
+            f"{read.source} is a continuous log ({read.count} rows): its rows are no stations. Find "
+            f"the standstills first: mwdcal stations {read.source} -o run.csv"
+        )
 
 
 def run(

@@ -41,7 +41,6 @@ SIGNAL = 128
 """Exit status of an ended command, less the number of the signal that ended it."""
 PATIENCE = 5.0
 """Seconds after which another signal ends at once a command that is still tidying up."""
-COLDEST, HOTTEST = -273.15, 1000.0
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
@@ -217,13 +216,13 @@ def verify(
     Exit: 0 pass, 1 fail, 2 input cannot be read or is not independent.
     """
     from mwdcal.app import text
-    from mwdcal.files import documents, runs, table
+    from mwdcal.files import documents, runs
     from mwdcal.files.limits import load_limits
     from mwdcal.quality import verify as judge
 
     _check_outputs([report], [calibration, run])
     made = documents.read(calibration)
-    readings, _ = runs.to_readings(table.read(run, decimal=decimal), made.profile)
+    readings, _ = runs.read_run(run, made.profile, decimal=decimal)
     result = judge(made, readings, load_limits(limits))
     if report:
         from mwdcal.app.report import write_report
@@ -293,10 +292,11 @@ def _temperature(option: str | None) -> float | str | None:
         value = None if option is None else float(option)
     except ValueError:
         return option
-    if value is not None and not COLDEST <= value <= HOTTEST:
-        raise InputError(
-            f"--temperature must be between {COLDEST:g} and {HOTTEST:g} °C; got {value:g}."
-        )
+    from mwdcal.files.contract import TEMPERATURE
+
+    low, high = TEMPERATURE.low, TEMPERATURE.high
+    if value is not None and not low <= value <= high:
+        raise InputError(f"--temperature must be between {low:g} and {high:g} °C; got {value:g}.")
     return value
 
 

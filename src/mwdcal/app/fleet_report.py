@@ -26,10 +26,10 @@ from mwdcal.app.fleet_summary import (
 from mwdcal.app.text import number, plural
 from mwdcal.core.vectors import Array, Bools, Ints
 from mwdcal.files import atomic, parquet
-from mwdcal.files.fleet_sources import SERIAL, is_simulated
+from mwdcal.files.fleet_sources import SERIAL
 from mwdcal.findings import SUSPECT
 from mwdcal.fleet import OK
-from mwdcal.readings import TRIADS
+from mwdcal.readings import TRIADS, is_simulated
 
 if TYPE_CHECKING:
     from jinja2 import Environment

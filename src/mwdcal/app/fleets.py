@@ -20,10 +20,10 @@ from mwdcal.app.choices import DATASHEET, curves_of, prior_profile, stated
 from mwdcal.app.fleet_asked import Asked
 from mwdcal.app.fleet_summary import Summary, document, options_asked, summarise, text
 from mwdcal.app.text import plural
-from mwdcal.checks import check_options
+from mwdcal.checks import check_options, no_temperature
 from mwdcal.core.fused import cores
 from mwdcal.curves import declared
-from mwdcal.errors import FitError, InputError
+from mwdcal.errors import InputError
 from mwdcal.files import atomic, parquet, profiles
 from mwdcal.files.fleet_parts import Plan, is_whole, load, solve
 from mwdcal.files.fleet_sources import SERIAL, Source, open_source
@@ -65,9 +65,7 @@ def calibrate_table(asked: Asked, say: Callable[[str], None]) -> Summary:
     options, per_tool = _options(asked, profile)
     source = open_source(asked["runs"])
     if options.order and "temperature_c" not in source.columns:
-        raise InputError(
-            f"--order {options.order} needs the column 'temperature_c'; use --order 0."
-        )
+        raise no_temperature(max(options.orders))
     target = atomic.target(asked["output"])
     _check_target(target, asked["runs"])
     folder = target.with_name(target.name + ".parts")
@@ -135,11 +133,6 @@ def _options(asked: Asked, profile: Profile) -> tuple[Options, PerTool]:
     options, tried = _curves(options, asked["nonlinearity"], profile)
     per_tool = PerTool(auto, () if asked["prior"] else tried, bool(asked["prior"]))
     check_options(replace(options, prior=from_datasheet(profile) if asked["prior"] else None))
-    if options.method == "swarm" and options.order:
-        raise FitError(
-            "method swarm finds the 12 parameters of one temperature: use --order 0 for it, or "
-            "--method joint for temperature terms."
-        )
     return options, per_tool
 
 

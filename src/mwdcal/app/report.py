@@ -21,6 +21,7 @@ from mwdcal.errors import InputError
 from mwdcal.files import atomic
 from mwdcal.notation import Notation, convert
 from mwdcal.predict import accuracy_at, accuracy_map, angles, middle_temperature
+from mwdcal.readings import is_simulated
 from mwdcal.residuals import RESHOOT
 
 if TYPE_CHECKING:
@@ -52,7 +53,7 @@ def render(calibration: Calibration, verdict: Verdict | None = None) -> str:
         verdict=verdict,
         banner=banner(calibration, verdict),
         findings=_findings(calibration, verdict),
-        simulated=is_simulated(calibration),
+        simulated=is_simulated(calibration.tool),
         facts=_facts(calibration),
         relative=_relative(calibration),
         figures=_figures(calibration),
@@ -159,11 +160,6 @@ def svg(text: str) -> Any:
     from markupsafe import Markup
 
     return Markup(text)
-
-
-def is_simulated(calibration: Calibration) -> bool:
-    """Whether the run says that no real tool was measured."""
-    return calibration.tool.get("simulated", "").lower() not in ("", "0", "false", "no")
 
 
 def _relative(calibration: Calibration) -> bool:

@@ -20,7 +20,7 @@ from typing import IO, Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from mwdcal.calibration import Calibration, Finding
+from mwdcal.calibration import MARGIN, Calibration, Finding
 from mwdcal.core import fused
 from mwdcal.core.vectors import AnyArray, Array, Bools
 from mwdcal.correction import (
@@ -61,8 +61,6 @@ SAMPLE = 1024
 """Rows of a part on which undetermined outputs are judged."""
 BLOCK = 1 << 14
 """Rows that plain NumPy takes at a time."""
-MARGIN = 1.0
-"""Degrees by which a temperature may lie outside the calibrated range."""
 OPTIONAL = {
     CHANNELS["magnetometer"]: "Fill it in, or remove the station.",
     ("temperature_c",): "Fill it in, or leave the whole column blank.",

@@ -11,6 +11,7 @@ from mwdcal.calibration import Calibration, Choices, ErrorRow, Finding, OrderSco
 from mwdcal.curves import CurveScore
 from mwdcal.notation import Notation, powers
 from mwdcal.quality import Verdict
+from mwdcal.readings import is_simulated
 
 WEIGHED = {
     "toolface": "toolface·sin I",
@@ -74,7 +75,7 @@ def heading(calibration: Calibration) -> str:
     if calibration.temperature_c:
         parts.append("{:.1f}–{:.1f} °C".format(*calibration.temperature_c))
     parts.append(f"I {min(inclinations):.0f}–{max(inclinations):.0f}°")
-    if "simulated" in calibration.tool:
+    if is_simulated(calibration.tool):
         parts.append("SIMULATED DATA")
     ranks = [f"{t.name} {t.rank} of {t.size} determined" for t in calibration.triads]
     how = ", ".join(

@@ -142,7 +142,7 @@ def _even(time: Array, value: Array, length: float) -> tuple[Array, Array, Array
     end = time[last] + step
     start = time[last - size + 1]
     steps = np.diff(time[: count * size + 1], append=time[-1:])[: count * size]
-    torn = np.any(steps.reshape(count, size)[:, :-1] > size * step, axis=-1)
+    torn = np.any(steps.reshape(count, size)[:, :-1] > (size + 0.5) * step, axis=-1)
     if count and time[-1] - time[last[-1]] < size * step:
         end[-1] = time[-1] + step
     return start, end, np.asarray(np.median(whole, axis=-1), float), torn

@@ -20,6 +20,7 @@ from mwdcal.files import contract, parquet
 from mwdcal.files.azimuths import magnetic_offset
 from mwdcal.files.columns import LABELS
 from mwdcal.files.contract import REFERENCES
+from mwdcal.readings import is_simulated
 
 SERIAL = "serial"
 OFFSET = "#offset"
@@ -137,11 +138,6 @@ def _agreed(stated: Sequence[Mapping[str, object]]) -> dict[str, object]:
     """Metadata on which all files agree; simulated is a fleet of which one file is."""
     found = {k: v for k, v in stated[0].items() if all(k in s and s[k] == v for s in stated)}
     return found | next(({"simulated": s["simulated"]} for s in stated if is_simulated(s)), {})
-
-
-def is_simulated(metadata: Mapping[str, object]) -> bool:
-    """Whether a file says so of itself."""
-    return str(metadata.get("simulated", "")).lower() not in ("", "0", "false", "no")
 
 
 def _paths(path: Path) -> list[Path]:

@@ -82,15 +82,25 @@ def is_index(name: str) -> bool:
 
 
 def as_column(name: str, cells: Any, arrow: Any) -> Column:
-    """A column as floats (blank: NaN) where it is numeric, else as text."""
+    """A column as floats (blank: NaN) where it is numeric, else as text; so long whole numbers."""
     if arrow.types.is_dictionary(cells.type):
         cells = cells.cast(cells.type.value_type)
     kinds = arrow.types
     numeric = kinds.is_floating(cells.type) or kinds.is_integer(cells.type)
+    if kinds.is_integer(cells.type) and _is_code(cells):
+        return texts(cells, arrow)
     if name not in LABELS and (numeric or kinds.is_decimal(cells.type)):
         values = cells.cast(arrow.float64(), safe=False).to_numpy()
         return np.array(values, float)
     return texts(cells, arrow)
+
+
+def _is_code(cells: Any) -> bool:
+    """Whether whole numbers have more digits than a double holds."""
+    import pyarrow.compute as compute
+
+    ends = compute.min_max(cells).as_py()
+    return any(abs(end) >= 10**15 for end in ends.values() if end is not None)
 
 
 def texts(cells: Any, arrow: Any) -> list[str]:

@@ -12,6 +12,7 @@ from pathlib import Path
 import msgspec
 
 from mwdcal.errors import InputError
+from mwdcal.files.contract import TEMPERATURE
 from mwdcal.files.table import shown
 from mwdcal.profile import Datasheet, Profile, StandProfile, TriadProfile
 
@@ -181,7 +182,13 @@ def check_profile(profile: Profile, source: str) -> None:
     if not profile.name.strip():
         raise InputError(f"{source}, key 'name': must not be blank; got ''. Name the tool.")
     temperature = profile.reference_temperature_c
-    _check_number(temperature, (-273.15, 1000.0), source, "reference_temperature_c", "In °C.")
+    _check_number(
+        temperature,
+        (TEMPERATURE.low, TEMPERATURE.high),
+        source,
+        "reference_temperature_c",
+        "In °C.",
+    )
     _check_triad(profile.accelerometer, "accelerometer", source)
     _check_triad(profile.magnetometer, "magnetometer", source)
     for field in StandProfile.__struct_fields__:

@@ -9,11 +9,13 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Mapping
+from dataclasses import replace
 
 import msgspec
 import numpy as np
 
 from mwdcal.core.vectors import AnyArray, Array, Bools
+from mwdcal.errors import InputError
 from mwdcal.files import table as tables
 from mwdcal.files.azimuths import magnetic_offset
 from mwdcal.files.columns import Column
@@ -38,7 +40,25 @@ def read_run(
     path: str | os.PathLike[str], profile: Profile, *, decimal: str = "."
 ) -> tuple[Readings, Profile]:
     """The readings of a run file, and the profile with its nominal scales filled in."""
-    return to_readings(tables.read(path, decimal=decimal), profile)
+    return to_readings(of_one_tool(tables.read(path, decimal=decimal)), profile)
+
+
+def of_one_tool(table: Table) -> Table:
+    """A table of one tool; what its column `serial` says of it stands in the metadata.
+
+    Refuses rows of several tools: they are a fleet, and no run.
+    """
+    if "serial" not in table.columns:
+        return table
+    found = list(dict.fromkeys(filter(None, labels(table, "serial"))))
+    stated = table.metadata.get("serial")
+    known = list(dict.fromkeys([*([] if stated is None else [str(stated)]), *found]))
+    if len(known) > 1:
+        raise InputError(
+            f"{table.source} has rows of more than one tool (serial {known[0]}, {known[1]}"
+            f"{', …' if known[2:] else ''}). Take the rows of one, or use mwdcal fleet."
+        )
+    return replace(table, metadata={**table.metadata, "serial": known[0]}) if known else table
 
 
 def write_run(
@@ -96,7 +116,7 @@ def from_readings(
     metadata = readings.metadata if metadata is None else metadata
     source = readings.source or "run"
     offset = magnetic_offset(metadata, source) if "azimuth" in readings.known else 0.0
-    columns: dict[str, Column] = {"station": list(_labelled(readings))}
+    columns: dict[str, Column] = {"station": list(readings.labels)}
     if readings.group is not None:
         columns["group"] = ["" if g < 0 else str(g) for g in readings.group.tolist()]
     if readings.temperature is not None:
@@ -296,10 +316,6 @@ def _digests(triads: list[Array]) -> tuple[str, ...]:
 def _digest(row: list[float]) -> str:
     text = ",".join(f"{value:.12g}" for value in row)
     return hashlib.sha256(text.encode()).hexdigest()[:_DIGEST_LENGTH]
-
-
-def _labelled(readings: Readings) -> tuple[str, ...]:
-    return readings.station or tuple(str(i) for i in range(1, readings.count + 1))
 
 
 def _raw_columns(readings: Readings, profile: Profile, kind: str) -> dict[str, Column]:

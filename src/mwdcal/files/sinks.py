@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import base64
 import csv
 import io
 from collections.abc import Mapping, Sequence
@@ -16,6 +17,8 @@ from mwdcal.core.vectors import AnyArray
 from mwdcal.files import metadata as meta
 from mwdcal.files import parquet, text
 from mwdcal.files.columns import as_text
+
+_ARROW_SCHEMA = b"ARROW:schema"
 
 
 class Sink(Protocol):
@@ -41,7 +44,7 @@ class ParquetSink:
         self._metadata = dict(metadata)
         self._names = names = results.names
         numeric = {f.name for f in schema if self._arrow.types.is_floating(f.type)}
-        schema = self._arrow.schema([*schema, *results])
+        self._schema = schema = self._arrow.schema([*schema, *results])
         schema = schema.with_metadata({parquet.KEY: self._described([])})
         self._writer = parquets.ParquetWriter(
             stream.name,
@@ -62,8 +65,10 @@ class ParquetSink:
 
     def finish(self, findings: Sequence[str]) -> None:
         """Write the findings and the end of the file."""
-        if findings:
-            self._writer.add_key_value_metadata({parquet.KEY: self._described(findings)})
+        if findings:  # also in Arrow's copy of the schema, whose metadata readers take
+            described = {parquet.KEY: self._described(findings)}
+            stored = base64.b64encode(self._schema.with_metadata(described).serialize())
+            self._writer.add_key_value_metadata({**described, _ARROW_SCHEMA: stored})
         self._writer.close()
 
     def _described(self, findings: Sequence[str]) -> bytes:

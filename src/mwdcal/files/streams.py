@@ -109,7 +109,7 @@ def open_parquet(path: Path, rows: int = 0, decimal: str = ".") -> Source:
     return Source(path.name, names, metadata, schema, count, count, pieces, load)
 
 
-def open_text(path: Path, delimiter: str | None = None, typed: bool = False) -> Source:
+def open_text(path: Path, typed: bool = False) -> Source:
     """A text table in pieces; `typed`: the contract's columns of numbers are carried as numbers."""
     arrow, _ = parquet.modules(path.name)
     try:
@@ -118,7 +118,7 @@ def open_text(path: Path, delimiter: str | None = None, typed: bool = False) -> 
     except OSError as error:
         raise InputError(f"cannot read '{path}': {error.strerror}.") from error
     start = _newlines(first)
-    top = text.head(start, path.name, delimiter)
+    top = text.head(start, path.name)
     numeric = [name for name in top.names if typed and name in _NUMERIC]
     types = {n: arrow.float64() if n in numeric else arrow.string() for n in top.names}
 
