@@ -181,3 +181,33 @@ def test_a_dead_member_does_not_stop_the_others(kind, monkeypatch):
     np.testing.assert_allclose(
         broken.state.params[others], whole.state.params[others], rtol=1e-9, atol=1e-9
     )
+
+
+@pytest.mark.parametrize("lacking", [("soaks",), ("soaks", "noise")], ids=["declared", "estimated"])
+@pytest.mark.parametrize("options", [Options(), Options(order=2)], ids=["polynomial", "factors"])
+def test_a_member_that_determines_less_does_not_change_the_others(options, lacking):
+    data, include = runs(lacking, 20), np.ones((20, 48))
+    include[3] = np.arange(48) % 12 == 0  # one toolface
+    include[7, 4:] = 0
+    others = ~np.isin(np.arange(20), (3, 7))
+    mixed, whole = fit(data, options, include), fit(data, options)
+    assert not mixed.analysis.determined.keep.all(-1)[~others].any()
+    assert (mixed.iterations[others] == 1).all()
+    assert (mixed.iterations[~others] > 1).all()
+    for name in ("params", "attitude"):
+        ours, theirs = (getattr(f.state, name) for f in (mixed, whole))
+        np.testing.assert_array_equal(ours[others], theirs[others])
+    for name in ("covariance", "variance_factor", "residual"):
+        ours, theirs = (getattr(f.analysis, name) for f in (mixed, whole))
+        np.testing.assert_array_equal(ours[others], theirs[others])
+    np.testing.assert_array_equal(mixed.noise[others], whole.noise[others])
+    for member in (3, 7):
+        part = fit(runs_of(data, [member]), options, include[[member]])
+        np.testing.assert_array_equal(mixed.state.params[[member]], part.state.params)
+        np.testing.assert_array_equal(mixed.noise[[member]], part.noise)
+
+
+def runs_of(data, members):
+    return replace(
+        data, accelerometer=data.accelerometer[members], magnetometer=data.magnetometer[members]
+    )

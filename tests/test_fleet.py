@@ -629,8 +629,30 @@ def _of_session(leader):
     return [pid for pid, session, state in rows if session == str(leader) and state[0] != "Z"]
 
 
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="asks ps for sessions")
-@pytest.mark.skipif(not shutil.which("ps"), reason="no ps on this system")
+PS = pytest.mark.skipif(
+    not (sys.platform.startswith("linux") and shutil.which("ps")), reason="asks ps for sessions"
+)
+
+
+@PS
+def test_an_interruption_while_workers_start_leaves_no_traceback(fleet, tmp_path):
+    command = ["fleet", fleet[0], "-o", tmp_path / "cals.parquet", "--tool", "servo"]
+    for others, later in ((1, 0.0), (2, 0.0), (2, 0.1), (2, 0.2)):
+        running = subprocess.Popen(
+            [*MWDCAL, *map(str, command), "--workers", "2"],
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
+        )  # fmt: skip
+        limit = time.monotonic() + 60
+        while len(_of_session(running.pid)) <= others and time.monotonic() < limit:
+            pass
+        time.sleep(later)
+        os.killpg(running.pid, signal.SIGINT)
+        out, err = running.communicate(timeout=60)
+        assert (running.returncode, out) == (130, "")
+        assert "Traceback" not in err
+
+
+@PS
 def test_workers_end_with_the_command_that_was_killed(tmp_path):
     path = many(tmp_path / "runs.parquet", tools=6000)
     output, folder = tmp_path / "cals.parquet", tmp_path / "cals.parquet.parts"

@@ -14,7 +14,7 @@ from mwdcal.options import Options
 from mwdcal.predict import typical_accuracy
 from mwdcal.readings import Readings
 from simulation import DEG, Tool, plan
-from test_fleet import bad_tools, roll_run, short_run, write_fleet
+from test_fleet import bad_tools, calibrated, roll_run, short_run, write_fleet
 
 pa = pytest.importorskip("pyarrow")
 pq = pytest.importorskip("pyarrow.parquet")
@@ -373,3 +373,50 @@ def test_an_option_that_both_commands_have_is_one():
     assert set(calibrate) - set(fleet) == {"run", "exclude", "decimal"}
     for name in ("method", "robust", "estimate", "ignore", "parameters", "order", "nonlinearity"):
         assert fleet[name].help == calibrate[name].help
+
+
+SAID = {
+    "too weak to fit": "weak-geometry",
+    "gain on tool axis": "gain",
+    "residuals are": "residuals",
+    "has no redundancy": "no-redundancy",
+    "did not settle": "not-converged",
+    "does not move": "channel",
+    "moves by": "channel",
+    "needs": "too-few-stations",
+    "cannot tell it from": "inseparable",
+}
+
+
+def broken(rng):
+    """A run of few stations with one or two things wrong."""
+    good = servo_run(int(rng.integers(1000)), (10, 40, 65, 90, 115, 140), 6)
+    some = np.sort(rng.permutation(36)[: rng.choice([6, 8, 12, 30])])
+    run = {name: np.array(values)[some] for name, values in good.items()}
+    for _ in range(rng.integers(1, 3)):
+        one, other = rng.permutation(["ax", "ay", "az", "mx", "my", "mz"])[:2]
+        wrong = rng.integers(5)
+        if wrong == 0:
+            run[one], run[other] = run[other], run[one]
+        if wrong == 1:
+            run[one] = -run[one]
+        if wrong == 2:
+            run[one] = run[one] * 10 ** rng.uniform(-2, 2)
+        if wrong == 3:
+            run[one] = run[one] + rng.normal(0, 10 ** rng.uniform(-3, 0.5), len(some))
+        if wrong == 4:
+            run["ref_toolface_deg"] = run["ref_toolface_deg"][::-1].copy()
+    return run
+
+
+@pytest.mark.parametrize(("tool", "options"), [
+    ("servo", ("--estimate", "azimuth-zero")), ("generic", ("--method", "newton")),
+])  # fmt: skip
+def test_a_status_says_what_its_message_says(tmp_path, tool, options):
+    rng = np.random.default_rng(1)
+    path = write_fleet(tmp_path / "runs.parquet", {f"B{k}": broken(rng) for k in range(80)})
+    rows = calibrated(path, *options, tool=tool)
+    bad = [row for row in rows.values() if row["status"] != "ok"]
+    for row in bad:
+        assert row["status"] == next(s for words, s in SAID.items() if words in row["message"])
+    assert len({row["status"] for row in bad}) >= 4

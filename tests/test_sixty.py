@@ -159,3 +159,46 @@ def _calibrate_states_the_same(readings, raw, half, tool):
     freedom = min(triad.degrees_of_freedom for triad in record.triads)
     assert (wider > 1 - 1e-4).all()
     assert (wider < stdtrit(freedom, 0.975) / 1.96 + 1e-4).all()
+
+
+def in_a_plane(away):
+    """Twelve inclinations of a plane at two azimuths, and four stations `away` degrees off it."""
+    roll = [(15 * k + 5, azimuth, 0) for azimuth in (0, 180) for k in range(12)]
+    return [*roll, (60, 0, away), (120, 0, -away), (60, 180, away), (90, 10, away)]
+
+
+def about_horizontal(away):
+    """Three inclinations about 90°."""
+    return [(90 + step * away, 65 * k, 55 * k) for step in (-1, 0, 1) for k in range(7)]
+
+
+@pytest.mark.parametrize("order", [1, 2, 3])
+@pytest.mark.parametrize(("stations", "away"), [
+    (in_a_plane, 1), (in_a_plane, 3), (about_horizontal, 0.6), (about_horizontal, 2),
+])  # fmt: skip
+def test_an_axis_that_sees_little_of_the_field_is_found(stations, away, order):
+    rng, tools = np.random.default_rng(order), 60
+    warmth = np.linspace(10.0, 90.0, order + 1)
+    stated = np.array(stations(away), float).T * DEG
+    angles = np.tile(stated, order + 1)
+    times = np.repeat(warmth, stated.shape[1])
+    stand = np.array([0.01, 0.05, 0.02]) * DEG
+    true = angles[:, None] + stand[:, None, None] * rng.normal(size=(3, tools, len(times)))
+    raw = factor_readings(factors_within_limits(rng, tools), times, vectors(true))
+    raw += NOISE * rng.normal(size=raw.shape)
+    noise = {"accelerometer": np.full(3, NOISE[0]), "magnetometer": np.full(3, NOISE[3])}
+    sigma = {n: np.full(len(times), s) for n, s in zip(NAMES, stand, strict=False)}
+    found = []
+    for known, spread in ((angles[:, None] + np.zeros_like(true), sigma), (true, {})):
+        place = dict(zip(NAMES, known, strict=False))
+        place |= {"field": np.full(len(times), FIELD), "dip": np.full(len(times), DIP)}
+        sd = {n: np.broadcast_to(s, (len(times), 3)) for n, s in noise.items()} | spread
+        data = Readings(raw[..., :3], raw[..., 3:], times, place, sd)
+        found.append(fit(data, Options(order=order)))
+    ours, closed = found
+    assert (closed.iterations == 1).all()  # at the true attitudes there is no start to go wrong
+    assert (ours.status == 0).all()
+    assert ours.analysis.determined.keep.all()
+    sd = np.sqrt(np.diagonal(ours.analysis.covariance, axis1=-2, axis2=-1))
+    assert np.sqrt(np.mean(((ours.state.params - closed.state.params) / sd) ** 2)) < 1.1
+    assert np.mean(ours.analysis.variance_factor) == pytest.approx(1.0, abs=0.1)

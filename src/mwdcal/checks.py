@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 
 import numpy as np
 
@@ -41,11 +42,26 @@ COARSE = 0.05
 
 def check_fit(result: Fit, free: list[Free], profile: Profile, readings: Readings) -> None:
     """Refuse a fit that did not settle, is too weak, has no redundancy, or absurd gains."""
-    _check_status(result)
-    _check_geometry(result, free, readings)
-    _check_freedom(result)
-    _check_gains(result, profile, readings)
-    _check_residuals(result, readings)
+    for _, check in fit_checks(result, free, profile, readings):
+        check()
+
+
+def fit_checks(
+    result: Fit, free: list[Free], profile: Profile, readings: Readings
+) -> Iterator[tuple[str, Callable[[], None]]]:
+    """The checks in turn, each with the status that a fleet gives to what it refuses.
+
+    Where nothing fits, the state is anywhere: that comes before what it leaves undetermined.
+    """
+    status = Status(int(result.status[0]))
+    residuals = ("residuals", partial(_check_residuals, result, readings))
+    yield status.name.lower().replace("_", "-"), partial(_check_status, status)
+    if any(map(is_bad, free)):
+        yield residuals
+    yield "weak-geometry", partial(_check_geometry, free)
+    yield "no-redundancy", partial(_check_freedom, result)
+    yield "gain", partial(_check_gains, result, profile, readings)
+    yield residuals
 
 
 def check_options(options: Options) -> None:
@@ -232,8 +248,7 @@ def _check_needs(readings: Readings, method: str) -> None:
             )
 
 
-def _check_status(result: Fit) -> None:
-    status = Status(int(result.status[0]))
+def _check_status(status: Status) -> None:
     if status is not Status.OK:
         raise FitError(f"the fit failed: {status.message}.")
 
@@ -243,14 +258,10 @@ def is_bad(direction: Free) -> bool:
     return direction.id.partition("-temperature-")[0] not in BENIGN
 
 
-def _check_geometry(result: Fit, free: list[Free], readings: Readings) -> None:
-    """Rotations and scales may stay free; anything else is a design too weak to fit.
-
-    Where nothing fits, the state is anywhere: that, not the design, is then what is wrong.
-    """
+def _check_geometry(free: list[Free]) -> None:
+    """Rotations and scales may stay free; anything else is a design too weak to fit."""
     bad = [entry for entry in free if is_bad(entry)]
     if bad:
-        _check_residuals(result, readings)
         each = [f"{TRIADS[t]} {e.id.removeprefix('weak-')}" for e in bad for t in e.triads]
         each = list(dict.fromkeys(each))
         more = f" and {len(each) - NAMED} more" if len(each) > NAMED else ""
@@ -268,7 +279,7 @@ def _check_freedom(result: Fit) -> None:
     ):
         if np.isfinite(noise) and freedom < 1:
             raise FitError(
-                f"the {name} has no redundancy ({freedom:.1f} degrees of freedom): its noise cannot "
+                f"the {name} has no redundancy ({max(freedom, 0):.1f} degrees of freedom): its noise cannot "
                 "be estimated. Add stations, or declare 'noise' in the tool profile."
             )
 

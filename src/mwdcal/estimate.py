@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -22,7 +21,7 @@ from mwdcal.core.uncertainty import (
     settle_gauge,
     station_misfit,
 )
-from mwdcal.core.vectors import AnyArray, Array, Bools, Ints
+from mwdcal.core.vectors import Array, Bools, Ints, placed
 from mwdcal.evidence import evidence_of, flat
 from mwdcal.methods import EVIDENCE, Solved, solve, with_stand_errors, without
 from mwdcal.options import Options
@@ -144,9 +143,17 @@ def _fit(readings: Readings, options: Options, include: Array | None) -> Fit:
     lead = np.broadcast_shapes(readings.accelerometer.shape[:-1], include.shape)
     problem, declared = _problem(readings, evidence, lead, options)
     problem, finite = _without_broken(problem)
-    closed = _closed(problem, declared, options, finite)
-    if closed is not None:
+    closed, alone = _closed(problem, declared, options, finite)
+    if closed is None:
+        return _general(problem, declared, options, finite)
+    if alone.all():
         return closed
+    rest = np.flatnonzero(~alone)
+    return _joined(closed, rest, _general(problem.take(rest), declared, options, finite[rest]))
+
+
+def _general(problem: Problem, declared: list[bool], options: Options, finite: Bools) -> Fit:
+    """The fit by steps."""
     solved = solve(problem, start(problem), options)
     iterations = solved.iterations
     stage = _Stage(problem, solved, np.ones(problem.evidence.include.shape))
@@ -168,25 +175,58 @@ def _fit(readings: Readings, options: Options, include: Array | None) -> Fit:
     return Fit(trusted, state, status, iterations, noise, trust, analysis)
 
 
-def _closed(problem: Problem, declared: list[bool], options: Options, finite: Bools) -> Fit | None:
-    """The fit in closed form, where all references are exact and the stations span all directions."""
+def _closed(
+    problem: Problem, declared: list[bool], options: Options, finite: Bools
+) -> tuple[Fit | None, Bools]:
+    """The fit in closed form, and members (B,) of which it is: those that determine all directions.
+
+    None where it is of none, as with references that are not exact.
+    """
+    none = np.zeros(len(finite), bool)
     if options.robust or options.own_solver or not exact.applies(problem):
-        return None
+        return None, none
     at = exact.start(problem)
     halfs = exact.halves(problem, at)
-    if halfs is None:
-        return None
     state, analysis = exact.solution(problem, at, halfs)
-    if not analysis.determined.keep.all():
-        return None
+    good = np.all([h.settled for h in halfs], 0) & analysis.determined.keep.all(-1)
+    if not good.any():
+        return None, none
     if not all(declared):
         problem = _rescaled(problem, np.sqrt(analysis.variance_factor), declared)
-        state, analysis = exact.solution(problem, at, exact.halves(problem, at) or halfs)
+        halfs = exact.halves(problem, at)
+        state, analysis = exact.solution(problem, at, halfs)
+        good &= np.all([h.settled for h in halfs], 0)
     sound = finite & np.isfinite(state.params).all(-1)
     status = np.where(sound, int(Status.OK), int(Status.NOT_FINITE))
     trust = np.ones(problem.evidence.include.shape)
     once = np.ones(len(status), int)
-    return Fit(problem, state, status, once, _noise(problem, declared), trust, analysis)
+    noise = _noise(problem, declared)
+    return Fit(problem, state, status, once, noise, trust, analysis), good
+
+
+def _joined(ours: Fit, index: Ints, other: Fit) -> Fit:
+    """Our fit with some members of another."""
+    ends = {
+        name: placed(getattr(ours, name), index, getattr(other, name))
+        for name in ("status", "iterations", "noise", "trust")
+    }
+    mine, theirs = ours.analysis, other.analysis
+    names = ("covariance", "variance_factor", "freedom", "residual", "spread", "constants")
+    found = {n: placed(getattr(mine, n), index, getattr(theirs, n)) for n in names}
+    determined = mine.determined.put(index, theirs.determined)
+    return Fit(
+        problem=_with_noise_of(ours.problem, index, other.problem),
+        state=ours.state.put(index, other.state),
+        analysis=replace(mine, determined=determined, **found),
+        **ends,
+    )
+
+
+def _with_noise_of(problem: Problem, index: Ints, other: Problem) -> Problem:
+    """The problem with the noise that some members have in another, which is the same besides."""
+    pairs = zip(problem.triads, other.triads, strict=True)
+    triads = tuple(replace(t, sd=placed(t.sd, index, o.sd)) for t, o in pairs)
+    return replace(problem, triads=triads)
 
 
 def _noise(problem: Problem, declared: list[bool]) -> Array:
@@ -280,33 +320,26 @@ class _Stage:
         return _Stage(self.problem.take(index), solved, self.trust[index])
 
     def put(self, index: Ints, other: _Stage) -> _Stage:
-        """Ours with some members replaced; of their problem only the noise is other than ours."""
-
-        def placed(mine: AnyArray, theirs: AnyArray) -> Any:
-            changed = mine.copy()
-            changed[index] = theirs
-            return changed
-
+        """Ours with some members replaced."""
         ours, new = self.solved, other.solved
-        pairs = zip(self.problem.triads, other.problem.triads, strict=True)
-        triads = tuple(replace(t, sd=placed(t.sd, o.sd)) for t, o in pairs)
         sums = {
             k: replace(
                 v,
-                reference=placed(v.reference, new.sums[k].reference),
-                weights=placed(v.weights, new.sums[k].weights),
+                reference=placed(v.reference, index, new.sums[k].reference),
+                weights=placed(v.weights, index, new.sums[k].weights),
             )
             for k, v in ours.sums.items()
         }
         solved = replace(
             ours,
             state=ours.state.put(index, new.state),
-            status=placed(ours.status, new.status),
-            iterations=placed(ours.iterations, new.iterations),
+            status=placed(ours.status, index, new.status),
+            iterations=placed(ours.iterations, index, new.iterations),
             sums=sums,
-            known={k: placed(v, new.known[k]) for k, v in ours.known.items()},
+            known={k: placed(v, index, new.known[k]) for k, v in ours.known.items()},
         )
-        return _Stage(replace(self.problem, triads=triads), solved, placed(self.trust, other.trust))
+        problem = _with_noise_of(self.problem, index, other.problem)
+        return _Stage(problem, solved, placed(self.trust, index, other.trust))
 
 
 def _in_turn(stage: _Stage, rounds: int, turn: Callable[[_Stage], tuple[_Stage, Bools]]) -> _Stage:

@@ -11,12 +11,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from mwdcal.calibration import FREE_SHARE, StandErrors
-from mwdcal.checks import check_fit, check_readings
+from mwdcal.checks import check_readings, fit_checks
 from mwdcal.core.models import Basis, Factors, Polynomial, Whole
 from mwdcal.core.observability import Free
 from mwdcal.core.uncertainty import analyse, marginal_rank
@@ -228,17 +229,20 @@ def _doubt(
     alone: Alone,
 ) -> None:
     """Give the suspects that the checks of a single fit refuse their status and message."""
-    for name, flags in suspect_fits(result, free, options).items():
-        for index in np.flatnonzero(flags & (outcome.status[members] == OK)):
-            tool = int(members[index])
-            readings, profile = alone(tool)
-            own = member(result, np.array([index]))
+    suspect = suspect_fits(result, free, options) & (outcome.status[members] == OK)
+    for index in np.flatnonzero(suspect):
+        tool = int(members[index])
+        readings, profile = alone(tool)
+        own = member(result, np.array([index]))
+        checks = [*fit_checks(own, free[index], profile, readings)]
+        if options.estimate:
+            checks.insert(0, ("inseparable", partial(check_separable, own, options.estimate)))
+        for status, check in checks:
             try:
-                if options.estimate:
-                    check_separable(own, options.estimate)
-                check_fit(own, free[index], profile, readings)
+                check()
             except MwdcalError as error:
-                outcome.status[tool], outcome.message[tool] = name, str(error)
+                outcome.status[tool], outcome.message[tool] = status, str(error)
+                break
 
 
 def _factors(result: Fit) -> Array:

@@ -23,8 +23,6 @@ from mwdcal.readings import TRIADS, Readings
 from mwdcal.selection import GAP
 from mwdcal.stand import LOOSE
 
-NOT_CONVERGED, NOT_FINITE = "not-converged", "not-finite"
-
 
 def suspect_readings(readings: Readings, options: Options) -> dict[str, Bools]:
     """Suspects (B,) before the fit: too few stations, channels, temperatures, references."""
@@ -92,21 +90,13 @@ def _lacking(readings: Readings, method: str) -> Bools:
     return np.asarray(np.any(blank, axis=0)) if blank else np.zeros(1, bool)
 
 
-def suspect_fits(result: Fit, free: list[list[Free]], options: Options) -> dict[str, Bools]:
+def suspect_fits(result: Fit, free: list[list[Free]], options: Options) -> Bools:
     """Suspects (B,) after the fit: not settled, too weak, without redundancy, absurd."""
-    analysis, noise = result.analysis, result.noise
-    weak = np.array([any(map(is_bad, each)) for each in free], bool)
-    absurd = _absurd(result)
-    clear = ~(weak & absurd)  # where nothing fits, that is said first
-    first = {"inseparable": _inseparable(result)} if options.estimate else {}
-    return first | {
-        NOT_CONVERGED: result.status == int(Status.NOT_CONVERGED),
-        NOT_FINITE: result.status == int(Status.NOT_FINITE),
-        "weak-geometry": weak & clear,
-        "no-redundancy": np.any(np.isfinite(noise) & (analysis.freedom < 1), -1) & clear,
-        "gain": _odd_gains(result) & clear,
-        "residuals": absurd,
-    }
+    suspect = result.status != int(Status.OK)
+    suspect |= [any(map(is_bad, each)) for each in free]
+    suspect |= np.any(np.isfinite(result.noise) & (result.analysis.freedom < 1), -1)
+    suspect |= _odd_gains(result) | _absurd(result)
+    return np.asarray(suspect | _inseparable(result) if options.estimate else suspect)
 
 
 def _inseparable(result: Fit) -> Bools:

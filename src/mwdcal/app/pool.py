@@ -19,7 +19,13 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
-from multiprocessing import forkserver, get_all_start_methods, get_context, parent_process
+from multiprocessing import (
+    forkserver,
+    get_all_start_methods,
+    get_context,
+    parent_process,
+    resource_tracker,
+)
 from multiprocessing.context import BaseContext
 from typing import Any
 
@@ -61,6 +67,7 @@ def preparing(workers: int | None) -> Iterator[None]:
     context = _context()
     with _settings_of_workers():
         if (workers or os.cpu_count() or 1) > 1 and context.get_start_method() == "forkserver":
+            resource_tracker.ensure_running()  # its start would unblock the interruption again
             before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGHUP})
             try:
                 forkserver.ensure_running()

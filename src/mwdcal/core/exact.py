@@ -21,7 +21,7 @@ from mwdcal.core.models import Factors, Polynomial
 from mwdcal.core.problem import GEOMETRIC_NOISE, Problem, State, Triad
 from mwdcal.core.solvers import RANK_TOLERANCE, Determined
 from mwdcal.core.uncertainty import Analysis
-from mwdcal.core.vectors import Array, eigen, eigenvalues, inverse, tool_from_earth
+from mwdcal.core.vectors import Array, Bools, eigen, eigenvalues, inverse, tool_from_earth
 
 ORDER = np.array([4 * i + j for i in range(3) for j in range(3)] + [4 * i + 3 for i in range(3)])
 """Places of the parameters (gains row by row, then offsets) among those of Θ, row by row."""
@@ -55,7 +55,7 @@ class Half:
     """One triad: terms f̃ = [f 1] (B, n, 4), Φ (B, 3, 4), F⁻¹ by axis (B, 3, 4, 4), M and T.
 
     `include` (B, n, 1) is 1 for stations that count; `left` (B, n, 3) are whitened residuals, `open`
-    (B, n, 3) their expected variances.
+    (B, n, 3) their expected variances. `settled` (B,): the stations span what the model needs.
     """
 
     include: Array
@@ -66,6 +66,7 @@ class Half:
     turn: Array
     left: Array
     open: Array
+    settled: Bools
 
     @property
     def params(self) -> Array:
@@ -108,19 +109,18 @@ class Half:
 Halves = list[Half | separable.Half]
 
 
-def halves(problem: Problem, at: State) -> Halves | None:
-    """The minimum of each triad at known attitudes; None where the stations do not span what a model needs."""
+def halves(problem: Problem, at: State) -> Halves:
+    """The minimum of each triad at known attitudes, where the stations span what a model needs."""
     include = problem.evidence.include
     pairs = list(zip(problem.triads, problem.targets(at), strict=False))
     factored = [pair for pair in pairs if isinstance(pair[0].model, Factors)]
     apart = iter(separable.halves(factored, problem.temperature, include))
-    found = [
+    return [
         next(apart)
         if isinstance(triad.model, Factors)
         else _half(triad, target, include[..., None])
         for triad, target in pairs
     ]
-    return [half for half in found if half] if all(found) else None
 
 
 def start(problem: Problem) -> State:
@@ -154,7 +154,7 @@ def solution(problem: Problem, at: State, halfs: Halves) -> tuple[State, Analysi
     return state, Analysis(covariance, determined(halfs), factor, freedom, left, spread, constants)
 
 
-def _half(triad: Triad, target: Array, include: Array) -> Half | None:
+def _half(triad: Triad, target: Array, include: Array) -> Half:
     terms = np.concatenate([target, np.ones_like(target[..., :1])], -1)
     weight = include / triad.sd**2
     alike = bool((weight == weight[..., :1]).all())
@@ -163,14 +163,15 @@ def _half(triad: Triad, target: Array, include: Array) -> Half | None:
     size = np.sqrt(np.maximum(np.diagonal(information, axis1=-2, axis2=-1), 1e-300))
     outer = size[..., :, None] * size[..., None, :]
     values, vectors = eigen(information / outer)
-    if not (values[..., 0] > SPANNED).all():
-        return None
+    spanned = np.all(values[..., 0] > SPANNED, -1)
     apart = (vectors / values[..., None, :]) @ np.swapaxes(vectors, -1, -2) / outer
     spread = np.broadcast_to(apart, (len(terms), 3, 4, 4))
     forward = np.einsum("bajk,bka->baj", spread, across @ (weight * triad.raw))
     left = (triad.raw - terms @ np.swapaxes(forward, -1, -2)) * np.sqrt(weight)
     share = np.einsum("banj,bnj->bna", terms[:, None] @ apart, terms) * weight
-    return Half(include, terms, forward, spread, *_own(triad, forward), left, include - share)
+    return Half(
+        include, terms, forward, spread, *_own(triad, forward), left, include - share, spanned
+    )
 
 
 def _own(triad: Triad, forward: Array) -> tuple[Array, Array]:

@@ -33,6 +33,7 @@ from mwdcal.core.vectors import (
     earth_gravity,
     eigen,
     inverse,
+    placed,
     rotation,
     skew,
 )
@@ -135,10 +136,7 @@ class State:
         """Ours with some members replaced."""
         ours = (self.params, self.attitude, self.constants, self.own)
         theirs = (other.params, other.attitude, other.constants, other.own)
-        changed = [part.copy() for part in ours]
-        for part, new in zip(changed, theirs, strict=True):
-            part[index] = new
-        return State(*changed)
+        return State(*(placed(a, index, b) for a, b in zip(ours, theirs, strict=True)))
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ import numpy as np
 
 from mwdcal.core.models import OFF_DIAGONAL
 from mwdcal.core.problem import GEOMETRIC_NOISE, Triad
-from mwdcal.core.vectors import Array, eigenvalues, inverse
+from mwdcal.core.vectors import Array, Bools, eigenvalues, inverse, solved
 
 OTHERS = np.array([[1, 2], [0, 2], [0, 1]])
 """The two axes that an axis is misaligned with."""
@@ -76,7 +76,7 @@ class Point:
     """The unknowns (B, 3, 2K + 2) after the last step, and what it began with.
 
     It is so short that scale and `rows`, the slopes, are those of the minimum; `left` are the
-    residuals after it.
+    residuals after it. `settled` (B,) says of which runs all axes came to their minimum.
     """
 
     unknowns: Array
@@ -84,10 +84,11 @@ class Point:
     rows: Array
     information: Array
     left: Array
+    settled: Bools
 
 
-def minimum(axes: Axes) -> Point | None:
-    """Every axis at its minimum; None where one does not settle."""
+def minimum(axes: Axes) -> Point:
+    """Every axis at its minimum; a run that has settled waits for the others before its last step."""
     count = axes.phi.shape[-2]
     unknowns = np.zeros((len(axes.raw), 3, 2 * count + 2))
     unknowns[..., 0] = 1.0
@@ -97,21 +98,15 @@ def minimum(axes: Axes) -> Point | None:
         left = axes.raw - scale * unit
         gradient = rows @ left[..., None]
         information = rows @ np.swapaxes(rows, -1, -2)
-        step = _solved(information, gradient)
-        unknowns = unknowns + step[..., 0]
+        step = solved(information, gradient)
+        settled = np.all(np.sum(step * gradient, (-1, -2)) < SMALL, -1) & (turn > 0)
+        if settled.all():
+            break
+        unknowns = unknowns + np.where(settled[:, None, None], 0.0, step[..., 0])
         if turn == 0:  # linear so far: what goes with the scale is still times it
             unknowns[..., count:] /= unknowns[..., :1]
-        elif (np.sum(step * gradient, (-1, -2)) < SMALL).all():
-            left -= (np.swapaxes(step, -1, -2) @ rows)[..., 0, :]
-            return Point(unknowns, scale, rows, information, left)
-    return None
-
-
-def _solved(matrix: Array, column: Array) -> Array:
-    try:
-        return np.asarray(np.linalg.solve(matrix, column))
-    except np.linalg.LinAlgError:
-        return inverse(matrix) @ column
+    left -= (np.swapaxes(step, -1, -2) @ rows)[..., 0, :]
+    return Point(unknowns + step[..., 0], scale, rows, information, left, settled)
 
 
 @dataclass(frozen=True)
@@ -119,7 +114,8 @@ class Half:
     """One triad at its minimum: factors (B, 6K + 6), their covariance, and what stations show.
 
     `left` (B, n, 3) are whitened residuals, `open` (B, n, 3) their expected variances; `values`
-    (B, p) are singular values of the evidence, `norms` (B, p) those of its columns.
+    (B, p) are singular values of the evidence, `norms` (B, p) those of its columns. `settled` (B,)
+    says which runs came to their minimum.
     """
 
     params: Array
@@ -128,6 +124,7 @@ class Half:
     open: Array
     values: Array
     norms: Array
+    settled: Bools
 
     @property
     def known(self) -> tuple[Array, Array]:
@@ -141,10 +138,8 @@ class Half:
         return [Half(*(array[place] for array in arrays)) for place in places]
 
 
-def halves(
-    triads: Sequence[tuple[Triad, Array]], temperature: Array, include: Array
-) -> list[Half | None]:
-    """Every triad, with the vectors it should read, at its minimum; None where one does not settle.
+def halves(triads: Sequence[tuple[Triad, Array]], temperature: Array, include: Array) -> list[Half]:
+    """Every triad, with the vectors it should read, at its minimum.
 
     Triads of one order are done together.
     """
@@ -160,10 +155,7 @@ def halves(
         np.concatenate([triad.sd for triad, _ in triads]),
         include := np.concatenate([include] * count),
     )
-    found = minimum(axes)
-    if found is None:
-        return [None] * count
-    return list(_half(axes, found, include).parted(count))
+    return _half(axes, minimum(axes), include).parted(count)
 
 
 def _half(axes: Axes, at: Point, include: Array) -> Half:
@@ -182,6 +174,7 @@ def _half(axes: Axes, at: Point, include: Array) -> Half:
         np.swapaxes(at.left, -1, -2),
         np.swapaxes(include[:, None] - share, -1, -2),
         *_evidence(at.rows, axes.noise / (GEOMETRIC_NOISE * strength), slope),
+        at.settled,
     )
 
 

@@ -21,7 +21,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from mwdcal.core import fast
-from mwdcal.core.vectors import Array, Bools, Ints, eigen, inverse
+from mwdcal.core.vectors import Array, Bools, Ints, eigen, inverse, placed
 
 RANK_TOLERANCE = 2e-2
 """Singular values of the column-normalised design below this share of the largest are free."""
@@ -91,13 +91,7 @@ class Linear:
 
     def put(self, index: Ints, other: Linear) -> Linear:
         """Ours with some members replaced."""
-
-        def replaced(mine: Array, theirs: Array) -> Array:
-            changed = mine.copy()
-            changed[index] = theirs
-            return changed
-
-        return self._mapped(replaced, other)
+        return self._mapped(lambda mine, theirs: placed(mine, index, theirs), other)
 
     def _mapped(self, change: Callable[..., Array], *others: Linear) -> Linear:
         """A change of every array, given the same ones of others."""
@@ -246,11 +240,12 @@ class Determined:
 
     def put(self, index: Ints, other: Determined) -> Determined:
         """Ours with some members replaced."""
-        basis, values, norms = self.basis.copy(), self.values.copy(), self.norms.copy()
-        keep = self.keep.copy()
-        basis[index], values[index], norms[index] = other.basis, other.values, other.norms
-        keep[index] = other.keep
-        return Determined(basis, values, norms, keep)
+        return Determined(
+            placed(self.basis, index, other.basis),
+            placed(self.values, index, other.values),
+            placed(self.norms, index, other.norms),
+            placed(self.keep, index, other.keep),
+        )
 
     @property
     def rank(self) -> Ints:

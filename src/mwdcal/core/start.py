@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from mwdcal.core import observables
-from mwdcal.core.problem import Problem, State, Triad
+from mwdcal.core.problem import Problem, State
 from mwdcal.core.vectors import (
     Array,
     Bools,
@@ -26,6 +26,8 @@ from mwdcal.core.vectors import (
 
 SPANNED = 2e-3
 """Columns of the ellipsoid with a singular value below this share of the largest are noise."""
+SEEN = 1e-3
+"""Share of the field that an axis must see for a start from least squares: any other is worse."""
 ANGLES = ("inclination", "azimuth", "toolface")
 
 
@@ -58,7 +60,7 @@ def _triad_start(problem: Problem, state: State, index: int) -> Array:
     radius = np.where(radius > 0, radius, 1.0)
     x = x / radius[:, None, None]
     matrix, offset = _ellipsoid(x, strength, include)
-    linear, linear_offset, usable = _linear(problem, state, triad, index, x)
+    linear, linear_offset, usable = _linear(problem, state, index, x)
     matrix = np.where(usable[:, None, None], linear, matrix)
     offset = np.where(usable[:, None], linear_offset, offset)
     matrix = matrix / radius[:, None, None]
@@ -104,9 +106,7 @@ def _where_determined(gram: Array, right: Array) -> Array:
     return np.asarray(np.einsum("bij,bj->bi", vectors, along))
 
 
-def _linear(
-    problem: Problem, state: State, triad: Triad, index: int, x: Array
-) -> tuple[Array, Array, Bools]:
+def _linear(problem: Problem, state: State, index: int, x: Array) -> tuple[Array, Array, Bools]:
     """Least squares on stations of known direction; and where these are enough."""
     evidence = problem.evidence
     known = [evidence.is_known(name) for name in ANGLES]
@@ -116,7 +116,7 @@ def _linear(
     terms = np.concatenate([x, np.ones_like(x[..., :1])], -1)
     gram = np.einsum("bn,bni,bnj->bij", weight, terms, terms)
     values = np.linalg.eigvalsh(gram)
-    usable = (values[:, 0] > 1e-3 * values[:, -1]) & (weight.sum(-1) >= 4)
+    usable = (values[:, 0] > SEEN**2 * values[:, -1]) & (weight.sum(-1) >= 4)
     gram = np.where(usable[:, None, None], gram, np.eye(4))
 
     def regress(target: Array) -> Array:

@@ -96,14 +96,35 @@ def rotation(turn: Array) -> Array:
     )
 
 
+def placed(ours: AnyArray, index: Ints, theirs: AnyArray) -> AnyArray:
+    """A copy of ours (B, ...) with theirs at some members of the batch."""
+    changed = ours.copy()
+    changed[index] = theirs
+    return changed
+
+
 def inverse(matrix: Array) -> Array:
     """Inverse (..., k, k) of every matrix of a stack; NaN for a singular one, never an exception."""
     try:
         return np.asarray(np.linalg.inv(matrix))
     except np.linalg.LinAlgError:
-        sound = np.linalg.slogdet(matrix)[0] != 0
-        whole = np.where(sound[..., None, None], matrix, np.eye(matrix.shape[-1]))
-        return np.where(sound[..., None, None], np.linalg.inv(whole), np.nan)
+        sound, whole = _regular(matrix)
+        return np.where(sound, np.linalg.inv(whole), np.nan)
+
+
+def solved(matrix: Array, right: Array) -> Array:
+    """Solutions (..., k, m) of matrix x = right; NaN for a singular matrix, never an exception."""
+    try:
+        return np.asarray(np.linalg.solve(matrix, right))
+    except np.linalg.LinAlgError:
+        sound, whole = _regular(matrix)
+        return np.where(sound, np.linalg.solve(whole, right), np.nan)
+
+
+def _regular(matrix: Array) -> tuple[Bools, Array]:
+    """Which matrices (..., 1, 1) are not singular, and all of them with 1 for the others."""
+    sound = np.linalg.slogdet(matrix)[0][..., None, None] != 0
+    return sound, np.where(sound, matrix, np.eye(matrix.shape[-1]))
 
 
 def eigen(matrix: Array) -> tuple[Array, Array]:
