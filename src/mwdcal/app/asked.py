@@ -113,19 +113,21 @@ def fit_options(order: str, nonlinearity: str, prior: str, known: str) -> tuple[
     )  # fmt: skip
 
 
+COLUMN_NAMES = click.option(
+    "--columns", default="", metavar="NAMES",
+    help="Columns of a text log without column names, such as time_s,ax,ay,az.",
+)  # fmt: skip
+SAMPLING_HZ = click.option(
+    "--sampling-hz", type=float, metavar="HZ", help="Rate of the log; wins over its column time_s."
+)
 _OPTIONS = (
     click.argument("log", type=FILE),
     click.option(
         "-o", "--output", type=FILE, required=True, metavar="STATIONS.csv",
         help="Run file to write; format by suffix.",
     ),
-    click.option(
-        "--columns", default="", metavar="NAMES",
-        help="Columns of a text log without column names, such as time_s,ax,ay,az.",
-    ),
-    click.option(
-        "--sampling-hz", type=float, metavar="HZ", help="Rate of the log; wins over its column time_s."
-    ),
+    COLUMN_NAMES,
+    SAMPLING_HZ,
     click.option(
         "--min-seconds", type=float, metavar="S",
         help="Shortest station, trimmed. Default: 1, or 15 samples of a slow log.",

@@ -8,7 +8,7 @@ from typing import Any, TypedDict
 
 import click
 
-from mwdcal.app.asked import DECIMAL, FILE, JSON, taking
+from mwdcal.app.asked import COLUMN_NAMES, DECIMAL, FILE, JSON, SAMPLING_HZ, taking
 
 
 class Asked(TypedDict):
@@ -34,14 +34,8 @@ _OPTIONS = (
         "--tool", metavar="NAME|FILE",
         help="Tool profile with the scales: figures also in g and nT.",
     ),
-    click.option(
-        "--columns", default="", metavar="NAMES",
-        help="Columns of a text log without column names, such as time_s,ax,ay,az.",
-    ),
-    click.option(
-        "--sampling-hz", type=float, metavar="HZ",
-        help="Rate of the log; wins over its column time_s.",
-    ),
+    COLUMN_NAMES,
+    SAMPLING_HZ,
     click.option(
         "--from", "start", type=float, metavar="S", help="Use the log from so many seconds on."
     ),
