@@ -479,10 +479,42 @@ def test_a_channel_of_its_own_rate(tmp_path):
     assert found["findings"] == []
 
 
+def test_a_channel_slower_than_a_station_is_told(tmp_path):
+    """Every 5 s: in stations of 2 s the figure is that of a sample, and none for the profile."""
+    columns = static(8000)
+    for name in ("mx", "my", "mz"):
+        columns[name][np.arange(8000) % 50 != 0] = np.nan
+    path = write_csv(tmp_path / "two.csv", columns, "sampling_hz = 10")
+    found = mwdcal("noise", path, "--station-seconds", 2, "--json").json
+    told = [f["text"] for f in found["findings"] if f["id"] == "slow"]
+    assert told[0].startswith("mx is sampled every 5 s, and a station lasts 2 s")
+    assert len(told) == 3
+    assert list(found["profile"]) == ["accelerometer"]
+    assert "mx, my, mz: less than a sample in a station" in found["withheld"]["magnetometer"]
+    assert found["channels"]["mx"]["station"]["noise"] == pytest.approx(7e-4, rel=0.2)
+    out = mwdcal("noise", path, "--station-seconds", 2).out
+    assert [line[:18] for line in out.splitlines() if "?" in line] == ["its 95 % interval "]
+    found = mwdcal("noise", path, "--station-seconds", 5, "--json").json
+    assert found["findings"] == []
+    assert list(found["profile"]) == ["accelerometer", "magnetometer"]
+
+
+def test_a_station_of_a_slow_log_has_a_sample(tmp_path):
+    """One sample a minute: the station of 30 s that is the default elsewhere would have none."""
+    columns = {"time_s": 60.0 * np.arange(2000), **static(2000)}
+    path = write_csv(tmp_path / "slow.csv", columns)
+    ran = mwdcal("noise", path, "--json")
+    assert ran.json["station_seconds"] == pytest.approx(60)
+    assert "slow" not in {f["id"] for f in ran.json["findings"]}
+    assert ran.json["channels"]["ax"]["station"]["noise"] == pytest.approx(3e-4, rel=0.1)
+    assert "one station of 60 s, 1σ" in mwdcal("noise", path).out
+
+
 @pytest.mark.parametrize(
     ("change", "part"),
     [
         (lambda c: c["ay"].fill(1.5), "ay reads 1.5 from end to end"),
+        (lambda c: c["ay"].fill(-0.0), "ay reads 0 from end to end"),
         (lambda c: c["ay"].fill(np.nan), "ay is blank from end to end"),
         (lambda c: c["ay"].__setitem__(slice(70, 72), np.nan), "first in line 73"),
         (lambda c: c["ay"].__setitem__(slice(70, 75, 2), np.nan), "first in line 73"),

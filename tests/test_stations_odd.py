@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 
 from cli_support import mwdcal, refused, write_csv
+from mwdcal.core import standstill
 from mwdcal.errors import InputError
 from mwdcal.files.table import Table
+from mwdcal.station_findings import time_unit
 from mwdcal.stations import find_stations
 from test_stations import ACC, MAG, means, multi_rate, tumble, without
 
@@ -53,6 +55,12 @@ def test_a_dead_channel_is_told_whatever_the_unit(unit):
     found = find_stations(without(log, **columns))
     assert found.table.count == len(starts)
     assert "ay reads" in finding(found, "dead-channel").text
+
+
+def test_a_dead_channel_reads_no_less_than_nothing():
+    log, *_ = tumble(2, stations=3)
+    found = find_stations(without(log, ay=np.full(len(log.columns["ay"]), -0.0)))
+    assert "ay reads 0 from" in finding(found, "dead-channel").text
 
 
 def test_nothing_but_dead_channels():
@@ -174,6 +182,84 @@ def test_a_given_rate_wins_and_says_so():
     assert found.table.count == len(starts)
     assert found.time[-1] == pytest.approx((len(found.time) - 1) / 50)
     assert "'time_s' is not used" in finding(found, "time-not-used").text
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.3, 1.77e9])
+@pytest.mark.parametrize("hz", [15, 20, 50, 100])
+def test_equal_dropouts_are_judged_alike_whatever_the_clock_shows(hz, offset):
+    """All but one sample of a cell lost in a row are no gap, a whole cell is one."""
+    size = max(3, round(0.2 * hz))
+    for lost, least in ((size - 1, 0), (size, 20)):
+        starts = np.arange(10, 20_000, 15 * size + 1)  # anywhere in a cell
+        kept = np.setdiff1d(np.arange(20_000), np.add.outer(starts, np.arange(lost)))
+        cells = standstill.cells_of(offset + kept / hz, np.sin(kept), 0.2)
+        own = kept[: len(cells.torn) * size].reshape(-1, size)
+        np.testing.assert_array_equal(cells.torn, np.diff(own).max(-1) > size)
+        assert (cells.torn.sum() > 0) == (least > 0)
+        assert cells.torn.sum() >= least
+
+
+@pytest.mark.parametrize("shift", [0, 1, 7, 13, 19])
+def test_blanks_of_one_channel_end_a_standstill_and_are_told(shift):
+    """Half a second, within cells of 20 samples or between: the times of the rows do not show it."""
+    log, starts, ends, _ = tumble(2, stations=5, still=(8, 12))
+    ay = log.columns["ay"].copy()
+    first = 20 * int(5 * (starts[2] + ends[2]) / 2) + shift
+    ay[first : first + 50] = np.nan
+    plain, found = find_stations(log), find_stations(without(log, ay=ay))
+    assert "gaps" not in ids(plain)
+    assert found.table.count == 6
+    told = finding(found, "gaps").text
+    assert told.startswith("ay has 1 gap of several samples, the first after ")
+    at = float(told.split("the first after ")[1].split()[0])
+    assert 0 <= first / 100 - at <= 0.21
+    start, end = (found.table.columns[n] for n in ("start_s", "end_s"))
+    assert not np.any((start < first / 100) & (end > (first + 50) / 100))
+
+
+@pytest.mark.parametrize(
+    ("hz", "hours", "told"),
+    [
+        (100, 0.2, ""), (1, 1, ""), (1, 12, ""), (20, 27, ""),
+        (1, 27, "samples are 1 s apart and the log lasts 1.125 days by time_s"),
+        (0.01, 220, "samples are 100 s apart and the log lasts 9.1667 days by time_s"),
+        (0.05, 5, "samples are 20 s apart and the log lasts 1.8e+04 s by time_s"),
+    ],
+)  # fmt: skip
+def test_times_that_can_hardly_be_seconds(hz, hours, told):
+    found = time_unit(np.arange(round(hours * 3600 * hz) + 1) / hz)
+    assert [f.id for f in found] == ["time-unit"] * bool(told)
+    assert not told or found[0].text.startswith(f"{told}: is it in milliseconds")
+
+
+@pytest.mark.parametrize("unit", [1e3, 1e6])
+def test_a_clock_in_milliseconds_is_told(unit):
+    log, *_ = tumble(1, hz=20.0)
+    assert "time-unit" in ids(find_stations(without(log, time_s=unit * log.columns["time_s"])))
+    assert "time-unit" not in ids(find_stations(log))
+
+
+@pytest.mark.parametrize("name", ["t", "time", "timestamp", "time_ms", "Clock (ms)"])
+def test_a_clock_of_another_name_is_named(tmp_path, name):
+    log, *_ = tumble(1, stations=2)
+    columns = {name if n == "time_s" else n: c for n, c in log.columns.items()}
+    told = refused(mwdcal("stations", write_csv(tmp_path / "log.csv", columns), "-o", "r.csv"), 2)
+    assert f"got '{name}'. Rename it to 'time_s'" in told
+    assert "--sampling-hz 100" in told
+    del columns[name]
+    columns["T"] = columns["ax"]  # a temperature
+    told = refused(mwdcal("stations", write_csv(tmp_path / "log.csv", columns), "-o", "r.csv"), 2)
+    assert "got neither" in told
+
+
+@pytest.mark.parametrize("command", [("stations", "-o", "run.csv"), ("noise",)])
+def test_a_parquet_log_without_rows(tmp_path, command):
+    arrow = pytest.importorskip("pyarrow")
+    path = tmp_path / "log.parquet"
+    none = arrow.table({n: arrow.array([], arrow.float64()) for n in ("time_s", *ACC)})
+    pytest.importorskip("pyarrow.parquet").write_table(none, path)
+    told = refused(mwdcal(command[0], path, *command[1:]), 2)
+    assert "log.parquet: the log has no samples" in told
 
 
 # Standstills that are not taken

@@ -51,10 +51,14 @@ UNEVEN = 2.0
 """Ratio of the noise of two channels of a triad that is worth a word."""
 COARSE = 0.5
 """Noise of one sample, in steps of the converter, below which the steps hide it."""
-DOUBTS = {"event": "a spike or a move", "misfit": "noise that is none of the five terms"}
-"""Findings after which the figures of a channel do not hold, in words."""
+DOUBTS = {
+    "event": "a spike or a move",
+    "misfit": "noise that is none of the five terms",
+    "slow": "less than a sample in a station",
+}
+"""Findings after which the figures of a channel do not hold, in words; `slow`: that of a station."""
 RATE = 0.01
-"""Share by which a given rate of sampling may differ from that of the log."""
+"""Share by which rates, or a sampling interval and a station, may differ and still be the same."""
 UNITS = {
     "quantisation": "·s",
     "white": "·√s",
@@ -99,7 +103,7 @@ class ChannelNoise(msgspec.Struct, frozen=True, kw_only=True):
         white_density: one-sided density per √Hz, √2 times the white term.
         fit_from_s: shortest averaging time that the terms describe.
         chance: probability of a misfit as large, if the terms describe the noise.
-        doubts: findings (`DOUBTS`) after which terms and station do not hold.
+        doubts: findings (`DOUBTS`) after which terms and station, or station, do not hold.
         unit, scale: physical unit and raw units per it, where the profile says so.
     """
 
@@ -294,7 +298,7 @@ def _samples(
     elif len(there) < FEWEST:
         problem = f"{name} has {len(there)} samples, of {FEWEST} needed."
     elif np.ptp(value[there]) == 0:
-        problem = f"{name} reads {value[there[0]]:g} from end to end: a dead channel?"
+        problem = f"{name} reads {value[there[0]] + 0.0:g} from end to end: a dead channel?"
     elif not (odd := np.flatnonzero(steps != np.median(steps))).size:
         return value[there], rate / float(steps[0])
     else:
@@ -343,7 +347,7 @@ def _channel(
     fitted = np.sqrt(fitted[0] + (terms.steady * moments.averaging) ** 2 / 2)
     named = _terms(terms, rate)
     white = named["white"].value
-    said = _findings(name, value, rate, moments, terms)
+    said = _findings(name, value, rate, station, moments, terms)
     findings += said
     return ChannelNoise(
         samples=len(value),
@@ -408,7 +412,7 @@ def _drift(terms: Terms, rate: float) -> Term:
 
 
 def _station(value: Array, length: float, moments: Moments, terms: Terms) -> StationNoise:
-    """The noise of a mean over `length` samples."""
+    """The noise of a mean over `length` samples, or of one."""
     noise, freedom, measured = noise_terms.single(value[None], length, moments, terms)
     lower, upper = allan.band(noise, freedom)
     return StationNoise(
@@ -420,7 +424,7 @@ def _station(value: Array, length: float, moments: Moments, terms: Terms) -> Sta
 
 
 def _findings(
-    name: str, value: Array, rate: float, moments: Moments, terms: Terms
+    name: str, value: Array, rate: float, station: float, moments: Moments, terms: Terms
 ) -> list[Finding]:
     """What the reader should know about a channel."""
     step = float(np.diff(np.unique(value)).min())
@@ -444,6 +448,9 @@ def _findings(
             f"{name}: below {start:.3g} s its noise is not that of the five terms (a filter, a vibration, "
             "or repeated samples); from there on they hold, without a quantisation."
         )
+    if station * rate < 1 - RATE:
+        seen = f"{name} is sampled every {1 / rate:.4g} s, and a station lasts {station:.4g} s"
+        texts["slow"] = f"{seen}: its figure is the noise of one sample. Ask for a longer station."
     return [Finding(id=key, text=text) for key, text in texts.items() if text]
 
 

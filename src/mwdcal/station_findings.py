@@ -17,6 +17,9 @@ MANY_SPIKES = 0.01
 """Share of spikes that is worth a word."""
 MOST_LISTED = 12
 """Stations, or stretches of time, that a finding names."""
+DAY = 86_400.0
+SPARSE, RARE = 0.5, 2.0
+"""Seconds between samples that are odd in a log of more than a day, and in any."""
 STEADY = 3.0
 """Standard deviations of a cell's level by which a noisy but steady stretch may drift."""
 
@@ -57,6 +60,19 @@ def about(rows: Rows, found: Standstills, seconds: float) -> list[Finding]:
     return findings
 
 
+def time_unit(time: Array) -> list[Finding]:
+    """Times of rows (n,) that can hardly be seconds."""
+    step, lasts = standstill.time_step(time), float(time[-1] - time[0])
+    if step < (SPARSE if lasts > DAY else RARE):
+        return []
+    whole = f"{lasts / DAY:.5g} days" if lasts > DAY else f"{lasts:.4g} s"
+    text = (
+        f"samples are {step:.5g} s apart and the log lasts {whole} by time_s: is it in milliseconds or "
+        "microseconds? time_s is in seconds."
+    )
+    return [Finding(id="time-unit", text=text)]
+
+
 def correlated_noise(names: list[str]) -> Finding:
     """Noise that is correlated over times that are not short against the standstills."""
     text = (
@@ -87,7 +103,7 @@ def _stuck(name: str, own: list[Summary]) -> list[Finding]:
     first = own[stations[0] - 1]
     text = (
         f"{name} stands at its limit, or is frozen, at {count(len(stations), 'station')} of {len(own)} "
-        f"({listed(stations)}): too many equal readings for its noise, such as {first.mean:.6g}. Its sd_ "
+        f"({listed(stations)}): too many equal readings for its noise, such as {first.mean + 0.0:.6g}. Its sd_ "
         "there is that of a reading known to the channel's range only."
     )
     return [Finding(id="stuck-channel", text=text, station=str(stations[0]))]

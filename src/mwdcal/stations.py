@@ -6,6 +6,7 @@ slower still: it never decides what stands still. See `core.standstill` for the 
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -21,7 +22,14 @@ from mwdcal.files.columns import Column
 from mwdcal.files.contract import CHANNELS, RAW, TEMPERATURE
 from mwdcal.files.logs import READ, TIME
 from mwdcal.files.table import Table, cell_error, numbers, shown
-from mwdcal.station_findings import about, correlated_noise, count, listed, noisy_rests
+from mwdcal.station_findings import (
+    about,
+    correlated_noise,
+    count,
+    listed,
+    noisy_rests,
+    time_unit,
+)
 
 MIN_SECONDS, TRIM_SECONDS = 1.0, 1.0
 """Defaults for a fast log; one sampled slowly needs a window, and a cell, respectively."""
@@ -33,6 +41,8 @@ MOST_CELLS = 50_000_000
 """Cells of the longest log: four months at 15 samples a second or more."""
 TOLD = 1.2
 """Times the uncertainty of most means of a triad that correlated noise adds, worth a word."""
+CLOCK = re.compile(r"^t(?![A-Za-z0-9])|(?i:time|stamp|clock|epoch|seconds|millis|micros)")
+"""Names of columns that may hold the time."""
 SMALLEST = 1e-12
 """Resolution of a channel that never changes, as a share of its reading."""
 PARTS = {"": "mean", "sd_": "sd", "spread_": "spread", "drift_": "drift", "samples_": "used"}
@@ -192,10 +202,7 @@ def row_times(log: Table, sampling_hz: float | None) -> Array:
         _check_span(log, time)
         return time
     if stated is None:
-        raise InputError(
-            f"{log.source}: a log needs a column '{TIME}', or its rate of sampling; got neither. "
-            "Add --sampling-hz 100, or a line '# sampling_hz = 100' above the column names."
-        )
+        raise _timeless(log)
     if isinstance(stated, bool) or not isinstance(stated, int | float) or not 0 < stated <= 1e9:
         here, advice = f"{log.source}: sampling_hz", "Correct it, or add --sampling-hz."
         if sampling_hz is not None:
@@ -204,6 +211,18 @@ def row_times(log: Table, sampling_hz: float | None) -> Array:
             f"{here} must be a number above 0 and at most 1e9 Hz; got {shown(stated)}. {advice}"
         )
     return np.arange(len(numbers(log, RAW[0]))) / float(stated)
+
+
+def _timeless(log: Table) -> InputError:
+    """A log without time, or with one of another name."""
+    clock = next((name for name in log.columns if CLOCK.search(name)), None)
+    got = "neither. Add"
+    if clock is not None:
+        got = f"'{clock}'. Rename it to '{TIME}', in seconds (convert it if it is not); or add"
+    return InputError(
+        f"{log.source}: a log needs a column '{TIME}', or its rate of sampling; got {got} "
+        "--sampling-hz 100, or a line '# sampling_hz = 100' above the column names."
+    )
 
 
 def _check_span(log: Table, time: Array) -> None:
@@ -233,7 +252,7 @@ def _traces(
                 "logger and the order of the columns, or leave out the triad."
             )
         if name in RAW and np.ptp(own[name][1]) == 0:
-            text = f"{name} reads {own[name][1][0]:g} from end to end: a dead channel?"
+            text = f"{name} reads {own[name][1][0] + 0.0:g} from end to end: a dead channel?"
             findings.append(Finding(id="dead-channel", text=text))
     temperature = own.pop("temperature_c", None)
     if temperature is not None:
@@ -271,11 +290,13 @@ def _possible(temperature: Trace, findings: list[Finding]) -> Trace:
 def _time_findings(
     log: Table, time: Array, traces: dict[str, Trace], sampling_hz: float | None
 ) -> list[Finding]:
-    """Gaps, times that occur twice in a channel, a time not used, and columns that go nowhere."""
+    """Gaps, times that occur twice in a channel or are not used, their unit, and spare columns."""
     findings = []
     if TIME in log.columns and sampling_hz is not None:
         text = f"--sampling-hz {sampling_hz:g} was given: the column '{TIME}' is not used."
         findings.append(Finding(id="time-not-used", text=text))
+    elif TIME in log.columns:
+        findings += time_unit(time)
     steps = np.diff(time)
     gaps = np.flatnonzero(steps > max(GAP * standstill.time_step(time), standstill.CELL))
     if gaps.size:
@@ -298,16 +319,18 @@ def _torn(activity: Activity, names: list[str], findings: list[Finding]) -> list
     """Stretches without samples that the times of the rows do not show, as gaps."""
     if any(finding.id == "gaps" for finding in findings):
         return []
-    torn = [int(np.count_nonzero(own.torn)) for own in activity.cells]
-    worst = int(np.argmax(torn))
-    if not torn[worst]:
+    cell = float(activity.edge[1] - activity.edge[0])
+    torn = []
+    for own in activity.cells:
+        between = np.append(own.start[1:] - own.end[:-1], 0.0)
+        torn.append(own.torn | (between > max(cell, standstill.FEWEST * own.step)))
+    worst = max(range(len(torn)), key=lambda i: np.count_nonzero(torn[i]))
+    if not torn[worst].any():
         return []
-    name, own = names[activity.channels[worst]], activity.cells[worst]
-    at = float(own.start[int(np.argmax(own.torn))])
-    text = (
-        f"{name} has {count(torn[worst], 'gap')} of several samples, the first after {at:.10g} s: no "
-        "standstill goes across one."
-    )
+    name, first = names[activity.channels[worst]], int(np.argmax(torn[worst]))
+    gaps = count(int(np.count_nonzero(torn[worst])), "gap")
+    at = f"{activity.cells[worst].start[first]:.10g} s"
+    text = f"{name} has {gaps} of several samples, the first after {at}: no standstill goes across one."
     return [Finding(id="gaps", text=text)]
 
 
@@ -386,12 +409,12 @@ def _summaries(
         summaries[name] = summarise_all(rests, float(resolution), said)
     for triad in CHANNELS.values():
         own = [name for name in triad if name in summaries]
-        variances = correlated([summaries[name] for name in own])
-        made = {n: widened(summaries[n], float(v)) for n, v in zip(own, variances, strict=True)}
+        told = correlated([summaries[name] for name in own])
+        made = {n: widened(summaries[n], float(v)) for n, v in zip(own, told.variance, strict=True)}
         grown = [
             a.sd > TOLD * b.sd for n in own for a, b in zip(made[n], summaries[n], strict=True)
         ]
-        if 2 * sum(grown) > len(grown):
+        if told.plain and 2 * sum(grown) > len(grown):
             findings.append(correlated_noise(own))
         summaries |= made
     return summaries

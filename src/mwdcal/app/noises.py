@@ -135,7 +135,7 @@ def terms(found: Noise, physical: bool) -> tuple[list[str], list[Line]]:
     for name, (what, unit) in ROWS.items():
         per = HOUR if name == "drift" else 1.0
         cells = [
-            _term(c.terms[name], factor * per, bool(c.doubts))
+            _term(c.terms[name], factor * per, bool({*c.doubts} - {"slow"}))
             for c, (_, factor) in zip(shown.values(), units, strict=True)
         ]
         lines.append((_label(what, unit), cells))

@@ -44,8 +44,8 @@ STUCK, QUIETER = 0.5, 5.0
 """Least share of equal readings at a limit, and times that a tool at rest may be less noisy than usual."""
 HALVES, MOST = 8, 9.0
 """Standstills of a triad whose halves can correct the uncertainty of all; most that one counts."""
-CHANCE, GROWN = 1e-3, 1e-2
-"""Chances that white noise is said to be correlated: by the halves, and by their growth."""
+CHANCE, GROWN = (5e-2, 1e-3), (1e-1, 1e-2)
+"""Chances that white noise is widened, and said to be correlated: by the halves, by their growth."""
 LONGEST = 1.0
 """Longest correlation time, in standstills, that their halves and quarters can tell."""
 GROWTH = 2.0
@@ -127,8 +127,20 @@ def summarise_all(
     return made
 
 
-def correlated(channels: Sequence[Sequence[Summary]]) -> Array:
-    """Variance of a sample's worth of mean, sd² times samples, of each channel of a triad; 0 for none.
+class Correlated(NamedTuple):
+    """What the halves of a triad's standstills tell of noise that is correlated over seconds.
+
+    Attributes:
+        variance: of a sample's worth of mean, sd² times samples, of each channel; 0 for none.
+        plain: whether it is worth a word; the uncertainty is widened before that (`CHANCE`).
+    """
+
+    variance: Array
+    plain: bool
+
+
+def correlated(channels: Sequence[Sequence[Summary]]) -> Correlated:
+    """Whether the means of a triad's channels scatter by more than the samples claim.
 
     Definition: what the halves of a channel's standstills tell, times what noise that reaches
     beyond a half hides in them (`beyond`, from the whole triad). None unless the halves tell more
@@ -140,7 +152,7 @@ def correlated(channels: Sequence[Sequence[Summary]]) -> Array:
     clear = [[m for m in own if not m.stuck] for own in channels]
     count = sum(map(len, clear))
     if count < HALVES or not all(clear):
-        return np.zeros(len(channels))
+        return Correlated(np.zeros(len(channels)), False)
     halves: Array = np.array([_typical([m.halves * m.used for m in own]) for own in clear])
     told = [m for own in clear for m in own if m.quarters == m.quarters]
     quarters = _typical([m.quarters * m.used for m in told]) if told else 0.0
@@ -148,10 +160,10 @@ def correlated(channels: Sequence[Sequence[Summary]]) -> Array:
     claimed = np.array([float(np.median([m.sd**2 * m.used for m in own])) for own in clear])
     parts = claimed / [len(own) for own in clear]
     freedom = claimed.sum() ** 2 / (claimed @ parts)  # Satterthwaite: a noisy channel counts most
-    plain = halves.sum() > chdtri(freedom, CHANCE) / freedom * claimed.sum()
-    plain |= growth > 0.5 * fdtri(max(len(told), 1), max(2 * len(told), 1), 1 - GROWN)
-    variance = halves * beyond(growth)
-    return np.asarray(variance if plain and growth < GROWTH else 0 * variance, float)
+    more = halves.sum() > chdtri(freedom, CHANCE) / freedom * claimed.sum()
+    more |= growth > 0.5 * fdtri(max(len(told), 1), max(2 * len(told), 1), 1 - np.array(GROWN))
+    widens, plain = (bool(one) for one in more & (growth < GROWTH))
+    return Correlated(halves * beyond(growth) if widens else 0 * halves, plain)
 
 
 def _typical(squares: Sequence[float]) -> float:

@@ -22,7 +22,7 @@ from mwdcal.core.vectors import Array
 from mwdcal.errors import InputError
 from mwdcal.files import metadata as meta
 from mwdcal.files import table as tables
-from mwdcal.files.columns import LABELS, Column, assemble, check_names, looks_numeric
+from mwdcal.files.columns import LABELS, Column, assemble, check_names, looks_numeric, no_stations
 from mwdcal.files.contract import COLUMNS, check_columns, check_near_misses
 from mwdcal.files.table import Table, shown
 
@@ -70,7 +70,12 @@ def read(
                 f"--columns names the columns of a text log without column names; '{path}' has "
                 "names of its own. Leave --columns out."
             )
-        return _numeric(tables.read(file, decimal=decimal))
+        try:
+            return _numeric(tables.read(file, decimal=decimal))
+        except InputError as error:
+            if str(error) != str(no_stations(file.name)):
+                raise
+            raise _empty(file.name) from None
     if decimal not in (".", ","):
         raise InputError(f"--decimal must be '.' or ','; got {shown(decimal)}.")
     try:
@@ -81,6 +86,11 @@ def read(
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise InputError(f"cannot read '{path}': {reason}. Check the name and the file.") from None
+
+
+def _empty(source: str) -> InputError:
+    """A log with nothing below its column names."""
+    return InputError(f"{source}: the log has no samples. Is the file complete?")
 
 
 def _numeric(table: Table) -> Table:
@@ -124,7 +134,7 @@ def _text(
         lines.append(own)
         say(f"reading {source}: {100 * stream.tell() / size:.0f} %")
     if not sum(map(len, lines)):
-        raise InputError(f"{source}: the log has no samples. Is the file complete?")
+        raise _empty(source)
     whole = np.concatenate(pieces)
     columns: dict[str, Column] = {name: [] for name in layout.names if name not in READ}
     columns |= {name: whole[:, i].copy() for i, name in enumerate(_wanted(layout))}
