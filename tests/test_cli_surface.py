@@ -21,6 +21,7 @@ from cli_support import (
     write_csv,
 )
 from mwdcal.app.cli import cli
+from mwdcal.correction import OUTSIDE
 from mwdcal.files import documents
 
 COMMANDS = sorted(cli.commands)
@@ -418,3 +419,28 @@ def test_12_digits_are_enough_to_give_the_same_corrections(tmp_path, files):
         wanted = x @ parameters[:9].reshape(3, 3).T + parameters[9:]
         got = np.stack([numbers(table[n]) for n in field], -1)
         np.testing.assert_allclose(got, wanted, rtol=1e-12, atol=1e-12 * np.abs(wanted).max())
+
+
+@pytest.mark.parametrize("word", ['simulated = "yes"', "simulated = true", "simulated = false"])
+def test_screens_say_what_is_simulated(tmp_path, word):
+    """Of calibration and roll test: also where only one of them is."""
+    said = not word.endswith("false")
+    made, test = servo_run(1), servo_run(1, inclinations=(45,))
+    run = write_csv(tmp_path / "run.csv", made, word)
+    calibrate = ("calibrate", run, "--tool", "servo", "-o", tmp_path / "cal.json")
+    apply = ("apply", tmp_path / "cal.json", run, "-o", tmp_path / "out.csv")
+    for metadata, expected in (([], said), (["simulated = 1"], True)):
+        roll = write_csv(tmp_path / "roll.csv", test, *metadata)
+        ran = mwdcal(*calibrate)
+        assert ("SIMULATED DATA" in ran.out.splitlines()[0]) == said
+        ran = mwdcal("verify", tmp_path / "cal.json", roll)
+        assert ("SIMULATED DATA" in ran.out.splitlines()[0]) == expected
+        assert ran.out.count("SIMULATED DATA") == expected
+        assert ("SIMULATED DATA" in mwdcal(*apply).out) == said
+
+
+def test_a_wrong_word_for_outside_is_refused(tmp_path, files):
+    ran = mwdcal("apply", *files, "-o", tmp_path / "out.csv", "--outside", "clip")
+    assert "--outside must be one of blank, refuse, extrapolate; got 'clip'" in refused(ran, 2)
+    words = "|".join(OUTSIDE)
+    assert words in mwdcal("apply", "--help").out

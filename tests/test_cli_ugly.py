@@ -294,3 +294,53 @@ def test_optional_columns_may_be_absent(tmp_path, missing):
     if missing == "magnetometer":
         run = {k: v for k, v in run.items() if not k.startswith("m")}
     assert ran(tmp_path, run).code == 0
+
+
+def test_rows_of_several_tools_are_refused(tmp_path):
+    columns = servo_run()
+    several = {"serial": ["A"] * 24 + ["B"] * 24, **columns}
+    message = refused(ran(tmp_path, several), 2)
+    assert "run.csv has rows of more than one tool (serial A, B)" in message
+    made = ran(tmp_path, {"serial": ["A"] * 48, **columns})
+    assert made.out.startswith("run.csv   A   48 stations")
+    test = write_csv(tmp_path / "run.csv", several)
+    assert "more than one tool" in refused(mwdcal("verify", tmp_path / "cal.json", test), 2)
+    assert "more than one tool" in refused(mwdcal("compare", test), 2)
+
+
+@pytest.mark.parametrize("mark", ["time_s", "sampling_hz"])
+def test_a_log_is_no_run(tmp_path, mark):
+    few, many = (servo_run(toolfaces=count) for count in (12, 251))
+    for columns in (few, many):
+        if mark == "time_s":
+            columns["time_s"] = np.arange(len(columns["ax"])) * 1.0
+    metadata = ["sampling_hz = 100"] if mark == "sampling_hz" else []
+    path = write_csv(tmp_path / "run.csv", many, *metadata)
+    message = refused(calibrate(tmp_path, path, "--order", 0), 2)
+    assert "run.csv is a continuous log (1004 rows): its rows are no stations." in message
+    assert message.endswith("If each row is a station, remove time_s and sampling_hz.")
+    assert "continuous log" in refused(mwdcal("compare", path), 2)
+    assert not left(tmp_path)
+    short = write_csv(tmp_path / "short.csv", few, *metadata)
+    assert calibrate(tmp_path, short, "--order", 0).code == 0
+    assert "continuous log" in refused(mwdcal("verify", tmp_path / "cal.json", path), 2)
+
+
+def test_a_blank_reading_of_a_run_has_no_way_round(tmp_path):
+    columns = servo_run()
+    columns["ax"][5] = np.nan
+    assert "--missing" not in refused(ran(tmp_path, columns), 2)
+
+
+def test_the_screen_names_twelve_stations_to_shoot_again(tmp_path):
+    columns = servo_run(inclinations=(5, 25, 45, 65, 90, 110, 135), toolfaces=24)
+    moved = np.arange(3, 168, 11)
+    columns["az"][moved] += 0.006 * (-1.0) ** np.arange(len(moved))
+    shown = ran(tmp_path, columns, "--order", 0)
+    told = ran(tmp_path, columns, "--order", 0, "--json").json["findings"]
+    count = sum(finding["id"] == "reshoot" for finding in told)
+    lines = [line for line in shown.out.splitlines() if line.startswith("! ")]
+    assert count > 12
+    assert sum("Re-shoot it" in line for line in lines) == 12
+    assert lines[-1] == f"! … and {count - 12} more to re-shoot"
+    assert len(lines) == len(told) - count + 13

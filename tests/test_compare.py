@@ -395,3 +395,14 @@ def test_what_cannot_be_done_is_refused_at_once(tmp_path):
     lost = mwdcal("compare", run, "--tool", "servo", "--report", run)
     assert "lost" in refused(lost, 2)
     refused(mwdcal("compare", tmp_path / "none.csv"), 2)
+
+
+def test_where_every_method_is_refused_the_command_fails_and_says_why(tmp_path):
+    few = {name: column[:3] for name, column in servo_run(3).items()}
+    run, page = write_csv(tmp_path / "run.csv", few), tmp_path / "methods.html"
+    for options in ((), ("--json",), ("--report", page)):
+        ran = mwdcal("compare", run, "--tool", "servo", *options)
+        assert ran.code == 3
+        assert "no method can calibrate this run" in ran.out
+        assert "needs 4 or more" in ran.out
+    assert page.exists()

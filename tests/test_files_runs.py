@@ -13,7 +13,7 @@ from hypothesis.extra.numpy import arrays
 
 from mwdcal.errors import InputError
 from mwdcal.files.profiles import list_profiles, load_profile
-from mwdcal.files.runs import from_readings, read_run, to_readings, write_run
+from mwdcal.files.runs import check_run, from_readings, read_run, to_readings, write_run
 from mwdcal.files.table import SUFFIXES, Table
 from mwdcal.profile import Profile, StandProfile, TriadProfile
 from mwdcal.readings import Readings
@@ -354,3 +354,36 @@ def test_the_distox_lies_level_with_its_display_up_at_toolface_zero(name):
     turned = (toolface - [0.0, 90.0, 180.0, 270.0] + 180.0) % 360.0 - 180.0
     assert np.abs(turned).max() < 10.0
     assert np.abs(gz).max() < 0.15  # of which 0.1 g is the bias of the long axis
+
+
+def tools(serials, **metadata):
+    return run(metadata, serial=serials)
+
+
+@pytest.mark.parametrize(
+    ("table", "serial"),
+    [
+        (tools(["", " A 7 ", "A 7"]), "A 7"),
+        (tools(["7", "7"], serial=7), "7"),
+        (tools(["", ""], serial="B"), "B"),
+        (run({"serial": 7}), 7),
+        (tools(["", ""]), None),
+    ],
+)
+def test_the_serial_of_a_run_may_be_a_column(table, serial):
+    assert to_readings(table, BARE)[0].metadata.get("serial") == serial
+
+
+@pytest.mark.parametrize(
+    ("table", "named"),
+    [
+        (tools(["A", "", "B"]), "A, B)"),
+        (tools(["A", "A"], serial="B"), "B, A)"),
+        (tools(["A", "B", "C", "D"]), "A, B, …)"),
+    ],
+)
+def test_rows_of_several_tools_are_no_run(table, named):
+    with pytest.raises(InputError, match="run.csv has rows of more than one tool") as refusal:
+        check_run(table)
+    assert f"(serial {named}" in str(refusal.value)
+    assert "mwdcal fleet" in str(refusal.value)

@@ -28,7 +28,7 @@ from mwdcal.app import progress, streaming
 from mwdcal.app.tables import apply_to_table
 from mwdcal.correction import MARK, NAMES
 from mwdcal.errors import InputError
-from mwdcal.files import documents, streams, table
+from mwdcal.files import documents, sinks, streams, table
 from simulation import Tool
 
 arrow = pytest.importorskip("pyarrow")
@@ -80,7 +80,8 @@ def write_parquet(path, columns, metadata=None, **options):
 
 def whole(calibration, path, outside="blank", missing="refuse"):
     """What the small path makes of the file."""
-    return apply_to_table(calibration, table.read(path), outside, missing)
+    result, _, findings = apply_to_table(calibration, table.read(path), outside, missing)
+    return result, findings
 
 
 def assert_same(path, wanted):
@@ -113,7 +114,7 @@ def test_parts_of_any_size_give_the_whole(tmp_path, warm, least, group):
     told = streaming.apply_to_file(
         made, source, out, "blank", lambda *done: seen.append(done), rows=321, least=least
     )
-    assert told == (5000, findings)
+    assert (told[0].rows, told[1]) == (5000, findings)
     assert [f.id for f in findings] == ["outside-temperature"]
     assert seen[-1] == (5000, 5000)
     assert_same(out, wanted)
@@ -276,7 +277,7 @@ def test_rows_that_lack_a_reading(tmp_path, warm, small_pieces, holes, least, ou
         streaming.apply_to_file(warm[1], source, out, outside, **options)
     told = streaming.apply_to_file(warm[1], source, out, outside, missing="blank", **options)
     wanted, findings = whole(warm[1], source, outside, "blank")
-    assert told == (3000, findings)
+    assert (told[0].rows, told[1]) == (3000, findings)
     assert_same(out, wanted)
     text = f"{(~sound).sum()} of 3000 rows lack a reading: their results are blank."
     assert text in [finding.text for finding in findings]
@@ -572,7 +573,7 @@ def test_text_in_pieces_gives_the_whole(tmp_path, warm, small_pieces, change, su
     source, out = text(tmp_path, change), tmp_path / f"out{suffix}"
     wanted, findings = whole(warm[1], source)
     told = streaming.apply_to_file(warm[1], source, out, "blank", least=least)
-    assert told == (120, findings)
+    assert (told[0].rows, told[1]) == (120, findings)
     table.write(tmp_path / f"whole{suffix}", wanted)
     found = table.read(out)
     for name, cells in table.read(tmp_path / f"whole{suffix}").columns.items():
@@ -761,3 +762,164 @@ def test_memory_does_not_grow_with_the_table(tmp_path, warm):
     peak = int(done.stderr.split()[-1]) * unit
     assert peak < 0.6e9
     assert resource is not None
+
+
+QUOTED = {3: 'say "x"', 57: "a, b", 58: "tab\there", 119: 'end "'}
+
+
+@pytest.fixture
+def exact(monkeypatch):
+    """Numbers of rows that went through the exact parser, and through the writer of short tables."""
+    seen = {"rows": 0, "render": 0}
+    rows, render = streams.text.rows, streams.text.render
+
+    def counted_rows(data, *others):
+        seen["rows"] += data.count(b"\n")
+        return rows(data, *others)
+
+    def counted_render(columns, *others):
+        seen["render"] += len(next(iter(columns.values())))
+        return render(columns, *others)
+
+    monkeypatch.setattr(streams.text, "rows", counted_rows)
+    monkeypatch.setattr(streams.text, "render", counted_render)
+    return seen
+
+
+@pytest.mark.parametrize("delimiter", [",", "\t"])
+@pytest.mark.parametrize("remarks", [QUOTED, dict.fromkeys(range(120), 'all ",\t'), {}])
+def test_rows_that_need_quotes_are_written_as_a_short_table_has_them(exact, delimiter, remarks):
+    count = 120
+    texts = [remarks.get(i, "" if i % 7 else "plain") for i in range(count)]
+    values = np.random.default_rng(0).uniform(1, 100, count)
+    values[::11] = np.nan
+    own = {"note": texts, "id": [str(i) for i in range(count)], "x": values.tolist()}
+    carried_along = arrow.table(
+        {"note": [t or None for t in texts], "id": np.arange(count), "x": values}
+    )
+    schema = arrow.schema([("r", arrow.float64()), (MARK, arrow.bool_())])
+    stream = io.BytesIO()
+    stream.name = "out.csv"
+    sink = sinks.TextSink(stream, carried_along.schema, schema, {}, [], delimiter)
+    sink.write(sink.render(carried_along, [values, values > 50], True))
+    sink.finish([])
+    needed = sum(any(mark in text for mark in ('"', delimiter)) for text in texts)
+    assert exact["render"] == needed  # before the next line renders the whole
+    marks = [str(mark).lower() for mark in values > 50]
+    whole_table = {**own, "x": values, "r": values, MARK: marks}
+    assert stream.getvalue().decode() == streams.text.render(whole_table, {}, delimiter)
+
+
+def test_only_unusual_lines_go_through_the_exact_parser(tmp_path, warm, small_pieces, exact):
+    def change(content):
+        return content.replace("S 77,", '"S, ""77""",').replace("\nS 40,", "\n S 40,  ")
+
+    source = text(tmp_path, change)
+    wanted, findings = whole(warm[1], source)
+    tally, said = streaming.apply_to_file(warm[1], source, tmp_path / "o.csv", "blank")
+    assert (tally.rows, said) == (120, findings)
+    assert exact["rows"] == 2
+    assert_same(tmp_path / "o.csv", wanted)
+    assert table.read(tmp_path / "o.csv").columns["station"][77] == 'S, "77"'
+
+
+def test_a_row_is_spelled_alike_whatever_stands_beside_it(tmp_path, cold):
+    found = []
+    for word in ("plain", "a, b"):
+        columns = {"note": ["", word, ""], "tiny": [5e-5, -3e-7, 2e20], **log(3, low=10, high=40)}
+        source = write_parquet(tmp_path / "log.parquet", columns)
+        streaming.apply_to_file(cold[1], source, tmp_path / "out.csv", "extrapolate")
+        found.append((tmp_path / "out.csv").read_text("utf-8").replace('"a, b"', "plain"))
+    assert found[0] == found[1]
+
+
+def test_findings_are_in_the_schema_that_readers_take(tmp_path, warm):
+    source = write_parquet(tmp_path / "log.parquet", log())
+    _, findings = streaming.apply_to_file(warm[1], source, tmp_path / "out.parquet", "blank")
+    read = parquet.read_table(tmp_path / "out.parquet").schema.metadata[b"mwdcal"]
+    assert json.loads(read)["findings"] == [finding.text for finding in findings]
+    assert findings
+
+
+def test_long_whole_numbers_keep_their_digits_in_a_workbook(tmp_path, cold):
+    pytest.importorskip("openpyxl")
+    ids = {"short": arrow.array([10**14, None]), "long": arrow.array([2**60 + 1, None])}
+    source = write_parquet(tmp_path / "log.parquet", {**ids, **log(2, low=10, high=40)})
+    assert mwdcal("apply", cold[0], source, "-o", tmp_path / "out.xlsx").code == 0
+    found = table.read(tmp_path / "out.xlsx").columns
+    assert found["long"] == [str(2**60 + 1), ""]
+    assert found["short"][0] == 1e14
+
+
+SERIALS = {
+    "ours": (["A 7"], None),
+    "ours, with blanks": (["A 7", "", " A 7 "], None),
+    "another": (["B"], "B"),
+    "among ours": (["A 7", "A 7", "B"], "A 7, B"),
+    "many": ([f"T{i}" for i in range(40)], "T0, T1, …"),
+    "odd": (["\x01é\N{SNAKE}" * 20, "\x02" * 50], "\x01é\N{SNAKE}" * 20 + ", " + "\x02" * 50),
+}
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
+@pytest.mark.parametrize("length", ["short", "long"])
+@pytest.mark.parametrize(("cells", "told"), SERIALS.values(), ids=SERIALS)
+def test_rows_of_another_tool_are_told(tmp_path, monkeypatch, cells, told, suffix, length):
+    run = write_csv(tmp_path / "run.csv", servo_run(tool=TOOL), 'serial = "A 7"')
+    command = ("calibrate", run, "--tool", "servo", "-o", tmp_path / "cal.json", "--order", 0)
+    assert mwdcal(*command).code == 0
+    if length == "long":
+        monkeypatch.setattr(streaming, "LONG", dict.fromkeys(streaming.LONG, 0))
+        monkeypatch.setattr(streams, "PIECE", 3000)
+    columns = {"serial": [cells[i * len(cells) // 120] for i in range(120)]}
+    columns |= log(120, low=24, high=26)
+    path = tmp_path / f"log{suffix}"
+    (write_csv if suffix == ".csv" else write_parquet)(path, columns)
+    out = tmp_path / f"out{suffix}"
+    ran = mwdcal("apply", tmp_path / "cal.json", path, "-o", out, "--json")
+    found = [f["text"] for f in ran.json["findings"] if f["id"] == "other-tool"]
+    word = "the readings are of tool {}, the calibration of tool A 7: is it the right one?"
+    assert found == ([] if told is None else [word.format(told)])
+    assert table.read(out).metadata.get("findings", []) == [f["text"] for f in ran.json["findings"]]
+    assert "serial" not in table.read(out).metadata
+
+
+@pytest.mark.parametrize("name", ["ax", "mz", "temperature_c"])
+@pytest.mark.parametrize("suffix", [".csv", ".long.csv", ".parquet"])
+def test_a_blank_reading_is_refused_with_the_way_out(tmp_path, warm, monkeypatch, name, suffix):
+    if "long" in suffix:
+        monkeypatch.setattr(streaming, "LONG", dict.fromkeys(streaming.LONG, 0))
+    columns = log(100, low=10, high=40)
+    columns[name] = columns[name].copy()
+    columns[name][50] = np.nan
+    path = tmp_path / f"log{suffix}"
+    if suffix == ".parquet":
+        write_parquet(path, columns | {name: arrow.array(columns[name], from_pandas=True)})
+    else:
+        write_csv(path, columns)
+    command = ("apply", warm[0], path, "-o", tmp_path / "out.csv")
+    message = refused(mwdcal(*command), 2)
+    assert f"column '{name}': must be filled in; got a blank cell." in message
+    assert message.endswith("Or leave the results of such rows blank: --missing blank.")
+    assert mwdcal(*command, "--missing", "blank").code == 0
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".long.csv", ".parquet"])
+@pytest.mark.parametrize("outside", ["blank", "extrapolate"])
+def test_rows_without_results_are_counted(tmp_path, warm, monkeypatch, suffix, outside):
+    if "long" in suffix:
+        monkeypatch.setattr(streaming, "LONG", dict.fromkeys(streaming.LONG, 0))
+    columns, _ = gappy(400, {"ax": range(5), "mz": range(3, 9)})
+    path = tmp_path / f"log{suffix}"
+    if suffix == ".parquet":
+        arrays = {n: arrow.array(c, from_pandas=True) for n, c in columns.items()}
+        write_parquet(path, arrays)
+    else:
+        write_csv(path, columns)
+    command = ("apply", warm[0], path, "-o", tmp_path / "out.csv", "--missing", "blank")
+    ran = mwdcal(*command, "--outside", outside, "--json")
+    blank = int(np.isnan(numbers(read_csv(tmp_path / "out.csv")["gravity_g"])).sum())
+    assert (ran.json["rows"], ran.json["blank"]) == (400, blank)
+    assert (blank > 9) == (outside == "blank")
+    said = mwdcal(*command, "--outside", outside)
+    assert said.out.startswith(f"400 rows corrected, {blank} of them blank   wrote ")

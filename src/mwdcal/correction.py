@@ -40,19 +40,30 @@ class Tally(NamedTuple):
     beyond: int = 0
     moved: tuple[str, ...] = ()
     lacking: int = 0
+    serials: tuple[str, ...] = ()
+
+    def blank(self, outside: str) -> int:
+        """Number of rows without results: for want of a reading, or `outside` the temperatures."""
+        return self.lacking + (self.beyond if outside == "blank" else 0)
 
 
 def correct(
-    calibration: Calibration, readings: Readings, outside: str = "blank", lacking: int = 0
+    calibration: Calibration, readings: Readings, outside: str = "blank"
 ) -> tuple[dict[str, AnyArray], list[Finding]]:
     """Output columns (n,) by name, and what the reader should know.
-
-    `lacking` more rows were left out, for want of a reading.
 
     Singular: at exactly vertical attitudes azimuth and toolface are NaN (blank in files);
     `magnetic_toolface_deg` stands beside them. A strength of zero has no direction: NaN.
     Temperatures outside the calibrated range are blanked, refused or extrapolated as `outside` says.
     """
+    columns, _, told = counted(calibration, readings, outside)
+    return columns, told
+
+
+def counted(
+    calibration: Calibration, readings: Readings, outside: str, lacking: int = 0
+) -> tuple[dict[str, AnyArray], Tally, list[Finding]]:
+    """The same, and between what was seen in the rows; `lacking` more were left out unread."""
     check_outside(outside)
     columns: dict[str, AnyArray] = {
         **(compiled(calibration, readings) or reference(calibration, readings))
@@ -65,7 +76,7 @@ def correct(
         columns = {name: np.where(beyond, np.nan, value) for name, value in columns.items()}
     if outside == "extrapolate":
         columns[MARK] = beyond
-    return columns, told
+    return columns, tally, told
 
 
 def result_names(outside: str) -> tuple[str, ...]:

@@ -12,15 +12,15 @@ import numpy as np
 from mwdcal.app import text
 from mwdcal.app.choices import Chosen, Typed, choose, prior_profile
 from mwdcal.calibrate import calibrate
-from mwdcal.calibration import Calibration
+from mwdcal.calibration import Calibration, Finding
 from mwdcal.errors import InputError
 from mwdcal.files import documents, profiles, runs, table
 from mwdcal.predict import typical_accuracy
 from mwdcal.profile import Profile
 from mwdcal.readings import Readings
 
-MANY = 1000
-"""Rows of a table with times from which it is a log."""
+RESHOT = 12
+"""Most stations to re-shoot that the screen names."""
 
 
 class Digests(TypedDict):
@@ -36,20 +36,11 @@ def load(
     """A run with its tool profile, and the digests of both files."""
     profile, profile_sha256 = profiles.load_profile(tool)
     profile = prior_profile(prior, profile)
-    read = runs.of_one_tool(table.read(run, decimal=decimal))
-    _check_no_log(read)
+    read = table.read(run, decimal=decimal)
+    runs.check_run(read)
     readings, profile = runs.to_readings(read, profile)
     digests = Digests(profile_sha256=profile_sha256, run_sha256=read.digest)
     return readings, profile, digests
-
-
-def _check_no_log(read: table.Table) -> None:
-    """Refuse a continuous log, whose rows are no stations."""
-    if read.count > MANY and ("time_s" in read.columns or "sampling_hz" in read.metadata):
-        raise InputError(
-            f"{read.source} is a continuous log ({read.count} rows): its rows are no stations. Find "
-            f"the standstills first: mwdcal stations {read.source} -o run.csv"
-        )
 
 
 def run(
@@ -117,6 +108,14 @@ def summary(made: Calibration, chosen: Chosen, output: Path, report: Path | None
     }
 
 
+def _told(found: list[Finding]) -> list[str]:
+    """The findings, of stations to re-shoot the first ones."""
+    again = [finding for finding in found if finding.id == "reshoot"]
+    left = again[RESHOT:]
+    lines = text.findings([finding for finding in found if finding not in left])
+    return lines + ([f"! … and {len(left)} more to re-shoot"] if left else [])
+
+
 def screen(made: Calibration, chosen: Chosen, output: Path, report: Path | None) -> str:
     """The result for people."""
     tables = [
@@ -133,7 +132,7 @@ def screen(made: Calibration, chosen: Chosen, output: Path, report: Path | None)
     for constant in made.constants:
         value = f"{constant.value:.6g} ± {constant.standard_uncertainty:.2g} {constant.unit}"
         lines.append(f"estimated constant of the run: {constant.name} {value}")
-    lines += text.stand(made.stand) + text.findings(made.findings)
+    lines += text.stand(made.stand) + _told(made.findings)
     wrote = f"wrote {output} (calibration)" + (f"   {report} (report)" if report else "")
     lines.append(f"{wrote}   next: mwdcal verify {output} ROLLTEST.csv")
     return "\n\n".join([*tables, "\n".join(lines)])

@@ -6,7 +6,7 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack
@@ -29,7 +29,7 @@ from mwdcal.app.fleet_asked import fleet_options
 from mwdcal.app.lean import without_pandas
 from mwdcal.app.noise_asked import Asked as AskedForNoise
 from mwdcal.app.noise_asked import noise_options
-from mwdcal.errors import InputError, MwdcalError
+from mwdcal.errors import FitError, InputError, MwdcalError
 
 if TYPE_CHECKING:
     from mwdcal.app.choices import Typed
@@ -64,6 +64,13 @@ def tell(findings: list[Finding]) -> None:
     """Findings, on stderr."""
     for finding in findings:
         say(f"! {finding.text}")
+
+
+def _simulated(*metadata: Mapping[str, object]) -> str:
+    """What a screen says where a calibration or a run is simulated."""
+    from mwdcal.readings import is_simulated
+
+    return "   SIMULATED DATA" if any(map(is_simulated, metadata)) else ""
 
 
 def print_json(value: Any) -> None:
@@ -118,14 +125,15 @@ def compare(**asked: Unpack[AskedToCompare]) -> None:
 
     \b
     Example: mwdcal compare run.csv --tool servo --report methods.html
-    Exit: 0 compared, 2 input cannot be read.
+    Exit: 0 compared, 2 input cannot be read, 3 every method refused.
     """
     from mwdcal.app import calibrating, comparison
 
     _check_outputs([asked["report"]], [asked["run"], Path(asked["tool"] or "")])
     readings, profile, digests = calibrating.load(asked["run"], asked["tool"], asked["decimal"])
-    result = comparison.run(asked, readings, profile, say, **digests)
+    sound, result = comparison.run(asked, readings, profile, say, **digests)
     (print_json if asked["as_json"] else click.echo)(result)
+    sys.exit(0 if sound else FitError.exit_code)
 
 
 @cli.command()
@@ -157,7 +165,7 @@ def stations(**asked: Unpack[Asked]) -> None:
     help="Table to write; format by suffix.",
 )
 @click.option(
-    "--outside", type=click.Choice(["blank", "refuse", "extrapolate"]), default="blank", show_default=True,
+    "--outside", default="blank", show_default=True, metavar="blank|refuse|extrapolate",
     help="Results of rows more than 1 °C outside the calibrated temperatures: none; refuse the file; or "
     "extrapolated, and marked in a column 'extrapolated'.",
 )  # fmt: skip
@@ -183,16 +191,25 @@ def apply(
     from mwdcal.app.progress import bar
     from mwdcal.app.tables import apply_to_any
     from mwdcal.files import documents
+    from mwdcal.files.runs import BlankReadingError
 
     _check_outputs([output], [calibration, readings])
     made = documents.read(calibration)
-    with bar("correcting") as advance:
-        count, findings = apply_to_any(made, readings, output, outside, missing, decimal, advance)
+    try:
+        with bar("correcting") as advance:
+            told = apply_to_any(made, readings, output, outside, missing, decimal, advance)
+    except BlankReadingError as error:
+        advice = "Or leave the results of such rows blank: --missing blank."
+        raise InputError(f"{error} {advice}") from None
+    tally, findings = told
     tell(findings)
+    blank = tally.blank(outside)
+    found = {"rows": tally.rows, "blank": blank, "output": str(output), "findings": findings}
     if as_json:
-        print_json({"rows": count, "output": str(output), "findings": findings})
+        print_json(found)
     else:
-        click.echo(f"{count} rows corrected   wrote {output}")
+        none = f", {blank} of them blank" if blank else ""
+        click.echo(f"{tally.rows} rows corrected{none}   wrote {output}{_simulated(made.tool)}")
 
 
 @cli.command()
@@ -231,7 +248,8 @@ def verify(
     if as_json:
         print_json(result)
     else:
-        click.echo(text.verdict(result))
+        first, _, rest = text.verdict(result).partition("\n")
+        click.echo(f"{first}{_simulated(made.tool, readings.metadata)}\n{rest}")
     tell(result.findings)
     sys.exit(0 if result.passed else 1)
 

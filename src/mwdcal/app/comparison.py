@@ -32,17 +32,20 @@ def run(
     profile: Profile,
     say: Callable[[str], None],
     **digests: str,
-) -> str | dict[str, Any]:
-    """Compare the methods on a run, write the report if asked for; text, or what JSON shows."""
+) -> tuple[bool, str | dict[str, Any]]:
+    """Compare the methods on a run, write the report if asked for.
+
+    Whether any method could calibrate it; text, or what JSON shows.
+    """
     order: int | Literal["auto"] = "auto" if asked["order"] == "auto" else int(asked["order"])
     found = compare(readings, profile, order, seed=asked["seed"], progress=say)
     path = asked["report"]
     if path:
         write_report(path, found, profile.name, **digests)
     if asked["as_json"]:
-        return {**document(found), "report": str(path or "")}
+        return bool(able(found.rows)), {**document(found), "report": str(path or "")}
     wrote = f"\nwrote {path} (report)" if path else ""
-    return text(found, asked["parameters"]) + wrote
+    return bool(able(found.rows)), text(found, asked["parameters"]) + wrote
 
 
 def text(found: Comparison, parameters: bool = False) -> str:

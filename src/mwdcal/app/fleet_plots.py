@@ -19,6 +19,14 @@ BINS = (12, 40)
 """Fewest and most bins: as many as half the root of the number of tools."""
 ABREAST = 3
 """Most panels in a row."""
+TICKS = 12
+"""Numbers along the axes of a row of panels: more would run into each other."""
+FAR = 6.0
+"""Robust standard deviations from the fleet's median beyond which a tool is an outlier."""
+FEWEST = 20
+"""Sound tools without which there is no fleet to be an outlier of."""
+SPREAD = 1.4826
+"""Standard deviation of a normal variable by its median absolute deviation."""
 KINDS = {
     "gain": ("own-axis gain", "cross-axis gain"),
     "scale": ("scale", ""),
@@ -29,6 +37,15 @@ KINDS = {
     "cube": ("own-axis cube", ""),
 }
 """Titles of panels: of one axis, and of two."""
+
+
+def distance(values: Array) -> Array:
+    """Robust standard deviations (n,) from the median; 0 for few values, or where most are equal."""
+    if np.sum(~np.isnan(values)) < FEWEST:
+        return np.zeros(len(values))
+    away = np.abs(values - np.nanmedian(values))
+    spread = SPREAD * np.nanmedian(away)
+    return away / spread if spread > 0 else np.zeros(len(values))
 
 
 def parameters(found: Sequence[Any]) -> str:
@@ -56,6 +73,7 @@ def parameters(found: Sequence[Any]) -> str:
                 _steps(axes, {m.title.partition(" ")[2]: m.values for m in members})
                 unit = members[0].unit
                 axes.set_xlabel(unit or "share of nominal")
+                axes.locator_params(axis="x", nbins=TICKS // columns)
         return plots._svg(figure, "parameters", "Distributions of the fleet's parameters")
 
 
@@ -71,7 +89,7 @@ def quality(panels: Sequence[tuple[str, str, Mapping[str, Array]]]) -> str:
         for axes, (title, label, series) in zip(row, panels, strict=True):
             axes.set_title(title)
             axes.set_xlabel(label)
-            axes.locator_params(axis="x", nbins=12 // len(panels))
+            axes.locator_params(axis="x", nbins=TICKS // len(panels))
             _steps(axes, series, abreast=3 if len(panels) < 3 else 1)
         return plots._svg(figure, "quality", "Distributions of residuals and accuracy")
 
@@ -83,8 +101,8 @@ def _steps(axes: Axes, series: Mapping[str, Array], abreast: int = 3) -> None:
     if not usable:
         axes.text(0.5, 0.5, "undetermined", ha="center", va="center", transform=axes.transAxes)
         return
-    every = np.concatenate(list(usable.values()))
-    low, high = np.quantile(every, (0.001, 0.999))
+    every = np.concatenate([values[distance(values) <= FAR] for values in usable.values()])
+    low, high = every.min(), every.max()
     margin = 0.05 * (high - low) or max(abs(high), 1e-9) * 1e-3
     most = max(values.size for values in usable.values())
     edges = np.linspace(low - margin, high + margin, int(np.clip(most**0.5 / 2, *BINS)) + 1)

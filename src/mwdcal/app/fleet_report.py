@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mwdcal.app import fleet_plots, report
+from mwdcal.app.fleet_plots import FAR, FEWEST
 from mwdcal.app.fleet_summary import (
     ERRORS,
     Said,
@@ -34,12 +35,8 @@ from mwdcal.readings import TRIADS, is_simulated
 if TYPE_CHECKING:
     from jinja2 import Environment
 
-FAR = 6.0
-"""Robust standard deviations from the fleet's median beyond which a tool is an outlier."""
-FEWEST = 20
-"""Sound tools without which there is no fleet to be an outlier of."""
-SPREAD = 1.4826
-"""Standard deviation of a normal variable by its median absolute deviation."""
+RELATIVE = "field = 1"
+"""The kind of magnetometers of which the strength of the field is not known."""
 
 
 @dataclass(frozen=True)
@@ -189,7 +186,7 @@ def _parameters(path: Path, sound: Ints) -> list[Parameter]:
     """All columns of parameters, with units that people use."""
     _, pq = parquet.modules(path.name)
     found, names = [], pq.read_schema(path).names
-    kinds = _kinds(path, sound)
+    kinds, nominal = _kinds(path, sound), _nominal(path, sound)
     for name in names:
         triad = next((t for t in TRIADS if name.startswith(f"{t}_")), "")
         rest = name.removeprefix(f"{triad}_")
@@ -202,7 +199,7 @@ def _parameters(path: Path, sound: Ints) -> list[Parameter]:
             values[which], sd[which] = every[which], spread[which]
             if np.isnan(values).all():
                 continue
-            unit, factor = _unit(rest, triad, bool(kind))
+            unit, factor = _unit(rest, triad, bool(kind), nominal)
             middle = float(np.nanmedian(sd)) * factor if not np.isnan(sd).all() else float("nan")
             found.append(Parameter(triad, kind, _title(rest), unit, values * factor, middle))
     return sorted(found, key=lambda each: each.sensors)
@@ -212,27 +209,48 @@ def _kinds(path: Path, sound: Ints) -> dict[str, Bools]:
     """Which tools are calibrated to nT, and which to a field of one: they do not compare."""
     units = _text(path, "field_unit")[sound]
     relative = np.array([unit not in (None, "nT") for unit in units])
-    found = {"": units == "nT", "field = 1": relative}
+    found = {"": units == "nT", RELATIVE: relative}
     return {name: which for name, which in found.items() if which.any()}
+
+
+def _nominal(path: Path, sound: Ints) -> str:
+    """Unit of the nominal readings of magnetometers calibrated to a field of one.
+
+    nT, or none where the profile states no scale: then they are relative too, and gains near 1, as
+    the fit refuses others. In nT a gain is one over the strength, and a scale is the strength.
+    """
+    _, pq = parquet.modules(path.name)
+    names, triad = pq.read_schema(path).names, TRIADS[1]
+    which = _kinds(path, sound).get(RELATIVE, np.zeros(len(sound), bool))
+    for name in ("gain_xx", "scale_x", "radius"):
+        if f"{triad}_{name}" in names:
+            every = _comparable(path, triad, name, column(path, f"{triad}_{name}"), names)
+            if not np.isnan(values := every[sound][which]).all():
+                return "" if 0.01 < abs(np.nanmedian(values)) < 100.0 else "nT"
+    return "nT"
 
 
 def _comparable(path: Path, triad: str, name: str, values: Array, names: list[str]) -> Array:
     """Values but for tools with own-axis terms, whose other parameters are of scaled readings."""
-    if f"{triad}_radius" not in names or name.startswith(("square", "cube")):
+    if f"{triad}_radius" not in names or name.startswith(("square", "cube", "radius")):
         return values
     return np.where(np.isnan(column(path, f"{triad}_radius")), values, np.nan)
 
 
-def _unit(name: str, triad: str, relative: bool) -> tuple[str, float]:
-    """Unit and factor of a parameter: offsets in mg or nT, the rest as shares of nominal."""
+def _unit(name: str, triad: str, relative: bool, nominal: str) -> tuple[str, float]:
+    """Unit and factor of a parameter: offsets in mg or nT, the rest as shares of nominal.
+
+    A `relative` field has no unit, whatever that of the `nominal` readings: a factor's scale has
+    theirs, and a gain one over it.
+    """
     kind, _, rest = name.partition("_")
     power = rest.partition("_t")[2]
     per = f"/°C{_raised(power)}" if power else ""
     if kind in ("offset", "bias", "square", "cube"):
         field = "of the field" if relative else "nT"
         return (f"mg{per}", 1e3) if triad == TRIADS[0] else (f"{field}{per}", 1.0)
-    if relative and kind in ("gain", "scale"):
-        return f"1/nT{per}", 1.0
+    if relative and nominal and kind in ("gain", "scale"):
+        return (f"1/{nominal}" if kind == "gain" else nominal) + per, 1.0
     return per.replace("/", "1/"), 1.0
 
 
@@ -286,7 +304,8 @@ def _noise(path: Path, triad: str, sound: Ints) -> tuple[str, str, dict[str, Arr
     if triad == TRIADS[0]:
         return title, "1σ, mg", {triad: 1e3 * values}
     kind, which = next(iter(_kinds(path, sound).items()))
-    return title, "1σ of the field" if kind else "1σ, nT", {triad: values[which]}
+    relative = kind == RELATIVE and not _nominal(path, sound)
+    return title, "1σ of the field" if relative else "1σ, nT", {triad: values[which]}
 
 
 def _outliers(path: Path, parameters: list[Parameter], sound: Ints) -> list[Outlier]:
@@ -295,11 +314,7 @@ def _outliers(path: Path, parameters: list[Parameter], sound: Ints) -> list[Outl
         return []
     distance, which = np.zeros(len(sound)), np.zeros(len(sound), int)
     for index, each in enumerate(parameters):
-        if np.sum(~np.isnan(each.values)) < FEWEST:
-            continue
-        away = np.abs(each.values - np.nanmedian(each.values))
-        spread = SPREAD * np.nanmedian(away)
-        mine = away / spread if spread > 0 else np.zeros(len(sound))
+        mine = fleet_plots.distance(each.values)
         which = np.where(mine > distance, index, which)
         distance = np.fmax(mine, distance)
     far = np.argsort(-distance, kind="stable")[: int(np.sum(distance > FAR))]

@@ -1,11 +1,11 @@
 """Tables of any length through a calibration: read, corrected and written part by part.
 
-Every Parquet table goes this way, so that its columns keep their types. Reading, computing and
-writing overlap: one thread reads, some compute, the caller writes, and only a few parts are in
-memory at any time. Results, findings and refusals are those of `app.tables.apply_to_table`,
-which is for short text and for workbooks, but for two: which outputs rest on undetermined
-directions is judged on a sample of each part, and blank `sd_` cells are compared with others of
-their part.
+Every Parquet table that becomes Parquet or text goes this way, so that its columns keep their
+types. Reading, computing and writing overlap: one thread reads, some compute, the caller writes,
+and only a few parts are in memory at any time. Results, findings and refusals are those of
+`app.tables.apply_to_table`, which is for short text and for workbooks, but for two: which outputs
+rest on undetermined directions is judged on a sample of each part, and blank `sd_` cells are
+compared with others of their part.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ from mwdcal.correction import (
 )
 from mwdcal.errors import InputError
 from mwdcal.files import atomic, parquet, runs, streams
-from mwdcal.files.columns import check_names, no_stations
+from mwdcal.files.columns import no_stations
 from mwdcal.files.contract import CHANNELS, RAW, RAW_RANGE, TEMPERATURE, check_columns
 from mwdcal.files.sinks import ParquetSink, Sink, TextSink
 from mwdcal.files.streams import Part, Source
-from mwdcal.files.table import Table, cell_error
+from mwdcal.files.table import Table, cell_error, check_header
 from mwdcal.files.table import numbers as as_numbers
 from mwdcal.profile import TriadProfile
 from mwdcal.readings import TRIADS, Readings
@@ -66,6 +66,8 @@ OPTIONAL = {
     ("temperature_c",): "Fill it in, or leave the whole column blank.",
 }
 """Columns that are blank on all rows or on none, and what to do where they are neither."""
+LONGEST = 60
+"""Characters of another tool's serial that are told of a column."""
 _MOST = 10**15
 
 Item = TypeVar("Item")
@@ -97,8 +99,8 @@ def apply_to_file(
     least: int = MANY,
     missing: str = "refuse",
     decimal: str = ".",
-) -> tuple[int, list[Finding]]:
-    """Correct a file into another; number of rows, and what the reader should know.
+) -> tuple[Tally, list[Finding]]:
+    """Correct a file into another; what was seen in the rows, and what the reader should know.
 
     `advance` is told how much of the whole is done. `rows` of a part of a Parquet table, by
     default as many as memory bears; `least` rows of the whole from which loops are compiled.
@@ -123,9 +125,9 @@ def apply_to_file(
         total = _total(tallies)
         if total.lacking == total.rows:
             raise nothing(source.name)
-        found = findings(calibration, worker.said, total, outside)
+        found = findings(calibration, worker.heard(total.serials), total, outside)
         sink.finish([finding.text for finding in found])
-    return total.rows, found
+    return total, found
 
 
 def overlapped(items: Iterator[Item], work: Callable[[Item], Made]) -> Iterator[Made]:
@@ -156,10 +158,8 @@ def _source(readings: Path, output: Path, rows: int, decimal: str) -> Source:
 
 def _check_header(source: Source, outside: str) -> None:
     """Refuse columns that are missing, doubtful, or have the name of a result."""
-    check_names(source.names, source.name)
+    check_header(source.names, source.name)
     check_columns(source.names, source.name)
-    if source.names[0].startswith("#"):
-        raise InputError(f"{source.name}: the first column name must not start with '#'.")
     check_free(source.names, result_names(outside), source.name)
 
 
@@ -191,7 +191,10 @@ def _loaded(source: Source, piece: Any) -> Part:
 def _total(tallies: Sequence[Tally]) -> Tally:
     moved = {name for tally in tallies for name in tally.moved}
     rows, beyond, lacking = np.sum([(t.rows, t.beyond, t.lacking) for t in tallies], 0).tolist()
-    return Tally(rows, beyond, tuple(name for name in JUDGED if name in moved), lacking)
+    serials = runs.serials({}, chain.from_iterable(tally.serials for tally in tallies))
+    return Tally(
+        rows, beyond, tuple(name for name in JUDGED if name in moved), lacking, tuple(serials)
+    )
 
 
 class Rules(NamedTuple):
@@ -258,7 +261,8 @@ class _Worker:
         how = "extrapolate" if outside == "refuse" else outside
         judged = JUDGED if self.calibration.free else ()
         lacking = 0 if self.rules.missing == "refuse" else _MOST
-        most = findings(self.calibration, self.said, Tally(_MOST, _MOST, judged, lacking), how)
+        said = self.heard(("\0" * LONGEST, "\1" * LONGEST, "…"))
+        most = findings(self.calibration, said, Tally(_MOST, _MOST, judged, lacking), how)
         longest = [finding.text for finding in most]
         delimiter = "," if suffix == ".csv" else "\t"
         return TextSink(stream, self.source.schema, results, metadata, longest, delimiter)
@@ -290,7 +294,21 @@ class _Worker:
         if whole is not None:
             results = [spread(values, whole) for values in results]
         rendered = sink.render(part.carried, results, bool(found.empty) or whole is not None)
-        return Corrected(rendered, part.size, Tally(rows, found.beyond, moved, rows - table.count))
+        tally = Tally(rows, found.beyond, moved, rows - table.count, self._serials(part.carried))
+        return Corrected(rendered, part.size, tally)
+
+    def _serials(self, carried: Any) -> tuple[str, ...]:
+        """The tools that a part names; names of others are cut, so that there is room for them."""
+        if "serial" not in carried.column_names:
+            return ()
+        arrow, _ = parquet.modules(self.source.name)
+        ours = self.calibration.tool.get("serial")
+        cells = [c.strip() for c in parquet.texts(carried.column("serial").unique(), arrow)]
+        return tuple(runs.serials({}, [c if c == ours else c[:LONGEST] for c in cells]))
+
+    def heard(self, serials: Sequence[str]) -> Readings:
+        """What the findings need to know of the source, with the tools that its parts named."""
+        return replace(self.said, metadata=runs.identified(self.source.metadata, serials))
 
     def _found(self, table: Table) -> tuple[dict[str, list[Array] | None], fused.Found]:
         """The channels of a table, and what is made of them."""
@@ -429,7 +447,7 @@ def spread(values: AnyArray, rows: Bools) -> AnyArray:
 
 def _blank(table: Table, names: tuple[str, ...]) -> InputError:
     problem = f"must be filled in; got a blank cell. {OPTIONAL[names]}"
-    return cell_error(table, names[0], 0, problem)
+    return runs.BlankReadingError(str(cell_error(table, names[0], 0, problem)))
 
 
 def _column(table: Table, name: str) -> Array:

@@ -20,7 +20,7 @@ from mwdcal.app.streaming import (
     wholly_blank,
 )
 from mwdcal.calibration import Calibration, Finding
-from mwdcal.correction import MARK, correct
+from mwdcal.correction import MARK, Tally, counted
 from mwdcal.files import table
 from mwdcal.files.columns import as_text
 from mwdcal.files.contract import check_columns
@@ -36,10 +36,10 @@ def apply_to_any(
     missing: str,
     decimal: str,
     advance: Callable[[int, int], None],
-) -> tuple[int, list[Finding]]:
+) -> tuple[Tally, list[Finding]]:
     """Correct a file into another: part by part, or whole where it is short text or a workbook.
 
-    Number of rows, and what the reader should know. `advance` is told how much of a long
+    What was seen in the rows, and what the reader should know. `advance` is told how much of a long
     table is done, and of how much.
     """
     if in_parts(readings, output, decimal):
@@ -47,17 +47,17 @@ def apply_to_any(
             calibration, readings, output, outside, advance, missing=missing, decimal=decimal
         )
     source = table.read(readings, decimal=decimal)
-    result, findings = apply_to_table(calibration, source, outside, missing)
+    result, tally, findings = apply_to_table(calibration, source, outside, missing)
     if MARK in result.columns and output.suffix.lower() != ".parquet":
         words = [as_text(bool(mark)) for mark in result.columns[MARK]]
         result = replace(result, columns={**result.columns, MARK: words})
     table.write(output, result)
-    return source.count, findings
+    return tally, findings
 
 
 def apply_to_table(
     calibration: Calibration, source: Table, outside: str, missing: str = "refuse"
-) -> tuple[Table, list[Finding]]:
+) -> tuple[Table, Tally, list[Finding]]:
     """The input's columns and metadata, the results, and what the calibration was."""
     check_columns(list(source.columns), source.source)
     whole = np.ones(source.count, bool)
@@ -67,10 +67,11 @@ def apply_to_table(
         raise nothing(source.source)
     kept = source if whole.all() else chosen(source, whole)
     readings, _ = to_readings(kept, calibration.profile)
-    found, findings = correct(calibration, readings, outside, source.count - kept.count)
+    found, tally, findings = counted(calibration, readings, outside, source.count - kept.count)
     check_free(source.columns, list(found), source.source)
     columns = found if whole.all() else {n: spread(values, whole) for n, values in found.items()}
     metadata = {**source.metadata, **described(calibration)}
     if findings:
         metadata["findings"] = [finding.text for finding in findings]
-    return replace(source, columns={**source.columns, **columns}, metadata=metadata), findings
+    made = replace(source, columns={**source.columns, **columns}, metadata=metadata)
+    return made, tally, findings

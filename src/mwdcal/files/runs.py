@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Iterable, Mapping, Sequence
 
 import msgspec
 import numpy as np
@@ -32,6 +31,13 @@ from mwdcal.files.table import Table, cell_error, labels, numbers, shown
 from mwdcal.profile import Profile, TriadProfile
 from mwdcal.readings import ANGLES, Readings
 
+
+class BlankReadingError(InputError):
+    """A blank cell among readings or temperatures: `apply` may leave the results of its row blank."""
+
+
+MANY = 1000
+"""Rows of a table with times from which it is a log."""
 _TURN = 360.0
 _DIGEST_LENGTH = 16
 
@@ -40,25 +46,42 @@ def read_run(
     path: str | os.PathLike[str], profile: Profile, *, decimal: str = "."
 ) -> tuple[Readings, Profile]:
     """The readings of a run file, and the profile with its nominal scales filled in."""
-    return to_readings(of_one_tool(tables.read(path, decimal=decimal)), profile)
+    table = tables.read(path, decimal=decimal)
+    check_run(table)
+    return to_readings(table, profile)
 
 
-def of_one_tool(table: Table) -> Table:
-    """A table of one tool; what its column `serial` says of it stands in the metadata.
-
-    Refuses rows of several tools: they are a fleet, and no run.
-    """
-    if "serial" not in table.columns:
-        return table
-    found = list(dict.fromkeys(filter(None, labels(table, "serial"))))
-    stated = table.metadata.get("serial")
-    known = list(dict.fromkeys([*([] if stated is None else [str(stated)]), *found]))
-    if len(known) > 1:
+def check_run(table: Table) -> None:
+    """Refuse a table of several tools, which is a fleet, and a continuous log."""
+    found = serials(table.metadata, _serial_cells(table))
+    if len(found) > 1:
         raise InputError(
-            f"{table.source} has rows of more than one tool (serial {known[0]}, {known[1]}"
-            f"{', …' if known[2:] else ''}). Take the rows of one, or use mwdcal fleet."
+            f"{table.source} has rows of more than one tool (serial {', '.join(found)}). Take the "
+            "rows of one, or use mwdcal fleet."
         )
-    return replace(table, metadata={**table.metadata, "serial": known[0]}) if known else table
+    if table.count > MANY and ("time_s" in table.columns or "sampling_hz" in table.metadata):
+        raise InputError(
+            f"{table.source} is a continuous log ({table.count} rows): its rows are no stations. Find "
+            f"the standstills first: mwdcal stations {table.source} -o run.csv. If each row is a "
+            "station, remove time_s and sampling_hz."
+        )
+
+
+def serials(metadata: Mapping[str, object], cells: Iterable[str]) -> list[str]:
+    """Serials of the tools, that of the metadata first; behind two of them '…' stands for the rest."""
+    stated = metadata.get("serial")
+    known = dict.fromkeys([*([] if stated is None else [str(stated)]), *filter(None, cells)])
+    return [*[*known][:2], *["…"] * (len(known) > 2)]
+
+
+def identified(metadata: Mapping[str, object], cells: Sequence[str]) -> Mapping[str, object]:
+    """The metadata, with the serials that cells state beside their own."""
+    found = serials(metadata, cells) if cells else []
+    return {**metadata, "serial": ", ".join(found)} if found else metadata
+
+
+def _serial_cells(table: Table) -> list[str]:
+    return labels(table, "serial") if "serial" in table.columns else []
 
 
 def write_run(
@@ -94,7 +117,7 @@ def to_readings(table: Table, profile: Profile) -> tuple[Readings, Profile]:
         group=_group(table),
         station=_stations(table),
         digest=_digests([*triads.values()]),
-        metadata=table.metadata,
+        metadata=identified(table.metadata, _serial_cells(table)),
         source=table.source,
     )
     return readings, profile
@@ -155,16 +178,22 @@ def _raw(table: Table, kind: str) -> Array | None:
     blank = np.isnan(values)
     if kind == "magnetometer" and blank.all():
         return None
-    _refuse_blank(table, names, blank, "Fill it in, or remove the station.")
+    _refuse_blank(table, names, blank, "Fill it in, or remove the station.", BlankReadingError)
     return values
 
 
-def _refuse_blank(table: Table, names: tuple[str, ...], blank: Bools, advice: str) -> None:
+def _refuse_blank(
+    table: Table,
+    names: tuple[str, ...],
+    blank: Bools,
+    advice: str,
+    kind: type[InputError] = InputError,
+) -> None:
     """Refuse the first blank cell of the columns `names`; `blank` is (n, columns)."""
     for row, column in np.argwhere(blank)[:1]:
         got = "a blank cell" if names[column] in table.columns else "no such column"
         problem = f"must be filled in; got {got}. {advice}"
-        raise cell_error(table, names[column], int(row), problem)
+        raise kind(str(cell_error(table, names[column], int(row), problem)))
 
 
 def _temperature(table: Table) -> Array | None:
@@ -175,7 +204,8 @@ def _temperature(table: Table) -> Array | None:
     blank = np.isnan(values)
     if blank.all():
         return None
-    _refuse_blank(table, (name,), blank[:, None], "Fill it in, or leave the whole column blank.")
+    advice = "Fill it in, or leave the whole column blank."
+    _refuse_blank(table, (name,), blank[:, None], advice, BlankReadingError)
     return values
 
 

@@ -12,11 +12,11 @@ from collections.abc import Mapping, Sequence
 from typing import IO, Any, Protocol
 
 import msgspec
+import numpy as np
 
-from mwdcal.core.vectors import AnyArray
+from mwdcal.core.vectors import AnyArray, Bools
 from mwdcal.files import metadata as meta
 from mwdcal.files import parquet, text
-from mwdcal.files.columns import as_text
 
 _ARROW_SCHEMA = b"ARROW:schema"
 
@@ -105,8 +105,6 @@ class TextSink:
 
     def render(self, carried: Any, results: Sequence[AnyArray], blank: bool) -> bytes:
         """The lines of the part."""
-        from pyarrow import csv as arrow_csv
-
         plain = {
             n: self._spelt(c) for n, c in zip(carried.column_names, carried.columns, strict=True)
         }
@@ -114,16 +112,45 @@ class TextSink:
             name: self._arrow.array(values, from_pandas=blank)
             for name, values in zip(self._names, results, strict=True)
         }
+        rows = self._arrow.table(plain)
+        try:
+            return self._lines(rows)
+        except self._arrow.ArrowInvalid:  # a cell needs quotes
+            return self._quoted(rows)
+
+    def _lines(self, rows: Any) -> bytes:
+        """Rows of which no cell needs quotes."""
+        from pyarrow import csv as arrow_csv
+
         stream = self._arrow.BufferOutputStream()
         options = arrow_csv.WriteOptions(
             include_header=False, delimiter=self._delimiter, quoting_style="none"
         )
-        try:
-            arrow_csv.write_csv(self._arrow.table(plain), stream, options)
-        except self._arrow.ArrowInvalid:  # a cell needs quotes
-            columns = {n: [as_text(v) for v in c.to_pylist()] for n, c in plain.items()}
-            return text.render(columns, {}, self._delimiter).partition("\n")[2].encode()
+        arrow_csv.write_csv(rows, stream, options)
         return bytes(stream.getvalue())
+
+    def _quoted(self, rows: Any) -> bytes:
+        """Rows of which some have such cells: these by the writer of short tables, numbers alike."""
+        odd = self._odd(rows)
+        words = [cells.cast(self._arrow.string()) for cells in rows.filter(odd).columns]
+        cells = [[word or "" for word in column.to_pylist()] for column in words]
+        columns = dict(zip(rows.column_names, cells, strict=True))
+        few = text.render(columns, {}, self._delimiter).encode().split(b"\n")
+        lines = np.empty(len(odd), object)
+        lines[odd] = few[-1 - int(odd.sum()) : -1]
+        lines[~odd] = self._lines(rows.filter(~odd)).split(b"\n")[:-1]
+        return b"\n".join([*lines, b""])
+
+    def _odd(self, rows: Any) -> Bools:
+        """Which rows (n,) have a cell that needs quotes."""
+        import pyarrow.compute as compute
+
+        odd = np.zeros(len(rows), bool)
+        for cells in rows.columns:
+            if self._arrow.types.is_string(cells.type):
+                found = compute.match_substring_regex(cells, f'["\r\n{self._delimiter}]')
+                odd |= found.fill_null(False).to_numpy()
+        return odd
 
     def write(self, rendered: bytes) -> None:
         """Append lines; the first ones wait, as a table of one part needs no room."""

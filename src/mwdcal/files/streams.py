@@ -1,9 +1,9 @@
 """Tables in parts: Parquet and text of any length, read in bounded memory.
 
 A source hands out pieces in order, which are cheap to make, and loads a piece, which may be
-done by several threads at once. Needs PyArrow. Text that is not plain (quotes, blanks before a
-cell, numbers in unusual spelling) and everything that is refused goes through the parser of
-`files.text`, piece by piece: one place decides what is accepted, and words it.
+done by several threads at once. Needs PyArrow. Lines of text that are not plain (quotes, blanks
+before a cell) go through the parser of `files.text`, and so do whole pieces with numbers in unusual
+spelling or anything that is refused: one place decides what is accepted, and words it.
 """
 
 from __future__ import annotations
@@ -17,6 +17,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from mwdcal.core.vectors import Ints
+from mwdcal.correction import NAMES
 from mwdcal.errors import InputError
 from mwdcal.files import parquet, text
 from mwdcal.files.columns import LABELS, Column, check_names, no_stations
@@ -29,7 +31,6 @@ PART = 16 << 20
 """Bytes that the numbers of such a part may take, results included."""
 PIECE = 1 << 20
 """Bytes of a piece of text."""
-_RESULTS = 13
 _LONGEST = 1 << 20
 _NUMERIC = tuple(name for name in COLUMNS if name not in LABELS)
 
@@ -84,7 +85,7 @@ def open_parquet(path: Path, rows: int = 0, decimal: str = ".") -> Source:
         raise no_stations(path.name)
     names = [name for name in stored.names if not parquet.is_index(name)]
     metadata = parquet.metadata_of(file.metadata.metadata, path.name)
-    step = rows or max(1, min(ROWS, PART // (8 * (len(names) + _RESULTS))))
+    step = rows or max(1, min(ROWS, PART // (8 * (len(names) + len(NAMES)))))
 
     def pieces() -> Iterator[Any]:
         first = 1
@@ -174,25 +175,45 @@ def _newlines(data: bytes) -> bytes:
 
 
 def _plain(data: bytes, top: text.Head, arrow: Any) -> tuple[Any, Table] | None:
-    """Strings and table of a piece without anything unusual; None where there may be."""
+    """Strings and table of a piece, unusual lines by the exact parser; None where it takes all."""
     from pyarrow import csv
 
-    delimiter = top.delimiter.encode()
-    unusual = (b'"', b"\0", delimiter + b" ", b"\n ")
-    if data.startswith(b" ") or not data.strip() or any(mark in data for mark in unusual):
+    plain, odd, order = _sorted(data, top.delimiter.encode())
+    if not plain.strip():
         return None
     strings = {name: arrow.string() for name in top.names}
     try:
         carried = csv.read_csv(
-            arrow.BufferReader(data),
-            csv.ReadOptions(column_names=top.names, use_threads=False, block_size=len(data) + 1),
+            arrow.BufferReader(plain),
+            csv.ReadOptions(column_names=top.names, use_threads=False, block_size=len(plain) + 1),
             csv.ParseOptions(delimiter=top.delimiter, quote_char=False),
             csv.ConvertOptions(column_types=strings, strings_can_be_null=False),
         )
+        if order is not None:
+            found = text.rows(odd, top, 1, "").columns
+            few = arrow.table({n: arrow.array(c, arrow.string()) for n, c in found.items()})
+            both = arrow.concat_tables([carried, few]).combine_chunks()
+            if len(both) != len(order):  # lines that are blank are no rows
+                return None
+            carried = both.take(order)
         columns = {n: _numbers(n, carried.column(n), arrow) for n in top.names if n in _NUMERIC}
     except (arrow.ArrowInvalid, arrow.ArrowKeyError):
         return None
     return carried, Table(columns, {}, "", range(carried.num_rows))
+
+
+def _sorted(data: bytes, delimiter: bytes) -> tuple[bytes, bytes, Ints | None]:
+    """The plain lines of a piece, its unusual ones, and which row of both together comes when.
+
+    Unusual: quotes, NUL, and blanks before a cell.
+    """
+    marks = (b'"', b"\0", delimiter + b" ")
+    if not data.startswith(b" ") and not any(mark in data for mark in (*marks, b"\n ")):
+        return data, b"", None
+    lines = np.array([line + b"\n" for line in data.split(b"\n") if line], object)
+    odd = np.array([s.startswith(b" ") or any(mark in s for mark in marks) for s in lines], bool)
+    order = np.argsort(np.argsort(odd, kind="stable"))
+    return b"".join(lines[~odd]), b"".join(lines[odd]), order
 
 
 def _numbers(name: str, cells: Any, arrow: Any) -> Column:

@@ -76,15 +76,20 @@ def write(path: str | os.PathLike[str], table: Table) -> None:
     """Write the table atomically, in the format of the suffix; the same table, the same bytes."""
     file = Path(path)
     suffix = _suffix(file)
-    check_names(list(table.columns), file.name)
-    if next(iter(table.columns)).startswith("#"):
-        raise InputError(f"{file.name}: the first column name must not start with '#'.")
+    check_header(list(table.columns), file.name)
     if suffix in (".csv", ".tsv"):
         delimiter = "," if suffix == ".csv" else "\t"
         atomic.write(file, text.render(_pointed(table), table.metadata, delimiter))
     else:
         render = parquet.render if suffix == ".parquet" else workbook.render
         atomic.write(file, render(_typed(table), table.metadata, file.name))
+
+
+def check_header(names: Sequence[str], source: str) -> None:
+    """Refuse column names that a written table cannot have."""
+    check_names(names, source)
+    if names[0].startswith("#"):
+        raise InputError(f"{source}: the first column name must not start with '#'.")
 
 
 def numbers(table: Table, name: str) -> Array:
