@@ -114,7 +114,7 @@ def test_ctrl_c_ends_with_130_and_one_line(tmp_path, when):
     child = started(("" if when == "writing" else fitting) + SLOW_WRITE, *CALIBRATE, target)
     assert child.stdout.readline() == "writing\n"
     child.send_signal(signal.SIGINT)
-    _, err = child.communicate(timeout=10)
+    _, err = child.communicate(timeout=30)
     assert child.returncode == 130
     assert err.strip() == "mwdcal: interrupted. Files are as they were before."
     assert not list(tmp_path.iterdir())
@@ -129,7 +129,7 @@ def test_every_orderly_end_tells_its_status_and_leaves_nothing(tmp_path, name, w
     child = started(SLOW_WRITE, *CALIBRATE, tmp_path / "cal.json")
     assert child.stdout.readline() == "writing\n"
     child.send_signal(number)
-    _, err = child.communicate(timeout=10)
+    _, err = child.communicate(timeout=30)
     assert child.returncode == 128 + number
     assert err.strip() == f"mwdcal: {word}. Files are as they were before."
     assert not list(tmp_path.iterdir())
@@ -156,7 +156,7 @@ def signalled_while_tidying(target, first, second, pause=0.0, **given):
     assert child.stdout.readline() == "tidying\n"
     time.sleep(pause)
     child.send_signal(getattr(signal, second))
-    _, err = child.communicate(timeout=10)
+    _, err = child.communicate(timeout=30)
     return child.returncode, err.strip()
 
 
@@ -185,7 +185,7 @@ def test_an_ignored_hang_up_stays_ignored(tmp_path):
     child = started(ignoring, *CALIBRATE, tmp_path / "cal.json")
     assert child.stdout.readline() == "writing\n"
     child.send_signal(signal.SIGHUP)
-    child.communicate(timeout=20)
+    child.communicate(timeout=40)
     assert child.returncode == 0
     assert (tmp_path / "cal.json").exists()
 

@@ -46,9 +46,9 @@ UNREADABLE = {
 @pytest.mark.parametrize("content", UNREADABLE.values(), ids=UNREADABLE)
 def test_unreadable_files(tmp_path, content):
     (tmp_path / "run.csv").write_bytes(content)
-    start = time.perf_counter()
+    start = time.process_time()
     assert "run.csv" in refused(calibrate(tmp_path, tmp_path / "run.csv"), 2)
-    assert time.perf_counter() - start < 5
+    assert time.process_time() - start < 5
     assert not left(tmp_path)
 
 

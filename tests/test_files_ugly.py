@@ -238,9 +238,9 @@ def test_a_file_beyond_every_run(tmp_path):
 )
 def test_long_lines_are_refused_at_once(tmp_path, content):
     path = put(tmp_path, content)
-    start = time.perf_counter()
+    start = time.process_time()
     assert "a line must have at most 100000 characters" in refusal(path)
-    assert time.perf_counter() - start < 5.0
+    assert time.process_time() - start < 5.0
 
 
 RUN = Table({"station": ["1", "2"], "ax": ["1", "2"], "ay": ["1", "2"], "az": ["1", "2"]})
@@ -322,9 +322,9 @@ def sheet_file(path, rows):
 )
 def test_ugly_sheets(tmp_path, rows, part):
     sheet_file(tmp_path / "run.xlsx", rows)
-    start = time.perf_counter()
+    start = time.process_time()
     assert part in refusal(tmp_path / "run.xlsx")
-    assert time.perf_counter() - start < 5.0
+    assert time.process_time() - start < 5.0
 
 
 quick = settings(

@@ -520,7 +520,7 @@ def test_ended_in_the_middle_of_a_long_table(tmp_path, warm, name, word):
     write_parquet(tmp_path / "log.parquet", log(250_000))
     child = caught_writing(tmp_path, warm[0])
     child.send_signal(number)
-    _, err = child.communicate(timeout=15)
+    _, err = child.communicate(timeout=30)
     assert child.returncode == 128 + number
     assert err.strip() == f"mwdcal: {word}. Files are as they were before."
     assert [f.name for f in tmp_path.iterdir()] == ["log.parquet"]
@@ -537,7 +537,7 @@ def test_what_a_killed_command_left_is_removed_by_the_next_one(tmp_path, warm):
     assert done.returncode == 0, done
     (left,) = tmp_path.glob(".mwdcal-*.tmp")
     alive.terminate()
-    alive.communicate(timeout=15)
+    alive.communicate(timeout=30)
     assert not left.exists()
 
 
