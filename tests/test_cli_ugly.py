@@ -344,3 +344,14 @@ def test_the_screen_names_twelve_stations_to_shoot_again(tmp_path):
     assert sum("Re-shoot it" in line for line in lines) == 12
     assert lines[-1] == f"! … and {count - 12} more to re-shoot"
     assert len(lines) == len(told) - count + 13
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_references_of_other_stations_are_named_before_the_design(tmp_path, seed):
+    run = {name: np.array(values) for name, values in servo_run().items()}
+    order = np.random.default_rng(seed).permutation(48)
+    for name in ("ref_inclination_deg", "ref_azimuth_deg", "ref_toolface_deg"):
+        run[name] = run[name][order]
+    message = refused(ran(tmp_path, run), 3)
+    assert "times the declared noise" in message
+    assert "reference angles and groups belong to the stations they stand at" in message
