@@ -51,17 +51,15 @@ def fit_checks(
 ) -> Iterator[tuple[str, Callable[[], None]]]:
     """The checks in turn, each with the status that a fleet gives to what it refuses.
 
-    Where nothing fits, the state is anywhere: that comes before what it leaves undetermined.
+    Where nothing fits, the state is anywhere: that comes before what it leaves undetermined, and
+    before its gains.
     """
     status = Status(int(result.status[0]))
-    residuals = ("residuals", partial(_check_residuals, result, readings))
     yield status.name.lower().replace("_", "-"), partial(_check_status, status)
-    if any(map(is_bad, free)):
-        yield residuals
+    yield "residuals", partial(_check_residuals, result, readings)
     yield "weak-geometry", partial(_check_geometry, free)
     yield "no-redundancy", partial(_check_freedom, result)
     yield "gain", partial(_check_gains, result, profile, readings)
-    yield residuals
 
 
 def check_options(options: Options) -> None:
@@ -320,9 +318,8 @@ def _check_residuals(result: Fit, readings: Readings) -> None:
         spread = float(np.std(problem.triads[index].raw[0], axis=0).max())
         size = max(min(float(strength.mean()), 2 * spread), 1e-300)
         declared = bool(np.isnan(noise))
-        if (
-            declared and excess > ABSURD and analysis.freedom[0, index] >= 1
-        ) or noise > COARSE * size:
+        absurd = excess > ABSURD if declared else noise > COARSE * size
+        if absurd and analysis.freedom[0, index] >= 1:
             much = (
                 f"{excess:.0f} times the declared noise"
                 if declared
