@@ -537,6 +537,14 @@ def test_neither_the_command_nor_its_workers_load_pandas(fleet, tmp_path):
     assert seen.exists()  # so PyArrow would
 
 
+def _started(*command):
+    """A command in a session of its own."""
+    return subprocess.Popen(
+        [*MWDCAL, *map(str, command)],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
+    )  # fmt: skip
+
+
 def _wait_for_a_part(folder):
     limit = time.monotonic() + 60
     while not list(folder.glob("*.arrow")) and time.monotonic() < limit:
@@ -606,10 +614,7 @@ def test_an_interruption_from_the_keyboard_leaves_parts_and_no_traceback(tmp_pat
     path = many(tmp_path / "runs.parquet", tools=6000)
     output, folder = tmp_path / "cals.parquet", tmp_path / "cals.parquet.parts"
     command = ["fleet", path, "-o", output, "--tool", "servo", "--workers", 2]
-    running = subprocess.Popen(
-        [*MWDCAL, *map(str, command)],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
-    )  # fmt: skip
+    running = _started(*command)
     _wait_for_a_part(folder)
     os.killpg(running.pid, signal.SIGINT)
     out, err = running.communicate(timeout=60)
@@ -638,10 +643,7 @@ PS = pytest.mark.skipif(
 def test_an_interruption_while_workers_start_leaves_no_traceback(fleet, tmp_path):
     command = ["fleet", fleet[0], "-o", tmp_path / "cals.parquet", "--tool", "servo"]
     for others, later in ((1, 0.0), (2, 0.0), (2, 0.1), (2, 0.2)):
-        running = subprocess.Popen(
-            [*MWDCAL, *map(str, command), "--workers", "2"],
-            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
-        )  # fmt: skip
+        running = _started(*command, "--workers", 2)
         limit = time.monotonic() + 60
         while len(_of_session(running.pid)) <= others and time.monotonic() < limit:
             pass

@@ -188,14 +188,14 @@ def _closed(
     at = exact.start(problem)
     halfs = exact.halves(problem, at)
     state, analysis = exact.solution(problem, at, halfs)
-    good = np.all([h.settled for h in halfs], 0) & analysis.determined.keep.all(-1)
+    good = exact.settled(halfs) & analysis.determined.keep.all(-1)
     if not good.any():
         return None, none
     if not all(declared):
         problem = _rescaled(problem, np.sqrt(analysis.variance_factor), declared)
         halfs = exact.halves(problem, at)
         state, analysis = exact.solution(problem, at, halfs)
-        good &= np.all([h.settled for h in halfs], 0)
+        good &= exact.settled(halfs)
     sound = finite & np.isfinite(state.params).all(-1)
     status = np.where(sound, int(Status.OK), int(Status.NOT_FINITE))
     trust = np.ones(problem.evidence.include.shape)

@@ -17,12 +17,18 @@ from mwdcal.core.vectors import AnyArray, Array, ArrayLike, Bools, Ints
 
 ANGLES = ("inclination", "azimuth", "toolface")
 TRIADS = ("accelerometer", "magnetometer")
+SIMULATED = "SIMULATED DATA"
 CONSTANTS = ("gravity", "field", "dip")
 
 
 def is_simulated(metadata: Mapping[str, object]) -> bool:
     """Whether what a file says of itself says that no real tool was measured."""
     return str(metadata.get("simulated", "")).lower() not in ("", "0", "false", "no")
+
+
+def simulated(*metadata: Mapping[str, object]) -> list[str]:
+    """What a heading says where calibration, run or log is simulated; else nothing."""
+    return [SIMULATED] if any(map(is_simulated, metadata)) else []
 
 
 @dataclass(frozen=True)

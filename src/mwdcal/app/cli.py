@@ -6,7 +6,7 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack
@@ -64,13 +64,6 @@ def tell(findings: list[Finding]) -> None:
     """Findings, on stderr."""
     for finding in findings:
         say(f"! {finding.text}")
-
-
-def _simulated(*metadata: Mapping[str, object]) -> str:
-    """What a screen says where a calibration or a run is simulated."""
-    from mwdcal.readings import is_simulated
-
-    return "   SIMULATED DATA" if any(map(is_simulated, metadata)) else ""
 
 
 def print_json(value: Any) -> None:
@@ -192,6 +185,7 @@ def apply(
     from mwdcal.app.tables import apply_to_any
     from mwdcal.files import documents
     from mwdcal.files.runs import BlankReadingError
+    from mwdcal.readings import simulated
 
     _check_outputs([output], [calibration, readings])
     made = documents.read(calibration)
@@ -209,7 +203,8 @@ def apply(
         print_json(found)
     else:
         none = f", {blank} of them blank" if blank else ""
-        click.echo(f"{tally.rows} rows corrected{none}   wrote {output}{_simulated(made.tool)}")
+        corrected = f"{tally.rows} rows corrected{none}   wrote {output}"
+        click.echo("   ".join([corrected, *simulated(made.tool)]))
 
 
 @cli.command()
@@ -248,8 +243,7 @@ def verify(
     if as_json:
         print_json(result)
     else:
-        first, _, rest = text.verdict(result).partition("\n")
-        click.echo(f"{first}{_simulated(made.tool, readings.metadata)}\n{rest}")
+        click.echo(text.verdict(result, made.tool, readings.metadata))
     tell(result.findings)
     sys.exit(0 if result.passed else 1)
 

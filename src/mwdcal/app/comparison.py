@@ -17,7 +17,7 @@ from mwdcal.app.text import WEIGHED, plain, table
 from mwdcal.compare import Comparison, Row, able, compare
 from mwdcal.files import atomic
 from mwdcal.profile import Profile
-from mwdcal.readings import Readings
+from mwdcal.readings import SIMULATED, Readings
 
 STATISTICS = (("mean", "mean"), ("STD", "std"), ("MSE", "mse"), ("RMSE", "rmse"))
 MARK = "*"
@@ -52,7 +52,7 @@ def text(found: Comparison, parameters: bool = False) -> str:
     """The advice, errors and residual statistics of every method, and why some were refused."""
     rows = able(found.rows)
     methods = [row.method for row in rows]
-    simulated = ["SIMULATED DATA"] if found.simulated else []
+    simulated = [SIMULATED] if found.simulated else []
     lines = ["   ".join([*heading(found), *simulated]), found.advice]
     if rows:
         lines += ["", _table(figures(found), ["", "before", *methods]), ""]

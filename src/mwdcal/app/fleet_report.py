@@ -186,7 +186,8 @@ def _parameters(path: Path, sound: Ints) -> list[Parameter]:
     """All columns of parameters, with units that people use."""
     _, pq = parquet.modules(path.name)
     found, names = [], pq.read_schema(path).names
-    kinds, nominal = _kinds(path, sound), _nominal(path, sound)
+    kinds = _kinds(path, sound)
+    nominal = _nominal(path, sound, kinds)
     for name in names:
         triad = next((t for t in TRIADS if name.startswith(f"{t}_")), "")
         rest = name.removeprefix(f"{triad}_")
@@ -213,7 +214,7 @@ def _kinds(path: Path, sound: Ints) -> dict[str, Bools]:
     return {name: which for name, which in found.items() if which.any()}
 
 
-def _nominal(path: Path, sound: Ints) -> str:
+def _nominal(path: Path, sound: Ints, kinds: Mapping[str, Bools]) -> str:
     """Unit of the nominal readings of magnetometers calibrated to a field of one.
 
     nT, or none where the profile states no scale: then they are relative too, and gains near 1, as
@@ -221,7 +222,7 @@ def _nominal(path: Path, sound: Ints) -> str:
     """
     _, pq = parquet.modules(path.name)
     names, triad = pq.read_schema(path).names, TRIADS[1]
-    which = _kinds(path, sound).get(RELATIVE, np.zeros(len(sound), bool))
+    which = kinds.get(RELATIVE, np.zeros(len(sound), bool))
     for name in ("gain_xx", "scale_x", "radius"):
         if f"{triad}_{name}" in names:
             every = _comparable(path, triad, name, column(path, f"{triad}_{name}"), names)
@@ -303,8 +304,9 @@ def _noise(path: Path, triad: str, sound: Ints) -> tuple[str, str, dict[str, Arr
     title = f"{triad}: estimated noise"
     if triad == TRIADS[0]:
         return title, "1σ, mg", {triad: 1e3 * values}
-    kind, which = next(iter(_kinds(path, sound).items()))
-    relative = kind == RELATIVE and not _nominal(path, sound)
+    kinds = _kinds(path, sound)
+    kind, which = next(iter(kinds.items()))
+    relative = kind == RELATIVE and not _nominal(path, sound, kinds)
     return title, "1σ of the field" if relative else "1σ, nT", {triad: values[which]}
 
 

@@ -14,6 +14,7 @@ from mwdcal.app import plots
 from mwdcal.errors import InputError
 from mwdcal.files.contract import CHANNELS
 from mwdcal.noise import ChannelNoise, Noise
+from mwdcal.readings import SIMULATED
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -80,7 +81,7 @@ def figure(found: Noise) -> Figure:
         if any(name in found.channels for name in names)
     ]
     made = Figure(figsize=(plots.WIDTH, 3.5), layout="constrained")
-    simulated = "   SIMULATED DATA" if found.simulated else ""
+    simulated = f"   {SIMULATED}" if found.simulated else ""
     made.suptitle(f"{found.log}, {found.seconds:.4g} s{simulated}", fontsize=8)
     panels = made.subplots(1, max(len(triads), 1), squeeze=False)[0]
     for axes, (kind, names) in zip(panels, triads, strict=True):

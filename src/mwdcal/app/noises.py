@@ -20,6 +20,7 @@ from mwdcal.files import atomic, logs
 from mwdcal.files.contract import CHANNELS
 from mwdcal.files.profiles import load_profile
 from mwdcal.noise import ChannelNoise, Noise, Term, check, find_noise
+from mwdcal.readings import SIMULATED
 
 ROWS = {
     "white": ("white noise N", "·√s"),
@@ -123,7 +124,7 @@ def heading(found: Noise) -> list[str]:
         f"{len(channels)} channel{'s' if len(channels) > 1 else ''}",
         f"{channels[0].samples} samples at {rates}",
         f"{found.seconds:.6g} s",
-        *(["SIMULATED DATA"] if found.simulated else []),
+        *([SIMULATED] if found.simulated else []),
     ]
 
 

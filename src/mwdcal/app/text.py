@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from typing import Any
 
@@ -11,7 +12,7 @@ from mwdcal.calibration import Calibration, Choices, ErrorRow, Finding, OrderSco
 from mwdcal.curves import CurveScore
 from mwdcal.notation import Notation, powers
 from mwdcal.quality import Verdict
-from mwdcal.readings import is_simulated
+from mwdcal.readings import simulated
 
 WEIGHED = {
     "toolface": "toolface·sin I",
@@ -75,8 +76,7 @@ def heading(calibration: Calibration) -> str:
     if calibration.temperature_c:
         parts.append("{:.1f}–{:.1f} °C".format(*calibration.temperature_c))
     parts.append(f"I {min(inclinations):.0f}–{max(inclinations):.0f}°")
-    if is_simulated(calibration.tool):
-        parts.append("SIMULATED DATA")
+    parts += simulated(calibration.tool)
     ranks = [f"{t.name} {t.rank} of {t.size} determined" for t in calibration.triads]
     how = ", ".join(
         [f"method {calibration.method}", model(calibration), *choices(calibration.options)]
@@ -163,8 +163,8 @@ def curves(scores: list[CurveScore]) -> str:
     return table(rows, ["own-axis nonlinearity of", "χ² left out", ""])
 
 
-def verdict(result: Verdict) -> str:
-    """The outcome first, then each limit."""
+def verdict(result: Verdict, *metadata: Mapping[str, object]) -> str:
+    """The outcome first, then each limit; `metadata` of calibration and run."""
     rows = [
         [
             row.name,
@@ -176,7 +176,9 @@ def verdict(result: Verdict) -> str:
         ]
         for row in result.rows
     ]
-    lines = [f"{'PASS' if result.passed else 'FAIL'}   {result.run}   {result.stations} stations"]
+    outcome = "PASS" if result.passed else "FAIL"
+    first = [outcome, result.run, f"{result.stations} stations", *simulated(*metadata)]
+    lines = ["   ".join(first)]
     lines += [f"limits {result.limits} ({result.source})", f"rule: {result.rule}"]
     return "\n".join(lines) + "\n\n" + table(rows, ["", "worst", "1σ", "limit", "", "where"])
 

@@ -123,6 +123,11 @@ def halves(problem: Problem, at: State) -> Halves:
     ]
 
 
+def settled(halfs: Halves) -> Bools:
+    """Members (B,) of which all triads are at their minimum."""
+    return np.asarray(np.all([half.settled for half in halfs], axis=0))
+
+
 def start(problem: Problem) -> State:
     """The known attitudes, with parameters of zero."""
     known, batch = problem.evidence.known, len(problem.temperature)
