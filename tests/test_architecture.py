@@ -44,6 +44,7 @@ LAYERS = (
     ("calibration",),
     ("evidence", "prior", "options"),
     ("methods", "estimate", "notation"),
+    ("covariance",),
     ("checks", "curves", "correction", "residuals", "scatter", "selection", "stand"),
     ("findings",),
     ("calibrate", "compare", "gauge", "predict", "quality", "simulate"),

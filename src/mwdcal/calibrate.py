@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cached_property
 from itertools import pairwise
@@ -24,9 +24,10 @@ from mwdcal.calibration import (
 )
 from mwdcal.checks import check_fit, check_readings
 from mwdcal.core.observability import Free, free_directions
-from mwdcal.core.problem import STAND
-from mwdcal.core.uncertainty import analyse, marginal_rank
+from mwdcal.core.problem import STAND_ERRORS
+from mwdcal.core.uncertainty import marginal_rank
 from mwdcal.core.vectors import Array
+from mwdcal.covariance import constants_covariance, error_name, stated_covariance
 from mwdcal.curves import with_nonlinearity
 from mwdcal.estimate import Fit, fit
 from mwdcal.findings import Findings, described, is_relative
@@ -108,7 +109,7 @@ class _Record:
             free=[d.tolist() for d in self.directions],
             singular_values=result.analysis.determined.values[0].tolist(),
             constants=self.constants(),
-            stand=stand_errors(result, float(np.sqrt(self.factors.max()))),
+            stand=stand_errors(result),
             earth=self.earth(),
             errors=error_rows(readings, result),
             measures=measure_rows(readings, result),
@@ -151,28 +152,13 @@ class _Record:
         return [slice(int(a), int(b)) for a, b in pairwise(ends)]
 
     @cached_property
-    def factors(self) -> Array:
-        """What scales each triad's variances: s², or 1 where there is no redundancy."""
-        analysis = self.result.analysis
-        usable = analysis.freedom[0] >= 1
-        return np.where(usable, np.nan_to_num(analysis.variance_factor[0], nan=1.0), 1.0)
-
-    @cached_property
     def covariance(self) -> Array:
-        """Covariance (p, p) of the file's parameters; what the data say is scaled by s²."""
-        return np.asarray(self.map @ self._scaled @ self.map.transpose())
+        """Covariance (p, p) of the file's parameters."""
+        return self._mapped(stated_covariance(self.result))
 
-    @cached_property
-    def _scaled(self) -> Array:
-        """Covariance (p, p) of the fit's parameters, scaled by s²; a prior is not."""
-        problem, analysis = self.result.problem, self.result.analysis
-        grown = np.sqrt(self.factors)
-        if self.options.prior is not None:
-            pairs = zip(problem.triads, grown, strict=True)
-            noisy = replace(problem, triads=tuple(replace(t, sd=t.sd * s) for t, s in pairs))
-            return np.asarray(analyse(noisy, self.result.state, analysis.determined).covariance[0])
-        spread = np.repeat(grown, [t.model.size for t in problem.triads])
-        return np.asarray(analysis.covariance[0] * np.outer(spread, spread))
+    def _mapped(self, covariance: Array) -> Array:
+        """A covariance (1, p, p) of the fit's parameters as one of the file's."""
+        return np.asarray(self.map @ covariance[0] @ self.map.transpose())
 
     @cached_property
     def directions(self) -> list[Array]:
@@ -191,22 +177,20 @@ class _Record:
     def constants(self) -> list[Constant]:
         """Estimated constants of the run with their uncertainty."""
         found = []
-        scale = float(np.sqrt(self.factors.max()))
+        spread = np.sqrt(np.diag(constants_covariance(self.result)[0]))
         for index, constant in enumerate(self.result.problem.evidence.constants):
             lone = constant.name == "dip" and len(self.result.problem.triads) == 1
-            if lone or constant.name in STAND:
+            asked = constant.unknown and constant.name in STAND_ERRORS  # these stand in `stand`
+            if lone or asked:
                 continue
-            degrees = float(np.degrees(1)) if constant.name == "dip" else 1.0
+            unit = {"gravity": "g", "field": "nT"}.get(constant.name, "°")
+            degrees = float(np.degrees(1)) if unit == "°" else 1.0
             found.append(
                 Constant(
-                    name=constant.name if constant.unknown else f"{constant.name} reference error",
+                    name=constant.name if constant.unknown else error_name(constant.name),
                     value=float(self.result.state.constants[0, index]) * degrees,
-                    standard_uncertainty=(
-                        float(np.sqrt(self.result.analysis.constants[0, index, index]))
-                        * scale
-                        * degrees
-                    ),
-                    unit={"dip": "°", "gravity": "g", "field": "nT"}[constant.name],
+                    standard_uncertainty=float(spread[index]) * degrees,
+                    unit=unit,
                 )
             )
         return found

@@ -64,6 +64,8 @@ class StandErrors(msgspec.Struct, frozen=True, kw_only=True):
 
     azimuth_zero_deg: float | None = None
     azimuth_zero_uncertainty_deg: float | None = None
+    inclination_zero_deg: float | None = None
+    inclination_zero_uncertainty_deg: float | None = None
     tilt_deg: float | None = None
     tilt_uncertainty_deg: float | None = None
     tilt_azimuth_deg: float | None = None

@@ -211,7 +211,7 @@ def _joined(ours: Fit, index: Ints, other: Fit) -> Fit:
         for name in ("status", "iterations", "noise", "trust")
     }
     mine, theirs = ours.analysis, other.analysis
-    names = ("covariance", "variance_factor", "freedom", "residual", "spread", "constants")
+    names = ("covariance", "variance_factor", "freedom", "residual", "spread")
     found = {n: placed(getattr(mine, n), index, getattr(theirs, n)) for n in names}
     determined = mine.determined.put(index, theirs.determined)
     return Fit(
@@ -270,6 +270,7 @@ def _robustly(found: Analysis, problem: Problem, state: State, loss: str) -> Ana
         found,
         covariance=wider.covariance,
         constants=wider.constants,
+        effects=wider.effects,
         variance_factor=found.variance_factor / share,
     )
 

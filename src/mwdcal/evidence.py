@@ -9,7 +9,11 @@ import numpy as np
 
 from mwdcal.core.problem import UNKNOWN, Constant, Evidence
 from mwdcal.core.vectors import AnyArray, Array, Ints
+from mwdcal.profile import COMMON
 from mwdcal.readings import ANGLES, CONSTANTS, Readings
+
+TURNS = {"tilt": ("stand-north", "stand-east")}
+"""Errors of the stand that consist of several turns of its frame."""
 
 
 def flat(value: AnyArray, lead: tuple[int, ...], *tail: int) -> AnyArray:
@@ -32,9 +36,29 @@ def evidence_of(readings: Readings, include: Array) -> Evidence:
     if readings.magnetometer is None:  # nothing is to be found of what nothing reads
         known |= {name: np.nan_to_num(known[name], nan=1.0) for name in ("field", "dip")}
         sd |= {name: np.zeros(group.shape) for name in ("field", "dip")}
-    bare = Evidence(known, sd, group, included, ())
+    bare = Evidence(known, sd, group, included, (), stand=_stand(readings, lead))
     known, sd = _share_known(bare)
     return replace(bare, known=known, sd=sd, constants=constants(bare))
+
+
+def _stand(readings: Readings, lead: tuple[int, ...]) -> dict[str, Array]:
+    """Standard uncertainties (B,) of errors of the stand, of each turn that they consist of.
+
+    A tilt of known size leans to any azimuth: each of its two turns has half the variance.
+    """
+    found: dict[str, Array] = {}
+    for name in COMMON:
+        if name in readings.sd:
+            turns = TURNS.get(name, (name,))
+            sd = flat(readings.uncertainty(name), lead).max(-1) / math.sqrt(len(turns))
+            found |= dict.fromkeys(turns, sd)
+    return found
+
+
+def acts_on(evidence: Evidence, name: str) -> Array:
+    """Stations (B, n), as zeros and ones, whose references have an error of the stand."""
+    angle = name.removesuffix("-zero") if name.endswith("-zero") else "inclination"
+    return evidence.is_known(angle).astype(float)
 
 
 def _shared_groups(group: Ints) -> Ints:
@@ -93,4 +117,9 @@ def constants(evidence: Evidence) -> tuple[Constant, ...]:
             found.append(
                 Constant(name, known.astype(float), np.zeros(len(sd)), floor, unknown=False)
             )
+    for name, sd in evidence.stand.items():
+        mask = acts_on(evidence, name)
+        if (sd > 0).any() and mask.any():
+            floor = np.where(sd > 0, sd, 1e-12)
+            found.append(Constant(name, mask, np.zeros(len(sd)), floor, unknown=False))
     return tuple(found)

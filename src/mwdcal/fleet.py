@@ -10,7 +10,7 @@ says which.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -20,8 +20,9 @@ from mwdcal.calibration import FREE_SHARE, StandErrors
 from mwdcal.checks import check_readings, fit_checks
 from mwdcal.core.models import Basis, Factors, Polynomial, Whole
 from mwdcal.core.observability import Free
-from mwdcal.core.uncertainty import analyse, marginal_rank
+from mwdcal.core.uncertainty import marginal_rank
 from mwdcal.core.vectors import AnyArray, Array, Ints
+from mwdcal.covariance import stated_covariance
 from mwdcal.errors import MwdcalError
 from mwdcal.estimate import Fit, fit
 from mwdcal.fleet_accuracy import ANGLES, typical_sd
@@ -207,10 +208,10 @@ def _record(
     findings, again = findings_of_batch(readings, profile, options, result, free)
     for place, own, stations in zip(members[good], findings, again, strict=True):
         outcome.findings[place], outcome.reshoot[place] = own, stations
-    if options.prior:
-        result = _with_prior_apart(result)
     reference = profile.reference_temperature_c
-    found = _columns(result, free, reference) | _besides(result, free, options, reference)
+    covariance = stated_covariance(result)
+    found = _columns(result, covariance, free, reference)
+    found |= _besides(result, covariance, free, options, reference)
     for name, values in found.items():
         outcome.columns[name][members[good]] = values
     for place, each in zip(members[good], free, strict=True):
@@ -245,33 +246,8 @@ def _doubt(
                 break
 
 
-def _factors(result: Fit) -> Array:
-    """What scales each triad's variances (B, t): s², or 1 where there is no redundancy."""
-    usable = result.analysis.freedom >= 1
-    return np.where(usable, np.nan_to_num(result.analysis.variance_factor, nan=1.0), 1.0)
-
-
-def _grown(result: Fit) -> Array:
-    """What scales each triad's noise (B, t)."""
-    return np.sqrt(_factors(result))
-
-
-def _with_prior_apart(result: Fit) -> Fit:
-    """The fit with a covariance that is right once scaled by s²: what a prior says is not."""
-    problem, grown = result.problem, _grown(result)
-    triads = [
-        replace(triad, sd=triad.sd * grown[:, index, None, None])
-        for index, triad in enumerate(problem.triads)
-    ]
-    noisy = replace(problem, triads=tuple(triads))
-    covariance = analyse(noisy, result.state, result.analysis.determined).covariance
-    spread = np.repeat(grown, [t.model.size for t in problem.triads], axis=-1)
-    covariance = covariance / (spread[:, :, None] * spread[:, None, :])
-    return replace(result, analysis=replace(result.analysis, covariance=covariance))
-
-
 def _besides(
-    result: Fit, free: list[list[Free]], options: Options, reference: float
+    result: Fit, covariance: Array, free: list[list[Free]], options: Options, reference: float
 ) -> dict[str, Array]:
     """Columns of what was chosen for these tools, and of what they were asked for besides."""
     count, found = len(result.status), {}
@@ -284,27 +260,22 @@ def _besides(
             found[f"{name}_radius"] = model.scale[:, 0, 0]
     if any(f"{name}_radius" in found for name in TRIADS):
         rows = free_rows(free, result.state.params.shape[-1])
-        found |= curved_sd(result, _grown(result), rows, reference)
+        found |= curved_sd(result, covariance, rows, reference)
     if options.estimate:
-        scale = _grown(result).max(-1)
-        errors = [
-            stand_errors(member(result, np.array([i])), float(scale[i])) for i in range(count)
-        ]
+        errors = [stand_errors(member(result, np.array([i]))) for i in range(count)]
         for name in (name for error in options.estimate for name in STAND[error]):
             found[name] = np.array([getattr(each, name) for each in errors])
     return found
 
 
-def _columns(result: Fit, free: list[list[Free]], reference: float) -> dict[str, Array]:
+def _columns(
+    result: Fit, covariance: Array, free: list[list[Free]], reference: float
+) -> dict[str, Array]:
     """Columns of the results of sound fits."""
-    factors = _factors(result)
     found: dict[str, Array] = {}
     for index in range(len(result.problem.triads)):
-        found |= _triad_columns(result, index, factors[:, index], free, reference)
-    sizes = [t.model.size for t in result.problem.triads]
-    spread = np.sqrt(np.repeat(factors, sizes, axis=-1))
-    covariance = result.analysis.covariance * spread[:, :, None] * spread[:, None, :]
-    found |= typical_sd(result, covariance, free_rows(free, spread.shape[-1]), reference)
+        found |= _triad_columns(result, index, covariance, free, reference)
+    found |= typical_sd(result, covariance, free_rows(free, covariance.shape[-1]), reference)
     problem, state = result.problem, result.state
     found["gravity_g"] = problem.constant(state, "gravity").mean(-1)
     if len(problem.triads) > 1:
@@ -324,7 +295,7 @@ def free_rows(free: list[list[Free]], size: int) -> Array:
 
 
 def _triad_columns(
-    result: Fit, index: int, factor: Array, free: list[list[Free]], reference: float
+    result: Fit, index: int, covariance: Array, free: list[list[Free]], reference: float
 ) -> dict[str, Array]:
     """Parameters at the reference temperature, uncertainties, rank and noise of one triad."""
     problem, analysis = result.problem, result.analysis
@@ -333,8 +304,8 @@ def _triad_columns(
     finished, one = triad.model.finished(reference)
     one = np.broadcast_to(one, (len(params), *one.shape[-2:]))
     values = np.einsum("bij,bj->bi", one, params)
-    inner = one @ analysis.covariance[:, where, where]
-    sd = np.sqrt(np.einsum("bij,bij->bi", inner, one) * factor[:, None])
+    inner = one @ covariance[:, where, where]
+    sd = np.sqrt(np.einsum("bij,bij->bi", inner, one))
     size, rank = triad.model.size, np.full(len(params), triad.model.size)
     some = np.flatnonzero([bool(each) for each in free])
     if some.size:

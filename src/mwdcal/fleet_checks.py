@@ -13,7 +13,7 @@ import numpy as np
 
 from mwdcal.checks import ABSURD, COARSE, GAIN, MOTION, NEEDS, is_bad
 from mwdcal.core.observability import EXACT, Free, free_directions
-from mwdcal.core.problem import STAND, UNKNOWN, Problem, State
+from mwdcal.core.problem import STAND_ERRORS, UNKNOWN, Problem, State
 from mwdcal.core.solvers import Determined, Status
 from mwdcal.core.uncertainty import COUPLED, candidates
 from mwdcal.core.vectors import Array, Bools, Ints
@@ -102,7 +102,7 @@ def suspect_fits(result: Fit, free: list[list[Free]], options: Options) -> Bools
 def _inseparable(result: Fit) -> Bools:
     """Where (B,) errors of the stand may not be told from those of the sensors."""
     constants = result.problem.evidence.constants
-    stand = [i for i, constant in enumerate(constants) if constant.name in STAND]
+    stand = [i for i, c in enumerate(constants) if c.unknown and c.name in STAND_ERRORS]
     variance = np.diagonal(result.analysis.constants, axis1=-2, axis2=-1)[:, stand]
     loose = np.any(~(np.sqrt(variance) <= LOOSE * UNKNOWN), -1)
     return np.asarray(loose | ~result.analysis.determined.keep.all(-1))

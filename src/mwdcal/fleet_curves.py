@@ -19,11 +19,11 @@ STEPS = 8
 """Newton steps from the field to the reading."""
 
 
-def curved_sd(result: Fit, grown: Array, free: Array, reference: float) -> dict[str, Array]:
+def curved_sd(result: Fit, covariance: Array, free: Array, reference: float) -> dict[str, Array]:
     """1σ (B,) of the calibration by angle at 45° inclination, degrees, as `…_sd_deg`.
 
-    Root mean square over azimuth and toolface. `grown` (B, t) scales the noise of each triad,
-    `free` are directions (B, k, p). NaN where an angle rests on a free direction.
+    Root mean square over azimuth and toolface. `covariance` (B, p, p) of the fit's parameters,
+    `free` directions (B, k, p). NaN where an angle rests on a free direction.
     """
     problem, state = result.problem, result.state
     earth = [
@@ -33,8 +33,6 @@ def curved_sd(result: Fit, grown: Array, free: Array, reference: float) -> dict[
     vectors = reference_vectors(TYPICAL, azimuth.reshape(1, -1), toolface.reshape(1, -1), *earth)
     temperature = np.clip(reference, problem.temperature.min(-1), problem.temperature.max(-1))
     warmth = np.repeat(temperature[:, None], azimuth.size, axis=1)
-    spread = np.repeat(grown, [t.model.size for t in problem.triads], axis=-1)
-    covariance = result.analysis.covariance * spread[:, :, None] * spread[:, None, :]
     changes = [
         _change(triad.model, state.params[:, where], target, warmth)
         for triad, where, target in zip(problem.triads, problem.slices(), vectors, strict=False)

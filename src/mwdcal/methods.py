@@ -18,12 +18,14 @@ from mwdcal.core.sums import STRENGTH, Params, Sums
 from mwdcal.core.swarm import forward_parts, swarm_forward
 from mwdcal.core.uncertainty import readjusted, unweighted_pulls
 from mwdcal.core.vectors import Array, Bools, Ints, inverse
-from mwdcal.evidence import constants
+from mwdcal.evidence import TURNS, acts_on, constants
 from mwdcal.options import Options
 from mwdcal.readings import ANGLES
 
-ESTIMABLE = {"azimuth-zero": ("azimuth-zero",), "tilt": ("stand-north", "stand-east")}
-"""Errors of the stand that can be found, and the turns of its frame (`STAND`) they consist of."""
+ESTIMABLE = {
+    name: TURNS.get(name, (name,)) for name in ("azimuth-zero", "inclination-zero", "tilt")
+}
+"""Errors of the stand that can be found, and the constants of the run that they consist of."""
 HELD = 1e18
 """Precision of a parameter that is held at its value."""
 ITERATIONS = 600
@@ -59,12 +61,14 @@ def strengths_alone(evidence: Evidence) -> Evidence:
 
 def with_stand_errors(evidence: Evidence, names: tuple[str, ...]) -> Evidence:
     """The evidence with errors of the stand (see `ESTIMABLE`) as unknown constants of the run."""
-    found = list(evidence.constants)
+    if not names:
+        return evidence
+    turns = [turn for error in names for turn in ESTIMABLE[error]]
+    found = [constant for constant in evidence.constants if constant.name not in turns]
     zero = np.zeros(len(evidence.include))
-    for name in (turn for error in names for turn in ESTIMABLE[error]):
-        angle = "azimuth" if name == "azimuth-zero" else "inclination"
-        mask = evidence.is_known(angle).astype(float)
-        found.append(Constant(name, mask, zero, np.full(len(zero), UNKNOWN), unknown=True))
+    for name in turns:
+        sd, mask = np.full(len(zero), UNKNOWN), acts_on(evidence, name)
+        found.append(Constant(name, mask, zero, sd, unknown=True))
     return replace(evidence, constants=tuple(found))
 
 
@@ -78,7 +82,8 @@ def without(evidence: Evidence, names: tuple[str, ...]) -> Evidence:
 def inclination_and_strength(evidence: Evidence) -> Evidence:
     """|g| and inclination of the accelerometer (Moosavi); azimuth, |b| and dip of the magnetometer."""
     known = {**evidence.known, "toolface": np.full_like(evidence.known["toolface"], np.nan)}
-    return replace(evidence, known=known, group=np.full_like(evidence.group, -1))
+    alone = np.full_like(evidence.group, -1)
+    return _reset(replace(evidence, known=known, group=alone), evidence.absent)
 
 
 def _reset(evidence: Evidence, absent: tuple[str, ...]) -> Evidence:

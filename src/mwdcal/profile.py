@@ -14,6 +14,9 @@ import numpy as np
 
 from mwdcal.core.vectors import Array
 
+COMMON = ("azimuth-zero", "toolface-zero", "inclination-zero", "tilt")
+"""Errors of the stand that all its stations have in common; in a profile `azimuth_zero_deg` …"""
+
 Axis = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
 
 
@@ -60,11 +63,41 @@ class TriadProfile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
 
 
 class StandProfile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Standard uncertainties of the stand's reference angles, degrees."""
+    """Standard uncertainties (1 σ) of the references that a stand gives.
+
+    `inclination_deg` … are of one setting, independent from station to station, where the run does
+    not state its own; `repeatability_…` is added to either in quadrature. The others are errors
+    that all stations have in common: zeros of the three scales, the lean of the stand's vertical,
+    and the references for gravity, field and dip where the run does not state their uncertainty.
+    """
 
     inclination_deg: float = 0.0
     azimuth_deg: float = 0.0
     toolface_deg: float = 0.0
+    repeatability_inclination_deg: float = 0.0
+    repeatability_azimuth_deg: float = 0.0
+    repeatability_toolface_deg: float = 0.0
+    inclination_zero_deg: float = 0.0
+    azimuth_zero_deg: float = 0.0
+    toolface_zero_deg: float = 0.0
+    tilt_deg: float = 0.0
+    gravity_g: float = 0.0
+    field_nt: float = 0.0
+    dip_deg: float = 0.0
+
+    def of(self, column: str) -> float:
+        """Standard uncertainty of a reference such as "azimuth_deg" where the run states none."""
+        return float(getattr(self, column))
+
+    def repeatability(self, column: str) -> float:
+        """What is added to the standard uncertainty of an angle in quadrature; strengths have none."""
+        return float(getattr(self, f"repeatability_{column}", 0.0))
+
+    def common(self) -> dict[str, float]:
+        """Standard uncertainties, in degrees, of errors of the stand that all stations share."""
+        keys = {name: f"{name.replace('-', '_')}_deg" for name in COMMON}
+        found = {name: float(getattr(self, key)) for name, key in keys.items()}
+        return {name: value for name, value in found.items() if value}
 
 
 class Profile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

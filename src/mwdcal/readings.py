@@ -47,7 +47,8 @@ class Readings:
         sd: standard uncertainties: of `accelerometer` and `magnetometer` (..., n, 3) per
             station and axis (missing: estimated from the residuals), of reference angles
             (..., n) independent per station, of gravity, field and dip (..., n) common
-            to the run. Missing or NaN reference uncertainties are zero.
+            to the run, and so are those of the errors of the stand in `profile.COMMON` (tilt: of
+            its amplitude). Missing or NaN reference uncertainties are zero.
         group: stations of the same non-negative number share one direction of the tool
             axis; -1 is none.
         station: labels, for messages and tables.

@@ -105,16 +105,12 @@ class Residuals:
         inner = total @ self.fit.analysis.spread @ total
         return np.asarray(inner[0])
 
-    @property
-    def _variance_factor(self) -> float:
-        """s² of all triads together: one, so that unknown turns still cancel between them."""
-        analysis = self.fit.analysis
-        freedom = float(analysis.freedom[0].sum())
-        squares = float(np.nansum(analysis.variance_factor[0] * analysis.freedom[0]))
-        return squares / freedom if freedom >= 1 else 1.0
-
     def expected(self, name: str) -> Array:
-        """Standard deviation (n,) to expect of `errors` after the fit; NaN if the fit did not use it."""
+        """Standard deviation (n,) of `errors` after the fit that noise and stand alone would give.
+
+        NaN if the fit did not use it. Declared noise is not scaled by what the residuals come to:
+        the two are compared.
+        """
         problem, state = self.fit.problem, self.fit.state
         if name in problem.evidence.absent:
             return np.full(self.readings.count, np.nan)
@@ -126,7 +122,7 @@ class Residuals:
             rows.append(np.einsum("ni,nij->nj", part, slope) * triad.sd[0])
         row = np.nan_to_num(np.concatenate(rows, -1) * self._weight(name)[:, None])
         variance = np.einsum("ni,nij,nj->n", row, self._spread, row)
-        return np.asarray(np.sqrt(np.maximum(variance, 0) * self._variance_factor))
+        return np.asarray(np.sqrt(np.maximum(variance, 0)))
 
     @cached_property
     def _moves(self) -> list[Array]:

@@ -8,8 +8,9 @@ from dataclasses import replace
 import numpy as np
 
 from mwdcal.calibration import StandErrors
-from mwdcal.core.problem import STAND, UNKNOWN
+from mwdcal.core.problem import STAND_ERRORS, UNKNOWN
 from mwdcal.core.solvers import Determined
+from mwdcal.covariance import constants_covariance
 from mwdcal.errors import FitError, InputError
 from mwdcal.estimate import Fit
 from mwdcal.methods import ESTIMABLE
@@ -39,7 +40,8 @@ def check_separable(result: Fit, names: Sequence[str]) -> None:
     """Refuse stand errors that these stations cannot tell from the sensors' own errors."""
     problem, state = result.problem, result.state
     evidence = problem.evidence
-    keep = [i for i, c in enumerate(evidence.constants) if c.name not in STAND]
+    asked = [c.unknown and c.name in STAND_ERRORS for c in evidence.constants]
+    keep = [i for i, stand in enumerate(asked) if not stand]
     fewer = replace(evidence, constants=tuple(evidence.constants[i] for i in keep))
     bare = replace(problem, evidence=fewer)
     still = replace(state, constants=state.constants[:, keep])
@@ -47,8 +49,8 @@ def check_separable(result: Fit, names: Sequence[str]) -> None:
     sd = np.sqrt(np.diag(result.analysis.constants[0]))
     loose = [
         c.name
-        for c, s in zip(evidence.constants, sd, strict=True)
-        if c.name in STAND and s > LOOSE * UNKNOWN
+        for c, s, stand in zip(evidence.constants, sd, asked, strict=True)
+        if stand and s > LOOSE * UNKNOWN
     ]
     if loose or ranks[0] < ranks[1]:
         raise FitError(
@@ -57,16 +59,17 @@ def check_separable(result: Fit, names: Sequence[str]) -> None:
         )
 
 
-def stand_errors(result: Fit, scale: float) -> StandErrors:
-    """Zero of azimuth, and tilt as amplitude and azimuth, with uncertainty times `scale`."""
-    names = [c.name for c in result.problem.evidence.constants]
+def stand_errors(result: Fit) -> StandErrors:
+    """Errors of the stand that were asked for: zeros, and tilt as amplitude and azimuth."""
+    names = [c.name if c.unknown else "" for c in result.problem.evidence.constants]
     value = dict(zip(names, np.degrees(result.state.constants[0]), strict=True))
-    covariance = np.degrees(np.degrees(result.analysis.constants[0])) * scale**2
+    covariance = np.degrees(np.degrees(constants_covariance(result)[0]))
     found: dict[str, float] = {}
-    if "azimuth-zero" in names:
-        place = names.index("azimuth-zero")
-        found["azimuth_zero_deg"] = float(value["azimuth-zero"])
-        found["azimuth_zero_uncertainty_deg"] = float(np.sqrt(covariance[place, place]))
+    for place, name in enumerate(names):
+        if name.endswith("-zero"):
+            word = name.replace("-", "_")
+            found[f"{word}_deg"] = float(value[name])
+            found[f"{word}_uncertainty_deg"] = float(np.sqrt(covariance[place, place]))
     if "stand-north" in names:
         pair = [names.index("stand-north"), names.index("stand-east")]
         turn = np.array([value["stand-north"], value["stand-east"]])

@@ -155,8 +155,9 @@ def solution(problem: Problem, at: State, halfs: Halves) -> tuple[State, Analysi
         for n, k in (("left", 2), ("open", 1))
     )
     factor = squares / np.where(freedom > 1e-9, freedom, np.nan)
-    constants = np.zeros((len(include), 0, 0))
-    return state, Analysis(covariance, determined(halfs), factor, freedom, left, spread, constants)
+    none = np.zeros((len(include), p, 0))
+    known = determined(halfs)
+    return state, Analysis(covariance, known, factor, freedom, left, spread, none[:, :0], none)
 
 
 def _half(triad: Triad, target: Array, include: Array) -> Half:

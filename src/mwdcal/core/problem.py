@@ -17,6 +17,7 @@ Batch axis B first, station next, component last.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
@@ -45,6 +46,8 @@ STAND = {
     "azimuth-zero": np.array([0.0, 0.0, 1.0]),
 }
 """Turns of the stand's frame, by the earth axis (north, east, down) they are about."""
+STAND_ERRORS = (*STAND, "inclination-zero", "toolface-zero")
+"""All errors of the stand that are common to its stations: turns of its frame, zeros of its scales."""
 UNKNOWN = np.pi / np.sqrt(3)
 """Standard uncertainty of an angle about which nothing is known, rad."""
 INFORMED = 1e-13
@@ -66,8 +69,8 @@ class Triad:
 class Constant:
     """A constant of the run that is estimated: gravity, field, dip, or an error.
 
-    Errors are of one of these references, or of the stand: a small turn of its frame about one
-    of `STAND`'s axes.
+    Errors are of one of these references, or of the stand: one of `STAND_ERRORS`, each a small
+    angle such that reading of the stand = value in the earth's frame + error.
 
     `mask` (B, n) says which stations it acts on; `value` (B,) is where it starts. `sd` (B,)
     is the standard uncertainty of the reference; for an unknown constant it is only a scale.
@@ -87,7 +90,8 @@ class Evidence:
     `sd` of the angles are independent per station. `group` shares a direction among
     stations of the same number (-1: none). `include` is 1 for stations that count, 0 for
     those left out. `absent` names the strengths and the dip of which nothing may be used:
-    each station then has its own.
+    each station then has its own. `stand` (B,) are the standard uncertainties of errors that all
+    stations have in common, by name of `STAND_ERRORS`.
     """
 
     known: dict[str, Array]
@@ -96,6 +100,7 @@ class Evidence:
     include: Array
     constants: tuple[Constant, ...]
     absent: tuple[str, ...] = ()
+    stand: Mapping[str, Array] = field(default_factory=dict)
 
     def is_known(self, name: str) -> Bools:
         """Where a reference value is given (B, n)."""
@@ -219,6 +224,7 @@ class Problem:
             group=evidence.group[index],
             include=evidence.include[index],
             constants=constants,
+            stand={k: v[index] for k, v in evidence.stand.items()},
         )
         triads = tuple(Triad(t.model.take(index), t.raw[index], t.sd[index]) for t in self.triads)
         return Problem(triads, self.temperature[index], chosen, self.prior.take(index))
@@ -339,14 +345,26 @@ class Problem:
         """Columns (B, n, m, q) of the constants; `geometry` takes references as exact."""
         columns = []
         for constant in self.evidence.constants:
-            if constant.name in STAND:
-                axis = state.attitude @ STAND[constant.name]
-                column = np.einsum("bnmi,bni->bnm", turns, axis)
+            if constant.name in STAND_ERRORS:
+                column = self.stand_column(state, constant.name, turns)
             else:
                 column = by_earth[..., EARTH.index(constant.name)]
             counts = constant.unknown or not geometry
             columns.append(column * constant.mask[..., None] * counts)
         return np.stack(columns, -1) if columns else np.zeros((*by_earth.shape[:-1], 0))
+
+    def stand_column(self, state: State, name: str, turns: Array) -> Array:
+        """Change (B, n, m) of the misfit by an error of the stand, from `turns` (B, n, m, 3)."""
+        axis = np.einsum("bnij,bnj->bni", state.attitude, self._stand_axis(state, name))
+        return np.asarray(np.einsum("bnmi,bni->bnm", turns, axis))
+
+    def _stand_axis(self, state: State, name: str) -> Array:
+        """Earth axis (B, n, 3) about which a station is turned by an error of the stand."""
+        if name == "inclination-zero":
+            return -self._inclination_axis(state)
+        if name == "toolface-zero":
+            return np.asarray(state.attitude[..., 2, :])
+        return np.broadcast_to(STAND[name], state.attitude.shape[:-1])
 
     def _own_scales(self, state: State) -> Array:
         """How far (B, n, a) each absent strength or dip may be anywhere: its own size, or any angle."""
@@ -470,9 +488,10 @@ class Problem:
     def _turn_stand(self, state: State, constants: Array) -> Array:
         attitude = state.attitude
         for index, constant in enumerate(self.evidence.constants):
-            if constant.name in STAND:
+            if constant.name in STAND_ERRORS:
                 turn = constants[:, index, None] * constant.mask
-                attitude = attitude @ rotation(turn[..., None] * STAND[constant.name])
+                axis = self._stand_axis(state, constant.name)
+                attitude = attitude @ rotation(turn[..., None] * axis)
         return attitude
 
     def _turn_groups(self, state: State, turns: Array) -> Array:

@@ -30,9 +30,10 @@ class Analysis:
     `variance_factor` (B, t) is s² and `freedom` (B, t) its degrees of freedom;
     `residual` (B, n, m) are whitened residuals left on the readings, and `spread`
     (B, n, m, m) their expected covariance, so that residual · spread⁺ · residual is χ²;
-    `constants` (B, q, q) is the covariance of the constants of the run. `influence` (B, n, u, m) is
-    how an error of a station's whitened reading moves X's unknowns, where that is not as the
-    likelihood has it.
+    `constants` (B, q, q) is the covariance of the constants of the run; `effects` (B, p, q) is
+    what one standard uncertainty of each does to the parameters, zero for unknown constants.
+    `influence` (B, n, u, m) is how an error of a station's whitened reading moves X's unknowns,
+    where that is not as the likelihood has it.
     """
 
     covariance: Array
@@ -42,6 +43,7 @@ class Analysis:
     residual: Array
     spread: Array
     constants: Array
+    effects: Array
     influence: Array | None = None
 
 
@@ -49,7 +51,7 @@ def analyse(problem: Problem, state: State, determined: Determined | None = None
     """Covariance, rank and residuals at a state; `determined` if it is known there already."""
     linear = problem.linear(state)
     determined = determined or Determined.of(problem, state)
-    whole = _whole_covariance(linear, determined)
+    whole = whole_covariance(linear, determined)
     residual, spread = _remaining(linear, whole)
     spread = spread * problem.evidence.include[..., None, None]
     factor, freedom = _variance_factors(residual, spread)
@@ -62,7 +64,18 @@ def analyse(problem: Problem, state: State, determined: Determined | None = None
         residual,
         spread,
         whole[:, p : p + q, p : p + q],
+        _effects(problem, whole[:, :p, p : p + q]),
     )
+
+
+def _effects(problem: Problem, cross: Array) -> Array:
+    """Effects (B, p, q) from the covariance (B, p, q) of parameters and constants."""
+    constants = problem.evidence.constants
+    each = [
+        np.zeros_like(cross[..., i]) if c.unknown else cross[..., i] / c.sd[:, None]
+        for i, c in enumerate(constants)
+    ]
+    return np.stack(each, -1) if each else cross
 
 
 def _remaining(linear: Linear, covariance: Array) -> tuple[Array, Array]:
@@ -119,13 +132,15 @@ def sandwich(found: Analysis, problem: Problem, state: State, pulls: dict[int, A
     covariance = np.einsum("bnim,bnmk,bnjk->bij", moved, noise, moved, optimize=True)
     own = covariance
     p, constants, rest = linear.size, problem.evidence.constants, ~fixed
+    effects = np.zeros((len(moved), p, len(constants)))
     for column in [p + i for i, c in enumerate(constants) if not c.unknown]:
         common = np.zeros((len(moved), u))
         common[:, fixed] = -np.einsum("bnim,bnm->bi", moved[:, :, fixed], design[..., column])
         pulled = np.einsum("bij,bj->bi", follow, common[:, fixed]) + linear.prior[:, rest, column]
         common[:, rest] = -np.einsum("bij,bj->bi", back, pulled)
-        outer = common[:, :, None] * common[:, None, :]
-        covariance = covariance + outer / linear.prior[:, column, column, None, None]
+        common = common / np.sqrt(linear.prior[:, column, column])[:, None]
+        covariance = covariance + common[:, :, None] * common[:, None, :]
+        effects[..., column - p] = common[:, :p]
     crossed = design @ moved @ noise
     left = noise + design @ own[:, None] @ np.swapaxes(design, -1, -2)
     left = left + crossed + np.swapaxes(crossed, -1, -2)
@@ -140,6 +155,7 @@ def sandwich(found: Analysis, problem: Problem, state: State, pulls: dict[int, A
         freedom=freedom,
         spread=spread,
         constants=covariance[:, p : p + q, p : p + q],
+        effects=effects,
         influence=moved,
     )
 
@@ -192,7 +208,7 @@ def _inverse_where_known(information: Array) -> Array:
     return np.asarray(np.linalg.pinv(information / outer, rcond=1e-12, hermitian=True) / outer)
 
 
-def _whole_covariance(linear: Linear, determined: Determined) -> Array:
+def whole_covariance(linear: Linear, determined: Determined) -> Array:
     """Covariance (B, p + s, p + s) of parameters and shared unknowns."""
     normal = linear.normal
     reduced, _, eliminate = normal.reduced()
@@ -237,7 +253,7 @@ def without_station(problem: Problem, state: State, analysis: Analysis) -> Array
         own = linear.design @ analysis.influence
         stay = inverse(np.eye(own.shape[-1]) + own) @ linear.residual[..., None]
         return np.asarray(-(analysis.influence[:, :, :p] @ stay)[..., 0])
-    whole = _whole_covariance(linear, analysis.determined)[:, : linear.size]
+    whole = whole_covariance(linear, analysis.determined)[:, : linear.size]
     values, vectors = eigen(analysis.spread)
     tested = values > TESTED
     along = np.einsum("bnij,bni->bnj", vectors, analysis.residual)

@@ -28,10 +28,10 @@ from mwdcal.files.contract import (
 )
 from mwdcal.files.fleet_sources import AZIMUTH, OFFSET, SERIAL
 from mwdcal.files.fleet_tables import one_chunk
-from mwdcal.files.runs import to_readings
+from mwdcal.files.runs import common_errors, reference_spread, to_readings
 from mwdcal.files.table import Table
 from mwdcal.profile import Profile, TriadProfile
-from mwdcal.readings import ANGLES, Readings
+from mwdcal.readings import Readings
 
 GROUP, STATION = "group", "station"
 
@@ -270,7 +270,7 @@ def _readings(rows: Rows, tools: Ints) -> Readings:
         magnetometer=triads.get("magnetometer"),
         temperature=cells("temperature_c"),
         known=known,
-        sd=sd | _reference_spreads(rows, known, cells),
+        sd=sd | _reference_spreads(rows, known, cells) | common_errors(rows.profile, where.shape),
         group=None if group is None or (group < 0).all() else group,
         source=rows.source,
     )
@@ -329,12 +329,11 @@ def _reference_spreads(rows: Rows, known: Mapping[str, Array], cells: Any) -> di
     """Standard uncertainties (B, n) of references: the table's, else the stand's, else zero."""
     found = {}
     for name in dict.fromkeys([*known, "gravity"]):
-        reference = REFERENCES[name]
-        stand = float(getattr(rows.profile.stand, f"{name}_deg")) if name in ANGLES else 0.0
-        values = cells(f"sd_{reference.column}")
-        if values is None and not stand:
+        stated = cells(f"sd_{REFERENCES[name].column}")
+        if stated is None and name not in known:
             continue
-        if values is None:
-            values = np.full(known[name].shape, np.nan)
-        found[name] = np.where(np.isnan(values), stand, values) * reference.factor
+        values = np.full_like(known[name], np.nan) if stated is None else stated
+        spread = reference_spread(rows.profile, name, values, name in known)
+        if spread.any():
+            found[name] = spread
     return found

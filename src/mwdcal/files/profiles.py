@@ -39,6 +39,7 @@ _WORDS = {
     "datetime": "a date with time",
     "time": "a time of day",
 }
+_STAND_UNITS = {"g": ("g", 2.0), "nt": ("nT", 200_000.0)}
 _SMALLEST_SCALE, _LARGEST_SCALE = 1e-15, 1e15
 
 
@@ -193,7 +194,8 @@ def check_profile(profile: Profile, source: str) -> None:
     _check_triad(profile.magnetometer, "magnetometer", source)
     for field in StandProfile.__struct_fields__:
         sigma = getattr(profile.stand, field)
-        _check_number(sigma, (0.0, 180.0), source, f"stand.{field}", "1 sigma, in degrees.")
+        unit, most = _STAND_UNITS.get(field.rpartition("_")[2], ("degrees", 180.0))
+        _check_number(sigma, (0.0, most), source, f"stand.{field}", f"1 sigma, in {unit}.")
 
 
 def _check_triad(triad: TriadProfile, name: str, source: str) -> None:

@@ -29,7 +29,7 @@ from mwdcal.files.contract import (
 )
 from mwdcal.files.table import Table, cell_error, labels, numbers, shown
 from mwdcal.profile import Profile, TriadProfile
-from mwdcal.readings import ANGLES, Readings
+from mwdcal.readings import Readings
 
 
 class BlankReadingError(InputError):
@@ -277,10 +277,15 @@ def _uncertainties(
         if spread is not None:
             sd[kind] = spread
     for name in dict.fromkeys([*known, "gravity"]):
-        spread = _reference_spread(table, profile, name)
+        spread = _reference_spread(table, profile, name, name in known)
         if spread.any():
             sd[name] = spread
-    return sd
+    return sd | common_errors(profile, (table.count,))
+
+
+def common_errors(profile: Profile, shape: tuple[int, ...]) -> dict[str, Array]:
+    """Standard uncertainties of errors that all stations of the stand share, radians."""
+    return {name: np.full(shape, np.radians(sd)) for name, sd in profile.stand.common().items()}
 
 
 def _triad_spread(table: Table, kind: str, triad: TriadProfile) -> Array | None:
@@ -308,16 +313,26 @@ def _spread(table: Table, name: str, limits: Range) -> Array:
     return _ranged(table, name, limits)
 
 
-def _reference_spread(table: Table, profile: Profile, name: str) -> Array:
+def _reference_spread(table: Table, profile: Profile, name: str, given: bool) -> Array:
     """Standard uncertainty (n,) of a reference: the table's, else the stand's, else zero."""
-    reference = REFERENCES[name]
-    values = _spread(table, f"sd_{reference.column}", reference.spread)
-    return np.where(np.isnan(values), _stand(profile, name), values) * reference.factor
+    values = _spread(table, f"sd_{REFERENCES[name].column}", REFERENCES[name].spread)
+    return reference_spread(profile, name, values, given)
 
 
-def _stand(profile: Profile, name: str) -> float:
-    """Standard uncertainty that the profile states for a reference, outside units."""
-    return float(getattr(profile.stand, f"{name}_deg")) if name in ANGLES else 0.0
+def reference_spread(profile: Profile, name: str, stated: Array, given: bool) -> Array:
+    """Standard uncertainty of a reference: as `stated`, NaN taking the stand's if it is `given`.
+
+    With the repeatability of the stand added. Units inside.
+    """
+    factor, quantity = REFERENCES[name].factor, _quantity(name)
+    stand = profile.stand.of(quantity) if given else 0.0
+    sd = np.where(np.isnan(stated), stand, stated)
+    return np.hypot(sd, profile.stand.repeatability(quantity)) * factor
+
+
+def _quantity(name: str) -> str:
+    """A reference with its unit, as in `azimuth_deg`."""
+    return REFERENCES[name].column.removeprefix("ref_")
 
 
 def _group(table: Table) -> AnyArray | None:
@@ -381,9 +396,12 @@ def _reference_columns(
             _turned(values) if name == "azimuth" else _trimmed(values, reference.values)
         )
     if name in readings.sd and (columns or name == "gravity"):
-        spread = readings.uncertainty(name) / reference.factor
-        if not np.allclose(spread, _stand(profile, name), rtol=1e-12, atol=0.0):
-            columns[f"sd_{reference.column}"] = spread
+        spread = readings.uncertainty(name)
+        usual = reference_spread(profile, name, np.array(np.nan), bool(columns))
+        if not np.allclose(spread, usual, rtol=1e-12, atol=0.0):
+            repeated = profile.stand.repeatability(_quantity(name))
+            own = (spread / reference.factor) ** 2 - repeated**2
+            columns[f"sd_{reference.column}"] = np.sqrt(np.maximum(own, 0.0))
     return columns
 
 

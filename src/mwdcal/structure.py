@@ -1,0 +1,236 @@
+"""What the misfit of a run looks like: zeros of the stand, drift, gradient, backlash, thermal lag.
+
+Each effect is a family of columns that the residuals may have in common with it. A family is named
+where it takes away more of the misfit than noise of any direction would (F test), the best one
+first; the others are then judged by what that one leaves. Nothing is corrected here: what moves
+with one of the sensor's own parameters has gone into the fit, and no residual shows it.
+
+Reference: efficient scores, C. R. Rao, Proc. Camb. Phil. Soc. 44, 50 (1948).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mwdcal.core.problem import Problem, State
+from mwdcal.core.uncertainty import whole_covariance
+from mwdcal.core.vectors import Array, eigen
+from mwdcal.covariance import variance_scales
+from mwdcal.estimate import Fit
+from mwdcal.evidence import TURNS, acts_on
+from mwdcal.readings import TRIADS
+
+UNLIKELY = 1e-4
+"""Chance of so much common structure in noise, below which an effect is named."""
+APART = 1e-3
+"""A column counts if the fit leaves this share of its square: what is left of others is rounding."""
+STAND = ("azimuth-zero", "inclination-zero", "tilt")
+"""Errors of the stand that leave residuals; a toolface zero does not."""
+DRIFTS = 2
+"""Degree of the polynomial of order (or of the row) that a drift is looked for as."""
+
+
+@dataclass(frozen=True)
+class Effect:
+    """One effect: its name, the share of the misfit it takes, chance in noise, and its size.
+
+    `values` and `uncertainties` belong to its columns, in their units (radians, g or nT); `size`
+    (t,) is the root mean square of what it does to the readings of each triad, in g and nT.
+    """
+
+    name: str
+    share: float
+    chance: float
+    values: Array
+    uncertainties: Array
+    size: Array
+
+
+@dataclass(frozen=True)
+class _Scores:
+    """Efficient scores (k,) and their covariance (k, k) for columns of unit length, with lengths."""
+
+    score: Array
+    information: Array
+    length: Array
+    columns: Array
+    places: dict[str, slice]
+
+    def gain(self, names: list[str]) -> tuple[float, int]:
+        """By how much some families lower the cost, and how many directions they have."""
+        value, vector, kept = self._spanned(names)
+        along = vector.transpose() @ self.score[self._index(names)]
+        return float(np.sum(along[kept] ** 2 / value[kept])), int(kept.sum())
+
+    def solution(self, names: list[str]) -> tuple[Array, Array]:
+        """Values (k',) of the columns of some families, and their covariance (k', k')."""
+        value, vector, kept = self._spanned(names)
+        inverse = (vector[:, kept] / value[kept]) @ vector[:, kept].transpose()
+        index = self._index(names)
+        length = self.length[index]
+        return -inverse @ self.score[index] / length, inverse / np.outer(length, length)
+
+    def _spanned(self, names: list[str]) -> tuple[Array, Array, Array]:
+        index = self._index(names)
+        value, vector = eigen(self.information[np.ix_(index, index)])
+        return value, vector, np.asarray(value > APART)
+
+    def _index(self, names: list[str]) -> Array:
+        return np.concatenate([np.arange(self.places[n].start, self.places[n].stop) for n in names])
+
+
+def effects(result: Fit) -> list[Effect]:
+    """Effects that the residuals of one fit (B = 1) show, the largest first."""
+    if result.analysis.influence is not None:
+        return []
+    scales = np.maximum(variance_scales(result), 1e-12)
+    triads = [
+        replace(t, sd=t.sd * np.sqrt(scales[:, i, None, None]))
+        for i, t in enumerate(result.problem.triads)
+    ]
+    problem = replace(result.problem, triads=tuple(triads))
+    scores = _scores(problem, result, dict(_families(problem, result.state)))
+    freedom, chosen, found = float(result.analysis.freedom[0].sum()), [], []
+    left, used = freedom, 0
+    while True:
+        trials = {n: _trial(scores, chosen, n, left, freedom - used) for n in scores.places}
+        open_ = {n: t for n, t in trials.items() if n not in chosen and t[0] < UNLIKELY}
+        if not open_:
+            return found
+        best = min(open_, key=lambda name: (open_[name][0], -open_[name][1]))
+        chance, gain, directions = open_[best]
+        chosen, left, used = [*chosen, best], left - gain, used + directions
+        found.append(_described(problem, scores, best, gain / freedom, chance))
+
+
+def _trial(
+    scores: _Scores, chosen: list[str], name: str, left: float, freedom: float
+) -> tuple[float, float, int]:
+    """Chance in noise, gain and directions of one more family, of misfit `left`."""
+    from scipy.special import fdtrc
+
+    before = scores.gain(chosen) if chosen else (0.0, 0)
+    after = scores.gain([*chosen, name])
+    gain, directions = after[0] - before[0], after[1] - before[1]
+    rest = freedom - directions
+    if directions < 1 or rest < 1:
+        return 1.0, 0.0, 0
+    gain = min(gain, left * (1 - 1e-9))
+    return float(fdtrc(directions, rest, gain / directions / ((left - gain) / rest))), gain, directions
+
+
+def _described(
+    problem: Problem, scores: _Scores, name: str, share: float, chance: float
+) -> Effect:
+    values, covariance = scores.solution([name])
+    where = scores.places[name]
+    change = (scores.columns[..., where] * scores.length[where]) @ values
+    size = [
+        np.sqrt(np.mean(np.sum((change[..., 3 * i : 3 * i + 3] * t.sd) ** 2, -1)))
+        for i, t in enumerate(problem.triads)
+    ]
+    return Effect(name, share, chance, values, np.sqrt(np.diag(covariance)), np.array(size))
+
+
+def _scores(problem: Problem, result: Fit, families: Mapping[str, Array]) -> _Scores:
+    """Efficient scores of columns (1, n, m, k): what the fit's own unknowns cannot take up."""
+    linear = problem.linear(result.state)
+    whole = whole_covariance(linear, result.analysis.determined)[0]
+    places, columns, at = {}, [], 0
+    for name, column in families.items():
+        places[name] = slice(at, at + column.shape[-1])
+        columns.append(column)
+        at += column.shape[-1]
+    every = np.concatenate(columns, -1)
+    length = np.sqrt(np.einsum("bnmk,bnmk->k", every, linear.weigh(every)))
+    length = np.where(length > 0, length, 1.0)
+    unit = every / length
+    weighed = linear.weigh(unit)
+    crossed = np.einsum("bnmu,bnmk->uk", linear.design, weighed)
+    own = linear.normal.gradient[0]
+    score = np.einsum("bnmk,bnm->k", weighed, linear.residual) - crossed.transpose() @ whole @ own
+    information = np.einsum("bnmk,bnml->kl", unit, weighed)
+    information = information - crossed.transpose() @ whole @ crossed
+    return _Scores(score, information, length, unit, places)
+
+
+def _families(problem: Problem, state: State) -> Iterator[tuple[str, Array]]:
+    """Columns (1, n, m, k) of every effect that this run could show, whitened."""
+    predictions = problem.predictions(state)
+    weights = [problem.evidence.include[..., None] / t.sd for t in problem.triads]
+    pairs = list(zip(predictions, weights, strict=True))
+    turns = np.concatenate([p.by_turn * w[..., None] for p, w in pairs], -2)
+    by_earth = np.concatenate([p.by_earth * w[..., None] for p, w in pairs], -2)
+    known = {n: turn for n, turn in _turns(problem, state, turns).items() if turn.any()}
+    for name in STAND:
+        each = [known[turn] for turn in TURNS.get(name, (name,)) if turn in known]
+        if each:
+            yield name, np.stack(each, -1)
+    count = state.attitude.shape[1]
+    order = np.polynomial.legendre.legvander(np.linspace(-1, 1, count), DRIFTS)[:, 1:]
+    down = problem.stand_column(state, "azimuth-zero", turns)
+    if len(problem.triads) > 1:
+        field = np.concatenate([by_earth[..., 1:], down[..., None]], -1)
+        field[..., :3, :] = 0.0  # the declination of a field that turns does not turn gravity
+        yield "field-drift", _products(field, order)
+        yield "field-gradient", _products(field, state.attitude[0, :, 2, :])
+    steps = _approach(problem)
+    back = [known[n] * s for n, s in steps.items() if n in known and s.any()]
+    if back:
+        yield "backlash", np.stack(back, -1)
+    for index, name in enumerate(TRIADS[: len(problem.triads)]):
+        yield from _of_sensor(problem, index, name, weights[index], order)
+
+
+def _turns(problem: Problem, state: State, turns: Array) -> dict[str, Array]:
+    """Columns (1, n, m) of the stand's errors, at stations whose references have them."""
+    names = ("azimuth-zero", "inclination-zero", "toolface-zero", "stand-north", "stand-east")
+    return {
+        name: problem.stand_column(state, name, turns)
+        * acts_on(problem.evidence, name)[..., None]
+        for name in names
+    }
+
+
+def _products(columns: Array, factors: Array) -> Array:
+    """Columns (1, n, m, a) times factors (n, b) of their stations: (1, n, m, a b)."""
+    product = columns[..., :, None] * factors[:, None, None, :]
+    return np.asarray(product.reshape(*columns.shape[:-1], -1))
+
+
+def _approach(problem: Problem) -> dict[str, Array]:
+    """From which side (n, 1) each angle of the stand was reached: 1, -1, or 0 where it did not move."""
+    found = {}
+    for name in ("inclination", "azimuth", "toolface"):
+        angle = problem.evidence.known[name][0]
+        step = np.diff(angle, prepend=angle[:1])
+        step = np.nan_to_num((step + np.pi) % (2 * np.pi) - np.pi)
+        found[f"{name}-zero"] = np.where(np.abs(step) > 1e-6, np.sign(step), 0.0)[:, None]
+    return found
+
+
+def _of_sensor(
+    problem: Problem, index: int, name: str, weight: Array, order: Array
+) -> Iterator[tuple[str, Array]]:
+    """Drift with the order of stations, hysteresis and thermal lag of one triad's readings."""
+    triad, count = problem.triads[index], weight.shape[1]
+    size = 3 * len(problem.triads)
+    axes = np.zeros((1, count, size, 3))
+    axes[0, :, 3 * index : 3 * index + 3] = np.eye(3)
+    axes[:, :, 3 * index : 3 * index + 3] *= weight[..., None]
+    if index == 0:
+        yield f"{name}-drift", _products(axes, order)
+    moved = np.diff(triad.raw[0], axis=0, prepend=triad.raw[0, :1])
+    typical = np.abs(moved).max() or 1.0
+    side = np.where(np.abs(moved) > 0.05 * typical, np.sign(moved), 0.0)
+    yield f"{name}-hysteresis", axes * side[:, None, :]
+    rate = np.diff(problem.temperature[0], prepend=problem.temperature[0, :1])
+    if np.ptp(rate) > 1.0:
+        rate = rate / np.abs(rate).max()
+        centred = (triad.raw[0] - triad.raw[0].mean(0)) / np.std(triad.raw[0])
+        scale = axes * (rate[:, None] * centred)[:, None, :]
+        yield f"{name}-thermal-lag", np.concatenate([axes * rate[:, None, None], scale], -1)
+
