@@ -46,6 +46,7 @@ LAYERS = (
     ("methods", "estimate", "notation"),
     ("covariance",),
     ("checks", "curves", "correction", "residuals", "scatter", "selection", "stand"),
+    ("structure",),
     ("findings",),
     ("calibrate", "compare", "gauge", "predict", "quality", "simulate"),
     ("fleet", "fleet_accuracy", "fleet_checks", "fleet_choices", "fleet_curves", "fleet_findings"),

@@ -14,6 +14,7 @@ import numpy as np
 from mwdcal import __version__
 from mwdcal.calibration import (
     FREE_SHARE,
+    BudgetRow,
     Calibration,
     Choices,
     Constant,
@@ -27,11 +28,19 @@ from mwdcal.core.observability import Free, free_directions
 from mwdcal.core.problem import STAND_ERRORS
 from mwdcal.core.uncertainty import marginal_rank
 from mwdcal.core.vectors import Array
-from mwdcal.covariance import constants_covariance, error_name, stated_covariance
+from mwdcal.covariance import (
+    PRIOR,
+    assumed_exact,
+    constants_covariance,
+    error_name,
+    shares,
+    stated_covariance,
+)
 from mwdcal.curves import with_nonlinearity
 from mwdcal.estimate import Fit, fit
 from mwdcal.findings import Findings, described, is_relative
 from mwdcal.options import Options
+from mwdcal.predict import typical_budget
 from mwdcal.profile import Profile
 from mwdcal.readings import TRIADS, Readings
 from mwdcal.residuals import error_rows, measure_rows, station_rows
@@ -66,7 +75,8 @@ def calibrate(
     check_fit(result, free, profile, readings)
     made = _Record(readings, profile, options, result, free)
     record = made.calibration(profile_sha256, run_sha256)
-    return rounded(msgspec.structs.replace(record, orders=list(orders)))
+    budget = made.budget(record)
+    return rounded(msgspec.structs.replace(record, orders=list(orders), budget=budget))
 
 
 @dataclass(frozen=True)
@@ -111,12 +121,17 @@ class _Record:
             constants=self.constants(),
             stand=stand_errors(result),
             earth=self.earth(),
+            assumed_exact=self.assumed,
             errors=error_rows(readings, result),
             measures=measure_rows(readings, result),
             station_rows=stations,
             inherited=list(options.prior.stations) if options.prior else [],
-            findings=Findings(readings, self.profile, options, result, self.free).all(stations),
+            findings=self._findings.all(stations),
         )
+
+    @cached_property
+    def _findings(self) -> Findings:
+        return Findings(self.readings, self.profile, self.options, self.result, self.free)
 
     @property
     def temperatures(self) -> tuple[float, float] | None:
@@ -160,10 +175,29 @@ class _Record:
         """A covariance (1, p, p) of the fit's parameters as one of the file's."""
         return np.asarray(self.map @ covariance[0] @ self.map.transpose())
 
+    def budget(self, record: Calibration) -> list[BudgetRow]:
+        """What each source of error adds to the accuracy to expect; tilt is one source."""
+        found: dict[str, Array] = {}
+        for name, share in shares(self.result).items():
+            source = "tilt of the stand" if name.startswith("stand-") else name
+            source = source if " " in source or source == PRIOR else error_name(source)
+            found[source] = found.get(source, 0.0) + self._mapped(share)
+        rows = typical_budget(record, found)
+        return [
+            BudgetRow(source=source, **{f"{n}_deg": sd for n, sd in row.items()})
+            for source, row in rows.items()
+        ]
+
     @cached_property
     def directions(self) -> list[Array]:
         """Free directions (p,) in the file's parameters, turning or stretching by one."""
         return [self.map @ entry.direction for entry in self.free]
+
+    @property
+    def assumed(self) -> list[str]:
+        """References taken as exact that no residual tests; a field of one is no reference."""
+        found = assumed_exact(self.result)
+        return [n for n in found if not (n.startswith("field") and self.relative)]
 
     def earth(self) -> dict[str, float]:
         """Mean gravity, field and dip of the run: given or estimated."""
@@ -203,7 +237,7 @@ class _Record:
         noise, declared = self.result.noise[0, index], np.isnan(self.result.noise[0, index])
         curved = TRIADS[index] in (self.options.nonlinearity or {})
         finished, _ = triad.model.finished(self.profile.reference_temperature_c)
-        freedom = float(analysis.freedom[0, index])
+        freedom, chance = float(analysis.freedom[0, index]), self._findings.chances[0, index]
         return TriadCalibration(
             name=TRIADS[index],
             unit="g" if index == 0 else ("1 (field = 1)" if self.relative else "nT"),
@@ -225,6 +259,7 @@ class _Record:
             noise_source="declared" if declared else "estimated from the residuals",
             variance_factor=float(analysis.variance_factor[0, index]) if freedom >= 1 else None,
             degrees_of_freedom=freedom,
+            misfit_probability=None if np.isnan(chance) else float(chance),
         )
 
     def _uncertainties(self, index: int) -> list[float | None]:

@@ -55,6 +55,15 @@ class Constant(msgspec.Struct, frozen=True, kw_only=True):
     unit: str
 
 
+class BudgetRow(msgspec.Struct, frozen=True, kw_only=True):
+    """What one source of error adds to the accuracy to expect, 1σ in degrees; None: undetermined."""
+
+    source: str
+    inclination_deg: float | None
+    toolface_deg: float | None
+    azimuth_deg: float | None = None
+
+
 class StandErrors(msgspec.Struct, frozen=True, kw_only=True):
     """Errors of the stand, estimated: reference reading = value in the earth's frame + zero.
 
@@ -160,7 +169,8 @@ class TriadCalibration(msgspec.Struct, frozen=True, kw_only=True):
     field = Σ τᵏ (A_k x + c_k); with `curved`, e₂ x² + e₃ x³ on each own axis follow, all
     terms then of (x - centre) / radius.
     model "factors": SF, B (temperature powers fastest) and m, field = (I - m)(x / SF - B).
-    `size` counts the fitted parameters, `rank` the determined ones: in a model of 9 or 6
+    `misfit_probability` is the chance of a larger s² if noise and stand are as declared; None where
+    the noise was estimated. `size` counts the fitted parameters, `rank` the determined ones: in a model of 9 or 6
     parameters the others stand in the list as zero, without uncertainty.
     """
 
@@ -182,6 +192,7 @@ class TriadCalibration(msgspec.Struct, frozen=True, kw_only=True):
     noise_source: str
     variance_factor: float | None
     degrees_of_freedom: float
+    misfit_probability: float | None = None
 
     def functions(self, reference: float) -> Model:
         """The model that these parameters belong to."""
@@ -197,6 +208,8 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
 
     `covariance` is of the parameters of all triads in order, scaled by s² where that is
     estimated; `free` are directions (rows) of parameter space that no evidence determines.
+    `budget` says what each source of error adds to the accuracy to expect; `assumed_exact` names
+    references without a declared uncertainty whose error no residual would show.
     `inherited` are the fingerprints of the stations behind the prior, if there was one.
     """
 
@@ -222,6 +235,8 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
     constants: list[Constant]
     stand: StandErrors = StandErrors()
     earth: dict[str, float]
+    budget: list[BudgetRow] = []
+    assumed_exact: list[str] = []
     errors: list[ErrorRow]
     measures: list[Measures]
     orders: list[OrderScore] = []

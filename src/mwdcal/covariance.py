@@ -56,6 +56,22 @@ def error_name(constant: str) -> str:
     return f"{constant} reference error"
 
 
+def assumed_exact(result: Fit) -> list[str]:
+    """References taken as exact whose error moves no residual: it goes into the calibration whole.
+
+    A toolface zero turns both triads, and a strength scales one, as sensors of other mounting or
+    scale would have it.
+    """
+    evidence, names = result.problem.evidence, ("toolface", "gravity", "field")
+    declared = [c.name.removesuffix("-zero") for c in evidence.constants]
+    found = [
+        n
+        for n in names[: 1 + len(result.problem.triads)]
+        if evidence.is_known(n).any() and n not in declared and n not in evidence.absent
+    ]
+    return ["toolface zero of the stand" if n == "toolface" else f"{n} reference" for n in found]
+
+
 def shares(result: Fit) -> dict[str, Array]:
     """Covariance (B, p, p) by source; all together they are `stated_covariance`.
 

@@ -3,26 +3,31 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from mwdcal.calibration import Finding, StationRow
+from mwdcal.core import exact
 from mwdcal.core.observability import Free, free_directions
 from mwdcal.core.problem import Prior
 from mwdcal.core.solvers import Determined
+from mwdcal.core.uncertainty import effective_freedom
 from mwdcal.core.vectors import Array, Bools, Ints, eigen
 from mwdcal.estimate import Fit
 from mwdcal.options import Options
 from mwdcal.profile import Profile
 from mwdcal.readings import TRIADS, Readings
-from mwdcal.residuals import REASONS, shown_in, tail
+from mwdcal.residuals import REASONS, chi_chance, shown_in, tail
+from mwdcal.structure import described as seen_as
+from mwdcal.structure import effects, suspected
 
 SUSPECT = 3.0
-"""A fit whose residuals exceed the declared noise this many times is reported."""
+"""Residuals of a robust fit that exceed the declared noise this many times are reported."""
 ENOUGH = 12.0
 """Degrees of freedom from which residuals far below the declared noise are no chance."""
 UNLIKELY = 1e-3
-"""Chance of so large a departure from the prior, below which it is reported."""
+"""Chance of so large residuals, or of so large a departure from the prior, below which it is reported."""
 LARGEST = 37.0
 """Deviations are not told apart beyond this: a normal variable's chance is then below 1e-300."""
 DISTRUSTED = 0.1
@@ -51,10 +56,30 @@ def is_relative(readings: Readings) -> bool:
     return readings.magnetometer is not None and bool(np.isnan(readings.reference("field")).all())
 
 
-def excessive(result: Fit) -> Bools:
-    """Triads (B, t) whose residuals are more than `SUSPECT` times the declared noise."""
-    declared = np.isnan(result.noise) & ~unchecked(result)
-    return np.asarray(declared & (result.analysis.variance_factor > SUSPECT**2))
+def misfit_chances(result: Fit) -> Array:
+    """Chance (B, t) of residuals as large as each triad's, if noise and stand are as declared.
+
+    NaN where noise was estimated, nothing is redundant, or station weights hide what is large.
+    """
+    problem, analysis = result.problem, result.analysis
+    freedom = analysis.freedom
+    if not exact.applies(problem) and analysis.influence is None:
+        freedom = effective_freedom(problem, result.state, analysis)
+    untested = np.isfinite(result.noise) | unchecked(result) | robust(result)[:, None]
+    freedom = np.where(untested, 1.0, freedom)
+    return np.where(untested, np.nan, chi_chance(analysis.variance_factor * freedom, freedom))
+
+
+def robust(result: Fit) -> Bools:
+    """Fits (B,) with station weights."""
+    return np.asarray((result.trust != 1).any(-1))
+
+
+def excessive(result: Fit, chances: Array) -> Bools:
+    """Triads (B, t) whose residuals noise and stand do not explain, by `misfit_chances`."""
+    weighed = robust(result)[:, None] & np.isnan(result.noise) & ~unchecked(result)
+    large = weighed & (result.analysis.variance_factor > SUSPECT**2)
+    return np.asarray(large | (np.nan_to_num(chances, nan=1.0) < UNLIKELY))
 
 
 def calm(result: Fit) -> Bools:
@@ -120,6 +145,7 @@ class Findings:
         """All of them, in order of weight."""
         return [
             *self.residuals(),
+            *self.structure(),
             *self.repeated(stations),
             *self.undetermined(),
             *self.prior(),
@@ -139,10 +165,12 @@ class Findings:
                 "not all by as much. Uncertainties are scaled down accordingly."
             )
             found.append(Finding(id=f"{TRIADS[index]}-noise", text=text))
-        for index in np.flatnonzero(excessive(self.result)[0]):
+        for index in np.flatnonzero(excessive(self.result, self.chances)[0]):
             excess = float(self.result.analysis.variance_factor[0, index])
+            chance = self.chances[0, index]
+            rare = "" if np.isnan(chance) else f" (chance in noise {chance:.0e})"
             text = (
-                f"{TRIADS[index]}: residuals are {excess**0.5:.1f} times the declared noise: "
+                f"{TRIADS[index]}: residuals are {excess**0.5:.2f} times the declared noise{rare}: "
                 "the noise figure, a reference, or the model is wrong. Uncertainties are "
                 "scaled up accordingly."
             )
@@ -152,6 +180,21 @@ class Findings:
             text = f"{' and '.join(bare)}: no redundancy, so nothing in this run checks the fit. Add stations."
             found.append(Finding(id="no-redundancy", text=text))
         return found
+
+    @cached_property
+    def chances(self) -> Array:
+        """Chance (1, t) of residuals as large as each triad's."""
+        return misfit_chances(self.result)
+
+    def structure(self) -> list[Finding]:
+        """What the residuals look like, where they are more than noise."""
+        if not suspected(self.result, self.chances)[0]:
+            return []
+        unit = shown_in("field", is_relative(self.readings))[1]
+        return [
+            Finding(id=f"looks-like-{effect.name}", text=seen_as(effect, unit))
+            for effect in effects(self.result)
+        ]
 
     def repeated(self, stations: list[StationRow]) -> list[Finding]:
         """Stations whose readings are another's to the last digit."""

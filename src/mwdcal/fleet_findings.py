@@ -23,6 +23,7 @@ from mwdcal.findings import (
     departures,
     distrusted,
     excessive,
+    misfit_chances,
     unchecked,
     without_prior,
 )
@@ -30,7 +31,9 @@ from mwdcal.fleet_checks import free_of_batch, member
 from mwdcal.options import Options
 from mwdcal.profile import Profile
 from mwdcal.readings import TRIADS, Readings
-from mwdcal.residuals import RESHOOT, chances, tail, to_reshoot
+from mwdcal.residuals import RESHOOT, tail, to_reshoot
+from mwdcal.residuals import chances as station_chances
+from mwdcal.structure import effects, suspected
 
 SMALL = 1e-9
 """What is added to variances (of whitened readings: 0…1), so that they have an inverse."""
@@ -47,15 +50,20 @@ def findings_of_batch(
     among the findings.
     """
     again = stations_to_reshoot(result)
+    chances = misfit_chances(result)
+    kinds = (("noise", calm(result)), ("residuals", excessive(result, chances)))
     flags = {
         f"{name}-{kind}": flag
-        for kind, each in (("noise", calm(result)), ("residuals", excessive(result)))
+        for kind, each in kinds
         for name, flag in zip(TRIADS, each.transpose(), strict=False)
     }
     flags["no-redundancy"] = np.any(unchecked(result), -1)
-    flags["repeated-readings"] = _repeated(result)
     found: list[list[str]] = [[] for _ in result.status]
     _add(found, flags)
+    for place in np.flatnonzero(suspected(result, chances)).tolist():
+        one = member(result, np.array([place]))
+        found[place] += [f"looks-like-{effect.name}" for effect in effects(one)]
+    _add(found, {"repeated-readings": _repeated(result)})
     if options.prior is not None:
         _add(found, _of_prior(result, free))
     common = [f.id for f in Findings(readings, profile, options, result, []).model()]
@@ -87,7 +95,7 @@ def stations_to_reshoot(result: Fit) -> Bools:
     found = np.zeros(result.analysis.residual.shape[:2], bool)
     some = np.flatnonzero(_suspects(result))
     if some.size:
-        found[some] = to_reshoot(chances(member(result, some)))
+        found[some] = to_reshoot(station_chances(member(result, some)))
     return found
 
 

@@ -6,7 +6,7 @@ Everything here is of the calibration at the run's mean gravity, field and dip
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -127,6 +127,24 @@ def accuracy_at(
     grid = np.meshgrid(np.asarray(inclinations, float), azimuth, indexing="ij")
     found = _over_toolface(calibration, grid[0], grid[1], temperature, noise)
     return {name: np.sqrt(np.mean(sd**2, -1)) for name, sd in found.items()}
+
+
+def typical_budget(
+    calibration: Calibration, shares: Mapping[str, Array]
+) -> dict[str, dict[str, float | None]]:
+    """What each share (p, p) of the covariance adds to `typical_accuracy`, degrees, by source and angle."""
+    azimuth = np.arange(12) * np.pi / 6
+    grid = np.meshgrid(azimuth, TOOLFACES)
+    readings = readings_at(calibration, TYPICAL, grid[0].ravel(), grid[1].ravel())
+    found: dict[str, dict[str, float | None]] = {source: {} for source in shares}
+    for name in angles(calibration):
+        rows = calibration.sensitivity(name, readings)
+        free = bool(calibration.rests_on_free(name, readings).any())
+        for source, share in shares.items():
+            variance = np.einsum("ni,ij,nj->n", rows, share, rows).mean()
+            sd = float(np.degrees(np.sqrt(max(variance, 0.0))))
+            found[source][name] = None if free else sd
+    return found
 
 
 def typical_accuracy(calibration: Calibration) -> dict[str, float | None]:

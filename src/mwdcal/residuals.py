@@ -269,6 +269,19 @@ def tail(square: Array, freedom: Array) -> Array:
     return found
 
 
+def chi_chance(square: Array, freedom: Array) -> Array:
+    """Chance of a larger χ² with any degrees of freedom, to some per cent of it from one on.
+
+    Reference: E. B. Wilson and M. M. Hilferty, Proc. Natl. Acad. Sci. 17, 684 (1931).
+
+    >>> chi_chance(np.array([18.467, 149.449]), np.array([4.0, 100.0])).round(5)
+    array([0.001  , 0.00099])
+    """
+    spread = 2 / (9 * np.maximum(freedom, 1e-9))
+    normal = (np.cbrt(square / np.maximum(freedom, 1e-9)) - 1 + spread) / np.sqrt(2 * spread)
+    return np.asarray(0.5 * np.vectorize(erfc, otypes=[float])(normal))
+
+
 def station_rows(readings: Readings, fit: Fit) -> list[StationRow]:
     """Errors of every station, with the ones to take again."""
     from scipy.special import ndtri

@@ -17,7 +17,7 @@ import numpy as np
 
 from mwdcal.core.problem import Problem, State
 from mwdcal.core.uncertainty import whole_covariance
-from mwdcal.core.vectors import Array, eigen
+from mwdcal.core.vectors import Array, Bools, eigen
 from mwdcal.covariance import variance_scales
 from mwdcal.estimate import Fit
 from mwdcal.evidence import TURNS, acts_on
@@ -25,12 +25,38 @@ from mwdcal.readings import TRIADS
 
 UNLIKELY = 1e-4
 """Chance of so much common structure in noise, below which an effect is named."""
+WORTH = 0.01
+"""Chance of residuals as large in declared noise, below which their structure is looked at."""
 APART = 1e-3
 """A column counts if the fit leaves this share of its square: what is left of others is rounding."""
 STAND = ("azimuth-zero", "inclination-zero", "tilt")
 """Errors of the stand that leave residuals; a toolface zero does not."""
 DRIFTS = 2
 """Degree of the polynomial of order (or of the row) that a drift is looked for as."""
+
+
+ZEROS = ("azimuth-zero", "inclination-zero", "dip-reference")
+"""Effects that are one angle."""
+TEXTS = {
+    "azimuth-zero": "an azimuth zero of the stand: set the index, or fit it with --estimate azimuth-zero, or declare "
+    "its uncertainty (azimuth_zero_deg under [stand])",
+    "inclination-zero": "an inclination zero of the stand: set the level, or fit it with --estimate inclination-zero, "
+    "or declare its uncertainty (inclination_zero_deg under [stand])",
+    "tilt": "a stand whose vertical leans: level it, or fit it with --estimate tilt, or declare its uncertainty "
+    "(tilt_deg under [stand])",
+    "dip-reference": "a wrong reference for the dip: check ref_dip_deg, or leave it blank to have it estimated",
+    "field-drift": "a field that changes in the order of the stations (diurnal variation, traffic): give ref_field_nt "
+    "and ref_dip_deg of each station from a reference magnetometer, or repeat the run at a quiet time",
+    "field-gradient": "a field that depends on where the tool points (iron nearby, or sensors off the pivot): move "
+    "iron away, or keep the sensors at one place while turning",
+    "backlash": "backlash of the stand: its angles depend on the side they were reached from. Reach every angle "
+    "from the same side",
+    "drift": "a drift in the order of the stations: let the tool warm up, or repeat the first stations at the end",
+    "hysteresis": "hysteresis: readings depend on the side they were reached from. Demagnetise, or look for play in "
+    "the mounting",
+    "thermal-lag": "thermal lag: readings follow the thermometer late. Wait longer after each change of temperature",
+}
+"""What the residuals look like, and what to do."""
 
 
 @dataclass(frozen=True)
@@ -93,8 +119,10 @@ def effects(result: Fit) -> list[Effect]:
     ]
     problem = replace(result.problem, triads=tuple(triads))
     scores = _scores(problem, result, dict(_families(problem, result.state)))
-    freedom, chosen, found = float(result.analysis.freedom[0].sum()), [], []
-    left, used = freedom, 0
+    left, freedom = _misfit(problem, result)
+    total, used = left, 0
+    chosen: list[str] = []
+    found: list[Effect] = []
     while True:
         trials = {n: _trial(scores, chosen, n, left, freedom - used) for n in scores.places}
         open_ = {n: t for n, t in trials.items() if n not in chosen and t[0] < UNLIKELY}
@@ -103,7 +131,19 @@ def effects(result: Fit) -> list[Effect]:
         best = min(open_, key=lambda name: (open_[name][0], -open_[name][1]))
         chance, gain, directions = open_[best]
         chosen, left, used = [*chosen, best], left - gain, used + directions
-        found.append(_described(problem, scores, best, gain / freedom, chance))
+        found.append(_described(problem, scores, best, gain / total, chance))
+
+
+def _misfit(problem: Problem, result: Fit) -> tuple[float, float]:
+    """The least ρᵀC⁻¹ρ of all readings, priors included, and its degrees of freedom."""
+    linear, include = problem.linear(result.state), problem.evidence.include
+    whole, normal = whole_covariance(linear, result.analysis.determined)[0], linear.normal
+    gradient = normal.gradient[0]
+    own = problem.linear(result.state, geometry=True).own
+    unknown = np.sum(np.linalg.svd(own, compute_uv=False) > 1.0)
+    readings = float(include.sum()) * linear.residual.shape[-1]
+    fitted = np.sum(whole * (normal.information - linear.prior)[0])
+    return float(normal.cost[0] - gradient @ whole @ gradient), readings - float(fitted + unknown)
 
 
 def _trial(
@@ -119,12 +159,14 @@ def _trial(
     if directions < 1 or rest < 1:
         return 1.0, 0.0, 0
     gain = min(gain, left * (1 - 1e-9))
-    return float(fdtrc(directions, rest, gain / directions / ((left - gain) / rest))), gain, directions
+    return (
+        float(fdtrc(directions, rest, gain / directions / ((left - gain) / rest))),
+        gain,
+        directions,
+    )
 
 
-def _described(
-    problem: Problem, scores: _Scores, name: str, share: float, chance: float
-) -> Effect:
+def _described(problem: Problem, scores: _Scores, name: str, share: float, chance: float) -> Effect:
     values, covariance = scores.solution([name])
     where = scores.places[name]
     change = (scores.columns[..., where] * scores.length[where]) @ values
@@ -170,9 +212,13 @@ def _families(problem: Problem, state: State) -> Iterator[tuple[str, Array]]:
         if each:
             yield name, np.stack(each, -1)
     count = state.attitude.shape[1]
-    order = np.polynomial.legendre.legvander(np.linspace(-1, 1, count), DRIFTS)[:, 1:]
+    place = np.linspace(-1, 1, count)
+    order = np.asarray(np.polynomial.legendre.legvander(place, DRIFTS)[:, 1:], float)
     down = problem.stand_column(state, "azimuth-zero", turns)
     if len(problem.triads) > 1:
+        given = problem.evidence.is_known("dip")[..., None]
+        if given.any() and "dip" not in problem.evidence.absent:
+            yield "dip-reference", (by_earth[..., 2] * given)[..., None]
         field = np.concatenate([by_earth[..., 1:], down[..., None]], -1)
         field[..., :3, :] = 0.0  # the declination of a field that turns does not turn gravity
         yield "field-drift", _products(field, order)
@@ -189,8 +235,7 @@ def _turns(problem: Problem, state: State, turns: Array) -> dict[str, Array]:
     """Columns (1, n, m) of the stand's errors, at stations whose references have them."""
     names = ("azimuth-zero", "inclination-zero", "toolface-zero", "stand-north", "stand-east")
     return {
-        name: problem.stand_column(state, name, turns)
-        * acts_on(problem.evidence, name)[..., None]
+        name: problem.stand_column(state, name, turns) * acts_on(problem.evidence, name)[..., None]
         for name in names
     }
 
@@ -234,3 +279,31 @@ def _of_sensor(
         scale = axes * (rate[:, None] * centred)[:, None, :]
         yield f"{name}-thermal-lag", np.concatenate([axes * rate[:, None, None], scale], -1)
 
+
+def suspected(result: Fit, chance: Array) -> Bools:
+    """Fits (B,) whose residuals are looked at: where noise is estimated, or residuals exceed it.
+
+    `chance` (B, t) is that of residuals as large as each triad's, NaN where noise is not declared.
+    """
+    estimated = np.isfinite(result.noise).any(-1)
+    return np.asarray(estimated | (np.nan_to_num(chance, nan=1.0) < WORTH).any(-1))
+
+
+def described(effect: Effect, unit: str) -> str:
+    """An effect in words; `unit` is that of the magnetometer."""
+    triad, _, kind = effect.name.partition("-")
+    own = triad in TRIADS
+    looks = TEXTS[kind if own else effect.name]
+    if effect.name in ZEROS:
+        size = f"{np.degrees(effect.values[0]):+.3g}° ± {np.degrees(effect.uncertainties[0]):.2g}°"
+    elif effect.name == "tilt":
+        size = f"{np.degrees(np.linalg.norm(effect.values)):.3g}°"
+    else:
+        parts = [(1e3, "mg"), (1.0, unit)][: len(effect.size)]
+        each = [f"{s * f:.3g} {u} rms" for s, (f, u) in zip(effect.size, parts, strict=True)]
+        size = " and ".join(each[TRIADS.index(triad) :][:1] if own else each)
+    whose = f"{triad}: " if own else ""
+    return (
+        f"{whose}the residuals look like {looks}. Size {size}, {effect.share:.0%} of the misfit; chance in "
+        f"noise {effect.chance:.0e}."
+    )

@@ -86,7 +86,15 @@ def write(made: Calibration, output: Path, report: Path | None) -> None:
 
 def summary(made: Calibration, chosen: Chosen, output: Path, report: Path | None) -> dict[str, Any]:
     """The result for machines."""
-    named = ("model", "order", "rank", "size", "undetermined", "variance_factor")
+    named = (
+        "model",
+        "order",
+        "rank",
+        "size",
+        "undetermined",
+        "variance_factor",
+        "misfit_probability",
+    )
     return {
         "run": made.run,
         "stations": made.stations,
@@ -98,6 +106,8 @@ def summary(made: Calibration, chosen: Chosen, output: Path, report: Path | None
         "errors": made.errors,
         "measures": made.measures,
         "accuracy_1sigma_deg": typical_accuracy(made),
+        "budget": made.budget,
+        "assumed_exact": made.assumed_exact,
         "constants": made.constants,
         "stand": made.stand,
         "findings": made.findings,
@@ -128,7 +138,13 @@ def screen(made: Calibration, chosen: Chosen, output: Path, report: Path | None)
         f"{n} {text.number(v)}{'°' if v is not None else ''}"
         for n, v in typical_accuracy(made).items()
     )
-    lines = [f"accuracy to expect (1σ, calibration alone, typical): {accuracy}"]
+    lines = [text.residuals(made)] if text.residuals(made) else []
+    lines += [f"accuracy to expect (1σ, calibration alone, typical): {accuracy}"]
+    if made.assumed_exact:
+        without = ", ".join(made.assumed_exact)
+        lines.append(
+            f"taken as exact, and no residual tests it: {without} (see [stand] of the tool profile)"
+        )
     for constant in made.constants:
         value = f"{constant.value:.6g} ± {constant.standard_uncertainty:.2g} {constant.unit}"
         lines.append(f"estimated constant of the run: {constant.name} {value}")

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mwdcal.app import plots
-from mwdcal.app.text import HELD, choices, is_held, plural
+from mwdcal.app.text import HELD, chance, choices, is_held, plural
 from mwdcal.app.text import model as model_of
 from mwdcal.calibration import Calibration, TriadCalibration
 from mwdcal.core.solvers import RANK_TOLERANCE
@@ -64,6 +64,7 @@ def render(calibration: Calibration, verdict: Verdict | None = None) -> str:
         parameters=_parameters(calibration),
         held=HELD,
         accuracy=_accuracy(calibration),
+        budget=_budget(calibration),
         titles=plots.TITLES,
         tolerance=RANK_TOLERANCE,
         earth=_earth(calibration),
@@ -95,6 +96,7 @@ def _environment() -> Environment:
         "svg": svg,
         "plural": plural,
         "unit": unit,
+        "chance": chance,
     }
     return made
 
@@ -370,6 +372,20 @@ def _accuracy(calibration: Calibration) -> dict[str, Any]:
         pairs = [[_degrees(found[name][0]) for found in both] for name in names]
         rows.append({"inclination": inclination, "temperature": temperature, "pairs": pairs})
     return {"names": names, "rows": rows, "temperature": middle}
+
+
+def _budget(calibration: Calibration) -> list[dict[str, str]]:
+    """What the calibration's uncertainty consists of: a row for each source, degrees by angle."""
+    names = angles(calibration)
+    return [
+        {"source": row.source}
+        | {
+            name: "undetermined" if sd is None else number(sd, 2)
+            for name in names
+            for sd in [getattr(row, f"{name}_deg")]
+        }
+        for row in calibration.budget
+    ]
 
 
 def _degrees(angle: float) -> str:

@@ -115,12 +115,34 @@ def errors(rows: list[ErrorRow]) -> str:
     return table(cells, ["", "before", "after", "1σ expected"])
 
 
+def residuals(calibration: Calibration) -> str:
+    """The size of the residuals over the declared noise, and how likely it is; empty where none is declared."""
+    each = [
+        f"{t.name} {number((t.variance_factor or 0.0) ** 0.5)} (chance {chance(t.misfit_probability)})"
+        for t in calibration.triads
+        if t.misfit_probability is not None
+    ]
+    return f"residuals over declared noise, s: {'   '.join(each)}" if each else ""
+
+
+def chance(probability: float) -> str:
+    """A probability to two digits; far below any decision a bound.
+
+    >>> [chance(p) for p in (0.41234, 0.00012, 1e-30)]
+    ['0.41', '0.00012', '< 1e-09']
+    """
+    return "< 1e-09" if probability < 1e-9 else f"{probability:.2g}"
+
+
 def stand(found: StandErrors) -> list[str]:
     """Estimated errors of the stand."""
     lines = []
     if found.azimuth_zero_deg is not None:
         sd = number(found.azimuth_zero_uncertainty_deg)
         lines.append(f"stand: azimuth zero {found.azimuth_zero_deg:+.4g}° ± {sd}°")
+    if found.inclination_zero_deg is not None:
+        sd = number(found.inclination_zero_uncertainty_deg)
+        lines.append(f"stand: inclination zero {found.inclination_zero_deg:+.4g}° ± {sd}°")
     if found.tilt_deg is not None:
         lean = f"{found.tilt_deg:.3g}° ± {number(found.tilt_uncertainty_deg)}°"
         azimuth = f"{found.tilt_azimuth_deg:.0f}° ± {number(found.tilt_azimuth_uncertainty_deg)}°"

@@ -229,6 +229,31 @@ def _variance_factors(residual: Array, spread: Array) -> tuple[Array, Array]:
     return squares / np.where(freedom > 1e-9, freedom, np.nan), freedom
 
 
+def effective_freedom(problem: Problem, state: State, analysis: Analysis) -> Array:
+    """Degrees of freedom (B, t) of the χ² that s² times them follows: tr(S)² / tr(S²).
+
+    S = C⁻¹ - C⁻¹X V XᵀC⁻¹ is the covariance of a triad's whitened residuals, of all stations. It is
+    a projection where references are exact; else uncertain angles take a share of some residuals,
+    and s² scatters less than its `freedom` says. Reference: F. E. Satterthwaite, Biometrics
+    Bulletin 2, 110 (1946).
+    """
+    linear = problem.linear(state)
+    whole = whole_covariance(linear, analysis.determined)
+    weighed, count = linear.weigh(linear.design), linear.residual.shape[-1]
+    inner = linear.weigh(np.broadcast_to(np.eye(count), (*linear.residual.shape, count)))
+    inner = inner * problem.evidence.include[..., None, None]
+    found = []
+    for first in range(0, count, 3):
+        own = slice(first, first + 3)
+        rows, block = weighed[..., own, :], inner[..., own, own]
+        mixed = np.einsum("bnij,bnjp,bnip->bp", block, rows @ whole[:, None], rows, optimize=True)
+        gram = np.einsum("bnip,bniq->bpq", rows, rows, optimize=True) @ whole
+        twice = np.einsum("bpq,bqp->b", gram, gram)
+        found.append(np.sum(block**2, (1, 2, 3)) - 2 * mixed.sum(-1) + twice)
+    squares = np.stack(found, -1)
+    return np.asarray(analysis.freedom**2 / np.where(squares > 1e-9, squares, np.inf))
+
+
 def station_misfit(analysis: Analysis) -> tuple[Array, Array]:
     """Misfit d² (B, n) of every station, χ² when all is as declared, and its degrees of freedom.
 
