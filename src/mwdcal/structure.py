@@ -122,16 +122,16 @@ def effects(result: Fit) -> list[Effect]:
     left, freedom = _misfit(problem, result)
     total, used = left, 0
     chosen: list[str] = []
-    found: list[Effect] = []
+    shown: list[tuple[str, float, float]] = []
     while True:
         trials = {n: _trial(scores, chosen, n, left, freedom - used) for n in scores.places}
         open_ = {n: t for n, t in trials.items() if n not in chosen and t[0] < UNLIKELY}
         if not open_:
-            return found
+            return _described(result, shown) if shown else []
         best = min(open_, key=lambda name: (open_[name][0], -open_[name][1]))
         chance, gain, directions = open_[best]
         chosen, left, used = [*chosen, best], left - gain, used + directions
-        found.append(_described(problem, scores, best, gain / total, chance))
+        shown.append((best, gain / total, chance))
 
 
 def _misfit(problem: Problem, result: Fit) -> tuple[float, float]:
@@ -166,15 +166,26 @@ def _trial(
     )
 
 
-def _described(problem: Problem, scores: _Scores, name: str, share: float, chance: float) -> Effect:
-    values, covariance = scores.solution([name])
-    where = scores.places[name]
-    change = (scores.columns[..., where] * scores.length[where]) @ values
-    size = [
-        np.sqrt(np.mean(np.sum((change[..., 3 * i : 3 * i + 3] * t.sd) ** 2, -1)))
-        for i, t in enumerate(problem.triads)
-    ]
-    return Effect(name, share, chance, values, np.sqrt(np.diag(covariance)), np.array(size))
+def _described(result: Fit, shown: list[tuple[str, float, float]]) -> list[Effect]:
+    """The effects with their sizes: all together, with the noise that they leave."""
+    problem, names = result.problem, [name for name, _, _ in shown]
+    scores = _scores(problem, result, dict(_families(problem, result.state)))
+    left, freedom = _misfit(problem, result)
+    gain, directions = scores.gain(names)
+    scale = np.sqrt(max(left - gain, 0.0) / max(freedom - directions, 1.0))
+    values, covariance = scores.solution(names)
+    spread, found, at = np.sqrt(np.diag(covariance)) * scale, [], 0
+    for name, share, chance in shown:
+        where = scores.places[name]
+        own = slice(at, at + where.stop - where.start)
+        at = own.stop
+        change = (scores.columns[..., where] * scores.length[where]) @ values[own]
+        size = [
+            np.sqrt(np.mean(np.sum((change[..., 3 * i : 3 * i + 3] * t.sd) ** 2, -1)))
+            for i, t in enumerate(problem.triads)
+        ]
+        found.append(Effect(name, share, chance, values[own], spread[own], np.array(size)))
+    return found
 
 
 def _scores(problem: Problem, result: Fit, families: Mapping[str, Array]) -> _Scores:
@@ -296,6 +307,11 @@ def described(effect: Effect, unit: str) -> str:
     looks = TEXTS[kind if own else effect.name]
     if effect.name in ZEROS:
         size = f"{np.degrees(effect.values[0]):+.3g}° ± {np.degrees(effect.uncertainties[0]):.2g}°"
+        size += (
+            " (dip less its reference)"
+            if effect.name == "dip-reference"
+            else " (reading less true)"
+        )
     elif effect.name == "tilt":
         size = f"{np.degrees(np.linalg.norm(effect.values)):.3g}°"
     else:

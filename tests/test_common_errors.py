@@ -1,0 +1,223 @@
+"""Errors that all stations of a stand share: declared, they widen the stated uncertainty as they should.
+
+The forward model turns the stand's own readings into true attitudes by plain trigonometry; nothing
+of the package is used for it.
+"""
+
+import numpy as np
+import pytest
+
+from mwdcal.calibrate import calibrate
+from mwdcal.core.observables import OBSERVABLES
+from mwdcal.core.vectors import centred
+from mwdcal.covariance import assumed_exact, shares, stated_covariance
+from mwdcal.estimate import fit
+from mwdcal.findings import misfit_chances
+from mwdcal.fleet_checks import member
+from mwdcal.options import Options
+from mwdcal.predict import typical_accuracy
+from mwdcal.profile import Profile
+from mwdcal.readings import Readings
+from simulation import DEG, Tool, attitude, plan
+
+COUNT = 200
+SETTINGS = np.array([0.01, 0.05, 0.02]) * DEG
+SIZES = {
+    "azimuth-zero": 0.1 * DEG,
+    "toolface-zero": 0.1 * DEG,
+    "inclination-zero": 0.03 * DEG,
+    "tilt": 0.02 * DEG,
+    "gravity": 1e-3,
+    "field": 50.0,
+    "dip": 0.1 * DEG,
+}
+
+
+def leaning(inc, azi, face, tilt, towards):
+    """True attitudes where the stand's vertical leans by `tilt` towards an azimuth, to first order."""
+    along, across = tilt * np.cos(azi - towards), tilt * np.sin(azi - towards)
+    return inc - along, azi + across / np.tan(inc), face - across / np.sin(inc)
+
+
+def runs(name, size, declared=True, seed=0, count=COUNT, stations=None, noise_declared=True):
+    """A batch of runs whose references share an error of standard deviation `size`."""
+    tool, rng = Tool.random(3, noise=(1e-4, 15.0)), np.random.default_rng(seed)
+    inc, azi, face = stations or plan((10, 45, 90, 135))
+    error = size * rng.normal(size=(count, 1))
+    shape = (count, len(inc))
+    true = [a + s * rng.normal(size=shape) for a, s in zip((inc, azi, face), SETTINGS, strict=True)]
+    zeros = ("inclination-zero", "azimuth-zero", "toolface-zero")
+    if name in zeros:
+        true[zeros.index(name)] = true[zeros.index(name)] - error
+    if name == "tilt":
+        true = leaning(*true, error, rng.uniform(0, 2 * np.pi, (count, 1)))
+    strengths = {"gravity": tool.gravity, "field": tool.field, "dip": tool.dip}
+    earth = {k: v + (error if k == name else 0.0) + 0 * error for k, v in strengths.items()}
+    g, b = attitude(*true)(1.0, 1.0, earth["dip"])
+    pair = (g * earth["gravity"][..., None], b * earth["field"][..., None])
+    raw = [v @ tool.matrix[t].T + tool.offset[t] for t, v in enumerate(pair)]
+    raw = [r + s * rng.normal(size=r.shape) for r, s in zip(raw, tool.noise, strict=True)]
+    angles = ("inclination", "azimuth", "toolface")
+    known = dict(zip(angles, (inc, azi, face), strict=True))
+    known |= {k: np.full(len(inc), v) for k, v in strengths.items()}
+    sd = {n: np.full(len(inc), s) for n, s in zip(angles, SETTINGS, strict=True)}
+    if noise_declared:
+        sd |= {"accelerometer": np.array(1e-4), "magnetometer": np.array(15.0)}
+    if declared:
+        sd[name] = np.full(len(inc), size)
+    return tool, Readings(raw[0], raw[1], known=known, sd=sd)
+
+
+def ratios(tool, result):
+    """Error over stated uncertainty, root mean square over attitudes and runs, by observable."""
+    azimuth, toolface = (x.ravel() for x in np.meshgrid(np.arange(8) * 45.0, np.arange(8) * 45.0))
+    inc, azi, face = np.full(64, 45.0) * DEG, azimuth * DEG + 0.1, toolface * DEG + 0.2
+    pair = attitude(inc, azi, face)(tool.gravity, tool.field, tool.dip)
+    wanted = {
+        "inclination": inc,
+        "azimuth": azi,
+        "toolface": face,
+        "gravity": 1.0,
+        "field": tool.field,
+    }
+    covariance, found = stated_covariance(result), {}
+    count = len(result.status)
+    fields, rows = [], []
+    for t, (triad, where) in enumerate(
+        zip(result.problem.triads, result.problem.slices(), strict=True)
+    ):
+        raw = np.broadcast_to(pair[t] @ tool.matrix[t].T + tool.offset[t], (count, 64, 3))
+        params = result.state.params[:, where]
+        fields.append(triad.model.fields(params, raw, np.zeros((count, 64))))
+        rows.append(triad.model.jacobian(params, raw, np.zeros((count, 64))))
+    for name, value in wanted.items():
+        observable = OBSERVABLES[name]
+        error = observable.value(*fields) - value
+        error = centred(error) if observable.period else error
+        gradient = observable.gradient(*fields)
+        parts = [gradient[..., 3 * t : 3 * t + 3] for t in (0, 1)]
+        change = np.concatenate(
+            [np.einsum("bni,bnip->bnp", p, r) for p, r in zip(parts, rows, strict=True)], -1
+        )
+        variance = np.einsum("bnp,bpq,bnq->bn", change, covariance, change, optimize=True)
+        found[name] = np.sqrt(np.mean(error**2) / np.mean(variance))
+    return found
+
+
+@pytest.mark.parametrize("name", SIZES)
+def test_declared_common_errors_are_in_the_stated_uncertainty(name):
+    tool, data = runs(name, SIZES[name])
+    result = fit(data)
+    assert (result.status == 0).all()
+    for observable, ratio in ratios(tool, result).items():
+        assert 0.9 < ratio < 1.1, observable
+
+
+def test_a_toolface_zero_is_understated_where_it_is_not_declared_and_said_to_be_taken_as_exact():
+    tool, data = runs("toolface-zero", SIZES["toolface-zero"], declared=False)
+    result = fit(data)
+    assert ratios(tool, result)["toolface"] > 10
+    assert np.nanmean(result.analysis.variance_factor) == pytest.approx(1.0, abs=0.05)
+    assert assumed_exact(result)[0] == "toolface zero of the stand"
+    _, data = runs("toolface-zero", SIZES["toolface-zero"])
+    assert "toolface zero of the stand" not in assumed_exact(fit(data))
+
+
+def test_shares_add_up_to_the_stated_covariance():
+    for name in ("azimuth-zero", "tilt", "gravity"):
+        _, data = runs(name, SIZES[name], count=3)
+        result = fit(data)
+        whole = stated_covariance(result)
+        total = sum(shares(result).values())
+        np.testing.assert_allclose(total, whole, rtol=1e-6, atol=1e-9 * np.abs(whole).max())
+
+
+def test_the_share_of_settings_is_what_they_do():
+    """Scatter of the parameters when only the stand's settings vary, the noise being left out."""
+    tool = Tool.random(3, noise=(1e-9, 1e-4))
+    rng = np.random.default_rng(1)
+    inc, azi, face = plan((10, 45, 90, 135))
+    angles = [
+        a + s * rng.normal(size=(400, 48)) for a, s in zip((inc, azi, face), SETTINGS, strict=True)
+    ]
+    pair = attitude(*angles)(tool.gravity, tool.field, tool.dip)
+    raw = [v @ tool.matrix[t].T + tool.offset[t] for t, v in enumerate(pair)]
+    names = ("inclination", "azimuth", "toolface")
+    known = dict(zip(names, (inc, azi, face), strict=True))
+    known |= {"field": np.full(48, tool.field), "dip": np.full(48, tool.dip)}
+    sd = {n: np.full(48, s) for n, s in zip(names, SETTINGS, strict=True)}
+    sd |= {"accelerometer": np.array(1e-4), "magnetometer": np.array(15.0)}
+    result = fit(Readings(raw[0], raw[1], known=known, sd=sd))
+    settings, where = shares(result)["settings of the stand"], result.problem.slices()
+    for triad, own in enumerate(where):
+        one = result.problem.triads[triad].model.finished(30.0)[1]
+        values = np.einsum("bij,bj->bi", one, result.state.params[:, own])
+        share = one @ settings[:, own, own] @ np.swapaxes(one, -1, -2)
+        share = share / result.analysis.variance_factor[:, triad, None, None]
+        stated = np.diagonal(share, axis1=1, axis2=2).mean(0)
+        np.testing.assert_allclose(values.var(0) / stated, 1.0, atol=0.3)
+
+
+def test_budget_of_the_record_adds_up_and_names_its_sources():
+    _, data = runs("azimuth-zero", SIZES["azimuth-zero"], count=1)
+    record = calibrate(member_readings(data, 0), Profile(name="x"))
+    sources = [row.source for row in record.budget]
+    assert sources == [
+        "noise of the readings",
+        "settings of the stand",
+        "azimuth zero of the stand",
+    ]
+    expected = typical_accuracy(record)
+    for angle in ("inclination", "toolface", "azimuth"):
+        total = sum(getattr(row, f"{angle}_deg") ** 2 for row in record.budget) ** 0.5
+        assert total == pytest.approx(expected[angle], rel=1e-3)
+    assert record.constants[0].name == "azimuth zero of the stand"
+
+
+def member_readings(data, index):
+    """One run of a batch."""
+    return Readings(
+        data.accelerometer[index], data.magnetometer[index], known=data.known, sd=data.sd
+    )
+
+
+def test_chance_of_the_residuals_is_uniform_where_all_is_as_declared():
+    _, data = runs("azimuth-zero", 0.0, declared=False, count=600, seed=5)
+    chances = misfit_chances(fit(data))
+    for limit in (0.05, 0.2, 0.5, 0.8):
+        expected = limit * chances.size
+        seen = (chances < limit).sum()
+        assert abs(seen - expected) < 4 * np.sqrt(expected * (1 - limit)), limit
+
+
+def test_noise_half_as_large_again_is_reported_and_the_expected_errors_stay():
+    _, data = runs("azimuth-zero", 0.0, declared=False, count=1)
+    louder = Readings(
+        data.accelerometer[0], data.magnetometer[0], known=data.known,
+        sd={**data.sd, "accelerometer": np.array(1e-4 / 1.5), "magnetometer": np.array(10.0)},
+    )  # fmt: skip
+    record = calibrate(louder, Profile(name="x"))
+    ids = [finding.id for finding in record.findings]
+    assert "magnetometer-residuals" in ids
+    assert record.magnetometer.misfit_probability < 1e-3
+    field = next(row for row in record.errors if row.observable == "field")
+    assert field.expected < 10.0 < field.after
+
+
+def test_estimated_inclination_zero_is_unbiased_with_honest_uncertainty():
+    _, data = runs("inclination-zero", 0.2 * DEG, declared=False)
+    result = fit(data, Options(estimate=("inclination-zero",)))
+    rng = np.random.default_rng(0)
+    true = 0.2 * DEG * rng.normal(size=(COUNT, 1))[:, 0]
+    index = [c.name for c in result.problem.evidence.constants].index("inclination-zero")
+    sd = np.sqrt(result.analysis.constants[:, index, index])
+    score = (result.state.constants[:, index] - true) / sd
+    assert abs(score.mean()) < 3 / np.sqrt(COUNT)
+    assert score.std() == pytest.approx(1.0, abs=0.15)
+
+
+def test_fits_of_one_member_and_of_a_batch_state_the_same():
+    _, data = runs("tilt", SIZES["tilt"], count=3)
+    result = fit(data)
+    one = stated_covariance(member(result, np.array([1])))[0]
+    np.testing.assert_allclose(one, stated_covariance(result)[1], rtol=1e-9, atol=1e-20)
