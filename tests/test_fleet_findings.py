@@ -117,17 +117,18 @@ def test_screen_and_page_name_the_doubtful_tools(tmp_path):
     runs = troubled()
     del runs["bare"]
     ran, page = said(tmp_path, runs)
-    assert "! accelerometer-residuals in 3 tools: off, named, alone" in ran.out
+    assert "! accelerometer-residuals in 4 tools: off, a little off, named, alone" in ran.out
     assert "! repeated-readings in 1 tool: copies" in ran.out
     assert "All calibrated" not in page
     assert "Some doubtful" in page
-    assert "accelerometer residuals in 3 tools" in page
+    assert "accelerometer residuals in 4 tools" in page
+    assert "looks-like" not in ran.out
     ran, _ = said(tmp_path, runs, "--json")
     first = ran.json["findings"][0]
     assert first == {
         "id": "accelerometer-residuals",
-        "tools": 3,
-        "serials": ["off", "named", "alone"],
+        "tools": 4,
+        "serials": ["off", "a little off", "named", "alone"],
     }
     _, page = said(tmp_path, {"fine": short_run(1)})
     assert "All calibrated" in page

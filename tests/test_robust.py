@@ -11,6 +11,7 @@ from mwdcal.core.robust import consistency, inflation, weight
 from mwdcal.errors import FitError, InputError
 from mwdcal.estimate import fit
 from mwdcal.options import Options
+from mwdcal.profile import Profile
 from mwdcal.readings import Readings
 from mwdcal.residuals import Residuals
 from simulation import DEG, Tool, bound, plan
@@ -95,7 +96,7 @@ def test_constants_of_the_weights_by_simulation(loss, k):
     predicted = inflation(loss, k) / np.mean(w.sum(1))
     assert np.mean(centre**2) == pytest.approx(predicted, rel=0.06 / np.sqrt(k) + 0.02)
     square = np.sum(rng.normal(size=(400_000, k)) ** 2, -1)
-    mean = np.mean(weight(loss, square, np.full(400_000, float(k))) * square) / k
+    mean = np.mean(weight(loss, square, np.full(400_000, float(k))) ** 2 * square) / k
     assert consistency(loss, k) == pytest.approx(mean, rel=5e-3)
 
 
@@ -163,3 +164,29 @@ def test_a_run_spoilt_by_one_station_is_refused_with_its_name_and_saved_by_weigh
 def test_robust_needs_the_common_estimator(method):
     with pytest.raises(InputError, match="--robust"):
         calibrate(make(), PROFILE, Options(method, robust="huber"))
+
+
+@pytest.mark.parametrize("loss", ["huber", "student-t"])
+def test_one_misread_toolface_leaves_what_is_stated_as_it_is(loss):
+    """An error of 80° at one station: s, expected errors and accuracy of the run without it."""
+    inc, azi, face = plan()
+    tool = Tool.random(5)
+    raw = [v[0] for v in tool.readings(np.random.default_rng(5), 1, inc, azi, face)]
+    known = {
+        "inclination": inc, "azimuth": azi, "toolface": face,
+        "field": np.full(48, tool.field), "dip": np.full(48, tool.dip),
+    }  # fmt: skip
+    sd = {"accelerometer": np.array(1e-4), "magnetometer": np.array(15.0)}
+    sd |= {n: np.full(48, s * DEG) for n, s in zip(known, (0.01, 0.05, 0.02), strict=False)}
+    misread = {**known, "toolface": face + 80 * DEG * (np.arange(48) == 17)}
+    labels = tuple(map(str, range(48)))
+    good, bad = (
+        calibrate(Readings(*raw, known=k, sd=sd, station=labels), Profile(name="x"), Options(robust=loss))
+        for k in (known, misread)
+    )
+    for one, other in zip(good.triads, bad.triads, strict=True):
+        assert other.variance_factor == pytest.approx(one.variance_factor, rel=0.3)
+    for one, other in zip(good.errors, bad.errors, strict=True):
+        assert other.expected == pytest.approx(one.expected, rel=0.05)
+    for one, other in zip(np.diag(good.covariance), np.diag(bad.covariance), strict=True):
+        assert other == pytest.approx(one, rel=0.5)

@@ -24,12 +24,19 @@ def steps(values):
     return np.sign(np.diff(values, prepend=values[:1], axis=0))
 
 
+def settling(temperatures):
+    """Temperature of 48 stations at each of some soaks, which it approaches over some stations."""
+    before = np.array([temperatures[0], *temperatures[:-1]])[:, None]
+    soak = np.array(temperatures, float)[:, None]
+    return (soak + (before - soak) * np.exp(-np.arange(1, 49) / 6)).ravel()
+
+
 def run(effect="", seed=0, noise=NOISE, unknown=(), group=None, temperatures=(25.0,)):
     """One run (n stations in serpentine order) of a tool and a stand with one effect."""
     tool, rng = Tool.random(3, noise=(1e-4, 15.0)), np.random.default_rng(seed)
     inc, azi, face = (np.tile(a, len(temperatures)) for a in plan((10, 45, 90, 135)))
     face = np.where((np.arange(len(inc)) // 12) % 2, face[::-1], face)
-    warmth = np.repeat(temperatures, 48)
+    warmth = settling(temperatures)
     n, known = len(inc), dict(zip(SETTINGS, (inc, azi, face), strict=True))
     actual = {k: v + SETTINGS[k] * rng.normal(size=n) for k, v in known.items()}
     if effect == "backlash":
@@ -51,7 +58,7 @@ def run(effect="", seed=0, noise=NOISE, unknown=(), group=None, temperatures=(25
     if effect == "magnetometer-hysteresis":
         raw[1] = raw[1] + 25.0 * steps(raw[1])
     if effect == "accelerometer-thermal-lag":
-        raw[0] = raw[0] + 8e-6 * np.diff(warmth, prepend=warmth[0])[:, None]
+        raw[0] = raw[0] + 8e-5 * np.diff(warmth, prepend=warmth[0])[:, None]
     raw = [r + s * rng.normal(size=(n, 3)) for r, s in zip(raw, (1e-4, 15.0), strict=True)]
     known |= {"field": np.full(n, tool.field), "dip": np.full(n, tool.dip)}
     return Readings(

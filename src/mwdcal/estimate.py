@@ -170,7 +170,9 @@ def _general(problem: Problem, declared: list[bool], options: Options, finite: B
         determined = _determined(trusted, state, solved)
     status = np.where(finite, solved.status, int(Status.NOT_FINITE))
     noise = _noise(problem, declared)
-    analysis = _analysed(analyse(trusted, state, determined), trusted, state, solved, options)
+    analysis = _analysed(
+        analyse(trusted, state, determined), trusted, state, solved, options, trust
+    )
     trusted.memo.at(None)
     return Fit(trusted, state, status, iterations, noise, trust, analysis)
 
@@ -246,18 +248,23 @@ def _determined(problem: Problem, state: State, solved: Solved) -> Determined:
 
 
 def _analysed(
-    found: Analysis, problem: Problem, state: State, solved: Solved, options: Options
+    found: Analysis,
+    problem: Problem,
+    state: State,
+    solved: Solved,
+    options: Options,
+    trust: Array,
 ) -> Analysis:
     """The analysis of the estimator that was used: not every one is the likelihood's."""
     pulls = solved.pulls(problem, state)
     if pulls:
         found = sandwich(found, problem, state, pulls)
     if options.robust:
-        found = _robustly(found, problem, state, options.robust)
+        found = _robustly(found, problem, state, options.robust, trust)
     return found
 
 
-def _robustly(found: Analysis, problem: Problem, state: State, loss: str) -> Analysis:
+def _robustly(found: Analysis, problem: Problem, state: State, loss: str, trust: Array) -> Analysis:
     """The analysis of a fit with station weights: the data say less than they seem to, a prior does not."""
     freedom = _tested(station_misfit(found)[1])
     louder = np.sqrt([inflation(loss, k) for k in freedom])[:, None, None]
@@ -265,14 +272,22 @@ def _robustly(found: Analysis, problem: Problem, state: State, loss: str) -> Ana
     sd = {n: s * louder[..., 0] if n in ANGLES else s for n, s in problem.evidence.sd.items()}
     evidence = replace(problem.evidence, sd=sd)
     wider = analyse(replace(problem, triads=triads, evidence=evidence), state, found.determined)
-    share = np.array([consistency(loss, k) for k in freedom])[:, None]
     return replace(
         found,
         covariance=wider.covariance,
         constants=wider.constants,
         effects=wider.effects,
-        variance_factor=found.variance_factor / share,
+        variance_factor=_bounded_factor(found, trust, loss, freedom),
     )
+
+
+def _bounded_factor(found: Analysis, trust: Array, loss: str, freedom: Array) -> Array:
+    """s² (B, t) of a fit with station weights `trust`, from the pulls w d that they bound."""
+    pulled = found.residual**2 * trust[..., None]
+    shape = (*pulled.shape[:-1], pulled.shape[-1] // 3, 3)
+    squares = np.sum(pulled.reshape(shape), (1, 3))
+    share = np.array([consistency(loss, k) for k in freedom])[:, None]
+    return np.asarray(squares / np.where(found.freedom > 1e-9, found.freedom, np.nan) / share)
 
 
 def _without_broken(problem: Problem) -> tuple[Problem, Bools]:
@@ -385,8 +400,8 @@ def _downweigh(stage: _Stage, declared: list[bool], options: Options) -> _Stage:
         excess = np.maximum(excess, 1.0) if all(declared) else excess
         trust = weight(loss, square / excess[:, None], freedom)
         if not all(declared):
-            share = np.array([consistency(loss, k) for k in _tested(freedom)])[:, None]
-            problem = _rescaled(problem, np.sqrt(analysis.variance_factor / share), declared)
+            factor = _bounded_factor(analysis, now.trust, loss, _tested(freedom))
+            problem = _rescaled(problem, np.sqrt(factor), declared)
         solved = solve(_trusting(problem, trust), solved.state, options)
         return _Stage(problem, solved, trust), ~np.any(np.abs(trust / now.trust - 1) >= SETTLED, -1)
 

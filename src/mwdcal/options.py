@@ -22,7 +22,7 @@ class Options:
         parameters: per triad at one temperature: 12, 9 (sensor frame) or 6 (scale and bias).
         nonlinearity: triads with own-axis quadratic and cubic terms, and their prior as a share
             of the field; None: what the profile declares.
-        estimate: errors of the stand to find as well: "azimuth-zero", "tilt".
+        estimate: errors of the stand to find as well: "azimuth-zero", "inclination-zero", "tilt".
         ignore: what may not be used at any station, of "gravity", "field", "dip": each station then
             has its own.
         robust: None, "huber" or "student-t": weights that bound what a bad station can do.

@@ -99,10 +99,13 @@ class Residuals:
 
     @cached_property
     def _spread(self) -> Array:
-        """Expected covariance (n, m, m) of the whitened misfit left after the fit."""
+        """Expected covariance (n, m, m) of the whitened misfit left after the fit.
+
+        In units of the noise itself, whatever weight a station has.
+        """
         own = self.fit.problem.linear(self.fit.state).own
         total = np.eye(own.shape[-2]) + own @ np.swapaxes(own, -1, -2)
-        inner = total @ self.fit.analysis.spread @ total
+        inner = total @ _judged(self.fit).spread @ total
         return np.asarray(inner[0])
 
     def expected(self, name: str) -> Array:
@@ -119,7 +122,8 @@ class Residuals:
         for index, (triad, where) in enumerate(zip(problem.triads, problem.slices(), strict=True)):
             slope = triad.model.slope(state.params[:, where], triad.raw, problem.temperature)[0]
             part = gradient[:, 3 * index : 3 * index + 3]
-            rows.append(np.einsum("ni,nij->nj", part, slope) * triad.sd[0])
+            noise = triad.sd[0] * np.sqrt(self.fit.trust[0])[:, None]
+            rows.append(np.einsum("ni,nij->nj", part, slope) * noise)
         row = np.nan_to_num(np.concatenate(rows, -1) * self._weight(name)[:, None])
         variance = np.einsum("ni,nij,nj->n", row, self._spread, row)
         return np.asarray(np.sqrt(np.maximum(variance, 0)))

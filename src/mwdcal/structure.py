@@ -22,11 +22,14 @@ from mwdcal.covariance import variance_scales
 from mwdcal.estimate import Fit
 from mwdcal.evidence import TURNS, acts_on
 from mwdcal.readings import TRIADS
+from mwdcal.residuals import chances, to_reshoot
 
 UNLIKELY = 1e-4
 """Chance of so much common structure in noise, below which an effect is named."""
 WORTH = 0.01
 """Chance of residuals as large in declared noise, below which their structure is looked at."""
+FEW = 0.1
+"""Share of bad stations up to which they are left out."""
 APART = 1e-3
 """A column counts if the fit leaves this share of its square: what is left of others is rounding."""
 STAND = ("azimuth-zero", "inclination-zero", "tilt")
@@ -112,6 +115,7 @@ def effects(result: Fit) -> list[Effect]:
     """Effects that the residuals of one fit (B = 1) show, the largest first."""
     if result.analysis.influence is not None:
         return []
+    result = _without_bad_stations(result)
     scales = np.maximum(variance_scales(result), 1e-12)
     triads = [
         replace(t, sd=t.sd * np.sqrt(scales[:, i, None, None]))
@@ -134,13 +138,23 @@ def effects(result: Fit) -> list[Effect]:
         shown.append((best, gain / total, chance))
 
 
+def _without_bad_stations(result: Fit) -> Fit:
+    """The fit less its stations to take again, if they are few: one bad station looks like anything."""
+    bad = to_reshoot(chances(result))
+    if bad.mean() > FEW:
+        return result
+    evidence = result.problem.evidence
+    fewer = replace(evidence, include=evidence.include * ~bad)
+    return replace(result, problem=replace(result.problem, evidence=fewer))
+
+
 def _misfit(problem: Problem, result: Fit) -> tuple[float, float]:
     """The least ρᵀC⁻¹ρ of all readings, priors included, and its degrees of freedom."""
     linear, include = problem.linear(result.state), problem.evidence.include
     whole, normal = whole_covariance(linear, result.analysis.determined)[0], linear.normal
     gradient = normal.gradient[0]
     own = problem.linear(result.state, geometry=True).own
-    unknown = np.sum(np.linalg.svd(own, compute_uv=False) > 1.0)
+    unknown = np.sum(np.linalg.svd(own, compute_uv=False) > 1.0)  # 0 where a station is left out
     readings = float(include.sum()) * linear.residual.shape[-1]
     fitted = np.sum(whole * (normal.information - linear.prior)[0])
     return float(normal.cost[0] - gradient @ whole @ gradient), readings - float(fitted + unknown)

@@ -78,7 +78,8 @@ _FIT: tuple[Option, ...] = (
     ),
     click.option(
         "--estimate", default="", metavar="NAMES",
-        help="Errors of the stand to find as well: azimuth-zero, tilt, or both with a comma.",
+        help="Errors of the stand to find as well: azimuth-zero, inclination-zero, tilt, or several with "
+        "commas.",
     ),
     click.option(
         "--model", type=click.Choice(["polynomial", "factors"]),

@@ -73,8 +73,11 @@ def _moments(loss: str, k: float) -> tuple[float, float, float, float]:
 
 
 def consistency(loss: str, freedom: float) -> float:
-    """What the weighted misfit per degree of freedom comes to with good stations: below 1."""
-    return _moments(loss, freedom)[1]
+    """What the misfit w² d² per degree of freedom comes to with good stations: below 1.
+
+    The square of the bounded pull w d: one bad station cannot make it large (Huber's proposal 2).
+    """
+    return _moments(loss, freedom)[2]
 
 
 def inflation(loss: str, freedom: float) -> float:
