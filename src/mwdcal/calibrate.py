@@ -29,7 +29,7 @@ from mwdcal.core.uncertainty import analyse, marginal_rank
 from mwdcal.core.vectors import Array
 from mwdcal.curves import with_nonlinearity
 from mwdcal.estimate import Fit, fit
-from mwdcal.findings import Findings, described, is_relative
+from mwdcal.findings import Findings, described
 from mwdcal.options import Options
 from mwdcal.profile import Profile
 from mwdcal.readings import TRIADS, Readings
@@ -99,7 +99,7 @@ class _Record:
             ),
             seed=options.seed if options.method == "swarm" else None,
             time=datetime.now(UTC).isoformat(timespec="seconds"),
-            field_unit="relative (field = 1)" if self.relative else "nT",
+            field_unit=readings.field_unit,
             stations=readings.count,
             temperature_c=self.temperatures,
             accelerometer=self.triad(0),
@@ -126,11 +126,6 @@ class _Record:
         low, high = float(temperature.min()), float(temperature.max())
         known = (prior.temperature if prior else None) or (low, high)
         return min(low, known[0]), max(high, known[1])
-
-    @property
-    def relative(self) -> bool:
-        """Whether the magnetometer is calibrated to a field of one."""
-        return is_relative(self.readings)
 
     @cached_property
     def map(self) -> Array:
@@ -222,7 +217,7 @@ class _Record:
         freedom = float(analysis.freedom[0, index])
         return TriadCalibration(
             name=TRIADS[index],
-            unit="g" if index == 0 else ("1 (field = 1)" if self.relative else "nT"),
+            unit="g" if index == 0 else ("1 (field = 1)" if self.readings.relative else "nT"),
             model=triad.model.kind,
             order=triad.model.basis.order,
             curved=curved,

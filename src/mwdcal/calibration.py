@@ -17,7 +17,7 @@ from mwdcal.core.observables import OBSERVABLES
 from mwdcal.core.vectors import Array, Bools
 from mwdcal.errors import InputError
 from mwdcal.profile import Profile
-from mwdcal.readings import Readings
+from mwdcal.readings import NANOTESLA, Readings
 
 SCHEMA_VERSION = 1
 DIGITS = 12
@@ -251,6 +251,11 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
     def has_field(self) -> bool:
         """Whether the magnetometer was calibrated."""
         return self.magnetometer is not None
+
+    @property
+    def relative(self) -> bool:
+        """Whether the magnetometer was calibrated to a field of one."""
+        return self.has_field and self.field_unit != NANOTESLA
 
     def _temperature(self, readings: Readings) -> Array:
         if readings.temperature is None and any(t.order for t in self.triads):

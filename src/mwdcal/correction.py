@@ -160,7 +160,7 @@ def findings(
         found.append(Finding(id="missing-reading", text=text))
     if tally.beyond:
         found.append(_outside(calibration, readings.source, outside, tally))
-    if calibration.field_unit != "nT" and calibration.has_field:
+    if calibration.relative:
         text = "the magnetometer is calibrated to field = 1: bx_nt, by_nt, bz_nt and field_nt are relative, not nT."
         found.append(Finding(id="field-relative", text=text))
     if tally.moved:

@@ -46,11 +46,6 @@ def described(name: str) -> str:
     return TEXTS.get(steady, steady) + course
 
 
-def is_relative(readings: Readings) -> bool:
-    """Whether the magnetometer is calibrated to a field of one."""
-    return readings.magnetometer is not None and bool(np.isnan(readings.reference("field")).all())
-
-
 def excessive(result: Fit) -> Bools:
     """Triads (B, t) whose residuals are more than `SUSPECT` times the declared noise."""
     declared = np.isnan(result.noise) & ~unchecked(result)
@@ -196,7 +191,7 @@ class Findings:
             )
             text += "has no such terms. Use --model polynomial for it."
             found.append(Finding(id="nonlinearity-ignored", text=text))
-        if is_relative(self.readings):
+        if self.readings.relative:
             text = "field strength is known at no station: the magnetometer is calibrated to field = 1. "
             found.append(Finding(id="field-unknown", text=text + "Give ref_field_nt to have nT."))
         if self.options.parameters < 12:
@@ -240,7 +235,7 @@ class Findings:
     def reshoot(self, row: StationRow) -> Finding:
         """A station to take again, with the reason."""
         worst = row.worst or "gravity"
-        _, unit = shown_in(worst, is_relative(self.readings))
+        _, unit = shown_in(worst, self.readings.relative)
         gap = "" if unit == "°" else " "
         value = row.errors.get(worst, float("nan"))
         size = f"{row.deviation:.1f}" if row.deviation < LARGEST else f"more than {LARGEST:.0f}"
