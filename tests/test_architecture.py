@@ -58,6 +58,7 @@ LAYERS = (
         "app.choices",
         "app.comparison",
         "app.comparison_plots",
+        "app.conversion",
         "app.fleet_asked",
         "app.fleet_plots",
         "app.fleet_report",

@@ -47,11 +47,13 @@ def calibrate(
     profile_sha256: str = "",
     run_sha256: str = "",
     orders: Sequence[OrderScore] = (),
+    excluded: Sequence[str] = (),
     progress: Callable[[str], None] = lambda text: None,
 ) -> Calibration:
     """Fit the sensor model to a run and state what it is worth.
 
-    `orders`: what left-out temperatures say of the order (`mwdcal.selection`), for the record.
+    For the record: `orders`, what left-out temperatures say of the order (`mwdcal.selection`), and
+    `excluded`, labels of stations of the run that the readings no longer have.
     Raises `FitError` where the data cannot give a calibration to be trusted.
     """
     options = with_nonlinearity(options or Options(), profile)
@@ -65,7 +67,8 @@ def calibrate(
     check_fit(result, free, profile, readings)
     made = _Record(readings, profile, options, result, free)
     record = made.calibration(profile_sha256, run_sha256)
-    return rounded(msgspec.structs.replace(record, orders=list(orders)))
+    also = {"orders": list(orders), "excluded": list(excluded)}
+    return rounded(msgspec.structs.replace(record, **also))
 
 
 @dataclass(frozen=True)

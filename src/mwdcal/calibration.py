@@ -195,7 +195,8 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
 
     `covariance` is of the parameters of all triads in order, scaled by s² where that is
     estimated; `free` are directions (rows) of parameter space that no evidence determines.
-    `inherited` are the fingerprints of the stations behind the prior, if there was one.
+    `inherited` are the fingerprints of the stations behind the prior, if there was one;
+    `excluded` the labels of stations of the run that were left out of the fit on request.
     """
 
     schema_version: int = SCHEMA_VERSION
@@ -211,6 +212,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
     time: str
     field_unit: str
     stations: int
+    excluded: list[str] = []
     temperature_c: tuple[float, float] | None
     accelerometer: TriadCalibration
     magnetometer: TriadCalibration | None = None
@@ -396,6 +398,10 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
         return np.asarray(
             (readings.temperature < low - MARGIN) | (readings.temperature > high + MARGIN)
         )
+
+    def unrecorded(self, readings: Readings) -> bool:
+        """Whether the readings have temperatures and the run of the calibration recorded none."""
+        return self.temperature_c is None and readings.temperature is not None
 
 
 def rounded(calibration: Calibration) -> Calibration:

@@ -53,9 +53,13 @@ def run(
 ) -> tuple[Chosen, Calibration]:
     """What was chosen for a run, and its calibration."""
     readings, profile, digests = load(source, tool, decimal, typed["prior"])
+    excluded = [label for label in readings.station if label in exclude]
     readings = without(readings, exclude)
     chosen = choose(readings, profile, typed, say)
-    return chosen, calibrate(readings, profile, chosen.options, orders=chosen.orders, **digests)
+    made = calibrate(
+        readings, profile, chosen.options, orders=chosen.orders, excluded=excluded, **digests
+    )
+    return chosen, made
 
 
 def without(readings: Readings, exclude: tuple[str, ...]) -> Readings:
@@ -90,6 +94,7 @@ def summary(made: Calibration, chosen: Chosen, output: Path, report: Path | None
     return {
         "run": made.run,
         "stations": made.stations,
+        "excluded": made.excluded,
         "temperature_c": made.temperature_c,
         "method": made.method,
         "options": made.options,

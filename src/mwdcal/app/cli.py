@@ -33,8 +33,7 @@ from mwdcal.errors import FitError, InputError, MwdcalError
 
 if TYPE_CHECKING:
     from mwdcal.app.choices import Typed
-    from mwdcal.calibration import Calibration, Finding
-    from mwdcal.notation import Notation
+    from mwdcal.calibration import Finding
 
 INTERNAL = 70
 SIGNAL = 128
@@ -276,26 +275,23 @@ def convert(
     Example: mwdcal convert tool.json --notation forward --json
     Example: mwdcal convert tool.json --notation forward --temperature course
     """
-    from mwdcal.app import text
-    from mwdcal.files import atomic, documents
-    from mwdcal.notation import COURSE
-    from mwdcal.notation import convert as rewrite
+    from mwdcal.app import conversion
 
     _check_outputs([output], [calibration])
-    at = _temperature(temperature)
-    made = documents.read(calibration)
-    found = rewrite(made, notation, at)
-    if not as_json and output is None:
-        click.echo(text.notation(found, made.reference_temperature if at == COURSE else None))
-        return
-    document = _notation_document(made, notation, at, found)
-    if output is None:
-        print_json(document)
-    else:
+    made = conversion.run(calibration, notation, _temperature(temperature))
+    tell(made.findings)
+    if output is not None:
         import msgspec
 
-        atomic.write(output, msgspec.json.format(msgspec.json.encode(document), indent=2) + b"\n")
+        from mwdcal.files import atomic
+
+        content = msgspec.json.encode(conversion.document(made))
+        atomic.write(output, msgspec.json.format(content, indent=2) + b"\n")
         click.echo(f"wrote {output}")
+    elif as_json:
+        print_json(conversion.document(made))
+    else:
+        click.echo(conversion.screen(made))
 
 
 def _temperature(option: str | None) -> float | str | None:
@@ -310,26 +306,6 @@ def _temperature(option: str | None) -> float | str | None:
     if value is not None and not low <= value <= high:
         raise InputError(f"--temperature must be between {low:g} and {high:g} °C; got {value:g}.")
     return value
-
-
-def _notation_document(
-    made: Calibration, notation: str, temperature: float | str | None, found: dict[str, Notation]
-) -> dict[str, Any]:
-    document: dict[str, Any] = {"notation": notation, "temperature_c": temperature}
-    if isinstance(temperature, str):
-        document["powers_of"] = "T - reference_temperature_c"
-    elif notation == "factors" or temperature is None:
-        document["temperature_c"] = made.reference_temperature
-    for name, item in found.items():
-        profile = getattr(made.profile, name)
-        document[name] = {
-            **{k: v.tolist() for k, v in item.values.items()},
-            "reference_temperature_c": made.reference_temperature,
-            "axes": profile.axes,
-            "standard_uncertainty": {k: v.tolist() for k, v in item.uncertainty.items()},
-            "covariance": item.covariance.tolist(),
-        }
-    return document
 
 
 @cli.command()

@@ -230,6 +230,7 @@ def _facts(calibration: Calibration) -> list[tuple[str, str]]:
         ("Measured", tool.get("date", "")),
         ("Run file", calibration.run or "not named"),
         ("Stations", _attitudes(calibration)),
+        ("Excluded", ", ".join(calibration.excluded)),
         ("Temperature", _temperatures(calibration)),
         ("Method", "; ".join(method)),
         ("Stand", tool.get("stand", "")),
