@@ -44,7 +44,7 @@ LAYERS = (
     ("calibration",),
     ("evidence", "prior", "options"),
     ("methods", "estimate", "notation"),
-    ("checks", "curves", "correction", "residuals", "scatter", "selection", "stand"),
+    ("checks", "curves", "correction", "residuals", "scatter", "selection", "stand", "strengths"),
     ("findings",),
     ("calibrate", "compare", "gauge", "predict", "quality", "simulate"),
     ("fleet", "fleet_accuracy", "fleet_checks", "fleet_choices", "fleet_curves", "fleet_findings"),

@@ -20,6 +20,7 @@ from typing import IO, Any, NamedTuple, TypeVar
 
 import numpy as np
 
+from mwdcal import strengths
 from mwdcal.calibration import MARGIN, Calibration, Finding
 from mwdcal.core import fused
 from mwdcal.core.vectors import AnyArray, Array, Bools
@@ -34,6 +35,7 @@ from mwdcal.correction import (
     reference,
     result_names,
     undetermined,
+    warmth,
 )
 from mwdcal.errors import InputError
 from mwdcal.files import atomic, parquet, runs, streams
@@ -126,6 +128,7 @@ def apply_to_file(
         if total.lacking == total.rows:
             raise nothing(source.name)
         found = findings(calibration, worker.heard(total.serials), total, outside)
+        strengths.check(calibration, total.strengths, source.name)
         sink.finish([finding.text for finding in found])
     return total, found
 
@@ -192,9 +195,11 @@ def _total(tallies: Sequence[Tally]) -> Tally:
     moved = {name for tally in tallies for name in tally.moved}
     rows, beyond, lacking = np.sum([(t.rows, t.beyond, t.lacking) for t in tallies], 0).tolist()
     serials = runs.serials({}, chain.from_iterable(tally.serials for tally in tallies))
+    lows, highs = zip(*(tally.warmth for tally in tallies), strict=True)
     return Tally(
-        rows, beyond, tuple(name for name in JUDGED if name in moved), lacking, tuple(serials)
-    )
+        rows, beyond, tuple(name for name in JUDGED if name in moved), lacking, tuple(serials),
+        strengths.total(tally.strengths for tally in tallies), (min(lows), max(highs)),
+    )  # fmt: skip
 
 
 class Rules(NamedTuple):
@@ -262,7 +267,10 @@ class _Worker:
         judged = JUDGED if self.calibration.free else ()
         lacking = 0 if self.rules.missing == "refuse" else _MOST
         said = self.heard(("\0" * LONGEST, "\1" * LONGEST, "…"))
-        most = findings(self.calibration, said, Tally(_MOST, _MOST, judged, lacking), how)
+        worst = strengths.Strengths(_MOST, _MOST, _MOST, _MOST, -1.23e-100, -1.24e-100)
+        off = dict.fromkeys(strengths.COLUMNS, worst)
+        tally = Tally(_MOST, _MOST, judged, lacking, (), off, (TEMPERATURE.low, TEMPERATURE.high))
+        most = findings(self.calibration, said, tally, how)
         longest = [finding.text for finding in most]
         delimiter = "," if suffix == ".csv" else "\t"
         return TextSink(stream, self.source.schema, results, metadata, longest, delimiter)
@@ -284,17 +292,23 @@ class _Worker:
             channels, found = self._found(table)
         if found.unsound:
             self._refuse(table)
+        known: Mapping[str, Array] = {}
         if any(name.startswith(("ref_", "sd_")) for name in table.columns):
             kinds = [kind for kind in TRIADS if channels[kind] is not None]
-            runs.check_references(table, self.calibration.profile, kinds)
+            known = runs.check_references(table, self.calibration.profile, kinds)
         moved = self._undetermined(channels, table.count)
-        results: list[AnyArray] = [*found.columns]
+        columns = dict(zip(NAMES, found.columns, strict=True))
+        results: list[AnyArray] = [*columns.values()]
         if self.rules.outside == "extrapolate":
             results.append(self._beyond(channels, table.count))
         if whole is not None:
             results = [spread(values, whole) for values in results]
         rendered = sink.render(part.carried, results, bool(found.empty) or whole is not None)
-        tally = Tally(rows, found.beyond, moved, rows - table.count, self._serials(part.carried))
+        tally = Tally(
+            rows, found.beyond, moved, rows - table.count, self._serials(part.carried),
+            strengths.judged(self.calibration, columns, known),
+            warmth(channels["temperature"][0] if channels["temperature"] else None),
+        )  # fmt: skip
         return Corrected(rendered, part.size, tally)
 
     def _serials(self, carried: Any) -> tuple[str, ...]:

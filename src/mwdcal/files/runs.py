@@ -123,9 +123,11 @@ def to_readings(table: Table, profile: Profile) -> tuple[Readings, Profile]:
     return readings, profile
 
 
-def check_references(table: Table, profile: Profile, kinds: list[str]) -> None:
-    """Refuse what `to_readings` refuses in references and uncertainties of triads `kinds`."""
-    _uncertainties(table, profile, kinds, list(_known(table)))
+def check_references(table: Table, profile: Profile, kinds: list[str]) -> dict[str, Array]:
+    """The references of a table; refuses what `to_readings` refuses in them and in triads `kinds`."""
+    known = _known(table)
+    _uncertainties(table, profile, kinds, list(known))
+    return known
 
 
 def from_readings(
