@@ -386,9 +386,9 @@ def test_a_temperature_outside_the_calibrated_range_is_a_finding(identified):
         ids = [finding["id"] for finding in ran.json["findings"]]
         assert ids == (["outside-temperature"] if told else []), asked
         assert ("25.0…105.0 °C" in ran.err) == told
-    assert (
-        "400 °C" in mwdcal("convert", identified, "--notation", "forward", "--temperature", 400).err
-    )
+    ran = mwdcal("convert", identified, "--notation", "forward", "--temperature", 400)
+    assert "400 °C" in ran.err
+    assert "temperature 400 °C   extrapolated: calibrated at 25.0…105.0 °C" in ran.out
 
 
 def test_the_reference_temperature_may_be_outside_too(tmp_path):

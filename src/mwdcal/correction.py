@@ -181,10 +181,10 @@ def findings(
     if tally.beyond:
         found.append(_outside(calibration, readings.source, outside, tally))
     if calibration.unrecorded(readings):
-        low, high = tally.warmth
+        at = "…".join(dict.fromkeys(f"{end:.1f}" for end in tally.warmth))
         text = (
             "the calibration was made at unrecorded temperatures, without temperature terms: nothing says how "
-            f"good the results are at the readings' {low:.1f}…{high:.1f} °C."
+            f"good the results are at the readings' {at} °C."
         )
         found.append(Finding(id="no-temperature", text=text))
     found += strengths.findings(tally.strengths)

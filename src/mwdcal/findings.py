@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,6 +26,9 @@ UNLIKELY = 1e-3
 """Chance of so large a departure from the prior, below which it is reported."""
 LARGEST = 37.0
 """Deviations are not told apart beyond this: a normal variable's chance is then below 1e-300."""
+UNUSED = "unused-columns"
+MOST_COLUMNS = 20
+"""Most columns that the finding names."""
 DISTRUSTED = 0.1
 """A station of less weight than this in a robust fit is reported."""
 
@@ -44,6 +48,15 @@ def described(name: str) -> str:
     steady, _, power = name.partition("-temperature-")
     course = f" (its course with temperature, power {power})" if power else ""
     return TEXTS.get(steady, steady) + course
+
+
+def unused_columns(columns: Sequence[str]) -> list[Finding]:
+    """Columns of a file that are not used, each with what it resembles."""
+    if not columns:
+        return []
+    more = f" and {len(columns) - MOST_COLUMNS} more" if len(columns) > MOST_COLUMNS else ""
+    text = f"columns not used: {', '.join(columns[:MOST_COLUMNS])}{more}."
+    return [Finding(id=UNUSED, text=text)]
 
 
 def excessive(result: Fit) -> Bools:
@@ -119,6 +132,7 @@ class Findings:
             *self.undetermined(),
             *self.prior(),
             *self.model(),
+            *unused_columns(self.readings.unused),
             *(self.reshoot(row) for row in stations if row.reshoot),
             *self.distrusted(stations),
         ]

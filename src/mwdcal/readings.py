@@ -61,6 +61,7 @@ class Readings:
         digest: SHA-256 of each station's raw reading: tells fit from verification data.
         metadata: what the file said about itself (serial, date, operator, …).
         source: name of the file.
+        unused: columns of the file that are not used, each with what it resembles.
     """
 
     accelerometer: Array
@@ -73,6 +74,7 @@ class Readings:
     digest: tuple[str, ...] = ()
     metadata: Mapping[str, object] = field(default_factory=dict)
     source: str = ""
+    unused: tuple[str, ...] = ()
 
     @property
     def count(self) -> int:

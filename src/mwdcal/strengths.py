@@ -68,9 +68,10 @@ def judged(
         free = any(entry.id == "scale" for entry in triad.undetermined)
         coil = name == "field" and bool(getattr(calibration.profile.stand, "coil", False))
         low, high = (-np.inf, np.inf) if coil else EARTH[name]
-        reference = np.asarray(np.nan if free else known.get(name, np.nan), float)
         earth = (values < low) | (values > high)
-        own = np.abs(values - reference) > SHARE * reference
+        own = np.zeros(values.shape, bool)
+        if name in known and not free:
+            own = np.abs(values - known[name]) > SHARE * known[name]
         found[name] = _counted(values, earth, own)
     return found
 

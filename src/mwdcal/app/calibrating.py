@@ -15,6 +15,7 @@ from mwdcal.calibrate import calibrate
 from mwdcal.calibration import Calibration, Finding
 from mwdcal.errors import InputError
 from mwdcal.files import documents, profiles, runs, table
+from mwdcal.findings import UNUSED
 from mwdcal.predict import typical_accuracy
 from mwdcal.profile import Profile
 from mwdcal.readings import Readings
@@ -114,10 +115,10 @@ def summary(made: Calibration, chosen: Chosen, output: Path, report: Path | None
 
 
 def _told(found: list[Finding]) -> list[str]:
-    """The findings, of stations to re-shoot the first ones."""
+    """The findings, of stations to re-shoot the first ones; unused columns are said before."""
     again = [finding for finding in found if finding.id == "reshoot"]
     left = again[RESHOT:]
-    lines = text.findings([finding for finding in found if finding not in left])
+    lines = text.findings([f for f in found if f not in left and f.id != UNUSED])
     return lines + ([f"! … and {len(left)} more to re-shoot"] if left else [])
 
 

@@ -85,10 +85,12 @@ def calibrate(
     Exit: 0 calibrated, 2 input cannot be read, 3 fit failed or refused.
     """
     from mwdcal.app import calibrating
+    from mwdcal.findings import UNUSED
 
     _check_outputs([output, report], [run, Path(tool or ""), Path(typed["prior"] or "")])
     chosen, made = calibrating.run(run, tool, exclude, decimal, typed, say)
     calibrating.write(made, output, report)
+    tell([finding for finding in made.findings if finding.id == UNUSED])
     if as_json:
         print_json(calibrating.summary(made, chosen, output, report))
     else:
@@ -120,9 +122,11 @@ def compare(**asked: Unpack[AskedToCompare]) -> None:
     Exit: 0 compared, 2 input cannot be read, 3 every method refused.
     """
     from mwdcal.app import calibrating, comparison
+    from mwdcal.findings import unused_columns
 
     _check_outputs([asked["report"]], [asked["run"], Path(asked["tool"] or "")])
     readings, profile, digests = calibrating.load(asked["run"], asked["tool"], asked["decimal"])
+    tell(unused_columns(readings.unused))
     sound, result = comparison.run(asked, readings, profile, say, **digests)
     (print_json if asked["as_json"] else click.echo)(result)
     sys.exit(0 if sound else FitError.exit_code)
@@ -226,15 +230,20 @@ def verify(
     Example: mwdcal verify tool.json rolltest.csv --limits roll-test
     Exit: 0 pass, 1 fail, 2 input cannot be read or is not independent.
     """
+    import msgspec
+
     from mwdcal.app import text
     from mwdcal.files import documents, runs
     from mwdcal.files.limits import load_limits
+    from mwdcal.findings import unused_columns
     from mwdcal.quality import verify as judge
 
     _check_outputs([report], [calibration, run])
     made = documents.read(calibration)
     readings, _ = runs.read_run(run, made.profile, decimal=decimal)
     result = judge(made, readings, load_limits(limits))
+    seen = [*result.findings, *unused_columns(readings.unused)]
+    result = msgspec.structs.replace(result, findings=seen)
     if report:
         from mwdcal.app.report import write_report
 

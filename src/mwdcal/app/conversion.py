@@ -129,9 +129,19 @@ def screen(made: Converted) -> str:
     ]
     stated = reference if at is None or made.notation == "factors" else at
     shown = "course" if isinstance(stated, str) else f"{stated:g} °C"
-    lines.append("   ".join([f"notation {made.notation}", f"temperature {shown}", *units]))
+    conditions = [f"notation {made.notation}", f"temperature {shown}", _calibrated(made)]
+    lines += ["   ".join(conditions), "   ".join(units)]
     values = text.notation(made.triads, reference if at == COURSE else None)
     return "\n".join(lines) + "\n\n" + values
+
+
+def _calibrated(made: Converted) -> str:
+    """The calibrated temperatures, and whether the values lie outside them."""
+    if made.calibration.temperature_c is None:
+        return "calibrated at unrecorded temperatures"
+    low, high = made.calibration.temperature_c
+    outside = "extrapolated: " if made.findings else ""
+    return f"{outside}calibrated at {low:.1f}…{high:.1f} °C"
 
 
 def _nominal(calibration: Calibration, name: str) -> str:

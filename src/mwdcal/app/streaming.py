@@ -38,13 +38,14 @@ from mwdcal.correction import (
     warmth,
 )
 from mwdcal.errors import InputError
-from mwdcal.files import atomic, parquet, runs, streams
+from mwdcal.files import atomic, parquet, runs, streams, synonyms
 from mwdcal.files.columns import no_stations
-from mwdcal.files.contract import CHANNELS, RAW, RAW_RANGE, TEMPERATURE, check_columns
+from mwdcal.files.contract import CHANNELS, COLUMNS, RAW, RAW_RANGE, TEMPERATURE, check_columns
 from mwdcal.files.sinks import ParquetSink, Sink, TextSink
 from mwdcal.files.streams import Part, Source
 from mwdcal.files.table import Table, cell_error, check_header
 from mwdcal.files.table import numbers as as_numbers
+from mwdcal.findings import unused_columns
 from mwdcal.profile import TriadProfile
 from mwdcal.readings import TRIADS, Readings
 
@@ -110,6 +111,7 @@ def apply_to_file(
     check_outside(outside)
     source = _source(readings, output, rows, decimal)
     _check_header(source, outside)
+    check_warmth(calibration, source.names, source.name)
     pieces = source.pieces()
     first = next((piece for piece in pieces if _loaded(source, piece).table.count), None)
     if first is None:
@@ -130,7 +132,7 @@ def apply_to_file(
         found = findings(calibration, worker.heard(total.serials), total, outside)
         strengths.check(calibration, total.strengths, source.name)
         sink.finish([finding.text for finding in found])
-    return total, found
+    return total, found + unused_columns(synonyms.unused(source.names, COLUMNS))
 
 
 def overlapped(items: Iterator[Item], work: Callable[[Item], Made]) -> Iterator[Made]:
@@ -164,6 +166,12 @@ def _check_header(source: Source, outside: str) -> None:
     check_header(source.names, source.name)
     check_columns(source.names, source.name)
     check_free(source.names, result_names(outside), source.name)
+
+
+def check_warmth(calibration: Calibration, names: Sequence[str], source: str) -> None:
+    """Refuse a temperature under another name or in another unit where it is needed."""
+    if any(triad.order for triad in calibration.triads):
+        synonyms.check_temperature(names, source)
 
 
 def check_free(names: Iterable[str], results: Sequence[str], source: str) -> None:
