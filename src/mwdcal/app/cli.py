@@ -182,7 +182,7 @@ def apply(
 
     \b
     Example: mwdcal apply tool.json surveys.csv -o corrected.csv
-    Exit: 0 written, 2 input cannot be read.
+    Exit: 0 written, 2 input cannot be read, or does not belong to the calibration.
     """
     from mwdcal.app.progress import bar
     from mwdcal.app.tables import apply_to_any
