@@ -1,5 +1,6 @@
 """`mwdcal convert`: three notations, one calibration; recomputed by hand from the printed numbers."""
 
+import hashlib
 import json
 
 import numpy as np
@@ -245,7 +246,7 @@ def test_a_course_that_is_no_polynomial_is_refused(warm):
 def test_the_text_of_a_course_names_the_powers(warm):
     notation = COURSES[warm[3]]
     said = mwdcal("convert", warm[0], "--notation", notation, "--temperature", "course").out
-    assert said.startswith("τ = T - 20 °C\n\naccelerometer\n")
+    assert "\n\nτ = T - 20 °C\n\naccelerometer\n" in said
     blocks = dict(zip(TRIADS, said.split("\n\nmagnetometer\n"), strict=True))
     document = converted(warm[0], notation, "--temperature", "course")
     for triad, block in blocks.items():
@@ -334,3 +335,74 @@ def test_undetermined_values_of_a_course_have_no_uncertainty(tmp_path):
     said = mwdcal("convert", calibration, *options).out
     assert "nan" not in said.lower()
     assert "undetermined" in said
+
+
+@pytest.fixture(scope="module")
+def identified(tmp_path_factory):
+    """A simulated tool of known serial, calibrated from 25 to 105 °C."""
+    folder = tmp_path_factory.mktemp("warm")
+    run = write_csv(
+        folder / "run.csv", servo_run(toolfaces=4, temperatures=(25.0, 65.0, 105.0)),
+        "serial = SIM-7", "simulated = true",
+    )  # fmt: skip
+    made = folder / "cal.json"
+    ran = mwdcal("calibrate", run, "--tool", "servo", "--order", "1", "-o", made)
+    assert ran.code == 0, ran.err
+    return made
+
+
+@pytest.mark.parametrize("notation", NOTATIONS)
+def test_a_document_says_whose_it_is_in_which_units(identified, notation):
+    made = json.loads(identified.read_bytes())
+    document = converted(identified, notation)
+    assert document["schema_version"] == 1
+    assert document["serial"] == document["tool"]["serial"] == "SIM-7"
+    assert document["simulated"] is True
+    assert document["run"] == "run.csv"
+    assert document["run_sha256"] == made["run_sha256"]
+    assert document["calibration"] == "cal.json"
+    assert document["calibration_sha256"] == hashlib.sha256(identified.read_bytes()).hexdigest()
+    assert document["software"] == made["software"]
+    assert document["field_unit"] == "nT"
+    assert document["calibrated_temperature_c"] == [25.0, 105.0]
+    units = {
+        triad: (document[triad]["unit"], document[triad]["nominal_raw_per_unit"])
+        for triad in TRIADS
+    }
+    assert units == {"accelerometer": ("g", 3.0), "magnetometer": ("nT", 5e-5)}
+    assert document["findings"] == []
+    screen = mwdcal("convert", identified, "--notation", notation).out
+    for word in ("SIM-7", "run.csv", document["calibration_sha256"], "SIMULATED DATA", "30 °C"):
+        assert word in screen
+
+
+def test_a_temperature_outside_the_calibrated_range_is_a_finding(identified):
+    for asked, told in ((400, True), (106.5, True), (105.5, False), (25, False), ("course", False)):
+        notation = "factors" if asked == "course" else "affine"
+        ran = mwdcal(
+            "convert", identified, "--notation", notation, "--json", "--temperature", asked
+        )
+        assert ran.code == 0, ran.err
+        ids = [finding["id"] for finding in ran.json["findings"]]
+        assert ids == (["outside-temperature"] if told else []), asked
+        assert ("25.0…105.0 °C" in ran.err) == told
+    ran = mwdcal("convert", identified, "--notation", "forward", "--temperature", 400)
+    assert "400 °C" in ran.err
+    assert "temperature 400 °C   extrapolated: calibrated at 25.0…105.0 °C" in ran.out
+
+
+def test_the_reference_temperature_may_be_outside_too(tmp_path):
+    hot = servo_run(toolfaces=4, temperatures=(90.0, 120.0, 150.0))
+    made = calibrated(tmp_path, hot, "--order", "1")
+    assert [f["id"] for f in converted(made, "affine")["findings"]] == ["outside-temperature"]
+    assert converted(made, "affine", "--temperature", "100")["findings"] == []
+    steady = calibrated(tmp_path, hot, "--order", "0")
+    assert converted(steady, "affine")["findings"] == []
+
+
+def test_a_temperature_asked_of_a_calibration_without_any_is_a_finding(tmp_path):
+    bare = {k: v for k, v in servo_run(toolfaces=4).items() if k != "temperature_c"}
+    made = calibrated(tmp_path, bare)
+    found = converted(made, "affine", "--temperature", "150")
+    assert [f["id"] for f in found["findings"]] == ["no-temperature"]
+    assert converted(made, "affine")["findings"] == []

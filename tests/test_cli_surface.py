@@ -146,7 +146,7 @@ def test_a_defect_is_called_one_and_shows_no_traceback(tmp_path, monkeypatch):
     def broken(*arguments):
         raise ZeroDivisionError("oh")
 
-    monkeypatch.setattr(documents, "read", broken)
+    monkeypatch.setattr(documents, "load", broken)
     monkeypatch.delenv("MWDCAL_DEBUG", raising=False)
     ran = mwdcal("convert", tmp_path / "c.json", "--notation", "affine")
     assert ran.code == 70
@@ -161,7 +161,7 @@ def test_not_enough_memory_is_told(tmp_path, monkeypatch):
     def big(*arguments):
         raise MemoryError
 
-    monkeypatch.setattr(documents, "read", big)
+    monkeypatch.setattr(documents, "load", big)
     assert "not enough memory" in refused(mwdcal("convert", "c", "--notation", "affine"), 2)
 
 
@@ -444,3 +444,36 @@ def test_a_wrong_word_for_outside_is_refused(tmp_path, files):
     assert "--outside must be one of blank, refuse, extrapolate; got 'clip'" in refused(ran, 2)
     words = "|".join(OUTSIDE)
     assert words in mwdcal("apply", "--help").out
+
+
+def test_excluded_stations_are_named_wherever_the_calibration_is(tmp_path):
+    """In the file, in JSON, on the screen and in the report; the run's other stations are fitted."""
+    run = write_csv(tmp_path / "run.csv", servo_run())
+    made, page = tmp_path / "cal.json", tmp_path / "cal.html"
+    options = ("--exclude", "30", "--exclude", "7", "-o", made)
+    ran = mwdcal("calibrate", run, "--tool", "servo", *options, "--report", page)
+    assert ran.code == 0, ran.err
+    assert "station 7, 30" in ran.out
+    record = json.loads(made.read_bytes())
+    assert record["excluded"] == ["7", "30"]
+    assert record["stations"] == 46
+    assert "<dt>Excluded</dt><dd>7, 30</dd>" in page.read_text("utf-8")
+    shown = mwdcal("calibrate", run, "--tool", "servo", *options, "--json").json
+    assert shown["excluded"] == ["7", "30"]
+    whole = mwdcal("calibrate", run, "--tool", "servo", "-o", made)
+    assert "--exclude" not in whole.out
+    assert json.loads(made.read_bytes())["excluded"] == []
+
+
+def test_excluded_stations_may_verify_the_calibration(tmp_path):
+    """They had no part in the fit; those that had are refused."""
+    columns = servo_run()
+    run = write_csv(tmp_path / "run.csv", columns)
+    made = tmp_path / "cal.json"
+    options = [f"--exclude={label}" for label in range(13, 25)]
+    assert mwdcal("calibrate", run, "--tool", "servo", *options, "-o", made).code == 0
+    own = np.arange(48)
+    for rows, codes in ((own[12:24], (0, 1)), (own[11:24], (2,))):
+        part = {name: np.asarray(values)[rows] for name, values in columns.items()}
+        test = write_csv(tmp_path / "roll.csv", part)
+        assert mwdcal("verify", made, test).code in codes

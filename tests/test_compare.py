@@ -23,7 +23,7 @@ from mwdcal.methods import EVIDENCE
 from mwdcal.options import Options
 from mwdcal.readings import Readings
 from simulation import Tool, attitude, plan
-from test_calibrate import PROFILE, make
+from test_calibrate import NOISE, PROFILE, make
 
 EXAMPLE = "examples/servo/run.csv"
 TURNS = ("rotation-x", "rotation-y", "toolface-zero")
@@ -406,3 +406,52 @@ def test_where_every_method_is_refused_the_command_fails_and_says_why(tmp_path):
         assert "no method can calibrate this run" in ran.out
         assert "needs 4 or more" in ran.out
     assert page.exists()
+
+
+def near_vertical(inclinations, blank=()):
+    """A run with stations near vertical, of which some references may be blank."""
+    tool = Tool.random(7)
+    inc, azi, face = plan(inclinations, 12)
+    a, m = tool.readings(np.random.default_rng(11), 1, inc, azi, face)
+    stated = np.where(np.isin(np.arange(len(inc)), blank), np.nan, inc)
+    known = {
+        "inclination": stated, "azimuth": azi, "toolface": face,
+        "field": np.full(len(inc), tool.field), "dip": np.full(len(inc), tool.dip),
+    }  # fmt: skip
+    return Readings(a[0], m[0], known=known, sd=NOISE), (inc, azi, face)
+
+
+@pytest.mark.parametrize("blank", [(), (0, 5, 14)], ids=["all known", "some blank"])
+def test_errors_near_vertical_are_those_that_calibrate_states(blank):
+    """Weighted by sin(I) of the reference, not of the reading: 0.02° is a third of the noise there."""
+    data, (inc, _, face) = near_vertical((0.02, 45, 90, 135), blank)
+    made = calibrate(data, PROFILE, Options(order=0))
+    found = module.errors(data, *made.fields(data))
+    stated = {row.observable: row.after for row in made.errors}
+    for name in ("toolface", "azimuth", "inclination"):
+        rms = np.degrees(np.sqrt(np.nanmean(found[name] ** 2)))
+        assert rms == pytest.approx(stated[name], rel=1e-9), name
+    g, _ = made.fields(data)
+    own = np.arctan2(np.hypot(g[:, 0], g[:, 1]), g[:, 2])
+    across = np.sin(np.where(np.isnan(data.known["inclination"]), own, inc))
+    turned = np.arctan2(-g[:, 0], -g[:, 1]) - face
+    assert found["toolface"] == pytest.approx(np.angle(np.exp(1j * turned)) * across, abs=1e-12)
+
+
+@pytest.mark.parametrize("vertical", [0.0, 180.0])
+def test_exactly_vertical_references_have_no_error_of_azimuth_and_toolface(vertical):
+    """They are left out, not counted as zeros, which would make the others look better."""
+    data, (inc, _, face) = near_vertical((vertical, 45, 90, 135))
+    made = calibrate(data, PROFILE, Options(order=0))
+    rows = {row.observable: row for row in made.errors}
+    assert rows["inclination"].stations == 48
+    assert rows["toolface"].stations == rows["azimuth"].stations == 36
+    g, _ = made.fields(data)
+    tilted = np.arange(48) >= 12
+    turned = np.angle(np.exp(1j * (np.arctan2(-g[:, 0], -g[:, 1]) - face))) * np.sin(inc)
+    rms = np.degrees(np.sqrt(np.mean(turned[tilted] ** 2)))
+    assert rows["toolface"].after == pytest.approx(rms, rel=1e-9)
+    found = module.errors(data, *made.fields(data))
+    assert (np.isnan(found["toolface"]) == ~tilted).all()
+    assert "toolface" not in made.station_rows[0].errors
+    assert "inclination" in made.station_rows[0].errors

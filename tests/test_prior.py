@@ -6,11 +6,13 @@ import msgspec
 import numpy as np
 import pytest
 
+from cli_support import SERVO_NOISE, calibrated, mwdcal, servo_run, write_csv
 from mwdcal.calibrate import calibrate
 from mwdcal.core.observables import OBSERVABLES
 from mwdcal.core.vectors import reference_vectors
 from mwdcal.errors import FitError, InputError
 from mwdcal.estimate import fit
+from mwdcal.files import documents
 from mwdcal.options import Options
 from mwdcal.prior import from_calibration, from_datasheet
 from mwdcal.profile import Datasheet, Profile, TriadProfile
@@ -161,3 +163,24 @@ def test_a_datasheet_speaks_of_both_models_alike():
         size = np.linalg.norm(pair[0], axis=-1).mean()
         assert np.abs(pair[0] - pair[1]).max() < 3e-4 * size  # scale 1/SF against SF: 3 % squared
     assert plan()[0].shape == (48,)
+
+
+@pytest.mark.parametrize("stated", [True, False], ids=["prior in nT", "relative prior"])
+def test_a_run_without_magnetometer_has_no_unit_that_could_differ_from_the_prior(stated, tmp_path):
+    """The prior's accelerometer counts, whatever the unit of its magnetometer."""
+    tool = Tool.random(1, noise=SERVO_NOISE)
+    columns = servo_run(1, tool=tool)
+    if not stated:
+        columns = {k: v for k, v in columns.items() if k != "ref_field_nt"}
+    previous = calibrated(tmp_path, columns)
+    again = servo_run(2, tool=tool).items()
+    alone = {k: v for k, v in again if k not in ("mx", "my", "mz", "ref_field_nt")}
+    run = write_csv(tmp_path / "alone.csv", alone)
+    made = tmp_path / "second.json"
+    ran = mwdcal("calibrate", run, "--tool", "servo", "--prior", previous, "-o", made)
+    assert ran.code == 0, ran.err
+    first, second = (documents.read(path) for path in (previous, made))
+    assert second.magnetometer is None
+    assert second.accelerometer.rank == 12
+    before, after = (np.array(c.accelerometer.standard_uncertainties) for c in (first, second))
+    assert (after < before).all()

@@ -181,7 +181,9 @@ def test_one_misread_toolface_leaves_what_is_stated_as_it_is(loss):
     misread = {**known, "toolface": face + 80 * DEG * (np.arange(48) == 17)}
     labels = tuple(map(str, range(48)))
     good, bad = (
-        calibrate(Readings(*raw, known=k, sd=sd, station=labels), Profile(name="x"), Options(robust=loss))
+        calibrate(
+            Readings(*raw, known=k, sd=sd, station=labels), Profile(name="x"), Options(robust=loss)
+        )
         for k in (known, misread)
     )
     for one, other in zip(good.triads, bad.triads, strict=True):

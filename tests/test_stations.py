@@ -390,7 +390,7 @@ def test_a_reference_in_the_log_goes_with_its_station():
     expected = 10.0 * np.arange(len(starts))
     expected[2] = np.nan
     np.testing.assert_array_equal(found.table.columns["ref_inclination_deg"], expected)
-    assert "columns-not-used" in finding_ids(found)
+    assert "unused-columns" in finding_ids(found)
 
 
 # The command

@@ -302,7 +302,7 @@ def test_a_refusal_says_how_long_it_stood_still(tmp_path):
     told = refused(ran, 2)
     longest = float(told.split("longest calm interval lasts ")[1].split()[0])
     assert longest == pytest.approx((ends - starts).max() - 2, abs=1.0)
-    assert "! columns not used: gx" in ran.err
+    assert "! columns not used: 'gx' (resembles 'ax')." in ran.err
     assert b"<svg" in plot.read_bytes()
     assert not out.exists()
     told = refused(mwdcal("stations", path, "-o", out, "--trim-seconds", 20), 2)

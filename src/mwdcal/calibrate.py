@@ -38,7 +38,7 @@ from mwdcal.covariance import (
 )
 from mwdcal.curves import with_nonlinearity
 from mwdcal.estimate import Fit, fit
-from mwdcal.findings import Findings, described, is_relative
+from mwdcal.findings import Findings, described
 from mwdcal.options import Options
 from mwdcal.predict import typical_budget
 from mwdcal.profile import Profile
@@ -57,11 +57,13 @@ def calibrate(
     profile_sha256: str = "",
     run_sha256: str = "",
     orders: Sequence[OrderScore] = (),
+    excluded: Sequence[str] = (),
     progress: Callable[[str], None] = lambda text: None,
 ) -> Calibration:
     """Fit the sensor model to a run and state what it is worth.
 
-    `orders`: what left-out temperatures say of the order (`mwdcal.selection`), for the record.
+    For the record: `orders`, what left-out temperatures say of the order (`mwdcal.selection`), and
+    `excluded`, labels of stations of the run that the readings no longer have.
     Raises `FitError` where the data cannot give a calibration to be trusted.
     """
     options = with_nonlinearity(options or Options(), profile)
@@ -75,8 +77,12 @@ def calibrate(
     check_fit(result, free, profile, readings)
     made = _Record(readings, profile, options, result, free)
     record = made.calibration(profile_sha256, run_sha256)
-    budget = made.budget(record)
-    return rounded(msgspec.structs.replace(record, orders=list(orders), budget=budget))
+    also = {
+        "orders": list(orders),
+        "excluded": list(excluded),
+        "budget": made.budget(record),
+    }
+    return rounded(msgspec.structs.replace(record, **also))
 
 
 @dataclass(frozen=True)
@@ -110,7 +116,7 @@ class _Record:
             ),
             seed=options.seed if options.method == "swarm" else None,
             time=datetime.now(UTC).isoformat(timespec="seconds"),
-            field_unit="relative (field = 1)" if self.relative else "nT",
+            field_unit=readings.field_unit,
             stations=readings.count,
             temperature_c=self.temperatures,
             accelerometer=self.triad(0),
@@ -142,11 +148,6 @@ class _Record:
         low, high = float(temperature.min()), float(temperature.max())
         known = (prior.temperature if prior else None) or (low, high)
         return min(low, known[0]), max(high, known[1])
-
-    @property
-    def relative(self) -> bool:
-        """Whether the magnetometer is calibrated to a field of one."""
-        return is_relative(self.readings)
 
     @cached_property
     def map(self) -> Array:
@@ -197,7 +198,7 @@ class _Record:
     def assumed(self) -> list[str]:
         """References taken as exact that no residual tests; a field of one is no reference."""
         found = assumed_exact(self.result)
-        return [n for n in found if not (n.startswith("field") and self.relative)]
+        return [n for n in found if not (n.startswith("field") and self.readings.relative)]
 
     def earth(self) -> dict[str, float]:
         """Mean gravity, field and dip of the run: given or estimated."""
@@ -240,7 +241,7 @@ class _Record:
         freedom, chance = float(analysis.freedom[0, index]), self._findings.chances[0, index]
         return TriadCalibration(
             name=TRIADS[index],
-            unit="g" if index == 0 else ("1 (field = 1)" if self.relative else "nT"),
+            unit="g" if index == 0 else ("1 (field = 1)" if self.readings.relative else "nT"),
             model=triad.model.kind,
             order=triad.model.basis.order,
             curved=curved,

@@ -17,7 +17,7 @@ from mwdcal.core.observables import OBSERVABLES
 from mwdcal.core.vectors import Array, Bools
 from mwdcal.errors import InputError
 from mwdcal.profile import Profile
-from mwdcal.readings import Readings
+from mwdcal.readings import NANOTESLA, Readings
 
 SCHEMA_VERSION = 1
 DIGITS = 12
@@ -210,7 +210,8 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
     estimated; `free` are directions (rows) of parameter space that no evidence determines.
     `budget` says what each source of error adds to the accuracy to expect; `assumed_exact` names
     references without a declared uncertainty whose error no residual would show.
-    `inherited` are the fingerprints of the stations behind the prior, if there was one.
+    `inherited` are the fingerprints of the stations behind the prior, if there was one;
+    `excluded` the labels of stations of the run that were left out of the fit on request.
     """
 
     schema_version: int = SCHEMA_VERSION
@@ -226,6 +227,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
     time: str
     field_unit: str
     stations: int
+    excluded: list[str] = []
     temperature_c: tuple[float, float] | None
     accelerometer: TriadCalibration
     magnetometer: TriadCalibration | None = None
@@ -268,6 +270,11 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
     def has_field(self) -> bool:
         """Whether the magnetometer was calibrated."""
         return self.magnetometer is not None
+
+    @property
+    def relative(self) -> bool:
+        """Whether the magnetometer was calibrated to a field of one."""
+        return self.has_field and self.field_unit != NANOTESLA
 
     def _temperature(self, readings: Readings) -> Array:
         if readings.temperature is None and any(t.order for t in self.triads):
@@ -408,6 +415,10 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
         return np.asarray(
             (readings.temperature < low - MARGIN) | (readings.temperature > high + MARGIN)
         )
+
+    def unrecorded(self, readings: Readings) -> bool:
+        """Whether the readings have temperatures and the run of the calibration recorded none."""
+        return self.temperature_c is None and readings.temperature is not None
 
 
 def rounded(calibration: Calibration) -> Calibration:

@@ -293,10 +293,9 @@ def gains(result: Fit) -> list[Array]:
 
 
 def _check_gains(result: Fit, profile: Profile, readings: Readings) -> None:
-    relative = bool(np.isnan(readings.reference("field")).all())
     for index, gain in enumerate(gains(result)):
         name = TRIADS[index]
-        unknown = getattr(profile, name).scale is None or (index == 1 and relative)
+        unknown = getattr(profile, name).scale is None or (index == 1 and readings.relative)
         share = gain / np.median(np.abs(gain)) if unknown else gain
         for axis, value in enumerate(share):
             if not GAIN[0] <= value <= GAIN[1]:

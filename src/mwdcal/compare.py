@@ -13,20 +13,20 @@ from mwdcal.calibrate import calibrate
 from mwdcal.calibration import Calibration, Measures
 from mwdcal.checks import check_readings
 from mwdcal.core.observability import Free, free_directions
-from mwdcal.core.observables import OBSERVABLES
 from mwdcal.core.solvers import Status
 from mwdcal.core.swarm import least_squares_forward, swarm_forward, vector_cost
-from mwdcal.core.vectors import Array, Ints, centred, reference_vectors
+from mwdcal.core.vectors import Array, Ints, reference_vectors
 from mwdcal.curves import choose_curves, declared
 from mwdcal.errors import FitError
 from mwdcal.estimate import Fit, fit
+from mwdcal.evidence import evidence_of
 from mwdcal.gauge import Gauge, in_gauge
 from mwdcal.methods import EVIDENCE, ITERATIONS
 from mwdcal.notation import Notation
 from mwdcal.options import Options, Orders
 from mwdcal.profile import Profile
-from mwdcal.readings import TRIADS, Readings, is_simulated
-from mwdcal.residuals import SHOWN, shown_in
+from mwdcal.readings import ANGLES, TRIADS, Readings, is_simulated
+from mwdcal.residuals import SHOWN, departure, rms, shown_in
 from mwdcal.scatter import directions, group_scatter
 from mwdcal.selection import choose_order
 
@@ -248,8 +248,7 @@ def nominal(readings: Readings) -> tuple[Array, Array]:
     raw = readings.magnetometer
     if raw is None:
         return readings.accelerometer, np.full_like(readings.accelerometer, np.nan)
-    relative = np.isnan(readings.reference("field")).all()
-    scale = np.linalg.norm(raw, axis=-1).mean() if relative else 1.0
+    scale = np.linalg.norm(raw, axis=-1).mean() if readings.relative else 1.0
     return readings.accelerometer, raw / scale
 
 
@@ -261,18 +260,16 @@ def _referenced(readings: Readings) -> list[str]:
 
 
 def errors(readings: Readings, g: Array, b: Array) -> dict[str, Array]:
-    """Departure (…, n) of each observable from the run's own reference, NaN where there is none.
+    """Error (n,) of each observable against the run's own reference, as `calibrate` states it.
 
-    Toolface and azimuth are times sin(inclination).
+    Of angles that is the group's where a station of a group has none of its own.
     """
-    found = {}
-    for name in _referenced(readings):
-        observable = OBSERVABLES[name]
-        error = observable.value(g, b) - readings.reference(name)
-        error = centred(error, observable.period) if observable.period else error
-        across = np.sin(OBSERVABLES["inclination"].value(g, b))
-        found[name] = error * across if name in ("toolface", "azimuth") else error
-    return found
+    shared = evidence_of(readings, np.ones(readings.count)).known
+    known = {
+        name: shared[name][0] if name in ANGLES else readings.reference(name)
+        for name in dict.fromkeys((*_referenced(readings), "inclination"))
+    }
+    return {name: departure(name, g, b, known) for name in _referenced(readings)}
 
 
 @dataclass(frozen=True)
@@ -308,7 +305,7 @@ class _Judge:
         return bool((self.readings.groups >= 0).any()) and self.readings.magnetometer is not None
 
     def _shown(self, name: str) -> tuple[float, str]:
-        return shown_in(name, bool(np.isnan(self.readings.reference("field")).all()))
+        return shown_in(name, self.readings.relative)
 
     def factor(self, name: str) -> float:
         """Factor from an observable's own unit to the one it is shown in."""
@@ -332,7 +329,7 @@ class _Judge:
 
     def summary(self, g: Array, b: Array) -> dict[str, float]:
         """Root mean square errors by observable, and the scatter within groups, in shown units."""
-        result = {n: _rms(e) * self.factor(n) for n, e in errors(self.readings, g, b).items()}
+        result = {n: rms(e) * self.factor(n) for n, e in errors(self.readings, g, b).items()}
         if self.grouped:
             result[SCATTER] = self._scatter(g, b)
         return result
@@ -372,12 +369,6 @@ class _Judge:
                 )
             )  # fmt: skip
         return found
-
-
-def _rms(values: Array) -> float:
-    """Root mean square of what is not NaN; NaN where nothing is left."""
-    values = values[~np.isnan(values)]
-    return float(np.sqrt(np.mean(values**2))) if values.size else float("nan")
 
 
 def score(row: Row, best: Mapping[str, float]) -> float:

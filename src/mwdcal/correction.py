@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
+from mwdcal import strengths
 from mwdcal.calibration import Calibration, Finding
 from mwdcal.core import fused
 from mwdcal.core.observables import OBSERVABLES
 from mwdcal.core.vectors import AnyArray, Array
 from mwdcal.errors import InputError
 from mwdcal.readings import Readings
+from mwdcal.strengths import Strengths
 
 OUTSIDE = ("blank", "refuse", "extrapolate")
 MARK = "extrapolated"
@@ -34,13 +36,18 @@ MANY = 300_000
 
 
 class Tally(NamedTuple):
-    """What the findings need to know of the rows: their number, and what was seen in them."""
+    """What the findings need to know of the rows: their number, and what was seen in them.
+
+    `warmth` are the lowest and the highest temperature of readings, °C.
+    """
 
     rows: int
     beyond: int = 0
     moved: tuple[str, ...] = ()
     lacking: int = 0
     serials: tuple[str, ...] = ()
+    strengths: Mapping[str, Strengths] = {}
+    warmth: tuple[float, float] = (np.inf, -np.inf)
 
     def blank(self, outside: str) -> int:
         """Number of rows without results: for want of a reading, or `outside` the temperatures."""
@@ -51,6 +58,8 @@ def correct(
     calibration: Calibration, readings: Readings, outside: str = "blank"
 ) -> tuple[dict[str, AnyArray], list[Finding]]:
     """Output columns (n,) by name, and what the reader should know.
+
+    Refuses readings of which most have a strength that no place on Earth has, or not their own reference.
 
     Singular: at exactly vertical attitudes azimuth and toolface are NaN (blank in files);
     `magnetic_toolface_deg` stands beside them. A strength of zero has no direction: NaN.
@@ -70,13 +79,24 @@ def counted(
     }
     beyond = calibration.outside(readings)
     rows, moved = readings.count + lacking, undetermined(calibration, readings)
-    tally = Tally(rows, int(beyond.sum()), moved, lacking)
-    told = findings(calibration, readings, tally, outside)
-    if outside == "blank" and tally.beyond:
+    if outside == "blank" and beyond.any():
         columns = {name: np.where(beyond, np.nan, value) for name, value in columns.items()}
+    tally = Tally(
+        rows, int(beyond.sum()), moved, lacking, (),
+        strengths.judged(calibration, columns, readings.known), warmth(readings.temperature),
+    )  # fmt: skip
+    told = findings(calibration, readings, tally, outside)
+    strengths.check(calibration, tally.strengths, readings.source)
     if outside == "extrapolate":
         columns[MARK] = beyond
     return columns, tally, told
+
+
+def warmth(temperature: Array | None) -> tuple[float, float]:
+    """Lowest and highest of temperatures, °C; infinite ends where there are none."""
+    if temperature is None:
+        return np.inf, -np.inf
+    return float(temperature.min(initial=np.inf)), float(temperature.max(initial=-np.inf))
 
 
 def result_names(outside: str) -> tuple[str, ...]:
@@ -160,7 +180,15 @@ def findings(
         found.append(Finding(id="missing-reading", text=text))
     if tally.beyond:
         found.append(_outside(calibration, readings.source, outside, tally))
-    if calibration.field_unit != "nT" and calibration.has_field:
+    if calibration.unrecorded(readings):
+        at = "…".join(dict.fromkeys(f"{end:.1f}" for end in tally.warmth))
+        text = (
+            "the calibration was made at unrecorded temperatures, without temperature terms: nothing says how "
+            f"good the results are at the readings' {at} °C."
+        )
+        found.append(Finding(id="no-temperature", text=text))
+    found += strengths.findings(tally.strengths)
+    if calibration.relative:
         text = "the magnetometer is calibrated to field = 1: bx_nt, by_nt, bz_nt and field_nt are relative, not nT."
         found.append(Finding(id="field-relative", text=text))
     if tally.moved:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -30,6 +31,9 @@ UNLIKELY = 1e-3
 """Chance of so large residuals, or of so large a departure from the prior, below which it is reported."""
 LARGEST = 37.0
 """Deviations are not told apart beyond this: a normal variable's chance is then below 1e-300."""
+UNUSED = "unused-columns"
+MOST_COLUMNS = 20
+"""Most columns that the finding names."""
 DISTRUSTED = 0.1
 """A station of less weight than this in a robust fit is reported."""
 
@@ -51,9 +55,13 @@ def described(name: str) -> str:
     return TEXTS.get(steady, steady) + course
 
 
-def is_relative(readings: Readings) -> bool:
-    """Whether the magnetometer is calibrated to a field of one."""
-    return readings.magnetometer is not None and bool(np.isnan(readings.reference("field")).all())
+def unused_columns(columns: Sequence[str]) -> list[Finding]:
+    """Columns of a file that are not used, each with what it resembles."""
+    if not columns:
+        return []
+    more = f" and {len(columns) - MOST_COLUMNS} more" if len(columns) > MOST_COLUMNS else ""
+    text = f"columns not used: {', '.join(columns[:MOST_COLUMNS])}{more}."
+    return [Finding(id=UNUSED, text=text)]
 
 
 def misfit_chances(result: Fit) -> Array:
@@ -150,6 +158,7 @@ class Findings:
             *self.undetermined(),
             *self.prior(),
             *self.model(),
+            *unused_columns(self.readings.unused),
             *(self.reshoot(row) for row in stations if row.reshoot),
             *self.distrusted(stations),
         ]
@@ -190,7 +199,7 @@ class Findings:
         """What the residuals look like, where they are more than noise."""
         if not suspected(self.result, self.chances)[0]:
             return []
-        unit = shown_in("field", is_relative(self.readings))[1]
+        unit = shown_in("field", self.readings.relative)[1]
         return [
             Finding(id=f"looks-like-{effect.name}", text=seen_as(effect, unit))
             for effect in effects(self.result)
@@ -239,7 +248,7 @@ class Findings:
             )
             text += "has no such terms. Use --model polynomial for it."
             found.append(Finding(id="nonlinearity-ignored", text=text))
-        if is_relative(self.readings):
+        if self.readings.relative:
             text = "field strength is known at no station: the magnetometer is calibrated to field = 1. "
             found.append(Finding(id="field-unknown", text=text + "Give ref_field_nt to have nT."))
         if self.options.parameters < 12:
@@ -283,7 +292,7 @@ class Findings:
     def reshoot(self, row: StationRow) -> Finding:
         """A station to take again, with the reason."""
         worst = row.worst or "gravity"
-        _, unit = shown_in(worst, is_relative(self.readings))
+        _, unit = shown_in(worst, self.readings.relative)
         gap = "" if unit == "°" else " "
         value = row.errors.get(worst, float("nan"))
         size = f"{row.deviation:.1f}" if row.deviation < LARGEST else f"more than {LARGEST:.0f}"

@@ -54,8 +54,7 @@ class PerTool:
         """The options with the prior of a whole batch."""
         if not self.datasheet:
             return options
-        relative = bool(np.isnan(readings.reference("field")).all())
-        return replace(options, prior=from_datasheet(profile, relative))
+        return replace(options, prior=from_datasheet(profile, readings.relative))
 
     def before(self, options: Options) -> Options:
         """The options that a tool must meet before its order is chosen."""

@@ -115,7 +115,7 @@ def from_calibration(previous: Calibration, relative: bool = False) -> Knowledge
             f"{where}: its own-axis quadratic and cubic terms belong to the readings of its own run. "
             "Calibrate that run with --nonlinearity none to use it as a prior."
         )
-    if previous.has_field and previous.field_unit.startswith("relative") != relative:
+    if previous.has_field and previous.relative != relative:
         raise InputError(
             f"{where}: it is in {previous.field_unit}, this run is not. Give both runs ref_field_nt, "
             "or neither."

@@ -19,6 +19,13 @@ ANGLES = ("inclination", "azimuth", "toolface")
 TRIADS = ("accelerometer", "magnetometer")
 SIMULATED = "SIMULATED DATA"
 CONSTANTS = ("gravity", "field", "dip")
+EARTH_GRAVITY = (0.9, 1.1)
+"""Least and greatest gravity of any place on Earth, with room for a doubtful unit, g."""
+EARTH_FIELD = (15_000.0, 80_000.0)
+"""Least and greatest magnetic field of any place on Earth, with room, nT."""
+NANOTESLA = "nT"
+RELATIVE = "relative (field = 1)"
+"""Unit of the calibrated field where its strength is known at no station."""
 
 
 def is_simulated(metadata: Mapping[str, object]) -> bool:
@@ -55,6 +62,7 @@ class Readings:
         digest: SHA-256 of each station's raw reading: tells fit from verification data.
         metadata: what the file said about itself (serial, date, operator, …).
         source: name of the file.
+        unused: columns of the file that are not used, each with what it resembles.
     """
 
     accelerometer: Array
@@ -67,6 +75,7 @@ class Readings:
     digest: tuple[str, ...] = ()
     metadata: Mapping[str, object] = field(default_factory=dict)
     source: str = ""
+    unused: tuple[str, ...] = ()
 
     @property
     def count(self) -> int:
@@ -82,6 +91,19 @@ class Readings:
     def groups(self) -> Ints:
         """Group numbers (..., n): -1 everywhere where none are given."""
         return np.full(self.count, -1) if self.group is None else self.group
+
+    @property
+    def relative(self) -> bool:
+        """Whether there is a magnetometer and the field strength is known at no station.
+
+        It is then calibrated to a field of one. Without a magnetometer nothing is relative.
+        """
+        return self.magnetometer is not None and bool(np.isnan(self.reference("field")).all())
+
+    @property
+    def field_unit(self) -> str:
+        """Unit in which a magnetometer is calibrated from these readings."""
+        return RELATIVE if self.relative else NANOTESLA
 
     def reference(self, name: str) -> Array:
         """The known value `name` (..., n), NaN where blank.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import erfc, gamma
@@ -19,6 +20,8 @@ SHOWN = ("gravity", "inclination", "toolface", "azimuth", "field", "dip")
 UNITS = {"gravity": "mg", "field": "nT"}
 RESHOOT = 0.01
 """A station is marked when one in a hundred runs would have any station as bad as it."""
+LEAST_ACROSS = 1e-9
+"""An attitude is exactly vertical below this sine of its inclination."""
 PROBES = 200
 """Stations at which the influence of each is looked at: no more, however long the run."""
 REASONS = {
@@ -31,6 +34,12 @@ REASONS = {
 }
 
 
+def rms(values: Array) -> float:
+    """Root mean square of what is not NaN; NaN where nothing is left."""
+    values = values[~np.isnan(values)]
+    return float(np.sqrt(np.mean(values**2))) if values.size else float("nan")
+
+
 def shown_in(name: str, relative: bool = False) -> tuple[float, str]:
     """Factor and unit in which an observable's errors are shown: mg, nT, °, or per mille."""
     if name == "field" and relative:
@@ -40,17 +49,39 @@ def shown_in(name: str, relative: bool = False) -> tuple[float, str]:
     return (1.0, "nT") if name == "field" else (float(np.degrees(1)), "°")
 
 
+def angle_weight(name: str, inclination: Array) -> Array:
+    """What an error of an observable counts at inclinations (…, n), radians; NaN: it has none there.
+
+    Definition: sin(inclination) for toolface and azimuth, 1 for all else.
+    Singular: NaN exactly at vertical, where toolface and azimuth do not exist.
+    """
+    if name not in ("toolface", "azimuth"):
+        return np.ones(inclination.shape)
+    across = np.sin(inclination)
+    return np.where(across < LEAST_ACROSS, np.nan, across)
+
+
+def departure(name: str, g: Array, b: Array, known: Mapping[str, Array]) -> Array:
+    """Error (…, n) of an observable of two vectors against its reference, radians, g or nT.
+
+    Definition: value - known[name], times its `angle_weight` at the reference inclination; at the
+    vectors' own where that is unknown.
+    Singular: NaN where there is no reference, and for toolface and azimuth exactly at vertical.
+    """
+    observable = OBSERVABLES[name]
+    error = observable.value(g, b) - known[name]
+    error = centred(error, observable.period) if observable.period else error
+    stated = known.get("inclination", np.full(error.shape, np.nan))
+    own = OBSERVABLES["inclination"].value(g, b)
+    return np.asarray(error * angle_weight(name, np.where(np.isnan(stated), own, stated)))
+
+
 @dataclass(frozen=True)
 class Residuals:
     """The errors of one fitted run (B = 1), before and after, with what was to be expected."""
 
     readings: Readings
     fit: Fit
-
-    @property
-    def relative(self) -> bool:
-        """Whether the field strength is known nowhere."""
-        return bool(np.isnan(self.readings.reference("field")).all())
 
     @cached_property
     def after(self) -> tuple[Array, Array]:
@@ -71,7 +102,7 @@ class Residuals:
         triads = [t.raw[0] for t in self.fit.problem.triads]
         if len(triads) == 1:
             return triads[0], np.full_like(triads[0], np.nan)
-        scale = np.linalg.norm(triads[1], axis=-1).mean() if self.relative else 1.0
+        scale = np.linalg.norm(triads[1], axis=-1).mean() if self.readings.relative else 1.0
         return triads[0], triads[1] / scale
 
     def known(self, name: str) -> Array:
@@ -83,19 +114,20 @@ class Residuals:
         return np.asarray(self.fit.problem.evidence.known[name][0])
 
     def _weight(self, name: str) -> Array:
-        if name not in ("toolface", "azimuth"):
-            return np.ones(self.readings.count)
+        """The weight (n,) of errors after the fit, zero where an observable does not exist."""
         inclination = self.known("inclination")
         guess = OBSERVABLES["inclination"].value(*self.after)
-        return np.sin(np.where(np.isnan(inclination), guess, inclination))
+        found = angle_weight(name, np.where(np.isnan(inclination), guess, inclination))
+        return np.nan_to_num(found)
+
+    def judged(self, name: str) -> Bools:
+        """Stations (n,) whose error of an observable is known."""
+        return ~np.isnan(self.known(name)) & (self._weight(name) > 0)
 
     def errors(self, name: str, fields: tuple[Array, Array]) -> Array:
-        """Departure (n,) from the reference; toolface and azimuth times sin(inclination)."""
-        observable = OBSERVABLES[name]
-        value = observable.value(*fields) - self.known(name)
-        value = centred(value, observable.period) if observable.period else value
-        weight = self._weight(name)
-        return np.where((weight < 1e-9) & ~np.isnan(self.known(name)), 0.0, value * weight)
+        """The `departure` (n,) of both vectors from the references of the run."""
+        known = {each: self.known(each) for each in dict.fromkeys((name, "inclination"))}
+        return departure(name, *fields, known)
 
     @cached_property
     def _spread(self) -> Array:
@@ -161,9 +193,9 @@ class Residuals:
         return np.asarray(np.abs(change * weight[:, None]).max(0))
 
     def names(self) -> list[str]:
-        """Observables with a reference somewhere in this run."""
+        """Observables with an error that is known somewhere in this run."""
         usable = SHOWN if len(self.fit.problem.triads) > 1 else SHOWN[:3]
-        return [n for n in usable if not np.isnan(self.known(n)).all()]
+        return [n for n in usable if self.judged(n).any()]
 
 
 def error_rows(readings: Readings, fit: Fit) -> list[ErrorRow]:
@@ -171,10 +203,10 @@ def error_rows(readings: Readings, fit: Fit) -> list[ErrorRow]:
     residuals = Residuals(readings, fit)
     rows = []
     for name in residuals.names():
-        factor, unit = shown_in(name, residuals.relative)
-        known = ~np.isnan(residuals.known(name))
+        factor, unit = shown_in(name, readings.relative)
+        known = residuals.judged(name)
         before, after, expected = (
-            float(np.sqrt(np.mean(values[known] ** 2)) * factor)
+            rms(values[known]) * factor
             for values in (
                 residuals.errors(name, residuals.before),
                 residuals.errors(name, residuals.after),
@@ -300,7 +332,7 @@ def station_rows(readings: Readings, fit: Fit) -> list[StationRow]:
     influence = {n: residuals.influence(n) for n in names}
     expected = {n: np.nan_to_num(residuals.expected(n), nan=np.inf) for n in names}
     ratio = {n: np.abs(after[n]) / np.maximum(expected[n], 1e-30) for n in names}
-    factors = {n: shown_in(n, residuals.relative)[0] for n in names}
+    factors = {n: shown_in(n, readings.relative)[0] for n in names}
     attitude = {n: np.degrees(OBSERVABLES[n].value(*residuals.after)) for n in SHOWN[1:4]}
     rows = []
     for i in range(readings.count):

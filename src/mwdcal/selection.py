@@ -172,8 +172,7 @@ def _tables(
     readings: Readings, orders: Sequence[tuple[int, int]], found: Array
 ) -> list[OrderScore]:
     """The tables of all triads over some orders, from `_compared` of a batch of one."""
-    relative = bool(np.isnan(readings.reference("field")).all())
-    shown = [shown_in("gravity"), shown_in("field", relative)]
+    shown = [shown_in("gravity"), shown_in("field", readings.relative)]
     chosen = _best(found)[0]
     return [
         score

@@ -21,7 +21,9 @@ from mwdcal.errors import InputError
 from mwdcal.files.columns import Column
 from mwdcal.files.contract import CHANNELS, RAW, TEMPERATURE
 from mwdcal.files.logs import READ, TIME
+from mwdcal.files.synonyms import unused
 from mwdcal.files.table import Table, cell_error, numbers, shown
+from mwdcal.findings import unused_columns
 from mwdcal.station_findings import (
     about,
     correlated_noise,
@@ -308,11 +310,7 @@ def _time_findings(
         findings.append(Finding(id="gaps", text=text))
     if not np.all(steps > 0):
         findings += _equal_times(log, time, list(traces))
-    spare = [name for name in log.columns if name not in READ]
-    if spare:
-        text = f"columns not used: {', '.join(spare[:10])}{' …' if spare[10:] else ''}."
-        findings.append(Finding(id="columns-not-used", text=text))
-    return findings
+    return findings + unused_columns(unused(list(log.columns), READ))
 
 
 def _torn(activity: Activity, names: list[str], findings: list[Finding]) -> list[Finding]:

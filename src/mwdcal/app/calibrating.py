@@ -15,6 +15,7 @@ from mwdcal.calibrate import calibrate
 from mwdcal.calibration import Calibration, Finding
 from mwdcal.errors import InputError
 from mwdcal.files import documents, profiles, runs, table
+from mwdcal.findings import UNUSED
 from mwdcal.predict import typical_accuracy
 from mwdcal.profile import Profile
 from mwdcal.readings import Readings
@@ -53,9 +54,13 @@ def run(
 ) -> tuple[Chosen, Calibration]:
     """What was chosen for a run, and its calibration."""
     readings, profile, digests = load(source, tool, decimal, typed["prior"])
+    excluded = [label for label in readings.station if label in exclude]
     readings = without(readings, exclude)
     chosen = choose(readings, profile, typed, say)
-    return chosen, calibrate(readings, profile, chosen.options, orders=chosen.orders, **digests)
+    made = calibrate(
+        readings, profile, chosen.options, orders=chosen.orders, excluded=excluded, **digests
+    )
+    return chosen, made
 
 
 def without(readings: Readings, exclude: tuple[str, ...]) -> Readings:
@@ -98,6 +103,7 @@ def summary(made: Calibration, chosen: Chosen, output: Path, report: Path | None
     return {
         "run": made.run,
         "stations": made.stations,
+        "excluded": made.excluded,
         "temperature_c": made.temperature_c,
         "method": made.method,
         "options": made.options,
@@ -119,10 +125,10 @@ def summary(made: Calibration, chosen: Chosen, output: Path, report: Path | None
 
 
 def _told(found: list[Finding]) -> list[str]:
-    """The findings, of stations to re-shoot the first ones."""
+    """The findings, of stations to re-shoot the first ones; unused columns are said before."""
     again = [finding for finding in found if finding.id == "reshoot"]
     left = again[RESHOT:]
-    lines = text.findings([finding for finding in found if finding not in left])
+    lines = text.findings([f for f in found if f not in left and f.id != UNUSED])
     return lines + ([f"! … and {len(left)} more to re-shoot"] if left else [])
 
 

@@ -128,10 +128,9 @@ def _with_prior(
     options: Options, order: str, typed: Typed, readings: Readings, profile: Profile
 ) -> tuple[Options, str]:
     """What is known beforehand; a previous calibration brings its model and order along."""
-    relative = bool(np.isnan(readings.reference("field")).all())
     prior = str(typed["prior"])
     if prior == DATASHEET:
-        return replace(options, prior=from_datasheet(profile, relative)), order
+        return replace(options, prior=from_datasheet(profile, readings.relative)), order
     previous = documents.read(Path(prior))
     other = previous.other_tool(readings)
     if other:
@@ -155,14 +154,18 @@ def _with_prior(
         model=options.model or (kinds.pop() if len(kinds) == 1 else None),
         order=(previous.triads[0].order, previous.triads[-1].order),
         parameters=previous.options.parameters,
-        prior=_of(previous, readings, relative),
+        prior=_of(previous, readings),
     )
     return options, "prior" if order == "auto" else order
 
 
-def _of(previous: Calibration, readings: Readings, relative: bool) -> Knowledge:
-    """A previous calibration's knowledge, of the triads that this run has."""
-    known = from_calibration(previous, relative)
+def _of(previous: Calibration, readings: Readings) -> Knowledge:
+    """A previous calibration's knowledge, of the triads that this run has.
+
+    A run without a magnetometer has no unit of the field that could differ.
+    """
+    alone = readings.magnetometer is None
+    known = from_calibration(previous, previous.relative if alone else readings.relative)
     if readings.magnetometer is not None or not previous.has_field:
         return known
     own = [i for i, name in enumerate(known.names) if name.startswith(TRIADS[0])]

@@ -33,8 +33,7 @@ from mwdcal.errors import FitError, InputError, MwdcalError
 
 if TYPE_CHECKING:
     from mwdcal.app.choices import Typed
-    from mwdcal.calibration import Calibration, Finding
-    from mwdcal.notation import Notation
+    from mwdcal.calibration import Finding
 
 INTERNAL = 70
 SIGNAL = 128
@@ -86,10 +85,12 @@ def calibrate(
     Exit: 0 calibrated, 2 input cannot be read, 3 fit failed or refused.
     """
     from mwdcal.app import calibrating
+    from mwdcal.findings import UNUSED
 
     _check_outputs([output, report], [run, Path(tool or ""), Path(typed["prior"] or "")])
     chosen, made = calibrating.run(run, tool, exclude, decimal, typed, say)
     calibrating.write(made, output, report)
+    tell([finding for finding in made.findings if finding.id == UNUSED])
     if as_json:
         print_json(calibrating.summary(made, chosen, output, report))
     else:
@@ -121,9 +122,11 @@ def compare(**asked: Unpack[AskedToCompare]) -> None:
     Exit: 0 compared, 2 input cannot be read, 3 every method refused.
     """
     from mwdcal.app import calibrating, comparison
+    from mwdcal.findings import unused_columns
 
     _check_outputs([asked["report"]], [asked["run"], Path(asked["tool"] or "")])
     readings, profile, digests = calibrating.load(asked["run"], asked["tool"], asked["decimal"])
+    tell(unused_columns(readings.unused))
     sound, result = comparison.run(asked, readings, profile, say, **digests)
     (print_json if asked["as_json"] else click.echo)(result)
     sys.exit(0 if sound else FitError.exit_code)
@@ -179,7 +182,7 @@ def apply(
 
     \b
     Example: mwdcal apply tool.json surveys.csv -o corrected.csv
-    Exit: 0 written, 2 input cannot be read.
+    Exit: 0 written, 2 input cannot be read, or does not belong to the calibration.
     """
     from mwdcal.app.progress import bar
     from mwdcal.app.tables import apply_to_any
@@ -227,15 +230,20 @@ def verify(
     Example: mwdcal verify tool.json rolltest.csv --limits roll-test
     Exit: 0 pass, 1 fail, 2 input cannot be read or is not independent.
     """
+    import msgspec
+
     from mwdcal.app import text
     from mwdcal.files import documents, runs
     from mwdcal.files.limits import load_limits
+    from mwdcal.findings import unused_columns
     from mwdcal.quality import verify as judge
 
     _check_outputs([report], [calibration, run])
     made = documents.read(calibration)
     readings, _ = runs.read_run(run, made.profile, decimal=decimal)
     result = judge(made, readings, load_limits(limits))
+    seen = [*result.findings, *unused_columns(readings.unused)]
+    result = msgspec.structs.replace(result, findings=seen)
     if report:
         from mwdcal.app.report import write_report
 
@@ -276,26 +284,23 @@ def convert(
     Example: mwdcal convert tool.json --notation forward --json
     Example: mwdcal convert tool.json --notation forward --temperature course
     """
-    from mwdcal.app import text
-    from mwdcal.files import atomic, documents
-    from mwdcal.notation import COURSE
-    from mwdcal.notation import convert as rewrite
+    from mwdcal.app import conversion
 
     _check_outputs([output], [calibration])
-    at = _temperature(temperature)
-    made = documents.read(calibration)
-    found = rewrite(made, notation, at)
-    if not as_json and output is None:
-        click.echo(text.notation(found, made.reference_temperature if at == COURSE else None))
-        return
-    document = _notation_document(made, notation, at, found)
-    if output is None:
-        print_json(document)
-    else:
+    made = conversion.run(calibration, notation, _temperature(temperature))
+    tell(made.findings)
+    if output is not None:
         import msgspec
 
-        atomic.write(output, msgspec.json.format(msgspec.json.encode(document), indent=2) + b"\n")
+        from mwdcal.files import atomic
+
+        content = msgspec.json.encode(conversion.document(made))
+        atomic.write(output, msgspec.json.format(content, indent=2) + b"\n")
         click.echo(f"wrote {output}")
+    elif as_json:
+        print_json(conversion.document(made))
+    else:
+        click.echo(conversion.screen(made))
 
 
 def _temperature(option: str | None) -> float | str | None:
@@ -310,26 +315,6 @@ def _temperature(option: str | None) -> float | str | None:
     if value is not None and not low <= value <= high:
         raise InputError(f"--temperature must be between {low:g} and {high:g} °C; got {value:g}.")
     return value
-
-
-def _notation_document(
-    made: Calibration, notation: str, temperature: float | str | None, found: dict[str, Notation]
-) -> dict[str, Any]:
-    document: dict[str, Any] = {"notation": notation, "temperature_c": temperature}
-    if isinstance(temperature, str):
-        document["powers_of"] = "T - reference_temperature_c"
-    elif notation == "factors" or temperature is None:
-        document["temperature_c"] = made.reference_temperature
-    for name, item in found.items():
-        profile = getattr(made.profile, name)
-        document[name] = {
-            **{k: v.tolist() for k, v in item.values.items()},
-            "reference_temperature_c": made.reference_temperature,
-            "axes": profile.axes,
-            "standard_uncertainty": {k: v.tolist() for k, v in item.uncertainty.items()},
-            "covariance": item.covariance.tolist(),
-        }
-    return document
 
 
 @cli.command()

@@ -16,6 +16,7 @@ from mwdcal.app.asked import AskedToCompare
 from mwdcal.app.text import WEIGHED, plain, table
 from mwdcal.compare import Comparison, Row, able, compare
 from mwdcal.files import atomic
+from mwdcal.findings import unused_columns
 from mwdcal.profile import Profile
 from mwdcal.readings import SIMULATED, Readings
 
@@ -43,7 +44,8 @@ def run(
     if path:
         write_report(path, found, profile.name, **digests)
     if asked["as_json"]:
-        return bool(able(found.rows)), {**document(found), "report": str(path or "")}
+        also = {"findings": unused_columns(readings.unused), "report": str(path or "")}
+        return bool(able(found.rows)), {**document(found), **also}
     wrote = f"\nwrote {path} (report)" if path else ""
     return bool(able(found.rows)), text(found, asked["parameters"]) + wrote
 

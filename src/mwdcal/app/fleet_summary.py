@@ -16,7 +16,7 @@ import numpy as np
 from mwdcal.app.choices import names
 from mwdcal.app.fleet_asked import Asked
 from mwdcal.app.text import choices, number, plural, table
-from mwdcal.calibration import Choices
+from mwdcal.calibration import Choices, Finding
 from mwdcal.core.vectors import Array
 from mwdcal.files import parquet
 from mwdcal.files.fleet_sources import SERIAL
@@ -58,6 +58,7 @@ class Said:
 class Summary:
     """What came of a fleet. `spread` has the 1 %, 50 % and 99 % point of columns of sound tools.
 
+    `unused` are columns that are not used, of all tools.
     `orders` and `nonlinear`: tools by triad and chosen order, and by triad with own-axis terms.
     """
 
@@ -78,6 +79,7 @@ class Summary:
     parts_done_before: int
     seconds: float
     notes: list[str]
+    unused: list[Finding]
 
     @property
     def sound(self) -> int:
@@ -93,6 +95,7 @@ def summarise(
     before: int,
     seconds: float,
     notes: list[str],
+    unused: list[Finding],
 ) -> Summary:
     """What the output says, read column by column."""
     _, pq = parquet.modules(target.name)
@@ -125,6 +128,7 @@ def summarise(
         parts_done_before=before,
         seconds=round(seconds, 3),
         notes=notes,
+        unused=unused,
     )
 
 
@@ -250,6 +254,8 @@ def _undetermined(whole: Any, columns: list[str]) -> dict[str, int]:
 def document(summary: Summary, report: Path | None) -> dict[str, Any]:
     """The summary for machines."""
     found: dict[str, Any] = msgspec.to_builtins(summary)
+    whole = {"tools": summary.tools, "serials": []}
+    found["findings"] += [{**each, **whole} for each in found.pop("unused")]
     found["tools_per_second"] = round(summary.tools / summary.seconds, 1)
     return {**found, "calibrated": summary.sound, "report": str(report or "")}
 

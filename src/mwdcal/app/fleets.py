@@ -34,6 +34,7 @@ from mwdcal.files.fleet_tables import (
     in_several_folders,
     partitions,
 )
+from mwdcal.findings import unused_columns
 from mwdcal.fleet_choices import PerTool
 from mwdcal.options import Options
 from mwdcal.prior import from_datasheet
@@ -66,6 +67,9 @@ def calibrate_table(asked: Asked, say: Callable[[str], None]) -> Summary:
     source = open_source(asked["runs"])
     if options.order and "temperature_c" not in source.columns:
         raise no_temperature(max(options.orders))
+    unused = unused_columns(source.unused)
+    for finding in unused:
+        say(f"! {finding.text}")
     target = atomic.target(asked["output"])
     _check_target(target, asked["runs"])
     folder = target.with_name(target.name + ".parts")
@@ -85,7 +89,7 @@ def calibrate_table(asked: Asked, say: Callable[[str], None]) -> Summary:
             _merge(paths, made, target, _metadata(source, plan, asked, digest))
         _tidy(folder)
         seconds = time.perf_counter() - begun
-        return summarise(asked, target, source.rows, len(parts), before, seconds, notes)
+        return summarise(asked, target, source.rows, len(parts), before, seconds, notes, unused)
 
 
 @contextlib.contextmanager

@@ -16,9 +16,10 @@ from mwdcal.app.noise_plots import marked, scaled
 from mwdcal.app.text import table
 from mwdcal.calibration import Finding
 from mwdcal.errors import InputError
-from mwdcal.files import atomic, logs
-from mwdcal.files.contract import CHANNELS
+from mwdcal.files import atomic, logs, synonyms
+from mwdcal.files.contract import CHANNELS, COLUMNS
 from mwdcal.files.profiles import load_profile
+from mwdcal.findings import unused_columns
 from mwdcal.noise import ChannelNoise, Noise, Term, check, find_noise
 from mwdcal.readings import SIMULATED
 
@@ -78,8 +79,9 @@ def find(asked: Asked, say: Callable[[str], None]) -> Noise:
     names = [name.strip() for name in asked["columns"].split(",")] if asked["columns"] else []
     profile = load_profile(asked["tool"])[0] if asked["tool"] else None
     slowly = progress.slowly(say)
-    return find_noise(
-        logs.read(asked["log"], names, decimal=asked["decimal"], say=slowly),
+    log = logs.read(asked["log"], names, decimal=asked["decimal"], say=slowly)
+    found = find_noise(
+        log,
         profile=profile,
         sampling_hz=asked["sampling_hz"],
         between=_between(asked),
@@ -87,6 +89,8 @@ def find(asked: Asked, say: Callable[[str], None]) -> Noise:
         kind="modified" if asked["modified"] else "overlapping",
         say=slowly,
     )
+    unused = unused_columns(synonyms.unused(list(log.columns), COLUMNS))
+    return msgspec.structs.replace(found, findings=[*found.findings, *unused])
 
 
 def _files(asked: Asked, found: Noise) -> list[tuple[Path, bytes | str]]:

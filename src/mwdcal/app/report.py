@@ -55,7 +55,7 @@ def render(calibration: Calibration, verdict: Verdict | None = None) -> str:
         findings=_findings(calibration, verdict),
         simulated=is_simulated(calibration.tool),
         facts=_facts(calibration),
-        relative=_relative(calibration),
+        relative=calibration.relative,
         figures=_figures(calibration),
         limit=_limit(calibration),
         decimals=_decimals(calibration),
@@ -164,10 +164,6 @@ def svg(text: str) -> Any:
     return Markup(text)
 
 
-def _relative(calibration: Calibration) -> bool:
-    return calibration.has_field and calibration.field_unit != "nT"
-
-
 def banner(calibration: Calibration, verdict: Verdict | None) -> dict[str, str]:
     """The outcome in plain words: level (good, attention, bad), word, headline, second line."""
     fit, level = _fit_outcome(calibration)
@@ -195,7 +191,7 @@ def _fit_outcome(calibration: Calibration) -> tuple[str, str]:
     undetermined = f"{', '.join(free)} undetermined"
     if free and doubts:
         parts.append(undetermined)
-    if _relative(calibration):
+    if calibration.relative:
         parts.append("magnetic field relative, not in nT")
     again = sum(row.reshoot for row in calibration.station_rows)
     if again:
@@ -236,6 +232,7 @@ def _facts(calibration: Calibration) -> list[tuple[str, str]]:
         ("Measured", tool.get("date", "")),
         ("Run file", calibration.run or "not named"),
         ("Stations", _attitudes(calibration)),
+        ("Excluded", ", ".join(calibration.excluded)),
         ("Temperature", _temperatures(calibration)),
         ("Method", "; ".join(method)),
         ("Stand", tool.get("stand", "")),
@@ -395,7 +392,7 @@ def _degrees(angle: float) -> str:
 def _earth(calibration: Calibration) -> list[tuple[str, str, str]]:
     """Gravity, field and dip of the run: name, value with unit, and where it comes from."""
     estimated = {c.name: c for c in calibration.constants}
-    nanotesla = "" if _relative(calibration) else "nT"
+    nanotesla = "" if calibration.relative else "nT"
     keys = (("gravity", "gravity_g", "g"), ("field", "field", nanotesla), ("dip", "dip_deg", "°"))
     rows = []
     for name, key, symbol in keys:
@@ -406,7 +403,7 @@ def _earth(calibration: Calibration) -> list[tuple[str, str, str]]:
         if name in estimated:
             text, sd = measured(value, estimated[name].standard_uncertainty)
             source = f"estimated from the run, 1σ {sd}{unit(symbol)}"
-        elif name == "field" and _relative(calibration):
+        elif name == "field" and calibration.relative:
             text, source = "1", "by convention: the strength is known at no station"
         rows.append((f"mean {name}", f"{text}{unit(symbol)}", source))
     for c in calibration.constants:

@@ -20,6 +20,7 @@ from typing import IO, Any, NamedTuple, TypeVar
 
 import numpy as np
 
+from mwdcal import strengths
 from mwdcal.calibration import MARGIN, Calibration, Finding
 from mwdcal.core import fused
 from mwdcal.core.vectors import AnyArray, Array, Bools
@@ -34,15 +35,17 @@ from mwdcal.correction import (
     reference,
     result_names,
     undetermined,
+    warmth,
 )
 from mwdcal.errors import InputError
-from mwdcal.files import atomic, parquet, runs, streams
+from mwdcal.files import atomic, parquet, runs, streams, synonyms
 from mwdcal.files.columns import no_stations
-from mwdcal.files.contract import CHANNELS, RAW, RAW_RANGE, TEMPERATURE, check_columns
+from mwdcal.files.contract import CHANNELS, COLUMNS, RAW, RAW_RANGE, TEMPERATURE, check_columns
 from mwdcal.files.sinks import ParquetSink, Sink, TextSink
 from mwdcal.files.streams import Part, Source
 from mwdcal.files.table import Table, cell_error, check_header
 from mwdcal.files.table import numbers as as_numbers
+from mwdcal.findings import unused_columns
 from mwdcal.profile import TriadProfile
 from mwdcal.readings import TRIADS, Readings
 
@@ -108,6 +111,7 @@ def apply_to_file(
     check_outside(outside)
     source = _source(readings, output, rows, decimal)
     _check_header(source, outside)
+    check_warmth(calibration, source.names, source.name)
     pieces = source.pieces()
     first = next((piece for piece in pieces if _loaded(source, piece).table.count), None)
     if first is None:
@@ -126,8 +130,9 @@ def apply_to_file(
         if total.lacking == total.rows:
             raise nothing(source.name)
         found = findings(calibration, worker.heard(total.serials), total, outside)
+        strengths.check(calibration, total.strengths, source.name)
         sink.finish([finding.text for finding in found])
-    return total, found
+    return total, found + unused_columns(synonyms.unused(source.names, COLUMNS))
 
 
 def overlapped(items: Iterator[Item], work: Callable[[Item], Made]) -> Iterator[Made]:
@@ -163,6 +168,12 @@ def _check_header(source: Source, outside: str) -> None:
     check_free(source.names, result_names(outside), source.name)
 
 
+def check_warmth(calibration: Calibration, names: Sequence[str], source: str) -> None:
+    """Refuse a temperature under another name or in another unit where it is needed."""
+    if any(triad.order for triad in calibration.triads):
+        synonyms.check_temperature(names, source)
+
+
 def check_free(names: Iterable[str], results: Sequence[str], source: str) -> None:
     """Refuse a table that has a column of the name of a result."""
     taken = [name for name in results if name in names]
@@ -192,9 +203,11 @@ def _total(tallies: Sequence[Tally]) -> Tally:
     moved = {name for tally in tallies for name in tally.moved}
     rows, beyond, lacking = np.sum([(t.rows, t.beyond, t.lacking) for t in tallies], 0).tolist()
     serials = runs.serials({}, chain.from_iterable(tally.serials for tally in tallies))
+    lows, highs = zip(*(tally.warmth for tally in tallies), strict=True)
     return Tally(
-        rows, beyond, tuple(name for name in JUDGED if name in moved), lacking, tuple(serials)
-    )
+        rows, beyond, tuple(name for name in JUDGED if name in moved), lacking, tuple(serials),
+        strengths.total(tally.strengths for tally in tallies), (min(lows), max(highs)),
+    )  # fmt: skip
 
 
 class Rules(NamedTuple):
@@ -262,7 +275,10 @@ class _Worker:
         judged = JUDGED if self.calibration.free else ()
         lacking = 0 if self.rules.missing == "refuse" else _MOST
         said = self.heard(("\0" * LONGEST, "\1" * LONGEST, "…"))
-        most = findings(self.calibration, said, Tally(_MOST, _MOST, judged, lacking), how)
+        worst = strengths.Strengths(_MOST, _MOST, _MOST, _MOST, -1.23e-100, -1.24e-100)
+        off = dict.fromkeys(strengths.COLUMNS, worst)
+        tally = Tally(_MOST, _MOST, judged, lacking, (), off, (TEMPERATURE.low, TEMPERATURE.high))
+        most = findings(self.calibration, said, tally, how)
         longest = [finding.text for finding in most]
         delimiter = "," if suffix == ".csv" else "\t"
         return TextSink(stream, self.source.schema, results, metadata, longest, delimiter)
@@ -284,17 +300,23 @@ class _Worker:
             channels, found = self._found(table)
         if found.unsound:
             self._refuse(table)
+        known: Mapping[str, Array] = {}
         if any(name.startswith(("ref_", "sd_")) for name in table.columns):
             kinds = [kind for kind in TRIADS if channels[kind] is not None]
-            runs.check_references(table, self.calibration.profile, kinds)
+            known = runs.check_references(table, self.calibration.profile, kinds)
         moved = self._undetermined(channels, table.count)
-        results: list[AnyArray] = [*found.columns]
+        columns = dict(zip(NAMES, found.columns, strict=True))
+        results: list[AnyArray] = [*columns.values()]
         if self.rules.outside == "extrapolate":
             results.append(self._beyond(channels, table.count))
         if whole is not None:
             results = [spread(values, whole) for values in results]
         rendered = sink.render(part.carried, results, bool(found.empty) or whole is not None)
-        tally = Tally(rows, found.beyond, moved, rows - table.count, self._serials(part.carried))
+        tally = Tally(
+            rows, found.beyond, moved, rows - table.count, self._serials(part.carried),
+            strengths.judged(self.calibration, columns, known),
+            warmth(channels["temperature"][0] if channels["temperature"] else None),
+        )  # fmt: skip
         return Corrected(rendered, part.size, tally)
 
     def _serials(self, carried: Any) -> tuple[str, ...]:

@@ -11,6 +11,7 @@ import numpy as np
 from mwdcal.app.streaming import (
     apply_to_file,
     check_free,
+    check_warmth,
     chosen,
     described,
     in_parts,
@@ -26,6 +27,7 @@ from mwdcal.files.columns import as_text
 from mwdcal.files.contract import check_columns
 from mwdcal.files.runs import to_readings
 from mwdcal.files.table import Table
+from mwdcal.findings import unused_columns
 
 
 def apply_to_any(
@@ -60,6 +62,7 @@ def apply_to_table(
 ) -> tuple[Table, Tally, list[Finding]]:
     """The input's columns and metadata, the results, and what the calibration was."""
     check_columns(list(source.columns), source.source)
+    check_warmth(calibration, list(source.columns), source.source)
     whole = np.ones(source.count, bool)
     if missing == "blank":
         whole = ~lacking(source, wholly_blank([source]))
@@ -74,4 +77,4 @@ def apply_to_table(
     if findings:
         metadata["findings"] = [finding.text for finding in findings]
     made = replace(source, columns={**source.columns, **columns}, metadata=metadata)
-    return made, tally, findings
+    return made, tally, findings + unused_columns(readings.unused)

@@ -81,7 +81,9 @@ def heading(calibration: Calibration) -> str:
     how = ", ".join(
         [f"method {calibration.method}", model(calibration), *choices(calibration.options)]
     )
-    return "   ".join(parts) + "\n" + "   ".join([how, *ranks])
+    left_out = ["left out by --exclude: station " + ", ".join(calibration.excluded)]
+    lines = ["   ".join(parts), "   ".join([how, *ranks])]
+    return "\n".join(lines + (left_out if calibration.excluded else []))
 
 
 def model(calibration: Calibration) -> str:

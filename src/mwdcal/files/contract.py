@@ -9,6 +9,7 @@ from math import pi
 from typing import NamedTuple
 
 from mwdcal.errors import InputError
+from mwdcal.files.synonyms import CONVERSIONS, resembled
 
 CHANNELS = {"accelerometer": ("ax", "ay", "az"), "magnetometer": ("mx", "my", "mz")}
 RAW = tuple(name for triad in CHANNELS.values() for name in triad)
@@ -96,9 +97,12 @@ def check_near_misses(names: Collection[str], contract: Sequence[str], what: str
     for name in names:
         meant = next((expected[form] for form in _forms(name) if form in expected), None)
         if meant is not None and name not in contract:
+            alike = resembled(name)
+            unit = alike.unit if alike else ""
+            how = CONVERSIONS.get(unit, "and convert its unit")
             raise InputError(
                 f"{what} '{name}' must be spelled exactly as documented. Did you mean "
-                f"'{meant}'? Rename it (and convert its unit), or choose a different name."
+                f"'{meant}'? Rename it ({how}), or choose a different name."
             )
 
 

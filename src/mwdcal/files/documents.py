@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import inspect
 import json
 import os
@@ -38,6 +39,11 @@ def write(path: str | os.PathLike[str], calibration: Calibration) -> None:
 
 def read(path: str | os.PathLike[str]) -> Calibration:
     """Read a calibration file, or say what is wrong with it."""
+    return load(path)[0]
+
+
+def load(path: str | os.PathLike[str]) -> tuple[Calibration, str]:
+    """The same, with the SHA-256 of the file's bytes."""
     name = Path(path).name
     try:
         data = Path(path).read_bytes()
@@ -51,11 +57,12 @@ def read(path: str | os.PathLike[str]) -> Calibration:
                 f"{name}: 'schema_version' must be {SCHEMA_VERSION}; got {version!r}. It is no "
                 "calibration file, or one of another version of mwdcal: calibrate again."
             )
-        return check(msgspec.json.decode(data, type=Calibration), name)
+        found = check(msgspec.json.decode(data, type=Calibration), name)
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
         raise InputError(
             f"{name} is not a calibration file: {error}. Use a file that mwdcal calibrate wrote."
         ) from None
+    return found, hashlib.sha256(data).hexdigest()
 
 
 def check(calibration: Calibration, name: str) -> Calibration:

@@ -149,12 +149,10 @@ def _calibrated(rows: Rows, batch: Batch, plan: Plan) -> Outcome:
 
 
 def _field_unit(batch: Batch) -> AnyArray:
-    """Unit of the calibrated field: "nT", or "relative (field = 1)"; None without magnetometer."""
-    none = np.full(len(batch.tools), None, object)
-    if batch.readings.magnetometer is None:
-        return none
-    unknown = np.isnan(batch.readings.reference("field")).all(-1)
-    return np.where(unknown, "relative (field = 1)", "nT").astype(object)
+    """Unit of the calibrated field (B,), one for a batch of one kind; None without magnetometer."""
+    readings = batch.readings
+    unit = None if readings.magnetometer is None else readings.field_unit
+    return np.full(len(batch.tools), unit, object)
 
 
 def _table(

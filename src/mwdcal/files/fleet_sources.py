@@ -16,7 +16,7 @@ from urllib.parse import unquote
 import msgspec
 
 from mwdcal.errors import InputError
-from mwdcal.files import contract, parquet
+from mwdcal.files import contract, parquet, synonyms
 from mwdcal.files.azimuths import magnetic_offset
 from mwdcal.files.columns import LABELS
 from mwdcal.files.contract import REFERENCES
@@ -70,6 +70,11 @@ class Source:
         """The columns that a run has, and the serial."""
         known = (*contract.COLUMNS, SERIAL, OFFSET)
         return tuple(name for name in self.columns if name in known)
+
+    @property
+    def unused(self) -> tuple[str, ...]:
+        """The columns that are not used, each with what it resembles."""
+        return synonyms.unused(self.columns, self.used)
 
     @property
     def fingerprint(self) -> str:
@@ -246,6 +251,7 @@ def _check_columns(names: Sequence[str], source: str) -> None:
             f"{', '.join(repr(n) for n in names[:20])}.{hint}"
         )
     contract.check_columns(list(names), source)
+    synonyms.check_evidence(names, source)
 
 
 _NEAR = (

@@ -15,11 +15,13 @@ import numpy as np
 
 from mwdcal.core.vectors import AnyArray, Array, Bools
 from mwdcal.errors import InputError
+from mwdcal.files import synonyms
 from mwdcal.files import table as tables
 from mwdcal.files.azimuths import magnetic_offset
 from mwdcal.files.columns import Column
 from mwdcal.files.contract import (
     CHANNELS,
+    COLUMNS,
     RAW_RANGE,
     RAW_SPREAD,
     REFERENCES,
@@ -52,7 +54,10 @@ def read_run(
 
 
 def check_run(table: Table) -> None:
-    """Refuse a table of several tools, which is a fleet, and a continuous log."""
+    """Refuse a table of several tools, a continuous log, and references under other names."""
+    names = list(table.columns)
+    check_columns(names, table.source)
+    synonyms.check_evidence(names, table.source)
     found = serials(table.metadata, _serial_cells(table))
     if len(found) > 1:
         raise InputError(
@@ -119,13 +124,16 @@ def to_readings(table: Table, profile: Profile) -> tuple[Readings, Profile]:
         digest=_digests([*triads.values()]),
         metadata=identified(table.metadata, _serial_cells(table)),
         source=table.source,
+        unused=synonyms.unused(list(table.columns), COLUMNS),
     )
     return readings, profile
 
 
-def check_references(table: Table, profile: Profile, kinds: list[str]) -> None:
-    """Refuse what `to_readings` refuses in references and uncertainties of triads `kinds`."""
-    _uncertainties(table, profile, kinds, list(_known(table)))
+def check_references(table: Table, profile: Profile, kinds: list[str]) -> dict[str, Array]:
+    """The references of a table; refuses what `to_readings` refuses in them and in triads `kinds`."""
+    known = _known(table)
+    _uncertainties(table, profile, kinds, list(known))
+    return known
 
 
 def from_readings(
