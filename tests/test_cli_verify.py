@@ -150,6 +150,9 @@ def test_the_guarded_rule_takes_twice_the_uncertainty_off(tmp_path, fitted):
     assert failed(judged(fitted[0], run, "--limits", guarded)) == {"error of azimuth"}
 
 
+NUMBERS = ("raw", "value", "uncertainty", "limit")
+
+
 def test_the_text_holds_the_numbers_of_the_json(tmp_path, fitted):
     run = roll(tmp_path, ax=lambda r: r["ax"] + 5e-3 * SCALE[0])
     said = mwdcal("verify", fitted[0], run)
@@ -158,7 +161,7 @@ def test_the_text_holds_the_numbers_of_the_json(tmp_path, fitted):
     lines = [" ".join(line.split()) for line in said.out.splitlines()]
     for name, row in judged(fitted[0], run).items():
         gap = "" if row["unit"] == "°" else " "
-        numbers = [f"{row[k]:.3g}{gap}{row['unit']}" for k in ("value", "uncertainty", "limit")]
+        numbers = [f"{row[k]:.3g}{gap}{row['unit']}" for k in NUMBERS]
         word = "pass" if row["passed"] else "FAIL"
         assert f"{name} {' '.join(numbers)} {word} {row['note']}" in lines
 
@@ -223,15 +226,14 @@ def test_data_of_the_fit_without_magnetometer_cannot_verify_it(tmp_path, fitted)
 def test_a_limit_on_an_undetermined_direction_cannot_be_passed(tmp_path):
     """No toolface reference: the zero of toolface is free, whatever the roll test shows.
 
-    A block of one attitude: its spread of toolface does not move with that zero and passes.
+    The spread of the error of toolface does not move with that zero and passes.
     """
     run = simulated(PLAN, 1)
     run["ref_toolface_deg"] = np.full(48, np.nan)
     calibration = calibrated(tmp_path, run)
     entries = json.loads(calibration.read_bytes())["accelerometer"]["undetermined"]
     assert [e["id"] for e in entries] == ["toolface-zero"]
-    still = simulate.Plan(*(np.full(5, v) for v in (45 * DEG, 60 * DEG, 30 * DEG, 25.0)))
-    test = write_csv(tmp_path / "roll.csv", simulated(still, 8))
+    test = write_csv(tmp_path / "roll.csv", simulated(ROLL, 8))
     names = ("inclination", "azimuth", "toolface", "dip")
     kinds = "\n".join(
         [f"[{kind}]\n" + "\n".join(f"{n}_deg = 90" for n in names) for kind in ("spread", "error")]
