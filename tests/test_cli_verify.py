@@ -1,5 +1,6 @@
 """`mwdcal verify`: a knocked tool fails on the limit that its knock moves, and only independent data count."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -166,6 +167,26 @@ def test_the_text_holds_the_numbers_of_the_json(tmp_path, fitted):
         assert f"{name} {' '.join(numbers)} {word} {row['note']}" in lines
 
 
+@pytest.mark.parametrize("toolfaces", [[40] * 12, [0, 5, 10]], ids=["one", "three close ones"])
+@pytest.mark.parametrize("references", [True, False], ids=["references", "group"])
+def test_a_knocked_tool_that_was_not_rolled_never_exits_with_0(
+    tmp_path, fitted, toolfaces, references
+):
+    """Knocked by 8 mg and 600 nT along x: rolled it fails, at one toolface it looks good."""
+    still = simulate.Plan(*(np.full(len(toolfaces), v) for v in (45 * DEG, 60 * DEG, 0.0, 25.0)))
+    run = simulated(dataclasses.replace(still, toolface=np.array(toolfaces) * DEG), 5)
+    run = {**run, "ax": run["ax"] + 8e-3 * SCALE[0], "mx": run["mx"] + 600 * SCALE[1]}
+    if not references:
+        run = {k: v for k, v in run.items() if not k.startswith("ref_")}
+        run["group"] = ["A"] * len(toolfaces)
+    ran = mwdcal("verify", fitted[0], write_csv(tmp_path / "still.csv", run))
+    assert ran.code == 1
+    assert ran.out.startswith("FAIL   still.csv")
+    assert ran.out.count("cannot be passed") == (5 if references else 3)
+    assert "Add toolfaces there" in ran.out
+    assert "nan" not in ran.out
+
+
 COPIES = {
     "the run itself": lambda run: run,
     "other labels": lambda run: {**run, "station": [f"new {i}" for i in range(48)]},
@@ -277,6 +298,16 @@ def test_a_test_that_no_limit_applies_to_is_refused(tmp_path, fitted):
     run = {k: v[:2] for k, v in simulated(ROLL, 2).items() if not k.startswith("ref_")}
     message = refused(mwdcal("verify", fitted[0], write_csv(tmp_path / "r.csv", run)), 2)
     assert "no limit of 'roll-test' applies" in message
+
+
+def test_a_test_of_the_same_soak_is_not_refused(tmp_path, fitted):
+    """The calibration has no temperature terms and was made at 25 °C."""
+    run = {**simulated(ROLL, 2), "temperature_c": np.full(12, 27.5)}
+    ran = mwdcal("verify", fitted[0], write_csv(tmp_path / "r.csv", run))
+    assert ran.code == 0
+    assert "12 of 12 stations (27.5 °C) lie outside the calibrated range 25.0 °C" in ran.err
+    out = tmp_path / "o.csv"
+    assert mwdcal("apply", fitted[0], tmp_path / "r.csv", "-o", out).err == ""
 
 
 def test_a_test_outside_the_calibrated_temperatures_is_refused(tmp_path, fitted):

@@ -28,7 +28,8 @@ CARRIED = 2.0
 """Largest standard uncertainty of the curve anywhere on the circle, in noises of one reading."""
 CHANCE = 1e-3
 """Residuals from the curve less likely than this are not what the stated noise leaves."""
-STEPS = 90
+STEPS = 120
+"""Toolfaces at which a curve is looked at: its range comes out at most 0.14 % too small."""
 PAIRS = 500
 SEED = 1
 
