@@ -242,8 +242,8 @@ def _judged(
             "angles do not show a misalignment of x and y): add toolfaces between them."
         )
         told.append(Finding(id="harmonic-unseen", text=text))
+    most = max((shown.raw * factor for shown in found.shown), default=None)
     if found.blocked:
-        most = max((shown.raw * factor for shown in found.shown), default=None)
         row = VerdictRow(
             name=title, unit=unit, value=None if found.unrolled else most, uncertainty=None,
             limit=limit, passed=False, note=f"cannot be passed: {found.blocked}", raw=most,
@@ -254,7 +254,7 @@ def _judged(
     passed = value + guard * sd <= limit
     row = VerdictRow(
         name=title, unit=unit, value=value, uncertainty=sd, limit=limit, passed=passed,
-        note=f"{worst.where}{_remark(value, sd, limit, passed)}", raw=worst.raw * factor,
+        note=f"{worst.where}{_remark(value, sd, limit, passed)}", raw=most,
         harmonics=_harmonics(worst, factor),
     )  # fmt: skip
     return row, [*told, *_weak(row), *_causes(row, name, worst)]
