@@ -307,7 +307,12 @@ standard deviation of counting.
 
 The simple rule shares the risk: near a limit every other verdict is wrong, either way. The guarded one
 puts it all on the tool: a wrong PASS is rare, and a tool whose true figure is less than about 4σ under
-the limit may fail. That is its price, and the FAIL says so where the value itself is within the limit.
+the limit may fail. That is its price, and the FAIL says so where the value itself is within the limit. At
+0.5 mg one σ of the spread of inclination is a quarter of its limit: average longer before you guard.
+
+What is stated knows nothing of how many tools are good. Where all are, no PASS is wrong and more FAILs are than
+stated. And a spread far below its limit is known better than stated: it cannot be negative, and its 1σ holds the
+size of the bias taken off.
 
 ## Each limit, knocked tools, simple rule
 

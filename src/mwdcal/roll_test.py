@@ -172,17 +172,14 @@ def extent(curve: Curve) -> Extent:
     scale = np.where(curve.calm, curve.scale, 1.0)
     root = _root(curve.covariance) * scale[..., None, None]
     moved = np.einsum("...ij,dj->...di", root, _draws())
-    centre = curve.coefficients[..., None, :]
-    wide, far = _measures(centre)
-    wide_drawn, far_drawn = _measures(centre + moved)
-    return Extent(*_corrected(wide, wide_drawn), *_corrected(far, far_drawn))
+    wide, far = _measures(curve.coefficients[..., None, :] + moved)
+    return Extent(*_corrected(wide), *_corrected(far))
 
 
-def _corrected(fitted_value: Array, drawn: Array) -> tuple[Array, Array]:
-    """Value (...) without the bias of the draws (..., d), and its standard uncertainty."""
-    bias = drawn - fitted_value
-    value = np.maximum(fitted_value[..., 0] - bias.mean(-1), 0.0)
-    return value, np.sqrt(np.mean(bias**2, -1))
+def _corrected(drawn: Array) -> tuple[Array, Array]:
+    """The first of (..., d) values without the bias of the others, and its standard uncertainty."""
+    own, bias = drawn[..., 0], drawn[..., 1:] - drawn[..., :1]
+    return np.maximum(own - bias.mean(-1), 0.0), np.sqrt(np.mean(bias**2, -1))
 
 
 def ends(curve: Curve) -> tuple[Array, Array, Array]:
@@ -211,8 +208,8 @@ def _root(covariance: Array) -> Array:
 
 @cache
 def _draws() -> Array:
-    """Draws (2 · PAIRS, 5) in opposite pairs, of mean zero and covariance one exactly."""
+    """Zero, then draws (2 · PAIRS, 5) in opposite pairs, of mean zero and covariance one exactly."""
     drawn = np.random.default_rng(SEED).normal(size=(PAIRS, COEFFICIENTS))
     square = drawn.swapaxes(-1, -2) @ drawn / PAIRS
     even = np.linalg.solve(np.linalg.cholesky(square), drawn.swapaxes(-1, -2)).swapaxes(-1, -2)
-    return np.concatenate([even, -even])
+    return np.concatenate([np.zeros((1, COEFFICIENTS)), even, -even])
