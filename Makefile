@@ -3,7 +3,7 @@
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: papers measured help demo test check bench docs clean
+.PHONY: papers measured verification help demo test check bench docs clean
 
 PYTHON ?= python3
 VENV := .venv
@@ -59,6 +59,9 @@ measured: $(INSTALLED) ## calibrate the measured sets (MWDCAL_DATA) and rewrite 
 
 papers: $(INSTALLED) ## recompute the papers and rewrite their pages and figures (a minute or two)
 	@$(CLOCK); for name in moradi moosavi ivanov; do $(ONE_THREAD) $(BIN)/python examples/papers/$$name.py; done
+
+verification: $(INSTALLED) ## count wrong verdicts of simulated roll tests and rewrite docs/verification.md (two minutes)
+	@$(CLOCK); $(ONE_THREAD) $(BIN)/python examples/verification/verification.py
 
 docs: $(INSTALLED) ## build the documentation into build/docs
 	@$(CLOCK); $(BIN)/sphinx-build -q -W --keep-going -b html docs build/docs; \

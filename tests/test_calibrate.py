@@ -240,8 +240,21 @@ def test_temperature_outside_and_missing():
     record = calibrate(data, PROFILE, Options(order=1))
     assert not record.outside(data).any()
     assert record.outside(msgspec_replace(data, temperature=data.temperature + 200)).all()
+    hottest = msgspec_replace(data, temperature=np.full(data.count, data.temperature.max()))
+    for added, beyond in ((0.9, False), (1.1, True)):
+        moved = msgspec_replace(hottest, temperature=hottest.temperature + added)
+        assert record.outside(moved).all() == record.outside(moved).any() == beyond
     with pytest.raises(InputError, match="temperature_c"):
         record.fields(msgspec_replace(data, temperature=None))
+
+
+def test_without_temperature_terms_a_calibration_holds_for_its_soak():
+    """Temperatures up to 5 °C apart are one soak: as far as that from the calibrated ones."""
+    data = msgspec_replace(make(), temperature=np.full(48, 25.0))
+    record = calibrate(data, PROFILE)
+    for temperature, beyond in ((20.1, False), (29.9, False), (19.9, True), (30.1, True)):
+        moved = msgspec_replace(data, temperature=np.full(48, temperature))
+        assert record.outside(moved).all() == record.outside(moved).any() == beyond
 
 
 def test_soaks_are_told_apart_by_gaps():

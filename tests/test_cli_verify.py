@@ -1,5 +1,6 @@
 """`mwdcal verify`: a knocked tool fails on the limit that its knock moves, and only independent data count."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -150,6 +151,9 @@ def test_the_guarded_rule_takes_twice_the_uncertainty_off(tmp_path, fitted):
     assert failed(judged(fitted[0], run, "--limits", guarded)) == {"error of azimuth"}
 
 
+NUMBERS = ("raw", "value", "uncertainty", "limit")
+
+
 def test_the_text_holds_the_numbers_of_the_json(tmp_path, fitted):
     run = roll(tmp_path, ax=lambda r: r["ax"] + 5e-3 * SCALE[0])
     said = mwdcal("verify", fitted[0], run)
@@ -158,9 +162,29 @@ def test_the_text_holds_the_numbers_of_the_json(tmp_path, fitted):
     lines = [" ".join(line.split()) for line in said.out.splitlines()]
     for name, row in judged(fitted[0], run).items():
         gap = "" if row["unit"] == "°" else " "
-        numbers = [f"{row[k]:.3g}{gap}{row['unit']}" for k in ("value", "uncertainty", "limit")]
+        numbers = [f"{row[k]:.3g}{gap}{row['unit']}" for k in NUMBERS]
         word = "pass" if row["passed"] else "FAIL"
         assert f"{name} {' '.join(numbers)} {word} {row['note']}" in lines
+
+
+@pytest.mark.parametrize("toolfaces", [[40] * 12, [0, 5, 10]], ids=["one", "three close ones"])
+@pytest.mark.parametrize("references", [True, False], ids=["references", "group"])
+def test_a_knocked_tool_that_was_not_rolled_never_exits_with_0(
+    tmp_path, fitted, toolfaces, references
+):
+    """Knocked by 8 mg and 600 nT along x: rolled it fails, at one toolface it looks good."""
+    still = simulate.Plan(*(np.full(len(toolfaces), v) for v in (45 * DEG, 60 * DEG, 0.0, 25.0)))
+    run = simulated(dataclasses.replace(still, toolface=np.array(toolfaces) * DEG), 5)
+    run = {**run, "ax": run["ax"] + 8e-3 * SCALE[0], "mx": run["mx"] + 600 * SCALE[1]}
+    if not references:
+        run = {k: v for k, v in run.items() if not k.startswith("ref_")}
+        run["group"] = ["A"] * len(toolfaces)
+    ran = mwdcal("verify", fitted[0], write_csv(tmp_path / "still.csv", run))
+    assert ran.code == 1
+    assert ran.out.startswith("FAIL   still.csv")
+    assert ran.out.count("cannot be passed") == (5 if references else 3)
+    assert "Add toolfaces there" in ran.out
+    assert "nan" not in ran.out
 
 
 COPIES = {
@@ -223,15 +247,14 @@ def test_data_of_the_fit_without_magnetometer_cannot_verify_it(tmp_path, fitted)
 def test_a_limit_on_an_undetermined_direction_cannot_be_passed(tmp_path):
     """No toolface reference: the zero of toolface is free, whatever the roll test shows.
 
-    A block of one attitude: its spread of toolface does not move with that zero and passes.
+    The spread of the error of toolface does not move with that zero and passes.
     """
     run = simulated(PLAN, 1)
     run["ref_toolface_deg"] = np.full(48, np.nan)
     calibration = calibrated(tmp_path, run)
     entries = json.loads(calibration.read_bytes())["accelerometer"]["undetermined"]
     assert [e["id"] for e in entries] == ["toolface-zero"]
-    still = simulate.Plan(*(np.full(5, v) for v in (45 * DEG, 60 * DEG, 30 * DEG, 25.0)))
-    test = write_csv(tmp_path / "roll.csv", simulated(still, 8))
+    test = write_csv(tmp_path / "roll.csv", simulated(ROLL, 8))
     names = ("inclination", "azimuth", "toolface", "dip")
     kinds = "\n".join(
         [f"[{kind}]\n" + "\n".join(f"{n}_deg = 90" for n in names) for kind in ("spread", "error")]
@@ -275,6 +298,16 @@ def test_a_test_that_no_limit_applies_to_is_refused(tmp_path, fitted):
     run = {k: v[:2] for k, v in simulated(ROLL, 2).items() if not k.startswith("ref_")}
     message = refused(mwdcal("verify", fitted[0], write_csv(tmp_path / "r.csv", run)), 2)
     assert "no limit of 'roll-test' applies" in message
+
+
+def test_a_test_of_the_same_soak_is_not_refused(tmp_path, fitted):
+    """The calibration has no temperature terms and was made at 25 °C."""
+    run = {**simulated(ROLL, 2), "temperature_c": np.full(12, 27.5)}
+    ran = mwdcal("verify", fitted[0], write_csv(tmp_path / "r.csv", run))
+    assert ran.code == 0
+    assert "12 of 12 stations (27.5 °C) lie outside the calibrated range 25.0 °C" in ran.err
+    out = tmp_path / "o.csv"
+    assert mwdcal("apply", fitted[0], tmp_path / "r.csv", "-o", out).err == ""
 
 
 def test_a_test_outside_the_calibrated_temperatures_is_refused(tmp_path, fitted):

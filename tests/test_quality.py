@@ -4,11 +4,18 @@ import numpy as np
 import pytest
 
 from mwdcal.calibrate import calibrate
+from mwdcal.errors import InputError
+from mwdcal.options import Options
 from mwdcal.quality import Bounds, Limits, verify
 from mwdcal.readings import Readings
-from simulation import Tool, plan
+from simulation import DEG, Tool, plan
 from test_calibrate import NOISE, PROFILE, make, msgspec_replace
 
+BOTH = Limits(
+    name="both",
+    spread=Bounds(inclination_deg=0.1, azimuth_deg=1, gravity_g=0.003),
+    error=Bounds(inclination_deg=0.25, azimuth_deg=2),
+)
 SPREADS = Limits(name="spreads", spread=Bounds(inclination_deg=0.1, azimuth_deg=1, gravity_g=0.003))
 
 
@@ -17,17 +24,32 @@ def record():
     return calibrate(make(), PROFILE)
 
 
-def roll(inclination, seed=9, sd=NOISE, **known):
-    tool = Tool.random(7)
-    inc, azi, face = plan((inclination,))
-    azi = np.full_like(azi, 1.0)
+def roll(inclination, seed=9, sd=NOISE, tool=None, toolfaces=None, **known):
+    """Readings of one direction at twelve toolfaces, or others (degrees), with references."""
+    tool = tool or Tool.random(7)
+    face = plan((45,))[2] if toolfaces is None else np.asarray(toolfaces) * DEG
+    inc, azi = np.full(len(face), inclination * DEG), np.full(len(face), 1.0)
     a, m = tool.readings(np.random.default_rng(seed), 1, inc, azi, face)
     values = {"inclination": inc, "azimuth": azi, "toolface": face, **known}
     return Readings(a[0], m[0], known=values, sd=sd, source="roll.csv")
 
 
-def test_a_good_tool_passes_and_its_spread_uncertainty_is_honest(record):
-    """Spread of |g| over two stations: its uncertainty against the scatter over many runs."""
+def knocked(mg=8.0, nanotesla=600.0, **others):
+    """The tool of the calibration after a knock: biases across its axis."""
+    tool = Tool.random(7, **others)
+    tool.offset = tool.offset + np.array([[mg * 1e-3, 0, 0], [nanotesla, 0, 0]])
+    return tool
+
+
+def rows_of(result):
+    return {row.name: row for row in result.rows}
+
+
+def ids(result):
+    return [finding.id for finding in result.findings]
+
+
+def test_a_good_tool_passes(record):
     rows = [verify(record, roll(45, seed), SPREADS) for seed in range(40)]
     assert all(result.passed for result in rows)
     assert {row.name for row in rows[0].rows} == {
@@ -40,8 +62,13 @@ def test_a_good_tool_passes_and_its_spread_uncertainty_is_honest(record):
 def test_an_error_common_to_the_run_cancels_in_a_spread_and_counts_in_an_error(record):
     common = {**NOISE, "gravity": np.array(0.01)}
     limits = Limits(name="g", spread=Bounds(gravity_g=0.003), error=Bounds(gravity_g=0.003))
-    exact = {row.name: row.uncertainty for row in verify(record, roll(45), limits).rows}
-    loose = {row.name: row.uncertainty for row in verify(record, roll(45, sd=common), limits).rows}
+    exact, loose = (
+        {
+            row.name: row.uncertainty
+            for row in verify(record, roll(45, sd=sd, gravity=np.ones(12)), limits).rows
+        }
+        for sd in (NOISE, common)
+    )
     assert loose["spread of gravity"] == pytest.approx(exact["spread of gravity"])
     assert loose["error of gravity"] == pytest.approx(np.hypot(exact["error of gravity"], 0.01))
 
@@ -69,3 +96,273 @@ def test_guarded_rule_takes_the_uncertainty_off_the_limit(record):
     tight = Bounds(inclination_deg=row.value + row.uncertainty)
     assert verify(record, roll(45), Limits(name="t", spread=tight)).passed
     assert not verify(record, roll(45), Limits(name="t", spread=tight, rule="guarded")).passed
+
+
+UNROLLED = {
+    "one": np.full(12, 40),
+    "three close ones": np.array([0, 5, 10]),
+    "half a circle": np.arange(12) * 15,
+}
+KNOWN = {
+    "group": {},
+    "nothing": {},
+    "references": {"inclination", "azimuth", "toolface"},
+    "group and references": {"inclination", "azimuth"},
+}
+
+
+@pytest.mark.parametrize("known", KNOWN)
+@pytest.mark.parametrize("toolfaces", UNROLLED.values(), ids=UNROLLED)
+def test_a_tool_that_was_not_rolled_cannot_pass(record, toolfaces, known):
+    """Knocked by 8 mg and 600 nT: 0.65° of inclination over a turn, next to nothing at one toolface."""
+    for seed in range(4):
+        test = roll(45, seed, tool=knocked(), toolfaces=toolfaces)
+        group = np.zeros(len(toolfaces), int) if known.startswith("group") else None
+        kept = {k: v for k, v in test.known.items() if k in KNOWN[known]}
+        result = verify(record, msgspec_replace(test, known=kept, group=group), BOTH)
+        assert not result.passed
+        for row in result.rows:
+            assert not row.passed
+            assert row.value is row.uncertainty is None
+            assert "leave a gap of" in row.note
+            assert "Add toolfaces there" in row.note
+    turned = verify(record, roll(45, tool=knocked()), BOTH)
+    assert rows_of(turned)["spread of inclination"].value == pytest.approx(0.65, abs=0.04)
+
+
+def test_a_group_that_was_not_rolled_fails_beside_one_that_was(record):
+    inc, azi, face = (
+        np.tile(v, 2) for v in (np.full(12, 45 * DEG), np.full(12, 1.0), np.arange(12))
+    )
+    face = np.where(np.arange(24) < 12, face * 30 * DEG, 40 * DEG)
+    a, m = Tool.random(7).readings(np.random.default_rng(2), 1, inc, azi, face)
+    group = np.repeat([0, 1], 12)
+    test = Readings(a[0], m[0], sd=NOISE, source="roll.csv", group=group)
+    assert not verify(record, test, SPREADS).passed
+    known = {"inclination": inc, "azimuth": np.where(group == 0, azi, 1.5)}
+    apart = verify(record, msgspec_replace(test, group=None, known=known), SPREADS)
+    assert apart.passed
+    assert ids(apart).count("partly-judged") == 3
+
+
+def test_errors_at_four_right_angles_say_what_they_do_not_show(record):
+    test = roll(45, toolfaces=np.arange(4) * 90)
+    limits = Limits(name="e", error=Bounds(inclination_deg=0.25))
+    result = verify(record, test, limits)
+    assert result.passed
+    assert ids(result) == ["harmonic-unseen"]
+    assert ids(verify(record, roll(45), limits)) == []
+
+
+def test_a_perfect_tool_at_half_a_milligram_passes(record):
+    """Noise of 0.5 mg: 0.029° of inclination. The raw spread of twelve fails 0.1° in two of five."""
+    noise = {"accelerometer": np.array(5e-4), "magnetometer": np.array(15.0)}
+    limits = Limits(name="i", spread=Bounds(inclination_deg=0.1))
+    tool = Tool.random(7, noise=(5e-4, 15.0))
+    found = [verify(record, roll(45, s, noise, tool), limits).rows[0] for s in range(100)]
+    assert np.mean([row.raw > 0.1 for row in found]) > 0.2
+    assert np.mean([row.passed for row in found]) > 0.97
+
+
+def test_the_uncertainty_is_that_of_the_test_not_of_the_calibration():
+    """A poor calibration of 12 stations: its error is part of what is found, not a doubt about it."""
+    poor = calibrate(make(3, (10, 60, 120), 4), PROFILE)
+    truth = Tool.random(7)
+    inc, azi, face = np.full(720, 45 * DEG), np.full(720, 1.0), np.arange(720) * 0.5 * DEG
+    clean = [v[None] for v in truth.clean(inc, azi, face)]
+    g, _ = poor.fields(Readings(clean[0][0], clean[1][0]))
+    wanted = np.ptp(np.degrees(np.arctan2(np.hypot(g[:, 0], g[:, 1]), g[:, 2])))
+    limits = Limits(name="i", spread=Bounds(inclination_deg=0.1))
+    rows = [verify(poor, roll(45, s), limits).rows[0] for s in range(120)]
+    departure = [(row.value - wanted) / row.uncertainty for row in rows]
+    assert 0.8 < np.sqrt(np.mean(np.square(departure))) < 1.2
+    assert abs(np.mean(departure)) < 0.4
+
+
+def test_the_harmonics_name_the_cause(record):
+    """8 mg across: a first harmonic of 8e-3 cos 45° rad. Scales of x and y 1 % apart: a second one.
+
+    Those move inclination by sin 45° cos 45° 0.01 sin² T: a range of 0.286°, half of it as amplitude.
+    """
+    first = verify(record, roll(45, tool=knocked(nanotesla=0)), SPREADS)
+    row = rows_of(first)["spread of inclination"]
+    assert row.harmonics == pytest.approx((np.degrees(8e-3 * np.sqrt(0.5)), 0), abs=0.01)
+    text = next(f.text for f in first.findings if f.id == "roll-harmonics")
+    assert "first harmonic 0.32° (a bias" in text
+    assert "second" not in text
+    tool = Tool.random(7)
+    tool.matrix = tool.matrix * np.array([[[1.01], [1], [1]], [[1], [1], [1]]])
+    tool.offset = tool.offset * np.array([[1.01, 1, 1], [1, 1, 1]])
+    second = verify(record, roll(45, tool=tool), SPREADS)
+    row = rows_of(second)["spread of inclination"]
+    assert row.harmonics == pytest.approx((0, 0.143), abs=0.01)
+    text = next(f.text for f in second.findings if f.id == "roll-harmonics")
+    assert "second harmonic 0.14° (a difference in scale" in text
+    assert "first" not in text
+
+
+@pytest.mark.parametrize("inclination", [0.3, 1, 179.5])
+@pytest.mark.parametrize("angle", ["azimuth", "toolface"])
+def test_errors_are_not_judged_near_vertical(record, inclination, angle):
+    limits = Limits(name="e", error=Bounds(inclination_deg=0.25, **{f"{angle}_deg": 0.2}))
+    for seed in range(5):
+        result = verify(record, roll(inclination, seed), limits)
+        assert result.passed
+        assert list(rows_of(result)) == ["error of inclination"]
+        assert ids(result) == ["not-judged"]
+        assert f"error of {angle} (every station within 5° of vertical)" in result.findings[0].text
+
+
+def test_stations_near_vertical_are_left_out_of_an_error(record):
+    inc, azi, face = (
+        np.repeat([2, 45], 12) * DEG,
+        np.full(24, 1.0),
+        np.tile(np.arange(12) * 30, 2) * DEG,
+    )
+    a, m = Tool.random(7).readings(np.random.default_rng(1), 1, inc, azi, face)
+    known = {"inclination": inc, "azimuth": azi, "toolface": face}
+    test = Readings(a[0], m[0], known=known, sd=NOISE, source="roll.csv")
+    result = verify(record, test, Limits(name="e", error=Bounds(azimuth_deg=0.2)))
+    assert result.passed
+    assert [f.text for f in result.findings if f.id == "partly-judged"] == [
+        "error of azimuth: 12 of 24 stations lie within 5° of vertical."
+    ]
+
+
+def test_gravity_field_and_dip_are_judged_by_references_of_the_test_alone():
+    """Gravity of 0.9967 g: a good tool is not 3.3 mg wrong because a test says nothing of it."""
+    tool = Tool.random(7, gravity=0.9967)
+    run = make(tool=tool)
+    known = {**run.known, "gravity": np.full(48, 0.9967)}
+    own = calibrate(msgspec_replace(run, known=known), PROFILE)
+    bounds = Bounds(gravity_g=0.002, field_nt=200, dip_deg=0.2, inclination_deg=0.25)
+    limits = Limits(name="g", error=bounds)
+    silent = verify(own, roll(45, tool=tool), limits)
+    assert silent.passed
+    assert list(rows_of(silent)) == ["error of inclination"]
+    for column in ("ref_gravity_g", "ref_field_nt", "ref_dip_deg"):
+        assert f"(no {column})" in silent.findings[0].text
+    given = {
+        "gravity": np.full(12, 0.9967),
+        "field": np.full(12, 5e4),
+        "dip": np.full(12, tool.dip),
+    }
+    assert len(verify(own, roll(45, tool=tool, **given), limits).rows) == 4
+    assert verify(own, roll(45, tool=tool, **given), limits).passed
+    assert not verify(own, roll(45, tool=tool, **{**given, "gravity": np.ones(12)}), limits).passed
+
+
+def test_soaks_are_not_pooled(record):
+    """Between two soaks |g| moves by 4 mg; within each it does not."""
+    one, other = (roll(45, seed, toolfaces=np.arange(6) * 60) for seed in (1, 2))
+    join = {k: np.concatenate([one.known[k], other.known[k]]) for k in one.known}
+    test = Readings(
+        np.concatenate([one.accelerometer, 1.004 * other.accelerometer]),
+        np.concatenate([one.magnetometer, other.magnetometer]),
+        known=join, sd=NOISE, source="roll.csv",
+    )  # fmt: skip
+    assert not verify(record, test, SPREADS).passed
+    for group in (None, np.zeros(12, int)):
+        warmth = np.repeat([20.0, 40.0], 6) + np.tile(np.arange(6) / 2, 2)
+        apart = verify(record, msgspec_replace(test, temperature=warmth, group=group), SPREADS)
+        assert apart.passed
+        assert all("°C" in row.note for row in apart.rows)
+
+
+def test_equal_inclinations_without_azimuth_are_not_one_direction(record):
+    """Four azimuths: inclination and |g| depend on toolface alone, azimuth is what differs."""
+    inc, face = np.full(24, 45 * DEG), np.tile(np.arange(6) * 60 * DEG, 4)
+    azi = np.repeat([0, 90, 180, 270], 6) * DEG
+    a, m = Tool.random(7).readings(np.random.default_rng(1), 1, inc, azi, face)
+    test = Readings(a[0], m[0], known={"inclination": inc}, sd=NOISE, source="roll.csv")
+    result = verify(record, test, SPREADS)
+    assert result.passed
+    assert list(rows_of(result)) == ["spread of inclination", "spread of gravity"]
+    assert "need group or ref_azimuth_deg" in result.findings[0].text
+    known = {"inclination": inc, "azimuth": azi}
+    assert len(verify(record, msgspec_replace(test, known=known), SPREADS).rows) == 3
+
+
+def test_a_guarded_failure_within_the_limit_says_so(record):
+    value = rows_of(verify(record, roll(45, tool=knocked(2)), SPREADS))["spread of inclination"]
+    tight = Bounds(inclination_deg=value.value + value.uncertainty)
+    row = verify(
+        record, roll(45, tool=knocked(2)), Limits(name="t", spread=tight, rule="guarded")
+    ).rows[0]
+    assert not row.passed
+    assert row.value < row.limit < row.value + 2 * row.uncertainty
+    assert "within the limit, but not by twice its uncertainty" in row.note
+    over = Bounds(inclination_deg=value.value / 2)
+    row = verify(
+        record, roll(45, tool=knocked(2)), Limits(name="t", spread=over, rule="guarded")
+    ).rows[0]
+    assert "within" not in row.note
+
+
+def test_a_station_that_moved_is_judged_as_it_is(record):
+    """One reading of twelve off by 0.3°: a curve would show a part of it."""
+    test = roll(45)
+    bent = test.accelerometer.copy()
+    bent[4] = bent[4] + [0, 0, 0.3 * DEG / np.sin(45 * DEG)]
+    row = rows_of(verify(record, msgspec_replace(test, accelerometer=bent), SPREADS))[
+        "spread of inclination"
+    ]
+    assert row.value == row.raw > 0.2
+    assert "raw figure judged" in row.note
+
+
+def test_a_test_too_noisy_for_its_limit_is_a_finding(record):
+    noise = {"accelerometer": np.array(2e-3), "magnetometer": np.array(15.0)}
+    result = verify(record, roll(45, 1, noise, Tool.random(7, noise=(2e-3, 15.0))), SPREADS)
+    text = [f.text for f in result.findings if f.id == "weak-test"]
+    assert any("spread of inclination" in t and "more than half of the limit" in t for t in text)
+    assert "weak-test" not in ids(verify(record, roll(45), SPREADS))
+
+
+def test_setting_the_stand_each_time_adds_its_repeatability_and_a_roll_in_place_does_not(record):
+    """σ of 0.05° per setting, beside 0.006° of noise: a spread is uncertain by it only where set."""
+    sd = {**NOISE, "inclination": np.array(0.05 * DEG)}
+    limits = Limits(
+        name="i", spread=Bounds(inclination_deg=0.1), error=Bounds(inclination_deg=0.25)
+    )
+    turned = roll(45 + 0.05 * np.random.default_rng(1).normal(size=12), sd=sd)
+    known = {**turned.known, "inclination": np.full(12, 45 * DEG)}
+    each = rows_of(verify(record, msgspec_replace(turned, known=known), limits))
+    still = msgspec_replace(roll(45, sd=sd), group=np.zeros(12, int))
+    shared = rows_of(verify(record, still, limits))
+    assert each["spread of inclination"].uncertainty > 0.03
+    assert shared["spread of inclination"].uncertainty < 0.01
+    assert shared["error of inclination"].uncertainty == pytest.approx(0.05, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("order", "temperature", "outside"),
+    [(0, 25.0, None), (0, 28.5, "finding"), (0, 31.0, "refused"), (1, 51.5, "refused")],
+)
+def test_how_far_outside_its_temperatures_a_calibration_is_verified(order, temperature, outside):
+    """Without temperature terms up to a soak's 5 °C with a finding; with them 1 °C."""
+    warmth = np.repeat([0.0, 50.0], 48) if order else np.full(48, 25.0)
+    parts = [make(seed) for seed in range(2 if order else 1)]
+    run = msgspec_replace(
+        parts[0],
+        accelerometer=np.concatenate([p.accelerometer for p in parts]),
+        magnetometer=np.concatenate([p.magnetometer for p in parts]),
+        known={k: np.concatenate([p.known[k] for p in parts]) for k in parts[0].known},
+        temperature=warmth,
+    )
+    own = calibrate(run, PROFILE, Options(order=order))
+    test = msgspec_replace(roll(45), temperature=np.full(12, temperature))
+    if outside == "refused":
+        with pytest.raises(InputError, match="outside the calibrated range"):
+            verify(own, test, SPREADS)
+        return
+    result = verify(own, test, SPREADS)
+    assert result.passed
+    assert ids(result) == (["outside-temperature"] if outside else [])
+
+
+def test_a_calibration_without_temperatures_says_so_at_any(record):
+    hot = verify(record, msgspec_replace(roll(45), temperature=np.full(12, 150.0)), SPREADS)
+    assert ids(hot) == ["no-temperature"]
+    assert "calibrated at unrecorded temperatures, and tested at 150.0 °C" in hot.findings[0].text
+    assert ids(verify(record, roll(45), SPREADS)) == []

@@ -97,6 +97,7 @@ class Row:
     name: str = "spread of azimuth"
     unit: str = "°"
     value: float | None = 1.23
+    raw: float | None = 1.45
     limit: float = 1.0
     uncertainty: float | None = 0.04
     passed: bool = False
@@ -271,6 +272,7 @@ def test_verdict_comes_first(whole, words):
     assert "Verification failed – 1 of 2 limits not met" in failed
     assert failed.index("Verification failed") < failed.index("Fit accepted")
     assert "1.23°" in failed
+    assert "1.45°" in failed
     assert "&lt;b&gt;" in failed
     assert "Not verified" not in failed
     passed = words(whole, Outcome(True, [Row(passed=True, value=0.5, uncertainty=None)]))

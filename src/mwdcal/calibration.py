@@ -23,7 +23,9 @@ SCHEMA_VERSION = 1
 DIGITS = 12
 """Significant digits of every number in a calibration file."""
 MARGIN = 1.0
-"""Degrees Celsius by which a temperature may lie outside the calibrated range."""
+"""Degrees Celsius by which a temperature may lie outside the calibrated range, as it is read."""
+SOAK_GAP = 5.0
+"""Temperatures closer than this belong to one soak, °C."""
 MAGNETIC = ("azimuth", "field", "dip", "magnetic_toolface", "bx", "by", "bz")
 """Observables that need a magnetometer."""
 FREE_SHARE = 5e-2
@@ -406,14 +408,25 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
         """Free directions of all triads, each once."""
         return [entry for triad in self.triads for entry in triad.undetermined]
 
-    def outside(self, readings: Readings) -> Bools:
-        """Stations (…, n) outside the calibrated temperature range by more than `MARGIN`."""
+    @property
+    def margin(self) -> float:
+        """Degrees Celsius by which a reading may lie outside the calibrated range.
+
+        A calibration without temperature terms holds for the soak it was made in: `SOAK_GAP`.
+        """
+        return MARGIN if any(t.order for t in self.triads) else SOAK_GAP
+
+    def outside(self, readings: Readings, margin: float | None = None) -> Bools:
+        """Stations (…, n) outside the calibrated temperature range by more than a margin, °C.
+
+        The margin is the calibration's own unless another is given.
+        """
         shape = readings.accelerometer.shape[:-1]
         if self.temperature_c is None or readings.temperature is None:
             return np.zeros(shape, bool)
-        low, high = self.temperature_c
+        (low, high), beyond = self.temperature_c, self.margin if margin is None else margin
         return np.asarray(
-            (readings.temperature < low - MARGIN) | (readings.temperature > high + MARGIN)
+            (readings.temperature < low - beyond) | (readings.temperature > high + beyond)
         )
 
     def unrecorded(self, readings: Readings) -> bool:

@@ -2,26 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
 from typing import Literal
 
 import msgspec
 import numpy as np
 
-from mwdcal.calibration import FREE_SHARE, Calibration, Finding
+from mwdcal.calibration import MARGIN, Calibration, Finding
 from mwdcal.core.observables import OBSERVABLES
-from mwdcal.core.vectors import AnyArray, Array, Bools, centred
+from mwdcal.departures import Outcome, Shown, Test
 from mwdcal.errors import InputError
-from mwdcal.readings import ANGLES, Readings
+from mwdcal.readings import Readings
 
 COVERAGE = 2.0
 """Coverage factor of the guard band and of the remark that a value is close to its limit."""
-UPRIGHT = ("azimuth", "toolface")
-NEAR_VERTICAL = np.radians(5.0)
-"""Spreads of azimuth and toolface are not judged nearer to vertical than this."""
-ROLL_SET = 3
-"""Fewest stations that make a roll set."""
+WEAK = 0.5
+"""A test whose 1σ is a larger share of the limit can hardly tell a good tool from a bad one."""
+CLEAR = 3.0
+"""Standard uncertainties above which a harmonic is named as a cause."""
+CAUSES = {
+    "inclination": (
+        "a bias of the accelerometer across the tool axis, or it leans",
+        "a difference in scale, or a misalignment, of the accelerometer's x and y",
+    ),
+    "azimuth": (
+        "a bias across the tool axis of either triad, or it leans",
+        "a difference in scale, or a misalignment, of x and y of either triad",
+    ),
+    "gravity": (
+        "a bias of the accelerometer across the tool axis, or its x or y is not square to z",
+        "a difference in scale, or a misalignment, of the accelerometer's x and y",
+    ),
+}
+"""What a first and a second harmonic of toolface come from; as for azimuth where not named."""
 
 
 class Bounds(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -45,8 +58,8 @@ class Bounds(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 class Limits(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """A limits profile: what a roll test may show, where the limits come from, and the rule.
 
-    rule "simple": a value passes up to its limit. "guarded": value plus twice its standard
-    uncertainty must not exceed the limit.
+    rule "simple": a noise-free value passes up to its limit. "guarded": value plus twice its
+    standard uncertainty must not exceed the limit.
     """
 
     name: str
@@ -57,7 +70,13 @@ class Limits(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 
 
 class VerdictRow(msgspec.Struct, frozen=True, kw_only=True):
-    """One limit: the worst value found, its standard uncertainty, and the decision."""
+    """One limit: the noise-free value found, its standard uncertainty, and the decision.
+
+    `raw` is the same figure with the noise in it: largest minus smallest value of a set as the
+    papers define a spread, or the largest departure of any station. `harmonics` are the
+    amplitudes of the first and second harmonic of toolface in the set that decided. None: it
+    cannot be stated.
+    """
 
     name: str
     unit: str
@@ -66,6 +85,8 @@ class VerdictRow(msgspec.Struct, frozen=True, kw_only=True):
     limit: float
     passed: bool
     note: str
+    raw: float | None = None
+    harmonics: tuple[float, float] | None = None
 
 
 class Verdict(msgspec.Struct, frozen=True, kw_only=True):
@@ -82,8 +103,8 @@ class Verdict(msgspec.Struct, frozen=True, kw_only=True):
 
 
 RULES = {
-    "simple": "simple acceptance: a value passes up to its limit; its standard uncertainty is stated beside it",
-    "guarded": "guarded acceptance: value + 2 × standard uncertainty must not exceed the limit",
+    "simple": "simple acceptance: a noise-free value passes up to its limit; its 1σ is stated beside it",
+    "guarded": "guarded acceptance: noise-free value + 2 × its 1σ must not exceed the limit",
 }
 
 
@@ -96,27 +117,79 @@ def verify(calibration: Calibration, readings: Readings, limits: Limits) -> Verd
     _check_tool(calibration, readings)
     _check_independent(calibration, readings)
     _check_temperature(calibration, readings)
-    test = _Test(calibration, readings, limits)
-    judged = {f"spread of {n}": test.spread(n, limit) for n, limit in limits.spread.items()}
-    judged |= {f"error of {n}": test.error(n, limit) for n, limit in limits.error.items()}
-    found = [row for row in judged.values() if row is not None]
-    skipped = [name for name, row in judged.items() if row is None]
-    if not found:
+    test = Test(calibration, readings)
+    asked = [("spread", n, limit, test.spread(n)) for n, limit in limits.spread.items()]
+    asked += [("error", n, limit, test.error(n)) for n, limit in limits.error.items()]
+    skipped = _skipped({f"{kind} of {n}": found.skipped for kind, n, _, found in asked})
+    judged = [
+        _judged(f"{kind} of {n}", n, limit, found, limits.rule == "guarded")
+        for kind, n, limit, found in asked
+        if not found.skipped
+    ]
+    if not judged:
         raise InputError(
-            f"{readings.source}: no limit of '{limits.name}' applies: there is neither a roll set "
-            f"({ROLL_SET} or more stations of one direction, by 'group' or equal reference angles) "
-            "nor a reference angle. Add one of them, or choose other --limits."
+            f"{readings.source}: no limit of '{limits.name}' applies: {'; '.join(skipped)}. Add what "
+            "is missing, or choose other --limits."
         )
     return Verdict(
-        passed=all(row.passed for row in found),
+        passed=all(row.passed for row, _ in judged),
         rule=RULES[limits.rule],
         limits=limits.name,
         source=limits.source,
         run=readings.source,
         stations=readings.count,
-        rows=found,
-        findings=test.findings(skipped),
+        rows=[row for row, _ in judged],
+        findings=[
+            *_findings(calibration, readings, test, skipped),
+            *(finding for _, found in judged for finding in found),
+        ],
     )
+
+
+def _skipped(reasons: dict[str, str]) -> list[str]:
+    """Limits that were not judged, by reason."""
+    names: dict[str, list[str]] = {}
+    for name, reason in reasons.items():
+        names.setdefault(reason, []).append(name)
+    return [f"{', '.join(names[reason])} ({reason})" for reason in names if reason]
+
+
+def _findings(
+    calibration: Calibration, readings: Readings, test: Test, skipped: Sequence[str]
+) -> list[Finding]:
+    """What the verdict as a whole rests on, and what was left out."""
+    found = [*_temperature_findings(calibration, readings)]
+    found += [Finding(id=u.id, text=f"{u.text}.") for u in calibration.undetermined()]
+    if skipped:
+        found.append(Finding(id="not-judged", text=f"not judged: {'; '.join(skipped)}."))
+    if not test.sets:
+        found.append(Finding(id="no-roll-set", text="no roll set: spreads were not judged."))
+    return found
+
+
+def _temperature_findings(calibration: Calibration, readings: Readings) -> Iterable[Finding]:
+    if readings.temperature is None:
+        return
+    coldest, hottest = float(readings.temperature.min()), float(readings.temperature.max())
+    if calibration.temperature_c is None:
+        text = (
+            f"the tool was calibrated at unrecorded temperatures, and tested at {_span(coldest, hottest)} °C: "
+            "the verdict holds for the temperatures of the test alone."
+        )
+        yield Finding(id="no-temperature", text=text)
+        return
+    beyond = int(calibration.outside(readings, MARGIN).sum())
+    if beyond:
+        text = (
+            f"{beyond} of {readings.count} stations ({_span(coldest, hottest)} °C) lie outside the calibrated "
+            f"range {_span(*calibration.temperature_c)} °C. The calibration has no temperature terms: drift "
+            "over the difference counts as its error."
+        )
+        yield Finding(id="outside-temperature", text=text)
+
+
+def _span(low: float, high: float) -> str:
+    return f"{low:.1f}…{high:.1f}" if high - low >= 0.1 else f"{low:.1f}"
 
 
 def _check_tool(calibration: Calibration, readings: Readings) -> None:
@@ -155,163 +228,77 @@ def _check_temperature(calibration: Calibration, readings: Readings) -> None:
         )
 
 
-@dataclass(frozen=True)
-class _Test:
-    calibration: Calibration
-    readings: Readings
-    limits: Limits
-
-    def _value(self, name: str) -> Array:
-        return OBSERVABLES[name].value(*self.calibration.fields(self.readings))
-
-    def _scale(self, name: str) -> tuple[float, str]:
-        unit = OBSERVABLES[name].unit
-        return (float(np.degrees(1)), "°") if unit == "rad" else (1.0, unit)
-
-    def _applies(self, name: str) -> bool:
-        magnetic = name in ("azimuth", "field", "dip")
-        return not magnetic or (
-            self.calibration.has_field and self.readings.magnetometer is not None
+def _judged(
+    title: str, name: str, limit: float, found: Outcome, guarded: bool
+) -> tuple[VerdictRow, list[Finding]]:
+    """The decision on one limit, by the worst set or station, and what the reader should know."""
+    guard = COVERAGE if guarded else 0.0
+    inside = OBSERVABLES[name].unit
+    factor, unit = (float(np.degrees(1)), "°") if inside == "rad" else (1.0, inside)
+    told = [Finding(id="partly-judged", text=f"{title}: {text}.") for text in found.apart]
+    if found.unseen:
+        text = (
+            f"{title}: the toolfaces hardly show one of the two harmonics of a turn (four at right "
+            "angles do not show a misalignment of x and y): add toolfaces between them."
         )
-
-    def sets(self) -> list[tuple[str, AnyArray]]:
-        """Roll sets: label and station numbers."""
-        found = []
-        for label, members in _directions(self.readings):
-            index = np.flatnonzero(members)
-            if len(index) >= ROLL_SET:
-                found.append((label, index))
-        return found
-
-    def _upright(self, index: AnyArray) -> bool:
-        """Whether a roll set is too close to vertical for a spread of azimuth or toolface."""
-        across = np.sin(self._value("inclination")[index])
-        return bool(across.mean() < np.sin(NEAR_VERTICAL))
-
-    def spread(self, name: str, limit: float) -> VerdictRow | None:
-        """The widest spread over the roll sets, or None where there is none."""
-        if not self._applies(name):
-            return None
-        value, period = self._value(name), OBSERVABLES[name].period
-        worst: tuple[float, AnyArray, str] | None = None
-        for label, index in self.sets():
-            part = value[index]
-            if np.isnan(part).any() or (name in UPRIGHT and self._upright(index)):
-                continue
-            middle = np.angle(np.mean(np.exp(1j * part))) if period else 0.0
-            part = centred(part - middle, period) if period else part
-            ends = index[[int(np.argmax(part)), int(np.argmin(part))]]
-            if worst is None or np.ptp(part) > worst[0]:
-                worst = (float(np.ptp(part)), ends, label)
-        if worst is None:
-            return None
-        width, ends, label = worst
-        contrast = np.zeros((1, self.readings.count))
-        contrast[0, ends] = 1.0, -1.0
-        labels = " to ".join(self.readings.labels[i] for i in sorted(ends))
-        free = any(self._free_spread(name, index) for _, index in self.sets())
-        return self._row(
-            f"spread of {name}", name, width, contrast, limit, free, f"{label}; stations {labels}"
-        )
-
-    def error(self, name: str, limit: float) -> VerdictRow | None:
-        """The largest departure from the reference, or None where there is no reference."""
-        reference = self.readings.reference(name)
-        if not self._applies(name):
-            return None
-        error = self._value(name) - reference
-        error = centred(error, OBSERVABLES[name].period) if OBSERVABLES[name].period else error
-        if np.isnan(error).all():
-            return None
-        worst = int(np.nanargmax(np.abs(error)))
-        contrast = np.zeros((1, self.readings.count))
-        contrast[0, worst] = 1.0
-        free = bool(self.calibration.rests_on_free(name, self.readings)[~np.isnan(error)].any())
-        note = f"station {self.readings.labels[worst]}"
-        return self._row(
-            f"error of {name}", name, abs(float(error[worst])), contrast, limit, free, note
-        )
-
-    def _free_spread(self, name: str, index: AnyArray) -> bool:
-        """Whether the spread of a set moves with a direction that no evidence determines."""
-        if not self.calibration.free:
-            return False
-        rows = np.nan_to_num(self.calibration.sensitivity(name, self.readings)[index])
-        moved = rows @ np.array(self.calibration.free).transpose()
-        size = {"g": 1.0, "nT": self.calibration.earth.get("field", 1.0)}.get(
-            OBSERVABLES[name].unit, 1.0
-        )
-        return bool((np.ptp(moved, axis=0) > FREE_SHARE * size).any())
-
-    def _uncertainty(self, name: str, contrast: Array, common_cancels: bool) -> float:
-        """Calibration, noise and references, of a sum of stations; common references may cancel."""
-        rows = np.nan_to_num(contrast @ self.calibration.sensitivity(name, self.readings))
-        variance = float((rows @ np.array(self.calibration.covariance) @ rows.transpose())[0, 0])
-        gradient = OBSERVABLES[name].gradient(*self.calibration.fields(self.readings))
-        gradient = np.nan_to_num(gradient)
-        noise = self.calibration.noise_covariance(self.readings)
-        each = np.einsum("ni,nij,nj->n", gradient, noise, gradient)
-        if not common_cancels:
-            each = each + self.readings.uncertainty(name) ** 2
-        return float(np.sqrt(variance + np.sum(contrast[0] ** 2 * each)))
-
-    def _row(
-        self,
-        title: str,
-        name: str,
-        value: float,
-        contrast: Array,
-        limit: float,
-        free: bool,
-        note: str,
-    ) -> VerdictRow:
-        factor, unit = self._scale(name)
-        cancels = title.startswith("spread") and name not in ANGLES
-        uncertainty = self._uncertainty(name, contrast, cancels) * factor
-        value = value * factor
-        guard = COVERAGE * uncertainty if self.limits.rule == "guarded" else 0.0
-        relative = name == "field" and self.calibration.field_unit != "nT"
-        if free or relative:
-            reason = "it rests on a direction that the calibration leaves undetermined"
-            reason = "the calibration is relative: field = 1, not nT" if relative else reason
-            return VerdictRow(
-                name=title,
-                unit=unit,
-                value=None if relative else value,
-                uncertainty=None,
-                limit=limit,
-                passed=False,
-                note=f"cannot be passed: {reason}",
-            )
-        if abs(value - limit) < COVERAGE * uncertainty:
-            note += "; closer to the limit than twice its uncertainty"
-        return VerdictRow(
-            name=title, unit=unit, value=value, uncertainty=uncertainty, limit=limit,
-            passed=value + guard <= limit, note=note,
+        told.append(Finding(id="harmonic-unseen", text=text))
+    most = max((shown.raw * factor for shown in found.shown), default=None)
+    if found.blocked:
+        row = VerdictRow(
+            name=title, unit=unit, value=None if found.unrolled else most, uncertainty=None,
+            limit=limit, passed=False, note=f"cannot be passed: {found.blocked}", raw=most,
         )  # fmt: skip
+        return row, told
+    worst = max(found.shown, key=lambda shown: shown.value + guard * shown.uncertainty)
+    value, sd = worst.value * factor, worst.uncertainty * factor
+    passed = value + guard * sd <= limit
+    row = VerdictRow(
+        name=title, unit=unit, value=value, uncertainty=sd, limit=limit, passed=passed,
+        note=f"{worst.where}{_remark(value, sd, limit, passed)}", raw=most,
+        harmonics=_harmonics(worst, factor),
+    )  # fmt: skip
+    return row, [*told, *_weak(row), *_causes(row, name, worst)]
 
-    def findings(self, skipped: list[str]) -> list[Finding]:
-        """What was left out, and what to know."""
-        found = [Finding(id=u.id, text=f"{u.text}.") for u in self.calibration.undetermined()]
-        if skipped:
-            text = f"not judged, for want of references, roll sets or magnetometer: {', '.join(skipped)}."
-            found.append(Finding(id="not-judged", text=text))
-        if not self.sets():
-            found.append(Finding(id="no-roll-set", text="no roll set: spreads were not judged."))
-        return found
+
+def _remark(value: float, sd: float, limit: float, passed: bool) -> str:
+    """How close the decision was."""
+    if value <= limit and not passed:
+        return "; within the limit, but not by twice its uncertainty as the guarded rule asks"
+    close = abs(value - limit) < COVERAGE * sd
+    return "; closer to the limit than twice its uncertainty" if close else ""
 
 
-def _directions(readings: Readings) -> list[tuple[str, Bools]]:
-    """Stations of one direction: by group, else by equal reference angles, else all of them."""
-    group = np.full(readings.count, -1) if readings.group is None else readings.group
-    found = [
-        (f"roll set {k + 1}", np.asarray(group == k)) for k in range(int(group.max(initial=-1)) + 1)
+def _harmonics(worst: Shown, factor: float) -> tuple[float, float] | None:
+    if worst.curve is None:
+        return None
+    first, second = (float(a) * factor for a in worst.curve.amplitudes)
+    return first, second
+
+
+def _weak(row: VerdictRow) -> Iterable[Finding]:
+    if row.uncertainty is not None and row.uncertainty > WEAK * row.limit:
+        text = (
+            f"{row.name}: its 1σ of {row.uncertainty:.2g} {row.unit} is more than half of the limit: this "
+            "test can hardly tell a good tool from a bad one. Average longer at each station, or "
+            "take more toolfaces."
+        )
+        yield Finding(id="weak-test", text=text)
+
+
+def _causes(row: VerdictRow, name: str, worst: Shown) -> Iterable[Finding]:
+    """What the harmonics of a failed set say is wrong."""
+    if row.passed or row.harmonics is None or worst.curve is None:
+        return
+    unit = row.unit if row.unit == "°" else f" {row.unit}"
+    causes = CAUSES.get(name, CAUSES["azimuth"])
+    size = worst.curve.amplitudes / np.maximum(worst.curve.amplitude_sd, 1e-30)
+    parts = [
+        f"{ordinal} harmonic {amplitude:.2g}{unit} ({cause})"
+        for ordinal, amplitude, cause, clear in zip(
+            ("first", "second"), row.harmonics, causes, size > CLEAR, strict=True
+        )
+        if clear
     ]
-    inclination, azimuth = readings.reference("inclination"), readings.reference("azimuth")
-    if not found and np.isnan(inclination).all():
-        return [("all stations", np.ones(readings.count, bool))]
-    key = np.round(np.degrees(np.stack([inclination, np.nan_to_num(azimuth, nan=-1.0)], -1)), 3)
-    for pair in np.unique(key[(group < 0) & ~np.isnan(inclination)], axis=0):
-        where = f", azimuth {pair[1]:g}°" if pair[1] >= 0 else ""
-        found.append((f"inclination {pair[0]:g}°{where}", np.all(key == pair, -1) & (group < 0)))
-    return found
+    if parts:
+        text = f"{row.name} over a turn of toolface: {'; '.join(parts)}."
+        yield Finding(id="roll-harmonics", text=text)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from mwdcal.calibration import OrderScore
+from mwdcal.calibration import SOAK_GAP, OrderScore
 from mwdcal.core.problem import Problem, State
 from mwdcal.core.solvers import Linear
 from mwdcal.core.uncertainty import TESTED, marginal_rank, readjusted
@@ -18,8 +18,7 @@ from mwdcal.options import Options, Orders
 from mwdcal.readings import TRIADS, Readings
 from mwdcal.residuals import shown_in
 
-GAP = 5.0
-"""Temperatures closer than this belong to one soak, °C."""
+GAP = SOAK_GAP
 SPAN = 10.0
 """A run that spans less has no temperature terms, °C."""
 HIGHEST = 3

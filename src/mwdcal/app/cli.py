@@ -162,8 +162,8 @@ def stations(**asked: Unpack[Asked]) -> None:
 )
 @click.option(
     "--outside", default="blank", show_default=True, metavar="blank|refuse|extrapolate",
-    help="Results of rows more than 1 °C outside the calibrated temperatures: none; refuse the file; or "
-    "extrapolated, and marked in a column 'extrapolated'.",
+    help="Results of rows more than 1 °C (without temperature terms: 5 °C) outside the calibrated "
+    "temperatures: none; refuse the file; or extrapolated, and marked in a column 'extrapolated'.",
 )  # fmt: skip
 @click.option(
     "--missing", type=click.Choice(["refuse", "blank"]), default="refuse", show_default=True,

@@ -21,7 +21,7 @@ from typing import IO, Any, NamedTuple, TypeVar
 import numpy as np
 
 from mwdcal import strengths
-from mwdcal.calibration import MARGIN, Calibration, Finding
+from mwdcal.calibration import Calibration, Finding
 from mwdcal.core import fused
 from mwdcal.core.vectors import AnyArray, Array, Bools
 from mwdcal.correction import (
@@ -360,7 +360,8 @@ class _Worker:
         if self.said.temperature is None:
             low, high = -np.inf, np.inf
         accepted = (RAW_RANGE.low, RAW_RANGE.high), (TEMPERATURE.low, TEMPERATURE.high)
-        return fused.Limits(*accepted, (low - MARGIN, high + MARGIN), self.rules.outside == "blank")
+        warmth = low - self.calibration.margin, high + self.calibration.margin
+        return fused.Limits(*accepted, warmth, self.rules.outside == "blank")
 
     def _compiled(self, channels: Mapping[str, list[Array] | None], count: int) -> fused.Found:
         assert self.triads is not None

@@ -23,6 +23,8 @@ WEIGHED = {
 SUPERSCRIPT = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
+WIDE = 300
+"""Width of a table whose last column holds remarks, which are never cut."""
 HELD = "held"
 """In place of the uncertainty of a parameter that a model of 9 or 6 keeps at zero."""
 
@@ -49,7 +51,7 @@ def plural(count: int, noun: str) -> str:
     return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
-def table(rows: list[list[str]], header: list[str]) -> str:
+def table(rows: list[list[str]], header: list[str], width: int = 160) -> str:
     """Columns aligned: the first to the left, the others to the right."""
     from rich import box
     from rich.console import Console
@@ -60,7 +62,7 @@ def table(rows: list[list[str]], header: list[str]) -> str:
         made.add_column(title, justify="left" if index == 0 else "right", no_wrap=True)
     for row in rows:
         made.add_row(*row)
-    console = Console(width=160, color_system=None, legacy_windows=False)
+    console = Console(width=width, color_system=None, legacy_windows=False)
     with console.capture() as capture:
         console.print(made)
     return "\n".join(line.rstrip() for line in capture.get().splitlines())
@@ -192,6 +194,7 @@ def verdict(result: Verdict, *metadata: Mapping[str, object]) -> str:
     rows = [
         [
             row.name,
+            quantity(row.raw, row.unit),
             quantity(row.value, row.unit),
             "not stated" if row.uncertainty is None else quantity(row.uncertainty, row.unit),
             quantity(row.limit, row.unit),
@@ -203,8 +206,10 @@ def verdict(result: Verdict, *metadata: Mapping[str, object]) -> str:
     outcome = "PASS" if result.passed else "FAIL"
     first = [outcome, result.run, f"{result.stations} stations", *simulated(*metadata)]
     lines = ["   ".join(first)]
-    lines += [f"limits {result.limits} ({result.source})", f"rule: {result.rule}"]
-    return "\n".join(lines) + "\n\n" + table(rows, ["", "worst", "1σ", "limit", "", "where"])
+    source = f" ({result.source})" if result.source else ""
+    lines += [f"limits {result.limits}{source}", f"rule: {result.rule}"]
+    header = ["", "raw", "noise-free", "1σ", "limit", "", "where"]
+    return "\n".join(lines) + "\n\n" + table(rows, header, WIDE)
 
 
 def notation(found: dict[str, Notation], reference: float | None = None) -> str:
