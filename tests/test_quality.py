@@ -366,3 +366,14 @@ def test_a_calibration_without_temperatures_says_so_at_any(record):
     assert ids(hot) == ["no-temperature"]
     assert "calibrated at unrecorded temperatures, and tested at 150.0 °C" in hot.findings[0].text
     assert ids(verify(record, roll(45), SPREADS)) == []
+
+
+def test_a_zero_of_the_stand_counts_in_errors_and_not_in_spreads(record):
+    limits = Limits(name="i", spread=Bounds(inclination_deg=0.1), error=Bounds(inclination_deg=0.3))
+    plain = rows_of(verify(record, roll(45), limits))
+    zeros = {**NOISE, "inclination-zero": np.full(12, 0.05 * DEG), "tilt": np.full(12, 0.04 * DEG)}
+    shared = rows_of(verify(record, roll(45, sd=zeros), limits))
+    assert shared["spread of inclination"] == plain["spread of inclination"]
+    before = plain["error of inclination"].uncertainty
+    expected = (before**2 + 0.05**2 + 0.04**2 / 2) ** 0.5
+    assert shared["error of inclination"].uncertainty == pytest.approx(expected, rel=1e-6)

@@ -201,7 +201,10 @@ class Test:
         whole = [s for s in seen if not self._loose(s.index) and (s.one_azimuth or name in LEVEL)]
         inside = np.concatenate([s.index for s in whole]) if whole else np.zeros(0, int)
         error, labels = np.abs(self._error(name)), self.readings.labels
-        sd = np.hypot(self._noise(name), self.readings.uncertainty(name))
+        reference = np.hypot(
+            self.readings.uncertainty(name), self.readings.common_uncertainty(name)
+        )
+        sd = np.hypot(self._noise(name), reference)
         return [self._curve_of(name, s, True) for s in whole] + [
             Shown(float(error[i]), float(sd[i]), float(error[i]), f"station {labels[i]}")
             for i in judged[~np.isin(judged, inside)].tolist()
@@ -228,10 +231,11 @@ class Test:
     def _reference_sd(self, name: str, roll_set: RollSet, error: bool) -> tuple[Array, float]:
         """Standard uncertainty of the reference: per station (k,), and what the set shares."""
         sd = self.readings.uncertainty(name)[roll_set.index]
-        zero, whole = np.zeros(sd.shape), float(np.sqrt(np.mean(sd**2)))
+        shared = float(self.readings.common_uncertainty(name).max()) if error else 0.0
         if name == "toolface" or (name in ANGLES and roll_set.set_each):
-            return sd, 0.0
-        return zero, whole if error else 0.0
+            return sd, shared
+        whole = float(np.sqrt(np.mean(sd**2))) if error else 0.0
+        return np.zeros(sd.shape), float(np.hypot(whole, shared))
 
     def _centred(self, name: str, index: Ints) -> Array:
         """Values (k,) of a set about their middle; of toolface its errors."""

@@ -126,6 +126,15 @@ class Readings:
             return np.zeros(self.accelerometer.shape[:-1])
         return self._per_station(np.nan_to_num(np.asarray(self.sd[name], float)))
 
+    def common_uncertainty(self, name: str) -> Array:
+        """Standard uncertainty of the reference `name` (..., n) by what all stations of a stand share.
+
+        The zero of its scale, and of inclination the lean of its vertical towards any one azimuth.
+        """
+        zero = self.uncertainty(f"{name}-zero")
+        tilt = self.uncertainty("tilt") if name == "inclination" else 0.0
+        return np.asarray(np.sqrt(zero**2 + np.square(tilt) / 2))
+
     def _per_station(self, value: ArrayLike) -> Array:
         whole, shape = np.asarray(value, float), self.accelerometer.shape[:-1]
         return whole if whole.shape == shape else np.broadcast_to(whole, shape)
