@@ -27,6 +27,7 @@ from mwdcal.core.observability import Free, free_directions
 from mwdcal.core.problem import STAND
 from mwdcal.core.uncertainty import analyse, marginal_rank
 from mwdcal.core.vectors import Array
+from mwdcal.courses import misfit_covariance
 from mwdcal.curves import with_nonlinearity
 from mwdcal.estimate import Fit, fit
 from mwdcal.findings import Findings, described, is_relative
@@ -164,7 +165,15 @@ class _Record:
 
     @cached_property
     def _scaled(self) -> Array:
-        """Covariance (p, p) of the fit's parameters, scaled by s²; a prior is not."""
+        """Covariance (p, p) of the fit's parameters, scaled by s²; a prior is not.
+
+        With what the temperature order leaves out.
+        """
+        return np.asarray(self._noisy + misfit_covariance(self.result)[0])
+
+    @property
+    def _noisy(self) -> Array:
+        """The part of noise, references and prior."""
         problem, analysis = self.result.problem, self.result.analysis
         grown = np.sqrt(self.factors)
         if self.options.prior is not None:

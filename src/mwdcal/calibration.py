@@ -134,12 +134,15 @@ class OrderScore(msgspec.Struct, frozen=True, kw_only=True):
     those two, by extrapolation. Of both: χ² per reading (`inside`, `ends`); root mean square
     error of the vector per axis in `unit` (`error_…`); of its two components across the field,
     as angles in degrees (`error_…_deg`). The noise of the readings is part of the errors:
-    `noise` and `noise_deg` are what it alone would leave. None: nothing tests it.
+    `noise` and `noise_deg` are what it alone would leave. None: no soak can be left out for it.
+    `chance`: probability that noise alone makes the term of this order as large as it is, in a
+    fit to all soaks; None at order 0, for an order that was given, and where nothing tests it.
     """
 
     triad: str
     order: int
     chosen: bool
+    chance: float | None = None
     inside: float | None
     ends: float | None
     unit: str

@@ -22,6 +22,7 @@ from mwdcal.core.models import Basis, Factors, Polynomial, Whole
 from mwdcal.core.observability import Free
 from mwdcal.core.uncertainty import analyse, marginal_rank
 from mwdcal.core.vectors import AnyArray, Array, Ints
+from mwdcal.courses import misfit_covariance
 from mwdcal.errors import MwdcalError
 from mwdcal.estimate import Fit, fit
 from mwdcal.fleet_accuracy import ANGLES, typical_sd
@@ -209,6 +210,7 @@ def _record(
         outcome.findings[place], outcome.reshoot[place] = own, stations
     if options.prior:
         result = _with_prior_apart(result)
+    result = _with_misfit(result)
     reference = profile.reference_temperature_c
     found = _columns(result, free, reference) | _besides(result, free, options, reference)
     for name, values in found.items():
@@ -267,6 +269,15 @@ def _with_prior_apart(result: Fit) -> Fit:
     covariance = analyse(noisy, result.state, result.analysis.determined).covariance
     spread = np.repeat(grown, [t.model.size for t in problem.triads], axis=-1)
     covariance = covariance / (spread[:, :, None] * spread[:, None, :])
+    return replace(result, analysis=replace(result.analysis, covariance=covariance))
+
+
+def _with_misfit(result: Fit) -> Fit:
+    """The fit with a covariance that, once scaled by s², has what the temperature order leaves out."""
+    grown = np.repeat(_grown(result), [t.model.size for t in result.problem.triads], axis=-1)
+    scale = grown[:, :, None] * grown[:, None, :]
+    extra = misfit_covariance(result) / np.where(scale > 0, scale, 1.0)
+    covariance = result.analysis.covariance + extra
     return replace(result, analysis=replace(result.analysis, covariance=covariance))
 
 

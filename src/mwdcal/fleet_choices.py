@@ -19,7 +19,8 @@ from mwdcal.options import Options
 from mwdcal.prior import from_datasheet
 from mwdcal.profile import Profile
 from mwdcal.readings import TRIADS, Readings
-from mwdcal.selection import HIGHEST, choose_orders, judged_soaks, mapped
+from mwdcal.selection import choose_orders, judged_soaks, mapped
+from mwdcal.soaks import HIGHEST
 
 CHUNK = 320
 """Tools fitted in one call: few enough for the cache, many enough for NumPy."""

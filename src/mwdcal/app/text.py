@@ -134,13 +134,13 @@ def findings(found: list[Finding]) -> list[str]:
 
 
 def orders(scores: list[OrderScore]) -> str:
-    """Error at temperatures left out of the fit, by triad and order: what chose the order."""
+    """Error at temperatures left out of the fit, by triad and order, and what chose the order."""
     word = "" if all(s.chosen for s in scores) else "chosen"
     rows = []
     for s in scores:
         values = (s.error_inside, s.error_ends, s.noise)
         shown = [quantity(value, s.unit.partition(" ")[0]) for value in values]
-        row = [s.triad, str(s.order), number(s.inside), number(s.ends), *shown]
+        row = [s.triad, str(s.order), number(s.inside), number(s.ends), *shown, chance(s.chance)]
         rows.append([*row, word if s.chosen else ""])
     header = [
         "temperatures left out",
@@ -151,7 +151,17 @@ def orders(scores: list[OrderScore]) -> str:
         "at the ends",
     ]
     note = "error: rms per axis, with the noise; inside: interpolation, at the ends: extrapolation"
-    return table(rows, [*header, "noise", ""]) + "\n" + note
+    if word:
+        note += (
+            "\nby chance: probability that noise alone gives such a term; chosen: the lowest order "
+            "above which none is below 0.001"
+        )
+    return table(rows, [*header, "noise", "by chance", ""]) + "\n" + note
+
+
+def chance(value: float | None) -> str:
+    """A probability in two digits."""
+    return number(value) if value is None else f"{value:.2g}" if value > 1e-12 else "< 1e-12"
 
 
 def curves(scores: list[CurveScore]) -> str:
