@@ -52,7 +52,7 @@ def calibrate(
 ) -> Calibration:
     """Fit the sensor model to a run and state what it is worth.
 
-    `orders`: what left-out temperatures say of the order (`mwdcal.selection`), for the record.
+    `orders`: what chose the order, and left-out temperatures say of it (`mwdcal.selection`), for the record.
     Raises `FitError` where the data cannot give a calibration to be trusted.
     """
     options = with_nonlinearity(options or Options(), profile)

@@ -91,22 +91,10 @@ def orders_of(result: Fit) -> list[int]:
 
 def terms_beyond(result: Fit) -> Terms:
     """The powers of temperature that a fit has not."""
-    highest = highest_order(result.problem.temperature)
-    count = min(int(highest.max()), TRIED)
-    triads, members = len(result.problem.triads), len(highest)
-    found = np.zeros((6, members, triads, TRIED))
-    orders = orders_of(result)
-    if count > min(orders):
-        shown = np.arange(1, count + 1) <= highest[:, None]
-        whole, pulled = _with_terms(result, shown)
-        every = np.arange(whole.shape[-1])
-        columns = every[-6 * triads * count :].reshape(count, triads, 6)
-        for index, order in enumerate(orders):
-            if order < count:
-                own = columns[:, index].ravel()
-                fitted = np.setdiff1d(every, own)
-                parts = _in_turn(whole, pulled, own[6 * order :], fitted)
-                found[:, :, index, order:count] = parts
+    memo = result.problem.memo.at(result.state)
+    if "terms" not in memo.besides:
+        memo.besides["terms"] = _every_term(result)
+    found = memo.besides["terms"]
     square, freedom = found[:2]
     size, noise = (np.moveaxis(found[at : at + 2], 0, -1) for at in (2, 4))
     factor, known = result.analysis.variance_factor, result.analysis.freedom
@@ -119,15 +107,36 @@ def terms_beyond(result: Fit) -> Terms:
     return Terms(square, freedom, size, noise, scatter, rest)
 
 
-def _with_terms(result: Fit, shown: Bools) -> tuple[Array, Array]:
-    """Information and pull of the fit's unknowns, then of every power `shown` (B, k).
+def _every_term(result: Fit) -> Array:
+    """What `_in_turn` says (6, B, t, k) of every power and triad."""
+    highest = highest_order(result.problem.temperature)
+    count = min(int(highest.max()), TRIED)
+    triads, orders = len(result.problem.triads), orders_of(result)
+    found = np.zeros((6, len(highest), triads, TRIED))
+    least = min(orders)
+    if count <= least:
+        return found
+    shown = (np.arange(1, count + 1) <= highest[:, None])[:, least:]
+    whole, pulled = _with_terms(result, shown, least)
+    every = np.arange(whole.shape[-1])
+    columns = every[-6 * triads * (count - least) :].reshape(count - least, triads, 6)
+    for index, order in enumerate(orders):
+        if order < count:
+            own = columns[:, index].ravel()
+            fitted, tested = np.setdiff1d(every, own), own[6 * (order - least) :]
+            found[:, :, index, order:count] = _in_turn(whole, pulled, tested, fitted)
+    return found
 
-    Of power 1 come the three gains and three offsets of each triad, then of power 2, and so on.
+
+def _with_terms(result: Fit, shown: Bools, least: int) -> tuple[Array, Array]:
+    """Information and pull of the fit's unknowns, then of the powers above `least` if `shown` (B, k).
+
+    Of each power come the three gains and three offsets of each triad.
     """
     problem, state = result.problem, result.state
     linear = problem.linear(state)
     steady = _steady(problem, state)
-    powers = _powers(problem.temperature, shown.shape[-1]) * shown[:, None]
+    powers = _powers(problem.temperature, least + shown.shape[-1])[..., least:] * shown[:, None]
     members, stations, count = powers.shape
     weighed = np.swapaxes(linear.weigh(steady), -1, -2)
     turned = np.swapaxes(powers, -1, -2)
@@ -155,11 +164,12 @@ def _steady(problem: Problem, state: State) -> Array:
     pairs = zip(problem.triads, problem.slices(), problem.targets(state), strict=False)
     for index, (triad, where, target) in enumerate(pairs):
         slope = triad.model.slope(state.params[:, where], triad.raw, problem.temperature)
-        strength = np.linalg.norm(target, axis=-1)[..., None, None]
-        both = np.concatenate([np.eye(3) * target[..., None], np.eye(3) * strength], -1)
         weight = problem.evidence.include[..., None] / triad.sd
-        own = slice(3 * index, 3 * index + 3)
-        columns[..., own, 6 * index : 6 * index + 6] = inverse(slope) @ both * weight[..., None]
+        back = inverse(slope) * weight[..., None]
+        rows, first = slice(3 * index, 3 * index + 3), 6 * index
+        columns[..., rows, first : first + 3] = back * target[..., None, :]
+        strength = np.linalg.norm(target, axis=-1)[..., None, None]
+        columns[..., rows, first + 3 : first + 6] = back * strength
     return columns
 
 
