@@ -166,10 +166,10 @@ def _steady(problem: Problem, state: State) -> Array:
         slope = triad.model.slope(state.params[:, where], triad.raw, problem.temperature)
         weight = problem.evidence.include[..., None] / triad.sd
         back = inverse(slope) * weight[..., None]
-        rows, first = slice(3 * index, 3 * index + 3), 6 * index
-        columns[..., rows, first : first + 3] = back * target[..., None, :]
+        own, first = slice(3 * index, 3 * index + 3), 6 * index
+        columns[..., own, first : first + 3] = back * target[..., None, :]
         strength = np.linalg.norm(target, axis=-1)[..., None, None]
-        columns[..., rows, first + 3 : first + 6] = back * strength
+        columns[..., own, first + 3 : first + 6] = back * strength
     return columns
 
 
