@@ -208,10 +208,13 @@ def test_json_of_the_order_table(tmp_path):
     said, told = mwdcal(*arguments), mwdcal(*arguments, "--json").json
     for triad in ("accelerometer", "magnetometer"):
         own = [o for o in told["orders"] if o["triad"] == triad]
-        assert [o["order"] for o in own] == [0, 1]
+        assert [o["order"] for o in own] == [0, 1, 2]
         assert sum(o["chosen"] for o in own) == 1
     for score in told["orders"]:
-        cells = f"{score['triad']} {score['order']} {score['inside']:.3g} {score['ends']:.3g}"
+        values = (score["inside"], score["ends"])
+        judged = ["–" if value is None else f"{value:.3g}" for value in values]
+        assert (judged == ["–", "–"]) == (score["order"] == 2)
+        cells = " ".join([score["triad"], str(score["order"]), *judged])
         assert any(" ".join(s.split()).startswith(cells) for s in said.out.splitlines())
 
 

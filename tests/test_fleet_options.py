@@ -177,11 +177,22 @@ def test_a_given_order_is_fitted_over_each_tools_own_range(tmp_path):
     check_all(*both(tmp_path, runs, "--order", 2))
 
 
+def test_an_order_too_low_is_stated_as_for_each_tool_alone(tmp_path):
+    """With what it leaves out in findings and uncertainties; temperatures differ in number."""
+    runs = {"three": drifting(2, 2, (20.0, 60.0, 100.0, 100.5)), "four": drifting(4, 2)}
+    rows, alone = both(tmp_path, runs, "--order", 1)
+    check_all(rows, alone)
+    for row in rows.values():
+        assert "accelerometer-temperature-misfit" in row["findings"]
+        assert row["inclination_sd_deg"] > 0.01
+
+
 def test_the_order_of_a_method_without_any(tmp_path):
     runs = {"still": drifting(0), "two": drifting(5, 1, (20.0, 80.0))}
     rows, alone = both(tmp_path, runs, "--order", "auto", "--method", "swarm")
     check_all(rows, alone)
-    assert [row["status"] for row in rows.values()] == ["ok", "temperature-span"]
+    assert [row["order"] for row in rows.values()] == [0, 0]
+    assert "magnetometer-temperature-misfit" in rows["two"]["findings"]
 
 
 def test_a_trial_that_stops_the_batch_does_not_stop_the_others(tmp_path, monkeypatch):

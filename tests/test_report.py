@@ -305,7 +305,7 @@ def test_errors_at_left_out_temperatures(words, monkeypatch):
             assert f">{number(value)}<" in row
         assert f">{number(score.error_ends_deg, 2)}<" in row
         assert ("chosen" in row) == score.chosen
-    for said in ("interpolation", "extrapolation", "within 2 % of the best", "25.0 to 105.0 °C",
+    for said in ("interpolation", "extrapolation", "above which none is below 0.001", "25.0 to 105.0 °C",
                  "--outside refuse", "--outside extrapolate", "The course with temperature is simulated"):  # fmt: skip
         assert said in page
 
@@ -313,7 +313,7 @@ def test_errors_at_left_out_temperatures(words, monkeypatch):
 def test_a_given_order_has_errors_but_nothing_to_compare(words):
     page = words(judged(1))
     assert 'id="orders"' in page
-    assert "within 2 %" not in page
+    assert "above which none" not in page
     assert ">chosen<" not in page
 
 

@@ -62,8 +62,9 @@ def calibrate(
 ) -> Calibration:
     """Fit the sensor model to a run and state what it is worth.
 
-    For the record: `orders`, what left-out temperatures say of the order (`mwdcal.selection`), and
-    `excluded`, labels of stations of the run that the readings no longer have.
+    For the record: `orders`, what chose the order and left-out temperatures say of it
+    (`mwdcal.selection`), and `excluded`, labels of stations of the run that the readings no longer
+    have.
     Raises `FitError` where the data cannot give a calibration to be trusted.
     """
     options = with_nonlinearity(options or Options(), profile)

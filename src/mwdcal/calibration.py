@@ -18,14 +18,13 @@ from mwdcal.core.vectors import Array, Bools
 from mwdcal.errors import InputError
 from mwdcal.profile import Profile
 from mwdcal.readings import NANOTESLA, Readings
+from mwdcal.soaks import GAP
 
 SCHEMA_VERSION = 1
 DIGITS = 12
 """Significant digits of every number in a calibration file."""
 MARGIN = 1.0
 """Degrees Celsius by which a temperature may lie outside the calibrated range, as it is read."""
-SOAK_GAP = 5.0
-"""Temperatures closer than this belong to one soak, °C."""
 MAGNETIC = ("azimuth", "field", "dip", "magnetic_toolface", "bx", "by", "bz")
 """Observables that need a magnetometer."""
 FREE_SHARE = 5e-2
@@ -147,12 +146,15 @@ class OrderScore(msgspec.Struct, frozen=True, kw_only=True):
     those two, by extrapolation. Of both: χ² per reading (`inside`, `ends`); root mean square
     error of the vector per axis in `unit` (`error_…`); of its two components across the field,
     as angles in degrees (`error_…_deg`). The noise of the readings is part of the errors:
-    `noise` and `noise_deg` are what it alone would leave. None: nothing tests it.
+    `noise` and `noise_deg` are what it alone would leave. None: no soak can be left out for it.
+    `chance`: probability that noise alone makes the term of this order as large as it is, in a
+    fit to all soaks; None at order 0, for an order that was given, and where nothing tests it.
     """
 
     triad: str
     order: int
     chosen: bool
+    chance: float | None = None
     inside: float | None
     ends: float | None
     unit: str
@@ -412,9 +414,9 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
     def margin(self) -> float:
         """Degrees Celsius by which a reading may lie outside the calibrated range.
 
-        A calibration without temperature terms holds for the soak it was made in: `SOAK_GAP`.
+        A calibration without temperature terms holds for the soak it was made in: `soaks.GAP`.
         """
-        return MARGIN if any(t.order for t in self.triads) else SOAK_GAP
+        return MARGIN if any(t.order for t in self.triads) else GAP
 
     def outside(self, readings: Readings, margin: float | None = None) -> Bools:
         """Stations (…, n) outside the calibrated temperature range by more than a margin, °C.

@@ -18,7 +18,7 @@ from mwdcal.methods import EVIDENCE
 from mwdcal.options import Options
 from mwdcal.profile import Profile
 from mwdcal.readings import CONSTANTS, TRIADS, Readings
-from mwdcal.selection import HIGHEST, soaks
+from mwdcal.soaks import HIGHEST, soaks
 
 GAIN = (0.3, 3.0)
 """An own-axis gain outside this share of nominal is a wrong profile, not a sensor error."""

@@ -118,7 +118,7 @@ def compare(
 ) -> Comparison:
     """Calibrate a run by every method and judge each by stations left out of its fit.
 
-    `order` "auto": as left-out temperatures speak for by the joint method, the same for all
+    `order` "auto": as the joint method chooses it, the same for all
     methods. A method that is refused gives its reason and leaves the others alone.
     """
     options = _options(readings, profile, order, seed, progress)

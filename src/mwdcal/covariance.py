@@ -3,7 +3,7 @@
 What the readings' noise and the settings of the stand do is independent from station to station
 and scales with s². Errors that all stations have in common (zeros and tilt of the stand, the
 references for gravity, field and dip) and a prior are as large as they were declared: no residual
-says how large they are.
+says how large they are. What the order of the temperature terms leaves out is added to both.
 """
 
 from __future__ import annotations
@@ -11,9 +11,11 @@ from __future__ import annotations
 import numpy as np
 
 from mwdcal.core.vectors import Array
+from mwdcal.courses import misfit_covariance
 from mwdcal.estimate import Fit
 
 NOISE, SETTINGS, PRIOR = "noise of the readings", "settings of the stand", "prior"
+ORDER = "order of the temperature terms"
 
 
 def variance_scales(result: Fit) -> Array:
@@ -23,9 +25,9 @@ def variance_scales(result: Fit) -> Array:
 
 
 def stated_covariance(result: Fit) -> Array:
-    """Covariance (B, p, p) of the fit's parameters: independent errors times s², common ones as declared."""
+    """Covariance (B, p, p) of the fit's parameters: independent errors times s², others as they are."""
     apart = _common(result)
-    return _scaled(result, result.analysis.covariance - apart) + apart
+    return _scaled(result, result.analysis.covariance - apart) + apart + misfit_covariance(result)
 
 
 def constants_covariance(result: Fit) -> Array:
@@ -88,6 +90,9 @@ def shares(result: Fit) -> dict[str, Array]:
         if effect.any():
             outer = effect[:, :, None] * effect[:, None, :]
             found[constant.name] = found.get(constant.name, 0.0) + outer
+    order = misfit_covariance(result)
+    if order.any():
+        found[ORDER] = order
     if result.problem.prior.precision.any():
         found[PRIOR] = _of_prior(result)
     return found

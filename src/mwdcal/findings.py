@@ -15,11 +15,13 @@ from mwdcal.core.problem import Prior
 from mwdcal.core.solvers import Determined
 from mwdcal.core.uncertainty import effective_freedom
 from mwdcal.core.vectors import Array, Bools, Ints, eigen
+from mwdcal.courses import Terms, misfit_size, terms_beyond, untested
 from mwdcal.estimate import Fit
 from mwdcal.options import Options
 from mwdcal.profile import Profile
 from mwdcal.readings import TRIADS, Readings
 from mwdcal.residuals import REASONS, chi_chance, shown_in, tail
+from mwdcal.soaks import HIGHEST
 from mwdcal.structure import described as seen_as
 from mwdcal.structure import effects, suspected
 
@@ -155,6 +157,7 @@ class Findings:
             *self.residuals(),
             *self.structure(),
             *self.repeated(stations),
+            *self.temperature(),
             *self.undetermined(),
             *self.prior(),
             *self.model(),
@@ -204,6 +207,52 @@ class Findings:
             Finding(id=f"looks-like-{effect.name}", text=seen_as(effect, unit))
             for effect in effects(self.result)
         ]
+
+    def temperature(self) -> list[Finding]:
+        """What the temperature orders leave out, and courses that nothing tests."""
+        terms = terms_beyond(self.result)
+        found = [self._misfit(int(t), terms) for t in np.flatnonzero(terms.misfit[0])]
+        bare = np.flatnonzero(untested(self.result)[0])
+        if bare.size:
+            names = " and ".join(TRIADS[t] for t in bare)
+            order = max(self.result.problem.triads[t].model.basis.order for t in bare)
+            unsaid = (
+                "no uncertainty here includes a curvature"
+                if order == 1
+                else "the uncertainty takes the next power to fall off as the last one did"
+            )
+            text = (
+                f"{names}: {order + 1} temperatures are as many as a course of order {order} takes, so "
+                f"nothing tests it between them, and {unsaid}. Add a temperature between them."
+            )
+            found.append(Finding(id="temperature-untested", text=text))
+        return found
+
+    def _misfit(self, index: int, terms: Terms) -> Finding:
+        """A course with temperature that the order of a triad does not follow."""
+        order = self.result.problem.triads[index].model.basis.order
+        there = np.flatnonzero(terms.present[0, index]) + 1
+        share = float(misfit_size(self.result, terms)[0, index])
+        observable = ("gravity", "field")[index]
+        strength = float(np.mean(self.result.problem.constant(self.result.state, observable)))
+        scale, unit = shown_in(observable, self.readings.relative)
+        if order < HIGHEST and there.min() <= HIGHEST:
+            cause = f"powers of temperature above order {order} are there"
+            remedy = f"Use --order auto, or --order {min(int(there.max()), HIGHEST)}"
+            if self.options.method == "swarm":
+                remedy = "Use another --method: swarm has no temperature terms"
+        else:
+            cause = "readings differ from one temperature to the next as no course of order 3 does"
+            remedy = (
+                "Let the tool come to rest at each temperature and look for hysteresis or a reference "
+                "that moved; more temperatures make the mean better"
+            )
+        text = (
+            f"{TRIADS[index]}: {cause}, beyond what noise explains: {share * strength * scale:.2g} {unit} "
+            f"rms per axis over the range ({np.degrees(share):.2g}° across the field). The "
+            f"uncertainties here include it. {remedy}."
+        )
+        return Finding(id=f"{TRIADS[index]}-temperature-misfit", text=text)
 
     def repeated(self, stations: list[StationRow]) -> list[Finding]:
         """Stations whose readings are another's to the last digit."""

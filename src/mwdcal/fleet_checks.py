@@ -20,7 +20,7 @@ from mwdcal.core.vectors import Array, Bools, Ints
 from mwdcal.estimate import Fit
 from mwdcal.options import Options
 from mwdcal.readings import TRIADS, Readings
-from mwdcal.selection import GAP
+from mwdcal.soaks import GAP
 from mwdcal.stand import LOOSE
 
 

@@ -19,7 +19,8 @@ from mwdcal.options import Options
 from mwdcal.prior import from_datasheet
 from mwdcal.profile import Profile
 from mwdcal.readings import TRIADS, Readings
-from mwdcal.selection import HIGHEST, choose_orders, judged_soaks, mapped
+from mwdcal.selection import choose_orders, judged_soaks, mapped
+from mwdcal.soaks import HIGHEST
 
 CHUNK = 320
 """Tools fitted in one call: few enough for the cache, many enough for NumPy."""
@@ -32,7 +33,7 @@ Alone = Callable[[int], tuple[Readings, Profile]]
 class PerTool:
     """What the options leave to each tool.
 
-    `order`: its temperature orders, by soaks left out. `nonlinearity`: triads whose own-axis
+    `order`: its temperature orders, by the terms that noise does not explain. `nonlinearity`: triads whose own-axis
     terms are tried, by stations left out. `datasheet`: the prior is the profile's tolerances, in
     the unit of the tool's field.
     """
@@ -101,7 +102,7 @@ def _alike(readings: Readings, tools: Ints) -> list[Ints]:
 def _tried_orders(
     readings: Readings, tools: Ints, options: Options
 ) -> Iterator[tuple[Ints, Ints | Exception]]:
-    """Orders (B, 2) of the given tools, by soaks left out, many in one call."""
+    """Orders (B, 2) of the given tools, many in one call."""
     trial = replace(options, nonlinearity={})
     for first in range(0, len(tools), CHUNK):
         part = tools[first : first + CHUNK]

@@ -14,6 +14,7 @@ import numpy as np
 from mwdcal.core.observability import Free
 from mwdcal.core.uncertainty import TESTED, station_misfit
 from mwdcal.core.vectors import Bools, Ints
+from mwdcal.courses import terms_beyond, untested
 from mwdcal.estimate import Fit
 from mwdcal.findings import (
     Findings,
@@ -58,6 +59,7 @@ def findings_of_batch(
         for name, flag in zip(TRIADS, each.transpose(), strict=False)
     }
     flags["no-redundancy"] = np.any(unchecked(result), -1)
+    flags |= _of_temperature(result)
     found: list[list[str]] = [[] for _ in result.status]
     _add(found, flags)
     for place in np.flatnonzero(suspected(result, chances)).tolist():
@@ -81,6 +83,13 @@ def _add(found: list[list[str]], flags: dict[str, Bools]) -> None:
     for name, flag in flags.items():
         for index in np.flatnonzero(flag):
             found[index].append(name)
+
+
+def _of_temperature(result: Fit) -> dict[str, Bools]:
+    """Members (B,) whose orders leave out what is there, and those whose courses nothing tests."""
+    misfits = terms_beyond(result).misfit.transpose()
+    found = {f"{n}-temperature-misfit": f for n, f in zip(TRIADS, misfits, strict=False)}
+    return found | {"temperature-untested": np.any(untested(result), -1)}
 
 
 def _of_prior(result: Fit, free: list[list[Free]]) -> dict[str, Bools]:

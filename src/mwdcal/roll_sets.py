@@ -9,7 +9,7 @@ import numpy as np
 
 from mwdcal.core.vectors import Array, Bools, Ints
 from mwdcal.readings import Readings
-from mwdcal.selection import soaks
+from mwdcal.soaks import soaks
 
 NEAR_VERTICAL = np.radians(5.0)
 """Nearer to vertical than this azimuth and toolface are not judged."""

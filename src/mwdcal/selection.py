@@ -1,4 +1,8 @@
-"""The temperature order, chosen and defended by leaving one temperature out at a time."""
+"""The temperature order: chosen by the terms that noise does not explain, judged at temperatures left out.
+
+Leaving one soak out can judge an order of two less than there are soaks; the terms of a fit to all soaks
+can be tested up to one less.
+"""
 
 from __future__ import annotations
 
@@ -8,43 +12,28 @@ from typing import Any
 
 import numpy as np
 
-from mwdcal.calibration import SOAK_GAP, OrderScore
+from mwdcal.calibration import OrderScore
 from mwdcal.core.problem import Problem, State
 from mwdcal.core.solvers import Linear
 from mwdcal.core.uncertainty import TESTED, marginal_rank, readjusted
 from mwdcal.core.vectors import AnyArray, Array, Bools, Ints
+from mwdcal.courses import terms_beyond
 from mwdcal.estimate import Fit, fit
 from mwdcal.options import Options, Orders
 from mwdcal.readings import TRIADS, Readings
 from mwdcal.residuals import shown_in
+from mwdcal.soaks import HIGHEST, highest_order, usable_soaks
 
-GAP = SOAK_GAP
-SPAN = 10.0
-"""A run that spans less has no temperature terms, °C."""
-HIGHEST = 3
-EXCESS = 1.5
-"""Residual variance of order 0, in units of the noise, beyond which a linear course is fitted."""
 FEWEST = 3
 """Fewest soaks among which one can be left out."""
 LOWEST_RANK = 8
 """A triad of 12 parameters whose three rotations and scale are free has this rank."""
-NEAR_BEST = 1.02
-
-
-def soaks(temperature: Array) -> Ints:
-    """Number (..., n) of the soak that each station belongs to, coldest first."""
-    order = np.argsort(temperature, -1, kind="stable")
-    ascending = np.take_along_axis(temperature, order, -1)
-    steps = np.cumsum(np.diff(ascending, prepend=ascending[..., :1], axis=-1) > GAP, -1)
-    numbers = np.empty(order.shape, int)
-    np.put_along_axis(numbers, order, steps, -1)
-    return numbers
 
 
 def choose_order(
     readings: Readings, options: Options, progress: Callable[[str], None]
 ) -> tuple[Orders, list[OrderScore]]:
-    """Each triad's lowest order whose held-out χ² is within 2 % of its best, and the tables.
+    """Each triad's lowest order above which noise explains all terms, and the tables.
 
     Order 0 without a table where there is no temperature, or too short a span of it.
     """
@@ -52,11 +41,21 @@ def choose_order(
     levels = int(judged_soaks(batch, options)[0])
     if levels < 2:
         return 0, []
+    progress(f"temperature order: testing its terms over {levels} temperatures")
+    chosen, chance = _tested(batch, options)
     if levels < FEWEST:
-        return _linear_if_needed(batch, options, progress), []
-    orders, found = _every_order(batch, options, progress)
-    chosen = _best(found)[0]
-    return (int(chosen[0]), int(chosen[-1])), _tables(readings, orders, found)
+        progress(
+            "two temperatures cannot be left out in turn: order 1 is taken where order 0 leaves "
+            "residuals beyond the noise. A third temperature would test the course between."
+        )
+    orders = [(order, order) for order in range(_highest(batch, options) + 1)]
+    judged = [pair for pair in orders if pair[0] + 2 <= levels and levels >= FEWEST]
+    batch = _with_noise(batch, replace(options, order=orders[-1]))
+    found = _compared(batch, options, judged, progress)
+    every = np.full((len(orders), *found.shape[1:]), np.nan)
+    every[: len(judged)] = found
+    pair = (int(chosen[0, 0]), int(chosen[0, -1]))
+    return pair, _tables(readings, orders, every, chosen[0], chance[0])
 
 
 def judged_soaks(readings: Readings, options: Options) -> Ints:
@@ -73,14 +72,31 @@ def choose_orders(readings: Readings, options: Options, levels: int) -> Ints:
 
     All members have the same number of `judged_soaks`.
     """
-    count = len(readings.accelerometer)
     if levels < 2:
-        return np.zeros((count, 2), int)
-    if levels < FEWEST:
-        chosen = (_without_course(readings, options) > EXCESS).astype(int)
-    else:
-        chosen = _best(_every_order(readings, options, lambda text: None)[1])
-    return chosen[:, [0, -1]]
+        return np.zeros((len(readings.accelerometer), 2), int)
+    return _tested(readings, options)[0][:, [0, -1]]
+
+
+def _tested(readings: Readings, options: Options) -> tuple[Ints, Array]:
+    """The lowest orders (B, t) that leave no term which is there, and the chance (B, t, k) of each term.
+
+    The chance is that of the term in a fit of the order below, or of the order chosen.
+    """
+    limit = _highest_each(readings, options)
+    triads = sum(getattr(readings, name) is not None for name in TRIADS)
+    orders = np.full((len(limit), triads), -1)
+    chance = np.full((len(limit), triads, HIGHEST), np.nan)
+    powers = np.arange(1, HIGHEST + 1)
+    for order in range(int(limit.max()) + 1):
+        terms = terms_beyond(fit(readings, replace(options, order=order)))
+        within = (powers <= limit[:, None]) & (powers > order)
+        open_ = (orders < 0)[..., None] & within[:, None]
+        chance = np.where(open_, terms.chance[..., :HIGHEST], chance)
+        wanted = np.any(terms.present[..., :HIGHEST] & within[:, None], -1)
+        orders = np.where((orders < 0) & ~(wanted & (order < limit)[:, None]), order, orders)
+        if (orders >= 0).all():
+            break
+    return orders, chance
 
 
 def order_errors(
@@ -94,10 +110,12 @@ def order_errors(
     levels = int(judged_soaks(batch, options)[0])
     if levels < max(FEWEST, max(options.orders) + 2):
         return []
-    yardstick = options.order if options.prior else _highest(options, levels)
-    batch = _with_noise(batch, replace(options, order=yardstick))
-    found = _compared(batch, options, [options.orders], progress)
-    return _tables(readings, [options.orders], found)
+    yardstick = options if options.prior else replace(options, order=_highest(batch, options))
+    found = _compared(_with_noise(batch, yardstick), options, [options.orders], progress)
+    triads = found.shape[2]
+    unknown = np.full((triads, HIGHEST), np.nan)
+    chosen = np.array(options.orders[:triads])
+    return _tables(readings, [options.orders], found, chosen, unknown)
 
 
 def _batch_of_one(readings: Readings) -> Readings:
@@ -124,26 +142,21 @@ def mapped(readings: Readings, change: Callable[[AnyArray], AnyArray]) -> Readin
 
 def _usable_soaks(readings: Readings) -> Ints:
     """Number (B, n) of each station's soak: all 0 without temperatures, or with too short a span."""
-    temperature = readings.temperature
-    if temperature is None:
+    if readings.temperature is None:
         return np.zeros(readings.accelerometer.shape[:-1], int)
-    wide = np.ptp(temperature, axis=-1, keepdims=True) >= SPAN
-    return np.where(wide, soaks(temperature), 0)
+    return usable_soaks(readings.temperature)
 
 
-def _highest(options: Options, levels: int) -> int:
-    """The highest order that can be judged when one soak is left out."""
-    return 0 if options.method == "swarm" else min(HIGHEST, levels - 2)
+def _highest_each(readings: Readings, options: Options) -> Ints:
+    """The highest order (B,) that the soaks can carry, with stations enough."""
+    if options.method == "swarm" or readings.temperature is None:
+        return np.zeros(len(readings.accelerometer), int)
+    return np.minimum(highest_order(readings.temperature), HIGHEST)
 
 
-def _every_order(
-    readings: Readings, options: Options, progress: Callable[[str], None]
-) -> tuple[list[tuple[int, int]], Array]:
-    """The orders that the soaks can judge, and what `_compared` says of them."""
-    highest = _highest(options, int(_usable_soaks(readings)[0].max()) + 1)
-    orders = [(order, order) for order in range(highest + 1)]
-    readings = _with_noise(readings, replace(options, order=highest))
-    return orders, _compared(readings, options, orders, progress)
+def _highest(readings: Readings, options: Options) -> int:
+    """The highest order that the soaks of any member can carry."""
+    return int(_highest_each(readings, options).max())
 
 
 def _compared(
@@ -154,6 +167,9 @@ def _compared(
 ) -> Array:
     """Mean squares (orders, B, triads, 5, soaks) of `_held_out` at some orders."""
     numbers, found = _usable_soaks(readings), []
+    if not orders:
+        triads = sum(getattr(readings, name) is not None for name in TRIADS)
+        return np.zeros((0, len(numbers), triads, 5, int(numbers.max()) + 1))
     for pair in orders:
         name = " and ".join(str(order) for order in dict.fromkeys(pair))
         progress(f"order {name}: leaving out each of {int(numbers.max()) + 1} temperatures")
@@ -161,32 +177,41 @@ def _compared(
     return np.stack(found)
 
 
-def _best(found: Array) -> Ints:
-    """The first of some orders (B, triads) that is within 2 % of the best, from `_compared`."""
-    totals = found[..., 0, :].mean(-1)
-    return np.asarray(np.argmax(totals <= NEAR_BEST * np.fmin.reduce(totals), axis=0))
-
-
 def _tables(
-    readings: Readings, orders: Sequence[tuple[int, int]], found: Array
+    readings: Readings,
+    orders: Sequence[tuple[int, int]],
+    found: Array,
+    chosen: Ints,
+    chance: Array,
 ) -> list[OrderScore]:
-    """The tables of all triads over some orders, from `_compared` of a batch of one."""
+    """The tables of all triads over some orders, from `_compared` of a batch of one.
+
+    `chosen` (t,) and the `chance` (t, k) of each term by triad.
+    """
     shown = [shown_in("gravity"), shown_in("field", readings.relative)]
-    chosen = _best(found)[0]
     return [
         score
         for t, name in enumerate(TRIADS[: len(chosen)])
-        for score in _scored(name, [p[t] for p in orders], int(chosen[t]), found[:, 0, t], shown[t])
+        for score in _scored(
+            name, [p[t] for p in orders], int(chosen[t]), found[:, 0, t], shown[t], chance[t]
+        )
     ]
 
 
 def _scored(
-    triad: str, orders: Sequence[int], best: int, found: Array, shown: tuple[float, str]
+    triad: str,
+    orders: Sequence[int],
+    chosen: int,
+    found: Array,
+    shown: tuple[float, str],
+    chance: Array,
 ) -> list[OrderScore]:
     """The table of one triad from the mean squares (orders, 5, soaks) of `_held_out`."""
-    means = np.stack([f.mean(-1) for f in (found, found[..., 1:-1], found[..., [0, -1]])], -1)
+    parts = (found, found[..., 1:-1] if found.shape[-1] > 2 else found, found[..., [0, -1]])
+    means = np.stack([f.mean(-1) for f in parts], -1)
     scale, degree = shown[0], float(np.degrees(1))
     means[:, 1:] = np.sqrt(means[:, 1:]) * np.array([scale, scale, degree, degree])[:, None]
+    known = {k: float(v) for k, v in enumerate(chance, 1) if not np.isnan(v)}
     rows = []
     for index, order in enumerate(orders):
         stated = [[None if np.isnan(v) else float(v) for v in row] for row in means[index]]
@@ -195,7 +220,8 @@ def _scored(
             OrderScore(
                 triad=triad,
                 order=order,
-                chosen=index == best,
+                chosen=order == chosen,
+                chance=known.get(order),
                 inside=chi[1],
                 ends=chi[2],
                 unit=shown[1],
@@ -208,26 +234,6 @@ def _scored(
             )
         )
     return rows
-
-
-def _linear_if_needed(
-    readings: Readings, options: Options, progress: Callable[[str], None]
-) -> Orders:
-    """Between two temperatures: order 1 where order 0 leaves clearly more than its noise."""
-    factor = _without_course(readings, options)[0]
-    wanted = [int(value > EXCESS) for value in factor]
-    progress(
-        "two temperatures cannot be left out in turn: order 1 is taken where order 0 leaves "
-        f"residuals beyond the noise ({', '.join(f'{v**0.5:.1f}' for v in factor)} times). "
-        "A third temperature would test the course between."
-    )
-    return wanted[0], wanted[-1]
-
-
-def _without_course(readings: Readings, options: Options) -> Array:
-    """Residual variance (B, triads) of order 0, in units of the noise that order 1 leaves."""
-    readings = _with_noise(readings, replace(options, order=1))
-    return fit(readings, replace(options, order=0)).analysis.variance_factor
 
 
 def _hopeless(readings: Readings, options: Options) -> Bools:

@@ -103,7 +103,7 @@ def fit_options(order: str, nonlinearity: str, prior: str, known: str) -> tuple[
         click.option("--prior", metavar=prior, help=f"What is known beforehand: {known}."),
         click.option(
             "--order", default=order, show_default=True, metavar="0…3|auto",
-            help="Order of temperature terms. auto: of each triad, by temperatures left out.",
+            help="Order of temperature terms. auto: of each triad, the terms that noise does not explain.",
         ),
         click.option(
             "--nonlinearity", default=nonlinearity, show_default=True, metavar="auto|none|NAMES",

@@ -181,7 +181,7 @@ def _of(previous: Calibration, readings: Readings) -> Knowledge:
 def _with_order(
     options: Options, order: str, readings: Readings, say: Callable[[str], None]
 ) -> tuple[Options, list[OrderScore]]:
-    """The order asked for, that of the prior, or the one that left-out temperatures speak for."""
+    """The order asked for, that of the prior, or the one whose terms noise does not explain."""
     if order == "prior":
         return options, []
     if order == "auto":

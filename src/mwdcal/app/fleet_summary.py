@@ -23,7 +23,7 @@ from mwdcal.files.fleet_sources import SERIAL
 from mwdcal.files.fleet_tables import one_chunk
 from mwdcal.fleet import OK, STAND
 from mwdcal.readings import TRIADS
-from mwdcal.selection import HIGHEST
+from mwdcal.soaks import HIGHEST
 
 SHOWN = 5
 """Most serials that a line names."""

@@ -57,6 +57,8 @@ def render(calibration: Calibration, verdict: Verdict | None = None) -> str:
         facts=_facts(calibration),
         relative=calibration.relative,
         figures=_figures(calibration),
+        compared=_compared(calibration),
+        judged=_judged(calibration),
         limit=_limit(calibration),
         decimals=_decimals(calibration),
         left_out=any(row.errors_left_out for row in calibration.station_rows),
@@ -275,7 +277,11 @@ def _figures(calibration: Calibration) -> dict[str, Any]:
         "errors": [plots.station_errors(calibration, name) for name in names],
         "missing": missing,
         "deviations": plots.deviations(calibration, _limit(calibration)),
-        "orders": plots.order_errors(calibration.orders) if _compared(calibration) else "",
+        "orders": (
+            plots.order_errors(calibration.orders)
+            if _compared(calibration) and _judged(calibration)
+            else ""
+        ),
         "accuracy": plots.accuracy(accuracy_map(calibration), angles(calibration)),
     }
 
@@ -283,6 +289,11 @@ def _figures(calibration: Calibration) -> dict[str, Any]:
 def _compared(calibration: Calibration) -> bool:
     """Whether orders were compared, rather than one given."""
     return not all(row.chosen for row in calibration.orders)
+
+
+def _judged(calibration: Calibration) -> bool:
+    """Whether some order was judged at temperatures left out."""
+    return any(row.ends is not None for row in calibration.orders)
 
 
 def _decimals(calibration: Calibration) -> dict[str, int]:

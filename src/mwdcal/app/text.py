@@ -129,13 +129,15 @@ def residuals(calibration: Calibration) -> str:
     return f"residuals over declared noise, s: {'   '.join(each)}" if each else ""
 
 
-def chance(probability: float) -> str:
-    """A probability to two digits; far below any decision a bound.
+def chance(probability: float | None) -> str:
+    """A probability to two digits; far below any decision a bound; a dash where there is none.
 
-    >>> [chance(p) for p in (0.41234, 0.00012, 1e-30)]
-    ['0.41', '0.00012', '< 1e-09']
+    >>> [chance(p) for p in (0.41234, 0.00012, 1e-30, None)]
+    ['0.41', '0.00012', '< 1e-9', '–']
     """
-    return "< 1e-09" if probability < 1e-9 else f"{probability:.2g}"
+    if probability is None:
+        return number(probability)
+    return "< 1e-9" if probability < 1e-9 else f"{probability:.2g}"
 
 
 def stand(found: StandErrors) -> list[str]:
@@ -160,13 +162,13 @@ def findings(found: list[Finding]) -> list[str]:
 
 
 def orders(scores: list[OrderScore]) -> str:
-    """Error at temperatures left out of the fit, by triad and order: what chose the order."""
+    """Error at temperatures left out of the fit, by triad and order, and what chose the order."""
     word = "" if all(s.chosen for s in scores) else "chosen"
     rows = []
     for s in scores:
         values = (s.error_inside, s.error_ends, s.noise)
         shown = [quantity(value, s.unit.partition(" ")[0]) for value in values]
-        row = [s.triad, str(s.order), number(s.inside), number(s.ends), *shown]
+        row = [s.triad, str(s.order), number(s.inside), number(s.ends), *shown, chance(s.chance)]
         rows.append([*row, word if s.chosen else ""])
     header = [
         "temperatures left out",
@@ -177,7 +179,12 @@ def orders(scores: list[OrderScore]) -> str:
         "at the ends",
     ]
     note = "error: rms per axis, with the noise; inside: interpolation, at the ends: extrapolation"
-    return table(rows, [*header, "noise", ""]) + "\n" + note
+    if word:
+        note += (
+            "\nby chance: probability that noise alone gives such a term; chosen: the lowest order "
+            "above which none is below 0.001"
+        )
+    return table(rows, [*header, "noise", "by chance", ""]) + "\n" + note
 
 
 def curves(scores: list[CurveScore]) -> str:

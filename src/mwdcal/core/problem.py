@@ -187,16 +187,20 @@ class Prior:
 
 @dataclass
 class Memo:
-    """What was found at the last state: rank, step and analysis ask at the same one."""
+    """What was found at the last state: rank, step and analysis ask at the same one.
+
+    `besides` keeps what others found there, by name.
+    """
 
     state: State | None = None
     predictions: list[Prediction] = field(default_factory=list)
     linear: dict[bool, Linear] = field(default_factory=dict)
+    besides: dict[str, Array] = field(default_factory=dict)
 
     def at(self, state: State | None) -> Memo:
         """Ours, emptied if it is of another state."""
         if self.state is not state or state is None:
-            self.state, self.predictions, self.linear = state, [], {}
+            self.state, self.predictions, self.linear, self.besides = state, [], {}, {}
         return self
 
 

@@ -24,7 +24,7 @@ from mwdcal.fleet_choices import PerTool
 from mwdcal.options import Options
 from mwdcal.profile import Profile
 from mwdcal.readings import TRIADS
-from mwdcal.selection import HIGHEST
+from mwdcal.soaks import HIGHEST
 
 LISTS = ("findings", "reshoot")
 """Columns of lists: ids of findings, and labels of stations to take again."""
