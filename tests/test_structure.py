@@ -112,6 +112,16 @@ def test_the_size_of_a_zero_is_right():
     assert 0.4 < np.std(scores) < 1.3
 
 
+def test_a_course_that_the_order_leaves_out_is_not_taken_for_a_drift():
+    """Rising temperatures keep step with the order of the stations."""
+    data = run(temperatures=(25.0, 55.0, 85.0, 115.0))
+    bent = 4e-4 * ((data.temperature - 70) / 45) ** 2
+    raw = data.accelerometer * (1 + bent[:, None]) + bent[:, None]
+    result = fit(Readings(raw, data.magnetometer, data.temperature, data.known, data.sd))
+    assert not effects(result)
+    assert result.analysis.variance_factor[0, 0] > 1.2
+
+
 def test_findings_name_the_effect_and_what_to_do():
     record = calibrate(run("field-drift"), Profile(name="x"))
     (finding,) = [f for f in record.findings if f.id.startswith("looks-like-")]

@@ -135,19 +135,22 @@ def _with_terms(result: Fit, shown: Bools, least: int) -> tuple[Array, Array]:
     """
     problem, state = result.problem, result.state
     linear = problem.linear(state)
-    steady = _steady(problem, state)
-    powers = _powers(problem.temperature, least + shown.shape[-1])[..., least:] * shown[:, None]
+    columns = steady_columns(problem, state)
+    powers = (
+        temperature_powers(problem.temperature, least + shown.shape[-1])[..., least:]
+        * shown[:, None]
+    )
     members, stations, count = powers.shape
-    weighed = np.swapaxes(linear.weigh(steady), -1, -2)
+    weighed = np.swapaxes(linear.weigh(columns), -1, -2)
     turned = np.swapaxes(powers, -1, -2)
 
     def summed(each: Array, by: Array) -> Array:
         return np.asarray(by @ each.reshape(members, stations, -1))
 
-    width = steady.shape[-1]
+    width = columns.shape[-1]
     cross = summed(weighed @ linear.design, turned).reshape(members, count * width, -1)
     pairs = (powers[..., None] * powers[..., None, :]).reshape(members, stations, -1)
-    own = summed(weighed @ steady, np.swapaxes(pairs, -1, -2))
+    own = summed(weighed @ columns, np.swapaxes(pairs, -1, -2))
     own = np.swapaxes(own.reshape(members, count, count, width, width), 2, 3)
     own = own.reshape(members, count * width, count * width)
     pulled = -summed(weighed @ linear.residual[..., None], turned).reshape(members, -1)
@@ -157,7 +160,7 @@ def _with_terms(result: Fit, shown: Bools, least: int) -> tuple[Array, Array]:
     return whole, np.concatenate([-normal.gradient, pulled], -1)
 
 
-def _steady(problem: Problem, state: State) -> Array:
+def steady_columns(problem: Problem, state: State) -> Array:
     """Columns (B, n, m, 6 t) of gains and offsets of each triad's axes, shares of the field."""
     rows = 3 * len(problem.triads)
     columns = np.zeros((*problem.temperature.shape, rows, 2 * rows))
@@ -179,7 +182,7 @@ def _mean(values: Array, weights: Array) -> Array:
     return np.swapaxes(both[0] / np.where(both[1] > 0, both[1], 1.0), 0, 1)
 
 
-def _powers(temperature: Array, count: int) -> Array:
+def temperature_powers(temperature: Array, count: int) -> Array:
     """Chebyshev polynomials (B, n, count) of temperatures (B, n) over each member's range, from 1."""
     low, high = temperature.min(-1, keepdims=True), temperature.max(-1, keepdims=True)
     scaled = (2 * temperature - low - high) / np.maximum(high - low, 1e-9)
@@ -285,7 +288,7 @@ def _left_out(problem: Problem, order: int) -> tuple[Array, Array]:
     low, high = temperature.min(-1, keepdims=True), temperature.max(-1, keepdims=True)
     even = low + (high - low) * np.linspace(0, 1, GRID)
     every = np.concatenate([temperature, even], -1)
-    powers = _powers(every, TRIED)
+    powers = temperature_powers(every, TRIED)
     whole = np.concatenate([np.ones_like(powers[..., :1]), powers], -1)
     stations = temperature.shape[-1]
     measured, shown = whole[:, :stations], whole[:, stations:]

@@ -18,11 +18,13 @@ import numpy as np
 from mwdcal.core.problem import Problem, State
 from mwdcal.core.uncertainty import whole_covariance
 from mwdcal.core.vectors import Array, Bools, eigen
+from mwdcal.courses import TRIED, steady_columns, temperature_powers
 from mwdcal.covariance import variance_scales
 from mwdcal.estimate import Fit
 from mwdcal.evidence import TURNS, acts_on
 from mwdcal.readings import TRIADS
 from mwdcal.residuals import chances, to_reshoot
+from mwdcal.soaks import HIGHEST, SPAN, highest_order
 
 UNLIKELY = 1e-4
 """Chance of so much common structure in noise, below which an effect is named."""
@@ -38,6 +40,8 @@ DRIFTS = 2
 """Degree of the polynomial of order (or of the row) that a drift is looked for as."""
 
 
+COURSE = "-temperature"
+"""What ends the names of the powers of temperature that the order of a triad leaves out."""
 ZEROS = ("azimuth-zero", "inclination-zero", "dip-reference")
 """Effects that are one angle."""
 TEXTS = {
@@ -131,7 +135,7 @@ def effects(result: Fit) -> list[Effect]:
         trials = {n: _trial(scores, chosen, n, left, freedom - used) for n in scores.places}
         open_ = {n: t for n, t in trials.items() if n not in chosen and t[0] < UNLIKELY}
         if not open_:
-            return _described(result, shown) if shown else []
+            return [e for e in _described(result, shown) if not e.name.endswith(COURSE)]
         best = min(open_, key=lambda name: (open_[name][0], -open_[name][1]))
         chance, gain, directions = open_[best]
         chosen, left, used = [*chosen, best], left - gain, used + directions
@@ -182,6 +186,8 @@ def _trial(
 
 def _described(result: Fit, shown: list[tuple[str, float, float]]) -> list[Effect]:
     """The effects with their sizes: all together, with the noise that they leave."""
+    if not shown:
+        return []
     problem, names = result.problem, [name for name, _, _ in shown]
     scores = _scores(problem, result, dict(_families(problem, result.state)))
     left, freedom = _misfit(problem, result)
@@ -252,8 +258,23 @@ def _families(problem: Problem, state: State) -> Iterator[tuple[str, Array]]:
     back = [known[n] * s for n, s in steps.items() if n in known and s.any()]
     if back:
         yield "backlash", np.stack(back, -1)
+    yield from _courses(problem, state)
     for index, name in enumerate(TRIADS[: len(problem.triads)]):
         yield from _of_sensor(problem, index, name, weights[index], order)
+
+
+def _courses(problem: Problem, state: State) -> Iterator[tuple[str, Array]]:
+    """Powers of temperature that a triad's order leaves out: another finding names these."""
+    if np.ptp(problem.temperature) < SPAN:
+        return
+    highest = int(np.clip(highest_order(problem.temperature)[0], HIGHEST, TRIED))
+    columns = steady_columns(problem, state)
+    powers = temperature_powers(problem.temperature, highest)[0]
+    for index, triad in enumerate(problem.triads):
+        order = triad.model.basis.order
+        if order < highest:
+            own = columns[..., 6 * index : 6 * index + 6]
+            yield f"{TRIADS[index]}{COURSE}", _products(own, powers[:, order:])
 
 
 def _turns(problem: Problem, state: State, turns: Array) -> dict[str, Array]:
