@@ -60,11 +60,15 @@ class TriadProfile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
 
 
 class StandProfile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Standard uncertainties of the stand's reference angles, degrees."""
+    """Standard uncertainties of the stand's reference angles, degrees.
+
+    `coil`: the field is made by a coil or simulated, and may be of any strength.
+    """
 
     inclination_deg: float = 0.0
     azimuth_deg: float = 0.0
     toolface_deg: float = 0.0
+    coil: bool = False
 
 
 class Profile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -28,6 +28,7 @@ _STRUCTS: dict[str, type[msgspec.Struct]] = {
     "accelerometer.datasheet": Datasheet,
     "magnetometer.datasheet": Datasheet,
 }
+_STAND_ANGLES = ("inclination_deg", "azimuth_deg", "toolface_deg")
 _WORDS = {
     "float": "a number",
     "int": "a whole number",
@@ -191,7 +192,7 @@ def check_profile(profile: Profile, source: str) -> None:
     )
     _check_triad(profile.accelerometer, "accelerometer", source)
     _check_triad(profile.magnetometer, "magnetometer", source)
-    for field in StandProfile.__struct_fields__:
+    for field in _STAND_ANGLES:
         sigma = getattr(profile.stand, field)
         _check_number(sigma, (0.0, 180.0), source, f"stand.{field}", "1 sigma, in degrees.")
 
