@@ -368,6 +368,8 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
 
         Student's t with the effective degrees of freedom of both triads (Welch-Satterthwaite);
         NaN as in `uncertainty`. Reference: JCGM 100, G.4.
+        Singular: near vertical an error across the tool axis tilts it whichever way it points, so
+        that of the inclination is the length of a vector; see `_tilt_width`.
         """
         from scipy.special import stdtrit
 
@@ -381,8 +383,32 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
             spread = spread + part**2 / max(triad.degrees_of_freedom, 1.0)
             start += len(triad.parameters)
         sd = self.uncertainty(name, readings)
-        freedom = sd**4 / np.where(spread > 0, spread, 1.0)
-        return np.asarray(sd * stdtrit(np.maximum(freedom, 1.0), (1 + probability) / 2))
+        freedom = np.maximum(sd**4 / np.where(spread > 0, spread, 1.0), 1.0)
+        width = np.asarray(sd * stdtrit(freedom, (1 + probability) / 2))
+        if name != "inclination":
+            return width
+        return self._tilt_width(readings, width, freedom, probability)
+
+    def _tilt_width(
+        self, readings: Readings, width: Array, freedom: Array, probability: float
+    ) -> Array:
+        """The half width (…, n) of inclination: `width` away from vertical, that of a tilt near it.
+
+        Definition: the tilt (gx, gy) / |g| has two errors, and with their larger uncertainty u its
+        error is below k u, k² = ν ((1 - p)^(-2/ν) - 1), Hotelling's for two. The one takes over from
+        the other between tilts of k u and 2 k u. Reference: JCGM 102, 7.
+        """
+        g, _ = self.fields(readings)
+        rows = self.jacobian(readings)[..., :2, :] / np.linalg.norm(g, axis=-1)[..., None, None]
+        spread = rows @ np.array(self.covariance) @ np.swapaxes(rows, -1, -2)
+        half, odd = (spread[..., 0, 0] + spread[..., 1, 1]) / 2, spread[..., 0, 1]
+        largest = half + np.hypot((spread[..., 0, 0] - spread[..., 1, 1]) / 2, odd)
+        factor = freedom * np.expm1(-2 / freedom * np.log1p(-probability))
+        tilt_width = np.sqrt(np.maximum(largest, 0.0) * factor)
+        tilt = np.linalg.norm(g[..., :2], axis=-1) / np.linalg.norm(g, axis=-1)
+        share = np.clip(tilt / np.maximum(tilt_width, 1e-300) - 1, 0.0, 1.0)
+        share = share**2 * (3 - 2 * share)
+        return np.asarray(tilt_width + share * (width - tilt_width) + 0 * width)
 
     def rests_on_free(self, name: str, readings: Readings) -> Bools:
         """Where (…, n) an observable moves with a direction that no evidence determines."""

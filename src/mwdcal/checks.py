@@ -2,23 +2,33 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 
 import numpy as np
 
+from mwdcal.axes import explaining
 from mwdcal.core.observability import Free
 from mwdcal.core.robust import LOSSES
 from mwdcal.core.solvers import Status
 from mwdcal.core.uncertainty import station_misfit
-from mwdcal.core.vectors import Array
 from mwdcal.errors import FitError, InputError
 from mwdcal.estimate import Fit
 from mwdcal.methods import EVIDENCE
 from mwdcal.options import Options
+from mwdcal.plausibility import (
+    excessive_errors,
+    gain_shares,
+    is_bad,
+    off_earth,
+    overturned,
+)
 from mwdcal.profile import Profile
-from mwdcal.readings import CONSTANTS, TRIADS, Readings
+from mwdcal.readings import CONSTANTS, EARTH, TRIADS, Readings
+from mwdcal.residuals import shown_in
 from mwdcal.soaks import HIGHEST, soaks
+from mwdcal.structure import described, effects
 
 GAIN = (0.3, 3.0)
 """An own-axis gain outside this share of nominal is a wrong profile, not a sensor error."""
@@ -30,8 +40,6 @@ NAMED = 4
 """Most undetermined parameters that a message lists."""
 
 
-BENIGN = ("rotation-x", "rotation-y", "toolface-zero", "scale")
-"""Directions that may stay free."""
 ABSURD = 30.0
 """Residuals of more than this many times the declared noise mean that something is plain wrong."""
 MOST = 0.3
@@ -52,14 +60,21 @@ def fit_checks(
     """The checks in turn, each with the status that a fleet gives to what it refuses.
 
     Where nothing fits, the state is anywhere: that comes before what it leaves undetermined, and
-    before its gains.
+    before its gains. What a wrong axis may have caused names the axes that would fit.
     """
+
+    def wired(check: Callable[[], None]) -> Callable[[], None]:
+        return partial(_naming_axes, check, readings, profile)
+
     status = Status(int(result.status[0]))
-    yield status.name.lower().replace("_", "-"), partial(_check_status, status)
-    yield "residuals", partial(_check_residuals, result, readings)
-    yield "weak-geometry", partial(_check_geometry, free)
+    yield status.name.lower().replace("_", "-"), wired(partial(_check_status, status))
+    yield "residuals", wired(partial(_check_residuals, result, readings))
+    yield "weak-geometry", wired(partial(_check_geometry, free))
     yield "no-redundancy", partial(_check_freedom, result)
-    yield "gain", partial(_check_gains, result, profile, readings)
+    yield "gain", wired(partial(_check_gains, result, profile, readings))
+    yield "earth", wired(partial(_check_dip, result))
+    yield "earth", partial(_check_strengths, result, profile)
+    yield "errors", wired(partial(_check_errors, result, readings))
 
 
 def check_options(options: Options) -> None:
@@ -251,11 +266,6 @@ def _check_status(status: Status) -> None:
         raise FitError(f"the fit failed: {status.message}.")
 
 
-def is_bad(direction: Free) -> bool:
-    """Whether a free direction means that the design is too weak."""
-    return direction.id.partition("-temperature-")[0] not in BENIGN
-
-
 def _check_geometry(free: list[Free]) -> None:
     """Rotations and scales may stay free; anything else is a design too weak to fit."""
     bad = [entry for entry in free if is_bad(entry)]
@@ -282,22 +292,12 @@ def _check_freedom(result: Fit) -> None:
             )
 
 
-def gains(result: Fit) -> list[Array]:
-    """Own-axis gain (3,) of each triad as a share of nominal, at the mean temperature."""
-    found = []
-    for triad, where in zip(result.problem.triads, result.problem.slices(), strict=True):
-        params = result.state.params[:, where]
-        slope = triad.model.slope(params, triad.raw, result.problem.temperature)
-        found.append(np.diagonal(slope[0].mean(0)))
-    return found
-
-
 def _check_gains(result: Fit, profile: Profile, readings: Readings) -> None:
-    for index, gain in enumerate(gains(result)):
+    for index in range(len(result.problem.triads)):
         name = TRIADS[index]
         unknown = getattr(profile, name).scale is None or (index == 1 and readings.relative)
-        share = gain / np.median(np.abs(gain)) if unknown else gain
-        for axis, value in enumerate(share):
+        gain, share = (each[0] for each in gain_shares(result, index))
+        for axis, value in enumerate(share if unknown else gain):
             if not GAIN[0] <= value <= GAIN[1]:
                 wrong = "has the wrong sign" if value < 0 else "is far from nominal"
                 raise FitError(
@@ -342,4 +342,67 @@ def _culprit(result: Fit, readings: Readings) -> str:
     return (
         f" Station {label} alone has {share:.0%} of the misfit: --exclude {label}, or fit with "
         "--robust student-t."
+    )
+
+
+def _naming_axes(check: Callable[[], None], readings: Readings, profile: Profile) -> None:
+    """A check whose refusal names the axes with which the run would fit, if there are any."""
+    try:
+        check()
+    except FitError as error:
+        each = [
+            f"axes = {json.dumps(axes)} of [{name}]"
+            for name, axes in explaining(readings, profile).items()
+        ]
+        if not each:
+            raise
+        raise FitError(f"{error} The run fits with {' and '.join(each)}.") from None
+
+
+def _check_dip(result: Fit) -> None:
+    """Refuse a dip beyond vertical: north of the field opposite to that of the azimuths."""
+    dip = float(np.degrees(overturned(result)[0]))
+    if np.isfinite(dip):
+        raise FitError(
+            f"the dip comes out at {dip:.1f}°, beyond vertical (accepted: -90…90): the magnetometer "
+            "reads the reverse of the field, or the reference azimuths are 180° off. Check 'axes' of "
+            "[magnetometer] in the tool profile, and ref_azimuth_deg."
+        )
+
+
+def _check_strengths(result: Fit, profile: Profile) -> None:
+    """Refuse a gravity or field that no place on Earth has."""
+    columns = {"gravity": ("ref_gravity_g", 1.0, "g"), "field": ("ref_field_nt", 1e-3, "µT")}
+    for name, (column, factor, unit) in columns.items():
+        outside = off_earth(result, name, profile.stand.coil)[0]
+        if not outside.any():
+            continue
+        place = int(np.flatnonzero(outside)[0])
+        value = float(result.problem.constant(result.state, name)[0, place]) * factor
+        given = bool(result.problem.evidence.is_known(name)[0, place])
+        low, high = (limit * factor for limit in EARTH[name])
+        source = f"'{column}' gives" if given else "the fit makes it"
+        coil = "; of a run in a coil, say coil = true under [stand]" if name == "field" else ""
+        raise FitError(
+            f"no place on Earth has a {name} of {value:.4g} {unit} ({low:g}…{high:g}): {source} so. "
+            f"Check {column} and its unit, and 'scale' in the tool profile{coil}."
+        )
+
+
+def _check_errors(result: Fit, readings: Readings) -> None:
+    """Refuse errors against the references that noise and stand do not explain."""
+    found = excessive_errors(readings, result)
+    if not found:
+        return
+    name = max(found, key=lambda n: found[n][0] / max(found[n][1], 1e-300))
+    factor, unit = shown_in(name, readings.relative)
+    seen = effects(result)[:1]
+    looks = [f" {described(each, shown_in('field', readings.relative)[1])}" for each in seen]
+    gap = "" if unit == "°" else " "
+    after, expected = (value * factor for value in found[name])
+    raise FitError(
+        f"the errors of {name} after calibration are {after:.3g}{gap}{unit} (root mean square), where noise "
+        f"and stand explain {expected:.2g}{gap}{unit}. Check the references of {name} and 'axes' in the "
+        f"tool profile, or declare 'noise' and [stand] as they are.{''.join(looks)}"
+        f"{_culprit(result, readings)}"
     )

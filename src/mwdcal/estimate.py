@@ -373,11 +373,15 @@ def _in_turn(stage: _Stage, rounds: int, turn: Callable[[_Stage], tuple[_Stage, 
 
 
 def _estimate_noise(stage: _Stage, declared: list[bool], options: Options) -> _Stage:
-    """Variance per triad by restricted maximum likelihood, fit and estimate in turn."""
+    """Variance per triad by restricted maximum likelihood, fit and estimate in turn.
+
+    A triad without redundancy keeps its start: its residuals are rounding, and say nothing.
+    """
     free = [i for i, known in enumerate(declared) if not known]
 
     def turn(now: _Stage) -> tuple[_Stage, Bools]:
-        scale = np.sqrt(analyse(now.problem, now.solved.state).variance_factor)
+        analysis = analyse(now.problem, now.solved.state)
+        scale = np.sqrt(np.where(analysis.freedom >= 1, analysis.variance_factor, np.nan))
         problem, solved = _rescaled(now.problem, scale, declared), now.solved
         if options.method != "swarm":
             solved = solve(problem, solved.state, options)

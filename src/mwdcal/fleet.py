@@ -199,7 +199,7 @@ def _record(
 ) -> None:
     """Check a fit of some tools and write down the results of the sound ones."""
     free = free_of_batch(result)
-    _doubt(outcome, members, result, free, options, alone)
+    _doubt(outcome, members, result, free, options, alone, profile)
     good = np.flatnonzero(outcome.status[members] == OK)
     if not good.size:
         return
@@ -228,14 +228,15 @@ def _doubt(
     free: list[list[Free]],
     options: Options,
     alone: Alone,
+    profile: Profile,
 ) -> None:
     """Give the suspects that the checks of a single fit refuse their status and message."""
-    suspect = suspect_fits(result, free, options) & (outcome.status[members] == OK)
+    suspect = suspect_fits(result, free, options, profile) & (outcome.status[members] == OK)
     for index in np.flatnonzero(suspect):
         tool = int(members[index])
-        readings, profile = alone(tool)
+        readings, own_profile = alone(tool)
         own = member(result, np.array([index]))
-        checks = [*fit_checks(own, free[index], profile, readings)]
+        checks = [*fit_checks(own, free[index], own_profile, readings)]
         if options.estimate:
             checks.insert(0, ("inseparable", partial(check_separable, own, options.estimate)))
         for status, check in checks:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from mwdcal.checks import ABSURD, COARSE, GAIN, MOTION, NEEDS, is_bad
+from mwdcal.checks import ABSURD, COARSE, GAIN, MOTION, NEEDS
 from mwdcal.core.observability import EXACT, Free, free_directions
 from mwdcal.core.problem import STAND_ERRORS, UNKNOWN, Problem, State
 from mwdcal.core.solvers import Determined, Status
@@ -19,7 +19,9 @@ from mwdcal.core.uncertainty import COUPLED, candidates
 from mwdcal.core.vectors import Array, Bools, Ints
 from mwdcal.estimate import Fit
 from mwdcal.options import Options
-from mwdcal.readings import TRIADS, Readings
+from mwdcal.plausibility import gain_shares, is_bad, off_earth, overturned, straying
+from mwdcal.profile import Profile
+from mwdcal.readings import EARTH, TRIADS, Readings
 from mwdcal.soaks import GAP
 from mwdcal.stand import LOOSE
 
@@ -90,12 +92,15 @@ def _lacking(readings: Readings, method: str) -> Bools:
     return np.asarray(np.any(blank, axis=0)) if blank else np.zeros(1, bool)
 
 
-def suspect_fits(result: Fit, free: list[list[Free]], options: Options) -> Bools:
+def suspect_fits(result: Fit, free: list[list[Free]], options: Options, profile: Profile) -> Bools:
     """Suspects (B,) after the fit: not settled, too weak, without redundancy, absurd."""
     suspect = result.status != int(Status.OK)
     suspect |= [any(map(is_bad, each)) for each in free]
     suspect |= np.any(np.isfinite(result.noise) & (result.analysis.freedom < 1), -1)
-    suspect |= _odd_gains(result) | _absurd(result)
+    suspect |= _odd_gains(result) | _absurd(result) | straying(result)
+    suspect |= np.isfinite(overturned(result))
+    for name in EARTH:
+        suspect |= off_earth(result, name, profile.stand.coil).any(-1)
     return np.asarray(suspect | _inseparable(result) if options.estimate else suspect)
 
 
@@ -111,16 +116,8 @@ def _inseparable(result: Fit) -> Bools:
 def _odd_gains(result: Fit) -> Bools:
     """Where (B,) an own-axis gain is not near nominal, or not near the others."""
     found = np.zeros(len(result.status), bool)
-    problem = result.problem
-    for triad, where in zip(problem.triads, problem.slices(), strict=True):
-        params = result.state.params[:, where]
-        some = slice(None if triad.model.basis.order else 1)
-        slope = triad.model.slope(params, triad.raw[:, some], problem.temperature[:, some]).mean(1)
-        gain = np.diagonal(slope, axis1=-2, axis2=-1)
-        middle = np.median(np.abs(gain), -1, keepdims=True)
-        inside = [
-            (share >= GAIN[0]) & (share <= GAIN[1]) for share in (gain, gain / np.abs(middle))
-        ]
+    for index in range(len(result.problem.triads)):
+        inside = [(share >= GAIN[0]) & (share <= GAIN[1]) for share in gain_shares(result, index)]
         found |= ~np.all(inside, (0, -1))
     return found
 

@@ -69,6 +69,7 @@ class StandProfile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     not state its own; `repeatability_…` is added to either in quadrature. The others are errors
     that all stations have in common: zeros of the three scales, the lean of the stand's vertical,
     and the references for gravity, field and dip where the run does not state their uncertainty.
+    `coil`: the field is made by a coil or simulated, and may be of any strength.
     """
 
     inclination_deg: float = 0.0
@@ -84,6 +85,7 @@ class StandProfile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     gravity_g: float = 0.0
     field_nt: float = 0.0
     dip_deg: float = 0.0
+    coil: bool = False
 
     def of(self, column: str) -> float:
         """Standard uncertainty of a reference such as "azimuth_deg" where the run states none."""

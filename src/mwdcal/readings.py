@@ -19,10 +19,8 @@ ANGLES = ("inclination", "azimuth", "toolface")
 TRIADS = ("accelerometer", "magnetometer")
 SIMULATED = "SIMULATED DATA"
 CONSTANTS = ("gravity", "field", "dip")
-EARTH_GRAVITY = (0.9, 1.1)
-"""Least and greatest gravity of any place on Earth, with room for a doubtful unit, g."""
-EARTH_FIELD = (15_000.0, 80_000.0)
-"""Least and greatest magnetic field of any place on Earth, with room, nT."""
+EARTH = {"gravity": (0.9, 1.1), "field": (15_000.0, 80_000.0)}
+"""Least and greatest strength of any place on Earth, with room for a doubtful unit: g, nT."""
 NANOTESLA = "nT"
 RELATIVE = "relative (field = 1)"
 """Unit of the calibrated field where its strength is known at no station."""

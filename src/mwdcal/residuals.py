@@ -10,7 +10,8 @@ from math import erfc, gamma
 import numpy as np
 
 from mwdcal.calibration import ErrorRow, Measures, StationRow
-from mwdcal.core.observables import OBSERVABLES
+from mwdcal.core.observables import OBSERVABLES, VERTICAL
+from mwdcal.core.problem import STAND_ERRORS
 from mwdcal.core.uncertainty import Analysis, station_misfit, without_station
 from mwdcal.core.vectors import Array, Bools, centred
 from mwdcal.estimate import Fit
@@ -106,12 +107,29 @@ class Residuals:
         return triads[0], triads[1] / scale
 
     def known(self, name: str) -> Array:
-        """Reference (n,) of an observable: given, or the estimated constant; NaN where unknown."""
+        """Reference (n,) of an observable: given, or the estimated constant; NaN where unknown.
+
+        Angles of a stand whose common errors are unknowns of the fit: as they are without them.
+        """
         if name in self.fit.problem.evidence.absent:
             return np.asarray(self.fit.problem.evidence.known[name][0])
         if name in ("gravity", "field", "dip"):
             return np.asarray(self.fit.problem.constant(self.fit.state, name)[0])
-        return np.asarray(self.fit.problem.evidence.known[name][0])
+        value = np.asarray(self.fit.problem.evidence.known[name][0])
+        if not any(c.name in STAND_ERRORS for c in self.fit.problem.evidence.constants):
+            return value
+        return np.where(np.isnan(value), np.nan, self._stood(name))
+
+    def _stood(self, name: str) -> Array:
+        """An angle (n,) of the fitted attitudes; at vertical, where two do not exist, as given."""
+        attitude, given = self.fit.state.attitude[0], self.fit.problem.evidence.known[name][0]
+        axis, down = attitude[:, 2], attitude[:, :, 2]
+        across = np.hypot(axis[:, 0], axis[:, 1])
+        if name == "inclination":
+            return np.asarray(np.arctan2(across, axis[:, 2]))
+        pair = (axis[:, 1], axis[:, 0]) if name == "azimuth" else (-down[:, 0], -down[:, 1])
+        angle = np.mod(np.arctan2(*pair), 2 * np.pi)
+        return np.asarray(np.where(across > VERTICAL, angle, given))
 
     def _weight(self, name: str) -> Array:
         """The weight (n,) of errors after the fit, zero where an observable does not exist."""

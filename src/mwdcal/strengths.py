@@ -15,7 +15,7 @@ import numpy as np
 from mwdcal.calibration import Calibration, Finding
 from mwdcal.core.vectors import AnyArray, Array
 from mwdcal.errors import InputError
-from mwdcal.readings import EARTH_FIELD, EARTH_GRAVITY
+from mwdcal.readings import EARTH
 
 SHARE = 0.05
 """Departure from the table's own reference, as a share of it, from which a strength is off."""
@@ -24,7 +24,6 @@ MOST = 0.5
 ALIKE = {"gravity": 1.5, "field": 6.0}
 """Greatest over least strength up to which one unit may explain all rows."""
 COLUMNS = {"gravity": "gravity_g", "field": "field_nt"}
-EARTH = {"gravity": EARTH_GRAVITY, "field": EARTH_FIELD}
 UNITS: dict[str, dict[str, float]] = {
     "gravity": {"g": 1.0, "m/s²": 9.80665, "mg": 1000.0},
     "field": {"nT": 1.0, "µT": 1e-3, "mT": 1e-6, "gauss": 1e-5, "mG": 1e-2},
@@ -66,7 +65,7 @@ def judged(
             continue
         values = np.asarray(columns[COLUMNS[name]], float)
         free = any(entry.id == "scale" for entry in triad.undetermined)
-        coil = name == "field" and bool(getattr(calibration.profile.stand, "coil", False))
+        coil = name == "field" and calibration.profile.stand.coil
         low, high = (-np.inf, np.inf) if coil else EARTH[name]
         earth = (values < low) | (values > high)
         own = np.zeros(values.shape, bool)

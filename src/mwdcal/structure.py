@@ -353,8 +353,8 @@ def described(effect: Effect, unit: str) -> str:
         parts = [(1e3, "mg"), (1.0, unit)][: len(effect.size)]
         each = [f"{s * f:.3g} {u} rms" for s, (f, u) in zip(effect.size, parts, strict=True)]
         size = " and ".join(each[TRIADS.index(triad) :][:1] if own else each)
-    whose = f"{triad}: " if own else ""
+    whose = f"{triad}: the" if own else "The"
     return (
-        f"{whose}the residuals look like {looks}. Size {size}, {effect.share:.0%} of the misfit; chance in "
+        f"{whose} residuals look like {looks}. Size {size}, {effect.share:.0%} of the misfit; chance in "
         f"noise {effect.chance:.0e}."
     )

@@ -365,7 +365,7 @@ class Problem:
     def _stand_axis(self, state: State, name: str) -> Array:
         """Earth axis (B, n, 3) about which a station is turned by an error of the stand."""
         if name == "inclination-zero":
-            return -self._inclination_axis(state)
+            return -self._across(state)
         if name == "toolface-zero":
             return np.asarray(state.attitude[..., 2, :])
         return np.broadcast_to(STAND[name], state.attitude.shape[:-1])
@@ -437,7 +437,7 @@ class Problem:
     def _own_turns(self, state: State, geometry: bool) -> Array:
         """Axes (B, n, 3, 3), as columns, of the station's private turns times their σ."""
         inclination, azimuth, toolface = self._own_sd(geometry)
-        across = np.einsum("bnij,bnj->bni", state.attitude, self._inclination_axis(state))
+        across = np.einsum("bnij,bnj->bni", state.attitude, self._across(state))
         down = state.attitude[..., :, 2]
         along = np.broadcast_to(np.array([0.0, 0.0, 1.0]), down.shape)
         natural = np.stack(
@@ -450,25 +450,44 @@ class Problem:
         )
         return np.where(self._free()[..., None, None], UNKNOWN * np.eye(3), natural)
 
-    def _inclination_axis(self, state: State) -> Array:
-        """Earth axis (B, n, 3) about which a station inclines: horizontal, across its azimuth."""
-        axis = state.attitude[..., 2, :]
+    def _across(self, state: State) -> Array:
+        """Earth axis (B, n, 3) about which a station inclines: horizontal, across its azimuth.
+
+        Singular: at vertical a known azimuth or toolface still says which way a station inclines.
+        """
+        axis, known = state.attitude[..., 2, :], self.evidence.known
         azimuth = np.arctan2(axis[..., 1], axis[..., 0])
-        known = self.evidence.known["azimuth"]
-        azimuth = np.where(np.isnan(known), azimuth, known)
-        return np.stack([np.sin(azimuth), -np.cos(azimuth), np.zeros_like(azimuth)], -1)
+        azimuth = np.where(np.isnan(known["azimuth"]), azimuth, known["azimuth"])
+        across = np.stack([np.sin(azimuth), -np.cos(azimuth), np.zeros_like(azimuth)], -1)
+        by_toolface = np.isnan(known["azimuth"]) & ~np.isnan(known["toolface"])
+        if not by_toolface.any():
+            return across
+        toolface = np.nan_to_num(known["toolface"])
+        fixed = np.stack([np.cos(toolface), -np.sin(toolface), np.zeros_like(toolface)], -1)
+        turned = np.einsum("bnij,bni->bnj", state.attitude, fixed)
+        return np.where(by_toolface[..., None], turned, across)
 
     def _group_axes(self, state: State) -> tuple[Array, Array]:
         """Two earth axes (B, k, 3) of each group's shared turns: inclining, and across or about down."""
         members = self.evidence.members
-        count = np.maximum(members.sum(-2), 1.0)
-        axis = np.einsum("bnk,bni->bki", members, state.attitude[..., 2, :]) / count[..., None]
+        tied = self.evidence.is_known("toolface") | self.evidence.is_known("azimuth")
+        axis = self._mean_of(members, state.attitude[..., 2, :])
         azimuth = np.arctan2(axis[..., 1], axis[..., 0])
         first = np.stack([np.sin(azimuth), -np.cos(azimuth), np.zeros_like(azimuth)], -1)
-        tied = self.evidence.is_known("toolface") | self.evidence.is_known("inclination")
         upright = np.einsum("bnk,bn->bk", members, tied) > 0
+        if upright.any():
+            along = self._mean_of(members * tied[..., None], self._across(state))
+            size = np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), 1e-300)
+            first = np.where(upright[..., None], along / size, first)
+        upright |= np.einsum("bnk,bn->bk", members, self.evidence.is_known("inclination")) > 0
         second = np.where(upright[..., None], np.array([0.0, 0.0, 1.0]), np.cross(axis, first))
         return first, second
+
+    @staticmethod
+    def _mean_of(members: Array, vectors: Array) -> Array:
+        """Mean (B, k, 3) of vectors (B, n, 3) over the members (B, n, k) of each group."""
+        count = np.maximum(members.sum(-2), 1.0)
+        return np.asarray(np.einsum("bnk,bni->bki", members, vectors) / count[..., None])
 
     def _group_turns(self, state: State, turns: Array) -> list[Array]:
         """Columns (B, n, m, k) of both shared turns of each group."""
@@ -505,8 +524,8 @@ class Problem:
         first, second = self._group_axes(state)
         attitude = state.attitude
         for axis, name, turn in (
-            (second, "azimuth", turns[:, half:]),
             (first, "inclination", turns[:, :half]),
+            (second, "azimuth", turns[:, half:]),
         ):
             vector = np.einsum("bnk,bk,bki->bni", self.evidence.shared(name), turn, axis)
             attitude = attitude @ rotation(vector)

@@ -25,6 +25,9 @@ from mwdcal.core.vectors import Array, Bools, Ints, eigen, inverse, placed
 
 RANK_TOLERANCE = 2e-2
 """Singular values of the column-normalised design below this share of the largest are free."""
+NEGLIGIBLE = 1e-2
+"""A member that is still on its way when iterations end has settled if a full step is a smaller
+share of the standard uncertainty than this."""
 
 
 class Status(IntEnum):
@@ -326,6 +329,16 @@ class _Descent:
         self.damping = np.where(better, calmer, np.maximum(10 * self.damping, 1e-3))
         return small & better, ~finite
 
+    def arrived(self) -> Bools:
+        """Which active members no full step would move by more than a `NEGLIGIBLE` share of σ.
+
+        Rounding of the cost can refuse such steps for ever, and flat directions make them shrink
+        slowly: both are at their minimum for all purposes.
+        """
+        normal = self.linear.normal
+        step = _step(normal, self.determined, np.zeros(len(self.damping)))
+        return self.settled(np.asarray(_length(normal, step) < NEGLIGIBLE**2))
+
     def _accept(self, trial: Any, after: Linear, better: Bools) -> None:
         if better.all():
             self.state, self.linear = trial, after
@@ -371,9 +384,14 @@ def _step(normal: Normal, determined: Determined, damping: Array) -> Array:
     return np.concatenate([step, -shared - eliminate @ step], -2)[..., 0]
 
 
+def _length(normal: Normal, step: Array) -> Array:
+    """Square (B,) of a step's length in standard uncertainties."""
+    return np.asarray(np.einsum("...i,...ij,...j->...", step, normal.information, step))
+
+
 def _small(normal: Normal, step: Array, size: Array) -> Bools:
     """Below a millionth of the standard uncertainty, or rounding."""
-    length = np.einsum("...i,...ij,...j->...", step, normal.information, step)
+    length = _length(normal, step)
     rounding = np.all(np.abs(step[..., : normal.size]) <= 1e-12 * size, -1)
     return np.asarray((length < 1e-12) | rounding)
 
@@ -397,4 +415,6 @@ def gauss_newton(problem: Problem, state: Any, limit: int = 60) -> tuple[Any, In
             return descent.state, status, iterations
         state = state.put(descent.active[stopped], descent.state.take(np.flatnonzero(stopped)))
         descent.drop(stopped)
+    if descent.active.size:
+        status[descent.active[descent.arrived()]] = Status.OK
     return state.put(descent.active, descent.state), status, iterations

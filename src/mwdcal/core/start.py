@@ -185,18 +185,15 @@ def _attitudes(problem: Problem, state: State) -> State:
     b = fields[1] if len(fields) > 1 else np.broadcast_to(np.array([0.0, 0.0, 1.0]), g.shape)
     guess = {name: np.nan_to_num(observables.OBSERVABLES[name].value(g, b)) for name in ANGLES}
     angles = {n: np.where(evidence.is_known(n), evidence.known[n], guess[n]) for n in ANGLES}
-    angles = _share(problem, angles)
+    angles = _by_toolface(problem, _share(problem, angles), g, b)
     state = _with_own(problem, _with_dip(problem, state, g, b), g, b)
     attitude = tool_from_earth(*(angles[name] for name in ANGLES))
     weights = [1 / np.maximum(np.linalg.norm(f, axis=-1), 1e-30) ** 2 for f in fields]
     earth = problem.earth(state)[0]
-    along = np.array([0.0, 0.0, 1.0])
-    lone = evidence.is_known("toolface") & ~evidence.is_known("azimuth") & (evidence.group < 0)
-    lone &= evidence.is_known("inclination")
-    for loose, axis in ((lone, attitude[..., :, 2]), (~evidence.is_known("toolface"), along)):
-        targets = [np.einsum("bnij,bnj->bni", attitude, e) for e in earth]
-        turn = best_turn(fields, targets, weights, np.broadcast_to(axis, g.shape))
-        attitude = _turned(attitude, np.broadcast_to(axis, g.shape), np.where(loose, turn, 0.0))
+    targets = [np.einsum("bnij,bnj->bni", attitude, each) for each in earth]
+    along = np.broadcast_to(np.array([0.0, 0.0, 1.0]), g.shape)
+    turn = best_turn(fields, targets, weights, along)
+    attitude = _turned(attitude, along, np.where(evidence.is_known("toolface"), 0.0, turn))
     return replace(state, attitude=attitude)
 
 
@@ -229,6 +226,36 @@ def _share(problem: Problem, angles: dict[str, Array]) -> dict[str, Array]:
         "azimuth": np.arctan2(mean[..., 1], mean[..., 0]),
     }
     return {n: np.where(shared[n], means[n], a) if n in shared else a for n, a in angles.items()}
+
+
+def _by_toolface(
+    problem: Problem, angles: dict[str, Array], g: Array, b: Array
+) -> dict[str, Array]:
+    """Unknown directions, of stations and of groups, where toolfaces are known.
+
+    Definition: turned back by its toolface, g reads (-sin I, 0, cos I) at every station of a group;
+    turned back by that inclination too, b reads north · (cos A, -sin A) across the vertical. The
+    inclination has a sign, and the azimuth is as well defined at vertical as elsewhere.
+    """
+    evidence = problem.evidence
+    faced = evidence.is_known("toolface") & (evidence.include > 0)
+    lone = faced & (evidence.group < 0)
+
+    def mean(name: str, inclination: Array, field: Array) -> tuple[Array, Bools]:
+        """Sum (B, n, 3) over a station's group of fields turned back, where the angle is unknown."""
+        back = tool_from_earth(inclination, np.zeros_like(inclination), angles["toolface"])
+        turned = np.einsum("bnji,bnj->bni", back, field)
+        members = evidence.shared(name) * faced[..., None]
+        total = evidence.members @ (np.swapaxes(members, -1, -2) @ turned)
+        some = np.einsum("bnk,bk->bn", evidence.members, members.sum(-2)) > 0
+        own = lone & ~evidence.is_known(name)
+        return np.where(own[..., None], turned, total), some | own
+
+    down, found = mean("inclination", np.zeros(faced.shape), g)
+    inclination = np.where(found, np.arctan2(-down[..., 0], down[..., 2]), angles["inclination"])
+    across, found = mean("azimuth", inclination, b)
+    azimuth = np.where(found, np.arctan2(-across[..., 1], across[..., 0]), angles["azimuth"])
+    return {**angles, "inclination": inclination, "azimuth": azimuth}
 
 
 def _with_own(problem: Problem, state: State, g: Array, b: Array) -> State:

@@ -28,6 +28,7 @@ _STRUCTS: dict[str, type[msgspec.Struct]] = {
     "accelerometer.datasheet": Datasheet,
     "magnetometer.datasheet": Datasheet,
 }
+_STAND_SIGMAS = tuple(n for n in StandProfile.__struct_fields__ if n != "coil")
 _WORDS = {
     "float": "a number",
     "int": "a whole number",
@@ -192,7 +193,7 @@ def check_profile(profile: Profile, source: str) -> None:
     )
     _check_triad(profile.accelerometer, "accelerometer", source)
     _check_triad(profile.magnetometer, "magnetometer", source)
-    for field in StandProfile.__struct_fields__:
+    for field in _STAND_SIGMAS:
         sigma = getattr(profile.stand, field)
         unit, most = _STAND_UNITS.get(field.rpartition("_")[2], ("degrees", 180.0))
         _check_number(sigma, (0.0, most), source, f"stand.{field}", f"1 sigma, in {unit}.")
