@@ -124,6 +124,7 @@ def test_nine_strengths_for_nine_parameters_leave_no_noise_to_estimate(tmp_path,
     run, clean = servo_run(inclinations=(20, 60, 100), toolfaces=3), channels(*vectors)
     for name, sd in zip(RAW, np.repeat(np.multiply(SCALE, SERVO_NOISE), 3), strict=True):
         run[name] = clean[name] + sd * rng.normal(size=9)
+    run["sd_ref_field_nt"] = np.full(9, 30.0)
     path = write_csv(tmp_path / "run.csv", run)
     options = ("--method", "scalar", "--order", "0", "-o", tmp_path / "cal.json")
     message = refused(mwdcal("calibrate", path, *options, *weights), 3)
