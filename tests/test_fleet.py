@@ -170,7 +170,7 @@ def evidence_patterns():
     angles = {f"ref_{a}_deg": blank for a in ANGLES}
     kinds = {
         "whole": {},
-        "no-azimuth": {"ref_azimuth_deg": blank, "ref_dip_deg": None},
+        "no-azimuth": {"ref_azimuth_deg": blank, "ref_dip_deg": np.full(28, np.nan)},
         "no-field": {"ref_field_nt": blank},
         "half": {"ref_inclination_deg": short_run(1)["ref_inclination_deg"] * half},
         "noise": noise,
@@ -295,6 +295,16 @@ def bad_tools():
         "channel": {**good, "mz": np.full(28, 2.0)},
         "channel-scale": {**good, "mx": good["mx"] * 1e6},
         "gain": {**good, "mx": -good["mx"]},
+        "earth": {
+            **good,
+            **{n: good[n] * 2 for n in ("mx", "my", "mz")},
+            "ref_field_nt": np.full(28, 1e5),
+        },
+        "earth-dip": {
+            **good,
+            **{n: -good[n] for n in ("mx", "my", "mz")},
+            "ref_dip_deg": np.full(28, np.nan),
+        },
         "gain-unit": {n: v * 9.81 if n in ("ax", "ay", "az") else v for n, v in good.items()},
         "residuals": {**good, "ax": scattered},
         "weak-geometry": servo_run(1, inclinations=(5, 45, 90), toolfaces=4),
@@ -302,7 +312,12 @@ def bad_tools():
 
 
 def statuses(serial):
-    return serial.removesuffix("-range").removesuffix("-temperature").removesuffix("-scale")
+    return (
+        serial.removesuffix("-range")
+        .removesuffix("-dip")
+        .removesuffix("-temperature")
+        .removesuffix("-scale")
+    )
 
 
 @pytest.mark.parametrize("method", ["joint", "scalar"])
@@ -325,7 +340,7 @@ def test_what_calibrate_refuses_is_refused_for_the_same_reason(tmp_path, method)
         else:
             check_same(rows[serial], expected)
     assert "serial bad-input of runs.parquet, row 32, column" in rows["bad-input"]["message"]
-    assert len(seen) == 5 + (method == "scalar"), seen
+    assert len(seen) == 6 + (method == "scalar"), seen
     assert ("weak-geometry" in seen) == (method == "scalar")
 
 

@@ -9,7 +9,8 @@ accepted, and what its message names (test_ranks).
 import numpy as np
 import pytest
 
-from cli_support import RAW, SCALE, SERVO_NOISE, mwdcal, refused, servo_run, write_csv
+from cli_support import RAW, SCALE, SERVO_NOISE, channels, mwdcal, refused, servo_run, write_csv
+from simulation import DEG, attitude
 
 METHODS = ("joint", "least-squares", "swarm", "newton", "toolface-inclination", "scalar")
 
@@ -107,3 +108,25 @@ def test_toolface_zero_is_not_to_be_had(tmp_path, names):
     message = said(tmp_path, servo_run(), "--estimate", names)
     assert "can never be told from a rotation of the sensors in the tool" in message
     assert "Set it by an index mark." in message
+
+
+@pytest.mark.parametrize("weights", [[], ["--paper-weights"]], ids=["likelihood", "paper"])
+def test_nine_strengths_for_nine_parameters_leave_no_noise_to_estimate(tmp_path, weights):
+    """The rest of such a fit is rounding; the noise of the profile `generic` is not declared."""
+    rng, designs = np.random.default_rng(4), []
+    for _ in range(300):
+        angles = np.arccos(rng.uniform(-1, 1, 9)), *rng.uniform(0, 2 * np.pi, (2, 9))
+        unit = attitude(*angles)(1.0, 1.0, 65 * DEG)
+        features = [np.column_stack([v, v**2, v * np.roll(v, 1, -1)]) for v in unit]
+        designs.append((min(np.linalg.svd(f)[1][-1] for f in features), angles))
+    angles = max(designs, key=lambda each: each[0])[1]
+    vectors = attitude(*angles)(1.0, 50_000.0, 65 * DEG)
+    run, clean = servo_run(inclinations=(20, 60, 100), toolfaces=3), channels(*vectors)
+    for name, sd in zip(RAW, np.repeat(np.multiply(SCALE, SERVO_NOISE), 3), strict=True):
+        run[name] = clean[name] + sd * rng.normal(size=9)
+    run["sd_ref_field_nt"] = np.full(9, 30.0)
+    path = write_csv(tmp_path / "run.csv", run)
+    options = ("--method", "scalar", "--order", "0", "-o", tmp_path / "cal.json")
+    message = refused(mwdcal("calibrate", path, *options, *weights), 3)
+    assert "no redundancy (0.0 degrees of freedom)" in message
+    assert not (tmp_path / "cal.json").exists()

@@ -390,7 +390,7 @@ def _check_strengths(result: Fit, profile: Profile) -> None:
 
 
 def _check_errors(result: Fit, readings: Readings) -> None:
-    """Refuse errors against the references that noise and stand do not explain."""
+    """Refuse errors against the references that the misfit of the run does not explain."""
     found = excessive_errors(readings, result)
     if not found:
         return
@@ -401,8 +401,8 @@ def _check_errors(result: Fit, readings: Readings) -> None:
     gap = "" if unit == "°" else " "
     after, expected = (value * factor for value in found[name])
     raise FitError(
-        f"the errors of {name} after calibration are {after:.3g}{gap}{unit} (root mean square), where noise "
-        f"and stand explain {expected:.2g}{gap}{unit}. Check the references of {name} and 'axes' in the "
+        f"the errors of {name} after calibration are {after:.3g}{gap}{unit} (root mean square), where the "
+        f"misfit of the run explains {expected:.2g}{gap}{unit}. Check the references of {name} and 'axes' in the "
         f"tool profile, or declare 'noise' and [stand] as they are.{''.join(looks)}"
         f"{_culprit(result, readings)}"
     )

@@ -6,6 +6,8 @@ puts it into words.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from mwdcal.core.observability import Free
@@ -83,11 +85,17 @@ def overturned(result: Fit) -> Array:
 
 
 def excessive_errors(readings: Readings, result: Fit) -> dict[str, tuple[float, float]]:
-    """Observables with errors far above their expectation: root mean squares of both.
+    """Observables with errors far above what the misfit of the run explains: rms of both.
 
-    In a robust fit every station counts with its weight.
+    Definition: the expectation is that of noise and stand, times the root of the run's own s² where
+    that is above one: so are the uncertainties that a calibration states. In a robust fit stations
+    count with their weights.
     """
-    residuals, weight = Residuals(readings, result), result.trust[0]
+    analysis = result.analysis
+    squares = np.nan_to_num(analysis.variance_factor[0]) * np.maximum(analysis.freedom[0], 0)
+    misfit = np.sqrt(max(squares.sum() / max(analysis.freedom[0].sum(), 1.0), 1.0))
+    plain = replace(analysis, variance_factor=np.ones_like(analysis.variance_factor))
+    residuals, weight = Residuals(readings, replace(result, analysis=plain)), result.trust[0]
     found = {}
     for name in residuals.names():
         after, expected = residuals.errors(name, residuals.after), residuals.expected(name)
@@ -98,8 +106,8 @@ def excessive_errors(readings: Readings, result: Fit) -> dict[str, tuple[float, 
             float(np.sqrt(np.average(e[known] ** 2, weights=weight[known])))
             for e in (after, expected)
         ]
-        if both[0] > EXCESS * max(both[1], SMALLEST):
-            found[name] = (both[0], both[1])
+        if both[0] > EXCESS * max(both[1] * misfit, SMALLEST):
+            found[name] = (both[0], float(both[1] * misfit))
     return found
 
 
