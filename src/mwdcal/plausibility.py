@@ -89,7 +89,7 @@ def excessive_errors(readings: Readings, result: Fit) -> dict[str, tuple[float, 
 
     Definition: the expectation is that of noise and stand, times the root of the run's own s² where
     that is above one: so are the uncertainties that a calibration states. In a robust fit stations
-    count with their weights.
+    count with the pull that they have.
     """
     analysis = result.analysis
     squares = np.nan_to_num(analysis.variance_factor[0]) * np.maximum(analysis.freedom[0], 0)
@@ -103,7 +103,7 @@ def excessive_errors(readings: Readings, result: Fit) -> dict[str, tuple[float, 
         if not known.any():
             continue
         both = [
-            float(np.sqrt(np.average(e[known] ** 2, weights=weight[known])))
+            float(np.sqrt(np.average(e[known] ** 2, weights=weight[known] ** 2)))
             for e in (after, expected)
         ]
         if both[0] > EXCESS * max(both[1] * misfit, SMALLEST):
