@@ -6,8 +6,6 @@ puts it into words.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from mwdcal.core.observability import Free
@@ -94,8 +92,7 @@ def excessive_errors(readings: Readings, result: Fit) -> dict[str, tuple[float, 
     analysis = result.analysis
     squares = np.nan_to_num(analysis.variance_factor[0]) * np.maximum(analysis.freedom[0], 0)
     misfit = np.sqrt(max(squares.sum() / max(analysis.freedom[0].sum(), 1.0), 1.0))
-    plain = replace(analysis, variance_factor=np.ones_like(analysis.variance_factor))
-    residuals, weight = Residuals(readings, replace(result, analysis=plain)), result.trust[0]
+    residuals, weight = Residuals(readings, result), result.trust[0]
     found = {}
     for name in residuals.names():
         after, expected = residuals.errors(name, residuals.after), residuals.expected(name)
