@@ -38,6 +38,15 @@ TEXTS = {
     "scale": "overall scale is undetermined: no evidence fixes it; kept at nominal. Give a reference strength",
 }
 
+NOTABLE = 3e-4
+"""A scatter from station to station beyond this share, or radians, is a finding."""
+_CONSTANT = {
+    "gravity": "the strength of g",
+    "field": "the strength of b",
+    "dip": "the dip",
+    "direction": "the direction within groups",
+}
+
 
 def described(name: str) -> str:
     """What a free direction means, and what would determine it."""
@@ -72,6 +81,12 @@ def copies(rows: Array) -> Ints:
     """Stations whose readings (n, k) are those of an earlier one, to the last digit."""
     _, first, place = np.unique(rows, axis=0, return_index=True, return_inverse=True)
     return np.flatnonzero(first[place.ravel()] != np.arange(len(rows)))
+
+
+def scattered(result: Fit) -> Bools:
+    """Whether (B,) strengths, dip or the directions of groups depart from station to station."""
+    sizes = [value.max(-1) for value in result.problem.evidence.scatter.values()]
+    return np.asarray(np.max([np.zeros(len(result.status)), *sizes], 0) > NOTABLE)
 
 
 def distrusted(result: Fit) -> Bools:
@@ -120,6 +135,7 @@ class Findings:
         """All of them, in order of weight."""
         return [
             *self.residuals(),
+            *self.scatter(),
             *self.repeated(stations),
             *self.undetermined(),
             *self.prior(),
@@ -152,6 +168,28 @@ class Findings:
             text = f"{' and '.join(bare)}: no redundancy, so nothing in this run checks the fit. Add stations."
             found.append(Finding(id="no-redundancy", text=text))
         return found
+
+    def scatter(self) -> list[Finding]:
+        """What departs from station to station beyond the noise of the sensors."""
+        if not scattered(self.result)[0]:
+            return []
+        sizes = {n: float(v.max()) for n, v in self.result.problem.evidence.scatter.items()}
+        words = [
+            f"{_CONSTANT[name]} by "
+            + (
+                f"{np.degrees(size):.2f}°"
+                if name in ("dip", "direction")
+                else f"{100 * size:.2f} %"
+            )
+            for name, size in sizes.items()
+            if size > NOTABLE
+        ]
+        text = (
+            f"from station to station, beyond the noise of the sensors, there departs {', '.join(words)} "
+            "(1σ, estimated; weights and uncertainties include it). Look for iron near the stand, and "
+            "for what holds the tool in its direction; or the model lacks something."
+        )
+        return [Finding(id="scatter", text=text)]
 
     def repeated(self, stations: list[StationRow]) -> list[Finding]:
         """Stations whose readings are another's to the last digit."""

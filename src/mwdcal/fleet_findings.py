@@ -23,6 +23,7 @@ from mwdcal.findings import (
     departures,
     distrusted,
     excessive,
+    scattered,
     unchecked,
     without_prior,
 )
@@ -52,6 +53,7 @@ def findings_of_batch(
         for kind, each in (("noise", calm(result)), ("residuals", excessive(result)))
         for name, flag in zip(TRIADS, each.transpose(), strict=False)
     }
+    flags["scatter"] = scattered(result)
     flags["no-redundancy"] = np.any(unchecked(result), -1)
     flags["repeated-readings"] = _repeated(result)
     found: list[list[str]] = [[] for _ in result.status]
