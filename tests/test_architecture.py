@@ -30,6 +30,7 @@ LAYERS = (
         "core.sums",
         "core.swarm",
         "core.uncertainty",
+        "core.variance",
         "core.observability",
         "core.standstill",
         "core.station_means",

@@ -16,7 +16,7 @@ from mwdcal.core.observability import Free, free_directions
 from mwdcal.core.solvers import Status
 from mwdcal.core.swarm import least_squares_forward, swarm_forward, vector_cost
 from mwdcal.core.vectors import Array, Ints, reference_vectors
-from mwdcal.curves import choose_curves, declared
+from mwdcal.curves import declared, with_chosen_curves
 from mwdcal.errors import FitError
 from mwdcal.estimate import Fit, fit
 from mwdcal.evidence import evidence_of
@@ -175,8 +175,8 @@ def _options(
         offered = declared(profile, options)
         if offered:
             check_readings(readings, options)
-            progress("own-axis nonlinearity: leaving stations out, with and without it")
-            options = replace(options, nonlinearity=choose_curves(readings, options, offered)[0])
+            progress("own-axis nonlinearity: comparing fits with and without it")
+            options = with_chosen_curves(readings, options, offered)[0]
     except FitError:
         pass
     return options

@@ -10,7 +10,7 @@ import numpy as np
 from mwdcal.core import exact
 from mwdcal.core.models import Basis, Factors, Polynomial, Restricted, Whole, restricted
 from mwdcal.core.problem import Evidence, Problem, State, Triad
-from mwdcal.core.robust import LOSSES, consistency, inflation, weight
+from mwdcal.core.robust import LOSSES, consistency, inflation, weight, weighted
 from mwdcal.core.solvers import Determined, Status
 from mwdcal.core.start import start
 from mwdcal.core.uncertainty import (
@@ -21,6 +21,7 @@ from mwdcal.core.uncertainty import (
     settle_gauge,
     station_misfit,
 )
+from mwdcal.core.variance import LEAST, START, scatter_ratios, with_scatter
 from mwdcal.core.vectors import Array, Bools, Ints, placed
 from mwdcal.evidence import evidence_of, flat
 from mwdcal.methods import EVIDENCE, Solved, solve, with_stand_errors, without
@@ -35,6 +36,10 @@ STEP = 10.0
 ROBUST_ROUNDS = 40
 SETTLED = 1e-3
 """Change of noise and station weights, as a share, at which weighing and fitting in turn ends."""
+SCATTER_ROUNDS = 16
+"""Most repetitions where a scatter from station to station is estimated too…"""
+SCATTER_SETTLED = 0.02
+"""…and the change of it, as a share, at which they end."""
 
 
 @dataclass(frozen=True)
@@ -140,6 +145,7 @@ def _fit(readings: Readings, options: Options, include: Array | None) -> Fit:
     evidence = EVIDENCE[options.method](evidence_of(readings, include))
     evidence = without(evidence, options.ignore)
     evidence = with_stand_errors(evidence, options.estimate)
+    evidence = _scattered(evidence, readings, options)
     lead = np.broadcast_shapes(readings.accelerometer.shape[:-1], include.shape)
     problem, declared = _problem(readings, evidence, lead, options)
     problem, finite = _without_broken(problem)
@@ -150,6 +156,26 @@ def _fit(readings: Readings, options: Options, include: Array | None) -> Fit:
         return closed
     rest = np.flatnonzero(~alone)
     return _joined(closed, rest, _general(problem.take(rest), declared, options, finite[rest]))
+
+
+def scatters(readings: Readings, options: Options) -> bool:
+    """Whether a scatter from station to station is estimated: with a joint fit's own noise of both."""
+    noisy = not any(name in readings.sd for name in TRIADS) and readings.magnetometer is not None
+    return (
+        options.scatter
+        and noisy
+        and options.method == "joint"
+        and bool((readings.groups >= 0).any())
+    )
+
+
+def _scattered(evidence: Evidence, readings: Readings, options: Options) -> Evidence:
+    """The evidence with the scatter whose estimation is asked for, where it begins."""
+    if not scatters(readings, options):
+        return evidence
+    names = [name for name in ("gravity", "field", "dip") if name not in evidence.absent]
+    start = np.full(evidence.include.shape, START)
+    return replace(evidence, scatter=dict.fromkeys((*names, "direction"), start))
 
 
 def _general(problem: Problem, declared: list[bool], options: Options, finite: Bools) -> Fit:
@@ -185,7 +211,8 @@ def _closed(
     None where it is of none, as with references that are not exact.
     """
     none = np.zeros(len(finite), bool)
-    if options.robust or options.own_solver or not exact.applies(problem):
+    apart = options.robust or options.own_solver or problem.evidence.scatter
+    if apart or not exact.applies(problem):
         return None, none
     at = exact.start(problem)
     halfs = exact.halves(problem, at)
@@ -228,7 +255,9 @@ def _with_noise_of(problem: Problem, index: Ints, other: Problem) -> Problem:
     """The problem with the noise that some members have in another, which is the same besides."""
     pairs = zip(problem.triads, other.triads, strict=True)
     triads = tuple(replace(t, sd=placed(t.sd, index, o.sd)) for t, o in pairs)
-    return replace(problem, triads=triads)
+    ours, theirs = problem.evidence.scatter, other.evidence.scatter
+    scatter = {name: placed(value, index, theirs[name]) for name, value in ours.items()}
+    return replace(problem, triads=triads, evidence=replace(problem.evidence, scatter=scatter))
 
 
 def _noise(problem: Problem, declared: list[bool]) -> Array:
@@ -270,7 +299,8 @@ def _robustly(found: Analysis, problem: Problem, state: State, loss: str, trust:
     louder = np.sqrt([inflation(loss, k) for k in freedom])[:, None, None]
     triads = tuple(replace(t, sd=t.sd * louder) for t in problem.triads)
     sd = {n: s * louder[..., 0] if n in ANGLES else s for n, s in problem.evidence.sd.items()}
-    evidence = replace(problem.evidence, sd=sd)
+    scatter = {n: s * louder[..., 0] for n, s in problem.evidence.scatter.items()}
+    evidence = replace(problem.evidence, sd=sd, scatter=scatter)
     wider = analyse(replace(problem, triads=triads, evidence=evidence), state, found.determined)
     return replace(
         found,
@@ -383,12 +413,28 @@ def _estimate_noise(stage: _Stage, declared: list[bool], options: Options) -> _S
         analysis = analyse(now.problem, now.solved.state)
         scale = np.sqrt(np.where(analysis.freedom >= 1, analysis.variance_factor, np.nan))
         problem, solved = _rescaled(now.problem, scale, declared), now.solved
+        settled = ~np.any(np.abs(scale[:, free] - 1) >= SETTLED, -1)
+        if problem.evidence.scatter:
+            ratios = scatter_ratios(now.problem, solved.state, analysis)
+            problem = with_scatter(problem, ratios)
+            settled = ~np.any(np.abs(scale[:, free] - 1) >= SCATTER_SETTLED, -1)
+            settled &= _steady(problem, ratios)
         if options.method != "swarm":
             solved = solve(problem, solved.state, options)
-        change = np.abs(scale[:, free] - 1)
-        return replace(now, problem=problem, solved=solved), ~np.any(change >= SETTLED, -1)
+        return replace(now, problem=problem, solved=solved), settled
 
-    return _in_turn(stage, options.rounds, turn)
+    rounds = SCATTER_ROUNDS if stage.problem.evidence.scatter else options.rounds
+    return _in_turn(stage, rounds, turn)
+
+
+def _steady(problem: Problem, ratios: dict[str, Array]) -> Bools:
+    """Members (B,) whose scatter has settled: changed little, or is none."""
+    scatter = problem.evidence.scatter
+    each = [
+        (np.abs(np.sqrt(ratio) - 1) < SCATTER_SETTLED) | (scatter[name].max(-1) < 10 * LEAST)
+        for name, ratio in ratios.items()
+    ]
+    return np.asarray(np.all(each, 0))
 
 
 def _downweigh(stage: _Stage, declared: list[bool], options: Options) -> _Stage:
@@ -397,7 +443,8 @@ def _downweigh(stage: _Stage, declared: list[bool], options: Options) -> _Stage:
 
     def turn(now: _Stage) -> tuple[_Stage, Bools]:
         problem, solved = now.problem, now.solved
-        analysis = analyse(_trusting(problem, now.trust), solved.state)
+        weighed = _trusting(problem, now.trust)
+        analysis = analyse(weighed, solved.state)
         square, freedom = station_misfit(analysis)
         square = square / now.trust
         excess = _typical(square, freedom)
@@ -406,6 +453,10 @@ def _downweigh(stage: _Stage, declared: list[bool], options: Options) -> _Stage:
         if not all(declared):
             factor = _bounded_factor(analysis, now.trust, loss, _tested(freedom))
             problem = _rescaled(problem, np.sqrt(factor), declared)
+            if problem.evidence.scatter:
+                share = np.array([weighted(loss, k) for k in _tested(freedom)])
+                ratios = scatter_ratios(weighed, solved.state, analysis)
+                problem = with_scatter(problem, {n: r / share for n, r in ratios.items()})
         solved = solve(_trusting(problem, trust), solved.state, options)
         return _Stage(problem, solved, trust), ~np.any(np.abs(trust / now.trust - 1) >= SETTLED, -1)
 
@@ -434,8 +485,11 @@ def _trusting(problem: Problem, trust: Array) -> Problem:
         return problem
     grown = 1 / np.sqrt(trust)
     triads = tuple(replace(t, sd=t.sd * grown[..., None]) for t in problem.triads)
-    sd = {n: s * grown if n in ANGLES else s for n, s in problem.evidence.sd.items()}
-    return replace(problem, triads=triads, evidence=replace(problem.evidence, sd=sd))
+    evidence = problem.evidence
+    sd = {n: s * grown if n in ANGLES else s for n, s in evidence.sd.items()}
+    scatter = {n: s * grown for n, s in evidence.scatter.items()}
+    evidence = replace(evidence, sd=sd, scatter=scatter)
+    return replace(problem, triads=triads, evidence=evidence)
 
 
 def _rescaled(problem: Problem, scale: Array, declared: list[bool]) -> Problem:
@@ -452,4 +506,4 @@ def _scaled_noise(triad: Triad, scale: Array) -> Array:
     return np.maximum(triad.sd * factor, FLOOR * _size(triad.raw))
 
 
-__all__ = ["Fit", "Status", "fit", "model_of", "temperature_ranges"]
+__all__ = ["Fit", "Status", "fit", "model_of", "scatters", "temperature_ranges"]

@@ -49,6 +49,15 @@ TEXTS = {
     "scale": "overall scale is undetermined: no evidence fixes it; kept at nominal. Give a reference strength",
 }
 
+NOTABLE = 3e-4
+"""A scatter from station to station beyond this share, or radians, is a finding."""
+_CONSTANT = {
+    "gravity": "the strength of g",
+    "field": "the strength of b",
+    "dip": "the dip",
+    "direction": "the direction within groups",
+}
+
 
 def described(name: str) -> str:
     """What a free direction means, and what would determine it."""
@@ -109,6 +118,12 @@ def copies(rows: Array) -> Ints:
     return np.flatnonzero(first[place.ravel()] != np.arange(len(rows)))
 
 
+def scattered(result: Fit) -> Bools:
+    """Whether (B,) strengths, dip or the directions of groups depart from station to station."""
+    sizes = [value.max(-1) for value in result.problem.evidence.scatter.values()]
+    return np.asarray(np.max([np.zeros(len(result.status)), *sizes], 0) > NOTABLE)
+
+
 def distrusted(result: Fit) -> Bools:
     """Stations (B, n) that a robust fit all but left out."""
     return np.asarray(result.trust < DISTRUSTED)
@@ -156,6 +171,7 @@ class Findings:
         return [
             *self.residuals(),
             *self.structure(),
+            *self.scatter(),
             *self.repeated(stations),
             *self.temperature(),
             *self.undetermined(),
@@ -253,6 +269,28 @@ class Findings:
             f"uncertainties here include it. {remedy}."
         )
         return Finding(id=f"{TRIADS[index]}-temperature-misfit", text=text)
+
+    def scatter(self) -> list[Finding]:
+        """What departs from station to station beyond the noise of the sensors."""
+        if not scattered(self.result)[0]:
+            return []
+        sizes = {n: float(v.max()) for n, v in self.result.problem.evidence.scatter.items()}
+        words = [
+            f"{_CONSTANT[name]} by "
+            + (
+                f"{np.degrees(size):.2f}°"
+                if name in ("dip", "direction")
+                else f"{100 * size:.2f} %"
+            )
+            for name, size in sizes.items()
+            if size > NOTABLE
+        ]
+        text = (
+            f"from station to station, beyond the noise of the sensors, there departs {', '.join(words)} "
+            "(1σ, estimated; weights and uncertainties include it). Look for iron near the stand, and "
+            "for what holds the tool in its direction; or the model lacks something."
+        )
+        return [Finding(id="scatter", text=text)]
 
     def repeated(self, stations: list[StationRow]) -> list[Finding]:
         """Stations whose readings are another's to the last digit."""

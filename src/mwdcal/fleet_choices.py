@@ -13,7 +13,7 @@ import numpy as np
 
 from mwdcal.checks import check_curves, check_options, check_readings
 from mwdcal.core.vectors import Ints
-from mwdcal.curves import choose_curves, declared
+from mwdcal.curves import declared, with_chosen_curves
 from mwdcal.estimate import temperature_ranges
 from mwdcal.options import Options
 from mwdcal.prior import from_datasheet
@@ -33,9 +33,9 @@ Alone = Callable[[int], tuple[Readings, Profile]]
 class PerTool:
     """What the options leave to each tool.
 
-    `order`: its temperature orders, by the terms that noise does not explain. `nonlinearity`: triads whose own-axis
-    terms are tried, by stations left out. `datasheet`: the prior is the profile's tolerances, in
-    the unit of the tool's field.
+    `order`: its temperature orders, by the terms that noise does not explain. `nonlinearity`:
+    triads whose own-axis terms are tried, by what the run says of them. `datasheet`: the prior is
+    the profile's tolerances, in the unit of the tool's field.
     """
 
     order: bool = False
@@ -127,7 +127,7 @@ def _of_soaks(
 def with_curves(
     tools: Ints, options: Options, readings: Readings, per_tool: PerTool, alone: Alone
 ) -> Iterator[tuple[Ints, Options | Exception]]:
-    """The given tools by the own-axis terms that their left-out stations speak for."""
+    """The given tools by the own-axis terms that their runs speak for."""
     if not per_tool.nonlinearity or options.prior:
         try:
             check_curves(readings, tuple(options.nonlinearity or {}))
@@ -137,20 +137,21 @@ def with_curves(
             return
         yield tools, options
         return
-    groups: dict[tuple[tuple[str, float], ...], list[int]] = {}
+    groups: dict[tuple[bool, tuple[tuple[str, float], ...]], list[int]] = {}
     for tool in tools.tolist():
         try:
             own, profile = alone(tool)
             offered = declared(profile, options)
             if offered:
                 check_readings(own, options)
-            found = choose_curves(own, options, offered)[0]
+            found = with_chosen_curves(own, options, offered)[0]
         except Exception as error:
             yield np.array([tool]), error
             continue
-        groups.setdefault(tuple(found.items()), []).append(tool)
-    for terms, members in groups.items():
-        yield np.array(members), replace(options, nonlinearity=dict(terms))
+        terms = tuple((found.nonlinearity or {}).items())
+        groups.setdefault((found.scatter, terms), []).append(tool)
+    for (scatter, terms), members in groups.items():
+        yield np.array(members), replace(options, nonlinearity=dict(terms), scatter=scatter)
 
 
 def halved(

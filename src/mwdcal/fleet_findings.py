@@ -25,6 +25,7 @@ from mwdcal.findings import (
     distrusted,
     excessive,
     misfit_chances,
+    scattered,
     unchecked,
     without_prior,
 )
@@ -58,6 +59,7 @@ def findings_of_batch(
         for kind, each in kinds
         for name, flag in zip(TRIADS, each.transpose(), strict=False)
     }
+    flags["scatter"] = scattered(result)
     flags["no-redundancy"] = np.any(unchecked(result), -1)
     flags |= _of_temperature(result)
     found: list[list[str]] = [[] for _ in result.status]

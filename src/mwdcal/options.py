@@ -22,6 +22,8 @@ class Options:
         parameters: per triad at one temperature: 12, 9 (sensor frame) or 6 (scale and bias).
         nonlinearity: triads with own-axis quadratic and cubic terms, and their prior as a share
             of the field; None: what the profile declares.
+        scatter: estimate how far strengths, dip and the direction of a group depart from station to
+            station, beside the noise; only where the noise of both triads is estimated.
         estimate: errors of the stand to find as well: "azimuth-zero", "inclination-zero", "tilt".
         ignore: what may not be used at any station, of "gravity", "field", "dip": each station then
             has its own.
@@ -37,6 +39,7 @@ class Options:
     order: Orders = 0
     parameters: int = 12
     nonlinearity: Mapping[str, float] | None = None
+    scatter: bool = False
     estimate: tuple[str, ...] = ()
     ignore: tuple[str, ...] = ()
     robust: str | None = None

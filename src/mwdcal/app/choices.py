@@ -12,7 +12,7 @@ from msgspec.structs import replace as replace_struct
 
 from mwdcal.calibration import Calibration, OrderScore
 from mwdcal.checks import check_curve_names, check_curves, check_order, check_readings
-from mwdcal.curves import USUAL, CurveScore, choose_curves, declared
+from mwdcal.curves import USUAL, CurveScore, declared, with_chosen_curves
 from mwdcal.errors import InputError
 from mwdcal.files import documents
 from mwdcal.options import Options
@@ -198,7 +198,7 @@ def _with_curves(
     profile: Profile,
     say: Callable[[str], None],
 ) -> tuple[Options, list[CurveScore]]:
-    """Own-axis terms: as asked, or of the triads that declare them where left-out stations improve."""
+    """Own-axis terms: as asked, or of the triads that declare them where the run speaks for them."""
     if asked == "none":
         return options, []
     offered = declared(profile, options)
@@ -206,9 +206,8 @@ def _with_curves(
         if not offered or options.prior:
             return options, []
         check_readings(readings, options)
-        say("own-axis nonlinearity: leaving stations out, with and without it")
-        found, scores = choose_curves(readings, options, offered)
-        return replace(options, nonlinearity=found), scores
+        say("own-axis nonlinearity: comparing fits with and without it")
+        return with_chosen_curves(readings, options, offered)
     wanted = curves_of(asked, offered)
     check_curves(readings, tuple(wanted))
     return replace(options, nonlinearity=wanted), []

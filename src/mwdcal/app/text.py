@@ -189,11 +189,17 @@ def orders(scores: list[OrderScore]) -> str:
 
 def curves(scores: list[CurveScore]) -> str:
     """The table that took or left the own-axis terms."""
+    judged = any(s.odds is not None for s in scores)
     rows = [
-        [" and ".join(s.triads) or "none", number(s.left_out), "chosen" if s.chosen else ""]
+        [
+            " and ".join(s.triads) or "none",
+            f"{s.odds:+.1f}" if s.odds is not None else number(s.left_out),
+            "chosen" if s.chosen else "",
+        ]
         for s in scores
     ]
-    return table(rows, ["own-axis nonlinearity of", "χ² left out", ""])
+    measure = "odds, powers of ten" if judged else "χ² left out"
+    return table(rows, ["own-axis nonlinearity of", measure, ""])
 
 
 def verdict(result: Verdict, *metadata: Mapping[str, object]) -> str:

@@ -91,7 +91,9 @@ class Evidence:
     stations of the same number (-1: none). `include` is 1 for stations that count, 0 for
     those left out. `absent` names the strengths and the dip of which nothing may be used:
     each station then has its own. `stand` (B,) are the standard uncertainties of errors that all
-    stations have in common, by name of `STAND_ERRORS`.
+    stations have in common, by name of `STAND_ERRORS`. `scatter` (B, n) is how far what should be
+    constant departs from station to station, 1σ: "gravity" and "field" as a share, "dip" and the
+    common "direction" of a group in radians.
     """
 
     known: dict[str, Array]
@@ -101,6 +103,7 @@ class Evidence:
     constants: tuple[Constant, ...]
     absent: tuple[str, ...] = ()
     stand: Mapping[str, Array] = field(default_factory=dict)
+    scatter: dict[str, Array] = field(default_factory=dict)
 
     def is_known(self, name: str) -> Bools:
         """Where a reference value is given (B, n)."""
@@ -229,6 +232,7 @@ class Problem:
             include=evidence.include[index],
             constants=constants,
             stand={k: v[index] for k, v in evidence.stand.items()},
+            scatter={k: v[index] for k, v in evidence.scatter.items()},
         )
         triads = tuple(Triad(t.model.take(index), t.raw[index], t.sd[index]) for t in self.triads)
         return Problem(triads, self.temperature[index], chosen, self.prior.take(index))
@@ -328,20 +332,45 @@ class Problem:
         residual = np.concatenate(
             [p.misfit * w for p, w in zip(predictions, weights, strict=True)], -1
         )
-        turns = np.concatenate(
-            [p.by_turn * w[..., None] for p, w in zip(predictions, weights, strict=True)], -2
-        )
-        by_earth = np.concatenate(
-            [p.by_earth * w[..., None] for p, w in zip(predictions, weights, strict=True)], -2
-        )
+        turns, by_earth = self._station_columns(predictions, weights)
         blocks = [p.by_params * w[..., None] for p, w in zip(predictions, weights, strict=True)]
         groups = np.concatenate(self._group_turns(state, turns), -1)
         constants = self._constant_columns(state, by_earth, turns, geometry)
         shared = np.concatenate([constants, groups], -1)
         private = [turns @ self._own_turns(state, geometry), self._own_earth(state, by_earth)]
+        if self.evidence.scatter and not geometry:
+            columns = self._scatter_columns(state, turns, by_earth)
+            scatter = self.evidence.scatter
+            private += [c * scatter[name][..., None, None] for name, c in columns.items()]
         own = np.concatenate(private, -1)
         prior, pull = self._prior(state, blocks, shared.shape[-1], geometry)
         return Linear(residual, tuple(blocks), shared, own, prior, pull)
+
+    def _station_columns(
+        self, predictions: list[Prediction], weights: list[Array]
+    ) -> tuple[Array, Array]:
+        """Whitened rows (B, n, m, 3) by a turn of the station, and by its gravity, field and dip."""
+        pairs = list(zip(predictions, weights, strict=True))
+        turns = np.concatenate([p.by_turn * w[..., None] for p, w in pairs], -2)
+        return turns, np.concatenate([p.by_earth * w[..., None] for p, w in pairs], -2)
+
+    def scatter_columns(self, state: State) -> dict[str, Array]:
+        """Whitened rows (B, n, m, k) by a departure of one in each of the evidence's `scatter`."""
+        predictions = self.predictions(state)
+        columns = self._station_columns(predictions, self._weights(predictions, geometry=False))
+        return self._scatter_columns(state, *columns)
+
+    def _scatter_columns(self, state: State, turns: Array, by_earth: Array) -> dict[str, Array]:
+        """The same from the rows by a turn and by the earth: a direction turns about x and y."""
+        found = {}
+        for name in self.evidence.scatter:
+            if name == "direction":
+                sharing = self.evidence.shared("inclination").sum(-1)
+                found[name] = turns[..., :2] * sharing[..., None, None]
+                continue
+            size = 1.0 if name == "dip" else self.constant(state, name)[..., None, None]
+            found[name] = by_earth[..., [EARTH.index(name)]] * size
+        return found
 
     def _constant_columns(
         self, state: State, by_earth: Array, turns: Array, geometry: bool
@@ -504,7 +533,8 @@ class Problem:
         attitude = self._turn_stand(state, step[:, p : p + q])
         attitude = self._turn_groups(replace(state, attitude=attitude), step[:, p + q :])
         attitude = self._turn_stations(state, attitude, private[..., :3])
-        own = state.own + private[..., 3:] * self._own_scales(state)
+        absent = private[..., 3 : 3 + state.own.shape[-1]]
+        own = state.own + absent * self._own_scales(state)
         constants = state.constants + step[:, p : p + q]
         return State(state.params + step[:, :p], attitude, constants, own)
 

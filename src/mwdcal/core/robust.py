@@ -80,6 +80,11 @@ def consistency(loss: str, freedom: float) -> float:
     return _moments(loss, freedom)[2]
 
 
+def weighted(loss: str, freedom: float) -> float:
+    """What the misfit w d² per degree of freedom comes to with good stations: below 1."""
+    return _moments(loss, freedom)[1]
+
+
 def inflation(loss: str, freedom: float) -> float:
     """Variance of an estimate over what its weighted information says, with good stations.
 
@@ -90,4 +95,4 @@ def inflation(loss: str, freedom: float) -> float:
     return mean * spread / bend**2
 
 
-__all__ = ["LOSSES", "consistency", "inflation", "weight"]
+__all__ = ["LOSSES", "consistency", "inflation", "weight", "weighted"]

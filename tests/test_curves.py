@@ -1,0 +1,151 @@
+"""Own-axis terms taken where a run speaks for them, and scatter from shot to shot beside the noise."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal
+
+from mwdcal.core.observables import OBSERVABLES
+from mwdcal.core.variance import PIN, log_evidence
+from mwdcal.core.vectors import centred
+from mwdcal.curves import ODDS, choices_of, choose_curves
+from mwdcal.estimate import fit
+from mwdcal.options import Options
+from mwdcal.readings import Readings
+
+nulls = pytest.importorskip("nulls")
+
+SCATTER = Options(nonlinearity={}, scatter=True)
+
+
+@cache
+def handful(count=40):
+    return nulls.runs(count, "sap5", False, 11)
+
+
+@cache
+def fitted(scatter):
+    readings, truth = handful()
+    return fit(readings, Options(nonlinearity={}, scatter=scatter)), truth
+
+
+def test_no_terms_are_taken_where_there_are_none():
+    """Six kinds of noise; `python examples/measured/nulls.py` does it with 500 runs."""
+    wrong = nulls.false_terms(6, seed=40)
+    assert {count for count, _ in wrong.values()} == {0}
+    assert sum(of for _, of in wrong.values()) == 6
+
+
+def test_terms_are_taken_where_they_are_plain():
+    bent, _ = nulls.runs(6, "sap5", False, 3, (0.0, 0.02))
+    assert (nulls.odds(bent) > ODDS).all()
+
+
+def test_odds_of_straight_runs_are_against_the_terms():
+    """Mostly below even, and clear in as many runs as their meaning allows: none of so few."""
+    straight, _ = handful()
+    found = nulls.odds(straight)
+    assert np.mean(found < 0) > 0.8
+    assert np.mean(np.exp(found)) < 1.5  # expected value of a likelihood ratio: one
+
+
+def test_the_choice_of_one_run():
+    readings, _ = nulls.runs(2, "sap5", False, 3, (0.0, 0.02))
+    one = Readings(readings.accelerometer[0], readings.magnetometer[0], group=readings.group[0])
+    found, table = choose_curves(one, SCATTER, nulls.OFFERED)
+    assert found == nulls.OFFERED
+    assert [(s.triads, s.chosen) for s in table] == [((), False), (tuple(nulls.OFFERED), True)]
+    assert table[1].odds == pytest.approx(nulls.odds(readings)[0] / np.log(10), rel=1e-6)
+    assert choose_curves(one, SCATTER, {}) == ({}, [])
+
+
+def test_scatter_is_what_was_simulated():
+    """Variances of REML, mean over runs, against those of the simulation."""
+    result, _ = fitted(True)
+    assert (result.status == 0).all()
+    size = nulls.SIZES["sap5"]
+    for name in ("dip", "direction"):
+        variance = np.mean(result.problem.evidence.scatter[name][:, 0] ** 2)
+        assert np.sqrt(variance) == pytest.approx(size[name], rel=0.15)
+    # of field strength and noise of b the sum is what |b| shows
+    whole = np.mean(result.noise[:, 1] ** 2 + result.problem.evidence.scatter["field"][:, 0] ** 2)
+    assert np.sqrt(whole) == pytest.approx(np.hypot(size["b"], size["field"]), rel=0.15)
+
+
+def errors(result, truth):
+    """Error and stated σ of the inclination, by runs and attitudes that were not in the fit."""
+    probe = [
+        np.radians(v) for v in ([20.0, 60, 85, 120], [10.0, 100, 200, 300], [15.0, 95, 170, 280])
+    ]
+    g, b = nulls.vectors(*probe, truth["dip"])
+    g = np.broadcast_to(g, b.shape)
+    found = []
+    for t, vector in enumerate((g, b)):
+        raw = np.einsum("bij,bnj->bni", truth["gain"][:, t], vector) + truth["offset"][:, t, None]
+        found.append(raw)
+    problem, state, cold = result.problem, result.state, np.zeros((len(g), 4))
+    fields, slopes = [], np.zeros((len(g), 4, 6, state.params.shape[-1]))
+    for t, (triad, where) in enumerate(zip(problem.triads, problem.slices(), strict=True)):
+        fields.append(triad.model.fields(state.params[:, where], found[t], cold))
+        slopes[:, :, 3 * t : 3 * t + 3, where] = triad.model.jacobian(
+            state.params[:, where], found[t], cold
+        )
+    pairs = {}
+    for name in ("inclination", "azimuth"):
+        gradient = OBSERVABLES[name].gradient(g, b)
+        rows = np.einsum("bni,bnip->bnp", gradient, slopes)
+        sd = np.sqrt(np.einsum("bnp,bpq,bnq->bn", rows, result.analysis.covariance, rows))
+        error = centred(OBSERVABLES[name].value(*fields) - OBSERVABLES[name].value(g, b))
+        pairs[name] = error, sd
+    return pairs
+
+
+@pytest.mark.parametrize("name", ["inclination", "azimuth"])
+def test_stated_uncertainty_covers_and_is_smaller(name):
+    with_it, without = (errors(*fitted(scatter))[name] for scatter in (True, False))
+    ratio = [np.sqrt(np.mean((error / sd) ** 2)) for error, sd in (with_it, without)]
+    assert 0.85 < ratio[0] < 1.2
+    rms = [np.sqrt(np.mean(error**2)) for error, _ in (with_it, without)]
+    assert rms[0] < rms[1]
+
+
+def test_evidence_is_the_density_of_the_readings():
+    """Ratio of two models' densities: log N(y; 0, C + X Λ⁻¹ Xᵀ) as one dense normal."""
+    readings, _ = nulls.runs(1, "sap5", False, 5, (0.0, 0.005))
+    readings = Readings(
+        readings.accelerometer[0], readings.magnetometer[0], group=readings.group[0]
+    )
+    found, dense = [], []
+    for terms in ({}, {"magnetometer": 0.005}):
+        result = fit(readings, Options(nonlinearity=terms, scatter=True))
+        problem, state = result.problem, result.state
+        found.append(log_evidence(problem, state)[0])
+        linear = problem.linear(state)
+        design = linear.design[0].reshape(-1, linear.design.shape[-1])
+        given = np.diagonal(linear.prior[0])
+        free = np.append(given[: linear.size] == 0, np.zeros(len(given) - linear.size, bool))
+        precision = given + np.append(np.full(linear.size, PIN**-2.0), 0 * given[linear.size :])
+        covariance = design / precision @ design.transpose()
+        for k in range(24):
+            own, rows = linear.own[0, k], slice(6 * k, 6 * k + 6)
+            covariance[rows, rows] += np.eye(6) + own @ own.transpose()
+        # unpriored parameters are integrated about the fit itself
+        y = linear.residual[0].ravel() - design @ np.where(free, 0, linear.pull[0])
+        noise = sum(np.log(t.sd).sum() for t in problem.triads)
+        dense.append(multivariate_normal.logpdf(y, cov=covariance) - noise)
+    assert found[1] - found[0] == pytest.approx(dense[1] - dense[0], abs=0.1)
+
+
+def test_a_declared_noise_leaves_the_choice_to_stations_left_out():
+    readings, _ = nulls.runs(1, "noise alone", False, 5)
+    sd = {"accelerometer": np.full(3, 0.003), "magnetometer": np.full(3, 0.0025)}
+    one = Readings(
+        readings.accelerometer[0], readings.magnetometer[0], group=readings.group[0], sd=sd
+    )
+    found, table = choose_curves(one, SCATTER, {"magnetometer": 0.005})
+    assert found == {}
+    assert [s.left_out is None for s in table] == [False, False]
+    assert [s.odds for s in table] == [None, None]
+    assert not fit(one, SCATTER).problem.evidence.scatter
+    assert choices_of(one, {"magnetometer": 0.005}) == [(), ("magnetometer",)]
