@@ -25,6 +25,7 @@ LAYERS = (
     ("core.solvers",),
     (
         "core.newton",
+        "core.evidence",
         "core.problem",
         "core.robust",
         "core.sums",

@@ -24,8 +24,8 @@ from mwdcal.calibration import (
     rounded,
 )
 from mwdcal.checks import check_fit, check_readings
+from mwdcal.core.evidence import STAND_ERRORS
 from mwdcal.core.observability import Free, free_directions
-from mwdcal.core.problem import STAND_ERRORS
 from mwdcal.core.uncertainty import marginal_rank
 from mwdcal.core.vectors import Array
 from mwdcal.covariance import (

@@ -8,8 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mwdcal.core import exact
+from mwdcal.core.evidence import Evidence
 from mwdcal.core.models import Basis, Factors, Polynomial, Restricted, Whole, restricted
-from mwdcal.core.problem import Evidence, Problem, State, Triad
+from mwdcal.core.problem import Problem, State, Triad
 from mwdcal.core.robust import LOSSES, consistency, inflation, weight, weighted
 from mwdcal.core.solvers import Determined, Status
 from mwdcal.core.start import start

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from mwdcal.core.problem import UNKNOWN, Constant, Evidence
+from mwdcal.core.evidence import UNKNOWN, Constant, Evidence
 from mwdcal.core.vectors import AnyArray, Array, Ints
 from mwdcal.profile import COMMON
 from mwdcal.readings import ANGLES, CONSTANTS, Readings

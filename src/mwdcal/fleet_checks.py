@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 
 from mwdcal.checks import ABSURD, COARSE, GAIN, MOTION, NEEDS
+from mwdcal.core.evidence import STAND_ERRORS, UNKNOWN
 from mwdcal.core.observability import EXACT, Free, free_directions
-from mwdcal.core.problem import STAND_ERRORS, UNKNOWN, Problem, State
+from mwdcal.core.problem import Problem, State
 from mwdcal.core.solvers import Determined, Status
 from mwdcal.core.uncertainty import COUPLED, candidates
 from mwdcal.core.vectors import Array, Bools, Ints

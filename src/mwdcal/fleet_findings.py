@@ -59,15 +59,14 @@ def findings_of_batch(
         for kind, each in kinds
         for name, flag in zip(TRIADS, each.transpose(), strict=False)
     }
-    flags["scatter"] = scattered(result)
     flags["no-redundancy"] = np.any(unchecked(result), -1)
-    flags |= _of_temperature(result)
     found: list[list[str]] = [[] for _ in result.status]
     _add(found, flags)
     for place in np.flatnonzero(suspected(result, chances)).tolist():
         one = member(result, np.array([place]))
         found[place] += [f"looks-like-{effect.name}" for effect in effects(one)]
-    _add(found, {"repeated-readings": _repeated(result)})
+    _add(found, {"scatter": scattered(result), "repeated-readings": _repeated(result)})
+    _add(found, _of_temperature(result))
     if options.prior is not None:
         _add(found, _of_prior(result, free))
     common = [f.id for f in Findings(readings, profile, options, result, []).model()]

@@ -11,8 +11,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from mwdcal.core.evidence import UNKNOWN, Constant, Evidence
 from mwdcal.core.newton import newton, propagated
-from mwdcal.core.problem import UNKNOWN, Constant, Evidence, Prior, Problem, State
+from mwdcal.core.problem import Prior, Problem, State
 from mwdcal.core.solvers import Status, gauss_newton
 from mwdcal.core.sums import STRENGTH, Params, Sums
 from mwdcal.core.swarm import forward_parts, swarm_forward

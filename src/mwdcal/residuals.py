@@ -10,8 +10,8 @@ from math import erfc, gamma
 import numpy as np
 
 from mwdcal.calibration import ErrorRow, Measures, StationRow
+from mwdcal.core.evidence import STAND_ERRORS
 from mwdcal.core.observables import OBSERVABLES, VERTICAL
-from mwdcal.core.problem import STAND_ERRORS
 from mwdcal.core.uncertainty import Analysis, station_misfit, without_station
 from mwdcal.core.vectors import Array, Bools, centred
 from mwdcal.estimate import Fit

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from mwdcal.calibration import StandErrors
-from mwdcal.core.problem import STAND_ERRORS, UNKNOWN
+from mwdcal.core.evidence import STAND_ERRORS, UNKNOWN
 from mwdcal.core.solvers import Determined
 from mwdcal.covariance import constants_covariance
 from mwdcal.errors import FitError, InputError
