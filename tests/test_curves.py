@@ -77,6 +77,18 @@ def test_scatter_is_what_was_simulated():
     assert np.sqrt(whole) == pytest.approx(np.hypot(size["b"], size["field"]), rel=0.15)
 
 
+@pytest.mark.parametrize("kind", nulls.SIZES)
+def test_the_noise_keeps_its_degrees_of_freedom(kind):
+    """Below one `calibrate` refuses, however strongly strengths scatter beside it."""
+    readings, _ = nulls.runs(20, kind, True, 9)
+    result = fit(readings, SCATTER)
+    assert (result.analysis.freedom > 3).all()
+    scatter = result.problem.evidence.scatter
+    size = [p.strength.mean(-1) for p in result.problem.predictions(result.state)]
+    for t, name in enumerate(("gravity", "field")):
+        assert (scatter[name][:, 0] <= 1.001 * result.noise[:, t] / size[t]).all()
+
+
 def errors(result, truth):
     """Error and stated σ of the inclination, by runs and attitudes that were not in the fit."""
     probe = [
