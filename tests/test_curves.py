@@ -1,11 +1,15 @@
 """Own-axis terms taken where a run speaks for them, and scatter from shot to shot beside the noise."""
 
+import json
 from functools import cache
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from scipy.stats import multivariate_normal
 
+from cli_support import mwdcal
 from mwdcal.core.observables import OBSERVABLES
 from mwdcal.core.variance import PIN, log_evidence
 from mwdcal.core.vectors import centred
@@ -71,6 +75,18 @@ def test_scatter_is_what_was_simulated():
     # of field strength and noise of b the sum is what |b| shows
     whole = np.mean(result.noise[:, 1] ** 2 + result.problem.evidence.scatter["field"][:, 0] ** 2)
     assert np.sqrt(whole) == pytest.approx(np.hypot(size["b"], size["field"]), rel=0.15)
+
+
+@pytest.mark.parametrize("kind", nulls.SIZES)
+def test_the_noise_keeps_its_degrees_of_freedom(kind):
+    """Below one `calibrate` refuses, however strongly strengths scatter beside it."""
+    readings, _ = nulls.runs(20, kind, True, 9)
+    result = fit(readings, SCATTER)
+    assert (result.analysis.freedom > 3).all()
+    scatter = result.problem.evidence.scatter
+    size = [p.strength.mean(-1) for p in result.problem.predictions(result.state)]
+    for t, name in enumerate(("gravity", "field")):
+        assert (scatter[name][:, 0] <= 1.001 * result.noise[:, t] / size[t]).all()
 
 
 def errors(result, truth):
@@ -149,3 +165,51 @@ def test_a_declared_noise_leaves_the_choice_to_stations_left_out():
     assert [s.odds for s in table] == [None, None]
     assert not fit(one, SCATTER).problem.evidence.scatter
     assert choices_of(one, {"magnetometer": 0.005}) == [(), ("magnetometer",)]
+
+
+PROFILE = """name = "held by hand"
+[accelerometer]
+scale = 1.0
+nonlinearity = 0.002
+[magnetometer]
+scale = 2e-5
+nonlinearity = 0.005
+"""
+
+
+def test_calibrate_and_fleet_choose_and_fit_alike(tmp_path):
+    """One straight tool, one bent: terms, scatter, parameters and findings of both commands."""
+    (tmp_path / "tool.toml").write_text(PROFILE)
+    straight, bent = (nulls.runs(1, "sap5", False, 3, (0.0, bend))[0] for bend in (0.0, 0.01))
+    names = ("ax", "ay", "az", "mx", "my", "mz")
+    rows = []
+    for serial, run in (("straight", straight), ("bent", bent)):
+        raw = np.concatenate([run.accelerometer[0], run.magnetometer[0]], -1)
+        own = [["", "A", "B"][g + 1] for g in nulls.GROUPS]
+        rows += [[serial, g, *map(repr, map(float, r))] for g, r in zip(own, raw, strict=True)]
+        text = "\n".join(",".join(row[1:]) for row in rows[-24:])
+        (tmp_path / f"{serial}.csv").write_text(",".join(("group", *names)) + "\n" + text + "\n")
+    columns = dict(zip(("serial", "group", *names), zip(*rows, strict=True), strict=True))
+    table = {
+        k: list(v) if k in ("serial", "group") else np.array(v, float) for k, v in columns.items()
+    }
+    pq.write_table(pa.table(table), tmp_path / "runs.parquet")
+    given = ("--tool", tmp_path / "tool.toml", "--nonlinearity", "auto", "--order", "0")
+    out = tmp_path / "cals.parquet"
+    ran = mwdcal("fleet", tmp_path / "runs.parquet", "-o", out, *given, "--workers", "1")
+    assert ran.code == 0, ran.err
+    for row in pq.read_table(out).to_pylist():
+        single = tmp_path / f"{row['serial']}.json"
+        ran = mwdcal("calibrate", tmp_path / f"{row['serial']}.csv", "-o", single, *given)
+        assert ran.code == 0, ran.err
+        made = json.loads(single.read_text("utf-8"))
+        curved = row["serial"] == "bent"
+        for triad in ("accelerometer", "magnetometer"):
+            own = made[triad]
+            assert own["curved"] == curved
+            assert (row[f"{triad}_radius"] is not None) == curved
+            name = own["parameter_names"][0]
+            column = f"{triad}_{name.replace('-', '_')}"
+            assert row[column] == pytest.approx(own["parameters"][0], rel=1e-9)
+        assert "scatter" in row["findings"]
+        assert "scatter" in {f["id"] for f in made["findings"]}

@@ -60,6 +60,14 @@ def test_distox_default_is_best_in_directions_that_no_fit_is_told_of():
     assert linear < curved
 
 
+@pytest.mark.parametrize("words", ["", "--robust student-t"])
+def test_the_default_refuses_no_set(words):
+    refused = {
+        name: measured.trial(name, words).refused for name in (*measured.SAP, *measured.DISTOX)
+    }
+    assert {name: reason for name, reason in refused.items() if reason} == {}
+
+
 @pytest.mark.parametrize("name", measured.DISTOX)
 def test_distox_scatter_below_the_peers_coefficients(name):
     peer = measured.distox_peer(name)

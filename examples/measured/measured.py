@@ -624,7 +624,6 @@ def _sap() -> list[str]:
         f"{curved:.3f}°. It takes terms that make the readings 1000 times as probable, and no others.",
         "",
         *_components(SAP),
-        "",
         f"Left out we are below what the peer's axis fit reaches in sample on {axis} of {len(SAP)} "
         f"sets. **The peer's non-linear fit is ahead of ours in sample on {len(ahead)} of "
         f"{len(SAP)}** (mean {means(every, 'peer_curved')[0]:.3f}° against "

@@ -417,9 +417,9 @@ def _estimate_noise(stage: _Stage, declared: list[bool], options: Options) -> _S
         settled = ~np.any(np.abs(scale[:, free] - 1) >= SETTLED, -1)
         if problem.evidence.scatter:
             ratios = scatter_ratios(now.problem, solved.state, analysis)
-            problem = with_scatter(problem, ratios)
+            problem = with_scatter(problem, solved.state, ratios)
             settled = ~np.any(np.abs(scale[:, free] - 1) >= SCATTER_SETTLED, -1)
-            settled &= _steady(problem, ratios)
+            settled &= _steady(now.problem, problem)
         if options.method != "swarm":
             solved = solve(problem, solved.state, options)
         return replace(now, problem=problem, solved=solved), settled
@@ -428,12 +428,12 @@ def _estimate_noise(stage: _Stage, declared: list[bool], options: Options) -> _S
     return _in_turn(stage, rounds, turn)
 
 
-def _steady(problem: Problem, ratios: dict[str, Array]) -> Bools:
+def _steady(old: Problem, new: Problem) -> Bools:
     """Members (B,) whose scatter has settled: changed little, or is none."""
-    scatter = problem.evidence.scatter
+    before, now = (p.evidence.scatter for p in (old, new))
     each = [
-        (np.abs(np.sqrt(ratio) - 1) < SCATTER_SETTLED) | (scatter[name].max(-1) < 10 * LEAST)
-        for name, ratio in ratios.items()
+        (np.abs(now[name] / value - 1).max(-1) < SCATTER_SETTLED) | (now[name].max(-1) < 10 * LEAST)
+        for name, value in before.items()
     ]
     return np.asarray(np.all(each, 0))
 
@@ -457,7 +457,8 @@ def _downweigh(stage: _Stage, declared: list[bool], options: Options) -> _Stage:
             if problem.evidence.scatter:
                 share = np.array([weighted(loss, k) for k in _tested(freedom)])
                 ratios = scatter_ratios(weighed, solved.state, analysis)
-                problem = with_scatter(problem, {n: r / share for n, r in ratios.items()})
+                ratios = {n: r / share for n, r in ratios.items()}
+                problem = with_scatter(problem, solved.state, ratios)
         solved = solve(_trusting(problem, trust), solved.state, options)
         return _Stage(problem, solved, trust), ~np.any(np.abs(trust / now.trust - 1) >= SETTLED, -1)
 

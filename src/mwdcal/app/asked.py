@@ -108,7 +108,7 @@ def fit_options(order: str, nonlinearity: str, prior: str, known: str) -> tuple[
         click.option(
             "--nonlinearity", default=nonlinearity, show_default=True, metavar="auto|none|NAMES",
             help="Own-axis quadratic and cubic terms. auto: of the triads whose profile declares "
-            "them, where left-out stations improve. NAMES: accelerometer, magnetometer, or both with "
+            "them, where the run speaks for them. NAMES: accelerometer, magnetometer, or both with "
             "a comma.",
         ),
     )  # fmt: skip

@@ -53,7 +53,7 @@ class Chosen:
 def choose(
     readings: Readings, profile: Profile, typed: Typed, say: Callable[[str], None]
 ) -> Chosen:
-    """Options as typed; what was left to the data is decided by stations left out of the fit."""
+    """Options as typed; what was left to the data is decided by the data."""
     options, order = stated(typed), typed["order"]
     if typed["prior"]:
         options, order = _with_prior(options, order, typed, readings, profile)

@@ -46,12 +46,21 @@ def scatter_ratios(problem: Problem, state: State, analysis: Analysis) -> dict[s
     return found
 
 
-def with_scatter(problem: Problem, ratios: dict[str, Array]) -> Problem:
-    """The problem with each scatter's variance times a ratio (B,)."""
+def with_scatter(problem: Problem, state: State, ratios: dict[str, Array]) -> Problem:
+    """The problem with each scatter's variance times a ratio (B,).
+
+    A strength scatters no more than the noise of its triad: else nothing would be left to tell
+    that noise by.
+    """
     scatter = {
         name: np.maximum(value * np.sqrt(ratios[name])[:, None], LEAST)
         for name, value in problem.evidence.scatter.items()
     }
+    sizes = [p.strength.mean(-1) for p in problem.predictions(state)]
+    for name, triad, size in zip(("gravity", "field"), problem.triads, sizes, strict=False):
+        if name in scatter:
+            noise = np.sqrt(np.mean(triad.sd**2, (1, 2))) / size
+            scatter[name] = np.minimum(scatter[name], np.maximum(noise, LEAST)[:, None])
     return replace(problem, evidence=replace(problem.evidence, scatter=scatter))
 
 
