@@ -324,12 +324,12 @@ def tail(square: Array, freedom: Array) -> Array:
 
 
 def chi_chance(square: Array, freedom: Array) -> Array:
-    """Chance of a larger χ² with any degrees of freedom, to some per cent of it from one on.
+    """Chance of a larger χ² with any degrees of freedom, to a tenth of it from four on.
 
     Reference: E. B. Wilson and M. M. Hilferty, Proc. Natl. Acad. Sci. 17, 684 (1931).
 
-    >>> chi_chance(np.array([18.467, 149.449]), np.array([4.0, 100.0])).round(5)
-    array([0.001  , 0.00099])
+    >>> chi_chance(np.array([18.467, 149.449]), np.array([4.0, 100.0])).round(4)
+    array([0.0011, 0.001 ])
     """
     spread = 2 / (9 * np.maximum(freedom, 1e-9))
     normal = (np.cbrt(square / np.maximum(freedom, 1e-9)) - 1 + spread) / np.sqrt(2 * spread)
