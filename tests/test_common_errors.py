@@ -7,15 +7,20 @@ of the package is used for it.
 import numpy as np
 import pytest
 
+from cli_support import EXAMPLE, mwdcal, servo_run, write_csv
 from mwdcal.calibrate import calibrate
 from mwdcal.core.observables import OBSERVABLES
 from mwdcal.core.vectors import centred
 from mwdcal.covariance import assumed_exact, shares, stated_covariance
+from mwdcal.errors import FitError
 from mwdcal.estimate import fit
+from mwdcal.files import documents
+from mwdcal.files.runs import read_run as runs_of
 from mwdcal.findings import misfit_chances
 from mwdcal.fleet_checks import member
 from mwdcal.options import Options
 from mwdcal.predict import typical_accuracy
+from mwdcal.prior import from_calibration
 from mwdcal.profile import Profile
 from mwdcal.readings import Readings
 from simulation import DEG, Tool, attitude, plan
@@ -221,3 +226,42 @@ def test_fits_of_one_member_and_of_a_batch_state_the_same():
     result = fit(data)
     one = stated_covariance(member(result, np.array([1])))[0]
     np.testing.assert_allclose(one, stated_covariance(result)[1], rtol=1e-9, atol=1e-20)
+
+
+def test_gravity_under_stand_counts_where_no_run_gives_gravity(tmp_path):
+    """Results are then in units of local gravity, which the stand knows to 1 mg."""
+    columns = servo_run(3)
+    del columns["ref_gravity_g"]
+    run, tool = write_csv(tmp_path / "run.csv", columns), tmp_path / "tool.toml"
+    text = (EXAMPLE / "tool.toml").read_text("utf-8")
+    tool.write_text(text + "gravity_g = 0.001\n", "utf-8")
+    ran = mwdcal("calibrate", run, "--tool", tool, "-o", tmp_path / "cal.json", "--json")
+    assert ran.code == 0, ran
+    assert "gravity reference error" in [row["source"] for row in ran.json["budget"]]
+    assert "gravity reference" not in ran.json["assumed_exact"]
+    cal = documents.read(tmp_path / "cal.json")
+    readings, _ = runs_of(run, cal.profile)
+    sd = cal.uncertainty("gravity", readings)
+    assert (sd > 0.99e-3).all()
+    assert (sd < 1.1e-3).all()
+
+
+@pytest.mark.parametrize(
+    "options", [{"method": "swarm"}, {"method": "scalar", "paper_weights": True}]
+)
+def test_methods_that_hold_the_stand_refuse_declared_common_errors(options):
+    _, data = runs("azimuth-zero", SIZES["azimuth-zero"], count=1)
+    with pytest.raises(FitError, match="azimuth-zero"):
+        calibrate(member_readings(data, 0), Profile(name="x"), Options(**options))
+
+
+def test_a_prior_of_the_same_stand_is_reported():
+    _, data = runs("toolface-zero", SIZES["toolface-zero"], count=2)
+    first = calibrate(member_readings(data, 0), Profile(name="x"))
+    options = Options(prior=from_calibration(first))
+    record = calibrate(member_readings(data, 1), Profile(name="x"), options)
+    (finding,) = [f for f in record.findings if f.id == "prior-shared"]
+    assert "toolface zero of the stand" in finding.text
+    bare = runs("toolface-zero", 0.0, declared=False, count=1, seed=4)[1]
+    record = calibrate(member_readings(bare, 0), Profile(name="x"), options)
+    assert not [f for f in record.findings if f.id == "prior-shared"]

@@ -368,12 +368,17 @@ def test_a_calibration_without_temperatures_says_so_at_any(record):
     assert ids(verify(record, roll(45), SPREADS)) == []
 
 
-def test_a_zero_of_the_stand_counts_in_errors_and_not_in_spreads(record):
-    limits = Limits(name="i", spread=Bounds(inclination_deg=0.1), error=Bounds(inclination_deg=0.3))
-    plain = rows_of(verify(record, roll(45), limits))
+def test_common_errors_of_the_stand_count_in_errors_and_not_in_spreads(record):
+    """A lean of the stand towards any azimuth turns azimuths by cot I and toolfaces by 1 / sin I."""
+    bounds = Bounds(inclination_deg=0.3, azimuth_deg=2, toolface_deg=2)
+    limits = Limits(name="i", spread=Bounds(inclination_deg=0.1), error=bounds)
+    plain = rows_of(verify(record, roll(30), limits))
     zeros = {**NOISE, "inclination-zero": np.full(12, 0.05 * DEG), "tilt": np.full(12, 0.04 * DEG)}
-    shared = rows_of(verify(record, roll(45, sd=zeros), limits))
+    shared = rows_of(verify(record, roll(30, sd=zeros), limits))
     assert shared["spread of inclination"] == plain["spread of inclination"]
-    before = plain["error of inclination"].uncertainty
-    expected = (before**2 + 0.05**2 + 0.04**2 / 2) ** 0.5
-    assert shared["error of inclination"].uncertainty == pytest.approx(expected, rel=1e-6)
+    lean = 0.04**2 / 2
+    own = {"inclination": 0.05**2 + lean, "azimuth": 3 * lean, "toolface": 4 * lean}
+    for name, added in own.items():
+        before = plain[f"error of {name}"].uncertainty
+        after = shared[f"error of {name}"].uncertainty
+        assert after == pytest.approx((before**2 + added) ** 0.5, rel=5e-3)

@@ -130,6 +130,26 @@ def test_findings_name_the_effect_and_what_to_do():
     assert "nT rms" in finding.text
 
 
+def test_settings_that_a_roll_set_shares_are_not_taken_for_another_effect():
+    """The stand is set once for twelve toolfaces: 0.02° of inclination, 0.1° of azimuth."""
+    tool, others = Tool.random(3, noise=(1e-4, 15.0)), 0
+    inc, azi = np.repeat([10, 45, 90, 135], 12) * DEG, np.repeat([0, 90, 180, 270], 12) * DEG
+    face = np.tile(np.arange(12) * 30, 4) * DEG
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        shared = [np.repeat(s * DEG * rng.normal(size=4), 12) for s in (0.02, 0.1)]
+        attitude = tool_from_earth(inc + shared[0], azi + shared[1], face)
+        earth = earth_gravity(np.ones(48)), earth_field(np.full(48, tool.field), tool.dip)
+        raw = [np.einsum("nij,nj->ni", attitude, e) for e in earth]
+        raw = [v @ tool.matrix[t].T + tool.offset[t] for t, v in enumerate(raw)]
+        raw = [r + s * rng.normal(size=(48, 3)) for r, s in zip(raw, (1e-4, 15.0), strict=True)]
+        known = {"inclination": inc, "azimuth": azi, "toolface": face}
+        known |= {"field": np.full(48, tool.field), "dip": np.full(48, tool.dip)}
+        names = [e.name for e in effects(fit(Readings(*raw, known=known)))]
+        others += len([n for n in names if n != "settings"])
+    assert others <= 1
+
+
 def test_what_the_sensors_take_up_is_not_seen():
     """A toolface zero turns both triads alike: residuals stay as they are."""
     data = run()

@@ -31,6 +31,7 @@ from mwdcal.core.vectors import Array
 from mwdcal.covariance import (
     PRIOR,
     assumed_exact,
+    common_source,
     constants_covariance,
     error_name,
     shares,
@@ -181,8 +182,7 @@ class _Record:
         """What each source of error adds to the accuracy to expect; tilt is one source."""
         found: dict[str, Array] = {}
         for name, share in shares(self.result).items():
-            source = "tilt of the stand" if name.startswith("stand-") else name
-            source = source if " " in source or source == PRIOR else error_name(source)
+            source = name if " " in name or name == PRIOR else common_source(name)
             found[source] = found.get(source, 0.0) + self._mapped(share)
         rows = typical_budget(record, found)
         return [

@@ -24,7 +24,7 @@ from mwdcal.plausibility import (
     off_earth,
     overturned,
 )
-from mwdcal.profile import Profile
+from mwdcal.profile import COMMON, Profile
 from mwdcal.readings import CONSTANTS, EARTH, TRIADS, Readings
 from mwdcal.residuals import shown_in
 from mwdcal.soaks import HIGHEST, soaks
@@ -178,11 +178,33 @@ def check_readings(readings: Readings, options: Options) -> None:
             f"parameters per triad and needs {-(-size // 3)} or more. Add stations at other "
             f"attitudes{', or lower --order' if highest else ''}."
         )
+    _check_common_errors(readings, options)
     for triad in TRIADS:
         _check_channels(readings, triad, options.prior is not None)
     if options.prior is None or options.prior.temperature is None:
         _check_temperature(readings, highest)
     _check_needs(readings, method)
+
+
+def holds_stand(options: Options) -> bool:
+    """Whether a method takes the stand as it reads: its uncertainty has no errors in common."""
+    return options.method == "swarm" or options.paper_weights
+
+
+def _check_common_errors(readings: Readings, options: Options) -> None:
+    """Refuse declared errors that all stations share where the method cannot have them as unknowns."""
+    found = [name for name in COMMON if name in readings.sd]
+    if found and holds_stand(options):
+        what = (
+            "the paper's weights take"
+            if options.paper_weights
+            else f"method {options.method} takes"
+        )
+        raise FitError(
+            f"{what} the stand as exact, and [stand] of the tool profile declares {', '.join(found)}: no "
+            "uncertainty would include it. Use --method least-squares or joint without --paper-weights, or "
+            "take it out of the profile."
+        )
 
 
 def _check_channels(readings: Readings, triad: str, prior: bool) -> None:

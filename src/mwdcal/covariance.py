@@ -58,6 +58,15 @@ def error_name(constant: str) -> str:
     return f"{constant} reference error"
 
 
+def common_source(constant: str) -> str:
+    """What a budget calls the source of a common error: a tilt is one source.
+
+    >>> [common_source(name) for name in ("stand-north", "azimuth-zero", "gravity")]
+    ['tilt of the stand', 'azimuth zero of the stand', 'gravity reference error']
+    """
+    return "tilt of the stand" if constant.startswith("stand-") else error_name(constant)
+
+
 def assumed_exact(result: Fit) -> list[str]:
     """References taken as exact whose error moves no residual: it goes into the calibration whole.
 

@@ -104,6 +104,10 @@ class Test:
         variance = np.einsum("ni,nij,nj->n", gradient, noise, gradient)
         return np.asarray(np.maximum(np.sqrt(variance), TINY))
 
+    def _common(self, name: str) -> Array:
+        """Standard uncertainty (n,) of a reference by errors that all stations of the stand share."""
+        return self.readings.common_uncertainty(name, self.value("inclination"))
+
     def _lacks(self, name: str) -> str:
         """What is missing to have an observable at all; empty where nothing is."""
         if name not in ("azimuth", "field", "dip"):
@@ -201,9 +205,7 @@ class Test:
         whole = [s for s in seen if not self._loose(s.index) and (s.one_azimuth or name in LEVEL)]
         inside = np.concatenate([s.index for s in whole]) if whole else np.zeros(0, int)
         error, labels = np.abs(self._error(name)), self.readings.labels
-        reference = np.hypot(
-            self.readings.uncertainty(name), self.readings.common_uncertainty(name)
-        )
+        reference = np.hypot(self.readings.uncertainty(name), self._common(name))
         sd = np.hypot(self._noise(name), reference)
         return [self._curve_of(name, s, True) for s in whole] + [
             Shown(float(error[i]), float(sd[i]), float(error[i]), f"station {labels[i]}")
@@ -231,7 +233,7 @@ class Test:
     def _reference_sd(self, name: str, roll_set: RollSet, error: bool) -> tuple[Array, float]:
         """Standard uncertainty of the reference: per station (k,), and what the set shares."""
         sd = self.readings.uncertainty(name)[roll_set.index]
-        shared = float(self.readings.common_uncertainty(name).max()) if error else 0.0
+        shared = float(self._common(name)[roll_set.index].max()) if error else 0.0
         if name == "toolface" or (name in ANGLES and roll_set.set_each):
             return sd, shared
         whole = float(np.sqrt(np.mean(sd**2))) if error else 0.0

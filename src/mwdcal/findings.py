@@ -16,8 +16,10 @@ from mwdcal.core.solvers import Determined
 from mwdcal.core.uncertainty import effective_freedom
 from mwdcal.core.vectors import Array, Bools, Ints, eigen
 from mwdcal.courses import Terms, misfit_size, terms_beyond, untested
+from mwdcal.covariance import common_source
 from mwdcal.estimate import Fit
 from mwdcal.options import Options
+from mwdcal.prior import Knowledge
 from mwdcal.profile import Profile
 from mwdcal.readings import TRIADS, Readings
 from mwdcal.residuals import REASONS, chi_chance, shown_in, tail
@@ -352,6 +354,25 @@ class Findings:
         knowledge = self.options.prior
         if knowledge is None:
             return []
+        return [*self._shared(knowledge), *self._resting(knowledge)]
+
+    def _shared(self, knowledge: Knowledge) -> list[Finding]:
+        """Errors of the stand that both the prior and this run have declared."""
+        ours = {
+            common_source(c.name) for c in self.result.problem.evidence.constants if not c.unknown
+        }
+        both = [name for name in knowledge.common if name in ours]
+        if not both:
+            return []
+        text = (
+            f"the prior ({knowledge.source}) and this run both have {', '.join(both)} in their uncertainty, and "
+            "count as independent there. On the same stand it is one error: what rests on it is then "
+            "stated up to 1.4 times too small."
+        )
+        return [Finding(id="prior-shared", text=text)]
+
+    def _resting(self, knowledge: Knowledge) -> list[Finding]:
+        """What rests on the prior alone, and a departure from it."""
         bare = without_prior(self.result)
         named = free_directions(bare.problem, bare.state, bare.analysis.determined)
         free = [entry.id for entry in self.free]

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from mwdcal.checks import ABSURD, COARSE, GAIN, MOTION, NEEDS
+from mwdcal.checks import ABSURD, COARSE, GAIN, MOTION, NEEDS, holds_stand
 from mwdcal.core.evidence import STAND_ERRORS, UNKNOWN
 from mwdcal.core.observability import EXACT, Free, free_directions
 from mwdcal.core.problem import Problem, State
@@ -21,7 +21,7 @@ from mwdcal.core.vectors import Array, Bools, Ints
 from mwdcal.estimate import Fit
 from mwdcal.options import Options
 from mwdcal.plausibility import gain_shares, is_bad, off_earth, overturned, straying
-from mwdcal.profile import Profile
+from mwdcal.profile import COMMON, Profile
 from mwdcal.readings import EARTH, TRIADS, Readings
 from mwdcal.soaks import GAP
 from mwdcal.stand import LOOSE
@@ -36,8 +36,10 @@ def suspect_readings(readings: Readings, options: Options) -> dict[str, Bools]:
     for triad in TRIADS:
         channels |= _odd_channels(readings, triad)
     blank = readings.temperature is None and method != "swarm"  # as where there is no such column
+    common = holds_stand(options) and any(name in readings.sd for name in COMMON)
     return {
         "too-few-stations": none | few,
+        "common-errors": none | common,
         "channel": channels,
         "bad-input" if blank else "temperature-span": (
             _short_span(readings, highest, method) if highest else none

@@ -30,7 +30,8 @@ class Knowledge:
     Names are "accelerometer scale-x" and so on, in nominal units and tool axes, of powers of
     T - `reference`. A direction without precision is not known. `loose`: names that a model
     does not have are of no account; else they are an error. `stations` are the fingerprints of
-    those that the knowledge comes from, `temperature` their range, °C.
+    those that the knowledge comes from, `temperature` their range, °C; `common` names errors of the
+    stand and of references that are part of its uncertainty, as `budget` of a calibration does.
     """
 
     source: str
@@ -41,6 +42,7 @@ class Knowledge:
     loose: bool = False
     stations: tuple[str, ...] = ()
     temperature: tuple[float, float] | None = None
+    common: tuple[str, ...] = ()
 
 
 def prior_of(knowledge: Knowledge | None, models: Sequence[Model], batch: int) -> Prior:
@@ -133,6 +135,7 @@ def from_calibration(previous: Calibration, relative: bool = False) -> Knowledge
         _precision(covariance[np.ix_(moving, moving)], free[:, moving]),
         stations=(*(row.digest for row in previous.station_rows), *previous.inherited),
         temperature=previous.temperature_c,
+        common=tuple(row.source for row in previous.budget),
     )
 
 

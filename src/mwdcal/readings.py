@@ -124,14 +124,22 @@ class Readings:
             return np.zeros(self.accelerometer.shape[:-1])
         return self._per_station(np.nan_to_num(np.asarray(self.sd[name], float)))
 
-    def common_uncertainty(self, name: str) -> Array:
+    def common_uncertainty(self, name: str, inclination: Array) -> Array:
         """Standard uncertainty of the reference `name` (..., n) by what all stations of a stand share.
 
-        The zero of its scale, and of inclination the lean of its vertical towards any one azimuth.
+        The zero of its scale, and the lean of its vertical towards any azimuth: at `inclination`
+        (..., n) that turns azimuths by its cotangent and toolfaces by its cosecant. Singular: at
+        vertical these two are held to those of 0.1°.
         """
-        zero = self.uncertainty(f"{name}-zero")
-        tilt = self.uncertainty("tilt") if name == "inclination" else 0.0
-        return np.asarray(np.sqrt(zero**2 + np.square(tilt) / 2))
+        zero, tilt = self.uncertainty(f"{name}-zero"), self.uncertainty("tilt")
+        across = np.maximum(np.abs(np.sin(inclination)), 2e-3)
+        shares = {
+            "inclination": 1.0,
+            "azimuth": np.cos(inclination) / across,
+            "toolface": 1 / across,
+        }
+        lean = tilt * np.asarray(shares.get(name, 0.0), float)
+        return np.asarray(np.sqrt(zero**2 + lean**2 / 2))
 
     def _per_station(self, value: ArrayLike) -> Array:
         whole, shape = np.asarray(value, float), self.accelerometer.shape[:-1]

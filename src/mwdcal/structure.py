@@ -40,6 +40,9 @@ DRIFTS = 2
 """Degree of the polynomial of order (or of the row) that a drift is looked for as."""
 
 
+SET = 3
+"""Fewest stations of one direction that may share an error of its setting."""
+SET_TURNS = ("inclination-zero", "azimuth-zero")
 COURSE = "-temperature"
 """What ends the names of the powers of temperature that the order of a triad leaves out."""
 ZEROS = ("azimuth-zero", "inclination-zero", "dip-reference")
@@ -51,6 +54,8 @@ TEXTS = {
     "or declare its uncertainty (inclination_zero_deg under [stand])",
     "tilt": "a stand whose vertical leans: level it, or fit it with --estimate tilt, or declare its uncertainty "
     "(tilt_deg under [stand])",
+    "settings": "settings of the stand that stations of one direction share: set it anew for each station, or give "
+    "the roll sets as group without their reference angles",
     "dip-reference": "a wrong reference for the dip: check ref_dip_deg, or leave it blank to have it estimated",
     "field-drift": "a field that changes in the order of the stations (diurnal variation, traffic): give ref_field_nt "
     "and ref_dip_deg of each station from a reference magnetometer, or repeat the run at a quiet time",
@@ -242,6 +247,10 @@ def _families(problem: Problem, state: State) -> Iterator[tuple[str, Array]]:
         each = [known[turn] for turn in TURNS.get(name, (name,)) if turn in known]
         if each:
             yield name, np.stack(each, -1)
+    sets = _sets(problem)
+    each = [known[n][..., None] * sets[..., None, :] for n in SET_TURNS if n in known]
+    if each and sets.shape[-1] > 1:
+        yield "settings", np.concatenate(each, -1)
     count = state.attitude.shape[1]
     place = np.linspace(-1, 1, count)
     order = np.asarray(np.polynomial.legendre.legvander(place, DRIFTS)[:, 1:], float)
@@ -261,6 +270,18 @@ def _families(problem: Problem, state: State) -> Iterator[tuple[str, Array]]:
     yield from _courses(problem, state)
     for index, name in enumerate(TRIADS[: len(problem.triads)]):
         yield from _of_sensor(problem, index, name, weights[index], order)
+
+
+def _sets(problem: Problem) -> Array:
+    """Membership (n, k) of stations in directions that several of them share by their references."""
+    known = problem.evidence.known
+    pair = np.stack([known["inclination"][0], known["azimuth"][0]], -1)
+    key = np.round(np.nan_to_num(pair, nan=-1.0), 6)
+    _, number, count = np.unique(key, axis=0, return_inverse=True, return_counts=True)
+    usable = np.flatnonzero(count >= SET)
+    if len(usable) > len(key) / SET:
+        usable = usable[:0]
+    return np.asarray(number.reshape(-1)[:, None] == usable, float)
 
 
 def _courses(problem: Problem, state: State) -> Iterator[tuple[str, Array]]:

@@ -270,7 +270,9 @@ def _readings(rows: Rows, tools: Ints) -> Readings:
         magnetometer=triads.get("magnetometer"),
         temperature=cells("temperature_c"),
         known=known,
-        sd=sd | _reference_spreads(rows, known, cells) | common_errors(rows.profile, where.shape),
+        sd=sd
+        | _reference_spreads(rows, known, cells, where.shape)
+        | common_errors(rows.profile, where.shape),
         group=None if group is None or (group < 0).all() else group,
         source=rows.source,
     )
@@ -325,15 +327,16 @@ def _spread(triad: TriadProfile, cells: Sequence[Array | None], raw: Array) -> A
     return None if np.isnan(noise).all() else np.hypot(noise, triad.repeatability)
 
 
-def _reference_spreads(rows: Rows, known: Mapping[str, Array], cells: Any) -> dict[str, Array]:
+def _reference_spreads(
+    rows: Rows, known: Mapping[str, Array], cells: Any, shape: tuple[int, ...]
+) -> dict[str, Array]:
     """Standard uncertainties (B, n) of references: the table's, else the stand's, else zero."""
     found = {}
     for name in dict.fromkeys([*known, "gravity"]):
         stated = cells(f"sd_{REFERENCES[name].column}")
-        if stated is None and name not in known:
-            continue
-        values = np.full_like(known[name], np.nan) if stated is None else stated
-        spread = reference_spread(rows.profile, name, values, name in known)
+        values = np.full(shape, np.nan) if stated is None else stated
+        given = name in known or name == "gravity"
+        spread = reference_spread(rows.profile, name, values, given)
         if spread.any():
             found[name] = spread
     return found

@@ -285,7 +285,7 @@ def _uncertainties(
         if spread is not None:
             sd[kind] = spread
     for name in dict.fromkeys([*known, "gravity"]):
-        spread = _reference_spread(table, profile, name, name in known)
+        spread = _reference_spread(table, profile, name, name in known or name == "gravity")
         if spread.any():
             sd[name] = spread
     return sd | common_errors(profile, (table.count,))
@@ -405,7 +405,8 @@ def _reference_columns(
         )
     if name in readings.sd and (columns or name == "gravity"):
         spread = readings.uncertainty(name)
-        usual = reference_spread(profile, name, np.array(np.nan), bool(columns))
+        given = bool(columns) or name == "gravity"
+        usual = reference_spread(profile, name, np.array(np.nan), given)
         if not np.allclose(spread, usual, rtol=1e-12, atol=0.0):
             repeated = profile.stand.repeatability(_quantity(name))
             own = (spread / reference.factor) ** 2 - repeated**2
