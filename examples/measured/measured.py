@@ -736,9 +736,12 @@ def _components(names: Iterable[str]) -> list[str]:
     columns = ("noise of g, %", "of b, %", "strength of g, %", "of b, %", "dip, °", "direction, °")
     lines = header("from shot to shot, 1σ", *columns)
     for name in names:
-        problem = _fitted(name, "").problem
+        result = _fitted(name, "")
+        problem = result.problem
+        strength = [p.strength.mean() for p in problem.predictions(result.state)]
         noise = [
-            100 * float(t.sd.mean() / np.linalg.norm(t.raw, axis=-1).mean()) for t in problem.triads
+            100 * float(t.sd.mean() / size)
+            for t, size in zip(problem.triads, strength, strict=True)
         ]
         sizes = [float(problem.evidence.scatter[k].max()) for k in COMPONENTS]
         cells = [*noise, *(100 * s for s in sizes[:2]), *(np.degrees(s) for s in sizes[2:])]
