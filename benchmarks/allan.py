@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 from measuring import Row, against
 
-from mwdcal.core.allan import deviation, octaves
+from mwdcal.logs.allan import deviation, octaves
 
 COUNT = 2**18
 """Samples of a record: 44 minutes at 100 Hz."""

@@ -18,15 +18,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mwdcal.calibrate import calibrate
-from mwdcal.calibration import Calibration
-from mwdcal.core import fused
-from mwdcal.core.vectors import Array
-from mwdcal.correction import compiled, numbers, reference
+from mwdcal.calibration.calibrate import calibrate
+from mwdcal.calibration.options import Options
+from mwdcal.calibration.readings import Readings
+from mwdcal.calibration.record import Calibration
 from mwdcal.files import documents, profiles
-from mwdcal.options import Options
-from mwdcal.readings import Readings
-from mwdcal.simulate import grid, run, servo
+from mwdcal.geometry.vectors import Array
+from mwdcal.planning.simulate import grid, run, servo
+from mwdcal.use import correction_numba
+from mwdcal.use.correction import compiled, numbers, reference
 
 MWDCAL = Path(sys.executable).with_name("mwdcal")
 NOMINAL = (3.0, 5e-5)
@@ -112,7 +112,7 @@ def in_memory(rows: int = 10**6) -> Iterator[Row]:
     triads, out, copied = numbers(made), np.empty((6, rows)), np.empty((6, rows))
     source = np.stack(columns[:6])
     ours, theirs, half = seconds(
-        lambda: fused.run(columns, triads, made.reference_temperature, out=out),
+        lambda: correction_numba.run(columns, triads, made.reference_temperature, out=out),
         lambda: np.copyto(copied, source),
         lambda: made.fields(readings),
     )

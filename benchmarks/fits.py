@@ -7,7 +7,7 @@ attitude,
 
 from the same start, the nominal tool. SciPy gets what does it most good: one vectorised NumPy
 function, scaled Chebyshev polynomials of temperature, the magnetometer in units of the field, so
-that all columns are of like size. `mwdcal.estimate.fit` does more than find the minimum: rank,
+that all columns are of like size. `mwdcal.calibration.estimate.fit` does more than find the minimum: rank,
 the covariance of all parameters and the share of each station are in its time.
 
 The 60 of an uncertain stand have 540 unknowns more: three angles of every station. SciPy
@@ -25,10 +25,10 @@ import numpy as np
 from measuring import Row, against
 from scipy.optimize import OptimizeResult, least_squares
 
-from mwdcal.core.models import OFF_DIAGONAL, Basis
-from mwdcal.estimate import Fit, fit
-from mwdcal.options import Options
-from mwdcal.readings import ANGLES, TRIADS, Readings
+from mwdcal.calibration.estimate import Fit, fit
+from mwdcal.calibration.options import Options
+from mwdcal.calibration.readings import ANGLES, TRIADS, Readings
+from mwdcal.sensor.models import OFF_DIAGONAL, Basis
 from simulation import (
     DEG,
     attitude,

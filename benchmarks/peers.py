@@ -13,10 +13,10 @@ from functools import partial
 import numpy as np
 from measuring import Row, against
 
-from mwdcal.estimate import Fit, fit
-from mwdcal.options import Options
-from mwdcal.readings import Readings
-from mwdcal.scatter import directions
+from mwdcal.calibration.estimate import Fit, fit
+from mwdcal.calibration.options import Options
+from mwdcal.calibration.readings import Readings
+from mwdcal.use.roll_scatter import directions
 from simulation import DEG, Tool
 
 TOOL = Tool.random(7)

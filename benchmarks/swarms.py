@@ -16,7 +16,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from measuring import Row, against
 
-from mwdcal.core.swarm import (
+from mwdcal.estimation.minimisers.swarm import (
     ACCELERATION,
     CONSTRICTION,
     least_squares_forward,

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from cli_support import mwdcal, refused, write_csv
-from mwdcal.core import allan, noise_terms
 from mwdcal.files import logs
 from mwdcal.files.profiles import load_profile
-from mwdcal.noise import find_noise
+from mwdcal.logs import allan, noise_terms
+from mwdcal.logs.noise import find_noise
 
 KINDS = ("overlapping", "modified", "standard")
 BATCHES = [(), (1,), (3, 1, 2)]

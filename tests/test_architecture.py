@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import ast
 import io
+import re
 import subprocess
 import tokenize
-from fnmatch import fnmatchcase
 from graphlib import CycleError, TopologicalSorter
-from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -16,100 +15,24 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 SOURCE = ROOT / "src" / "mwdcal"
 
-# From the bottom up: a module imports from its own layer or from one above it in this table.
-LAYERS = (
-    ("errors", "core.vectors"),
-    ("core.observables", "core.models"),
-    ("core.fast", "core.machine", "core.compiled"),
-    ("core.fused", "core.kernels"),
-    ("core.solvers",),
-    (
-        "core.newton",
-        "core.evidence",
-        "core.problem",
-        "core.robust",
-        "core.sums",
-        "core.swarm",
-        "core.uncertainty",
-        "core.variance",
-        "core.observability",
-        "core.standstill",
-        "core.station_means",
-        "core.allan",
-        "core.noise_terms",
-        "core.start",
-        "core.exact",
-        "core.separable",
-        "core",
-    ),
-    ("readings", "profile", "profiles", "soaks"),
+# From the bottom up: a room imports from rooms below it. Rooms of one floor are strangers.
+FLOORS = (
+    ("errors",),
+    ("geometry",),
+    ("sensor",),
+    ("estimation",),
     ("calibration",),
-    ("evidence", "prior", "options"),
-    ("methods", "estimate", "notation"),
-    ("courses",),
-    ("covariance",),
-    (
-        "axes",
-        "checks",
-        "curves",
-        "correction",
-        "plausibility",
-        "residuals",
-        "scatter",
-        "selection",
-        "stand",
-        "strengths",
-        "structure",
-    ),
-    ("findings",),
-    (
-        "calibrate",
-        "compare",
-        "departures",
-        "gauge",
-        "predict",
-        "quality",
-        "roll_sets",
-        "roll_test",
-        "simulate",
-    ),
-    ("fleet", "fleet_accuracy", "fleet_checks", "fleet_choices", "fleet_curves", "fleet_findings"),
-    ("files", "files.*"),
-    ("registry", "registry.*", "datasets", "station_findings", "stations", "noise"),
+    ("use",),
+    ("files", "profiles"),
+    ("comparison", "fleet", "logs", "planning", "registry", "survey"),
     ("",),  # the package itself: its public names
-    (
-        "app",
-        "app.asked",
-        "app.calibrating",
-        "app.choices",
-        "app.comparison",
-        "app.comparison_plots",
-        "app.conversion",
-        "app.fleet_asked",
-        "app.fleet_plots",
-        "app.fleet_report",
-        "app.fleet_summary",
-        "app.fleets",
-        "app.lean",
-        "app.noise_asked",
-        "app.noise_plots",
-        "app.noises",
-        "app.plots",
-        "app.pool",
-        "app.worker",
-        "app.report",
-        "app.report.*",
-        "app.progress",
-        "app.standstills",
-        "app.streaming",
-        "app.tables",
-        "app.text",
-    ),
-    ("app.cli", "app.cli.*", "app.web", "app.web.*", "__main__"),
+    ("app",),
+    ("__main__",),
 )
-# Pairs that share a layer and still never import each other.
-STRANGERS = (("app.cli", "app.web"),)
+ARRAY_ROOMS = ("geometry", "estimation", "sensor.models")
 
+MAX_ROOMS = 20
+MAX_MODULES = 12
 MAX_FUNCTION_LINES = 50
 MAX_MODULE_LINES = 400
 
@@ -129,12 +52,10 @@ PATHS = {module_name(path): path for path in sorted(SOURCE.rglob("*.py"))}
 TREES = {name: ast.parse(path.read_text("utf-8"), str(path)) for name, path in PATHS.items()}
 
 
-def layer(name: str) -> int | None:
-    """Index of a module's layer, None for one that is not in the table."""
-    for index, patterns in enumerate(LAYERS):
-        if any(fnmatchcase(name, pattern) for pattern in patterns):
-            return index
-    return None
+def floor(name: str) -> int:
+    """Index of the floor on which a module's room lies."""
+    room = name.split(".", 1)[0]
+    return next(index for index, rooms in enumerate(FLOORS) if room in rooms)
 
 
 def imported_base(name: str, node: ast.ImportFrom) -> str | None:
@@ -175,16 +96,37 @@ IMPORTS = {name: targets(name) for name in PATHS}
 
 
 @pytest.mark.parametrize("name", PATHS)
-def test_module_is_in_the_layers_table(name: str) -> None:
-    assert layer(name) is not None, f"mwdcal.{name}: add it to the layers table above"
+def test_every_room_lies_on_a_floor(name: str) -> None:
+    assert any(name.split(".", 1)[0] in rooms for rooms in FLOORS), (
+        f"mwdcal.{name}: enter its room in the floors above"
+    )
 
 
 @pytest.mark.parametrize("name", PATHS)
 def test_imports_point_downwards(name: str) -> None:
-    own = layer(name)
-    known = {target: layer(target) for target in IMPORTS[name]}
-    upward = [t for t, other in known.items() if None not in (own, other) and other > own]
-    assert not upward, f"mwdcal.{name} imports from a higher layer: {', '.join(sorted(upward))}"
+    room = name.split(".", 1)[0]
+    others = {target for target in IMPORTS[name] if target.split(".", 1)[0] != room}
+    upward = sorted(target for target in others if floor(target) >= floor(name))
+    assert not upward, f"mwdcal.{name} imports from a room above or beside it: {', '.join(upward)}"
+
+
+ROOMS = sorted(name for name, path in PATHS.items() if path.name == "__init__.py" and name)
+
+
+def test_rooms_are_few_and_small() -> None:
+    modules = {room: [n for n in PATHS if n.rpartition(".")[0] == room] for room in ROOMS}
+    sizes = {room: len([n for n in names if n not in ROOMS]) for room, names in modules.items()}
+    assert len(ROOMS) <= MAX_ROOMS
+    assert {room: size for room, size in sizes.items() if size > MAX_MODULES} == {}
+
+
+def test_contributing_lists_the_rooms_with_their_purpose() -> None:
+    table = (ROOT / "CONTRIBUTING.md").read_text("utf-8")
+    rows = re.findall(r"^\| `([a-z./]+)/` \| (.*?) \|", table, re.M)
+    purposes = {room: (ast.get_docstring(TREES[room]) or "").split("\n")[0] for room in ROOMS}
+    assert all(purposes.values()), "each room says in its __init__ in one line what it holds"
+    assert {room.replace("/", "."): said for room, said in rows} == purposes
+    assert [floor(room.replace("/", ".")) for room, _ in rows] == sorted(map(floor, ROOMS))
 
 
 def test_no_import_cycle() -> None:
@@ -192,21 +134,6 @@ def test_no_import_cycle() -> None:
         TopologicalSorter(IMPORTS).prepare()
     except CycleError as error:
         pytest.fail("import cycle: " + " <- ".join(error.args[1]))
-
-
-@pytest.mark.parametrize("pair", STRANGERS, ids="-".join)
-def test_strangers_never_import_each_other(pair: tuple[str, str]) -> None:
-    def inside(name: str, top: str) -> bool:
-        return name == top or name.startswith(top + ".")
-
-    crossings = [
-        f"{name} imports {target}"
-        for one, other in (pair, pair[::-1])
-        for name in PATHS
-        for target in IMPORTS[name]
-        if inside(name, one) and inside(target, other)
-    ]
-    assert not crossings, "; ".join(crossings)
 
 
 def rank_questions(tree: ast.AST) -> list[tuple[int, str]]:
@@ -221,8 +148,8 @@ def rank_questions(tree: ast.AST) -> list[tuple[int, str]]:
     return names + [(node.lineno, node.attr) for node in attributes]
 
 
-@pytest.mark.parametrize("name", [n for n in PATHS if n == "core" or n.startswith("core.")])
-def test_core_asks_no_rank(name: str) -> None:
+@pytest.mark.parametrize("name", [n for n in PATHS if n.startswith(ARRAY_ROOMS)])
+def test_array_code_asks_no_rank(name: str) -> None:
     found = [f"line {line}: {word}" for line, word in rank_questions(TREES[name])]
     advice = "broadcast over leading axes; use swapaxes(-1, -2) or [..., None]"
     assert not found, f"mwdcal.{name}, {'; '.join(found)}. {advice}"
@@ -291,8 +218,3 @@ def test_forbidden_words_do_not_occur() -> None:
         if word.encode() in path.read_bytes()
     ]
     assert not found, "\n".join(found)
-
-
-def test_layers_table_has_no_module_twice() -> None:
-    names = sorted(pattern for patterns in LAYERS for pattern in patterns)
-    assert all(one != other for one, other in pairwise(names))

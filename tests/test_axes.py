@@ -6,16 +6,16 @@ from itertools import permutations, product
 import numpy as np
 import pytest
 
-from mwdcal.axes import explaining, named
-from mwdcal.calibrate import calibrate
-from mwdcal.checks import check_fit
+from mwdcal.calibration.calibrate import calibrate
+from mwdcal.calibration.diagnosis.axes import explaining, named
+from mwdcal.calibration.diagnosis.plausibility import excessive_errors
+from mwdcal.calibration.diagnosis.refusals import check_fit
+from mwdcal.calibration.estimate import fit
+from mwdcal.calibration.options import Options
+from mwdcal.calibration.readings import TRIADS, Readings
 from mwdcal.errors import FitError
-from mwdcal.estimate import fit
-from mwdcal.fleet_checks import free_of_batch, member, suspect_fits
-from mwdcal.options import Options
-from mwdcal.plausibility import excessive_errors
-from mwdcal.profile import Profile, StandProfile
-from mwdcal.readings import TRIADS, Readings
+from mwdcal.fleet.refusals import free_of_batch, member, suspect_fits
+from mwdcal.sensor.profile import Profile, StandProfile
 from simulation import DEG, attitude, factor_readings, factors_within_limits, plan
 
 PROFILE = Profile(name="test tool")

@@ -4,18 +4,18 @@ import msgspec
 import numpy as np
 import pytest
 
-from mwdcal.calibrate import calibrate
-from mwdcal.calibration import Calibration
-from mwdcal.core.observables import OBSERVABLES
-from mwdcal.core.vectors import reference_vectors
+from mwdcal.calibration.automatic.order_selection import choose_order
+from mwdcal.calibration.calibrate import calibrate
+from mwdcal.calibration.options import Options
+from mwdcal.calibration.prediction import readings_at
+from mwdcal.calibration.readings import Readings
+from mwdcal.calibration.record import Calibration
+from mwdcal.calibration.soaks import soaks
 from mwdcal.errors import FitError, InputError
-from mwdcal.options import Options
-from mwdcal.predict import readings_at
-from mwdcal.profile import Profile, TriadProfile
-from mwdcal.readings import Readings
-from mwdcal.selection import choose_order
-from mwdcal.simulate import grid, run, servo
-from mwdcal.soaks import soaks
+from mwdcal.geometry.observables import OBSERVABLES
+from mwdcal.geometry.vectors import reference_vectors
+from mwdcal.planning.simulate import grid, run, servo
+from mwdcal.sensor.profile import Profile, TriadProfile
 from simulation import Tool, plan
 
 PROFILE = Profile(name="test tool")

@@ -12,7 +12,8 @@ import time
 import pytest
 
 from cli_support import EXAMPLE, mwdcal, process
-from mwdcal.app import cli, fleets
+from mwdcal.app import cli
+from mwdcal.app.commands import fleet
 
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="POSIX signals")
 
@@ -107,7 +108,7 @@ def test_a_killed_first_run_leaves_no_file_of_that_name(tmp_path):
 @pytest.mark.parametrize("when", ["fitting", "writing"])
 def test_ctrl_c_ends_with_130_and_one_line(tmp_path, when):
     target = tmp_path / "cal.json"
-    fitting = "import mwdcal.estimate as e, time\nreal = e.start\ndef slow(p):\n" + (
+    fitting = "import mwdcal.calibration.estimate as e, time\nreal = e.start\ndef slow(p):\n" + (
         "    print('writing', flush=True)\n    for _ in range(2000):\n        time.sleep(0.01)\n"
         "    return real(p)\ne.start = slow\n"
     )
@@ -138,6 +139,7 @@ def test_every_orderly_end_tells_its_status_and_leaves_nothing(tmp_path, name, w
 TIDYING = """
 import time
 from mwdcal.app import cli
+from mwdcal.app.commands import fleet
 from mwdcal.files import atomic
 real_remove = atomic._remove
 def remove(path):
@@ -195,7 +197,7 @@ def test_an_interrupted_fleet_says_that_finished_parts_are_kept(tmp_path, monkey
     def interrupt(*given):
         raise stop
 
-    monkeypatch.setattr(fleets, "run", interrupt)
+    monkeypatch.setattr(fleet, "run", interrupt)
     before = [signal.getsignal(getattr(signal, name)) for name in ENDINGS]
     ran = mwdcal("fleet", tmp_path / "runs.parquet", "-o", tmp_path / "cals.parquet")
     assert ran.code == 128 + (signal.SIGTERM if isinstance(stop, cli.Ended) else signal.SIGINT)
@@ -243,7 +245,7 @@ def test_the_same_input_gives_the_same_corrected_readings(tmp_path, suffix):
 
 
 def test_the_same_input_gives_the_same_report(tmp_path):
-    pytest.importorskip("mwdcal.app.report")
+    pytest.importorskip("mwdcal.app.pages.report")
     arguments = (*CALIBRATE, "cal.json", "--report")
     first, second = twice(tmp_path, *arguments, suffix=".html")
     times = {json.loads((p.parent / "cal.json").read_bytes())["time"] for p in (first, second)}

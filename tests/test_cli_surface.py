@@ -21,8 +21,8 @@ from cli_support import (
     write_csv,
 )
 from mwdcal.app.cli import cli
-from mwdcal.correction import OUTSIDE
 from mwdcal.files import documents
+from mwdcal.use.correction import OUTSIDE
 
 COMMANDS = sorted(cli.commands)
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from cli_support import SCALE, calibrated, channels, mwdcal, refused, servo_run, stations, write_csv
-from mwdcal import simulate
+from mwdcal.planning import simulate
 
 SEED = 11
 PLAN = simulate.grid([5, 45, 90, 135], 12, [0, 90, 180, 270], [25.0])

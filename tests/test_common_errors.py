@@ -8,21 +8,21 @@ import numpy as np
 import pytest
 
 from cli_support import EXAMPLE, mwdcal, servo_run, write_csv
-from mwdcal.calibrate import calibrate
-from mwdcal.core.observables import OBSERVABLES
-from mwdcal.core.vectors import centred
-from mwdcal.covariance import assumed_exact, shares, stated_covariance
+from mwdcal.calibration.calibrate import calibrate
+from mwdcal.calibration.covariance import assumed_exact, shares, stated_covariance
+from mwdcal.calibration.diagnosis.findings import misfit_chances
+from mwdcal.calibration.estimate import fit
+from mwdcal.calibration.options import Options
+from mwdcal.calibration.prediction import typical_accuracy
+from mwdcal.calibration.prior import from_calibration
+from mwdcal.calibration.readings import Readings
 from mwdcal.errors import FitError
-from mwdcal.estimate import fit
 from mwdcal.files import documents
 from mwdcal.files.runs import read_run as runs_of
-from mwdcal.findings import misfit_chances
-from mwdcal.fleet_checks import member
-from mwdcal.options import Options
-from mwdcal.predict import typical_accuracy
-from mwdcal.prior import from_calibration
-from mwdcal.profile import Profile
-from mwdcal.readings import Readings
+from mwdcal.fleet.refusals import member
+from mwdcal.geometry.observables import OBSERVABLES
+from mwdcal.geometry.vectors import centred
+from mwdcal.sensor.profile import Profile
 from simulation import DEG, Tool, attitude, plan
 
 COUNT = 200

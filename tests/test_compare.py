@@ -12,16 +12,16 @@ from scipy.linalg import polar
 from scipy.spatial.transform import Rotation
 
 from cli_support import mwdcal, refused, servo_run, write_csv
-from mwdcal import compare as module
-from mwdcal import simulate
-from mwdcal.app import comparison
-from mwdcal.calibrate import calibrate
-from mwdcal.compare import SCATTER, compare
-from mwdcal.core.observability import Free
-from mwdcal.gauge import Gauge, in_gauge
-from mwdcal.methods import EVIDENCE
-from mwdcal.options import Options
-from mwdcal.readings import Readings
+from mwdcal.app.commands import compare as command
+from mwdcal.calibration.calibrate import calibrate
+from mwdcal.calibration.methods import EVIDENCE
+from mwdcal.calibration.options import Options
+from mwdcal.calibration.readings import Readings
+from mwdcal.comparison import compare as module
+from mwdcal.comparison.common_gauge import Gauge, in_gauge
+from mwdcal.comparison.compare import SCATTER, compare
+from mwdcal.estimation.rank import Free
+from mwdcal.planning import simulate
 from simulation import Tool, attitude, plan
 from test_calibrate import NOISE, PROFILE, make
 
@@ -233,7 +233,7 @@ def test_order_is_chosen_and_shown_and_the_swarm_says_why_it_cannot():
     assert [m for m, row in rows.items() if row.refused] == ["swarm"]
     assert "one temperature" in rows["swarm"].refused
     assert rows["joint"].parameters["accelerometer"].values["SF"].shape == (3, found.orders[0] + 1)
-    text = comparison.text(found, parameters=True)
+    text = command.text(found, parameters=True)
     assert f"temperature order {found.orders[0]}" in text
     assert "SF x·τ, raw/g/°C" in text
     assert "swarm refused: " in text
@@ -251,11 +251,11 @@ def test_a_run_that_nothing_can_calibrate():
     found = compare(make(1).select(np.arange(48) < 3), PROFILE)
     assert all(row.refused for row in found.rows)
     assert "no method" in found.advice
-    page = comparison.render(found)
+    page = command.render(found)
     assert all(row.refused.split("'")[0] in page for row in found.rows)
-    assert "before" not in comparison.text(found)
-    assert comparison.text(found).count("refused: ") == page.count("refused:</b>") == 1
-    assert "every method refused: " in comparison.text(found)
+    assert "before" not in command.text(found)
+    assert command.text(found).count("refused: ") == page.count("refused:</b>") == 1
+    assert "every method refused: " in command.text(found)
 
 
 def test_a_failing_part_is_counted_and_its_method_not_preferred(monkeypatch):
@@ -277,8 +277,8 @@ def test_a_failing_part_is_counted_and_its_method_not_preferred(monkeypatch):
     assert np.isfinite(list(rows["joint"].held_out.values())).all()
     assert SCATTER in rows["joint"].held_out
     assert "use swarm" in found.advice
-    assert "stations no fit could judge" in comparison.text(found)
-    assert "stations no fit could judge" in comparison.render(found)
+    assert "stations no fit could judge" in command.text(found)
+    assert "stations no fit could judge" in command.render(found)
 
 
 class Page(HTMLParser):
@@ -306,7 +306,7 @@ class Page(HTMLParser):
 
 
 def test_the_page_is_whole_and_needs_nothing_else(whole):
-    page = comparison.render(whole, [("run file", "<run>", "ab" * 32)])
+    page = command.render(whole, [("run file", "<run>", "ab" * 32)])
     parsed = Page()
     parsed.feed(page)
     assert parsed.open == []
@@ -318,11 +318,11 @@ def test_the_page_is_whole_and_needs_nothing_else(whole):
     assert page.index("Use joint") < page.index("<svg")
     assert "&lt;run&gt;" in page
     assert "SIMULATED" not in page
-    assert page == comparison.render(whole, [("run file", "<run>", "ab" * 32)])
+    assert page == command.render(whole, [("run file", "<run>", "ab" * 32)])
 
 
 def test_the_page_says_what_is_simulated_and_what_is_refused():
-    page = comparison.render(heated())
+    page = command.render(heated())
     assert "SIMULATED DATA" in page
     assert "<b>swarm refused:</b>" in page
     assert "SF x·τ" in page
@@ -330,7 +330,7 @@ def test_the_page_says_what_is_simulated_and_what_is_refused():
 
 
 def test_long_runs_show_the_worst_of_each_part():
-    from mwdcal.app.comparison_plots import MOST_STATIONS, _largest
+    from mwdcal.app.pages.comparison_plots import MOST_STATIONS, _largest
 
     values = np.sin(np.arange(1000) ** 2) * 1e-3
     values[737] = 9.0
@@ -352,7 +352,7 @@ def test_long_runs_show_the_worst_of_each_part():
     ],
 )
 def test_uncertainty_in_parentheses(pair, text):
-    assert comparison._joined(*pair) == text
+    assert compare._joined(*pair) == text
 
 
 def test_command_prints_the_same_as_its_json(tmp_path):

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mwdcal.calibrate import calibrate
-from mwdcal.core.observables import OBSERVABLES
-from mwdcal.courses import course_misfit, misfit_covariance, terms_beyond
-from mwdcal.estimate import fit
-from mwdcal.options import Options
-from mwdcal.profile import Profile
-from mwdcal.readings import TRIADS, Readings
-from mwdcal.selection import choose_order, choose_orders, mapped
-from mwdcal.simulate import servo
+from mwdcal.calibration.automatic.courses import course_misfit, misfit_covariance, terms_beyond
+from mwdcal.calibration.automatic.order_selection import choose_order, choose_orders, mapped
+from mwdcal.calibration.calibrate import calibrate
+from mwdcal.calibration.estimate import fit
+from mwdcal.calibration.options import Options
+from mwdcal.calibration.readings import TRIADS, Readings
+from mwdcal.geometry.observables import OBSERVABLES
+from mwdcal.planning.simulate import servo
+from mwdcal.sensor.profile import Profile
 from simulation import DEG, attitude, factor_readings, factors_within_limits, plan
 
 NOISE = (1e-4, 15.0)

@@ -10,13 +10,13 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from cli_support import mwdcal
-from mwdcal.core.observables import OBSERVABLES
-from mwdcal.core.variance import PIN, log_evidence
-from mwdcal.core.vectors import centred
-from mwdcal.curves import ODDS, choices_of, choose_curves
-from mwdcal.estimate import fit
-from mwdcal.options import Options
-from mwdcal.readings import Readings
+from mwdcal.calibration.automatic.nonlinearity import ODDS, choices_of, choose_curves
+from mwdcal.calibration.estimate import fit
+from mwdcal.calibration.options import Options
+from mwdcal.calibration.readings import Readings
+from mwdcal.estimation.variance import PIN, log_evidence
+from mwdcal.geometry.observables import OBSERVABLES
+from mwdcal.geometry.vectors import centred
 
 nulls = pytest.importorskip("nulls")
 

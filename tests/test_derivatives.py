@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from mwdcal.core.models import Basis, Factors, Polynomial, restricted
-from mwdcal.core.observables import OBSERVABLES
+from mwdcal.geometry.observables import OBSERVABLES
+from mwdcal.sensor.models import Basis, Factors, Polynomial, restricted
 from simulation import DEG, attitude, complex_steps
 from test_observables import complex_value
 

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from mwdcal.core.observables import OBSERVABLES
-from mwdcal.estimate import fit
-from mwdcal.options import Options
-from mwdcal.readings import Readings
+from mwdcal.calibration.estimate import fit
+from mwdcal.calibration.options import Options
+from mwdcal.calibration.readings import Readings
+from mwdcal.geometry.observables import OBSERVABLES
 from simulation import DEG, Tool, bound, plan
 
 SEEDS = 400

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mwdcal.core.observability import free_directions
-from mwdcal.core.uncertainty import marginal_rank
-from mwdcal.core.vectors import rotation
-from mwdcal.estimate import fit
-from mwdcal.options import Options
-from mwdcal.readings import Readings
+from mwdcal.calibration.estimate import fit
+from mwdcal.calibration.options import Options
+from mwdcal.calibration.readings import Readings
+from mwdcal.estimation.rank import free_directions
+from mwdcal.estimation.uncertainty import marginal_rank
+from mwdcal.geometry.vectors import rotation
 from simulation import DEG, Tool, plan
 
 NOISE = {"accelerometer": np.array(1e-4), "magnetometer": np.array(15.0)}

@@ -5,10 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mwdcal.core import exact, fast
-from mwdcal.estimate import fit
-from mwdcal.options import Options
-from mwdcal.readings import Readings
+from mwdcal.calibration.estimate import fit
+from mwdcal.calibration.options import Options
+from mwdcal.calibration.readings import Readings
+from mwdcal.estimation import fit_numba
+from mwdcal.estimation.minimisers import closed_form
 from simulation import Tool, plan
 from test_calibrate import NOISE
 
@@ -62,9 +63,9 @@ def runs(lacking, count=90):
 def test_a_large_batch_is_fitted_as_a_small_one(case, monkeypatch):
     options, lacking = CASES[case]
     data = runs(lacking)
-    monkeypatch.setattr(fast, "ENOUGH", 10**9)
+    monkeypatch.setattr(fit_numba, "ENOUGH", 10**9)
     plain = fit(data, options)
-    monkeypatch.setattr(fast, "ENOUGH", 1)
+    monkeypatch.setattr(fit_numba, "ENOUGH", 1)
     compiled = fit(data, options)
     np.testing.assert_array_equal(plain.status, compiled.status)
     np.testing.assert_array_equal(plain.analysis.determined.rank, compiled.analysis.determined.rank)
@@ -81,10 +82,10 @@ def test_a_large_batch_is_fitted_as_a_small_one(case, monkeypatch):
 
 def test_loops_can_be_turned_off(monkeypatch):
     monkeypatch.setenv("MWDCAL_NUMPY", "1")
-    assert not fast.pays(np.zeros((10_000, 48)))
+    assert not fit_numba.pays(np.zeros((10_000, 48)))
     monkeypatch.delenv("MWDCAL_NUMPY")
-    assert fast.pays(np.zeros((10_000, 48)))
-    assert not fast.pays(np.zeros((1, 48)))
+    assert fit_numba.pays(np.zeros((10_000, 48)))
+    assert not fit_numba.pays(np.zeros((1, 48)))
 
 
 EXACT = {
@@ -116,10 +117,10 @@ def test_the_closed_form_is_the_general_minimum(case, part, monkeypatch):
         data = replace(data, sd=uneven)
     include = np.ones((part, 48))
     include[:, 5] = 0
-    assert exact.applies(fit(data, options, include).problem)
+    assert closed_form.applies(fit(data, options, include).problem)
     closed = fit(data, options, include)
     assert (closed.iterations == 1).all()
-    monkeypatch.setattr(exact, "applies", lambda problem: False)
+    monkeypatch.setattr(closed_form, "applies", lambda problem: False)
     general = fit(data, options, include)
     np.testing.assert_array_equal(closed.status, general.status)
     scale = np.sqrt(np.diagonal(general.analysis.covariance, axis1=-2, axis2=-1))
@@ -155,7 +156,7 @@ def test_factors_are_found_under_offsets_of_several_fields(monkeypatch):
     data = replace(data, accelerometer=data.accelerometer + np.array([3.0, -5.0, 0.0]))
     closed = fit(data, Options(order=2))
     assert (closed.iterations == 1).all()
-    monkeypatch.setattr(exact, "applies", lambda problem: False)
+    monkeypatch.setattr(closed_form, "applies", lambda problem: False)
     general = fit(data, Options(order=2))
     ours, theirs = (f.problem.fields(f.state)[0] for f in (closed, general))
     np.testing.assert_allclose(ours, theirs, atol=1e-9)
@@ -170,7 +171,7 @@ def test_the_closed_form_is_not_taken_where_stations_are_too_few():
 
 @pytest.mark.parametrize("kind", ["polynomial", "factors"])
 def test_a_dead_member_does_not_stop_the_others(kind, monkeypatch):
-    monkeypatch.setattr(fast, "ENOUGH", 1)
+    monkeypatch.setattr(fit_numba, "ENOUGH", 1)
     data, options = runs(("sd",), 20), Options(model=kind)
     raw = data.accelerometer.copy()
     raw[3] = 0.0

@@ -9,7 +9,7 @@ import time
 import pytest
 
 from mwdcal.errors import InputError
-from mwdcal.files import atomic
+from mwdcal.files.formats import atomic
 
 
 def test_writes_text_as_utf8_and_bytes_as_they_are(tmp_path):

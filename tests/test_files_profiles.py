@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from mwdcal.errors import InputError
 from mwdcal.files.profiles import list_profiles, load_profile
-from mwdcal.profile import Profile, TriadProfile
+from mwdcal.sensor.profile import Profile, TriadProfile
 
 
 def load(folder, text, name="tool.toml"):

@@ -11,12 +11,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from mwdcal.calibration.readings import Readings
 from mwdcal.errors import InputError
+from mwdcal.files.formats.table import SUFFIXES, Table
 from mwdcal.files.profiles import list_profiles, load_profile
 from mwdcal.files.runs import check_run, from_readings, read_run, to_readings, write_run
-from mwdcal.files.table import SUFFIXES, Table
-from mwdcal.profile import Profile, StandProfile, TriadProfile
-from mwdcal.readings import Readings
+from mwdcal.sensor.profile import Profile, StandProfile, TriadProfile
 
 DATA = os.environ.get("MWDCAL_DATA", "")
 BARE = Profile(

@@ -9,7 +9,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from mwdcal.errors import InputError
-from mwdcal.files.table import SUFFIXES, Table, labels, numbers, read, write
+from mwdcal.files.formats.table import SUFFIXES, Table, labels, numbers, read, write
 
 quick = settings(
     max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]

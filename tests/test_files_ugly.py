@@ -10,9 +10,9 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from mwdcal.errors import InputError
+from mwdcal.files.formats.table import Table, write
 from mwdcal.files.profiles import load_profile
 from mwdcal.files.runs import read_run
-from mwdcal.files.table import Table, write
 
 HEADER = (
     "station,group,temperature_c,ax,ay,az,mx,my,mz,ref_inclination_deg,ref_azimuth_deg,"

@@ -23,18 +23,18 @@ from cli_support import (
     servo_run,
     stations,
 )
-from mwdcal.calibrate import calibrate
-from mwdcal.core.observability import free_directions
+from mwdcal.calibration.calibrate import calibrate
+from mwdcal.calibration.estimate import fit
+from mwdcal.calibration.options import Options
+from mwdcal.calibration.prediction import typical_accuracy
+from mwdcal.calibration.readings import Readings
 from mwdcal.errors import InputError, MwdcalError
-from mwdcal.estimate import fit
-from mwdcal.files import table as tables
+from mwdcal.estimation.rank import free_directions
+from mwdcal.files.formats import table as tables
 from mwdcal.files.profiles import load_profile
 from mwdcal.files.runs import to_readings
-from mwdcal.fleet import column, names, taken
-from mwdcal.fleet_checks import free_of_batch
-from mwdcal.options import Options
-from mwdcal.predict import typical_accuracy
-from mwdcal.readings import Readings
+from mwdcal.fleet.calibrate import column, names, taken
+from mwdcal.fleet.refusals import free_of_batch
 from simulation import DEG, Tool, attitude, plan
 
 MWDCAL = (sys.executable, "-m", "mwdcal")
@@ -42,8 +42,10 @@ pa = pytest.importorskip("pyarrow")
 pq = pytest.importorskip("pyarrow.parquet")
 
 from mwdcal.app import pool  # noqa: E402
-from mwdcal.files import atomic, fleet_sources, fleet_tables  # noqa: E402
-from mwdcal.files.fleet_parts import Plan, load, solve  # noqa: E402
+from mwdcal.files.formats import atomic  # noqa: E402
+from mwdcal.fleet import sources  # noqa: E402
+from mwdcal.fleet import tables as fleet_tables  # noqa: E402
+from mwdcal.fleet.parts import Plan, load, solve  # noqa: E402
 
 ANGLES = ("inclination", "azimuth", "toolface")
 
@@ -269,7 +271,7 @@ def test_a_folder_with_one_tool_in_each_part(tmp_path):
 def test_the_table_says_what_it_is(tmp_path):
     path = write_fleet(tmp_path / "runs.parquet", {"T1": short_run(1)}, {"simulated": True})
     calibrated(path)
-    made = tables.read(tmp_path / "cals.parquet")
+    made = fleet_tables.read(tmp_path / "cals.parquet")
     assert made.metadata["simulated"] is True
     assert made.metadata["profile"] == load_profile("servo")[0].name
     assert list(made.columns)[:4] == ["serial", "status", "message", "stations"]
@@ -370,7 +372,7 @@ def test_one_member_that_stops_the_batch_does_not_stop_the_others(tmp_path, monk
             raise np.linalg.LinAlgError("no convergence")
         return fit(readings, options)
 
-    monkeypatch.setattr("mwdcal.fleet.fit", fragile)
+    monkeypatch.setattr("mwdcal.fleet.calibrate.fit", fragile)
     runs = {f"T{seed}": short_run(seed) for seed in range(5)}
     runs["T3"]["ax"][0] = 50.0
     rows = calibrated(write_fleet(tmp_path / "runs.parquet", runs))
@@ -696,8 +698,8 @@ def test_workers_end_with_the_command_that_was_killed(tmp_path):
 
 def test_other_options_or_input_are_other_parts(fleet):
     path, _ = fleet
-    source = fleet_sources.open_source(path)
-    part = fleet_tables.partitions(source, fleet_tables.find_tools(source), path.parent)[0]
+    source = sources.open_source(path)
+    part = fleet_tables.partitions(source, tables.find_tools(source), path.parent)[0]
     profile = load_profile("servo")[0]
     plan = Plan.of(source, profile, Options())
     others = [
@@ -759,7 +761,7 @@ def test_partitions_are_of_whole_tools_and_bounded(tmp_path, monkeypatch, batch)
     path = write_fleet(
         tmp_path / "runs.parquet", {i: short_run(i) for i in range(9)}, row_group_size=37
     )
-    source = fleet_sources.open_source(path)
+    source = sources.open_source(path)
     tools = fleet_tables.find_tools(source)
     assert tools.count == 9
     assert tools.together

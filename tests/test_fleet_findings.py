@@ -7,7 +7,7 @@ import pytest
 from scipy.special import chdtrc
 
 from cli_support import mwdcal
-from mwdcal.residuals import tail
+from mwdcal.calibration.residuals import tail
 from test_fleet import alone, calibrated, check_same, servo_run, short_run, write_fleet
 
 pq = pytest.importorskip("pyarrow.parquet")

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from cli_support import mwdcal, refused, servo_run
-from mwdcal.estimate import fit
+from mwdcal.calibration.estimate import fit
+from mwdcal.calibration.options import Options
+from mwdcal.calibration.prediction import typical_accuracy
+from mwdcal.calibration.readings import Readings
 from mwdcal.files import documents
-from mwdcal.fleet import column, taken
-from mwdcal.options import Options
-from mwdcal.predict import typical_accuracy
-from mwdcal.readings import Readings
+from mwdcal.fleet.calibrate import column, taken
 from simulation import DEG, Tool, plan
 from test_fleet import bad_tools, calibrated, roll_run, short_run, write_fleet
 
@@ -196,7 +196,7 @@ def test_the_order_of_a_method_without_any(tmp_path):
 
 
 def test_a_trial_that_stops_the_batch_does_not_stop_the_others(tmp_path, monkeypatch):
-    import mwdcal.selection as selection
+    import mwdcal.calibration.automatic.order_selection as selection
 
     def fragile(readings, *given):
         if readings.accelerometer[..., 0, 0].max() > 5:

@@ -12,7 +12,7 @@ from test_fleet_findings import said
 pa = pytest.importorskip("pyarrow")
 pq = pytest.importorskip("pyarrow.parquet")
 
-from mwdcal.app import fleet_plots, fleet_report  # noqa: E402
+from mwdcal.app.pages import fleet_plots, fleet_report  # noqa: E402
 
 
 def unknown(seed):

@@ -9,17 +9,16 @@ import numpy as np
 import pytest
 
 from cli_support import servo_run
-from mwdcal import correction
-from mwdcal.calibrate import calibrate
-from mwdcal.core import fused
-from mwdcal.core.models import Basis, Factors, Polynomial
+from mwdcal.calibration.calibrate import calibrate
+from mwdcal.calibration.readings import Readings
+from mwdcal.files.formats.table import Table
 from mwdcal.files.profiles import load_profile
 from mwdcal.files.runs import to_readings
-from mwdcal.files.table import Table
-from mwdcal.readings import Readings
+from mwdcal.sensor.models import Basis, Factors, Polynomial
+from mwdcal.use import correction, correction_numba
 
 pytest.importorskip("numba")
-pytestmark = pytest.mark.skipif(not fused.available(), reason="MWDCAL_NUMPY is set")
+pytestmark = pytest.mark.skipif(not correction_numba.available(), reason="MWDCAL_NUMPY is set")
 
 SIZE = {"accelerometer": 1.0, "magnetometer": 5e4}
 MODELS = [
@@ -174,7 +173,7 @@ def test_units_signs_and_order_of_channels(sound):
     nominal = np.concatenate([readings.accelerometer, readings.magnetometer], -1)
     columns = [*(nominal * units).T, readings.temperature]
     zero = calibration.reference_temperature
-    found = fused.run(columns, correction.numbers(calibration), zero, units)
+    found = correction_numba.run(columns, correction.numbers(calibration), zero, units)
     named = dict(zip(correction.NAMES, found.columns, strict=True))
     assert_equal(named, correction.reference(calibration, readings))
 
@@ -185,10 +184,10 @@ def test_a_row_has_the_same_digits_wherever_it_stands_and_however_many_compute(s
     columns = [*readings.accelerometer.T, *readings.magnetometer.T, readings.temperature]
     plain = [np.ascontiguousarray(c) for c in columns]
     triads, zero = correction.numbers(calibration), calibration.reference_temperature
-    one = fused.run(plain, triads, zero, workers=1).columns
-    np.testing.assert_array_equal(fused.run(plain, triads, zero, workers=3).columns, one)
-    np.testing.assert_array_equal(fused.run(columns, triads, zero).columns, one)
-    shifted = fused.run([c[77:500] for c in plain], triads, zero).columns
+    one = correction_numba.run(plain, triads, zero, workers=1).columns
+    np.testing.assert_array_equal(correction_numba.run(plain, triads, zero, workers=3).columns, one)
+    np.testing.assert_array_equal(correction_numba.run(columns, triads, zero).columns, one)
+    shifted = correction_numba.run([c[77:500] for c in plain], triads, zero).columns
     np.testing.assert_array_equal(shifted, one[:, 77:500])
 
 
@@ -198,8 +197,8 @@ def test_what_is_remarkable_is_counted(sound):
     columns = [*readings.accelerometer.T.copy(), *readings.magnetometer.T.copy()]
     columns.append(np.linspace(0.0, 99.9, 1000))
     columns[0][5], columns[4][7], columns[5][8] = np.nan, 1e20, -np.inf
-    limits = fused.Limits((-1e15, 1e15), (5.0, 1000.0), (20.0, 80.0), blank=True)
-    found = fused.run(columns, correction.numbers(calibration), 30.0, limits=limits)
+    limits = correction_numba.Limits((-1e15, 1e15), (5.0, 1000.0), (20.0, 80.0), blank=True)
+    found = correction_numba.run(columns, correction.numbers(calibration), 30.0, limits=limits)
     assert found.unsound == 3 + int((columns[6] < 5.0).sum())
     beyond = (columns[6] < 20.0) | (columns[6] > 80.0)
     assert found.beyond == beyond.sum()
@@ -211,8 +210,8 @@ def test_vectors_alone(sound):
     calibration = changed(sound, ("factors", 3, False), ("factors", 3, False))
     readings = random_readings((1000,))
     columns = [*readings.accelerometer.T, *readings.magnetometer.T, readings.temperature]
-    out = np.empty((fused.VECTORS, 1000))
-    fused.run(columns, correction.numbers(calibration), 30.0, out=out)
+    out = np.empty((correction_numba.VECTORS, 1000))
+    correction_numba.run(columns, correction.numbers(calibration), 30.0, out=out)
     wanted = np.concatenate(calibration.fields(readings), -1).T
     np.testing.assert_allclose(out, wanted, rtol=1e-12, atol=1e-12 * 5e4)
 
@@ -237,13 +236,13 @@ def test_loops_are_left_alone_where_they_cannot_or_must_not(sound, monkeypatch):
     )
     without = Readings(readings.accelerometer, readings.magnetometer)
     assert correction.compiled(cold, without, least=0) is None
-    assert fused.numbers(Factors(Basis(4, 30.0)), np.ones(36)) is None
+    assert correction_numba.numbers(Factors(Basis(4, 30.0)), np.ones(36)) is None
     monkeypatch.setenv("MWDCAL_NUMPY", "1")
     assert correction.compiled(sound, readings, least=0) is None
 
 
 def test_numba_is_not_loaded_before_it_is_needed():
-    code = "import sys, mwdcal.app.cli, mwdcal.app.tables; sys.exit('numba' in sys.modules)"
+    code = "import sys, mwdcal.app.cli, mwdcal.app.commands.apply; sys.exit('numba' in sys.modules)"
     environment = {k: v for k, v in os.environ.items() if k != "MWDCAL_NUMPY"}
     assert (
         subprocess.run([sys.executable, "-c", code], env=environment, check=False).returncode == 0

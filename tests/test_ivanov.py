@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mwdcal.core.observability import free_directions
-from mwdcal.core.observables import OBSERVABLES
-from mwdcal.estimate import fit
-from mwdcal.options import Options
-from mwdcal.readings import Readings
+from mwdcal.calibration.estimate import fit
+from mwdcal.calibration.options import Options
+from mwdcal.calibration.readings import Readings
+from mwdcal.estimation.rank import free_directions
+from mwdcal.geometry.observables import OBSERVABLES
 from simulation import DEG, Tool, attitude, plan
 
 SOURCE = Path(__file__).parents[1] / "examples" / "papers" / "ivanov.py"

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from mwdcal.core.models import Basis, Factors, Polynomial
-from mwdcal.core.vectors import rotation
+from mwdcal.geometry.vectors import rotation
+from mwdcal.sensor.models import Basis, Factors, Polynomial
 
 LEADS = [(), (1,), (3, 2)]
 

@@ -5,12 +5,12 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from mwdcal.core import newton as core
-from mwdcal.core.models import Basis, Factors, Polynomial
-from mwdcal.core.newton import newton, propagated
-from mwdcal.core.solvers import Status
-from mwdcal.core.vectors import rotation
-from mwdcal.simulate import grid, reading, servo
+from mwdcal.estimation.minimisers import newton as core
+from mwdcal.estimation.minimisers.newton import newton, propagated
+from mwdcal.estimation.solvers import Status
+from mwdcal.geometry.vectors import rotation
+from mwdcal.planning.simulate import grid, reading, servo
+from mwdcal.sensor.models import Basis, Factors, Polynomial
 
 LEADS = [(), (1,), (3, 2)]
 COLD, HOT = [25.0], [25.0, 36.0, 47.0, 58.0, 69.0, 80.0]

@@ -6,10 +6,10 @@ import msgspec
 import numpy as np
 import pytest
 
-from mwdcal.calibration import Calibration
+from mwdcal.calibration.readings import Readings
+from mwdcal.calibration.record import Calibration
 from mwdcal.errors import InputError
-from mwdcal.notation import COURSE, convert, powers
-from mwdcal.readings import Readings
+from mwdcal.use.notation import COURSE, convert, powers
 
 TRIADS = ("accelerometer", "magnetometer")
 AXES = {

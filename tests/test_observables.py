@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from mwdcal.core.observables import OBSERVABLES
-from mwdcal.core.vectors import reference_vectors
+from mwdcal.geometry.observables import OBSERVABLES
+from mwdcal.geometry.vectors import reference_vectors
 
 SHAPES = [(), (1,), (3, 1, 2)]
 

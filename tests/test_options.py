@@ -8,15 +8,15 @@ import pytest
 from scipy.optimize import least_squares
 
 from cli_support import mwdcal
-from mwdcal.calibrate import calibrate
-from mwdcal.core.observables import OBSERVABLES
-from mwdcal.core.vectors import centred
-from mwdcal.curves import choose_curves
+from mwdcal.calibration.automatic.nonlinearity import choose_curves
+from mwdcal.calibration.calibrate import calibrate
+from mwdcal.calibration.estimate import fit
+from mwdcal.calibration.options import Options
+from mwdcal.calibration.prediction import readings_at
+from mwdcal.calibration.readings import Readings
 from mwdcal.errors import InputError
-from mwdcal.estimate import fit
-from mwdcal.options import Options
-from mwdcal.predict import readings_at
-from mwdcal.readings import Readings
+from mwdcal.geometry.observables import OBSERVABLES
+from mwdcal.geometry.vectors import centred
 from simulation import Tool, information, plan
 from test_calibrate import NOISE, PROFILE, make
 from test_efficiency import sensitivity

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mwdcal.core.observables import OBSERVABLES
-from mwdcal.estimate import fit
-from mwdcal.options import Options
-from mwdcal.readings import Readings
+from mwdcal.calibration.estimate import fit
+from mwdcal.calibration.options import Options
+from mwdcal.calibration.readings import Readings
+from mwdcal.geometry.observables import OBSERVABLES
 from simulation import DEG, attitude, factor_readings, factors_within_limits, plan
 
 FIELD, DIP = 50_000.0, 65 * DEG

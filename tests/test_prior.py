@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 
 from cli_support import SERVO_NOISE, calibrated, mwdcal, servo_run, write_csv
-from mwdcal.calibrate import calibrate
-from mwdcal.core.observables import OBSERVABLES
-from mwdcal.core.vectors import reference_vectors
+from mwdcal.calibration.calibrate import calibrate
+from mwdcal.calibration.estimate import fit
+from mwdcal.calibration.options import Options
+from mwdcal.calibration.prior import from_calibration, from_datasheet
+from mwdcal.calibration.readings import Readings
 from mwdcal.errors import FitError, InputError
-from mwdcal.estimate import fit
 from mwdcal.files import documents
-from mwdcal.options import Options
-from mwdcal.prior import from_calibration, from_datasheet
-from mwdcal.profile import Datasheet, Profile, TriadProfile
-from mwdcal.readings import Readings
+from mwdcal.geometry.observables import OBSERVABLES
+from mwdcal.geometry.vectors import reference_vectors
+from mwdcal.sensor.profile import Datasheet, Profile, TriadProfile
 from simulation import Tool, plan
 from test_calibrate import PROFILE, make
 

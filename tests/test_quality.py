@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from mwdcal.calibrate import calibrate
+from mwdcal.calibration.calibrate import calibrate
+from mwdcal.calibration.options import Options
+from mwdcal.calibration.readings import Readings
 from mwdcal.errors import InputError
-from mwdcal.options import Options
-from mwdcal.quality import Bounds, Limits, verify
-from mwdcal.readings import Readings
+from mwdcal.use.verification import Bounds, Limits, verify
 from simulation import DEG, Tool, plan
 from test_calibrate import NOISE, PROFILE, make, msgspec_replace
 

@@ -12,13 +12,13 @@ import pytest
 
 from cli_support import SERVO_NOISE, channels, mwdcal, refused, write_csv
 from cli_support import stations as references
-from mwdcal.calibration import Calibration
-from mwdcal.core.uncertainty import marginal_rank
-from mwdcal.estimate import fit
+from mwdcal.calibration.estimate import fit
+from mwdcal.calibration.options import Options
+from mwdcal.calibration.readings import Readings
+from mwdcal.calibration.record import Calibration
+from mwdcal.estimation.uncertainty import marginal_rank
 from mwdcal.files.profiles import load_profile
 from mwdcal.files.runs import read_run
-from mwdcal.options import Options
-from mwdcal.readings import Readings
 from simulation import (
     DEG,
     Tool,

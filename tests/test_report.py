@@ -13,19 +13,21 @@ import msgspec
 import numpy as np
 import pytest
 
-from mwdcal import simulate
-from mwdcal.app import calibrating, plots, report, text
-from mwdcal.app.choices import Chosen
-from mwdcal.app.report import css_string, measured, number, render, signed, write_report
-from mwdcal.calibrate import calibrate
-from mwdcal.core.vectors import reference_vectors
+from mwdcal.app import text
+from mwdcal.app.commands import calibrate as command
+from mwdcal.app.commands.choices import Chosen
+from mwdcal.app.pages import plots, report
+from mwdcal.app.pages.report import css_string, measured, number, render, signed, write_report
+from mwdcal.calibration.automatic.order_selection import choose_order, order_errors
+from mwdcal.calibration.calibrate import calibrate
+from mwdcal.calibration.options import Options
+from mwdcal.calibration.prediction import accuracy_at, accuracy_map, readings_at, typical_accuracy
+from mwdcal.calibration.readings import Readings
 from mwdcal.errors import InputError
-from mwdcal.notation import convert
-from mwdcal.options import Options
-from mwdcal.predict import accuracy_at, accuracy_map, readings_at, typical_accuracy
-from mwdcal.profile import Profile, TriadProfile
-from mwdcal.readings import Readings
-from mwdcal.selection import choose_order, order_errors
+from mwdcal.geometry.vectors import reference_vectors
+from mwdcal.planning import simulate
+from mwdcal.sensor.profile import Profile, TriadProfile
+from mwdcal.use.notation import convert
 from simulation import DEG, Tool, plan
 
 SERVO = Profile(
@@ -417,7 +419,7 @@ def test_zero_has_no_sign():
 
 def test_summary_says_what_was_asked_for(tmp_path):
     made = asked()
-    found = calibrating.summary(made, Chosen(Options(), [], []), tmp_path / "tool.json", None)
+    found = command.summary(made, Chosen(Options(), [], []), tmp_path / "tool.json", None)
     found = msgspec.to_builtins(found)
     assert found["options"]["parameters"] == 9
     assert found["options"]["robust"] == "huber"

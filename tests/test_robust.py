@@ -5,15 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mwdcal.calibrate import calibrate
-from mwdcal.core.observables import OBSERVABLES
-from mwdcal.core.robust import consistency, inflation, weight
+from mwdcal.calibration.calibrate import calibrate
+from mwdcal.calibration.estimate import fit
+from mwdcal.calibration.options import Options
+from mwdcal.calibration.readings import Readings
+from mwdcal.calibration.residuals import Residuals
 from mwdcal.errors import FitError, InputError
-from mwdcal.estimate import fit
-from mwdcal.options import Options
-from mwdcal.profile import Profile
-from mwdcal.readings import Readings
-from mwdcal.residuals import Residuals
+from mwdcal.estimation.robust import consistency, inflation, weight
+from mwdcal.geometry.observables import OBSERVABLES
+from mwdcal.sensor.profile import Profile
 from simulation import DEG, Tool, bound, plan
 from test_calibrate import NOISE, PROFILE, make
 from test_efficiency import affine, sensitivity

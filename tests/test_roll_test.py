@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mwdcal.roll_test import coverage, ends, extent, fitted
+from mwdcal.use.roll_test import coverage, ends, extent, fitted
 from simulation import DEG
 
 TWELVE = np.arange(12) * 30 * DEG

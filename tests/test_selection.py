@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from cli_support import mwdcal, servo_run, write_csv
-from mwdcal.calibrate import calibrate
-from mwdcal.calibration import Calibration, OrderScore
-from mwdcal.core.vectors import reference_vectors
-from mwdcal.options import Options
-from mwdcal.profile import Profile
-from mwdcal.selection import choose_order, order_errors
-from mwdcal.simulate import Plan, grid, run, servo
+from mwdcal.calibration.automatic.order_selection import choose_order, order_errors
+from mwdcal.calibration.calibrate import calibrate
+from mwdcal.calibration.options import Options
+from mwdcal.calibration.record import Calibration, OrderScore
+from mwdcal.geometry.vectors import reference_vectors
+from mwdcal.planning.simulate import Plan, grid, run, servo
+from mwdcal.sensor.profile import Profile
 
 PROFILE = Profile(name="test tool")
 NOISE = {"accelerometer": np.array(1e-4), "magnetometer": np.array(15.0)}

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from scipy.special import stdtrit
 
-from mwdcal import covariance as covariances
-from mwdcal.calibrate import calibrate
-from mwdcal.core.observables import OBSERVABLES
-from mwdcal.estimate import fit
-from mwdcal.options import Options
-from mwdcal.profile import Profile
-from mwdcal.readings import Readings
+from mwdcal.calibration import covariance as covariances
+from mwdcal.calibration.calibrate import calibrate
+from mwdcal.calibration.estimate import fit
+from mwdcal.calibration.options import Options
+from mwdcal.calibration.readings import Readings
+from mwdcal.geometry.observables import OBSERVABLES
+from mwdcal.sensor.profile import Profile
 from simulation import (
     DEG,
     attitude,

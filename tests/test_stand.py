@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from mwdcal.calibrate import calibrate
-from mwdcal.core.vectors import earth_field, earth_gravity, rotation, tool_from_earth
+from mwdcal.calibration.calibrate import calibrate
+from mwdcal.calibration.estimate import fit
+from mwdcal.calibration.options import Options
+from mwdcal.calibration.readings import Readings
 from mwdcal.errors import FitError, InputError
-from mwdcal.estimate import fit
-from mwdcal.options import Options
-from mwdcal.profile import Profile
-from mwdcal.readings import Readings
+from mwdcal.geometry.vectors import earth_field, earth_gravity, rotation, tool_from_earth
+from mwdcal.sensor.profile import Profile
 from simulation import DEG, Tool, plan
 
 NOISE = {"accelerometer": np.array(1e-4), "magnetometer": np.array(15.0)}

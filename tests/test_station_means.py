@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from mwdcal.core.standstill import resolution
-from mwdcal.core.station_means import correlated, hidden, summarise_all, widened
-from mwdcal.stations import find_stations
+from mwdcal.logs.standstill import resolution
+from mwdcal.logs.station_means import correlated, hidden, summarise_all, widened
+from mwdcal.logs.stations import find_stations
 from test_stations import ACC, ar1, means, tumble, without
 
 SEED = 20261121

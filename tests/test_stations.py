@@ -12,13 +12,13 @@ import pytest
 from scipy.signal import lfilter
 
 from cli_support import mwdcal, numbers, read_csv, refused, write_csv
-from mwdcal.calibrate import calibrate
-from mwdcal.core import standstill
-from mwdcal.core.station_means import summarise
+from mwdcal.calibration.calibrate import calibrate
 from mwdcal.files import logs
-from mwdcal.files.table import Table
-from mwdcal.notation import convert
-from mwdcal.stations import find_stations
+from mwdcal.files.formats.table import Table
+from mwdcal.logs import standstill
+from mwdcal.logs.station_means import summarise
+from mwdcal.logs.stations import find_stations
+from mwdcal.use.notation import convert
 
 ACC, MAG = ("ax", "ay", "az"), ("mx", "my", "mz")
 

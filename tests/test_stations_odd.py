@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from cli_support import mwdcal, refused, write_csv
-from mwdcal.core import standstill
 from mwdcal.errors import InputError
-from mwdcal.files.table import Table
-from mwdcal.station_findings import time_unit
-from mwdcal.stations import find_stations
+from mwdcal.files.formats.table import Table
+from mwdcal.logs import standstill
+from mwdcal.logs.station_findings import time_unit
+from mwdcal.logs.stations import find_stations
 from test_stations import ACC, MAG, means, multi_rate, tumble, without
 
 

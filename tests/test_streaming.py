@@ -24,11 +24,13 @@ from cli_support import (
     servo_run,
     write_csv,
 )
-from mwdcal.app import progress, streaming
-from mwdcal.app.tables import apply_to_table
-from mwdcal.correction import MARK, NAMES
+from mwdcal.app import progress
+from mwdcal.app.commands import streaming
+from mwdcal.app.commands.apply import apply_to_table
 from mwdcal.errors import InputError
-from mwdcal.files import documents, sinks, streams, table
+from mwdcal.files import documents, streams
+from mwdcal.files.formats import sinks, table
+from mwdcal.use.correction import MARK, NAMES
 from simulation import Tool
 
 arrow = pytest.importorskip("pyarrow")

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from cli_support import calibrated, channels, mwdcal, read_csv, refused, servo_run, write_csv
-from mwdcal import strengths
-from mwdcal.app import streaming
-from mwdcal.app.streaming import apply_to_file
+from mwdcal.app.commands import streaming
+from mwdcal.app.commands.streaming import apply_to_file
 from mwdcal.errors import InputError
 from mwdcal.files import documents
+from mwdcal.use import strengths
 from simulation import Tool
 
 TOOL = Tool.random(4)
@@ -198,8 +198,8 @@ def test_a_calibration_without_temperatures_on_warm_readings_is_a_finding(tmp_pa
 
 
 def test_python_refuses_what_the_command_refuses(tmp_path, calibration):
-    from mwdcal.correction import correct
     from mwdcal.files import runs
+    from mwdcal.use.correction import correct
 
     made = documents.read(calibration)
     source = written(tmp_path, surveys((1 / 3.0, 1.0)), ".csv")

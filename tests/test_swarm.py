@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mwdcal.core.swarm import (
+from mwdcal.estimation.minimisers.swarm import (
     CONSTRICTION,
     forward_parts,
     least_squares_affine,

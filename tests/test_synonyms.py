@@ -8,11 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cli_support import calibrated, mwdcal, numbers, read_csv, refused, servo_run, write_csv
-from mwdcal.correction import NAMES
 from mwdcal.errors import InputError
 from mwdcal.files import documents, synonyms
 from mwdcal.files.contract import COLUMNS
 from mwdcal.files.synonyms import CONVERSIONS, Resemblance, check_evidence, resembled, unused
+from mwdcal.use.correction import NAMES
 from simulation import Tool
 
 ALIKE = {

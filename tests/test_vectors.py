@@ -3,8 +3,15 @@
 import numpy as np
 import pytest
 
-from mwdcal.core import observables as ob
-from mwdcal.core.vectors import centred, reference_vectors, rotation, skew, tool_from_earth, wrap
+from mwdcal.geometry import observables as ob
+from mwdcal.geometry.vectors import (
+    centred,
+    reference_vectors,
+    rotation,
+    skew,
+    tool_from_earth,
+    wrap,
+)
 
 SHAPES = [(), (1,), (3, 1, 2)]
 DEG = np.pi / 180

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import verification
 
-from mwdcal.core.observables import OBSERVABLES
+from mwdcal.geometry.observables import OBSERVABLES
 from simulation import attitude
 
 NOISE = (5e-4, 75.0)

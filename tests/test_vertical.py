@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mwdcal.calibrate import calibrate
-from mwdcal.estimate import fit
-from mwdcal.fleet_checks import free_of_batch, suspect_fits
-from mwdcal.options import Options
-from mwdcal.profile import Profile
-from mwdcal.readings import Readings
+from mwdcal.calibration.calibrate import calibrate
+from mwdcal.calibration.estimate import fit
+from mwdcal.calibration.options import Options
+from mwdcal.calibration.readings import Readings
+from mwdcal.fleet.refusals import free_of_batch, suspect_fits
+from mwdcal.sensor.profile import Profile
 from simulation import DEG, Tool, attitude, plan
 
 NOISE = {"accelerometer": np.array(1e-4), "magnetometer": np.array(15.0)}

@@ -19,23 +19,23 @@ import nulls
 import numpy as np
 
 from mwdcal.app import cli
-from mwdcal.app.choices import Typed, choose
-from mwdcal.calibrate import calibrate
-from mwdcal.calibration import Calibration
-from mwdcal.core.observability import free_directions
-from mwdcal.curves import ODDS, USUAL, choices_of, declared, log_odds
-from mwdcal.datasets import fetch
+from mwdcal.app.commands.choices import Typed, choose
+from mwdcal.calibration.automatic.nonlinearity import ODDS, USUAL, choices_of, declared, log_odds
+from mwdcal.calibration.calibrate import calibrate
+from mwdcal.calibration.estimate import Fit, fit
+from mwdcal.calibration.methods import EVIDENCE
+from mwdcal.calibration.options import Options
+from mwdcal.calibration.readings import TRIADS, Readings
+from mwdcal.calibration.record import Calibration
 from mwdcal.errors import MwdcalError
-from mwdcal.estimate import Fit, fit
+from mwdcal.estimation.rank import free_directions
+from mwdcal.files.datasets import fetch
+from mwdcal.files.formats.table import Table
 from mwdcal.files.profiles import load_profile
 from mwdcal.files.runs import read_run, to_readings
-from mwdcal.files.table import Table
-from mwdcal.methods import EVIDENCE
-from mwdcal.notation import Notation, convert
-from mwdcal.options import Options
-from mwdcal.profile import Profile, TriadProfile
-from mwdcal.readings import TRIADS, Readings
-from mwdcal.scatter import directions, group_scatter
+from mwdcal.sensor.profile import Profile, TriadProfile
+from mwdcal.use.notation import Notation, convert
+from mwdcal.use.roll_scatter import directions, group_scatter
 
 SAP = {
     "sap6/BB": (0.692, 0.389), "sap6/CF": (0.556, 0.414), "sap6/HC": (0.724, 0.181),

@@ -18,16 +18,16 @@ from pathlib import Path
 
 import numpy as np
 
-from mwdcal.calibrate import calibrate
-from mwdcal.core.observability import free_directions
-from mwdcal.core.vectors import Array, centred, earth_gravity, rotation, tool_from_earth
-from mwdcal.datasets import fetch
+from mwdcal.calibration.calibrate import calibrate
+from mwdcal.calibration.estimate import Fit, fit
+from mwdcal.calibration.options import Options
+from mwdcal.calibration.readings import Readings
 from mwdcal.errors import FitError
-from mwdcal.estimate import Fit, fit
-from mwdcal.options import Options
-from mwdcal.profile import Profile, TriadProfile
-from mwdcal.readings import Readings
-from mwdcal.simulate import Truth, grid, run, servo
+from mwdcal.estimation.rank import free_directions
+from mwdcal.files.datasets import fetch
+from mwdcal.geometry.vectors import Array, centred, earth_gravity, rotation, tool_from_earth
+from mwdcal.planning.simulate import Truth, grid, run, servo
+from mwdcal.sensor.profile import Profile, TriadProfile
 
 DEG = np.pi / 180
 PAPER_AXES = np.diag([-1.0, -1.0, 1.0])

@@ -17,11 +17,11 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from mwdcal.core.models import Basis, Factors
-from mwdcal.core.newton import Local, Newton, Stations, cost, local, newton
-from mwdcal.core.solvers import Status
-from mwdcal.core.vectors import Array, centred, reference_vectors
-from mwdcal.simulate import Plan, Truth, grid, reading, servo
+from mwdcal.estimation.minimisers.newton import Local, Newton, Stations, cost, local, newton
+from mwdcal.estimation.solvers import Status
+from mwdcal.geometry.vectors import Array, centred, reference_vectors
+from mwdcal.planning.simulate import Plan, Truth, grid, reading, servo
+from mwdcal.sensor.models import Basis, Factors
 
 PAGES = Path(__file__).parents[2] / "docs" / "papers"
 SEED, SEEDS = 123, 200

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mwdcal.core.swarm import (
+from mwdcal.estimation.minimisers.swarm import (
     Swarm,
     forward_parts,
     least_squares_affine,
@@ -22,7 +22,7 @@ from mwdcal.core.swarm import (
     swarm_forward,
     vector_cost,
 )
-from mwdcal.core.vectors import Array, Bools, inverse, reference_vectors
+from mwdcal.geometry.vectors import Array, Bools, inverse, reference_vectors
 
 STATES = np.array([[0, 0, 1], [0, 0, -1], [0, 1, 0], [0, -1, 0], [1, 0, 0], [-1, 0, 0]], float)
 """Table 1: z down, z up, y down, y up, x down, x up; g."""
@@ -318,8 +318,8 @@ One simulated test; least squares by one linear solve, the swarm with Moradi's 6
 |---|---|---|
 {met}
 
-The swarm used here is a constricted one in centred, whitened coordinates (`mwdcal.core.swarm`). The paper does not
-say which it used.
+The swarm used here is a constricted one in centred, whitened coordinates (`mwdcal.estimation.minimisers.swarm`).
+The paper does not say which it used.
 
 Equations 12 and 13 are different estimators, and that difference is no matter of the solver either. Mean Euclidean
 distance of the twelve parameters, by the root mean square length of the noise per reading:

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
-from mwdcal.files import table
+from mwdcal.files.formats import table
 from mwdcal.files.profiles import load_profile
 from mwdcal.files.runs import from_readings
-from mwdcal.simulate import grid, run, servo
+from mwdcal.planning.simulate import grid, run, servo
 
 HERE = Path(__file__).parent
 SEED = 20160620

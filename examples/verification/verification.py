@@ -15,13 +15,13 @@ from pathlib import Path
 
 import numpy as np
 
-from mwdcal.calibrate import calibrate
-from mwdcal.calibration import Calibration
+from mwdcal.calibration.calibrate import calibrate
+from mwdcal.calibration.readings import Readings
+from mwdcal.calibration.record import Calibration
 from mwdcal.files.limits import load_limits
-from mwdcal.profile import Profile
-from mwdcal.quality import COVERAGE, Limits, VerdictRow, verify
-from mwdcal.readings import Readings
-from mwdcal.roll_test import extent, fitted
+from mwdcal.sensor.profile import Profile
+from mwdcal.use.roll_test import extent, fitted
+from mwdcal.use.verification import COVERAGE, Limits, VerdictRow, verify
 
 FIELD, DIP = 48_000.0, np.radians(63.0)
 NOISES = ((1e-4, 15.0), (5e-4, 75.0))

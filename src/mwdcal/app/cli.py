@@ -14,7 +14,12 @@ from typing import TYPE_CHECKING, Any, Unpack
 import click
 
 from mwdcal import __version__
-from mwdcal.app.asked import (
+from mwdcal.app.block_pandas import without_pandas
+from mwdcal.app.commands.fleet_options import Asked as FleetAsked
+from mwdcal.app.commands.fleet_options import fleet_options
+from mwdcal.app.commands.noise_options import Asked as AskedForNoise
+from mwdcal.app.commands.noise_options import noise_options
+from mwdcal.app.commands.options import (
     DECIMAL,
     FILE,
     JSON,
@@ -24,16 +29,11 @@ from mwdcal.app.asked import (
     comparison_options,
     standstill_options,
 )
-from mwdcal.app.fleet_asked import Asked as FleetAsked
-from mwdcal.app.fleet_asked import fleet_options
-from mwdcal.app.lean import without_pandas
-from mwdcal.app.noise_asked import Asked as AskedForNoise
-from mwdcal.app.noise_asked import noise_options
 from mwdcal.errors import FitError, InputError, MwdcalError
 
 if TYPE_CHECKING:
-    from mwdcal.app.choices import Typed
-    from mwdcal.calibration import Finding
+    from mwdcal.app.commands.choices import Typed
+    from mwdcal.calibration.record import Finding
 
 INTERNAL = 70
 SIGNAL = 128
@@ -84,22 +84,22 @@ def calibrate(
     Example: mwdcal calibrate run.csv --tool servo -o tool.json --report tool.html
     Exit: 0 calibrated, 2 input cannot be read, 3 fit failed or refused.
     """
-    from mwdcal.app import calibrating
-    from mwdcal.findings import UNUSED
+    from mwdcal.app.commands import calibrate
+    from mwdcal.calibration.diagnosis.findings import UNUSED
 
     _check_outputs([output, report], [run, Path(tool or ""), Path(typed["prior"] or "")])
-    chosen, made = calibrating.run(run, tool, exclude, decimal, typed, say)
-    calibrating.write(made, output, report)
+    chosen, made = calibrate.run(run, tool, exclude, decimal, typed, say)
+    calibrate.write(made, output, report)
     tell([finding for finding in made.findings if finding.id == UNUSED])
     if as_json:
-        print_json(calibrating.summary(made, chosen, output, report))
+        print_json(calibrate.summary(made, chosen, output, report))
     else:
-        click.echo(calibrating.screen(made, chosen, output, report))
+        click.echo(calibrate.screen(made, chosen, output, report))
 
 
 def _check_outputs(outputs: list[Path | None], inputs: list[Path]) -> None:
     """Refuse, before any work, an output that cannot be written or would replace an input."""
-    from mwdcal.files import atomic
+    from mwdcal.files.formats import atomic
 
     taken = [path.resolve() for path in inputs if path.is_file()]
     for path in filter(None, outputs):
@@ -121,13 +121,13 @@ def compare(**asked: Unpack[AskedToCompare]) -> None:
     Example: mwdcal compare run.csv --tool servo --report methods.html
     Exit: 0 compared, 2 input cannot be read, 3 every method refused.
     """
-    from mwdcal.app import calibrating, comparison
-    from mwdcal.findings import unused_columns
+    from mwdcal.app.commands import calibrate, compare
+    from mwdcal.calibration.diagnosis.findings import unused_columns
 
     _check_outputs([asked["report"]], [asked["run"], Path(asked["tool"] or "")])
-    readings, profile, digests = calibrating.load(asked["run"], asked["tool"], asked["decimal"])
+    readings, profile, digests = calibrate.load(asked["run"], asked["tool"], asked["decimal"])
     tell(unused_columns(readings.unused))
-    sound, result = comparison.run(asked, readings, profile, say, **digests)
+    sound, result = compare.run(asked, readings, profile, say, **digests)
     (print_json if asked["as_json"] else click.echo)(result)
     sys.exit(0 if sound else FitError.exit_code)
 
@@ -141,10 +141,10 @@ def stations(**asked: Unpack[Asked]) -> None:
     Example: mwdcal stations log.csv -o run.csv --plot log.png
     Exit: 0 written, 2 input cannot be read or never stands still.
     """
-    from mwdcal.app import standstills
+    from mwdcal.app.commands import stations
 
     _check_outputs([asked["output"], asked["plot"]], [asked["log"]])
-    findings, result = standstills.run(asked, say)
+    findings, result = stations.run(asked, say)
     tell(findings)
     (print_json if asked["as_json"] else click.echo)(result)
 
@@ -184,11 +184,11 @@ def apply(
     Example: mwdcal apply tool.json surveys.csv -o corrected.csv
     Exit: 0 written, 2 input cannot be read, or does not belong to the calibration.
     """
+    from mwdcal.app.commands.apply import apply_to_any
     from mwdcal.app.progress import bar
-    from mwdcal.app.tables import apply_to_any
+    from mwdcal.calibration.readings import simulated
     from mwdcal.files import documents
     from mwdcal.files.runs import BlankReadingError
-    from mwdcal.readings import simulated
 
     _check_outputs([output], [calibration, readings])
     made = documents.read(calibration)
@@ -233,10 +233,10 @@ def verify(
     import msgspec
 
     from mwdcal.app import text
+    from mwdcal.calibration.diagnosis.findings import unused_columns
     from mwdcal.files import documents, runs
     from mwdcal.files.limits import load_limits
-    from mwdcal.findings import unused_columns
-    from mwdcal.quality import verify as judge
+    from mwdcal.use.verification import verify as judge
 
     _check_outputs([report], [calibration, run])
     made = documents.read(calibration)
@@ -245,7 +245,7 @@ def verify(
     seen = [*result.findings, *unused_columns(readings.unused)]
     result = msgspec.structs.replace(result, findings=seen)
     if report:
-        from mwdcal.app.report import write_report
+        from mwdcal.app.pages.report import write_report
 
         write_report(report, made, result)
     if as_json:
@@ -284,23 +284,23 @@ def convert(
     Example: mwdcal convert tool.json --notation forward --json
     Example: mwdcal convert tool.json --notation forward --temperature course
     """
-    from mwdcal.app import conversion
+    from mwdcal.app.commands import convert
 
     _check_outputs([output], [calibration])
-    made = conversion.run(calibration, notation, _temperature(temperature))
+    made = convert.run(calibration, notation, _temperature(temperature))
     tell(made.findings)
     if output is not None:
         import msgspec
 
-        from mwdcal.files import atomic
+        from mwdcal.files.formats import atomic
 
-        content = msgspec.json.encode(conversion.document(made))
+        content = msgspec.json.encode(convert.document(made))
         atomic.write(output, msgspec.json.format(content, indent=2) + b"\n")
         click.echo(f"wrote {output}")
     elif as_json:
-        print_json(conversion.document(made))
+        print_json(convert.document(made))
     else:
-        click.echo(conversion.screen(made))
+        click.echo(convert.screen(made))
 
 
 def _temperature(option: str | None) -> float | str | None:
@@ -331,16 +331,16 @@ def fleet(**asked: Unpack[FleetAsked]) -> None:
     from mwdcal.app import pool
 
     with pool.preparing(1 if asked["scheduler"] else asked["workers"]):
-        from mwdcal.app import fleets
+        from mwdcal.app.commands import fleet
 
     _check_outputs([asked["output"], asked["report"]], [asked["runs"], Path(asked["tool"] or "")])
     try:
-        sound, result = fleets.run(asked, say)
+        sound, result = fleet.run(asked, say)
     except KeyboardInterrupt as stop:
         stop.add_note("Finished parts are kept: the same command goes on from there.")
         raise
     (print_json if asked["as_json"] else click.echo)(result)
-    sys.exit(0 if sound else fleets.REFUSED)
+    sys.exit(0 if sound else fleet.REFUSED)
 
 
 @cli.command()
@@ -352,11 +352,11 @@ def noise(**asked: Unpack[AskedForNoise]) -> None:
     Example: mwdcal noise static.csv --tool servo --plot noise.png
     Exit: 0 found, 2 input cannot be read or used.
     """
-    from mwdcal.app import noises
+    from mwdcal.app.commands import noise
 
     inputs = [asked["log"], Path(asked["tool"] or "")]
     _check_outputs([asked["plot"], asked["report"]], inputs)
-    findings, result = noises.run(asked, say)
+    findings, result = noise.run(asked, say)
     tell(findings)
     (print_json if asked["as_json"] else click.echo)(result)
 

@@ -42,7 +42,7 @@ ATTEMPTS = 3
 """How often a part whose worker died is given to another."""
 PATIENCE = "30s"
 """How long a cluster may take to answer and to have a worker."""
-COMMAND, WORKER = "mwdcal.app.cli", "mwdcal.app.worker"
+COMMAND, WORKER = "mwdcal.app.cli", "mwdcal.app.worker_preload"
 """Modules that a worker process has loaded before it is given anything."""
 
 

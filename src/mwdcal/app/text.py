@@ -8,11 +8,18 @@ from typing import Any
 
 import numpy as np
 
-from mwdcal.calibration import Calibration, Choices, ErrorRow, Finding, OrderScore, StandErrors
-from mwdcal.curves import CurveScore
-from mwdcal.notation import Notation, powers
-from mwdcal.quality import Verdict
-from mwdcal.readings import simulated
+from mwdcal.calibration.automatic.nonlinearity import CurveScore
+from mwdcal.calibration.readings import simulated
+from mwdcal.calibration.record import (
+    Calibration,
+    Choices,
+    ErrorRow,
+    Finding,
+    OrderScore,
+    StandErrors,
+)
+from mwdcal.use.notation import Notation, powers
+from mwdcal.use.verification import Verdict
 
 WEIGHED = {
     "toolface": "toolface·sin I",

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 
 from mwdcal.errors import InputError
 from mwdcal.files.contract import AZIMUTH_KEYS, ROTATION, check_near_misses
-from mwdcal.files.table import shown
+from mwdcal.files.formats.table import shown
 
 _NEEDED: dict[str, tuple[str, ...]] = {
     "magnetic": (),

@@ -13,11 +13,11 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from mwdcal.calibration import SCHEMA_VERSION, Calibration
+from mwdcal.calibration.readings import TRIADS
+from mwdcal.calibration.record import SCHEMA_VERSION, Calibration
 from mwdcal.errors import InputError
-from mwdcal.files import atomic
+from mwdcal.files.formats import atomic
 from mwdcal.files.profiles import check_profile
-from mwdcal.readings import TRIADS
 
 HIGHEST = 3
 """The highest order of temperature terms."""

@@ -11,7 +11,7 @@ from pathlib import Path
 import msgspec
 
 from mwdcal.errors import InputError
-from mwdcal.quality import Limits
+from mwdcal.use.verification import Limits
 
 
 def list_limits() -> list[str]:

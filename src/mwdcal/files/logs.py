@@ -18,13 +18,20 @@ from typing import BinaryIO, NamedTuple
 
 import numpy as np
 
-from mwdcal.core.vectors import Array
 from mwdcal.errors import InputError
 from mwdcal.files import metadata as meta
-from mwdcal.files import table as tables
-from mwdcal.files.columns import LABELS, Column, assemble, check_names, looks_numeric, no_stations
 from mwdcal.files.contract import COLUMNS, check_columns, check_near_misses
-from mwdcal.files.table import Table, shown
+from mwdcal.files.formats import table as tables
+from mwdcal.files.formats.columns import (
+    LABELS,
+    Column,
+    assemble,
+    check_names,
+    looks_numeric,
+    no_stations,
+)
+from mwdcal.files.formats.table import Table, shown
+from mwdcal.geometry.vectors import Array
 
 TIME = "time_s"
 READ = tuple(name for name in (TIME, *COLUMNS) if name not in LABELS)

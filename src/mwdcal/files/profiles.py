@@ -13,8 +13,8 @@ import msgspec
 
 from mwdcal.errors import InputError
 from mwdcal.files.contract import TEMPERATURE
-from mwdcal.files.table import shown
-from mwdcal.profile import Datasheet, Profile, StandProfile, TriadProfile
+from mwdcal.files.formats.table import shown
+from mwdcal.sensor.profile import Datasheet, Profile, StandProfile, TriadProfile
 
 _DEFAULT = "generic"
 _PACKAGE = "mwdcal.profiles"

@@ -13,12 +13,10 @@ from collections.abc import Iterable, Mapping, Sequence
 import msgspec
 import numpy as np
 
-from mwdcal.core.vectors import AnyArray, Array, Bools
+from mwdcal.calibration.readings import Readings
 from mwdcal.errors import InputError
 from mwdcal.files import synonyms
-from mwdcal.files import table as tables
 from mwdcal.files.azimuths import magnetic_offset
-from mwdcal.files.columns import Column
 from mwdcal.files.contract import (
     CHANNELS,
     COLUMNS,
@@ -29,9 +27,11 @@ from mwdcal.files.contract import (
     Range,
     check_columns,
 )
-from mwdcal.files.table import Table, cell_error, labels, numbers, shown
-from mwdcal.profile import Profile, TriadProfile
-from mwdcal.readings import Readings
+from mwdcal.files.formats import table as tables
+from mwdcal.files.formats.columns import Column
+from mwdcal.files.formats.table import Table, cell_error, labels, numbers, shown
+from mwdcal.geometry.vectors import AnyArray, Array, Bools
+from mwdcal.sensor.profile import Profile, TriadProfile
 
 
 class BlankReadingError(InputError):

@@ -17,13 +17,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mwdcal.core.vectors import Ints
-from mwdcal.correction import NAMES
 from mwdcal.errors import InputError
-from mwdcal.files import parquet, text
-from mwdcal.files.columns import LABELS, Column, check_names, no_stations
 from mwdcal.files.contract import COLUMNS, RAW
-from mwdcal.files.table import Table, numbers
+from mwdcal.files.formats import parquet, text
+from mwdcal.files.formats.columns import LABELS, Column, check_names, no_stations
+from mwdcal.files.formats.table import Table, numbers
+from mwdcal.geometry.vectors import Ints
+from mwdcal.use.correction import NAMES
 
 ROWS = 1 << 16
 """Most rows of a part of a Parquet table."""

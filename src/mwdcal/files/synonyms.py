@@ -12,8 +12,8 @@ import unicodedata
 from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
-from mwdcal.correction import MARK, NAMES
 from mwdcal.errors import InputError
+from mwdcal.use.correction import MARK, NAMES
 
 UNITS = {
     "deg": "°",

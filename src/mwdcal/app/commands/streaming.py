@@ -1,0 +1,502 @@
+"""Tables of any length through a calibration: read, corrected and written part by part.
+
+Every Parquet table that becomes Parquet or text goes this way, so that its columns keep their
+types. Reading, computing and writing overlap: one thread reads, some compute, the caller writes,
+and only a few parts are in memory at any time. Results, findings and refusals are those of
+`app.tables.apply_to_table`, which is for short text and for workbooks, but for two: which outputs
+rest on undetermined directions is judged on a sample of each part, and blank `sd_` cells are
+compared with others of their part.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from itertools import chain
+from pathlib import Path
+from typing import IO, Any, NamedTuple, TypeVar
+
+import numpy as np
+
+from mwdcal.calibration.diagnosis.findings import unused_columns
+from mwdcal.calibration.readings import TRIADS, Readings
+from mwdcal.calibration.record import Calibration, Finding
+from mwdcal.errors import InputError
+from mwdcal.files import runs, streams, synonyms
+from mwdcal.files.contract import CHANNELS, COLUMNS, RAW, RAW_RANGE, TEMPERATURE, check_columns
+from mwdcal.files.formats import atomic, parquet
+from mwdcal.files.formats.columns import no_stations
+from mwdcal.files.formats.sinks import ParquetSink, Sink, TextSink
+from mwdcal.files.formats.table import Table, cell_error, check_header
+from mwdcal.files.formats.table import numbers as as_numbers
+from mwdcal.files.streams import Part, Source
+from mwdcal.geometry.vectors import AnyArray, Array, Bools
+from mwdcal.sensor.profile import TriadProfile
+from mwdcal.use import correction_numba, strengths
+from mwdcal.use.correction import (
+    JUDGED,
+    MARK,
+    NAMES,
+    Tally,
+    check_outside,
+    findings,
+    numbers,
+    reference,
+    result_names,
+    undetermined,
+    warmth,
+)
+
+LONG = {".csv": 1_000_000, ".tsv": 1_000_000, ".parquet": 16_000_000}
+"""Bytes of a text table from which it is taken in parts, by what it becomes.
+
+Text that becomes Parquet has numbers in fewer columns when it is.
+"""
+MANY = 3_000_000
+"""Rows from which the compiled loops are worth their start: until then the writer is the slowest."""
+LINES = 1 << 14
+"""Rows of a part that becomes text."""
+WORKERS = 4
+"""Most parts that are computed at once: more would wait for the writer."""
+SAMPLE = 1024
+"""Rows of a part on which undetermined outputs are judged."""
+BLOCK = 1 << 14
+"""Rows that plain NumPy takes at a time."""
+OPTIONAL = {
+    CHANNELS["magnetometer"]: "Fill it in, or remove the station.",
+    ("temperature_c",): "Fill it in, or leave the whole column blank.",
+}
+"""Columns that are blank on all rows or on none, and what to do where they are neither."""
+LONGEST = 60
+"""Characters of another tool's serial that are told of a column."""
+_MOST = 10**15
+
+Item = TypeVar("Item")
+Made = TypeVar("Made")
+
+
+class Corrected(NamedTuple):
+    """A part, rendered for the sink, and what was seen in it."""
+
+    rendered: Any
+    size: int
+    tally: Tally
+
+
+def in_parts(readings: Path, output: Path, decimal: str) -> bool:
+    """Whether a table is taken in parts: Parquet or long text, where format and sign allow it."""
+    least = LONG.get(output.suffix.lower())
+    plain = decimal == "." or readings.suffix.lower() == ".parquet"
+    return plain and least is not None and streams.in_parts(readings, least)
+
+
+def apply_to_file(
+    calibration: Calibration,
+    readings: Path,
+    output: Path,
+    outside: str,
+    advance: Callable[[int, int], None] = lambda done, total: None,
+    rows: int = 0,
+    least: int = MANY,
+    missing: str = "refuse",
+    decimal: str = ".",
+) -> tuple[Tally, list[Finding]]:
+    """Correct a file into another; what was seen in the rows, and what the reader should know.
+
+    `advance` is told how much of the whole is done. `rows` of a part of a Parquet table, by
+    default as many as memory bears; `least` rows of the whole from which loops are compiled.
+    """
+    check_outside(outside)
+    source = _source(readings, output, rows, decimal)
+    _check_header(source, outside)
+    check_warmth(calibration, source.names, source.name)
+    pieces = source.pieces()
+    first = next((piece for piece in pieces if _loaded(source, piece).table.count), None)
+    if first is None:
+        raise no_stations(source.name)
+    rules = Rules(outside, missing)
+    worker = _Worker.of(calibration, source, first, rules, source.rows >= least)
+    done, tallies = 0, []
+    with atomic.replacing(output) as stream:
+        sink = worker.sink(stream, output)
+        for part in overlapped(chain([first], pieces), lambda piece: worker(piece, sink)):
+            sink.write(part.rendered)
+            tallies.append(part.tally)
+            done += part.size
+            advance(done, source.size)
+        total = _total(tallies)
+        if total.lacking == total.rows:
+            raise nothing(source.name)
+        found = findings(calibration, worker.heard(total.serials), total, outside)
+        strengths.check(calibration, total.strengths, source.name)
+        sink.finish([finding.text for finding in found])
+    return total, found + unused_columns(synonyms.unused(source.names, COLUMNS))
+
+
+def overlapped(items: Iterator[Item], work: Callable[[Item], Made]) -> Iterator[Made]:
+    """`work` of every item, in order; the next ones are taken and worked on meanwhile."""
+    workers = min(WORKERS, correction_numba.cores())
+    end: Any = object()
+    with ThreadPoolExecutor(workers + 1) as pool:
+        upcoming = pool.submit(next, items, end)
+        running: deque[Future[Made]] = deque()
+        try:
+            while (item := upcoming.result()) is not end:
+                upcoming = pool.submit(next, items, end)
+                running.append(pool.submit(work, item))
+                if len(running) > workers:
+                    yield running.popleft().result()
+            while running:
+                yield running.popleft().result()
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+def _source(readings: Path, output: Path, rows: int, decimal: str) -> Source:
+    typed = output.suffix.lower() == ".parquet"
+    if readings.suffix.lower() == ".parquet":
+        return streams.open_parquet(readings, rows or (0 if typed else LINES), decimal)
+    return streams.open_text(readings, typed=typed)
+
+
+def _check_header(source: Source, outside: str) -> None:
+    """Refuse columns that are missing, doubtful, or have the name of a result."""
+    check_header(source.names, source.name)
+    check_columns(source.names, source.name)
+    check_free(source.names, result_names(outside), source.name)
+
+
+def check_warmth(calibration: Calibration, names: Sequence[str], source: str) -> None:
+    """Refuse a temperature under another name or in another unit where it is needed."""
+    if any(triad.order for triad in calibration.triads):
+        synonyms.check_temperature(names, source)
+
+
+def check_free(names: Iterable[str], results: Sequence[str], source: str) -> None:
+    """Refuse a table that has a column of the name of a result."""
+    taken = [name for name in results if name in names]
+    if taken:
+        raise InputError(
+            f"{source}: the column '{taken[0]}' is there already, and would be lost under "
+            "the result of that name. Rename it, or correct the readings without it."
+        )
+
+
+def nothing(source: str) -> InputError:
+    """A table of which no row can be corrected."""
+    return InputError(
+        f"{source}: every row lacks a reading, so that there is nothing to correct. Check the "
+        "columns of the raw channels and temperature_c."
+    )
+
+
+def _loaded(source: Source, piece: Any) -> Part:
+    try:
+        return source.load(piece, False)
+    except InputError:
+        return source.load(piece, True)
+
+
+def _total(tallies: Sequence[Tally]) -> Tally:
+    moved = {name for tally in tallies for name in tally.moved}
+    rows, beyond, lacking = np.sum([(t.rows, t.beyond, t.lacking) for t in tallies], 0).tolist()
+    serials = runs.serials({}, chain.from_iterable(tally.serials for tally in tallies))
+    lows, highs = zip(*(tally.warmth for tally in tallies), strict=True)
+    return Tally(
+        rows, beyond, tuple(name for name in JUDGED if name in moved), lacking, tuple(serials),
+        strengths.total(tally.strengths for tally in tallies), (min(lows), max(highs)),
+    )  # fmt: skip
+
+
+class Rules(NamedTuple):
+    """What is done with rows outside the calibrated temperatures, and with those lacking a reading."""
+
+    outside: str = "blank"
+    missing: str = "refuse"
+
+
+@dataclass(frozen=True)
+class _Worker:
+    """Corrects parts; may be called by several threads at once.
+
+    Attributes:
+        first: the first piece that has rows.
+        absent: groups of columns that are wholly blank in the first part, and so everywhere.
+            Where rows may lack a reading: that are wholly blank in all parts.
+        said: readings without rows: what the findings need to know of the source.
+        triads: numbers for the compiled loops; None where NumPy computes.
+        tool: which channel each tool axis is, and the nominal unit of it, by triad.
+        moved: outputs already known to rest on what the calibration leaves undetermined.
+    """
+
+    calibration: Calibration
+    source: Source
+    rules: Rules
+    first: Any
+    absent: tuple[tuple[str, ...], ...]
+    said: Readings
+    triads: tuple[correction_numba.Numbers, correction_numba.Numbers] | None
+    tool: tuple[tuple[list[int], list[float]], ...]
+    moved: set[str] = field(default_factory=set)
+
+    @classmethod
+    def of(
+        cls, calibration: Calibration, source: Source, first: Any, rules: Rules, many: bool
+    ) -> _Worker:
+        """What the first piece says about all."""
+        judged = [first] if rules.missing == "refuse" else source.pieces()
+        absent = wholly_blank(_loaded(source, piece).table for piece in judged)
+        kept = [g[0] for g in OPTIONAL if g[0] in source.names and g not in absent]
+        empty = np.empty((0, 3))
+        said = Readings(
+            accelerometer=empty,
+            magnetometer=empty if "mx" in kept else None,
+            temperature=empty[:, 0] if "temperature_c" in kept else None,
+            metadata=source.metadata,
+            source=source.name,
+        )
+        reference(calibration, said)  # refuses a calibration with temperature terms without any
+        triads = numbers(calibration) if many and correction_numba.available() else None
+        tool = tuple(_tool(calibration, triad) for triad in TRIADS)
+        return cls(calibration, source, rules, first, absent, said, triads, tool)
+
+    def sink(self, stream: IO[bytes], output: Path) -> Sink:
+        """An empty table in the format of the output's name."""
+        arrow, _ = parquet.modules(output.name)
+        metadata = {**self.source.metadata, **described(self.calibration)}
+        suffix, outside = output.suffix.lower(), self.rules.outside
+        kinds = {name: arrow.float64() for name in NAMES} | {MARK: arrow.bool_()}
+        results = arrow.schema([(name, kinds[name]) for name in result_names(outside)])
+        if suffix == ".parquet":
+            return ParquetSink(stream, self.source.schema, results, metadata)
+        how = "extrapolate" if outside == "refuse" else outside
+        judged = JUDGED if self.calibration.free else ()
+        lacking = 0 if self.rules.missing == "refuse" else _MOST
+        said = self.heard(("\0" * LONGEST, "\1" * LONGEST, "…"))
+        worst = strengths.Strengths(_MOST, _MOST, _MOST, _MOST, -1.23e-100, -1.24e-100)
+        off = dict.fromkeys(strengths.COLUMNS, worst)
+        tally = Tally(_MOST, _MOST, judged, lacking, (), off, (TEMPERATURE.low, TEMPERATURE.high))
+        most = findings(self.calibration, said, tally, how)
+        longest = [finding.text for finding in most]
+        delimiter = "," if suffix == ".csv" else "\t"
+        return TextSink(stream, self.source.schema, results, metadata, longest, delimiter)
+
+    def __call__(self, piece: Any, sink: Sink) -> Corrected:
+        """A piece, corrected and rendered; text that seems wrong is looked at line by line."""
+        try:
+            return self._corrected(self.source.load(piece, False), sink)
+        except InputError:
+            return self._corrected(self.source.load(piece, True), sink)
+
+    def _corrected(self, part: Part, sink: Sink) -> Corrected:
+        table, rows = part.table, part.table.count
+        channels, found = self._found(table)
+        whole: Bools | None = None
+        if found.unsound and self.rules.missing == "blank":
+            whole = ~lacking(table, self.absent)
+            table = chosen(table, whole)
+            channels, found = self._found(table)
+        if found.unsound:
+            self._refuse(table)
+        known: Mapping[str, Array] = {}
+        if any(name.startswith(("ref_", "sd_")) for name in table.columns):
+            kinds = [kind for kind in TRIADS if channels[kind] is not None]
+            known = runs.check_references(table, self.calibration.profile, kinds)
+        moved = self._undetermined(channels, table.count)
+        columns = dict(zip(NAMES, found.columns, strict=True))
+        results: list[AnyArray] = [*columns.values()]
+        if self.rules.outside == "extrapolate":
+            results.append(self._beyond(channels, table.count))
+        if whole is not None:
+            results = [spread(values, whole) for values in results]
+        rendered = sink.render(part.carried, results, bool(found.empty) or whole is not None)
+        tally = Tally(
+            rows, found.beyond, moved, rows - table.count, self._serials(part.carried),
+            strengths.judged(self.calibration, columns, known),
+            warmth(channels["temperature"][0] if channels["temperature"] else None),
+        )  # fmt: skip
+        return Corrected(rendered, part.size, tally)
+
+    def _serials(self, carried: Any) -> tuple[str, ...]:
+        """The tools that a part names; names of others are cut, so that there is room for them."""
+        if "serial" not in carried.column_names:
+            return ()
+        arrow, _ = parquet.modules(self.source.name)
+        ours = self.calibration.tool.get("serial")
+        cells = [c.strip() for c in parquet.texts(carried.column("serial").unique(), arrow)]
+        return tuple(runs.serials({}, [c if c == ours else c[:LONGEST] for c in cells]))
+
+    def heard(self, serials: Sequence[str]) -> Readings:
+        """What the findings need to know of the source, with the tools that its parts named."""
+        return replace(self.said, metadata=runs.identified(self.source.metadata, serials))
+
+    def _found(self, table: Table) -> tuple[dict[str, list[Array] | None], correction_numba.Found]:
+        """The channels of a table, and what is made of them."""
+        channels = self._channels(table)
+        compute = self._compiled if self.triads else self._plain
+        return channels, compute(channels, table.count)
+
+    def _beyond(self, channels: Mapping[str, list[Array] | None], count: int) -> Bools:
+        """Rows (n,) outside the calibrated temperatures."""
+        low, high = self._limits().calibrated
+        warmth = channels["temperature"]
+        return (warmth[0] < low) | (warmth[0] > high) if warmth else np.zeros(count, bool)
+
+    def _channels(self, table: Table) -> dict[str, list[Array] | None]:
+        """Columns of each triad, and of the temperature; None where there are none."""
+        groups = {**CHANNELS, "temperature": ("temperature_c",)}
+        found: dict[str, list[Array] | None] = {}
+        for kind, names in groups.items():
+            lacking = names in self.absent or names[0] not in table.columns
+            found[kind] = None if lacking else [_column(table, name) for name in names]
+            if names in self.absent and not all(_is_blank(table, name) for name in names):
+                raise _blank(self.source.load(self.first, True).table, names)
+        return found
+
+    def _limits(self) -> correction_numba.Limits:
+        low, high = self.calibration.temperature_c or (-np.inf, np.inf)
+        if self.said.temperature is None:
+            low, high = -np.inf, np.inf
+        accepted = (RAW_RANGE.low, RAW_RANGE.high), (TEMPERATURE.low, TEMPERATURE.high)
+        warmth = low - self.calibration.margin, high + self.calibration.margin
+        return correction_numba.Limits(*accepted, warmth, self.rules.outside == "blank")
+
+    def _compiled(
+        self, channels: Mapping[str, list[Array] | None], count: int
+    ) -> correction_numba.Found:
+        assert self.triads is not None
+        columns, units, blank = [], [], 0
+        for kind, (order, unit) in zip(TRIADS, self.tool, strict=True):
+            three = channels[kind] or [np.full(count, np.nan)] * 3
+            blank += 0 if channels[kind] else 3
+            columns += [three[i] for i in order]
+            units += unit
+        zero = self.calibration.reference_temperature
+        columns += channels["temperature"] or [np.full(count, zero)]
+        found = correction_numba.run(columns, self.triads, zero, units, self._limits(), workers=1)
+        return found._replace(unsound=found.unsound - blank * count)
+
+    def _plain(
+        self, channels: Mapping[str, list[Array] | None], count: int
+    ) -> correction_numba.Found:
+        """The same by plain NumPy, a block at a time."""
+        limits, out = self._limits(), np.empty((len(NAMES), count))
+        beyond = unsound = 0
+        for kind, columns in channels.items():
+            low, high = limits.temperature if kind == "temperature" else limits.raw
+            unsound += sum(int((~((c >= low) & (c <= high))).sum()) for c in columns or [])
+        for start in range(0, 0 if unsound else count, BLOCK):
+            rows = slice(start, start + BLOCK)
+            readings = self._readings(channels, rows)
+            out[:, rows] = [*reference(self.calibration, readings).values()]
+            hot = self.calibration.outside(readings)
+            beyond += int(hot.sum())
+            if limits.blank:
+                out[:, rows][:, hot] = np.nan
+        return correction_numba.Found(out, unsound, beyond, int(np.isnan(out).sum()))
+
+    def _readings(self, channels: Mapping[str, list[Array] | None], rows: slice) -> Readings:
+        """Some rows as `Readings`, without labels and references."""
+        profile, magnetic = self.calibration.profile, channels["magnetometer"]
+        warmth = channels["temperature"]
+        return replace(
+            self.said,
+            accelerometer=_nominal(channels["accelerometer"] or [], rows, profile.accelerometer),
+            magnetometer=_nominal(magnetic, rows, profile.magnetometer) if magnetic else None,
+            temperature=warmth[0][rows] if warmth else None,
+        )
+
+    def _undetermined(
+        self, channels: Mapping[str, list[Array] | None], count: int
+    ) -> tuple[str, ...]:
+        if not self.calibration.free or not count:
+            return ()
+        readings = self._readings(channels, slice(0, count, max(1, count // SAMPLE)))
+        names = [name for name in JUDGED if name not in self.moved]
+        moved = undetermined(self.calibration, readings, names)
+        self.moved.update(moved)
+        return moved
+
+    def _refuse(self, table: Table) -> None:
+        """Say what is wrong with a part, in the words of a run file."""
+        runs.to_readings(table, self.calibration.profile)
+        for names in OPTIONAL:
+            present = names[0] in table.columns and names not in self.absent
+            if present and _is_blank(table, names[0]):
+                raise _blank(table, names)
+
+
+def described(calibration: Calibration) -> dict[str, object]:
+    """What a corrected table says of the calibration it rests on."""
+    return {
+        "calibration_run": calibration.run,
+        "calibration_time": calibration.time,
+        "azimuth_out": "magnetic",
+        "field_unit": calibration.field_unit,
+    }
+
+
+def wholly_blank(tables: Iterable[Table]) -> tuple[tuple[str, ...], ...]:
+    """Groups of optional columns that are blank on every row of all tables; looks no further than needed."""
+    left = [*OPTIONAL]
+    for table in tables:
+        left = [g for g in left if g[0] in table.columns and all(_is_blank(table, n) for n in g)]
+        if not left:
+            break
+    return tuple(left)
+
+
+def lacking(table: Table, absent: Sequence[tuple[str, ...]]) -> Bools:
+    """Rows (n,) with a blank reading or temperature; columns `absent` on all rows do not count."""
+    without = [name for group in absent for name in group]
+    names = [n for n in (*RAW, "temperature_c") if n in table.columns and n not in without]
+    return np.asarray(np.isnan([_column(table, name) for name in names]).any(axis=0))
+
+
+def chosen(table: Table, rows: Bools) -> Table:
+    """Some rows of a table, with their places."""
+    picked = np.flatnonzero(rows).tolist()
+    columns = {
+        name: [column[i] for i in picked] if isinstance(column, list) else column[rows]
+        for name, column in table.columns.items()
+    }
+    return replace(table, columns=columns, lines=[table.lines[i] for i in picked])
+
+
+def spread(values: AnyArray, rows: Bools) -> AnyArray:
+    """Values of the chosen rows, at their places among all; others are NaN, or False."""
+    out = np.full(rows.shape, False if values.dtype == bool else np.nan, values.dtype)
+    out[rows] = values
+    return out
+
+
+def _blank(table: Table, names: tuple[str, ...]) -> InputError:
+    problem = f"must be filled in; got a blank cell. {OPTIONAL[names]}"
+    return runs.BlankReadingError(str(cell_error(table, names[0], 0, problem)))
+
+
+def _column(table: Table, name: str) -> Array:
+    """The column as numbers; what they may be is checked with all the rest."""
+    column = table.columns[name]
+    return as_numbers(table, name) if isinstance(column, list) else column
+
+
+def _nominal(channels: Sequence[Array], rows: slice, triad: TriadProfile) -> Array:
+    return runs.to_nominal(np.stack([channel[rows] for channel in channels], -1), triad)
+
+
+def _is_blank(table: Table, name: str) -> bool:
+    column = table.columns[name]
+    if isinstance(column, list):
+        return not any(cell.strip() for cell in column)
+    return bool(np.isnan(column).all())
+
+
+def _tool(calibration: Calibration, kind: str) -> tuple[list[int], list[float]]:
+    """Which channel each tool axis is, and raw units, with sign, per nominal one."""
+    triad = getattr(calibration.profile, kind)
+    channel = np.abs(triad.permutation).argmax(axis=1)
+    sign = triad.permutation[np.arange(3), channel]
+    return channel.tolist(), (sign * (triad.scale or 1.0)).tolist()

@@ -1,0 +1,322 @@
+"""What came of a fleet: counts, spreads and undetermined directions, for people and machines.
+
+The table of calibrations is read column by column, whatever its length.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from mwdcal.app.commands.choices import names
+from mwdcal.app.commands.fleet_options import Asked
+from mwdcal.app.text import choices, number, plural, table
+from mwdcal.calibration.readings import TRIADS
+from mwdcal.calibration.record import Choices, Finding
+from mwdcal.calibration.soaks import HIGHEST
+from mwdcal.files.formats import parquet
+from mwdcal.fleet.calibrate import OK, STAND
+from mwdcal.fleet.sources import SERIAL
+from mwdcal.fleet.tables import one_chunk
+from mwdcal.geometry.vectors import Array
+
+SHOWN = 5
+"""Most serials that a line names."""
+DOUBTS = ("no-redundancy", "repeated-readings", "prior-conflict")
+"""Findings of a doubtful fit, besides residuals beyond the declared noise."""
+ERRORS = [name for columns in STAND.values() for name in columns]
+"""Columns of errors of the stand."""
+SPAN = 10.0
+"""A run that spans more without temperature terms is mentioned, °C."""
+
+
+@dataclass(frozen=True)
+class Kind:
+    """Tools of one status: how many, the first serials, and one message."""
+
+    status: str
+    tools: int
+    serials: list[Any]
+    message: str
+
+
+@dataclass(frozen=True)
+class Said:
+    """Sound tools with one finding: how many, and the first serials."""
+
+    id: str
+    tools: int
+    serials: list[Any]
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What came of a fleet. `spread` has the 1 %, 50 % and 99 % point of columns of sound tools.
+
+    `unused` are columns that are not used, of all tools.
+    `orders` and `nonlinear`: tools by triad and chosen order, and by triad with own-axis terms.
+    """
+
+    runs: str
+    output: str
+    tools: int
+    stations: int
+    method: str
+    order: int | str
+    options: dict[str, Any]
+    orders: dict[str, dict[str, int]]
+    nonlinear: dict[str, int]
+    statuses: list[Kind]
+    findings: list[Said]
+    spread: dict[str, list[float]]
+    undetermined: dict[str, int]
+    parts: int
+    parts_done_before: int
+    seconds: float
+    notes: list[str]
+    unused: list[Finding]
+
+    @property
+    def sound(self) -> int:
+        """Number of calibrated tools."""
+        return sum(kind.tools for kind in self.statuses if kind.status == OK)
+
+
+def summarise(
+    asked: Asked,
+    target: Path,
+    stations: int,
+    parts: int,
+    before: int,
+    seconds: float,
+    notes: list[str],
+    unused: list[Finding],
+) -> Summary:
+    """What the output says, read column by column."""
+    _, pq = parquet.modules(target.name)
+    whole = pq.ParquetFile(target)
+    head = whole.read([SERIAL, "status", "message", "findings"])
+    columns = whole.schema_arrow.names
+    shown = [n for n in columns if n.endswith(("_sd_deg", "_variance_factor")) or n in ERRORS]
+    spread = {name: _quantiles(numbers(whole, name)) for name in shown}
+    if asked["order"] == "0":
+        span = numbers(whole, "temperature_max_c") - numbers(whole, "temperature_min_c")
+        wide = int(np.sum(span > SPAN))
+        if wide:
+            spans = f"{plural(wide, 'tool')} {'spans' if wide == 1 else 'span'}"
+            notes.append(f"{spans} more than {SPAN:g} °C, and --order 0 has no temperature terms.")
+    return Summary(
+        runs=asked["runs"].name,
+        output=str(asked["output"]),
+        tools=head.num_rows,
+        stations=stations,
+        method=asked["method"],
+        order=asked["order"] if asked["order"] == "auto" else int(asked["order"]),
+        options=options_asked(asked),
+        orders=_orders(whole, columns) if asked["order"] == "auto" else {},
+        nonlinear=_nonlinear(whole, columns),
+        statuses=_kinds(head),
+        findings=_findings(head),
+        spread=spread,
+        undetermined=_undetermined(whole, columns),
+        parts=parts,
+        parts_done_before=before,
+        seconds=round(seconds, 3),
+        notes=notes,
+        unused=unused,
+    )
+
+
+def options_asked(asked: Asked) -> dict[str, Any]:
+    """How a fleet was asked for, under the names that a calibration file and the command have."""
+    also = Choices(
+        parameters=int(asked["parameters"] or 12),
+        ignore=names(asked["ignore"]),
+        robust=asked["robust"],
+        paper_weights=asked["paper_weights"],
+        prior=asked["prior"],
+    )
+    return {
+        "method": asked["method"],
+        "seed": asked["seed"] if asked["method"] == "swarm" else None,
+        "model": asked["model"],
+        "order": asked["order"] if asked["order"] == "auto" else int(asked["order"]),
+        "nonlinearity": asked["nonlinearity"],
+        "estimate": names(asked["estimate"]),
+        **msgspec.to_builtins(also),
+    }
+
+
+def unusual(options: Mapping[str, Any]) -> list[str]:
+    """What was asked for beyond method and order, in words."""
+    also = Choices(**{name: options[name] for name in Choices.__struct_fields__})
+    terms, stand = options["nonlinearity"], " and ".join(options["estimate"])
+    return [
+        *([f"model {options['model']}"] if options["model"] else []),
+        *([f"own-axis terms {terms}"] if terms != "none" else []),
+        *([f"stand: {stand}"] if stand else []),
+        *choices(also),
+        *([f"seed {options['seed']}"] if options["seed"] else []),
+    ]
+
+
+def column(path: Path, name: str) -> Array:
+    """One column of numbers of a table of calibrations, NaN where there is none."""
+    _, pq = parquet.modules(path.name)
+    return numbers(pq.ParquetFile(path), name)
+
+
+def numbers(whole: Any, name: str) -> Array:
+    """One column of numbers of an opened Parquet file, NaN where there is none."""
+    arrow, _ = parquet.modules(name)
+    cells = whole.read([name]).column(0)
+    return np.asarray(cells.cast(arrow.float64()).to_numpy(), float)
+
+
+def _quantiles(values: Array) -> list[float]:
+    if np.isnan(values).all():
+        return []
+    return [float(v) for v in np.nanquantile(values, (0.01, 0.5, 0.99))]
+
+
+def _kinds(head: Any) -> list[Kind]:
+    """Statuses with their tools, sound ones first, then by number."""
+    counted = head.column("status").value_counts().to_pylist()
+    found = []
+    for each in sorted(counted, key=lambda c: (c["values"] != OK, -c["counts"])):
+        own = head.filter(_equal(head.column("status"), each["values"])).slice(0, SHOWN).to_pydict()
+        found.append(Kind(each["values"], each["counts"], own[SERIAL], own["message"][0]))
+    return found
+
+
+def _findings(head: Any) -> list[Said]:
+    """Findings with their tools: doubts of the fit first, then by number."""
+    arrow, _ = parquet.modules("findings")
+    column = one_chunk(head.column("findings"))
+    ids = column.flatten().dictionary_encode()
+    tool = np.repeat(np.arange(len(column)), column.value_lengths().fill_null(0).to_numpy())
+    found = []
+    for code, name in enumerate(ids.dictionary.to_pylist()):
+        own = tool[ids.indices.to_numpy() == code]
+        serials = head.column(SERIAL).take(arrow.array(own[:SHOWN])).to_pylist()
+        found.append(Said(name, len(own), serials))
+    return sorted(found, key=lambda said: (not is_doubt(said.id), -said.tools, said.id))
+
+
+def is_doubt(finding: str) -> bool:
+    """Whether a finding says that a fit is doubtful, not only that something was chosen or looks odd."""
+    return finding.endswith("-residuals") or finding in DOUBTS
+
+
+def _orders(whole: Any, columns: list[str]) -> dict[str, dict[str, int]]:
+    """Tools by triad and the order that was chosen."""
+    found: dict[str, dict[str, int]] = {}
+    for triad in TRIADS:
+        if f"{triad}_order" in columns:
+            values = numbers(whole, f"{triad}_order")
+            found[triad] = {str(k): int(np.sum(values == k)) for k in range(HIGHEST + 1)}
+    return {triad: own for triad, own in found.items() if any(own.values())}
+
+
+def _nonlinear(whole: Any, columns: list[str]) -> dict[str, int]:
+    """Tools by triad that have own-axis terms, where they may."""
+    radii = {triad: f"{triad}_radius" for triad in TRIADS}
+    return {
+        triad: int(np.sum(~np.isnan(numbers(whole, radius))))
+        for triad, radius in radii.items()
+        if radius in columns
+    }
+
+
+def _equal(cells: Any, value: str) -> Any:
+    from pyarrow import compute
+
+    return compute.equal(cells, value)
+
+
+def _undetermined(whole: Any, columns: list[str]) -> dict[str, int]:
+    """Tools by triad and direction that nothing determines."""
+    found: dict[str, int] = {}
+    for name in columns:
+        if name.endswith("_undetermined"):
+            cells = whole.read([name]).column(0)
+            for each in cells.combine_chunks().flatten().value_counts().to_pylist():
+                value, count = each["values"], each["counts"]
+                found[f"{name.removesuffix('_undetermined')}: {value}"] = count
+    return found
+
+
+def document(summary: Summary, report: Path | None) -> dict[str, Any]:
+    """The summary for machines."""
+    found: dict[str, Any] = msgspec.to_builtins(summary)
+    whole = {"tools": summary.tools, "serials": []}
+    found["findings"] += [{**each, **whole} for each in found.pop("unused")]
+    found["tools_per_second"] = round(summary.tools / summary.seconds, 1)
+    return {**found, "calibrated": summary.sound, "report": str(report or "")}
+
+
+def text(summary: Summary, report: Path | None) -> str:
+    """The summary for people: about one screen."""
+    heading = (
+        f"{summary.runs}   {plural(summary.tools, 'tool')}   {plural(summary.stations, 'station')}   "
+        f"method {summary.method}   order {summary.order}"
+    )
+    also = unusual(summary.options)
+    rows = [[k.status, str(k.tools), _serials(k)] for k in summary.statuses]
+    lines = [heading, *(["options: " + ", ".join(also)] if also else []), ""]
+    lines += [table(rows, ["status", "tools", "serials"])]
+    refused = [kind for kind in summary.statuses if kind.status != OK]
+    lines += [f"! {kind.status}, for example: {kind.message}" for kind in refused]
+    lines += [f"! {said.id} in {_count(said)}" for said in summary.findings]
+    spread = [
+        [_title(name), *(number(v) for v in values)]
+        for name, values in summary.spread.items()
+        if values
+    ]
+    if spread:
+        lines += ["", table(spread, ["of sound tools", "1 %", "median", "99 %"])]
+    if summary.orders:
+        header, body = orders_table(summary)
+        lines += ["", table(body, header)]
+    for name, count in summary.nonlinear.items():
+        lines.append(f"own-axis terms in {plural(count, 'tool')}: {name}")
+    for name, count in summary.undetermined.items():
+        lines.append(f"undetermined in {plural(count, 'tool')}: {name}")
+    lines += [f"! {note}" for note in summary.notes]
+    rate = summary.tools / summary.seconds
+    wrote = f"wrote {summary.output} (calibrations)" + (f"   {report} (report)" if report else "")
+    return "\n".join([*lines, "", f"{wrote}   {summary.seconds:.1f} s, {rate:.0f} tools/s"])
+
+
+def orders_table(summary: Summary) -> tuple[list[str], list[list[str]]]:
+    """Header and rows of the tools by chosen order, a triad in each row."""
+    header = ["tools of order", *map(str, range(HIGHEST + 1))]
+    return header, [[triad, *map(str, own.values())] for triad, own in summary.orders.items()]
+
+
+def _count(said: Said) -> str:
+    """How many tools have a finding, and which."""
+    return f"{plural(said.tools, 'tool')}: {_first(said)}"
+
+
+def _serials(kind: Kind) -> str:
+    return "" if kind.status == OK else _first(kind)
+
+
+def _first(some: Kind | Said) -> str:
+    """The first serials of some tools."""
+    return ", ".join(map(str, some.serials)) + (" …" if some.tools > len(some.serials) else "")
+
+
+def _title(name: str) -> str:
+    """A column as people call it."""
+    if name.endswith("_variance_factor"):
+        return f"{name.removesuffix('_variance_factor')} s²"
+    if name in ERRORS:
+        return f"stand: {name.removesuffix('_deg').replace('_', ' ')}, °"
+    return f"1σ {name.removesuffix('_sd_deg')} at 45°, °"

@@ -1,0 +1,426 @@
+"""The report of a calibration: one HTML file that needs nothing else, to be read and signed.
+
+`render` collects what the template shows; the pictures are drawn in `plots`, the wording of
+fixed text stands in `templates/`. Needs the extra `report` (jinja2, matplotlib).
+"""
+
+from __future__ import annotations
+
+import os
+from datetime import datetime
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mwdcal.app.pages import plots
+from mwdcal.app.text import HELD, chance, choices, is_held, plural
+from mwdcal.app.text import model as model_of
+from mwdcal.calibration.prediction import accuracy_at, accuracy_map, angles, middle_temperature
+from mwdcal.calibration.readings import is_simulated
+from mwdcal.calibration.record import Calibration, TriadCalibration
+from mwdcal.calibration.residuals import RESHOOT
+from mwdcal.errors import InputError
+from mwdcal.estimation.solvers import RANK_TOLERANCE
+from mwdcal.files.formats import atomic
+from mwdcal.use.notation import Notation, convert
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
+
+    from mwdcal.calibration.record import Finding
+    from mwdcal.use.verification import Verdict
+
+SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+LONG_TABLE = 60
+"""A run of more stations has its station table at the end, as an annex."""
+ROWS = (5.0, 45.0, 90.0)
+"""Inclinations of the table of predicted accuracy, degrees."""
+
+
+def write_report(
+    path: str | os.PathLike[str], calibration: Calibration, verdict: Verdict | None = None
+) -> None:
+    """Write the report; the old file or the new one exists at any moment, never a part."""
+    atomic.write(path, render(calibration, verdict))
+
+
+def render(calibration: Calibration, verdict: Verdict | None = None) -> str:
+    """The report as HTML: the same input gives the same text, byte for byte."""
+    template = _environment().get_template("report.html")
+    return template.render(
+        cal=calibration,
+        name=calibration.tool.get("serial") or calibration.profile.name,
+        verdict=verdict,
+        banner=banner(calibration, verdict),
+        findings=_findings(calibration, verdict),
+        simulated=is_simulated(calibration.tool),
+        facts=_facts(calibration),
+        relative=calibration.relative,
+        figures=_figures(calibration),
+        compared=_compared(calibration),
+        judged=_judged(calibration),
+        limit=_limit(calibration),
+        decimals=_decimals(calibration),
+        left_out=any(row.errors_left_out for row in calibration.station_rows),
+        annex=len(calibration.station_rows) > LONG_TABLE,
+        parameters=_parameters(calibration),
+        held=HELD,
+        accuracy=_accuracy(calibration),
+        budget=_budget(calibration),
+        titles=plots.TITLES,
+        tolerance=RANK_TOLERANCE,
+        earth=_earth(calibration),
+        when=_when(calibration.time),
+    )
+
+
+def _environment() -> Environment:
+    try:
+        import matplotlib  # noqa: F401
+        from jinja2 import Environment, PackageLoader, StrictUndefined
+    except ImportError as error:
+        raise InputError(
+            f"the report needs {error.name}, which is not installed. Install mwdcal[report]: "
+            "pip install 'mwdcal[report]'"
+        ) from None
+    made = Environment(
+        loader=PackageLoader("mwdcal.app.pages"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    made.filters |= {
+        "number": number,
+        "signed": signed,
+        "fixed": fixed,
+        "css": css_string,
+        "svg": svg,
+        "plural": plural,
+        "unit": unit,
+        "chance": chance,
+    }
+    return made
+
+
+def number(value: float | None, digits: int = 3) -> str:
+    """A number to some significant digits, without E notation; a dash where there is none."""
+    if value is None or not np.isfinite(value):
+        return "–"
+    if value == 0:
+        return "0"
+    mantissa, power = f"{value:.{digits - 1}e}".split("e")
+    exponent = int(power)
+    if not -5 < exponent < 7:
+        return f"{mantissa}×10{str(exponent).translate(SUPERSCRIPT)}".replace("-", "−")
+    return fixed(value, max(digits - 1 - exponent, 0))
+
+
+def fixed(value: float | None, decimals: int) -> str:
+    """A number to some decimals, with a true minus sign; a dash where there is none."""
+    if value is None or not np.isfinite(value):
+        return "–"
+    return f"{round(value, decimals) + 0.0:.{max(decimals, 0)}f}".replace("-", "−")
+
+
+def signed(value: float | None, decimals: int) -> str:
+    """As `fixed`, with a plus sign too."""
+    text = fixed(value, decimals)
+    return text if text[0] in "−–" or not float(text) else f"+{text}"
+
+
+def measured(value: float, uncertainty: float | None) -> tuple[str, str]:
+    """Value and standard uncertainty as text, both to two significant digits of the latter."""
+    if uncertainty is None or not np.isfinite(uncertainty):
+        return number(value, 6), "undetermined"
+    if uncertainty == 0:
+        return number(value, 9), "0"
+    decimals = 1 - _exponent(uncertainty)
+    power = _exponent(max(abs(value), uncertainty))
+    if decimals <= 7 and power < 7:
+        return fixed(value, decimals), fixed(uncertainty, decimals)
+    factor, times = 10.0**-power, f"×10{str(power).translate(SUPERSCRIPT)}"
+    pair = (fixed(v * factor, decimals + power) for v in (value, uncertainty))
+    first, second = (f"{text}{times}" for text in pair)
+    return first, second
+
+
+def _exponent(value: float) -> int:
+    return int(f"{value:.1e}".split("e")[1])
+
+
+def unit(symbol: str) -> str:
+    """A unit as it follows a number: the degree sign without a space."""
+    return symbol if symbol in ("", "°") else f" {symbol}"
+
+
+def css_string(text: str) -> str:
+    """Text as the inside of a CSS string: nothing but letters and digits is left bare."""
+    return "".join(c if c.isascii() and c.isalnum() else f"\\{ord(c):x} " for c in text)
+
+
+def svg(text: str) -> Any:
+    """A figure of our own making, which needs no escaping."""
+    from markupsafe import Markup
+
+    return Markup(text)
+
+
+def banner(calibration: Calibration, verdict: Verdict | None) -> dict[str, str]:
+    """The outcome in plain words: level (good, attention, bad), word, headline, second line."""
+    fit, level = _fit_outcome(calibration)
+    if verdict is None:
+        after = "Not verified: run mwdcal verify on a roll test that was not used in the fit."
+        return _banner(level, fit, after)
+    missed = sum(not row.passed for row in verdict.rows)
+    count = plural(len(verdict.rows), "limit")
+    if not verdict.passed:
+        return _banner("bad", f"Verification failed – {missed} of {count} not met", fit)
+    return _banner(level, f"Verification passed – {count} met", fit)
+
+
+def _banner(level: str, headline: str, after: str) -> dict[str, str]:
+    word = {"good": "OK", "attention": "Attention", "bad": "Failed"}[level]
+    return {"level": level, "word": word, "headline": headline, "after": after}
+
+
+def _fit_outcome(calibration: Calibration) -> tuple[str, str]:
+    """What the fit came to, in one line, and its level."""
+    ids = [finding.id for finding in calibration.findings]
+    doubts = [i.removesuffix("-residuals") for i in ids if i.endswith("-residuals")]
+    parts = [f"{name} residuals exceed the declared noise" for name in doubts]
+    free = dict.fromkeys(entry.id.replace("-", " ") for entry in calibration.undetermined())
+    undetermined = f"{', '.join(free)} undetermined"
+    if free and doubts:
+        parts.append(undetermined)
+    if calibration.relative:
+        parts.append("magnetic field relative, not in nT")
+    again = sum(row.reshoot for row in calibration.station_rows)
+    if again:
+        parts.append(f"{plural(again, 'station')} to re-shoot")
+    accepted = undetermined[0].upper() + undetermined[1:] if free else "Fit accepted"
+    headline = "Fit doubtful" if doubts else accepted
+    text = f"{headline} – {'; '.join(parts)}" if parts else headline
+    return text, "attention" if parts or free else "good"
+
+
+def _findings(calibration: Calibration, verdict: Verdict | None) -> list[Finding]:
+    """What to know and do, each thing once; stations to re-shoot first."""
+    found = {f.text: f for f in calibration.findings}
+    ids = {f.id for f in calibration.findings}
+    for extra in verdict.findings if verdict else ():
+        if extra.id not in ids:
+            found.setdefault(extra.text, extra)
+    return sorted(found.values(), key=lambda f: f.id != "reshoot")
+
+
+def _when(time: str) -> str:
+    """A time of the record as people write it."""
+    try:
+        return datetime.fromisoformat(time).strftime("%Y-%m-%d %H:%M UTC")
+    except ValueError:
+        return time
+
+
+def _facts(calibration: Calibration) -> list[tuple[str, str]]:
+    """What was calibrated, with what."""
+    tool, profile = calibration.tool, calibration.profile
+    method = [calibration.method, model_of(calibration), *choices(calibration.options)]
+    facts = [
+        ("Tool", tool.get("serial") or "no serial given"),
+        ("Type", tool.get("tool", profile.name)),
+        ("Sensors", " and ".join(t.name for t in calibration.triads)),
+        ("Calibrated", _when(calibration.time)),
+        ("Measured", tool.get("date", "")),
+        ("Run file", calibration.run or "not named"),
+        ("Stations", _attitudes(calibration)),
+        ("Excluded", ", ".join(calibration.excluded)),
+        ("Temperature", _temperatures(calibration)),
+        ("Method", "; ".join(method)),
+        ("Stand", tool.get("stand", "")),
+        ("Laboratory", tool.get("lab", "")),
+        ("Operator", tool.get("operator", "")),
+    ]
+    return [(name, value) for name, value in facts if value]
+
+
+def _temperatures(calibration: Calibration) -> str:
+    if calibration.temperature_c is None:
+        return "not recorded"
+    low, high = (fixed(t, 1) for t in calibration.temperature_c)
+    return f"{low} °C" if low == high else f"{low} to {high} °C"
+
+
+def _attitudes(calibration: Calibration) -> str:
+    rows = calibration.station_rows
+    found = [r.inclination_deg for r in rows if r.inclination_deg is not None]
+    if not found:
+        return str(calibration.stations)
+    return f"{calibration.stations}, at inclinations {min(found):.0f} to {max(found):.0f}°"
+
+
+def _limit(calibration: Calibration) -> float:
+    """The deviation above which a station is marked, σ."""
+    from scipy.special import ndtri
+
+    return float(-ndtri(RESHOOT / max(len(calibration.station_rows), 1) / 2))
+
+
+def _figures(calibration: Calibration) -> dict[str, Any]:
+    names = [row.observable for row in calibration.errors]
+    missing = [
+        name
+        for name in plots.TITLES
+        if name not in names and (calibration.has_field or name not in ("azimuth", "field", "dip"))
+    ]
+    return {
+        "errors": [plots.station_errors(calibration, name) for name in names],
+        "missing": missing,
+        "deviations": plots.deviations(calibration, _limit(calibration)),
+        "orders": (
+            plots.order_errors(calibration.orders)
+            if _compared(calibration) and _judged(calibration)
+            else ""
+        ),
+        "accuracy": plots.accuracy(accuracy_map(calibration), angles(calibration)),
+    }
+
+
+def _compared(calibration: Calibration) -> bool:
+    """Whether orders were compared, rather than one given."""
+    return not all(row.chosen for row in calibration.orders)
+
+
+def _judged(calibration: Calibration) -> bool:
+    """Whether some order was judged at temperatures left out."""
+    return any(row.ends is not None for row in calibration.orders)
+
+
+def _decimals(calibration: Calibration) -> dict[str, int]:
+    """Decimals of the station table: two significant digits of what is left after the fit."""
+    return {
+        row.observable: min(max(1 - _exponent(row.after), 0), 9) if row.after > 0 else 3
+        for row in calibration.errors
+    }
+
+
+def _parameters(calibration: Calibration) -> dict[str, Any]:
+    """Parameters of each triad as rows: as factors of the raw channels where there are any."""
+    try:
+        found = convert(calibration, "factors")
+    except InputError:
+        tables = {triad.name: _own_rows(triad) for triad in calibration.triads}
+        return {"notation": "record", "tables": tables}
+    tables = {triad.name: _factor_rows(triad, found[triad.name]) for triad in calibration.triads}
+    return {"notation": "factors", "tables": tables}
+
+
+def _row(name: str, index: str, power: int, value: float, sd: float | None, symbol: str) -> Any:
+    per = "" if power == 0 else "/°C" + (str(power).translate(SUPERSCRIPT) if power > 1 else "")
+    shown = ("0", HELD) if is_held(value, sd) else measured(value, sd)
+    course = "" if power == 0 else "τ" + (str(power).translate(SUPERSCRIPT) if power > 1 else "")
+    return {
+        "name": name,
+        "index": index,
+        "course": course,
+        "value": shown[0],
+        "sd": shown[1],
+        "unit": symbol + per,
+    }
+
+
+def _own_rows(triad: TriadCalibration) -> list[Any]:
+    """The parameters of the record: tool axes, nominal units."""
+    columns = zip(
+        triad.parameter_names, triad.parameters, triad.standard_uncertainties, strict=True
+    )
+    rows = []
+    for full, value, sd in columns:
+        base, _, power = full.partition("·")
+        name, _, index = base.rpartition("-")
+        symbol = "1" if name in ("gain", "scale", "misalignment") else _unit(triad)
+        rows.append(_row(name, index, int(power or 0), value, sd, symbol))
+    return rows
+
+
+def _unit(triad: TriadCalibration) -> str:
+    return triad.unit if triad.unit in ("g", "nT") else "1"
+
+
+def _stated(uncertainty: float) -> float | None:
+    return None if np.isnan(uncertainty) else uncertainty
+
+
+def _factor_rows(triad: TriadCalibration, found: Notation) -> list[Any]:
+    raw = "raw" if _unit(triad) == "1" else f"raw/{triad.unit}"
+    units, channels = {"SF": raw, "B": _unit(triad), "m": "1"}, "xyz"
+    rows = []
+    for name, values in found.values.items():
+        for i, j in np.ndindex(values.shape):
+            if name == "m" and i == j:
+                continue
+            sd = _stated(float(found.uncertainty[name][i, j]))
+            index = channels[i] + channels[j] if name == "m" else channels[i]
+            power = 0 if name == "m" else j
+            rows.append(_row(name, index, power, float(values[i, j]), sd, units[name]))
+    return rows
+
+
+def _accuracy(calibration: Calibration) -> dict[str, Any]:
+    """1σ in degrees by angle: of the calibration alone, and of one reading."""
+    middle = middle_temperature(calibration)
+    cases = [(inclination, middle) for inclination in ROWS]
+    if any(t.order for t in calibration.triads) and calibration.temperature_c:
+        cases += [(45.0, t) for t in calibration.temperature_c]
+    names = angles(calibration)
+    rows = []
+    for inclination, temperature in cases:
+        at = [float(np.radians(inclination))]
+        both = [accuracy_at(calibration, at, noise, temperature) for noise in (False, True)]
+        pairs = [[_degrees(found[name][0]) for found in both] for name in names]
+        rows.append({"inclination": inclination, "temperature": temperature, "pairs": pairs})
+    return {"names": names, "rows": rows, "temperature": middle}
+
+
+def _budget(calibration: Calibration) -> list[dict[str, str]]:
+    """What the calibration's uncertainty consists of: a row for each source, degrees by angle."""
+    names = angles(calibration)
+    return [
+        {"source": row.source}
+        | {
+            name: "undetermined" if sd is None else number(sd, 2)
+            for name in names
+            for sd in [getattr(row, f"{name}_deg")]
+        }
+        for row in calibration.budget
+    ]
+
+
+def _degrees(angle: float) -> str:
+    return "undetermined" if np.isnan(angle) else number(float(np.degrees(angle)), 2)
+
+
+def _earth(calibration: Calibration) -> list[tuple[str, str, str]]:
+    """Gravity, field and dip of the run: name, value with unit, and where it comes from."""
+    estimated = {c.name: c for c in calibration.constants}
+    nanotesla = "" if calibration.relative else "nT"
+    keys = (("gravity", "gravity_g", "g"), ("field", "field", nanotesla), ("dip", "dip_deg", "°"))
+    rows = []
+    for name, key, symbol in keys:
+        if key not in calibration.earth:
+            continue
+        value, source = calibration.earth[key], "given"
+        text = f"{value:.7g}".replace("-", "−")
+        if name in estimated:
+            text, sd = measured(value, estimated[name].standard_uncertainty)
+            source = f"estimated from the run, 1σ {sd}{unit(symbol)}"
+        elif name == "field" and calibration.relative:
+            text, source = "1", "by convention: the strength is known at no station"
+        rows.append((f"mean {name}", f"{text}{unit(symbol)}", source))
+    for c in calibration.constants:
+        if c.name.endswith("reference error"):
+            text, sd = measured(c.value, c.standard_uncertainty)
+            rows.append(
+                (c.name, f"{text}{unit(c.unit)}", f"estimated with the fit, 1σ {sd}{unit(c.unit)}")
+            )
+    return rows

@@ -1,0 +1,325 @@
+"""What the temperature order of a fit leaves out: terms beyond it, their test, size and share.
+
+Gain and offset of each axis may vary with temperature by more than the order of the model says.
+At the solution of a fit each further power (a Chebyshev polynomial of temperature over the run, for
+the gains and the offsets of one triad, as shares of the field) is tried by one step: its χ² given all
+lower powers, judged by the scatter that no power explains, says whether it is there; the excess of
+χ² over what noise alone gives is its mean square.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mwdcal.calibration.estimate import Fit
+from mwdcal.calibration.soaks import HIGHEST, highest_order, usable_soaks
+from mwdcal.estimation.problem import Problem, State
+from mwdcal.geometry.vectors import Array, Bools, Ints, eigen, inverse
+
+TRIED = 5
+"""The highest power that is tried, if there are soaks enough."""
+UNLIKELY = 1e-3
+"""A term is there if noise alone gives one as large with a probability below this."""
+WEAK = 1e-6
+"""A direction of a term counts if the fit leaves this share of its information to it."""
+RIDGE = 1e-11
+"""Added to the information of the fit's own unknowns, that it has an inverse: free ones stay free."""
+STEP = 1e-5
+"""Change of a gain by which its direction among the parameters is found."""
+OFFSETS = tuple(f"{word}-{axis}" for word in ("offset", "bias") for axis in "xyz")
+"""Steady offsets of the axes, in either model."""
+GRID = 64
+"""Temperatures over the range at which what is left out is averaged."""
+
+
+@dataclass(frozen=True)
+class Terms:
+    """Powers 1…`TRIED` of temperature that a fit has not, by member and triad: arrays (B, t, k).
+
+    `square` is χ² of a term, all lower ones being fitted, `freedom` its degrees of freedom: 0 where
+    the fit has it, or no soak shows it. `size` (B, t, k, 2) is the mean square of its coefficients,
+    gains and offsets, and `noise` what the declared noise adds to it. `scatter` (B, t) is the
+    variance of whitened residuals that no term explains, `rest` (B, t) its degrees of freedom.
+    """
+
+    square: Array
+    freedom: Array
+    size: Array
+    noise: Array
+    scatter: Array
+    rest: Array
+
+    @property
+    def chance(self) -> Array:
+        """Probability (B, t, k) of so large a term by noise alone; NaN where there is none to test."""
+        return _chance(self.square, self.freedom, self.scatter[..., None], self.rest[..., None])
+
+    @property
+    def present(self) -> Bools:
+        """Terms (B, t, k) that noise does not explain."""
+        return np.asarray(np.nan_to_num(self.chance, nan=1.0) < UNLIKELY)
+
+    @property
+    def misfit(self) -> Bools:
+        """Triads (B, t) of which noise does not explain all terms."""
+        return np.asarray(self.present.any(-1))
+
+    @property
+    def variance(self) -> Array:
+        """Mean square (B, t, k, 2) of a term's gains and offsets, shares of the field, noise taken off."""
+        excess = self.size - self.noise * self.scatter[..., None, None]
+        usable = (self.freedom > 0) & (self.rest[..., None] >= 1)
+        return np.where(usable[..., None], np.maximum(excess, 0.0), 0.0)
+
+
+def _chance(square: Array, freedom: Array, scatter: Array, rest: Array) -> Array:
+    """Probability of so large a χ² by noise alone: Fisher's F."""
+    from scipy.special import fdtrc
+
+    tested = (freedom > 0) & (rest >= 1)
+    ratio = square / np.where(tested, freedom * scatter, 1.0)
+    ratio, freedom = np.where(tested, ratio, 0.0), np.where(tested, freedom, 1.0)
+    return np.where(tested, fdtrc(freedom, np.maximum(rest, 1.0), ratio), np.nan)
+
+
+def orders_of(result: Fit) -> list[int]:
+    """Temperature order of each triad."""
+    return [triad.model.basis.order for triad in result.problem.triads]
+
+
+def terms_beyond(result: Fit) -> Terms:
+    """The powers of temperature that a fit has not."""
+    memo = result.problem.memo.at(result.state)
+    if "terms" not in memo.besides:
+        memo.besides["terms"] = _every_term(result)
+    found = memo.besides["terms"]
+    square, freedom = found[:2]
+    size, noise = (np.moveaxis(found[at : at + 2], 0, -1) for at in (2, 4))
+    factor, known = result.analysis.variance_factor, result.analysis.freedom
+    rest = known - freedom.sum(-1)
+    left = np.nan_to_num(factor * known) - square.sum(-1)
+    least = 1e-3 * np.nan_to_num(factor)
+    scatter = np.maximum(left / np.maximum(rest, 1.0), np.maximum(least, 1e-300))
+    declared = np.isnan(result.noise) & (rest < 1)
+    scatter, rest = np.where(declared, 1.0, scatter), np.where(declared, 1e9, rest)
+    return Terms(square, freedom, size, noise, scatter, rest)
+
+
+def _every_term(result: Fit) -> Array:
+    """What `_in_turn` says (6, B, t, k) of every power and triad."""
+    highest = highest_order(result.problem.temperature)
+    count = min(int(highest.max()), TRIED)
+    triads, orders = len(result.problem.triads), orders_of(result)
+    found = np.zeros((6, len(highest), triads, TRIED))
+    least = min(orders)
+    if count <= least:
+        return found
+    shown = (np.arange(1, count + 1) <= highest[:, None])[:, least:]
+    whole, pulled = _with_terms(result, shown, least)
+    every = np.arange(whole.shape[-1])
+    columns = every[-6 * triads * (count - least) :].reshape(count - least, triads, 6)
+    for index, order in enumerate(orders):
+        if order < count:
+            own = columns[:, index].ravel()
+            fitted, tested = np.setdiff1d(every, own), own[6 * (order - least) :]
+            found[:, :, index, order:count] = _in_turn(whole, pulled, tested, fitted)
+    return found
+
+
+def _with_terms(result: Fit, shown: Bools, least: int) -> tuple[Array, Array]:
+    """Information and pull of the fit's unknowns, then of the powers above `least` if `shown` (B, k).
+
+    Of each power come the three gains and three offsets of each triad.
+    """
+    problem, state = result.problem, result.state
+    linear = problem.linear(state)
+    columns = steady_columns(problem, state)
+    powers = (
+        temperature_powers(problem.temperature, least + shown.shape[-1])[..., least:]
+        * shown[:, None]
+    )
+    members, stations, count = powers.shape
+    weighed = np.swapaxes(linear.weigh(columns), -1, -2)
+    turned = np.swapaxes(powers, -1, -2)
+
+    def summed(each: Array, by: Array) -> Array:
+        return np.asarray(by @ each.reshape(members, stations, -1))
+
+    width = columns.shape[-1]
+    cross = summed(weighed @ linear.design, turned).reshape(members, count * width, -1)
+    pairs = (powers[..., None] * powers[..., None, :]).reshape(members, stations, -1)
+    own = summed(weighed @ columns, np.swapaxes(pairs, -1, -2))
+    own = np.swapaxes(own.reshape(members, count, count, width, width), 2, 3)
+    own = own.reshape(members, count * width, count * width)
+    pulled = -summed(weighed @ linear.residual[..., None], turned).reshape(members, -1)
+    normal = linear.normal
+    top = np.concatenate([normal.information, np.swapaxes(cross, -1, -2)], -1)
+    whole = np.concatenate([top, np.concatenate([cross, own], -1)], -2)
+    return whole, np.concatenate([-normal.gradient, pulled], -1)
+
+
+def steady_columns(problem: Problem, state: State) -> Array:
+    """Columns (B, n, m, 6 t) of gains and offsets of each triad's axes, shares of the field."""
+    rows = 3 * len(problem.triads)
+    columns = np.zeros((*problem.temperature.shape, rows, 2 * rows))
+    pairs = zip(problem.triads, problem.slices(), problem.targets(state), strict=False)
+    for index, (triad, where, target) in enumerate(pairs):
+        slope = triad.model.slope(state.params[:, where], triad.raw, problem.temperature)
+        weight = problem.evidence.include[..., None] / triad.sd
+        back = inverse(slope) * weight[..., None]
+        own, first = slice(3 * index, 3 * index + 3), 6 * index
+        columns[..., own, first : first + 3] = back * target[..., None, :]
+        strength = np.linalg.norm(target, axis=-1)[..., None, None]
+        columns[..., own, first + 3 : first + 6] = back * strength
+    return columns
+
+
+def _mean(values: Array, weights: Array) -> Array:
+    """Weighted means (2, B) of the gains and of the offsets among six coefficients (B, 6)."""
+    both = [(values * weights).reshape(-1, 2, 3).sum(-1), weights.reshape(-1, 2, 3).sum(-1)]
+    return np.swapaxes(both[0] / np.where(both[1] > 0, both[1], 1.0), 0, 1)
+
+
+def temperature_powers(temperature: Array, count: int) -> Array:
+    """Chebyshev polynomials (B, n, count) of temperatures (B, n) over each member's range, from 1."""
+    low, high = temperature.min(-1, keepdims=True), temperature.max(-1, keepdims=True)
+    scaled = (2 * temperature - low - high) / np.maximum(high - low, 1e-9)
+    return np.asarray(np.polynomial.chebyshev.chebvander(scaled, count)[..., 1:])
+
+
+def _in_turn(whole: Array, pulled: Array, tested: Ints, fitted: Ints) -> Array:
+    """χ², degrees of freedom, size and noise (6, B, k) of powers in turn, six coefficients each.
+
+    Each is what it adds to the `fitted` unknowns, and to the powers before it.
+    """
+    norm = np.sqrt(np.diagonal(whole, axis1=-2, axis2=-1))
+    norm = np.where(norm > 0, norm, 1.0)
+    whole = whole / (norm[:, :, None] * norm[:, None, :])
+    pulled = pulled / norm
+    base, cross = whole[:, fitted][:, :, fitted], whole[:, fitted][:, :, tested]
+    absent = np.diagonal(base, axis1=-2, axis2=-1) == 0
+    base = base + (RIDGE + absent[:, :, None]) * np.eye(len(fitted))
+    right = np.concatenate([cross, pulled[:, fitted, None]], -1)
+    both = np.concatenate([whole[:, tested][:, :, tested], pulled[:, tested, None]], -1)
+    both = both - np.swapaxes(cross, -1, -2) @ np.linalg.solve(base, right)
+    found = []
+    for first in range(0, len(tested), 6):
+        at = slice(first, first + 6)
+        values, vectors = eigen(both[:, at, at])
+        kept = values > WEAK
+        back = (vectors * np.where(kept, 1 / np.where(kept, values, 1.0), 0.0)[:, None]) @ (
+            np.swapaxes(vectors, -1, -2)
+        )
+        step = back @ both[:, at]
+        square = np.einsum("bi,bi->b", both[:, at, -1], step[..., -1])
+        worth = np.einsum("bii->bi", both[:, at, at])
+        scale = norm[:, tested[at]] ** 2
+        sizes = [step[..., -1] ** 2, np.einsum("bii->bi", back)]
+        means = [_mean(each / scale, worth * scale) for each in sizes]
+        found.append(np.concatenate([np.stack([square, kept.sum(-1)]), *means]))
+        both = both - both[:, :, at] @ step
+    return np.stack(found, -1)
+
+
+def untested(result: Fit) -> Bools:
+    """Triads (B, t) whose order takes all soaks that there are: nothing tests the course between."""
+    temperature, orders = result.problem.temperature, np.array(orders_of(result))
+    levels = usable_soaks(temperature).max(-1)[:, None] + 1
+    return np.asarray((levels > 1) & (orders > 0) & (levels <= orders + 1))
+
+
+def misfit_size(result: Fit, terms: Terms) -> Array:
+    """Root mean square (B, t), per axis, of what the orders leave out, as a share of the field."""
+    gains, offsets = np.moveaxis(course_misfit(result, terms), -1, 0)
+    return np.asarray(np.sqrt(gains / 3 + offsets))
+
+
+def course_misfit(result: Fit, terms: Terms | None = None) -> Array:
+    """Variance (B, t, 2) of gains and offsets that the order leaves out, shares of the field squared.
+
+    Mean square over the range of temperatures of all terms that are there, and of the next one
+    whether it is there or not: what noise may hide is not known to be absent. A term beyond the
+    highest order is scatter between soaks: it is as large at any other temperature, and each soak
+    passes its share of it on to the fit.
+    """
+    terms = terms or terms_beyond(result)
+    problem, found = result.problem, []
+    for index, order in enumerate(orders_of(result)):
+        powers = np.arange(1, TRIED + 1)
+        counted = terms.present[:, index] | (powers == order + 1)
+        smooth, scattered = _left_out(problem, order)
+        share = np.where((powers > HIGHEST) & terms.present[:, index], scattered, smooth)
+        share = np.where(counted, share, 0.0)
+        known = np.einsum("bk,bks->bs", share, terms.variance[:, index])
+        untested = (terms.freedom[:, index, order : order + 1] == 0) & (order > 1)
+        expected = smooth[:, order : order + 1] * _next_term(result, index)
+        found.append(np.where(untested, expected, known))
+    return np.stack(found, 1)
+
+
+def _next_term(result: Fit, index: int) -> Array:
+    """Variance (B, 2) expected of the power above a triad's highest: it falls off as that one did."""
+    problem, order = result.problem, orders_of(result)[index]
+    if order < 2:
+        return np.zeros((len(problem.temperature), 2))
+    low, high = problem.temperature.min(-1), problem.temperature.max(-1)
+    nodes = np.cos(np.pi * (np.arange(order + 1) + 0.5) / (order + 1))
+    warmth = (low + high)[:, None] / 2 + (high - low)[:, None] / 2 * nodes
+    model, params = problem.triads[index].model, result.state.params[:, problem.slices()[index]]
+    still = np.zeros((*warmth.shape, 3))
+    strength = np.linalg.norm(problem.targets(result.state)[index], axis=-1).mean(-1)
+    gain = np.diagonal(model.slope(params, still, warmth), axis1=-2, axis2=-1)
+    offset = model.fields(params, still, warmth) / strength[:, None, None]
+    both = np.stack([gain, offset], -1).reshape(*warmth.shape, 6)
+    back = np.linalg.inv(np.polynomial.chebyshev.chebvander(nodes, order))
+    size = ((back @ both) ** 2).reshape(*warmth.shape, 3, 2).mean(-2)
+    before, last = size[:, order - 1], size[:, order]
+    return np.asarray(last * np.minimum(last / np.maximum(before, 1e-300), 1.0))
+
+
+def _left_out(problem: Problem, order: int) -> tuple[Array, Array]:
+    """Mean square (B, k) of each power's remainder when lower powers up to an order take its place.
+
+    Over the range of temperatures; then that of soaks that scatter as much as the remainder does.
+    """
+    temperature, weight = problem.temperature, problem.evidence.include
+    low, high = temperature.min(-1, keepdims=True), temperature.max(-1, keepdims=True)
+    even = low + (high - low) * np.linspace(0, 1, GRID)
+    every = np.concatenate([temperature, even], -1)
+    powers = temperature_powers(every, TRIED)
+    whole = np.concatenate([np.ones_like(powers[..., :1]), powers], -1)
+    stations = temperature.shape[-1]
+    measured, shown = whole[:, :stations], whole[:, stations:]
+    basis = np.swapaxes(measured[..., : order + 1] * weight[..., None], -1, -2)
+    gram = basis @ measured[..., : order + 1] + 1e-9 * np.eye(order + 1)
+    taken = np.linalg.solve(gram, basis @ measured[..., 1:])
+    remainder = shown[..., 1:] - shown[..., : order + 1] @ taken
+    left = measured[..., 1:] - measured[..., : order + 1] @ taken
+    levels = usable_soaks(temperature).max(-1)[:, None] + 1.0
+    mean = np.sum(left**2 * weight[..., None], -2) / weight.sum(-1)[:, None]
+    freedom = np.maximum(np.minimum(levels - 1, TRIED) - order, 1.0)
+    return np.mean(remainder**2, -2), mean * levels / freedom * (1 + (order + 1) / levels)
+
+
+def misfit_covariance(result: Fit, terms: Terms | None = None) -> Array:
+    """Covariance (B, p, p) of the fit's parameters that stands for what its order leaves out."""
+    problem, params = result.problem, result.state.params
+    found = np.zeros((*params.shape, params.shape[-1]))
+    if not highest_order(problem.temperature).any():
+        return found
+    variance = course_misfit(result, terms)
+    for index, (triad, where) in enumerate(zip(problem.triads, problem.slices(), strict=True)):
+        target = problem.targets(result.state)[index]
+        strength = np.linalg.norm(target, axis=-1).mean(-1)
+        own = params[:, where]
+        turns = np.eye(3) + STEP * np.eye(3)[:, None] * np.eye(3)
+        gains = [(triad.model.transformed(own, turn) - own) / STEP for turn in turns]
+        names = [name for name in triad.model.names if name in OFFSETS]
+        offsets = np.eye(own.shape[-1])[[triad.model.names.index(name) for name in names]]
+        every = [np.stack(gains, 1), offsets * strength[:, None, None]]
+        for place, rows in enumerate(every):
+            spread = np.swapaxes(rows, -1, -2) @ rows
+            found[:, where, where] += spread * variance[:, index, place, None, None]
+    return found

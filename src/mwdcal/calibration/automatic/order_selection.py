@@ -1,0 +1,331 @@
+"""The temperature order: chosen by the terms that noise does not explain, judged at temperatures left out.
+
+Leaving one soak out can judge an order of two less than there are soaks; the terms of a fit to all soaks
+can be tested up to one less.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from mwdcal.calibration.automatic.courses import terms_beyond
+from mwdcal.calibration.estimate import Fit, fit
+from mwdcal.calibration.options import Options, Orders
+from mwdcal.calibration.readings import TRIADS, Readings
+from mwdcal.calibration.record import OrderScore
+from mwdcal.calibration.residuals import shown_in
+from mwdcal.calibration.soaks import HIGHEST, highest_order, usable_soaks
+from mwdcal.estimation.problem import Problem, State
+from mwdcal.estimation.solvers import Linear
+from mwdcal.estimation.uncertainty import TESTED, marginal_rank, readjusted
+from mwdcal.geometry.vectors import AnyArray, Array, Bools, Ints
+
+FEWEST = 3
+"""Fewest soaks among which one can be left out."""
+LOWEST_RANK = 8
+"""A triad of 12 parameters whose three rotations and scale are free has this rank."""
+
+
+def choose_order(
+    readings: Readings, options: Options, progress: Callable[[str], None]
+) -> tuple[Orders, list[OrderScore]]:
+    """Each triad's lowest order above which noise explains all terms, and the tables.
+
+    Order 0 without a table where there is no temperature, or too short a span of it.
+    """
+    batch = _batch_of_one(readings)
+    levels = int(judged_soaks(batch, options)[0])
+    if levels < 2:
+        return 0, []
+    progress(f"temperature order: testing its terms over {levels} temperatures")
+    chosen, chance = _tested(batch, options)
+    if levels < FEWEST:
+        progress(
+            "two temperatures cannot be left out in turn: order 1 is taken where order 0 leaves "
+            "residuals beyond the noise. A third temperature would test the course between."
+        )
+    orders = [(order, order) for order in range(_highest(batch, options) + 1)]
+    judged = [pair for pair in orders if pair[0] + 2 <= levels and levels >= FEWEST]
+    batch = _with_noise(batch, replace(options, order=orders[-1]))
+    found = _compared(batch, options, judged, progress)
+    every = np.full((len(orders), *found.shape[1:]), np.nan)
+    every[: len(judged)] = found
+    pair = (int(chosen[0, 0]), int(chosen[0, -1]))
+    return pair, _tables(readings, orders, every, chosen[0], chance[0])
+
+
+def judged_soaks(readings: Readings, options: Options) -> Ints:
+    """Soaks (B,) by which the order of each member is judged; 1: it has order 0 without a trial."""
+    levels = _usable_soaks(readings).max(-1) + 1
+    wide = np.flatnonzero(levels > 1)
+    if wide.size:
+        levels = np.where(_hopeless(readings, options), 1, levels)
+    return np.asarray(levels)
+
+
+def choose_orders(readings: Readings, options: Options, levels: int) -> Ints:
+    """Orders (B, 2) of accelerometer and magnetometer, as `choose_order` has them for each alone.
+
+    All members have the same number of `judged_soaks`.
+    """
+    if levels < 2:
+        return np.zeros((len(readings.accelerometer), 2), int)
+    return _tested(readings, options)[0][:, [0, -1]]
+
+
+def _tested(readings: Readings, options: Options) -> tuple[Ints, Array]:
+    """The lowest orders (B, t) that leave no term which is there, and the chance (B, t, k) of each term.
+
+    The chance is that of the term in a fit of the order below, or of the order chosen.
+    """
+    limit = _highest_each(readings, options)
+    triads = sum(getattr(readings, name) is not None for name in TRIADS)
+    orders = np.full((len(limit), triads), -1)
+    chance = np.full((len(limit), triads, HIGHEST), np.nan)
+    powers = np.arange(1, HIGHEST + 1)
+    for order in range(int(limit.max()) + 1):
+        terms = terms_beyond(fit(readings, replace(options, order=order)))
+        within = (powers <= limit[:, None]) & (powers > order)
+        open_ = (orders < 0)[..., None] & within[:, None]
+        chance = np.where(open_, terms.chance[..., :HIGHEST], chance)
+        wanted = np.any(terms.present[..., :HIGHEST] & within[:, None], -1)
+        orders = np.where((orders < 0) & ~(wanted & (order < limit)[:, None]), order, orders)
+        if (orders >= 0).all():
+            break
+    return orders, chance
+
+
+def order_errors(
+    readings: Readings, options: Options, progress: Callable[[str], None]
+) -> list[OrderScore]:
+    """What an order that was given is worth at temperatures left out, one row per triad.
+
+    None where there are too few soaks to leave one out.
+    """
+    batch = _batch_of_one(readings)
+    levels = int(judged_soaks(batch, options)[0])
+    if levels < max(FEWEST, max(options.orders) + 2):
+        return []
+    yardstick = options if options.prior else replace(options, order=_highest(batch, options))
+    found = _compared(_with_noise(batch, yardstick), options, [options.orders], progress)
+    triads = found.shape[2]
+    unknown = np.full((triads, HIGHEST), np.nan)
+    chosen = np.array(options.orders[:triads])
+    return _tables(readings, [options.orders], found, chosen, unknown)
+
+
+def _batch_of_one(readings: Readings) -> Readings:
+    """A run without leading axes as a batch."""
+    return mapped(readings, lambda value: np.asarray(value)[None])
+
+
+def mapped(readings: Readings, change: Callable[[AnyArray], AnyArray]) -> Readings:
+    """The readings with every array changed."""
+
+    def own(value: AnyArray | None) -> Any:
+        return None if value is None else change(value)
+
+    return replace(
+        readings,
+        accelerometer=change(readings.accelerometer),
+        magnetometer=own(readings.magnetometer),
+        temperature=own(readings.temperature),
+        known={k: change(v) for k, v in readings.known.items()},
+        sd={k: change(v) for k, v in readings.sd.items()},
+        group=own(readings.group),
+    )
+
+
+def _usable_soaks(readings: Readings) -> Ints:
+    """Number (B, n) of each station's soak: all 0 without temperatures, or with too short a span."""
+    if readings.temperature is None:
+        return np.zeros(readings.accelerometer.shape[:-1], int)
+    return usable_soaks(readings.temperature)
+
+
+def _highest_each(readings: Readings, options: Options) -> Ints:
+    """The highest order (B,) that the soaks can carry, with stations enough."""
+    if options.method == "swarm" or readings.temperature is None:
+        return np.zeros(len(readings.accelerometer), int)
+    return np.minimum(highest_order(readings.temperature), HIGHEST)
+
+
+def _highest(readings: Readings, options: Options) -> int:
+    """The highest order that the soaks of any member can carry."""
+    return int(_highest_each(readings, options).max())
+
+
+def _compared(
+    readings: Readings,
+    options: Options,
+    orders: Sequence[tuple[int, int]],
+    progress: Callable[[str], None],
+) -> Array:
+    """Mean squares (orders, B, triads, 5, soaks) of `_held_out` at some orders."""
+    numbers, found = _usable_soaks(readings), []
+    if not orders:
+        triads = sum(getattr(readings, name) is not None for name in TRIADS)
+        return np.zeros((0, len(numbers), triads, 5, int(numbers.max()) + 1))
+    for pair in orders:
+        name = " and ".join(str(order) for order in dict.fromkeys(pair))
+        progress(f"order {name}: leaving out each of {int(numbers.max()) + 1} temperatures")
+        found.append(_held_out(readings, replace(options, order=pair), numbers))
+    return np.stack(found)
+
+
+def _tables(
+    readings: Readings,
+    orders: Sequence[tuple[int, int]],
+    found: Array,
+    chosen: Ints,
+    chance: Array,
+) -> list[OrderScore]:
+    """The tables of all triads over some orders, from `_compared` of a batch of one.
+
+    `chosen` (t,) and the `chance` (t, k) of each term by triad.
+    """
+    shown = [shown_in("gravity"), shown_in("field", readings.relative)]
+    return [
+        score
+        for t, name in enumerate(TRIADS[: len(chosen)])
+        for score in _scored(
+            name, [p[t] for p in orders], int(chosen[t]), found[:, 0, t], shown[t], chance[t]
+        )
+    ]
+
+
+def _scored(
+    triad: str,
+    orders: Sequence[int],
+    chosen: int,
+    found: Array,
+    shown: tuple[float, str],
+    chance: Array,
+) -> list[OrderScore]:
+    """The table of one triad from the mean squares (orders, 5, soaks) of `_held_out`."""
+    parts = (found, found[..., 1:-1] if found.shape[-1] > 2 else found, found[..., [0, -1]])
+    means = np.stack([f.mean(-1) for f in parts], -1)
+    scale, degree = shown[0], float(np.degrees(1))
+    means[:, 1:] = np.sqrt(means[:, 1:]) * np.array([scale, scale, degree, degree])[:, None]
+    known = {k: float(v) for k, v in enumerate(chance, 1) if not np.isnan(v)}
+    rows = []
+    for index, order in enumerate(orders):
+        stated = [[None if np.isnan(v) else float(v) for v in row] for row in means[index]]
+        chi, noise, error, noise_deg, error_deg = stated
+        rows.append(
+            OrderScore(
+                triad=triad,
+                order=order,
+                chosen=order == chosen,
+                chance=known.get(order),
+                inside=chi[1],
+                ends=chi[2],
+                unit=shown[1],
+                noise=noise[0],
+                error_inside=error[1],
+                error_ends=error[2],
+                noise_deg=noise_deg[0],
+                error_inside_deg=error_deg[1],
+                error_ends_deg=error_deg[2],
+            )
+        )
+    return rows
+
+
+def _hopeless(readings: Readings, options: Options) -> Bools:
+    """Whether (B,) the stations cannot even determine what all temperatures have in common."""
+    result = fit(readings, Options(method=options.method))
+    ranks = [marginal_rank(result.analysis.determined, w) for w in result.problem.slices()]
+    return np.asarray(np.min(ranks, 0) < LOWEST_RANK)
+
+
+def _with_noise(readings: Readings, options: Options) -> Readings:
+    """The readings (B, n) with noise declared: where it was not, as a fit leaves it.
+
+    Every order is then judged by the same yardstick.
+    """
+    names = [name for name in TRIADS if getattr(readings, name) is not None]
+    if all(name in readings.sd for name in names):
+        return readings
+    noise = fit(readings, options).noise
+    found = {
+        name: noise[:, index, None, None]
+        for index, name in enumerate(names)
+        if name not in readings.sd
+    }
+    return replace(readings, sd={**readings.sd, **found})
+
+
+def _held_out(readings: Readings, options: Options, numbers: Ints) -> Array:
+    """Mean squares (B, triads, 5, soaks) of each soak's stations, fitted without them.
+
+    Of the reading, in units of its noise (χ²); then of noise and error per axis of the vector
+    (g, nT), and of noise and error across the field (rad).
+    """
+    soak = np.arange(int(numbers.max()) + 1)
+    include = (soak[:, None] != numbers[:, None, :]).astype(float)
+    result = fit(mapped(readings, lambda v: np.expand_dims(v, 1)), options, include)
+    held = 1 - include.reshape(-1, readings.count)
+    problem, state = _everyone(result)
+    linear = problem.linear(state)
+    chi = np.sum(_chi(linear) * held[..., None], 1) / (3 * held.sum(1))[:, None]
+    left = linear.weigh(linear.residual[..., None])
+    share = linear.weigh(
+        np.broadcast_to(np.eye(left.shape[-2]), (*left.shape[:-1], left.shape[-2]))
+    )
+    found = []
+    for index, (triad, where) in enumerate(zip(problem.triads, problem.slices(), strict=True)):
+        params, own = state.params[:, where], slice(3 * index, 3 * index + 3)
+        vector = triad.model.fields(params, triad.raw, problem.temperature)[..., None]
+        slope = triad.model.slope(params, triad.raw, problem.temperature) * triad.sd[..., None, :]
+        strength = np.linalg.norm(vector, axis=-2, keepdims=True)
+        along = vector / strength
+        across = (slope - along @ (np.swapaxes(along, -1, -2) @ slope)) / strength
+        parts = left[..., own, :], share[..., own, own], held
+        found.append(
+            np.stack([chi[:, index], *_squares(slope, *parts, 3), *_squares(across, *parts, 2)])
+        )
+    whole = np.stack(found).reshape(len(found), 5, len(numbers), len(soak))
+    return np.moveaxis(whole, 2, 0)
+
+
+def _squares(
+    effect: Array, left: Array, share: Array, held: Array, axes: int
+) -> tuple[Array, Array]:
+    """Mean squares (parts,) per axis of noise, and of the error left at the stations `held`.
+
+    `effect` (B, n, 3, 3) turns a reading, in units of its noise, into what is judged, in so many
+    `axes`. References that are unknown or uncertain test only the `share` of the noise that
+    the station's own unknowns leave; the error is what is `left` for each such share of noise.
+    """
+    whole = np.sum(effect**2, (-2, -1)) * held
+    tested = np.einsum("bnij,bnjk,bnik->bn", effect, share, effect) * held
+    error = np.sum((effect @ left) ** 2, (-2, -1)) * held
+    noise, tested, error = (x.sum(-1) for x in (whole, tested, error))
+    tested = np.where(tested > TESTED * noise, tested, np.nan)
+    noise = noise / (axes * held.sum(-1))
+    return noise, noise * error / tested
+
+
+def _everyone(result: Fit) -> tuple[Problem, State]:
+    """The problem with the left-out stations back, each at its best attitude for the fit."""
+    evidence = result.problem.evidence
+    everyone = replace(evidence, include=np.ones_like(evidence.include))
+    problem = replace(result.problem, evidence=everyone)
+    return problem, readjusted(problem, result.state)
+
+
+def misfit(result: Fit) -> Array:
+    """χ² (B, n, t) of every station by triad, left out or not, attitudes at their best."""
+    problem, state = _everyone(result)
+    return _chi(problem.linear(state))
+
+
+def _chi(linear: Linear) -> Array:
+    weighed = linear.weigh(linear.residual[..., None])[..., 0]
+    rows = linear.residual * weighed
+    return np.asarray(rows.reshape(*rows.shape[:-1], rows.shape[-1] // 3, 3).sum(-1))

@@ -1,0 +1,104 @@
+"""Which `axes` of the tool profile would explain a run that the declared ones do not.
+
+A linear triad absorbs any exchange and reversal of its channels into its gain: raw readings that
+are fitted with their references give the gain, and the signed permutation nearest to it says how
+the channels lie.
+"""
+
+from __future__ import annotations
+
+from itertools import permutations, product
+
+import numpy as np
+
+from mwdcal.calibration.diagnosis.plausibility import is_bad, overturned
+from mwdcal.calibration.estimate import Fit, fit
+from mwdcal.calibration.readings import TRIADS, Readings
+from mwdcal.errors import MwdcalError
+from mwdcal.estimation.rank import free_directions
+from mwdcal.estimation.solvers import Status
+from mwdcal.geometry.vectors import Array
+from mwdcal.sensor.profile import Profile
+
+NEAR = 0.3
+"""Largest gain across the axes, as a share of those along them, of a triad in its right axes."""
+FITS = 0.05
+"""Residuals of a run in its right axes are less than this share of the field."""
+SIGNED = np.array(
+    [
+        np.eye(3)[list(order)] * np.array(signs)[:, None]
+        for order in permutations(range(3))
+        for signs in product((1.0, -1.0), repeat=3)
+    ]
+)
+"""The 48 signed permutations (48, 3, 3)."""
+
+
+def nearest(gain: Array) -> Array:
+    """The signed permutation Q (3, 3) that a gain M (3, 3) is nearest to: trace M Qᵀ is largest.
+
+    >>> nearest(np.array([[0.01, -1.1, 0], [0.9, 0.02, 0], [0, 0.01, 1.0]])).astype(int).tolist()
+    [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
+    """
+    return np.asarray(SIGNED[int(np.argmax(np.sum(SIGNED * gain, (-1, -2))))])
+
+
+def named(permutation: Array) -> tuple[str, ...]:
+    """The `axes` of a profile (tool axes from channels, (3, 3)).
+
+    >>> named(np.array([[0, -1.0, 0], [1, 0, 0], [0, 0, 1]]))
+    ('+y', '-x', '+z')
+    """
+    rows = [int(np.argmax(np.abs(column))) for column in np.transpose(permutation)]
+    return tuple(
+        ("+" if permutation[row, channel] > 0 else "-") + "xyz"[row]
+        for channel, row in enumerate(rows)
+    )
+
+
+def explaining(readings: Readings, profile: Profile) -> dict[str, tuple[str, ...]]:
+    """The `axes` with which a run fits, by triad, where they are not those of the profile."""
+    try:
+        found = fit(readings)
+    except (MwdcalError, np.linalg.LinAlgError):
+        return {}
+    if found.status[0] != Status.OK or not _fits(found):
+        return {}
+    if any(map(is_bad, free_directions(found.problem, found.state, found.analysis.determined))):
+        return {}
+    result = {}
+    for index, gain in enumerate(_gains(found)):
+        name, turned = TRIADS[index], index == 1 and np.isfinite(overturned(found)[0])
+        gain = -gain if turned else gain
+        own = nearest(gain)
+        if not _is_near(gain @ own.transpose()):
+            return {}
+        if not np.array_equal(own, np.eye(3)):
+            result[name] = named(own @ getattr(profile, name).permutation)
+    return result
+
+
+def _gains(found: Fit) -> list[Array]:
+    """Mean gain (3, 3) of each triad."""
+    problem, params = found.problem, found.state.params
+    return [
+        np.asarray(t.model.slope(params[:, where], t.raw, problem.temperature)[0].mean(0))
+        for t, where in zip(problem.triads, problem.slices(), strict=True)
+    ]
+
+
+def _is_near(gain: Array) -> bool:
+    """Whether a gain is along its axes."""
+    own = np.diagonal(gain)
+    across = np.abs(gain - np.diag(own)).max()
+    return bool(own.min() > 0 and across < NEAR * own.min())
+
+
+def _fits(found: Fit) -> bool:
+    """Whether the readings are explained at all."""
+    for index, triad in enumerate(found.problem.triads):
+        noise = np.sqrt(found.analysis.variance_factor[0, index]) * triad.sd.mean()
+        size = np.linalg.norm(triad.raw[0] - triad.raw[0].mean(0), axis=-1).mean()
+        if not noise < FITS * size:
+            return False
+    return True

@@ -1,0 +1,381 @@
+"""What the misfit of a run looks like: zeros of the stand, drift, gradient, backlash, thermal lag.
+
+Each effect is a family of columns that the residuals may have in common with it. A family is named
+where it takes away more of the misfit than noise of any direction would (F test), the best one
+first; the others are then judged by what that one leaves. Nothing is corrected here: what moves
+with one of the sensor's own parameters has gone into the fit, and no residual shows it.
+
+Reference: efficient scores, C. R. Rao, Proc. Camb. Phil. Soc. 44, 50 (1948).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mwdcal.calibration.automatic.courses import TRIED, steady_columns, temperature_powers
+from mwdcal.calibration.covariance import variance_scales
+from mwdcal.calibration.estimate import Fit
+from mwdcal.calibration.evidence import TURNS, acts_on
+from mwdcal.calibration.readings import TRIADS
+from mwdcal.calibration.residuals import chances, to_reshoot
+from mwdcal.calibration.soaks import HIGHEST, SPAN, highest_order
+from mwdcal.estimation.problem import Problem, State
+from mwdcal.estimation.uncertainty import whole_covariance
+from mwdcal.geometry.vectors import Array, Bools, eigen
+
+UNLIKELY = 1e-4
+"""Chance of so much common structure in noise, below which an effect is named."""
+WORTH = 0.01
+"""Chance of residuals as large in declared noise, below which their structure is looked at."""
+FEW = 0.1
+"""Share of bad stations up to which they are left out."""
+APART = 1e-3
+"""A column counts if the fit leaves this share of its square: what is left of others is rounding."""
+STAND = ("azimuth-zero", "inclination-zero", "tilt")
+"""Errors of the stand that leave residuals; a toolface zero does not."""
+DRIFTS = 2
+"""Degree of the polynomial of order (or of the row) that a drift is looked for as."""
+
+
+SET = 3
+"""Fewest stations of one direction that may share an error of its setting."""
+SET_TURNS = ("inclination-zero", "azimuth-zero")
+COURSE = "-temperature"
+"""What ends the names of the powers of temperature that the order of a triad leaves out."""
+ZEROS = ("azimuth-zero", "inclination-zero", "dip-reference")
+"""Effects that are one angle."""
+TEXTS = {
+    "azimuth-zero": "an azimuth zero of the stand: set the index, or fit it with --estimate azimuth-zero, or declare "
+    "its uncertainty (azimuth_zero_deg under [stand])",
+    "inclination-zero": "an inclination zero of the stand: set the level, or fit it with --estimate inclination-zero, "
+    "or declare its uncertainty (inclination_zero_deg under [stand])",
+    "tilt": "a stand whose vertical leans: level it, or fit it with --estimate tilt, or declare its uncertainty "
+    "(tilt_deg under [stand])",
+    "settings": "settings of the stand that stations of one direction share: set it anew for each station, or give "
+    "the roll sets as group without their reference angles",
+    "dip-reference": "a wrong reference for the dip: check ref_dip_deg, or leave it blank to have it estimated",
+    "field-drift": "a field that changes in the order of the stations (diurnal variation, traffic): give ref_field_nt "
+    "and ref_dip_deg of each station from a reference magnetometer, or repeat the run at a quiet time",
+    "field-gradient": "a field that depends on where the tool points (iron nearby, or sensors off the pivot): move "
+    "iron away, or keep the sensors at one place while turning",
+    "backlash": "backlash of the stand: its angles depend on the side they were reached from. Reach every angle "
+    "from the same side",
+    "drift": "a drift in the order of the stations: let the tool warm up, or repeat the first stations at the end",
+    "hysteresis": "hysteresis: readings depend on the side they were reached from. Demagnetise, or look for play in "
+    "the mounting",
+    "thermal-lag": "thermal lag: readings follow the thermometer late. Wait longer after each change of temperature",
+}
+"""What the residuals look like, and what to do."""
+
+
+@dataclass(frozen=True)
+class Effect:
+    """One effect: its name, the share of the misfit it takes, chance in noise, and its size.
+
+    `values` and `uncertainties` belong to its columns, in their units (radians, g or nT); `size`
+    (t,) is the root mean square of what it does to the readings of each triad, in g and nT.
+    """
+
+    name: str
+    share: float
+    chance: float
+    values: Array
+    uncertainties: Array
+    size: Array
+
+
+@dataclass(frozen=True)
+class _Scores:
+    """Efficient scores (k,) and their covariance (k, k) for columns of unit length, with lengths."""
+
+    score: Array
+    information: Array
+    length: Array
+    columns: Array
+    places: dict[str, slice]
+
+    def gain(self, names: list[str]) -> tuple[float, int]:
+        """By how much some families lower the cost, and how many directions they have."""
+        value, vector, kept = self._spanned(names)
+        along = vector.transpose() @ self.score[self._index(names)]
+        return float(np.sum(along[kept] ** 2 / value[kept])), int(kept.sum())
+
+    def solution(self, names: list[str]) -> tuple[Array, Array]:
+        """Values (k',) of the columns of some families, and their covariance (k', k')."""
+        value, vector, kept = self._spanned(names)
+        inverse = (vector[:, kept] / value[kept]) @ vector[:, kept].transpose()
+        index = self._index(names)
+        length = self.length[index]
+        return -inverse @ self.score[index] / length, inverse / np.outer(length, length)
+
+    def _spanned(self, names: list[str]) -> tuple[Array, Array, Array]:
+        index = self._index(names)
+        value, vector = eigen(self.information[np.ix_(index, index)])
+        return value, vector, np.asarray(value > APART)
+
+    def _index(self, names: list[str]) -> Array:
+        return np.concatenate([np.arange(self.places[n].start, self.places[n].stop) for n in names])
+
+
+def effects(result: Fit) -> list[Effect]:
+    """Effects that the residuals of one fit (B = 1) show, the largest first."""
+    if result.analysis.influence is not None:
+        return []
+    result = _without_bad_stations(result)
+    scales = np.maximum(variance_scales(result), 1e-12)
+    triads = [
+        replace(t, sd=t.sd * np.sqrt(scales[:, i, None, None]))
+        for i, t in enumerate(result.problem.triads)
+    ]
+    problem = replace(result.problem, triads=tuple(triads))
+    scores = _scores(problem, result, dict(_families(problem, result.state)))
+    left, freedom = _misfit(problem, result)
+    total, used = left, 0
+    chosen: list[str] = []
+    shown: list[tuple[str, float, float]] = []
+    while True:
+        trials = {n: _trial(scores, chosen, n, left, freedom - used) for n in scores.places}
+        open_ = {n: t for n, t in trials.items() if n not in chosen and t[0] < UNLIKELY}
+        if not open_:
+            return [e for e in _described(result, shown) if not e.name.endswith(COURSE)]
+        best = min(open_, key=lambda name: (open_[name][0], -open_[name][1]))
+        chance, gain, directions = open_[best]
+        chosen, left, used = [*chosen, best], left - gain, used + directions
+        shown.append((best, gain / total, chance))
+
+
+def _without_bad_stations(result: Fit) -> Fit:
+    """The fit less its stations to take again, if they are few: one bad station looks like anything."""
+    bad = to_reshoot(chances(result))
+    if bad.mean() > FEW:
+        return result
+    evidence = result.problem.evidence
+    fewer = replace(evidence, include=evidence.include * ~bad)
+    return replace(result, problem=replace(result.problem, evidence=fewer))
+
+
+def _misfit(problem: Problem, result: Fit) -> tuple[float, float]:
+    """The least ρᵀC⁻¹ρ of all readings, priors included, and its degrees of freedom."""
+    linear, include = problem.linear(result.state), problem.evidence.include
+    whole, normal = whole_covariance(linear, result.analysis.determined)[0], linear.normal
+    gradient = normal.gradient[0]
+    own = problem.linear(result.state, geometry=True).own
+    unknown = np.sum(np.linalg.svd(own, compute_uv=False) > 1.0)  # 0 where a station is left out
+    readings = float(include.sum()) * linear.residual.shape[-1]
+    fitted = np.sum(whole * (normal.information - linear.prior)[0])
+    return float(normal.cost[0] - gradient @ whole @ gradient), readings - float(fitted + unknown)
+
+
+def _trial(
+    scores: _Scores, chosen: list[str], name: str, left: float, freedom: float
+) -> tuple[float, float, int]:
+    """Chance in noise, gain and directions of one more family, of misfit `left`."""
+    from scipy.special import fdtrc
+
+    before = scores.gain(chosen) if chosen else (0.0, 0)
+    after = scores.gain([*chosen, name])
+    gain, directions = after[0] - before[0], after[1] - before[1]
+    rest = freedom - directions
+    if directions < 1 or rest < 1:
+        return 1.0, 0.0, 0
+    gain = min(gain, left * (1 - 1e-9))
+    return (
+        float(fdtrc(directions, rest, gain / directions / ((left - gain) / rest))),
+        gain,
+        directions,
+    )
+
+
+def _described(result: Fit, shown: list[tuple[str, float, float]]) -> list[Effect]:
+    """The effects with their sizes: all together, with the noise that they leave."""
+    if not shown:
+        return []
+    problem, names = result.problem, [name for name, _, _ in shown]
+    scores = _scores(problem, result, dict(_families(problem, result.state)))
+    left, freedom = _misfit(problem, result)
+    gain, directions = scores.gain(names)
+    scale = np.sqrt(max(left - gain, 0.0) / max(freedom - directions, 1.0))
+    values, covariance = scores.solution(names)
+    spread, found, at = np.sqrt(np.diag(covariance)) * scale, [], 0
+    for name, share, chance in shown:
+        where = scores.places[name]
+        own = slice(at, at + where.stop - where.start)
+        at = own.stop
+        change = (scores.columns[..., where] * scores.length[where]) @ values[own]
+        size = [
+            np.sqrt(np.mean(np.sum((change[..., 3 * i : 3 * i + 3] * t.sd) ** 2, -1)))
+            for i, t in enumerate(problem.triads)
+        ]
+        found.append(Effect(name, share, chance, values[own], spread[own], np.array(size)))
+    return found
+
+
+def _scores(problem: Problem, result: Fit, families: Mapping[str, Array]) -> _Scores:
+    """Efficient scores of columns (1, n, m, k): what the fit's own unknowns cannot take up."""
+    linear = problem.linear(result.state)
+    whole = whole_covariance(linear, result.analysis.determined)[0]
+    places, columns, at = {}, [], 0
+    for name, column in families.items():
+        places[name] = slice(at, at + column.shape[-1])
+        columns.append(column)
+        at += column.shape[-1]
+    every = np.concatenate(columns, -1)
+    length = np.sqrt(np.einsum("bnmk,bnmk->k", every, linear.weigh(every)))
+    length = np.where(length > 0, length, 1.0)
+    unit = every / length
+    weighed = linear.weigh(unit)
+    crossed = np.einsum("bnmu,bnmk->uk", linear.design, weighed)
+    own = linear.normal.gradient[0]
+    score = np.einsum("bnmk,bnm->k", weighed, linear.residual) - crossed.transpose() @ whole @ own
+    information = np.einsum("bnmk,bnml->kl", unit, weighed)
+    information = information - crossed.transpose() @ whole @ crossed
+    return _Scores(score, information, length, unit, places)
+
+
+def _families(problem: Problem, state: State) -> Iterator[tuple[str, Array]]:
+    """Columns (1, n, m, k) of every effect that this run could show, whitened."""
+    predictions = problem.predictions(state)
+    weights = [problem.evidence.include[..., None] / t.sd for t in problem.triads]
+    pairs = list(zip(predictions, weights, strict=True))
+    turns = np.concatenate([p.by_turn * w[..., None] for p, w in pairs], -2)
+    by_earth = np.concatenate([p.by_earth * w[..., None] for p, w in pairs], -2)
+    known = {n: turn for n, turn in _turns(problem, state, turns).items() if turn.any()}
+    for name in STAND:
+        each = [known[turn] for turn in TURNS.get(name, (name,)) if turn in known]
+        if each:
+            yield name, np.stack(each, -1)
+    sets = _sets(problem)
+    each = [known[n][..., None] * sets[..., None, :] for n in SET_TURNS if n in known]
+    if each and sets.shape[-1] > 1:
+        yield "settings", np.concatenate(each, -1)
+    count = state.attitude.shape[1]
+    place = np.linspace(-1, 1, count)
+    order = np.asarray(np.polynomial.legendre.legvander(place, DRIFTS)[:, 1:], float)
+    down = problem.stand_column(state, "azimuth-zero", turns)
+    if len(problem.triads) > 1:
+        given = problem.evidence.is_known("dip")[..., None]
+        if given.any() and "dip" not in problem.evidence.absent:
+            yield "dip-reference", (by_earth[..., 2] * given)[..., None]
+        field = np.concatenate([by_earth[..., 1:], down[..., None]], -1)
+        field[..., :3, :] = 0.0  # the declination of a field that turns does not turn gravity
+        yield "field-drift", _products(field, order)
+        yield "field-gradient", _products(field, state.attitude[0, :, 2, :])
+    steps = _approach(problem)
+    back = [known[n] * s for n, s in steps.items() if n in known and s.any()]
+    if back:
+        yield "backlash", np.stack(back, -1)
+    yield from _courses(problem, state)
+    for index, name in enumerate(TRIADS[: len(problem.triads)]):
+        yield from _of_sensor(problem, index, name, weights[index], order)
+
+
+def _sets(problem: Problem) -> Array:
+    """Membership (n, k) of stations in directions that several of them share by their references."""
+    known = problem.evidence.known
+    pair = np.stack([known["inclination"][0], known["azimuth"][0]], -1)
+    key = np.round(np.nan_to_num(pair, nan=-1.0), 6)
+    _, number, count = np.unique(key, axis=0, return_inverse=True, return_counts=True)
+    usable = np.flatnonzero(count >= SET)
+    if len(usable) > len(key) / SET:
+        usable = usable[:0]
+    return np.asarray(number.reshape(-1)[:, None] == usable, float)
+
+
+def _courses(problem: Problem, state: State) -> Iterator[tuple[str, Array]]:
+    """Powers of temperature that a triad's order leaves out: another finding names these."""
+    if np.ptp(problem.temperature) < SPAN:
+        return
+    highest = int(np.clip(highest_order(problem.temperature)[0], HIGHEST, TRIED))
+    columns = steady_columns(problem, state)
+    powers = temperature_powers(problem.temperature, highest)[0]
+    for index, triad in enumerate(problem.triads):
+        order = triad.model.basis.order
+        if order < highest:
+            own = columns[..., 6 * index : 6 * index + 6]
+            yield f"{TRIADS[index]}{COURSE}", _products(own, powers[:, order:])
+
+
+def _turns(problem: Problem, state: State, turns: Array) -> dict[str, Array]:
+    """Columns (1, n, m) of the stand's errors, at stations whose references have them."""
+    names = ("azimuth-zero", "inclination-zero", "toolface-zero", "stand-north", "stand-east")
+    return {
+        name: problem.stand_column(state, name, turns) * acts_on(problem.evidence, name)[..., None]
+        for name in names
+    }
+
+
+def _products(columns: Array, factors: Array) -> Array:
+    """Columns (1, n, m, a) times factors (n, b) of their stations: (1, n, m, a b)."""
+    product = columns[..., :, None] * factors[:, None, None, :]
+    return np.asarray(product.reshape(*columns.shape[:-1], -1))
+
+
+def _approach(problem: Problem) -> dict[str, Array]:
+    """From which side (n, 1) each angle of the stand was reached: 1, -1, or 0 where it did not move."""
+    found = {}
+    for name in ("inclination", "azimuth", "toolface"):
+        angle = problem.evidence.known[name][0]
+        step = np.diff(angle, prepend=angle[:1])
+        step = np.nan_to_num((step + np.pi) % (2 * np.pi) - np.pi)
+        found[f"{name}-zero"] = np.where(np.abs(step) > 1e-6, np.sign(step), 0.0)[:, None]
+    return found
+
+
+def _of_sensor(
+    problem: Problem, index: int, name: str, weight: Array, order: Array
+) -> Iterator[tuple[str, Array]]:
+    """Drift with the order of stations, hysteresis and thermal lag of one triad's readings."""
+    triad, count = problem.triads[index], weight.shape[1]
+    size = 3 * len(problem.triads)
+    axes = np.zeros((1, count, size, 3))
+    axes[0, :, 3 * index : 3 * index + 3] = np.eye(3)
+    axes[:, :, 3 * index : 3 * index + 3] *= weight[..., None]
+    if index == 0:
+        yield f"{name}-drift", _products(axes, order)
+    moved = np.diff(triad.raw[0], axis=0, prepend=triad.raw[0, :1])
+    typical = np.abs(moved).max() or 1.0
+    side = np.where(np.abs(moved) > 0.05 * typical, np.sign(moved), 0.0)
+    yield f"{name}-hysteresis", axes * side[:, None, :]
+    rate = np.diff(problem.temperature[0], prepend=problem.temperature[0, :1])
+    if np.ptp(rate) > 1.0:
+        rate = rate / np.abs(rate).max()
+        centred = (triad.raw[0] - triad.raw[0].mean(0)) / np.std(triad.raw[0])
+        scale = axes * (rate[:, None] * centred)[:, None, :]
+        yield f"{name}-thermal-lag", np.concatenate([axes * rate[:, None, None], scale], -1)
+
+
+def suspected(result: Fit, chance: Array) -> Bools:
+    """Fits (B,) whose residuals are looked at: where noise is estimated, or residuals exceed it.
+
+    `chance` (B, t) is that of residuals as large as each triad's, NaN where noise is not declared.
+    """
+    estimated = np.isfinite(result.noise).any(-1)
+    return np.asarray(estimated | (np.nan_to_num(chance, nan=1.0) < WORTH).any(-1))
+
+
+def described(effect: Effect, unit: str) -> str:
+    """An effect in words; `unit` is that of the magnetometer."""
+    triad, _, kind = effect.name.partition("-")
+    own = triad in TRIADS
+    looks = TEXTS[kind if own else effect.name]
+    if effect.name in ZEROS:
+        size = f"{np.degrees(effect.values[0]):+.3g}° ± {np.degrees(effect.uncertainties[0]):.2g}°"
+        size += (
+            " (dip less its reference)"
+            if effect.name == "dip-reference"
+            else " (reading less true)"
+        )
+    elif effect.name == "tilt":
+        size = f"{np.degrees(np.linalg.norm(effect.values)):.3g}°"
+    else:
+        parts = [(1e3, "mg"), (1.0, unit)][: len(effect.size)]
+        each = [f"{s * f:.3g} {u} rms" for s, (f, u) in zip(effect.size, parts, strict=True)]
+        size = " and ".join(each[TRIADS.index(triad) :][:1] if own else each)
+    whose = f"{triad}: the" if own else "The"
+    return (
+        f"{whose} residuals look like {looks}. Size {size}, {effect.share:.0%} of the misfit; chance in "
+        f"noise {effect.chance:.0e}."
+    )

@@ -1,0 +1,511 @@
+"""From readings to a fitted problem: evidence, noise, weights, gauge, uncertainty."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mwdcal.calibration.evidence import evidence_of, flat
+from mwdcal.calibration.methods import EVIDENCE, Solved, solve, with_stand_errors, without
+from mwdcal.calibration.options import Options
+from mwdcal.calibration.prior import prior_of
+from mwdcal.calibration.readings import ANGLES, TRIADS, Readings
+from mwdcal.estimation.evidence import Evidence
+from mwdcal.estimation.minimisers import closed_form
+from mwdcal.estimation.problem import Problem, State, Triad
+from mwdcal.estimation.robust import LOSSES, consistency, inflation, weight, weighted
+from mwdcal.estimation.solvers import Determined, Status
+from mwdcal.estimation.start import start
+from mwdcal.estimation.uncertainty import (
+    Analysis,
+    analyse,
+    determined_apart,
+    sandwich,
+    settle_gauge,
+    station_misfit,
+)
+from mwdcal.estimation.variance import LEAST, START, scatter_ratios, with_scatter
+from mwdcal.geometry.vectors import Array, Bools, Ints, placed
+from mwdcal.sensor.models import Basis, Factors, Polynomial, Restricted, Whole, restricted
+
+FLOOR = 1e-9
+"""Smallest noise, as a share of the signal, that an estimate from residuals may reach."""
+STEP = 10.0
+"""The range of temperatures that a model is conditioned for ends at multiples of this, °C."""
+ROBUST_ROUNDS = 40
+SETTLED = 1e-3
+"""Change of noise and station weights, as a share, at which weighing and fitting in turn ends."""
+SCATTER_ROUNDS = 16
+"""Most repetitions where a scatter from station to station is estimated too…"""
+SCATTER_SETTLED = 0.02
+"""…and the change of it, as a share, at which they end."""
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A batch of fitted problems: shapes lead with the batch axis B.
+
+    `noise` (B, triads) is the estimated standard deviation, NaN where it was declared;
+    `status` holds `Status` codes; `trust` (B, n) are the weights of a robust fit, else 1.
+    """
+
+    problem: Problem
+    state: State
+    status: Ints
+    iterations: Ints
+    noise: Array
+    trust: Array
+    analysis: Analysis
+
+
+def model_of(
+    kind: str, order: int, raw: Array, temperature: Array, include: Array, curved: bool = False
+) -> Whole:
+    """A conditioned model for readings (B, n, 3): centred, scaled, Chebyshev in temperature.
+
+    The range of temperatures is common to the batch: see `temperature_ranges`.
+    """
+    ranges = temperature_ranges(temperature)
+    low, high = float(ranges[:, 0].min()), float(ranges[:, 1].max())
+    half = (high - low) / 2 or 1.0
+    basis = Basis(order, (low + high) / 2, half, chebyshev=True)
+    if kind == "factors":
+        return Factors(basis)
+    weight = include[..., None] / include.sum(-1)[:, None, None]
+    centre = np.sum(raw * weight, -2, keepdims=True)
+    radius = np.sqrt(np.sum((raw - centre) ** 2 * weight, (-2, -1)))
+    radius = np.where(radius > 0, radius, 1.0)
+    return Polynomial(
+        basis, centre, np.broadcast_to(radius[:, None, None], centre.shape).copy(), curved
+    )
+
+
+def temperature_ranges(temperature: Array) -> Array:
+    """Range (B, 2) of each member's temperatures (B, n), widened to multiples of `STEP`.
+
+    Members of one range are fitted together as each would be alone.
+    """
+    low, high = np.floor(temperature.min(-1) / STEP), np.ceil(temperature.max(-1) / STEP)
+    return np.stack([low, high], -1) * STEP
+
+
+def _problem(
+    readings: Readings, evidence: Evidence, lead: tuple[int, ...], options: Options
+) -> tuple[Problem, list[bool]]:
+    """The problem, and for each triad whether its noise is declared."""
+    cold = np.zeros(readings.count)
+    temperature = flat(cold if readings.temperature is None else readings.temperature, lead)
+    curved = options.nonlinearity or {}
+    triads: list[Triad] = []
+    for name, order in zip(TRIADS, options.orders, strict=True):
+        values = getattr(readings, name)
+        if values is None:
+            continue
+        raw = flat(values, lead, 3)
+        whole = model_of(
+            options.kind(order), order, raw, temperature, evidence.include, name in curved
+        )
+        sd = (
+            flat(readings.sd[name], lead, 3) if name in readings.sd else 1e-3 * _size(raw) + 0 * raw
+        )
+        triads.append(Triad(restricted(whole, options.parameters), raw, sd))
+    prior = prior_of(options.prior, [t.model for t in triads], len(evidence.include))
+    problem = Problem(tuple(triads), temperature, evidence, prior)
+    _bound_curves(problem, curved)
+    return problem, [name in readings.sd for name in TRIADS[: len(triads)]]
+
+
+def _bound_curves(problem: Problem, curved: Mapping[str, float]) -> None:
+    """Give the own-axis terms, the last six of a triad, their prior."""
+    for name, strength, where in zip(TRIADS, ("gravity", "field"), problem.slices(), strict=False):
+        if name in curved:
+            last = np.arange(where.stop - 6, where.stop)
+            size = np.nanmean(problem.evidence.known[strength], -1)[:, None]
+            problem.prior.precision[:, last, last] += (curved[name] * size) ** -2
+
+
+def _size(raw: Array) -> Array:
+    """Root mean square departure of readings from their mean (B, 1, 1)."""
+    size = np.sqrt(np.mean((raw - raw.mean(-2, keepdims=True)) ** 2, (-2, -1), keepdims=True))
+    return np.where(size > 0, size, 1.0)
+
+
+def fit(readings: Readings, options: Options | None = None, include: Array | None = None) -> Fit:
+    """Fit a run, or a batch of runs (leading axes of the readings, or of `include`).
+
+    `include` (..., n) is 1 for stations that count and 0 for those left out.
+    """
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        return _fit(readings, options or Options(), include)
+
+
+def _fit(readings: Readings, options: Options, include: Array | None) -> Fit:
+    include = np.ones(readings.count) if include is None else np.asarray(include, float)
+    evidence = EVIDENCE[options.method](evidence_of(readings, include))
+    evidence = without(evidence, options.ignore)
+    evidence = with_stand_errors(evidence, options.estimate)
+    evidence = _scattered(evidence, readings, options)
+    lead = np.broadcast_shapes(readings.accelerometer.shape[:-1], include.shape)
+    problem, declared = _problem(readings, evidence, lead, options)
+    problem, finite = _without_broken(problem)
+    closed, alone = _closed(problem, declared, options, finite)
+    if closed is None:
+        return _general(problem, declared, options, finite)
+    if alone.all():
+        return closed
+    rest = np.flatnonzero(~alone)
+    return _joined(closed, rest, _general(problem.take(rest), declared, options, finite[rest]))
+
+
+def scatters(readings: Readings, options: Options) -> bool:
+    """Whether a scatter from station to station is estimated: with a joint fit's own noise of both."""
+    noisy = not any(name in readings.sd for name in TRIADS) and readings.magnetometer is not None
+    return (
+        options.scatter
+        and noisy
+        and options.method == "joint"
+        and bool((readings.groups >= 0).any())
+    )
+
+
+def _scattered(evidence: Evidence, readings: Readings, options: Options) -> Evidence:
+    """The evidence with the scatter whose estimation is asked for, where it begins."""
+    if not scatters(readings, options):
+        return evidence
+    names = [name for name in ("gravity", "field", "dip") if name not in evidence.absent]
+    start = np.full(evidence.include.shape, START)
+    return replace(evidence, scatter=dict.fromkeys((*names, "direction"), start))
+
+
+def _general(problem: Problem, declared: list[bool], options: Options, finite: Bools) -> Fit:
+    """The fit by steps."""
+    solved = solve(problem, start(problem), options)
+    iterations = solved.iterations
+    stage = _Stage(problem, solved, np.ones(problem.evidence.include.shape))
+    if not all(declared):
+        stage = _estimate_noise(stage, declared, options)
+    if options.robust:
+        stage = _downweigh(stage, declared, options)
+    problem, solved, trust = stage.problem, stage.solved, stage.trust
+    trusted = _trusting(problem, trust)
+    state = solved.state
+    determined = _determined(trusted, state, solved)
+    if len(state.params) and not determined.keep.all():
+        state = settle_gauge(trusted, state, determined)
+        determined = _determined(trusted, state, solved)
+    status = np.where(finite, solved.status, int(Status.NOT_FINITE))
+    noise = _noise(problem, declared)
+    analysis = _analysed(
+        analyse(trusted, state, determined), trusted, state, solved, options, trust
+    )
+    trusted.memo.at(None)
+    return Fit(trusted, state, status, iterations, noise, trust, analysis)
+
+
+def _closed(
+    problem: Problem, declared: list[bool], options: Options, finite: Bools
+) -> tuple[Fit | None, Bools]:
+    """The fit in closed form, and members (B,) of which it is: those that determine all directions.
+
+    None where it is of none, as with references that are not exact.
+    """
+    none = np.zeros(len(finite), bool)
+    apart = options.robust or options.own_solver or problem.evidence.scatter
+    if apart or not closed_form.applies(problem):
+        return None, none
+    at = closed_form.start(problem)
+    halfs = closed_form.halves(problem, at)
+    state, analysis = closed_form.solution(problem, at, halfs)
+    good = closed_form.settled(halfs) & analysis.determined.keep.all(-1)
+    if not good.any():
+        return None, none
+    if not all(declared):
+        problem = _rescaled(problem, np.sqrt(analysis.variance_factor), declared)
+        halfs = closed_form.halves(problem, at)
+        state, analysis = closed_form.solution(problem, at, halfs)
+        good &= closed_form.settled(halfs)
+    sound = finite & np.isfinite(state.params).all(-1)
+    status = np.where(sound, int(Status.OK), int(Status.NOT_FINITE))
+    trust = np.ones(problem.evidence.include.shape)
+    once = np.ones(len(status), int)
+    noise = _noise(problem, declared)
+    return Fit(problem, state, status, once, noise, trust, analysis), good
+
+
+def _joined(ours: Fit, index: Ints, other: Fit) -> Fit:
+    """Our fit with some members of another."""
+    ends = {
+        name: placed(getattr(ours, name), index, getattr(other, name))
+        for name in ("status", "iterations", "noise", "trust")
+    }
+    mine, theirs = ours.analysis, other.analysis
+    names = ("covariance", "variance_factor", "freedom", "residual", "spread")
+    found = {n: placed(getattr(mine, n), index, getattr(theirs, n)) for n in names}
+    determined = mine.determined.put(index, theirs.determined)
+    return Fit(
+        problem=_with_noise_of(ours.problem, index, other.problem),
+        state=ours.state.put(index, other.state),
+        analysis=replace(mine, determined=determined, **found),
+        **ends,
+    )
+
+
+def _with_noise_of(problem: Problem, index: Ints, other: Problem) -> Problem:
+    """The problem with the noise that some members have in another, which is the same besides."""
+    pairs = zip(problem.triads, other.triads, strict=True)
+    triads = tuple(replace(t, sd=placed(t.sd, index, o.sd)) for t, o in pairs)
+    ours, theirs = problem.evidence.scatter, other.evidence.scatter
+    scatter = {name: placed(value, index, theirs[name]) for name, value in ours.items()}
+    return replace(problem, triads=triads, evidence=replace(problem.evidence, scatter=scatter))
+
+
+def _noise(problem: Problem, declared: list[bool]) -> Array:
+    """Estimated noise (B, triads) of one reading, NaN where it was declared."""
+    noise = [
+        np.full(len(t.sd), np.nan) if k else t.sd[:, 0, 0]
+        for t, k in zip(problem.triads, declared, strict=True)
+    ]
+    return np.stack(noise, -1)
+
+
+def _determined(problem: Problem, state: State, solved: Solved) -> Determined:
+    """Which directions the evidence that the method uses determines."""
+    if solved.known:
+        return determined_apart(problem, state, solved.known)
+    return Determined.of(problem, state)
+
+
+def _analysed(
+    found: Analysis,
+    problem: Problem,
+    state: State,
+    solved: Solved,
+    options: Options,
+    trust: Array,
+) -> Analysis:
+    """The analysis of the estimator that was used: not every one is the likelihood's."""
+    pulls = solved.pulls(problem, state)
+    if pulls:
+        found = sandwich(found, problem, state, pulls)
+    if options.robust:
+        found = _robustly(found, problem, state, options.robust, trust)
+    return found
+
+
+def _robustly(found: Analysis, problem: Problem, state: State, loss: str, trust: Array) -> Analysis:
+    """The analysis of a fit with station weights: the data say less than they seem to, a prior does not."""
+    freedom = _tested(station_misfit(found)[1])
+    louder = np.sqrt([inflation(loss, k) for k in freedom])[:, None, None]
+    triads = tuple(replace(t, sd=t.sd * louder) for t in problem.triads)
+    sd = {n: s * louder[..., 0] if n in ANGLES else s for n, s in problem.evidence.sd.items()}
+    scatter = {n: s * louder[..., 0] for n, s in problem.evidence.scatter.items()}
+    evidence = replace(problem.evidence, sd=sd, scatter=scatter)
+    wider = analyse(replace(problem, triads=triads, evidence=evidence), state, found.determined)
+    return replace(
+        found,
+        covariance=wider.covariance,
+        constants=wider.constants,
+        effects=wider.effects,
+        variance_factor=_bounded_factor(found, trust, loss, freedom),
+    )
+
+
+def _bounded_factor(found: Analysis, trust: Array, loss: str, freedom: Array) -> Array:
+    """s² (B, t) of a fit with station weights `trust`, from the pulls w d that they bound."""
+    pulled = found.residual**2 * trust[..., None]
+    shape = (*pulled.shape[:-1], pulled.shape[-1] // 3, 3)
+    squares = np.sum(pulled.reshape(shape), (1, 3))
+    share = np.array([consistency(loss, k) for k in freedom])[:, None]
+    return np.asarray(squares / np.where(found.freedom > 1e-9, found.freedom, np.nan) / share)
+
+
+def _without_broken(problem: Problem) -> tuple[Problem, Bools]:
+    """Members with readings that are not finite get stand-ins, so that the batch goes on."""
+    finite = np.all([np.isfinite(t.raw).all((-1, -2)) for t in problem.triads], axis=0)
+    if finite.all():
+        return problem, finite
+    pattern = np.sin(np.arange(problem.triads[0].raw[0].size) ** 1.5).reshape(-1, 3)
+    triads = []
+    for triad in problem.triads:
+        raw = np.where(finite[:, None, None], triad.raw, pattern)
+        model = triad.model
+        if isinstance(model, Restricted):
+            model = replace(model, whole=_finite_model(model.whole))
+        else:
+            model = _finite_model(model)
+        triads.append(replace(triad, raw=raw, model=model))
+    return replace(problem, triads=tuple(triads)), finite
+
+
+def _finite_model(model: Whole) -> Whole:
+    if isinstance(model, Factors):
+        return model
+    centre = np.where(np.isfinite(model.centre), model.centre, 0.0)
+    return replace(model, centre=centre, scale=np.where(np.isfinite(model.scale), model.scale, 1.0))
+
+
+@dataclass(frozen=True)
+class _Stage:
+    """Where weighing and fitting in turn have come to: problem, solution, station weights (B, n)."""
+
+    problem: Problem
+    solved: Solved
+    trust: Array
+
+    def take(self, index: Ints) -> _Stage:
+        """Some members of the batch."""
+        solved = replace(
+            self.solved,
+            state=self.solved.state.take(index),
+            status=self.solved.status[index],
+            iterations=self.solved.iterations[index],
+            sums={k: v.take(index) for k, v in self.solved.sums.items()},
+            known={k: v[index] for k, v in self.solved.known.items()},
+        )
+        return _Stage(self.problem.take(index), solved, self.trust[index])
+
+    def put(self, index: Ints, other: _Stage) -> _Stage:
+        """Ours with some members replaced."""
+        ours, new = self.solved, other.solved
+        sums = {
+            k: replace(
+                v,
+                reference=placed(v.reference, index, new.sums[k].reference),
+                weights=placed(v.weights, index, new.sums[k].weights),
+            )
+            for k, v in ours.sums.items()
+        }
+        solved = replace(
+            ours,
+            state=ours.state.put(index, new.state),
+            status=placed(ours.status, index, new.status),
+            iterations=placed(ours.iterations, index, new.iterations),
+            sums=sums,
+            known={k: placed(v, index, new.known[k]) for k, v in ours.known.items()},
+        )
+        problem = _with_noise_of(self.problem, index, other.problem)
+        return _Stage(problem, solved, placed(self.trust, index, other.trust))
+
+
+def _in_turn(stage: _Stage, rounds: int, turn: Callable[[_Stage], tuple[_Stage, Bools]]) -> _Stage:
+    """The stage after turns that also say who has settled: each member ends as if it were alone."""
+    whole, active = stage, np.arange(len(stage.trust))
+    for _ in range(rounds):
+        stage, settled = turn(stage)
+        if settled.all():
+            break
+        if settled.any():
+            done, rest = np.flatnonzero(settled), np.flatnonzero(~settled)
+            whole = whole.put(active[done], stage.take(done))
+            stage, active = stage.take(rest), active[rest]
+    return stage if len(active) == len(whole.trust) else whole.put(active, stage)
+
+
+def _estimate_noise(stage: _Stage, declared: list[bool], options: Options) -> _Stage:
+    """Variance per triad by restricted maximum likelihood, fit and estimate in turn.
+
+    A triad without redundancy keeps its start: its residuals are rounding, and say nothing.
+    """
+    free = [i for i, known in enumerate(declared) if not known]
+
+    def turn(now: _Stage) -> tuple[_Stage, Bools]:
+        analysis = analyse(now.problem, now.solved.state)
+        scale = np.sqrt(np.where(analysis.freedom >= 1, analysis.variance_factor, np.nan))
+        problem, solved = _rescaled(now.problem, scale, declared), now.solved
+        settled = ~np.any(np.abs(scale[:, free] - 1) >= SETTLED, -1)
+        if problem.evidence.scatter:
+            ratios = scatter_ratios(now.problem, solved.state, analysis)
+            problem = with_scatter(problem, solved.state, ratios)
+            settled = ~np.any(np.abs(scale[:, free] - 1) >= SCATTER_SETTLED, -1)
+            settled &= _steady(now.problem, problem)
+        if options.method != "swarm":
+            solved = solve(problem, solved.state, options)
+        return replace(now, problem=problem, solved=solved), settled
+
+    rounds = SCATTER_ROUNDS if stage.problem.evidence.scatter else options.rounds
+    return _in_turn(stage, rounds, turn)
+
+
+def _steady(old: Problem, new: Problem) -> Bools:
+    """Members (B,) whose scatter has settled: changed little, or is none."""
+    before, now = (p.evidence.scatter for p in (old, new))
+    each = [
+        (np.abs(now[name] / value - 1).max(-1) < SCATTER_SETTLED) | (now[name].max(-1) < 10 * LEAST)
+        for name, value in before.items()
+    ]
+    return np.asarray(np.all(each, 0))
+
+
+def _downweigh(stage: _Stage, declared: list[bool], options: Options) -> _Stage:
+    """Weigh the stations by their misfit and fit in turn."""
+    loss = options.robust or LOSSES[0]
+
+    def turn(now: _Stage) -> tuple[_Stage, Bools]:
+        problem, solved = now.problem, now.solved
+        weighed = _trusting(problem, now.trust)
+        analysis = analyse(weighed, solved.state)
+        square, freedom = station_misfit(analysis)
+        square = square / now.trust
+        excess = _typical(square, freedom)
+        excess = np.maximum(excess, 1.0) if all(declared) else excess
+        trust = weight(loss, square / excess[:, None], freedom)
+        if not all(declared):
+            factor = _bounded_factor(analysis, now.trust, loss, _tested(freedom))
+            problem = _rescaled(problem, np.sqrt(factor), declared)
+            if problem.evidence.scatter:
+                share = np.array([weighted(loss, k) for k in _tested(freedom)])
+                ratios = scatter_ratios(weighed, solved.state, analysis)
+                ratios = {n: r / share for n, r in ratios.items()}
+                problem = with_scatter(problem, solved.state, ratios)
+        solved = solve(_trusting(problem, trust), solved.state, options)
+        return _Stage(problem, solved, trust), ~np.any(np.abs(trust / now.trust - 1) >= SETTLED, -1)
+
+    return _in_turn(stage, ROBUST_ROUNDS, turn)
+
+
+def _typical(square: Array, freedom: Array) -> Array:
+    """Misfit (B,) of the median station, over what is to be expected of good ones."""
+    from scipy.special import chdtri
+
+    ratio = square / chdtri(np.maximum(freedom, 1.0), 0.5)
+    ratio = np.where(freedom > 0, ratio, np.nan)
+    nothing = np.isnan(ratio).all(-1, keepdims=True)
+    return np.asarray(np.nanmedian(np.where(nothing, 1.0, ratio), -1))
+
+
+def _tested(freedom: Array) -> Array:
+    """Mean degrees of freedom (B,) of the stations that anything tests, to a tenth."""
+    mean = freedom.sum(-1) / np.maximum(np.count_nonzero(freedom, axis=-1), 1)
+    return np.asarray(np.maximum(np.round(mean, 1), 1.0))
+
+
+def _trusting(problem: Problem, trust: Array) -> Problem:
+    """The problem with the covariance of each station, readings and angles, over its weight."""
+    if (trust == 1).all():
+        return problem
+    grown = 1 / np.sqrt(trust)
+    triads = tuple(replace(t, sd=t.sd * grown[..., None]) for t in problem.triads)
+    evidence = problem.evidence
+    sd = {n: s * grown if n in ANGLES else s for n, s in evidence.sd.items()}
+    scatter = {n: s * grown for n, s in evidence.scatter.items()}
+    evidence = replace(evidence, sd=sd, scatter=scatter)
+    return replace(problem, triads=triads, evidence=evidence)
+
+
+def _rescaled(problem: Problem, scale: Array, declared: list[bool]) -> Problem:
+    """The problem with the noise of triads that declare none times `scale` (B, triads)."""
+    triads = tuple(
+        t if known else replace(t, sd=_scaled_noise(t, scale[:, i]))
+        for i, (t, known) in enumerate(zip(problem.triads, declared, strict=True))
+    )
+    return replace(problem, triads=triads)
+
+
+def _scaled_noise(triad: Triad, scale: Array) -> Array:
+    factor = np.where(np.isfinite(scale), scale, 1.0)[:, None, None]
+    return np.maximum(triad.sd * factor, FLOOR * _size(triad.raw))
+
+
+__all__ = ["Fit", "Status", "fit", "model_of", "scatters", "temperature_ranges"]

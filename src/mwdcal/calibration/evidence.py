@@ -1,0 +1,125 @@
+"""What a run's readings say about its stations: references, uncertainties, groups, constants."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from mwdcal.calibration.readings import ANGLES, CONSTANTS, Readings
+from mwdcal.estimation.evidence import UNKNOWN, Constant, Evidence
+from mwdcal.geometry.vectors import AnyArray, Array, Ints
+from mwdcal.sensor.profile import COMMON
+
+TURNS = {"tilt": ("stand-north", "stand-east")}
+"""Errors of the stand that consist of several turns of its frame."""
+
+
+def flat(value: AnyArray, lead: tuple[int, ...], *tail: int) -> AnyArray:
+    """A value with one batch axis: (B, n, *tail)."""
+    whole, shape = np.asarray(value), (*lead, *tail)
+    if whole.shape != shape:
+        whole = np.broadcast_to(whole, shape)
+    return np.asarray(whole.reshape(math.prod(lead[:-1]), lead[-1], *tail))
+
+
+def evidence_of(readings: Readings, include: Array) -> Evidence:
+    """Everything the readings say about their stations, for one batch axis."""
+    lead = np.broadcast_shapes(readings.accelerometer.shape[:-1], include.shape)
+    known = {n: flat(readings.reference(n), lead) for n in ANGLES + CONSTANTS}
+    sd = {n: flat(readings.uncertainty(n), lead) for n in ANGLES + CONSTANTS}
+    group = _shared_groups(flat(readings.groups, lead))
+    included = flat(include, lead).astype(float)
+    nowhere = np.isnan(known["field"]).all(-1, keepdims=True)
+    known["field"] = np.where(nowhere, 1.0, known["field"])
+    if readings.magnetometer is None:  # nothing is to be found of what nothing reads
+        known |= {name: np.nan_to_num(known[name], nan=1.0) for name in ("field", "dip")}
+        sd |= {name: np.zeros(group.shape) for name in ("field", "dip")}
+    bare = Evidence(known, sd, group, included, (), stand=_stand(readings, lead))
+    known, sd = _share_known(bare)
+    return replace(bare, known=known, sd=sd, constants=constants(bare))
+
+
+def _stand(readings: Readings, lead: tuple[int, ...]) -> dict[str, Array]:
+    """Standard uncertainties (B,) of errors of the stand, of each turn that they consist of.
+
+    A tilt of known size leans to any azimuth: each of its two turns has half the variance.
+    """
+    found: dict[str, Array] = {}
+    for name in COMMON:
+        if name in readings.sd:
+            turns = TURNS.get(name, (name,))
+            sd = flat(readings.uncertainty(name), lead).max(-1) / math.sqrt(len(turns))
+            found |= dict.fromkeys(turns, sd)
+    return found
+
+
+def acts_on(evidence: Evidence, name: str) -> Array:
+    """Stations (B, n), as zeros and ones, whose references have an error of the stand."""
+    angle = name.removesuffix("-zero") if name.endswith("-zero") else "inclination"
+    return evidence.is_known(angle).astype(float)
+
+
+def _shared_groups(group: Ints) -> Ints:
+    """Group numbers (B, n) without gaps, -1 where a station is alone in its group."""
+    if (group < 0).all():
+        return np.full(group.shape, -1)
+    labels, compact = np.unique(group, return_inverse=True)
+    keys = compact.reshape(group.shape) + len(labels) * np.arange(len(group))[:, None]
+    _, where, counts = np.unique(keys, return_inverse=True, return_counts=True)
+    shared = (counts[where].reshape(group.shape) > 1) & (group >= 0)
+    kept = np.unique(group[shared])
+    return np.where(shared, np.searchsorted(kept, group), -1)
+
+
+def _share_known(evidence: Evidence) -> tuple[dict[str, Array], dict[str, Array]]:
+    """References and their σ where blank angles of a group take the mean of its filled cells.
+
+    One error is then common to the group: every member gets a σ that leaves the group as
+    uncertain as the mean of its k filled cells, σ √(members / k).
+    """
+    known, spread = dict(evidence.known), dict(evidence.sd)
+    if (evidence.group < 0).all():
+        return known, spread
+    for name in ("inclination", "azimuth"):
+        given = evidence.is_known(name)
+        filled = evidence.members * given[..., None]
+        count, total = filled.sum(-2), evidence.members.sum(-2)
+        turn = np.einsum("bnk,bn->bk", filled, np.exp(1j * np.nan_to_num(known[name])))
+        square = np.einsum("bnk,bn->bk", filled, evidence.sd[name] ** 2)
+        partly = (count > 0) & (count < total)
+        factor = np.where(partly, total / np.maximum(count, 1) ** 2, 0.0)
+        common = np.einsum("bnk,bk->bn", evidence.members, np.sqrt(square * factor))
+        mean = np.einsum("bnk,bk->bn", evidence.members, np.angle(turn))
+        within = np.einsum("bnk,bk->bn", evidence.members, partly) > 0
+        known[name] = np.where(within & ~given, mean, known[name])
+        spread[name] = np.where(within, common, evidence.sd[name])
+    return known, spread
+
+
+def constants(evidence: Evidence) -> tuple[Constant, ...]:
+    """Constants of the run to estimate: unknown ones, and errors of uncertain references."""
+    found = []
+    for name, size in (("gravity", 1.0), ("field", 0.0), ("dip", UNKNOWN)):
+        if name in evidence.absent:
+            continue
+        known = evidence.is_known(name)
+        if not known.all():
+            value = np.nan_to_num(
+                np.nansum(evidence.known[name], -1) / np.maximum(known.sum(-1), 1)
+            )
+            scale = np.full(len(value), size) if size else np.where(value > 0, value, 1.0)
+            found.append(Constant(name, (~known).astype(float), value, scale, unknown=True))
+        sd = np.max(np.where(known, evidence.sd[name], 0.0), -1)
+        if (sd > 0).any():
+            floor = np.where(sd > 0, sd, 1e-12)
+            found.append(
+                Constant(name, known.astype(float), np.zeros(len(sd)), floor, unknown=False)
+            )
+    for name, sd in evidence.stand.items():
+        mask = acts_on(evidence, name)
+        if (sd > 0).any() and mask.any():
+            floor = np.where(sd > 0, sd, 1e-12)
+            found.append(Constant(name, mask, np.zeros(len(sd)), floor, unknown=False))
+    return tuple(found)

@@ -1,0 +1,258 @@
+"""The methods: which evidence each uses, and how each finds its minimum.
+
+A method is a selection of evidence (`EVIDENCE`); most share one estimator. Newton-Raphson and the
+swarm have their own, and so have the papers' unweighted sums (`Options.paper_weights`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from mwdcal.calibration.evidence import TURNS, acts_on, constants
+from mwdcal.calibration.options import Options
+from mwdcal.calibration.readings import ANGLES
+from mwdcal.estimation.evidence import UNKNOWN, Constant, Evidence
+from mwdcal.estimation.minimisers.newton import newton, propagated
+from mwdcal.estimation.minimisers.swarm import forward_parts, swarm_forward
+from mwdcal.estimation.minimisers.unweighted import STRENGTH, Params, Sums
+from mwdcal.estimation.problem import Prior, Problem, State
+from mwdcal.estimation.solvers import Status, gauss_newton
+from mwdcal.estimation.uncertainty import readjusted, unweighted_pulls
+from mwdcal.geometry.vectors import Array, Bools, Ints, inverse
+
+ESTIMABLE = {
+    name: TURNS.get(name, (name,)) for name in ("azimuth-zero", "inclination-zero", "tilt")
+}
+"""Errors of the stand that can be found, and the constants of the run that they consist of."""
+HELD = 1e18
+"""Precision of a parameter that is held at its value."""
+ITERATIONS = 600
+"""Iterations of the swarm, as Moradi's."""
+PAPER = 1e10
+"""Weight of every square of an unweighted sum: only its digits matter, not the minimum."""
+
+
+def joint(evidence: Evidence) -> Evidence:
+    """All evidence, weighted by its uncertainty."""
+    return evidence
+
+
+def whole_vectors(evidence: Evidence) -> Evidence:
+    """Reference vectors only, taken as exact: least squares as in the six-state test."""
+    exact = {name: np.zeros_like(sd) for name, sd in evidence.sd.items()}
+    return replace(evidence, sd=exact, group=np.full_like(evidence.group, -1))
+
+
+def angles_alone(evidence: Evidence) -> Evidence:
+    """Inclination and toolface of the accelerometer, without |g| (Ivanov); scale stays nominal."""
+    return _reset(evidence, absent=("gravity",))
+
+
+def strengths_alone(evidence: Evidence) -> Evidence:
+    """|g| and |b| at every station, and nothing else: the scalar (total field) method."""
+    known = dict(evidence.known)
+    for name in (*ANGLES, "dip"):
+        known[name] = np.full_like(known[name], np.nan)
+    alone = np.full_like(evidence.group, -1)
+    return _reset(replace(evidence, known=known, group=alone), absent=("dip",))
+
+
+def with_stand_errors(evidence: Evidence, names: tuple[str, ...]) -> Evidence:
+    """The evidence with errors of the stand (see `ESTIMABLE`) as unknown constants of the run."""
+    if not names:
+        return evidence
+    turns = [turn for error in names for turn in ESTIMABLE[error]]
+    found = [constant for constant in evidence.constants if constant.name not in turns]
+    zero = np.zeros(len(evidence.include))
+    for name in turns:
+        sd, mask = np.full(len(zero), UNKNOWN), acts_on(evidence, name)
+        found.append(Constant(name, mask, zero, sd, unknown=True))
+    return replace(evidence, constants=tuple(found))
+
+
+def without(evidence: Evidence, names: tuple[str, ...]) -> Evidence:
+    """The evidence without some strengths or the dip: every station has its own."""
+    if not names:
+        return evidence
+    return _reset(evidence, tuple(dict.fromkeys((*evidence.absent, *names))))
+
+
+def inclination_and_strength(evidence: Evidence) -> Evidence:
+    """|g| and inclination of the accelerometer (Moosavi); azimuth, |b| and dip of the magnetometer."""
+    known = {**evidence.known, "toolface": np.full_like(evidence.known["toolface"], np.nan)}
+    alone = np.full_like(evidence.group, -1)
+    return _reset(replace(evidence, known=known, group=alone), evidence.absent)
+
+
+def _reset(evidence: Evidence, absent: tuple[str, ...]) -> Evidence:
+    """The evidence with its constants worked out again after a change."""
+    changed = replace(evidence, absent=absent, constants=())
+    return replace(changed, constants=constants(changed))
+
+
+EVIDENCE: dict[str, Callable[[Evidence], Evidence]] = {
+    "joint": joint,
+    "least-squares": whole_vectors,
+    "newton": inclination_and_strength,
+    "swarm": whole_vectors,
+    "toolface-inclination": angles_alone,
+    "scalar": strengths_alone,
+}
+
+
+@dataclass(frozen=True)
+class Solved:
+    """A minimum: state, `Status` codes and iterations (B,), and the sums it minimises, by triad.
+
+    Triads without an entry in `sums` have the likelihood of their readings at its largest; for
+    the others `known` (B, p_t, p_t) is the information of what they are fitted to. `unweighted`:
+    least squares with all readings of a triad alike, whatever their noise.
+    """
+
+    state: State
+    status: Ints
+    iterations: Ints
+    sums: dict[int, Sums] = field(default_factory=dict)
+    known: dict[int, Array] = field(default_factory=dict)
+    unweighted: bool = False
+
+    def pulls(self, problem: Problem, state: State) -> dict[int, Array]:
+        """How an error of a station's whitened reading moves the triads that have sums of their own.
+
+        (B, n, p_t, 3) by triad; none where the likelihood is at its largest.
+        """
+        if self.unweighted:
+            return unweighted_pulls(problem, _alike(problem), state)
+        triples = zip(problem.triads, problem.slices(), problem.targets(state), strict=False)
+        return {
+            index: replace(self.sums[index], triad=triad).pulls(state.params[:, where], target)
+            for index, (triad, where, target) in enumerate(triples)
+            if index in self.sums
+        }
+
+
+def solve(problem: Problem, state: State, options: Options) -> Solved:
+    """The minimum that the method is defined by, from a start."""
+    if options.method == "swarm":
+        return _swarmed(problem, state, options.seed)
+    if options.method == "newton":
+        return _by_newton(problem, state, options.paper_weights)
+    if options.paper_weights and options.method in ("toolface-inclination", "scalar"):
+        return _by_sums(problem, state, options.method)
+    if options.paper_weights:
+        return Solved(*gauss_newton(_alike(problem), state), unweighted=True)
+    return Solved(*gauss_newton(problem, state))
+
+
+def _alike(problem: Problem) -> Problem:
+    """The problem with one noise for all readings of a triad, as an unweighted sum has it."""
+    triads = [
+        replace(t, sd=np.sqrt(np.mean(t.sd**2, (1, 2), keepdims=True)) + 0 * t.sd)
+        for t in problem.triads
+    ]
+    return replace(problem, triads=tuple(triads))
+
+
+def _swarmed(problem: Problem, state: State, seed: int) -> Solved:
+    """Parameters by particle swarm on the error in the readings, directions and strengths known."""
+    parts = []
+    for triad, earth in zip(problem.triads, problem.earth(state)[0], strict=False):
+        target = np.einsum("bnij,bnj->bni", state.attitude, earth)
+        found = _swarm_forward(triad.raw, target, problem.evidence.include > 0, seed)
+        matrix, offset = forward_parts(found)
+        back = inverse(matrix)
+        parts.append(triad.model.start(back, -np.einsum("bij,bj->bi", back, offset)))
+    params = np.concatenate(parts, -1)
+    finite = np.isfinite(params).all(-1)
+    status = np.where(finite, int(Status.OK), int(Status.NOT_FINITE))
+    flown = np.full(len(params), ITERATIONS)
+    return Solved(replace(state, params=params), status, flown, unweighted=True)
+
+
+def _swarm_forward(raw: Array, target: Array, include: Bools, seed: int) -> Array:
+    """Forward parameters (B, 12); members that leave stations out fly one by one."""
+    if include.all():
+        return swarm_forward(raw, target, "reading", iterations=ITERATIONS, seed=seed).position
+    each = [
+        swarm_forward(r[keep], t[keep], "reading", iterations=ITERATIONS, seed=seed).position
+        for r, t, keep in zip(raw, target, include, strict=True)
+    ]
+    return np.stack(each)
+
+
+def _by_newton(problem: Problem, state: State, paper: bool) -> Solved:
+    """The accelerometer by Newton-Raphson from the datasheet, then the magnetometer against it."""
+    triad, evidence = problem.triads[0], problem.evidence
+    batch = len(state.params)
+    nominal = triad.model.start(np.zeros((batch, 3, 3)) + np.eye(3), np.zeros((batch, 3)))
+    gravity = problem.constant(state, "gravity")
+    noise = np.sqrt(np.mean(triad.sd**2, -1))
+    weights = np.full((*gravity.shape, 2), PAPER)
+    if not paper:
+        weights = propagated(gravity, noise, evidence.sd["inclination"])
+    weights = weights * evidence.include[..., None]
+    found = newton(
+        triad.model, nominal, triad.raw, problem.temperature, gravity,
+        evidence.known["inclination"], weights=weights,
+    )  # fmt: skip
+    own = _sums(problem, state, 0, (STRENGTH, "inclination"), weights)
+    later = _magnetometer(problem, state, found.params)
+    status = np.maximum(later.status, found.status)
+    return Solved(later.state, status, found.iterations, {0: own}, {0: found.information})
+
+
+def _by_sums(problem: Problem, state: State, method: str) -> Solved:
+    """The accelerometer, or with |v| alone both triads, by an unweighted sum of squares."""
+    scalar = method == "scalar"
+    names = (STRENGTH,) if scalar else ("toolface", "inclination")
+    include = problem.evidence.include[..., None]
+    sums, found = {}, []
+    for index in range(len(problem.triads) if scalar else 1):
+        strength = problem.constant(state, ("gravity", "field")[index]).mean(-1)[:, None, None]
+        weights = include * (PAPER / strength**4 if scalar else PAPER) * np.ones(len(names))
+        sums[index] = _sums(problem, state, index, names, weights)
+        where = problem.slices()[index]
+        found.append(gauss_newton(sums[index], Params(state.params[:, where])))
+    params = np.concatenate([each[0].params for each in found], -1)
+    status = np.max([each[1] for each in found], 0)
+    iterations = np.max([each[2] for each in found], 0)
+    if scalar:
+        after = Solved(readjusted(problem, replace(state, params=params)), status, iterations)
+    else:
+        after = _magnetometer(problem, state, params)
+    pairs = zip(sums.items(), found, strict=True)
+    known = {index: one.information(each[0].params) for (index, one), each in pairs}
+    return Solved(after.state, np.maximum(status, after.status), iterations, sums, known)
+
+
+def _sums(
+    problem: Problem, state: State, index: int, names: tuple[str, ...], weights: Array
+) -> Sums:
+    """What a paper sums over one triad, with the run's references; those unknown do not count."""
+    evidence, strength = problem.evidence, ("gravity", "field")[index]
+    value = problem.constant(state, strength)
+    known = [value**2 if n == STRENGTH else evidence.known[n] for n in names]
+    reference = np.stack(known, -1)
+    weights = weights * ~np.isnan(reference)
+    triad, temperature = problem.triads[index], problem.temperature
+    return Sums(triad, temperature, names, np.nan_to_num(reference), weights)
+
+
+def _magnetometer(problem: Problem, state: State, accelerometer: Array) -> Solved:
+    """The magnetometer by all its evidence, the accelerometer's parameters (B, p) being held."""
+    where = problem.slices()[0]
+    params, precision = state.params.copy(), problem.prior.precision.copy()
+    params[:, where] = accelerometer
+    state = readjusted(problem, replace(state, params=params))
+    if len(problem.triads) == 1:
+        none = np.zeros(len(params), int)
+        return Solved(state, none, none)
+    precision[:, where, :] = precision[:, :, where] = 0.0
+    precision[:, where, where] = HELD * np.eye(accelerometer.shape[-1])
+    expected = problem.prior.expected.copy()
+    expected[:, where] = accelerometer
+    held = replace(problem, prior=Prior(precision, expected))
+    return Solved(*gauss_newton(held, state))

@@ -1,0 +1,178 @@
+"""What is known of a tool before the run: its datasheet, or a previous calibration.
+
+Knowledge is of the parameters as files name them, at a reference temperature; `prior_of` puts it
+into the parameters of a fit, where it is one more block of residuals.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from mwdcal.calibration.readings import TRIADS
+from mwdcal.calibration.record import Calibration
+from mwdcal.errors import FitError, InputError
+from mwdcal.estimation.problem import Prior
+from mwdcal.geometry.vectors import Array
+from mwdcal.sensor.models import Model, Restricted
+from mwdcal.sensor.profile import Datasheet, Profile
+
+FAR = 50.0
+"""A datasheet's drift per °C holds to this far from the reference: later powers add no more, °C."""
+
+
+@dataclass(frozen=True)
+class Knowledge:
+    """Expected values (k,) of named parameters and their precision (k, k).
+
+    Names are "accelerometer scale-x" and so on, in nominal units and tool axes, of powers of
+    T - `reference`. A direction without precision is not known. `loose`: names that a model
+    does not have are of no account; else they are an error. `stations` are the fingerprints of
+    those that the knowledge comes from, `temperature` their range, °C; `common` names errors of the
+    stand and of references that are part of its uncertainty, as `budget` of a calibration does.
+    """
+
+    source: str
+    reference: float
+    names: tuple[str, ...]
+    expected: Array
+    precision: Array
+    loose: bool = False
+    stations: tuple[str, ...] = ()
+    temperature: tuple[float, float] | None = None
+    common: tuple[str, ...] = ()
+
+
+def prior_of(knowledge: Knowledge | None, models: Sequence[Model], batch: int) -> Prior:
+    """Knowledge as precision and expectation (B, p) of a fit's own parameters; none: all free.
+
+    Raises `FitError` where the knowledge is of another model.
+    """
+    size = sum(model.size for model in models)
+    precision, nothing = np.zeros((batch, size, size)), np.zeros((batch, size))
+    if knowledge is None:
+        return Prior(precision, nothing)
+    whole, names, start = np.zeros_like(precision), [], 0
+    for triad, model in zip(TRIADS, models, strict=False):
+        _, one = model.finished(knowledge.reference)
+        kept = model.kept if isinstance(model, Restricted) else range(model.size)
+        where = slice(start, start + model.size)
+        whole[:, where, where] = one[..., list(kept), :]
+        names += [f"{triad} {name}" for name in model.names]
+        start += model.size
+    strange = [name for name in knowledge.names if name not in names]
+    if strange and not knowledge.loose:
+        raise FitError(
+            f"the prior ({knowledge.source}) has parameters that this model lacks, such as "
+            f"{strange[0]}. Use the same --model, --order and --parameters as it had."
+        )
+    rows = [i for i, name in enumerate(names) if name in knowledge.names]
+    theirs = [knowledge.names.index(names[i]) for i in rows]
+    values, known = np.zeros(size), np.zeros((size, size))
+    values[rows] = knowledge.expected[theirs]
+    known[np.ix_(rows, rows)] = knowledge.precision[np.ix_(theirs, theirs)]
+    centre = np.linalg.solve(whole, np.broadcast_to(values, (batch, size))[..., None])[..., 0]
+    return Prior(np.swapaxes(whole, -1, -2) @ known @ whole, np.asarray(centre))
+
+
+def from_datasheet(profile: Profile, relative: bool = False) -> Knowledge:
+    """The datasheet's tolerances (1 σ) as knowledge of either model, at any order.
+
+    `relative`: the field's strength is unknown, so that neither scale nor bias of the
+    magnetometer is known in its units, and only misalignments are.
+    """
+    names, expected, spread = [], [], []
+    for triad in TRIADS:
+        sheet = getattr(profile, triad).datasheet
+        if sheet is None:
+            continue
+        unknown = relative and triad == "magnetometer"
+        for name, value, sd in _tolerances(sheet):
+            if sd is not None and (not unknown or name.startswith("misalignment")):
+                names.append(f"{triad} {name}")
+                expected.append(value)
+                spread.append(sd)
+    precision = np.diag(np.array(spread) ** -2.0)
+    return Knowledge(
+        "datasheet",
+        profile.reference_temperature_c,
+        tuple(names),
+        np.array(expected),
+        precision,
+        loose=True,
+    )
+
+
+def from_calibration(previous: Calibration, relative: bool = False) -> Knowledge:
+    """A previous calibration of the same tool, with its covariance and what it left undetermined.
+
+    Raises `InputError` for one with own-axis terms (they are centred on their own run), or in
+    another unit of the field than this run's.
+    """
+    where = f"--prior {previous.run}"
+    if any(triad.curved for triad in previous.triads):
+        raise InputError(
+            f"{where}: its own-axis quadratic and cubic terms belong to the readings of its own run. "
+            "Calibrate that run with --nonlinearity none to use it as a prior."
+        )
+    if previous.has_field and previous.relative != relative:
+        raise InputError(
+            f"{where}: it is in {previous.field_unit}, this run is not. Give both runs ref_field_nt, "
+            "or neither."
+        )
+    names = [f"{t.name} {name}" for t in previous.triads for name in t.parameter_names]
+    expected = np.concatenate([t.parameters for t in previous.triads])
+    covariance = np.array(previous.covariance)
+    free = np.array(previous.free, float).reshape(len(previous.free), len(expected))
+    moving = np.flatnonzero(np.diag(covariance) > 0)
+    return Knowledge(
+        previous.run,
+        previous.reference_temperature,
+        tuple(names[i] for i in moving),
+        expected[moving],
+        _precision(covariance[np.ix_(moving, moving)], free[:, moving]),
+        stations=(*(row.digest for row in previous.station_rows), *previous.inherited),
+        temperature=previous.temperature_c,
+        common=tuple(row.source for row in previous.budget),
+    )
+
+
+def _precision(covariance: Array, free: Array) -> Array:
+    """Inverse (k, k) of a covariance of which some directions, the rows of `free`, are not known.
+
+    The covariance is singular there; the precision says nothing along them: both have the
+    oblique projector onto its range, along the free directions, in common.
+    """
+    scale = np.sqrt(np.diag(covariance))
+    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
+    kept = np.argsort(values)[len(free) :]
+    span = vectors[:, kept]
+    whole = np.concatenate([span, (free / scale).transpose()], -1)
+    onto = np.linalg.solve(whole, np.eye(len(scale)))[: len(kept)]
+    inner = onto.transpose() / values[kept] @ onto
+    return np.asarray(inner / np.outer(scale, scale))
+
+
+def _tolerances(sheet: Datasheet) -> list[tuple[str, float, float | None]]:
+    """Name, expected value and standard deviation of every parameter, for both models."""
+    turn = None if sheet.misalignment_deg is None else float(np.radians(sheet.misalignment_deg))
+    found: list[tuple[str, float, float | None]] = []
+    for power in range(4):
+        scale = _at(power, sheet.scale, sheet.scale_per_c)
+        bias = _at(power, sheet.bias, sheet.bias_per_c)
+        suffix = f"·{power}" if power else ""
+        across = turn if power == 0 else (turn * scale if turn and scale else None)
+        for i in "xyz":
+            found += [(f"scale-{i}{suffix}", float(power == 0), scale)]
+            found += [(f"gain-{i}{i}{suffix}", float(power == 0), scale)]
+            found += [(f"bias-{i}{suffix}", 0.0, bias), (f"offset-{i}{suffix}", 0.0, bias)]
+            found += [(f"gain-{i}{j}{suffix}", 0.0, across) for j in "xyz" if j != i]
+    return found + [(f"misalignment-{i}{j}", 0.0, turn) for i in "xyz" for j in "xyz" if j != i]
+
+
+def _at(power: int, steady: float | None, drift: float | None) -> float | None:
+    if power == 0 or drift is None:
+        return steady if power == 0 else None
+    return drift / FAR ** (power - 1)

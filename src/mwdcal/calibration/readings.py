@@ -1,0 +1,170 @@
+"""`Readings`: the noun of input. What the sensors said, and what is known about it.
+
+Inside the package raw channels have already been mapped to the tool axes and divided
+by their nominal scale (`files.tables` does it): values are nominal g and nominal nT,
+angles are radians, temperatures are °C. A blank cell is NaN, never zero.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from mwdcal.geometry.vectors import AnyArray, Array, ArrayLike, Bools, Ints
+
+ANGLES = ("inclination", "azimuth", "toolface")
+TRIADS = ("accelerometer", "magnetometer")
+SIMULATED = "SIMULATED DATA"
+CONSTANTS = ("gravity", "field", "dip")
+EARTH = {"gravity": (0.9, 1.1), "field": (15_000.0, 80_000.0)}
+"""Least and greatest strength of any place on Earth, with room for a doubtful unit: g, nT."""
+NANOTESLA = "nT"
+RELATIVE = "relative (field = 1)"
+"""Unit of the calibrated field where its strength is known at no station."""
+
+
+def is_simulated(metadata: Mapping[str, object]) -> bool:
+    """Whether what a file says of itself says that no real tool was measured."""
+    return str(metadata.get("simulated", "")).lower() not in ("", "0", "false", "no")
+
+
+def simulated(*metadata: Mapping[str, object]) -> list[str]:
+    """What a heading says where calibration, run or log is simulated; else nothing."""
+    return [SIMULATED] if any(map(is_simulated, metadata)) else []
+
+
+@dataclass(frozen=True)
+class Readings:
+    """Static stations of one tool (or of many: leading axes).
+
+    Shapes: `accelerometer` and `magnetometer` (..., n, 3); `temperature`, `group` and
+    each entry of `known` (..., n).
+
+    Attributes:
+        accelerometer: nominal g along the tool axes.
+        magnetometer: nominal nT along the tool axes, or None.
+        temperature: °C, or None (then no model can have temperature terms).
+        known: reference values by name, of `ANGLES` and `CONSTANTS`; NaN where blank.
+            A missing key is blank everywhere; gravity is then 1 g.
+        sd: standard uncertainties: of `accelerometer` and `magnetometer` (..., n, 3) per
+            station and axis (missing: estimated from the residuals), of reference angles
+            (..., n) independent per station, of gravity, field and dip (..., n) common
+            to the run, and so are those of the errors of the stand in `profile.COMMON` (tilt: of
+            its amplitude). Missing or NaN reference uncertainties are zero.
+        group: stations of the same non-negative number share one direction of the tool
+            axis; -1 is none.
+        station: labels, for messages and tables.
+        digest: SHA-256 of each station's raw reading: tells fit from verification data.
+        metadata: what the file said about itself (serial, date, operator, …).
+        source: name of the file.
+        unused: columns of the file that are not used, each with what it resembles.
+    """
+
+    accelerometer: Array
+    magnetometer: Array | None = None
+    temperature: Array | None = None
+    known: Mapping[str, Array] = field(default_factory=dict)
+    sd: Mapping[str, Array] = field(default_factory=dict)
+    group: Ints | None = None
+    station: tuple[str, ...] = ()
+    digest: tuple[str, ...] = ()
+    metadata: Mapping[str, object] = field(default_factory=dict)
+    source: str = ""
+    unused: tuple[str, ...] = ()
+
+    @property
+    def count(self) -> int:
+        """Number of stations."""
+        return int(self.accelerometer.shape[-2])
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Labels of the stations: the given ones, else their numbers from 1."""
+        return self.station or tuple(str(i) for i in range(1, self.count + 1))
+
+    @property
+    def groups(self) -> Ints:
+        """Group numbers (..., n): -1 everywhere where none are given."""
+        return np.full(self.count, -1) if self.group is None else self.group
+
+    @property
+    def relative(self) -> bool:
+        """Whether there is a magnetometer and the field strength is known at no station.
+
+        It is then calibrated to a field of one. Without a magnetometer nothing is relative.
+        """
+        return self.magnetometer is not None and bool(np.isnan(self.reference("field")).all())
+
+    @property
+    def field_unit(self) -> str:
+        """Unit in which a magnetometer is calibrated from these readings."""
+        return RELATIVE if self.relative else NANOTESLA
+
+    def reference(self, name: str) -> Array:
+        """The known value `name` (..., n), NaN where blank.
+
+        Blank gravity is the mean of what is given at other stations, or 1 g.
+        """
+        value = self._per_station(self.known.get(name, np.nan))
+        if name != "gravity":
+            return value
+        blank = np.isnan(value)
+        if blank.all():
+            return np.ones(value.shape)
+        count = np.maximum((~blank).sum(-1, keepdims=True), 1)
+        mean = np.where(blank, 0.0, value).sum(-1, keepdims=True) / count
+        return np.where(blank, np.where(blank.all(-1, keepdims=True), 1.0, mean), value)
+
+    def uncertainty(self, name: str) -> Array:
+        """Standard uncertainty of the known value `name` (..., n); 0 where not stated."""
+        if name not in self.sd:
+            return np.zeros(self.accelerometer.shape[:-1])
+        return self._per_station(np.nan_to_num(np.asarray(self.sd[name], float)))
+
+    def common_uncertainty(self, name: str, inclination: Array) -> Array:
+        """Standard uncertainty of the reference `name` (..., n) by what all stations of a stand share.
+
+        The zero of its scale, and the lean of its vertical towards any azimuth: at `inclination`
+        (..., n) that turns azimuths by its cotangent and toolfaces by its cosecant. Singular: at
+        vertical these two are held to those of 0.1°.
+        """
+        zero, tilt = self.uncertainty(f"{name}-zero"), self.uncertainty("tilt")
+        across = np.maximum(np.abs(np.sin(inclination)), 2e-3)
+        shares = {
+            "inclination": 1.0,
+            "azimuth": np.cos(inclination) / across,
+            "toolface": 1 / across,
+        }
+        lean = tilt * np.asarray(shares.get(name, 0.0), float)
+        return np.asarray(np.sqrt(zero**2 + lean**2 / 2))
+
+    def _per_station(self, value: ArrayLike) -> Array:
+        whole, shape = np.asarray(value, float), self.accelerometer.shape[:-1]
+        return whole if whole.shape == shape else np.broadcast_to(whole, shape)
+
+    def select(self, keep: Bools) -> Readings:
+        """The stations where `keep` (n,) is true, of a run without leading axes."""
+        chosen = np.flatnonzero(keep)
+
+        def rows(value: AnyArray | None) -> Any:
+            return None if value is None else np.asarray(value)[chosen]
+
+        per_station = {k: np.broadcast_to(v, self._shape(k)) for k, v in self.sd.items()}
+        return replace(
+            self,
+            accelerometer=self.accelerometer[chosen],
+            magnetometer=rows(self.magnetometer),
+            temperature=rows(self.temperature),
+            known={k: self.reference(k)[chosen] for k in self.known},
+            sd={k: v[chosen] for k, v in per_station.items()},
+            group=rows(self.group),
+            station=tuple(self.station[i] for i in chosen) if self.station else (),
+            digest=tuple(self.digest[i] for i in chosen) if self.digest else (),
+        )
+
+    def _shape(self, name: str) -> tuple[int, ...]:
+        shape = self.accelerometer.shape
+        return shape if name.endswith("meter") else shape[:-1]

@@ -1,0 +1,478 @@
+"""`Calibration`: what a fit leaves behind, and what is applied to readings ever after.
+
+The record is the file: every number is rounded to 12 significant digits when it is made, so
+a calibration in memory and one read back give the same results.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from mwdcal.calibration.readings import NANOTESLA, Readings
+from mwdcal.calibration.soaks import GAP
+from mwdcal.errors import InputError
+from mwdcal.geometry.observables import OBSERVABLES
+from mwdcal.geometry.vectors import Array, Bools
+from mwdcal.sensor.models import Basis, Factors, Model, Polynomial
+from mwdcal.sensor.profile import Profile
+
+SCHEMA_VERSION = 1
+DIGITS = 12
+"""Significant digits of every number in a calibration file."""
+MARGIN = 1.0
+"""Degrees Celsius by which a temperature may lie outside the calibrated range, as it is read."""
+MAGNETIC = ("azimuth", "field", "dip", "magnetic_toolface", "bx", "by", "bz")
+"""Observables that need a magnetometer."""
+FREE_SHARE = 5e-2
+"""An output rests on a free direction if it moves by more than this share of it (rad per rad,
+or of its own strength), the direction being scaled to turn or stretch the fields by one."""
+
+
+class Finding(msgspec.Struct, frozen=True, kw_only=True):
+    """Something the reader should know: `id` for machines, `text` for people, maybe a station."""
+
+    id: str
+    text: str
+    station: str | None = None
+
+
+class Undetermined(msgspec.Struct, frozen=True, kw_only=True):
+    """A direction of parameter space that the evidence leaves free, in plain language."""
+
+    id: str
+    text: str
+
+
+class Constant(msgspec.Struct, frozen=True, kw_only=True):
+    """A constant of the run that was estimated, with its standard uncertainty."""
+
+    name: str
+    value: float
+    standard_uncertainty: float
+    unit: str
+
+
+class BudgetRow(msgspec.Struct, frozen=True, kw_only=True):
+    """What one source of error adds to the accuracy to expect, 1σ in degrees; None: undetermined."""
+
+    source: str
+    inclination_deg: float | None
+    toolface_deg: float | None
+    azimuth_deg: float | None = None
+
+
+class StandErrors(msgspec.Struct, frozen=True, kw_only=True):
+    """Errors of the stand, estimated: reference reading = value in the earth's frame + zero.
+
+    The stand's vertical leans by `tilt_deg` towards the azimuth `tilt_azimuth_deg`: a reading
+    of inclination at azimuth A is too large by tilt · cos(A - tilt azimuth). None: not asked for.
+    """
+
+    azimuth_zero_deg: float | None = None
+    azimuth_zero_uncertainty_deg: float | None = None
+    inclination_zero_deg: float | None = None
+    inclination_zero_uncertainty_deg: float | None = None
+    tilt_deg: float | None = None
+    tilt_uncertainty_deg: float | None = None
+    tilt_azimuth_deg: float | None = None
+    tilt_azimuth_uncertainty_deg: float | None = None
+
+
+class ErrorRow(msgspec.Struct, frozen=True, kw_only=True):
+    """Root mean square error of one observable over the stations where it is known."""
+
+    observable: str
+    unit: str
+    stations: int
+    before: float
+    after: float
+    expected: float | None = None
+
+
+class StationRow(msgspec.Struct, frozen=True, kw_only=True):
+    """One station of the fit: errors left where references are known, and how unlikely they are.
+
+    `deviation` is the station's χ² put as an equivalent number of standard deviations of one
+    normal variable; `reshoot` marks the ones to take again. `errors_left_out` are the errors
+    when the station has no part in the fit, `influence` the largest change it makes by itself
+    at any station of the run, `weight` its share in a robust fit.
+    """
+
+    station: str
+    digest: str
+    temperature_c: float | None
+    inclination_deg: float | None
+    toolface_deg: float | None
+    azimuth_deg: float | None
+    errors: dict[str, float]
+    errors_before: dict[str, float]
+    errors_left_out: dict[str, float] = {}
+    influence: dict[str, float] = {}
+    weight: float = 1.0
+    deviation: float
+    reshoot: bool = False
+    worst: str | None = None
+
+
+class Measures(msgspec.Struct, frozen=True, kw_only=True):
+    """Moradi's measures of the vector error |ideal - estimated|, as a share of the field."""
+
+    triad: str
+    when: str
+    mean: float
+    std: float
+    mse: float
+    rmse: float
+
+
+class Choices(msgspec.Struct, frozen=True, kw_only=True):
+    """How the fit was asked for, beyond method, model and order; see `mwdcal.calibration.options.Options`."""
+
+    parameters: int = 12
+    ignore: list[str] = []
+    robust: str | None = None
+    paper_weights: bool = False
+    prior: str | None = None
+
+
+class OrderScore(msgspec.Struct, frozen=True, kw_only=True):
+    """How well a triad's model of one temperature order predicts soaks left out of the fit.
+
+    `…inside`: soaks between the coldest and the hottest, predicted by interpolation; `…ends`:
+    those two, by extrapolation. Of both: χ² per reading (`inside`, `ends`); root mean square
+    error of the vector per axis in `unit` (`error_…`); of its two components across the field,
+    as angles in degrees (`error_…_deg`). The noise of the readings is part of the errors:
+    `noise` and `noise_deg` are what it alone would leave. None: no soak can be left out for it.
+    `chance`: probability that noise alone makes the term of this order as large as it is, in a
+    fit to all soaks; None at order 0, for an order that was given, and where nothing tests it.
+    """
+
+    triad: str
+    order: int
+    chosen: bool
+    chance: float | None = None
+    inside: float | None
+    ends: float | None
+    unit: str
+    noise: float | None
+    error_inside: float | None
+    error_ends: float | None
+    noise_deg: float | None
+    error_inside_deg: float | None
+    error_ends_deg: float | None
+
+
+class TriadCalibration(msgspec.Struct, frozen=True, kw_only=True):
+    """One triad: field = model(x, T - reference), x = P (raw / scale), in tool axes.
+
+    model "polynomial": parameters are A (row by row) and c for each power of temperature,
+    field = Σ τᵏ (A_k x + c_k); with `curved`, e₂ x² + e₃ x³ on each own axis follow, all
+    terms then of (x - centre) / radius.
+    model "factors": SF, B (temperature powers fastest) and m, field = (I - m)(x / SF - B).
+    `misfit_probability` is the chance of a larger s² if noise and stand are as declared; None where
+    the noise was estimated. `size` counts the fitted parameters, `rank` the determined ones: in a model of 9 or 6
+    parameters the others stand in the list as zero, without uncertainty.
+    """
+
+    name: str
+    unit: str
+    model: str
+    order: int
+    curved: bool
+    centre: list[float]
+    radius: float
+    parameter_names: list[str]
+    parameters: list[float]
+    standard_uncertainties: list[float | None]
+    rank: int
+    size: int
+    singular_values: list[float]
+    undetermined: list[Undetermined]
+    noise: float
+    noise_source: str
+    variance_factor: float | None
+    degrees_of_freedom: float
+    misfit_probability: float | None = None
+
+    def functions(self, reference: float) -> Model:
+        """The model that these parameters belong to."""
+        basis = Basis(self.order, reference)
+        if self.model == "factors":
+            return Factors(basis)
+        centre, radius = np.array([self.centre]), np.full((1, 3), self.radius)
+        return Polynomial(basis, centre, radius, self.curved)
+
+
+class Calibration(msgspec.Struct, frozen=True, kw_only=True):
+    """A calibrated tool: see `docs/files.md` for every field.
+
+    `covariance` is of the parameters of all triads in order, scaled by s² where that is
+    estimated; `free` are directions (rows) of parameter space that no evidence determines.
+    `budget` says what each source of error adds to the accuracy to expect; `assumed_exact` names
+    references without a declared uncertainty whose error no residual would show.
+    `inherited` are the fingerprints of the stations behind the prior, if there was one;
+    `excluded` the labels of stations of the run that were left out of the fit on request.
+    """
+
+    schema_version: int = SCHEMA_VERSION
+    tool: dict[str, str]
+    profile: Profile
+    profile_sha256: str
+    run: str
+    run_sha256: str
+    software: str
+    method: str
+    options: Choices = Choices()
+    seed: int | None = None
+    time: str
+    field_unit: str
+    stations: int
+    excluded: list[str] = []
+    temperature_c: tuple[float, float] | None
+    accelerometer: TriadCalibration
+    magnetometer: TriadCalibration | None = None
+    covariance: list[list[float]]
+    free: list[list[float]]
+    singular_values: list[float]
+    constants: list[Constant]
+    stand: StandErrors = StandErrors()
+    earth: dict[str, float]
+    budget: list[BudgetRow] = []
+    assumed_exact: list[str] = []
+    errors: list[ErrorRow]
+    measures: list[Measures]
+    orders: list[OrderScore] = []
+    station_rows: list[StationRow]
+    inherited: list[str] = []
+    findings: list[Finding]
+
+    @property
+    def reference_temperature(self) -> float:
+        """The temperature τ = 0 of the model, °C."""
+        return self.profile.reference_temperature_c
+
+    def used(self, digests: Iterable[str]) -> list[bool]:
+        """Which stations, by their fingerprints, were in the fit; by the triads both have."""
+        fitted = {row.digest for row in self.station_rows} | set(self.inherited)
+        first = {digest.partition("-")[0] for digest in fitted}
+        whole = self.has_field
+        return [
+            d in fitted or (("-" not in d or not whole) and d.partition("-")[0] in first)
+            for d in digests
+        ]
+
+    @property
+    def triads(self) -> list[TriadCalibration]:
+        """The calibrated triads, accelerometer first."""
+        return [t for t in (self.accelerometer, self.magnetometer) if t is not None]
+
+    @property
+    def has_field(self) -> bool:
+        """Whether the magnetometer was calibrated."""
+        return self.magnetometer is not None
+
+    @property
+    def relative(self) -> bool:
+        """Whether the magnetometer was calibrated to a field of one."""
+        return self.has_field and self.field_unit != NANOTESLA
+
+    def _temperature(self, readings: Readings) -> Array:
+        if readings.temperature is None and any(t.order for t in self.triads):
+            raise InputError(
+                f"{readings.source or 'the readings'}: the calibration has temperature terms, and the "
+                "column 'temperature_c' is missing or blank. Add it, or calibrate with --order 0."
+            )
+        if readings.temperature is None:
+            return np.full(readings.accelerometer.shape[:-1], self.reference_temperature)
+        return readings.temperature
+
+    def fields(self, readings: Readings) -> tuple[Array, Array]:
+        """Gravity (…, n, 3), g, and magnetic field (…, n, 3), nT: NaN without magnetometer."""
+        temperature = self._temperature(readings)
+        found = []
+        for triad in self.triads:
+            model = triad.functions(self.reference_temperature)
+            raw = getattr(readings, triad.name)
+            if raw is None:
+                found.append(np.full_like(readings.accelerometer, np.nan))
+            else:
+                found.append(model.fields(np.array(triad.parameters), raw, temperature))
+        while len(found) < 2:
+            found.append(np.full_like(readings.accelerometer, np.nan))
+        return found[0], found[1]
+
+    def jacobian(self, readings: Readings) -> Array:
+        """Derivative (…, n, 6, p) of both vectors with respect to the parameters of all triads."""
+        temperature = self._temperature(readings)
+        size = sum(len(t.parameters) for t in self.triads)
+        result = np.zeros((*readings.accelerometer.shape[:-1], 6, size))
+        at = 0
+        for index, triad in enumerate(self.triads):
+            model, raw = triad.functions(self.reference_temperature), getattr(readings, triad.name)
+            if raw is not None:
+                block = model.jacobian(np.array(triad.parameters), raw, temperature)
+                result[..., 3 * index : 3 * index + 3, at : at + block.shape[-1]] = block
+            at += len(triad.parameters)
+        return result
+
+    def noise_covariance(self, readings: Readings) -> Array:
+        """Covariance (…, n, 6, 6) of both vectors from the noise of one reading."""
+        temperature = self._temperature(readings)
+        result = np.zeros((*readings.accelerometer.shape[:-1], 6, 6))
+        for index, triad in enumerate(self.triads):
+            raw = getattr(readings, triad.name)
+            if raw is None:
+                continue
+            model = triad.functions(self.reference_temperature)
+            slope = model.slope(np.array(triad.parameters), raw, temperature)
+            sd = np.broadcast_to(readings.sd.get(triad.name, np.array(triad.noise)), raw.shape)
+            block = slice(3 * index, 3 * index + 3)
+            result[..., block, block] = slope * sd[..., None, :] ** 2 @ np.swapaxes(slope, -1, -2)
+        return result
+
+    def sensitivity(self, name: str, readings: Readings) -> Array:
+        """Gradient (…, n, p) of an observable with respect to the parameters."""
+        gradient = OBSERVABLES[name].gradient(*self.fields(readings))
+        gradient = np.where(np.isnan(gradient), 0.0, gradient) if not self.has_field else gradient
+        return np.asarray(np.einsum("...ni,...nip->...np", gradient, self.jacobian(readings)))
+
+    def uncertainty(self, name: str, readings: Readings, noise: bool = False) -> Array:
+        """Standard uncertainty (…, n) of an observable, of the calibration or of one reading too.
+
+        NaN where the observable rests on a free direction: no uncertainty can be quoted.
+        """
+        rows = self.sensitivity(name, readings)
+        variance = np.einsum("...ni,ij,...nj->...n", rows, np.array(self.covariance), rows)
+        if noise:
+            gradient = OBSERVABLES[name].gradient(*self.fields(readings))
+            gradient = (
+                np.where(np.isnan(gradient), 0.0, gradient) if not self.has_field else gradient
+            )
+            spread = self.noise_covariance(readings)
+            variance = variance + np.einsum("...ni,...nij,...nj->...n", gradient, spread, gradient)
+        blank = self.rests_on_free(name, readings) | self._lacks(name)
+        return np.where(blank, np.nan, np.sqrt(variance))
+
+    def _lacks(self, name: str) -> bool:
+        """Whether an observable needs a magnetometer that was not calibrated."""
+        return name in MAGNETIC and not self.has_field
+
+    def expanded_uncertainty(
+        self, name: str, readings: Readings, probability: float = 0.95
+    ) -> Array:
+        """Half width (…, n) of the interval that holds the calibration's error with a probability.
+
+        Student's t with the effective degrees of freedom of both triads (Welch-Satterthwaite);
+        NaN as in `uncertainty`. Reference: JCGM 100, G.4.
+        Singular: near vertical an error across the tool axis tilts it whichever way it points, so
+        that of the inclination is the length of a vector; see `_tilt_width`.
+        """
+        from scipy.special import stdtrit
+
+        rows, covariance = self.sensitivity(name, readings), np.array(self.covariance)
+        start, spread = 0, np.zeros(rows.shape[:-1])
+        for triad in self.triads:
+            own = slice(start, start + len(triad.parameters))
+            part = np.einsum(
+                "...i,ij,...j->...", rows[..., own], covariance[own, own], rows[..., own]
+            )
+            spread = spread + part**2 / max(triad.degrees_of_freedom, 1.0)
+            start += len(triad.parameters)
+        sd = self.uncertainty(name, readings)
+        freedom = np.maximum(sd**4 / np.where(spread > 0, spread, 1.0), 1.0)
+        width = np.asarray(sd * stdtrit(freedom, (1 + probability) / 2))
+        if name != "inclination":
+            return width
+        return self._tilt_width(readings, width, freedom, probability)
+
+    def _tilt_width(
+        self, readings: Readings, width: Array, freedom: Array, probability: float
+    ) -> Array:
+        """The half width (…, n) of inclination: `width` away from vertical, that of a tilt near it.
+
+        Definition: the tilt (gx, gy) / |g| has two errors, and with their larger uncertainty u its
+        error is below k u, k² = ν ((1 - p)^(-2/ν) - 1), Hotelling's for two. The one takes over from
+        the other between tilts of k u and 2 k u. Reference: JCGM 102, 7.
+        """
+        g, _ = self.fields(readings)
+        rows = self.jacobian(readings)[..., :2, :] / np.linalg.norm(g, axis=-1)[..., None, None]
+        spread = rows @ np.array(self.covariance) @ np.swapaxes(rows, -1, -2)
+        half, odd = (spread[..., 0, 0] + spread[..., 1, 1]) / 2, spread[..., 0, 1]
+        largest = half + np.hypot((spread[..., 0, 0] - spread[..., 1, 1]) / 2, odd)
+        factor = freedom * np.expm1(-2 / freedom * np.log1p(-probability))
+        tilt_width = np.sqrt(np.maximum(largest, 0.0) * factor)
+        tilt = np.linalg.norm(g[..., :2], axis=-1) / np.linalg.norm(g, axis=-1)
+        share = np.clip(tilt / np.maximum(tilt_width, 1e-300) - 1, 0.0, 1.0)
+        share = share**2 * (3 - 2 * share)
+        return np.asarray(tilt_width + share * (width - tilt_width) + 0 * width)
+
+    def rests_on_free(self, name: str, readings: Readings) -> Bools:
+        """Where (…, n) an observable moves with a direction that no evidence determines."""
+        shape = readings.accelerometer.shape[:-1]
+        g, b = self.fields(readings)
+        moved = np.einsum("...nip,kp->...nki", self.jacobian(readings), self._free_rows())
+        gradient = np.nan_to_num(OBSERVABLES[name].gradient(g, b))
+        change = np.abs(np.einsum("...ni,...nki->...nk", gradient, moved))
+        scale = {"g": np.linalg.norm(g, axis=-1), "nT": np.linalg.norm(b, axis=-1)}
+        limit = FREE_SHARE * scale.get(OBSERVABLES[name].unit, np.ones(shape))
+        return np.asarray(np.any(change > np.nan_to_num(limit)[..., None], -1))
+
+    def _free_rows(self) -> Array:
+        size = sum(len(t.parameters) for t in self.triads)
+        return np.array(self.free, float).reshape(len(self.free), size)
+
+    def other_tool(self, readings: Readings) -> tuple[str, str] | None:
+        """Our serial and the readings', where both are stated and differ."""
+        ours, theirs = self.tool.get("serial"), readings.metadata.get("serial")
+        if ours is None or theirs is None or ours == str(theirs):
+            return None
+        return ours, str(theirs)
+
+    def undetermined(self) -> list[Undetermined]:
+        """Free directions of all triads, each once."""
+        return [entry for triad in self.triads for entry in triad.undetermined]
+
+    @property
+    def margin(self) -> float:
+        """Degrees Celsius by which a reading may lie outside the calibrated range.
+
+        A calibration without temperature terms holds for the soak it was made in: `soaks.GAP`.
+        """
+        return MARGIN if any(t.order for t in self.triads) else GAP
+
+    def outside(self, readings: Readings, margin: float | None = None) -> Bools:
+        """Stations (…, n) outside the calibrated temperature range by more than a margin, °C.
+
+        The margin is the calibration's own unless another is given.
+        """
+        shape = readings.accelerometer.shape[:-1]
+        if self.temperature_c is None or readings.temperature is None:
+            return np.zeros(shape, bool)
+        (low, high), beyond = self.temperature_c, self.margin if margin is None else margin
+        return np.asarray(
+            (readings.temperature < low - beyond) | (readings.temperature > high + beyond)
+        )
+
+    def unrecorded(self, readings: Readings) -> bool:
+        """Whether the readings have temperatures and the run of the calibration recorded none."""
+        return self.temperature_c is None and readings.temperature is not None
+
+
+def rounded(calibration: Calibration) -> Calibration:
+    """The same record with every number at 12 significant digits, as files keep it.
+
+    More digits would differ from machine to machine with the threads of its linear algebra.
+    """
+    return msgspec.convert(_rounded(msgspec.to_builtins(calibration)), Calibration)
+
+
+def _rounded(value: Any) -> Any:
+    if isinstance(value, float):
+        return float(f"{value:.{DIGITS - 1}e}")
+    if isinstance(value, dict):
+        return {key: _rounded(item) for key, item in value.items()}
+    return [_rounded(item) for item in value] if isinstance(value, list | tuple) else value

@@ -1,0 +1,388 @@
+"""Errors of a fit where references are known: per observable, per station, per triad."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from math import erfc, gamma
+
+import numpy as np
+
+from mwdcal.calibration.estimate import Fit
+from mwdcal.calibration.readings import TRIADS, Readings
+from mwdcal.calibration.record import ErrorRow, Measures, StationRow
+from mwdcal.estimation.evidence import STAND_ERRORS
+from mwdcal.estimation.uncertainty import Analysis, station_misfit, without_station
+from mwdcal.geometry.observables import OBSERVABLES, VERTICAL
+from mwdcal.geometry.vectors import Array, Bools, centred
+
+SHOWN = ("gravity", "inclination", "toolface", "azimuth", "field", "dip")
+UNITS = {"gravity": "mg", "field": "nT"}
+RESHOOT = 0.01
+"""A station is marked when one in a hundred runs would have any station as bad as it."""
+LEAST_ACROSS = 1e-9
+"""An attitude is exactly vertical below this sine of its inclination."""
+PROBES = 200
+"""Stations at which the influence of each is looked at: no more, however long the run."""
+REASONS = {
+    "gravity": "moved before it settled?",
+    "inclination": "stand inclination misread?",
+    "toolface": "stand toolface misread?",
+    "azimuth": "stand azimuth misread, or iron nearby?",
+    "field": "iron or current near the stand?",
+    "dip": "iron near the stand, or the tool moved?",
+}
+
+
+def rms(values: Array) -> float:
+    """Root mean square of what is not NaN; NaN where nothing is left."""
+    values = values[~np.isnan(values)]
+    return float(np.sqrt(np.mean(values**2))) if values.size else float("nan")
+
+
+def shown_in(name: str, relative: bool = False) -> tuple[float, str]:
+    """Factor and unit in which an observable's errors are shown: mg, nT, °, or per mille."""
+    if name == "field" and relative:
+        return 1e3, "‰ of the field"
+    if name == "gravity":
+        return 1e3, "mg"
+    return (1.0, "nT") if name == "field" else (float(np.degrees(1)), "°")
+
+
+def angle_weight(name: str, inclination: Array) -> Array:
+    """What an error of an observable counts at inclinations (…, n), radians; NaN: it has none there.
+
+    Definition: sin(inclination) for toolface and azimuth, 1 for all else.
+    Singular: NaN exactly at vertical, where toolface and azimuth do not exist.
+    """
+    if name not in ("toolface", "azimuth"):
+        return np.ones(inclination.shape)
+    across = np.sin(inclination)
+    return np.where(across < LEAST_ACROSS, np.nan, across)
+
+
+def departure(name: str, g: Array, b: Array, known: Mapping[str, Array]) -> Array:
+    """Error (…, n) of an observable of two vectors against its reference, radians, g or nT.
+
+    Definition: value - known[name], times its `angle_weight` at the reference inclination; at the
+    vectors' own where that is unknown.
+    Singular: NaN where there is no reference, and for toolface and azimuth exactly at vertical.
+    """
+    observable = OBSERVABLES[name]
+    error = observable.value(g, b) - known[name]
+    error = centred(error, observable.period) if observable.period else error
+    stated = known.get("inclination", np.full(error.shape, np.nan))
+    own = OBSERVABLES["inclination"].value(g, b)
+    return np.asarray(error * angle_weight(name, np.where(np.isnan(stated), own, stated)))
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """The errors of one fitted run (B = 1), before and after, with what was to be expected."""
+
+    readings: Readings
+    fit: Fit
+
+    @cached_property
+    def after(self) -> tuple[Array, Array]:
+        """Corrected vectors (n, 3) each; the field is NaN without magnetometer."""
+        g, b = self.fit.problem.fields(self.fit.state)
+        return g[0], b[0]
+
+    @cached_property
+    def targets(self) -> tuple[Array, Array]:
+        """Vectors (n, 3) each that a perfect tool would read at the fitted attitudes."""
+        attitude, (g, b) = self.fit.state.attitude[0], self.fit.problem.earth(self.fit.state)[0]
+        first, second = (np.einsum("nij,nj->ni", attitude, e[0]) for e in (g, b))
+        return first, second
+
+    @cached_property
+    def before(self) -> tuple[Array, Array]:
+        """Nominal readings as vectors: what the tool says uncalibrated."""
+        triads = [t.raw[0] for t in self.fit.problem.triads]
+        if len(triads) == 1:
+            return triads[0], np.full_like(triads[0], np.nan)
+        scale = np.linalg.norm(triads[1], axis=-1).mean() if self.readings.relative else 1.0
+        return triads[0], triads[1] / scale
+
+    def known(self, name: str) -> Array:
+        """Reference (n,) of an observable: given, or the estimated constant; NaN where unknown.
+
+        Angles of a stand whose common errors are unknowns of the fit: as they are without them.
+        """
+        if name in self.fit.problem.evidence.absent:
+            return np.asarray(self.fit.problem.evidence.known[name][0])
+        if name in ("gravity", "field", "dip"):
+            return np.asarray(self.fit.problem.constant(self.fit.state, name)[0])
+        value = np.asarray(self.fit.problem.evidence.known[name][0])
+        if not any(c.name in STAND_ERRORS for c in self.fit.problem.evidence.constants):
+            return value
+        return np.where(np.isnan(value), np.nan, self._stood(name))
+
+    def _stood(self, name: str) -> Array:
+        """An angle (n,) of the fitted attitudes; at vertical, where two do not exist, as given."""
+        attitude, given = self.fit.state.attitude[0], self.fit.problem.evidence.known[name][0]
+        axis, down = attitude[:, 2], attitude[:, :, 2]
+        across = np.hypot(axis[:, 0], axis[:, 1])
+        if name == "inclination":
+            return np.asarray(np.arctan2(across, axis[:, 2]))
+        pair = (axis[:, 1], axis[:, 0]) if name == "azimuth" else (-down[:, 0], -down[:, 1])
+        angle = np.mod(np.arctan2(*pair), 2 * np.pi)
+        return np.asarray(np.where(across > VERTICAL, angle, given))
+
+    def _weight(self, name: str) -> Array:
+        """The weight (n,) of errors after the fit, zero where an observable does not exist."""
+        inclination = self.known("inclination")
+        guess = OBSERVABLES["inclination"].value(*self.after)
+        found = angle_weight(name, np.where(np.isnan(inclination), guess, inclination))
+        return np.nan_to_num(found)
+
+    def judged(self, name: str) -> Bools:
+        """Stations (n,) whose error of an observable is known."""
+        return ~np.isnan(self.known(name)) & (self._weight(name) > 0)
+
+    def errors(self, name: str, fields: tuple[Array, Array]) -> Array:
+        """The `departure` (n,) of both vectors from the references of the run."""
+        known = {each: self.known(each) for each in dict.fromkeys((name, "inclination"))}
+        return departure(name, *fields, known)
+
+    @cached_property
+    def _spread(self) -> Array:
+        """Expected covariance (n, m, m) of the whitened misfit left after the fit.
+
+        In units of the noise itself, whatever weight a station has.
+        """
+        own = self.fit.problem.linear(self.fit.state).own
+        total = np.eye(own.shape[-2]) + own @ np.swapaxes(own, -1, -2)
+        inner = total @ _judged(self.fit).spread @ total
+        return np.asarray(inner[0])
+
+    def expected(self, name: str) -> Array:
+        """Standard deviation (n,) of `errors` after the fit that noise and stand alone would give.
+
+        NaN if the fit did not use it. Declared noise is not scaled by what the residuals come to:
+        the two are compared.
+        """
+        problem, state = self.fit.problem, self.fit.state
+        if name in problem.evidence.absent:
+            return np.full(self.readings.count, np.nan)
+        gradient = OBSERVABLES[name].gradient(*self.targets)
+        rows = []
+        for index, (triad, where) in enumerate(zip(problem.triads, problem.slices(), strict=True)):
+            slope = triad.model.slope(state.params[:, where], triad.raw, problem.temperature)[0]
+            part = gradient[:, 3 * index : 3 * index + 3]
+            noise = triad.sd[0] * np.sqrt(self.fit.trust[0])[:, None]
+            rows.append(np.einsum("ni,nij->nj", part, slope) * noise)
+        row = np.nan_to_num(np.concatenate(rows, -1) * self._weight(name)[:, None])
+        variance = np.einsum("ni,nij,nj->n", row, self._spread, row)
+        return np.asarray(np.sqrt(np.maximum(variance, 0)))
+
+    @cached_property
+    def _moves(self) -> list[Array]:
+        """Change (n, p) of each triad's parameters when a station is left out."""
+        fit = self.fit
+        moved = without_station(fit.problem, fit.state, fit.analysis)[0]
+        return [moved[:, where] for where in fit.problem.slices()]
+
+    @cached_property
+    def left_out(self) -> tuple[Array, Array]:
+        """Corrected vectors (n, 3) of each station, by the fit without it."""
+        problem, state = self.fit.problem, self.fit.state
+        found = []
+        for triad, where, moved in zip(problem.triads, problem.slices(), self._moves, strict=True):
+            params = state.params[:, where] + moved
+            raw, temperature = triad.raw[0][:, None], problem.temperature[0][:, None]
+            found.append(triad.model.fields(params, raw, temperature)[:, 0])
+        return found[0], found[1] if len(found) > 1 else np.full_like(found[0], np.nan)
+
+    def influence(self, name: str) -> Array:
+        """Largest change (n,) that each station makes to an observable, at stations of the run."""
+        some = np.unique(np.linspace(0, self.readings.count - 1, PROBES).astype(int))
+        problem, state = self.fit.problem, self.fit.state
+        gradient = OBSERVABLES[name].gradient(*self.after)[some]
+        change = np.zeros((len(some), self.readings.count))
+        for index, (triad, where) in enumerate(zip(problem.triads, problem.slices(), strict=True)):
+            raw, temperature = triad.raw[:, some], problem.temperature[:, some]
+            rows = triad.model.jacobian(state.params[:, where], raw, temperature)[0]
+            part = np.nan_to_num(gradient[:, 3 * index : 3 * index + 3])
+            change += np.einsum("ni,nip->np", part, rows) @ self._moves[index].transpose()
+        weight = np.nan_to_num(self._weight(name)[some])
+        return np.asarray(np.abs(change * weight[:, None]).max(0))
+
+    def names(self) -> list[str]:
+        """Observables with an error that is known somewhere in this run."""
+        usable = SHOWN if len(self.fit.problem.triads) > 1 else SHOWN[:3]
+        return [n for n in usable if self.judged(n).any()]
+
+
+def error_rows(readings: Readings, fit: Fit) -> list[ErrorRow]:
+    """Root mean square errors before and after, and what was to be expected after."""
+    residuals = Residuals(readings, fit)
+    rows = []
+    for name in residuals.names():
+        factor, unit = shown_in(name, readings.relative)
+        known = residuals.judged(name)
+        before, after, expected = (
+            rms(values[known]) * factor
+            for values in (
+                residuals.errors(name, residuals.before),
+                residuals.errors(name, residuals.after),
+                residuals.expected(name),
+            )
+        )
+        rows.append(
+            ErrorRow(
+                observable=name,
+                unit=unit,
+                stations=int(known.sum()),
+                before=before,
+                after=after,
+                expected=None if np.isnan(expected) else expected,
+            )
+        )
+    return rows
+
+
+def measure_rows(readings: Readings, fit: Fit) -> list[Measures]:
+    """Moradi's mean, STD, MSE and RMSE of the vector error, where reference vectors are whole."""
+    residuals, problem = Residuals(readings, fit), fit.problem
+    rows = []
+    for index, name in enumerate(TRIADS[: len(problem.triads)]):
+        needed = ("inclination", "toolface", "azimuth")[: 2 + index]
+        whole = np.all([~np.isnan(residuals.known(n)) for n in needed], axis=0)
+        if whole.sum() < 2:
+            continue
+        for when, fields in (("before", residuals.before), ("after", residuals.after)):
+            error = np.linalg.norm((fields[index] - residuals.targets[index])[whole], axis=-1)
+            error = error / np.linalg.norm(residuals.targets[index][whole], axis=-1)
+            mse = float(np.mean(error**2))
+            rows.append(
+                Measures(
+                    triad=name,
+                    when=when,
+                    mean=float(error.mean()),
+                    std=float(error.std(ddof=1)),
+                    mse=mse,
+                    rmse=mse**0.5,
+                )
+            )
+    return rows
+
+
+def _judged(fit: Fit) -> Analysis:
+    """The analysis by which stations are judged: in a robust fit their own errors are whole.
+
+    A weight w takes a station's pull on the fit, not its noise: with V = C⁻¹ the residual V ρ has
+    the covariance V + (1 - 2 w) V X Cov XᵀV, from V - … at w = 1 to V + … where it is left out.
+    """
+    trust, found = fit.trust[..., None, None], fit.analysis
+    if (trust == 1).all():
+        return found
+    linear = fit.problem.linear(fit.state)
+    count = found.residual.shape[-1]
+    weight = linear.weigh(np.broadcast_to(np.eye(count), (*found.residual.shape, count)))
+    pulled = (weight - found.spread) / trust
+    include = fit.problem.evidence.include[..., None, None]
+    spread = (weight + (1 - 2 * trust) * pulled) * include
+    return replace(found, residual=found.residual / np.sqrt(fit.trust[..., None]), spread=spread)
+
+
+def chances(fit: Fit) -> Array:
+    """How likely a misfit as large as each station's (B, n) is, if only noise is in it."""
+    square, freedom = station_misfit(_judged(fit))
+    others = np.maximum(freedom.sum(-1, keepdims=True) - freedom, 1)
+    variance = np.maximum((square.sum(-1, keepdims=True) - square) / others, 1e-30)
+    declared = np.isnan(fit.noise).all(-1, keepdims=True)
+    return tail(square / np.where(declared, np.maximum(variance, 1.0), variance), freedom)
+
+
+def to_reshoot(chance: Array) -> Bools:
+    """Stations to take again, by the chances (..., n) of all."""
+    return np.asarray(chance < RESHOOT / chance.shape[-1])
+
+
+def tail(square: Array, freedom: Array) -> Array:
+    """Chance of a larger χ² with whole degrees of freedom, 1 where there are none.
+
+    In closed form: SciPy's takes as long to load as a fleet of some thousand tools to fit.
+
+    >>> tail(np.array([3.841459, 5.991465]), np.array([1, 2])).round(6)
+    array([0.05, 0.05])
+    """
+    found = np.ones(square.shape)
+    for degrees in np.unique(freedom[freedom > 0]):
+        some = freedom == degrees
+        half = np.minimum(square[some] / 2, 700)
+        power = 0.5 if degrees % 2 else 1.0
+        small = np.exp(-half)
+        total = np.vectorize(erfc)(np.sqrt(half)) if degrees % 2 else small
+        while power < degrees / 2:
+            total, power = total + half**power * small / gamma(power + 1), power + 1
+        found[some] = total
+    return found
+
+
+def chi_chance(square: Array, freedom: Array) -> Array:
+    """Chance of a larger χ² with any degrees of freedom, to a tenth of it from four on.
+
+    Reference: E. B. Wilson and M. M. Hilferty, Proc. Natl. Acad. Sci. 17, 684 (1931).
+
+    >>> chi_chance(np.array([18.467, 149.449]), np.array([4.0, 100.0])).round(4)
+    array([0.0011, 0.001 ])
+    """
+    spread = 2 / (9 * np.maximum(freedom, 1e-9))
+    normal = (np.cbrt(square / np.maximum(freedom, 1e-9)) - 1 + spread) / np.sqrt(2 * spread)
+    return np.asarray(0.5 * np.vectorize(erfc, otypes=[float])(normal))
+
+
+def station_rows(readings: Readings, fit: Fit) -> list[StationRow]:
+    """Errors of every station, with the ones to take again."""
+    from scipy.special import ndtri
+
+    residuals = Residuals(readings, fit)
+    names = residuals.names()
+    chance = chances(fit)[0]
+    again, deviation = to_reshoot(chance), -ndtri(np.maximum(chance, 1e-300) / 2)
+    after = {n: residuals.errors(n, residuals.after) for n in names}
+    before = {n: residuals.errors(n, residuals.before) for n in names}
+    left_out = {n: residuals.errors(n, residuals.left_out) for n in names}
+    influence = {n: residuals.influence(n) for n in names}
+    expected = {n: np.nan_to_num(residuals.expected(n), nan=np.inf) for n in names}
+    ratio = {n: np.abs(after[n]) / np.maximum(expected[n], 1e-30) for n in names}
+    factors = {n: shown_in(n, readings.relative)[0] for n in names}
+    attitude = {n: np.degrees(OBSERVABLES[n].value(*residuals.after)) for n in SHOWN[1:4]}
+    rows = []
+    for i in range(readings.count):
+        bad = bool(again[i])
+        scores = {n: float(ratio[n][i]) for n in names if not np.isnan(after[n][i])}
+        rows.append(
+            StationRow(
+                station=readings.labels[i],
+                digest=readings.digest[i] if readings.digest else "",
+                temperature_c=None
+                if readings.temperature is None
+                else float(readings.temperature[i]),
+                inclination_deg=_plain(attitude["inclination"][i]),
+                toolface_deg=_plain(attitude["toolface"][i]),
+                azimuth_deg=_plain(attitude["azimuth"][i]),
+                errors=_scaled(after, factors, i),
+                errors_before=_scaled(before, factors, i),
+                errors_left_out=_scaled(left_out, factors, i),
+                influence=_scaled(influence, factors, i),
+                weight=float(fit.trust[0, i]),
+                deviation=float(deviation[i]),
+                reshoot=bad,
+                worst=max(scores, key=lambda n: scores[n]) if bad and scores else None,
+            )
+        )
+    return rows
+
+
+def _plain(value: float) -> float | None:
+    return None if np.isnan(value) else float(value)
+
+
+def _scaled(errors: dict[str, Array], factors: dict[str, float], index: int) -> dict[str, float]:
+    pairs = {n: float(e[index] * factors[n]) for n, e in errors.items()}
+    return {n: v for n, v in pairs.items() if not np.isnan(v)}

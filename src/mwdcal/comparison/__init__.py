@@ -1,0 +1,1 @@
+"""All methods on one run, side by side."""

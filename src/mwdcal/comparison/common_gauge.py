@@ -1,0 +1,220 @@
+"""One gauge for several calibrations of a run, so that their parameters can be compared.
+
+A turn or a stretch that no evidence determines is put by convention: the mean gain of a triad,
+split into rotation and symmetric stretch, has no rotation, and the mean strength of its field
+is that of the references. Here every calibration is put there, also the one that determines
+the direction; the turn and the stretch that are taken out of each are kept beside, with their
+uncertainty. (In geodesy: an S-transformation.)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from itertools import pairwise
+
+import msgspec
+import numpy as np
+
+from mwdcal.calibration.readings import Readings
+from mwdcal.calibration.record import FREE_SHARE, Calibration, TriadCalibration
+from mwdcal.estimation.rank import Free
+from mwdcal.geometry.vectors import Array, rotation
+from mwdcal.sensor.models import Basis, Model, Polynomial
+from mwdcal.use.notation import Notation, convert
+
+TURNS = ("rotation-x", "rotation-y", "toolface-zero")
+SCALE = "scale"
+STEP = 1e-6
+"""Step of a derivative, as the share of the field by which it changes the field."""
+
+
+@dataclass(frozen=True)
+class Gauge:
+    """Directions put by convention, each with the triads that it turns or stretches together."""
+
+    free: frozenset[tuple[str, tuple[int, ...]]]
+
+    @classmethod
+    def of(cls, free: Iterable[Free]) -> Gauge:
+        """All that any of several calibrations leaves free, but for courses with temperature."""
+        return cls(frozenset((f.id, f.triads) for f in free if f.id in (*TURNS, SCALE)))
+
+    def names(self, triad: int) -> list[str]:
+        """The directions that are put by convention for one triad, in their usual order."""
+        own = {name for name, triads in self.free if triad in triads}
+        return [name for name in (*TURNS, SCALE) if name in own]
+
+    def turns(self, triads: tuple[int, ...]) -> list[str]:
+        """Axes about which these triads turn together."""
+        return [name for name in TURNS if (name, triads) in self.free]
+
+
+def in_gauge(
+    made: Calibration, readings: Readings, gauge: Gauge
+) -> tuple[dict[str, Notation], dict[str, Notation]]:
+    """Factors of each triad in a gauge, and what was taken out to put them there.
+
+    Taken out: `rotation_deg` (3,), the rotation vector in degrees about the tool axes, and
+    `scale` (1,), each with uncertainty: NaN where this calibration does not determine it.
+    Own-axis terms do not count: factors are those of the tangent at the centre of the readings.
+    """
+    made = _straight(made)
+    settle = _Settle.of(made, readings, gauge)
+    params = np.concatenate([t.parameters for t in made.triads])
+    found, slope = settle(params), settle.slope(made, readings, params)
+    covariance = slope @ np.array(made.covariance) @ slope.transpose()
+    free = np.array(made.free, float).reshape(len(made.free), len(params)) @ slope.transpose()
+    size = len(params)
+    triads = [
+        msgspec.structs.replace(t, parameters=found[w].tolist())
+        for t, w in zip(made.triads, settle.slices, strict=True)
+    ]
+    put = msgspec.structs.replace(
+        made,
+        accelerometer=triads[0],
+        magnetometer=triads[1] if len(triads) > 1 else None,
+        covariance=covariance[:size, :size].tolist(),
+        free=free[:, :size].tolist(),
+    )
+    moved = np.abs(free[:, size:]).max(0, initial=0.0)
+    sd = np.sqrt(np.maximum(np.diag(covariance)[size:], 0))
+    sd = np.where(moved > FREE_SHARE, np.nan, sd)
+    unit = np.array([*np.full(3, np.degrees(1)), 1.0])
+    taken = {}
+    for index, triad in enumerate(triads):
+        own = slice(4 * index, 4 * index + 4)
+        far = slice(size + own.start, size + own.stop)
+        value, spread = found[far] * unit, covariance[far, far] * np.outer(unit, unit)
+        parts = {"rotation_deg": slice(0, 3), "scale": slice(3, 4)}
+        taken[triad.name] = Notation(
+            {name: value[part] for name, part in parts.items()},
+            {name: (sd[own] * unit)[part] for name, part in parts.items()},
+            spread,
+        )
+    return convert(put, "factors"), taken
+
+
+@dataclass(frozen=True)
+class _Settle:
+    """The map from the parameters (p,) of all triads to those in the gauge."""
+
+    gauge: Gauge
+    models: list[Model]
+    slices: list[slice]
+    raw: list[Array]
+    temperature: Array
+    nominal: list[float]
+
+    @classmethod
+    def of(cls, made: Calibration, readings: Readings, gauge: Gauge) -> _Settle:
+        reference, triads = made.reference_temperature, made.triads
+        ends = np.cumsum([0, *(len(t.parameters) for t in triads)])
+        temperature = readings.temperature
+        if temperature is None:
+            temperature = np.full(readings.count, reference)
+        strengths = [readings.reference(name) for name in ("gravity", "field")[: len(triads)]]
+        return cls(
+            gauge,
+            [t.functions(reference) for t in triads],
+            [slice(int(a), int(b)) for a, b in pairwise(ends)],
+            [getattr(readings, t.name) for t in triads],
+            temperature,
+            [1.0 if np.isnan(s).all() else float(np.nanmean(s)) for s in strengths],
+        )
+
+    def __call__(self, params: Array) -> Array:
+        """Parameters in the gauge, then per triad the rotation vector, rad, and scale taken out."""
+        parts = [params[w] for w in self.slices]
+        every = tuple(range(len(parts)))
+        turned = [np.eye(3) for _ in every]
+        for triads in dict.fromkeys([every, *((t,) for t in every)]):
+            turn = self._turn(parts[triads[0]], triads)
+            for t in triads:
+                parts[t] = self.models[t].transformed(parts[t], turn)
+                turned[t] = turn @ turned[t]
+        taken = []
+        for t in every:
+            factor = self._factor(parts[t], t)
+            parts[t] = self.models[t].transformed(parts[t], factor * np.eye(3))
+            taken += [*_rotation_vector(turned[t].transpose()), 1 / factor]
+        return np.concatenate([*parts, taken])
+
+    def slope(self, made: Calibration, readings: Readings, params: Array) -> Array:
+        """Derivative (p + 4 t, p) of the map, by central differences."""
+        effect, fields = made.jacobian(readings), made.fields(readings)
+        columns = []
+        for t, where in enumerate(self.slices):
+            strength = np.linalg.norm(fields[t], axis=-1).mean()
+            rows = effect[:, 3 * t : 3 * t + 3, where]
+            sizes = np.sqrt(np.mean(np.sum(rows**2, 1), 0)) / strength
+            for index, size in zip(range(where.start, where.stop), sizes, strict=True):
+                step = np.zeros(len(params))
+                step[index] = STEP / size
+                change = self(params + step) - self(params - step)
+                columns.append(change / (2 * step[index]))
+        return np.stack(columns, -1)
+
+    def _turn(self, params: Array, triads: tuple[int, ...]) -> Array:
+        """The turn that leaves the first triad's gain without rotation about the free axes."""
+        axes, first = self.gauge.turns(triads), triads[0]
+        gain = self.models[first].slope(params, self.raw[first], self.temperature).mean(0)
+        u, _, vt = np.linalg.svd(gain)
+        polar = u @ vt
+        if len(axes) == len(TURNS):
+            return np.asarray(polar.transpose())
+        about = np.arctan2(polar[0, 1] - polar[1, 0], polar[0, 0] + polar[1, 1])
+        return rotation(np.array([0.0, 0.0, about if "toolface-zero" in axes else 0.0]))
+
+    def _factor(self, params: Array, triad: int) -> float:
+        """What brings the triad's mean strength to that of the references, if its scale is free."""
+        if SCALE not in self.gauge.names(triad):
+            return 1.0
+        fields = self.models[triad].fields(params, self.raw[triad], self.temperature)
+        return self.nominal[triad] / float(np.linalg.norm(fields, axis=-1).mean())
+
+
+def _rotation_vector(turn: Array) -> Array:
+    """Rotation vector (3,), rad, of a rotation by less than half a turn."""
+    odd = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / 2
+    sine = np.linalg.norm(odd)
+    angle = np.arctan2(sine, (np.trace(turn) - 1) / 2)
+    return odd * (angle / sine if sine > 0 else 1.0)
+
+
+def _straight(made: Calibration) -> Calibration:
+    """The calibration with own-axis terms replaced by the tangent at the centre of the readings."""
+    if not any(t.curved for t in made.triads):
+        return made
+    blocks = [_tangent(t, made.reference_temperature) for t in made.triads]
+    whole = np.zeros(np.sum([b.shape for b in blocks], 0))
+    row = column = 0
+    for block in blocks:
+        whole[row : row + block.shape[0], column : column + block.shape[1]] = block
+        row, column = row + block.shape[0], column + block.shape[1]
+    triads = [
+        msgspec.structs.replace(
+            t,
+            curved=False,
+            parameter_names=t.parameter_names[: len(block)],
+            parameters=(block @ t.parameters).tolist(),
+        )
+        for t, block in zip(made.triads, blocks, strict=True)
+    ]
+    free = np.array(made.free, float).reshape(len(made.free), whole.shape[1])
+    return msgspec.structs.replace(
+        made,
+        accelerometer=triads[0],
+        magnetometer=triads[1] if len(triads) > 1 else None,
+        covariance=(whole @ np.array(made.covariance) @ whole.transpose()).tolist(),
+        free=(free @ whole.transpose()).tolist(),
+    )
+
+
+def _tangent(triad: TriadCalibration, reference: float) -> Array:
+    """Linear map from a triad's parameters to those of its tangent on plain readings."""
+    if not triad.curved:
+        return np.eye(len(triad.parameters))
+    centre, radius = np.array([triad.centre]), np.full((1, 3), triad.radius)
+    plain = Polynomial(Basis(triad.order, reference), centre, radius).finished(reference)[1]
+    return np.concatenate([plain, np.zeros((len(plain), 6))], -1)

@@ -1,0 +1,409 @@
+"""Every applicable method on the same run, side by side, judged by stations left out."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+
+from mwdcal.calibration.automatic.nonlinearity import declared, with_chosen_curves
+from mwdcal.calibration.automatic.order_selection import choose_order
+from mwdcal.calibration.calibrate import calibrate
+from mwdcal.calibration.diagnosis.refusals import check_readings
+from mwdcal.calibration.estimate import Fit, fit
+from mwdcal.calibration.evidence import evidence_of
+from mwdcal.calibration.methods import EVIDENCE, ITERATIONS
+from mwdcal.calibration.options import Options, Orders
+from mwdcal.calibration.readings import ANGLES, TRIADS, Readings, is_simulated
+from mwdcal.calibration.record import Calibration, Measures
+from mwdcal.calibration.residuals import SHOWN, departure, rms, shown_in
+from mwdcal.comparison.common_gauge import Gauge, in_gauge
+from mwdcal.errors import FitError
+from mwdcal.estimation.minimisers.swarm import least_squares_forward, swarm_forward, vector_cost
+from mwdcal.estimation.rank import Free, free_directions
+from mwdcal.estimation.solvers import Status
+from mwdcal.geometry.vectors import Array, Ints, reference_vectors
+from mwdcal.sensor.profile import Profile
+from mwdcal.use.notation import Notation
+from mwdcal.use.roll_scatter import directions, group_scatter
+
+SCATTER = "scatter within groups"
+FOLDS = 8
+"""Parts into which the stations are dealt; each is left out once."""
+SINGLY = 24
+"""Runs of no more stations have each left out by itself."""
+NEAR_BEST = 1.02
+"""A simpler preference stands if its held-out error is within this ratio of the best."""
+
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Row:
+    """One method on the run: what it reached, or why it was refused.
+
+    `in_sample` and `held_out` are root mean square errors by observable in shown units, only
+    where the run has references, whichever of them the method used; `resting` names those that
+    rest on a convention, because the method leaves a direction free. `lost` counts stations
+    that no fit without them could judge. `measures` are Moradi's, after the fit and left out.
+    `parameters` are factors by triad, in the gauge of the comparison, and `taken_out` what puts
+    them there (`mwdcal.comparison.common_gauge`). `station_errors` (n,) are left out, in shown units; `course`
+    is the swarm's: excess of its cost over the least after each iteration, by triad.
+    """
+
+    method: str
+    refused: str = ""
+    ranks: dict[str, tuple[int, int]] = field(default_factory=dict)
+    undetermined: tuple[str, ...] = ()
+    iterations: int = 0
+    seconds: float = 0.0
+    in_sample: dict[str, float] = field(default_factory=dict)
+    held_out: dict[str, float] = field(default_factory=dict)
+    resting: tuple[str, ...] = ()
+    lost: int = 0
+    measures: tuple[Measures, ...] = ()
+    parameters: dict[str, Notation] = field(default_factory=dict)
+    taken_out: dict[str, Notation] = field(default_factory=dict)
+    station_errors: dict[str, Array] = field(default_factory=dict)
+    course: dict[str, Array] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """All methods on one run, the units of their errors, and which to use and why.
+
+    `orders` are the temperature orders of the triads, `curved` those with own-axis terms;
+    `parts` counts the parts of the stations that were left out in turn. `before` and
+    `measures_before` are errors of the nominal readings; `gauge` names, by triad, the
+    directions that some method leaves free and all are therefore stripped of.
+    """
+
+    run: str
+    stations: int
+    labels: tuple[str, ...]
+    simulated: bool
+    orders: tuple[int, int]
+    curved: tuple[str, ...]
+    parts: int
+    seed: int
+    units: dict[str, str]
+    before: dict[str, float]
+    measures_before: tuple[Measures, ...]
+    gauge: dict[str, list[str]]
+    rows: tuple[Row, ...]
+    advice: str
+
+
+@dataclass(frozen=True)
+class _Made:
+    """One method's calibration, its fit and the time that took, and the free directions."""
+
+    options: Options
+    calibration: Calibration
+    whole: Fit
+    seconds: float
+    free: list[Free]
+
+
+def compare(
+    readings: Readings,
+    profile: Profile,
+    order: Orders | Literal["auto"] = "auto",
+    *,
+    seed: int = 0,
+    progress: Progress = lambda text: None,
+) -> Comparison:
+    """Calibrate a run by every method and judge each by stations left out of its fit.
+
+    `order` "auto": as the joint method chooses it, the same for all
+    methods. A method that is refused gives its reason and leaves the others alone.
+    """
+    options = _options(readings, profile, order, seed, progress)
+    made: dict[str, _Made | str] = {}
+    for method in EVIDENCE:
+        progress(f"{method}: fit")
+        made[method] = _made(readings, profile, replace(options, method=method))
+    usable = [one for one in made.values() if isinstance(one, _Made)]
+    gauge = Gauge.of(entry for one in usable for entry in one.free)
+    judge = _Judge.of(readings, usable[0].calibration.earth if usable else {})
+    rows = []
+    for method, one in made.items():
+        if isinstance(one, str):
+            rows.append(Row(method, refused=one))
+        else:
+            progress(f"{method}: {judge.parts} fits without a part of the stations each")
+            rows.append(_row(one, judge, gauge))
+    bare = nominal(readings)
+    return Comparison(
+        readings.source,
+        readings.count,
+        readings.labels,
+        is_simulated(readings.metadata),
+        options.orders,
+        tuple(options.nonlinearity or ()),
+        judge.parts,
+        seed,
+        judge.units(),
+        judge.summary(*bare),
+        tuple(judge.measures("before", *bare)),
+        {name: gauge.names(i) for i, name in enumerate(TRIADS) if gauge.names(i)},
+        tuple(rows),
+        advice(tuple(rows)),
+    )
+
+
+def _options(
+    readings: Readings,
+    profile: Profile,
+    order: Orders | Literal["auto"],
+    seed: int,
+    progress: Progress,
+) -> Options:
+    """Order and own-axis terms, chosen by the joint method where they are left to the data.
+
+    A run that cannot be chosen for is left to the methods, each of which then says why.
+    """
+    options = Options(nonlinearity={}, seed=seed)
+    try:
+        if order == "auto":
+            check_readings(readings, options)
+            order, _ = choose_order(readings, options, progress)
+        options = replace(options, order=order)
+        offered = declared(profile, options)
+        if offered:
+            check_readings(readings, options)
+            progress("own-axis nonlinearity: comparing fits with and without it")
+            options = with_chosen_curves(readings, options, offered)[0]
+    except FitError:
+        pass
+    return options
+
+
+def _made(readings: Readings, profile: Profile, options: Options) -> _Made | str:
+    """A method's calibration, or the reason why there is none."""
+    if options.method == "swarm":
+        options = replace(options, nonlinearity={})
+    try:
+        found = calibrate(readings, profile, options)
+    except FitError as error:
+        return str(error)
+    except np.linalg.LinAlgError as error:
+        return f"the stations are too weak to fit the model ({error}). Add stations."
+    started = time.perf_counter()
+    whole = fit(readings, options)
+    seconds = time.perf_counter() - started
+    free = free_directions(whole.problem, whole.state, whole.analysis.determined)
+    return _Made(options, found, whole, seconds, free)
+
+
+def _row(made: _Made, judge: _Judge, gauge: Gauge) -> Row:
+    found, readings = made.calibration, judge.readings
+    left_out = judge.left_out(made.options)
+    inside = found.fields(readings)
+    parameters, taken_out = in_gauge(found, readings, gauge)
+    return Row(
+        made.options.method,
+        ranks={t.name: (t.rank, t.size) for t in found.triads},
+        undetermined=tuple(dict.fromkeys(u.id for u in found.undetermined())),
+        iterations=int(made.whole.iterations[0]),
+        seconds=made.seconds,
+        in_sample=judge.summary(*inside),
+        held_out=judge.summary(*left_out),
+        resting=tuple(n for n in judge.units() if _rests(n, found, readings)),
+        lost=int(np.isnan(left_out[0]).any(-1).sum()),
+        measures=(*judge.measures("after", *inside), *judge.measures("left out", *left_out)),
+        parameters=parameters,
+        taken_out=taken_out,
+        station_errors={n: e * judge.factor(n) for n, e in errors(readings, *left_out).items()},
+        course=_course(made) if made.options.method == "swarm" else {},
+    )
+
+
+def _rests(name: str, made: Calibration, readings: Readings) -> bool:
+    """Whether an error moves with a direction that a method leaves free."""
+    moving = ("inclination", "azimuth") if name == SCATTER else (name,)
+    return any(bool(made.rests_on_free(n, readings).any()) for n in moving)
+
+
+def _course(made: _Made) -> dict[str, Array]:
+    """Excess of the swarm's best cost over the least one, as a share of it, by triad."""
+    problem, state = made.whole.problem, made.whole.state
+    found = {}
+    for name, triad, earth in zip(TRIADS, problem.triads, problem.earth(state)[0], strict=False):
+        target = np.einsum("bnij,bnj->bni", state.attitude, earth)
+        swarm = swarm_forward(
+            triad.raw, target, "reading", iterations=ITERATIONS, seed=made.options.seed
+        )
+        least = least_squares_forward(triad.raw, target)[:, None]
+        cost = vector_cost(triad.raw, target, "reading")(least)[0, 0]
+        found[name] = swarm.history[0] / cost - 1
+    return found
+
+
+def nominal(readings: Readings) -> tuple[Array, Array]:
+    """Vectors (n, 3) that the tool reads uncalibrated; the field has a mean of one if unknown."""
+    raw = readings.magnetometer
+    if raw is None:
+        return readings.accelerometer, np.full_like(readings.accelerometer, np.nan)
+    scale = np.linalg.norm(raw, axis=-1).mean() if readings.relative else 1.0
+    return readings.accelerometer, raw / scale
+
+
+def _referenced(readings: Readings) -> list[str]:
+    """Observables that have a reference somewhere in the run."""
+    magnetic = ("azimuth", "field", "dip")
+    usable = [n for n in SHOWN if readings.magnetometer is not None or n not in magnetic]
+    return [n for n in usable if not np.isnan(readings.reference(n)).all()]
+
+
+def errors(readings: Readings, g: Array, b: Array) -> dict[str, Array]:
+    """Error (n,) of each observable against the run's own reference, as `calibrate` states it.
+
+    Of angles that is the group's where a station of a group has none of its own.
+    """
+    shared = evidence_of(readings, np.ones(readings.count)).known
+    known = {
+        name: shared[name][0] if name in ANGLES else readings.reference(name)
+        for name in dict.fromkeys((*_referenced(readings), "inclination"))
+    }
+    return {name: departure(name, g, b, known) for name in _referenced(readings)}
+
+
+@dataclass(frozen=True)
+class _Judge:
+    """How well vectors agree with a run's references, the same for every method.
+
+    `earth` stands in where field and dip have no reference; `part` (n,) numbers the part that
+    each station is left out with.
+    """
+
+    readings: Readings
+    earth: Mapping[str, float]
+    part: Ints
+
+    @classmethod
+    def of(cls, readings: Readings, earth: Mapping[str, float]) -> _Judge:
+        count = readings.count
+        return cls(readings, earth, np.arange(count) % (count if count <= SINGLY else FOLDS))
+
+    @property
+    def parts(self) -> int:
+        """Number of parts."""
+        return int(self.part.max()) + 1
+
+    @property
+    def names(self) -> list[str]:
+        """Observables that have a reference somewhere in the run."""
+        return _referenced(self.readings)
+
+    @property
+    def grouped(self) -> bool:
+        """Whether directions within groups can be compared."""
+        return bool((self.readings.groups >= 0).any()) and self.readings.magnetometer is not None
+
+    def _shown(self, name: str) -> tuple[float, str]:
+        return shown_in(name, self.readings.relative)
+
+    def factor(self, name: str) -> float:
+        """Factor from an observable's own unit to the one it is shown in."""
+        return self._shown(name)[0]
+
+    def units(self) -> dict[str, str]:
+        """Units in which errors are shown."""
+        units = {name: self._shown(name)[1] for name in self.names}
+        return {**units, SCATTER: "°"} if self.grouped else units
+
+    def left_out(self, options: Options) -> tuple[Array, Array]:
+        """Vectors (n, 3) of each station from the fit that left its part out; NaN if that failed."""
+        include = (np.arange(self.parts)[:, None] != self.part).astype(float)
+        result = fit(self.readings, options, include)
+        failed = result.status != Status.OK
+        g, b = (
+            np.where(failed[:, None, None], np.nan, v) for v in result.problem.fields(result.state)
+        )
+        own = np.arange(self.readings.count)
+        return g[self.part, own], b[self.part, own]
+
+    def summary(self, g: Array, b: Array) -> dict[str, float]:
+        """Root mean square errors by observable, and the scatter within groups, in shown units."""
+        result = {n: rms(e) * self.factor(n) for n, e in errors(self.readings, g, b).items()}
+        if self.grouped:
+            result[SCATTER] = self._scatter(g, b)
+        return result
+
+    def _scatter(self, g: Array, b: Array) -> float:
+        """Scatter of directions within groups of two stations or more, degrees."""
+        group = np.where(np.isnan(g).any(-1), -1, self.readings.groups)
+        numbers, place, count = np.unique(group, return_inverse=True, return_counts=True)
+        usable = (numbers >= 0) & (count > 1)
+        group = np.where(usable, np.cumsum(usable) - 1, -1)[place]
+        axis = directions(g, b)
+        return float(np.degrees(group_scatter(axis, group))) if usable.any() else float("nan")
+
+    def measures(self, when: str, *fields: Array) -> list[Measures]:
+        """Moradi's measures of the vector error, as a share of the reference vector."""
+        known = {n: self.readings.reference(n) for n in ("inclination", "azimuth", "toolface")}
+        field, dip = self.readings.reference("field"), self.readings.reference("dip")
+        field = np.where(np.isnan(field), self.earth.get("field", np.nan), field)
+        dip = np.where(np.isnan(dip), np.radians(self.earth.get("dip_deg", np.nan)), dip)
+        blind = {**known, "azimuth": np.zeros(self.readings.count)}
+        gravity = self.readings.reference("gravity")
+        ideal = [
+            reference_vectors(**blind, gravity=gravity)[0],
+            reference_vectors(**known, field=field, dip=dip)[1],
+        ]
+        found = []
+        for name, target, actual in zip(TRIADS, ideal, fields, strict=True):
+            error = np.linalg.norm(actual - target, axis=-1) / np.linalg.norm(target, axis=-1)
+            error = error[~np.isnan(error)]
+            if len(error) < 2:
+                continue
+            mse = float(np.mean(error**2))
+            found.append(
+                Measures(
+                    triad=name, when=when, mean=float(error.mean()),
+                    std=float(error.std(ddof=1)), mse=mse, rmse=mse**0.5,
+                )
+            )  # fmt: skip
+        return found
+
+
+def score(row: Row, best: Mapping[str, float]) -> float:
+    """Mean ratio of a method's held-out errors to the best of any method."""
+    ratios = [row.held_out[n] / value for n, value in best.items() if value > 0]
+    ratios = [ratio for ratio in ratios if not np.isnan(ratio)]
+    return float(np.mean(ratios)) if ratios else float("inf")
+
+
+def able(rows: Iterable[Row]) -> list[Row]:
+    """The methods that could calibrate the run."""
+    return [row for row in rows if not row.refused]
+
+
+def _gaps(row: Row) -> tuple[int, int]:
+    """Directions that a method leaves free, and stations that it could not be judged by."""
+    return len(row.undetermined), row.lost
+
+
+def advice(rows: tuple[Row, ...]) -> str:
+    """Which method to use on this run, and why."""
+    usable = able(rows)
+    if not usable:
+        return "no method can calibrate this run: see why each was refused."
+    names = usable[0].held_out
+    best = {n: float(np.fmin.reduce([row.held_out[n] for row in usable])) for n in names}
+    scores = {row.method: score(row, best) for row in usable}
+    winner = min(usable, key=lambda row: (*_gaps(row), scores[row.method]))
+    joint = next((row for row in usable if row.method == "joint"), None)
+    if joint is not None and _gaps(joint) <= _gaps(winner):
+        within = scores["joint"] <= NEAR_BEST * scores[winner.method]
+        winner = joint if within else winner
+    why = f"{winner.method}: held-out errors {scores[winner.method]:.2f} times the best of each"
+    free = f"; leaves {', '.join(winner.undetermined)} undetermined" if winner.undetermined else ""
+    others = [
+        f"{m} {s:.2f}" for m, s in sorted(scores.items(), key=lambda x: x[1]) if m != winner.method
+    ]
+    return f"use {why}{free} (others: {', '.join(others)})." if others else f"use {why}{free}."

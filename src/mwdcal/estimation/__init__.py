@@ -1,0 +1,1 @@
+"""The estimator on plain arrays: evidence, residual, steps, rank, uncertainty, robust weights."""

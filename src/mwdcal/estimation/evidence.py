@@ -1,0 +1,79 @@
+"""What is known of the stations of a run: references with their uncertainty, and errors in common."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from mwdcal.geometry.vectors import Array, Bools, Ints
+
+EARTH = ("gravity", "field", "dip")
+STAND = {
+    "stand-north": np.array([1.0, 0.0, 0.0]),
+    "stand-east": np.array([0.0, 1.0, 0.0]),
+    "azimuth-zero": np.array([0.0, 0.0, 1.0]),
+}
+"""Turns of the stand's frame, by the earth axis (north, east, down) they are about."""
+STAND_ERRORS = (*STAND, "inclination-zero", "toolface-zero")
+"""All errors of the stand that are common to its stations: turns of its frame, zeros of its scales."""
+UNKNOWN = np.pi / np.sqrt(3)
+"""Standard uncertainty of an angle about which nothing is known, rad."""
+
+
+@dataclass(frozen=True)
+class Constant:
+    """A constant of the run that is estimated: gravity, field, dip, or an error.
+
+    Errors are of one of these references, or of the stand: one of `STAND_ERRORS`, each a small
+    angle such that reading of the stand = value in the earth's frame + error.
+
+    `mask` (B, n) says which stations it acts on; `value` (B,) is where it starts. `sd` (B,)
+    is the standard uncertainty of the reference; for an unknown constant it is only a scale.
+    """
+
+    name: str
+    mask: Array
+    value: Array
+    sd: Array
+    unknown: bool
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What is known of the stations: arrays (B, n), radians, g, nT; NaN where unknown.
+
+    `sd` of the angles are independent per station. `group` shares a direction among
+    stations of the same number (-1: none). `include` is 1 for stations that count, 0 for
+    those left out. `absent` names the strengths and the dip of which nothing may be used:
+    each station then has its own. `stand` (B,) are the standard uncertainties of errors that all
+    stations have in common, by name of `STAND_ERRORS`. `scatter` (B, n) is how far what should be
+    constant departs from station to station, 1σ: "gravity" and "field" as a share, "dip" and the
+    common "direction" of a group in radians.
+    """
+
+    known: dict[str, Array]
+    sd: dict[str, Array]
+    group: Ints
+    include: Array
+    constants: tuple[Constant, ...]
+    absent: tuple[str, ...] = ()
+    stand: Mapping[str, Array] = field(default_factory=dict)
+    scatter: dict[str, Array] = field(default_factory=dict)
+
+    def is_known(self, name: str) -> Bools:
+        """Where a reference value is given (B, n)."""
+        return ~np.isnan(self.known[name])
+
+    @property
+    def members(self) -> Array:
+        """Membership (B, n, k) of the k groups, as zeros and ones."""
+        numbers = np.arange(int(self.group.max(initial=-1)) + 1)
+        return np.asarray(self.group[..., None] == numbers, float)
+
+    def shared(self, name: str) -> Array:
+        """Membership (B, n, k) of the groups for which an angle is a shared unknown."""
+        members = self.members
+        given = np.einsum("bnk,bn->bk", members, self.is_known(name))
+        return np.asarray(members * (given == 0)[:, None, :])

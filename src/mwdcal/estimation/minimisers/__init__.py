@@ -1,0 +1,1 @@
+"""Closed forms, Newton's method and the particle swarm: other ways to the same minimum."""

@@ -1,0 +1,131 @@
+"""Sums of squared differences of observables, as the papers wrote them: weights are given.
+
+    E = Σ_n Σ_o w_no (o(field_n) - reference_no)²
+
+Minimised, this is no maximum of likelihood: its covariance is a sandwich (`core.uncertainty.sandwich`).
+
+"strength-squared" is |v|² of either triad, "inclination" and "toolface" are the
+accelerometer's. Shapes: batch axis B, n stations, m observables, p parameters. Singular:
+toolface of a reference or a reading that is vertical has weight zero, as it has no value.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mwdcal.estimation.problem import Triad
+from mwdcal.estimation.solvers import Determined, Linear, Normal
+from mwdcal.geometry.observables import OBSERVABLES, is_vertical
+from mwdcal.geometry.vectors import Array, Bools, Ints, centred
+
+STRENGTH = "strength-squared"
+
+
+@dataclass(frozen=True)
+class Params:
+    """The state of such a sum: parameters (B, p) alone."""
+
+    params: Array
+
+    def take(self, index: Ints) -> Params:
+        """Some members of the batch."""
+        return Params(self.params[index])
+
+    def put(self, index: Ints, other: Params) -> Params:
+        """Ours with some members replaced."""
+        changed = self.params.copy()
+        changed[index] = other.params
+        return Params(changed)
+
+
+@dataclass(frozen=True)
+class Sums:
+    """One triad, the observables compared with `reference` (B, n, m), and their `weights`."""
+
+    triad: Triad
+    temperature: Array
+    names: tuple[str, ...]
+    reference: Array
+    weights: Array
+
+    def take(self, index: Ints) -> Sums:
+        """The sums of some members of the batch."""
+        triad = Triad(self.triad.model.take(index), self.triad.raw[index], self.triad.sd[index])
+        return replace(
+            self,
+            triad=triad,
+            temperature=self.temperature[index],
+            reference=self.reference[index],
+            weights=self.weights[index],
+        )
+
+    def compared(self, params: Array) -> tuple[Array, Array, Bools]:
+        """Differences (B, n, m), gradients (B, n, m, 3) by the field, and whether each counts."""
+        return self.at(self.triad.model.fields(params, self.triad.raw, self.temperature))
+
+    def at(self, field: Array) -> tuple[Array, Array, Bools]:
+        """The same for given vectors (B, n, 3)."""
+        errors, gradients, counts = [], [], []
+        for index, name in enumerate(self.names):
+            if name == STRENGTH:
+                value, gradient = np.sum(field**2, -1), 2 * field
+            else:
+                observable, blank = OBSERVABLES[name], np.zeros_like(field)
+                value = observable.value(field, blank)
+                gradient = observable.gradient(field, blank)[..., :3]
+            error = value - self.reference[..., index]
+            errors.append(centred(error, OBSERVABLES[name].period) if name == "toolface" else error)
+            gradients.append(gradient)
+            counts.append(np.logical_or(name != "toolface", is_vertical(field) == 0))
+        counted = np.stack(counts, -1) & (self.weights > 0)
+        error = np.where(counted, np.stack(errors, -1), 0.0)
+        return error, np.where(counted[..., None], np.stack(gradients, -2), 0.0), counted
+
+    def linear(self, state: Params, geometry: bool = False) -> Linear:
+        """Linearise at a state; with `geometry` each observable is in units of its own size."""
+        error, gradient, _ = self.compared(state.params)
+        jacobian = self.triad.model.jacobian(state.params, self.triad.raw, self.temperature)
+        root = np.sqrt(self.weights)
+        if geometry:
+            sizes = [np.abs(self.reference[..., k]) if n == STRENGTH else np.ones(root.shape[:-1])
+                     for k, n in enumerate(self.names)]  # fmt: skip
+            root = (self.weights > 0) / np.stack(sizes, -1)
+        size = state.params.shape[-1]
+        return Linear(
+            error * root,
+            (gradient @ jacobian * root[..., None],),
+            np.zeros((*error.shape, 0)),
+            np.zeros((*error.shape, 1)),
+            np.zeros((len(error), size, size)),
+            np.zeros((len(error), size)),
+        )
+
+    def move(self, state: Params, linear: Linear, step: Array) -> Params:
+        """The state after a step."""
+        return Params(state.params + step)
+
+    def size_of(self, state: Params) -> Array:
+        """Largest parameter (B, p): steps far below it are rounding."""
+        largest = np.max(np.abs(state.params), -1, keepdims=True)
+        return np.broadcast_to(largest, state.params.shape)
+
+    def information(self, params: Array) -> Array:
+        """Information (B, p, p) of the observables, in relative units and radians."""
+        return Normal.of(self.linear(Params(params), geometry=True)).information
+
+    def pulls(self, params: Array, target: Array) -> Array:
+        """Change (B, n, p, 3) of the minimum by an error of each station's whitened reading.
+
+        On the determined subspace. The observables' gradients are taken at `target` (B, n, 3), the
+        vectors that a perfect tool reads: along an unknown turn they are then exactly zero.
+        """
+        state = Params(params)
+        determined = Determined.of(self, state)
+        bread = determined.inverse(Normal.of(self.linear(state)).information)
+        model, raw = self.triad.model, self.triad.raw
+        _, gradient, _ = self.at(target)
+        noise = gradient @ model.slope(params, raw, self.temperature) * self.triad.sd[..., None, :]
+        rows = gradient @ model.jacobian(params, raw, self.temperature) * self.weights[..., None]
+        return -bread[:, None] @ np.swapaxes(rows, -1, -2) @ noise

@@ -1,0 +1,515 @@
+"""A calibration problem: sensor models, what the stations are known to be, one residual.
+
+Per station the raw readings are compared with what the model says the reference vectors
+would have read:
+
+    ρ = (slope⁻¹ (field(reading) - R e)) / σ
+
+R is the station's attitude, e the earth's vectors. Every reference angle is a private
+unknown with its own standard uncertainty: zero for an exact stand, π/√3 where the angle is
+not known. Directions shared by a group, and unknown or uncertain field strength, dip and
+gravity, are shared unknowns. Value, constant in a group, absent and exactly vertical
+stations are thereby one path. Residual and Jacobian are taken at the predicted reading,
+which makes this the estimator of errors in the readings for any evidence.
+
+Batch axis B first, station next, component last.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+
+import numpy as np
+
+from mwdcal.estimation import fit_numba
+from mwdcal.estimation.evidence import EARTH, STAND, STAND_ERRORS, UNKNOWN, Evidence
+from mwdcal.estimation.solvers import Linear
+from mwdcal.geometry.vectors import (
+    Array,
+    Bools,
+    Ints,
+    earth_field,
+    earth_gravity,
+    eigen,
+    inverse,
+    placed,
+    rotation,
+    skew,
+)
+from mwdcal.sensor.models import Model
+
+INFORMED = 1e-13
+"""A prior says something of a direction if its precision exceeds this share of the largest."""
+GEOMETRIC_NOISE = 1e-4
+"""Noise, as a share of the field, at which rank is counted whatever the actual noise."""
+
+
+@dataclass(frozen=True)
+class Triad:
+    """One sensor triad: model, readings (B, n, 3), their noise (B, n, 3)."""
+
+    model: Model
+    raw: Array
+    sd: Array
+
+
+@dataclass(frozen=True)
+class State:
+    """Where a fit stands: parameters (B, p), attitudes (B, n, 3, 3), constants (B, q).
+
+    `own` (B, n, a) are the stations' own departures of the absent strengths and dip.
+    """
+
+    params: Array
+    attitude: Array
+    constants: Array
+    own: Array
+
+    def take(self, index: Ints) -> State:
+        """Some members of the batch."""
+        return State(
+            self.params[index], self.attitude[index], self.constants[index], self.own[index]
+        )
+
+    def put(self, index: Ints, other: State) -> State:
+        """Ours with some members replaced."""
+        ours = (self.params, self.attitude, self.constants, self.own)
+        theirs = (other.params, other.attitude, other.constants, other.own)
+        return State(*(placed(a, index, b) for a, b in zip(ours, theirs, strict=True)))
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """One triad at a state: misfit of the reading, its derivatives, and the size of the field.
+
+    `misfit` (B, n, 3) raw; `by_params` (B, n, 3, p); `by_turn` (B, n, 3, 3) for a turn of the
+    station; `by_earth` (B, n, 3, 3) for its gravity, field and dip; `strength` (B, n) of the
+    field in raw units.
+    """
+
+    misfit: Array
+    by_params: Array
+    by_turn: Array
+    by_earth: Array
+    strength: Array
+
+
+@dataclass(frozen=True)
+class Prior:
+    """What is known of all parameters beforehand: `precision` (B, p, p) about `expected` (B, p)."""
+
+    precision: Array
+    expected: Array
+
+    def take(self, index: Ints) -> Prior:
+        """That of some members of the batch."""
+        return Prior(self.precision[index], self.expected[index])
+
+    def informed(self, norms: Array) -> Array:
+        """Precision (B, p, p) as large as the data's wherever it is not zero.
+
+        It tells which directions a prior determines, however loosely; `norms` (B, p) are
+        those of the data's columns.
+        """
+        norms = np.where(norms > 0, norms, 1.0)  # of what the data say nothing of
+        outer = norms[:, :, None] * norms[:, None, :]
+        values, vectors = eigen(self.precision / outer)
+        informed = values > INFORMED * np.maximum(values[:, -1:], 1e-300)
+        known = vectors * informed[:, None, :]
+        return np.asarray(known @ np.swapaxes(known, -1, -2) * outer)
+
+
+@dataclass
+class Memo:
+    """What was found at the last state: rank, step and analysis ask at the same one.
+
+    `besides` keeps what others found there, by name.
+    """
+
+    state: State | None = None
+    predictions: list[Prediction] = field(default_factory=list)
+    linear: dict[bool, Linear] = field(default_factory=dict)
+    besides: dict[str, Array] = field(default_factory=dict)
+
+    def at(self, state: State | None) -> Memo:
+        """Ours, emptied if it is of another state."""
+        if self.state is not state or state is None:
+            self.state, self.predictions, self.linear, self.besides = state, [], {}, {}
+        return self
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Models, readings, evidence and prior knowledge of a batch of runs."""
+
+    triads: tuple[Triad, ...]
+    temperature: Array
+    evidence: Evidence
+    prior: Prior
+    memo: Memo = field(init=False, repr=False, compare=False, default_factory=Memo)
+
+    def take(self, index: Ints) -> Problem:
+        """The problem of some members of the batch."""
+        evidence = self.evidence
+        constants = tuple(
+            replace(c, mask=c.mask[index], value=c.value[index], sd=c.sd[index])
+            for c in evidence.constants
+        )
+        chosen = replace(
+            evidence,
+            known={k: v[index] for k, v in evidence.known.items()},
+            sd={k: v[index] for k, v in evidence.sd.items()},
+            group=evidence.group[index],
+            include=evidence.include[index],
+            constants=constants,
+            stand={k: v[index] for k, v in evidence.stand.items()},
+            scatter={k: v[index] for k, v in evidence.scatter.items()},
+        )
+        triads = tuple(Triad(t.model.take(index), t.raw[index], t.sd[index]) for t in self.triads)
+        return Problem(triads, self.temperature[index], chosen, self.prior.take(index))
+
+    def slices(self) -> list[slice]:
+        """Where each triad's parameters lie."""
+        ends = np.cumsum([0] + [t.model.size for t in self.triads])
+        return [slice(int(a), int(b)) for a, b in pairwise(ends)]
+
+    def fields(self, state: State) -> tuple[Array, Array]:
+        """Corrected vectors (B, n, 3) of both triads, left-out stations too; NaN for a missing one."""
+        found = [
+            triad.model.fields(state.params[:, where], triad.raw, self.temperature)
+            for triad, where in zip(self.triads, self.slices(), strict=True)
+        ]
+        return found[0], found[1] if len(found) > 1 else np.full_like(found[0], np.nan)
+
+    def constant(self, state: State, name: str) -> Array:
+        """Value (B, n) of gravity, field or dip at each station."""
+        value = np.nan_to_num(self.evidence.known[name])
+        for index, constant in enumerate(self.evidence.constants):
+            if constant.name == name:
+                value = value + constant.mask * state.constants[:, index, None]
+        if name in self.evidence.absent:
+            value = value + state.own[..., self.evidence.absent.index(name)]
+        return np.asarray(value)
+
+    def earth(self, state: State) -> tuple[list[Array], list[Array]]:
+        """Earth vectors (B, n, 3) of each triad, and (B, n, 3, 3) by gravity, field and dip."""
+        gravity, field, dip = (self.constant(state, c) for c in EARTH)
+        vectors = self.vectors(state)
+        zero = np.zeros_like(vectors[0])
+        slopes = [
+            [earth_gravity(np.ones_like(gravity)), zero, zero],
+            [zero, earth_field(np.ones_like(field), dip), earth_field(field, dip + np.pi / 2)],
+        ]
+        return vectors, [np.stack(columns, -1) for columns in slopes]
+
+    def vectors(self, state: State) -> list[Array]:
+        """Earth vectors (B, n, 3) of each triad: gravity, then the field."""
+        gravity, field, dip = (self.constant(state, c) for c in EARTH)
+        return [earth_gravity(gravity), earth_field(field, dip)]
+
+    def targets(self, state: State) -> list[Array]:
+        """Vectors (B, n, 3) that perfect triads would read: gravity, then the field."""
+        return [np.einsum("bnij,bnj->bni", state.attitude, e) for e in self.vectors(state)]
+
+    def predictions(self, state: State) -> list[Prediction]:
+        """Compare each triad's readings with the reference vectors; the last answer is kept."""
+        memo = self.memo.at(state)
+        memo.predictions = memo.predictions or self._predictions(state)
+        return memo.predictions
+
+    def _predictions(self, state: State) -> list[Prediction]:
+        vectors, slopes = self.earth(state)
+        result = []
+        for triad, where, earth, change in zip(
+            self.triads, self.slices(), vectors, slopes, strict=False
+        ):
+            params = state.params[:, where]
+            target = np.einsum("bnij,bnj->bni", state.attitude, earth)
+            if fit_numba.pays(target):
+                back, misfit, by_params = fit_numba.responses(
+                    triad.model, params, triad.raw, self.temperature, target
+                )
+                turned = fit_numba.turned(back, target, state.attitude, change)
+                result.append(Prediction(misfit, by_params, *turned))
+                continue
+            field = triad.model.fields(params, triad.raw, self.temperature)
+            back = inverse(triad.model.slope(params, triad.raw, self.temperature))
+            misfit = np.einsum("bnij,bnj->bni", back, field - target)
+            by_params = triad.model.jacobian(params, triad.raw - misfit, self.temperature)
+            result.append(
+                Prediction(
+                    misfit,
+                    back @ by_params,
+                    back @ skew(target),
+                    -back @ state.attitude @ change,
+                    np.linalg.norm(np.einsum("bnij,bnj->bni", back, target), axis=-1),
+                )
+            )
+        return result
+
+    def linear(self, state: State, geometry: bool = False) -> Linear:
+        """Linearise at a state; `geometry` takes references as exact and noise as uniform.
+
+        The last answers are kept.
+        """
+        memo = self.memo.at(state)
+        if geometry not in memo.linear:
+            memo.linear[geometry] = self._linear(state, geometry)
+        return memo.linear[geometry]
+
+    def _linear(self, state: State, geometry: bool) -> Linear:
+        predictions = self.predictions(state)
+        weights = self._weights(predictions, geometry)
+        residual = np.concatenate(
+            [p.misfit * w for p, w in zip(predictions, weights, strict=True)], -1
+        )
+        turns, by_earth = self._station_columns(predictions, weights)
+        blocks = [p.by_params * w[..., None] for p, w in zip(predictions, weights, strict=True)]
+        groups = np.concatenate(self._group_turns(state, turns), -1)
+        constants = self._constant_columns(state, by_earth, turns, geometry)
+        shared = np.concatenate([constants, groups], -1)
+        private = [turns @ self._own_turns(state, geometry), self._own_earth(state, by_earth)]
+        if self.evidence.scatter and not geometry:
+            columns = self._scatter_columns(state, turns, by_earth)
+            scatter = self.evidence.scatter
+            private += [c * scatter[name][..., None, None] for name, c in columns.items()]
+        own = np.concatenate(private, -1)
+        prior, pull = self._prior(state, blocks, shared.shape[-1], geometry)
+        return Linear(residual, tuple(blocks), shared, own, prior, pull)
+
+    def _station_columns(
+        self, predictions: list[Prediction], weights: list[Array]
+    ) -> tuple[Array, Array]:
+        """Whitened rows (B, n, m, 3) by a turn of the station, and by its gravity, field and dip."""
+        pairs = list(zip(predictions, weights, strict=True))
+        turns = np.concatenate([p.by_turn * w[..., None] for p, w in pairs], -2)
+        return turns, np.concatenate([p.by_earth * w[..., None] for p, w in pairs], -2)
+
+    def scatter_columns(self, state: State) -> dict[str, Array]:
+        """Whitened rows (B, n, m, k) by a departure of one in each of the evidence's `scatter`."""
+        predictions = self.predictions(state)
+        columns = self._station_columns(predictions, self._weights(predictions, geometry=False))
+        return self._scatter_columns(state, *columns)
+
+    def _scatter_columns(self, state: State, turns: Array, by_earth: Array) -> dict[str, Array]:
+        """The same from the rows by a turn and by the earth: a direction turns about x and y."""
+        found = {}
+        for name in self.evidence.scatter:
+            if name == "direction":
+                sharing = self.evidence.shared("inclination").sum(-1)
+                found[name] = turns[..., :2] * sharing[..., None, None]
+                continue
+            size = 1.0 if name == "dip" else self.constant(state, name)[..., None, None]
+            found[name] = by_earth[..., [EARTH.index(name)]] * size
+        return found
+
+    def _constant_columns(
+        self, state: State, by_earth: Array, turns: Array, geometry: bool
+    ) -> Array:
+        """Columns (B, n, m, q) of the constants; `geometry` takes references as exact."""
+        columns = []
+        for constant in self.evidence.constants:
+            if constant.name in STAND_ERRORS:
+                column = self.stand_column(state, constant.name, turns)
+            else:
+                column = by_earth[..., EARTH.index(constant.name)]
+            counts = constant.unknown or not geometry
+            columns.append(column * constant.mask[..., None] * counts)
+        return np.stack(columns, -1) if columns else np.zeros((*by_earth.shape[:-1], 0))
+
+    def stand_column(self, state: State, name: str, turns: Array) -> Array:
+        """Change (B, n, m) of the misfit by an error of the stand, from `turns` (B, n, m, 3)."""
+        axis = np.einsum("bnij,bnj->bni", state.attitude, self._stand_axis(state, name))
+        return np.asarray(np.einsum("bnmi,bni->bnm", turns, axis))
+
+    def _stand_axis(self, state: State, name: str) -> Array:
+        """Earth axis (B, n, 3) about which a station is turned by an error of the stand."""
+        if name == "inclination-zero":
+            return -self._across(state)
+        if name == "toolface-zero":
+            return np.asarray(state.attitude[..., 2, :])
+        return np.broadcast_to(STAND[name], state.attitude.shape[:-1])
+
+    def _own_scales(self, state: State) -> Array:
+        """How far (B, n, a) each absent strength or dip may be anywhere: its own size, or any angle."""
+        scales = [
+            np.full(state.attitude.shape[:2], UNKNOWN)
+            if name == "dip"
+            else np.abs(self.constant(state, name))
+            for name in self.evidence.absent
+        ]
+        return np.stack(scales, -1) if scales else np.zeros((*state.attitude.shape[:2], 0))
+
+    def _own_earth(self, state: State, by_earth: Array) -> Array:
+        """Columns (B, n, m, a) of the stations' own strengths and dip, times their scale."""
+        chosen = [EARTH.index(name) for name in self.evidence.absent]
+        return np.asarray(by_earth[..., chosen] * self._own_scales(state)[..., None, :])
+
+    def _weights(self, predictions: list[Prediction], geometry: bool) -> list[Array]:
+        """One over the noise (B, n, 3), zero for stations left out."""
+        include = self.evidence.include[..., None]
+        if geometry:
+            return [
+                np.broadcast_to(include / (GEOMETRIC_NOISE * p.strength[..., None]), p.misfit.shape)
+                for p in predictions
+            ]
+        return [include / t.sd for t in self.triads]
+
+    def _prior(
+        self, state: State, blocks: list[Array], shared: int, geometry: bool
+    ) -> tuple[Array, Array]:
+        """Precision (B, u, u) and pull (B, u) of the parameters and the shared unknowns.
+
+        `geometry` asks which directions of the parameters have a prior, not how precise it is.
+        """
+        p, constants = state.params.shape[-1], self.evidence.constants
+        pull = np.zeros((len(state.params), p + shared))
+        pull[:, :p] = state.params - self.prior.expected
+        own = np.full(pull.shape, UNKNOWN**-2)
+        for index, constant in enumerate(constants):
+            own[:, p + index] = constant.sd**-2
+            if not constant.unknown:
+                pull[:, p + index] = state.constants[:, index] - constant.value
+        precision = own[..., None] * np.eye(own.shape[-1])
+        known = self.prior.precision
+        if geometry and known.any():
+            norms = [np.sqrt(np.sum(block**2, (1, 2))) for block in blocks]
+            known = self.prior.informed(np.concatenate(norms, -1))
+        precision[:, :p, :p] = known
+        return precision, pull
+
+    def _free(self) -> Bools:
+        """Stations (B, n) of which neither direction nor toolface is known."""
+        loose = ~self.evidence.is_known("inclination") & ~self.evidence.is_known("azimuth")
+        return loose & ~self.evidence.is_known("toolface") & (self.evidence.group < 0)
+
+    def _own_sd(self, geometry: bool) -> list[Array]:
+        """Standard uncertainty (B, n) of each station's own inclination, azimuth, toolface."""
+        evidence = self.evidence
+        result = []
+        for name in ("inclination", "azimuth", "toolface"):
+            known, exact = evidence.is_known(name), np.zeros_like(evidence.sd[name])
+            grouped = np.zeros_like(known) if name == "toolface" else evidence.group >= 0
+            stated = exact if geometry else evidence.sd[name]
+            result.append(np.where(known, stated, np.where(grouped, 0.0, UNKNOWN)))
+        return result
+
+    def _own_turns(self, state: State, geometry: bool) -> Array:
+        """Axes (B, n, 3, 3), as columns, of the station's private turns times their σ."""
+        inclination, azimuth, toolface = self._own_sd(geometry)
+        across = np.einsum("bnij,bnj->bni", state.attitude, self._across(state))
+        down = state.attitude[..., :, 2]
+        along = np.broadcast_to(np.array([0.0, 0.0, 1.0]), down.shape)
+        natural = np.stack(
+            [
+                across * inclination[..., None],
+                down * azimuth[..., None],
+                along * toolface[..., None],
+            ],
+            -1,
+        )
+        return np.where(self._free()[..., None, None], UNKNOWN * np.eye(3), natural)
+
+    def _across(self, state: State) -> Array:
+        """Earth axis (B, n, 3) about which a station inclines: horizontal, across its azimuth.
+
+        Singular: at vertical a known azimuth or toolface still says which way a station inclines.
+        """
+        axis, known = state.attitude[..., 2, :], self.evidence.known
+        azimuth = np.arctan2(axis[..., 1], axis[..., 0])
+        azimuth = np.where(np.isnan(known["azimuth"]), azimuth, known["azimuth"])
+        across = np.stack([np.sin(azimuth), -np.cos(azimuth), np.zeros_like(azimuth)], -1)
+        by_toolface = np.isnan(known["azimuth"]) & ~np.isnan(known["toolface"])
+        if not by_toolface.any():
+            return across
+        toolface = np.nan_to_num(known["toolface"])
+        fixed = np.stack([np.cos(toolface), -np.sin(toolface), np.zeros_like(toolface)], -1)
+        turned = np.einsum("bnij,bni->bnj", state.attitude, fixed)
+        return np.where(by_toolface[..., None], turned, across)
+
+    def _group_axes(self, state: State) -> tuple[Array, Array]:
+        """Two earth axes (B, k, 3) of each group's shared turns: inclining, and across or about down."""
+        members = self.evidence.members
+        tied = self.evidence.is_known("toolface") | self.evidence.is_known("azimuth")
+        axis = self._mean_of(members, state.attitude[..., 2, :])
+        azimuth = np.arctan2(axis[..., 1], axis[..., 0])
+        first = np.stack([np.sin(azimuth), -np.cos(azimuth), np.zeros_like(azimuth)], -1)
+        upright = np.einsum("bnk,bn->bk", members, tied) > 0
+        if upright.any():
+            along = self._mean_of(members * tied[..., None], self._across(state))
+            size = np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), 1e-300)
+            first = np.where(upright[..., None], along / size, first)
+        upright |= np.einsum("bnk,bn->bk", members, self.evidence.is_known("inclination")) > 0
+        second = np.where(upright[..., None], np.array([0.0, 0.0, 1.0]), np.cross(axis, first))
+        return first, second
+
+    @staticmethod
+    def _mean_of(members: Array, vectors: Array) -> Array:
+        """Mean (B, k, 3) of vectors (B, n, 3) over the members (B, n, k) of each group."""
+        count = np.maximum(members.sum(-2), 1.0)
+        return np.asarray(np.einsum("bnk,bni->bki", members, vectors) / count[..., None])
+
+    def _group_turns(self, state: State, turns: Array) -> list[Array]:
+        """Columns (B, n, m, k) of both shared turns of each group."""
+        columns = []
+        for name, axis in zip(("inclination", "azimuth"), self._group_axes(state), strict=True):
+            tool = np.einsum("bnij,bkj->bnik", state.attitude, axis)
+            columns.append(turns @ tool * self.evidence.shared(name)[..., None, :])
+        return columns
+
+    def move(self, state: State, linear: Linear, step: Array) -> State:
+        """The state after a step; unknown private angles follow, known ones stay at their reference."""
+        p, q = linear.size, len(self.evidence.constants)
+        private = linear.private(step)
+        attitude = self._turn_stand(state, step[:, p : p + q])
+        attitude = self._turn_groups(replace(state, attitude=attitude), step[:, p + q :])
+        attitude = self._turn_stations(state, attitude, private[..., :3])
+        absent = private[..., 3 : 3 + state.own.shape[-1]]
+        own = state.own + absent * self._own_scales(state)
+        constants = state.constants + step[:, p : p + q]
+        return State(state.params + step[:, :p], attitude, constants, own)
+
+    def _turn_stand(self, state: State, constants: Array) -> Array:
+        attitude = state.attitude
+        for index, constant in enumerate(self.evidence.constants):
+            if constant.name in STAND_ERRORS:
+                turn = constants[:, index, None] * constant.mask
+                axis = self._stand_axis(state, constant.name)
+                attitude = attitude @ rotation(turn[..., None] * axis)
+        return attitude
+
+    def _turn_groups(self, state: State, turns: Array) -> Array:
+        half = turns.shape[-1] // 2
+        if not half:
+            return state.attitude
+        first, second = self._group_axes(state)
+        attitude = state.attitude
+        for axis, name, turn in (
+            (first, "inclination", turns[:, :half]),
+            (second, "azimuth", turns[:, half:]),
+        ):
+            vector = np.einsum("bnk,bk,bki->bni", self.evidence.shared(name), turn, axis)
+            attitude = attitude @ rotation(vector)
+        return attitude
+
+    def _turn_stations(self, state: State, attitude: Array, private: Array) -> Array:
+        own = self._own_turns(state, geometry=True)
+        if not own.any():
+            return attitude
+        turn = own * private[..., None, :]
+        free = rotation(np.sum(turn, -1)) @ attitude
+        about_down = np.zeros_like(turn[..., 0])
+        about_down[..., 2] = np.einsum("bni,bni->bn", turn[..., 1], state.attitude[..., :, 2])
+        natural = rotation(turn[..., 2]) @ rotation(turn[..., 0]) @ attitude @ rotation(about_down)
+        return np.where(self._free()[..., None, None], free, natural)
+
+    def size_of(self, state: State) -> Array:
+        """Largest parameter of each triad (B, p): steps far below it are rounding."""
+        parts = [
+            np.broadcast_to(
+                np.max(np.abs(state.params[:, w]), -1, keepdims=True), state.params[:, w].shape
+            )
+            for w in self.slices()
+        ]
+        return np.concatenate(parts, -1)

@@ -1,0 +1,420 @@
+"""Gauss-Newton with Levenberg-Marquardt damping, on the determined subspace, for a batch.
+
+A problem linearises to residual rows per station, ρ + X δ, where X holds the columns of
+all parameters and shared unknowns, and `own` the columns of the station's private unknowns
+(attitude turns scaled to unit prior variance). Private unknowns are marginalised exactly:
+
+    C⁻¹ = I - G (I + GᵀG)⁻¹ Gᵀ,     G = own columns
+
+so a known angle (small σ), an unknown one (σ = π/√3) and everything between is one path.
+Shared unknowns (field strength, dip, group directions) are eliminated by a Schur complement.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import IntEnum
+from functools import cached_property
+from typing import Any, Protocol
+
+import numpy as np
+
+from mwdcal.estimation import fit_numba
+from mwdcal.geometry.vectors import Array, Bools, Ints, eigen, inverse, placed
+
+RANK_TOLERANCE = 2e-2
+"""Singular values of the column-normalised design below this share of the largest are free."""
+NEGLIGIBLE = 1e-2
+"""A member that is still on its way when iterations end has settled if a full step is a smaller
+share of the standard uncertainty than this."""
+
+
+class Status(IntEnum):
+    """What became of one member of a batch; `message` says what to do about it."""
+
+    OK = 0
+    NOT_CONVERGED = 1
+    NOT_FINITE = 2
+
+    @property
+    def message(self) -> str:
+        """One sentence with the remedy."""
+        return _MESSAGES[self]
+
+
+_MESSAGES = {
+    Status.OK: "converged",
+    Status.NOT_CONVERGED: "the fit did not settle: look for a wrong axis in the profile, a wrong "
+    "reference cell, or a station that moved",
+    Status.NOT_FINITE: "the fit ran into numbers that are not finite: the stations do not span "
+    "enough attitudes for a start value; add stations at other inclinations and toolfaces",
+}
+
+
+@dataclass(frozen=True)
+class Linear:
+    """A problem at one state: ρ (B, n, m) and its columns X by u unknowns, private ones apart.
+
+    X has the columns of each triad's parameters in `blocks`, (B, n, m_t, p_t) for the rows of that
+    triad alone, then `shared` (B, n, m, s). `own` (B, n, m, a) are the private unknowns. `prior`
+    (B, u, u) is the precision of X's unknowns, `pull` (B, u) their departure from the prior value
+    (zero where unknown).
+    """
+
+    residual: Array
+    blocks: tuple[Array, ...]
+    shared: Array
+    own: Array
+    prior: Array
+    pull: Array
+
+    @property
+    def size(self) -> int:
+        """Number p of model parameters, at the head of X."""
+        return sum(block.shape[-1] for block in self.blocks)
+
+    @cached_property
+    def design(self) -> Array:
+        """X (B, n, m, u) as one array."""
+        rows = sum(block.shape[-2] for block in self.blocks)
+        lead = self.residual.shape[:-1]
+        whole = np.zeros((*lead, rows, self.size + self.shared.shape[-1]))
+        row = column = 0
+        for block in self.blocks:
+            height, width = block.shape[-2:]
+            whole[..., row : row + height, column : column + width] = block
+            row, column = row + height, column + width
+        whole[..., self.size :] = self.shared
+        return whole
+
+    def take(self, index: Ints) -> Linear:
+        """That of some members of the batch."""
+        return self._mapped(lambda mine: mine[index])
+
+    def put(self, index: Ints, other: Linear) -> Linear:
+        """Ours with some members replaced."""
+        return self._mapped(lambda mine, theirs: placed(mine, index, theirs), other)
+
+    def _mapped(self, change: Callable[..., Array], *others: Linear) -> Linear:
+        """A change of every array, given the same ones of others."""
+
+        def every(name: str) -> Array:
+            return change(getattr(self, name), *(getattr(other, name) for other in others))
+
+        pairs = zip(self.blocks, *(other.blocks for other in others), strict=True)
+        return Linear(
+            every("residual"),
+            tuple(change(*pair) for pair in pairs),
+            every("shared"),
+            every("own"),
+            every("prior"),
+            every("pull"),
+        )
+
+    @property
+    def norms(self) -> Array:
+        """Column norms (B, p) of the parameters, prior in: the scale in which rank is counted."""
+        squares = np.concatenate([np.sum(b**2, (-3, -2)) for b in self.blocks], -1)
+        own = np.diagonal(self.prior, axis1=-2, axis2=-1)[..., : self.size]
+        return np.asarray(np.sqrt(squares + own))
+
+    @cached_property
+    def normal(self) -> Normal:
+        """Its normal equations."""
+        return Normal.of(self)
+
+    @cached_property
+    def determined(self) -> Determined:
+        """Which directions it determines, if it is of the geometry."""
+        return Determined.by(self.normal, self.norms)
+
+    def cost(self, at: Linear) -> Array:
+        """ρᵀC⁻¹ρ over all stations, and the prior's part (B,), of residuals `at` a state; C is ours."""
+        weighed = self.weigh(at.residual[..., None])[..., 0]
+        pulled = np.einsum("...i,...ij,...j->...", at.pull, at.prior, at.pull)
+        return np.asarray(np.sum(at.residual * weighed, (-1, -2)) + pulled)
+
+    @cached_property
+    def core(self) -> Array:
+        """(I + GᵀG)⁻¹ (B, n, a, a)."""
+        gram = np.swapaxes(self.own, -1, -2) @ self.own
+        return np.asarray(inverse(np.eye(gram.shape[-1]) + gram))
+
+    def weigh(self, columns: Array) -> Array:
+        """C⁻¹ times columns (B, n, m, k)."""
+        return np.asarray(
+            columns - self.own @ (self.core @ (np.swapaxes(self.own, -1, -2) @ columns))
+        )
+
+    def private(self, step: Array) -> Array:
+        """Private unknowns (B, n, a), in their prior's units, after a step of X's unknowns."""
+        moved = self.residual + np.einsum("bnms,bs->bnm", self.shared, step[:, self.size :])
+        row = column = 0
+        for block in self.blocks:
+            height, width = block.shape[-2:]
+            part = np.einsum("bnmp,bp->bnm", block, step[:, column : column + width])
+            moved[..., row : row + height] += part
+            row, column = row + height, column + width
+        pulled = np.swapaxes(self.own, -1, -2) @ moved[..., None]
+        return np.asarray(-(self.core @ pulled)[..., 0])
+
+
+@dataclass(frozen=True)
+class Normal:
+    """Normal equations of a `Linear`: information, gradient and cost."""
+
+    information: Array
+    gradient: Array
+    cost: Array
+    size: int
+
+    @classmethod
+    def of(cls, linear: Linear) -> Normal:
+        """Sum over stations, priors included."""
+        if fit_numba.pays(linear.residual):
+            whole = fit_numba.gram(linear.residual, linear.blocks, linear.shared, linear.own)
+        else:
+            columns = np.concatenate([linear.design, linear.residual[..., None]], -1)
+            weighed = linear.weigh(columns)
+            whole = np.einsum("...nmi,...nmj->...ij", columns, weighed, optimize=True)
+        information, gradient = whole[..., :-1, :-1].copy(), whole[..., :-1, -1].copy()
+        pulled = (linear.prior @ linear.pull[..., None])[..., 0]
+        information += linear.prior
+        gradient += pulled
+        cost = whole[..., -1, -1] + np.sum(linear.pull * pulled, -1)
+        return cls(information, gradient, cost, linear.size)
+
+    def reduced(self) -> tuple[Array, Array, Array]:
+        """Information (B, p, p) and gradient (B, p) of the parameters, and the elimination.
+
+        The elimination E (B, s, p) gives the shared step that goes with a parameter step:
+        shared = -(H_ss⁻¹ g_s + E · step).
+        """
+        p = self.size
+        own, cross = self.information[..., :p, :p], self.information[..., p:, :p]
+        eliminate = inverse(self.information[..., p:, p:]) @ cross
+        reduced = own - np.swapaxes(cross, -1, -2) @ eliminate
+        offset = np.swapaxes(eliminate, -1, -2) @ self.gradient[..., p:, None]
+        return reduced, self.gradient[..., :p] - offset[..., 0], eliminate
+
+
+@dataclass(frozen=True)
+class Determined:
+    """Which directions of parameter space the evidence determines.
+
+    `basis` (B, p, p): orthonormal directions in normalised columns, largest singular value
+    first; `values` (B, p): singular values as a share of the largest; `norms` (B, p): norms of
+    the whole columns, private unknowns in; `keep` (B, p): which are determined. Where all are,
+    `basis` may be any orthonormal one: no direction of it is of interest then.
+    """
+
+    basis: Array
+    values: Array
+    norms: Array
+    keep: Bools
+
+    @classmethod
+    def by(cls, geometry: Normal, norms: Array, tolerance: float = RANK_TOLERANCE) -> Determined:
+        """From the evidence's geometry: what is known, not how precisely.
+
+        `norms` (B, p) are those of the whole columns. What is left of a column when private
+        unknowns are taken out may be noise alone: its own norm would make much of that.
+        """
+        norms = np.where(norms > 0, norms, 1.0)
+        reduced, _, _ = geometry.reduced()
+        scaled = np.nan_to_num(reduced / (norms[..., :, None] * norms[..., None, :]))
+        values, basis = eigen(scaled)
+        values = np.sqrt(np.clip(values[..., ::-1], 0, None))
+        values = values / np.maximum(values[..., :1], 1e-300)
+        return cls(basis[..., ::-1], values, norms, values > tolerance)
+
+    @classmethod
+    def of(cls, problem: Problem, state: Any) -> Determined:
+        """Of a problem at a state."""
+        linear = problem.linear(state, geometry=True)
+        return linear.determined
+
+    def take(self, index: Ints) -> Determined:
+        """That of some members of the batch."""
+        return Determined(
+            self.basis[index], self.values[index], self.norms[index], self.keep[index]
+        )
+
+    def put(self, index: Ints, other: Determined) -> Determined:
+        """Ours with some members replaced."""
+        return Determined(
+            placed(self.basis, index, other.basis),
+            placed(self.values, index, other.values),
+            placed(self.norms, index, other.norms),
+            placed(self.keep, index, other.keep),
+        )
+
+    @property
+    def rank(self) -> Ints:
+        """Number of determined directions (B,)."""
+        return np.asarray(np.sum(self.keep, -1))
+
+    def inverse(self, information: Array, damping: Array | float = 0.0) -> Array:
+        """Inverse (B, p, p) of an information matrix on the determined subspace."""
+        scaled = information / (self.norms[..., :, None] * self.norms[..., None, :])
+        kept = self.basis * self.keep[..., None, :]
+        inner = np.swapaxes(kept, -1, -2) @ scaled @ kept
+        diagonal = np.arange(inner.shape[-1])
+        extra = np.asarray(damping)[..., None] * inner[..., diagonal, diagonal]
+        inner[..., diagonal, diagonal] += np.where(self.keep, extra, 1.0)
+        outer = kept @ inverse(inner) @ np.swapaxes(kept, -1, -2)
+        return np.asarray(outer / (self.norms[..., :, None] * self.norms[..., None, :]))
+
+    def null(self) -> Array:
+        """Free directions (B, p, p) as columns in normalised units; determined ones are zero."""
+        return np.asarray(self.basis * ~self.keep[..., None, :])
+
+
+class Problem(Protocol):
+    """What the solver asks of a problem; states are opaque to it."""
+
+    def linear(self, state: Any, geometry: bool = False) -> Linear:
+        """Linearise; `geometry` asks for what is known, leaving out how precisely."""
+
+    def move(self, state: Any, linear: Linear, step: Array) -> Any:
+        """The state after a step of X's unknowns, private unknowns re-adjusted."""
+
+    def take(self, index: Ints) -> Problem:
+        """The problem of some members of the batch."""
+
+    def size_of(self, state: Any) -> Array:
+        """Magnitude (B, p) below 1e-12 of which a parameter step is rounding."""
+
+
+@dataclass
+class _Descent:
+    """Damped steps of one batch until every member has stopped.
+
+    All are of the members still `active`; `linear` is taken at `state`.
+    """
+
+    problem: Problem
+    state: Any
+    linear: Linear
+    determined: Determined
+    damping: Array
+    active: Ints
+
+    @classmethod
+    def at(cls, problem: Problem, state: Any) -> _Descent:
+        """At the start."""
+        count = len(state.params)
+        determined = Determined.of(problem, state)
+        linear = problem.linear(state)
+        return cls(problem, state, linear, determined, np.zeros(count), np.arange(count))
+
+    def step(self) -> tuple[Bools, Bools]:
+        """One iteration: which active members are at a minimum, and which are not finite."""
+        problem, linear = self.problem, self.linear
+        normal = linear.normal
+        finite = np.isfinite(normal.cost) & np.isfinite(normal.information).all((-1, -2))
+        if not finite.all():
+            return np.zeros_like(finite), ~finite
+        step = _step(normal, self.determined, self.damping)
+        trial = problem.move(self.state, linear, step)
+        after = problem.linear(trial)
+        # the gradient holds the weights fixed, and so must the cost that judges the step
+        cost = linear.cost(after)
+        small = _small(normal, step, problem.size_of(self.state))
+        with np.errstate(invalid="ignore"):
+            better = (cost <= normal.cost * (1 + 1e-9) + 1e-9) | small
+        self._accept(trial, after, better)
+        calmer = np.where(self.damping < 1e-6, 0.0, self.damping / 10)
+        self.damping = np.where(better, calmer, np.maximum(10 * self.damping, 1e-3))
+        return small & better, ~finite
+
+    def arrived(self) -> Bools:
+        """Which active members no full step would move by more than a `NEGLIGIBLE` share of σ.
+
+        Rounding of the cost can refuse such steps for ever, and flat directions make them shrink
+        slowly: both are at their minimum for all purposes.
+        """
+        normal = self.linear.normal
+        step = _step(normal, self.determined, np.zeros(len(self.damping)))
+        return self.settled(np.asarray(_length(normal, step) < NEGLIGIBLE**2))
+
+    def _accept(self, trial: Any, after: Linear, better: Bools) -> None:
+        if better.all():
+            self.state, self.linear = trial, after
+            return
+        which = np.flatnonzero(better)
+        self.state = self.state.put(which, trial.take(which))
+        self.linear = self.linear.put(which, after.take(which))
+
+    def settled(self, converged: Bools) -> Bools:
+        """Which converged members still have the rank that their steps were taken with.
+
+        The others go on, with the directions that are determined where they are now.
+        """
+        if not converged.any():
+            return converged
+        which = np.flatnonzero(converged)
+        if converged.all():
+            now = Determined.of(self.problem, self.state)
+        else:
+            now = Determined.of(self.problem.take(which), self.state.take(which))
+        same = now.rank == self.determined.rank[which]
+        if not same.all():
+            self.determined = self.determined.put(which, now)
+        settled = converged.copy()
+        settled[which] = same
+        return settled
+
+    def drop(self, stopped: Bools) -> None:
+        """Go on without some members."""
+        if not stopped.any():
+            return
+        rest = np.flatnonzero(~stopped)
+        self.problem, self.state = self.problem.take(rest), self.state.take(rest)
+        self.linear, self.determined = self.linear.take(rest), self.determined.take(rest)
+        self.damping, self.active = self.damping[rest], self.active[rest]
+
+
+def _step(normal: Normal, determined: Determined, damping: Array) -> Array:
+    reduced, gradient, eliminate = normal.reduced()
+    step = -(determined.inverse(reduced, damping) @ gradient[..., None])
+    p = normal.size
+    shared = inverse(normal.information[..., p:, p:]) @ normal.gradient[..., p:, None]
+    return np.concatenate([step, -shared - eliminate @ step], -2)[..., 0]
+
+
+def _length(normal: Normal, step: Array) -> Array:
+    """Square (B,) of a step's length in standard uncertainties."""
+    return np.asarray(np.einsum("...i,...ij,...j->...", step, normal.information, step))
+
+
+def _small(normal: Normal, step: Array, size: Array) -> Bools:
+    """Below a millionth of the standard uncertainty, or rounding."""
+    length = _length(normal, step)
+    rounding = np.all(np.abs(step[..., : normal.size]) <= 1e-12 * size, -1)
+    return np.asarray((length < 1e-12) | rounding)
+
+
+def gauss_newton(problem: Problem, state: Any, limit: int = 60) -> tuple[Any, Ints, Ints]:
+    """Minimise a batch of problems; returns states, `Status` codes and iteration counts."""
+    count = len(state.params)
+    status = np.full(count, int(Status.NOT_CONVERGED))
+    iterations = np.zeros(count, int)
+    descent = _Descent.at(problem, state)
+    for _ in range(limit):
+        if not descent.active.size:
+            break
+        converged, broken = descent.step()
+        iterations[descent.active[~broken]] += 1
+        settled = descent.settled(converged)
+        status[descent.active[settled]] = Status.OK
+        status[descent.active[broken]] = Status.NOT_FINITE
+        stopped = settled | broken
+        if len(stopped) == count and stopped.all():
+            return descent.state, status, iterations
+        state = state.put(descent.active[stopped], descent.state.take(np.flatnonzero(stopped)))
+        descent.drop(stopped)
+    if descent.active.size:
+        status[descent.active[descent.arrived()]] = Status.OK
+    return state.put(descent.active, descent.state), status, iterations

@@ -1,0 +1,279 @@
+"""Start values: linear where directions are known, else an ellipsoid; then attitudes.
+
+Nominal scales may be 10 % off and hard iron may exceed the field: nothing here uses the
+nominal values but for the orientation of the axes, and where all else fails.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from mwdcal.estimation.problem import Problem, State
+from mwdcal.geometry import observables
+from mwdcal.geometry.vectors import (
+    Array,
+    Bools,
+    earth_field,
+    earth_gravity,
+    eigen,
+    inverse,
+    rotation,
+    tool_from_earth,
+)
+
+SPANNED = 2e-3
+"""Columns of the ellipsoid with a singular value below this share of the largest are noise."""
+SEEN = 1e-3
+"""Share of the field that an axis must see for a start from least squares: any other is worse."""
+ANGLES = ("inclination", "azimuth", "toolface")
+
+
+def start(problem: Problem) -> State:
+    """A state close enough for Gauss-Newton, for every member of the batch."""
+    constants = [c.value for c in problem.evidence.constants]
+    batch, count = problem.temperature.shape
+    empty = State(
+        np.zeros((batch, 0)),
+        np.broadcast_to(np.eye(3), (batch, count, 3, 3)),
+        np.stack(constants, -1) if constants else np.zeros((batch, 0)),
+        np.zeros((batch, count, len(problem.evidence.absent))),
+    )
+    params = [_triad_start(problem, empty, index) for index in range(len(problem.triads))]
+    found = np.concatenate(params, -1)
+    for where in problem.slices():
+        known = np.diagonal(problem.prior.precision[:, where, where], axis1=-2, axis2=-1) > 0
+        whole = known.all(-1, keepdims=True)
+        found[:, where] = np.where(whole, problem.prior.expected[:, where], found[:, where])
+    state = replace(empty, params=found)
+    return _attitudes(problem, state)
+
+
+def _triad_start(problem: Problem, state: State, index: int) -> Array:
+    triad, include = problem.triads[index], problem.evidence.include
+    strength = problem.constant(state, ("gravity", "field")[index])
+    centre = np.sum(triad.raw * include[..., None], -2) / np.sum(include, -1)[..., None]
+    x = triad.raw - centre[:, None, :]
+    radius = np.sqrt(np.sum(x * x * include[..., None], (-2, -1)) / np.sum(include, -1))
+    radius = np.where(radius > 0, radius, 1.0)
+    x = x / radius[:, None, None]
+    matrix, offset = _ellipsoid(x, strength, include)
+    linear, linear_offset, usable = _linear(problem, state, index, x)
+    matrix = np.where(usable[:, None, None], linear, matrix)
+    offset = np.where(usable[:, None], linear_offset, offset)
+    matrix = matrix / radius[:, None, None]
+    return triad.model.start(matrix, offset - np.einsum("bij,bj->bi", matrix, centre))
+
+
+def _ellipsoid(x: Array, strength: Array, include: Array) -> tuple[Array, Array]:
+    """Symmetric matrix and offset that put centred readings on a sphere of the given strength."""
+    i, j = np.triu_indices(3)
+    features = np.concatenate([x[..., i] * x[..., j] * np.where(i == j, 1.0, 2.0), 2 * x], -1)
+    weighed = features * include[..., None]
+    gram = np.swapaxes(weighed, -1, -2) @ features
+    size = np.sum(x * x * include[..., None], (-2, -1)) / np.sum(include, -1)
+    sphere = np.concatenate([np.eye(3)[i, j], np.zeros(3)]) / np.maximum(size, 1e-300)[:, None]
+    left = np.sum(weighed, -2) - np.einsum("bij,bj->bi", gram, sphere)
+    solution = sphere + _where_determined(gram, left)
+    quadric = np.zeros((len(x), 3, 3))
+    quadric[:, i, j] = solution[:, :6]
+    quadric[:, j, i] = solution[:, :6]
+    values, vectors = eigen(quadric)
+    sound = values[:, 0] > 1e-3 * values[:, 2]
+    values = np.where(sound[:, None], values, 1.0)
+    half = np.einsum("bij,bj,bkj->bik", vectors, values, vectors)
+    centre = -np.linalg.solve(half, solution[:, 6:, None])[..., 0]
+    centre = np.where(sound[:, None], centre, (x.max(-2) + x.min(-2)) / 2)
+    root = np.einsum("bij,bj,bkj->bik", vectors, np.sqrt(values), vectors)
+    mapped = np.linalg.norm(np.einsum("bij,bnj->bni", root, x - centre[:, None, :]), axis=-1)
+    scale = np.sum(strength * include, -1) / np.maximum(np.sum(mapped * include, -1), 1e-30)
+    matrix = root * scale[:, None, None]
+    return matrix, -np.einsum("bij,bj->bi", matrix, centre)
+
+
+def _where_determined(gram: Array, right: Array) -> Array:
+    """Solution (B, k) of gram · x = right, zero in directions that the columns hardly span.
+
+    Noise alone would set those, and a start that is far off there looks as if it determined them.
+    The columns are of size one as they come: one that is noise alone must not be scaled up.
+    """
+    values, vectors = eigen(gram)
+    kept = values > SPANNED**2 * values[:, -1:]
+    along = np.einsum("bij,bi->bj", vectors, right)
+    along = np.where(kept, along / np.where(kept, values, 1.0), 0.0)
+    return np.asarray(np.einsum("bij,bj->bi", vectors, along))
+
+
+def _linear(problem: Problem, state: State, index: int, x: Array) -> tuple[Array, Array, Bools]:
+    """Least squares on stations of known direction; and where these are enough."""
+    evidence = problem.evidence
+    known = [evidence.is_known(name) for name in ANGLES]
+    whole = known[0] & known[2] & (known[1] | (index == 0))
+    weight = evidence.include * whole
+    attitude = tool_from_earth(*(np.nan_to_num(evidence.known[name]) for name in ANGLES))
+    terms = np.concatenate([x, np.ones_like(x[..., :1])], -1)
+    gram = np.einsum("bn,bni,bnj->bij", weight, terms, terms)
+    values = np.linalg.eigvalsh(gram)
+    usable = (values[:, 0] > SEEN**2 * values[:, -1]) & (weight.sum(-1) >= 4)
+    gram = np.where(usable[:, None, None], gram, np.eye(4))
+
+    def regress(target: Array) -> Array:
+        crossed = np.einsum("bn,bni,bnj->bij", weight, terms, target)
+        return np.asarray(np.linalg.solve(gram, crossed))
+
+    if index == 0:
+        earth = earth_gravity(problem.constant(state, "gravity"))
+    else:
+        field, dip = problem.constant(state, "field"), problem.constant(state, "dip")
+        unknown = _unknown_dip(attitude, field, terms, weight, regress)
+        blank = ~evidence.is_known("dip")
+        earth = earth_field(field, np.where(blank, unknown[:, None], dip))
+    forward = _forward(np.einsum("bnij,bnj->bni", attitude, earth), x, weight)
+    usable = usable & np.isfinite(forward).all((-1, -2))
+    forward = np.where(usable[:, None, None], forward, np.eye(4)[:, :3])
+    back = inverse(np.swapaxes(forward[:, :3], -1, -2))
+    return back, -np.einsum("bij,bj->bi", back, forward[:, 3]), np.asarray(usable)
+
+
+def _forward(field: Array, x: Array, weight: Array) -> Array:
+    """Readings as a linear function (B, 4, 3) of the field and one: noise is in the readings alone.
+
+    With exact references this is the minimum itself.
+    """
+    terms = np.concatenate([field, np.ones_like(field[..., :1])], -1)
+    size = np.sqrt(np.einsum("bn,bni->bi", weight, terms**2))
+    size = np.where(size > 0, size, 1.0)
+    scaled = terms / size[:, None]
+    gram = np.einsum("bn,bni,bnj->bij", weight, scaled, scaled, optimize=True)
+    crossed = np.einsum("bn,bni,bnj->bij", weight, scaled, x, optimize=True)
+    return np.asarray(inverse(gram) @ crossed / size[..., None])
+
+
+def _unknown_dip(
+    attitude: Array,
+    field: Array,
+    terms: Array,
+    weight: Array,
+    regress: Callable[[Array], Array],
+) -> Array:
+    """Dip (B,) at which the readings fit best: the weakest direction of what they leave over."""
+    parts = [
+        np.einsum("bnij,bnj->bni", attitude, earth_field(field, np.full_like(field, angle)))
+        for angle in (0.0, np.pi / 2)
+    ]
+    left = [part - terms @ regress(part) for part in parts]
+    gram = np.stack(
+        [np.stack([np.einsum("bn,bni,bni->b", weight, p, q) for q in left], -1) for p in left], -2
+    )
+    _, vectors = eigen(gram)
+    north, down = vectors[:, 0, 0], vectors[:, 1, 0]
+    gains = [np.trace(regress(part)[:, :3], axis1=-2, axis2=-1) for part in parts]
+    sign = np.where(north * gains[0] + down * gains[1] < 0, -1.0, 1.0)
+    return np.asarray(np.arctan2(sign * down, sign * north))
+
+
+def _attitudes(problem: Problem, state: State) -> State:
+    """Fill unknown angles from the start's own fields, share directions, find unknown turns."""
+    evidence = problem.evidence
+    fields = [
+        triad.model.fields(state.params[:, where], triad.raw, problem.temperature)
+        for triad, where in zip(problem.triads, problem.slices(), strict=True)
+    ]
+    g = fields[0]
+    b = fields[1] if len(fields) > 1 else np.broadcast_to(np.array([0.0, 0.0, 1.0]), g.shape)
+    guess = {name: np.nan_to_num(observables.OBSERVABLES[name].value(g, b)) for name in ANGLES}
+    angles = {n: np.where(evidence.is_known(n), evidence.known[n], guess[n]) for n in ANGLES}
+    angles = _by_toolface(problem, _share(problem, angles), g, b)
+    state = _with_own(problem, _with_dip(problem, state, g, b), g, b)
+    attitude = tool_from_earth(*(angles[name] for name in ANGLES))
+    weights = [1 / np.maximum(np.linalg.norm(f, axis=-1), 1e-30) ** 2 for f in fields]
+    earth = problem.earth(state)[0]
+    targets = [np.einsum("bnij,bnj->bni", attitude, each) for each in earth]
+    along = np.broadcast_to(np.array([0.0, 0.0, 1.0]), g.shape)
+    turn = best_turn(fields, targets, weights, along)
+    attitude = _turned(attitude, along, np.where(evidence.is_known("toolface"), 0.0, turn))
+    return replace(state, attitude=attitude)
+
+
+def best_turn(
+    fields: list[Array], targets: list[Array], weights: list[Array], axis: Array
+) -> Array:
+    """Angle (B, n) about a unit axis that brings targets closest to fields, in closed form."""
+    sine, cosine = np.zeros(axis.shape[:-1]), np.zeros(axis.shape[:-1])
+    for field, target, weight in zip(fields, targets, weights, strict=False):
+        flat = target - np.sum(target * axis, -1, keepdims=True) * axis
+        cosine += weight * np.sum(field * flat, -1)
+        sine += weight * np.sum(field * np.cross(axis, flat), -1)
+    return np.asarray(np.arctan2(sine, cosine))
+
+
+def _turned(attitude: Array, axis: Array, angle: Array) -> Array:
+    return rotation(axis * angle[..., None]) @ attitude
+
+
+def _share(problem: Problem, angles: dict[str, Array]) -> dict[str, Array]:
+    """Stations of a group whose direction is unknown start from their mean direction."""
+    evidence = problem.evidence
+    inc, azi = angles["inclination"], angles["azimuth"]
+    axis = tool_from_earth(inc, azi, np.zeros_like(inc))[..., 2, :]
+    members = evidence.members
+    mean = members @ (np.swapaxes(members, -1, -2) @ axis)
+    shared = {n: evidence.shared(n).sum(-1) > 0 for n in ("inclination", "azimuth")}
+    means = {
+        "inclination": np.arctan2(np.hypot(mean[..., 0], mean[..., 1]), mean[..., 2]),
+        "azimuth": np.arctan2(mean[..., 1], mean[..., 0]),
+    }
+    return {n: np.where(shared[n], means[n], a) if n in shared else a for n, a in angles.items()}
+
+
+def _by_toolface(
+    problem: Problem, angles: dict[str, Array], g: Array, b: Array
+) -> dict[str, Array]:
+    """Unknown directions, of stations and of groups, where toolfaces are known.
+
+    Definition: turned back by its toolface, g reads (-sin I, 0, cos I) at every station of a group;
+    turned back by that inclination too, b reads north · (cos A, -sin A) across the vertical. The
+    inclination has a sign, and the azimuth is as well defined at vertical as elsewhere.
+    """
+    evidence = problem.evidence
+    faced = evidence.is_known("toolface") & (evidence.include > 0)
+    lone = faced & (evidence.group < 0)
+
+    def mean(name: str, inclination: Array, field: Array) -> tuple[Array, Bools]:
+        """Sum (B, n, 3) over a station's group of fields turned back, where the angle is unknown."""
+        back = tool_from_earth(inclination, np.zeros_like(inclination), angles["toolface"])
+        turned = np.einsum("bnji,bnj->bni", back, field)
+        members = evidence.shared(name) * faced[..., None]
+        total = evidence.members @ (np.swapaxes(members, -1, -2) @ turned)
+        some = np.einsum("bnk,bk->bn", evidence.members, members.sum(-2)) > 0
+        own = lone & ~evidence.is_known(name)
+        return np.where(own[..., None], turned, total), some | own
+
+    down, found = mean("inclination", np.zeros(faced.shape), g)
+    inclination = np.where(found, np.arctan2(-down[..., 0], down[..., 2]), angles["inclination"])
+    across, found = mean("azimuth", inclination, b)
+    azimuth = np.where(found, np.arctan2(-across[..., 1], across[..., 0]), angles["azimuth"])
+    return {**angles, "inclination": inclination, "azimuth": azimuth}
+
+
+def _with_own(problem: Problem, state: State, g: Array, b: Array) -> State:
+    """Strengths and dip of which nothing may be used start as the start's own fields have them."""
+    own = state.own.copy()
+    for index, name in enumerate(problem.evidence.absent):
+        value = observables.OBSERVABLES[name].value(g, b)
+        own[..., index] = value - problem.constant(state, name)
+    return replace(state, own=own)
+
+
+def _with_dip(problem: Problem, state: State, g: Array, b: Array) -> State:
+    """Unknown dip starts from the mean angle between the two vectors."""
+    include = problem.evidence.include
+    constants = state.constants.copy()
+    for index, constant in enumerate(problem.evidence.constants):
+        if constant.name == "dip" and constant.unknown:
+            weight = constant.mask * include
+            total = np.sum(observables.dip(g, b) * weight, -1) / np.maximum(weight.sum(-1), 1)
+            constants[:, index] = total
+    return replace(state, constants=constants)

@@ -1,0 +1,422 @@
+"""What a fit is worth: covariance, rank, free directions by name, residuals per station.
+
+Nothing is quoted for a direction that the evidence does not determine.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mwdcal.estimation import fit_numba
+from mwdcal.estimation.problem import GEOMETRIC_NOISE, Problem, State
+from mwdcal.estimation.solvers import RANK_TOLERANCE, Determined, Linear, Normal
+from mwdcal.geometry.vectors import AnyArray, Array, Bools, Ints, eigen, inverse, rotation
+
+SEEN = 0.05
+"""A free direction with less than this share on a triad does not move the triad."""
+TESTED = 1e-3
+"""A direction of a station's readings counts if this share of its variance is left by the fit."""
+COUPLED = 0.9
+"""Share of a candidate direction that must lie in the null space to be called free."""
+
+
+@dataclass(frozen=True)
+class Analysis:
+    """A fit at its solution, with leading batch axis B and t triads.
+
+    `covariance` (B, p, p) with declared noise; `determined` says which directions;
+    `variance_factor` (B, t) is s² and `freedom` (B, t) its degrees of freedom;
+    `residual` (B, n, m) are whitened residuals left on the readings, and `spread`
+    (B, n, m, m) their expected covariance, so that residual · spread⁺ · residual is χ²;
+    `constants` (B, q, q) is the covariance of the constants of the run; `effects` (B, p, q) is
+    what one standard uncertainty of each does to the parameters, zero for unknown constants.
+    `influence` (B, n, u, m) is how an error of a station's whitened reading moves X's unknowns,
+    where that is not as the likelihood has it.
+    """
+
+    covariance: Array
+    determined: Determined
+    variance_factor: Array
+    freedom: Array
+    residual: Array
+    spread: Array
+    constants: Array
+    effects: Array
+    influence: Array | None = None
+
+
+def analyse(problem: Problem, state: State, determined: Determined | None = None) -> Analysis:
+    """Covariance, rank and residuals at a state; `determined` if it is known there already."""
+    linear = problem.linear(state)
+    determined = determined or Determined.of(problem, state)
+    whole = whole_covariance(linear, determined)
+    residual, spread = _remaining(linear, whole)
+    spread = spread * problem.evidence.include[..., None, None]
+    factor, freedom = _variance_factors(residual, spread)
+    p, q = linear.size, len(problem.evidence.constants)
+    return Analysis(
+        whole[:, :p, :p],
+        determined,
+        factor,
+        freedom,
+        residual,
+        spread,
+        whole[:, p : p + q, p : p + q],
+        _effects(problem, whole[:, :p, p : p + q]),
+    )
+
+
+def _effects(problem: Problem, cross: Array) -> Array:
+    """Effects (B, p, q) from the covariance (B, p, q) of parameters and constants."""
+    constants = problem.evidence.constants
+    each = [
+        np.zeros_like(cross[..., i]) if c.unknown else cross[..., i] / c.sd[:, None]
+        for i, c in enumerate(constants)
+    ]
+    return np.stack(each, -1) if each else cross
+
+
+def _remaining(linear: Linear, covariance: Array) -> tuple[Array, Array]:
+    """Whitened residuals C⁻¹ρ (B, n, m), and their covariance C⁻¹ - C⁻¹X V XᵀC⁻¹ (B, n, m, m)."""
+    if fit_numba.pays(linear.residual):
+        parts = (linear.residual, linear.blocks, linear.shared, linear.own)
+        return fit_numba.remaining(*parts, covariance)
+    weighed = linear.weigh(linear.design)
+    left = linear.weigh(linear.residual[..., None])[..., 0]
+    spread = linear.weigh(np.broadcast_to(np.eye(left.shape[-1]), (*left.shape, left.shape[-1])))
+    return left, spread - weighed @ covariance[:, None] @ np.swapaxes(weighed, -1, -2)
+
+
+def determined_apart(problem: Problem, state: State, own: dict[int, Array]) -> Determined:
+    """Which directions are determined when some triads are fitted to less than all evidence.
+
+    `own` (B, p_t, p_t), by triad, is the information of what those are fitted to, in relative
+    units and radians. The other triad follows them: what is free in them is free in both, however
+    much its own evidence would say of it.
+    """
+    linear = problem.linear(state, geometry=True)
+    whole, _, _ = linear.normal.reduced()
+    slices, found = problem.slices(), np.zeros_like(whole)
+    for index, where in enumerate(slices):
+        ours = own.get(index)
+        found[:, where, where] = (
+            whole[:, where, where] if ours is None else ours / GEOMETRIC_NOISE**2
+        )
+    if len(own) < len(slices):
+        (first, second), norms = slices, linear.norms
+        outer = norms[:, :, None] * norms[:, None, :]
+        scaled = whole / np.where(outer > 0, outer, 1.0)
+        cross, block = scaled[:, second, first], scaled[:, second, second]
+        back = np.linalg.pinv(block, rcond=RANK_TOLERANCE**2, hermitian=True)
+        follow = np.swapaxes(cross, -1, -2) @ back
+        found[:, first, first] += follow @ cross * outer[:, first, first]
+        found[:, second, first] = block @ back @ cross * outer[:, second, first]
+        found[:, first, second] = np.swapaxes(found[:, second, first], -1, -2)
+    nothing = np.zeros_like(state.params)
+    return Determined.by(Normal(found, nothing, nothing[:, 0], linear.size), linear.norms)
+
+
+def sandwich(found: Analysis, problem: Problem, state: State, pulls: dict[int, Array]) -> Analysis:
+    """The analysis when triads minimise sums of their own: covariance, residuals' spread and s².
+
+    `pulls` (B, n, p_t, 3), by triad, is how an error of a station's whitened reading moves those.
+    All other unknowns then follow as in the likelihood, those being held. Every error is counted
+    with all that it does: of the readings, of the stand (in C = I + GGᵀ), of common references.
+    """
+    linear = problem.linear(state)
+    design, u = linear.design, linear.prior.shape[-1]
+    moved, follow, back, fixed = _followed(problem, linear, pulls)
+    noise = np.eye(design.shape[2]) + linear.own @ np.swapaxes(linear.own, -1, -2)
+    covariance = np.einsum("bnim,bnmk,bnjk->bij", moved, noise, moved, optimize=True)
+    own = covariance
+    p, constants, rest = linear.size, problem.evidence.constants, ~fixed
+    effects = np.zeros((len(moved), p, len(constants)))
+    for column in [p + i for i, c in enumerate(constants) if not c.unknown]:
+        common = np.zeros((len(moved), u))
+        common[:, fixed] = -np.einsum("bnim,bnm->bi", moved[:, :, fixed], design[..., column])
+        pulled = np.einsum("bij,bj->bi", follow, common[:, fixed]) + linear.prior[:, rest, column]
+        common[:, rest] = -np.einsum("bij,bj->bi", back, pulled)
+        common = common / np.sqrt(linear.prior[:, column, column])[:, None]
+        covariance = covariance + common[:, :, None] * common[:, None, :]
+        effects[..., column - p] = common[:, :p]
+    crossed = design @ moved @ noise
+    left = noise + design @ own[:, None] @ np.swapaxes(design, -1, -2)
+    left = left + crossed + np.swapaxes(crossed, -1, -2)
+    weight = linear.weigh(np.broadcast_to(np.eye(noise.shape[-1]), noise.shape))
+    spread = weight @ left @ weight * problem.evidence.include[..., None, None]
+    factor, freedom = _variance_factors(found.residual, spread)
+    q = len(constants)
+    return replace(
+        found,
+        covariance=covariance[:, :p, :p],
+        variance_factor=factor,
+        freedom=freedom,
+        spread=spread,
+        constants=covariance[:, p : p + q, p : p + q],
+        effects=effects,
+        influence=moved,
+    )
+
+
+def _followed(
+    problem: Problem, linear: Linear, pulls: dict[int, Array]
+) -> tuple[Array, Array, Array, Bools]:
+    """Influence (B, n, u, m) of errors on all unknowns when some triads have their own `pulls`.
+
+    Also how the gradient of the others follows those, the inverse of their information, and which
+    unknowns (u,) are fixed by pulls.
+    """
+    design, weighed, u = linear.design, linear.weigh(linear.design), linear.prior.shape[-1]
+    moved = np.zeros((*design.shape[:2], u, design.shape[2]))
+    fixed = np.zeros(u, bool)
+    for index, pull in pulls.items():
+        where = problem.slices()[index]
+        moved[:, :, where, 3 * index : 3 * index + 3] = pull
+        fixed[where] = True
+    rest = ~fixed
+    whole = np.einsum("bnmi,bnmj->bij", design, weighed, optimize=True)
+    back = _inverse_where_known((whole + linear.prior)[:, rest][:, :, rest])
+    follow = whole[:, rest][:, :, fixed]
+    own = np.swapaxes(weighed[..., rest], -1, -2)
+    moved[:, :, rest] = -back[:, None] @ (follow[:, None] @ moved[:, :, fixed] + own)
+    return moved, follow, back, fixed
+
+
+def unweighted_pulls(problem: Problem, even: Problem, state: State) -> dict[int, Array]:
+    """Pulls (B, n, p_t, 3) of least squares with the noise of `even`, all references being exact."""
+    linear = even.linear(state)
+    determined = Determined.of(even, state)
+    reduced, _, eliminate = linear.normal.reduced()
+    p = linear.size
+    rows = linear.design[..., :p] - linear.design[..., p:] @ eliminate[:, None]
+    moved = -determined.inverse(reduced)[:, None] @ np.swapaxes(rows, -1, -2)
+    found = {}
+    for index, (triad, alike, where) in enumerate(
+        zip(problem.triads, even.triads, problem.slices(), strict=True)
+    ):
+        ratio = (triad.sd / alike.sd)[..., None, :]
+        found[index] = moved[:, :, where, 3 * index : 3 * index + 3] * ratio
+    return found
+
+
+def _inverse_where_known(information: Array) -> Array:
+    """Inverse (B, k, k) of an information matrix, zero along directions that it says nothing of."""
+    scale = np.sqrt(np.maximum(np.diagonal(information, axis1=-2, axis2=-1), 1e-300))
+    outer = scale[:, :, None] * scale[:, None, :]
+    return np.asarray(np.linalg.pinv(information / outer, rcond=1e-12, hermitian=True) / outer)
+
+
+def whole_covariance(linear: Linear, determined: Determined) -> Array:
+    """Covariance (B, p + s, p + s) of parameters and shared unknowns."""
+    normal = linear.normal
+    reduced, _, eliminate = normal.reduced()
+    own = determined.inverse(reduced)
+    cross = -own @ np.swapaxes(eliminate, -1, -2)
+    p = normal.size
+    shared = inverse(normal.information[..., p:, p:]) - eliminate @ cross
+    top = np.concatenate([own, cross], -1)
+    return np.concatenate([top, np.concatenate([np.swapaxes(cross, -1, -2), shared], -1)], -2)
+
+
+def _variance_factors(residual: Array, spread: Array) -> tuple[Array, Array]:
+    """s² and degrees of freedom (B, t) of each triad: restricted maximum likelihood."""
+    expected = np.diagonal(spread, axis1=-2, axis2=-1)
+    shape = (*residual.shape[:-1], residual.shape[-1] // 3, 3)
+    squares = np.sum((residual**2).reshape(shape), (1, 3))
+    freedom = np.sum(expected.reshape(shape), (1, 3))
+    return squares / np.where(freedom > 1e-9, freedom, np.nan), freedom
+
+
+def effective_freedom(problem: Problem, state: State, analysis: Analysis) -> Array:
+    """Degrees of freedom (B, t) of the χ² that s² times them follows: tr(S)² / tr(S²).
+
+    S = C⁻¹ - C⁻¹X V XᵀC⁻¹ is the covariance of a triad's whitened residuals, of all stations. It is
+    a projection where references are exact; else uncertain angles take a share of some residuals,
+    and s² scatters less than its `freedom` says. Reference: F. E. Satterthwaite, Biometrics
+    Bulletin 2, 110 (1946).
+    """
+    linear = problem.linear(state)
+    whole = whole_covariance(linear, analysis.determined)
+    weighed, count = linear.weigh(linear.design), linear.residual.shape[-1]
+    inner = linear.weigh(np.broadcast_to(np.eye(count), (*linear.residual.shape, count)))
+    inner = inner * problem.evidence.include[..., None, None]
+    found = []
+    for first in range(0, count, 3):
+        own = slice(first, first + 3)
+        rows, block = weighed[..., own, :], inner[..., own, own]
+        mixed = np.einsum("bnij,bnjp,bnip->bp", block, rows @ whole[:, None], rows, optimize=True)
+        gram = np.einsum("bnip,bniq->bpq", rows, rows, optimize=True) @ whole
+        twice = np.einsum("bpq,bqp->b", gram, gram)
+        found.append(np.sum(block**2, (1, 2, 3)) - 2 * mixed.sum(-1) + twice)
+    squares = np.stack(found, -1)
+    return np.asarray(analysis.freedom**2 / np.where(squares > 1e-9, squares, np.inf))
+
+
+def station_misfit(analysis: Analysis) -> tuple[Array, Array]:
+    """Misfit d² (B, n) of every station, χ² when all is as declared, and its degrees of freedom.
+
+    Directions of a station's readings that nothing tests (share below `TESTED`) do not count.
+    """
+    values, vectors = eigen(analysis.spread)
+    tested = values > TESTED
+    along = np.einsum("bnij,bni->bnj", vectors, analysis.residual) ** 2
+    square = np.sum(np.where(tested, along / np.where(tested, values, 1.0), 0.0), -1)
+    return square, np.sum(tested, -1).astype(float)
+
+
+def without_station(problem: Problem, state: State, analysis: Analysis) -> Array:
+    """Change (B, n, p) of the parameters when one station is left out, for each station.
+
+    Exact for a linear problem: Cov Xᵀ C⁻¹ spread⁺ C⁻¹ρ, every term as the fit has it.
+    Directions of a station's readings that nothing else tests are left as they are.
+    """
+    linear = problem.linear(state)
+    if analysis.influence is not None:
+        p = linear.size
+        own = linear.design @ analysis.influence
+        stay = inverse(np.eye(own.shape[-1]) + own) @ linear.residual[..., None]
+        return np.asarray(-(analysis.influence[:, :, :p] @ stay)[..., 0])
+    whole = whole_covariance(linear, analysis.determined)[:, : linear.size]
+    values, vectors = eigen(analysis.spread)
+    tested = values > TESTED
+    along = np.einsum("bnij,bni->bnj", vectors, analysis.residual)
+    along = np.where(tested, along / np.where(tested, values, 1.0), 0.0)
+    pulled = np.einsum("bnij,bnj->bni", vectors, along)
+    pulled = np.einsum("bnmu,bnm->bnu", linear.weigh(linear.design), pulled)
+    return np.asarray(np.einsum("bpu,bnu->bnp", whole, pulled))
+
+
+def candidates(problem: Problem, state: State, triads: list[int]) -> dict[str, Array]:
+    """Directions (B, p) of parameter space that have a name: turns and scales of some triads."""
+    directions = {}
+    zero = np.zeros_like(state.params)
+    for axis, name in enumerate(("rotation-x", "rotation-y", "toolface-zero")):
+        directions[name] = zero.copy()
+        directions[name][:, _columns(problem, triads)] = _tangent(
+            problem, state, triads, rotation(1e-5 * np.eye(3)[axis])
+        )
+    directions["scale"] = zero.copy()
+    directions["scale"][:, _columns(problem, triads)] = _tangent(
+        problem, state, triads, np.eye(3) * (1 + 1e-5)
+    )
+    return directions | _courses(problem, directions, triads)
+
+
+def _courses(problem: Problem, steady: dict[str, Array], triads: list[int]) -> dict[str, Array]:
+    """Turns and scales in proportion to each power of temperature, named `…-temperature-k`."""
+    orders = [problem.triads[t].model.basis.order for t in triads]
+    found = {}
+    for name, direction in steady.items():
+        for power in range(1, min(orders) + 1):
+            moved = np.zeros_like(direction)
+            for triad in triads:
+                where, model = problem.slices()[triad], problem.triads[triad].model
+                moved[:, where] = model.with_course(direction[:, where], power)
+            found[f"{name}-temperature-{power}"] = moved
+    return found
+
+
+def _columns(problem: Problem, triads: list[int]) -> Array:
+    slices = problem.slices()
+    return np.concatenate([np.arange(slices[t].start, slices[t].stop) for t in triads])
+
+
+def _tangent(problem: Problem, state: State, triads: list[int], change: Array) -> Array:
+    """Change of the parameters when the fields of some triads are transformed, per unit."""
+    slices = problem.slices()
+    parts = [
+        problem.triads[t].model.transformed(state.params[:, slices[t]], change)
+        - state.params[:, slices[t]]
+        for t in triads
+    ]
+    return np.asarray(np.concatenate(parts, -1) / 1e-5)
+
+
+def free_share(determined: Determined, direction: Array) -> Array:
+    """Share (B,), 0…1, of a direction of parameter space that lies in the free subspace."""
+    scaled = direction * determined.norms
+    inside = np.einsum("bpk,bp->bk", determined.null(), scaled)
+    total = np.sum(scaled**2, -1)
+    return np.asarray(np.sum(inside**2, -1) / np.where(total > 0, total, 1.0))
+
+
+def marginal_rank(determined: Determined, where: slice) -> Ints:
+    """Rank (B,) of one triad: its size less the dimension of the free subspace as seen by it."""
+    seen = np.linalg.svd(determined.null()[..., where, :], compute_uv=False)
+    return np.asarray(where.stop - where.start - np.sum(seen > SEEN, -1))
+
+
+def settle_gauge(problem: Problem, state: State, determined: Determined) -> State:
+    """Put free directions where they belong by convention, whatever solver or model came here.
+
+    Free rotation: the gain's polar factor has none. Free scale: the mean strength of the field
+    is the nominal one.
+    """
+    every = list(range(len(problem.triads)))
+    for triads in [every] + [[t] for t in every if len(every) > 1]:
+        named = candidates(problem, state, triads)
+        axes = ("rotation-x", "rotation-y", "toolface-zero")
+        free = np.stack([free_share(determined, named[axis]) > COUPLED for axis in axes], -1)
+        turn = _polar_turn(problem, state, triads[0], free)
+        state = _turn(problem, state, triads, turn, stations=len(triads) == len(every))
+    for triad in every:
+        share = free_share(determined, candidates(problem, state, [triad])["scale"])
+        state = _rescale(problem, state, triad, share > COUPLED)
+    return readjusted(problem, state)
+
+
+def readjusted(problem: Problem, state: State) -> State:
+    """The state with stations' and groups' own unknowns at their best for the parameters."""
+    for _ in range(4):
+        linear = problem.linear(state)
+        normal = linear.normal
+        fixed = linear.size + len(problem.evidence.constants)
+        step = np.zeros((len(state.params), linear.design.shape[-1]))
+        groups = inverse(normal.information[:, fixed:, fixed:])
+        step[:, fixed:] = -(groups @ normal.gradient[:, fixed:, None])[..., 0]
+        state = problem.move(state, linear, step)
+    return state
+
+
+def _rescale(problem: Problem, state: State, triad: int, free: Bools) -> State:
+    """Bring the mean strength of a triad of free scale to the nominal one."""
+    name = ("gravity", "field")[triad]
+    known = problem.evidence.known[name]
+    nominal = np.nan_to_num(known).sum(-1) / np.maximum((~np.isnan(known)).sum(-1), 1)
+    factor = np.where(free, nominal / problem.constant(state, name).mean(-1), 1.0)
+    where, params = problem.slices()[triad], state.params.copy()
+    matrix = factor[:, None, None] * np.eye(3)
+    params[:, where] = problem.triads[triad].model.transformed(params[:, where], matrix)
+    own = state.own.copy()
+    if name in problem.evidence.absent:
+        place = problem.evidence.absent.index(name)
+        base = problem.constant(state, name) - own[..., place]
+        own[..., place] = factor[:, None] * problem.constant(state, name) - base
+    return replace(state, params=params, own=own)
+
+
+def _polar_turn(problem: Problem, state: State, triad: int, free: AnyArray) -> Array:
+    """Rotation (B, 3, 3) about the free axes that leaves the triad's gain without rotation."""
+    where = problem.slices()[triad]
+    chosen = problem.triads[triad]
+    gain = chosen.model.slope(state.params[:, where], chosen.raw, problem.temperature).mean(1)
+    gain = np.where(np.isfinite(gain), gain, np.eye(3))
+    u, _, vt = np.linalg.svd(gain)
+    sign = np.where(np.linalg.det(u @ vt) < 0, -1.0, 1.0)
+    polar = (u * np.stack([np.ones_like(sign), np.ones_like(sign), sign], -1)[:, None, :]) @ vt
+    about_z = np.arctan2(polar[:, 0, 1] - polar[:, 1, 0], polar[:, 0, 0] + polar[:, 1, 1])
+    along = np.zeros((len(polar), 3))
+    along[:, 2] = np.where(free[:, 2], about_z, 0.0)
+    whole = np.swapaxes(polar, -1, -2)
+    return np.where(np.all(free, -1, keepdims=True)[..., None], whole, rotation(along))
+
+
+def _turn(problem: Problem, state: State, triads: list[int], turn: Array, stations: bool) -> State:
+    params = state.params.copy()
+    for triad in triads:
+        where = problem.slices()[triad]
+        params[:, where] = problem.triads[triad].model.transformed(params[:, where], turn)
+    attitude = turn[:, None] @ state.attitude if stations else state.attitude
+    return replace(state, params=params, attitude=attitude)

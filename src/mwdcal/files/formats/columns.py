@@ -1,0 +1,156 @@
+"""What every table format shares: columns, the header, and rows of cells turned into columns."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from datetime import date, time
+from typing import NamedTuple
+
+import numpy as np
+
+from mwdcal.errors import InputError
+from mwdcal.geometry.vectors import Array
+
+# Text as it was read, or numbers with NaN where the cell is blank.
+Column = list[str] | Array
+
+# Columns that are text even where every cell looks like a number.
+LABELS = ("station", "group", "serial")
+
+MAX_COLUMNS = 1000
+
+_NUMBER = re.compile(r"[+-]?(\d+[.,]?\d*|[.,]\d+)([eE][+-]?\d+)?", re.ASCII)
+
+
+class Parts(NamedTuple):
+    """What a format reads from the bytes of a file."""
+
+    columns: dict[str, Column]
+    metadata: dict[str, object]
+    lines: Sequence[int]
+
+
+def looks_numeric(text: str, decimal: str = ".") -> bool:
+    """Whether the text is one plain decimal number, with the given decimal sign."""
+    other = "," if decimal == "." else "."
+    return other not in text and _NUMBER.fullmatch(text) is not None
+
+
+def check_names(names: Sequence[str], where: str) -> None:
+    """Refuse a header with too many, unnamed or repeated columns, or without names at all."""
+    if not names:
+        raise InputError(
+            f"{where}: expected the column names; got the end of the file. Add a line with the "
+            "column names, such as ax,ay,az, and one row per station."
+        )
+    if len(names) > MAX_COLUMNS:
+        raise InputError(
+            f"{where}: a table must have at most {MAX_COLUMNS} columns; got {len(names)}. "
+            "Is this a run file?"
+        )
+    if all(looks_numeric(name) for name in names):
+        raise InputError(
+            f"{where}: expected the column names; got numbers. Put a line with the column "
+            "names, such as ax,ay,az, above them."
+        )
+    for position, name in enumerate(names, 1):
+        if not name:
+            raise InputError(
+                f"{where}: every column must have a name; column {position} has none. "
+                "Name it, or remove it with its delimiter."
+            )
+    _check_unique(names, where)
+
+
+def _check_unique(names: Sequence[str], where: str) -> None:
+    seen: set[str] = set()
+    for name in names:
+        if name in seen:
+            raise InputError(
+                f"{where}: column names must be unique; got '{name}' more than once. "
+                "Rename or remove one of the columns."
+            )
+        seen.add(name)
+
+
+def assemble(
+    rows: Iterator[tuple[int, Sequence[object]]], source: str, word: str
+) -> tuple[list[str], list[Sequence[object]], list[int]]:
+    """Names, rows of equal length, and their line numbers; the first row is the header.
+
+    Rows without any content are no stations and are left out.
+    """
+    number, header = next(rows, (1, ()))
+    names = [as_text(cell).strip() for cell in header]
+    check_names(names, f"{source}, {word} {number}")
+    kept: list[Sequence[object]] = []
+    lines: list[int] = []
+    for number, row in rows:
+        if _is_blank(row):
+            continue
+        if len(row) != len(names):
+            raise _ragged(row, len(names), f"{source}, {word} {number}")
+        kept.append(row)
+        lines.append(number)
+    if not kept:
+        raise no_stations(source)
+    return names, kept, lines
+
+
+def no_stations(source: str) -> InputError:
+    """A table with a header and nothing below it."""
+    return InputError(
+        f"{source}: the file has column names but no stations. Add one row per station."
+    )
+
+
+def _is_blank(row: Sequence[object]) -> bool:
+    return not any(cell.strip() if isinstance(cell, str) else cell is not None for cell in row)
+
+
+def _ragged(row: Sequence[object], width: int, where: str) -> InputError:
+    if as_text(row[0]).lstrip().startswith("#"):
+        advice = "Lines that start with '#' belong above the column names."
+    else:
+        advice = "Check the delimiters of this line; a decimal comma needs ';' between cells."
+    return InputError(
+        f"{where}: expected {width} cells, as many as there are column names; "
+        f"got {len(row)}. {advice}"
+    )
+
+
+def typed(name: str, cells: Iterable[object]) -> Column:
+    """A column of typed cells: numbers if all are numbers or blank, else text."""
+    values = list(cells)
+    if name in LABELS or not all(_is_number(value) for value in values):
+        return [as_text(value) for value in values]
+    return np.array([np.nan if value is None else value for value in values], float)
+
+
+def _is_number(value: object) -> bool:
+    return value is None or (isinstance(value, int | float) and not isinstance(value, bool))
+
+
+def as_text(value: object) -> str:
+    """A typed cell as text: whole numbers without a decimal point, dates in ISO form.
+
+    >>> [as_text(v) for v in (None, "A", 7.0, 0.1, True)]
+    ['', 'A', '7', '0.1', 'true']
+    """
+    if value is None:
+        return ""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, float):
+        return number(value).removesuffix(".0")
+    if isinstance(value, date | time):
+        return value.isoformat()
+    if isinstance(value, bytes):
+        return value.decode("utf-8", "replace")
+    return str(value)
+
+
+def number(value: float) -> str:
+    """The shortest text that reads back as the same number; blank for NaN."""
+    return "" if np.isnan(value) else repr(float(value))

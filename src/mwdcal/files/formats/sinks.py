@@ -1,0 +1,190 @@
+"""Where parts of a table go: Parquet or text, written as they come, metadata at the end.
+
+`render` may be called by several threads at once, `write` takes what it gave, in order.
+"""
+
+from __future__ import annotations
+
+import base64
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from typing import IO, Any, Protocol
+
+import msgspec
+import numpy as np
+
+from mwdcal.files import metadata as meta
+from mwdcal.files.formats import parquet, text
+from mwdcal.geometry.vectors import AnyArray, Bools
+
+_ARROW_SCHEMA = b"ARROW:schema"
+
+
+class Sink(Protocol):
+    """A table being written: `carried` columns, then results beside them."""
+
+    def render(self, carried: Any, results: Sequence[AnyArray], blank: bool) -> Any:
+        """What is written of a part; without `blank` no result is NaN."""
+
+    def write(self, rendered: Any) -> None:
+        """Append a part."""
+
+    def finish(self, findings: Sequence[str]) -> None:
+        """Complete the table; `findings` are known only now."""
+
+
+class ParquetSink:
+    """A Parquet file; results are neither compressed nor searched for repetitions: there are none."""
+
+    def __init__(
+        self, stream: IO[bytes], schema: Any, results: Any, metadata: Mapping[str, object]
+    ) -> None:
+        self._arrow, parquets = parquet.modules(stream.name)
+        self._metadata = dict(metadata)
+        self._names = names = results.names
+        numeric = {f.name for f in schema if self._arrow.types.is_floating(f.type)}
+        self._schema = schema = self._arrow.schema([*schema, *results])
+        schema = schema.with_metadata({parquet.KEY: self._described([])})
+        self._writer = parquets.ParquetWriter(
+            stream.name,
+            schema,
+            use_dictionary=[f.name for f in schema if f.name not in numeric.union(names)],
+            compression={f.name: "none" if f.name in names else "snappy" for f in schema},
+        )
+
+    def render(self, carried: Any, results: Sequence[AnyArray], blank: bool) -> Any:
+        """The Arrow table of the part; numbers are not copied where nothing is blank."""
+        for name, values in zip(self._names, results, strict=True):
+            carried = carried.append_column(name, self._arrow.array(values, from_pandas=blank))
+        return carried
+
+    def write(self, rendered: Any) -> None:
+        """Append a row group."""
+        self._writer.write_table(rendered)
+
+    def finish(self, findings: Sequence[str]) -> None:
+        """Write the findings and the end of the file."""
+        if findings:  # also in Arrow's copy of the schema, whose metadata readers take
+            described = {parquet.KEY: self._described(findings)}
+            stored = base64.b64encode(self._schema.with_metadata(described).serialize())
+            self._writer.add_key_value_metadata({**described, _ARROW_SCHEMA: stored})
+        self._writer.close()
+
+    def _described(self, findings: Sequence[str]) -> bytes:
+        metadata = {**self._metadata, "findings": list(findings)} if findings else self._metadata
+        return msgspec.json.encode(metadata, enc_hook=str)
+
+
+class TextSink:
+    """A text table; the findings are above its header.
+
+    From the second part on room is kept for them there, as a comment line of blanks.
+    """
+
+    def __init__(
+        self,
+        stream: IO[bytes],
+        schema: Any,
+        results: Any,
+        metadata: Mapping[str, object],
+        longest: Sequence[str],
+        delimiter: str,
+    ) -> None:
+        self._arrow, _ = parquet.modules(stream.name)
+        self._stream = stream
+        self._delimiter = delimiter
+        self._names = results.names
+        stream.write("".join(f"{line}\n" for line in meta.render(metadata)).encode())
+        self._place = stream.tell()
+        self._room = len(_line(longest)) if longest else 0
+        header = csv.writer(buffer := io.StringIO(), delimiter=self._delimiter, lineterminator="\n")
+        header.writerow([*schema.names, *results.names])
+        self._header = buffer.getvalue().encode()
+        self._first: bytes | None = None
+
+    def render(self, carried: Any, results: Sequence[AnyArray], blank: bool) -> bytes:
+        """The lines of the part."""
+        plain = {
+            n: self._spelt(c) for n, c in zip(carried.column_names, carried.columns, strict=True)
+        }
+        plain |= {
+            name: self._arrow.array(values, from_pandas=blank)
+            for name, values in zip(self._names, results, strict=True)
+        }
+        rows = self._arrow.table(plain)
+        try:
+            return self._lines(rows)
+        except self._arrow.ArrowInvalid:  # a cell needs quotes
+            return self._quoted(rows)
+
+    def _lines(self, rows: Any) -> bytes:
+        """Rows of which no cell needs quotes."""
+        from pyarrow import csv as arrow_csv
+
+        stream = self._arrow.BufferOutputStream()
+        options = arrow_csv.WriteOptions(
+            include_header=False, delimiter=self._delimiter, quoting_style="none"
+        )
+        arrow_csv.write_csv(rows, stream, options)
+        return bytes(stream.getvalue())
+
+    def _quoted(self, rows: Any) -> bytes:
+        """Rows of which some have such cells: these by the writer of short tables, numbers alike."""
+        odd = self._odd(rows)
+        words = [cells.cast(self._arrow.string()) for cells in rows.filter(odd).columns]
+        cells = [[word or "" for word in column.to_pylist()] for column in words]
+        columns = dict(zip(rows.column_names, cells, strict=True))
+        few = text.render(columns, {}, self._delimiter).encode().split(b"\n")
+        lines = np.empty(len(odd), object)
+        lines[odd] = few[-1 - int(odd.sum()) : -1]
+        lines[~odd] = self._lines(rows.filter(~odd)).split(b"\n")[:-1]
+        return b"\n".join([*lines, b""])
+
+    def _odd(self, rows: Any) -> Bools:
+        """Which rows (n,) have a cell that needs quotes."""
+        import pyarrow.compute as compute
+
+        odd = np.zeros(len(rows), bool)
+        for cells in rows.columns:
+            if self._arrow.types.is_string(cells.type):
+                found = compute.match_substring_regex(cells, f'["\r\n{self._delimiter}]')
+                odd |= found.fill_null(False).to_numpy()
+        return odd
+
+    def write(self, rendered: bytes) -> None:
+        """Append lines; the first ones wait, as a table of one part needs no room."""
+        if self._first is None:
+            self._first = rendered
+            return
+        if self._header:
+            self._begin(b"#".ljust(self._room) + b"\n" if self._room else b"")
+        self._stream.write(rendered)
+
+    def _begin(self, comment: bytes) -> None:
+        self._stream.write(comment + self._header + (self._first or b""))
+        self._header = self._first = b""
+
+    def finish(self, findings: Sequence[str]) -> None:
+        """Put the findings where they belong."""
+        if self._header:
+            self._begin(_line(findings) + b"\n" if findings else b"")
+        elif findings:
+            self._stream.seek(self._place)
+            self._stream.write(_line(findings).ljust(self._room))
+
+    def _spelt(self, cells: Any) -> Any:
+        """A column of numbers (blank: null) or of text, as text tables have them."""
+        import pyarrow.compute as compute
+
+        types, kind = self._arrow.types, cells.type
+        if types.is_integer(kind) or types.is_string(kind):
+            return cells
+        if types.is_floating(kind) or types.is_decimal(kind):
+            values = cells.cast(self._arrow.float64(), safe=False)
+            return compute.if_else(compute.is_nan(values), None, values)
+        return self._arrow.array(parquet.texts(cells, self._arrow), self._arrow.string())
+
+
+def _line(findings: Sequence[str]) -> bytes:
+    return meta.render({"findings": list(findings)})[0].encode()

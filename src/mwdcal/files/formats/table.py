@@ -1,0 +1,253 @@
+"""The raw table: cells as they were read, with the place of each for messages."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from mwdcal.errors import InputError
+from mwdcal.files.formats import atomic, parquet, text, workbook
+from mwdcal.files.formats.columns import LABELS, Column, as_text, check_names, looks_numeric
+from mwdcal.geometry.vectors import Array
+
+_PARSERS = {
+    ".csv": text.parse,
+    ".tsv": text.parse,
+    ".parquet": parquet.parse,
+    ".xlsx": workbook.parse,
+}
+SUFFIXES = tuple(_PARSERS)
+
+_LARGEST = {".parquet": 2_000_000_000}
+_LARGEST_TEXT = 50_000_000
+_MARKS = {sign: frozenset(f"0123456789+-eE {sign}") for sign in ".,"}
+_LONGEST_SHOWN = 40
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """Columns of cells as read: text, or numbers (NaN: blank) from typed formats.
+
+    Attributes:
+        columns: by name, in the order of the file.
+        metadata: what the file says about itself.
+        source: name of the file.
+        lines: line (text) or row (other formats) of each station, for messages.
+        digest: SHA-256 of the file's bytes, hexadecimal.
+        decimal: the decimal sign of numbers in text cells.
+    """
+
+    columns: Mapping[str, Column]
+    metadata: Mapping[str, object] = field(default_factory=dict)
+    source: str = "table"
+    lines: Sequence[int] = ()
+    digest: str = ""
+    decimal: str = "."
+
+    @property
+    def count(self) -> int:
+        """Number of stations."""
+        return len(next(iter(self.columns.values()), ()))
+
+
+def read(
+    path: str | os.PathLike[str], *, decimal: str = ".", delimiter: str | None = None
+) -> Table:
+    """The table in a .csv, .tsv, .parquet or .xlsx file.
+
+    `decimal` is the decimal sign of text cells, '.' or ','; without `delimiter` the header
+    line of a text file tells it.
+    """
+    _check_options(decimal, delimiter)
+    file = Path(path)
+    data = _content(file)
+    parts = _PARSERS[_suffix(file)](data, file.name, delimiter)
+    digest = hashlib.sha256(data).hexdigest()
+    return Table(parts.columns, parts.metadata, file.name, parts.lines, digest, decimal)
+
+
+def write(path: str | os.PathLike[str], table: Table) -> None:
+    """Write the table atomically, in the format of the suffix; the same table, the same bytes."""
+    file = Path(path)
+    suffix = _suffix(file)
+    check_header(list(table.columns), file.name)
+    if suffix in (".csv", ".tsv"):
+        delimiter = "," if suffix == ".csv" else "\t"
+        atomic.write(file, text.render(_pointed(table), table.metadata, delimiter))
+    else:
+        render = parquet.render if suffix == ".parquet" else workbook.render
+        atomic.write(file, render(_typed(table), table.metadata, file.name))
+
+
+def check_header(names: Sequence[str], source: str) -> None:
+    """Refuse column names that a written table cannot have."""
+    check_names(names, source)
+    if names[0].startswith("#"):
+        raise InputError(f"{source}: the first column name must not start with '#'.")
+
+
+def numbers(table: Table, name: str) -> Array:
+    """The column as numbers (n,), NaN where blank; text, NaN and infinity are refused."""
+    column = table.columns[name]
+    if isinstance(column, list):
+        fast = _floats(column, table.decimal)
+        return _one_by_one(table, name, column) if fast is None else fast
+    endless = np.flatnonzero(np.isinf(column))
+    if endless.size:
+        row = int(endless[0])
+        raise cell_error(table, name, row, f"expected a finite number; got {column[row]}.")
+    return column
+
+
+def labels(table: Table, name: str) -> list[str]:
+    """The column as text without surrounding blanks."""
+    column = table.columns[name]
+    cells = column if isinstance(column, list) else [as_text(value) for value in column.tolist()]
+    return [cell.strip() for cell in cells]
+
+
+def cell_error(table: Table, name: str, row: int, problem: str) -> InputError:
+    """The error that names file, line and column before the problem."""
+    word = "row" if Path(table.source).suffix.lower() in ("", ".parquet", ".xlsx") else "line"
+    number = table.lines[row] if row < len(table.lines) else row + 1
+    return InputError(f"{table.source}, {word} {number}, column '{name}': {problem}")
+
+
+def shown(value: object) -> str:
+    """A value for a message: text in quotes, long text cut, numbers in short form."""
+    if isinstance(value, str):
+        cut = value if len(value) <= _LONGEST_SHOWN else value[:_LONGEST_SHOWN] + "…"
+        return f"'{cut}'" if cut.isprintable() else repr(cut)
+    return f"{value:.12g}" if isinstance(value, float) else str(value)
+
+
+def _check_options(decimal: str, delimiter: str | None) -> None:
+    if decimal not in _MARKS:
+        raise InputError(f"`decimal` must be '.' or ','; got {shown(decimal)}.")
+    bad = "\"'#\r\n\0"
+    if delimiter is not None and (len(delimiter) != 1 or delimiter in bad or delimiter == decimal):
+        raise InputError(
+            "`delimiter` must be one character, such as ',', ';' or a tab, and not the decimal "
+            f"sign; got {shown(delimiter)}."
+        )
+
+
+def _suffix(path: Path) -> str:
+    suffix = path.suffix.lower()
+    if suffix not in _PARSERS:
+        raise InputError(
+            f"'{path}': the suffix must be one of {', '.join(SUFFIXES)}; got "
+            f"'{suffix or 'none'}'. Convert or rename the file."
+        )
+    return suffix
+
+
+def _content(path: Path) -> bytes:
+    """The bytes of an existing, regular file of bearable size and known suffix."""
+    try:
+        if path.is_dir():
+            raise InputError(f"'{path}' is a folder. Name a file in it.")
+        if not path.exists():
+            raise InputError(f"'{path}': no such file. Check the name and the folder.")
+        if not path.is_file():
+            raise InputError(f"'{path}' is not a regular file. Name a file with readings.")
+        _check_size(path.stat().st_size, path)
+        return path.read_bytes()
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise InputError(
+            f"cannot read '{path}': {reason}. Check that the file may be read and is not "
+            "locked by another program."
+        ) from error
+
+
+def _check_size(size: int, path: Path) -> None:
+    largest = _LARGEST.get(_suffix(path), _LARGEST_TEXT)
+    if size > largest:
+        raise InputError(
+            f"'{path}': the file must have at most {largest} bytes; got {size}. Split it, or "
+            "write long tables as Parquet."
+        )
+
+
+def _floats(cells: Sequence[str], decimal: str) -> Array | None:
+    """The cells as numbers, blank as NaN; None where a cell is not a plain finite number."""
+    if not set("".join(cells)) <= _MARKS[decimal]:
+        return None
+    pointed = [cell.replace(",", ".").strip() for cell in cells]
+    try:
+        values = np.array([float(cell) if cell else np.nan for cell in pointed])
+    except ValueError:
+        return None
+    return None if np.isinf(values).any() else values
+
+
+def _one_by_one(table: Table, name: str, cells: Sequence[str]) -> Array:
+    """The same, for cells with unusual blanks, or to find the one that is no number."""
+    values = np.full(len(cells), np.nan)
+    for row, cell in enumerate(cells):
+        stripped = cell.strip()
+        if not stripped:
+            continue
+        if not looks_numeric(stripped, table.decimal):
+            advice = _advice(stripped, table.decimal)
+            problem = f"expected a number; got {shown(cell)}. {advice}"
+            raise cell_error(table, name, row, problem)
+        values[row] = float(stripped.replace(",", "."))
+        if np.isinf(values[row]):
+            problem = f"expected a finite number; got {shown(cell)}, which is too large."
+            raise cell_error(table, name, row, problem)
+    return values
+
+
+def _advice(cell: str, decimal: str) -> str:
+    """What to do about a cell that is no number."""
+    if decimal == "." and looks_numeric(cell, ","):
+        return "Is the decimal comma intended? Use --decimal=,"
+    if decimal == "," and looks_numeric(cell, "."):
+        return "The decimal sign was given as a comma. Is the point intended? Use --decimal=."
+    if re.fullmatch(r"[+-]?(nan|inf|infinity|∞|n/?a|null|none)", cell, re.IGNORECASE):
+        return "Every number must be finite. Leave the cell blank where a value is unknown."
+    if re.fullmatch(r"[+-]?\d{1,3}([ ,.'’_\u00a0\u202f]\d{3})+([.,]\d*)?", cell):
+        return "Write numbers without thousands separators."
+    if re.match(r"0[xXbBoO]", cell):
+        return "Write decimal numbers."
+    if re.fullmatch(r"[+-]?[\d.,]+([eE][+-]?\d+)?\s*[^\d\s.,+-][^\d]*", cell):
+        return "Write the number without its unit; the column name states it."
+    return "Write a plain number, such as 0.998 or 9.98e-1."
+
+
+def _pointed(table: Table) -> dict[str, Column]:
+    """The columns with the decimal point in every number, for text files."""
+    if table.decimal == ".":
+        return dict(table.columns)
+    return {
+        name: [c.replace(",", ".") if looks_numeric(c.strip(), ",") else c for c in column]
+        if isinstance(column, list) and name not in LABELS
+        else column
+        for name, column in table.columns.items()
+    }
+
+
+def _typed(table: Table) -> dict[str, Column]:
+    """The columns for typed formats: text columns that hold nothing but numbers as numbers."""
+    return {name: _typed_column(name, c, table.decimal) for name, c in table.columns.items()}
+
+
+def _typed_column(name: str, column: Column, decimal: str) -> Column:
+    if not isinstance(column, list) or name in LABELS or any(_is_code(c) for c in column):
+        return column
+    values = _floats(column, decimal)
+    return column if values is None else values
+
+
+def _is_code(cell: str) -> bool:
+    """Whether a number would lose digits of the cell: leading zeros ('007'), or more than it holds."""
+    digits = cell.removeprefix("-")
+    return bool(re.match(r"0\d", digits)) or (len(digits) > 15 and digits.isdigit())

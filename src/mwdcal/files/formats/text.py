@@ -1,0 +1,195 @@
+"""CSV and TSV: UTF-8 text, metadata lines, one header line, one line per station."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import chain, takewhile
+from typing import NamedTuple
+
+from mwdcal.errors import InputError
+from mwdcal.files import metadata as meta
+from mwdcal.files.formats.columns import Column, Parts, assemble, check_names, number
+
+_LONGEST_LINE = 100_000
+_MAX_LINES = 1_000_000
+
+_FOREIGN = {
+    b"\xff\xfe": ("UTF-16 text", "Save it as UTF-8 (in Excel: 'CSV UTF-8')."),
+    b"\xfe\xff": ("UTF-16 text", "Save it as UTF-8 (in Excel: 'CSV UTF-8')."),
+    b"\x89PNG": ("a PNG picture", "Name the file with the readings."),
+    b"%PDF": ("a PDF document", "Name the file with the readings."),
+    b"PK\x03\x04": ("a ZIP archive or Excel workbook", "A workbook must be named .xlsx."),
+    b"PAR1": ("a Parquet file", "Name it .parquet."),
+    b"\x1f\x8b": ("gzip-compressed", "Unpack it first."),
+    b"\xd0\xcf\x11\xe0": ("an old Excel workbook (.xls)", "Save it as .xlsx or CSV UTF-8."),
+}
+
+
+def parse(data: bytes, source: str, delimiter: str | None = None) -> Parts:
+    """The table in the bytes of a text file; without `delimiter` the header line tells it."""
+    lines = _lines(data, source)
+    comments = list(takewhile(_is_preamble, lines))
+    entries = [(i, _comment(line)) for i, line in enumerate(comments, 1)]
+    metadata = meta.parse(entries, source)
+    start = len(comments)
+    if start < len(lines):
+        delimiter = delimiter or _delimiter(lines[start], source)
+    rows = _rows(lines[start:], start, delimiter or ",", source)
+    names, cells, numbers = assemble(rows, source, "line")
+    columns: dict[str, Column] = {
+        name: [str(cell) for cell in column]
+        for name, column in zip(names, zip(*cells, strict=True), strict=True)
+    }
+    return Parts(columns, metadata, numbers)
+
+
+class Head(NamedTuple):
+    """What stands above the rows of a text table, and the rest of the piece it was read from."""
+
+    names: list[str]
+    metadata: dict[str, object]
+    delimiter: str
+    lines: int
+    body: bytes
+
+
+def head(data: bytes, source: str, delimiter: str | None = None) -> Head:
+    """The head of a text table of which `data` is the beginning, whole lines."""
+    lines = _lines(data, source)
+    comments = list(takewhile(_is_preamble, lines))
+    metadata = meta.parse([(i, _comment(line)) for i, line in enumerate(comments, 1)], source)
+    start = len(comments)
+    header = lines[start : start + 1]
+    delimiter = delimiter or (_delimiter(header[0], source) if header else ",")
+    cells = next(_rows(header, start, delimiter, source), (start + 1, ()))[1]
+    names = [str(cell).strip() for cell in cells]
+    check_names(names, f"{source}, line {start + 1}")
+    return Head(names, metadata, delimiter, start + 1, "\n".join(lines[start + 1 :]).encode())
+
+
+def rows(data: bytes, top: Head, above: int, source: str) -> Parts:
+    """The rows of a piece of a text table, whole lines with `above` lines of the file before."""
+    columns: dict[str, Column] = {name: [] for name in top.names}
+    if not data.strip(top.delimiter.encode() + b" \t\r\n"):
+        return Parts(columns, {}, ())
+    entries = _rows(_lines(data, source, above), above, top.delimiter, source)
+    _, cells, numbers = assemble(chain([(above, top.names)], entries), source, "line")
+    texts = [[str(cell) for cell in column] for column in zip(*cells, strict=True)]
+    return Parts(dict(zip(columns, texts, strict=True)), {}, numbers)
+
+
+def render(columns: Mapping[str, Column], metadata: Mapping[str, object], delimiter: str) -> str:
+    """The text that `parse` turns back into the same columns and metadata."""
+    stream = io.StringIO()
+    stream.writelines(f"{line}\n" for line in meta.render(metadata))
+    writer = csv.writer(stream, delimiter=delimiter, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(zip(*(_cells(k, v) for k, v in columns.items()), strict=True))
+    return stream.getvalue()
+
+
+def _cells(name: str, column: Column) -> list[str]:
+    if not isinstance(column, list):
+        return [number(value) for value in column]
+    for cell in column:
+        if any(mark in cell for mark in "\n\r\0"):
+            raise InputError(
+                f"column '{name}': cells of a text file must be one line; got {cell!r}. "
+                "Remove the line break, or write Parquet."
+            )
+    return column
+
+
+def _lines(data: bytes, source: str, above: int = 0) -> list[str]:
+    """The lines without their ends, blank ones at the end left out; `above` lines came before."""
+    if not above:
+        _refuse_foreign(data, source)
+    content = _decoded(data, source, above).replace("\r\n", "\n").replace("\r", "\n").rstrip("\n")
+    if not content.strip():
+        raise InputError(
+            f"{source}: the file is empty. A run file needs a line with the column names, "
+            "such as ax,ay,az, and one row per station."
+        )
+    ends = content.count("\n")
+    if ends > _MAX_LINES:
+        raise InputError(
+            f"{source}: a text table must have at most {_MAX_LINES} lines; got {ends}. "
+            "Split it, or write long tables as Parquet."
+        )
+    lines = content.split("\n")
+    for position, line in enumerate(lines, above + 1):
+        if len(line) > _LONGEST_LINE:
+            raise InputError(
+                f"{source}, line {position}: a line must have at most {_LONGEST_LINE} "
+                f"characters; got {len(line)}. Is this a run file, with one line per station?"
+            )
+    return lines
+
+
+def _refuse_foreign(data: bytes, source: str) -> None:
+    for signature, (kind, advice) in _FOREIGN.items():
+        if data.startswith(signature):
+            raise InputError(f"{source}: expected a text table; the file is {kind}. {advice}")
+
+
+def _decoded(data: bytes, source: str, above: int) -> str:
+    """The text; every refusal names the line of the first offending byte."""
+    position = data.find(b"\0")
+    if position >= 0:
+        raise InputError(
+            f"{source}, line {above + _line_of(data, position)}: expected text; got a NUL byte. The "
+            "file is binary or UTF-16: save the table as UTF-8 text."
+        )
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(
+            f"{source}, line {above + _line_of(data, error.start)}: expected UTF-8 text; got byte "
+            f"0x{data[error.start]:02X}. Save the file as UTF-8 (in Excel: 'CSV UTF-8')."
+        ) from None
+
+
+def _line_of(data: bytes, position: int) -> int:
+    return data.count(b"\n", 0, position) + 1
+
+
+def _is_preamble(line: str) -> bool:
+    """Whether the line stands above the header: a comment, or blank.
+
+    A spreadsheet that saves the file again may have put quotes around a comment.
+    """
+    return line.lstrip().startswith(("#", '"#')) or not line.strip()
+
+
+def _comment(line: str) -> str:
+    """The comment without what a spreadsheet adds: quotes, and delimiters at the end."""
+    if line.lstrip().startswith('"'):
+        line = ",".join(next(csv.reader([line], skipinitialspace=True)))
+    return line.strip().rstrip(",;\t ")
+
+
+def _delimiter(header: str, source: str) -> str:
+    """The delimiter of the header line: the most frequent one of tab, ';' and ','."""
+    order = "\t,;" if source.lower().endswith(".tsv") else ",;\t"
+    return max(order, key=header.count)
+
+
+def _rows(
+    lines: Sequence[str], start: int, delimiter: str, source: str
+) -> Iterator[tuple[int, Sequence[object]]]:
+    """The cells of each line with its line number; `start` lines stand above."""
+    reader = csv.reader(lines, delimiter=delimiter, strict=True, skipinitialspace=True)
+    done = 0
+    try:
+        for row in reader:
+            if reader.line_num != done + 1:
+                raise csv.Error("line break within quotes")
+            done += 1
+            yield start + done, row
+    except csv.Error as error:
+        raise InputError(
+            f"{source}, line {start + done + 1}: a cell in quotes must end on its line and "
+            f"be followed by the delimiter ({error}). Remove the quote or the line break."
+        ) from None

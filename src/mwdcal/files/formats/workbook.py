@@ -1,0 +1,162 @@
+"""XLSX: the first sheet; metadata in leading rows whose first cell starts with '#'."""
+
+from __future__ import annotations
+
+import datetime
+import io
+import re
+import warnings
+import zipfile
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import islice
+from typing import Any
+
+from mwdcal.errors import InputError
+from mwdcal.files import metadata as meta
+from mwdcal.files.formats.columns import Column, Parts, assemble, number, typed
+
+_LARGEST_UNPACKED = 100_000_000
+_MAX_ROWS = 1_048_576
+_LONGEST_CELL = 32_767
+# A file must not depend on the hour it was written: the first day a ZIP archive can hold.
+_EPOCH = datetime.datetime(1980, 1, 1)
+_TIMES = re.compile(rb"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ")
+_UNWRITABLE = re.compile(r"[\x00-\x08\x0b-\x1f\ufffe\uffff]")
+
+Row = tuple[int, Sequence[object]]
+
+
+def parse(data: bytes, source: str, delimiter: str | None = None) -> Parts:
+    """The table on the first sheet of a workbook; `delimiter` has no meaning here."""
+    rows = iter(_rows(data, source))
+    comments: list[tuple[int, str]] = []
+    header: list[Row] = []
+    for line, row in rows:
+        if row and str(row[0]).lstrip().startswith("#"):
+            comments.append((line, str(row[0]).strip()))
+        elif row:
+            header.append((line, row))
+            break
+    metadata = meta.parse(comments, source, "row")
+    width = len(header[0][1]) if header else 0
+    names, cells, lines = assemble(_padded(header, rows, width), source, "row")
+    columns = {
+        name: typed(name, column)
+        for name, column in zip(names, zip(*cells, strict=True), strict=True)
+    }
+    return Parts(columns, metadata, lines)
+
+
+def render(columns: Mapping[str, Column], metadata: Mapping[str, object], source: str) -> bytes:
+    """The bytes that `parse` turns back into the same columns and metadata."""
+    book = _module(source).Workbook(write_only=True)
+    rows: list[Sequence[str | float]] = [[line] for line in meta.render(metadata)]
+    rows += [list(columns), *zip(*columns.values(), strict=True)]
+    _check_texts(rows, source)
+    sheet = book.create_sheet("run")
+    for row in rows:
+        sheet.append([_cell(sheet, value) for value in row])
+    stream = io.BytesIO()
+    book.save(stream)
+    return _timeless(stream)
+
+
+def _module(source: str) -> Any:
+    try:
+        import openpyxl
+    except ImportError:
+        raise InputError(
+            f"{source}: Excel files need the extra 'xlsx'. "
+            "Install it with: pip install 'mwdcal[xlsx]'"
+        ) from None
+    return openpyxl
+
+
+def _rows(data: bytes, source: str) -> list[Row]:
+    """Row numbers and cells of the first sheet, without the blank cells at the end."""
+    openpyxl = _module(source)
+    try:
+        _check_size(data, source)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            book = openpyxl.load_workbook(io.BytesIO(data), read_only=True, data_only=True)
+            sheet = book.worksheets[0]
+            sheet.reset_dimensions()
+            cells = islice(sheet.iter_rows(values_only=True), _MAX_ROWS + 1)
+            rows = [(line, _trimmed(row)) for line, row in enumerate(cells, 1)]
+    except InputError:
+        raise
+    except Exception as error:
+        raise _unreadable(source, error) from error
+    if len(rows) > _MAX_ROWS:
+        raise InputError(f"{source}: a sheet must have at most {_MAX_ROWS} rows. Split it.")
+    return rows
+
+
+def _check_size(data: bytes, source: str) -> None:
+    """Refuse an archive that would unpack to more memory than any run needs."""
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        size = sum(entry.file_size for entry in archive.infolist())
+    if size > _LARGEST_UNPACKED:
+        raise InputError(
+            f"{source}: a workbook must unpack to at most {_LARGEST_UNPACKED} bytes; "
+            f"got {size}. Save the sheet with the run alone, or as CSV UTF-8."
+        )
+
+
+def _unreadable(source: str, error: Exception) -> InputError:
+    """Whatever the reader raises on a foreign or damaged file means the same to the user."""
+    reason = (str(error).strip() or type(error).__name__).splitlines()[0][:120]
+    return InputError(
+        f"{source}: expected an Excel workbook (.xlsx); reading it failed ({reason}). "
+        "Save it again as .xlsx, or as CSV UTF-8."
+    )
+
+
+def _trimmed(row: Sequence[object]) -> Sequence[object]:
+    end = len(row)
+    while end and (row[end - 1] is None or row[end - 1] == ""):
+        end -= 1
+    return row[:end]
+
+
+def _padded(header: Sequence[Row], rows: Iterator[Row], width: int) -> Iterator[Row]:
+    """Header and rows, each row filled up with blank cells to `width`."""
+    yield from header
+    for line, row in rows:
+        yield line, [*row, *[None] * (width - len(row))]
+
+
+def _check_texts(rows: Iterable[Sequence[str | float]], source: str) -> None:
+    """Refuse text that a workbook cannot hold, before any of it is written."""
+    for value in (value for row in rows for value in row if isinstance(value, str)):
+        if len(value) > _LONGEST_CELL or _UNWRITABLE.search(value):
+            raise InputError(
+                f"{source}: a cell of a workbook must be plain text of at most {_LONGEST_CELL} "
+                f"characters; got {value[:40]!r}. Write CSV or Parquet."
+            )
+
+
+def _cell(sheet: Any, value: str | float) -> Any:
+    """A cell with all digits of a number, or text that stays text, whatever it looks like."""
+    from openpyxl.cell import WriteOnlyCell
+
+    content = value if isinstance(value, str) else number(value)
+    if not content:
+        return None
+    cell = WriteOnlyCell(sheet, content)
+    cell.data_type = "s" if isinstance(value, str) else "n"
+    return cell
+
+
+def _timeless(stream: io.BytesIO) -> bytes:
+    """The same archive, its entries and properties dated `_EPOCH`."""
+    result = io.BytesIO()
+    with zipfile.ZipFile(stream) as old, zipfile.ZipFile(result, "w") as new:
+        for name in old.namelist():
+            content = old.read(name)
+            if name == "docProps/core.xml":
+                content = _TIMES.sub(f"{_EPOCH.isoformat()}Z".encode(), content)
+            entry = zipfile.ZipInfo(name, _EPOCH.timetuple()[:6])
+            new.writestr(entry, content, zipfile.ZIP_DEFLATED)
+    return result.getvalue()

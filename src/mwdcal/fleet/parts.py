@@ -1,0 +1,207 @@
+"""One partition of a fleet: the same two steps for every worker, on this machine or another."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from mwdcal import __version__
+from mwdcal.calibration.options import Options
+from mwdcal.calibration.readings import TRIADS
+from mwdcal.calibration.soaks import HIGHEST
+from mwdcal.errors import InputError
+from mwdcal.files.contract import AZIMUTH_KEYS, CHANNELS
+from mwdcal.files.formats import parquet
+from mwdcal.fleet.calibrate import ALIKE, BAD_INPUT, OK, Outcome, calibrate_batch, names
+from mwdcal.fleet.choices import PerTool
+from mwdcal.fleet.runs import Batch, Rows, batches, refused_tools
+from mwdcal.fleet.sources import SERIAL, Source
+from mwdcal.fleet.tables import Partition, read
+from mwdcal.geometry.vectors import AnyArray, Array
+from mwdcal.sensor.profile import Profile
+
+LISTS = ("findings", "reshoot")
+"""Columns of lists: ids of findings, and labels of stations to take again."""
+WHOLE = ("rank", "size", "order", "stations")
+"""Ends of the names of columns of whole numbers."""
+
+END = b"\xff\xff\xff\xff\x00\x00\x00\x00"
+"""End of a stream in Arrow's format."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is to be done to every partition."""
+
+    source: str
+    metadata: Mapping[str, object]
+    columns: tuple[str, ...]
+    profile: Profile
+    options: Options
+    per_tool: PerTool = ALIKE
+    version: str = __version__
+
+    @classmethod
+    def of(
+        cls, source: Source, profile: Profile, options: Options, per_tool: PerTool = ALIKE
+    ) -> Plan:
+        """For a table: of its columns those that a run file has; which north is one of them."""
+        metadata = {k: v for k, v in source.metadata.items() if k not in AZIMUTH_KEYS}
+        return cls(source.name, metadata, source.used, profile, options, per_tool)
+
+    @property
+    def triads(self) -> tuple[str, ...]:
+        """The triads that the table has columns for."""
+        return TRIADS[: 1 + (CHANNELS["magnetometer"][0] in self.columns)]
+
+    @property
+    def noise_estimated(self) -> tuple[str, ...]:
+        """Triads of which neither the profile nor the table states the noise."""
+        stated = {t for t in self.triads if any(f"sd_{n}" in self.columns for n in CHANNELS[t])}
+        return tuple(
+            t for t in self.triads if t not in stated and getattr(self.profile, t).noise is None
+        )
+
+    def key(self, partition: Partition) -> str:
+        """Name of the partition's result: another input, option or version has another."""
+        return hashlib.sha256(msgspec.json.encode([self, partition])).hexdigest()[:32]
+
+
+def load(plan: Plan, partition: Partition) -> bytes:
+    """The rows of a partition, in Arrow's stream format."""
+    return packed(read(partition, plan.columns))
+
+
+def solve(plan: Plan, loaded: bytes) -> bytes:
+    """Calibrate the tools of loaded rows: a table in Arrow's stream format, one row per tool."""
+    if plan.version != __version__:
+        raise InputError(
+            f"the worker has mwdcal {__version__}, the command is of {plan.version}. Install the "
+            "same version everywhere."
+        )
+    arrow, _ = parquet.modules(plan.source)
+    table = arrow.ipc.open_stream(loaded).read_all()
+    rows = Rows.of(table, plan.source, plan.metadata, plan.profile)
+    return packed(_result(rows, plan))
+
+
+def is_whole(path: Path) -> bool:
+    """Whether a finished part is there: Arrow's stream ends with its own mark."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as stream:
+        stream.seek(max(path.stat().st_size - len(END), 0))
+        return stream.read() == END
+
+
+def packed(table: Any) -> bytes:
+    """A table in Arrow's stream format; measured first, as memory that grows costs most of the time."""
+    arrow, _ = parquet.modules("fleet")
+    size = arrow.MockOutputStream()
+    with arrow.ipc.new_stream(size, table.schema) as writer:
+        writer.write_table(table)
+    found = bytearray(size.size())
+    stream = arrow.FixedSizeBufferWriter(arrow.py_buffer(found))
+    with arrow.ipc.new_stream(stream, table.schema) as writer:
+        writer.write_table(table)
+    return bytes(found)
+
+
+def _result(rows: Rows, plan: Plan) -> Any:
+    """The result table of some tools."""
+    count = len(rows.counts)
+    every = names(plan.options, plan.triads, plan.per_tool)
+    filled = {name: np.full(count, np.nan) for name in every}
+    status, message = np.full(count, OK, object), np.full(count, "", object)
+    unit = np.full(count, None, object)
+    free: list[tuple[list[str], ...]] = [([], [])] * count
+    said: list[tuple[list[str], list[str]]] = [([], [])] * count
+    for tool, text in refused_tools(rows).items():
+        status[tool], message[tool] = BAD_INPUT, text
+    for batch in batches(rows, np.flatnonzero(status == OK)):
+        outcome = _calibrated(rows, batch, plan)
+        status[batch.tools], message[batch.tools] = outcome.status, outcome.message
+        unit[batch.tools] = _field_unit(batch)
+        for name, values in filled.items():
+            values[batch.tools] = outcome.columns[name]
+        for tool, each in zip(batch.tools, outcome.free, strict=True):
+            free[tool] = each
+        for tool, found, again in zip(batch.tools, outcome.findings, outcome.reshoot, strict=True):
+            said[tool] = found, [rows.label(int(tool), station) for station in again]
+    unit[status != OK] = None
+    return _table(rows, plan, (status, message, unit), filled, free, said)
+
+
+def _calibrated(rows: Rows, batch: Batch, plan: Plan) -> Outcome:
+    return calibrate_batch(
+        batch.readings,
+        plan.options,
+        plan.profile,
+        lambda i: rows.alone(int(batch.tools[i])),
+        plan.per_tool,
+    )
+
+
+def _field_unit(batch: Batch) -> AnyArray:
+    """Unit of the calibrated field (B,), one for a batch of one kind; None without magnetometer."""
+    readings = batch.readings
+    unit = None if readings.magnetometer is None else readings.field_unit
+    return np.full(len(batch.tools), unit, object)
+
+
+def _table(
+    rows: Rows,
+    plan: Plan,
+    texts: tuple[AnyArray, AnyArray, AnyArray],
+    filled: dict[str, Array],
+    free: list[tuple[list[str], ...]],
+    said: list[tuple[list[str], list[str]]],
+) -> Any:
+    """The Arrow table of results, in the order of the columns."""
+    arrow, _ = parquet.modules(plan.source)
+    status, message, unit = texts
+    count, good = len(status), status == OK
+    options, columns = plan.options, {}
+    low, high = _temperatures(rows)
+    columns[SERIAL] = rows.serials
+    columns["status"] = arrow.array(status, arrow.string())
+    columns["message"] = arrow.array(message, arrow.string())
+    columns["stations"] = arrow.array(rows.counts, arrow.int32())
+    columns["temperature_min_c"] = arrow.array(low, mask=np.isnan(low))
+    columns["temperature_max_c"] = arrow.array(high, mask=np.isnan(high))
+    for index, name in enumerate(LISTS):
+        lists = [each[index] if ok else None for each, ok in zip(said, good, strict=True)]
+        columns[name] = arrow.array(lists, arrow.list_(arrow.string()))
+    for name, values in filled.items():
+        whole = name.rpartition("_")[2] in WHOLE
+        numbers = np.nan_to_num(values).astype(np.int32) if whole else values
+        columns[name] = arrow.array(numbers, mask=np.isnan(values))
+    for index, triad in enumerate(plan.triads):
+        ids = [each[index] if ok else None for each, ok in zip(free, good, strict=True)]
+        columns[f"{triad}_undetermined"] = arrow.array(ids, arrow.list_(arrow.string()))
+    columns["field_unit"] = arrow.array(unit, arrow.string())
+    columns["method"] = arrow.array([options.method] * count, arrow.string())
+    order = np.fmax.reduce([filled[f"{triad}_order"] for triad in plan.triads])
+    if not plan.per_tool.order:
+        order = np.full(count, float(max(options.orders)))
+    kinds = np.array([None, *(options.kind(k) for k in range(HIGHEST + 1))], object)
+    model = kinds[np.nan_to_num(order + 1).astype(int)]
+    columns["model"] = arrow.array(model, arrow.string())
+    columns["order"] = arrow.array(np.nan_to_num(order).astype(np.int32), mask=np.isnan(order))
+    return arrow.table(columns)
+
+
+def _temperatures(rows: Rows) -> tuple[Array, Array]:
+    """Coldest and hottest station (T,) of each tool; NaN where there is no temperature."""
+    values = rows.numbers.get("temperature_c")
+    if values is None:
+        none = np.full(len(rows.counts), np.nan)
+        return none, none
+    first = rows.starts[:-1]
+    return np.minimum.reduceat(values, first), np.maximum.reduceat(values, first)

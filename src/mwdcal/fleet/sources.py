@@ -1,0 +1,267 @@
+"""What a fleet is read from: a Parquet file or a folder of them, and what these say of their rows.
+
+Names of folders (`serial=MWD-17`) state a column of the rows below them. The metadata of a file
+hold for its own rows: which north their azimuths count from becomes a column of the table.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+import msgspec
+
+from mwdcal.calibration.readings import is_simulated
+from mwdcal.errors import InputError
+from mwdcal.files import contract, synonyms
+from mwdcal.files.azimuths import magnetic_offset
+from mwdcal.files.contract import REFERENCES
+from mwdcal.files.formats import parquet
+from mwdcal.files.formats.columns import LABELS
+
+SERIAL = "serial"
+OFFSET = "#offset"
+"""Column of stated azimuth minus magnetic azimuth, °; there where a file's metadata say so."""
+AZIMUTH = REFERENCES["azimuth"].column
+BLANK = ("", "__HIVE_DEFAULT_PARTITION__")
+"""What folder names say of a blank cell."""
+LARGEST_GROUP = 20_000_000
+"""Rows of the largest row group that is read; it is dealt as a whole."""
+
+Keys = tuple[tuple[str, str | float | None], ...]
+
+
+@dataclass(frozen=True)
+class Piece:
+    """One row group of a Parquet file.
+
+    `keys` are the columns that its folders and its metadata state. `text`: its serials are
+    taken as text, because those of some file are.
+    """
+
+    path: str
+    stamp: tuple[int, int]
+    group: int
+    rows: int
+    keys: Keys
+    text: bool = False
+
+
+@dataclass(frozen=True)
+class Source:
+    """A fleet's table: its pieces, columns, the metadata of all its files, and what to mention."""
+
+    name: str
+    pieces: tuple[Piece, ...]
+    columns: tuple[str, ...]
+    metadata: dict[str, object]
+    notes: tuple[str, ...] = ()
+
+    @property
+    def rows(self) -> int:
+        """Number of stations of all tools."""
+        return sum(piece.rows for piece in self.pieces)
+
+    @property
+    def used(self) -> tuple[str, ...]:
+        """The columns that a run has, and the serial."""
+        known = (*contract.COLUMNS, SERIAL, OFFSET)
+        return tuple(name for name in self.columns if name in known)
+
+    @property
+    def unused(self) -> tuple[str, ...]:
+        """The columns that are not used, each with what it resembles."""
+        return synonyms.unused(self.columns, self.used)
+
+    @property
+    def fingerprint(self) -> str:
+        """What changes when a file of the table does."""
+        parts = [(Path(p.path).name, p.stamp, p.group, p.rows, p.keys) for p in self.pieces]
+        return hashlib.sha256(msgspec.json.encode([parts, self.metadata])).hexdigest()
+
+
+@dataclass(frozen=True)
+class _File:
+    """What one file says: `text` of its serials, `offset` of its azimuths."""
+
+    pieces: list[Piece]
+    columns: tuple[str, ...]
+    metadata: dict[str, object]
+    text: bool
+    offset: float
+
+
+def open_source(path: Path) -> Source:
+    """The table at `path`, its columns checked; refuses what is no table of many tools."""
+    paths = _paths(path)
+    files = [_look(file, path) for file in paths]
+    columns = files[0].columns
+    for file, found in zip(paths, files, strict=True):
+        if set(found.columns) != set(columns):
+            odd = sorted(set(found.columns) ^ set(columns))[0]
+            raise InputError(
+                f"{file}: all files of '{path.name}' must have the same columns; '{odd}' is in some "
+                f"and not in others ({paths[0].name} …). Write the table again."
+            )
+    _check_columns(columns, path.name)
+    source = _joined(path.name, files)
+    if source.rows == 0:
+        raise InputError(f"{path.name}: the table has no rows. Add one row per station.")
+    largest = max(piece.rows for piece in source.pieces)
+    if largest > LARGEST_GROUP:
+        raise InputError(
+            f"{path.name}: a row group must have at most {LARGEST_GROUP} rows; got {largest}. Write "
+            "the table again with row groups of about a million rows (`row_group_size`)."
+        )
+    return source
+
+
+def _joined(name: str, files: Sequence[_File]) -> Source:
+    """The table of all files: each with its own azimuths, and serials of one kind."""
+    columns, notes = files[0].columns, []
+    offsets = sorted({file.offset for file in files})
+    text = any(file.text for file in files)
+    pieces = []
+    for file in files:
+        stated: Keys = ((OFFSET, file.offset),) if any(offsets) else ()
+        pieces += [replace(p, keys=(*p.keys, *stated), text=text) for p in file.pieces]
+    if any(offsets):
+        columns = (*columns, OFFSET)
+    if len(offsets) > 1:
+        notes.append(
+            f"azimuths count from {len(offsets)} norths, {offsets[0]:g}° to {offsets[-1]:g}° from "
+            "magnetic: each file's metadata hold for its own rows."
+        )
+    metadata = _agreed([file.metadata for file in files])
+    return Source(name, tuple(pieces), columns, metadata, tuple(notes))
+
+
+def _agreed(stated: Sequence[Mapping[str, object]]) -> dict[str, object]:
+    """Metadata on which all files agree; simulated is a fleet of which one file is."""
+    found = {k: v for k, v in stated[0].items() if all(k in s and s[k] == v for s in stated)}
+    return found | next(({"simulated": s["simulated"]} for s in stated if is_simulated(s)), {})
+
+
+def _paths(path: Path) -> list[Path]:
+    """The Parquet files of a table: itself, or all in a folder, in order of their names."""
+    if path.is_dir():
+        hidden = ("_", ".")
+        found = sorted(
+            file
+            for file in path.rglob("*.parquet")
+            if not any(part.startswith(hidden) for part in file.relative_to(path).parts)
+        )
+        if not found:
+            raise InputError(f"'{path}' is a folder without .parquet files. Name a Parquet table.")
+        return found
+    if not path.exists():
+        raise InputError(f"'{path}': no such file. Check the name and the folder.")
+    if path.suffix.lower() != ".parquet":
+        raise InputError(
+            f"'{path}': a fleet is read from a Parquet file or a folder of them; got "
+            f"'{path.suffix or 'no suffix'}'. Convert the table, with a column 'serial'."
+        )
+    return [path]
+
+
+def _look(file: Path, root: Path) -> _File:
+    """Pieces, columns and metadata of one file."""
+    arrow, pq = parquet.modules(str(file))
+    try:
+        opened = pq.ParquetFile(file)
+    except Exception as error:
+        raise parquet.unreadable(str(file), error) from error
+    with opened:
+        schema, keys = opened.schema_arrow, _keys(file, root)
+        every = dict.fromkeys((*schema.names, *dict(keys)))
+        names = tuple(n for n in every if not n.startswith("__index"))
+        for name in set(contract.COLUMNS).difference(LABELS).intersection(schema.names):
+            _check_numeric(schema.field(name).type, name, file)
+        kind = schema.field(SERIAL).type if SERIAL in schema.names else arrow.string()
+        kind = kind.value_type if arrow.types.is_dictionary(kind) else kind
+        metadata = parquet.metadata_of(schema.metadata, str(file))
+        pieces = pieces_of(file, opened.metadata, keys)
+    offset = magnetic_offset(metadata, str(file)) if AZIMUTH in names else 0.0
+    text = SERIAL in dict(keys) or not arrow.types.is_integer(kind)
+    return _File(pieces, names, metadata, text, offset)
+
+
+def pieces_of(file: Path, about: Any, keys: Keys = ()) -> list[Piece]:
+    """The row groups of a file with the given Parquet metadata."""
+    status = file.stat()
+    stamp = (status.st_size, status.st_mtime_ns)
+    return [
+        Piece(str(file.resolve()), stamp, group, about.row_group(group).num_rows, keys)
+        for group in range(about.num_row_groups)
+    ]
+
+
+def _keys(file: Path, root: Path) -> Keys:
+    """The columns that the names of a file's folders state, below the folder of the table."""
+    folders = file.relative_to(root).parent.parts if root.is_dir() else ()
+    found: dict[str, str | float | None] = {}
+    for folder in folders:
+        name, equals, value = (unquote(part) for part in folder.partition("="))
+        if not equals:
+            continue
+        found[name] = None if value in BLANK else value
+        if name == SERIAL and value in BLANK:
+            raise InputError(
+                f"{file.parent}, column '{SERIAL}': must be filled in; the folder '{folder}' stands for "
+                "a blank cell. Say which tool these stations belong to."
+            )
+        if name in contract.COLUMNS and name not in LABELS and found[name] is not None:
+            found[name] = _number(value, name, file)
+    return tuple(found.items())
+
+
+def _number(value: str, name: str, file: Path) -> float:
+    """The number that a folder's name states."""
+    try:
+        return float(value)
+    except ValueError:
+        raise InputError(
+            f"{file.parent}, column '{name}': expected a number; the folder says '{value}'. Rename it."
+        ) from None
+
+
+def _check_numeric(kind: Any, name: str, file: Path) -> None:
+    """Refuse a column of text where numbers belong."""
+    arrow, _ = parquet.modules(str(file))
+    types = arrow.types
+    fine = (types.is_integer, types.is_floating, types.is_decimal, types.is_null)
+    if not any(test(kind) for test in fine):
+        raise InputError(
+            f"{file.name}, column '{name}': expected numbers; the column has the type {kind}. "
+            "Write it as numbers, with empty cells where a value is unknown: with pandas, "
+            f"table['{name}'] = pandas.to_numeric(table['{name}'])."
+        )
+
+
+def _check_columns(names: Sequence[str], source: str) -> None:
+    """Refuse a table that does not tell its tools apart, or lacks the channels."""
+    if SERIAL not in names:
+        near = [n for n in names if n.strip().lower().replace("_", " ") in _NEAR]
+        hint = f" Is it '{near[0]}'? Rename it." if near else " Add it."
+        raise InputError(
+            f"{source}: a fleet needs the column '{SERIAL}', which tells its tools apart; found "
+            f"{', '.join(repr(n) for n in names[:20])}.{hint}"
+        )
+    contract.check_columns(list(names), source)
+    synonyms.check_evidence(names, source)
+
+
+_NEAR = (
+    "sn",
+    "serial no",
+    "serial number",
+    "serialno",
+    "serialnumber",
+    "serial",
+    "tool",
+    "tool id",
+)

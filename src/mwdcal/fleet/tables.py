@@ -1,0 +1,373 @@
+"""Tables of many tools: which rows belong to which tool, and partitions of whole tools.
+
+One pass over the serial column finds the tools; memory holds their serials, never the readings.
+Where the rows of a tool are not together, the rows are dealt once into files of whole tools.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from threading import Lock
+from typing import Any
+
+import numpy as np
+
+from mwdcal.errors import InputError
+from mwdcal.files.formats import parquet
+from mwdcal.files.formats.columns import LABELS, as_text
+from mwdcal.fleet.sources import OFFSET, SERIAL, Piece, Source, pieces_of
+from mwdcal.geometry.vectors import Ints
+
+TOOL = "#tool"
+"""Column of dealt rows: number of the tool, in order of first appearance."""
+ROWS = (6_000, 100_000)
+"""Fewest and most rows of a partition that is not a single tool…"""
+SHARES = 32
+"""…and into how many a fleet between these is divided."""
+BATCH = 32_768
+"""Rows that are read at once."""
+MOST_STRETCHES = 50_000_000
+"""Most stretches of rows of one tool in a table."""
+MOST_FILES = 200
+"""Files of dealt rows that are written at once."""
+
+
+@dataclass(frozen=True)
+class Partition:
+    """Whole tools: `rows` rows of some pieces after the first `skip`.
+
+    `first` is the number of the first row in the whole table; `dealt` says that the rows are
+    not in order of tools.
+    """
+
+    pieces: tuple[Piece, ...]
+    skip: int
+    rows: int
+    first: int
+    tools: int
+    dealt: bool = False
+
+
+@dataclass(frozen=True)
+class Tools:
+    """The `count` tools of a table, in order of first appearance.
+
+    `runs` are the first rows (r,) of stretches of one tool, `tool` (r,) whose each is.
+    """
+
+    count: int
+    runs: Ints
+    tool: Ints
+
+    @property
+    def together(self) -> bool:
+        """Whether the rows of every tool are next to each other."""
+        return len(self.runs) == self.count
+
+
+def find_tools(source: Source) -> Tools:
+    """One pass over the serials."""
+    arrow, _ = parquet.modules(source.name)
+    starts: list[Ints] = []
+    heads: list[Any] = []
+    row, last = 0, None
+    for values in _serials(source):
+        codes = values.indices.to_numpy(zero_copy_only=False)
+        change = np.flatnonzero(np.diff(codes, prepend=codes[0] - 1))
+        if values[0].as_py() == last:
+            change = change[1:]
+        starts.append(change + row)
+        indices = arrow.array(codes[change], values.indices.type)
+        heads.append(arrow.DictionaryArray.from_arrays(indices, values.dictionary))
+        row, last = row + len(codes), values[-1].as_py()
+        _check_stretches(sum(map(len, starts)), source.name)
+    every = one_chunk(arrow.chunked_array(heads))
+    codes = every.indices.to_numpy(zero_copy_only=False)
+    used, first, number = np.unique(codes, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    rank = np.empty(len(order), int)
+    rank[order] = np.arange(len(order))
+    return Tools(len(used), np.concatenate(starts), rank[number])
+
+
+def one_chunk(column: Any) -> Any:
+    """A dictionary-encoded column as one array."""
+    joined = column.unify_dictionaries().combine_chunks()
+    return joined.chunk(0) if hasattr(joined, "chunks") else joined
+
+
+def _check_stretches(count: int, source: str) -> None:
+    """Refuse rows so mixed that to remember where the tools are would fill the memory."""
+    if count > MOST_STRETCHES:
+        raise InputError(
+            f"{source}: the rows change from tool to tool more than {MOST_STRETCHES} times. Sort the "
+            f"table by '{SERIAL}'."
+        )
+
+
+def in_several_folders(source: Source, tools: Tools) -> int:
+    """Number of tools with rows in folders that state different values of a column."""
+    numbers: dict[Any, int] = {}
+    own = [tuple(k for k in p.keys if k[0] not in (SERIAL, OFFSET)) for p in source.pieces]
+    folder = np.array([numbers.setdefault(keys, len(numbers)) for keys in own])
+    if len(numbers) == 1:
+        return 0
+    ends = np.cumsum([piece.rows for piece in source.pieces])
+    last = np.append(tools.runs[1:], source.rows) - 1
+    places = folder[np.searchsorted(ends, [tools.runs, last], "right")]
+    low, high = np.full(tools.count, len(numbers)), np.full(tools.count, -1)
+    np.minimum.at(low, tools.tool, places.min(0))
+    np.maximum.at(high, tools.tool, places.max(0))
+    return int(np.sum(low < high))
+
+
+def _serials(source: Source) -> Iterator[Any]:
+    """The serial column, in dictionary-encoded stretches; whole numbers stay numbers."""
+    arrow, pq = parquet.modules(source.name)
+    row = 0
+    for piece in filter(lambda p: p.rows, source.pieces):
+        stated = dict(piece.keys).get(SERIAL)
+        if stated is not None:
+            one = arrow.array([stated]).dictionary_encode()
+            yield one.take(arrow.array(np.zeros(piece.rows, int)))
+            row += piece.rows
+            continue
+        with pq.ParquetFile(piece.path, read_dictionary=[SERIAL]) as file:
+            for batch in file.iter_batches(500_000, row_groups=[piece.group], columns=[SERIAL]):
+                column = _encoded(batch.column(0), piece)
+                _check_filled(column, row, source.name)
+                row += len(column)
+                if len(column):
+                    yield column
+
+
+def _check_filled(serials: Any, row: int, source: str) -> None:
+    """Refuse the first blank of dictionary-encoded serials; `row` is the number of their first."""
+    values = serials.indices.fill_null(-1).to_numpy(zero_copy_only=False)
+    blank = values < 0
+    if parquet.modules(source)[0].types.is_string(serials.dictionary.type):
+        blank |= values == serials.dictionary.index("").as_py()
+    if blank.any():
+        raise InputError(
+            f"{source}, row {row + int(np.argmax(blank)) + 1}, column '{SERIAL}': must be filled in; got "
+            "a blank cell. Say which tool the station belongs to."
+        )
+
+
+def _encoded(column: Any, piece: Piece) -> Any:
+    """Serials, 64-bit whole numbers or text, as a dictionary and the place of each in it."""
+    arrow, _ = parquet.modules(piece.path)
+    types = arrow.types
+    kind = column.type.value_type if types.is_dictionary(column.type) else column.type
+    whole = types.is_integer(kind)
+    if not (whole or types.is_string(kind) or types.is_large_string(kind)):
+        raise InputError(
+            f"{Path(piece.path).name}, column '{SERIAL}': must be text or whole numbers; the column has "
+            f"the type {kind}. Write it as text."
+        )
+    if piece.text or not whole:
+        return _texts(column)
+    return column.cast(kind).cast(arrow.int64()).dictionary_encode()
+
+
+def _texts(column: Any) -> Any:
+    """A column of labels as text, as a dictionary and the place of each in it."""
+    arrow, _ = parquet.modules("fleet")
+    encoded = arrow.dictionary(arrow.int32(), arrow.string())
+    if column.type == encoded:
+        return column
+    if arrow.types.is_dictionary(column.type):
+        column = column.cast(column.type.value_type)
+    column = column.dictionary_encode()
+    column = one_chunk(column) if hasattr(column, "chunks") else column
+    texts = arrow.array([as_text(v) for v in column.dictionary.to_pylist()], arrow.string())
+    return arrow.DictionaryArray.from_arrays(column.indices, texts)
+
+
+def partitions(source: Source, tools: Tools, folder: Path) -> list[Partition]:
+    """The table in partitions of whole tools; dealt into files in `folder` where it must be."""
+    size = int(np.clip(source.rows // SHARES, *ROWS))
+    if not tools.together:
+        return _dealt(source, tools, folder, size)
+    ends = np.append(tools.runs[1:], source.rows)
+    cuts = _cuts(ends, size)
+    found, before = [], 0
+    for cut in cuts:
+        first = int(tools.runs[before])
+        found.append(_part(source, first, int(ends[cut]), cut + 1 - before))
+        before = cut + 1
+    return found
+
+
+def _cuts(ends: Ints, size: int) -> list[int]:
+    """Last tool of each partition: as soon as `size` rows are full."""
+    last = np.searchsorted(ends, np.arange(size, int(ends[-1]) + size, size))
+    return sorted({min(int(i), len(ends) - 1) for i in last} | {len(ends) - 1})
+
+
+def _part(source: Source, first: int, stop: int, tools: int) -> Partition:
+    """The partition of rows `first` to `stop`."""
+    bounds = np.cumsum([0, *(piece.rows for piece in source.pieces)])
+    low = int(np.searchsorted(bounds, first, "right")) - 1
+    high = int(np.searchsorted(bounds, stop, "left"))
+    return Partition(source.pieces[low:high], first - int(bounds[low]), stop - first, first, tools)
+
+
+def _dealt(source: Source, tools: Tools, folder: Path, size: int) -> list[Partition]:
+    """Rows dealt into files by tool; done once, whatever interrupts it."""
+    _, pq = parquet.modules(source.name)
+    rows = np.bincount(tools.tool, np.diff(tools.runs, append=source.rows), tools.count)
+    share = max(size, -(-source.rows // MOST_FILES))
+    number = np.cumsum(rows).astype(int) // share
+    number = np.minimum(number, MOST_FILES - 1)
+    done = folder / f"sorted-{source.fingerprint[:16]}"
+    if not done.is_dir():
+        unfinished = done.with_suffix(".tmp")
+        shutil.rmtree(unfinished, ignore_errors=True)
+        unfinished.mkdir(parents=True)
+        _deal(source, tools, number, unfinished)
+        unfinished.rename(done)
+    found = []
+    for each in np.unique(number):
+        file = done / f"{each:04d}.parquet"
+        pieces = tuple(
+            replace(piece, stamp=(0, 0), keys=(("", source.fingerprint),))
+            for piece in pieces_of(file, pq.read_metadata(file))
+        )
+        total = sum(piece.rows for piece in pieces)
+        count = int(np.sum(number == each))
+        found.append(Partition(pieces, 0, total, 0, count, dealt=True))
+    return found
+
+
+def _deal(source: Source, tools: Tools, number: Ints, folder: Path) -> None:
+    """Write the rows of every piece into the file of their tool."""
+    arrow, pq = parquet.modules(source.name)
+    writers: dict[int, Any] = {}
+    row = 0
+    try:
+        for piece in filter(lambda p: p.rows, source.pieces):
+            table = arrow.concat_tables(_batches(piece, source.used)).unify_dictionaries()
+            rows = np.arange(row, row + piece.rows)
+            tool = tools.tool[np.searchsorted(tools.runs, rows, "right") - 1]
+            table = table.append_column(TOOL, arrow.array(tool))
+            table = table.append_column("#row", arrow.array(rows))
+            own = number[tool]
+            order = np.argsort(own, kind="stable")
+            sorted_own = own[order]
+            table = table.take(arrow.array(order))
+            bounds = np.flatnonzero(np.diff(sorted_own, prepend=-1))
+            for start, stop in zip(bounds, [*bounds[1:], len(own)], strict=True):
+                key = int(sorted_own[start])
+                if key not in writers:
+                    path = folder / f"{key:04d}.parquet"
+                    writers[key] = pq.ParquetWriter(path, table.schema, compression="lz4")
+                writers[key].write_table(table.slice(start, stop - start))
+            row += piece.rows
+    finally:
+        for writer in writers.values():
+            writer.close()
+
+
+def read(partition: Partition, columns: Sequence[str]) -> Any:
+    """The rows of a partition as an Arrow table, in order of tools, with their row numbers."""
+    arrow, _ = parquet.modules("fleet")
+    names = (*columns, TOOL, "#row") if partition.dealt else tuple(columns)
+    tables, start, rows = [], partition.skip, partition.rows
+    for piece in partition.pieces:
+        stop = min(piece.rows, start + rows)
+        tables += _rows(piece, names, start, stop) if stop > start else []
+        start, rows = 0, rows - (stop - start)
+    table = arrow.concat_tables(tables, promote_options="permissive").unify_dictionaries()
+    if not partition.dealt:
+        numbers = np.arange(partition.first, partition.first + partition.rows)
+        return table.append_column("#row", arrow.array(numbers))
+    order = np.argsort(table.column(TOOL).to_numpy(), kind="stable")
+    return table.take(arrow.array(order)).drop_columns([TOOL])
+
+
+@dataclass
+class _Reading:
+    """A row group that is being read: `held` is the batch of rows that has come, `row` its first."""
+
+    batches: Iterator[Any]
+    held: Any
+    row: int = 0
+
+    def rows(self, start: int, stop: int) -> list[Any]:
+        """The rows `start` to `stop`, in stretches; those before are passed over."""
+        found = []
+        while True:
+            end = self.row + len(self.held)
+            if end > start:
+                first = max(start - self.row, 0)
+                found.append(self.held.slice(first, min(stop, end) - self.row - first))
+            if end >= stop:
+                return found
+            self.row, self.held = end, next(self.batches)
+
+
+_ONE_AT_A_TIME = Lock()
+
+
+def _rows(piece: Piece, columns: tuple[str, ...], start: int, stop: int) -> list[Any]:
+    """Rows of a row group; partitions next to each other go on where the last one ended."""
+    with _ONE_AT_A_TIME:
+        try:
+            if _reading(piece, columns).row > start:
+                _reading.cache_clear()
+            return _reading(piece, columns).rows(start, stop)
+        except Exception:
+            _reading.cache_clear()
+            raise
+
+
+@lru_cache(maxsize=1)
+def _reading(piece: Piece, columns: tuple[str, ...]) -> _Reading:
+    batches = _batches(piece, columns)
+    return _Reading(batches, next(batches))
+
+
+def _batches(piece: Piece, columns: tuple[str, ...]) -> Iterator[Any]:
+    """The rows of a row group in tables, with the values that its folder names state."""
+    arrow, pq = parquet.modules(piece.path)
+    keys = dict(piece.keys)
+    wanted = [name for name in columns if name not in keys]
+    labels = [name for name in LABELS if name in wanted]
+    try:
+        with pq.ParquetFile(piece.path, memory_map=True, read_dictionary=labels) as file:
+            for batch in file.iter_batches(BATCH, [piece.group], wanted):
+                yield _complete(arrow.Table.from_batches([batch]), piece, columns)
+    except FileNotFoundError:
+        raise InputError(
+            f"'{piece.path}': no such file on this machine. Workers on other machines must see "
+            "the table, and the folder of the output, under the same paths."
+        ) from None
+    except OSError as error:
+        raise parquet.unreadable(piece.path, error) from error
+
+
+def _complete(table: Any, piece: Piece, columns: tuple[str, ...]) -> Any:
+    """Rows with the columns that their piece states: labels as text, encoded, the rest as numbers."""
+    arrow, _ = parquet.modules(piece.path)
+    stated = dict(piece.keys)
+    found = {}
+    for name in columns:
+        if name in stated:
+            kind = arrow.string() if name in LABELS else arrow.float64()
+            places = arrow.array(np.zeros(len(table), int))
+            column = arrow.array([stated[name]], kind).take(places)
+        else:
+            column = table.column(name)
+        if name == SERIAL:
+            column = _encoded(column, piece)
+        elif name in LABELS:
+            column = _texts(column)
+        elif name not in (TOOL, "#row"):
+            column = column.cast(arrow.float64(), safe=False)
+        found[name] = column
+    return arrow.table(found)

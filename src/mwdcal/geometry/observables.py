@@ -1,0 +1,172 @@
+"""Observables: scalars of the two tool vectors, each with its gradient, period and unit.
+
+An observable is a function of gravity g (..., 3) and field b (..., 3). Gradients are
+(..., 6): three components for g, then three for b. Adding an observable is one entry
+in `OBSERVABLES`.
+
+Singular: at exactly vertical attitudes toolface and azimuth do not exist (NaN);
+inclination does, and its gradient there is the limit taken along toolface zero.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from mwdcal.geometry.vectors import Array, wrap
+
+VERTICAL = 1e-12
+"""A transverse share of gravity below this is an exactly vertical attitude."""
+
+
+def _transverse(g: Array) -> Array:
+    return np.hypot(g[..., 0], g[..., 1])
+
+
+def is_vertical(g: Array) -> Array:
+    """Where the attitude is exactly vertical (..., ) as booleans."""
+    return np.asarray(_transverse(g) <= VERTICAL * np.linalg.norm(g, axis=-1))
+
+
+def inclination(g: Array, b: Array) -> Array:
+    """Angle between the tool axis and the vertical, 0…π."""
+    return np.asarray(np.arctan2(_transverse(g), g[..., 2]))
+
+
+def toolface(g: Array, b: Array) -> Array:
+    """Gravity (highside) toolface, 0…2π; NaN at vertical."""
+    return np.where(is_vertical(g), np.nan, wrap(np.arctan2(-g[..., 0], -g[..., 1])))
+
+
+def magnetic_toolface(g: Array, b: Array) -> Array:
+    """Magnetic toolface, 0…2π: azimuth + toolface at vertical, used at low inclination."""
+    return wrap(np.arctan2(b[..., 0], b[..., 1]))
+
+
+def _azimuth_parts(g: Array, b: Array) -> tuple[Array, Array]:
+    strength = np.linalg.norm(g, axis=-1)
+    east = (g[..., 0] * b[..., 1] - g[..., 1] * b[..., 0]) * strength
+    along = g[..., 0] * b[..., 0] + g[..., 1] * b[..., 1]
+    return east, b[..., 2] * (g[..., 0] ** 2 + g[..., 1] ** 2) - g[..., 2] * along
+
+
+def azimuth(g: Array, b: Array) -> Array:
+    """Magnetic azimuth of the tool axis, 0…2π; NaN at vertical."""
+    return np.where(is_vertical(g), np.nan, wrap(np.arctan2(*_azimuth_parts(g, b))))
+
+
+def dip(g: Array, b: Array) -> Array:
+    """Angle of the field below the horizontal, -π/2…π/2 (through atan2: exact at the poles)."""
+    down = np.sum(g * b, -1)
+    return np.asarray(np.arctan2(down, np.linalg.norm(np.cross(g, b), axis=-1)))
+
+
+def gravity(g: Array, b: Array) -> Array:
+    """Strength of gravity."""
+    return np.asarray(np.linalg.norm(g, axis=-1))
+
+
+def field(g: Array, b: Array) -> Array:
+    """Strength of the magnetic field."""
+    return np.asarray(np.linalg.norm(b, axis=-1))
+
+
+def _six(first: Array, second: Array) -> Array:
+    return np.concatenate(np.broadcast_arrays(first, second), -1)
+
+
+def _gravity_gradient(g: Array, b: Array) -> Array:
+    return _six(g / np.linalg.norm(g, axis=-1, keepdims=True), np.zeros_like(b))
+
+
+def _field_gradient(g: Array, b: Array) -> Array:
+    return _six(np.zeros_like(g), b / np.linalg.norm(b, axis=-1, keepdims=True))
+
+
+def _inclination_gradient(g: Array, b: Array) -> Array:
+    vertical, across = is_vertical(g), _transverse(g)
+    safe = np.where(vertical, 1.0, across)
+    x = np.where(vertical, 0.0, g[..., 0] / safe)
+    y = np.where(vertical, -1.0, g[..., 1] / safe)
+    down = g[..., 2]
+    rows = np.stack([down * x, down * y, -across], -1) / np.sum(g * g, -1)[..., None]
+    return _six(rows, np.zeros_like(b))
+
+
+def _toolface_gradient(g: Array, b: Array) -> Array:
+    square = np.where(is_vertical(g), np.nan, g[..., 0] ** 2 + g[..., 1] ** 2)
+    rows = np.stack([g[..., 1], -g[..., 0], np.zeros_like(square)], -1) / square[..., None]
+    return _six(rows, np.zeros_like(b))
+
+
+def _magnetic_toolface_gradient(g: Array, b: Array) -> Array:
+    square = b[..., 0] ** 2 + b[..., 1] ** 2
+    rows = np.stack([b[..., 1], -b[..., 0], np.zeros_like(square)], -1) / square[..., None]
+    return _six(np.zeros_like(g), rows)
+
+
+def _azimuth_gradient(g: Array, b: Array) -> Array:
+    east, north = _azimuth_parts(g, b)
+    strength = np.linalg.norm(g, axis=-1)
+    (gx, gy, gz), (bx, by, bz) = np.moveaxis(g, -1, 0), np.moveaxis(b, -1, 0)
+    zero, scaled = np.zeros_like(east), east / strength**2
+    east_g = [strength * by + scaled * gx, -strength * bx + scaled * gy, scaled * gz]
+    east_b = [-strength * gy, strength * gx, zero]
+    north_g = [2 * bz * gx - gz * bx, 2 * bz * gy - gz * by, -(gx * bx + gy * by)]
+    north_b = [-gz * gx, -gz * gy, gx**2 + gy**2]
+    numerator = north[..., None] * np.stack([*east_g, *east_b], -1)
+    numerator -= east[..., None] * np.stack([*north_g, *north_b], -1)
+    square = np.where(is_vertical(g), np.nan, east**2 + north**2)
+    return np.asarray(numerator / square[..., None])
+
+
+def _dip_gradient(g: Array, b: Array) -> Array:
+    strength = np.linalg.norm(g, axis=-1, keepdims=True)
+    total = np.linalg.norm(b, axis=-1, keepdims=True)
+    down, north = g / strength, b / total
+    sine = np.sum(down * north, -1, keepdims=True)
+    cosine = np.linalg.norm(np.cross(down, north), axis=-1, keepdims=True)
+    return _six(
+        (north - sine * down) / (strength * cosine), (down - sine * north) / (total * cosine)
+    )
+
+
+def _component(
+    index: int,
+) -> tuple[Callable[[Array, Array], Array], Callable[[Array, Array], Array]]:
+    def value(g: Array, b: Array) -> Array:
+        return _six(g, b)[..., index]
+
+    def gradient(g: Array, b: Array) -> Array:
+        return np.broadcast_to(np.eye(6)[index], _six(g, b).shape)
+
+    return value, gradient
+
+
+@dataclass(frozen=True)
+class Observable:
+    """A scalar of (g, b): value and gradient, its period (0: none) and its unit inside."""
+
+    value: Callable[[Array, Array], Array]
+    gradient: Callable[[Array, Array], Array]
+    period: float
+    unit: str
+
+
+OBSERVABLES: dict[str, Observable] = {
+    "inclination": Observable(inclination, _inclination_gradient, 0.0, "rad"),
+    "toolface": Observable(toolface, _toolface_gradient, 2 * np.pi, "rad"),
+    "azimuth": Observable(azimuth, _azimuth_gradient, 2 * np.pi, "rad"),
+    "magnetic_toolface": Observable(
+        magnetic_toolface, _magnetic_toolface_gradient, 2 * np.pi, "rad"
+    ),
+    "gravity": Observable(gravity, _gravity_gradient, 0.0, "g"),
+    "field": Observable(field, _field_gradient, 0.0, "nT"),
+    "dip": Observable(dip, _dip_gradient, 0.0, "rad"),
+    **{
+        name: Observable(*_component(index), 0.0, "g" if index < 3 else "nT")
+        for index, name in enumerate(("gx", "gy", "gz", "bx", "by", "bz"))
+    },
+}

@@ -1,0 +1,1 @@
+"""Continuous logs: standstills as stations, and sensor noise from the Allan deviation."""

@@ -1,0 +1,524 @@
+"""Noise of the raw channels of a log of a tool at rest: Allan deviation, terms, one station.
+
+A channel has a rate of its own where its cells are blank at regular places. What is wrong with
+one channel leaves it out, with a finding; what is wrong with the log is an error.
+
+The noise of a station of T seconds is the Allan deviation at T: 1 σ of a mean over T, as two
+stations show it that follow each other. It is taken from the fitted terms or, where that has
+far more degrees of freedom or the terms do not describe the channel, from the variance measured
+at T itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import msgspec
+import numpy as np
+
+from mwdcal.calibration.readings import is_simulated
+from mwdcal.calibration.record import Finding
+from mwdcal.errors import InputError
+from mwdcal.files.contract import CHANNELS, RAW
+from mwdcal.files.formats.table import Table, cell_error, numbers, shown
+from mwdcal.files.logs import TIME
+from mwdcal.geometry.vectors import Array, Ints
+from mwdcal.logs import allan, noise_terms
+from mwdcal.logs.allan import Kind, Moments
+from mwdcal.logs.noise_terms import Terms
+from mwdcal.logs.stations import row_times
+from mwdcal.sensor.profile import Profile
+
+FEWEST = 128
+"""Samples of a channel below which the terms cannot be told apart at all."""
+STATION_SECONDS = 30.0
+"""Duration of a station, unless the log is too short for it."""
+AVERAGES = 4
+"""Stations that a log has to hold at least."""
+SOUND = 10
+"""Stations that a log holds where their duration is chosen for it."""
+SPARSE = 1e-3
+"""Share of single blanks that are filled in: they change less than the noise of the noise."""
+JITTER = 0.5
+"""Share of the sampling interval by which one may differ: more is a gap."""
+EVENT = 8.0
+"""Size of a difference, in robust standard deviations, that no noise reaches."""
+ROUNDING = 1e-6
+"""Of a whole number of steps of the converter over another."""
+PARTS = 256
+"""Averages in a log between which events are looked for."""
+UNEVEN = 2.0
+"""Ratio of the noise of two channels of a triad that is worth a word."""
+COARSE = 0.5
+"""Noise of one sample, in steps of the converter, below which the steps hide it."""
+DOUBTS = {
+    "event": "a spike or a move",
+    "misfit": "noise that is none of the five terms",
+    "slow": "less than a sample in a station",
+}
+"""Findings after which the figures of a channel do not hold, in words; `slow`: that of a station."""
+RATE = 0.01
+"""Share by which rates, or a sampling interval and a station, may differ and still be the same."""
+UNITS = {
+    "quantisation": "·s",
+    "white": "·√s",
+    "bias-instability": "",
+    "random-walk": "/√s",
+    "drift": "/s",
+}
+"""What follows the unit of the channel in that of a term."""
+PHYSICAL = {"accelerometer": "g", "magnetometer": "nT"}
+
+
+class Term(msgspec.Struct, frozen=True, kw_only=True):
+    """One noise term: `value` and `standard_uncertainty` are None where the log does not show it.
+
+    `lower` and `upper` enclose it with 95 %; without a value `upper` is a bound of 95 %.
+    """
+
+    value: float | None
+    standard_uncertainty: float | None
+    lower: float
+    upper: float
+    unit: str
+
+
+class StationNoise(msgspec.Struct, frozen=True, kw_only=True):
+    """1 σ of one station's mean, its 95 % interval, and whether from `terms` or `measured`."""
+
+    noise: float
+    lower: float
+    upper: float
+    source: str
+
+
+class ChannelNoise(msgspec.Struct, frozen=True, kw_only=True):
+    """One channel, in its raw unit; lists are by averaging time.
+
+    Attributes:
+        deviation, lower, upper: Allan deviation with its 95 % band.
+        freedom: its equivalent degrees of freedom.
+        fitted: Allan deviation of the fitted terms.
+        terms: by name, see `UNITS`.
+        white_density: one-sided density per √Hz, √2 times the white term.
+        fit_from_s: shortest averaging time that the terms describe.
+        chance: probability of a misfit as large, if the terms describe the noise.
+        doubts: findings (`DOUBTS`) after which terms and station, or station, do not hold.
+        unit, scale: physical unit and raw units per it, where the profile says so.
+    """
+
+    samples: int
+    sampling_hz: float
+    mean: float
+    tau_s: list[float]
+    deviation: list[float]
+    lower: list[float]
+    upper: list[float]
+    freedom: list[float]
+    fitted: list[float]
+    terms: dict[str, Term]
+    white_density: float | None
+    fit_from_s: float
+    chance: float
+    doubts: list[str]
+    station: StationNoise
+    unit: str | None = None
+    scale: float | None = None
+
+
+class Noise(msgspec.Struct, frozen=True, kw_only=True):
+    """The noise of a log; `profile` is the recommended `noise` of each triad, raw units.
+
+    `withheld` says why there is none for a triad whose channels do not hold.
+    """
+
+    log: str
+    seconds: float
+    kind: Kind
+    station_seconds: float
+    simulated: bool
+    channels: dict[str, ChannelNoise]
+    profile: dict[str, float]
+    withheld: dict[str, str]
+    findings: list[Finding]
+
+
+def _silent(text: str) -> None:
+    """Say nothing."""
+
+
+def find_noise(
+    log: Table,
+    *,
+    profile: Profile | None = None,
+    sampling_hz: float | None = None,
+    between: tuple[float, float] = (-np.inf, np.inf),
+    station_seconds: float | None = None,
+    kind: Kind = "overlapping",
+    say: Callable[[str], None] = _silent,
+) -> Noise:
+    """The noise of each raw channel of a log (`files.logs.read`) of a tool at rest.
+
+    `sampling_hz` comes before a column `time_s`; `between` are the first and last second to be
+    used; `station_seconds` by default 30, or a tenth of a shorter log.
+    Errors: a log without time, with gaps, too short, or without a channel that can be used.
+    """
+    check(between, station_seconds)
+    findings: list[Finding] = []
+    first, last, rate = _section(log, sampling_hz, between, findings)
+    seconds = (last - first) / rate
+    station = _station_seconds(station_seconds, seconds, rate, log.source)
+    found: dict[str, ChannelNoise] = {}
+    for name in (name for name in RAW if name in log.columns):
+        say(f"Allan variances of {name}, {last - first} samples")
+        taken = _samples(log, name, first, last, rate, findings)
+        if taken is not None:
+            found[name] = _channel(name, *taken, station, kind, findings)
+    if not found:
+        raise InputError(
+            f"{log.source}: no channel that could be used. {' '.join(f.text for f in findings)}"
+        )
+    if profile is not None:
+        found = {name: _physical(name, channel, profile) for name, channel in found.items()}
+    withheld = _withheld(found)
+    return Noise(
+        log=log.source,
+        seconds=seconds,
+        kind=kind,
+        station_seconds=station,
+        simulated=is_simulated(log.metadata),
+        channels=found,
+        profile=_recommended(found, withheld, findings),
+        withheld=withheld,
+        findings=findings,
+    )
+
+
+def check(between: tuple[float, float], station_seconds: float | None) -> None:
+    """Refuse seconds that no log can have."""
+    start, end = between
+    for option, value in (("--from", start), ("--to", end)):
+        if np.isnan(value):
+            raise InputError(
+                f"{option} must be seconds from the start of the log; got nan. Correct it."
+            )
+    if not start < end:
+        raise InputError(
+            f"--from must be less than --to; got --from {start:g} and --to {end:g}. Swap them?"
+        )
+    if station_seconds is not None and not 0 < station_seconds < np.inf:
+        raise InputError(
+            f"--station-seconds must be above 0 and finite; got {station_seconds:g}. Correct it."
+        )
+
+
+def _section(
+    log: Table, given: float | None, between: tuple[float, float], findings: list[Finding]
+) -> tuple[int, int, float]:
+    """First row, row after the last, and rows a second, of what is to be used of a log."""
+    time = row_times(_without_time(log) if given else log, given)
+    inside = np.flatnonzero((time - time[0] >= between[0]) & (time - time[0] <= between[1]))
+    if len(inside) < FEWEST:
+        problem, advice = f"got {len(time)}", "Record for longer."
+        if len(time) >= FEWEST:
+            problem = f"--from and --to leave {len(inside)} of {len(time)} rows"
+            advice = f"The log lasts {time[-1] - time[0]:.4g} s: widen them."
+        raise InputError(
+            f"{log.source}: at least {FEWEST} samples are needed for an Allan deviation; {problem}. "
+            f"{advice}"
+        )
+    first, last = int(inside[0]), int(inside[-1]) + 1
+    steps = np.diff(time[first:last])
+    step = float(np.median(steps))
+    if step <= 0:
+        raise InputError(
+            f"{log.source}, column '{TIME}': most samples have the time of the one before; written "
+            "with too few digits? Give the rate: --sampling-hz 100."
+        )
+    for row in np.flatnonzero(np.abs(steps - step) > JITTER * step)[:1]:
+        got = f"{steps[row]:.4g} s after {shown(float(time[first + row]))} s, not {step:.4g} s"
+        advice = (
+            "An Allan deviation needs regular samples: choose a part without gaps by --from and "
+            "--to (seconds from the start), or give the rate if only the clock is coarse."
+        )
+        raise cell_error(log, TIME, first + int(row) + 1, f"the next sample came {got}. {advice}")
+    rate = (last - first - 1) / float(time[last - 1] - time[first])
+    if given and TIME in log.columns:
+        _compare_rates(log, first, last, given, findings)
+    return first, last, given or rate
+
+
+def _without_time(log: Table) -> Table:
+    columns = {name: column for name, column in log.columns.items() if name != TIME}
+    return Table(columns, log.metadata, log.source, log.lines, log.digest, log.decimal)
+
+
+def _compare_rates(
+    log: Table, first: int, last: int, given: float, findings: list[Finding]
+) -> None:
+    """A word where the column of times says something else than the rate that was given."""
+    time = numbers(log, TIME)[first:last]
+    whole = float(time[-1] - time[0])
+    own = (len(time) - 1) / whole if whole > 0 else np.inf
+    if not abs(own / given - 1) < RATE:
+        text = (
+            f"--sampling-hz {given:g} was used, but {TIME} goes from {time[0]:g} to {time[-1]:g} s in "
+            f"{len(time)} rows ({own:.6g} Hz): all times and densities rest on the rate given."
+        )
+        findings.append(Finding(id="rate", text=text))
+
+
+def _station_seconds(given: float | None, seconds: float, rate: float, source: str) -> float:
+    longest = seconds / AVERAGES
+    if given is None:
+        return max(min(STATION_SECONDS, seconds / SOUND), 1 / rate)
+    if given < 1 / rate:
+        raise InputError(
+            f"--station-seconds must be at least one sample of {source}, {1 / rate:g} s; got {given:g}. "
+            "Ask for a longer station."
+        )
+    if given > longest:
+        raise InputError(
+            f"--station-seconds must be at most a quarter of {source}, {longest:.4g} s; got {given:g}. "
+            f"Record for at least {AVERAGES * given:g} s, better {SOUND * given:g} s, or ask for a "
+            "shorter station."
+        )
+    return given
+
+
+def _samples(
+    log: Table, name: str, first: int, last: int, rate: float, findings: list[Finding]
+) -> tuple[Array, float] | None:
+    """Values of a channel and samples a second; None with a finding where it cannot be used."""
+    value = numbers(log, name)[first:last]
+    there = np.flatnonzero(~np.isnan(value))
+    steps = np.diff(there)
+    if not there.size:
+        problem = f"{name} is blank from end to end."
+    elif len(there) < FEWEST:
+        problem = f"{name} has {len(there)} samples, of {FEWEST} needed."
+    elif np.ptp(value[there]) == 0:
+        problem = f"{name} reads {value[there[0]] + 0.0:g} from end to end: a dead channel?"
+    elif not (odd := np.flatnonzero(steps != np.median(steps))).size:
+        return value[there], rate / float(steps[0])
+    else:
+        row = first + min(there[odd[0]] + int(np.median(steps)), there[odd[0] + 1])
+        line = log.lines[row] if row < len(log.lines) else row + 1
+        filled = _filled(value, there)
+        if filled is not None:
+            text = (
+                f"{name} is blank in {len(odd)} of {len(filled)} samples, first in line {line}: taken as "
+                "the mean of the two neighbours."
+            )
+            findings.append(Finding(id="filled", text=text))
+            return filled, rate / float(np.median(steps))
+        problem = f"{name} is blank at irregular places, first in line {line}: fill in or cut."
+    findings.append(Finding(id="channel-left-out", text=f"{problem} It was left out."))
+    return None
+
+
+def _filled(value: Array, there: Ints) -> Array | None:
+    """Samples of a channel, present `there`, each single blank the mean of its neighbours.
+
+    None where others are blank, or more than `SPARSE`.
+    """
+    steps = np.diff(there)
+    step = int(np.median(steps))
+    single = steps == 2 * step
+    if np.any(~single & (steps != step)) or single.sum() > max(SPARSE * len(there), 1):
+        return None
+    return np.asarray(np.interp(np.arange(there[0], there[-1] + 1, step), there, value[there]))
+
+
+def _channel(
+    name: str, value: Array, rate: float, station: float, kind: Kind, findings: list[Finding]
+) -> ChannelNoise:
+    """The noise of one channel; samples are counted inside, seconds outside."""
+    factors = allan.octaves(len(value))
+    moments = allan.moments(len(value), factors)
+    asked = moments if kind == "overlapping" else allan.moments(len(value), factors, kind)
+    centred = allan.variance(value, factors, centred=True)
+    slope = np.asarray(allan.drift(value))
+    terms = noise_terms.fit(centred[None], slope[None], moments)
+    plain = allan.deviation(value, factors, kind)
+    freedom = allan.freedom(asked, terms.bounded, terms.steady, terms.covariance)[0]
+    lower, upper = allan.band(plain, freedom)
+    fitted = terms.bounded @ np.swapaxes(asked.plain_mean, -1, -2)
+    fitted = np.sqrt(fitted[0] + (terms.steady * moments.averaging) ** 2 / 2)
+    named = _terms(terms, rate)
+    white = named["white"].value
+    said = _findings(name, value, rate, station, moments, terms)
+    findings += said
+    return ChannelNoise(
+        samples=len(value),
+        sampling_hz=rate,
+        mean=float(value.mean()),
+        tau_s=(moments.averaging / rate).tolist(),
+        deviation=plain.tolist(),
+        lower=lower.tolist(),
+        upper=upper.tolist(),
+        freedom=freedom.tolist(),
+        fitted=fitted.tolist(),
+        terms=named,
+        white_density=None if white is None else float(np.sqrt(2)) * white,
+        fit_from_s=float(moments.averaging[terms.start[0]] / rate),
+        chance=float(terms.chance[0]),
+        doubts=[finding.id for finding in said if finding.id in DOUBTS],
+        station=_station(value, station * rate, moments, terms),
+    )
+
+
+def _drifts(terms: Terms) -> Array:
+    """Whether the drift (B,) cannot be absent."""
+    from scipy.special import ndtr
+
+    chance = 2 * ndtr(-np.abs(terms.slope) / terms.slope_sd)
+    return np.asarray(chance < noise_terms.DETECTED)
+
+
+def _terms(terms: Terms, rate: float) -> dict[str, Term]:
+    """The terms of the one record, in units of the channel and seconds."""
+    factors = dict(zip(UNITS, (1 / rate, rate**-0.5, 1.0, rate**0.5, rate), strict=True))
+    found = {}
+    for i, name in enumerate(allan.TERMS):
+        shown = bool(terms.determined[0, i])
+        size = float(np.sqrt(max(terms.square[0, i], 0.0))) * factors[name]
+        spread = float(np.sqrt(terms.covariance[0, i, i])) * factors[name] ** 2
+        found[name] = Term(
+            value=size if shown else None,
+            standard_uncertainty=spread / (2 * size) if shown else None,
+            lower=float(np.sqrt(terms.lower[0, i])) * factors[name],
+            upper=float(np.sqrt(terms.upper[0, i])) * factors[name],
+            unit=UNITS[name],
+        )
+    return {**found, "drift": _drift(terms, rate)}
+
+
+def _drift(terms: Terms, rate: float) -> Term:
+    """The drift, with its sign; where it may be absent, a bound of its size."""
+    from scipy.special import ndtri
+
+    slope, sd = float(terms.slope[0]) * rate, float(terms.slope_sd[0]) * rate
+    tail = 1 - noise_terms.LEVEL
+    shown = bool(_drifts(terms)[0])
+    reach = float(ndtri(1 - tail / 2)) * sd
+    return Term(
+        value=slope if shown else None,
+        standard_uncertainty=sd if shown else None,
+        lower=slope - reach if shown else 0.0,
+        upper=slope + reach if shown else abs(slope) + float(ndtri(1 - tail)) * sd,
+        unit=UNITS["drift"],
+    )
+
+
+def _station(value: Array, length: float, moments: Moments, terms: Terms) -> StationNoise:
+    """The noise of a mean over `length` samples, or of one."""
+    noise, freedom, measured = noise_terms.single(value[None], length, moments, terms)
+    lower, upper = allan.band(noise, freedom)
+    return StationNoise(
+        noise=float(noise[0]),
+        lower=float(lower[0]),
+        upper=float(upper[0]),
+        source="measured" if measured[0] else "terms",
+    )
+
+
+def _findings(
+    name: str, value: Array, rate: float, station: float, moments: Moments, terms: Terms
+) -> list[Finding]:
+    """What the reader should know about a channel."""
+    step = float(np.diff(np.unique(value)).min())
+    sample = float(np.std(np.diff(value)) / np.sqrt(2))
+    coarse = sample < COARSE * step
+    texts = {"event": _event(name, value, rate, COARSE * step, coarse)}
+    if coarse:
+        texts["coarse"] = (
+            f"{name} is read in steps of {step:.3g}, above its noise of {sample:.2g}: the figures "
+            "are those of the rounding. Read it with more digits."
+        )
+    start = moments.averaging[terms.start[0]] / rate
+    if terms.chance[0] < noise_terms.CONTRADICTED:
+        texts["misfit"] = (
+            f"{name}: the five terms do not describe the noise (χ² {terms.misfit[0]:.0f} for "
+            f"{terms.freedom[0]}); their values and uncertainties do not hold, the Allan deviations do. Was the "
+            "tool at rest, and is there a vibration?"
+        )
+    elif terms.start[0]:
+        texts["filtered"] = (
+            f"{name}: below {start:.3g} s its noise is not that of the five terms (a filter, a vibration, "
+            "or repeated samples); from there on they hold, without a quantisation."
+        )
+    if station * rate < 1 - RATE:
+        seen = f"{name} is sampled every {1 / rate:.4g} s, and a station lasts {station:.4g} s"
+        texts["slow"] = f"{seen}: its figure is the noise of one sample. Ask for a longer station."
+    return [Finding(id=key, text=text) for key, text in texts.items() if text]
+
+
+def _event(name: str, value: Array, rate: float, least: float, coarse: bool) -> str:
+    """A word on a difference between averages that is no noise: a spike, or a move.
+
+    `least` is the noise that the steps of the converter can hide: in single samples, and if they
+    are `coarse` in averages.
+    """
+    for m in sorted({1, max(len(value) // PARTS, 1)}):
+        size = np.abs(allan.differences(value, m))
+        usual = max(1.4826 * float(np.median(size)), least if coarse or m == 1 else 0.0)
+        worst = int(np.argmax(size))
+        if usual > 0 and size[worst] / usual > EVENT + ROUNDING:
+            return (
+                f"{name} changes by {size[worst]:.3g} about {(worst + m) / rate:.4g} s after the start, "
+                f"{size[worst] / usual:.0f} times what is usual within {m / rate:.2g} s: a spike or a move. "
+                "Choose a quiet part by --from and --to."
+            )
+    return ""
+
+
+def _physical(name: str, channel: ChannelNoise, profile: Profile) -> ChannelNoise:
+    """The same with its physical unit and scale, where the profile has one."""
+    kind = next(kind for kind, names in CHANNELS.items() if name in names)
+    scale = getattr(profile, kind).scale
+    if scale is None:
+        return channel
+    return msgspec.structs.replace(channel, unit=PHYSICAL[kind], scale=float(scale))
+
+
+def _withheld(found: dict[str, ChannelNoise]) -> dict[str, str]:
+    """Why there is no noise to recommend, for each triad where that is so."""
+    reasons = {}
+    for kind, names in CHANNELS.items():
+        own: dict[str, list[str]] = {}
+        for name in (name for name in names if name in found and found[name].doubts):
+            reason = " and ".join(DOUBTS[doubt] for doubt in found[name].doubts)
+            own.setdefault(reason, []).append(name)
+        if own:
+            reasons[kind] = "; ".join(f"{', '.join(who)}: {why}" for why, who in own.items())
+    return reasons
+
+
+def _recommended(
+    found: dict[str, ChannelNoise], withheld: dict[str, str], findings: list[Finding]
+) -> dict[str, float]:
+    """The noise of one station for each triad that holds: root mean square of its channels."""
+    profile = {}
+    for kind, names in CHANNELS.items():
+        own = {name: found[name].station.noise for name in names if name in found}
+        if not own or kind in withheld:
+            continue
+        profile[kind] = root_mean_square(list(own.values()))
+        noisy, quiet = max(own, key=lambda n: own[n]), min(own, key=lambda n: own[n])
+        if own[noisy] > UNEVEN * own[quiet]:
+            text = (
+                f"{noisy} has {own[noisy] / own[quiet]:.1f} times the noise of {quiet}; the profile has one "
+                f"figure for the {kind}, their root mean square. Is {noisy} in order?"
+            )
+            findings.append(Finding(id="uneven", text=text))
+    return profile
+
+
+def root_mean_square(values: Sequence[float]) -> float:
+    """Root of the mean square.
+
+    >>> root_mean_square([3.0, 4.0, 5.0])
+    4.08...
+    """
+    return float(np.sqrt(np.mean(np.square(values))))

@@ -1,0 +1,395 @@
+"""Standstills in a continuous record: where the tool did not move, and what it read there.
+
+Each channel is cut into short cells, each with the median of its samples (its *level*, which a
+few spikes cannot move). The range of the levels within a window of five cells says how much the
+channel moves; the range of its quietest windows is its noise floor. The *activity* of a cell is
+that range, in noise floors, of the quietest window that covers it, in the liveliest channel.
+Where it stays below a threshold the tool stands still.
+
+The threshold is the one that matters least: over a geometric series of thresholds, the
+standstills stay the same ones over the widest stretch, between noise that breaks them up and
+movements that are swallowed. It is taken near the quiet end of that stretch, where edges are
+sharpest.
+
+A channel too slow for that, such as a magnetometer read once a second, cuts what the others call
+a standstill where its own readings step from one level to another.
+
+Reference: P. J. Huber, Robust Statistics, chapter 6 (medians, MAD).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import chain, pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from mwdcal.geometry.vectors import Array, Bools, Ints
+
+CELL = 0.2
+"""Shortest cell, seconds."""
+FEWEST = 3
+"""Samples that a cell needs for its median to stand a spike."""
+WINDOW = 5
+"""Cells of a window."""
+QUIET = 0.05
+"""Quantile of the windows' ranges that is the noise floor."""
+STEPS = 120
+"""Thresholds tried."""
+CHUNK = 32
+"""Samples whose median step in time is the rate there."""
+SAME = 0.02
+"""Share of the standstills that may come, go or merge while they still count as the same."""
+AGREE, SHARE = 0.03, 0.1
+"""Steps of a channel that differ by less are equal; share of equal ones that is its resolution."""
+TURN = 0.05
+"""Share of a triad's size by which no channel of a tool at rest moves within a window."""
+NOISE = 8.0
+"""The same in standard deviations of the difference of successive samples."""
+STEP = 0.01
+"""Share of a triad's size by which no slow channel of a tool at rest steps."""
+MANY = 100_000
+"""Differences of readings that are looked at."""
+INTO = 0.15
+"""How far into the stretch the threshold lies, in logarithm."""
+
+
+class Cells(NamedTuple):
+    """One channel in short cells (m,): start, end, median, and whether there is a gap within.
+
+    `step` is the time between samples, `rough` the robust standard deviation of a sample as
+    the difference of successive ones tells it: noise, whatever the tool does. `resolution` is
+    the step in which readings come.
+    """
+
+    start: Array
+    end: Array
+    level: Array
+    torn: Bools
+    step: float
+    rough: float
+    resolution: float
+
+
+class Slow(NamedTuple):
+    """A channel too slow for the activity: times and values (n,), and the step that is movement."""
+
+    time: Array
+    value: Array
+    limit: float
+
+
+class Activity(NamedTuple):
+    """Activity on a common grid of cells.
+
+    Attributes:
+        edge: start of each cell, and the end of the last (m + 1,), s.
+        value: activity (m,), in noise floors; infinite where a channel has no samples.
+        channels: which of the channels were looked at.
+        cells: these channels, cut up.
+        floor: noise floor of each, in its own unit.
+    """
+
+    edge: Array
+    value: Array
+    channels: tuple[int, ...]
+    cells: tuple[Cells, ...]
+    floor: Array
+
+
+class Threshold(NamedTuple):
+    """The threshold in noise floors, and the stretch (first, last) over which it hardly matters."""
+
+    value: float
+    stretch: tuple[float, float]
+
+
+class Standstills(NamedTuple):
+    """Intervals that look still (k,), their edges trimmed, and what became of each.
+
+    `taken`: long enough, and no channel creeps on; `short`: not long enough. What is neither
+    moves slowly.
+    """
+
+    start: Array
+    end: Array
+    taken: Bools
+    short: Bools
+
+
+def cells_of(time: Array, value: Array, length: float) -> Cells:
+    """A channel in cells of about `length` seconds, but of no fewer than `FEWEST` samples.
+
+    Shapes: `time` (n,) ascending, `value` (n,) without blanks. Where the rate changes, so does the
+    number of samples of a cell; what is left there belongs in time to the cell before.
+    """
+    step = time_step(time)
+    rough = float(np.median(np.abs(np.diff(value)))) / 0.6745 / np.sqrt(2)
+    bounds = [*_rate_changes(time), len(time)]
+    parts = [_even(time[a:b], value[a:b], length) for a, b in pairwise(bounds)]
+    start, end, level, torn = (np.concatenate(own) for own in zip(*parts, strict=True))
+    return Cells(start, end, level, torn, step, rough, resolution(value))
+
+
+def _even(time: Array, value: Array, length: float) -> tuple[Array, Array, Array, Bools]:
+    """Start, end, median and gaps of cells of samples at one rate."""
+    step = time_step(time)
+    size = max(FEWEST, round(length / step)) if step > 0 else FEWEST
+    count = len(time) // size
+    whole = value[: count * size].reshape(count, size)
+    last = np.arange(1, count + 1) * size - 1
+    end = time[last] + step
+    start = time[last - size + 1]
+    steps = np.diff(time[: count * size + 1], append=time[-1:])[: count * size]
+    torn = np.any(steps.reshape(count, size)[:, :-1] > (size + 0.5) * step, axis=-1)
+    if count and time[-1] - time[last[-1]] < size * step:
+        end[-1] = time[-1] + step
+    return start, end, np.asarray(np.median(whole, axis=-1), float), torn
+
+
+def _rate_changes(time: Array) -> Ints:
+    """First samples of the stretches at one rate: the rate of a chunk is that of its median step."""
+    count = (len(time) - 1) // CHUNK
+    if count < 2:
+        return np.zeros(1, int)
+    steps = np.median(np.diff(time)[: count * CHUNK].reshape(count, CHUNK), axis=-1)
+    usual = time_step(time)
+    level = np.round(np.log2(np.maximum(steps, 1e-3 * usual) / usual)) if usual else steps
+    return np.concatenate([[0], (np.flatnonzero(np.diff(level)) + 1) * CHUNK])
+
+
+def resolution(value: Array) -> float:
+    """The step in which the readings (n,) of a channel come; hardly anything where they show none.
+
+    Definition: the smallest difference of successive readings on which `SHARE` of those that
+    differ agree, but none that is far below another such one or below movements, as arises where
+    a coarse reading was rescaled by something smooth. Without one, the difference that 1 % stay
+    below: single odd readings do not make a channel fine.
+    """
+    every = max(1, len(value) // MANY)
+    steps = np.sort(np.abs(value[1::every] - value[:-1:every]))
+    steps = steps[steps > 0]
+    if not steps.size:
+        return 0.0
+    for least in (0.0, 1e-3 * float(np.quantile(steps, 0.99))):
+        own = _agreed(steps[np.searchsorted(steps, least) :])
+        if own:
+            return own
+    return float(np.quantile(steps, 0.01, method="lower"))
+
+
+def _agreed(steps: Array) -> float:
+    """The smallest of the ascending steps (n,) on which many agree and few are below; else 0."""
+    count = np.searchsorted(steps, steps * (1 + AGREE), "right") - np.arange(len(steps))
+    common = np.flatnonzero(count >= max(SHARE * len(steps), 10))
+    if not common.size:
+        return 0.0
+    first = common[np.searchsorted(steps[common], steps[common[-1]] / 20)]
+    first = first + int(np.argmax(count[first : first + count[first]]))
+    own = float(steps[first + count[first] // 2])
+    between = np.searchsorted(steps, [0.05 * own, 0.9 * own])
+    return own if between[1] - between[0] <= SHARE * count[first] else 0.0
+
+
+def time_step(time: Array) -> float:
+    """Median time between samples that differ in time; 0 where there are none."""
+    steps = np.diff(time)
+    steps = steps[steps > 0]
+    return float(np.median(steps)) if steps.size else 0.0
+
+
+def distinct(time: Array) -> Array:
+    """The times (n,) with equal ones spread over the usual step, as a coarse clock leaves them."""
+    later = time[1:] > time[:-1]
+    if later.all() or not later.any():
+        return time
+    first = np.concatenate([[0], np.flatnonzero(later) + 1])
+    own = time[first]
+    many = np.diff(first, append=len(time))
+    room = np.minimum(np.diff(own, append=np.inf), time_step(own))
+    rank = np.arange(len(time)) - np.repeat(first, many)
+    return np.asarray(np.repeat(own, many) + rank * np.repeat(room / many, many))
+
+
+def activity(channels: Sequence[tuple[Array, Array]]) -> Activity:
+    """How much each moment moves, of channels (time (n,), value (n,)) with rates of their own.
+
+    A channel too slow to have a cell within a window of the fastest is not looked at, nor one
+    that never changes. Singular: fewer samples than a window needs give no cells at all.
+    """
+    steps = [time_step(time) for time, _ in channels]
+    length = max(CELL, FEWEST * min((s for s in steps if s > 0), default=0.0))
+    fast = [i for i, s in enumerate(steps) if 0 < FEWEST * s <= WINDOW * length]
+    cut = {i: cells_of(*channels[i], length) for i in fast if np.ptp(channels[i][1]) > 0}
+    cut = {i: own for i, own in cut.items() if len(own.level) >= WINDOW}
+    cells = tuple(cut.values())
+    if not cells:
+        return Activity(np.zeros(1), np.zeros(0), (), (), np.zeros(0))
+    start = min(c.start[0] for c in cells)
+    count = round(float(max(c.end[-1] for c in cells) - start) / length)
+    edge = start + length * np.arange(max(count, 1) + 1)
+    floors, value = [], np.zeros(len(edge) - 1)
+    for own in cells:
+        ranges = quietest_range(own.level)
+        # One step of the readings up or down is no movement.
+        floor = max(noise_floor(ranges), (1 + AGREE) * own.resolution)
+        ranges = np.where(own.torn, np.inf, ranges)
+        value = np.maximum(value, on_grid(edge, own, ranges) / floor)
+        floors.append(floor)
+    return Activity(edge, value, tuple(cut), cells, np.array(floors))
+
+
+def quietest_range(level: Array) -> Array:
+    """Range of the levels (m,) in the quietest window of `WINDOW` cells that covers each."""
+    from scipy.ndimage import maximum_filter1d, minimum_filter1d
+
+    ranges = maximum_filter1d(level, WINDOW) - minimum_filter1d(level, WINDOW)
+    half = WINDOW // 2
+    ranges[:half] = ranges[-half:] = np.inf
+    return np.asarray(minimum_filter1d(ranges, WINDOW, mode="constant", cval=np.inf))
+
+
+def noise_floor(ranges: Array) -> float:
+    """The low quantile of the ranges (m,), without those that are zero; 1 if all are."""
+    alive = ranges[(ranges > 0) & np.isfinite(ranges)]
+    return float(np.quantile(alive, QUIET)) if alive.size else 1.0
+
+
+def on_grid(edge: Array, cells: Cells, value: Array) -> Array:
+    """Each grid cell's value of the channel: that of the channel's cell at its middle."""
+    middle = (edge[1:] + edge[:-1]) / 2
+    place = np.searchsorted(cells.start, middle, side="right") - 1
+    inside = (place >= 0) & (middle <= cells.end[place] + cells.step)
+    return np.where(inside, value[place], np.inf)
+
+
+def triad_size(levels: Sequence[Array]) -> float:
+    """Strength of what a triad measures, from the levels (m,) of its channels, in their unit.
+
+    Definition: half the range that a channel covers, the largest of the triad. A triad that
+    covers less than 3 % of its norm has never been turned: then it is that norm.
+    """
+    half = max(float(np.ptp(level)) / 2 for level in levels)
+    norm = float(np.linalg.norm([np.median(level) for level in levels]))
+    return half if half > 0.03 * norm else norm
+
+
+def rest_limit(cells: Cells, size: float) -> float:
+    """Largest range within a window that can be rest: a share of the triad's `size`, or noise."""
+    return max(TURN * size, NOISE * cells.rough, 2 * cells.resolution)
+
+
+def stretches(still: Bools, least: int = 1) -> tuple[Ints, Ints]:
+    """First cells, and cells after the last, of the runs of at least `least` true ones."""
+    step = np.diff(still.astype(np.int8), prepend=0, append=0)
+    first, last = np.flatnonzero(step == 1), np.flatnonzero(step == -1)
+    long = last - first >= least
+    return first[long], last[long]
+
+
+def choose_threshold(value: Array, least: int, highest: float) -> Threshold:
+    """The threshold of the activity (m,) on which the standstills depend least.
+
+    Definition: of all stretches of thresholds over which no more than `SAME` of the standstills of
+    at least `least` cells come, go or merge, the longest in logarithm; the first with the
+    stretch's median number from `INTO` of it on. Tried is a geometric series from the quietest
+    cell, but no less than the noise floor, up to `highest`.
+    Singular: without any standstill at any threshold the value is NaN.
+    """
+    alive = value[np.isfinite(value) & (value > 0)]
+    low = max(float(alive.min()), 1.0) if alive.size else 1.0
+    tried = np.geomspace(low, highest, STEPS) if highest >= low else np.zeros(0)
+    runs = [stretches(value <= t, least)[0] for t in tried]
+    counts = np.array([len(run) for run in runs], int)
+    changes = np.cumsum([0, *(_changes(a, b) for a, b in pairwise(runs))])
+    best, longest = slice(0), 0
+    for first, count in enumerate(counts):
+        other = changes[first : len(counts)] - changes[first] > SAME * count
+        length = int(np.argmax(other)) if other.any() else len(other)
+        if count and length > longest:
+            best, longest = slice(first, first + length), length
+    if not longest:
+        return Threshold(np.nan, (np.nan, np.nan))
+    counts, tried = counts[best], tried[best]
+    usual = (counts == np.median(counts)) & (np.arange(longest) >= INTO * (longest - 1))
+    chosen = int(np.argmax(usual)) if usual.any() else longest // 2
+    return Threshold(float(tried[chosen]), (float(tried[0]), float(tried[-1])))
+
+
+def _changes(before: Ints, after: Ints) -> int:
+    """Runs that came or merged as the threshold rose, by the first cells (k,) of all of them."""
+    shared = len(np.unique(np.searchsorted(after, before, side="right")))
+    return len(before) + len(after) - 2 * shared
+
+
+def calm(found: Activity, threshold: float, trim: float) -> tuple[Array, Array]:
+    """Start and end of the intervals whose activity stays at or below the threshold, trimmed."""
+    first, last = stretches(found.value <= threshold)
+    start, end = found.edge[first] + trim, found.edge[last] - trim
+    some = end > start
+    return start[some], end[some]
+
+
+def standstills(
+    found: Activity, limits: Array, threshold: float, shortest: float, trim: float,
+    slow: Sequence[Slow] = (),
+) -> Standstills:  # fmt: skip
+    """The intervals whose activity stays at or below the threshold, cut and judged.
+
+    `limits` (channels,) is the largest range of each channel within a window that can be rest
+    (`rest_limit`); twice that over a whole interval is slow movement. `trim` seconds are cut
+    off each end; `shortest` seconds must remain. Slow channels cut intervals where they step.
+    """
+    start, end = calm(found, threshold, trim)
+    start, end = cut_at_steps(start, end, slow, trim)
+    creeps = np.zeros(len(start), bool)
+    for own, limit in zip(found.cells, limits, strict=True):
+        creeps |= _travels(own.start, own.level, start, end) > 2 * limit
+    for time, value, limit in slow:
+        middle = np.median(np.stack([value[:-2], value[1:-1], value[2:]]), axis=0)
+        step = time_step(time)
+        creeps |= _travels(time[1:-1], middle, start + step, end - step) > 4 * limit
+    short = end - start < shortest
+    return Standstills(start, end, ~short & ~creeps, short)
+
+
+def _travels(time: Array, level: Array, start: Array, end: Array) -> Array:
+    """Range of the levels (n,) within each interval (k,)."""
+    places = np.searchsorted(time, np.stack([start, end], -1))
+    return np.array([np.ptp(level[a:b]) if b > a else 0.0 for a, b in places], float)
+
+
+def cut_at_steps(
+    start: Array, end: Array, slow: Sequence[Slow], trim: float
+) -> tuple[Array, Array]:
+    """The intervals (k,), without the times at which slow channels step from one level to another."""
+    rooms = [max(trim - 2 * time_step(own.time), 0.0) for own in slow]
+    pieces = []
+    for a, b in zip(start, end, strict=True):
+        spans = [_steps(a, b, own, room) for own, room in zip(slow, rooms, strict=True)]
+        for first, last in sorted(chain.from_iterable(spans)):
+            pieces.append((a, first))
+            a = max(a, last)
+        pieces.append((a, b))
+    kept = np.array([piece for piece in pieces if piece[1] > piece[0]], float).reshape(-1, 2)
+    return kept[:, 0], kept[:, 1]
+
+
+def _steps(start: float, end: float, slow: Slow, room: float) -> list[tuple[float, float]]:
+    """When a slow channel steps within an interval: from when to when nothing is at rest.
+
+    Definition: a step is where the medians of three samples before and after differ by more than
+    the channel's limit, all of them within the interval; a spike is none. It lasts from two
+    samples before to two after, and `room` seconds more to each side.
+    """
+    first, last = np.searchsorted(slow.time, [start, end])
+    time, value = slow.time[first:last], slow.value[first:last]
+    if len(time) < 2 * FEWEST:
+        return []
+    middle = np.median(np.stack([value[:-2], value[1:-1], value[2:]]), axis=0)
+    stepped = np.abs(middle[FEWEST:] - middle[:-FEWEST]) > slow.limit
+    return [
+        (float(time[i + FEWEST - 2] - room), float(time[min(j + FEWEST, len(time) - 1)] + room))
+        for i, j in zip(*stretches(stepped), strict=True)
+    ]

@@ -1,0 +1,180 @@
+"""What the reader of a log's stations should know: what was missed, and what is odd at a station."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from math import ceil, floor, log10
+
+import numpy as np
+
+from mwdcal.calibration.record import Finding
+from mwdcal.geometry.vectors import Array
+from mwdcal.logs import standstill
+from mwdcal.logs.standstill import Activity, Standstills
+from mwdcal.logs.station_means import Summary
+
+MANY_SPIKES = 0.01
+"""Share of spikes that is worth a word."""
+MOST_LISTED = 12
+"""Stations, or stretches of time, that a finding names."""
+DAY = 86_400.0
+SPARSE, RARE = 0.5, 2.0
+"""Seconds between samples that are odd in a log of more than a day, and in any."""
+STEADY = 3.0
+"""Standard deviations of a cell's level by which a noisy but steady stretch may drift."""
+
+Rows = dict[str, list[Summary]]
+"""What each channel read at each station."""
+
+
+def count(number: int, word: str) -> str:
+    """'1 station', '2 stations'."""
+    return f"{number} {word}" if number == 1 else f"{number} {word}s"
+
+
+def listed(parts: Iterable[object]) -> str:
+    """The first few, with commas."""
+    names = [str(part) for part in parts]
+    return ", ".join(names[:MOST_LISTED]) + (" …" if len(names) > MOST_LISTED else "")
+
+
+def _between(start: Array, end: Array) -> str:
+    return listed(f"{a:.1f}–{b:.1f} s" for a, b in zip(start, end, strict=True))
+
+
+def about(rows: Rows, found: Standstills, seconds: float) -> list[Finding]:
+    """Findings about the stations, and about what was left; `seconds` lasts the log once trimmed."""
+    start, end = found.start[found.taken], found.end[found.taken]
+    findings = []
+    creeping = ~found.taken & ~found.short
+    if creeping.any():
+        where = _between(found.start[creeping], found.end[creeping])
+        text = f"left out, as the tool moves slowly there: {where}."
+        findings.append(Finding(id="slow-movement", text=text))
+    if len(start) == 1 and end[0] - start[0] > 0.9 * seconds:
+        text = "the log stands still from end to end: one station. A calibration needs several attitudes."
+        findings.append(Finding(id="all-still", text=text))
+    findings += _spikes(rows)
+    for name, own in rows.items():
+        findings += _stuck(name, own) + _unsteady(name, own) + _drifting(name, own, end - start)
+    return findings
+
+
+def time_unit(time: Array) -> list[Finding]:
+    """Times of rows (n,) that can hardly be seconds."""
+    step, lasts = standstill.time_step(time), float(time[-1] - time[0])
+    if step < (SPARSE if lasts > DAY else RARE):
+        return []
+    whole = f"{lasts / DAY:.5g} days" if lasts > DAY else f"{lasts:.4g} s"
+    text = (
+        f"samples are {step:.5g} s apart and the log lasts {whole} by time_s: is it in milliseconds or "
+        "microseconds? time_s is in seconds."
+    )
+    return [Finding(id="time-unit", text=text)]
+
+
+def correlated_noise(names: list[str]) -> Finding:
+    """Noise that is correlated over times that are not short against the standstills."""
+    text = (
+        f"noise of {', '.join(names)} is correlated over seconds: the halves of standstills differ by "
+        "more than their samples explain. sd_ is widened to what they tell; with 1/f noise it is still "
+        "too small. Stand still for longer, or state the noise in the tool profile."
+    )
+    return Finding(id="correlated-noise", text=text)
+
+
+def _spikes(rows: Rows) -> list[Finding]:
+    share = {
+        n: sum(r.spikes for r in own) / sum(r.spikes + r.used for r in own)
+        for n, own in rows.items()
+    }
+    name = max(share, key=lambda n: share[n])
+    if share[name] <= MANY_SPIKES:
+        return []
+    text = f"{100 * share[name]:.1f} % of the samples of {name} were left out as spikes: check the wiring."
+    return [Finding(id="spikes", text=text)]
+
+
+def _stuck(name: str, own: list[Summary]) -> list[Finding]:
+    """A channel at its limit, or frozen."""
+    stations = [i + 1 for i, row in enumerate(own) if row.stuck]
+    if not stations:
+        return []
+    first = own[stations[0] - 1]
+    text = (
+        f"{name} stands at its limit, or is frozen, at {count(len(stations), 'station')} of {len(own)} "
+        f"({listed(stations)}): too many equal readings for its noise, such as {first.mean + 0.0:.6g}. Its sd_ "
+        "there is that of a reading known to the channel's range only."
+    )
+    return [Finding(id="stuck-channel", text=text, station=str(stations[0]))]
+
+
+def _unsteady(name: str, own: list[Summary]) -> list[Finding]:
+    """A channel that is less steady than usual, or steps within a standstill."""
+    stations = [i + 1 for i, row in enumerate(own) if row.unsteady and not row.stuck]
+    if not stations:
+        return []
+    usual = float(np.median([row.spread for row in own]))
+    text = (
+        f"{name} is less steady than usual at {count(len(stations), 'station')} of {len(own)} "
+        f"({listed(stations)}): it spreads more than at the others, or moves within the standstill "
+        f"(usual spread of one sample {usual:.2g}). Was the tool knocked, turned or shaken?"
+    )
+    return [Finding(id="unsteady", text=text, station=str(stations[0]))]
+
+
+def _drifting(name: str, own: list[Summary], seconds: Array) -> list[Finding]:
+    drifting = [i for i, row in enumerate(own) if row.drifts]
+    if not drifting:
+        return []
+    worst = max(drifting, key=lambda i: abs(own[i].drift))
+    text = (
+        f"{name} drifts at {len(drifting)} of {len(own)} stations, most at station {worst + 1}: by "
+        f"{own[worst].drift:.3g} over {seconds[worst]:.1f} s (noise of one sample "
+        f"{own[worst].spread:.2g}). See the columns drift_."
+    )
+    return [Finding(id="drift", text=text, station=str(worst + 1))]
+
+
+def noisy_rests(
+    activity: Activity, limits: Array, found: Standstills, threshold: float, least: float
+) -> list[Finding]:
+    """Stretches of at least `least` seconds that are steady on average, but above the threshold.
+
+    Definition: no channel moves by more than can be rest within a window, and by the straight line
+    none changes by more than `STEADY` times what its cells scatter about that line.
+    """
+    can_rest = activity.value > threshold
+    for own, limit in zip(activity.cells, limits, strict=True):
+        ranges = np.where(own.torn, np.inf, standstill.quietest_range(own.level))
+        can_rest &= standstill.on_grid(activity.edge, own, ranges) <= limit
+    cell = activity.edge[1] - activity.edge[0]
+    first, last = standstill.stretches(can_rest, max(ceil(least / cell), standstill.WINDOW))
+    start, end = activity.edge[first], activity.edge[last]
+    kept = [
+        i
+        for i, (a, b) in enumerate(zip(start, end, strict=True))
+        if not np.any((found.start < b) & (found.end > a))
+        and all(_is_steady(own.start, own.level, a, b) for own in activity.cells)
+    ]
+    if not kept:
+        return []
+    enough = max(float(activity.value[first[i] : last[i]].max()) for i in kept)
+    digit = 10.0 ** (floor(log10(enough)) - 1)
+    text = (
+        f"{len(kept)} stretch{'es' if len(kept) > 1 else ''} steady on average, but too noisy for rest, "
+        f"left out: {_between(start[kept], end[kept])}. Vibration? "
+        f"--threshold {ceil(enough / digit) * digit:g} takes them."
+    )
+    return [Finding(id="noisy-rest", text=text)]
+
+
+def _is_steady(time: Array, level: Array, start: float, end: float) -> bool:
+    """Whether the levels between these times scatter about a constant."""
+    first, last = np.searchsorted(time, [start, end])
+    own, clock = level[first:last], time[first:last] - start
+    if len(own) < standstill.WINDOW:
+        return True
+    slope, constant = np.polyfit(clock, own, 1)
+    scatter = np.std(own - slope * clock - constant)
+    return bool(abs(slope) * (clock[-1] - clock[0]) <= STEADY * scatter)

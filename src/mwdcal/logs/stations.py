@@ -1,0 +1,492 @@
+"""Stations from a continuous log: its standstills, each as one row of a run file.
+
+Channels may have rates of their own (blank cells in one table), and the temperature may be
+slower still: it never decides what stands still. See `core.standstill` for the method.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mwdcal.calibration.diagnosis.findings import unused_columns
+from mwdcal.calibration.record import Finding
+from mwdcal.errors import InputError
+from mwdcal.files.contract import CHANNELS, RAW, TEMPERATURE
+from mwdcal.files.formats.columns import Column
+from mwdcal.files.formats.table import Table, cell_error, numbers, shown
+from mwdcal.files.logs import READ, TIME
+from mwdcal.files.synonyms import unused
+from mwdcal.geometry.vectors import Array, Ints
+from mwdcal.logs import standstill
+from mwdcal.logs.standstill import Activity, Slow, Standstills
+from mwdcal.logs.station_findings import (
+    about,
+    correlated_noise,
+    count,
+    listed,
+    noisy_rests,
+    time_unit,
+)
+from mwdcal.logs.station_means import Summary, correlated, summarise, summarise_all, widened
+
+MIN_SECONDS, TRIM_SECONDS = 1.0, 1.0
+"""Defaults for a fast log; one sampled slowly needs a window, and a cell, respectively."""
+LEAST_SAMPLES = 3
+"""Samples of each channel below which there is no station."""
+GAP = 5.0
+"""Times the usual step between samples that are a gap."""
+MOST_CELLS = 50_000_000
+"""Cells of the longest log: four months at 15 samples a second or more."""
+TOLD = 1.2
+"""Times the uncertainty of most means of a triad that correlated noise adds, worth a word."""
+CLOCK = re.compile(r"^t(?![A-Za-z0-9])|(?i:time|stamp|clock|epoch|seconds|millis|micros)")
+"""Names of columns that may hold the time."""
+SMALLEST = 1e-12
+"""Resolution of a channel that never changes, as a share of its reading."""
+PARTS = {"": "mean", "sd_": "sd", "spread_": "spread", "drift_": "drift", "samples_": "used"}
+"""Columns per channel: prefix, and what of its summary stands there."""
+
+Trace = tuple[Array, Array]
+"""Times (n,) and values (n,) of one channel, where it has any."""
+
+
+@dataclass(frozen=True, eq=False)
+class Stations:
+    """What a log holds.
+
+    Attributes:
+        table: the run, one row per station.
+        found: all intervals that look still, with what became of each.
+        activity: how much each moment moves, in noise floors.
+        threshold: activity up to which it stands still.
+        stretch: thresholds from which to which the standstills are the same ones; None
+            where the threshold was given.
+        min_seconds, trim_seconds: as used.
+        time: of each row of the log, s.
+        traces: the channels that have samples.
+        findings: what the reader should know.
+    """
+
+    table: Table
+    found: Standstills
+    activity: Activity
+    threshold: float
+    stretch: tuple[float, float] | None
+    min_seconds: float
+    trim_seconds: float
+    time: Array
+    traces: dict[str, Trace]
+    findings: list[Finding]
+
+
+class StandstillError(InputError):
+    """A log without a standstill; `made` holds what was looked at, with an empty table."""
+
+    def __init__(self, text: str, made: Stations) -> None:
+        super().__init__(text)
+        self.made = made
+
+
+def _silent(text: str) -> None:
+    """Say nothing."""
+
+
+def find_stations(
+    log: Table,
+    *,
+    sampling_hz: float | None = None,
+    min_seconds: float | None = None,
+    trim_seconds: float | None = None,
+    threshold: float | None = None,
+    say: Callable[[str], None] = _silent,
+) -> Stations:
+    """The standstills of a log (`files.logs.read`) as the rows of a run.
+
+    `sampling_hz` is the rate of a log without a column `time_s`; `threshold` in noise floors,
+    found from the log where None. Errors: a log without time, without samples of a channel,
+    or without standstills.
+    """
+    _check("min-seconds", min_seconds)
+    _check("trim-seconds", trim_seconds)
+    _check("threshold", threshold)
+    findings: list[Finding] = []
+    time = row_times(log, sampling_hz)
+    traces, temperature = _traces(log, time, findings)
+    findings += _time_findings(log, time, traces, sampling_hz)
+    say(f"looking for standstills in {len(time)} rows")
+    activity = standstill.activity(list(traces.values()))
+    if not activity.cells:
+        raise _short(log, time, traces)
+    cell = float(activity.edge[1] - activity.edge[0])
+    shortest = max(MIN_SECONDS, standstill.WINDOW * cell) if min_seconds is None else min_seconds
+    trim = max(TRIM_SECONDS, cell) if trim_seconds is None else trim_seconds
+    findings += _torn(activity, list(traces), findings)
+    limits, slow = _limits(activity, traces)
+    highest = float(np.min(limits / activity.floor))
+    value, stretch = threshold, None
+    if value is None:
+        least = int(np.ceil((shortest + 2 * trim) / cell))
+        value, stretch = standstill.choose_threshold(activity.value, least, highest)
+        if np.isnan(value):  # nothing lasts: what comes nearest
+            value, stretch = highest, None
+    found = standstill.standstills(activity, limits, value, shortest, trim, slow)
+    found = _with_samples(found, traces, findings)
+    findings += noisy_rests(activity, limits, found, value, shortest + 2 * trim)
+    made = Stations(
+        Table({}, log.metadata, log.source), found, activity, value, stretch, shortest, trim, time,
+        traces, findings,
+    )  # fmt: skip
+    if not found.taken.any():
+        raise StandstillError(_none(made), made)
+    start, end = found.start[found.taken], found.end[found.taken]
+    rows = _summaries(traces, start, end, findings, say)
+    columns = _columns(log, time, rows, start, end)
+    columns |= _temperatures(temperature, start, end, findings)
+    findings += about(rows, found, float(time[-1] - time[0]) - 2 * trim)
+    metadata = {**log.metadata, "log": log.source, "log_sha256": log.digest}
+    table = Table(_ordered(columns), metadata, log.source, range(1, len(start) + 1))
+    return replace(made, table=table)
+
+
+def _check(name: str, value: float | None) -> None:
+    if value is not None and not 0 <= value < float("inf"):
+        raise InputError(f"--{name} must be a number of at least 0; got {shown(value)}.")
+
+
+def _short(log: Table, time: Array, traces: dict[str, Trace]) -> InputError:
+    if len(time) > 1 and not any(np.ptp(value) for _, value in traces.values()):
+        return InputError(
+            f"{log.source}: no channel ever changes, so that nothing tells rest from movement. "
+            "Check the logger and the order of the columns."
+        )
+    window = standstill.WINDOW
+    return InputError(
+        f"{log.source}: too short to find standstills in; got {len(time)} rows over "
+        f"{time[-1] - time[0]:g} s. A channel needs at least {window * standstill.FEWEST} samples, over "
+        f"{window * standstill.CELL:g} s. Is the log complete, and its time in seconds?"
+    )
+
+
+def _none(made: Stations) -> str:
+    """Why there is no station."""
+    longest = float((made.found.end - made.found.start).max(initial=0.0))
+    moving = int(np.count_nonzero(~made.found.short))
+    trimmed = f"after {made.trim_seconds:g} s trimmed off each end"
+    if moving:
+        word = "interval moves" if moving == 1 else "intervals move"
+        seen = f"{moving} long calm {word} on slowly by more than a standstill can"
+    elif longest:
+        seen = f"the longest calm interval lasts {longest:.3g} s {trimmed}"
+    else:
+        seen = f"nothing is left {trimmed}"
+    return (
+        f"{made.table.source}: no standstill of at least {made.min_seconds:g} s; {seen}. Stand still "
+        "for longer, lower --min-seconds or --trim-seconds, or set --threshold; --plot shows the log."
+    )
+
+
+def row_times(log: Table, sampling_hz: float | None) -> Array:
+    """Seconds of each row: from the rate of sampling if given, else the column `time_s`."""
+    stated = log.metadata.get("sampling_hz") if sampling_hz is None else sampling_hz
+    if TIME in log.columns and sampling_hz is None:
+        time = numbers(log, TIME)
+        for row in np.flatnonzero(np.isnan(time))[:1]:
+            advice = "Fill it in, or remove the row."
+            raise cell_error(log, TIME, int(row), f"must be filled in; got a blank cell. {advice}")
+        for row in np.flatnonzero(np.diff(time) < 0)[:1]:
+            got = f"{shown(float(time[row + 1]))} s after {shown(float(time[row]))} s"
+            advice = "Sort the log by time, or split it where the clock was set back."
+            raise cell_error(log, TIME, int(row) + 1, f"must not go back; got {got}. {advice}")
+        _check_span(log, time)
+        return time
+    if stated is None:
+        raise _timeless(log)
+    if isinstance(stated, bool) or not isinstance(stated, int | float) or not 0 < stated <= 1e9:
+        here, advice = f"{log.source}: sampling_hz", "Correct it, or add --sampling-hz."
+        if sampling_hz is not None:
+            here, advice = "--sampling-hz", "State the samples per second."
+        raise InputError(
+            f"{here} must be a number above 0 and at most 1e9 Hz; got {shown(stated)}. {advice}"
+        )
+    return np.arange(len(numbers(log, RAW[0]))) / float(stated)
+
+
+def _timeless(log: Table) -> InputError:
+    """A log without time, or with one of another name."""
+    clock = next((name for name in log.columns if CLOCK.search(name)), None)
+    got = "neither. Add"
+    if clock is not None:
+        got = f"'{clock}'. Rename it to '{TIME}', in seconds (convert it if it is not); or add"
+    return InputError(
+        f"{log.source}: a log needs a column '{TIME}', or its rate of sampling; got {got} "
+        "--sampling-hz 100, or a line '# sampling_hz = 100' above the column names."
+    )
+
+
+def _check_span(log: Table, time: Array) -> None:
+    """Refuse a clock that jumps so far that most of the log would be nothing."""
+    cell = max(standstill.CELL, standstill.FEWEST * standstill.time_step(time))
+    if time[-1] - time[0] > MOST_CELLS * cell:
+        row = int(np.argmax(np.diff(time))) + 1
+        got = f"{shown(float(time[row]))} s after {shown(float(time[row - 1]))} s"
+        advice = "Correct the clock, split the log there, or write the time in seconds."
+        raise cell_error(log, TIME, row, f"must not jump so far; got {got}. {advice}")
+
+
+def _traces(
+    log: Table, time: Array, findings: list[Finding]
+) -> tuple[dict[str, Trace], Trace | None]:
+    """The raw channels that have samples, and the temperature."""
+    own = {name: _trace(log, time, name) for name in (*RAW, "temperature_c") if name in log.columns}
+    magnetometer = [name for name in CHANNELS["magnetometer"] if name in own]
+    if magnetometer and not any(len(own[name][0]) for name in magnetometer):
+        text = "mx, my and mz are blank from end to end: the stations have no magnetometer."
+        findings.append(Finding(id="no-magnetometer", text=text))
+        own = {name: trace for name, trace in own.items() if name not in magnetometer}
+    for name, (values, _) in own.items():
+        if not len(values) and name in RAW:
+            raise InputError(
+                f"{log.source}, column '{name}': must have samples; every cell is blank. Check the "
+                "logger and the order of the columns, or leave out the triad."
+            )
+        if name in RAW and np.ptp(own[name][1]) == 0:
+            text = f"{name} reads {own[name][1][0] + 0.0:g} from end to end: a dead channel?"
+            findings.append(Finding(id="dead-channel", text=text))
+    temperature = own.pop("temperature_c", None)
+    if temperature is not None:
+        temperature = _possible(temperature, findings)
+    if temperature is not None and not len(temperature[0]):
+        text = "temperature_c is blank from end to end: the stations have no temperature."
+        findings.append(Finding(id="no-temperature", text=text))
+        temperature = None
+    return own, temperature
+
+
+def _trace(log: Table, time: Array, name: str) -> Trace:
+    """Times and values where there are values; times that are equal are spread."""
+    value = numbers(log, name)
+    there = ~np.isnan(value)
+    if not there.all():
+        time, value = time[there], value[there]
+    return standstill.distinct(time), value
+
+
+def _possible(temperature: Trace, findings: list[Finding]) -> Trace:
+    """The temperatures that can be some; others, such as -999, are left out and told."""
+    time, value = temperature
+    fine = (value >= TEMPERATURE.low) & (value <= TEMPERATURE.high)
+    if not fine.all():
+        wrong = np.flatnonzero(~fine)
+        text = (
+            f"{wrong.size} of {len(value)} values of temperature_c are none between {TEMPERATURE.low:g} "
+            f"and {TEMPERATURE.high:g} °C, such as {value[wrong[0]]:g}: left out."
+        )
+        findings.append(Finding(id="impossible-temperature", text=text))
+    return time[fine], value[fine]
+
+
+def _time_findings(
+    log: Table, time: Array, traces: dict[str, Trace], sampling_hz: float | None
+) -> list[Finding]:
+    """Gaps, times that occur twice in a channel or are not used, their unit, and spare columns."""
+    findings = []
+    if TIME in log.columns and sampling_hz is not None:
+        text = f"--sampling-hz {sampling_hz:g} was given: the column '{TIME}' is not used."
+        findings.append(Finding(id="time-not-used", text=text))
+    elif TIME in log.columns:
+        findings += time_unit(time)
+    steps = np.diff(time)
+    gaps = np.flatnonzero(steps > max(GAP * standstill.time_step(time), standstill.CELL))
+    if gaps.size:
+        widest = int(gaps[np.argmax(steps[gaps])])
+        text = (
+            f"{gaps.size} gap{'s' if gaps.size > 1 else ''} in time, the widest {steps[widest]:.3g} s after "
+            f"{TIME} = {time[widest]:.10g} (line {log.lines[widest]}): no standstill goes across one."
+        )
+        findings.append(Finding(id="gaps", text=text))
+    if not np.all(steps > 0):
+        findings += _equal_times(log, time, list(traces))
+    return findings + unused_columns(unused(list(log.columns), READ))
+
+
+def _torn(activity: Activity, names: list[str], findings: list[Finding]) -> list[Finding]:
+    """Stretches without samples that the times of the rows do not show, as gaps."""
+    if any(finding.id == "gaps" for finding in findings):
+        return []
+    cell = float(activity.edge[1] - activity.edge[0])
+    torn = []
+    for own in activity.cells:
+        between = np.append(own.start[1:] - own.end[:-1], 0.0)
+        torn.append(own.torn | (between > max(cell, standstill.FEWEST * own.step)))
+    worst = max(range(len(torn)), key=lambda i: np.count_nonzero(torn[i]))
+    if not torn[worst].any():
+        return []
+    name, first = names[activity.channels[worst]], int(np.argmax(torn[worst]))
+    gaps = count(int(np.count_nonzero(torn[worst])), "gap")
+    at = f"{activity.cells[worst].start[first]:.10g} s"
+    text = f"{name} has {gaps} of several samples, the first after {at}: no standstill goes across one."
+    return [Finding(id="gaps", text=text)]
+
+
+def _equal_times(log: Table, time: Array, names: list[str]) -> list[Finding]:
+    """Samples of a channel at one time; rows of different channels may share theirs."""
+    there = {name: ~np.isnan(numbers(log, name)) for name in names}
+    twice = {name: int(np.count_nonzero(np.diff(time[own]) == 0)) for name, own in there.items()}
+    name = max(twice, key=lambda n: twice[n])
+    if not twice[name]:
+        return []
+    text = (
+        f"{twice[name]} samples of {name} have the time of the one before: all are used, spread "
+        "over the step. Is the time written with too few digits, or are rows doubled?"
+    )
+    return [Finding(id="duplicate-time", text=text)]
+
+
+def _limits(activity: Activity, traces: dict[str, Trace]) -> tuple[Array, list[Slow]]:
+    """The largest range that can be rest of each channel looked at, and the others that can step."""
+    names = list(traces)
+    cells = dict(zip((names[i] for i in activity.channels), activity.cells, strict=True))
+    cut = {
+        name: cells[name] if name in cells else standstill.cells_of(*trace, standstill.CELL)
+        for name, trace in traces.items()
+    }
+    limits, slow = [], []
+    for name, own in cut.items():
+        triad = next(kind for kind in CHANNELS.values() if name in kind)
+        levels = [cut[n].level for n in triad if n in cut and len(cut[n].level)]
+        size = standstill.triad_size(levels) if levels else 0.0
+        if name in cells:
+            limits.append(standstill.rest_limit(own, size))
+        else:
+            noise = max(own.rough, own.resolution)
+            slow.append(Slow(*traces[name], max(standstill.STEP * size, standstill.NOISE * noise)))
+    return np.array(limits), slow
+
+
+def _within(time: Array, start: Array, end: Array) -> tuple[Ints, Ints]:
+    """First sample of each interval, and the one after its last."""
+    return np.searchsorted(time, start), np.searchsorted(time, end, side="right")
+
+
+def _with_samples(
+    found: Standstills, traces: dict[str, Trace], findings: list[Finding]
+) -> Standstills:
+    """The same, without stations for which a slow channel has hardly a sample."""
+    enough = np.ones(len(found.start), bool)
+    for time, _ in traces.values():
+        first, last = _within(time, found.start, found.end)
+        enough &= last - first >= LEAST_SAMPLES
+    poor = int(np.count_nonzero(found.taken & ~enough))
+    if poor:
+        text = (
+            f"{count(poor, 'standstill')} left out: a channel has fewer than {LEAST_SAMPLES} samples there. "
+            "Stand still for longer, or sample it faster."
+        )
+        findings.append(Finding(id="few-samples", text=text))
+    return found._replace(taken=found.taken & enough, short=found.short | ~enough)
+
+
+def _summaries(
+    traces: dict[str, Trace], start: Array, end: Array, findings: list[Finding],
+    say: Callable[[str], None],
+) -> dict[str, list[Summary]]:  # fmt: skip
+    """What each channel read at each station."""
+    summaries: dict[str, list[Summary]] = {}
+    for name, (time, value) in traces.items():
+        resolution = standstill.resolution(value) or SMALLEST * abs(value[0]) or SMALLEST
+        places = zip(*_within(time, start, end), strict=True)
+        rests = [(time[a:b], value[a:b]) for a, b in places]
+
+        def said(done: int, name: str = name) -> None:
+            say(f"station {done} of {len(start)}, {name}")
+
+        summaries[name] = summarise_all(rests, float(resolution), said)
+    for triad in CHANNELS.values():
+        own = [name for name in triad if name in summaries]
+        told = correlated([summaries[name] for name in own])
+        made = {n: widened(summaries[n], float(v)) for n, v in zip(own, told.variance, strict=True)}
+        grown = [
+            a.sd > TOLD * b.sd for n in own for a, b in zip(made[n], summaries[n], strict=True)
+        ]
+        if told.plain and 2 * sum(grown) > len(grown):
+            findings.append(correlated_noise(own))
+        summaries |= made
+    return summaries
+
+
+def _columns(
+    log: Table, time: Array, rows: dict[str, list[Summary]], start: Array, end: Array
+) -> dict[str, Column]:
+    """The run: labels and times, means, and what is known of each mean."""
+    first, last = _within(time, start, end)
+    columns: dict[str, Column] = {
+        "station": [str(i) for i in range(1, len(start) + 1)],
+        "start_s": time[first],
+        "end_s": time[last - 1],
+        "samples": np.asarray(last - first, float),
+    }
+    for prefix, part in PARTS.items():
+        for name, found in rows.items():
+            columns[prefix + name] = np.array([float(getattr(row, part)) for row in found])
+    columns["drifting"] = [
+        " ".join(n for n in rows if rows[n][i].drifts) for i in range(len(start))
+    ]
+    for name in (n for n in log.columns if n.startswith(("ref_", "sd_ref_")) and n in READ):
+        value = numbers(log, name)
+        columns[name] = np.array([_middle(value[a:b]) for a, b in zip(first, last, strict=True)])
+    return columns
+
+
+def _temperatures(
+    temperature: Trace | None, start: Array, end: Array, findings: list[Finding]
+) -> dict[str, Column]:
+    """The temperature of each station, and its change; blank where none was taken nearby."""
+    if temperature is None:
+        return {}
+    ends = zip(start, end, strict=True)
+    lag = GAP * standstill.time_step(temperature[0])
+    warmth = np.array([_temperature(*temperature, *own, lag) for own in ends])
+    blank = np.flatnonzero(np.isnan(warmth[:, 0])) + 1
+    if blank.size:
+        text = (
+            f"{count(blank.size, 'station')} without a temperature nearby ({listed(blank)}): blank "
+            "there. Fill temperature_c in, or leave these stations out."
+        )
+        findings.append(Finding(id="no-temperature-nearby", text=text))
+    return {"temperature_c": warmth[:, 0], "drift_temperature_c": warmth[:, 1]}
+
+
+def _temperature(
+    time: Array, value: Array, start: float, end: float, lag: float
+) -> tuple[float, float]:
+    """Mean over an interval and change over it; between samples along straight lines.
+
+    Singular: NaN where no sample is within the interval, or within `lag` seconds of it.
+    """
+    first, last = np.searchsorted(time, [start, end])
+    if last - first >= standstill.WINDOW:
+        found = summarise(time[first:last], value[first:last], 0.0)
+        return found.mean, found.drift
+    before = time[first - 1] if first else -np.inf
+    after = time[last] if last < len(time) else np.inf
+    if last == first and min(start - before, after - end) > lag:
+        return np.nan, np.nan
+    grid = np.linspace(start, end, 9)
+    course = np.interp(grid, time, value)
+    return float(course.mean()), float(np.polyfit(grid - start, course, 1)[0] * (end - start))
+
+
+def _ordered(columns: dict[str, Column]) -> dict[str, Column]:
+    """The columns with the temperature before the means."""
+    first = ("station", "start_s", "end_s", "samples", "temperature_c", "drift_temperature_c")
+    return {n: columns[n] for n in first if n in columns} | columns
+
+
+def _middle(value: Array) -> float:
+    """The middle one of the cells that are filled in, NaN if none is."""
+    there = np.sort(value[~np.isnan(value)])
+    return float(there[(len(there) - 1) // 2]) if there.size else np.nan

@@ -1,0 +1,1 @@
+"""Simulated tools and runs."""

@@ -1,0 +1,112 @@
+"""The tool profile: which axis each channel measures, nominal scales, noise, stand.
+
+Instrument polarity and raw units live here and nowhere else: `files.tables` turns
+raw channels into nominal readings along the tool axes with it, and `notation`
+turns fitted parameters back into the instrument's own channels.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import msgspec
+import numpy as np
+
+from mwdcal.geometry.vectors import Array
+
+COMMON = ("azimuth-zero", "toolface-zero", "inclination-zero", "tilt")
+"""Errors of the stand that all its stations have in common; in a profile `azimuth_zero_deg` …"""
+
+Axis = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
+
+
+class Datasheet(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What the maker promises of a triad, 1 σ: knowledge for a fit that asks for it.
+
+    `scale` as a share, `bias` in g or nT, `misalignment_deg`; `scale_per_c` and `bias_per_c`
+    their drift per °C. What is not given is not known.
+    """
+
+    scale: float | None = None
+    bias: float | None = None
+    misalignment_deg: float | None = None
+    scale_per_c: float | None = None
+    bias_per_c: float | None = None
+
+
+class TriadProfile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Three channels of one kind: axes, nominal scale and noise, in raw units.
+
+    `scale` is raw units per g (accelerometer) or per nT (magnetometer); None means
+    unknown: it is then taken from the readings and cannot serve as a check.
+    `noise` is the standard uncertainty of one station's raw reading (None: it is
+    estimated from the residuals); `repeatability` is added to it in quadrature.
+    `nonlinearity` is the linearity error of the datasheet as a share of the field (1 σ, for
+    example 0.005): each axis then has its own quadratic and cubic term with that prior.
+    `datasheet` are the maker's tolerances.
+    """
+
+    axes: tuple[Axis, Axis, Axis] = ("+x", "+y", "+z")
+    scale: float | None = None
+    noise: float | None = None
+    repeatability: float = 0.0
+    nonlinearity: float | None = None
+    datasheet: Datasheet | None = None
+
+    @property
+    def permutation(self) -> Array:
+        """The signed permutation P (3, 3): tool axes from channels."""
+        matrix = np.zeros((3, 3))
+        for channel, (sign, axis) in enumerate(self.axes):
+            matrix["xyz".index(axis), channel] = 1.0 if sign == "+" else -1.0
+        return matrix
+
+
+class StandProfile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Standard uncertainties (1 σ) of the references that a stand gives.
+
+    `inclination_deg` … are of one setting, independent from station to station, where the run does
+    not state its own; `repeatability_…` is added to either in quadrature. The others are errors
+    that all stations have in common: zeros of the three scales, the lean of the stand's vertical,
+    and the references for gravity, field and dip where the run does not state their uncertainty.
+    `coil`: the field is made by a coil or simulated, and may be of any strength.
+    """
+
+    inclination_deg: float = 0.0
+    azimuth_deg: float = 0.0
+    toolface_deg: float = 0.0
+    repeatability_inclination_deg: float = 0.0
+    repeatability_azimuth_deg: float = 0.0
+    repeatability_toolface_deg: float = 0.0
+    inclination_zero_deg: float = 0.0
+    azimuth_zero_deg: float = 0.0
+    toolface_zero_deg: float = 0.0
+    tilt_deg: float = 0.0
+    gravity_g: float = 0.0
+    field_nt: float = 0.0
+    dip_deg: float = 0.0
+    coil: bool = False
+
+    def of(self, column: str) -> float:
+        """Standard uncertainty of a reference such as "azimuth_deg" where the run states none."""
+        return float(getattr(self, column))
+
+    def repeatability(self, column: str) -> float:
+        """What is added to the standard uncertainty of an angle in quadrature; strengths have none."""
+        return float(getattr(self, f"repeatability_{column}", 0.0))
+
+    def common(self) -> dict[str, float]:
+        """Standard uncertainties, in degrees, of errors of the stand that all stations share."""
+        keys = {name: f"{name.replace('-', '_')}_deg" for name in COMMON}
+        found = {name: float(getattr(self, key)) for name, key in keys.items()}
+        return {name: value for name, value in found.items() if value}
+
+
+class Profile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A tool as its maker describes it: see `docs/files.md` for the TOML form."""
+
+    name: str
+    reference_temperature_c: float = 30.0
+    accelerometer: TriadProfile = TriadProfile()
+    magnetometer: TriadProfile = TriadProfile()
+    stand: StandProfile = StandProfile()

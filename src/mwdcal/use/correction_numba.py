@@ -1,0 +1,153 @@
+"""Vectors, angles and strengths of many rows at once, by the compiled loops of `core.kernels`.
+
+The same formulas as `core.models` and `core.observables`, which are the reference: both
+agree to 1e-12 (`tests/test_fused.py`; reasons and timings: `design/kernels.md`). Numba is
+imported when rows are first computed, never before; MWDCAL_NUMPY=1 turns it off.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
+
+import numpy as np
+
+from mwdcal.estimation.fit_numba import available
+from mwdcal.geometry.vectors import AnyArray, Array
+from mwdcal.sensor.models import OFF_DIAGONAL, Factors, Model, Polynomial
+
+__all__ = ["available", "cores", "numbers", "run"]
+
+HIGHEST = 3
+"""Highest order in temperature that the loops know."""
+VECTORS, OUTPUTS = 6, 13
+"""Rows of a result: the two vectors; these, the angles and the strengths."""
+_PIECE = 1 << 15
+
+
+class Numbers(NamedTuple):
+    """A triad: field_i = Σ_j gain_ij(τ) z_j + offset_i(τ) + (square_i + cube_i z_i) z_i².
+
+    z_j = (x_j - centre_j) / (radius_j scale_j(τ)). `courses` are powers of τ, four each, of
+    nine gains, three offsets and three scales; `shape` are centre, radius, square and cube.
+    """
+
+    courses: tuple[tuple[float, ...], ...]
+    shape: tuple[float, ...]
+    curved: bool
+
+
+class Limits(NamedTuple):
+    """Accepted raw values and temperatures, both ends included, and the calibrated range.
+
+    Results of rows beyond the calibrated range are NaN where `blank`.
+    """
+
+    raw: tuple[float, float] = (-np.inf, np.inf)
+    temperature: tuple[float, float] = (-np.inf, np.inf)
+    calibrated: tuple[float, float] = (-np.inf, np.inf)
+    blank: bool = False
+
+
+ANYTHING = Limits()
+
+
+class Found(NamedTuple):
+    """Results (rows of output, n), and how many cells and rows were remarkable.
+
+    `unsound`: cells out of the accepted ranges or NaN. `beyond`: rows out of the calibrated
+    range. `empty`: results that are NaN.
+    """
+
+    columns: Array
+    unsound: int
+    beyond: int
+    empty: int
+
+
+def cores() -> int:
+    """Cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def numbers(model: Model, params: Array) -> Numbers | None:
+    """A finished model (powers of T - reference) of parameters (p,); None: not for the loops."""
+    if model.basis.order > HIGHEST:
+        return None
+    if isinstance(model, Polynomial):
+        return _polynomial(model, params)
+    return _factors(model, params) if isinstance(model, Factors) else None
+
+
+NOTHING = Numbers(((0.0,) * 4,) * 12 + ((1.0, 0.0, 0.0, 0.0),) * 3, (np.nan,) * 12, False)
+"""A triad that is not there: all results NaN."""
+
+
+def _polynomial(model: Polynomial, params: Array) -> Numbers:
+    powers = params[: model.affine].reshape(-1, 12)
+    scale = np.zeros((len(powers), 3))
+    scale[0] = 1.0
+    curves = params[model.affine :] if model.curved else np.zeros(6)
+    shape = np.concatenate([model.centre.ravel(), model.scale.ravel(), curves])
+    return Numbers(_courses(np.hstack([powers, scale])), tuple(shape.tolist()), model.curved)
+
+
+def _factors(model: Factors, params: Array) -> Numbers:
+    count = model.basis.order + 1
+    scale, bias = params[: 6 * count].reshape(2, 3, count)
+    mixing = np.eye(3)
+    for (i, j), value in zip(OFF_DIAGONAL, params[6 * count :], strict=True):
+        mixing[i, j] = -value
+    gain = np.zeros((count, 9))
+    gain[0] = mixing.ravel()
+    powers = np.hstack([gain, -np.swapaxes(mixing @ bias, 0, 1), np.swapaxes(scale, 0, 1)])
+    return Numbers(_courses(powers), (0.0,) * 3 + (1.0,) * 3 + (0.0,) * 6, False)
+
+
+def _courses(powers: Array) -> tuple[tuple[float, ...], ...]:
+    """Coefficients (powers, 15) as one tuple of four per quantity."""
+    padded = np.zeros((HIGHEST + 1, 15))
+    padded[: len(powers)] = powers
+    return tuple(map(tuple, np.swapaxes(padded, 0, 1).tolist()))
+
+
+def run(
+    columns: Sequence[AnyArray],
+    triads: tuple[Numbers, Numbers],
+    reference: float,
+    units: Sequence[float] = (1.0,) * 6,
+    limits: Limits = ANYTHING,
+    out: Array | None = None,
+    workers: int | None = None,
+) -> Found:
+    """All results of `columns`: three of gravity, three of the field, in tool order; temperature.
+
+    Columns are (n,), in `units` (with their sign) per nominal g or nT; the last is °C, and
+    `reference` the temperature τ = 0. `out` (6 or 13, n) is filled where given; by default
+    all results are computed, on all cores.
+    """
+    from mwdcal.use import correction_kernels
+
+    count = len(columns[-1])
+    out = np.empty((OUTPUTS, count)) if out is None else out
+    settings = (
+        *(tuple(columns[:3]), tuple(columns[3:6]), columns[6], tuple(map(float, units))),
+        (*limits.raw, reference, *limits.temperature, *limits.calibrated, float(limits.blank)),
+        *(triads[0][:2], triads[1][:2], (triads[0].curved, triads[1].curved)),
+    )
+
+    def piece(start: int, stop: int) -> tuple[int, int, int]:
+        return correction_kernels.rows(*settings, out, start, stop)
+
+    workers = workers or cores()
+    step = max(_PIECE, -(-count // workers))
+    starts = range(0, count, step)
+    if len(starts) < 2:
+        return Found(out, *piece(0, count))
+    with ThreadPoolExecutor(len(starts)) as pool:
+        counts = pool.map(piece, starts, [min(s + step, count) for s in starts])
+        return Found(out, *np.sum(list(counts), axis=0).tolist())

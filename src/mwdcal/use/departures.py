@@ -1,0 +1,293 @@
+"""What a test run shows of a calibrated tool: noise-free spreads and departures from references.
+
+The uncertainty of each figure is that of the test: noise of its readings, references, setting
+of the stand. That of the calibration is not part of it, for an error of the calibration is
+part of what is measured.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from mwdcal.calibration.readings import ANGLES, Readings
+from mwdcal.calibration.record import FREE_SHARE, Calibration
+from mwdcal.geometry.observables import OBSERVABLES
+from mwdcal.geometry.vectors import Array, Bools, Ints, centred
+from mwdcal.use.roll_sets import ROLL_SET, RollSet, near_vertical, roll_sets
+from mwdcal.use.roll_test import GAP, OPEN, SLACK, Coverage, Curve, coverage, ends, extent, fitted
+
+TURNING = ("azimuth", "toolface")
+"""Angles that lose their meaning near vertical."""
+LEVEL = ("inclination", "gravity")
+"""Observables that stations of one inclination share at every azimuth."""
+COLUMNS = {
+    **{name: f"ref_{name}_deg" for name in ("inclination", "azimuth", "toolface", "dip")},
+    "gravity": "ref_gravity_g",
+    "field": "ref_field_nt",
+}
+"""Reference column of each observable."""
+NO_TOOLFACE = f"the toolface of exactly vertical stations is not known. Give {COLUMNS['toolface']}"
+SEEN = 0.7
+"""Least share of the amplitude of each harmonic that stations should show."""
+TINY = 1e-15
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What a roll set, or a single station, shows of an observable, in inside units."""
+
+    value: float
+    uncertainty: float
+    raw: float
+    where: str
+    curve: Curve | None = None
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a run shows of one observable, or why it shows nothing.
+
+    `skipped`: why it cannot be judged. `blocked`: why no limit on it can be passed; `unrolled`
+    where that is because the tool was not rolled all round: then there is no noise-free value,
+    and `shown` has the raw one. `apart`: parts of the run that were left out, and why. `unseen`:
+    the toolfaces hardly show one of the harmonics.
+    """
+
+    shown: tuple[Shown, ...] = ()
+    skipped: str = ""
+    blocked: str = ""
+    unrolled: bool = False
+    apart: tuple[str, ...] = ()
+    unseen: bool = False
+
+
+@dataclass(frozen=True)
+class Test:
+    """Readings that a fit has not seen, through its calibration."""
+
+    calibration: Calibration
+    readings: Readings
+
+    @cached_property
+    def fields(self) -> tuple[Array, Array]:
+        """Both corrected vectors (n, 3) of every station."""
+        return self.calibration.fields(self.readings)
+
+    @cached_property
+    def sets(self) -> list[RollSet]:
+        """Roll sets of the run."""
+        return roll_sets(self.readings)
+
+    @cached_property
+    def near(self) -> Bools:
+        """Stations (n,) too near to vertical for azimuth and toolface."""
+        return near_vertical(self.readings, self.value("inclination"))
+
+    @cached_property
+    def toolface(self) -> Array:
+        """Toolface (n,) by which the tool was rolled: near vertical the magnetic one, if there is any."""
+        magnetic = self.value("magnetic_toolface")
+        upright = np.where(np.isnan(magnetic), self.readings.reference("toolface"), magnetic)
+        return np.where(self.near & ~np.isnan(upright), upright, self.value("toolface"))
+
+    def value(self, name: str) -> Array:
+        """An observable (n,) of the corrected vectors."""
+        return OBSERVABLES[name].value(*self.fields)
+
+    def _noise(self, name: str) -> Array:
+        """Standard uncertainty (n,) of an observable by the noise of the test's own readings."""
+        gradient = np.nan_to_num(OBSERVABLES[name].gradient(*self.fields))
+        noise = self.calibration.noise_covariance(self.readings)
+        variance = np.einsum("ni,nij,nj->n", gradient, noise, gradient)
+        return np.asarray(np.maximum(np.sqrt(variance), TINY))
+
+    def _common(self, name: str) -> Array:
+        """Standard uncertainty (n,) of a reference by errors that all stations of the stand share."""
+        return self.readings.common_uncertainty(name, self.value("inclination"))
+
+    def _lacks(self, name: str) -> str:
+        """What is missing to have an observable at all; empty where nothing is."""
+        if name not in ("azimuth", "field", "dip"):
+            return ""
+        if not self.calibration.has_field:
+            return "the magnetometer is not calibrated"
+        return "" if self.readings.magnetometer is not None else "no columns mx, my, mz"
+
+    def _error(self, name: str) -> Array:
+        """Departure (n,) from the reference that the run itself gives; NaN where it gives none."""
+        known = self.readings.known.get(name, np.full(self.readings.count, np.nan))
+        error = np.asarray(self.value(name) - known)
+        period = OBSERVABLES[name].period
+        return centred(error, period) if period else error
+
+    def _coverage(self, index: Ints) -> Coverage | None:
+        """How the toolfaces of stations cover the circle; None where none of them is known."""
+        toolface = self.toolface[index]
+        known = ~np.isnan(toolface)
+        return coverage(toolface[known]) if known.any() else None
+
+    def _loose(self, index: Ints) -> str:
+        """Why stations do not determine a curve of two harmonics; empty where they do."""
+        found = None if np.isnan(self.toolface[index]).any() else self._coverage(index)
+        if found is None or found.rolled:
+            return "" if found else NO_TOOLFACE
+        return _gap(found, GAP) or (
+            "the toolfaces do not determine a mean and two harmonics. Add toolfaces between them: "
+            "five or more, well apart"
+        )
+
+    def _unfit(self, name: str, roll_set: RollSet) -> str:
+        """Why a roll set has no spread of an observable; empty where it has."""
+        if not roll_set.one_azimuth and name not in LEVEL:
+            return f"{roll_set.label}: stations of one direction need group or {COLUMNS['azimuth']}"
+        if name in TURNING and self.near[roll_set.index].any():
+            return f"{roll_set.label}: within 5° of vertical"
+        if name == "toolface" and np.isnan(self._error(name)[roll_set.index]).any():
+            return f"{roll_set.label}: no {COLUMNS[name]}"
+        return ""
+
+    def spread(self, name: str) -> Outcome:
+        """The widest noise-free spread over the roll sets.
+
+        A group that was not rolled cannot pass, nor can sets of equal reference directions of
+        which none was; other sets that were not rolled are left out. Toolface: of its error.
+        """
+        lacks = self._lacks(name) or (
+            "" if self.sets else f"no {ROLL_SET} stations of one direction"
+        )
+        unfit = [] if lacks else [why for s in self.sets if (why := self._unfit(name, s))]
+        fit = [] if lacks else [s for s in self.sets if not self._unfit(name, s)]
+        if not fit:
+            return Outcome(skipped=lacks or "; ".join(unfit))
+        gaps = {s.label: self._loose(s.index) for s in fit}
+        rolled = [s for s in fit if not gaps[s.label]]
+        loose = [s for s in fit if gaps[s.label]]
+        wrong = [s.label for s in loose if s.declared or (s.one_azimuth and not rolled)]
+        apart = [f"{k}: not rolled, {why}" for k, why in gaps.items() if why and k not in wrong]
+        if not rolled and not wrong:
+            return Outcome(skipped="; ".join([*unfit, *apart]))
+        blocked = self._unusable(name, any(self._free_spread(name, s.index) for s in fit))
+        if wrong and not blocked:
+            blocked = f"{wrong[0]} was not rolled: {gaps[wrong[0]]}"
+        shown = [self._curve_of(name, s, False) for s in rolled]
+        shown += [self._raw_spread(name, s) for s in fit if s.label in wrong]
+        return self._outcome(name, shown, blocked, bool(wrong), (*unfit, *apart))
+
+    def error(self, name: str) -> Outcome:
+        """The largest noise-free departure from the reference: of rolled sets, and other stations.
+
+        Cannot be passed on stations that were not, taken together, rolled all round.
+        """
+        lacks = self._lacks(name)
+        given = ~np.isnan(self._error(name)) if not lacks else np.zeros(self.readings.count, bool)
+        near = given & self.near if name in TURNING else np.zeros(given.shape, bool)
+        judged = np.flatnonzero(given & ~near)
+        if not judged.size:
+            steep = "every station within 5° of vertical" if near.any() else f"no {COLUMNS[name]}"
+            return Outcome(skipped=lacks or steep)
+        free = bool(self.calibration.rests_on_free(name, self.readings)[judged].any())
+        found, blocked = self._coverage(judged), self._unusable(name, free)
+        gap = NO_TOOLFACE if found is None else _gap(found, OPEN)
+        if gap and not blocked:
+            blocked = f"the stations were not rolled: {gap}"
+        left = f"{near.sum()} of {given.sum()} stations lie within 5° of vertical"
+        unseen = found is not None and not gap and bool(found.seen.min() < SEEN)
+        shown = self._departures(name, judged)
+        apart = (left,) if near.any() else ()
+        return self._outcome(name, shown, blocked, bool(gap), apart, unseen)
+
+    def _departures(self, name: str, judged: Ints) -> list[Shown]:
+        """Largest departures of rolled sets, and of each station outside of them."""
+        seen = [replace(s, index=s.index[np.isin(s.index, judged)]) for s in self.sets]
+        whole = [s for s in seen if not self._loose(s.index) and (s.one_azimuth or name in LEVEL)]
+        inside = np.concatenate([s.index for s in whole]) if whole else np.zeros(0, int)
+        error, labels = np.abs(self._error(name)), self.readings.labels
+        reference = np.hypot(self.readings.uncertainty(name), self._common(name))
+        sd = np.hypot(self._noise(name), reference)
+        return [self._curve_of(name, s, True) for s in whole] + [
+            Shown(float(error[i]), float(sd[i]), float(error[i]), f"station {labels[i]}")
+            for i in judged[~np.isin(judged, inside)].tolist()
+        ]
+
+    def _curve_of(self, name: str, roll_set: RollSet, error: bool) -> Shown:
+        """Noise-free spread, or largest error, of a rolled set."""
+        index = roll_set.index
+        part = self._error(name)[index] if error else self._centred(name, index)
+        each, common = self._reference_sd(name, roll_set, error)
+        sd = np.hypot(self._noise(name)[index], each)
+        curve = fitted(part, sd, self.toolface[index])
+        found, (most, least, farthest) = extent(curve), np.degrees(ends(curve))
+        raw = float(np.abs(part).max() if error else np.ptp(part))
+        value = float(found.largest if error else found.range)
+        noise = float(found.largest_sd if error else found.range_sd)
+        at = f"toolface {farthest:.0f}°" if error else f"toolfaces {least:.0f}° to {most:.0f}°"
+        where = f"{roll_set.label}; {at}"
+        if curve.rough:
+            where += f"; raw figure judged: {float(curve.scale):.2g} × the noise is left about a smooth curve"
+            value, noise = raw, noise * float(curve.scale)
+        return Shown(value, float(np.hypot(noise, common)), raw, where, curve)
+
+    def _reference_sd(self, name: str, roll_set: RollSet, error: bool) -> tuple[Array, float]:
+        """Standard uncertainty of the reference: per station (k,), and what the set shares."""
+        sd = self.readings.uncertainty(name)[roll_set.index]
+        shared = float(self._common(name)[roll_set.index].max()) if error else 0.0
+        if name == "toolface" or (name in ANGLES and roll_set.set_each):
+            return sd, shared
+        whole = float(np.sqrt(np.mean(sd**2))) if error else 0.0
+        return np.zeros(sd.shape), float(np.hypot(whole, shared))
+
+    def _centred(self, name: str, index: Ints) -> Array:
+        """Values (k,) of a set about their middle; of toolface its errors."""
+        part = (self._error(name) if name == "toolface" else self.value(name))[index]
+        period = OBSERVABLES[name].period
+        middle = np.angle(np.mean(np.exp(1j * part))) if period else part.mean()
+        return centred(part - middle, period) if period else np.asarray(part - middle)
+
+    def _raw_spread(self, name: str, roll_set: RollSet) -> Shown:
+        raw = float(np.ptp(self._centred(name, roll_set.index)))
+        return Shown(raw, 0.0, raw, roll_set.label)
+
+    def _outcome(
+        self,
+        name: str,
+        shown: list[Shown],
+        blocked: str,
+        unrolled: bool,
+        apart: tuple[str, ...],
+        unseen: bool = False,
+    ) -> Outcome:
+        if self._relative(name):
+            return Outcome(blocked=blocked, apart=apart)
+        return Outcome(tuple(shown), "", blocked, unrolled, apart, unseen)
+
+    def _relative(self, name: str) -> bool:
+        return name == "field" and self.calibration.field_unit != "nT"
+
+    def _unusable(self, name: str, free: bool) -> str:
+        """Why no limit on an observable can be passed; empty where it can."""
+        if self._relative(name):
+            return "the calibration is relative: field = 1, not nT"
+        return "it rests on a direction that the calibration leaves undetermined" if free else ""
+
+    def _free_spread(self, name: str, index: Ints) -> bool:
+        """Whether the spread of a set moves with a direction that no evidence determines."""
+        if not self.calibration.free:
+            return False
+        rows = np.nan_to_num(self.calibration.sensitivity(name, self.readings)[index])
+        moved = rows @ np.array(self.calibration.free).transpose()
+        size = {"g": 1.0, "nT": self.calibration.earth.get("field", 1.0)}.get(
+            OBSERVABLES[name].unit, 1.0
+        )
+        return bool((np.ptp(moved, axis=0) > FREE_SHARE * size).any())
+
+
+def _gap(found: Coverage, most: float) -> str:
+    """What is wrong where the toolfaces leave a gap wider than `most` (radians); empty if not."""
+    if found.gap <= most + SLACK:
+        return ""
+    width, start = round(float(np.degrees(found.gap))), round(float(np.degrees(found.start)))
+    span = f"{width}° from {start % 360}° to {(start + width) % 360}°"
+    return f"the toolfaces leave a gap of {span} (at most {np.degrees(most):.0f}°). Add toolfaces there"

@@ -1,0 +1,269 @@
+"""The same calibration in another notation, with covariance.
+
+forward   raw = S · field + o          (Moradi 3-4)
+affine    field = M · raw + b          (Ivanov)
+factors   SF, B, m                     (Moosavi 1-8, in the order of the raw channels)
+
+Raw units, channels in the order of the file; fields in g and nT (or a field of one).
+
+At one temperature all three say the same. The whole course of temperature is given by power
+of τ = T - reference where it is a polynomial: factors of order n have SF and B of degree n,
+hence S of degree n and o = SF · B of degree 2n; the model that is linear in its parameters has
+M and b of degree n. The other pairs are quotients of polynomials, and refused.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from mwdcal.calibration.record import FREE_SHARE, Calibration, TriadCalibration
+from mwdcal.errors import InputError
+from mwdcal.geometry.vectors import AnyArray, Array, Ints
+from mwdcal.sensor.models import OFF_DIAGONAL
+from mwdcal.sensor.profile import TriadProfile
+
+NOTATIONS = ("factors", "forward", "affine")
+COURSE = "course"
+"""In place of a temperature: the whole course, by power of T - reference."""
+AXES = {"S": 2, "o": 1, "M": 2, "b": 1, "SF": 1, "B": 1, "m": 2}
+"""Axes of each value at one temperature."""
+
+
+@dataclass(frozen=True)
+class Notation:
+    """One triad in one notation: named arrays, their standard uncertainties and covariance.
+
+    At one temperature S, M (3, 3) and o, b (3,); as a course S (n + 1, 3, 3), o (2n + 1, 3),
+    M (n + 1, 3, 3) and b (n + 1, 3), by power of T - reference. SF and B (3, n + 1) have the
+    powers last, m (3, 3) has none. `covariance` is of all values in the order of `values`,
+    each row by row (power slowest in a course). A value that moves with a direction which no
+    evidence determines has the uncertainty NaN.
+    """
+
+    values: dict[str, Array]
+    uncertainty: dict[str, Array]
+    covariance: Array
+
+
+def powers(name: str, value: AnyArray) -> Ints:
+    """Power of T - reference that each element of a value belongs to, in the value's shape."""
+    count = np.arange(value.shape[-1] if name in ("SF", "B") else len(value))
+    if name not in ("SF", "B"):
+        course = value.ndim > AXES[name]
+        count = count.reshape(-1, *[1] * AXES[name]) if course else np.zeros(1, int)
+    return np.broadcast_to(count, value.shape)
+
+
+def convert(
+    calibration: Calibration, notation: str, temperature: float | str | None = None
+) -> dict[str, Notation]:
+    """Each triad of a calibration in a notation, at a temperature or as the whole course.
+
+    `temperature` is in °C (default: the reference temperature) or the word "course". Factors
+    are a course at any temperature.
+
+    Errors: unknown notation or word; own-axis nonlinearity, which no notation can carry; a
+    course that is no polynomial of temperature: factors or forward of a polynomial model and
+    affine of the model of factors, both of order 1 or more.
+    """
+    if notation not in NOTATIONS:
+        raise InputError(f"--notation must be one of {', '.join(NOTATIONS)}; got {notation!r}.")
+    if isinstance(temperature, str) and temperature != COURSE:
+        raise InputError(
+            "--temperature must be a number in °C, or the word 'course' for coefficients by power "
+            f"of temperature; got {temperature!r}."
+        )
+    at = calibration.reference_temperature if temperature is None else temperature
+    return {
+        triad.name: _one(_Part.of(calibration, index), notation, at)
+        for index, triad in enumerate(calibration.triads)
+    }
+
+
+@dataclass(frozen=True)
+class _Part:
+    """One triad of a calibration, with its part of the covariance and of the free directions."""
+
+    triad: TriadCalibration
+    profile: TriadProfile
+    covariance: Array
+    free: Array
+    strength: float
+    reference: float
+    half_range: float
+
+    @classmethod
+    def of(cls, calibration: Calibration, index: int) -> _Part:
+        triads = calibration.triads
+        triad, start = triads[index], sum(len(t.parameters) for t in triads[:index])
+        where = slice(start, start + len(triad.parameters))
+        low, high = calibration.temperature_c or (0.0, 0.0)
+        total = sum(len(t.parameters) for t in triads)
+        free = np.array(calibration.free, float).reshape(len(calibration.free), total)
+        return cls(
+            triad,
+            getattr(calibration.profile, triad.name),
+            np.array(calibration.covariance)[where, where],
+            free[:, where],
+            calibration.earth.get("field", 1.0) if index else 1.0,
+            calibration.reference_temperature,
+            max((high - low) / 2, 1.0),
+        )
+
+    def sizes(self, values: dict[str, Array]) -> Array:
+        """What each value is compared with to see whether a free direction moves it."""
+        name, value = next((n, v) for n, v in values.items() if n in ("S", "SF", "M"))
+        gain = np.abs(value[powers(name, value) == 0]).max()
+        own = {"m": 1.0, "b": self.strength, "B": self.strength, "o": gain * self.strength}
+        found = []
+        for name, value in values.items():
+            size = own.get(name, gain) / self.half_range ** powers(name, value)
+            found.append(size.ravel())
+        return np.concatenate(found)
+
+
+def _one(part: _Part, notation: str, temperature: float | str) -> Notation:
+    triad, profile = part.triad, part.profile
+    _refuse(triad, notation, temperature)
+    permutation = profile.permutation
+    scale = np.full(3, 1.0 if profile.scale is None else profile.scale)
+    course = isinstance(temperature, str)
+    tau = 0.0 if isinstance(temperature, str) else temperature - part.reference
+
+    def values(params: AnyArray) -> dict[str, AnyArray]:
+        if notation == triad.model:
+            return _own_factors(params, permutation, scale)
+        if course and triad.order:
+            return _COURSES[notation](params, permutation, scale)
+        matrix, offset = _affine(params, triad, tau)
+        found = _FORMS[notation](matrix @ permutation / scale, offset, permutation)
+        lead = course and notation != "factors"
+        return {name: value[None] for name, value in found.items()} if lead else found
+
+    return _propagate(values, part)
+
+
+def _refuse(triad: TriadCalibration, notation: str, temperature: float | str) -> None:
+    """Refuse what the notation cannot carry, with the reason and what to do."""
+    if triad.curved:
+        raise InputError(
+            f"the {triad.name} has own-axis quadratic and cubic terms, which the notation "
+            f"{notation!r} cannot carry. Calibrate without 'nonlinearity' in the profile, or use "
+            "mwdcal apply."
+        )
+    model = "polynomial" if notation == "affine" else "factors"
+    if not triad.order or triad.model == model:
+        return
+    what = f"the {triad.name} has the model '{triad.model}' of order {triad.order} in temperature"
+    if notation == "factors":
+        raise InputError(
+            f"{what}: its factors are no polynomials of temperature. Use --notation affine, "
+            "for one temperature or with --temperature course, or --notation forward for one "
+            "temperature, or calibrate with --model factors."
+        )
+    if temperature == COURSE:
+        able = "affine" if model == "factors" else "forward or factors"
+        raise InputError(
+            f"{what}: its {notation} notation is a quotient of polynomials of temperature and has "
+            f"no coefficients by power. Use --notation {able}, or a number in °C for "
+            f"--temperature, or calibrate with --model {model}."
+        )
+
+
+def _stored_factors(params: AnyArray) -> tuple[AnyArray, AnyArray, AnyArray]:
+    """SF (3, n + 1), B (3, n + 1) and m (3, 3) as they are stored: tool axes, nominal units."""
+    scale, bias = params[:-6].reshape(2, 3, -1)
+    mixing = np.zeros((3, 3), dtype=params.dtype)
+    for (i, j), value in zip(OFF_DIAGONAL, params[-6:], strict=True):
+        mixing[i, j] = value
+    return scale, bias, mixing
+
+
+def _affine(params: AnyArray, triad: TriadCalibration, tau: float) -> tuple[AnyArray, AnyArray]:
+    """Matrix and offset of field = A x + c at a temperature, x in tool axes and nominal units."""
+    course = tau ** np.arange(triad.order + 1)
+    if triad.model == "polynomial":
+        terms = course @ params.reshape(triad.order + 1, 12)
+        return terms[:9].reshape(3, 3), terms[9:]
+    scale, bias, mixing = _stored_factors(params)
+    mixing = np.eye(3) - mixing
+    return mixing / (scale @ course), -mixing @ (bias @ course)
+
+
+def _as_affine(matrix: AnyArray, offset: AnyArray, permutation: Array) -> dict[str, AnyArray]:
+    return {"M": matrix, "b": offset}
+
+
+def _as_forward(matrix: AnyArray, offset: AnyArray, permutation: Array) -> dict[str, AnyArray]:
+    inverse = np.linalg.inv(matrix)
+    return {"S": inverse, "o": -inverse @ offset}
+
+
+def _as_factors(matrix: AnyArray, offset: AnyArray, permutation: Array) -> dict[str, AnyArray]:
+    channel = permutation.transpose() @ matrix
+    scale = 1 / np.diagonal(channel)
+    mixing = channel * scale
+    bias = -np.linalg.solve(mixing, permutation.transpose() @ offset)
+    return {"SF": scale[:, None], "B": bias[:, None], "m": -mixing * (1 - np.eye(3))}
+
+
+def _own_factors(params: AnyArray, permutation: Array, scale: Array) -> dict[str, AnyArray]:
+    """Stored factors, tool axes and nominal units, to channels and raw units: exact."""
+    gain, bias, mixing = _stored_factors(params)
+    back = permutation.transpose()
+    return {
+        "SF": np.abs(back) @ gain * scale[:, None],
+        "B": back @ bias,
+        "m": back @ mixing @ permutation,
+    }
+
+
+def _forward_course(params: AnyArray, permutation: Array, scale: Array) -> dict[str, AnyArray]:
+    """S and o of stored factors by power: diag(SF)(I - m)⁻¹ and SF · B of the nominal reading."""
+    gain, bias, mixing = _stored_factors(params)
+    matrix = gain.transpose()[:, :, None] * np.linalg.inv(np.eye(3) - mixing)
+    offset = np.stack([np.convolve(s, b) for s, b in zip(gain, bias, strict=True)], -1)
+    back = permutation.transpose() * scale[:, None]
+    return {"S": back @ matrix, "o": offset @ back.transpose()}
+
+
+def _affine_course(params: AnyArray, permutation: Array, scale: Array) -> dict[str, AnyArray]:
+    """M and b by power: the parameters of the polynomial model themselves, for raw channels."""
+    terms = params.reshape(-1, 12)
+    matrix = terms[:, :9].reshape(-1, 3, 3)
+    return {"M": matrix @ permutation / scale, "b": terms[:, 9:]}
+
+
+_Form = Callable[[AnyArray, AnyArray, Array], dict[str, AnyArray]]
+_FORMS: dict[str, _Form] = {
+    "affine": _as_affine,
+    "forward": _as_forward,
+    "factors": _as_factors,
+}
+_COURSES: dict[str, _Form] = {"affine": _affine_course, "forward": _forward_course}
+
+
+def _propagate(values: Callable[[AnyArray], dict[str, AnyArray]], part: _Part) -> Notation:
+    """Values and covariance; derivatives by complex step, exact to rounding."""
+    params = np.array(part.triad.parameters)
+    found = {name: np.asarray(value.real) + 0.0 for name, value in values(params).items()}
+    columns = []
+    for index in range(len(params)):
+        step = np.zeros(len(params), complex)
+        size = max(abs(params[index]), 1.0) * 1e-30
+        step[index] = 1j * size
+        columns.append(
+            np.concatenate([v.imag.ravel() / size for v in values(params + step).values()])
+        )
+    jacobian = np.stack(columns, -1)
+    spread = jacobian @ part.covariance @ jacobian.transpose()
+    moved = np.abs(jacobian @ part.free.transpose()).max(-1, initial=0.0)
+    loose = moved > FREE_SHARE * part.sizes(found)
+    sd = np.where(loose, np.nan, np.sqrt(np.maximum(np.diag(spread), 0.0)))
+    ends = np.cumsum([value.size for value in found.values()])[:-1]
+    parts = zip(found.items(), np.split(sd, ends), strict=True)
+    uncertainty = {name: part.reshape(value.shape) for (name, value), part in parts}
+    return Notation(found, uncertainty, spread)

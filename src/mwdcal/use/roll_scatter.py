@@ -1,0 +1,49 @@
+"""Scatter of the tool direction in groups of one direction, in sample and leave-one-out.
+
+In-sample scatter flatters a model with many parameters: judge by the left-out one.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mwdcal.calibration.estimate import Fit, fit
+from mwdcal.calibration.options import Options
+from mwdcal.calibration.readings import Readings
+from mwdcal.geometry.vectors import Array, Ints
+
+
+def directions(g: Array, b: Array) -> Array:
+    """Unit vector (..., 3) of the tool axis in the earth frame: north, east, down.
+
+    Singular: where field and gravity are parallel (a magnetic pole) there is no north.
+    """
+    down = g / np.linalg.norm(g, axis=-1, keepdims=True)
+    east = np.cross(down, b)
+    east = east / np.linalg.norm(east, axis=-1, keepdims=True)
+    north = np.cross(east, down)
+    return np.stack([north[..., 2], east[..., 2], down[..., 2]], -1)
+
+
+def group_scatter(axis: Array, group: Ints) -> float:
+    """Mean over groups of the norm of the (N - 1) standard deviations of `axis`, radians.
+
+    Shapes: axis (n, 3), group (n,), -1: in no group. Reference: the accuracy measure of
+    CircuitPython_mag_cal, so that results compare.
+    """
+    numbers = range(int(group.max(initial=-1)) + 1)
+    each = [np.linalg.norm(axis[group == k].std(axis=0, ddof=1)) for k in numbers]
+    return float(np.mean(each))
+
+
+def _fields(result: Fit) -> tuple[Array, Array]:
+    return result.problem.fields(result.state)
+
+
+def scatter(readings: Readings, options: Options | None = None) -> tuple[float, float]:
+    """Direction scatter of a run's groups, radians: in sample, and with each station left out."""
+    whole = directions(*_fields(fit(readings, options)))[0]
+    left_out = fit(readings, options, 1 - np.eye(readings.count))
+    own = np.arange(readings.count)
+    axis = directions(*_fields(left_out))[own, own]
+    return group_scatter(whole, readings.groups), group_scatter(axis, readings.groups)

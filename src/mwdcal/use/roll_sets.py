@@ -1,0 +1,88 @@
+"""Which stations of a run were taken in one direction of the tool axis and one soak: roll sets."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from mwdcal.calibration.readings import Readings
+from mwdcal.calibration.soaks import soaks
+from mwdcal.geometry.vectors import Array, Bools, Ints
+
+NEAR_VERTICAL = np.radians(5.0)
+"""Nearer to vertical than this azimuth and toolface are not judged."""
+ROLL_SET = 3
+"""Fewest stations that make a roll set."""
+_DIGITS = 3
+_BLANK = -1.0
+_ROUNDING = 1e-9
+
+
+@dataclass(frozen=True)
+class RollSet:
+    """Stations of one direction and one soak.
+
+    `index` (k,) are their numbers. `declared`: the run says that they are a roll set, by `group`
+    or by naming no direction at all. `one_azimuth`: they are known to share an azimuth too.
+    `set_each`: the stand was set to the direction at each station.
+    """
+
+    label: str
+    index: Ints
+    declared: bool
+    one_azimuth: bool
+    set_each: bool
+
+
+def roll_sets(readings: Readings) -> list[RollSet]:
+    """Roll sets of a run: by group, else by equal reference angles, else all stations.
+
+    Stations of different soaks are never of one set. Equal inclinations without azimuth make
+    a set that does not share an azimuth.
+    """
+    warmth = readings.temperature
+    soak = np.zeros(readings.count, int) if warmth is None else soaks(warmth)
+    found = []
+    for label, members, declared, one_azimuth in _directions(readings):
+        for number in np.unique(soak[members]):
+            index = np.flatnonzero(members & (soak == number))
+            if len(index) < ROLL_SET:
+                continue
+            at = f", {warmth[index].mean():.1f} °C" if warmth is not None and soak.any() else ""
+            set_each = not declared
+            found.append(RollSet(label + at, index, declared, one_azimuth, set_each))
+    return found
+
+
+def _directions(readings: Readings) -> Iterator[tuple[str, Bools, bool, bool]]:
+    """Label and members (n,) of each direction, whether it is declared, and of one azimuth."""
+    group = readings.groups
+    for number in range(int(group.max(initial=-1)) + 1):
+        yield f"roll set {number + 1}", np.asarray(group == number), True, True
+    inclination, azimuth = (np.degrees(readings.reference(n)) for n in ("inclination", "azimuth"))
+    known = ~np.isnan(inclination)
+    if not known.any() and (group < 0).all():
+        yield "all stations", np.ones(readings.count, bool), True, True
+        return
+    key = np.round(np.stack([inclination, np.nan_to_num(azimuth, nan=_BLANK)], -1), _DIGITS)
+    for pair in np.unique(key[(group < 0) & known], axis=0):
+        given = bool(pair[1] != _BLANK)
+        where = f"azimuth {pair[1]:g}°" if given else "azimuth not given"
+        members = np.all(key == pair, -1) & (group < 0)
+        yield f"inclination {pair[0]:g}°, {where}", members, False, given
+
+
+def near_vertical(readings: Readings, inclination: Array) -> Bools:
+    """Stations (n,) within `NEAR_VERTICAL` of vertical.
+
+    By the reference, else by the mean measured `inclination` (n,) of the group, else by the
+    station's own.
+    """
+    steep, group = np.sin(inclination), readings.groups
+    for number in range(int(group.max(initial=-1)) + 1):
+        steep = np.where(group == number, steep[group == number].mean(), steep)
+    given = readings.reference("inclination")
+    steep = np.where(np.isnan(given), steep, np.sin(given))
+    return np.asarray(steep < np.sin(NEAR_VERTICAL) - _ROUNDING)

@@ -1,0 +1,176 @@
+"""Corrected strengths of gravity and field against the Earth's, and against a table's own references.
+
+What is off at a few rows is shock, iron or a bad reading; what is off at most of them is a calibration
+that does not belong to the readings, or readings in another unit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from math import sqrt
+from typing import NamedTuple
+
+import numpy as np
+
+from mwdcal.calibration.readings import EARTH
+from mwdcal.calibration.record import Calibration, Finding
+from mwdcal.errors import InputError
+from mwdcal.geometry.vectors import AnyArray, Array
+
+SHARE = 0.05
+"""Departure from the table's own reference, as a share of it, from which a strength is off."""
+MOST = 0.5
+"""A table of which more than this share of the rows is off is refused."""
+ALIKE = {"gravity": 1.5, "field": 6.0}
+"""Greatest over least strength up to which one unit may explain all rows."""
+COLUMNS = {"gravity": "gravity_g", "field": "field_nt"}
+UNITS: dict[str, dict[str, float]] = {
+    "gravity": {"g": 1.0, "m/s²": 9.80665, "mg": 1000.0},
+    "field": {"nT": 1.0, "µT": 1e-3, "mT": 1e-6, "gauss": 1e-5, "mG": 1e-2},
+}
+"""Units in which readings come, per g or nT."""
+REASONS = {
+    "gravity": "the tool moved while it was read, or a reading is in another unit.",
+    "field": "iron or a current was near, or a reading is in another unit.",
+}
+
+
+class Strengths(NamedTuple):
+    """One corrected strength over the rows that have it.
+
+    `earth` counts rows that no place on Earth has, `own` those off the table's own reference,
+    `off` those of either kind; `low` and `high` are the extremes of these.
+    """
+
+    rows: int = 0
+    earth: int = 0
+    own: int = 0
+    off: int = 0
+    low: float = np.inf
+    high: float = -np.inf
+
+
+def judged(
+    calibration: Calibration, columns: Mapping[str, AnyArray], known: Mapping[str, Array]
+) -> dict[str, Strengths]:
+    """Both strengths of corrected rows; `known` are the table's own references, NaN where blank.
+
+    A field that is relative is not judged, that of a coil not by the Earth's, and a scale that
+    the calibration leaves free not by references.
+    """
+    triads = dict(zip(COLUMNS, calibration.triads, strict=False))
+    found = {}
+    for name, triad in triads.items():
+        if name == "field" and calibration.relative:
+            continue
+        values = np.asarray(columns[COLUMNS[name]], float)
+        free = any(entry.id == "scale" for entry in triad.undetermined)
+        coil = name == "field" and calibration.profile.stand.coil
+        low, high = (-np.inf, np.inf) if coil else EARTH[name]
+        earth = (values < low) | (values > high)
+        own = np.zeros(values.shape, bool)
+        if name in known and not free:
+            own = np.abs(values - known[name]) > SHARE * known[name]
+        found[name] = _counted(values, earth, own)
+    return found
+
+
+def _counted(values: Array, earth: AnyArray, own: AnyArray) -> Strengths:
+    off = earth | own
+    which = values[off]
+    return Strengths(
+        rows=int(np.count_nonzero(~np.isnan(values))),
+        earth=int(np.count_nonzero(earth)),
+        own=int(np.count_nonzero(own)),
+        off=int(np.count_nonzero(off)),
+        low=float(which.min(initial=np.inf)),
+        high=float(which.max(initial=-np.inf)),
+    )
+
+
+def total(parts: Iterable[Mapping[str, Strengths]]) -> dict[str, Strengths]:
+    """The strengths of all parts of a table."""
+    found: dict[str, Strengths] = {}
+    for part in parts:
+        for name, each in part.items():
+            found[name] = _both(found.get(name, Strengths()), each)
+    return found
+
+
+def _both(first: Strengths, second: Strengths) -> Strengths:
+    return Strengths(
+        rows=first.rows + second.rows,
+        earth=first.earth + second.earth,
+        own=first.own + second.own,
+        off=first.off + second.off,
+        low=min(first.low, second.low),
+        high=max(first.high, second.high),
+    )
+
+
+def findings(strengths: Mapping[str, Strengths]) -> list[Finding]:
+    """What to know of rows whose strength is off."""
+    return [
+        Finding(
+            id=f"implausible-{name}",
+            text=f"{each.off} of {each.rows} rows: {_departure(name, each)}: {REASONS[name]}",
+        )
+        for name, each in strengths.items()
+        if each.off
+    ]
+
+
+def _departure(name: str, each: Strengths) -> str:
+    unit, (low, high) = COLUMNS[name].rpartition("_")[2], EARTH[name]
+    unit = "nT" if unit == "nt" else unit
+    reasons = []
+    if each.earth:
+        reasons.append(f"no place on Earth has it ({low:g}…{high:g} {unit})")
+    if each.own:
+        reasons.append(f"it is more than {SHARE:.0%} off the table's own ref_{COLUMNS[name]}")
+    ends = dict.fromkeys(f"{end:.3g}" for end in (each.low, each.high))
+    extent = "…".join(ends)
+    return f"corrected {name} is {extent} {unit}, and {' and '.join(reasons)}"
+
+
+def check(calibration: Calibration, strengths: Mapping[str, Strengths], source: str) -> None:
+    """Refuse a table of which most rows have a strength that is off."""
+    for name, each in strengths.items():
+        if each.off > MOST * each.rows:
+            raise InputError(
+                f"{source or 'the readings'}: at {each.off} of {each.rows} rows "
+                f"{_departure(name, each)}. {_advice(calibration, name, each)}"
+            )
+
+
+def _advice(calibration: Calibration, name: str, each: Strengths) -> str:
+    """What most likely is wrong with a table, and what to do."""
+    triad = "accelerometer" if name == "gravity" else "magnetometer"
+    scale = getattr(calibration.profile, triad).scale
+    unit = "g" if name == "gravity" else "nT"
+    if scale is None:
+        nominal, likely = "", ""
+    else:
+        nominal = f" of about {scale:.4g} raw units per {unit}"
+        likely = _likely(name, each, scale)
+    else_ = (
+        " The field of a coil is declared in the tool profile before the calibration: [stand] coil = true."
+        if name == "field" and each.earth
+        else ""
+    )
+    return (
+        f"The calibration ({calibration.run}) is for {triad} readings{nominal}{likely}. Give the readings in the "
+        f"units of its run, or the calibration that belongs to them.{else_}"
+    )
+
+
+def _likely(name: str, each: Strengths, scale: float) -> str:
+    """The unit that would explain the strengths; empty where none does, or the scale is that unit's."""
+    if not 0 < each.low <= each.high <= ALIKE[name] * each.low:
+        return ""
+    low, high = EARTH[name]
+    raw = sqrt(each.low * each.high) * scale
+    for unit, per in UNITS[name].items():
+        if low <= raw / per <= high and not 0.9 < scale / per < 1.1:
+            return f"; these look like readings in {unit}"
+    return ""

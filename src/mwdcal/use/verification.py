@@ -1,0 +1,304 @@
+"""Verification: a calibration against independent readings and a limits profile. Pure data."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Literal
+
+import msgspec
+import numpy as np
+
+from mwdcal.calibration.readings import Readings
+from mwdcal.calibration.record import MARGIN, Calibration, Finding
+from mwdcal.errors import InputError
+from mwdcal.geometry.observables import OBSERVABLES
+from mwdcal.use.departures import Outcome, Shown, Test
+
+COVERAGE = 2.0
+"""Coverage factor of the guard band and of the remark that a value is close to its limit."""
+WEAK = 0.5
+"""A test whose 1σ is a larger share of the limit can hardly tell a good tool from a bad one."""
+CLEAR = 3.0
+"""Standard uncertainties above which a harmonic is named as a cause."""
+CAUSES = {
+    "inclination": (
+        "a bias of the accelerometer across the tool axis, or it leans",
+        "a difference in scale, or a misalignment, of the accelerometer's x and y",
+    ),
+    "azimuth": (
+        "a bias across the tool axis of either triad, or it leans",
+        "a difference in scale, or a misalignment, of x and y of either triad",
+    ),
+    "gravity": (
+        "a bias of the accelerometer across the tool axis, or its x or y is not square to z",
+        "a difference in scale, or a misalignment, of the accelerometer's x and y",
+    ),
+}
+"""What a first and a second harmonic of toolface come from; as for azimuth where not named."""
+
+
+class Bounds(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Limits of one kind, each optional."""
+
+    inclination_deg: float | None = None
+    azimuth_deg: float | None = None
+    toolface_deg: float | None = None
+    gravity_g: float | None = None
+    field_nt: float | None = None
+    dip_deg: float | None = None
+
+    def items(self) -> Iterable[tuple[str, float]]:
+        """Observable and limit, of those that are set; angles in degrees."""
+        for name in self.__struct_fields__:
+            value = getattr(self, name)
+            if value is not None:
+                yield name.rpartition("_")[0], value
+
+
+class Limits(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A limits profile: what a roll test may show, where the limits come from, and the rule.
+
+    rule "simple": a noise-free value passes up to its limit. "guarded": value plus twice its
+    standard uncertainty must not exceed the limit.
+    """
+
+    name: str
+    source: str = ""
+    rule: Literal["simple", "guarded"] = "simple"
+    spread: Bounds = Bounds()
+    error: Bounds = Bounds()
+
+
+class VerdictRow(msgspec.Struct, frozen=True, kw_only=True):
+    """One limit: the noise-free value found, its standard uncertainty, and the decision.
+
+    `raw` is the same figure with the noise in it: largest minus smallest value of a set as the
+    papers define a spread, or the largest departure of any station. `harmonics` are the
+    amplitudes of the first and second harmonic of toolface in the set that decided. None: it
+    cannot be stated.
+    """
+
+    name: str
+    unit: str
+    value: float | None
+    uncertainty: float | None
+    limit: float
+    passed: bool
+    note: str
+    raw: float | None = None
+    harmonics: tuple[float, float] | None = None
+
+
+class Verdict(msgspec.Struct, frozen=True, kw_only=True):
+    """The outcome of a verification."""
+
+    passed: bool
+    rule: str
+    limits: str
+    source: str
+    run: str
+    stations: int
+    rows: list[VerdictRow]
+    findings: list[Finding]
+
+
+RULES = {
+    "simple": "simple acceptance: a noise-free value passes up to its limit; its 1σ is stated beside it",
+    "guarded": "guarded acceptance: noise-free value + 2 × its 1σ must not exceed the limit",
+}
+
+
+def verify(calibration: Calibration, readings: Readings, limits: Limits) -> Verdict:
+    """Apply a calibration to independent readings and judge by a limits profile.
+
+    Errors: stations of the fit, temperatures outside the calibrated range, or nothing that
+    any of the limits could be applied to.
+    """
+    _check_tool(calibration, readings)
+    _check_independent(calibration, readings)
+    _check_temperature(calibration, readings)
+    test = Test(calibration, readings)
+    asked = [("spread", n, limit, test.spread(n)) for n, limit in limits.spread.items()]
+    asked += [("error", n, limit, test.error(n)) for n, limit in limits.error.items()]
+    skipped = _skipped({f"{kind} of {n}": found.skipped for kind, n, _, found in asked})
+    judged = [
+        _judged(f"{kind} of {n}", n, limit, found, limits.rule == "guarded")
+        for kind, n, limit, found in asked
+        if not found.skipped
+    ]
+    if not judged:
+        raise InputError(
+            f"{readings.source}: no limit of '{limits.name}' applies: {'; '.join(skipped)}. Add what "
+            "is missing, or choose other --limits."
+        )
+    return Verdict(
+        passed=all(row.passed for row, _ in judged),
+        rule=RULES[limits.rule],
+        limits=limits.name,
+        source=limits.source,
+        run=readings.source,
+        stations=readings.count,
+        rows=[row for row, _ in judged],
+        findings=[
+            *_findings(calibration, readings, test, skipped),
+            *(finding for _, found in judged for finding in found),
+        ],
+    )
+
+
+def _skipped(reasons: dict[str, str]) -> list[str]:
+    """Limits that were not judged, by reason."""
+    names: dict[str, list[str]] = {}
+    for name, reason in reasons.items():
+        names.setdefault(reason, []).append(name)
+    return [f"{', '.join(names[reason])} ({reason})" for reason in names if reason]
+
+
+def _findings(
+    calibration: Calibration, readings: Readings, test: Test, skipped: Sequence[str]
+) -> list[Finding]:
+    """What the verdict as a whole rests on, and what was left out."""
+    found = [*_temperature_findings(calibration, readings)]
+    found += [Finding(id=u.id, text=f"{u.text}.") for u in calibration.undetermined()]
+    if skipped:
+        found.append(Finding(id="not-judged", text=f"not judged: {'; '.join(skipped)}."))
+    if not test.sets:
+        found.append(Finding(id="no-roll-set", text="no roll set: spreads were not judged."))
+    return found
+
+
+def _temperature_findings(calibration: Calibration, readings: Readings) -> Iterable[Finding]:
+    if readings.temperature is None:
+        return
+    coldest, hottest = float(readings.temperature.min()), float(readings.temperature.max())
+    if calibration.temperature_c is None:
+        text = (
+            f"the tool was calibrated at unrecorded temperatures, and tested at {_span(coldest, hottest)} °C: "
+            "the verdict holds for the temperatures of the test alone."
+        )
+        yield Finding(id="no-temperature", text=text)
+        return
+    beyond = int(calibration.outside(readings, MARGIN).sum())
+    if beyond:
+        text = (
+            f"{beyond} of {readings.count} stations ({_span(coldest, hottest)} °C) lie outside the calibrated "
+            f"range {_span(*calibration.temperature_c)} °C. The calibration has no temperature terms: drift "
+            "over the difference counts as its error."
+        )
+        yield Finding(id="outside-temperature", text=text)
+
+
+def _span(low: float, high: float) -> str:
+    return f"{low:.1f}…{high:.1f}" if high - low >= 0.1 else f"{low:.1f}"
+
+
+def _check_tool(calibration: Calibration, readings: Readings) -> None:
+    other = calibration.other_tool(readings)
+    if other is not None:
+        ours, theirs = other
+        raise InputError(
+            f"{readings.source} is of tool {theirs}, the calibration of tool {ours}. Verify with a "
+            "run of the same tool, or correct 'serial' in the file."
+        )
+
+
+def _check_independent(calibration: Calibration, readings: Readings) -> None:
+    used = [
+        label
+        for label, seen in zip(readings.labels, calibration.used(readings.digest), strict=False)
+        if seen
+    ]
+    if used:
+        raise InputError(
+            f"{readings.source}: {len(used)} of {readings.count} stations were in the fit (first: "
+            f"station {used[0]}). Verification needs data that the fit has not seen: take a roll "
+            "test of its own."
+        )
+
+
+def _check_temperature(calibration: Calibration, readings: Readings) -> None:
+    outside = calibration.outside(readings)
+    if outside.any() and calibration.temperature_c is not None:
+        low, high = calibration.temperature_c
+        first = int(np.flatnonzero(outside)[0])
+        raise InputError(
+            f"{readings.source}: {int(outside.sum())} stations lie outside the calibrated range "
+            f"{low:.1f}…{high:.1f} °C (first: station {readings.labels[first]}). Verify within "
+            "the range, or calibrate over a wider one."
+        )
+
+
+def _judged(
+    title: str, name: str, limit: float, found: Outcome, guarded: bool
+) -> tuple[VerdictRow, list[Finding]]:
+    """The decision on one limit, by the worst set or station, and what the reader should know."""
+    guard = COVERAGE if guarded else 0.0
+    inside = OBSERVABLES[name].unit
+    factor, unit = (float(np.degrees(1)), "°") if inside == "rad" else (1.0, inside)
+    told = [Finding(id="partly-judged", text=f"{title}: {text}.") for text in found.apart]
+    if found.unseen:
+        text = (
+            f"{title}: the toolfaces hardly show one of the two harmonics of a turn (four at right "
+            "angles do not show a misalignment of x and y): add toolfaces between them."
+        )
+        told.append(Finding(id="harmonic-unseen", text=text))
+    most = max((shown.raw * factor for shown in found.shown), default=None)
+    if found.blocked:
+        row = VerdictRow(
+            name=title, unit=unit, value=None if found.unrolled else most, uncertainty=None,
+            limit=limit, passed=False, note=f"cannot be passed: {found.blocked}", raw=most,
+        )  # fmt: skip
+        return row, told
+    worst = max(found.shown, key=lambda shown: shown.value + guard * shown.uncertainty)
+    value, sd = worst.value * factor, worst.uncertainty * factor
+    passed = value + guard * sd <= limit
+    row = VerdictRow(
+        name=title, unit=unit, value=value, uncertainty=sd, limit=limit, passed=passed,
+        note=f"{worst.where}{_remark(value, sd, limit, passed)}", raw=most,
+        harmonics=_harmonics(worst, factor),
+    )  # fmt: skip
+    return row, [*told, *_weak(row), *_causes(row, name, worst)]
+
+
+def _remark(value: float, sd: float, limit: float, passed: bool) -> str:
+    """How close the decision was."""
+    if value <= limit and not passed:
+        return "; within the limit, but not by twice its uncertainty as the guarded rule asks"
+    close = abs(value - limit) < COVERAGE * sd
+    return "; closer to the limit than twice its uncertainty" if close else ""
+
+
+def _harmonics(worst: Shown, factor: float) -> tuple[float, float] | None:
+    if worst.curve is None:
+        return None
+    first, second = (float(a) * factor for a in worst.curve.amplitudes)
+    return first, second
+
+
+def _weak(row: VerdictRow) -> Iterable[Finding]:
+    if row.uncertainty is not None and row.uncertainty > WEAK * row.limit:
+        text = (
+            f"{row.name}: its 1σ of {row.uncertainty:.2g} {row.unit} is more than half of the limit: this "
+            "test can hardly tell a good tool from a bad one. Average longer at each station, or "
+            "take more toolfaces."
+        )
+        yield Finding(id="weak-test", text=text)
+
+
+def _causes(row: VerdictRow, name: str, worst: Shown) -> Iterable[Finding]:
+    """What the harmonics of a failed set say is wrong."""
+    if row.passed or row.harmonics is None or worst.curve is None:
+        return
+    unit = row.unit if row.unit == "°" else f" {row.unit}"
+    causes = CAUSES.get(name, CAUSES["azimuth"])
+    size = worst.curve.amplitudes / np.maximum(worst.curve.amplitude_sd, 1e-30)
+    parts = [
+        f"{ordinal} harmonic {amplitude:.2g}{unit} ({cause})"
+        for ordinal, amplitude, cause, clear in zip(
+            ("first", "second"), row.harmonics, causes, size > CLEAR, strict=True
+        )
+        if clear
+    ]
+    if parts:
+        text = f"{row.name} over a turn of toolface: {'; '.join(parts)}."
+        yield Finding(id="roll-harmonics", text=text)
