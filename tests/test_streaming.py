@@ -502,7 +502,7 @@ def caught_writing(folder, calibration):
     In many short sleeps: a signal that comes just before one does not wake from it.
     """
     slow = (
-        "import sys, time\nfrom mwdcal.app import streaming\nfrom mwdcal.app.cli import main\n"
+        f"import sys, time, {streaming.__name__} as streaming\nfrom mwdcal.app.cli import main\n"
         "def write(*given):\n    print('writing', flush=True)\n"
         "    for _ in range(2000):\n        time.sleep(0.01)\n"
         "streaming.ParquetSink.write = write\nmain(sys.argv[1:])\n"
