@@ -79,6 +79,7 @@ SHOWN = ("gravity", "inclination", "azimuth", "field", "dip")
 RUNS = 500
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sd", [NOISE, {}], ids=["declared", "estimated"])
 @pytest.mark.parametrize(
     "unknown", [(), ("toolface", "dip")], ids=["whole", "toolface and dip unknown"]

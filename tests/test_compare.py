@@ -169,6 +169,7 @@ def test_what_is_taken_out_is_the_rotation_and_the_stretch_is_left():
         np.testing.assert_allclose(np.eye(3) - values["m"], stretch / np.diag(stretch), atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["joint", "scalar"])
 def test_uncertainties_in_the_gauge_are_those_of_repeated_runs(method):
     found, stated = [], []

@@ -532,6 +532,7 @@ def test_one_good_run_in_a_hundred_has_a_station_to_take_again(tmp_path):
     assert 5 <= marked <= 27
 
 
+@pytest.mark.slow
 def test_a_pool_of_processes_writes_the_same_bytes(fleet, tmp_path):
     path, expected = fleet
     output = tmp_path / "cals.parquet"
@@ -552,6 +553,7 @@ def test_a_pool_of_processes_writes_the_same_bytes(fleet, tmp_path):
     assert sum(large) <= 10  # of 2400 triads 2.4 exceed the noise by chance, one in a thousand
 
 
+@pytest.mark.slow
 def test_neither_the_command_nor_its_workers_load_pandas(fleet, tmp_path):
     seen, package = tmp_path / "seen", tmp_path / "path" / "pandas.py"
     package.parent.mkdir()
@@ -583,6 +585,7 @@ def _wait_for_a_part(folder):
         time.sleep(0.005)
 
 
+@pytest.mark.slow
 def test_an_interrupted_fleet_goes_on_where_it_was(fleet, tmp_path):
     path, expected = fleet
     output = tmp_path / "cals.parquet"
@@ -615,6 +618,7 @@ def test_an_interrupted_fleet_goes_on_where_it_was(fleet, tmp_path):
     assert not folder.exists()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="no such locks on this system")
 def test_one_output_is_written_by_one_fleet_at_a_time(fleet, tmp_path):
     path, expected = fleet
@@ -641,6 +645,7 @@ def test_one_output_is_written_by_one_fleet_at_a_time(fleet, tmp_path):
     assert {each.name for each in tmp_path.iterdir()} == {"cals.parquet"}
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "killpg"), reason="no process groups on this system")
 def test_an_interruption_from_the_keyboard_leaves_parts_and_no_traceback(tmp_path):
     path = many(tmp_path / "runs.parquet", tools=6000)
@@ -671,6 +676,7 @@ PS = pytest.mark.skipif(
 )
 
 
+@pytest.mark.slow
 @PS
 def test_an_interruption_while_workers_start_leaves_no_traceback(fleet, tmp_path):
     command = ["fleet", fleet[0], "-o", tmp_path / "cals.parquet", "--tool", "servo"]
@@ -686,6 +692,7 @@ def test_an_interruption_while_workers_start_leaves_no_traceback(fleet, tmp_path
         assert "Traceback" not in err
 
 
+@pytest.mark.slow
 @PS
 def test_workers_end_with_the_command_that_was_killed(tmp_path):
     path = many(tmp_path / "runs.parquet", tools=6000)
@@ -743,6 +750,7 @@ def _die(task):
     os.kill(os.getpid(), signal.SIGKILL)
 
 
+@pytest.mark.slow
 def test_a_process_that_dies_loses_nothing(tmp_path):
     from functools import partial
 
@@ -755,6 +763,7 @@ def test_a_process_that_dies_loses_nothing(tmp_path):
         list(pool.results(pool.Steps(int, _die), [0, 1], 2, None))
 
 
+@pytest.mark.slow
 def test_workers_are_prepared_with_settings_of_their_own(monkeypatch):
     monkeypatch.setenv("OMP_NUM_THREADS", "3")
     monkeypatch.delenv("MKL_NUM_THREADS", raising=False)
@@ -813,6 +822,7 @@ def cluster(folder, workers=2):
             each.wait()
 
 
+@pytest.mark.slow
 def test_a_cluster_of_two_of_which_one_dies_half_way(tmp_path):
     path = many(tmp_path / "runs.parquet", tools=4800)
     output, folder = tmp_path / "cals.parquet", tmp_path / "cals.parquet.parts"
@@ -847,6 +857,7 @@ def test_a_cluster_without_its_extra(fleet, tmp_path, monkeypatch):
     assert "pip install 'mwdcal[parquet,cluster]'" in refused(ran, 2)
 
 
+@pytest.mark.slow
 def test_no_cluster_there(fleet, tmp_path, monkeypatch):
     pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
     path, _ = fleet
