@@ -31,7 +31,7 @@ CLOCK = set -e; start=$$(date +%s); \
 	trap 'code=$$?; echo "make $@: $$(($$(date +%s) - start)) s"; exit $$code' EXIT
 
 help: ## list the targets
-	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /  make \1\t/' | expand -t 16
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /  make \1\t/' | expand -t 20
 	@echo "Another interpreter: make PYTHON=python3.12 test"
 
 demo: $(INSTALLED) ## calibrate the example tool, verify it, write its report
@@ -48,7 +48,7 @@ test-quick: $(INSTALLED) ## run the most telling tests (under a minute)
 	@$(CLOCK); $(ONE_THREAD) $(BIN)/python -m pytest -q -n auto -m "not slow" $(QUICK_TESTS:%=tests/test_%.py)
 
 mutations: $(INSTALLED) ## change one operator or constant in so many (EVERY=40) and list what no test notices
-	@$(CLOCK); $(BIN)/python tests/mutation_run.py --every $(or $(EVERY),40)
+	@$(CLOCK); $(ONE_THREAD) $(BIN)/python tests/mutation_run.py --every $(or $(EVERY),40)
 
 check: $(INSTALLED) ## lint, format, types, architecture, doctests, docs
 	@$(CLOCK); \

@@ -166,6 +166,8 @@ def test_a_declared_noise_leaves_the_choice_to_stations_left_out():
     assert found == {}
     assert [s.left_out is None for s in table] == [False, False]
     assert [s.odds for s in table] == [None, None]
+    # χ² per reading of stations left out of a fit of the declared noise: one, not three or a third
+    assert [s.left_out for s in table] == [pytest.approx(1.0, abs=0.3)] * 2
     assert not fit(one, SCATTER).problem.evidence.scatter
     assert choices_of(one, {"magnetometer": 0.005}) == [(), ("magnetometer",)]
 
