@@ -23,7 +23,7 @@ endif
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1
 
 # Tests of the numbers, of one command and of the fleet: what most mistakes are noticed by.
-QUICK_TESTS := vectors observables models derivatives estimate ranks efficiency expectations calibrate \
+QUICK_TESTS := vectors observables models derivatives estimate efficiency expectations calibrate \
 	notation refusals files_table cli_verify fleet architecture
 
 # First words of every recipe: stop at the first error, say the seconds at the end.
