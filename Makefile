@@ -3,7 +3,7 @@
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: papers measured verification help demo test check bench docs clean
+.PHONY: papers measured verification mutations help demo test test-quick check bench docs clean
 
 PYTHON ?= python3
 VENV := .venv
@@ -22,12 +22,16 @@ endif
 # One BLAS thread: repeatable last digits, and no contention between test workers.
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1
 
+# Tests of the numbers, of one command and of the fleet: what most mistakes are noticed by.
+QUICK_TESTS := vectors observables models derivatives estimate efficiency expectations calibrate \
+	notation refusals files_table cli_verify fleet architecture
+
 # First words of every recipe: stop at the first error, say the seconds at the end.
 CLOCK = set -e; start=$$(date +%s); \
 	trap 'code=$$?; echo "make $@: $$(($$(date +%s) - start)) s"; exit $$code' EXIT
 
 help: ## list the targets
-	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /  make \1\t/' | expand -t 16
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /  make \1\t/' | expand -t 20
 	@echo "Another interpreter: make PYTHON=python3.12 test"
 
 demo: $(INSTALLED) ## calibrate the example tool, verify it, write its report
@@ -39,6 +43,12 @@ demo: $(INSTALLED) ## calibrate the example tool, verify it, write its report
 
 test: $(INSTALLED) ## run the tests on all cores
 	@$(CLOCK); $(ONE_THREAD) $(BIN)/python -m pytest -q -rs -n auto
+
+test-quick: $(INSTALLED) ## run the most telling tests (under a minute)
+	@$(CLOCK); $(ONE_THREAD) $(BIN)/python -m pytest -q -n auto -m "not slow" $(QUICK_TESTS:%=tests/test_%.py)
+
+mutations: $(INSTALLED) ## change one operator or constant in so many (EVERY=40) and list what no test notices
+	@$(CLOCK); $(ONE_THREAD) $(BIN)/python tests/mutation_run.py --every $(or $(EVERY),40)
 
 check: $(INSTALLED) ## lint, format, types, architecture, doctests, docs
 	@$(CLOCK); \

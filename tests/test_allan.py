@@ -282,6 +282,7 @@ def test_the_fit_is_not_contradicted_by_its_own_noise():
     assert np.mean(chances < 0.01) < 0.03
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("count", "white", "walk"),
     [(200, 1, 0.3), (1024, 1, 0.3), (COUNT, 1, 0.1)],
@@ -324,6 +325,7 @@ def test_correlated_noise_is_no_quantisation():
     assert not terms.determined[terms.start > 0, 0].any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("drift", [0, 1e-5, 2e-5, 1e-4])
 def test_the_interval_of_one_station_holds_at_any_drift(drift):
     """N 1e-3 raw·√s, K 1e-4 raw/√s at 5 Hz, station of 30 s: 61 % at 2e-5 raw/s before."""

@@ -3,9 +3,11 @@
 import msgspec
 import numpy as np
 import pytest
+from scipy.special import stdtrit
 
 from mwdcal.calibration.automatic.order_selection import choose_order
 from mwdcal.calibration.calibrate import calibrate
+from mwdcal.calibration.estimate import fit
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.prediction import readings_at
 from mwdcal.calibration.readings import Readings
@@ -33,24 +35,80 @@ def make(seed=0, inclinations=(5, 45, 90, 135), toolfaces=12, unknown=(), sd=NOI
     return Readings(a[0], m[0], known={k: v for k, v in known.items() if k not in unknown}, sd=sd)
 
 
+def many_runs(count, seed, inclinations, toolfaces, unknown=(), sd=NOISE):
+    """Readings of `count` runs of one tool."""
+    tool = Tool.random(7)
+    inc, azi, face = plan(inclinations, toolfaces)
+    a, m = tool.readings(np.random.default_rng(seed), count, inc, azi, face)
+    known = {
+        "inclination": inc, "azimuth": azi, "toolface": face,
+        "field": np.full(len(inc), tool.field), "dip": np.full(len(inc), tool.dip),
+    }  # fmt: skip
+    return Readings(a, m, known={k: v for k, v in known.items() if k not in unknown}, sd=sd)
+
+
+def half_widths(result, raw):
+    """Errors' 95 % half widths (runs, 5, n) at raw readings, written once more.
+
+    Per triad s² times the covariance; Student's t with the degrees of freedom of Welch and
+    Satterthwaite. Also the corrected vectors (runs, n, 6).
+    """
+    triads = list(zip(result.problem.triads, result.problem.slices(), strict=True))
+    size, runs = triads[-1][1].stop, len(result.state.params)
+    fields, slopes, scale = [], np.zeros((runs, len(raw[0]), 6, size)), np.ones((runs, size))
+    for t, (triad, where) in enumerate(triads):
+        params, warmth = result.state.params[:, where], np.zeros((1, len(raw[t])))
+        fields.append(triad.model.fields(params, raw[t], warmth))
+        slopes[:, :, 3 * t : 3 * t + 3, where] = triad.model.jacobian(params, raw[t], warmth)
+        scale[:, where] = np.sqrt(result.analysis.variance_factor[:, t, None])
+    covariance = result.analysis.covariance * scale[:, :, None] * scale[:, None, :]
+    widths = []
+    for name in SHOWN:
+        rows = np.einsum("bni,bnip->bnp", OBSERVABLES[name].gradient(*fields), slopes)
+        square = np.einsum("bnp,bpq,bnq->bn", rows, covariance, rows)
+        below = 0.0
+        for t, (_, where) in enumerate(triads):
+            part = rows[..., where]
+            part = np.einsum("bnp,bpq,bnq->bn", part, covariance[:, where, where], part)
+            below = below + part**2 / result.analysis.freedom[:, t, None]
+        widths.append(np.sqrt(square) * stdtrit(square**2 / below, 0.975))
+    return np.stack(widths, 1), np.concatenate(fields, -1)
+
+
+SHOWN = ("gravity", "inclination", "azimuth", "field", "dip")
+RUNS = 500
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("sd", [NOISE, {}], ids=["declared", "estimated"])
 @pytest.mark.parametrize(
     "unknown", [(), ("toolface", "dip")], ids=["whole", "toolface and dip unknown"]
 )
 def test_stated_95_percent_intervals_cover(unknown, sd):
-    """12 stations only, so that Student's t matters: 24 degrees of freedom or fewer per triad."""
+    """12 stations only, so that Student's t matters: 24 degrees of freedom or fewer per triad.
+
+    500 runs fitted at once: the coverage has a standard deviation below 0.4 %. That `calibrate`
+    states these intervals is seen on three of them.
+    """
     tool = Tool.random(7)
     attitudes = np.radians([[20.0, 60, 100, 150], [10.0, 100, 200, 300], [15.0, 75, 160, 301]])
     g, b = reference_vectors(*attitudes, tool.gravity, tool.field, tool.dip)
     raw = [v @ s.T + o for v, s, o in zip((g, b), tool.matrix, tool.offset, strict=True)]
-    probe = Readings(raw[0], raw[1])
-    covered = []
-    for seed in range(250):
-        record = calibrate(make(seed, (10, 60, 120), 4, unknown, sd, tool), PROFILE)
-        for name in ("gravity", "inclination", "azimuth", "field", "dip"):
-            error = OBSERVABLES[name].value(*record.fields(probe)) - OBSERVABLES[name].value(g, b)
-            covered.append(np.abs(error) < record.expanded_uncertainty(name, probe))
-    assert 0.93 < np.mean(covered) < 0.97
+    data = many_runs(RUNS, 3, (10, 60, 120), 4, unknown, sd)
+    result = fit(data, Options())
+    assert (result.status == 0).all()
+    half, fields = half_widths(result, raw)
+    true = np.stack([OBSERVABLES[name].value(g, b) for name in SHOWN])
+    found = [OBSERVABLES[name].value(fields[..., :3], fields[..., 3:]) for name in SHOWN]
+    covered = np.abs(np.stack(found, 1) - true) < half
+    assert covered.mean((1, 2)).std() / np.sqrt(RUNS) < 0.004
+    assert 0.938 < covered.mean() < 0.962
+    probe = Readings(*raw)
+    for index in (0, 1, 2):
+        pair = (data.accelerometer[index], data.magnetometer[index])
+        record = calibrate(Readings(*pair, known=data.known, sd=sd), PROFILE)
+        stated = [record.expanded_uncertainty(name, probe) for name in SHOWN]
+        np.testing.assert_allclose(stated, half[index], rtol=1e-5)
 
 
 def test_undetermined_outputs_have_no_uncertainty():
@@ -78,14 +136,6 @@ def msgspec_replace(data, **changes):
     from dataclasses import replace
 
     return replace(data, **changes)
-
-
-def test_good_runs_are_rarely_accused():
-    """One in a hundred good runs has a marked station."""
-    marked = sum(
-        any(r.reshoot for r in calibrate(make(seed), PROFILE).station_rows) for seed in range(200)
-    )
-    assert marked <= 8
 
 
 def test_wrong_noise_figure_is_a_finding_and_scales_the_uncertainty():

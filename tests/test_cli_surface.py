@@ -391,6 +391,7 @@ def leaves(value, path=()):
         yield path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("value", [None, 0, -1e300, 1e300, "", [], {}], ids=repr)
 def test_whatever_stands_in_a_calibration_file_there_is_no_internal_error(tmp_path, files, value):
     text = files[0].read_text("utf-8")

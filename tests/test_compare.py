@@ -169,6 +169,7 @@ def test_what_is_taken_out_is_the_rotation_and_the_stretch_is_left():
         np.testing.assert_allclose(np.eye(3) - values["m"], stretch / np.diag(stretch), atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["joint", "scalar"])
 def test_uncertainties_in_the_gauge_are_those_of_repeated_runs(method):
     found, stated = [], []
@@ -352,7 +353,7 @@ def test_long_runs_show_the_worst_of_each_part():
     ],
 )
 def test_uncertainty_in_parentheses(pair, text):
-    assert compare._joined(*pair) == text
+    assert command._joined(*pair) == text
 
 
 def test_command_prints_the_same_as_its_json(tmp_path):

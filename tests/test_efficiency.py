@@ -77,7 +77,10 @@ def sensitivity(tool, name):
     return by_affine, by_forward
 
 
-METHODS = [(case, "joint") for case in CASES] + [
+SLOW = pytest.mark.slow
+METHODS = [
+    pytest.param(case, "joint", marks=SLOW if case == "toolface unknown" else ()) for case in CASES
+] + [
     (case, "least-squares")
     for case in ("whole", "vertical", "dip unknown", "dip unknown, vertical")
 ]

@@ -175,6 +175,7 @@ def test_one_bad_member_does_not_harm_the_others():
     assert result.status.tolist() == [0, 2, 0]
 
 
+@pytest.mark.slow
 def test_estimated_noise_is_unbiased_and_intervals_cover():
     """REML of both triads, from groups alone; 95 % intervals of |g| at other attitudes by Student t."""
     inc, azi, face = plan((10, 50, 90, 135), 6)
@@ -254,6 +255,7 @@ def test_a_group_of_one_is_no_group():
     np.testing.assert_allclose(lonely.state.params, free.state.params, rtol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stand", [(0.05, 0.2, 0.1), (0.2, 0.5, 0.5)])
 @pytest.mark.parametrize("inclinations", [(5, 45, 90, 135), (0, 45, 90, 180)])
 def test_a_coarse_stand_of_known_uncertainty_always_settles(stand, inclinations):

@@ -315,6 +315,7 @@ def test_two_groups_are_refused_and_what_they_leave_free_is_named(tmp_path):
         assert marginal_rank(result.analysis.determined, where) == 10
 
 
+@pytest.mark.slow
 def test_a_group_at_exactly_vertical_converges_in_60_of_60_tools(tmp_path):
     angles, group = rolls((0, 45, 90, 135))
     group = [f"roll {k}" for k in group]

@@ -88,6 +88,7 @@ def stated(scores):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("orders", [(0, 1), (1, 2), (2, 3), (3, 0)])
 def test_the_order_of_the_truth_is_chosen(orders):
     """Each triad's own, over 6 seeds of each of 4 pairs; never too low, rarely too high."""

@@ -120,6 +120,7 @@ def ratio(error, covariance):
     return np.sqrt(np.mean(error**2 / np.diagonal(covariance, axis1=-2, axis2=-1)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", STANDS)
 def test_errors_meet_the_bound_and_intervals_cover(name):
     """Pooled within 3 %, more than three standard deviations; each observable within four of its."""

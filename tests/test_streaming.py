@@ -206,7 +206,7 @@ def carried(count):
     }
 
 
-@pytest.mark.parametrize("count", [1, 5, 1000, 300_000])
+@pytest.mark.parametrize("count", [1, 5, 1000, pytest.param(300_000, marks=pytest.mark.slow)])
 def test_what_is_carried_along_is_untouched_at_any_length(tmp_path, cold, count):
     own = carried(count)
     schema = arrow.schema([arrow.field(n, c.type, nullable=n != "id") for n, c in own.items()])
@@ -502,7 +502,7 @@ def caught_writing(folder, calibration):
     In many short sleeps: a signal that comes just before one does not wake from it.
     """
     slow = (
-        "import sys, time\nfrom mwdcal.app import streaming\nfrom mwdcal.app.cli import main\n"
+        f"import sys, time, {streaming.__name__} as streaming\nfrom mwdcal.app.cli import main\n"
         "def write(*given):\n    print('writing', flush=True)\n"
         "    for _ in range(2000):\n        time.sleep(0.01)\n"
         "streaming.ParquetSink.write = write\nmain(sys.argv[1:])\n"
@@ -741,6 +741,7 @@ def test_progress_begins_with_what_was_told_before_it_was_seen(monkeypatch):
         assert "50%" in shown.getvalue()
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow_with_the_table(tmp_path, warm):
     resource = pytest.importorskip("resource")
     part = arrow.table(log(250_000, low=10, high=40))

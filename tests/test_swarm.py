@@ -59,6 +59,7 @@ CASES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("error", ["field", "reading"])
 @pytest.mark.parametrize("case", CASES)
 def test_swarm_and_least_squares_meet_for_every_seed(case, error):
@@ -258,6 +259,7 @@ def test_moradi_swarm_and_least_squares_meet(error):
     assert cost < 1e-12
 
 
+@pytest.mark.slow
 def test_moradi_page_and_figure_are_written_from_figures():
     pytest.importorskip("matplotlib")
     text = moradi.page(draws=500, seeds=1)

@@ -32,6 +32,13 @@ def test_forward_values_to_the_printed_digits(angles, g, b):
     np.testing.assert_allclose(got_b, b, rtol=0, atol=0.5000001e-4)
 
 
+def test_without_strengths_both_vectors_are_of_length_one_and_the_field_is_horizontal():
+    g, b = reference_vectors(0.7, 1.2, 0.3)
+    assert np.hypot.reduce(g) == pytest.approx(1.0, rel=1e-12)
+    assert np.hypot.reduce(b) == pytest.approx(1.0, rel=1e-12)
+    assert g @ b == pytest.approx(0.0, abs=1e-12)
+
+
 @pytest.mark.parametrize("shape", SHAPES)
 def test_round_trip_of_angles(shape):
     rng = np.random.default_rng(1)
