@@ -22,7 +22,6 @@ from itertools import pairwise
 
 import numpy as np
 
-from mwdcal.estimation import fit_numba
 from mwdcal.estimation.evidence import EARTH, STAND, STAND_ERRORS, UNKNOWN, Evidence
 from mwdcal.estimation.solvers import Linear
 from mwdcal.geometry.vectors import (
@@ -226,13 +225,6 @@ class Problem:
         ):
             params = state.params[:, where]
             target = np.einsum("bnij,bnj->bni", state.attitude, earth)
-            if fit_numba.pays(target):
-                back, misfit, by_params = fit_numba.responses(
-                    triad.model, params, triad.raw, self.temperature, target
-                )
-                turned = fit_numba.turned(back, target, state.attitude, change)
-                result.append(Prediction(misfit, by_params, *turned))
-                continue
             field = triad.model.fields(params, triad.raw, self.temperature)
             back = inverse(triad.model.slope(params, triad.raw, self.temperature))
             misfit = np.einsum("bnij,bnj->bni", back, field - target)

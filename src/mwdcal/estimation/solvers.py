@@ -20,7 +20,6 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from mwdcal.estimation import fit_numba
 from mwdcal.geometry.vectors import Array, Bools, Ints, eigen, inverse, placed
 
 RANK_TOLERANCE = 2e-2
@@ -172,12 +171,9 @@ class Normal:
     @classmethod
     def of(cls, linear: Linear) -> Normal:
         """Sum over stations, priors included."""
-        if fit_numba.pays(linear.residual):
-            whole = fit_numba.gram(linear.residual, linear.blocks, linear.shared, linear.own)
-        else:
-            columns = np.concatenate([linear.design, linear.residual[..., None]], -1)
-            weighed = linear.weigh(columns)
-            whole = np.einsum("...nmi,...nmj->...ij", columns, weighed, optimize=True)
+        columns = np.concatenate([linear.design, linear.residual[..., None]], -1)
+        weighed = linear.weigh(columns)
+        whole = np.einsum("...nmi,...nmj->...ij", columns, weighed, optimize=True)
         information, gradient = whole[..., :-1, :-1].copy(), whole[..., :-1, -1].copy()
         pulled = (linear.prior @ linear.pull[..., None])[..., 0]
         information += linear.prior

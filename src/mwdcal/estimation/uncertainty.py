@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mwdcal.estimation import fit_numba
 from mwdcal.estimation.problem import GEOMETRIC_NOISE, Problem, State
 from mwdcal.estimation.solvers import RANK_TOLERANCE, Determined, Linear, Normal
 from mwdcal.geometry.vectors import AnyArray, Array, Bools, Ints, eigen, inverse, rotation
@@ -80,9 +79,6 @@ def _effects(problem: Problem, cross: Array) -> Array:
 
 def _remaining(linear: Linear, covariance: Array) -> tuple[Array, Array]:
     """Whitened residuals C⁻¹ρ (B, n, m), and their covariance C⁻¹ - C⁻¹X V XᵀC⁻¹ (B, n, m, m)."""
-    if fit_numba.pays(linear.residual):
-        parts = (linear.residual, linear.blocks, linear.shared, linear.own)
-        return fit_numba.remaining(*parts, covariance)
     weighed = linear.weigh(linear.design)
     left = linear.weigh(linear.residual[..., None])[..., 0]
     spread = linear.weigh(np.broadcast_to(np.eye(left.shape[-1]), (*left.shape, left.shape[-1])))

@@ -1,4 +1,4 @@
-"""Compiled loops behind `core.fused`: rows to vectors and angles in one pass over memory.
+"""Compiled loops behind `correction_numba`: rows to vectors and angles in one pass over memory.
 
 Rows are taken in tiles that stay in the innermost cache. Every loop runs over one scratch
 array whose row length is a constant, which is what lets the compiler use the vector units;
@@ -8,11 +8,14 @@ digits wherever it stands. Importing this module needs Numba.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import TypeVar, cast
+
 import numpy as np
+from numba import njit
 
 from mwdcal.geometry.observables import VERTICAL
 from mwdcal.geometry.vectors import AnyArray, Array
-from mwdcal.sensor.jit import compiled
 
 Floats = tuple[float, ...]
 Courses = tuple[Floats, ...]
@@ -27,6 +30,22 @@ VECTORS = 6
 _T, _G, _B = 0, 1, 4
 _INC, _AZI, _FACE, _GRAVITY, _FIELD, _DIP, _MAGNETIC = 7, 8, 9, 10, 11, 12, 13
 _ACROSS, _EAST, _NORTH, _DOWN, _CROSS, _TAU, _ROWS = 14, 15, 16, 17, 18, 19, 20
+
+
+_F = TypeVar("_F", bound=Callable[..., object])
+
+
+def compiled(function: _F) -> _F:
+    """The function as machine code, kept on disk where a folder for it can be written.
+
+    Arithmetic is plain IEEE, and division by zero raises nothing: a result has the same bytes from
+    code compiled just now and from code kept on disk.
+    """
+    try:
+        loop = njit(nogil=True, cache=True, error_model="numpy")(function)
+    except RuntimeError:  # no such folder
+        loop = njit(nogil=True, error_model="numpy")(function)
+    return cast(_F, loop)
 
 
 @compiled
@@ -76,7 +95,7 @@ def field(
     shape: Floats,
     curved: bool,
 ) -> None:
-    """Nominal readings x, y, z become the field, in place; see `core.fused.Numbers`."""
+    """Nominal readings x, y, z become the field, in place; see `correction_numba.Numbers`."""
     c = courses
     for i in range(count):
         w = t[i]
@@ -190,7 +209,7 @@ def rows(
 ) -> tuple[int, int, int]:
     """Fill rows start…stop of `out`; unsound cells, rows beyond the temperatures, NaN results.
 
-    See `core.fused.run`. `limits`: accepted raw values, reference temperature, accepted and
+    See `correction_numba.run`. `limits`: accepted raw values, reference temperature, accepted and
     calibrated temperatures, and whether results beyond these become NaN.
     """
     s = np.empty((_ROWS, TILE))

@@ -1,6 +1,6 @@
-"""Vectors, angles and strengths of many rows at once, by the compiled loops of `core.kernels`.
+"""Vectors, angles and strengths of many rows at once, by the compiled loops of `correction_kernels`.
 
-The same formulas as `core.models` and `core.observables`, which are the reference: both
+The same formulas as `sensor.models` and `geometry.observables`, which are the reference: both
 agree to 1e-12 (`tests/test_fused.py`; reasons and timings: `design/kernels.md`). Numba is
 imported when rows are first computed, never before; MWDCAL_NUMPY=1 turns it off.
 """
@@ -10,11 +10,12 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from importlib.util import find_spec
 from typing import NamedTuple
 
 import numpy as np
 
-from mwdcal.estimation.fit_numba import available
 from mwdcal.geometry.vectors import AnyArray, Array
 from mwdcal.sensor.models import OFF_DIAGONAL, Factors, Model, Polynomial
 
@@ -65,6 +66,16 @@ class Found(NamedTuple):
     unsound: int
     beyond: int
     empty: int
+
+
+def available() -> bool:
+    """Whether compiled loops can be had, and are wanted: Numba, and not MWDCAL_NUMPY=1."""
+    return _installed() and not os.environ.get("MWDCAL_NUMPY")
+
+
+@cache
+def _installed() -> bool:
+    return find_spec("numba") is not None
 
 
 def cores() -> int:
