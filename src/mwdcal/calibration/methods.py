@@ -16,12 +16,13 @@ from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import ANGLES
 from mwdcal.estimation.evidence import UNKNOWN, Constant, Evidence
 from mwdcal.estimation.minimisers.newton import newton, propagated
-from mwdcal.estimation.minimisers.swarm import forward_parts, swarm_forward
+from mwdcal.estimation.minimisers.swarm import swarm_forward
 from mwdcal.estimation.minimisers.unweighted import STRENGTH, Params, Sums
 from mwdcal.estimation.problem import Prior, Problem, State
 from mwdcal.estimation.solvers import Status, gauss_newton
 from mwdcal.estimation.uncertainty import readjusted, unweighted_pulls
 from mwdcal.geometry.vectors import Array, Bools, Ints, inverse
+from mwdcal.sensor.models import affine_parts
 
 ESTIMABLE = {
     name: TURNS.get(name, (name,)) for name in ("azimuth-zero", "inclination-zero", "tilt")
@@ -162,7 +163,7 @@ def _swarmed(problem: Problem, state: State, seed: int) -> Solved:
     for triad, earth in zip(problem.triads, problem.earth(state)[0], strict=False):
         target = np.einsum("bnij,bnj->bni", state.attitude, earth)
         found = _swarm_forward(triad.raw, target, problem.evidence.include > 0, seed)
-        matrix, offset = forward_parts(found)
+        matrix, offset = affine_parts(found)
         back = inverse(matrix)
         parts.append(triad.model.start(back, -np.einsum("bij,bj->bi", back, offset)))
     params = np.concatenate(parts, -1)

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mwdcal.geometry.vectors import AnyArray, Array
-from mwdcal.sensor.models import OFF_DIAGONAL, Factors, Model, Polynomial
+from mwdcal.sensor.models import Factors, Model, Polynomial, affine_parts, factor_parts
 
 __all__ = ["available", "cores", "numbers", "run"]
 
@@ -99,30 +99,27 @@ NOTHING = Numbers(((0.0,) * 4,) * 12 + ((1.0, 0.0, 0.0, 0.0),) * 3, (np.nan,) * 
 
 
 def _polynomial(model: Polynomial, params: Array) -> Numbers:
-    powers = params[: model.affine].reshape(-1, 12)
-    scale = np.zeros((len(powers), 3))
+    gain, offset = affine_parts(params[: model.affine].reshape(-1, 12))
+    scale = np.zeros_like(offset)
     scale[0] = 1.0
     curves = params[model.affine :] if model.curved else np.zeros(6)
     shape = np.concatenate([model.centre.ravel(), model.scale.ravel(), curves])
-    return Numbers(_courses(np.hstack([powers, scale])), tuple(shape.tolist()), model.curved)
+    return Numbers(_courses(gain, offset, scale), tuple(shape.tolist()), model.curved)
 
 
 def _factors(model: Factors, params: Array) -> Numbers:
-    count = model.basis.order + 1
-    scale, bias = params[: 6 * count].reshape(2, 3, count)
-    mixing = np.eye(3)
-    for (i, j), value in zip(OFF_DIAGONAL, params[6 * count :], strict=True):
-        mixing[i, j] = -value
-    gain = np.zeros((count, 9))
-    gain[0] = mixing.ravel()
-    powers = np.hstack([gain, -np.swapaxes(mixing @ bias, 0, 1), np.swapaxes(scale, 0, 1)])
-    return Numbers(_courses(powers), (0.0,) * 3 + (1.0,) * 3 + (0.0,) * 6, False)
+    scale, bias, misalignment = factor_parts(params)
+    mixing = np.eye(3) - misalignment
+    gain = np.zeros((model.basis.order + 1, 3, 3))
+    gain[0] = mixing
+    courses = _courses(gain, -np.swapaxes(mixing @ bias, 0, 1), np.swapaxes(scale, 0, 1))
+    return Numbers(courses, (0.0,) * 3 + (1.0,) * 3 + (0.0,) * 6, False)
 
 
-def _courses(powers: Array) -> tuple[tuple[float, ...], ...]:
-    """Coefficients (powers, 15) as one tuple of four per quantity."""
+def _courses(gain: Array, offset: Array, scale: Array) -> tuple[tuple[float, ...], ...]:
+    """Coefficients by power, gains (K, 3, 3), offsets and scales (K, 3), as one tuple of four each."""
     padded = np.zeros((HIGHEST + 1, 15))
-    padded[: len(powers)] = powers
+    padded[: len(gain)] = np.hstack([gain.reshape(-1, 9), offset, scale])
     return tuple(map(tuple, np.swapaxes(padded, 0, 1).tolist()))
 
 

@@ -21,10 +21,11 @@ from mwdcal.estimation.problem import GEOMETRIC_NOISE, Problem, State, Triad
 from mwdcal.estimation.solvers import RANK_TOLERANCE, Determined
 from mwdcal.estimation.uncertainty import Analysis
 from mwdcal.geometry.vectors import Array, Bools, eigen, eigenvalues, inverse, tool_from_earth
-from mwdcal.sensor.models import Factors, Polynomial
+from mwdcal.sensor.models import Factors, Polynomial, affine_terms
 
-ORDER = np.array([4 * i + j for i in range(3) for j in range(3)] + [4 * i + 3 for i in range(3)])
-"""Places of the parameters (gains row by row, then offsets) among those of Θ, row by row."""
+_ROWS = np.arange(12).reshape(3, 4)
+PLACES = affine_terms(_ROWS[:, :3], _ROWS[:, 3])
+"""Places of the parameters among the elements of Θ, row by row."""
 SPANNED = 1e-6
 """Smallest eigenvalue of the normalised 4 × 4 information with which this way is taken."""
 
@@ -71,7 +72,7 @@ class Half:
     @property
     def params(self) -> Array:
         """Parameters (B, 12) of the model."""
-        return np.asarray(self.turn[:, :3].reshape(-1, 12)[:, ORDER])
+        return np.asarray(self.turn[:, :3].reshape(-1, 12)[:, PLACES])
 
     @property
     def covariance(self) -> Array:
@@ -80,7 +81,7 @@ class Half:
         outer = self.back[:, :, None] * self.back[:, None]
         whole = outer.reshape(-1, 9, 3) @ inner.reshape(-1, 3, 16)
         whole = np.swapaxes(whole.reshape(-1, 3, 3, 4, 4), 2, 3).reshape(-1, 12, 12)
-        return np.asarray(whole[:, ORDER[:, None], ORDER])
+        return np.asarray(whole[:, PLACES[:, None], PLACES])
 
     @property
     def known(self) -> tuple[Array, Array]:
@@ -103,7 +104,7 @@ class Half:
             for m, s in zip(parts, sizes, strict=True)
         ]
         squares, norms = (np.einsum("bi,bj->bij", *p).reshape(batch, 12) for p in (pair, sizes))
-        return np.sqrt(np.clip(squares, 0, None)), norms[:, ORDER]
+        return np.sqrt(np.clip(squares, 0, None)), norms[:, PLACES]
 
 
 Halves = list[Half | closed_form_factors.Half]

@@ -21,12 +21,10 @@ import numpy as np
 
 from mwdcal.estimation.problem import GEOMETRIC_NOISE, Triad
 from mwdcal.geometry.vectors import Array, Bools, eigenvalues, inverse, solved
-from mwdcal.sensor.models import OFF_DIAGONAL
+from mwdcal.sensor.models import OFF_COLUMNS, OFF_ROWS, factor_params, factor_parts
 
 OTHERS = np.array([[1, 2], [0, 2], [0, 1]])
 """The two axes that an axis is misaligned with."""
-FIRST, SECOND = np.array(OFF_DIAGONAL).transpose()
-"""The axes of each misalignment."""
 STEPS = 12
 """Most steps to the minimum; a sound run takes three to five."""
 SMALL = 1e-8
@@ -197,20 +195,19 @@ def factors(unknowns: Array) -> tuple[Array, Array, Array]:
     shares[:, np.arange(3)[:, None], OTHERS] = cross
     back = inverse(shares)
     own = np.diagonal(back, axis1=-2, axis2=-1)
-    linear = np.concatenate([scale / own[..., None], bias * own[..., None]], 1)
-    params = np.concatenate(
-        [linear.reshape(batch, -1), -back[:, FIRST, SECOND] / own[:, SECOND]], -1
-    )
-    slope = np.zeros((batch, 3, 2 * count + 2, 6 * count + 6))
-    at, k = np.arange(3)[:, None], np.arange(count)
-    slope[:, at, k, at * count + k] = own[..., None]
-    slope[:, at, count + 2 + k, (3 + at) * count + k] = 1 / own[..., None]
+    params = factor_params(scale / own[..., None], bias * own[..., None], -back / own[:, None, :])
+    slope = np.zeros((batch, 3, 2 * count + 2, params.shape[-1]))
+    scales, biases, misalignments = factor_parts(np.arange(params.shape[-1]))
+    axis, k = np.arange(3)[:, None], np.arange(count)
+    slope[:, axis, k, scales] = own[..., None]
+    slope[:, axis, count + 2 + k, biases] = 1 / own[..., None]
     turn = shares * own[..., None]  # N; dN = N dm N
-    pulled, moved = turn[:, :, FIRST] / own[..., None], turn[:, SECOND]
+    pulled, moved = turn[:, :, OFF_ROWS] / own[..., None], turn[:, OFF_COLUMNS]
     grown = (pulled * np.swapaxes(moved, -1, -2))[:, :, None]
-    by_mixing = slope[..., 6 * count :]
+    by_mixing = np.zeros((batch, 3, 2 * count + 2, 6))
     by_mixing[:, :, :count] = scale[..., None] * grown
     by_mixing[:, :, count + 2 :] = -bias[..., None] * grown
     each = pulled[:, :, None] * moved[:, :, OTHERS].transpose(0, 2, 3, 1)
     by_mixing[:, :, count : count + 2] = each - cross[..., None] * grown
+    slope[..., misalignments[OFF_ROWS, OFF_COLUMNS]] = by_mixing
     return params, shares, slope

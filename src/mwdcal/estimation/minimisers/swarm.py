@@ -6,7 +6,7 @@ least_squares_forward  where the error in the reading is least: one linear solve
 least_squares_affine   where the error in the field is least: another one
 swarm_forward          the swarm on either cost, in coordinates that suit it
 
-Forward parameters (..., 12) of a triad: S row by row, then o, of reading = S · field + o.
+Forward parameters (..., 12) of a triad: S and o of reading = S · field + o, as `affine_parts` has them.
 
 Moradi's equations 12 and 13 are two estimators. Each is a convex quadratic (13 in the matrix
 that takes readings to fields), so swarm and least squares meet on either, and neither
@@ -22,6 +22,7 @@ from typing import Literal
 import numpy as np
 
 from mwdcal.geometry.vectors import Array, ArrayLike, inverse
+from mwdcal.sensor.models import affine_parts, affine_terms
 
 ACCELERATION = 2.05
 """Pull towards a particle's own best and towards the swarm's best, each."""
@@ -157,16 +158,6 @@ def swarm(
     )
 
 
-def forward_parts(params: Array) -> tuple[Array, Array]:
-    """S (..., 3, 3) and o (..., 3) of forward parameters (..., 12)."""
-    return params[..., :9].reshape(*params.shape[:-1], 3, 3), params[..., 9:]
-
-
-def _joined(matrix: Array, offset: Array) -> Array:
-    flat = matrix.reshape(*matrix.shape[:-2], 9)
-    return np.concatenate([flat, offset], -1)
-
-
 def vector_cost(raw: Array, reference: Array, error: Error = "field") -> Cost:
     """Mean squared length of the error over the stations, as a function of forward parameters.
 
@@ -180,11 +171,11 @@ def vector_cost(raw: Array, reference: Array, error: Error = "field") -> Cost:
     readings, known = raw[..., None, :, :], reference[..., None, :, :]
 
     def in_reading(params: Array) -> Array:
-        matrix, offset = forward_parts(params)
+        matrix, offset = affine_parts(params)
         return (readings - offset[..., None, :]) - known @ np.swapaxes(matrix, -1, -2)
 
     def in_field(params: Array) -> Array:
-        matrix, offset = forward_parts(params)
+        matrix, offset = affine_parts(params)
         back = np.swapaxes(inverse(matrix), -1, -2)
         return (readings - offset[..., None, :]) @ back - known
 
@@ -211,7 +202,7 @@ def _regressed(target: Array, terms: Array) -> Array:
 
 def _through_means(matrix: Array, raw: Array, reference: Array) -> Array:
     """Forward parameters of S and the offset that takes the mean reference to the mean reading."""
-    return _joined(matrix, (raw - reference @ np.swapaxes(matrix, -1, -2))[..., 0, :])
+    return affine_terms(matrix, (raw - reference @ np.swapaxes(matrix, -1, -2))[..., 0, :])
 
 
 def least_squares_forward(raw: Array, reference: Array) -> Array:
@@ -265,7 +256,7 @@ class Coordinates:
 
     def parts(self, place: Array) -> tuple[Array, Array]:
         """K (..., particles, 3, 3) and middle (..., particles, 3) at u (..., particles, 12)."""
-        turn, shift = forward_parts(place)
+        turn, shift = affine_parts(place)
         spread = self.spread[..., None, None]
         matrix = (turn @ self.whiten[..., None, :, :]) * spread[..., None]
         matrix = matrix + self.gain[..., None, None, None] * np.eye(3)
@@ -305,7 +296,9 @@ def _field_search(raw: Array, reference: Array) -> tuple[Cost, Callable[[Array],
     def params(place: Array) -> Array:
         matrix, middle = coordinates.parts(place)
         back = inverse(matrix)
-        return _joined(back, coordinates.mean_terms - np.einsum("...ij,...j->...i", back, middle))
+        return affine_terms(
+            back, coordinates.mean_terms - np.einsum("...ij,...j->...i", back, middle)
+        )
 
     return coordinates.cost(reference, raw), params
 
@@ -317,7 +310,7 @@ def _reading_search(raw: Array, reference: Array) -> tuple[Cost, Callable[[Array
     def params(place: Array) -> Array:
         matrix, middle = coordinates.parts(place)
         mean = np.einsum("...ij,...j->...i", matrix, coordinates.mean_terms)
-        return _joined(matrix, middle - mean)
+        return affine_terms(matrix, middle - mean)
 
     return coordinates.cost(raw, reference), params
 
