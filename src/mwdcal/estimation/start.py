@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from mwdcal.estimation.problem import Problem, State
+from mwdcal.estimation.regression import regress
 from mwdcal.geometry import observables
 from mwdcal.geometry.vectors import (
     Array,
@@ -119,7 +120,7 @@ def _linear(problem: Problem, state: State, index: int, x: Array) -> tuple[Array
     usable = (values[:, 0] > SEEN**2 * values[:, -1]) & (weight.sum(-1) >= 4)
     gram = np.where(usable[:, None, None], gram, np.eye(4))
 
-    def regress(target: Array) -> Array:
+    def fields_of(target: Array) -> Array:
         crossed = np.einsum("bn,bni,bnj->bij", weight, terms, target)
         return np.asarray(np.linalg.solve(gram, crossed))
 
@@ -127,28 +128,15 @@ def _linear(problem: Problem, state: State, index: int, x: Array) -> tuple[Array
         earth = earth_gravity(problem.constant(state, "gravity"))
     else:
         field, dip = problem.constant(state, "field"), problem.constant(state, "dip")
-        unknown = _unknown_dip(attitude, field, terms, weight, regress)
+        unknown = _unknown_dip(attitude, field, terms, weight, fields_of)
         blank = ~evidence.is_known("dip")
         earth = earth_field(field, np.where(blank, unknown[:, None], dip))
-    forward = _forward(np.einsum("bnij,bnj->bni", attitude, earth), x, weight)
+    target = np.einsum("bnij,bnj->bni", attitude, earth)
+    forward = regress(x, target, weight[..., None]).forward
     usable = usable & np.isfinite(forward).all((-1, -2))
-    forward = np.where(usable[:, None, None], forward, np.eye(4)[:, :3])
+    forward = np.where(usable[:, None, None], forward, np.eye(4, 3))
     back = inverse(np.swapaxes(forward[:, :3], -1, -2))
     return back, -np.einsum("bij,bj->bi", back, forward[:, 3]), np.asarray(usable)
-
-
-def _forward(field: Array, x: Array, weight: Array) -> Array:
-    """Readings as a linear function (B, 4, 3) of the field and one: noise is in the readings alone.
-
-    With exact references this is the minimum itself.
-    """
-    terms = np.concatenate([field, np.ones_like(field[..., :1])], -1)
-    size = np.sqrt(np.einsum("bn,bni->bi", weight, terms**2))
-    size = np.where(size > 0, size, 1.0)
-    scaled = terms / size[:, None]
-    gram = np.einsum("bn,bni,bnj->bij", weight, scaled, scaled, optimize=True)
-    crossed = np.einsum("bn,bni,bnj->bij", weight, scaled, x, optimize=True)
-    return np.asarray(inverse(gram) @ crossed / size[..., None])
 
 
 def _unknown_dip(
@@ -156,20 +144,20 @@ def _unknown_dip(
     field: Array,
     terms: Array,
     weight: Array,
-    regress: Callable[[Array], Array],
+    fields_of: Callable[[Array], Array],
 ) -> Array:
     """Dip (B,) at which the readings fit best: the weakest direction of what they leave over."""
     parts = [
         np.einsum("bnij,bnj->bni", attitude, earth_field(field, np.full_like(field, angle)))
         for angle in (0.0, np.pi / 2)
     ]
-    left = [part - terms @ regress(part) for part in parts]
+    left = [part - terms @ fields_of(part) for part in parts]
     gram = np.stack(
         [np.stack([np.einsum("bn,bni,bni->b", weight, p, q) for q in left], -1) for p in left], -2
     )
     _, vectors = eigen(gram)
     north, down = vectors[:, 0, 0], vectors[:, 1, 0]
-    gains = [np.trace(regress(part)[:, :3], axis1=-2, axis2=-1) for part in parts]
+    gains = [np.trace(fields_of(part)[:, :3], axis1=-2, axis2=-1) for part in parts]
     sign = np.where(north * gains[0] + down * gains[1] < 0, -1.0, 1.0)
     return np.asarray(np.arctan2(sign * down, sign * north))
 

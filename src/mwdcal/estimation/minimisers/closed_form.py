@@ -18,16 +18,15 @@ import numpy as np
 
 from mwdcal.estimation.minimisers import closed_form_factors
 from mwdcal.estimation.problem import GEOMETRIC_NOISE, Problem, State, Triad
+from mwdcal.estimation.regression import regress
 from mwdcal.estimation.solvers import RANK_TOLERANCE, Determined
 from mwdcal.estimation.uncertainty import Analysis
-from mwdcal.geometry.vectors import Array, Bools, eigen, eigenvalues, inverse, tool_from_earth
+from mwdcal.geometry.vectors import Array, Bools, eigenvalues, inverse, tool_from_earth
 from mwdcal.sensor.models import Factors, Polynomial, affine_terms
 
 _ROWS = np.arange(12).reshape(3, 4)
 PLACES = affine_terms(_ROWS[:, :3], _ROWS[:, 3])
 """Places of the parameters among the elements of Θ, row by row."""
-SPANNED = 1e-6
-"""Smallest eigenvalue of the normalised 4 × 4 information with which this way is taken."""
 
 
 def applies(problem: Problem) -> bool:
@@ -162,22 +161,14 @@ def solution(problem: Problem, at: State, halfs: Halves) -> tuple[State, Analysi
 
 
 def _half(triad: Triad, target: Array, include: Array) -> Half:
-    terms = np.concatenate([target, np.ones_like(target[..., :1])], -1)
     weight = include / triad.sd**2
     alike = bool((weight == weight[..., :1]).all())
-    across, unlike = np.swapaxes(terms, -1, -2), weight[..., :1] if alike else weight
-    information = (across[:, None] * np.swapaxes(unlike, -1, -2)[:, :, None]) @ terms[:, None]
-    size = np.sqrt(np.maximum(np.diagonal(information, axis1=-2, axis2=-1), 1e-300))
-    outer = size[..., :, None] * size[..., None, :]
-    values, vectors = eigen(information / outer)
-    spanned = np.all(values[..., 0] > SPANNED, -1)
-    apart = (vectors / values[..., None, :]) @ np.swapaxes(vectors, -1, -2) / outer
-    spread = np.broadcast_to(apart, (len(terms), 3, 4, 4))
-    forward = np.einsum("bajk,bka->baj", spread, across @ (weight * triad.raw))
+    fit = regress(triad.raw, target, weight[..., :1] if alike else weight)
+    terms, forward, spread = fit.terms, np.swapaxes(fit.forward, -1, -2), fit.cofactor
     left = (triad.raw - terms @ np.swapaxes(forward, -1, -2)) * np.sqrt(weight)
-    share = np.einsum("banj,bnj->bna", terms[:, None] @ apart, terms) * weight
+    share = np.einsum("banj,bnj->bna", terms[:, None] @ spread, terms) * weight
     return Half(
-        include, terms, forward, spread, *_own(triad, forward), left, include - share, spanned
+        include, terms, forward, spread, *_own(triad, forward), left, include - share, fit.spanned
     )
 
 

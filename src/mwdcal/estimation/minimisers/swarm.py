@@ -21,6 +21,7 @@ from typing import Literal
 
 import numpy as np
 
+from mwdcal.estimation.regression import regress
 from mwdcal.geometry.vectors import Array, ArrayLike, inverse
 from mwdcal.sensor.models import affine_parts, affine_terms
 
@@ -194,25 +195,13 @@ def _centred(vectors: Array) -> tuple[Array, Array]:
     return vectors - mean, mean
 
 
-def _regressed(target: Array, terms: Array) -> Array:
-    """Matrix K (..., 3, 3) of least squares target = K · terms, both centred."""
-    q, r = np.linalg.qr(terms)
-    return np.swapaxes(inverse(r) @ (np.swapaxes(q, -1, -2) @ target), -1, -2)
-
-
-def _through_means(matrix: Array, raw: Array, reference: Array) -> Array:
-    """Forward parameters of S and the offset that takes the mean reference to the mean reading."""
-    return affine_terms(matrix, (raw - reference @ np.swapaxes(matrix, -1, -2))[..., 0, :])
-
-
 def least_squares_forward(raw: Array, reference: Array) -> Array:
     """Forward parameters (..., 12) with the least error in the readings (Moradi 12).
 
-    Shapes: `raw`, `reference` (..., n, 3). Singular: NaN or meaningless where the reference
-    vectors do not span space about their mean (fewer than four stations, or all in a plane).
+    Shapes: `raw`, `reference` (..., n, 3). Singular: as `regress`.
     """
-    (x, mean_x), (a, mean_a) = _centred(raw), _centred(reference)
-    return _through_means(_regressed(x, a), mean_x, mean_a)
+    forward = regress(raw, reference, np.ones((*raw.shape[:-1], 1))).forward
+    return affine_terms(np.swapaxes(forward[..., :3, :], -1, -2), forward[..., 3, :])
 
 
 def least_squares_affine(raw: Array, reference: Array) -> Array:
@@ -222,8 +211,12 @@ def least_squares_affine(raw: Array, reference: Array) -> Array:
     noise in the readings M is a little too small, by (noise / signal)².
     Shapes and singular cases: as `least_squares_forward`.
     """
-    (x, mean_x), (a, mean_a) = _centred(raw), _centred(reference)
-    return _through_means(inverse(_regressed(a, x)), mean_x, mean_a)
+    centred, mean = _centred(raw)
+    back = regress(reference, centred, np.ones((*raw.shape[:-1], 1))).forward
+    matrix = inverse(np.swapaxes(back[..., :3, :], -1, -2))
+    return affine_terms(
+        matrix, mean[..., 0, :] - np.einsum("...ij,...j->...i", matrix, back[..., 3, :])
+    )
 
 
 @dataclass(frozen=True)
