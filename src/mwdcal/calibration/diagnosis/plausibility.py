@@ -12,9 +12,10 @@ from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.readings import EARTH, Readings
 from mwdcal.calibration.residuals import Residuals
 from mwdcal.estimation.rank import Free
+from mwdcal.estimation.uncertainty import ROTATIONS
 from mwdcal.geometry.vectors import Array, Bools, centred
 
-BENIGN = ("rotation-x", "rotation-y", "toolface-zero", "scale")
+BENIGN = (*ROTATIONS, "scale")
 """Directions that may stay free."""
 EXCESS = 10.0
 """An error after calibration of more than this many times its expectation is no error of a sensor."""

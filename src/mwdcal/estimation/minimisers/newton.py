@@ -33,7 +33,7 @@ from math import prod
 import numpy as np
 
 from mwdcal.estimation.solvers import Determined, Normal, Status
-from mwdcal.estimation.uncertainty import COUPLED, free_share
+from mwdcal.estimation.uncertainty import COUPLED, ROTATIONS, free_share
 from mwdcal.geometry.observables import OBSERVABLES, VERTICAL, is_vertical
 from mwdcal.geometry.vectors import AnyArray, Array, ArrayLike, Bools, Ints, inverse, rotation
 from mwdcal.sensor.models import Model
@@ -49,7 +49,6 @@ SMALLEST = 1e-12
 DECREASE = 1e-4
 """Share of the decrease promised by the gradient with which the line search is content."""
 HALVINGS = 40
-TURNS = ("rotation-x", "rotation-y", "toolface-zero")
 TINY = 1e-5
 EPSILON = float(np.finfo(float).eps)
 
@@ -398,7 +397,7 @@ class _Descent:
 
     def free(self, determined: Determined) -> dict[str, Bools]:
         """Whether a turn of all readings about an axis, or their scale, is free (B,), by name."""
-        turns = zip(TURNS, np.eye(3), strict=True)
+        turns = zip(ROTATIONS, np.eye(3), strict=True)
         changes = {name: rotation(TINY * axis) for name, axis in turns}
         changes["scale"] = np.eye(3) * (1 + TINY)
         result = {}
