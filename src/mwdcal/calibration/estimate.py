@@ -28,7 +28,7 @@ from mwdcal.estimation.uncertainty import (
 )
 from mwdcal.estimation.variance import LEAST, START, scatter_ratios, with_scatter
 from mwdcal.geometry.vectors import Array, Bools, Ints, placed
-from mwdcal.sensor.models import Basis, Factors, Polynomial, Restricted, Whole, restricted
+from mwdcal.sensor.models import Basis, Factors, Polynomial, Whole, restricted
 
 FLOOR = 1e-9
 """Smallest noise, as a share of the signal, that an estimate from residuals may reach."""
@@ -93,28 +93,38 @@ def temperature_ranges(temperature: Array) -> Array:
 
 def _problem(
     readings: Readings, evidence: Evidence, lead: tuple[int, ...], options: Options
-) -> tuple[Problem, list[bool]]:
-    """The problem, and for each triad whether its noise is declared."""
+) -> tuple[Problem, list[bool], Bools]:
+    """The problem, for each triad whether its noise is declared, and which members (B,) are finite.
+
+    Members with readings that are not finite get stand-ins, so that the batch goes on.
+    """
     cold = np.zeros(readings.count)
     temperature = flat(cold if readings.temperature is None else readings.temperature, lead)
     curved = options.nonlinearity or {}
+    names = [name for name in TRIADS if getattr(readings, name) is not None]
+    raws = [flat(getattr(readings, name), lead, 3) for name in names]
+    finite = np.all([np.isfinite(raw).all((-1, -2)) for raw in raws], axis=0)
     triads: list[Triad] = []
-    for name, order in zip(TRIADS, options.orders, strict=True):
-        values = getattr(readings, name)
-        if values is None:
-            continue
-        raw = flat(values, lead, 3)
-        whole = model_of(
-            options.kind(order), order, raw, temperature, evidence.include, name in curved
-        )
-        sd = (
-            flat(readings.sd[name], lead, 3) if name in readings.sd else 1e-3 * _size(raw) + 0 * raw
-        )
-        triads.append(Triad(restricted(whole, options.parameters), raw, sd))
+    for name, raw, order in zip(names, raws, options.orders, strict=False):
+        kind, sound = options.kind(order), raw if finite.all() else _sound(raw, finite)
+        whole = model_of(kind, order, sound, temperature, evidence.include, name in curved)
+        sd = flat(readings.sd[name], lead, 3) if name in readings.sd else _first_noise(raw)
+        triads.append(Triad(restricted(whole, options.parameters), sound, sd))
     prior = prior_of(options.prior, [t.model for t in triads], len(evidence.include))
     problem = Problem(tuple(triads), temperature, evidence, prior)
     _bound_curves(problem, curved)
-    return problem, [name in readings.sd for name in TRIADS[: len(triads)]]
+    return problem, [name in readings.sd for name in names], finite
+
+
+def _sound(raw: Array, finite: Bools) -> Array:
+    """Readings with stand-ins of harmless size for members that are not finite."""
+    pattern = np.sin(np.arange(raw[0].size) ** 1.5).reshape(-1, 3)
+    return np.where(finite[:, None, None], raw, pattern)
+
+
+def _first_noise(raw: Array) -> Array:
+    """Noise (B, n, 3) at which its estimation begins, a thousandth of the readings' size."""
+    return np.asarray(1e-3 * _size(raw) + 0 * raw)
 
 
 def _bound_curves(problem: Problem, curved: Mapping[str, float]) -> None:
@@ -132,24 +142,21 @@ def _size(raw: Array) -> Array:
     return np.where(size > 0, size, 1.0)
 
 
+@np.errstate(invalid="ignore", divide="ignore", over="ignore")
 def fit(readings: Readings, options: Options | None = None, include: Array | None = None) -> Fit:
     """Fit a run, or a batch of runs (leading axes of the readings, or of `include`).
 
-    `include` (..., n) is 1 for stations that count and 0 for those left out.
+    `include` (..., n) is 1 for stations that count and 0 for those left out. Nothing is raised for
+    a member that cannot be fitted: its `status` says so.
     """
-    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        return _fit(readings, options or Options(), include)
-
-
-def _fit(readings: Readings, options: Options, include: Array | None) -> Fit:
+    options = options or Options()
     include = np.ones(readings.count) if include is None else np.asarray(include, float)
     evidence = EVIDENCE[options.method](evidence_of(readings, include))
     evidence = without(evidence, options.ignore)
     evidence = with_stand_errors(evidence, options.estimate)
     evidence = _scattered(evidence, readings, options)
     lead = np.broadcast_shapes(readings.accelerometer.shape[:-1], include.shape)
-    problem, declared = _problem(readings, evidence, lead, options)
-    problem, finite = _without_broken(problem)
+    problem, declared, finite = _problem(readings, evidence, lead, options)
     closed, alone = _closed(problem, declared, options, finite)
     if closed is None:
         return _general(problem, declared, options, finite)
@@ -278,7 +285,7 @@ def _determined(problem: Problem, state: State, solved: Solved) -> Determined:
 
 
 def _analysed(
-    found: Analysis,
+    analysis: Analysis,
     problem: Problem,
     state: State,
     solved: Solved,
@@ -288,62 +295,35 @@ def _analysed(
     """The analysis of the estimator that was used: not every one is the likelihood's."""
     pulls = solved.pulls(problem, state)
     if pulls:
-        found = sandwich(found, problem, state, pulls)
+        analysis = sandwich(analysis, problem, state, pulls)
     if options.robust:
-        found = _robustly(found, problem, state, options.robust, trust)
-    return found
+        analysis = _robustly(analysis, problem, state, options.robust, trust)
+    return analysis
 
 
-def _robustly(found: Analysis, problem: Problem, state: State, loss: str, trust: Array) -> Analysis:
+def _robustly(
+    analysis: Analysis, problem: Problem, state: State, loss: str, trust: Array
+) -> Analysis:
     """The analysis of a fit with station weights: the data say less than they seem to, a prior does not."""
-    freedom = _tested(station_misfit(found)[1])
-    louder = np.sqrt([inflation(loss, k) for k in freedom])[:, None, None]
-    triads = tuple(replace(t, sd=t.sd * louder) for t in problem.triads)
-    sd = {n: s * louder[..., 0] if n in ANGLES else s for n, s in problem.evidence.sd.items()}
-    scatter = {n: s * louder[..., 0] for n, s in problem.evidence.scatter.items()}
-    evidence = replace(problem.evidence, sd=sd, scatter=scatter)
-    wider = analyse(replace(problem, triads=triads, evidence=evidence), state, found.determined)
+    freedom = _tested(station_misfit(analysis)[1])
+    louder = np.sqrt([inflation(loss, k) for k in freedom])[:, None]
+    wider = analyse(_louder(problem, louder), state, analysis.determined)
     return replace(
-        found,
+        analysis,
         covariance=wider.covariance,
         constants=wider.constants,
         effects=wider.effects,
-        variance_factor=_bounded_factor(found, trust, loss, freedom),
+        variance_factor=_bounded_factor(analysis, trust, loss, freedom),
     )
 
 
-def _bounded_factor(found: Analysis, trust: Array, loss: str, freedom: Array) -> Array:
+def _bounded_factor(analysis: Analysis, trust: Array, loss: str, freedom: Array) -> Array:
     """s² (B, t) of a fit with station weights `trust`, from the pulls w d that they bound."""
-    pulled = found.residual**2 * trust[..., None]
+    pulled = analysis.residual**2 * trust[..., None]
     shape = (*pulled.shape[:-1], pulled.shape[-1] // 3, 3)
     squares = np.sum(pulled.reshape(shape), (1, 3))
     share = np.array([consistency(loss, k) for k in freedom])[:, None]
-    return np.asarray(squares / np.where(found.freedom > 1e-9, found.freedom, np.nan) / share)
-
-
-def _without_broken(problem: Problem) -> tuple[Problem, Bools]:
-    """Members with readings that are not finite get stand-ins, so that the batch goes on."""
-    finite = np.all([np.isfinite(t.raw).all((-1, -2)) for t in problem.triads], axis=0)
-    if finite.all():
-        return problem, finite
-    pattern = np.sin(np.arange(problem.triads[0].raw[0].size) ** 1.5).reshape(-1, 3)
-    triads = []
-    for triad in problem.triads:
-        raw = np.where(finite[:, None, None], triad.raw, pattern)
-        model = triad.model
-        if isinstance(model, Restricted):
-            model = replace(model, whole=_finite_model(model.whole))
-        else:
-            model = _finite_model(model)
-        triads.append(replace(triad, raw=raw, model=model))
-    return replace(problem, triads=tuple(triads)), finite
-
-
-def _finite_model(model: Whole) -> Whole:
-    if isinstance(model, Factors):
-        return model
-    centre = np.where(np.isfinite(model.centre), model.centre, 0.0)
-    return replace(model, centre=centre, scale=np.where(np.isfinite(model.scale), model.scale, 1.0))
+    return np.asarray(squares / np.where(analysis.freedom > 1e-9, analysis.freedom, np.nan) / share)
 
 
 @dataclass(frozen=True)
@@ -485,13 +465,16 @@ def _trusting(problem: Problem, trust: Array) -> Problem:
     """The problem with the covariance of each station, readings and angles, over its weight."""
     if (trust == 1).all():
         return problem
-    grown = 1 / np.sqrt(trust)
-    triads = tuple(replace(t, sd=t.sd * grown[..., None]) for t in problem.triads)
+    return _louder(problem, 1 / np.sqrt(trust))
+
+
+def _louder(problem: Problem, factor: Array) -> Problem:
+    """The problem with all that is a station's own, readings and angles, noisier by a factor (B, n)."""
+    triads = tuple(replace(t, sd=t.sd * factor[..., None]) for t in problem.triads)
     evidence = problem.evidence
-    sd = {n: s * grown if n in ANGLES else s for n, s in evidence.sd.items()}
-    scatter = {n: s * grown for n, s in evidence.scatter.items()}
-    evidence = replace(evidence, sd=sd, scatter=scatter)
-    return replace(problem, triads=triads, evidence=evidence)
+    sd = {n: s * factor if n in ANGLES else s for n, s in evidence.sd.items()}
+    scatter = {n: s * factor for n, s in evidence.scatter.items()}
+    return replace(problem, triads=triads, evidence=replace(evidence, sd=sd, scatter=scatter))
 
 
 def _rescaled(problem: Problem, scale: Array, declared: list[bool]) -> Problem:
@@ -506,6 +489,3 @@ def _rescaled(problem: Problem, scale: Array, declared: list[bool]) -> Problem:
 def _scaled_noise(triad: Triad, scale: Array) -> Array:
     factor = np.where(np.isfinite(scale), scale, 1.0)[:, None, None]
     return np.maximum(triad.sd * factor, FLOOR * _size(triad.raw))
-
-
-__all__ = ["Fit", "Status", "fit", "model_of", "scatters", "temperature_ranges"]
