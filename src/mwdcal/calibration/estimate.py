@@ -26,13 +26,13 @@ from mwdcal.estimation.uncertainty import (
     settle_gauge,
     station_misfit,
 )
-from mwdcal.estimation.variance import LEAST, START, scatter_ratios, with_scatter
+from mwdcal.estimation.variance import FIRST_SCATTER, LEAST_SCATTER, scatter_ratios, with_scatter
 from mwdcal.geometry.vectors import Array, Bools, Ints, placed
 from mwdcal.sensor.models import Basis, Factors, Polynomial, Whole, restricted
 
-FLOOR = 1e-9
+LEAST_NOISE = 1e-9
 """Smallest noise, as a share of the signal, that an estimate from residuals may reach."""
-STEP = 10.0
+TEMPERATURE_STEP = 10.0
 """The range of temperatures that a model is conditioned for ends at multiples of this, °C."""
 ROBUST_ROUNDS = 40
 SETTLED = 1e-3
@@ -83,12 +83,15 @@ def model_of(
 
 
 def temperature_ranges(temperature: Array) -> Array:
-    """Range (B, 2) of each member's temperatures (B, n), widened to multiples of `STEP`.
+    """Range (B, 2) of each member's temperatures (B, n), widened to multiples of `TEMPERATURE_STEP`.
 
     Members of one range are fitted together as each would be alone.
     """
-    low, high = np.floor(temperature.min(-1) / STEP), np.ceil(temperature.max(-1) / STEP)
-    return np.stack([low, high], -1) * STEP
+    low, high = (
+        np.floor(temperature.min(-1) / TEMPERATURE_STEP),
+        np.ceil(temperature.max(-1) / TEMPERATURE_STEP),
+    )
+    return np.stack([low, high], -1) * TEMPERATURE_STEP
 
 
 def _problem(
@@ -182,7 +185,7 @@ def _scattered(evidence: Evidence, readings: Readings, options: Options) -> Evid
     if not scatters(readings, options):
         return evidence
     names = [name for name in ("gravity", "field", "dip") if name not in evidence.absent]
-    start = np.full(evidence.include.shape, START)
+    start = np.full(evidence.include.shape, FIRST_SCATTER)
     return replace(evidence, scatter=dict.fromkeys((*names, "direction"), start))
 
 
@@ -223,16 +226,16 @@ def _closed(
     if apart or not closed_form.applies(problem):
         return None, none
     at = closed_form.start(problem)
-    halfs = closed_form.halves(problem, at)
-    state, analysis = closed_form.solution(problem, at, halfs)
-    good = closed_form.settled(halfs) & analysis.determined.keep.all(-1)
+    triads = closed_form.minima(problem, at)
+    state, analysis = closed_form.solution(problem, at, triads)
+    good = closed_form.settled(triads) & analysis.determined.keep.all(-1)
     if not good.any():
         return None, none
     if not all(declared):
         problem = _rescaled(problem, np.sqrt(analysis.variance_factor), declared)
-        halfs = closed_form.halves(problem, at)
-        state, analysis = closed_form.solution(problem, at, halfs)
-        good &= closed_form.settled(halfs)
+        triads = closed_form.minima(problem, at)
+        state, analysis = closed_form.solution(problem, at, triads)
+        good &= closed_form.settled(triads)
     sound = finite & np.isfinite(state.params).all(-1)
     status = np.where(sound, int(Status.OK), int(Status.NOT_FINITE))
     trust = np.ones(problem.evidence.include.shape)
@@ -412,7 +415,8 @@ def _steady(old: Problem, new: Problem) -> Bools:
     """Members (B,) whose scatter has settled: changed little, or is none."""
     before, now = (p.evidence.scatter for p in (old, new))
     each = [
-        (np.abs(now[name] / value - 1).max(-1) < SCATTER_SETTLED) | (now[name].max(-1) < 10 * LEAST)
+        (np.abs(now[name] / value - 1).max(-1) < SCATTER_SETTLED)
+        | (now[name].max(-1) < 10 * LEAST_SCATTER)
         for name, value in before.items()
     ]
     return np.asarray(np.all(each, 0))
@@ -488,4 +492,4 @@ def _rescaled(problem: Problem, scale: Array, declared: list[bool]) -> Problem:
 
 def _scaled_noise(triad: Triad, scale: Array) -> Array:
     factor = np.where(np.isfinite(scale), scale, 1.0)[:, None, None]
-    return np.maximum(triad.sd * factor, FLOOR * _size(triad.raw))
+    return np.maximum(triad.sd * factor, LEAST_NOISE * _size(triad.raw))

@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 
 from mwdcal.calibration.readings import ANGLES, CONSTANTS, Readings
-from mwdcal.estimation.evidence import UNKNOWN, Constant, Evidence
+from mwdcal.estimation.evidence import UNKNOWN, Evidence, SharedConstant
 from mwdcal.geometry.vectors import AnyArray, Array, Ints
 from mwdcal.sensor.profile import COMMON
 
-TURNS = {"tilt": ("stand-north", "stand-east")}
+STAND_TURNS = {"tilt": ("stand-north", "stand-east")}
 """Errors of the stand that consist of several turns of its frame."""
 
 
@@ -49,7 +49,7 @@ def _stand(readings: Readings, lead: tuple[int, ...]) -> dict[str, Array]:
     found: dict[str, Array] = {}
     for name in COMMON:
         if name in readings.sd:
-            turns = TURNS.get(name, (name,))
+            turns = STAND_TURNS.get(name, (name,))
             sd = flat(readings.uncertainty(name), lead).max(-1) / math.sqrt(len(turns))
             found |= dict.fromkeys(turns, sd)
     return found
@@ -98,7 +98,7 @@ def _share_known(evidence: Evidence) -> tuple[dict[str, Array], dict[str, Array]
     return known, spread
 
 
-def constants(evidence: Evidence) -> tuple[Constant, ...]:
+def constants(evidence: Evidence) -> tuple[SharedConstant, ...]:
     """Constants of the run to estimate: unknown ones, and errors of uncertain references."""
     found = []
     for name, size in (("gravity", 1.0), ("field", 0.0), ("dip", UNKNOWN)):
@@ -110,16 +110,16 @@ def constants(evidence: Evidence) -> tuple[Constant, ...]:
                 np.nansum(evidence.known[name], -1) / np.maximum(known.sum(-1), 1)
             )
             scale = np.full(len(value), size) if size else np.where(value > 0, value, 1.0)
-            found.append(Constant(name, (~known).astype(float), value, scale, unknown=True))
+            found.append(SharedConstant(name, (~known).astype(float), value, scale, unknown=True))
         sd = np.max(np.where(known, evidence.sd[name], 0.0), -1)
         if (sd > 0).any():
             floor = np.where(sd > 0, sd, 1e-12)
             found.append(
-                Constant(name, known.astype(float), np.zeros(len(sd)), floor, unknown=False)
+                SharedConstant(name, known.astype(float), np.zeros(len(sd)), floor, unknown=False)
             )
     for name, sd in evidence.stand.items():
         mask = acts_on(evidence, name)
         if (sd > 0).any() and mask.any():
             floor = np.where(sd > 0, sd, 1e-12)
-            found.append(Constant(name, mask, np.zeros(len(sd)), floor, unknown=False))
+            found.append(SharedConstant(name, mask, np.zeros(len(sd)), floor, unknown=False))
     return tuple(found)

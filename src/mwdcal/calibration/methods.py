@@ -11,10 +11,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from mwdcal.calibration.evidence import TURNS, acts_on, constants
+from mwdcal.calibration.evidence import STAND_TURNS, acts_on, constants
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import ANGLES
-from mwdcal.estimation.evidence import UNKNOWN, Constant, Evidence
+from mwdcal.estimation.evidence import UNKNOWN, Evidence, SharedConstant
 from mwdcal.estimation.minimisers.newton import newton, propagated
 from mwdcal.estimation.minimisers.swarm import swarm_forward
 from mwdcal.estimation.minimisers.unweighted import STRENGTH, Params, Sums
@@ -25,14 +25,14 @@ from mwdcal.geometry.vectors import Array, Bools, Ints, inverse
 from mwdcal.sensor.models import affine_parts
 
 ESTIMABLE = {
-    name: TURNS.get(name, (name,)) for name in ("azimuth-zero", "inclination-zero", "tilt")
+    name: STAND_TURNS.get(name, (name,)) for name in ("azimuth-zero", "inclination-zero", "tilt")
 }
 """Errors of the stand that can be found, and the constants of the run that they consist of."""
-HELD = 1e18
+HELD_PRECISION = 1e18
 """Precision of a parameter that is held at its value."""
-ITERATIONS = 600
+SWARM_ITERATIONS = 600
 """Iterations of the swarm, as Moradi's."""
-PAPER = 1e10
+PAPER_WEIGHT = 1e10
 """Weight of every square of an unweighted sum: only its digits matter, not the minimum."""
 
 
@@ -70,7 +70,7 @@ def with_stand_errors(evidence: Evidence, names: tuple[str, ...]) -> Evidence:
     zero = np.zeros(len(evidence.include))
     for name in turns:
         sd, mask = np.full(len(zero), UNKNOWN), acts_on(evidence, name)
-        found.append(Constant(name, mask, zero, sd, unknown=True))
+        found.append(SharedConstant(name, mask, zero, sd, unknown=True))
     return replace(evidence, constants=tuple(found))
 
 
@@ -169,16 +169,18 @@ def _swarmed(problem: Problem, state: State, seed: int) -> Solved:
     params = np.concatenate(parts, -1)
     finite = np.isfinite(params).all(-1)
     status = np.where(finite, int(Status.OK), int(Status.NOT_FINITE))
-    flown = np.full(len(params), ITERATIONS)
+    flown = np.full(len(params), SWARM_ITERATIONS)
     return Solved(replace(state, params=params), status, flown, unweighted=True)
 
 
 def _swarm_forward(raw: Array, target: Array, include: Bools, seed: int) -> Array:
     """Forward parameters (B, 12); members that leave stations out fly one by one."""
     if include.all():
-        return swarm_forward(raw, target, "reading", iterations=ITERATIONS, seed=seed).position
+        return swarm_forward(
+            raw, target, "reading", iterations=SWARM_ITERATIONS, seed=seed
+        ).position
     each = [
-        swarm_forward(r[keep], t[keep], "reading", iterations=ITERATIONS, seed=seed).position
+        swarm_forward(r[keep], t[keep], "reading", iterations=SWARM_ITERATIONS, seed=seed).position
         for r, t, keep in zip(raw, target, include, strict=True)
     ]
     return np.stack(each)
@@ -191,7 +193,7 @@ def _by_newton(problem: Problem, state: State, paper: bool) -> Solved:
     nominal = triad.model.start(np.zeros((batch, 3, 3)) + np.eye(3), np.zeros((batch, 3)))
     gravity = problem.constant(state, "gravity")
     noise = np.sqrt(np.mean(triad.sd**2, -1))
-    weights = np.full((*gravity.shape, 2), PAPER)
+    weights = np.full((*gravity.shape, 2), PAPER_WEIGHT)
     if not paper:
         weights = propagated(gravity, noise, evidence.sd["inclination"])
     weights = weights * evidence.include[..., None]
@@ -213,7 +215,9 @@ def _by_sums(problem: Problem, state: State, method: str) -> Solved:
     sums, found = {}, []
     for index in range(len(problem.triads) if scalar else 1):
         strength = problem.constant(state, ("gravity", "field")[index]).mean(-1)[:, None, None]
-        weights = include * (PAPER / strength**4 if scalar else PAPER) * np.ones(len(names))
+        weights = (
+            include * (PAPER_WEIGHT / strength**4 if scalar else PAPER_WEIGHT) * np.ones(len(names))
+        )
         sums[index] = _sums(problem, state, index, names, weights)
         where = problem.slices()[index]
         found.append(gauss_newton(sums[index], Params(state.params[:, where])))
@@ -252,7 +256,7 @@ def _magnetometer(problem: Problem, state: State, accelerometer: Array) -> Solve
         none = np.zeros(len(params), int)
         return Solved(state, none, none)
     precision[:, where, :] = precision[:, :, where] = 0.0
-    precision[:, where, where] = HELD * np.eye(accelerometer.shape[-1])
+    precision[:, where, where] = HELD_PRECISION * np.eye(accelerometer.shape[-1])
     expected = problem.prior.expected.copy()
     expected[:, where] = accelerometer
     held = replace(problem, prior=Prior(precision, expected))

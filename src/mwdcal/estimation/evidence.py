@@ -23,7 +23,7 @@ UNKNOWN = np.pi / np.sqrt(3)
 
 
 @dataclass(frozen=True)
-class Constant:
+class SharedConstant:
     """A constant of the run that is estimated: gravity, field, dip, or an error.
 
     Errors are of one of these references, or of the stand: one of `STAND_ERRORS`, each a small
@@ -57,7 +57,7 @@ class Evidence:
     sd: dict[str, Array]
     group: Ints
     include: Array
-    constants: tuple[Constant, ...]
+    constants: tuple[SharedConstant, ...]
     absent: tuple[str, ...] = ()
     stand: Mapping[str, Array] = field(default_factory=dict)
     scatter: dict[str, Array] = field(default_factory=dict)

@@ -226,7 +226,7 @@ class Determined:
         return cls(basis[..., ::-1], values, norms, values > tolerance)
 
     @classmethod
-    def of(cls, problem: Problem, state: Any) -> Determined:
+    def of(cls, problem: Linearisable, state: Any) -> Determined:
         """Of a problem at a state."""
         linear = problem.linear(state, geometry=True)
         return linear.determined
@@ -267,7 +267,7 @@ class Determined:
         return np.asarray(self.basis * ~self.keep[..., None, :])
 
 
-class Problem(Protocol):
+class Linearisable(Protocol):
     """What the solver asks of a problem; states are opaque to it."""
 
     def linear(self, state: Any, geometry: bool = False) -> Linear:
@@ -276,7 +276,7 @@ class Problem(Protocol):
     def move(self, state: Any, linear: Linear, step: Array) -> Any:
         """The state after a step of X's unknowns, private unknowns re-adjusted."""
 
-    def take(self, index: Ints) -> Problem:
+    def take(self, index: Ints) -> Linearisable:
         """The problem of some members of the batch."""
 
     def size_of(self, state: Any) -> Array:
@@ -290,7 +290,7 @@ class _Descent:
     All are of the members still `active`; `linear` is taken at `state`.
     """
 
-    problem: Problem
+    problem: Linearisable
     state: Any
     linear: Linear
     determined: Determined
@@ -298,7 +298,7 @@ class _Descent:
     active: Ints
 
     @classmethod
-    def at(cls, problem: Problem, state: Any) -> _Descent:
+    def at(cls, problem: Linearisable, state: Any) -> _Descent:
         """At the start."""
         count = len(state.params)
         determined = Determined.of(problem, state)
@@ -392,7 +392,7 @@ def _small(normal: Normal, step: Array, size: Array) -> Bools:
     return np.asarray((length < 1e-12) | rounding)
 
 
-def gauss_newton(problem: Problem, state: Any, limit: int = 60) -> tuple[Any, Ints, Ints]:
+def gauss_newton(problem: Linearisable, state: Any, limit: int = 60) -> tuple[Any, Ints, Ints]:
     """Minimise a batch of problems; returns states, `Status` codes and iteration counts."""
     count = len(state.params)
     status = np.full(count, int(Status.NOT_CONVERGED))

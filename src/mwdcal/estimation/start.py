@@ -25,9 +25,9 @@ from mwdcal.geometry.vectors import (
     tool_from_earth,
 )
 
-SPANNED = 2e-3
+ELLIPSOID_SPAN = 2e-3
 """Columns of the ellipsoid with a singular value below this share of the largest are noise."""
-SEEN = 1e-3
+LEAST_SPAN = 1e-3
 """Share of the field that an axis must see for a start from least squares: any other is worse."""
 ANGLES = ("inclination", "azimuth", "toolface")
 
@@ -101,7 +101,7 @@ def _where_determined(gram: Array, right: Array) -> Array:
     The columns are of size one as they come: one that is noise alone must not be scaled up.
     """
     values, vectors = eigen(gram)
-    kept = values > SPANNED**2 * values[:, -1:]
+    kept = values > ELLIPSOID_SPAN**2 * values[:, -1:]
     along = np.einsum("bij,bi->bj", vectors, right)
     along = np.where(kept, along / np.where(kept, values, 1.0), 0.0)
     return np.asarray(np.einsum("bij,bj->bi", vectors, along))
@@ -117,7 +117,7 @@ def _linear(problem: Problem, state: State, index: int, x: Array) -> tuple[Array
     terms = np.concatenate([x, np.ones_like(x[..., :1])], -1)
     gram = np.einsum("bn,bni,bnj->bij", weight, terms, terms)
     values = np.linalg.eigvalsh(gram)
-    usable = (values[:, 0] > SEEN**2 * values[:, -1]) & (weight.sum(-1) >= 4)
+    usable = (values[:, 0] > LEAST_SPAN**2 * values[:, -1]) & (weight.sum(-1) >= 4)
     gram = np.where(usable[:, None, None], gram, np.eye(4))
 
     def fields_of(target: Array) -> Array:

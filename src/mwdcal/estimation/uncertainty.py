@@ -21,7 +21,7 @@ from mwdcal.geometry.vectors import (
     rotation,
 )
 
-SEEN = 0.05
+LEAST_SHARE = 0.05
 """A free direction with less than this share on a triad does not move the triad."""
 TESTED = 1e-3
 """A direction of a station's readings counts if this share of its variance is left by the fit."""
@@ -351,7 +351,7 @@ def free_share(determined: Determined, direction: Array) -> Array:
 def marginal_rank(determined: Determined, where: slice) -> Ints:
     """Rank (B,) of one triad: its size less the dimension of the free subspace as seen by it."""
     seen = np.linalg.svd(determined.null()[..., where, :], compute_uv=False)
-    return np.asarray(where.stop - where.start - np.sum(seen > SEEN, -1))
+    return np.asarray(where.stop - where.start - np.sum(seen > LEAST_SHARE, -1))
 
 
 def settle_gauge(problem: Problem, state: State, determined: Determined) -> State:

@@ -16,7 +16,7 @@ from mwdcal.use import correction_numba, strengths
 from mwdcal.use.strengths import Strengths
 
 OUTSIDE = ("blank", "refuse", "extrapolate")
-MARK = "extrapolated"
+EXTRAPOLATED = "extrapolated"
 """The column that says of each row whether it was extrapolated, where that is allowed."""
 JUDGED = ("gravity", "inclination", "toolface", "azimuth", "field", "dip", "magnetic_toolface")
 DIRECTIONS = {
@@ -30,11 +30,11 @@ NAMES = (
     "magnetic_toolface_deg",
 )
 """The output columns, in their order."""
-MANY = 300_000
+COMPILED_ROWS = 300_000
 """From this number of rows on the compiled loops are worth their start."""
 
 
-class Tally(NamedTuple):
+class RowCounts(NamedTuple):
     """What the findings need to know of the rows: their number, and what was seen in them.
 
     `warmth` are the lowest and the highest temperature of readings, °C.
@@ -70,7 +70,7 @@ def correct(
 
 def counted(
     calibration: Calibration, readings: Readings, outside: str, lacking: int = 0
-) -> tuple[dict[str, AnyArray], Tally, list[Finding]]:
+) -> tuple[dict[str, AnyArray], RowCounts, list[Finding]]:
     """The same, and between what was seen in the rows; `lacking` more were left out unread."""
     check_outside(outside)
     columns: dict[str, AnyArray] = {
@@ -80,14 +80,14 @@ def counted(
     rows, moved = readings.count + lacking, undetermined(calibration, readings)
     if outside == "blank" and beyond.any():
         columns = {name: np.where(beyond, np.nan, value) for name, value in columns.items()}
-    tally = Tally(
+    tally = RowCounts(
         rows, int(beyond.sum()), moved, lacking, (),
         strengths.judged(calibration, columns, readings.known), warmth(readings.temperature),
     )  # fmt: skip
     told = findings(calibration, readings, tally, outside)
     strengths.check(calibration, tally.strengths, readings.source)
     if outside == "extrapolate":
-        columns[MARK] = beyond
+        columns[EXTRAPOLATED] = beyond
     return columns, tally, told
 
 
@@ -100,7 +100,7 @@ def warmth(temperature: Array | None) -> tuple[float, float]:
 
 def result_names(outside: str) -> tuple[str, ...]:
     """The columns of results, in their order."""
-    return (*NAMES, MARK) if outside == "extrapolate" else NAMES
+    return (*NAMES, EXTRAPOLATED) if outside == "extrapolate" else NAMES
 
 
 def check_outside(outside: str) -> None:
@@ -134,7 +134,7 @@ def compiled(
     shape = readings.accelerometer.shape[:-1]
     triads = numbers(calibration)
     unknown = readings.temperature is None and any(t.order for t in calibration.triads)
-    few = np.prod(shape) < (MANY if least is None else least)
+    few = np.prod(shape) < (COMPILED_ROWS if least is None else least)
     if few or triads is None or unknown or not correction_numba.available():
         return None
     zero = calibration.reference_temperature
@@ -167,7 +167,7 @@ def numbers(
 
 
 def findings(
-    calibration: Calibration, readings: Readings, tally: Tally, outside: str
+    calibration: Calibration, readings: Readings, tally: RowCounts, outside: str
 ) -> list[Finding]:
     """What the reader should know of the results; refuses rows outside if `outside` says so.
 
@@ -212,7 +212,7 @@ def _other_tool(calibration: Calibration, readings: Readings) -> list[Finding]:
     return [Finding(id="other-tool", text=text)]
 
 
-def _outside(calibration: Calibration, source: str, how: str, tally: Tally) -> Finding:
+def _outside(calibration: Calibration, source: str, how: str, tally: RowCounts) -> Finding:
     low, high = calibration.temperature_c or (np.nan, np.nan)
     text = f"{tally.beyond} of {tally.rows} rows lie outside the calibrated range {low:.1f}…{high:.1f} °C"
     if how == "refuse":
@@ -223,7 +223,7 @@ def _outside(calibration: Calibration, source: str, how: str, tally: Tally) -> F
         "their results are blank"
         if how == "blank"
         else "their results are extrapolated, with no statement of accuracy, and marked in the "
-        f"column '{MARK}'"
+        f"column '{EXTRAPOLATED}'"
     )
     return Finding(id="outside-temperature", text=f"{text}: {done}.")
 

@@ -22,9 +22,7 @@ Courses = tuple[Floats, ...]
 
 TILE = 128
 DEGREES = 180.0 / np.pi
-TURN = 2.0 * np.pi
-VECTORS = 6
-"""Output rows of the vectors alone."""
+FULL_TURN = 2.0 * np.pi
 
 # Scratch rows: temperature, then the outputs in their order, then what angles are made of.
 _T, _G, _B = 0, 1, 4
@@ -139,15 +137,15 @@ def angles(s: Array, count: int) -> None:
         s[_INC, i] = DEGREES * angle(s[_ACROSS, i], s[_G + 2, i])
     for i in range(count):
         found = angle(s[_EAST, i], s[_NORTH, i])
-        s[_AZI, i] = DEGREES * (found + TURN if found < 0.0 else found)
+        s[_AZI, i] = DEGREES * (found + FULL_TURN if found < 0.0 else found)
     for i in range(count):
         found = angle(-s[_G, i], -s[_G + 1, i])
-        s[_FACE, i] = DEGREES * (found + TURN if found < 0.0 else found)
+        s[_FACE, i] = DEGREES * (found + FULL_TURN if found < 0.0 else found)
     for i in range(count):
         s[_DIP, i] = DEGREES * angle(s[_DOWN, i], s[_CROSS, i])
     for i in range(count):
         found = angle(s[_B, i], s[_B + 1, i])
-        s[_MAGNETIC, i] = DEGREES * (found + TURN if found < 0.0 else found)
+        s[_MAGNETIC, i] = DEGREES * (found + FULL_TURN if found < 0.0 else found)
     for i in range(count):
         still = s[_GRAVITY, i] == 0.0
         quiet = s[_FIELD, i] == 0.0
@@ -227,7 +225,7 @@ def rows(
             tau[i] = s[_T, i] - reference
         field(tau, s[_G], s[_G + 1], s[_G + 2], count, first[0], first[1], curved[0])
         field(tau, s[_B], s[_B + 1], s[_B + 2], count, second[0], second[1], curved[1])
-        if last > VECTORS:
+        if last >= _INC:
             parts(s, count)
             angles(s, count)
         beyond += mask(s, count, low, high, blank > 0.0, last)

@@ -21,11 +21,11 @@ from mwdcal.sensor.models import Factors, Model, Polynomial, affine_parts, facto
 
 __all__ = ["available", "cores", "numbers", "run"]
 
-HIGHEST = 3
+HIGHEST_POWER = 3
 """Highest order in temperature that the loops know."""
 VECTORS, OUTPUTS = 6, 13
 """Rows of a result: the two vectors; these, the angles and the strengths."""
-_PIECE = 1 << 15
+_PIECE_ROWS = 1 << 15
 
 
 class Numbers(NamedTuple):
@@ -40,7 +40,7 @@ class Numbers(NamedTuple):
     curved: bool
 
 
-class Limits(NamedTuple):
+class RowLimits(NamedTuple):
     """Accepted raw values and temperatures, both ends included, and the calibrated range.
 
     Results of rows beyond the calibrated range are NaN where `blank`.
@@ -52,10 +52,10 @@ class Limits(NamedTuple):
     blank: bool = False
 
 
-ANYTHING = Limits()
+ANYTHING = RowLimits()
 
 
-class Found(NamedTuple):
+class CorrectedRows(NamedTuple):
     """Results (rows of output, n), and how many cells and rows were remarkable.
 
     `unsound`: cells out of the accepted ranges or NaN. `beyond`: rows out of the calibrated
@@ -87,7 +87,7 @@ def cores() -> int:
 
 def numbers(model: Model, params: Array) -> Numbers | None:
     """A finished model (powers of T - reference) of parameters (p,); None: not for the loops."""
-    if model.basis.order > HIGHEST:
+    if model.basis.order > HIGHEST_POWER:
         return None
     if isinstance(model, Polynomial):
         return _polynomial(model, params)
@@ -118,7 +118,7 @@ def _factors(model: Factors, params: Array) -> Numbers:
 
 def _courses(gain: Array, offset: Array, scale: Array) -> tuple[tuple[float, ...], ...]:
     """Coefficients by power, gains (K, 3, 3), offsets and scales (K, 3), as one tuple of four each."""
-    padded = np.zeros((HIGHEST + 1, 15))
+    padded = np.zeros((HIGHEST_POWER + 1, 15))
     padded[: len(gain)] = np.hstack([gain.reshape(-1, 9), offset, scale])
     return tuple(map(tuple, np.swapaxes(padded, 0, 1).tolist()))
 
@@ -128,10 +128,10 @@ def run(
     triads: tuple[Numbers, Numbers],
     reference: float,
     units: Sequence[float] = (1.0,) * 6,
-    limits: Limits = ANYTHING,
+    limits: RowLimits = ANYTHING,
     out: Array | None = None,
     workers: int | None = None,
-) -> Found:
+) -> CorrectedRows:
     """All results of `columns`: three of gravity, three of the field, in tool order; temperature.
 
     Columns are (n,), in `units` (with their sign) per nominal g or nT; the last is °C, and
@@ -152,10 +152,10 @@ def run(
         return correction_kernels.rows(*settings, out, start, stop)
 
     workers = workers or cores()
-    step = max(_PIECE, -(-count // workers))
+    step = max(_PIECE_ROWS, -(-count // workers))
     starts = range(0, count, step)
     if len(starts) < 2:
-        return Found(out, *piece(0, count))
+        return CorrectedRows(out, *piece(0, count))
     with ThreadPoolExecutor(len(starts)) as pool:
         counts = pool.map(piece, starts, [min(s + step, count) for s in starts])
-        return Found(out, *np.sum(list(counts), axis=0).tolist())
+        return CorrectedRows(out, *np.sum(list(counts), axis=0).tolist())

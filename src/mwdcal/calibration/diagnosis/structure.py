@@ -18,7 +18,7 @@ import numpy as np
 from mwdcal.calibration.automatic.courses import TRIED, steady_columns, temperature_powers
 from mwdcal.calibration.covariance import variance_scales
 from mwdcal.calibration.estimate import Fit
-from mwdcal.calibration.evidence import TURNS, acts_on
+from mwdcal.calibration.evidence import STAND_TURNS, acts_on
 from mwdcal.calibration.readings import TRIADS
 from mwdcal.calibration.residuals import chances, to_reshoot
 from mwdcal.calibration.soaks import HIGHEST, SPAN, highest_order
@@ -244,7 +244,7 @@ def _families(problem: Problem, state: State) -> Iterator[tuple[str, Array]]:
     by_earth = np.concatenate([p.by_earth * w[..., None] for p, w in pairs], -2)
     known = {n: turn for n, turn in _turns(problem, state, turns).items() if turn.any()}
     for name in STAND:
-        each = [known[turn] for turn in TURNS.get(name, (name,)) if turn in known]
+        each = [known[turn] for turn in STAND_TURNS.get(name, (name,)) if turn in known]
         if each:
             yield name, np.stack(each, -1)
     sets = _sets(problem)

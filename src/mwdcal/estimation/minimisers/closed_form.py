@@ -51,7 +51,7 @@ def _is_closed(triad: Triad) -> bool:
 
 
 @dataclass(frozen=True)
-class Half:
+class AffineMinimum:
     """One triad: terms f̃ = [f 1] (B, n, 4), Φ (B, 3, 4), F⁻¹ by axis (B, 3, 4, 4), M and T.
 
     `include` (B, n, 1) is 1 for stations that count; `left` (B, n, 3) are whitened residuals, `open`
@@ -106,26 +106,26 @@ class Half:
         return np.sqrt(np.clip(squares, 0, None)), norms[:, PLACES]
 
 
-Halves = list[Half | closed_form_factors.Half]
+Minima = list[AffineMinimum | closed_form_factors.FactorsMinimum]
 
 
-def halves(problem: Problem, at: State) -> Halves:
+def minima(problem: Problem, at: State) -> Minima:
     """The minimum of each triad at known attitudes, where the stations span what a model needs."""
     include = problem.evidence.include
     pairs = list(zip(problem.triads, problem.targets(at), strict=False))
     factored = [pair for pair in pairs if isinstance(pair[0].model, Factors)]
-    apart = iter(closed_form_factors.halves(factored, problem.temperature, include))
+    apart = iter(closed_form_factors.minima(factored, problem.temperature, include))
     return [
         next(apart)
         if isinstance(triad.model, Factors)
-        else _half(triad, target, include[..., None])
+        else _affine_minimum(triad, target, include[..., None])
         for triad, target in pairs
     ]
 
 
-def settled(halfs: Halves) -> Bools:
+def settled(triads: Minima) -> Bools:
     """Members (B,) of which all triads are at their minimum."""
-    return np.asarray(np.all([half.settled for half in halfs], axis=0))
+    return np.asarray(np.all([triad.settled for triad in triads], axis=0))
 
 
 def start(problem: Problem) -> State:
@@ -139,35 +139,35 @@ def start(problem: Problem) -> State:
     return State(np.zeros((batch, size)), attitude, nothing, own)
 
 
-def solution(problem: Problem, at: State, halfs: Halves) -> tuple[State, Analysis]:
+def solution(problem: Problem, at: State, triads: Minima) -> tuple[State, Analysis]:
     """State and analysis at the minimum."""
     include = problem.evidence.include
-    state = replace(at, params=np.concatenate([h.params for h in halfs], -1))
+    state = replace(at, params=np.concatenate([h.params for h in triads], -1))
     p = state.params.shape[-1]
     covariance = np.zeros((len(include), p, p))
-    for half, where in zip(halfs, problem.slices(), strict=True):
-        covariance[:, where, where] = half.covariance
-    left, free = (np.concatenate([getattr(h, n) for h in halfs], -1) for n in ("left", "open"))
+    for triad, where in zip(triads, problem.slices(), strict=True):
+        covariance[:, where, where] = triad.covariance
+    left, free = (np.concatenate([getattr(h, n) for h in triads], -1) for n in ("left", "open"))
     spread = np.zeros((*free.shape, free.shape[-1]))
     np.einsum("...ii->...i", spread)[...] = free
     squares, freedom = (
-        np.stack([np.sum(getattr(h, n) ** k, (1, 2)) for h in halfs], -1)
+        np.stack([np.sum(getattr(h, n) ** k, (1, 2)) for h in triads], -1)
         for n, k in (("left", 2), ("open", 1))
     )
     factor = squares / np.where(freedom > 1e-9, freedom, np.nan)
     none = np.zeros((len(include), p, 0))
-    known = determined(halfs)
+    known = determined(triads)
     return state, Analysis(covariance, known, factor, freedom, left, spread, none[:, :0], none)
 
 
-def _half(triad: Triad, target: Array, include: Array) -> Half:
+def _affine_minimum(triad: Triad, target: Array, include: Array) -> AffineMinimum:
     weight = include / triad.sd**2
     alike = bool((weight == weight[..., :1]).all())
     fit = regress(triad.raw, target, weight[..., :1] if alike else weight)
     terms, forward, spread = fit.terms, np.swapaxes(fit.forward, -1, -2), fit.cofactor
     left = (triad.raw - terms @ np.swapaxes(forward, -1, -2)) * np.sqrt(weight)
     share = np.einsum("banj,bnj->bna", terms[:, None] @ spread, terms) * weight
-    return Half(
+    return AffineMinimum(
         include, terms, forward, spread, *_own(triad, forward), left, include - share, fit.spanned
     )
 
@@ -184,10 +184,10 @@ def _own(triad: Triad, forward: Array) -> tuple[Array, Array]:
     return back, turn
 
 
-def determined(halfs: Halves) -> Determined:
+def determined(triads: Minima) -> Determined:
     """How well all triads' parameters are determined; the directions themselves are not worked out."""
     values, norms = (
-        np.concatenate(each, -1) for each in zip(*(h.known for h in halfs), strict=True)
+        np.concatenate(each, -1) for each in zip(*(h.known for h in triads), strict=True)
     )
     values = -np.sort(-values, -1)
     values = values / np.maximum(values[:, :1], 1e-300)

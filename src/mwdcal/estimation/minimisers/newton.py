@@ -40,21 +40,21 @@ from mwdcal.sensor.models import Model
 
 THRESHOLD = 1.5e-6
 """Criterion 22: the largest relative change of a parameter at which the iteration ends."""
-FLOOR = 1e-3
+CRITERION_FLOOR = 1e-3
 """Floor of its denominator, as a share of the change that moves the observables by one unit."""
 BOTH_VERTICAL = 1e-9
 """A vertical reading this close to its reference, rad, has the curvature of the limit."""
-SMALLEST = 1e-12
+SMALLEST_EIGENVALUE = 1e-12
 """Eigenvalues below this share of the largest are taken as that."""
 DECREASE = 1e-4
 """Share of the decrease promised by the gradient with which the line search is content."""
-HALVINGS = 40
-TINY = 1e-5
+MOST_HALVINGS = 40
+TANGENT_STEP = 1e-5
 EPSILON = float(np.finfo(float).eps)
 
 
 @dataclass(frozen=True)
-class Stations:
+class Compared:
     """What is compared: raw (B, n, 3), temperature, gravity, inclination (B, n), weights (B, n, 2).
 
     A reference of weight zero has a harmless value: nothing here is NaN for being unknown.
@@ -71,9 +71,9 @@ class Stations:
         """Which of |g| and inclination count (B, n, 2)."""
         return np.asarray(self.weights > 0)
 
-    def take(self, index: Ints) -> Stations:
+    def take(self, index: Ints) -> Compared:
         """The stations of some members of the batch."""
-        return Stations(
+        return Compared(
             self.raw[index],
             self.temperature[index],
             self.gravity[index],
@@ -139,10 +139,10 @@ def newton(
     lead = np.broadcast_shapes(
         params.shape[:-1], raw.shape[:-2], shares.shape[:-2], model.lead, *shapes
     )
-    stations = _stations(raw, known, shares, lead)
+    stations = _compared(raw, known, shares, lead)
     start = np.broadcast_to(params, (*lead, model.size)).reshape(prod(lead), model.size)
     with np.errstate(all="ignore"):
-        descent = _Descent.at(model.flat(lead), stations, start, limit)
+        descent = _NewtonDescent.at(model.flat(lead), stations, start, limit)
         for _ in range(limit):
             if descent.active.size:
                 descent.step()
@@ -158,7 +158,7 @@ def propagated(gravity: ArrayLike, noise: ArrayLike, stand: ArrayLike = 0.0) -> 
     return np.stack([1 / (2 * strength * sd) ** 2, 1 / ((sd / strength) ** 2 + angle**2)], -1)
 
 
-def _stations(raw: Array, known: list[Array], shares: Array, lead: tuple[int, ...]) -> Stations:
+def _compared(raw: Array, known: list[Array], shares: Array, lead: tuple[int, ...]) -> Compared:
     """Everything with one batch axis; what is not known has weight zero."""
     count = raw.shape[-2]
 
@@ -170,7 +170,7 @@ def _stations(raw: Array, known: list[Array], shares: Array, lead: tuple[int, ..
     weights = np.where(absent, 0.0, flat(shares, 2))
     strong, inclined = weights[..., 0] > 0, weights[..., 1] > 0
     counts = strong | inclined
-    return Stations(
+    return Compared(
         np.where(counts[..., None], flat(raw, 3), np.array([0.0, 0.0, 1.0])),
         np.where(counts, temperature, 0.0),
         np.where(strong, gravity, 1.0),
@@ -217,7 +217,7 @@ def half_square_inclination(g: Array, inclination: Array) -> tuple[Array, Array,
     return error, error[..., None] * up / strength, second
 
 
-def cost(model: Model, params: Array, stations: Stations) -> Array:
+def cost(model: Model, params: Array, stations: Compared) -> Array:
     """E (B,): the mean over stations of both weighted squares."""
     g = model.fields(params, stations.raw, stations.temperature)
     strength = np.sum(g * g, -1) - stations.gravity**2
@@ -226,7 +226,7 @@ def cost(model: Model, params: Array, stations: Stations) -> Array:
     return np.asarray(np.sum(squares, (-1, -2)) / g.shape[-2])
 
 
-def local(model: Model, params: Array, stations: Stations) -> Local:
+def local(model: Model, params: Array, stations: Compared) -> Local:
     """E and its exact derivatives: those of the two squares, chained with those of the model."""
     raw, temperature = stations.raw, stations.temperature
     g = model.fields(params, raw, temperature)
@@ -246,14 +246,14 @@ def local(model: Model, params: Array, stations: Stations) -> Local:
     return Local(0.5 * np.sum(squares, (-1, -2)), gradient, hessian)
 
 
-def determines(model: Model, params: Array, stations: Stations) -> Determined:
+def determines(model: Model, params: Array, stations: Compared) -> Determined:
     """Which directions of parameter space the stations determine, however noisy they are."""
     gram, norms = geometry(model, params, stations)
     nothing = np.zeros_like(params)
     return Determined.by(Normal(gram, nothing, nothing[:, 0], model.size), norms)
 
 
-def geometry(model: Model, params: Array, stations: Stations) -> tuple[Array, Array]:
+def geometry(model: Model, params: Array, stations: Compared) -> tuple[Array, Array]:
     """Information (B, p, p) of what the stations compare, and norms (B, p) of the whole columns.
 
     Rows are the logarithm of |g| and the inclination; at a vertical reference, where the
@@ -274,7 +274,7 @@ def geometry(model: Model, params: Array, stations: Stations) -> tuple[Array, Ar
     return gram, norms
 
 
-def _target(g: Array, stations: Stations) -> Array:
+def _target(g: Array, stations: Compared) -> Array:
     """The vector (B, n, 3) nearest to g of which the known references hold exactly."""
     used, across = stations.used, np.hypot(g[..., 0], g[..., 1])
     strength = np.where(used[..., 0], stations.gravity, np.linalg.norm(g, axis=-1))
@@ -287,7 +287,7 @@ def _target(g: Array, stations: Stations) -> Array:
     )
 
 
-def _rows(target: Array, stations: Stations) -> Array:
+def _rows(target: Array, stations: Compared) -> Array:
     """What each station compares, as rows (B, n, 3, 3) on the field, in units of gravity."""
     along, up, turn = _directions(target)
     used = stations.used[..., None]
@@ -302,7 +302,7 @@ def downhill(here: Local, determined: Determined) -> Array:
     inner = np.swapaxes(kept, -1, -2) @ (here.hessian / _outer(norms, norms)) @ kept
     values, vectors = np.linalg.eigh(inner)
     size = np.abs(values)
-    size = np.maximum(size, SMALLEST * np.max(size, -1, keepdims=True))
+    size = np.maximum(size, SMALLEST_EIGENVALUE * np.max(size, -1, keepdims=True))
     axes = kept @ vectors
     along = np.swapaxes(axes, -1, -2) @ (here.gradient / norms)[..., None]
     length = np.where(size > 0, along[..., 0] / np.where(size > 0, size, 1.0), 0.0)
@@ -310,7 +310,7 @@ def downhill(here: Local, determined: Determined) -> Array:
 
 
 def search(
-    model: Model, params: Array, stations: Stations, here: Local, step: Array
+    model: Model, params: Array, stations: Compared, here: Local, step: Array
 ) -> tuple[Array, Array]:
     """The largest α (B,) of 1, 1/2, 1/4, … that lowers E enough, and E there; 0 where none does."""
     promised = DECREASE * np.sum(here.gradient * step, -1)
@@ -318,7 +318,7 @@ def search(
     digits = np.sum(stations.weights * sizes, (-1, -2)) / sizes.shape[-2]
     bound = here.cost * (1 + 4 * EPSILON) + digits * (4 * EPSILON) ** 2
     share = np.ones_like(here.cost)
-    for _ in range(HALVINGS):
+    for _ in range(MOST_HALVINGS):
         trial = cost(model, params + share[:, None] * step, stations)
         good = trial <= bound + share * promised
         if good.all():
@@ -327,8 +327,8 @@ def search(
     return np.where(good, share, 0.0), np.where(good, trial, here.cost)
 
 
-def criterion(params: Array, step: Array, determined: Determined, stations: Stations) -> Array:
-    """Number 22 (B,), its denominator no less than `FLOOR` of each parameter's own scale.
+def criterion(params: Array, step: Array, determined: Determined, stations: Compared) -> Array:
+    """Number 22 (B,), its denominator no less than `CRITERION_FLOOR` of each parameter's own scale.
 
     That scale is the change which moves |g| by itself or the inclination by a radian, in the
     root mean square over the stations: about 1 g for a bias, 1 for a scale or a misalignment.
@@ -336,15 +336,15 @@ def criterion(params: Array, step: Array, determined: Determined, stations: Stat
     comparisons = np.sum(stations.used, (-1, -2))[:, None]
     scale = np.sqrt(comparisons) / determined.norms
     mean = np.abs(params + step / 2)
-    return np.asarray(np.max(np.abs(step) / np.maximum(mean, FLOOR * scale), -1))
+    return np.asarray(np.max(np.abs(step) / np.maximum(mean, CRITERION_FLOOR * scale), -1))
 
 
 @dataclass
-class _Descent:
+class _NewtonDescent:
     """Steps of one batch, each member until it has stopped."""
 
     model: Model
-    stations: Stations
+    stations: Compared
     params: Array
     status: Ints
     iterations: Ints
@@ -353,7 +353,7 @@ class _Descent:
     active: Ints
 
     @classmethod
-    def at(cls, model: Model, stations: Stations, params: Array, limit: int) -> _Descent:
+    def at(cls, model: Model, stations: Compared, params: Array, limit: int) -> _NewtonDescent:
         """At the start values."""
         count = len(params)
         costs = np.full((count, limit + 1), np.nan)
@@ -398,12 +398,12 @@ class _Descent:
     def free(self, determined: Determined) -> dict[str, Bools]:
         """Whether a turn of all readings about an axis, or their scale, is free (B,), by name."""
         turns = zip(ROTATIONS, np.eye(3), strict=True)
-        changes = {name: rotation(TINY * axis) for name, axis in turns}
-        changes["scale"] = np.eye(3) * (1 + TINY)
+        changes = {name: rotation(TANGENT_STEP * axis) for name, axis in turns}
+        changes["scale"] = np.eye(3) * (1 + TANGENT_STEP)
         result = {}
         for name, change in changes.items():
             moved = self.model.transformed(self.params, change)
-            share = free_share(determined, (moved - self.params) / TINY)
+            share = free_share(determined, (moved - self.params) / TANGENT_STEP)
             result[name] = np.asarray(share > COUPLED)
         return result
 
