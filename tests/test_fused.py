@@ -219,7 +219,7 @@ def test_vectors_alone(sound):
 def test_long_arrays_take_the_loops_and_the_result_is_the_same(sound, monkeypatch):
     calibration = changed(sound, ("factors", 3, False), ("factors", 3, False))
     readings = random_readings((4000,))
-    monkeypatch.setattr(correction, "MANY", 1000)
+    monkeypatch.setattr(correction, "COMPILED_ROWS", 1000)
     assert correction.compiled(calibration, readings) is not None
     plain, said = correction.correct(calibration, readings, "blank")
     monkeypatch.setattr(correction, "compiled", lambda *given: None)

@@ -85,7 +85,7 @@ def model_of(
 def temperature_ranges(temperature: Array) -> Array:
     """Range (B, 2) of each member's temperatures (B, n), widened to multiples of `TEMPERATURE_STEP`.
 
-    Members of one range are fitted together as each would be alone.
+    Members of equal range have the same model in a batch as alone.
     """
     low, high = (
         np.floor(temperature.min(-1) / TEMPERATURE_STEP),
@@ -181,7 +181,7 @@ def scatters(readings: Readings, options: Options) -> bool:
 
 
 def _scattered(evidence: Evidence, readings: Readings, options: Options) -> Evidence:
-    """The evidence with the scatter whose estimation is asked for, where it begins."""
+    """The evidence with the first value of each scatter that the options have estimated."""
     if not scatters(readings, options):
         return evidence
     names = [name for name in ("gravity", "field", "dip") if name not in evidence.absent]
@@ -190,7 +190,7 @@ def _scattered(evidence: Evidence, readings: Readings, options: Options) -> Evid
 
 
 def _general(problem: Problem, declared: list[bool], options: Options, finite: Bools) -> Fit:
-    """The fit by steps."""
+    """The fit by the method's minimiser, with estimated noise and station weights in turn."""
     solved = solve(problem, start(problem), options)
     iterations = solved.iterations
     stage = _Stage(problem, solved, np.ones(problem.evidence.include.shape))
@@ -217,9 +217,9 @@ def _general(problem: Problem, declared: list[bool], options: Options, finite: B
 def _closed(
     problem: Problem, declared: list[bool], options: Options, finite: Bools
 ) -> tuple[Fit | None, Bools]:
-    """The fit in closed form, and members (B,) of which it is: those that determine all directions.
+    """The fit in closed form, and for which members (B,) it holds: all directions are determined.
 
-    None where it is of none, as with references that are not exact.
+    None where it holds for no member, as with references that are not exact.
     """
     none = np.zeros(len(finite), bool)
     apart = options.robust or options.own_solver or problem.evidence.scatter
@@ -245,19 +245,19 @@ def _closed(
 
 
 def _joined(ours: Fit, index: Ints, other: Fit) -> Fit:
-    """Our fit with some members of another."""
+    """A fit with some members replaced by those of another."""
     ends = {
         name: placed(getattr(ours, name), index, getattr(other, name))
         for name in ("status", "iterations", "noise", "trust")
     }
     mine, theirs = ours.analysis, other.analysis
     names = ("covariance", "variance_factor", "freedom", "residual", "spread")
-    found = {n: placed(getattr(mine, n), index, getattr(theirs, n)) for n in names}
+    arrays = {n: placed(getattr(mine, n), index, getattr(theirs, n)) for n in names}
     determined = mine.determined.put(index, theirs.determined)
     return Fit(
         problem=_with_noise_of(ours.problem, index, other.problem),
         state=ours.state.put(index, other.state),
-        analysis=replace(mine, determined=determined, **found),
+        analysis=replace(mine, determined=determined, **arrays),
         **ends,
     )
 
@@ -295,7 +295,7 @@ def _analysed(
     options: Options,
     trust: Array,
 ) -> Analysis:
-    """The analysis of the estimator that was used: not every one is the likelihood's."""
+    """The likelihood's analysis as it changes with the papers' sums and with robust weights."""
     pulls = solved.pulls(problem, state)
     if pulls:
         analysis = sandwich(analysis, problem, state, pulls)
@@ -307,7 +307,7 @@ def _analysed(
 def _robustly(
     analysis: Analysis, problem: Problem, state: State, loss: str, trust: Array
 ) -> Analysis:
-    """The analysis of a fit with station weights: the data say less than they seem to, a prior does not."""
+    """The analysis of a fit with station weights: they cost information of the data, none of the prior."""
     freedom = _tested(station_misfit(analysis)[1])
     louder = np.sqrt([inflation(loss, k) for k in freedom])[:, None]
     wider = analyse(_louder(problem, louder), state, analysis.determined)

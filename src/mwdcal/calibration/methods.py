@@ -1,7 +1,7 @@
-"""The methods: which evidence each uses, and how each finds its minimum.
+"""The methods: which evidence each uses, and how each minimises.
 
 A method is a selection of evidence (`EVIDENCE`); most share one estimator. Newton-Raphson and the
-swarm have their own, and so have the papers' unweighted sums (`Options.paper_weights`).
+swarm have one of their own, as have the papers' unweighted sums (`Options.paper_weights`).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from mwdcal.sensor.models import affine_parts
 ESTIMABLE = {
     name: STAND_TURNS.get(name, (name,)) for name in ("azimuth-zero", "inclination-zero", "tilt")
 }
-"""Errors of the stand that can be found, and the constants of the run that they consist of."""
+"""Errors of the stand that can be estimated, and the constants of the run that each consists of."""
 HELD_PRECISION = 1e18
 """Precision of a parameter that is held at its value."""
 SWARM_ITERATIONS = 600
@@ -66,12 +66,12 @@ def with_stand_errors(evidence: Evidence, names: tuple[str, ...]) -> Evidence:
     if not names:
         return evidence
     turns = [turn for error in names for turn in ESTIMABLE[error]]
-    found = [constant for constant in evidence.constants if constant.name not in turns]
+    shared = [constant for constant in evidence.constants if constant.name not in turns]
     zero = np.zeros(len(evidence.include))
     for name in turns:
         sd, mask = np.full(len(zero), UNKNOWN), acts_on(evidence, name)
-        found.append(SharedConstant(name, mask, zero, sd, unknown=True))
-    return replace(evidence, constants=tuple(found))
+        shared.append(SharedConstant(name, mask, zero, sd, unknown=True))
+    return replace(evidence, constants=tuple(shared))
 
 
 def without(evidence: Evidence, names: tuple[str, ...]) -> Evidence:
@@ -162,8 +162,8 @@ def _swarmed(problem: Problem, state: State, seed: int) -> Solved:
     parts = []
     for triad, earth in zip(problem.triads, problem.earth(state)[0], strict=False):
         target = np.einsum("bnij,bnj->bni", state.attitude, earth)
-        found = _swarm_forward(triad.raw, target, problem.evidence.include > 0, seed)
-        matrix, offset = affine_parts(found)
+        forward = _swarm_forward(triad.raw, target, problem.evidence.include > 0, seed)
+        matrix, offset = affine_parts(forward)
         back = inverse(matrix)
         parts.append(triad.model.start(back, -np.einsum("bij,bj->bi", back, offset)))
     params = np.concatenate(parts, -1)
@@ -197,14 +197,14 @@ def _by_newton(problem: Problem, state: State, paper: bool) -> Solved:
     if not paper:
         weights = propagated(gravity, noise, evidence.sd["inclination"])
     weights = weights * evidence.include[..., None]
-    found = newton(
+    minimum = newton(
         triad.model, nominal, triad.raw, problem.temperature, gravity,
         evidence.known["inclination"], weights=weights,
     )  # fmt: skip
     own = _sums(problem, state, 0, (STRENGTH, "inclination"), weights)
-    later = _magnetometer(problem, state, found.params)
-    status = np.maximum(later.status, found.status)
-    return Solved(later.state, status, found.iterations, {0: own}, {0: found.information})
+    later = _magnetometer(problem, state, minimum.params)
+    status = np.maximum(later.status, minimum.status)
+    return Solved(later.state, status, minimum.iterations, {0: own}, {0: minimum.information})
 
 
 def _by_sums(problem: Problem, state: State, method: str) -> Solved:
@@ -212,7 +212,7 @@ def _by_sums(problem: Problem, state: State, method: str) -> Solved:
     scalar = method == "scalar"
     names = (STRENGTH,) if scalar else ("toolface", "inclination")
     include = problem.evidence.include[..., None]
-    sums, found = {}, []
+    sums, minima = {}, []
     for index in range(len(problem.triads) if scalar else 1):
         strength = problem.constant(state, ("gravity", "field")[index]).mean(-1)[:, None, None]
         weights = (
@@ -220,15 +220,15 @@ def _by_sums(problem: Problem, state: State, method: str) -> Solved:
         )
         sums[index] = _sums(problem, state, index, names, weights)
         where = problem.slices()[index]
-        found.append(gauss_newton(sums[index], Params(state.params[:, where])))
-    params = np.concatenate([each[0].params for each in found], -1)
-    status = np.max([each[1] for each in found], 0)
-    iterations = np.max([each[2] for each in found], 0)
+        minima.append(gauss_newton(sums[index], Params(state.params[:, where])))
+    params = np.concatenate([each[0].params for each in minima], -1)
+    status = np.max([each[1] for each in minima], 0)
+    iterations = np.max([each[2] for each in minima], 0)
     if scalar:
         after = Solved(readjusted(problem, replace(state, params=params)), status, iterations)
     else:
         after = _magnetometer(problem, state, params)
-    pairs = zip(sums.items(), found, strict=True)
+    pairs = zip(sums.items(), minima, strict=True)
     known = {index: one.information(each[0].params) for (index, one), each in pairs}
     return Solved(after.state, np.maximum(status, after.status), iterations, sums, known)
 

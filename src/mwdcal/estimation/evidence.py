@@ -9,6 +9,7 @@ import numpy as np
 
 from mwdcal.geometry.vectors import Array, Bools, Ints
 
+ANGLES = ("inclination", "azimuth", "toolface")
 EARTH = ("gravity", "field", "dip")
 STAND = {
     "stand-north": np.array([1.0, 0.0, 0.0]),

@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from mwdcal.estimation.evidence import ANGLES
 from mwdcal.estimation.problem import Problem, State
 from mwdcal.estimation.regression import regress
 from mwdcal.geometry import observables
@@ -28,12 +29,15 @@ from mwdcal.geometry.vectors import (
 ELLIPSOID_SPAN = 2e-3
 """Columns of the ellipsoid with a singular value below this share of the largest are noise."""
 LEAST_SPAN = 1e-3
-"""Share of the field that an axis must see for a start from least squares: any other is worse."""
-ANGLES = ("inclination", "azimuth", "toolface")
+"""Least share of the field along an axis with which least squares gives a start."""
 
 
 def start(problem: Problem) -> State:
-    """A state close enough for Gauss-Newton, for every member of the batch."""
+    """A state of every member of the batch from which Gauss-Newton converges.
+
+    Singular: where neither known directions nor strengths determine a triad, the start is a sphere
+    about the middle of its readings.
+    """
     constants = [c.value for c in problem.evidence.constants]
     batch, count = problem.temperature.shape
     empty = State(
@@ -43,12 +47,12 @@ def start(problem: Problem) -> State:
         np.zeros((batch, count, len(problem.evidence.absent))),
     )
     params = [_triad_start(problem, empty, index) for index in range(len(problem.triads))]
-    found = np.concatenate(params, -1)
+    values = np.concatenate(params, -1)
     for where in problem.slices():
         known = np.diagonal(problem.prior.precision[:, where, where], axis1=-2, axis2=-1) > 0
         whole = known.all(-1, keepdims=True)
-        found[:, where] = np.where(whole, problem.prior.expected[:, where], found[:, where])
-    state = replace(empty, params=found)
+        values[:, where] = np.where(whole, problem.prior.expected[:, where], values[:, where])
+    state = replace(empty, params=values)
     return _attitudes(problem, state)
 
 
@@ -108,7 +112,7 @@ def _where_determined(gram: Array, right: Array) -> Array:
 
 
 def _linear(problem: Problem, state: State, index: int, x: Array) -> tuple[Array, Array, Bools]:
-    """Least squares on stations of known direction; and where these are enough."""
+    """Matrix and offset (field = matrix x + offset) from stations of known direction; where usable (B,)."""
     evidence = problem.evidence
     known = [evidence.is_known(name) for name in ANGLES]
     whole = known[0] & known[2] & (known[1] | (index == 0))
@@ -146,7 +150,10 @@ def _unknown_dip(
     weight: Array,
     fields_of: Callable[[Array], Array],
 ) -> Array:
-    """Dip (B,) at which the readings fit best: the weakest direction of what they leave over."""
+    """Dip (B,) at which the fields are nearest to a linear function of the readings.
+
+    Definition: the smallest eigenvector of the residual sums of a horizontal and a vertical field.
+    """
     parts = [
         np.einsum("bnij,bnj->bni", attitude, earth_field(field, np.full_like(field, angle)))
         for angle in (0.0, np.pi / 2)
@@ -239,15 +246,15 @@ def _by_toolface(
         own = lone & ~evidence.is_known(name)
         return np.where(own[..., None], turned, total), some | own
 
-    down, found = mean("inclination", np.zeros(faced.shape), g)
-    inclination = np.where(found, np.arctan2(-down[..., 0], down[..., 2]), angles["inclination"])
-    across, found = mean("azimuth", inclination, b)
-    azimuth = np.where(found, np.arctan2(-across[..., 1], across[..., 0]), angles["azimuth"])
+    down, known = mean("inclination", np.zeros(faced.shape), g)
+    inclination = np.where(known, np.arctan2(-down[..., 0], down[..., 2]), angles["inclination"])
+    across, known = mean("azimuth", inclination, b)
+    azimuth = np.where(known, np.arctan2(-across[..., 1], across[..., 0]), angles["azimuth"])
     return {**angles, "inclination": inclination, "azimuth": azimuth}
 
 
 def _with_own(problem: Problem, state: State, g: Array, b: Array) -> State:
-    """Strengths and dip of which nothing may be used start as the start's own fields have them."""
+    """The state with each station's own strength and dip as its corrected fields have them."""
     own = state.own.copy()
     for index, name in enumerate(problem.evidence.absent):
         value = observables.OBSERVABLES[name].value(g, b)

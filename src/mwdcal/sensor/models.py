@@ -2,7 +2,7 @@
 
 Two families, composed and never subclassed:
 
-polynomial   field = Σ_k φ_k(T) (A_k x + c_k) [+ e₂ x² + e₃ x³, own axis, where asked for]
+polynomial   field = Σ_k φ_k(T) (A_k x + c_k) [+ e₂ x² + e₃ x³, own axis, if `curved`]
              linear in its 12 (n + 1) parameters [+ 6]
 factors      field = (I - m) (x / SF(T) - B(T))          Moosavi 1-8: 6 (n + 1) + 6 parameters
 
@@ -179,7 +179,7 @@ class Polynomial:
     def transformed(self, params: Array, turn: Array) -> Array:
         """Parameters of the model whose fields are a matrix `turn` (..., 3, 3) times ours.
 
-        Curved terms stay on their own axes: they are small, and so are the turns asked for.
+        Curved terms are not turned: they and the turns are taken to be small.
         """
         matrix, offset = affine_parts(self._blocks(params))
         offset = np.einsum("...ij,...kj->...ki", turn, offset)

@@ -69,11 +69,11 @@ def angle(y: float, x: float) -> float:
     q = q * w + 4.328810604912902668951e2
     q = q * w + 4.853903996359136964868e2
     q = q * w + 1.945506571482613964425e2
-    found = z * (w * p / q) + z
-    found = found + 0.25 * np.pi if fold else found
-    found = 0.5 * np.pi - found if steep else found
-    found = np.pi - found if np.copysign(1.0, x) < 0.0 else found
-    return float(np.copysign(found, y))
+    turn = z * (w * p / q) + z
+    turn = turn + 0.25 * np.pi if fold else turn
+    turn = 0.5 * np.pi - turn if steep else turn
+    turn = np.pi - turn if np.copysign(1.0, x) < 0.0 else turn
+    return float(np.copysign(turn, y))
 
 
 @compiled
@@ -136,16 +136,16 @@ def angles(s: Array, count: int) -> None:
     for i in range(count):
         s[_INC, i] = DEGREES * angle(s[_ACROSS, i], s[_G + 2, i])
     for i in range(count):
-        found = angle(s[_EAST, i], s[_NORTH, i])
-        s[_AZI, i] = DEGREES * (found + FULL_TURN if found < 0.0 else found)
+        turn = angle(s[_EAST, i], s[_NORTH, i])
+        s[_AZI, i] = DEGREES * (turn + FULL_TURN if turn < 0.0 else turn)
     for i in range(count):
-        found = angle(-s[_G, i], -s[_G + 1, i])
-        s[_FACE, i] = DEGREES * (found + FULL_TURN if found < 0.0 else found)
+        turn = angle(-s[_G, i], -s[_G + 1, i])
+        s[_FACE, i] = DEGREES * (turn + FULL_TURN if turn < 0.0 else turn)
     for i in range(count):
         s[_DIP, i] = DEGREES * angle(s[_DOWN, i], s[_CROSS, i])
     for i in range(count):
-        found = angle(s[_B, i], s[_B + 1, i])
-        s[_MAGNETIC, i] = DEGREES * (found + FULL_TURN if found < 0.0 else found)
+        turn = angle(s[_B, i], s[_B + 1, i])
+        s[_MAGNETIC, i] = DEGREES * (turn + FULL_TURN if turn < 0.0 else turn)
     for i in range(count):
         still = s[_GRAVITY, i] == 0.0
         quiet = s[_FIELD, i] == 0.0

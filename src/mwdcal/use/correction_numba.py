@@ -56,7 +56,7 @@ ANYTHING = RowLimits()
 
 
 class CorrectedRows(NamedTuple):
-    """Results (rows of output, n), and how many cells and rows were remarkable.
+    """Results (outputs, n), with counts of cells and rows that need a remark.
 
     `unsound`: cells out of the accepted ranges or NaN. `beyond`: rows out of the calibrated
     range. `empty`: results that are NaN.
@@ -86,7 +86,7 @@ def cores() -> int:
 
 
 def numbers(model: Model, params: Array) -> Numbers | None:
-    """A finished model (powers of T - reference) of parameters (p,); None: not for the loops."""
+    """A finished model (powers of T - reference) of parameters (p,); None where its order is too high."""
     if model.basis.order > HIGHEST_POWER:
         return None
     if isinstance(model, Polynomial):

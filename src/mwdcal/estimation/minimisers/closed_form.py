@@ -7,7 +7,7 @@ linear in Φ = [S o], separately for each axis, and the model's own parameters �
 
 so that all covariances and ranks are products of 3 × 3 and 4 × 4 matrices. These are the same
 figures as the general way gives, for a hundredth of the work; they are tested against it. Moosavi's
-factors come apart by axis as well: `separable` has them.
+factors come apart by axis as well (`closed_form_factors`).
 """
 
 from __future__ import annotations

@@ -152,8 +152,8 @@ def swarm(
             flight.step(one)
             history[:, index] = flight.lowest
     lead = flight.lead
-    found = flight.aims[1].reshape(*lead, *shape)[..., :1, :]
-    position = (middle + half * found)[..., 0, :]
+    leader = flight.aims[1].reshape(*lead, *shape)[..., :1, :]
+    position = (middle + half * leader)[..., 0, :]
     return Swarm(
         position, flight.lowest.reshape(lead), history.reshape(*lead, iterations), iterations
     )
@@ -183,8 +183,8 @@ def vector_cost(raw: Array, reference: Array, error: Error = "field") -> Cost:
     misfit = {"field": in_field, "reading": in_reading}[error]
 
     def cost(params: Array) -> Array:
-        found = misfit(params)
-        return np.asarray(np.einsum("...ni,...ni->...", found, found) / raw.shape[-2])
+        error = misfit(params)
+        return np.asarray(np.einsum("...ni,...ni->...", error, error) / raw.shape[-2])
 
     return cost
 
@@ -336,7 +336,7 @@ def swarm_forward(
     Singular: as `least_squares_forward`.
     """
     cost, params = _SEARCHES[error](raw, reference)
-    found = swarm(
+    flight = swarm(
         cost,
         np.full(12, -reach),
         np.full(12, reach),
@@ -344,4 +344,4 @@ def swarm_forward(
         iterations=iterations,
         seed=seed,
     )
-    return replace(found, position=params(found.position[..., None, :])[..., 0, :])
+    return replace(flight, position=params(flight.position[..., None, :])[..., 0, :])

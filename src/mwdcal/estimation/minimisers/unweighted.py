@@ -2,7 +2,7 @@
 
     E = Σ_n Σ_o w_no (o(field_n) - reference_no)²
 
-Minimised, this is no maximum of likelihood: its covariance is a sandwich (`core.uncertainty.sandwich`).
+Minimised, this is no maximum of likelihood: its covariance is a sandwich (`estimation.uncertainty.sandwich`).
 
 "strength-squared" is |v|² of either triad, "inclination" and "toolface" are the
 accelerometer's. Shapes: batch axis B, n stations, m observables, p parameters. Singular:
