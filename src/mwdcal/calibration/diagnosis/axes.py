@@ -64,7 +64,7 @@ def explaining(readings: Readings, profile: Profile) -> dict[str, tuple[str, ...
         return {}
     if found.status[0] != Status.OK or not _fits(found):
         return {}
-    if any(map(is_bad, free_directions(found.problem, found.state, found.analysis.determined))):
+    if any(map(is_bad, free_directions(found.problem, found.state, found.analysis.determined)[0])):
         return {}
     result = {}
     for index, gain in enumerate(_gains(found)):

@@ -47,7 +47,7 @@ COURSE = "-temperature"
 """What ends the names of the powers of temperature that the order of a triad leaves out."""
 ZEROS = ("azimuth-zero", "inclination-zero", "dip-reference")
 """Effects that are one angle."""
-TEXTS = {
+LOOKS = {
     "azimuth-zero": "an azimuth zero of the stand: set the index, or fit it with --estimate azimuth-zero, or declare "
     "its uncertainty (azimuth_zero_deg under [stand])",
     "inclination-zero": "an inclination zero of the stand: set the level, or fit it with --estimate inclination-zero, "
@@ -360,7 +360,7 @@ def described(effect: Effect, unit: str) -> str:
     """An effect in words; `unit` is that of the magnetometer."""
     triad, _, kind = effect.name.partition("-")
     own = triad in TRIADS
-    looks = TEXTS[kind if own else effect.name]
+    looks = LOOKS[kind if own else effect.name]
     if effect.name in ZEROS:
         size = f"{np.degrees(effect.values[0]):+.3g}° ± {np.degrees(effect.uncertainties[0]):.2g}°"
         size += (
