@@ -7,7 +7,8 @@ is common to all of them: names, orders, flags.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import fields, is_dataclass
+from functools import cache
 from typing import Any, TypeVar
 
 import numpy as np
@@ -47,15 +48,22 @@ def mapped(change: Callable[..., AnyArray], tree: _T, *others: _T) -> _T:
     return _mapped(change, tree, *others)  # type: ignore[no-any-return]
 
 
-def _mapped(change: Callable[..., AnyArray], tree: Any, *others: Any) -> Any:
+def _mapped(change: Callable[..., AnyArray], *trees: Any) -> Any:
+    tree = trees[0]
     if isinstance(tree, np.ndarray):
-        return change(tree, *others)
+        return change(*trees)
     if isinstance(tree, Mapping):
-        return {k: _mapped(change, v, *(other[k] for other in others)) for k, v in tree.items()}
+        return {key: _mapped(change, *(each[key] for each in trees)) for key in tree}
     if isinstance(tree, tuple):
-        return tuple(_mapped(change, *parts) for parts in zip(tree, *others, strict=True))
-    if is_dataclass(tree) and not isinstance(tree, type):
-        names = [field.name for field in fields(tree) if field.init]
-        parts = {n: _mapped(change, *(getattr(t, n) for t in (tree, *others))) for n in names}
-        return replace(tree, **parts)
-    return tree
+        return tuple(_mapped(change, *parts) for parts in zip(*trees, strict=True))
+    names = _names(tree.__class__)
+    if not names:
+        return tree
+    parts = {n: _mapped(change, *(getattr(each, n) for each in trees)) for n in names}
+    return type(tree)(**parts)
+
+
+@cache
+def _names(kind: type) -> tuple[str, ...]:
+    """What the constructor of a dataclass takes, in order; nothing for any other type."""
+    return tuple(f.name for f in fields(kind) if f.init) if is_dataclass(kind) else ()

@@ -20,15 +20,15 @@ from mwdcal.calibration.soaks import HIGHEST
 from mwdcal.estimation.rank import free_directions
 from mwdcal.geometry.vectors import Bools
 
-LARGEST = 37.0
+LARGEST_DEVIATION = 37.0
 """Deviations are not told apart beyond this: a normal variable's chance is then below 1e-300."""
 UNUSED = "unused-columns"
-MOST_COLUMNS = 20
+COLUMNS_NAMED = 20
 """Most columns that the finding names."""
-MOST_STATIONS = 8
+STATIONS_NAMED = 8
 """Most stations that a finding names."""
 
-DIRECTIONS = {
+FREE_DIRECTIONS = {
     "toolface-zero": "toolface zero is undetermined: no evidence fixes rotation about the tool axis; kept at nominal. "
     "Give ref_toolface_deg at some stations to determine it",
     "rotation-x": "rotation about the tool's x axis is undetermined: no evidence fixes it; kept at nominal. Give "
@@ -50,15 +50,15 @@ def described(name: str) -> str:
     """What a free direction means, and what would determine it."""
     steady, _, power = name.partition("-temperature-")
     course = f" (its course with temperature, power {power})" if power else ""
-    return DIRECTIONS.get(steady, steady) + course
+    return FREE_DIRECTIONS.get(steady, steady) + course
 
 
 def unused_columns(columns: Sequence[str]) -> list[Finding]:
     """Columns of a file that are not used, each with what it resembles."""
     if not columns:
         return []
-    more = f" and {len(columns) - MOST_COLUMNS} more" if len(columns) > MOST_COLUMNS else ""
-    text = f"columns not used: {', '.join(columns[:MOST_COLUMNS])}{more}."
+    more = f" and {len(columns) - COLUMNS_NAMED} more" if len(columns) > COLUMNS_NAMED else ""
+    text = f"columns not used: {', '.join(columns[:COLUMNS_NAMED])}{more}."
     return [Finding(id=UNUSED, text=text)]
 
 
@@ -115,8 +115,8 @@ def _joined(triads: Bools) -> str:
 
 def _listed(stations: Sequence[str]) -> str:
     """The first few stations, and how many more."""
-    more = len(stations) - MOST_STATIONS
-    return ", ".join(stations[:MOST_STATIONS]) + (f" and {more} more" if more > 0 else "")
+    more = len(stations) - STATIONS_NAMED
+    return ", ".join(stations[:STATIONS_NAMED]) + (f" and {more} more" if more > 0 else "")
 
 
 def _calm(fitted: FittedRuns, index: int) -> Flag:
@@ -179,7 +179,7 @@ def _scatter(fitted: FittedRuns) -> Flag:
                 else f"{100 * size:.2f} %"
             )
             for name, size in sizes.items()
-            if size > misfit.NOTABLE
+            if size > misfit.SCATTER_SHARE
         ]
         return (
             f"from station to station, beyond the noise of the sensors, there departs {', '.join(words)} "
@@ -355,7 +355,11 @@ def _reshoot(fitted: FittedRuns) -> Iterator[Flag]:
         _, unit = shown_in(worst, fitted.readings.relative)
         gap = "" if unit == "°" else " "
         value = row.errors.get(worst, float("nan"))
-        size = f"{row.deviation:.1f}" if row.deviation < LARGEST else f"more than {LARGEST:.0f}"
+        size = (
+            f"{row.deviation:.1f}"
+            if row.deviation < LARGEST_DEVIATION
+            else f"more than {LARGEST_DEVIATION:.0f}"
+        )
         alone, moves = (d.get(worst, 0.0) for d in (row.errors_left_out, row.influence))
         return (
             f"station {row.station}: residual {size}σ, most in {worst} "

@@ -16,17 +16,17 @@ from mwdcal.estimation.solvers import Determined
 from mwdcal.estimation.uncertainty import TESTED, effective_freedom, station_misfit
 from mwdcal.geometry.vectors import Array, Bools, Ints, eigen
 
-SUSPECT = 3.0
+NOISE_RATIO = 3.0
 """Residuals of a robust fit that exceed the declared noise this many times are reported."""
-ENOUGH = 12.0
+CALM_FREEDOM = 12.0
 """Degrees of freedom from which residuals far below the declared noise are no chance."""
-UNLIKELY = 1e-3
+MISFIT_CHANCE = 1e-3
 """Chance of so large residuals, or of so large a departure from the prior, below which it is reported."""
-DISTRUSTED = 0.1
+LOW_WEIGHT = 0.1
 """A station of less weight than this in a robust fit is reported."""
-NOTABLE = 3e-4
+SCATTER_SHARE = 3e-4
 """A scatter from station to station beyond this share, or radians, is a finding."""
-SMALL = 1e-9
+VARIANCE_RIDGE = 1e-9
 """What is added to variances (of whitened readings: 0…1), so that they have an inverse."""
 LEEWAY = 1.01
 """A station is suspect already if a bound is as unlikely as this many times the limit."""
@@ -54,14 +54,14 @@ def robust(result: Fit) -> Bools:
 def excessive(result: Fit, chance: Array) -> Bools:
     """Triads (B, t) whose residuals noise and stand do not explain, by `misfit_chances`."""
     weighed = robust(result)[:, None] & np.isnan(result.noise) & ~unchecked(result)
-    large = weighed & (result.analysis.variance_factor > SUSPECT**2)
-    return np.asarray(large | (np.nan_to_num(chance, nan=1.0) < UNLIKELY))
+    large = weighed & (result.analysis.variance_factor > NOISE_RATIO**2)
+    return np.asarray(large | (np.nan_to_num(chance, nan=1.0) < MISFIT_CHANCE))
 
 
 def calm(result: Fit) -> Bools:
-    """Triads (B, t) whose residuals are less than the declared noise over `SUSPECT`."""
-    tested = np.isnan(result.noise) & (result.analysis.freedom >= ENOUGH)
-    return np.asarray(tested & (result.analysis.variance_factor < SUSPECT**-2))
+    """Triads (B, t) whose residuals are less than the declared noise over `NOISE_RATIO`."""
+    tested = np.isnan(result.noise) & (result.analysis.freedom >= CALM_FREEDOM)
+    return np.asarray(tested & (result.analysis.variance_factor < NOISE_RATIO**-2))
 
 
 def unchecked(result: Fit) -> Bools:
@@ -73,7 +73,7 @@ def copies(result: Fit) -> Bools:
     """Stations (B, n) whose readings are those of an earlier one of the same run, to the last digit."""
     problem = result.problem
     rows = np.concatenate([*(t.raw for t in problem.triads), problem.temperature[..., None]], -1)
-    key = np.sort(np.sum(rows * np.sqrt(2.0 + np.arange(rows.shape[-1])), -1), -1)
+    key = np.sort(np.einsum("bnk,k->bn", rows, np.sqrt(2.0 + np.arange(rows.shape[-1]))), -1)
     found = np.zeros(rows.shape[:-1], bool)
     for member in np.flatnonzero(np.any(np.diff(key, axis=-1) == 0, -1)):
         _, first, place = np.unique(rows[member], axis=0, return_index=True, return_inverse=True)
@@ -84,12 +84,12 @@ def copies(result: Fit) -> Bools:
 def scattered(result: Fit) -> Bools:
     """Whether (B,) strengths, dip or the directions of groups depart from station to station."""
     sizes = [value.max(-1) for value in result.problem.evidence.scatter.values()]
-    return np.asarray(np.max([np.zeros(len(result.status)), *sizes], 0) > NOTABLE)
+    return np.asarray(np.max([np.zeros(len(result.status)), *sizes], 0) > SCATTER_SHARE)
 
 
 def distrusted(result: Fit) -> Bools:
     """Stations (B, n) that a robust fit all but left out."""
-    return np.asarray(result.trust < DISTRUSTED)
+    return np.asarray(result.trust < LOW_WEIGHT)
 
 
 def without_prior(result: Fit) -> Fit:
@@ -116,7 +116,7 @@ def departures(result: Fit) -> tuple[Array, Ints]:
 
 def conflicting(square: Array, freedom: Ints) -> Bools:
     """Whether departures (B,) from the prior are unlikely."""
-    return np.asarray(tail(square, np.maximum(freedom, 1)) <= UNLIKELY)
+    return np.asarray(tail(square, np.maximum(freedom, 1)) <= MISFIT_CHANCE)
 
 
 def stations_to_reshoot(result: Fit) -> Bools:
@@ -143,7 +143,7 @@ def _suspects(result: Fit) -> Bools:
     good &= (smallest > TESTED) & (analysis.influence is None)
     tool, station = np.nonzero(~good & ~found[:, None])
     left = residual[tool, station]
-    whole = spread[tool, station] + SMALL * np.eye(size)
+    whole = spread[tool, station] + VARIANCE_RIDGE * np.eye(size)
     bound = np.sum(left * np.linalg.solve(whole, left[..., None])[..., 0], -1)
     large = bound > likely(1, chance)
     tool, station, left = tool[large], station[large], left[large]

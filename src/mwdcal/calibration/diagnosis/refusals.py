@@ -35,20 +35,20 @@ from mwdcal.estimation.batch import batch_of_one
 from mwdcal.estimation.robust import LOSSES
 from mwdcal.estimation.solvers import Status
 from mwdcal.estimation.uncertainty import station_misfit
-from mwdcal.geometry.vectors import Bools
+from mwdcal.geometry.vectors import Array, Bools
 from mwdcal.sensor.profile import COMMON
 
-GAIN = (0.3, 3.0)
+GAIN_RANGE = (0.3, 3.0)
 """An own-axis gain outside this share of nominal is a wrong profile, not a sensor error."""
-MOTION = (1e-2, 30.0)
+MOTION_RANGE = (1e-2, 30.0)
 """A channel that moves by less or more than this share of the field has not seen the field."""
-NAMED = 4
+PARAMETERS_NAMED = 4
 """Most undetermined parameters that a message lists."""
-ABSURD = 30.0
+ABSURD_RATIO = 30.0
 """Residuals of more than this many times the declared noise mean that something is plain wrong."""
-MOST = 0.3
+CULPRIT_SHARE = 0.3
 """Share of all misfit at which a single station is named as the cause."""
-COARSE = 0.05
+COARSE_NOISE = 0.05
 """Estimated noise of more than this share of the field likewise."""
 BAD_INPUT = "bad-input"
 """The status of what is wrong with the input itself: an `InputError` of a single run."""
@@ -228,7 +228,7 @@ def _channels(readings: Readings, triad: str, prior: bool, run: Run) -> Iterator
     values = getattr(readings, triad)
     if values is None:
         return
-    spread = np.ptp(values, axis=-2)
+    spread = np.ptp(np.ascontiguousarray(np.swapaxes(values, -1, -2)), axis=-1)
     dead = spread <= 1e-12 * np.abs(values).max((-1, -2))[:, None]
     name, unit = ("gravity", "g") if triad == "accelerometer" else ("field", "nT")
     known = readings.reference(name)
@@ -236,7 +236,7 @@ def _channels(readings: Readings, triad: str, prior: bool, run: Run) -> Iterator
     share = (
         spread / np.where(given > 0, np.nansum(known, -1) / np.maximum(given, 1), np.nan)[:, None]
     )
-    odd = (share < (0.0 if prior else MOTION[0])) | (share > MOTION[1])
+    odd = (share < (0.0 if prior else MOTION_RANGE[0])) | (share > MOTION_RANGE[1])
 
     def where(place: int, flags: Bools) -> tuple[int, str]:
         axis = int(np.argmax(flags[place]))
@@ -254,7 +254,7 @@ def _channels(readings: Readings, triad: str, prior: bool, run: Run) -> Iterator
         axis, channel = where(place, odd)
         moves = f"{channel} moves by {spread[place, axis]:.3g} {unit} over the run, "
         scale = f"a wrong 'scale' of [{triad}] in the tool profile"
-        if share[place, axis] < MOTION[0]:
+        if share[place, axis] < MOTION_RANGE[0]:
             return (
                 f"{moves}too little to calibrate it. Add stations at other inclinations and "
                 f"toolfaces; if there are, look for a dead sensor, a wrong column, or {scale}."
@@ -378,16 +378,17 @@ def _absurd(fitted: FittedRuns, index: int) -> Flag:
     """Residuals that no error of a sensor explains: columns, references or groups are mixed up."""
     result, raw = fitted.result, fitted.result.problem.triads[index].raw
     excess = np.sqrt(np.nan_to_num(result.analysis.variance_factor[:, index]))
-    strength = np.linalg.norm(raw, axis=-1).mean(-1)
-    size = np.maximum(np.minimum(strength, 2 * raw.std(axis=1).max(-1)), 1e-300)
     noise = result.noise[:, index]
-    absurd = np.where(np.isnan(noise), excess > ABSURD, noise > COARSE * size)
+    declared = np.isnan(noise)
+    absurd = declared & (excess > ABSURD_RATIO)
+    if not declared.all():
+        absurd |= noise > COARSE_NOISE * _signal(raw)
 
     def sentence(place: int) -> str:
         much = (
             f"{excess[place]:.0f} times the declared noise"
-            if np.isnan(noise[place])
-            else f"{noise[place] / size[place]:.0%} of the field"
+            if declared[place]
+            else f"{noise[place] / _signal(raw)[place]:.0%} of the field"
         )
         return (
             f"the {TRIADS[index]}'s residuals are {much}: no sensor model explains these readings. Check "
@@ -398,12 +399,18 @@ def _absurd(fitted: FittedRuns, index: int) -> Flag:
     return Flag("residuals", absurd & (result.analysis.freedom[:, index] >= 1), sentence)
 
 
+def _signal(raw: Array) -> Array:
+    """Size (B,) of what readings (B, n, 3) measure, at least 1e-300."""
+    strength = np.linalg.norm(raw, axis=-1).mean(-1)
+    return np.asarray(np.maximum(np.minimum(strength, 2 * raw.std(axis=1).max(-1)), 1e-300))
+
+
 def _culprit(fitted: FittedRuns, place: int) -> str:
     """The station to look at first, if a single one has most of the misfit."""
     square = station_misfit(fitted.member(place).analysis)[0][0]
     worst = int(np.argmax(square))
     share = square[worst] / max(float(square.sum()), 1e-300)
-    if share < MOST:
+    if share < CULPRIT_SHARE:
         return ""
     label = fitted.alone(place)[0].labels[worst]
     return (
@@ -419,8 +426,8 @@ def _too_weak(fitted: FittedRuns) -> Flag:
     def sentence(place: int) -> str:
         each = [f"{TRIADS[t]} {e.id.removeprefix('weak-')}" for e in bad[place] for t in e.triads]
         each = list(dict.fromkeys(each))
-        more = f" and {len(each) - NAMED} more" if len(each) > NAMED else ""
-        names = ", ".join(each[:NAMED]) + more
+        more = f" and {len(each) - PARAMETERS_NAMED} more" if len(each) > PARAMETERS_NAMED else ""
+        names = ", ".join(each[:PARAMETERS_NAMED]) + more
         return (
             f"the stations are too weak to fit the model: nothing determines {names}. Add stations "
             "at other inclinations (at least three, well apart, up and down) with six or more "
@@ -450,14 +457,14 @@ def _odd_gain(fitted: FittedRuns, index: int) -> Flag:
     unscaled = getattr(fitted.profile, name).scale is None
     gain, share = gain_shares(fitted.result, index)
     value = share if unscaled or (index == 1 and fitted.readings.relative) else gain
-    odd = ~((value >= GAIN[0]) & (value <= GAIN[1]))
+    odd = ~((value >= GAIN_RANGE[0]) & (value <= GAIN_RANGE[1]))
 
     def sentence(place: int) -> str:
         axis = int(np.argmax(odd[place]))
         wrong = "has the wrong sign" if value[place, axis] < 0 else "is far from nominal"
         return (
             f"the {name}'s gain on tool axis {'xyz'[axis]} comes out at {value[place, axis]:.3g} times "
-            f"nominal and {wrong} (accepted: {GAIN[0]}…{GAIN[1]}). Check 'axes' and 'scale' "
+            f"nominal and {wrong} (accepted: {GAIN_RANGE[0]}…{GAIN_RANGE[1]}). Check 'axes' and 'scale' "
             f"of [{name}] in the tool profile, and the reference angles."
         )
 
