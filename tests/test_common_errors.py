@@ -10,7 +10,7 @@ import pytest
 from cli_support import EXAMPLE, mwdcal, servo_run, write_csv
 from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.covariance import assumed_exact, shares, stated_covariance
-from mwdcal.calibration.diagnosis.misfit import misfit_chances
+from mwdcal.calibration.diagnosis.plausibility import misfit_chances
 from mwdcal.calibration.estimate import fit
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.prediction import typical_accuracy

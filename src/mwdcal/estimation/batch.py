@@ -20,7 +20,8 @@ _T = TypeVar("_T")
 
 def take(batch: _T, index: Ints) -> _T:
     """The members at `index`, as a batch of their own."""
-    return mapped(lambda array: array[index], batch)
+    members: _T = mapped(lambda array: array[index], batch)
+    return members
 
 
 def put(batch: _T, index: Ints, members: _T) -> _T:
@@ -31,39 +32,37 @@ def put(batch: _T, index: Ints, members: _T) -> _T:
         changed[index] = theirs
         return changed
 
-    return mapped(placed, batch, members)
+    changed: _T = mapped(placed, batch, members)
+    return changed
 
 
 def batch_of_one(member: _T) -> _T:
     """A batch whose only member is one without a leading axis."""
-    return mapped(lambda array: array[None], member)
+    batch: _T = mapped(lambda array: array[None], member)
+    return batch
 
 
-def mapped(change: Callable[..., AnyArray], tree: _T, *others: _T) -> _T:
+def mapped(change: Callable[..., AnyArray], *trees: Any) -> Any:
     """A tree of dataclasses, mappings and tuples with every array changed.
 
-    `change` is given an array and those at the same place of the `others`. Fields that the
-    constructor does not take are not carried over.
+    `change` is given the arrays at one place of all trees; what is not an array is that of the
+    first. Fields that a constructor does not take are not carried over.
     """
-    return _mapped(change, tree, *others)  # type: ignore[no-any-return]
-
-
-def _mapped(change: Callable[..., AnyArray], *trees: Any) -> Any:
     tree = trees[0]
     if isinstance(tree, np.ndarray):
         return change(*trees)
     if isinstance(tree, Mapping):
-        return {key: _mapped(change, *(each[key] for each in trees)) for key in tree}
+        return {key: mapped(change, *(each[key] for each in trees)) for key in tree}
     if isinstance(tree, tuple):
-        return tuple(_mapped(change, *parts) for parts in zip(*trees, strict=True))
+        return tuple(mapped(change, *parts) for parts in zip(*trees, strict=True))
     names = _names(tree.__class__)
     if not names:
         return tree
-    parts = {n: _mapped(change, *(getattr(each, n) for each in trees)) for n in names}
+    parts = {name: mapped(change, *(getattr(each, name) for each in trees)) for name in names}
     return type(tree)(**parts)
 
 
 @cache
 def _names(kind: type) -> tuple[str, ...]:
-    """What the constructor of a dataclass takes, in order; nothing for any other type."""
+    """What the constructor of a dataclass takes; nothing for any other type."""
     return tuple(f.name for f in fields(kind) if f.init) if is_dataclass(kind) else ()

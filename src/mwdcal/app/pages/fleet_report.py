@@ -25,7 +25,7 @@ from mwdcal.app.pages.fleet_summary import (
     unusual,
 )
 from mwdcal.app.text import number, plural
-from mwdcal.calibration.diagnosis.misfit import NOISE_RATIO
+from mwdcal.calibration.diagnosis.plausibility import NOISE_RATIO
 from mwdcal.calibration.readings import TRIADS, is_simulated
 from mwdcal.files.formats import atomic, parquet
 from mwdcal.fleet.calibrate import OK

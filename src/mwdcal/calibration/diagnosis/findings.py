@@ -9,7 +9,7 @@ import numpy as np
 
 from mwdcal.calibration.automatic.courses import Terms, misfit_size, terms_beyond, untested
 from mwdcal.calibration.covariance import common_source
-from mwdcal.calibration.diagnosis import misfit
+from mwdcal.calibration.diagnosis import plausibility
 from mwdcal.calibration.diagnosis.flags import FittedRuns, Flag
 from mwdcal.calibration.diagnosis.structure import described as seen_as
 from mwdcal.calibration.diagnosis.structure import effects, suspected
@@ -130,12 +130,12 @@ def _calm(fitted: FittedRuns, index: int) -> Flag:
             "not all by as much. Uncertainties are scaled down accordingly."
         )
 
-    return Flag(f"{TRIADS[index]}-noise", misfit.calm(fitted.result)[:, index], sentence)
+    return Flag(f"{TRIADS[index]}-noise", plausibility.calm(fitted.result)[:, index], sentence)
 
 
 def _excessive(fitted: FittedRuns, index: int) -> Flag:
     """Residuals far beyond the declared noise."""
-    large = misfit.excessive(fitted.result, fitted.chances)[:, index]
+    large = plausibility.excessive(fitted.result, fitted.chances)[:, index]
 
     def sentence(place: int) -> str:
         excess = float(fitted.result.analysis.variance_factor[place, index])
@@ -152,7 +152,7 @@ def _excessive(fitted: FittedRuns, index: int) -> Flag:
 
 def _no_redundancy(fitted: FittedRuns) -> Flag:
     """Triads that nothing checks."""
-    bare = misfit.unchecked(fitted.result)
+    bare = plausibility.unchecked(fitted.result)
     text = "no redundancy, so nothing in this run checks the fit. Add stations."
     return Flag("no-redundancy", np.any(bare, -1), lambda place: f"{_joined(bare[place])}: {text}")
 
@@ -179,7 +179,7 @@ def _scatter(fitted: FittedRuns) -> Flag:
                 else f"{100 * size:.2f} %"
             )
             for name, size in sizes.items()
-            if size > misfit.SCATTER_SHARE
+            if size > plausibility.SCATTER_SHARE
         ]
         return (
             f"from station to station, beyond the noise of the sensors, there departs {', '.join(words)} "
@@ -187,12 +187,12 @@ def _scatter(fitted: FittedRuns) -> Flag:
             "for what holds the tool in its direction; or the model lacks something."
         )
 
-    return Flag("scatter", misfit.scattered(fitted.result), sentence)
+    return Flag("scatter", plausibility.scattered(fitted.result), sentence)
 
 
 def _repeated(fitted: FittedRuns) -> Flag:
     """Stations whose readings are another's to the last digit."""
-    copies = misfit.copies(fitted.result)
+    copies = plausibility.copies(fitted.result)
 
     def sentence(place: int) -> str:
         labels = fitted.alone(place)[0].labels
@@ -286,7 +286,7 @@ def _prior(fitted: FittedRuns) -> Iterator[Flag]:
 
 def _prior_only(fitted: FittedRuns, source: str) -> Flag:
     """What rests on the prior alone."""
-    bare = misfit.without_prior(fitted.result)
+    bare = plausibility.without_prior(fitted.result)
     named = free_directions(bare.problem, bare.state, bare.analysis.determined)
     ids = [{entry.id for entry in free} for free in fitted.free]
     only = [[e.id for e in each if e.id not in free] for each, free in zip(named, ids, strict=True)]
@@ -303,7 +303,7 @@ def _prior_only(fitted: FittedRuns, source: str) -> Flag:
 
 def _prior_conflict(fitted: FittedRuns, source: str) -> Flag:
     """A departure from the prior that is unlikely."""
-    square, tested = misfit.departures(fitted.result)
+    square, tested = plausibility.departures(fitted.result)
 
     def sentence(place: int) -> str:
         ratio = np.sqrt(square[place] / tested[place])
@@ -312,7 +312,7 @@ def _prior_conflict(fitted: FittedRuns, source: str) -> Flag:
             "changed, or the prior is too narrow. Leave --prior out, or widen it."
         )
 
-    return Flag("prior-conflict", misfit.conflicting(square, tested), sentence)
+    return Flag("prior-conflict", plausibility.conflicting(square, tested), sentence)
 
 
 def _model(fitted: FittedRuns) -> Iterator[Flag]:
@@ -347,7 +347,7 @@ def _model(fitted: FittedRuns) -> Iterator[Flag]:
 
 def _reshoot(fitted: FittedRuns) -> Iterator[Flag]:
     """Stations to take again, with the reason."""
-    again = misfit.stations_to_reshoot(fitted.result)
+    again = plausibility.stations_to_reshoot(fitted.result)
 
     def sentence(place: int, station: int) -> str:
         row = fitted.rows(place)[station]
@@ -373,7 +373,7 @@ def _reshoot(fitted: FittedRuns) -> Iterator[Flag]:
 
 def _distrusted(fitted: FittedRuns) -> Flag:
     """Stations that a robust fit all but left out."""
-    low = misfit.distrusted(fitted.result)
+    low = plausibility.distrusted(fitted.result)
 
     def sentence(place: int) -> str:
         labels, weight = fitted.alone(place)[0].labels, fitted.result.trust[place]

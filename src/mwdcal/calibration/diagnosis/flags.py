@@ -12,7 +12,7 @@ from functools import cached_property
 
 import numpy as np
 
-from mwdcal.calibration.diagnosis.misfit import misfit_chances
+from mwdcal.calibration.diagnosis.plausibility import misfit_chances
 from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import Readings
