@@ -34,14 +34,14 @@ def free_directions(problem: Problem, state: State, determined: Determined) -> l
     Each triad's own turns and scale are tried first, then common ones, then single
     parameters; a direction that is none of these is called `weak` after its largest part.
     """
-    found: list[list[Free]] = [[] for _ in determined.keep]
+    directions: list[list[Free]] = [[] for _ in determined.keep]
     missing = np.sum(~determined.keep, -1)
     for count in np.unique(missing[missing > 0]):
         index = np.flatnonzero(missing == count)
         every = _named(*take((problem, state, determined), index), int(count))
         for place, each in zip(index, every, strict=True):
-            found[place] = each
-    return found
+            directions[place] = each
+    return directions
 
 
 def _named(problem: Problem, state: State, determined: Determined, count: int) -> list[list[Free]]:
@@ -54,7 +54,7 @@ def _named(problem: Problem, state: State, determined: Determined, count: int) -
     scaled = directions * norms[:, None]
     length = np.sum(scaled**2, -1)
     null = determined.basis[..., -count:]
-    found: list[list[Free]] = [[] for _ in members]
+    free: list[list[Free]] = [[] for _ in members]
     used = np.zeros(length.shape, bool)
     for _ in range(count):
         inside = np.sum((scaled @ null) ** 2, -1) / np.where(length > 0, length, 1.0)
@@ -68,9 +68,9 @@ def _named(problem: Problem, state: State, determined: Determined, count: int) -
         chosen = np.where(clear[:, None], chosen, null[..., -1])
         for place, index in enumerate(best):
             name, triads = ids[index] if clear[place] else _weak(problem, chosen[place])
-            found[place].append(Free(name, triads, chosen[place] / norms[place]))
+            free[place].append(Free(name, triads, chosen[place] / norms[place]))
         null = _without(null, chosen)
-    return found
+    return free
 
 
 def _candidates(problem: Problem, state: State) -> tuple[list[tuple[str, tuple[int, ...]]], Array]:

@@ -46,16 +46,16 @@ def inseparable(result: Fit) -> Bools:
     constants = result.problem.evidence.constants
     stand = np.array([c.unknown and c.name in STAND_ERRORS for c in constants])
     sd = np.sqrt(np.diagonal(result.analysis.constants, axis1=-2, axis2=-1)[:, stand])
-    found = np.any(sd > LOOSE * UNKNOWN, -1)
-    some = np.flatnonzero(~found & ~result.analysis.determined.keep.all(-1))
+    lost = np.any(sd > LOOSE * UNKNOWN, -1)
+    some = np.flatnonzero(~lost & ~result.analysis.determined.keep.all(-1))
     if some.size:
         problem, state = take((result.problem, result.state), some)
         kept = np.flatnonzero(~stand)
         fewer = tuple(problem.evidence.constants[index] for index in kept)
         bare = replace(problem, evidence=replace(problem.evidence, constants=fewer))
         still = replace(state, constants=state.constants[:, kept])
-        found[some] = Determined.of(problem, state).rank < Determined.of(bare, still).rank
-    return np.asarray(found)
+        lost[some] = Determined.of(problem, state).rank < Determined.of(bare, still).rank
+    return np.asarray(lost)
 
 
 def stand_errors(result: Fit) -> StandErrors:

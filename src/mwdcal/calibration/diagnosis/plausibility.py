@@ -86,18 +86,18 @@ def overturned(result: Fit) -> Array:
     Definition: with a known azimuth somewhere, north of the field and of the azimuths are then
     opposite. Where no azimuth is known the same field has a dip within ±90° and is not meant.
     """
-    problem, found = result.problem, np.full(len(result.status), np.nan)
+    problem, dips = result.problem, np.full(len(result.status), np.nan)
     if len(problem.triads) == 1:
-        return found
-    told = problem.evidence.is_known("azimuth").any(-1)
+        return dips
+    referenced = problem.evidence.is_known("azimuth").any(-1)
     for index, constant in enumerate(problem.evidence.constants):
         if constant.name != "dip" or not constant.unknown:
             continue
         dip = centred(result.state.constants[:, index], 2 * np.pi)
         sd = np.sqrt(np.nan_to_num(result.analysis.constants[:, index, index]))
         beyond = np.abs(dip) - np.pi / 2 > DIP_CERTAINTY * np.minimum(sd, 1.0)
-        found = np.where(told & beyond, dip, found)
-    return np.asarray(found)
+        dips = np.where(referenced & beyond, dip, dips)
+    return np.asarray(dips)
 
 
 def excessive_errors(readings: Readings, result: Fit) -> dict[str, tuple[float, float]]:
@@ -111,7 +111,7 @@ def excessive_errors(readings: Readings, result: Fit) -> dict[str, tuple[float, 
     squares = np.nan_to_num(analysis.variance_factor[0]) * np.maximum(analysis.freedom[0], 0)
     misfit = np.sqrt(max(squares.sum() / max(analysis.freedom[0].sum(), 1.0), 1.0))
     residuals, weight = Residuals(readings, result), result.trust[0]
-    found = {}
+    excessive = {}
     for name in residuals.names():
         after, expected = residuals.errors(name, residuals.after), residuals.expected(name)
         known = ~np.isnan(after + expected) & (weight > 0)
@@ -122,8 +122,8 @@ def excessive_errors(readings: Readings, result: Fit) -> dict[str, tuple[float, 
             for e in (after, expected)
         ]
         if both[0] > EXCESS_RATIO * max(both[1] * misfit, SMALLEST_EXPECTATION):
-            found[name] = (both[0], float(both[1] * misfit))
-    return found
+            excessive[name] = (both[0], float(both[1] * misfit))
+    return excessive
 
 
 def straying(result: Fit) -> Bools:
@@ -176,11 +176,11 @@ def copies(result: Fit) -> Bools:
     problem = result.problem
     rows = np.concatenate([*(t.raw for t in problem.triads), problem.temperature[..., None]], -1)
     key = np.sort(np.einsum("bnk,k->bn", rows, np.sqrt(2.0 + np.arange(rows.shape[-1]))), -1)
-    found = np.zeros(rows.shape[:-1], bool)
+    repeated = np.zeros(rows.shape[:-1], bool)
     for member in np.flatnonzero(np.any(np.diff(key, axis=-1) == 0, -1)):
         _, first, place = np.unique(rows[member], axis=0, return_index=True, return_inverse=True)
-        found[member] = first[place.ravel()] != np.arange(len(found[member]))
-    return found
+        repeated[member] = first[place.ravel()] != np.arange(len(repeated[member]))
+    return repeated
 
 
 def scattered(result: Fit) -> Bools:
@@ -223,11 +223,11 @@ def conflicting(square: Array, freedom: Ints) -> Bools:
 
 def stations_to_reshoot(result: Fit) -> Bools:
     """Stations (B, n) to take again: `to_reshoot`, asked only where a bound allows it to be true."""
-    found = np.zeros(result.analysis.residual.shape[:2], bool)
+    again = np.zeros(result.analysis.residual.shape[:2], bool)
     some = np.flatnonzero(_suspects(result))
     if some.size:
-        found[some] = to_reshoot(chances(take(result, some)))
-    return found
+        again[some] = to_reshoot(chances(take(result, some)))
+    return again
 
 
 def _suspects(result: Fit) -> Bools:
@@ -239,19 +239,19 @@ def _suspects(result: Fit) -> Bools:
     analysis = result.analysis
     residual, spread = analysis.residual, analysis.spread
     size, chance = spread.shape[-1], RESHOOT / len(result.trust[0])
-    found = np.any(~np.isnan(result.noise), -1) | robust(result)
+    suspect = np.any(~np.isnan(result.noise), -1) | robust(result)
     smallest = np.trace(spread, axis1=-2, axis2=-1) - (size - 1)
     good = np.sum(residual**2, -1) < likely(size, chance) * smallest
     good &= (smallest > TESTED) & (analysis.influence is None)
-    tool, station = np.nonzero(~good & ~found[:, None])
+    tool, station = np.nonzero(~good & ~suspect[:, None])
     left = residual[tool, station]
     whole = spread[tool, station] + VARIANCE_RIDGE * np.eye(size)
     bound = np.sum(left * np.linalg.solve(whole, left[..., None])[..., 0], -1)
     large = bound > likely(1, chance)
     tool, station, left = tool[large], station[large], left[large]
     some = replace(analysis, residual=left[None], spread=spread[None, tool, station])
-    found[tool[tail(*station_misfit(some))[0] < LEEWAY * chance]] = True
-    return np.asarray(found)
+    suspect[tool[tail(*station_misfit(some))[0] < LEEWAY * chance]] = True
+    return np.asarray(suspect)
 
 
 @cache

@@ -91,14 +91,14 @@ def check_options(options: Options) -> None:
         raise InputError(f"--robust must be one of {', '.join(LOSSES)}; got {options.robust!r}.")
     _check_ignored(options)
     _check_curved_models(options)
-    own = "the paper's weights" if options.paper_weights else f"method {method}"
+    minimiser = "the paper's weights" if options.paper_weights else f"method {method}"
     if options.own_solver and options.robust:
         raise InputError(
-            f"--robust cannot weigh the stations of {own}. Use --method joint with it."
+            f"--robust cannot weigh the stations of {minimiser}. Use --method joint with it."
         )
     if options.own_solver and options.nonlinearity:
         raise InputError(
-            f"--nonlinearity cannot be combined with {own}: own-axis terms need their prior. Use "
+            f"--nonlinearity cannot be combined with {minimiser}: own-axis terms need their prior. Use "
             "--method joint, or --nonlinearity none."
         )
     if method == "swarm" and max(options.orders):
@@ -117,7 +117,7 @@ def check_options(options: Options) -> None:
             "swarm, newton, toolface-inclination or scalar."
         )
     if options.prior and (options.own_solver or options.nonlinearity):
-        what = "own-axis nonlinearity" if options.nonlinearity else own
+        what = "own-axis nonlinearity" if options.nonlinearity else minimiser
         raise InputError(
             f"--prior cannot be combined with {what}. Use --method joint, without "
             "--paper-weights and with --nonlinearity none."
@@ -520,13 +520,13 @@ def _unexplained_errors(fitted: FittedRuns, sound: Bools) -> Flag:
     relative = fitted.readings.relative
 
     def sentence(place: int) -> str:
-        found = errors[place]
-        name = max(found, key=lambda n: found[n][0] / max(found[n][1], 1e-300))
+        rms = errors[place]
+        name = max(rms, key=lambda n: rms[n][0] / max(rms[n][1], 1e-300))
         factor, unit = shown_in(name, relative)
         first = effects(fitted.member(place))[:1]
         looks = [f" {described(each, shown_in('field', relative)[1])}" for each in first]
         gap = "" if unit == "°" else " "
-        after, expected = (value * factor for value in found[name])
+        after, expected = (value * factor for value in rms[name])
         return (
             f"the errors of {name} after calibration are {after:.3g}{gap}{unit} (root mean square), where the "
             f"misfit of the run explains {expected:.2g}{gap}{unit}. Check the references of {name} and 'axes' in the "

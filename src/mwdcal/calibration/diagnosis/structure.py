@@ -162,8 +162,10 @@ def _misfit(problem: Problem, result: Fit) -> tuple[float, float]:
     linear, include = problem.linear(result.state), problem.evidence.include
     whole, normal = whole_covariance(linear, result.analysis.determined)[0], linear.normal
     gradient = normal.gradient[0]
-    own = problem.linear(result.state, geometry=True).own
-    unknown = np.sum(np.linalg.svd(own, compute_uv=False) > 1.0)  # 0 where a station is left out
+    private = problem.linear(result.state, geometry=True).own
+    unknown = np.sum(
+        np.linalg.svd(private, compute_uv=False) > 1.0
+    )  # 0 where a station is left out
     readings = float(include.sum()) * linear.residual.shape[-1]
     fitted = np.sum(whole * (normal.information - linear.prior)[0])
     return float(normal.cost[0] - gradient @ whole @ gradient), readings - float(fitted + unknown)
@@ -199,18 +201,18 @@ def _described(result: Fit, shown: list[tuple[str, float, float]]) -> list[Effec
     gain, directions = scores.gain(names)
     scale = np.sqrt(max(left - gain, 0.0) / max(freedom - directions, 1.0))
     values, covariance = scores.solution(names)
-    spread, found, at = np.sqrt(np.diag(covariance)) * scale, [], 0
+    spread, sized, at = np.sqrt(np.diag(covariance)) * scale, [], 0
     for name, share, chance in shown:
         where = scores.places[name]
-        own = slice(at, at + where.stop - where.start)
-        at = own.stop
-        change = (scores.columns[..., where] * scores.length[where]) @ values[own]
+        columns = slice(at, at + where.stop - where.start)
+        at = columns.stop
+        change = (scores.columns[..., where] * scores.length[where]) @ values[columns]
         size = [
             np.sqrt(np.mean(np.sum((change[..., 3 * i : 3 * i + 3] * t.sd) ** 2, -1)))
             for i, t in enumerate(problem.triads)
         ]
-        found.append(Effect(name, share, chance, values[own], spread[own], np.array(size)))
-    return found
+        sized.append(Effect(name, share, chance, values[columns], spread[columns], np.array(size)))
+    return sized
 
 
 def _scores(problem: Problem, result: Fit, families: Mapping[str, Array]) -> _Scores:
@@ -228,8 +230,10 @@ def _scores(problem: Problem, result: Fit, families: Mapping[str, Array]) -> _Sc
     unit = every / length
     weighed = linear.weigh(unit)
     crossed = np.einsum("bnmu,bnmk->uk", linear.design, weighed)
-    own = linear.normal.gradient[0]
-    score = np.einsum("bnmk,bnm->k", weighed, linear.residual) - crossed.transpose() @ whole @ own
+    gradient = linear.normal.gradient[0]
+    score = (
+        np.einsum("bnmk,bnm->k", weighed, linear.residual) - crossed.transpose() @ whole @ gradient
+    )
     information = np.einsum("bnmk,bnml->kl", unit, weighed)
     information = information - crossed.transpose() @ whole @ crossed
     return _Scores(score, information, length, unit, places)
@@ -294,8 +298,8 @@ def _courses(problem: Problem, state: State) -> Iterator[tuple[str, Array]]:
     for index, triad in enumerate(problem.triads):
         order = triad.model.basis.order
         if order < highest:
-            own = columns[..., 6 * index : 6 * index + 6]
-            yield f"{TRIADS[index]}{COURSE_SUFFIX}", _products(own, powers[:, order:])
+            of_triad = columns[..., 6 * index : 6 * index + 6]
+            yield f"{TRIADS[index]}{COURSE_SUFFIX}", _products(of_triad, powers[:, order:])
 
 
 def _turns(problem: Problem, state: State, turns: Array) -> dict[str, Array]:
@@ -315,13 +319,13 @@ def _products(columns: Array, factors: Array) -> Array:
 
 def _approach(problem: Problem) -> dict[str, Array]:
     """From which side (n, 1) each angle of the stand was reached: 1, -1, or 0 where it did not move."""
-    found = {}
+    sides = {}
     for name in ("inclination", "azimuth", "toolface"):
         angle = problem.evidence.known[name][0]
         step = np.diff(angle, prepend=angle[:1])
         step = np.nan_to_num((step + np.pi) % (2 * np.pi) - np.pi)
-        found[f"{name}-zero"] = np.where(np.abs(step) > 1e-6, np.sign(step), 0.0)[:, None]
-    return found
+        sides[f"{name}-zero"] = np.where(np.abs(step) > 1e-6, np.sign(step), 0.0)[:, None]
+    return sides
 
 
 def _of_sensor(
@@ -359,8 +363,8 @@ def suspected(result: Fit, chance: Array) -> Bools:
 def described(effect: Effect, unit: str) -> str:
     """An effect in words; `unit` is that of the magnetometer."""
     triad, _, kind = effect.name.partition("-")
-    own = triad in TRIADS
-    looks = EFFECTS[kind if own else effect.name]
+    of_triad = triad in TRIADS
+    looks = EFFECTS[kind if of_triad else effect.name]
     if effect.name in ZEROS:
         size = f"{np.degrees(effect.values[0]):+.3g}° ± {np.degrees(effect.uncertainties[0]):.2g}°"
         size += (
@@ -373,8 +377,8 @@ def described(effect: Effect, unit: str) -> str:
     else:
         parts = [(1e3, "mg"), (1.0, unit)][: len(effect.size)]
         each = [f"{s * f:.3g} {u} rms" for s, (f, u) in zip(effect.size, parts, strict=True)]
-        size = " and ".join(each[TRIADS.index(triad) :][:1] if own else each)
-    whose = f"{triad}: the" if own else "The"
+        size = " and ".join(each[TRIADS.index(triad) :][:1] if of_triad else each)
+    whose = f"{triad}: the" if of_triad else "The"
     return (
         f"{whose} residuals look like {looks}. Size {size}, {effect.share:.0%} of the misfit; chance in "
         f"noise {effect.chance:.0e}."
