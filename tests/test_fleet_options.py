@@ -360,7 +360,7 @@ def test_what_could_be_right_for_no_tool_is_refused_at_once(tmp_path):
     assert "of one tool: use it with mwdcal calibrate" in message("--prior", "T1.json")
     assert "has none" in message("--prior", "datasheet", tool="generic")
     assert "cannot weigh" in message("--robust", "huber", "--method", "newton")
-    assert "of no paper" in message("--paper-weights")
+    assert "does not come from a paper" in message("--paper-weights")
     assert "--ignore must be of" in message("--ignore", "toolface")
     assert "needs --method joint" in message("--ignore", "dip", "--method", "scalar")
     assert "--estimate must be of" in message("--estimate", "dip")

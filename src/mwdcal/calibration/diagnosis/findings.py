@@ -49,7 +49,7 @@ SCATTERED = {
 def described(name: str) -> str:
     """What a free direction means, and what would determine it."""
     steady, _, power = name.partition("-temperature-")
-    course = f" (its course with temperature, power {power})" if power else ""
+    course = f" (its variation with temperature, power {power})" if power else ""
     return FREE_DIRECTIONS.get(steady, steady) + course
 
 
@@ -98,14 +98,14 @@ def finding_flags(fitted: FittedRuns) -> Iterator[Flag]:
 
 
 def _common(fitted: FittedRuns, name: str, text: str, places: Sequence[int] | None = None) -> Flag:
-    """What holds alike of all members, or of those at some places."""
+    """One sentence for all members, or for those at some places."""
     index = np.arange(fitted.count)
     members = np.ones(fitted.count, bool) if places is None else np.isin(index, places)
     return Flag(name, members, lambda _: text)
 
 
 def _joined(triads: Bools) -> str:
-    """The names of the triads (t,) that are meant.
+    """The names of the flagged triads (t,).
 
     >>> _joined(np.array([True, True]))
     'accelerometer and magnetometer'
@@ -166,7 +166,7 @@ def _structure(fitted: FittedRuns) -> Iterator[Flag]:
 
 
 def _scatter(fitted: FittedRuns) -> Flag:
-    """What departs from station to station beyond the noise of the sensors."""
+    """What varies from station to station by more than the noise of the sensors."""
 
     def sentence(place: int) -> str:
         scatter = fitted.result.problem.evidence.scatter
@@ -182,23 +182,23 @@ def _scatter(fitted: FittedRuns) -> Flag:
             if size > plausibility.SCATTER_SHARE
         ]
         return (
-            f"from station to station, beyond the noise of the sensors, there departs {', '.join(words)} "
-            "(1σ, estimated; weights and uncertainties include it). Look for iron near the stand, and "
-            "for what holds the tool in its direction; or the model lacks something."
+            f"beyond sensor noise, these vary from station to station: {', '.join(words)} "
+            "(1σ, estimated; weights and uncertainties include it). Look for iron near the stand and "
+            "play in the tool holder; or the model lacks something."
         )
 
     return Flag("scatter", plausibility.scattered(fitted.result), sentence)
 
 
 def _repeated(fitted: FittedRuns) -> Flag:
-    """Stations whose readings are another's to the last digit."""
+    """Stations whose readings are identical to another's."""
     copies = plausibility.copies(fitted.result)
 
     def sentence(place: int) -> str:
         labels = fitted.alone(place)[0].labels
         names = [labels[index] for index in np.flatnonzero(copies[place])]
         return (
-            f"station {_listed(names)}: the very readings of an earlier station. Copies count as "
+            f"station {_listed(names)}: readings identical to those of an earlier station. Copies count as "
             "measurements of their own, and uncertainties come out too small. Remove them."
         )
 
@@ -206,7 +206,7 @@ def _repeated(fitted: FittedRuns) -> Flag:
 
 
 def _beyond_order(fitted: FittedRuns, index: int, terms: Terms) -> Flag:
-    """A course with temperature that the order of a triad does not follow."""
+    """A variation with temperature that the order of a triad does not follow."""
     problem, state = fitted.result.problem, fitted.result.state
     order, observable = problem.triads[index].model.basis.order, ("gravity", "field")[index]
     scale, unit = shown_in(observable, fitted.readings.relative)
@@ -236,7 +236,7 @@ def _beyond_order(fitted: FittedRuns, index: int, terms: Terms) -> Flag:
 
 
 def _untested(fitted: FittedRuns) -> Flag:
-    """Courses with temperature that nothing tests."""
+    """Temperature terms that nothing tests."""
     bare = untested(fitted.result)
     orders = np.array([t.model.basis.order for t in fitted.result.problem.triads])
 
@@ -267,7 +267,7 @@ def _undetermined(fitted: FittedRuns) -> Iterator[Flag]:
 
 
 def _prior(fitted: FittedRuns) -> Iterator[Flag]:
-    """What rests on the prior alone, and whether run and prior agree."""
+    """Parameters that rest on the prior alone, and whether run and prior agree."""
     prior, constants = fitted.options.prior, fitted.result.problem.evidence.constants
     if prior is None:
         return
@@ -285,7 +285,7 @@ def _prior(fitted: FittedRuns) -> Iterator[Flag]:
 
 
 def _prior_only(fitted: FittedRuns, source: str) -> Flag:
-    """What rests on the prior alone."""
+    """Parameters that only the prior determines."""
     bare = plausibility.without_prior(fitted.result)
     named = free_directions(bare.problem, bare.state, bare.analysis.determined)
     ids = [{entry.id for entry in free} for free in fitted.free]
@@ -316,7 +316,7 @@ def _prior_conflict(fitted: FittedRuns, source: str) -> Flag:
 
 
 def _model(fitted: FittedRuns) -> Iterator[Flag]:
-    """What the chosen model cannot say."""
+    """Limits of the chosen model."""
     options = fitted.options
     ignored = [
         name
@@ -372,12 +372,14 @@ def _reshoot(fitted: FittedRuns) -> Iterator[Flag]:
 
 
 def _distrusted(fitted: FittedRuns) -> Flag:
-    """Stations that a robust fit all but left out."""
+    """Stations that a robust fit has nearly left out."""
     low = plausibility.distrusted(fitted.result)
 
     def sentence(place: int) -> str:
         labels, weight = fitted.alone(place)[0].labels, fitted.result.trust[place]
         each = [f"{labels[i]} ({weight[i]:.1g})" for i in np.flatnonzero(low[place])]
-        return f"robust fit: of little weight are station {_listed(each)}. Look at what they have in common."
+        return (
+            f"robust fit: low weight for station {_listed(each)}. Look at what they have in common."
+        )
 
     return Flag("distrusted", np.any(low, -1), sentence)

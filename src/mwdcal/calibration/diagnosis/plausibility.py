@@ -21,7 +21,7 @@ from mwdcal.geometry.vectors import Array, Bools, Ints, centred, eigen
 BENIGN_DIRECTIONS = ("rotation-x", "rotation-y", "toolface-zero", "scale")
 """Directions that may stay free."""
 EXCESS_RATIO = 10.0
-"""An error after calibration of more than this many times its expectation is no error of a sensor."""
+"""An error after calibration of more than this many times its expectation is not a sensor's."""
 DIP_CERTAINTY = 4.0
 """Standard uncertainties by which a dip must lie beyond vertical, not to be noise at a pole."""
 STRAY_DEVIATIONS = 5.0
@@ -31,7 +31,7 @@ SMALLEST_EXPECTATION = 1e-12
 NOISE_RATIO = 3.0
 """Residuals of a robust fit that exceed the declared noise this many times are reported."""
 CALM_FREEDOM = 12.0
-"""Degrees of freedom from which residuals far below the declared noise are no chance."""
+"""Degrees of freedom from which residuals far below the declared noise are not a coincidence."""
 MISFIT_CHANCE = 1e-3
 """Chance of so large residuals, or of so large a departure from the prior, below which it is reported."""
 LOW_WEIGHT = 0.1
@@ -184,13 +184,13 @@ def copies(result: Fit) -> Bools:
 
 
 def scattered(result: Fit) -> Bools:
-    """Whether (B,) strengths, dip or the directions of groups depart from station to station."""
+    """Whether (B,) strengths, dip or the directions of groups vary from station to station."""
     sizes = [value.max(-1) for value in result.problem.evidence.scatter.values()]
     return np.asarray(np.max([np.zeros(len(result.status)), *sizes], 0) > SCATTER_SHARE)
 
 
 def distrusted(result: Fit) -> Bools:
-    """Stations (B, n) that a robust fit all but left out."""
+    """Stations (B, n) that a robust fit has nearly left out."""
     return np.asarray(result.trust < LOW_WEIGHT)
 
 

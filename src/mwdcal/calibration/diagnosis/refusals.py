@@ -1,7 +1,7 @@
-"""Refusals: what no fit could mend, and what no fit result may be trusted with.
+"""Refusals: runs that no fit can calibrate, and fits whose result cannot be trusted.
 
-Each check looks at a batch of runs and gives flags, whose ids are the statuses of a fleet's table. A
-single run is refused by the first flag in order, and so is each tool of a fleet.
+Each check looks at a batch of runs and returns a flag; its id is the status in a fleet's table. A
+single run is refused by the first flag that holds, and so is each tool of a fleet.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def check(refusals: Iterable[Flag]) -> None:
 
 
 def check_readings(readings: Readings, options: Options) -> None:
-    """Refuse a run that no fit could mend, before trying."""
+    """Refuse a run that no fit can calibrate, and options that do not go together."""
     check_options(options)
     check(reading_refusals(batch_of_one(readings), options, lambda _: readings))
 
@@ -113,7 +113,7 @@ def check_options(options: Options) -> None:
         )
     if options.paper_weights and method == "joint":
         raise InputError(
-            "--paper-weights: method joint is of no paper. Name the paper's method: least-squares, "
+            "--paper-weights: method joint does not come from a paper. Name the paper's method: least-squares, "
             "swarm, newton, toolface-inclination or scalar."
         )
     if options.prior and (options.own_solver or options.nonlinearity):
@@ -135,13 +135,13 @@ def _check_curved_models(options: Options) -> None:
 
 
 def check_order(asked: str) -> None:
-    """Refuse what is no temperature order."""
+    """Refuse anything but a temperature order or "auto"."""
     if asked not in ("auto", *map(str, range(HIGHEST + 1))):
         raise InputError(f"--order must be 0, 1, 2, 3 or auto; got {asked!r}.")
 
 
 def check_curve_names(asked: str, wanted: Sequence[str]) -> None:
-    """Refuse own-axis terms of what is no triad."""
+    """Refuse own-axis terms of anything but a triad."""
     if not wanted or not set(wanted) <= set(TRIADS):
         raise InputError(
             f"--nonlinearity must be auto, none, {' or '.join(TRIADS)}; got {asked!r}."
@@ -158,7 +158,7 @@ def check_curves(readings: Readings, wanted: Sequence[str]) -> None:
 
 
 def _check_ignored(options: Options) -> None:
-    """Refuse to ignore what is no strength, or with a method that says itself what it uses."""
+    """Refuse to ignore anything but strengths and dip, or with a method that fixes what it uses."""
     unknown = [name for name in options.ignore if name not in CONSTANTS]
     if unknown:
         raise InputError(f"--ignore must be of {', '.join(CONSTANTS)}; got {unknown[0]!r}.")
@@ -169,7 +169,7 @@ def _check_ignored(options: Options) -> None:
 
 
 def reading_refusals(readings: Readings, options: Options, run: Run) -> Iterator[Flag]:
-    """What no fit could mend in runs (B, n, ...), in the order in which it is looked for."""
+    """What no fit of runs (B, n, ...) can make good, in order of precedence."""
     yield _few_stations(readings, options, run)
     yield _common_errors(readings, options)
     for triad in TRIADS:
@@ -182,7 +182,7 @@ def reading_refusals(readings: Readings, options: Options, run: Run) -> Iterator
 
 
 def _all(readings: Readings, hold: bool) -> Bools:
-    """What holds of all runs (B,) of one shape, or of none."""
+    """A flag that holds for all runs (B,) of one shape, or for none."""
     return np.full(len(readings.accelerometer), hold)
 
 
@@ -205,7 +205,7 @@ def _few_stations(readings: Readings, options: Options, run: Run) -> Flag:
 
 
 def holds_stand(options: Options) -> bool:
-    """Whether a method takes the stand as it reads: its uncertainty has no errors in common."""
+    """Whether a method takes the stand as exact: errors common to its stations have no place in it."""
     return options.method == "swarm" or options.paper_weights
 
 
@@ -266,7 +266,7 @@ def _channels(readings: Readings, triad: str, prior: bool, run: Run) -> Iterator
 
 
 def no_temperature(order: int) -> InputError:
-    """Of an order that needs temperatures where none are read."""
+    """The error of an order that needs temperatures in a run without them."""
     return InputError(f"--order {order} needs the column 'temperature_c'; use --order 0.")
 
 
@@ -314,10 +314,10 @@ def _blank(readings: Readings, method: str, needed: list[str], name: str, run: R
 
 
 def fit_refusals(fitted: FittedRuns) -> Iterator[Flag]:
-    """What no fit may be trusted with, in the order in which it is looked for.
+    """Reasons not to trust a fit, in order of precedence.
 
-    Where nothing fits, the state is anywhere: that comes before what it leaves undetermined, and
-    before its gains. What a wrong axis may have caused names the axes that would fit.
+    A fit that explains nothing may have ended anywhere: its residuals are judged before its rank and
+    its gains. Refusals that a wrong axis may have caused name the axes with which the run fits.
     """
     sound = np.ones(fitted.count, bool)
     for flag in _by_arrays(fitted):
@@ -438,7 +438,7 @@ def _too_weak(fitted: FittedRuns) -> Flag:
 
 
 def _without_redundancy(fitted: FittedRuns, index: int) -> Flag:
-    """Triads whose noise would have to be estimated from residuals that are none."""
+    """Triads without redundancy whose noise would have to be estimated from the residuals."""
     freedom = fitted.result.analysis.freedom[:, index]
 
     def sentence(place: int) -> str:
