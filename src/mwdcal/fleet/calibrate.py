@@ -1,10 +1,9 @@
-"""A batch of tools calibrated at once: one fit for all, and each tool checked as if it were alone.
+"""A batch of tools calibrated at once: one fit for all, each tool refused or reported as if alone.
 
-Every tool of a `Batch` has the same number of stations and the same kinds of evidence. What
-`calibrate` would refuse is refused here with the same words: a screen of array operations
-picks the suspects, and the check of a single run decides and speaks. What `calibrate` leaves to
-the data is decided for each tool (`fleet_choices`). Results are columns, not objects: `names`
-says which.
+Every tool of a `Batch` has the same number of stations and the same kinds of evidence. Refusals and
+findings are those of `mwdcal.calibration.diagnosis`, of which a single run has the first member's.
+What `calibrate` leaves to the data is decided for each tool (`mwdcal.fleet.choices`). Results are
+columns, not objects: `names` says which.
 """
 
 from __future__ import annotations
@@ -203,8 +202,8 @@ def _record(
     alone: Alone,
 ) -> None:
     """Check a fit of some tools and write down the results of the sound ones."""
-    own = take(readings, members)
-    fitted = FittedRuns.of(own, profile, options, result, lambda i: alone(int(members[i])))
+    part, tools = take(readings, members), members
+    fitted = FittedRuns.of(part, profile, options, result, lambda i: alone(int(tools[i])))
     _refuse(outcome, members, fit_refusals(fitted))
     good = np.flatnonzero(outcome.status[members] == OK)
     if not good.size:
