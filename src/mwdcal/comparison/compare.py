@@ -195,7 +195,7 @@ def _made(readings: Readings, profile: Profile, options: Options) -> _Made | str
     started = time.perf_counter()
     whole = fit(readings, options)
     seconds = time.perf_counter() - started
-    free = free_directions(whole.problem, whole.state, whole.analysis.determined)
+    free = free_directions(whole.problem, whole.state, whole.analysis.determined)[0]
     return _Made(options, found, whole, seconds, free)
 
 

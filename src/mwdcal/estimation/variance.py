@@ -33,7 +33,7 @@ def scatter_ratios(problem: Problem, state: State, analysis: Analysis) -> dict[s
     Definition: with q = P y and P the covariance of the weighed residuals, qᵀVq / tr(PV) for the
     component V = GGᵀ of unit variance. One where nothing tests a component.
     """
-    found = {}
+    ratios = {}
     for name, columns in problem.scatter_columns(state).items():
         share = problem.evidence.scatter[name][..., None]
         share = share / np.maximum(share.max(1, keepdims=True), LEAST_SCATTER)
@@ -42,8 +42,8 @@ def scatter_ratios(problem: Problem, state: State, analysis: Analysis) -> dict[s
         whole = np.einsum("bnmk,bnml,bnlk->b", tested, analysis.spread, tested, optimize=True)
         square = np.sum(along**2, (-1, -2))
         ratio = np.where(whole > 0, square / np.where(whole > 0, whole, 1.0), 1.0)
-        found[name] = np.clip(np.nan_to_num(ratio, nan=1.0), 1 / LARGEST_CHANGE, LARGEST_CHANGE)
-    return found
+        ratios[name] = np.clip(np.nan_to_num(ratio, nan=1.0), 1 / LARGEST_CHANGE, LARGEST_CHANGE)
+    return ratios
 
 
 def with_scatter(problem: Problem, state: State, ratios: dict[str, Array]) -> Problem:

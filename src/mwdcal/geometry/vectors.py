@@ -107,13 +107,6 @@ def nearest_rotation(matrix: Array) -> Array:
     return np.asarray((u * signs[..., None, :]) @ vt)
 
 
-def placed(ours: AnyArray, index: Ints, theirs: AnyArray) -> AnyArray:
-    """A copy of ours (B, ...) with theirs at some members of the batch."""
-    changed = ours.copy()
-    changed[index] = theirs
-    return changed
-
-
 def inverse(matrix: Array) -> Array:
     """Inverse (..., k, k) of every matrix of a stack; NaN for a singular one, never an exception."""
     try:
