@@ -11,8 +11,9 @@ from mwdcal.calibration.estimate import fit
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.prediction import typical_accuracy
 from mwdcal.calibration.readings import Readings
+from mwdcal.estimation.batch import take
 from mwdcal.files import documents
-from mwdcal.fleet.calibrate import column, taken
+from mwdcal.fleet.calibrate import column
 from simulation import DEG, Tool, plan
 from test_fleet import bad_tools, calibrated, roll_run, short_run, write_fleet
 
@@ -336,7 +337,7 @@ def test_a_tool_does_not_depend_on_its_neighbours(options):
     readings = of_different_noise(100)
     many = fit(readings, options)
     for index in range(0, 100, 9):
-        one = fit(taken(readings, np.array([index])), options)
+        one = fit(take(readings, np.array([index])), options)
         sd = np.sqrt(np.diagonal(one.analysis.covariance[0]))
         assert np.abs((many.state.params[index] - one.state.params[0]) / sd).max() < 1e-6
         np.testing.assert_allclose(many.noise[index], one.noise[0], 1e-7)
@@ -359,7 +360,7 @@ def test_what_could_be_right_for_no_tool_is_refused_at_once(tmp_path):
     assert "of one tool: use it with mwdcal calibrate" in message("--prior", "T1.json")
     assert "has none" in message("--prior", "datasheet", tool="generic")
     assert "cannot weigh" in message("--robust", "huber", "--method", "newton")
-    assert "of no paper" in message("--paper-weights")
+    assert "does not come from a paper" in message("--paper-weights")
     assert "--ignore must be of" in message("--ignore", "toolface")
     assert "needs --method joint" in message("--ignore", "dip", "--method", "scalar")
     assert "--estimate must be of" in message("--estimate", "dip")

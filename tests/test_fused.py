@@ -197,7 +197,7 @@ def test_what_is_remarkable_is_counted(sound):
     columns = [*readings.accelerometer.T.copy(), *readings.magnetometer.T.copy()]
     columns.append(np.linspace(0.0, 99.9, 1000))
     columns[0][5], columns[4][7], columns[5][8] = np.nan, 1e20, -np.inf
-    limits = correction_numba.Limits((-1e15, 1e15), (5.0, 1000.0), (20.0, 80.0), blank=True)
+    limits = correction_numba.RowLimits((-1e15, 1e15), (5.0, 1000.0), (20.0, 80.0), blank=True)
     found = correction_numba.run(columns, correction.numbers(calibration), 30.0, limits=limits)
     assert found.unsound == 3 + int((columns[6] < 5.0).sum())
     beyond = (columns[6] < 20.0) | (columns[6] > 80.0)
@@ -219,7 +219,7 @@ def test_vectors_alone(sound):
 def test_long_arrays_take_the_loops_and_the_result_is_the_same(sound, monkeypatch):
     calibration = changed(sound, ("factors", 3, False), ("factors", 3, False))
     readings = random_readings((4000,))
-    monkeypatch.setattr(correction, "MANY", 1000)
+    monkeypatch.setattr(correction, "COMPILED_ROWS", 1000)
     assert correction.compiled(calibration, readings) is not None
     plain, said = correction.correct(calibration, readings, "blank")
     monkeypatch.setattr(correction, "compiled", lambda *given: None)

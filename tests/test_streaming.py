@@ -30,7 +30,7 @@ from mwdcal.app.commands.apply import apply_to_table
 from mwdcal.errors import InputError
 from mwdcal.files import documents, streams
 from mwdcal.files.formats import sinks, table
-from mwdcal.use.correction import MARK, NAMES
+from mwdcal.use.correction import EXTRAPOLATED, NAMES
 from simulation import Tool
 
 arrow = pytest.importorskip("pyarrow")
@@ -93,7 +93,7 @@ def assert_same(path, wanted):
     assert {**found.metadata, "findings": 0} == {**wanted.metadata, "findings": 0}
     assert found.metadata.get("findings", []) == wanted.metadata.get("findings", [])
     for name in wanted.columns:
-        if name == MARK:
+        if name == EXTRAPOLATED:
             assert found.columns[name] == [str(mark).lower() for mark in wanted.columns[name]]
         elif name in NAMES or not isinstance(wanted.columns[name], list):
             theirs, ours = table.numbers(wanted, name), table.numbers(found, name)
@@ -293,8 +293,8 @@ def test_rows_that_lack_a_reading(tmp_path, warm, small_pieces, holes, least, ou
         np.testing.assert_array_equal(found[sound], rest.columns[name])
         assert np.isnan(found[sound][hot]).all() == (outside == "blank")
     if outside == "extrapolate":
-        np.testing.assert_array_equal(wanted.columns[MARK][sound], hot)
-        assert not wanted.columns[MARK][~sound].any()
+        np.testing.assert_array_equal(wanted.columns[EXTRAPOLATED][sound], hot)
+        assert not wanted.columns[EXTRAPOLATED][~sound].any()
 
 
 @pytest.mark.parametrize("suffix", [".parquet", ".csv", ".xlsx"])
@@ -360,12 +360,12 @@ def test_marks_are_truth_values_where_the_format_has_them(tmp_path, warm, suffix
     source = tmp_path / f"log{suffix}"
     table.write(source, table.read(text))
     assert mwdcal("apply", warm[0], source, "-o", out, "--outside", "extrapolate").code == 0
-    column = parquet.read_table(out)[MARK]
+    column = parquet.read_table(out)[EXTRAPOLATED]
     assert column.type == arrow.bool_()
     assert 0 < sum(column.to_pylist()) < 50
     taken = mwdcal("apply", warm[0], source, "-o", tmp_path / "b.csv")
     assert taken.code == 0
-    write_csv(tmp_path / "taken.csv", {**log(5), MARK: ["no"] * 5})
+    write_csv(tmp_path / "taken.csv", {**log(5), EXTRAPOLATED: ["no"] * 5})
     again = ("apply", warm[0], tmp_path / "taken.csv", "-o", out)
     assert mwdcal(*again).code == 0
     message = refused(mwdcal(*again, "--outside", "extrapolate"), 2)
@@ -802,7 +802,7 @@ def test_rows_that_need_quotes_are_written_as_a_short_table_has_them(exact, deli
     carried_along = arrow.table(
         {"note": [t or None for t in texts], "id": np.arange(count), "x": values}
     )
-    schema = arrow.schema([("r", arrow.float64()), (MARK, arrow.bool_())])
+    schema = arrow.schema([("r", arrow.float64()), (EXTRAPOLATED, arrow.bool_())])
     stream = io.BytesIO()
     stream.name = "out.csv"
     sink = sinks.TextSink(stream, carried_along.schema, schema, {}, [], delimiter)
@@ -811,7 +811,7 @@ def test_rows_that_need_quotes_are_written_as_a_short_table_has_them(exact, deli
     needed = sum(any(mark in text for mark in ('"', delimiter)) for text in texts)
     assert exact["render"] == needed  # before the next line renders the whole
     marks = [str(mark).lower() for mark in values > 50]
-    whole_table = {**own, "x": values, "r": values, MARK: marks}
+    whole_table = {**own, "x": values, "r": values, EXTRAPOLATED: marks}
     assert stream.getvalue().decode() == streams.text.render(whole_table, {}, delimiter)
 
 

@@ -8,13 +8,13 @@ import pytest
 
 from mwdcal.estimation.minimisers.swarm import (
     CONSTRICTION,
-    forward_parts,
     least_squares_affine,
     least_squares_forward,
     swarm,
     swarm_forward,
     vector_cost,
 )
+from mwdcal.sensor.models import affine_parts
 from simulation import attitude, plan
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "papers" / "moradi.py"
@@ -46,7 +46,7 @@ def simulated(seed, reference, offset, noise, lead=()):
 def apart(one, other, raw, reference):
     """Largest difference of two sets of forward parameters: as parameters, and as fields."""
     fields = []
-    for matrix, offset in map(forward_parts, (one, other)):
+    for matrix, offset in map(affine_parts, (one, other)):
         back = np.swapaxes(np.linalg.inv(matrix), -1, -2)
         fields.append((raw - offset[..., None, :]) @ back)
     return max(np.abs(fields[0] - fields[1]).max(), np.abs(one - other).max())
@@ -92,7 +92,7 @@ def affine_miss(readings, reference, reach, seed):
     middle = np.concatenate([np.eye(3).ravel(), np.zeros(3)])
 
     def fields(params):
-        matrix, offset = forward_parts(params)
+        matrix, offset = affine_parts(params)
         return readings @ np.swapaxes(matrix, -1, -2) + offset[..., None, :]
 
     def cost(params):
@@ -146,7 +146,7 @@ def test_equations_12_and_13_are_different_estimators():
     assert moradi.apart(reference, 1e-4 * np.sqrt(3)) == pytest.approx(6e-8, rel=0.1)
     assert moradi.apart(reference, 6.5e-3) == pytest.approx(8e-5, rel=0.1)
     assert moradi.apart(reference, 6.5e-3 * np.sqrt(3)) == pytest.approx(2.5e-4, rel=0.1)
-    gain = [np.linalg.det(forward_parts(SOLVE[e](*noisy()))[0]) for e in ("field", "reading")]
+    gain = [np.linalg.det(affine_parts(SOLVE[e](*noisy()))[0]) for e in ("field", "reading")]
     assert gain[0].mean() > gain[1].mean()  # M too small: S too large
 
 

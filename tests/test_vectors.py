@@ -6,6 +6,7 @@ import pytest
 from mwdcal.geometry import observables as ob
 from mwdcal.geometry.vectors import (
     centred,
+    nearest_rotation,
     reference_vectors,
     rotation,
     skew,
@@ -91,6 +92,16 @@ def test_rotation_matrices(shape):
         term = term @ cross / k
         total = total + term
     np.testing.assert_allclose(matrix, total, atol=1e-12)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_nearest_rotation_is_proper_and_leaves_a_symmetric_stretch(shape):
+    rng = np.random.default_rng(3)
+    turn = rotation(rng.normal(size=(*shape, 3)))
+    stretch = np.diag([1.2, 0.9, 0.5])
+    np.testing.assert_allclose(nearest_rotation(turn @ stretch), turn, atol=1e-12)
+    mirrored = nearest_rotation(turn @ np.diag([1.2, 0.9, -0.5]))  # nearest: the least gain flips
+    np.testing.assert_allclose(mirrored, turn, atol=1e-12)
 
 
 def test_attitude_is_a_proper_rotation():

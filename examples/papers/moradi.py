@@ -16,13 +16,13 @@ import numpy as np
 
 from mwdcal.estimation.minimisers.swarm import (
     Swarm,
-    forward_parts,
     least_squares_affine,
     least_squares_forward,
     swarm_forward,
     vector_cost,
 )
 from mwdcal.geometry.vectors import Array, Bools, inverse, reference_vectors
+from mwdcal.sensor.models import affine_parts
 
 STATES = np.array([[0, 0, 1], [0, 0, -1], [0, 1, 0], [0, -1, 0], [1, 0, 0], [-1, 0, 0]], float)
 """Table 1: z down, z up, y down, y up, x down, x up; g."""
@@ -54,7 +54,7 @@ FLIP = np.repeat([1.0, -1.0], [9, 3])
 
 def corrected(raw: Array, params: Array) -> Array:
     """S⁻¹ (reading - B)."""
-    matrix, offset = forward_parts(params)
+    matrix, offset = affine_parts(params)
     back = np.swapaxes(inverse(matrix), -1, -2)
     return np.asarray((raw - offset[..., None, :]) @ back)
 
@@ -87,7 +87,7 @@ def left_by_a_fit(errors: Array) -> Array:
 
 def readings(errors: Array, truth: Array = TABLE_2) -> Array:
     """Six-state tests (draws, 6, 3) that `truth` corrects to the states plus `errors`."""
-    matrix, offset = forward_parts(truth)
+    matrix, offset = affine_parts(truth)
     return np.asarray((STATES + errors) @ matrix.T + offset)
 
 
@@ -145,7 +145,7 @@ def plan_48() -> Array:
 def apart(reference: Array, length: float, draws: int = 2000) -> float:
     """Mean Euclidean distance of the parameters of equations 12 and 13; noise of an rms length."""
     noise = np.random.default_rng(1).normal(size=(draws, *reference.shape)) * length / np.sqrt(3)
-    matrix, offset = forward_parts(TABLE_2)
+    matrix, offset = affine_parts(TABLE_2)
     raw = reference @ matrix.T + offset + noise
     both = least_squares_forward(raw, reference) - least_squares_affine(raw, reference)
     return float(np.linalg.norm(both, axis=-1).mean())

@@ -12,6 +12,7 @@ from mwdcal.calibration.methods import EVIDENCE, Solved, solve, with_stand_error
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.prior import prior_of
 from mwdcal.calibration.readings import ANGLES, TRIADS, Readings
+from mwdcal.estimation.batch import put, take
 from mwdcal.estimation.evidence import Evidence
 from mwdcal.estimation.minimisers import closed_form
 from mwdcal.estimation.problem import Problem, State, Triad
@@ -26,13 +27,13 @@ from mwdcal.estimation.uncertainty import (
     settle_gauge,
     station_misfit,
 )
-from mwdcal.estimation.variance import LEAST, START, scatter_ratios, with_scatter
-from mwdcal.geometry.vectors import Array, Bools, Ints, placed
-from mwdcal.sensor.models import Basis, Factors, Polynomial, Restricted, Whole, restricted
+from mwdcal.estimation.variance import FIRST_SCATTER, LEAST_SCATTER, scatter_ratios, with_scatter
+from mwdcal.geometry.vectors import Array, Bools, Ints
+from mwdcal.sensor.models import Basis, Factors, Polynomial, Whole, restricted
 
-FLOOR = 1e-9
+LEAST_NOISE = 1e-9
 """Smallest noise, as a share of the signal, that an estimate from residuals may reach."""
-STEP = 10.0
+TEMPERATURE_STEP = 10.0
 """The range of temperatures that a model is conditioned for ends at multiples of this, °C."""
 ROBUST_ROUNDS = 40
 SETTLED = 1e-3
@@ -83,38 +84,51 @@ def model_of(
 
 
 def temperature_ranges(temperature: Array) -> Array:
-    """Range (B, 2) of each member's temperatures (B, n), widened to multiples of `STEP`.
+    """Range (B, 2) of each member's temperatures (B, n), widened to multiples of `TEMPERATURE_STEP`.
 
-    Members of one range are fitted together as each would be alone.
+    Members of equal range have the same model in a batch as alone.
     """
-    low, high = np.floor(temperature.min(-1) / STEP), np.ceil(temperature.max(-1) / STEP)
-    return np.stack([low, high], -1) * STEP
+    low, high = (
+        np.floor(temperature.min(-1) / TEMPERATURE_STEP),
+        np.ceil(temperature.max(-1) / TEMPERATURE_STEP),
+    )
+    return np.stack([low, high], -1) * TEMPERATURE_STEP
 
 
 def _problem(
     readings: Readings, evidence: Evidence, lead: tuple[int, ...], options: Options
-) -> tuple[Problem, list[bool]]:
-    """The problem, and for each triad whether its noise is declared."""
+) -> tuple[Problem, list[bool], Bools]:
+    """The problem, for each triad whether its noise is declared, and which members (B,) are finite.
+
+    Members with readings that are not finite get stand-ins, so that the batch goes on.
+    """
     cold = np.zeros(readings.count)
     temperature = flat(cold if readings.temperature is None else readings.temperature, lead)
     curved = options.nonlinearity or {}
+    names = [name for name in TRIADS if getattr(readings, name) is not None]
+    raws = [flat(getattr(readings, name), lead, 3) for name in names]
+    finite = np.all([np.isfinite(raw).all((-1, -2)) for raw in raws], axis=0)
     triads: list[Triad] = []
-    for name, order in zip(TRIADS, options.orders, strict=True):
-        values = getattr(readings, name)
-        if values is None:
-            continue
-        raw = flat(values, lead, 3)
-        whole = model_of(
-            options.kind(order), order, raw, temperature, evidence.include, name in curved
-        )
-        sd = (
-            flat(readings.sd[name], lead, 3) if name in readings.sd else 1e-3 * _size(raw) + 0 * raw
-        )
-        triads.append(Triad(restricted(whole, options.parameters), raw, sd))
+    for name, raw, order in zip(names, raws, options.orders, strict=False):
+        kind, sound = options.kind(order), raw if finite.all() else _sound(raw, finite)
+        whole = model_of(kind, order, sound, temperature, evidence.include, name in curved)
+        sd = flat(readings.sd[name], lead, 3) if name in readings.sd else _first_noise(raw)
+        triads.append(Triad(restricted(whole, options.parameters), sound, sd))
     prior = prior_of(options.prior, [t.model for t in triads], len(evidence.include))
     problem = Problem(tuple(triads), temperature, evidence, prior)
     _bound_curves(problem, curved)
-    return problem, [name in readings.sd for name in TRIADS[: len(triads)]]
+    return problem, [name in readings.sd for name in names], finite
+
+
+def _sound(raw: Array, finite: Bools) -> Array:
+    """Readings with stand-ins of harmless size for members that are not finite."""
+    pattern = np.sin(np.arange(raw[0].size) ** 1.5).reshape(-1, 3)
+    return np.where(finite[:, None, None], raw, pattern)
+
+
+def _first_noise(raw: Array) -> Array:
+    """Noise (B, n, 3) at which its estimation begins, a thousandth of the readings' size."""
+    return np.asarray(1e-3 * _size(raw) + 0 * raw)
 
 
 def _bound_curves(problem: Problem, curved: Mapping[str, float]) -> None:
@@ -132,31 +146,28 @@ def _size(raw: Array) -> Array:
     return np.where(size > 0, size, 1.0)
 
 
+@np.errstate(invalid="ignore", divide="ignore", over="ignore")
 def fit(readings: Readings, options: Options | None = None, include: Array | None = None) -> Fit:
     """Fit a run, or a batch of runs (leading axes of the readings, or of `include`).
 
-    `include` (..., n) is 1 for stations that count and 0 for those left out.
+    `include` (..., n) is 1 for stations that count and 0 for those left out. Nothing is raised for
+    a member that cannot be fitted: its `status` says so.
     """
-    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        return _fit(readings, options or Options(), include)
-
-
-def _fit(readings: Readings, options: Options, include: Array | None) -> Fit:
+    options = options or Options()
     include = np.ones(readings.count) if include is None else np.asarray(include, float)
     evidence = EVIDENCE[options.method](evidence_of(readings, include))
     evidence = without(evidence, options.ignore)
     evidence = with_stand_errors(evidence, options.estimate)
     evidence = _scattered(evidence, readings, options)
     lead = np.broadcast_shapes(readings.accelerometer.shape[:-1], include.shape)
-    problem, declared = _problem(readings, evidence, lead, options)
-    problem, finite = _without_broken(problem)
+    problem, declared, finite = _problem(readings, evidence, lead, options)
     closed, alone = _closed(problem, declared, options, finite)
     if closed is None:
         return _general(problem, declared, options, finite)
     if alone.all():
         return closed
     rest = np.flatnonzero(~alone)
-    return _joined(closed, rest, _general(problem.take(rest), declared, options, finite[rest]))
+    return put(closed, rest, _general(take(problem, rest), declared, options, finite[rest]))
 
 
 def scatters(readings: Readings, options: Options) -> bool:
@@ -171,16 +182,16 @@ def scatters(readings: Readings, options: Options) -> bool:
 
 
 def _scattered(evidence: Evidence, readings: Readings, options: Options) -> Evidence:
-    """The evidence with the scatter whose estimation is asked for, where it begins."""
+    """The evidence with the first value of each scatter that the options have estimated."""
     if not scatters(readings, options):
         return evidence
     names = [name for name in ("gravity", "field", "dip") if name not in evidence.absent]
-    start = np.full(evidence.include.shape, START)
+    start = np.full(evidence.include.shape, FIRST_SCATTER)
     return replace(evidence, scatter=dict.fromkeys((*names, "direction"), start))
 
 
 def _general(problem: Problem, declared: list[bool], options: Options, finite: Bools) -> Fit:
-    """The fit by steps."""
+    """The fit by the method's minimiser, with estimated noise and station weights in turn."""
     solved = solve(problem, start(problem), options)
     iterations = solved.iterations
     stage = _Stage(problem, solved, np.ones(problem.evidence.include.shape))
@@ -207,58 +218,31 @@ def _general(problem: Problem, declared: list[bool], options: Options, finite: B
 def _closed(
     problem: Problem, declared: list[bool], options: Options, finite: Bools
 ) -> tuple[Fit | None, Bools]:
-    """The fit in closed form, and members (B,) of which it is: those that determine all directions.
+    """The fit in closed form, and for which members (B,) it holds: all directions are determined.
 
-    None where it is of none, as with references that are not exact.
+    None where it holds for no member, as with references that are not exact.
     """
     none = np.zeros(len(finite), bool)
     apart = options.robust or options.own_solver or problem.evidence.scatter
     if apart or not closed_form.applies(problem):
         return None, none
     at = closed_form.start(problem)
-    halfs = closed_form.halves(problem, at)
-    state, analysis = closed_form.solution(problem, at, halfs)
-    good = closed_form.settled(halfs) & analysis.determined.keep.all(-1)
+    triads = closed_form.minima(problem, at)
+    state, analysis = closed_form.solution(problem, at, triads)
+    good = closed_form.settled(triads) & analysis.determined.keep.all(-1)
     if not good.any():
         return None, none
     if not all(declared):
         problem = _rescaled(problem, np.sqrt(analysis.variance_factor), declared)
-        halfs = closed_form.halves(problem, at)
-        state, analysis = closed_form.solution(problem, at, halfs)
-        good &= closed_form.settled(halfs)
+        triads = closed_form.minima(problem, at)
+        state, analysis = closed_form.solution(problem, at, triads)
+        good &= closed_form.settled(triads)
     sound = finite & np.isfinite(state.params).all(-1)
     status = np.where(sound, int(Status.OK), int(Status.NOT_FINITE))
     trust = np.ones(problem.evidence.include.shape)
     once = np.ones(len(status), int)
     noise = _noise(problem, declared)
     return Fit(problem, state, status, once, noise, trust, analysis), good
-
-
-def _joined(ours: Fit, index: Ints, other: Fit) -> Fit:
-    """Our fit with some members of another."""
-    ends = {
-        name: placed(getattr(ours, name), index, getattr(other, name))
-        for name in ("status", "iterations", "noise", "trust")
-    }
-    mine, theirs = ours.analysis, other.analysis
-    names = ("covariance", "variance_factor", "freedom", "residual", "spread")
-    found = {n: placed(getattr(mine, n), index, getattr(theirs, n)) for n in names}
-    determined = mine.determined.put(index, theirs.determined)
-    return Fit(
-        problem=_with_noise_of(ours.problem, index, other.problem),
-        state=ours.state.put(index, other.state),
-        analysis=replace(mine, determined=determined, **found),
-        **ends,
-    )
-
-
-def _with_noise_of(problem: Problem, index: Ints, other: Problem) -> Problem:
-    """The problem with the noise that some members have in another, which is the same besides."""
-    pairs = zip(problem.triads, other.triads, strict=True)
-    triads = tuple(replace(t, sd=placed(t.sd, index, o.sd)) for t, o in pairs)
-    ours, theirs = problem.evidence.scatter, other.evidence.scatter
-    scatter = {name: placed(value, index, theirs[name]) for name, value in ours.items()}
-    return replace(problem, triads=triads, evidence=replace(problem.evidence, scatter=scatter))
 
 
 def _noise(problem: Problem, declared: list[bool]) -> Array:
@@ -278,72 +262,45 @@ def _determined(problem: Problem, state: State, solved: Solved) -> Determined:
 
 
 def _analysed(
-    found: Analysis,
+    analysis: Analysis,
     problem: Problem,
     state: State,
     solved: Solved,
     options: Options,
     trust: Array,
 ) -> Analysis:
-    """The analysis of the estimator that was used: not every one is the likelihood's."""
+    """The likelihood's analysis as it changes with the papers' sums and with robust weights."""
     pulls = solved.pulls(problem, state)
     if pulls:
-        found = sandwich(found, problem, state, pulls)
+        analysis = sandwich(analysis, problem, state, pulls)
     if options.robust:
-        found = _robustly(found, problem, state, options.robust, trust)
-    return found
+        analysis = _robustly(analysis, problem, state, options.robust, trust)
+    return analysis
 
 
-def _robustly(found: Analysis, problem: Problem, state: State, loss: str, trust: Array) -> Analysis:
-    """The analysis of a fit with station weights: the data say less than they seem to, a prior does not."""
-    freedom = _tested(station_misfit(found)[1])
-    louder = np.sqrt([inflation(loss, k) for k in freedom])[:, None, None]
-    triads = tuple(replace(t, sd=t.sd * louder) for t in problem.triads)
-    sd = {n: s * louder[..., 0] if n in ANGLES else s for n, s in problem.evidence.sd.items()}
-    scatter = {n: s * louder[..., 0] for n, s in problem.evidence.scatter.items()}
-    evidence = replace(problem.evidence, sd=sd, scatter=scatter)
-    wider = analyse(replace(problem, triads=triads, evidence=evidence), state, found.determined)
+def _robustly(
+    analysis: Analysis, problem: Problem, state: State, loss: str, trust: Array
+) -> Analysis:
+    """The analysis of a fit with station weights: they cost information of the data, none of the prior."""
+    freedom = _tested(station_misfit(analysis)[1])
+    louder = np.sqrt([inflation(loss, k) for k in freedom])[:, None]
+    wider = analyse(_louder(problem, louder), state, analysis.determined)
     return replace(
-        found,
+        analysis,
         covariance=wider.covariance,
         constants=wider.constants,
         effects=wider.effects,
-        variance_factor=_bounded_factor(found, trust, loss, freedom),
+        variance_factor=_bounded_factor(analysis, trust, loss, freedom),
     )
 
 
-def _bounded_factor(found: Analysis, trust: Array, loss: str, freedom: Array) -> Array:
+def _bounded_factor(analysis: Analysis, trust: Array, loss: str, freedom: Array) -> Array:
     """s² (B, t) of a fit with station weights `trust`, from the pulls w d that they bound."""
-    pulled = found.residual**2 * trust[..., None]
+    pulled = analysis.residual**2 * trust[..., None]
     shape = (*pulled.shape[:-1], pulled.shape[-1] // 3, 3)
     squares = np.sum(pulled.reshape(shape), (1, 3))
     share = np.array([consistency(loss, k) for k in freedom])[:, None]
-    return np.asarray(squares / np.where(found.freedom > 1e-9, found.freedom, np.nan) / share)
-
-
-def _without_broken(problem: Problem) -> tuple[Problem, Bools]:
-    """Members with readings that are not finite get stand-ins, so that the batch goes on."""
-    finite = np.all([np.isfinite(t.raw).all((-1, -2)) for t in problem.triads], axis=0)
-    if finite.all():
-        return problem, finite
-    pattern = np.sin(np.arange(problem.triads[0].raw[0].size) ** 1.5).reshape(-1, 3)
-    triads = []
-    for triad in problem.triads:
-        raw = np.where(finite[:, None, None], triad.raw, pattern)
-        model = triad.model
-        if isinstance(model, Restricted):
-            model = replace(model, whole=_finite_model(model.whole))
-        else:
-            model = _finite_model(model)
-        triads.append(replace(triad, raw=raw, model=model))
-    return replace(problem, triads=tuple(triads)), finite
-
-
-def _finite_model(model: Whole) -> Whole:
-    if isinstance(model, Factors):
-        return model
-    centre = np.where(np.isfinite(model.centre), model.centre, 0.0)
-    return replace(model, centre=centre, scale=np.where(np.isfinite(model.scale), model.scale, 1.0))
+    return np.asarray(squares / np.where(analysis.freedom > 1e-9, analysis.freedom, np.nan) / share)
 
 
 @dataclass(frozen=True)
@@ -353,40 +310,6 @@ class _Stage:
     problem: Problem
     solved: Solved
     trust: Array
-
-    def take(self, index: Ints) -> _Stage:
-        """Some members of the batch."""
-        solved = replace(
-            self.solved,
-            state=self.solved.state.take(index),
-            status=self.solved.status[index],
-            iterations=self.solved.iterations[index],
-            sums={k: v.take(index) for k, v in self.solved.sums.items()},
-            known={k: v[index] for k, v in self.solved.known.items()},
-        )
-        return _Stage(self.problem.take(index), solved, self.trust[index])
-
-    def put(self, index: Ints, other: _Stage) -> _Stage:
-        """Ours with some members replaced."""
-        ours, new = self.solved, other.solved
-        sums = {
-            k: replace(
-                v,
-                reference=placed(v.reference, index, new.sums[k].reference),
-                weights=placed(v.weights, index, new.sums[k].weights),
-            )
-            for k, v in ours.sums.items()
-        }
-        solved = replace(
-            ours,
-            state=ours.state.put(index, new.state),
-            status=placed(ours.status, index, new.status),
-            iterations=placed(ours.iterations, index, new.iterations),
-            sums=sums,
-            known={k: placed(v, index, new.known[k]) for k, v in ours.known.items()},
-        )
-        problem = _with_noise_of(self.problem, index, other.problem)
-        return _Stage(problem, solved, placed(self.trust, index, other.trust))
 
 
 def _in_turn(stage: _Stage, rounds: int, turn: Callable[[_Stage], tuple[_Stage, Bools]]) -> _Stage:
@@ -398,9 +321,9 @@ def _in_turn(stage: _Stage, rounds: int, turn: Callable[[_Stage], tuple[_Stage, 
             break
         if settled.any():
             done, rest = np.flatnonzero(settled), np.flatnonzero(~settled)
-            whole = whole.put(active[done], stage.take(done))
-            stage, active = stage.take(rest), active[rest]
-    return stage if len(active) == len(whole.trust) else whole.put(active, stage)
+            whole = put(whole, active[done], take(stage, done))
+            stage, active = take(stage, rest), active[rest]
+    return stage if len(active) == len(whole.trust) else put(whole, active, stage)
 
 
 def _estimate_noise(stage: _Stage, declared: list[bool], options: Options) -> _Stage:
@@ -432,7 +355,8 @@ def _steady(old: Problem, new: Problem) -> Bools:
     """Members (B,) whose scatter has settled: changed little, or is none."""
     before, now = (p.evidence.scatter for p in (old, new))
     each = [
-        (np.abs(now[name] / value - 1).max(-1) < SCATTER_SETTLED) | (now[name].max(-1) < 10 * LEAST)
+        (np.abs(now[name] / value - 1).max(-1) < SCATTER_SETTLED)
+        | (now[name].max(-1) < 10 * LEAST_SCATTER)
         for name, value in before.items()
     ]
     return np.asarray(np.all(each, 0))
@@ -485,13 +409,16 @@ def _trusting(problem: Problem, trust: Array) -> Problem:
     """The problem with the covariance of each station, readings and angles, over its weight."""
     if (trust == 1).all():
         return problem
-    grown = 1 / np.sqrt(trust)
-    triads = tuple(replace(t, sd=t.sd * grown[..., None]) for t in problem.triads)
+    return _louder(problem, 1 / np.sqrt(trust))
+
+
+def _louder(problem: Problem, factor: Array) -> Problem:
+    """The problem with all that is a station's own, readings and angles, noisier by a factor (B, n)."""
+    triads = tuple(replace(t, sd=t.sd * factor[..., None]) for t in problem.triads)
     evidence = problem.evidence
-    sd = {n: s * grown if n in ANGLES else s for n, s in evidence.sd.items()}
-    scatter = {n: s * grown for n, s in evidence.scatter.items()}
-    evidence = replace(evidence, sd=sd, scatter=scatter)
-    return replace(problem, triads=triads, evidence=evidence)
+    sd = {n: s * factor if n in ANGLES else s for n, s in evidence.sd.items()}
+    scatter = {n: s * factor for n, s in evidence.scatter.items()}
+    return replace(problem, triads=triads, evidence=replace(evidence, sd=sd, scatter=scatter))
 
 
 def _rescaled(problem: Problem, scale: Array, declared: list[bool]) -> Problem:
@@ -505,7 +432,4 @@ def _rescaled(problem: Problem, scale: Array, declared: list[bool]) -> Problem:
 
 def _scaled_noise(triad: Triad, scale: Array) -> Array:
     factor = np.where(np.isfinite(scale), scale, 1.0)[:, None, None]
-    return np.maximum(triad.sd * factor, FLOOR * _size(triad.raw))
-
-
-__all__ = ["Fit", "Status", "fit", "model_of", "scatters", "temperature_ranges"]
+    return np.maximum(triad.sd * factor, LEAST_NOISE * _size(triad.raw))

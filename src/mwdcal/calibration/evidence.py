@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 
 from mwdcal.calibration.readings import ANGLES, CONSTANTS, Readings
-from mwdcal.estimation.evidence import UNKNOWN, Constant, Evidence
+from mwdcal.estimation.evidence import UNKNOWN, Evidence, SharedConstant
 from mwdcal.geometry.vectors import AnyArray, Array, Ints
 from mwdcal.sensor.profile import COMMON
 
-TURNS = {"tilt": ("stand-north", "stand-east")}
+STAND_TURNS = {"tilt": ("stand-north", "stand-east")}
 """Errors of the stand that consist of several turns of its frame."""
 
 
@@ -25,7 +25,7 @@ def flat(value: AnyArray, lead: tuple[int, ...], *tail: int) -> AnyArray:
 
 
 def evidence_of(readings: Readings, include: Array) -> Evidence:
-    """Everything the readings say about their stations, for one batch axis."""
+    """References and uncertainties of all stations of readings, with one batch axis (B, n)."""
     lead = np.broadcast_shapes(readings.accelerometer.shape[:-1], include.shape)
     known = {n: flat(readings.reference(n), lead) for n in ANGLES + CONSTANTS}
     sd = {n: flat(readings.uncertainty(n), lead) for n in ANGLES + CONSTANTS}
@@ -33,7 +33,7 @@ def evidence_of(readings: Readings, include: Array) -> Evidence:
     included = flat(include, lead).astype(float)
     nowhere = np.isnan(known["field"]).all(-1, keepdims=True)
     known["field"] = np.where(nowhere, 1.0, known["field"])
-    if readings.magnetometer is None:  # nothing is to be found of what nothing reads
+    if readings.magnetometer is None:  # unread: any value will do
         known |= {name: np.nan_to_num(known[name], nan=1.0) for name in ("field", "dip")}
         sd |= {name: np.zeros(group.shape) for name in ("field", "dip")}
     bare = Evidence(known, sd, group, included, (), stand=_stand(readings, lead))
@@ -46,13 +46,13 @@ def _stand(readings: Readings, lead: tuple[int, ...]) -> dict[str, Array]:
 
     A tilt of known size leans to any azimuth: each of its two turns has half the variance.
     """
-    found: dict[str, Array] = {}
+    turn_sd: dict[str, Array] = {}
     for name in COMMON:
         if name in readings.sd:
-            turns = TURNS.get(name, (name,))
+            turns = STAND_TURNS.get(name, (name,))
             sd = flat(readings.uncertainty(name), lead).max(-1) / math.sqrt(len(turns))
-            found |= dict.fromkeys(turns, sd)
-    return found
+            turn_sd |= dict.fromkeys(turns, sd)
+    return turn_sd
 
 
 def acts_on(evidence: Evidence, name: str) -> Array:
@@ -98,9 +98,9 @@ def _share_known(evidence: Evidence) -> tuple[dict[str, Array], dict[str, Array]
     return known, spread
 
 
-def constants(evidence: Evidence) -> tuple[Constant, ...]:
+def constants(evidence: Evidence) -> tuple[SharedConstant, ...]:
     """Constants of the run to estimate: unknown ones, and errors of uncertain references."""
-    found = []
+    shared = []
     for name, size in (("gravity", 1.0), ("field", 0.0), ("dip", UNKNOWN)):
         if name in evidence.absent:
             continue
@@ -110,16 +110,16 @@ def constants(evidence: Evidence) -> tuple[Constant, ...]:
                 np.nansum(evidence.known[name], -1) / np.maximum(known.sum(-1), 1)
             )
             scale = np.full(len(value), size) if size else np.where(value > 0, value, 1.0)
-            found.append(Constant(name, (~known).astype(float), value, scale, unknown=True))
+            shared.append(SharedConstant(name, (~known).astype(float), value, scale, unknown=True))
         sd = np.max(np.where(known, evidence.sd[name], 0.0), -1)
         if (sd > 0).any():
             floor = np.where(sd > 0, sd, 1e-12)
-            found.append(
-                Constant(name, known.astype(float), np.zeros(len(sd)), floor, unknown=False)
+            shared.append(
+                SharedConstant(name, known.astype(float), np.zeros(len(sd)), floor, unknown=False)
             )
     for name, sd in evidence.stand.items():
         mask = acts_on(evidence, name)
         if (sd > 0).any() and mask.any():
             floor = np.where(sd > 0, sd, 1e-12)
-            found.append(Constant(name, mask, np.zeros(len(sd)), floor, unknown=False))
-    return tuple(found)
+            shared.append(SharedConstant(name, mask, np.zeros(len(sd)), floor, unknown=False))
+    return tuple(shared)

@@ -1,7 +1,7 @@
-"""The methods: which evidence each uses, and how each finds its minimum.
+"""The methods: which evidence each uses, and how each minimises.
 
 A method is a selection of evidence (`EVIDENCE`); most share one estimator. Newton-Raphson and the
-swarm have their own, and so have the papers' unweighted sums (`Options.paper_weights`).
+swarm have one of their own, as have the papers' unweighted sums (`Options.paper_weights`).
 """
 
 from __future__ import annotations
@@ -11,27 +11,28 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from mwdcal.calibration.evidence import TURNS, acts_on, constants
+from mwdcal.calibration.evidence import STAND_TURNS, acts_on, constants
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import ANGLES
-from mwdcal.estimation.evidence import UNKNOWN, Constant, Evidence
+from mwdcal.estimation.evidence import UNKNOWN, Evidence, SharedConstant
 from mwdcal.estimation.minimisers.newton import newton, propagated
-from mwdcal.estimation.minimisers.swarm import forward_parts, swarm_forward
+from mwdcal.estimation.minimisers.swarm import swarm_forward
 from mwdcal.estimation.minimisers.unweighted import STRENGTH, Params, Sums
 from mwdcal.estimation.problem import Prior, Problem, State
 from mwdcal.estimation.solvers import Status, gauss_newton
 from mwdcal.estimation.uncertainty import readjusted, unweighted_pulls
 from mwdcal.geometry.vectors import Array, Bools, Ints, inverse
+from mwdcal.sensor.models import affine_parts
 
 ESTIMABLE = {
-    name: TURNS.get(name, (name,)) for name in ("azimuth-zero", "inclination-zero", "tilt")
+    name: STAND_TURNS.get(name, (name,)) for name in ("azimuth-zero", "inclination-zero", "tilt")
 }
-"""Errors of the stand that can be found, and the constants of the run that they consist of."""
-HELD = 1e18
+"""Errors of the stand that can be estimated, and the constants of the run that each consists of."""
+HELD_PRECISION = 1e18
 """Precision of a parameter that is held at its value."""
-ITERATIONS = 600
+SWARM_ITERATIONS = 600
 """Iterations of the swarm, as Moradi's."""
-PAPER = 1e10
+PAPER_WEIGHT = 1e10
 """Weight of every square of an unweighted sum: only its digits matter, not the minimum."""
 
 
@@ -65,12 +66,12 @@ def with_stand_errors(evidence: Evidence, names: tuple[str, ...]) -> Evidence:
     if not names:
         return evidence
     turns = [turn for error in names for turn in ESTIMABLE[error]]
-    found = [constant for constant in evidence.constants if constant.name not in turns]
+    shared = [constant for constant in evidence.constants if constant.name not in turns]
     zero = np.zeros(len(evidence.include))
     for name in turns:
         sd, mask = np.full(len(zero), UNKNOWN), acts_on(evidence, name)
-        found.append(Constant(name, mask, zero, sd, unknown=True))
-    return replace(evidence, constants=tuple(found))
+        shared.append(SharedConstant(name, mask, zero, sd, unknown=True))
+    return replace(evidence, constants=tuple(shared))
 
 
 def without(evidence: Evidence, names: tuple[str, ...]) -> Evidence:
@@ -161,23 +162,25 @@ def _swarmed(problem: Problem, state: State, seed: int) -> Solved:
     parts = []
     for triad, earth in zip(problem.triads, problem.earth(state)[0], strict=False):
         target = np.einsum("bnij,bnj->bni", state.attitude, earth)
-        found = _swarm_forward(triad.raw, target, problem.evidence.include > 0, seed)
-        matrix, offset = forward_parts(found)
+        forward = _swarm_forward(triad.raw, target, problem.evidence.include > 0, seed)
+        matrix, offset = affine_parts(forward)
         back = inverse(matrix)
         parts.append(triad.model.start(back, -np.einsum("bij,bj->bi", back, offset)))
     params = np.concatenate(parts, -1)
     finite = np.isfinite(params).all(-1)
     status = np.where(finite, int(Status.OK), int(Status.NOT_FINITE))
-    flown = np.full(len(params), ITERATIONS)
+    flown = np.full(len(params), SWARM_ITERATIONS)
     return Solved(replace(state, params=params), status, flown, unweighted=True)
 
 
 def _swarm_forward(raw: Array, target: Array, include: Bools, seed: int) -> Array:
     """Forward parameters (B, 12); members that leave stations out fly one by one."""
     if include.all():
-        return swarm_forward(raw, target, "reading", iterations=ITERATIONS, seed=seed).position
+        return swarm_forward(
+            raw, target, "reading", iterations=SWARM_ITERATIONS, seed=seed
+        ).position
     each = [
-        swarm_forward(r[keep], t[keep], "reading", iterations=ITERATIONS, seed=seed).position
+        swarm_forward(r[keep], t[keep], "reading", iterations=SWARM_ITERATIONS, seed=seed).position
         for r, t, keep in zip(raw, target, include, strict=True)
     ]
     return np.stack(each)
@@ -190,18 +193,18 @@ def _by_newton(problem: Problem, state: State, paper: bool) -> Solved:
     nominal = triad.model.start(np.zeros((batch, 3, 3)) + np.eye(3), np.zeros((batch, 3)))
     gravity = problem.constant(state, "gravity")
     noise = np.sqrt(np.mean(triad.sd**2, -1))
-    weights = np.full((*gravity.shape, 2), PAPER)
+    weights = np.full((*gravity.shape, 2), PAPER_WEIGHT)
     if not paper:
         weights = propagated(gravity, noise, evidence.sd["inclination"])
     weights = weights * evidence.include[..., None]
-    found = newton(
+    minimum = newton(
         triad.model, nominal, triad.raw, problem.temperature, gravity,
         evidence.known["inclination"], weights=weights,
     )  # fmt: skip
     own = _sums(problem, state, 0, (STRENGTH, "inclination"), weights)
-    later = _magnetometer(problem, state, found.params)
-    status = np.maximum(later.status, found.status)
-    return Solved(later.state, status, found.iterations, {0: own}, {0: found.information})
+    later = _magnetometer(problem, state, minimum.params)
+    status = np.maximum(later.status, minimum.status)
+    return Solved(later.state, status, minimum.iterations, {0: own}, {0: minimum.information})
 
 
 def _by_sums(problem: Problem, state: State, method: str) -> Solved:
@@ -209,21 +212,23 @@ def _by_sums(problem: Problem, state: State, method: str) -> Solved:
     scalar = method == "scalar"
     names = (STRENGTH,) if scalar else ("toolface", "inclination")
     include = problem.evidence.include[..., None]
-    sums, found = {}, []
+    sums, minima = {}, []
     for index in range(len(problem.triads) if scalar else 1):
         strength = problem.constant(state, ("gravity", "field")[index]).mean(-1)[:, None, None]
-        weights = include * (PAPER / strength**4 if scalar else PAPER) * np.ones(len(names))
+        weights = (
+            include * (PAPER_WEIGHT / strength**4 if scalar else PAPER_WEIGHT) * np.ones(len(names))
+        )
         sums[index] = _sums(problem, state, index, names, weights)
         where = problem.slices()[index]
-        found.append(gauss_newton(sums[index], Params(state.params[:, where])))
-    params = np.concatenate([each[0].params for each in found], -1)
-    status = np.max([each[1] for each in found], 0)
-    iterations = np.max([each[2] for each in found], 0)
+        minima.append(gauss_newton(sums[index], Params(state.params[:, where])))
+    params = np.concatenate([each[0].params for each in minima], -1)
+    status = np.max([each[1] for each in minima], 0)
+    iterations = np.max([each[2] for each in minima], 0)
     if scalar:
         after = Solved(readjusted(problem, replace(state, params=params)), status, iterations)
     else:
         after = _magnetometer(problem, state, params)
-    pairs = zip(sums.items(), found, strict=True)
+    pairs = zip(sums.items(), minima, strict=True)
     known = {index: one.information(each[0].params) for (index, one), each in pairs}
     return Solved(after.state, np.maximum(status, after.status), iterations, sums, known)
 
@@ -251,7 +256,7 @@ def _magnetometer(problem: Problem, state: State, accelerometer: Array) -> Solve
         none = np.zeros(len(params), int)
         return Solved(state, none, none)
     precision[:, where, :] = precision[:, :, where] = 0.0
-    precision[:, where, where] = HELD * np.eye(accelerometer.shape[-1])
+    precision[:, where, where] = HELD_PRECISION * np.eye(accelerometer.shape[-1])
     expected = problem.prior.expected.copy()
     expected[:, where] = accelerometer
     held = replace(problem, prior=Prior(precision, expected))

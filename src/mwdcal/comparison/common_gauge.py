@@ -19,11 +19,11 @@ import numpy as np
 from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import FREE_SHARE, Calibration, TriadCalibration
 from mwdcal.estimation.rank import Free
-from mwdcal.geometry.vectors import Array, rotation
+from mwdcal.estimation.uncertainty import ROTATIONS, unrotating
+from mwdcal.geometry.vectors import Array
 from mwdcal.sensor.models import Basis, Model, Polynomial
 from mwdcal.use.notation import Notation, convert
 
-TURNS = ("rotation-x", "rotation-y", "toolface-zero")
 SCALE = "scale"
 STEP = 1e-6
 """Step of a derivative, as the share of the field by which it changes the field."""
@@ -38,16 +38,16 @@ class Gauge:
     @classmethod
     def of(cls, free: Iterable[Free]) -> Gauge:
         """All that any of several calibrations leaves free, but for courses with temperature."""
-        return cls(frozenset((f.id, f.triads) for f in free if f.id in (*TURNS, SCALE)))
+        return cls(frozenset((f.id, f.triads) for f in free if f.id in (*ROTATIONS, SCALE)))
 
     def names(self, triad: int) -> list[str]:
         """The directions that are put by convention for one triad, in their usual order."""
         own = {name for name, triads in self.free if triad in triads}
-        return [name for name in (*TURNS, SCALE) if name in own]
+        return [name for name in (*ROTATIONS, SCALE) if name in own]
 
     def turns(self, triads: tuple[int, ...]) -> list[str]:
         """Axes about which these triads turn together."""
-        return [name for name in TURNS if (name, triads) in self.free]
+        return [name for name in ROTATIONS if (name, triads) in self.free]
 
 
 def in_gauge(
@@ -159,12 +159,7 @@ class _Settle:
         """The turn that leaves the first triad's gain without rotation about the free axes."""
         axes, first = self.gauge.turns(triads), triads[0]
         gain = self.models[first].slope(params, self.raw[first], self.temperature).mean(0)
-        u, _, vt = np.linalg.svd(gain)
-        polar = u @ vt
-        if len(axes) == len(TURNS):
-            return np.asarray(polar.transpose())
-        about = np.arctan2(polar[0, 1] - polar[1, 0], polar[0, 0] + polar[1, 1])
-        return rotation(np.array([0.0, 0.0, about if "toolface-zero" in axes else 0.0]))
+        return unrotating(gain, np.array([axis in axes for axis in ROTATIONS]))
 
     def _factor(self, params: Array, triad: int) -> float:
         """What brings the triad's mean strength to that of the references, if its scale is free."""

@@ -15,7 +15,7 @@ from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.diagnosis.refusals import check_readings
 from mwdcal.calibration.estimate import Fit, fit
 from mwdcal.calibration.evidence import evidence_of
-from mwdcal.calibration.methods import EVIDENCE, ITERATIONS
+from mwdcal.calibration.methods import EVIDENCE, SWARM_ITERATIONS
 from mwdcal.calibration.options import Options, Orders
 from mwdcal.calibration.readings import ANGLES, TRIADS, Readings, is_simulated
 from mwdcal.calibration.record import Calibration, Measures
@@ -195,7 +195,7 @@ def _made(readings: Readings, profile: Profile, options: Options) -> _Made | str
     started = time.perf_counter()
     whole = fit(readings, options)
     seconds = time.perf_counter() - started
-    free = free_directions(whole.problem, whole.state, whole.analysis.determined)
+    free = free_directions(whole.problem, whole.state, whole.analysis.determined)[0]
     return _Made(options, found, whole, seconds, free)
 
 
@@ -235,7 +235,7 @@ def _course(made: _Made) -> dict[str, Array]:
     for name, triad, earth in zip(TRIADS, problem.triads, problem.earth(state)[0], strict=False):
         target = np.einsum("bnij,bnj->bni", state.attitude, earth)
         swarm = swarm_forward(
-            triad.raw, target, "reading", iterations=ITERATIONS, seed=made.options.seed
+            triad.raw, target, "reading", iterations=SWARM_ITERATIONS, seed=made.options.seed
         )
         least = least_squares_forward(triad.raw, target)[:, None]
         cost = vector_cost(triad.raw, target, "reading")(least)[0, 0]

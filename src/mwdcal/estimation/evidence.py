@@ -9,6 +9,7 @@ import numpy as np
 
 from mwdcal.geometry.vectors import Array, Bools, Ints
 
+ANGLES = ("inclination", "azimuth", "toolface")
 EARTH = ("gravity", "field", "dip")
 STAND = {
     "stand-north": np.array([1.0, 0.0, 0.0]),
@@ -23,7 +24,7 @@ UNKNOWN = np.pi / np.sqrt(3)
 
 
 @dataclass(frozen=True)
-class Constant:
+class SharedConstant:
     """A constant of the run that is estimated: gravity, field, dip, or an error.
 
     Errors are of one of these references, or of the stand: one of `STAND_ERRORS`, each a small
@@ -57,7 +58,7 @@ class Evidence:
     sd: dict[str, Array]
     group: Ints
     include: Array
-    constants: tuple[Constant, ...]
+    constants: tuple[SharedConstant, ...]
     absent: tuple[str, ...] = ()
     stand: Mapping[str, Array] = field(default_factory=dict)
     scatter: dict[str, Array] = field(default_factory=dict)

@@ -22,11 +22,11 @@ import numpy as np
 from mwdcal.geometry.vectors import Array
 
 LOSSES = ("huber", "student-t")
-FREEDOM = 4.0
+TAIL = 4.0
 """ν of Student's t: heavy enough tails for a stand angle misread by ten degrees."""
 INLIERS = 0.95
 """Share of good stations that Huber's weight leaves alone."""
-LEAST = 1e-6
+LEAST_WEIGHT = 1e-6
 """Smallest weight: a station this far off is as good as left out."""
 
 
@@ -43,10 +43,11 @@ def weight(loss: str, square: Array, freedom: Array) -> Array:
     """
     k = np.maximum(freedom, 1.0)
     if loss == "huber":
-        found = _corner(k) / np.maximum(np.sqrt(square), _corner(k))
+        corner = _corner(k)
+        weights = corner / np.maximum(np.sqrt(square), corner)
     else:
-        found = (FREEDOM + k) / (FREEDOM + square)
-    return np.where(freedom > 0, np.maximum(found, LEAST), 1.0)
+        weights = (TAIL + k) / (TAIL + square)
+    return np.where(freedom > 0, np.maximum(weights, LEAST_WEIGHT), 1.0)
 
 
 def _slope(loss: str, square: Array, k: float) -> Array:
@@ -55,7 +56,7 @@ def _slope(loss: str, square: Array, k: float) -> Array:
         distance = np.sqrt(square)
         corner = _corner(np.asarray(k))
         return np.where(distance > corner, -corner / np.maximum(distance, corner), 0.0)
-    return -2 * square * (FREEDOM + k) / (FREEDOM + square) ** 2
+    return -2 * square * (TAIL + k) / (TAIL + square) ** 2
 
 
 @cache
@@ -93,6 +94,3 @@ def inflation(loss: str, freedom: float) -> float:
     """
     mean, _, spread, bend = _moments(loss, freedom)
     return mean * spread / bend**2
-
-
-__all__ = ["LOSSES", "consistency", "inflation", "weight", "weighted"]

@@ -12,7 +12,6 @@ Shared unknowns (field strength, dip, group directions) are eliminated by a Schu
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property
@@ -20,8 +19,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from mwdcal.estimation import fit_numba
-from mwdcal.geometry.vectors import Array, Bools, Ints, eigen, inverse, placed
+from mwdcal.estimation.batch import put, take
+from mwdcal.geometry.vectors import Array, Bools, Ints, eigen, inverse
 
 RANK_TOLERANCE = 2e-2
 """Singular values of the column-normalised design below this share of the largest are free."""
@@ -88,30 +87,6 @@ class Linear:
         whole[..., self.size :] = self.shared
         return whole
 
-    def take(self, index: Ints) -> Linear:
-        """That of some members of the batch."""
-        return self._mapped(lambda mine: mine[index])
-
-    def put(self, index: Ints, other: Linear) -> Linear:
-        """Ours with some members replaced."""
-        return self._mapped(lambda mine, theirs: placed(mine, index, theirs), other)
-
-    def _mapped(self, change: Callable[..., Array], *others: Linear) -> Linear:
-        """A change of every array, given the same ones of others."""
-
-        def every(name: str) -> Array:
-            return change(getattr(self, name), *(getattr(other, name) for other in others))
-
-        pairs = zip(self.blocks, *(other.blocks for other in others), strict=True)
-        return Linear(
-            every("residual"),
-            tuple(change(*pair) for pair in pairs),
-            every("shared"),
-            every("own"),
-            every("prior"),
-            every("pull"),
-        )
-
     @property
     def norms(self) -> Array:
         """Column norms (B, p) of the parameters, prior in: the scale in which rank is counted."""
@@ -172,12 +147,9 @@ class Normal:
     @classmethod
     def of(cls, linear: Linear) -> Normal:
         """Sum over stations, priors included."""
-        if fit_numba.pays(linear.residual):
-            whole = fit_numba.gram(linear.residual, linear.blocks, linear.shared, linear.own)
-        else:
-            columns = np.concatenate([linear.design, linear.residual[..., None]], -1)
-            weighed = linear.weigh(columns)
-            whole = np.einsum("...nmi,...nmj->...ij", columns, weighed, optimize=True)
+        columns = np.concatenate([linear.design, linear.residual[..., None]], -1)
+        weighed = linear.weigh(columns)
+        whole = np.einsum("...nmi,...nmj->...ij", columns, weighed, optimize=True)
         information, gradient = whole[..., :-1, :-1].copy(), whole[..., :-1, -1].copy()
         pulled = (linear.prior @ linear.pull[..., None])[..., 0]
         information += linear.prior
@@ -230,25 +202,10 @@ class Determined:
         return cls(basis[..., ::-1], values, norms, values > tolerance)
 
     @classmethod
-    def of(cls, problem: Problem, state: Any) -> Determined:
+    def of(cls, problem: Linearisable, state: Any) -> Determined:
         """Of a problem at a state."""
         linear = problem.linear(state, geometry=True)
         return linear.determined
-
-    def take(self, index: Ints) -> Determined:
-        """That of some members of the batch."""
-        return Determined(
-            self.basis[index], self.values[index], self.norms[index], self.keep[index]
-        )
-
-    def put(self, index: Ints, other: Determined) -> Determined:
-        """Ours with some members replaced."""
-        return Determined(
-            placed(self.basis, index, other.basis),
-            placed(self.values, index, other.values),
-            placed(self.norms, index, other.norms),
-            placed(self.keep, index, other.keep),
-        )
 
     @property
     def rank(self) -> Ints:
@@ -271,7 +228,7 @@ class Determined:
         return np.asarray(self.basis * ~self.keep[..., None, :])
 
 
-class Problem(Protocol):
+class Linearisable(Protocol):
     """What the solver asks of a problem; states are opaque to it."""
 
     def linear(self, state: Any, geometry: bool = False) -> Linear:
@@ -279,9 +236,6 @@ class Problem(Protocol):
 
     def move(self, state: Any, linear: Linear, step: Array) -> Any:
         """The state after a step of X's unknowns, private unknowns re-adjusted."""
-
-    def take(self, index: Ints) -> Problem:
-        """The problem of some members of the batch."""
 
     def size_of(self, state: Any) -> Array:
         """Magnitude (B, p) below 1e-12 of which a parameter step is rounding."""
@@ -294,7 +248,7 @@ class _Descent:
     All are of the members still `active`; `linear` is taken at `state`.
     """
 
-    problem: Problem
+    problem: Linearisable
     state: Any
     linear: Linear
     determined: Determined
@@ -302,7 +256,7 @@ class _Descent:
     active: Ints
 
     @classmethod
-    def at(cls, problem: Problem, state: Any) -> _Descent:
+    def at(cls, problem: Linearisable, state: Any) -> _Descent:
         """At the start."""
         count = len(state.params)
         determined = Determined.of(problem, state)
@@ -344,8 +298,8 @@ class _Descent:
             self.state, self.linear = trial, after
             return
         which = np.flatnonzero(better)
-        self.state = self.state.put(which, trial.take(which))
-        self.linear = self.linear.put(which, after.take(which))
+        self.state = put(self.state, which, take(trial, which))
+        self.linear = put(self.linear, which, take(after, which))
 
     def settled(self, converged: Bools) -> Bools:
         """Which converged members still have the rank that their steps were taken with.
@@ -358,10 +312,10 @@ class _Descent:
         if converged.all():
             now = Determined.of(self.problem, self.state)
         else:
-            now = Determined.of(self.problem.take(which), self.state.take(which))
+            now = Determined.of(take(self.problem, which), take(self.state, which))
         same = now.rank == self.determined.rank[which]
         if not same.all():
-            self.determined = self.determined.put(which, now)
+            self.determined = put(self.determined, which, now)
         settled = converged.copy()
         settled[which] = same
         return settled
@@ -371,8 +325,8 @@ class _Descent:
         if not stopped.any():
             return
         rest = np.flatnonzero(~stopped)
-        self.problem, self.state = self.problem.take(rest), self.state.take(rest)
-        self.linear, self.determined = self.linear.take(rest), self.determined.take(rest)
+        self.problem, self.state = take((self.problem, self.state), rest)
+        self.linear, self.determined = take((self.linear, self.determined), rest)
         self.damping, self.active = self.damping[rest], self.active[rest]
 
 
@@ -396,7 +350,7 @@ def _small(normal: Normal, step: Array, size: Array) -> Bools:
     return np.asarray((length < 1e-12) | rounding)
 
 
-def gauss_newton(problem: Problem, state: Any, limit: int = 60) -> tuple[Any, Ints, Ints]:
+def gauss_newton(problem: Linearisable, state: Any, limit: int = 60) -> tuple[Any, Ints, Ints]:
     """Minimise a batch of problems; returns states, `Status` codes and iteration counts."""
     count = len(state.params)
     status = np.full(count, int(Status.NOT_CONVERGED))
@@ -413,8 +367,8 @@ def gauss_newton(problem: Problem, state: Any, limit: int = 60) -> tuple[Any, In
         stopped = settled | broken
         if len(stopped) == count and stopped.all():
             return descent.state, status, iterations
-        state = state.put(descent.active[stopped], descent.state.take(np.flatnonzero(stopped)))
+        state = put(state, descent.active[stopped], take(descent.state, np.flatnonzero(stopped)))
         descent.drop(stopped)
     if descent.active.size:
         status[descent.active[descent.arrived()]] = Status.OK
-    return state.put(descent.active, descent.state), status, iterations
+    return put(state, descent.active, descent.state), status, iterations

@@ -11,7 +11,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from mwdcal.estimation.evidence import ANGLES
 from mwdcal.estimation.problem import Problem, State
+from mwdcal.estimation.regression import regress
 from mwdcal.geometry import observables
 from mwdcal.geometry.vectors import (
     Array,
@@ -24,15 +26,18 @@ from mwdcal.geometry.vectors import (
     tool_from_earth,
 )
 
-SPANNED = 2e-3
+ELLIPSOID_SPAN = 2e-3
 """Columns of the ellipsoid with a singular value below this share of the largest are noise."""
-SEEN = 1e-3
-"""Share of the field that an axis must see for a start from least squares: any other is worse."""
-ANGLES = ("inclination", "azimuth", "toolface")
+LEAST_SPAN = 1e-3
+"""Least share of the field along an axis with which least squares gives a start."""
 
 
 def start(problem: Problem) -> State:
-    """A state close enough for Gauss-Newton, for every member of the batch."""
+    """A state of every member of the batch from which Gauss-Newton converges.
+
+    Singular: where neither known directions nor strengths determine a triad, the start is a sphere
+    about the middle of its readings.
+    """
     constants = [c.value for c in problem.evidence.constants]
     batch, count = problem.temperature.shape
     empty = State(
@@ -42,12 +47,12 @@ def start(problem: Problem) -> State:
         np.zeros((batch, count, len(problem.evidence.absent))),
     )
     params = [_triad_start(problem, empty, index) for index in range(len(problem.triads))]
-    found = np.concatenate(params, -1)
+    values = np.concatenate(params, -1)
     for where in problem.slices():
         known = np.diagonal(problem.prior.precision[:, where, where], axis1=-2, axis2=-1) > 0
         whole = known.all(-1, keepdims=True)
-        found[:, where] = np.where(whole, problem.prior.expected[:, where], found[:, where])
-    state = replace(empty, params=found)
+        values[:, where] = np.where(whole, problem.prior.expected[:, where], values[:, where])
+    state = replace(empty, params=values)
     return _attitudes(problem, state)
 
 
@@ -100,14 +105,14 @@ def _where_determined(gram: Array, right: Array) -> Array:
     The columns are of size one as they come: one that is noise alone must not be scaled up.
     """
     values, vectors = eigen(gram)
-    kept = values > SPANNED**2 * values[:, -1:]
+    kept = values > ELLIPSOID_SPAN**2 * values[:, -1:]
     along = np.einsum("bij,bi->bj", vectors, right)
     along = np.where(kept, along / np.where(kept, values, 1.0), 0.0)
     return np.asarray(np.einsum("bij,bj->bi", vectors, along))
 
 
 def _linear(problem: Problem, state: State, index: int, x: Array) -> tuple[Array, Array, Bools]:
-    """Least squares on stations of known direction; and where these are enough."""
+    """Matrix and offset (field = matrix x + offset) from stations of known direction; where usable (B,)."""
     evidence = problem.evidence
     known = [evidence.is_known(name) for name in ANGLES]
     whole = known[0] & known[2] & (known[1] | (index == 0))
@@ -116,10 +121,10 @@ def _linear(problem: Problem, state: State, index: int, x: Array) -> tuple[Array
     terms = np.concatenate([x, np.ones_like(x[..., :1])], -1)
     gram = np.einsum("bn,bni,bnj->bij", weight, terms, terms)
     values = np.linalg.eigvalsh(gram)
-    usable = (values[:, 0] > SEEN**2 * values[:, -1]) & (weight.sum(-1) >= 4)
+    usable = (values[:, 0] > LEAST_SPAN**2 * values[:, -1]) & (weight.sum(-1) >= 4)
     gram = np.where(usable[:, None, None], gram, np.eye(4))
 
-    def regress(target: Array) -> Array:
+    def fields_of(target: Array) -> Array:
         crossed = np.einsum("bn,bni,bnj->bij", weight, terms, target)
         return np.asarray(np.linalg.solve(gram, crossed))
 
@@ -127,28 +132,15 @@ def _linear(problem: Problem, state: State, index: int, x: Array) -> tuple[Array
         earth = earth_gravity(problem.constant(state, "gravity"))
     else:
         field, dip = problem.constant(state, "field"), problem.constant(state, "dip")
-        unknown = _unknown_dip(attitude, field, terms, weight, regress)
+        unknown = _unknown_dip(attitude, field, terms, weight, fields_of)
         blank = ~evidence.is_known("dip")
         earth = earth_field(field, np.where(blank, unknown[:, None], dip))
-    forward = _forward(np.einsum("bnij,bnj->bni", attitude, earth), x, weight)
+    target = np.einsum("bnij,bnj->bni", attitude, earth)
+    forward = regress(x, target, weight[..., None]).forward
     usable = usable & np.isfinite(forward).all((-1, -2))
-    forward = np.where(usable[:, None, None], forward, np.eye(4)[:, :3])
+    forward = np.where(usable[:, None, None], forward, np.eye(4, 3))
     back = inverse(np.swapaxes(forward[:, :3], -1, -2))
     return back, -np.einsum("bij,bj->bi", back, forward[:, 3]), np.asarray(usable)
-
-
-def _forward(field: Array, x: Array, weight: Array) -> Array:
-    """Readings as a linear function (B, 4, 3) of the field and one: noise is in the readings alone.
-
-    With exact references this is the minimum itself.
-    """
-    terms = np.concatenate([field, np.ones_like(field[..., :1])], -1)
-    size = np.sqrt(np.einsum("bn,bni->bi", weight, terms**2))
-    size = np.where(size > 0, size, 1.0)
-    scaled = terms / size[:, None]
-    gram = np.einsum("bn,bni,bnj->bij", weight, scaled, scaled, optimize=True)
-    crossed = np.einsum("bn,bni,bnj->bij", weight, scaled, x, optimize=True)
-    return np.asarray(inverse(gram) @ crossed / size[..., None])
 
 
 def _unknown_dip(
@@ -156,20 +148,23 @@ def _unknown_dip(
     field: Array,
     terms: Array,
     weight: Array,
-    regress: Callable[[Array], Array],
+    fields_of: Callable[[Array], Array],
 ) -> Array:
-    """Dip (B,) at which the readings fit best: the weakest direction of what they leave over."""
+    """Dip (B,) at which the fields are nearest to a linear function of the readings.
+
+    Definition: the smallest eigenvector of the residual sums of a horizontal and a vertical field.
+    """
     parts = [
         np.einsum("bnij,bnj->bni", attitude, earth_field(field, np.full_like(field, angle)))
         for angle in (0.0, np.pi / 2)
     ]
-    left = [part - terms @ regress(part) for part in parts]
+    left = [part - terms @ fields_of(part) for part in parts]
     gram = np.stack(
         [np.stack([np.einsum("bn,bni,bni->b", weight, p, q) for q in left], -1) for p in left], -2
     )
     _, vectors = eigen(gram)
     north, down = vectors[:, 0, 0], vectors[:, 1, 0]
-    gains = [np.trace(regress(part)[:, :3], axis1=-2, axis2=-1) for part in parts]
+    gains = [np.trace(fields_of(part)[:, :3], axis1=-2, axis2=-1) for part in parts]
     sign = np.where(north * gains[0] + down * gains[1] < 0, -1.0, 1.0)
     return np.asarray(np.arctan2(sign * down, sign * north))
 
@@ -251,15 +246,15 @@ def _by_toolface(
         own = lone & ~evidence.is_known(name)
         return np.where(own[..., None], turned, total), some | own
 
-    down, found = mean("inclination", np.zeros(faced.shape), g)
-    inclination = np.where(found, np.arctan2(-down[..., 0], down[..., 2]), angles["inclination"])
-    across, found = mean("azimuth", inclination, b)
-    azimuth = np.where(found, np.arctan2(-across[..., 1], across[..., 0]), angles["azimuth"])
+    down, known = mean("inclination", np.zeros(faced.shape), g)
+    inclination = np.where(known, np.arctan2(-down[..., 0], down[..., 2]), angles["inclination"])
+    across, known = mean("azimuth", inclination, b)
+    azimuth = np.where(known, np.arctan2(-across[..., 1], across[..., 0]), angles["azimuth"])
     return {**angles, "inclination": inclination, "azimuth": azimuth}
 
 
 def _with_own(problem: Problem, state: State, g: Array, b: Array) -> State:
-    """Strengths and dip of which nothing may be used start as the start's own fields have them."""
+    """The state with each station's own strength and dip as its corrected fields have them."""
     own = state.own.copy()
     for index, name in enumerate(problem.evidence.absent):
         value = observables.OBSERVABLES[name].value(g, b)

@@ -9,15 +9,24 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mwdcal.estimation import fit_numba
 from mwdcal.estimation.problem import GEOMETRIC_NOISE, Problem, State
 from mwdcal.estimation.solvers import RANK_TOLERANCE, Determined, Linear, Normal
-from mwdcal.geometry.vectors import AnyArray, Array, Bools, Ints, eigen, inverse, rotation
+from mwdcal.geometry.vectors import (
+    Array,
+    Bools,
+    Ints,
+    eigen,
+    inverse,
+    nearest_rotation,
+    rotation,
+)
 
-SEEN = 0.05
+LEAST_SHARE = 0.05
 """A free direction with less than this share on a triad does not move the triad."""
 TESTED = 1e-3
 """A direction of a station's readings counts if this share of its variance is left by the fit."""
+ROTATIONS = ("rotation-x", "rotation-y", "toolface-zero")
+"""Names of the turns of a triad about the tool's three axes."""
 COUPLED = 0.9
 """Share of a candidate direction that must lie in the null space to be called free."""
 
@@ -80,9 +89,6 @@ def _effects(problem: Problem, cross: Array) -> Array:
 
 def _remaining(linear: Linear, covariance: Array) -> tuple[Array, Array]:
     """Whitened residuals C⁻¹ρ (B, n, m), and their covariance C⁻¹ - C⁻¹X V XᵀC⁻¹ (B, n, m, m)."""
-    if fit_numba.pays(linear.residual):
-        parts = (linear.residual, linear.blocks, linear.shared, linear.own)
-        return fit_numba.remaining(*parts, covariance)
     weighed = linear.weigh(linear.design)
     left = linear.weigh(linear.residual[..., None])[..., 0]
     spread = linear.weigh(np.broadcast_to(np.eye(left.shape[-1]), (*left.shape, left.shape[-1])))
@@ -292,7 +298,7 @@ def candidates(problem: Problem, state: State, triads: list[int]) -> dict[str, A
     """Directions (B, p) of parameter space that have a name: turns and scales of some triads."""
     directions = {}
     zero = np.zeros_like(state.params)
-    for axis, name in enumerate(("rotation-x", "rotation-y", "toolface-zero")):
+    for axis, name in enumerate(ROTATIONS):
         directions[name] = zero.copy()
         directions[name][:, _columns(problem, triads)] = _tangent(
             problem, state, triads, rotation(1e-5 * np.eye(3)[axis])
@@ -345,7 +351,7 @@ def free_share(determined: Determined, direction: Array) -> Array:
 def marginal_rank(determined: Determined, where: slice) -> Ints:
     """Rank (B,) of one triad: its size less the dimension of the free subspace as seen by it."""
     seen = np.linalg.svd(determined.null()[..., where, :], compute_uv=False)
-    return np.asarray(where.stop - where.start - np.sum(seen > SEEN, -1))
+    return np.asarray(where.stop - where.start - np.sum(seen > LEAST_SHARE, -1))
 
 
 def settle_gauge(problem: Problem, state: State, determined: Determined) -> State:
@@ -357,8 +363,7 @@ def settle_gauge(problem: Problem, state: State, determined: Determined) -> Stat
     every = list(range(len(problem.triads)))
     for triads in [every] + [[t] for t in every if len(every) > 1]:
         named = candidates(problem, state, triads)
-        axes = ("rotation-x", "rotation-y", "toolface-zero")
-        free = np.stack([free_share(determined, named[axis]) > COUPLED for axis in axes], -1)
+        free = np.stack([free_share(determined, named[n]) > COUPLED for n in ROTATIONS], -1)
         turn = _polar_turn(problem, state, triads[0], free)
         state = _turn(problem, state, triads, turn, stations=len(triads) == len(every))
     for triad in every:
@@ -397,20 +402,24 @@ def _rescale(problem: Problem, state: State, triad: int, free: Bools) -> State:
     return replace(state, params=params, own=own)
 
 
-def _polar_turn(problem: Problem, state: State, triad: int, free: AnyArray) -> Array:
+def _polar_turn(problem: Problem, state: State, triad: int, free: Bools) -> Array:
     """Rotation (B, 3, 3) about the free axes that leaves the triad's gain without rotation."""
     where = problem.slices()[triad]
     chosen = problem.triads[triad]
     gain = chosen.model.slope(state.params[:, where], chosen.raw, problem.temperature).mean(1)
-    gain = np.where(np.isfinite(gain), gain, np.eye(3))
-    u, _, vt = np.linalg.svd(gain)
-    sign = np.where(np.linalg.det(u @ vt) < 0, -1.0, 1.0)
-    polar = (u * np.stack([np.ones_like(sign), np.ones_like(sign), sign], -1)[:, None, :]) @ vt
-    about_z = np.arctan2(polar[:, 0, 1] - polar[:, 1, 0], polar[:, 0, 0] + polar[:, 1, 1])
-    along = np.zeros((len(polar), 3))
-    along[:, 2] = np.where(free[:, 2], about_z, 0.0)
+    return unrotating(np.where(np.isfinite(gain), gain, np.eye(3)), free)
+
+
+def unrotating(gain: Array, free: Bools) -> Array:
+    """Turn (..., 3, 3) about the free axes (..., 3) that leaves a gain (..., 3, 3) without rotation.
+
+    Definition: the transposed polar factor where all axes are free; else its part about z alone.
+    """
+    polar = nearest_rotation(gain)
+    about_z = np.arctan2(polar[..., 0, 1] - polar[..., 1, 0], polar[..., 0, 0] + polar[..., 1, 1])
+    along = np.where(free[..., 2], about_z, 0.0)[..., None] * np.array([0.0, 0.0, 1.0])
     whole = np.swapaxes(polar, -1, -2)
-    return np.where(np.all(free, -1, keepdims=True)[..., None], whole, rotation(along))
+    return np.where(np.all(free, -1)[..., None, None], whole, rotation(along))
 
 
 def _turn(problem: Problem, state: State, triads: list[int], turn: Array, stations: bool) -> State:

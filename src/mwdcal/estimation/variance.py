@@ -17,11 +17,11 @@ from mwdcal.estimation.problem import Problem, State
 from mwdcal.estimation.uncertainty import Analysis
 from mwdcal.geometry.vectors import Array
 
-START = 1e-3
+FIRST_SCATTER = 1e-3
 """Scatter at which its estimation begins, as a share or in radians."""
-LEAST = 1e-5
+LEAST_SCATTER = 1e-5
 """Scatter below which there is none."""
-MOST = 20.0
+LARGEST_CHANGE = 20.0
 """A variance changes by this factor at most in one round."""
 PIN = 0.05
 """Parameters are known to this share of the field when runs are compared by their probability."""
@@ -33,17 +33,17 @@ def scatter_ratios(problem: Problem, state: State, analysis: Analysis) -> dict[s
     Definition: with q = P y and P the covariance of the weighed residuals, qᵀVq / tr(PV) for the
     component V = GGᵀ of unit variance. One where nothing tests a component.
     """
-    found = {}
+    ratios = {}
     for name, columns in problem.scatter_columns(state).items():
         share = problem.evidence.scatter[name][..., None]
-        share = share / np.maximum(share.max(1, keepdims=True), LEAST)
+        share = share / np.maximum(share.max(1, keepdims=True), LEAST_SCATTER)
         along = np.einsum("bnmk,bnm->bnk", columns, analysis.residual) * share
         tested = columns * share[..., None]
         whole = np.einsum("bnmk,bnml,bnlk->b", tested, analysis.spread, tested, optimize=True)
         square = np.sum(along**2, (-1, -2))
         ratio = np.where(whole > 0, square / np.where(whole > 0, whole, 1.0), 1.0)
-        found[name] = np.clip(np.nan_to_num(ratio, nan=1.0), 1 / MOST, MOST)
-    return found
+        ratios[name] = np.clip(np.nan_to_num(ratio, nan=1.0), 1 / LARGEST_CHANGE, LARGEST_CHANGE)
+    return ratios
 
 
 def with_scatter(problem: Problem, state: State, ratios: dict[str, Array]) -> Problem:
@@ -53,14 +53,14 @@ def with_scatter(problem: Problem, state: State, ratios: dict[str, Array]) -> Pr
     that noise by.
     """
     scatter = {
-        name: np.maximum(value * np.sqrt(ratios[name])[:, None], LEAST)
+        name: np.maximum(value * np.sqrt(ratios[name])[:, None], LEAST_SCATTER)
         for name, value in problem.evidence.scatter.items()
     }
     sizes = [p.strength.mean(-1) for p in problem.predictions(state)]
     for name, triad, size in zip(("gravity", "field"), problem.triads, sizes, strict=False):
         if name in scatter:
             noise = np.sqrt(np.mean(triad.sd**2, (1, 2))) / size
-            scatter[name] = np.minimum(scatter[name], np.maximum(noise, LEAST)[:, None])
+            scatter[name] = np.minimum(scatter[name], np.maximum(noise, LEAST_SCATTER)[:, None])
     return replace(problem, evidence=replace(problem.evidence, scatter=scatter))
 
 

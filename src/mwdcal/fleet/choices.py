@@ -12,21 +12,21 @@ from typing import TypeVar
 import numpy as np
 
 from mwdcal.calibration.automatic.nonlinearity import declared, with_chosen_curves
-from mwdcal.calibration.automatic.order_selection import choose_orders, judged_soaks, mapped
+from mwdcal.calibration.automatic.order_selection import choose_orders, judged_soaks
+from mwdcal.calibration.diagnosis.flags import Alone
 from mwdcal.calibration.diagnosis.refusals import check_curves, check_options, check_readings
 from mwdcal.calibration.estimate import temperature_ranges
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.prior import from_datasheet
 from mwdcal.calibration.readings import TRIADS, Readings
 from mwdcal.calibration.soaks import HIGHEST
+from mwdcal.estimation.batch import take
 from mwdcal.geometry.vectors import Ints
 from mwdcal.sensor.profile import Profile
 
 CHUNK = 320
 """Tools fitted in one call: few enough for the cache, many enough for NumPy."""
 _T = TypeVar("_T")
-Alone = Callable[[int], tuple[Readings, Profile]]
-"""Readings and profile of one tool of a batch by themselves, as `calibrate` takes them."""
 
 
 @dataclass(frozen=True)
@@ -159,7 +159,7 @@ def halved(
 ) -> Iterator[tuple[Ints, _T | Exception]]:
     """The work on given members of a batch, done in halves where one member stops the whole."""
     try:
-        yield tools, work(mapped(readings, lambda value: value[tools]))
+        yield tools, work(take(readings, tools))
     except (ArithmeticError, ValueError, np.linalg.LinAlgError) as error:
         if len(tools) == 1:
             yield tools, error

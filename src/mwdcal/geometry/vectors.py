@@ -96,11 +96,15 @@ def rotation(turn: Array) -> Array:
     )
 
 
-def placed(ours: AnyArray, index: Ints, theirs: AnyArray) -> AnyArray:
-    """A copy of ours (B, ...) with theirs at some members of the batch."""
-    changed = ours.copy()
-    changed[index] = theirs
-    return changed
+def nearest_rotation(matrix: Array) -> Array:
+    """Rotation (..., 3, 3) nearest to a matrix in least squares: its polar factor.
+
+    Singular: where the polar factor is a reflection, the axis of least gain is turned back.
+    """
+    u, _, vt = np.linalg.svd(matrix)
+    sign = np.where(np.linalg.det(u @ vt) < 0, -1.0, 1.0)
+    signs = np.stack([np.ones_like(sign), np.ones_like(sign), sign], -1)
+    return np.asarray((u * signs[..., None, :]) @ vt)
 
 
 def inverse(matrix: Array) -> Array:

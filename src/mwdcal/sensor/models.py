@@ -2,7 +2,7 @@
 
 Two families, composed and never subclassed:
 
-polynomial   field = Σ_k φ_k(T) (A_k x + c_k) [+ e₂ x² + e₃ x³, own axis, where asked for]
+polynomial   field = Σ_k φ_k(T) (A_k x + c_k) [+ e₂ x² + e₃ x³, own axis, if `curved`]
              linear in its 12 (n + 1) parameters [+ 6]
 factors      field = (I - m) (x / SF(T) - B(T))          Moosavi 1-8: 6 (n + 1) + 6 parameters
 
@@ -10,6 +10,8 @@ Readings x are already in tool axes and nominal units (`files`), so an ideal tri
 A = I, c = 0, SF = 1, B = 0, m = 0. Shapes: parameters (..., p), readings (..., n, 3),
 temperature (..., n); results (..., n, 3), Jacobian (..., n, 3, p), slope d field / d x
 (..., n, 3, 3).
+
+The order of the parameters is defined by `affine_parts` and `factor_parts`, and nowhere else.
 """
 
 from __future__ import annotations
@@ -20,9 +22,38 @@ from math import prod
 
 import numpy as np
 
-from mwdcal.geometry.vectors import Array, Ints, inverse
+from mwdcal.geometry.vectors import AnyArray, Array, inverse
 
 OFF_DIAGONAL = tuple((i, j) for i in range(3) for j in range(3) if i != j)
+"""Axes of the six misalignments, in their order."""
+OFF_ROWS, OFF_COLUMNS = np.array(OFF_DIAGONAL).transpose()
+
+
+def affine_parts(terms: AnyArray) -> tuple[AnyArray, AnyArray]:
+    """Matrix (..., 3, 3) and offset (..., 3) of twelve parameters (..., 12) at one power of T."""
+    return terms[..., :9].reshape(*terms.shape[:-1], 3, 3), terms[..., 9:]
+
+
+def affine_terms(matrix: AnyArray, offset: AnyArray) -> AnyArray:
+    """Twelve parameters (..., 12) of a matrix (..., 3, 3) and an offset (..., 3)."""
+    return np.concatenate([matrix.reshape(*matrix.shape[:-2], 9), offset], -1)
+
+
+def factor_parts(params: AnyArray) -> tuple[AnyArray, AnyArray, AnyArray]:
+    """SF and B (..., 3, K) by axis and power of T, and m (..., 3, 3), of factors (..., 6 K + 6)."""
+    count = params.shape[-1] // 6 - 1
+    linear = params[..., :-6].reshape(*params.shape[:-1], 2, 3, count)
+    misalignment = np.zeros((*params.shape[:-1], 3, 3), params.dtype)
+    misalignment[..., OFF_ROWS, OFF_COLUMNS] = params[..., -6:]
+    return linear[..., 0, :, :], linear[..., 1, :, :], misalignment
+
+
+def factor_params(scale: AnyArray, bias: AnyArray, misalignment: AnyArray) -> AnyArray:
+    """Factors (..., 6 K + 6) of SF and B (..., 3, K) and m (..., 3, 3): its diagonal does not count."""
+    linear = [
+        part.reshape(*part.shape[:-2], part.shape[-2] * part.shape[-1]) for part in (scale, bias)
+    ]
+    return np.concatenate([*linear, misalignment[..., OFF_ROWS, OFF_COLUMNS]], -1)
 
 
 @dataclass(frozen=True)
@@ -90,8 +121,8 @@ class Polynomial:
         return params[..., : self.affine].reshape(*params.shape[:-1], self.basis.order + 1, 12)
 
     def _terms(self, params: Array, temperature: Array) -> tuple[Array, Array]:
-        terms = np.einsum("...nk,...kp->...np", self.basis(temperature), self._blocks(params))
-        return terms[..., :9].reshape(*terms.shape[:-1], 3, 3), terms[..., 9:]
+        phi = self.basis(temperature)
+        return affine_parts(np.einsum("...nk,...kp->...np", phi, self._blocks(params)))
 
     def fields(self, params: Array, raw: Array, temperature: Array) -> Array:
         """Field vectors (..., n, 3)."""
@@ -115,13 +146,13 @@ class Polynomial:
     def jacobian(self, params: Array, raw: Array, temperature: Array) -> Array:
         """Derivative of the field with respect to the parameters (..., n, 3, p): the basis."""
         x = self._scaled(raw)
-        rows = np.einsum("ij,...k->...ijk", np.eye(3), x).reshape(*x.shape[:-1], 3, 9)
-        one = np.concatenate([rows, np.broadcast_to(np.eye(3), (*x.shape[:-1], 3, 3))], -1)
+        by_matrix = np.einsum("ij,...k->...ijk", np.eye(3), x)
+        one = affine_terms(by_matrix, np.broadcast_to(np.eye(3), (*x.shape[:-1], 3, 3)))
         blocks = np.einsum("...nk,...nip->...nikp", self.basis(temperature), one)
         result = blocks.reshape(*one.shape[:-1], self.affine)
         if self.curved:
-            own = [np.eye(3) * (x**power)[..., None, :] for power in (2, 3)]
-            result = np.concatenate([result, *own], -1)
+            curves = [np.eye(3) * (x**power)[..., None, :] for power in (2, 3)]
+            result = np.concatenate([result, *curves], -1)
         return np.asarray(result)
 
     def curvature(self, params: Array, raw: Array, temperature: Array, covector: Array) -> Array:
@@ -133,29 +164,27 @@ class Polynomial:
     @cached_property
     def names(self) -> tuple[str, ...]:
         """Names of the parameters: `gain-xy` is A[x, y], `offset-x` is c[x]; `·k` for T^k."""
-        one = [f"gain-{i}{j}" for i in "xyz" for j in "xyz"] + [f"offset-{i}" for i in "xyz"]
-        names = [_with_order(name, k) for k in range(self.basis.order + 1) for name in one]
+        gains = np.array([[f"gain-{i}{j}" for j in "xyz"] for i in "xyz"])
+        one = affine_terms(gains, np.array([f"offset-{i}" for i in "xyz"])).tolist()
+        names = [_with_power(name, k) for k in range(self.basis.order + 1) for name in one]
         return (*names, *(f"{w}-{i}" for w in ("square", "cube") for i in "xyz" if self.curved))
 
     def start(self, matrix: Array, offset: Array) -> Array:
         """Parameters (..., p) of field = matrix · raw + offset."""
         offset = offset + np.einsum("...ij,...j->...i", matrix, self.centre[..., 0, :])
-        matrix = matrix * self.scale
-        first = np.concatenate([matrix.reshape(*matrix.shape[:-2], 9), offset], -1)
+        first = affine_terms(matrix * self.scale, offset)
         later = np.zeros((*first.shape[:-1], self.size - 12))
         return np.concatenate([first, later], -1)
 
     def transformed(self, params: Array, turn: Array) -> Array:
         """Parameters of the model whose fields are a matrix `turn` (..., 3, 3) times ours.
 
-        Curved terms stay on their own axes: they are small, and so are the turns asked for.
+        Curved terms are not turned: they and the turns are taken to be small.
         """
-        blocks = self._blocks(params)
-        shape = blocks.shape[:-1]
-        matrix = turn[..., None, :, :] @ blocks[..., :9].reshape(*shape, 3, 3)
-        offset = np.einsum("...ij,...kj->...ki", turn, blocks[..., 9:])
-        joined = np.concatenate([matrix.reshape(*shape, 9), offset], -1)
-        flat = joined.reshape(*params.shape[:-1], self.affine)
+        matrix, offset = affine_parts(self._blocks(params))
+        offset = np.einsum("...ij,...kj->...ki", turn, offset)
+        blocks = affine_terms(turn[..., None, :, :] @ matrix, offset)
+        flat = blocks.reshape(*params.shape[:-1], self.affine)
         return np.concatenate([flat, params[..., self.affine :]], -1)
 
     def with_course(self, direction: Array, power: int) -> Array:
@@ -176,10 +205,6 @@ class Polynomial:
         centre, scale = (np.broadcast_to(x, (*lead, 1, 3)) for x in (self.centre, self.scale))
         return replace(self, centre=centre.reshape(count, 1, 3), scale=scale.reshape(count, 1, 3))
 
-    def take(self, index: Ints) -> Polynomial:
-        """The model of some members of a batch."""
-        return replace(self, centre=self.centre[index], scale=self.scale[index])
-
     def finished(self, reference: float) -> tuple[Polynomial, Array]:
         """The same model on plain readings and powers of T - reference, and the linear map to it.
 
@@ -194,19 +219,17 @@ class Polynomial:
             return Polynomial(basis, self.centre, self.scale, True), whole
         centre, scale = np.broadcast_arrays(self.centre, self.scale)
         one = np.zeros((*scale.shape[:-2], 12, 12))
-        for row in range(3):
-            for column in range(3):
-                where = 3 * row + column
-                one[..., where, where] = 1 / scale[..., 0, column]
-                one[..., 9 + row, where] = -centre[..., 0, column] / scale[..., 0, column]
-            one[..., 9 + row, 9 + row] = 1.0
+        gains, offsets = affine_parts(np.arange(12))
+        one[..., gains, gains] = 1 / scale
+        one[..., offsets[:, None], gains] = -centre / scale
+        one[..., offsets, offsets] = 1.0
         mixed = np.einsum("ab,...ij->...aibj", powers, one)
         return Polynomial(basis), mixed.reshape(*one.shape[:-2], size, size)
 
 
 @dataclass(frozen=True)
 class Factors:
-    """Moosavi's factors: SF_i,k, then B_i,k (k fastest), then the six m_ij row by row."""
+    """Moosavi's factors, linear but for products: SF_i(T), B_i(T) and m_ij; see `factor_parts`."""
 
     basis: Basis
     kind = "factors"
@@ -217,17 +240,10 @@ class Factors:
         return 6 * (self.basis.order + 1) + 6
 
     def _split(self, params: Array, temperature: Array) -> tuple[Array, Array, Array]:
-        count = self.basis.order + 1
-        values = self.basis(temperature)
-        both = params[..., : 6 * count].reshape(*params.shape[:-1], 2, 3, count)
-        both = np.einsum("...nk,...sik->...sni", values, both)
-        return both[..., 0, :, :], both[..., 1, :, :], self._mixing(params)
-
-    def _mixing(self, params: Array) -> Array:
-        mixing = np.broadcast_to(np.eye(3), (*params.shape[:-1], 3, 3)).copy()
-        for where, (i, j) in enumerate(OFF_DIAGONAL):
-            mixing[..., i, j] = -params[..., 6 * (self.basis.order + 1) + where]
-        return mixing
+        """SF(T) and B(T) (..., n, 3), and I - m (..., 3, 3)."""
+        values, (scale, bias, misalignment) = self.basis(temperature), factor_parts(params)
+        scale, bias = (np.einsum("...nk,...ik->...ni", values, part) for part in (scale, bias))
+        return scale, bias, np.eye(3) - misalignment
 
     def fields(self, params: Array, raw: Array, temperature: Array) -> Array:
         """Field vectors (..., n, 3)."""
@@ -245,19 +261,14 @@ class Factors:
         values, column = self.basis(temperature), mixing[..., None, :, :]
         by_scale = -(raw / scale**2)[..., None, :, None] * column[..., None]
         by_scale = by_scale * values[..., None, None, :]
-        by_bias = -column[..., None] * values[..., None, None, :]
-        flat = (*by_scale.shape[:-2], by_scale.shape[-2] * by_scale.shape[-1])
-        by_bias = np.broadcast_to(by_bias, by_scale.shape)
-        unit = raw / scale - bias
-        by_mixing = np.zeros((*unit.shape, 6))
-        for where, (i, j) in enumerate(OFF_DIAGONAL):
-            by_mixing[..., i, where] = -unit[..., j]
-        return np.concatenate([by_scale.reshape(flat), by_bias.reshape(flat), by_mixing], -1)
+        by_bias = np.broadcast_to(-column[..., None] * values[..., None, None, :], by_scale.shape)
+        by_misalignment = -np.einsum("ij,...k->...ijk", np.eye(3), raw / scale - bias)
+        return factor_params(by_scale, by_bias, by_misalignment)
 
     def curvature(self, params: Array, raw: Array, temperature: Array, covector: Array) -> Array:
         """Second derivatives (..., p, p) of Σ covector (..., n, 3) · field, summed over stations."""
         scale, _, mixing = self._split(params, temperature)
-        values, count = self.basis(temperature), self.basis.order + 1
+        values = self.basis(temperature)
         pulled = np.einsum("...ni,...ij->...nj", covector, mixing)
         bend = np.einsum(
             "...nj,...nk,...nl->...jkl", 2 * pulled * raw / scale**3, values, values, optimize=True
@@ -265,58 +276,51 @@ class Factors:
         both = np.stack([raw / scale**2, np.ones_like(scale)], -2)
         cross = np.einsum("...ni,...nsj,...nk->...isjk", covector, both, values, optimize=True)
         result = np.zeros((*cross.shape[:-4], self.size, self.size))
-        for j in range(3):
-            own = slice(j * count, (j + 1) * count)
-            result[..., own, own] = bend[..., j, :, :]
-        for where, (i, j) in enumerate(OFF_DIAGONAL):
-            column = 6 * count + where
-            for s in range(2):
-                rows = slice((3 * s + j) * count, (3 * s + j + 1) * count)
+        scales, biases, misalignments = factor_parts(np.arange(self.size))
+        for at, block in zip(scales, np.moveaxis(bend, -3, 0), strict=True):
+            result[..., at[:, None], at] = block
+        for i, j in OFF_DIAGONAL:
+            column = misalignments[i, j]
+            for s, rows in enumerate((scales[j], biases[j])):
                 result[..., rows, column] = result[..., column, rows] = cross[..., i, s, j, :]
         return result
 
     @cached_property
     def names(self) -> tuple[str, ...]:
         """Names of the parameters: `scale-x`, `bias-x` (with `·k` for T^k), `misalignment-xy`."""
-        count = range(self.basis.order + 1)
-        linear = [
-            _with_order(f"{w}-{i}", k) for w in ("scale", "bias") for i in "xyz" for k in count
-        ]
-        return (*linear, *(f"misalignment-{'xyz'[i]}{'xyz'[j]}" for i, j in OFF_DIAGONAL))
+        powers = range(self.basis.order + 1)
+        scale, bias = (
+            np.array([[_with_power(f"{name}-{i}", k) for k in powers] for i in "xyz"])
+            for name in ("scale", "bias")
+        )
+        misalignment = np.array([[f"misalignment-{i}{j}" for j in "xyz"] for i in "xyz"])
+        return tuple(factor_params(scale, bias, misalignment).tolist())
 
     def start(self, matrix: Array, offset: Array) -> Array:
         """Parameters (..., p) of field = matrix · raw + offset."""
         scale = 1 / np.diagonal(matrix, axis1=-2, axis2=-1)
         mixing = matrix * scale[..., None, :]
         bias = -np.einsum("...ij,...j->...i", inverse(mixing), offset)
-        count = self.basis.order + 1
-        linear = np.zeros((*offset.shape[:-1], 6, count))
-        linear[..., 0] = np.concatenate([scale, bias], -1)
-        off = np.stack([-mixing[..., i, j] for i, j in OFF_DIAGONAL], -1)
-        return np.concatenate([linear.reshape(*offset.shape[:-1], 6 * count), off], -1)
+        steady = np.arange(self.basis.order + 1) == 0
+        return factor_params(scale[..., None] * steady, bias[..., None] * steady, -mixing)
 
     def transformed(self, params: Array, turn: Array) -> Array:
         """Parameters of the model whose fields are a matrix `turn` (..., 3, 3) times ours."""
-        count = self.basis.order + 1
-        linear = params[..., : 6 * count].reshape(*params.shape[:-1], 2, 3, count)
-        mixing = turn @ self._mixing(params)
+        scale, bias, misalignment = factor_parts(params)
+        mixing = turn @ (np.eye(3) - misalignment)
         gain = np.diagonal(mixing, axis1=-2, axis2=-1)
-        linear = linear * np.stack([1 / gain, gain], -2)[..., None]
-        mixing = mixing / gain[..., None, :]
-        off = np.stack([-mixing[..., i, j] for i, j in OFF_DIAGONAL], -1)
-        return np.concatenate([linear.reshape(*params.shape[:-1], 6 * count), off], -1)
+        scale, bias = scale * (1 / gain)[..., None], bias * gain[..., None]
+        return factor_params(scale, bias, -(mixing / gain[..., None, :]))
 
     def with_course(self, direction: Array, power: int) -> Array:
         """A change (..., p) of the steady parameters, moved to a power of temperature.
 
         Misalignments have no course: what needs one is left as zero.
         """
-        count = self.basis.order + 1
-        linear = direction[..., : 6 * count].reshape(*direction.shape[:-1], 6, count)
-        moved = np.zeros_like(linear)
-        moved[..., power] = linear[..., 0]
-        flat = moved.reshape(*direction.shape[:-1], 6 * count)
-        return np.concatenate([flat, np.zeros_like(direction[..., 6 * count :])], -1)
+        scale, bias, misalignment = factor_parts(direction)
+        moved = np.arange(scale.shape[-1]) == power
+        scale, bias = scale[..., :1] * moved, bias[..., :1] * moved
+        return factor_params(scale, bias, np.zeros_like(misalignment))
 
     @property
     def lead(self) -> tuple[int, ...]:
@@ -327,15 +331,12 @@ class Factors:
         """The model with one batch axis: the same for all."""
         return self
 
-    def take(self, index: Ints) -> Factors:
-        """The model of some members of a batch: the same for all."""
-        return self
-
     def finished(self, reference: float) -> tuple[Factors, Array]:
         """The same model in powers of T - reference, and the linear map to it."""
-        count = self.basis.order + 1
-        whole = np.eye(self.size)
-        whole[: 6 * count, : 6 * count] = np.kron(np.eye(6), self.basis.powers(reference))
+        whole, powers = np.eye(self.size), self.basis.powers(reference)
+        scale, bias, _ = factor_parts(np.arange(self.size))
+        for at in (*scale, *bias):
+            whole[at[:, None], at] = powers
         return Factors(Basis(self.basis.order, reference)), whole
 
 
@@ -416,10 +417,6 @@ class Restricted:
         """The model with one batch axis for these leading axes."""
         return replace(self, whole=self.whole.flat(lead))
 
-    def take(self, index: Ints) -> Restricted:
-        """The model of some members of a batch."""
-        return replace(self, whole=self.whole.take(index))
-
     def finished(self, reference: float) -> tuple[Whole, Array]:
         """The whole model on plain readings, and the linear map (..., all, p) to it."""
         model, whole = self.whole.finished(reference)
@@ -444,5 +441,5 @@ def restricted(model: Whole, parameters: int) -> Model:
 Model = Whole | Restricted
 
 
-def _with_order(name: str, order: int) -> str:
-    return f"{name}·{order}" if order else name
+def _with_power(name: str, power: int) -> str:
+    return f"{name}·{power}" if power else name

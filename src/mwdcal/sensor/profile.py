@@ -21,7 +21,7 @@ Axis = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
 
 
 class Datasheet(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What the maker promises of a triad, 1 σ: knowledge for a fit that asks for it.
+    """The maker's tolerances of a triad, 1 σ, used as a prior where the options say so.
 
     `scale` as a share, `bias` in g or nT, `misalignment_deg`; `scale_per_c` and `bias_per_c`
     their drift per °C. What is not given is not known.
@@ -98,8 +98,8 @@ class StandProfile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     def common(self) -> dict[str, float]:
         """Standard uncertainties, in degrees, of errors of the stand that all stations share."""
         keys = {name: f"{name.replace('-', '_')}_deg" for name in COMMON}
-        found = {name: float(getattr(self, key)) for name, key in keys.items()}
-        return {name: value for name, value in found.items() if value}
+        values = {name: float(getattr(self, key)) for name, key in keys.items()}
+        return {name: value for name, value in values.items() if value}
 
 
 class Profile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

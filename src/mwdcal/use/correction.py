@@ -16,7 +16,7 @@ from mwdcal.use import correction_numba, strengths
 from mwdcal.use.strengths import Strengths
 
 OUTSIDE = ("blank", "refuse", "extrapolate")
-MARK = "extrapolated"
+EXTRAPOLATED = "extrapolated"
 """The column that says of each row whether it was extrapolated, where that is allowed."""
 JUDGED = ("gravity", "inclination", "toolface", "azimuth", "field", "dip", "magnetic_toolface")
 DIRECTIONS = {
@@ -30,12 +30,12 @@ NAMES = (
     "magnetic_toolface_deg",
 )
 """The output columns, in their order."""
-MANY = 300_000
-"""From this number of rows on the compiled loops are worth their start."""
+COMPILED_ROWS = 300_000
+"""Number of rows from which the compiled loops repay their loading."""
 
 
-class Tally(NamedTuple):
-    """What the findings need to know of the rows: their number, and what was seen in them.
+class RowCounts(NamedTuple):
+    """Counts over the rows that the findings are made from.
 
     `warmth` are the lowest and the highest temperature of readings, °C.
     """
@@ -49,7 +49,7 @@ class Tally(NamedTuple):
     warmth: tuple[float, float] = (np.inf, -np.inf)
 
     def blank(self, outside: str) -> int:
-        """Number of rows without results: for want of a reading, or `outside` the temperatures."""
+        """Number of rows without results: a reading is missing, or the temperature is outside."""
         return self.lacking + (self.beyond if outside == "blank" else 0)
 
 
@@ -64,14 +64,14 @@ def correct(
     `magnetic_toolface_deg` stands beside them. A strength of zero has no direction: NaN.
     Temperatures outside the calibrated range are blanked, refused or extrapolated as `outside` says.
     """
-    columns, _, told = counted(calibration, readings, outside)
-    return columns, told
+    columns, _, notes = counted(calibration, readings, outside)
+    return columns, notes
 
 
 def counted(
     calibration: Calibration, readings: Readings, outside: str, lacking: int = 0
-) -> tuple[dict[str, AnyArray], Tally, list[Finding]]:
-    """The same, and between what was seen in the rows; `lacking` more were left out unread."""
+) -> tuple[dict[str, AnyArray], RowCounts, list[Finding]]:
+    """As `correct`, with the counts in between; `lacking` further rows had no complete reading."""
     check_outside(outside)
     columns: dict[str, AnyArray] = {
         **(compiled(calibration, readings) or reference(calibration, readings))
@@ -80,15 +80,15 @@ def counted(
     rows, moved = readings.count + lacking, undetermined(calibration, readings)
     if outside == "blank" and beyond.any():
         columns = {name: np.where(beyond, np.nan, value) for name, value in columns.items()}
-    tally = Tally(
+    tally = RowCounts(
         rows, int(beyond.sum()), moved, lacking, (),
         strengths.judged(calibration, columns, readings.known), warmth(readings.temperature),
     )  # fmt: skip
-    told = findings(calibration, readings, tally, outside)
+    notes = findings(calibration, readings, tally, outside)
     strengths.check(calibration, tally.strengths, readings.source)
     if outside == "extrapolate":
-        columns[MARK] = beyond
-    return columns, tally, told
+        columns[EXTRAPOLATED] = beyond
+    return columns, tally, notes
 
 
 def warmth(temperature: Array | None) -> tuple[float, float]:
@@ -100,11 +100,11 @@ def warmth(temperature: Array | None) -> tuple[float, float]:
 
 def result_names(outside: str) -> tuple[str, ...]:
     """The columns of results, in their order."""
-    return (*NAMES, MARK) if outside == "extrapolate" else NAMES
+    return (*NAMES, EXTRAPOLATED) if outside == "extrapolate" else NAMES
 
 
 def check_outside(outside: str) -> None:
-    """Refuse a word that says nothing about temperatures outside the calibrated range."""
+    """Raise `InputError` unless `outside` is one of `OUTSIDE`."""
     if outside not in OUTSIDE:
         raise InputError(f"--outside must be one of {', '.join(OUTSIDE)}; got {outside!r}.")
 
@@ -130,11 +130,11 @@ def reference(calibration: Calibration, readings: Readings) -> dict[str, Array]:
 def compiled(
     calibration: Calibration, readings: Readings, least: int | None = None
 ) -> dict[str, Array] | None:
-    """The same columns by the compiled loops; None for few rows, or where they cannot."""
+    """The same columns by the compiled loops; None for few rows, or a model they do not have."""
     shape = readings.accelerometer.shape[:-1]
     triads = numbers(calibration)
     unknown = readings.temperature is None and any(t.order for t in calibration.triads)
-    few = np.prod(shape) < (MANY if least is None else least)
+    few = np.prod(shape) < (COMPILED_ROWS if least is None else least)
     if few or triads is None or unknown or not correction_numba.available():
         return None
     zero = calibration.reference_temperature
@@ -142,8 +142,8 @@ def compiled(
     flat = np.ascontiguousarray(np.broadcast_to(warmth, shape), float).reshape(-1)
     g, b = readings.accelerometer, readings.magnetometer
     vectors = [*_axes(g), *(_axes(b) if b is not None else [np.full(flat.shape, np.nan)] * 3)]
-    found = correction_numba.run([*vectors, flat], triads, zero)
-    return {n: c.reshape(shape) for n, c in zip(NAMES, found.columns, strict=True)}
+    rows = correction_numba.run([*vectors, flat], triads, zero)
+    return {n: c.reshape(shape) for n, c in zip(NAMES, rows.columns, strict=True)}
 
 
 def _axes(vectors: Array) -> list[Array]:
@@ -155,50 +155,50 @@ def _axes(vectors: Array) -> list[Array]:
 def numbers(
     calibration: Calibration,
 ) -> tuple[correction_numba.Numbers, correction_numba.Numbers] | None:
-    """Both triads for the compiled loops; None where a model is not for them."""
-    found = [
+    """Both triads for the compiled loops; None for a model that they do not have."""
+    triads = [
         correction_numba.numbers(
             t.functions(calibration.reference_temperature), np.array(t.parameters)
         )
         for t in calibration.triads
     ]
-    first, second = [*found, correction_numba.NOTHING][:2]
+    first, second = [*triads, correction_numba.NOTHING][:2]
     return None if first is None or second is None else (first, second)
 
 
 def findings(
-    calibration: Calibration, readings: Readings, tally: Tally, outside: str
+    calibration: Calibration, readings: Readings, tally: RowCounts, outside: str
 ) -> list[Finding]:
     """What the reader should know of the results; refuses rows outside if `outside` says so.
 
     Of the readings only their metadata count, and whether there is a magnetometer.
     """
-    found = []
+    notes = []
     if calibration.has_field and readings.magnetometer is None:
         text = "no columns mx, my, mz: magnetic results are blank."
-        found.append(Finding(id="no-magnetometer", text=text))
-    found += _other_tool(calibration, readings)
+        notes.append(Finding(id="no-magnetometer", text=text))
+    notes += _other_tool(calibration, readings)
     if tally.lacking:
         text = f"{tally.lacking} of {tally.rows} rows lack a reading: their results are blank."
-        found.append(Finding(id="missing-reading", text=text))
+        notes.append(Finding(id="missing-reading", text=text))
     if tally.beyond:
-        found.append(_outside(calibration, readings.source, outside, tally))
+        notes.append(_outside(calibration, readings.source, outside, tally))
     if calibration.unrecorded(readings):
         at = "…".join(dict.fromkeys(f"{end:.1f}" for end in tally.warmth))
         text = (
             "the calibration was made at unrecorded temperatures, without temperature terms: nothing says how "
             f"good the results are at the readings' {at} °C."
         )
-        found.append(Finding(id="no-temperature", text=text))
-    found += strengths.findings(tally.strengths)
+        notes.append(Finding(id="no-temperature", text=text))
+    notes += strengths.findings(tally.strengths)
     if calibration.relative:
         text = "the magnetometer is calibrated to field = 1: bx_nt, by_nt, bz_nt and field_nt are relative, not nT."
-        found.append(Finding(id="field-relative", text=text))
+        notes.append(Finding(id="field-relative", text=text))
     if tally.moved:
         free = ", ".join(dict.fromkeys(u.id for u in calibration.undetermined()))
         text = f"{', '.join(tally.moved)} rest on what the calibration leaves undetermined ({free})"
-        found.append(Finding(id="undetermined", text=f"{text}: no uncertainty can be stated."))
-    return found
+        notes.append(Finding(id="undetermined", text=f"{text}: no uncertainty can be stated."))
+    return notes
 
 
 def _other_tool(calibration: Calibration, readings: Readings) -> list[Finding]:
@@ -212,7 +212,7 @@ def _other_tool(calibration: Calibration, readings: Readings) -> list[Finding]:
     return [Finding(id="other-tool", text=text)]
 
 
-def _outside(calibration: Calibration, source: str, how: str, tally: Tally) -> Finding:
+def _outside(calibration: Calibration, source: str, how: str, tally: RowCounts) -> Finding:
     low, high = calibration.temperature_c or (np.nan, np.nan)
     text = f"{tally.beyond} of {tally.rows} rows lie outside the calibrated range {low:.1f}…{high:.1f} °C"
     if how == "refuse":
@@ -223,7 +223,7 @@ def _outside(calibration: Calibration, source: str, how: str, tally: Tally) -> F
         "their results are blank"
         if how == "blank"
         else "their results are extrapolated, with no statement of accuracy, and marked in the "
-        f"column '{MARK}'"
+        f"column '{EXTRAPOLATED}'"
     )
     return Finding(id="outside-temperature", text=f"{text}: {done}.")
 

@@ -1,4 +1,4 @@
-"""Compiled loops behind `core.fused`: rows to vectors and angles in one pass over memory.
+"""Compiled loops behind `correction_numba`: rows to vectors and angles in one pass over memory.
 
 Rows are taken in tiles that stay in the innermost cache. Every loop runs over one scratch
 array whose row length is a constant, which is what lets the compiler use the vector units;
@@ -8,25 +8,42 @@ digits wherever it stands. Importing this module needs Numba.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import TypeVar, cast
+
 import numpy as np
+from numba import njit
 
 from mwdcal.geometry.observables import VERTICAL
 from mwdcal.geometry.vectors import AnyArray, Array
-from mwdcal.sensor.jit import compiled
 
 Floats = tuple[float, ...]
 Courses = tuple[Floats, ...]
 
 TILE = 128
 DEGREES = 180.0 / np.pi
-TURN = 2.0 * np.pi
-VECTORS = 6
-"""Output rows of the vectors alone."""
+FULL_TURN = 2.0 * np.pi
 
 # Scratch rows: temperature, then the outputs in their order, then what angles are made of.
 _T, _G, _B = 0, 1, 4
 _INC, _AZI, _FACE, _GRAVITY, _FIELD, _DIP, _MAGNETIC = 7, 8, 9, 10, 11, 12, 13
 _ACROSS, _EAST, _NORTH, _DOWN, _CROSS, _TAU, _ROWS = 14, 15, 16, 17, 18, 19, 20
+
+
+_F = TypeVar("_F", bound=Callable[..., object])
+
+
+def compiled(function: _F) -> _F:
+    """The function as machine code, kept on disk where a folder for it can be written.
+
+    Arithmetic is plain IEEE, and division by zero raises nothing: a result has the same bytes from
+    code compiled just now and from code kept on disk.
+    """
+    try:
+        loop = njit(nogil=True, cache=True, error_model="numpy")(function)
+    except RuntimeError:  # no such folder
+        loop = njit(nogil=True, error_model="numpy")(function)
+    return cast(_F, loop)
 
 
 @compiled
@@ -52,11 +69,11 @@ def angle(y: float, x: float) -> float:
     q = q * w + 4.328810604912902668951e2
     q = q * w + 4.853903996359136964868e2
     q = q * w + 1.945506571482613964425e2
-    found = z * (w * p / q) + z
-    found = found + 0.25 * np.pi if fold else found
-    found = 0.5 * np.pi - found if steep else found
-    found = np.pi - found if np.copysign(1.0, x) < 0.0 else found
-    return float(np.copysign(found, y))
+    turn = z * (w * p / q) + z
+    turn = turn + 0.25 * np.pi if fold else turn
+    turn = 0.5 * np.pi - turn if steep else turn
+    turn = np.pi - turn if np.copysign(1.0, x) < 0.0 else turn
+    return float(np.copysign(turn, y))
 
 
 @compiled
@@ -76,7 +93,7 @@ def field(
     shape: Floats,
     curved: bool,
 ) -> None:
-    """Nominal readings x, y, z become the field, in place; see `core.fused.Numbers`."""
+    """Nominal readings x, y, z become the field, in place; see `correction_numba.Numbers`."""
     c = courses
     for i in range(count):
         w = t[i]
@@ -119,16 +136,16 @@ def angles(s: Array, count: int) -> None:
     for i in range(count):
         s[_INC, i] = DEGREES * angle(s[_ACROSS, i], s[_G + 2, i])
     for i in range(count):
-        found = angle(s[_EAST, i], s[_NORTH, i])
-        s[_AZI, i] = DEGREES * (found + TURN if found < 0.0 else found)
+        turn = angle(s[_EAST, i], s[_NORTH, i])
+        s[_AZI, i] = DEGREES * (turn + FULL_TURN if turn < 0.0 else turn)
     for i in range(count):
-        found = angle(-s[_G, i], -s[_G + 1, i])
-        s[_FACE, i] = DEGREES * (found + TURN if found < 0.0 else found)
+        turn = angle(-s[_G, i], -s[_G + 1, i])
+        s[_FACE, i] = DEGREES * (turn + FULL_TURN if turn < 0.0 else turn)
     for i in range(count):
         s[_DIP, i] = DEGREES * angle(s[_DOWN, i], s[_CROSS, i])
     for i in range(count):
-        found = angle(s[_B, i], s[_B + 1, i])
-        s[_MAGNETIC, i] = DEGREES * (found + TURN if found < 0.0 else found)
+        turn = angle(s[_B, i], s[_B + 1, i])
+        s[_MAGNETIC, i] = DEGREES * (turn + FULL_TURN if turn < 0.0 else turn)
     for i in range(count):
         still = s[_GRAVITY, i] == 0.0
         quiet = s[_FIELD, i] == 0.0
@@ -190,7 +207,7 @@ def rows(
 ) -> tuple[int, int, int]:
     """Fill rows start…stop of `out`; unsound cells, rows beyond the temperatures, NaN results.
 
-    See `core.fused.run`. `limits`: accepted raw values, reference temperature, accepted and
+    See `correction_numba.run`. `limits`: accepted raw values, reference temperature, accepted and
     calibrated temperatures, and whether results beyond these become NaN.
     """
     s = np.empty((_ROWS, TILE))
@@ -208,7 +225,7 @@ def rows(
             tau[i] = s[_T, i] - reference
         field(tau, s[_G], s[_G + 1], s[_G + 2], count, first[0], first[1], curved[0])
         field(tau, s[_B], s[_B + 1], s[_B + 2], count, second[0], second[1], curved[1])
-        if last > VECTORS:
+        if last >= _INC:
             parts(s, count)
             angles(s, count)
         beyond += mask(s, count, low, high, blank > 0.0, last)

@@ -1,6 +1,6 @@
-"""Vectors, angles and strengths of many rows at once, by the compiled loops of `core.kernels`.
+"""Vectors, angles and strengths of many rows at once, by the compiled loops of `correction_kernels`.
 
-The same formulas as `core.models` and `core.observables`, which are the reference: both
+The same formulas as `sensor.models` and `geometry.observables`, which are the reference: both
 agree to 1e-12 (`tests/test_fused.py`; reasons and timings: `design/kernels.md`). Numba is
 imported when rows are first computed, never before; MWDCAL_NUMPY=1 turns it off.
 """
@@ -10,21 +10,22 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from importlib.util import find_spec
 from typing import NamedTuple
 
 import numpy as np
 
-from mwdcal.estimation.fit_numba import available
 from mwdcal.geometry.vectors import AnyArray, Array
-from mwdcal.sensor.models import OFF_DIAGONAL, Factors, Model, Polynomial
+from mwdcal.sensor.models import Factors, Model, Polynomial, affine_parts, factor_parts
 
 __all__ = ["available", "cores", "numbers", "run"]
 
-HIGHEST = 3
+HIGHEST_POWER = 3
 """Highest order in temperature that the loops know."""
 VECTORS, OUTPUTS = 6, 13
 """Rows of a result: the two vectors; these, the angles and the strengths."""
-_PIECE = 1 << 15
+_PIECE_ROWS = 1 << 15
 
 
 class Numbers(NamedTuple):
@@ -39,7 +40,7 @@ class Numbers(NamedTuple):
     curved: bool
 
 
-class Limits(NamedTuple):
+class RowLimits(NamedTuple):
     """Accepted raw values and temperatures, both ends included, and the calibrated range.
 
     Results of rows beyond the calibrated range are NaN where `blank`.
@@ -51,11 +52,11 @@ class Limits(NamedTuple):
     blank: bool = False
 
 
-ANYTHING = Limits()
+ANYTHING = RowLimits()
 
 
-class Found(NamedTuple):
-    """Results (rows of output, n), and how many cells and rows were remarkable.
+class CorrectedRows(NamedTuple):
+    """Results (outputs, n), with counts of cells and rows that need a remark.
 
     `unsound`: cells out of the accepted ranges or NaN. `beyond`: rows out of the calibrated
     range. `empty`: results that are NaN.
@@ -67,6 +68,16 @@ class Found(NamedTuple):
     empty: int
 
 
+def available() -> bool:
+    """Whether compiled loops can be had, and are wanted: Numba, and not MWDCAL_NUMPY=1."""
+    return _installed() and not os.environ.get("MWDCAL_NUMPY")
+
+
+@cache
+def _installed() -> bool:
+    return find_spec("numba") is not None
+
+
 def cores() -> int:
     """Cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
@@ -75,8 +86,8 @@ def cores() -> int:
 
 
 def numbers(model: Model, params: Array) -> Numbers | None:
-    """A finished model (powers of T - reference) of parameters (p,); None: not for the loops."""
-    if model.basis.order > HIGHEST:
+    """A finished model (powers of T - reference) of parameters (p,); None where its order is too high."""
+    if model.basis.order > HIGHEST_POWER:
         return None
     if isinstance(model, Polynomial):
         return _polynomial(model, params)
@@ -88,30 +99,27 @@ NOTHING = Numbers(((0.0,) * 4,) * 12 + ((1.0, 0.0, 0.0, 0.0),) * 3, (np.nan,) * 
 
 
 def _polynomial(model: Polynomial, params: Array) -> Numbers:
-    powers = params[: model.affine].reshape(-1, 12)
-    scale = np.zeros((len(powers), 3))
+    gain, offset = affine_parts(params[: model.affine].reshape(-1, 12))
+    scale = np.zeros_like(offset)
     scale[0] = 1.0
     curves = params[model.affine :] if model.curved else np.zeros(6)
     shape = np.concatenate([model.centre.ravel(), model.scale.ravel(), curves])
-    return Numbers(_courses(np.hstack([powers, scale])), tuple(shape.tolist()), model.curved)
+    return Numbers(_courses(gain, offset, scale), tuple(shape.tolist()), model.curved)
 
 
 def _factors(model: Factors, params: Array) -> Numbers:
-    count = model.basis.order + 1
-    scale, bias = params[: 6 * count].reshape(2, 3, count)
-    mixing = np.eye(3)
-    for (i, j), value in zip(OFF_DIAGONAL, params[6 * count :], strict=True):
-        mixing[i, j] = -value
-    gain = np.zeros((count, 9))
-    gain[0] = mixing.ravel()
-    powers = np.hstack([gain, -np.swapaxes(mixing @ bias, 0, 1), np.swapaxes(scale, 0, 1)])
-    return Numbers(_courses(powers), (0.0,) * 3 + (1.0,) * 3 + (0.0,) * 6, False)
+    scale, bias, misalignment = factor_parts(params)
+    mixing = np.eye(3) - misalignment
+    gain = np.zeros((model.basis.order + 1, 3, 3))
+    gain[0] = mixing
+    courses = _courses(gain, -np.swapaxes(mixing @ bias, 0, 1), np.swapaxes(scale, 0, 1))
+    return Numbers(courses, (0.0,) * 3 + (1.0,) * 3 + (0.0,) * 6, False)
 
 
-def _courses(powers: Array) -> tuple[tuple[float, ...], ...]:
-    """Coefficients (powers, 15) as one tuple of four per quantity."""
-    padded = np.zeros((HIGHEST + 1, 15))
-    padded[: len(powers)] = powers
+def _courses(gain: Array, offset: Array, scale: Array) -> tuple[tuple[float, ...], ...]:
+    """Coefficients by power, gains (K, 3, 3), offsets and scales (K, 3), as one tuple of four each."""
+    padded = np.zeros((HIGHEST_POWER + 1, 15))
+    padded[: len(gain)] = np.hstack([gain.reshape(-1, 9), offset, scale])
     return tuple(map(tuple, np.swapaxes(padded, 0, 1).tolist()))
 
 
@@ -120,10 +128,10 @@ def run(
     triads: tuple[Numbers, Numbers],
     reference: float,
     units: Sequence[float] = (1.0,) * 6,
-    limits: Limits = ANYTHING,
+    limits: RowLimits = ANYTHING,
     out: Array | None = None,
     workers: int | None = None,
-) -> Found:
+) -> CorrectedRows:
     """All results of `columns`: three of gravity, three of the field, in tool order; temperature.
 
     Columns are (n,), in `units` (with their sign) per nominal g or nT; the last is °C, and
@@ -144,10 +152,10 @@ def run(
         return correction_kernels.rows(*settings, out, start, stop)
 
     workers = workers or cores()
-    step = max(_PIECE, -(-count // workers))
+    step = max(_PIECE_ROWS, -(-count // workers))
     starts = range(0, count, step)
     if len(starts) < 2:
-        return Found(out, *piece(0, count))
+        return CorrectedRows(out, *piece(0, count))
     with ThreadPoolExecutor(len(starts)) as pool:
         counts = pool.map(piece, starts, [min(s + step, count) for s in starts])
-        return Found(out, *np.sum(list(counts), axis=0).tolist())
+        return CorrectedRows(out, *np.sum(list(counts), axis=0).tolist())

@@ -22,7 +22,7 @@ import numpy as np
 from mwdcal.calibration.record import FREE_SHARE, Calibration, TriadCalibration
 from mwdcal.errors import InputError
 from mwdcal.geometry.vectors import AnyArray, Array, Ints
-from mwdcal.sensor.models import OFF_DIAGONAL
+from mwdcal.sensor.models import affine_parts, factor_parts
 from mwdcal.sensor.profile import TriadProfile
 
 NOTATIONS = ("factors", "forward", "affine")
@@ -173,22 +173,12 @@ def _refuse(triad: TriadCalibration, notation: str, temperature: float | str) ->
         )
 
 
-def _stored_factors(params: AnyArray) -> tuple[AnyArray, AnyArray, AnyArray]:
-    """SF (3, n + 1), B (3, n + 1) and m (3, 3) as they are stored: tool axes, nominal units."""
-    scale, bias = params[:-6].reshape(2, 3, -1)
-    mixing = np.zeros((3, 3), dtype=params.dtype)
-    for (i, j), value in zip(OFF_DIAGONAL, params[-6:], strict=True):
-        mixing[i, j] = value
-    return scale, bias, mixing
-
-
 def _affine(params: AnyArray, triad: TriadCalibration, tau: float) -> tuple[AnyArray, AnyArray]:
     """Matrix and offset of field = A x + c at a temperature, x in tool axes and nominal units."""
     course = tau ** np.arange(triad.order + 1)
     if triad.model == "polynomial":
-        terms = course @ params.reshape(triad.order + 1, 12)
-        return terms[:9].reshape(3, 3), terms[9:]
-    scale, bias, mixing = _stored_factors(params)
+        return affine_parts(course @ params.reshape(triad.order + 1, 12))
+    scale, bias, mixing = factor_parts(params)
     mixing = np.eye(3) - mixing
     return mixing / (scale @ course), -mixing @ (bias @ course)
 
@@ -212,7 +202,7 @@ def _as_factors(matrix: AnyArray, offset: AnyArray, permutation: Array) -> dict[
 
 def _own_factors(params: AnyArray, permutation: Array, scale: Array) -> dict[str, AnyArray]:
     """Stored factors, tool axes and nominal units, to channels and raw units: exact."""
-    gain, bias, mixing = _stored_factors(params)
+    gain, bias, mixing = factor_parts(params)
     back = permutation.transpose()
     return {
         "SF": np.abs(back) @ gain * scale[:, None],
@@ -223,7 +213,7 @@ def _own_factors(params: AnyArray, permutation: Array, scale: Array) -> dict[str
 
 def _forward_course(params: AnyArray, permutation: Array, scale: Array) -> dict[str, AnyArray]:
     """S and o of stored factors by power: diag(SF)(I - m)⁻¹ and SF · B of the nominal reading."""
-    gain, bias, mixing = _stored_factors(params)
+    gain, bias, mixing = factor_parts(params)
     matrix = gain.transpose()[:, :, None] * np.linalg.inv(np.eye(3) - mixing)
     offset = np.stack([np.convolve(s, b) for s, b in zip(gain, bias, strict=True)], -1)
     back = permutation.transpose() * scale[:, None]
@@ -232,9 +222,8 @@ def _forward_course(params: AnyArray, permutation: Array, scale: Array) -> dict[
 
 def _affine_course(params: AnyArray, permutation: Array, scale: Array) -> dict[str, AnyArray]:
     """M and b by power: the parameters of the polynomial model themselves, for raw channels."""
-    terms = params.reshape(-1, 12)
-    matrix = terms[:, :9].reshape(-1, 3, 3)
-    return {"M": matrix @ permutation / scale, "b": terms[:, 9:]}
+    matrix, offset = affine_parts(params.reshape(-1, 12))
+    return {"M": matrix @ permutation / scale, "b": offset}
 
 
 _Form = Callable[[AnyArray, AnyArray, Array], dict[str, AnyArray]]

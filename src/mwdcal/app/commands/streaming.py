@@ -36,10 +36,10 @@ from mwdcal.geometry.vectors import AnyArray, Array, Bools
 from mwdcal.sensor.profile import TriadProfile
 from mwdcal.use import correction_numba, strengths
 from mwdcal.use.correction import (
+    EXTRAPOLATED,
     JUDGED,
-    MARK,
     NAMES,
-    Tally,
+    RowCounts,
     check_outside,
     findings,
     numbers,
@@ -82,7 +82,7 @@ class Corrected(NamedTuple):
 
     rendered: Any
     size: int
-    tally: Tally
+    tally: RowCounts
 
 
 def in_parts(readings: Path, output: Path, decimal: str) -> bool:
@@ -102,7 +102,7 @@ def apply_to_file(
     least: int = MANY,
     missing: str = "refuse",
     decimal: str = ".",
-) -> tuple[Tally, list[Finding]]:
+) -> tuple[RowCounts, list[Finding]]:
     """Correct a file into another; what was seen in the rows, and what the reader should know.
 
     `advance` is told how much of the whole is done. `rows` of a part of a Parquet table, by
@@ -199,12 +199,12 @@ def _loaded(source: Source, piece: Any) -> Part:
         return source.load(piece, True)
 
 
-def _total(tallies: Sequence[Tally]) -> Tally:
+def _total(tallies: Sequence[RowCounts]) -> RowCounts:
     moved = {name for tally in tallies for name in tally.moved}
     rows, beyond, lacking = np.sum([(t.rows, t.beyond, t.lacking) for t in tallies], 0).tolist()
     serials = runs.serials({}, chain.from_iterable(tally.serials for tally in tallies))
     lows, highs = zip(*(tally.warmth for tally in tallies), strict=True)
-    return Tally(
+    return RowCounts(
         rows, beyond, tuple(name for name in JUDGED if name in moved), lacking, tuple(serials),
         strengths.total(tally.strengths for tally in tallies), (min(lows), max(highs)),
     )  # fmt: skip
@@ -267,7 +267,7 @@ class _Worker:
         arrow, _ = parquet.modules(output.name)
         metadata = {**self.source.metadata, **described(self.calibration)}
         suffix, outside = output.suffix.lower(), self.rules.outside
-        kinds = {name: arrow.float64() for name in NAMES} | {MARK: arrow.bool_()}
+        kinds = {name: arrow.float64() for name in NAMES} | {EXTRAPOLATED: arrow.bool_()}
         results = arrow.schema([(name, kinds[name]) for name in result_names(outside)])
         if suffix == ".parquet":
             return ParquetSink(stream, self.source.schema, results, metadata)
@@ -277,7 +277,9 @@ class _Worker:
         said = self.heard(("\0" * LONGEST, "\1" * LONGEST, "…"))
         worst = strengths.Strengths(_MOST, _MOST, _MOST, _MOST, -1.23e-100, -1.24e-100)
         off = dict.fromkeys(strengths.COLUMNS, worst)
-        tally = Tally(_MOST, _MOST, judged, lacking, (), off, (TEMPERATURE.low, TEMPERATURE.high))
+        tally = RowCounts(
+            _MOST, _MOST, judged, lacking, (), off, (TEMPERATURE.low, TEMPERATURE.high)
+        )
         most = findings(self.calibration, said, tally, how)
         longest = [finding.text for finding in most]
         delimiter = "," if suffix == ".csv" else "\t"
@@ -312,7 +314,7 @@ class _Worker:
         if whole is not None:
             results = [spread(values, whole) for values in results]
         rendered = sink.render(part.carried, results, bool(found.empty) or whole is not None)
-        tally = Tally(
+        tally = RowCounts(
             rows, found.beyond, moved, rows - table.count, self._serials(part.carried),
             strengths.judged(self.calibration, columns, known),
             warmth(channels["temperature"][0] if channels["temperature"] else None),
@@ -332,7 +334,9 @@ class _Worker:
         """What the findings need to know of the source, with the tools that its parts named."""
         return replace(self.said, metadata=runs.identified(self.source.metadata, serials))
 
-    def _found(self, table: Table) -> tuple[dict[str, list[Array] | None], correction_numba.Found]:
+    def _found(
+        self, table: Table
+    ) -> tuple[dict[str, list[Array] | None], correction_numba.CorrectedRows]:
         """The channels of a table, and what is made of them."""
         channels = self._channels(table)
         compute = self._compiled if self.triads else self._plain
@@ -355,17 +359,17 @@ class _Worker:
                 raise _blank(self.source.load(self.first, True).table, names)
         return found
 
-    def _limits(self) -> correction_numba.Limits:
+    def _limits(self) -> correction_numba.RowLimits:
         low, high = self.calibration.temperature_c or (-np.inf, np.inf)
         if self.said.temperature is None:
             low, high = -np.inf, np.inf
         accepted = (RAW_RANGE.low, RAW_RANGE.high), (TEMPERATURE.low, TEMPERATURE.high)
         warmth = low - self.calibration.margin, high + self.calibration.margin
-        return correction_numba.Limits(*accepted, warmth, self.rules.outside == "blank")
+        return correction_numba.RowLimits(*accepted, warmth, self.rules.outside == "blank")
 
     def _compiled(
         self, channels: Mapping[str, list[Array] | None], count: int
-    ) -> correction_numba.Found:
+    ) -> correction_numba.CorrectedRows:
         assert self.triads is not None
         columns, units, blank = [], [], 0
         for kind, (order, unit) in zip(TRIADS, self.tool, strict=True):
@@ -380,7 +384,7 @@ class _Worker:
 
     def _plain(
         self, channels: Mapping[str, list[Array] | None], count: int
-    ) -> correction_numba.Found:
+    ) -> correction_numba.CorrectedRows:
         """The same by plain NumPy, a block at a time."""
         limits, out = self._limits(), np.empty((len(NAMES), count))
         beyond = unsound = 0
@@ -395,7 +399,7 @@ class _Worker:
             beyond += int(hot.sum())
             if limits.blank:
                 out[:, rows][:, hot] = np.nan
-        return correction_numba.Found(out, unsound, beyond, int(np.isnan(out).sum()))
+        return correction_numba.CorrectedRows(out, unsound, beyond, int(np.isnan(out).sum()))
 
     def _readings(self, channels: Mapping[str, list[Array] | None], rows: slice) -> Readings:
         """Some rows as `Readings`, without labels and references."""

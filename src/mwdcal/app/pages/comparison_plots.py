@@ -13,8 +13,9 @@ import numpy as np
 
 from mwdcal.app.pages import plots
 from mwdcal.calibration.methods import EVIDENCE
-from mwdcal.comparison.common_gauge import SCALE, TURNS
+from mwdcal.comparison.common_gauge import SCALE
 from mwdcal.comparison.compare import Comparison, Row, able
+from mwdcal.estimation.uncertainty import ROTATIONS
 from mwdcal.geometry.vectors import Array
 
 if TYPE_CHECKING:
@@ -70,7 +71,9 @@ def places(found: Comparison, triad: str) -> list[Place]:
             title = f"{title}·{course}" if power else title
             result.append(Place(triad, title, f"{units[key]}{per}", key, (i, j)))
     for name in found.gauge.get(triad, []):
-        key, at, unit = (name, 0, "") if name == SCALE else ("rotation_deg", TURNS.index(name), "°")
+        key, at, unit = (
+            (name, 0, "") if name == SCALE else ("rotation_deg", ROTATIONS.index(name), "°")
+        )
         result.append(Place(triad, name, unit, key, (at,)))
     return result
 

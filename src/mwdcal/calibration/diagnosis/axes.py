@@ -20,9 +20,9 @@ from mwdcal.estimation.solvers import Status
 from mwdcal.geometry.vectors import Array
 from mwdcal.sensor.profile import Profile
 
-NEAR = 0.3
+CROSS_GAIN = 0.3
 """Largest gain across the axes, as a share of those along them, of a triad in its right axes."""
-FITS = 0.05
+FITTING_SHARE = 0.05
 """Residuals of a run in its right axes are less than this share of the field."""
 SIGNED = np.array(
     [
@@ -59,28 +59,30 @@ def named(permutation: Array) -> tuple[str, ...]:
 def explaining(readings: Readings, profile: Profile) -> dict[str, tuple[str, ...]]:
     """The `axes` with which a run fits, by triad, where they are not those of the profile."""
     try:
-        found = fit(readings)
+        result = fit(readings)
     except (MwdcalError, np.linalg.LinAlgError):
         return {}
-    if found.status[0] != Status.OK or not _fits(found):
+    if result.status[0] != Status.OK or not _fits(result):
         return {}
-    if any(map(is_bad, free_directions(found.problem, found.state, found.analysis.determined))):
+    if any(
+        map(is_bad, free_directions(result.problem, result.state, result.analysis.determined)[0])
+    ):
         return {}
-    result = {}
-    for index, gain in enumerate(_gains(found)):
-        name, turned = TRIADS[index], index == 1 and np.isfinite(overturned(found)[0])
-        gain = -gain if turned else gain
-        own = nearest(gain)
-        if not _is_near(gain @ own.transpose()):
+    axes = {}
+    for index, gain in enumerate(_gains(result)):
+        name, reversed_ = TRIADS[index], index == 1 and np.isfinite(overturned(result)[0])
+        gain = -gain if reversed_ else gain
+        permutation = nearest(gain)
+        if not _is_near(gain @ permutation.transpose()):
             return {}
-        if not np.array_equal(own, np.eye(3)):
-            result[name] = named(own @ getattr(profile, name).permutation)
-    return result
+        if not np.array_equal(permutation, np.eye(3)):
+            axes[name] = named(permutation @ getattr(profile, name).permutation)
+    return axes
 
 
-def _gains(found: Fit) -> list[Array]:
+def _gains(result: Fit) -> list[Array]:
     """Mean gain (3, 3) of each triad."""
-    problem, params = found.problem, found.state.params
+    problem, params = result.problem, result.state.params
     return [
         np.asarray(t.model.slope(params[:, where], t.raw, problem.temperature)[0].mean(0))
         for t, where in zip(problem.triads, problem.slices(), strict=True)
@@ -89,16 +91,16 @@ def _gains(found: Fit) -> list[Array]:
 
 def _is_near(gain: Array) -> bool:
     """Whether a gain is along its axes."""
-    own = np.diagonal(gain)
-    across = np.abs(gain - np.diag(own)).max()
-    return bool(own.min() > 0 and across < NEAR * own.min())
+    along = np.diagonal(gain)
+    across = np.abs(gain - np.diag(along)).max()
+    return bool(along.min() > 0 and across < CROSS_GAIN * along.min())
 
 
-def _fits(found: Fit) -> bool:
+def _fits(result: Fit) -> bool:
     """Whether the readings are explained at all."""
-    for index, triad in enumerate(found.problem.triads):
-        noise = np.sqrt(found.analysis.variance_factor[0, index]) * triad.sd.mean()
+    for index, triad in enumerate(result.problem.triads):
+        noise = np.sqrt(result.analysis.variance_factor[0, index]) * triad.sd.mean()
         size = np.linalg.norm(triad.raw[0] - triad.raw[0].mean(0), axis=-1).mean()
-        if not noise < FITS * size:
+        if not noise < FITTING_SHARE * size:
             return False
     return True

@@ -1,34 +1,52 @@
-"""What a fit may not say, however well it fits: a field that is nowhere on Earth, errors left over.
-
-Functions on arrays with the batch axis first find it, for one run and for a fleet alike; `checks`
-puts it into words.
-"""
+"""How plausible fits are, as arrays with a leading tool axis: refusals and findings put it into words."""
 
 from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
 
 import numpy as np
 
 from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.readings import EARTH, Readings
-from mwdcal.calibration.residuals import Residuals
+from mwdcal.calibration.residuals import RESHOOT, Residuals, chances, chi_chance, tail, to_reshoot
+from mwdcal.estimation.batch import take
+from mwdcal.estimation.minimisers import closed_form
+from mwdcal.estimation.problem import Prior
 from mwdcal.estimation.rank import Free
-from mwdcal.geometry.vectors import Array, Bools, centred
+from mwdcal.estimation.solvers import Determined
+from mwdcal.estimation.uncertainty import ROTATIONS, TESTED, effective_freedom, station_misfit
+from mwdcal.geometry.vectors import Array, Bools, Ints, centred, eigen
 
-BENIGN = ("rotation-x", "rotation-y", "toolface-zero", "scale")
+BENIGN_DIRECTIONS = (*ROTATIONS, "scale")
 """Directions that may stay free."""
-EXCESS = 10.0
-"""An error after calibration of more than this many times its expectation is no error of a sensor."""
-CERTAIN = 4.0
+EXCESS_RATIO = 10.0
+"""An error after calibration of more than this many times its expectation is not a sensor's."""
+DIP_CERTAINTY = 4.0
 """Standard uncertainties by which a dip must lie beyond vertical, not to be noise at a pole."""
-STRAY = 5.0
+STRAY_DEVIATIONS = 5.0
 """Standard deviations of one reading's residual from which the errors of a run are looked at."""
-SMALLEST = 1e-12
+SMALLEST_EXPECTATION = 1e-12
 """Expectations below this, in the observable's own unit, are rounding."""
+NOISE_RATIO = 3.0
+"""Residuals of a robust fit that exceed the declared noise this many times are reported."""
+CALM_FREEDOM = 12.0
+"""Degrees of freedom from which residuals far below the declared noise are not a coincidence."""
+MISFIT_CHANCE = 1e-3
+"""Chance of so large residuals, or of so large a departure from the prior, below which it is reported."""
+LOW_WEIGHT = 0.1
+"""A station of less weight than this in a robust fit is reported."""
+SCATTER_SHARE = 3e-4
+"""A scatter from station to station beyond this share, or radians, is a finding."""
+VARIANCE_RIDGE = 1e-9
+"""What is added to variances (of whitened readings: 0…1), so that they have an inverse."""
+LEEWAY = 1.01
+"""A station is suspect already if a bound is as unlikely as this many times the limit."""
 
 
 def is_bad(direction: Free) -> bool:
     """Whether a free direction means that the design is too weak."""
-    return direction.id.partition("-temperature-")[0] not in BENIGN
+    return direction.id.partition("-temperature-")[0] not in BENIGN_DIRECTIONS
 
 
 def gain_shares(result: Fit, index: int) -> tuple[Array, Array]:
@@ -68,18 +86,18 @@ def overturned(result: Fit) -> Array:
     Definition: with a known azimuth somewhere, north of the field and of the azimuths are then
     opposite. Where no azimuth is known the same field has a dip within ±90° and is not meant.
     """
-    problem, found = result.problem, np.full(len(result.status), np.nan)
+    problem, dips = result.problem, np.full(len(result.status), np.nan)
     if len(problem.triads) == 1:
-        return found
-    told = problem.evidence.is_known("azimuth").any(-1)
+        return dips
+    referenced = problem.evidence.is_known("azimuth").any(-1)
     for index, constant in enumerate(problem.evidence.constants):
         if constant.name != "dip" or not constant.unknown:
             continue
         dip = centred(result.state.constants[:, index], 2 * np.pi)
         sd = np.sqrt(np.nan_to_num(result.analysis.constants[:, index, index]))
-        beyond = np.abs(dip) - np.pi / 2 > CERTAIN * np.minimum(sd, 1.0)
-        found = np.where(told & beyond, dip, found)
-    return np.asarray(found)
+        beyond = np.abs(dip) - np.pi / 2 > DIP_CERTAINTY * np.minimum(sd, 1.0)
+        dips = np.where(referenced & beyond, dip, dips)
+    return np.asarray(dips)
 
 
 def excessive_errors(readings: Readings, result: Fit) -> dict[str, tuple[float, float]]:
@@ -93,7 +111,7 @@ def excessive_errors(readings: Readings, result: Fit) -> dict[str, tuple[float, 
     squares = np.nan_to_num(analysis.variance_factor[0]) * np.maximum(analysis.freedom[0], 0)
     misfit = np.sqrt(max(squares.sum() / max(analysis.freedom[0].sum(), 1.0), 1.0))
     residuals, weight = Residuals(readings, result), result.trust[0]
-    found = {}
+    excessive = {}
     for name in residuals.names():
         after, expected = residuals.errors(name, residuals.after), residuals.expected(name)
         known = ~np.isnan(after + expected) & (weight > 0)
@@ -103,14 +121,141 @@ def excessive_errors(readings: Readings, result: Fit) -> dict[str, tuple[float, 
             float(np.sqrt(np.average(e[known] ** 2, weights=weight[known] ** 2)))
             for e in (after, expected)
         ]
-        if both[0] > EXCESS * max(both[1] * misfit, SMALLEST):
-            found[name] = (both[0], float(both[1] * misfit))
-    return found
+        if both[0] > EXCESS_RATIO * max(both[1] * misfit, SMALLEST_EXPECTATION):
+            excessive[name] = (both[0], float(both[1] * misfit))
+    return excessive
 
 
 def straying(result: Fit) -> Bools:
     """Members (B,) of which a reading is so far off that their errors have to be looked at."""
     analysis = result.analysis
     variance = np.diagonal(analysis.spread, axis1=-2, axis2=-1)
-    stray = analysis.residual**2 > STRAY**2 * np.maximum(variance, 1e-30)
+    stray = analysis.residual**2 > STRAY_DEVIATIONS**2 * np.maximum(variance, 1e-30)
     return np.asarray(stray.any((-1, -2)))
+
+
+def misfit_chances(result: Fit) -> Array:
+    """Chance (B, t) of residuals as large as each triad's, if noise and stand are as declared.
+
+    NaN where noise was estimated, nothing is redundant, or station weights hide what is large.
+    """
+    problem, analysis = result.problem, result.analysis
+    freedom = analysis.freedom
+    if not closed_form.applies(problem) and analysis.influence is None:
+        freedom = effective_freedom(problem, result.state, analysis)
+    untested = np.isfinite(result.noise) | unchecked(result) | robust(result)[:, None]
+    freedom = np.where(untested, 1.0, freedom)
+    return np.where(untested, np.nan, chi_chance(analysis.variance_factor * freedom, freedom))
+
+
+def robust(result: Fit) -> Bools:
+    """Fits (B,) with station weights."""
+    return np.asarray((result.trust != 1).any(-1))
+
+
+def excessive(result: Fit, chance: Array) -> Bools:
+    """Triads (B, t) whose residuals noise and stand do not explain, by `misfit_chances`."""
+    weighed = robust(result)[:, None] & np.isnan(result.noise) & ~unchecked(result)
+    large = weighed & (result.analysis.variance_factor > NOISE_RATIO**2)
+    return np.asarray(large | (np.nan_to_num(chance, nan=1.0) < MISFIT_CHANCE))
+
+
+def calm(result: Fit) -> Bools:
+    """Triads (B, t) whose residuals are less than the declared noise over `NOISE_RATIO`."""
+    tested = np.isnan(result.noise) & (result.analysis.freedom >= CALM_FREEDOM)
+    return np.asarray(tested & (result.analysis.variance_factor < NOISE_RATIO**-2))
+
+
+def unchecked(result: Fit) -> Bools:
+    """Triads (B, t) without redundancy."""
+    return np.asarray(result.analysis.freedom < 1)
+
+
+def copies(result: Fit) -> Bools:
+    """Stations (B, n) whose readings are those of an earlier one of the same run, to the last digit."""
+    problem = result.problem
+    rows = np.concatenate([*(t.raw for t in problem.triads), problem.temperature[..., None]], -1)
+    key = np.sort(np.einsum("bnk,k->bn", rows, np.sqrt(2.0 + np.arange(rows.shape[-1]))), -1)
+    repeated = np.zeros(rows.shape[:-1], bool)
+    for member in np.flatnonzero(np.any(np.diff(key, axis=-1) == 0, -1)):
+        _, first, place = np.unique(rows[member], axis=0, return_index=True, return_inverse=True)
+        repeated[member] = first[place.ravel()] != np.arange(len(repeated[member]))
+    return repeated
+
+
+def scattered(result: Fit) -> Bools:
+    """Whether (B,) strengths, dip or the directions of groups vary from station to station."""
+    sizes = [value.max(-1) for value in result.problem.evidence.scatter.values()]
+    return np.asarray(np.max([np.zeros(len(result.status)), *sizes], 0) > SCATTER_SHARE)
+
+
+def distrusted(result: Fit) -> Bools:
+    """Stations (B, n) that a robust fit has nearly left out."""
+    return np.asarray(result.trust < LOW_WEIGHT)
+
+
+def without_prior(result: Fit) -> Fit:
+    """The fit with only those directions determined that the run itself determines."""
+    prior = result.problem.prior
+    bare = replace(result.problem, prior=Prior(0 * prior.precision, prior.expected))
+    determined = Determined.of(bare, result.state)
+    return replace(result, problem=bare, analysis=replace(result.analysis, determined=determined))
+
+
+def departures(result: Fit) -> tuple[Array, Ints]:
+    """The χ² (B,) of the departure from the prior, Λd with covariance Λ - ΛCΛ, and its freedom."""
+    prior, covariance = result.problem.prior, result.analysis.covariance
+    precision, away = prior.precision, result.state.params - prior.expected
+    spread = precision - precision @ covariance @ precision
+    scale = np.sqrt(np.maximum(np.diagonal(precision, axis1=-2, axis2=-1), 1e-300))
+    values, vectors = eigen(spread / (scale[:, :, None] * scale[:, None, :]))
+    pull = (precision @ away[..., None])[..., 0] / scale
+    along = np.einsum("bij,bi->bj", vectors, pull) ** 2
+    tested = values > 1e-6
+    square = np.sum(np.where(tested, along / np.where(tested, values, 1.0), 0.0), -1)
+    return square, np.sum(tested, -1)
+
+
+def conflicting(square: Array, freedom: Ints) -> Bools:
+    """Whether departures (B,) from the prior are unlikely."""
+    return np.asarray(tail(square, np.maximum(freedom, 1)) <= MISFIT_CHANCE)
+
+
+def stations_to_reshoot(result: Fit) -> Bools:
+    """Stations (B, n) to take again: `to_reshoot`, asked only where a bound allows it to be true."""
+    again = np.zeros(result.analysis.residual.shape[:2], bool)
+    some = np.flatnonzero(_suspects(result))
+    if some.size:
+        again[some] = to_reshoot(chances(take(result, some)))
+    return again
+
+
+def _suspects(result: Fit) -> Bools:
+    """Members (B,) of which some station's misfit may be too large.
+
+    With declared noise and no robust weights χ² itself must be. It is bounded from above by what
+    the trace of the residuals' covariance says, whose eigenvalues are 0…1, then by its inverse.
+    """
+    analysis = result.analysis
+    residual, spread = analysis.residual, analysis.spread
+    size, chance = spread.shape[-1], RESHOOT / len(result.trust[0])
+    suspect = np.any(~np.isnan(result.noise), -1) | robust(result)
+    smallest = np.trace(spread, axis1=-2, axis2=-1) - (size - 1)
+    good = np.sum(residual**2, -1) < likely(size, chance) * smallest
+    good &= (smallest > TESTED) & (analysis.influence is None)
+    tool, station = np.nonzero(~good & ~suspect[:, None])
+    left = residual[tool, station]
+    whole = spread[tool, station] + VARIANCE_RIDGE * np.eye(size)
+    bound = np.sum(left * np.linalg.solve(whole, left[..., None])[..., 0], -1)
+    large = bound > likely(1, chance)
+    tool, station, left = tool[large], station[large], left[large]
+    some = replace(analysis, residual=left[None], spread=spread[None, tool, station])
+    suspect[tool[tail(*station_misfit(some))[0] < LEEWAY * chance]] = True
+    return np.asarray(suspect)
+
+
+@cache
+def likely(freedom: int, chance: float) -> float:
+    """A χ² that is exceeded with more than this chance, to 0.1."""
+    steps = 0.1 * np.arange(2001.0)
+    return float(steps[np.sum(tail(steps, np.full(len(steps), freedom)) > LEEWAY * chance) - 1])

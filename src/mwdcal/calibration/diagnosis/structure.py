@@ -18,7 +18,7 @@ import numpy as np
 from mwdcal.calibration.automatic.courses import TRIED, steady_columns, temperature_powers
 from mwdcal.calibration.covariance import variance_scales
 from mwdcal.calibration.estimate import Fit
-from mwdcal.calibration.evidence import TURNS, acts_on
+from mwdcal.calibration.evidence import STAND_TURNS, acts_on
 from mwdcal.calibration.readings import TRIADS
 from mwdcal.calibration.residuals import chances, to_reshoot
 from mwdcal.calibration.soaks import HIGHEST, SPAN, highest_order
@@ -26,28 +26,28 @@ from mwdcal.estimation.problem import Problem, State
 from mwdcal.estimation.uncertainty import whole_covariance
 from mwdcal.geometry.vectors import Array, Bools, eigen
 
-UNLIKELY = 1e-4
+EFFECT_CHANCE = 1e-4
 """Chance of so much common structure in noise, below which an effect is named."""
-WORTH = 0.01
+STRUCTURE_CHANCE = 0.01
 """Chance of residuals as large in declared noise, below which their structure is looked at."""
-FEW = 0.1
+BAD_SHARE = 0.1
 """Share of bad stations up to which they are left out."""
-APART = 1e-3
+LEFT_BY_FIT = 1e-3
 """A column counts if the fit leaves this share of its square: what is left of others is rounding."""
-STAND = ("azimuth-zero", "inclination-zero", "tilt")
+STAND_EFFECTS = ("azimuth-zero", "inclination-zero", "tilt")
 """Errors of the stand that leave residuals; a toolface zero does not."""
 DRIFTS = 2
 """Degree of the polynomial of order (or of the row) that a drift is looked for as."""
 
 
-SET = 3
+SMALLEST_SET = 3
 """Fewest stations of one direction that may share an error of its setting."""
 SET_TURNS = ("inclination-zero", "azimuth-zero")
-COURSE = "-temperature"
+COURSE_SUFFIX = "-temperature"
 """What ends the names of the powers of temperature that the order of a triad leaves out."""
 ZEROS = ("azimuth-zero", "inclination-zero", "dip-reference")
 """Effects that are one angle."""
-TEXTS = {
+EFFECTS = {
     "azimuth-zero": "an azimuth zero of the stand: set the index, or fit it with --estimate azimuth-zero, or declare "
     "its uncertainty (azimuth_zero_deg under [stand])",
     "inclination-zero": "an inclination zero of the stand: set the level, or fit it with --estimate inclination-zero, "
@@ -114,7 +114,7 @@ class _Scores:
     def _spanned(self, names: list[str]) -> tuple[Array, Array, Array]:
         index = self._index(names)
         value, vector = eigen(self.information[np.ix_(index, index)])
-        return value, vector, np.asarray(value > APART)
+        return value, vector, np.asarray(value > LEFT_BY_FIT)
 
     def _index(self, names: list[str]) -> Array:
         return np.concatenate([np.arange(self.places[n].start, self.places[n].stop) for n in names])
@@ -138,9 +138,9 @@ def effects(result: Fit) -> list[Effect]:
     shown: list[tuple[str, float, float]] = []
     while True:
         trials = {n: _trial(scores, chosen, n, left, freedom - used) for n in scores.places}
-        open_ = {n: t for n, t in trials.items() if n not in chosen and t[0] < UNLIKELY}
+        open_ = {n: t for n, t in trials.items() if n not in chosen and t[0] < EFFECT_CHANCE}
         if not open_:
-            return [e for e in _described(result, shown) if not e.name.endswith(COURSE)]
+            return [e for e in _described(result, shown) if not e.name.endswith(COURSE_SUFFIX)]
         best = min(open_, key=lambda name: (open_[name][0], -open_[name][1]))
         chance, gain, directions = open_[best]
         chosen, left, used = [*chosen, best], left - gain, used + directions
@@ -150,7 +150,7 @@ def effects(result: Fit) -> list[Effect]:
 def _without_bad_stations(result: Fit) -> Fit:
     """The fit less its stations to take again, if they are few: one bad station looks like anything."""
     bad = to_reshoot(chances(result))
-    if bad.mean() > FEW:
+    if bad.mean() > BAD_SHARE:
         return result
     evidence = result.problem.evidence
     fewer = replace(evidence, include=evidence.include * ~bad)
@@ -162,8 +162,10 @@ def _misfit(problem: Problem, result: Fit) -> tuple[float, float]:
     linear, include = problem.linear(result.state), problem.evidence.include
     whole, normal = whole_covariance(linear, result.analysis.determined)[0], linear.normal
     gradient = normal.gradient[0]
-    own = problem.linear(result.state, geometry=True).own
-    unknown = np.sum(np.linalg.svd(own, compute_uv=False) > 1.0)  # 0 where a station is left out
+    private = problem.linear(result.state, geometry=True).own
+    unknown = np.sum(
+        np.linalg.svd(private, compute_uv=False) > 1.0
+    )  # 0 where a station is left out
     readings = float(include.sum()) * linear.residual.shape[-1]
     fitted = np.sum(whole * (normal.information - linear.prior)[0])
     return float(normal.cost[0] - gradient @ whole @ gradient), readings - float(fitted + unknown)
@@ -199,18 +201,18 @@ def _described(result: Fit, shown: list[tuple[str, float, float]]) -> list[Effec
     gain, directions = scores.gain(names)
     scale = np.sqrt(max(left - gain, 0.0) / max(freedom - directions, 1.0))
     values, covariance = scores.solution(names)
-    spread, found, at = np.sqrt(np.diag(covariance)) * scale, [], 0
+    spread, sized, at = np.sqrt(np.diag(covariance)) * scale, [], 0
     for name, share, chance in shown:
         where = scores.places[name]
-        own = slice(at, at + where.stop - where.start)
-        at = own.stop
-        change = (scores.columns[..., where] * scores.length[where]) @ values[own]
+        columns = slice(at, at + where.stop - where.start)
+        at = columns.stop
+        change = (scores.columns[..., where] * scores.length[where]) @ values[columns]
         size = [
             np.sqrt(np.mean(np.sum((change[..., 3 * i : 3 * i + 3] * t.sd) ** 2, -1)))
             for i, t in enumerate(problem.triads)
         ]
-        found.append(Effect(name, share, chance, values[own], spread[own], np.array(size)))
-    return found
+        sized.append(Effect(name, share, chance, values[columns], spread[columns], np.array(size)))
+    return sized
 
 
 def _scores(problem: Problem, result: Fit, families: Mapping[str, Array]) -> _Scores:
@@ -228,8 +230,10 @@ def _scores(problem: Problem, result: Fit, families: Mapping[str, Array]) -> _Sc
     unit = every / length
     weighed = linear.weigh(unit)
     crossed = np.einsum("bnmu,bnmk->uk", linear.design, weighed)
-    own = linear.normal.gradient[0]
-    score = np.einsum("bnmk,bnm->k", weighed, linear.residual) - crossed.transpose() @ whole @ own
+    gradient = linear.normal.gradient[0]
+    score = (
+        np.einsum("bnmk,bnm->k", weighed, linear.residual) - crossed.transpose() @ whole @ gradient
+    )
     information = np.einsum("bnmk,bnml->kl", unit, weighed)
     information = information - crossed.transpose() @ whole @ crossed
     return _Scores(score, information, length, unit, places)
@@ -243,8 +247,8 @@ def _families(problem: Problem, state: State) -> Iterator[tuple[str, Array]]:
     turns = np.concatenate([p.by_turn * w[..., None] for p, w in pairs], -2)
     by_earth = np.concatenate([p.by_earth * w[..., None] for p, w in pairs], -2)
     known = {n: turn for n, turn in _turns(problem, state, turns).items() if turn.any()}
-    for name in STAND:
-        each = [known[turn] for turn in TURNS.get(name, (name,)) if turn in known]
+    for name in STAND_EFFECTS:
+        each = [known[turn] for turn in STAND_TURNS.get(name, (name,)) if turn in known]
         if each:
             yield name, np.stack(each, -1)
     sets = _sets(problem)
@@ -278,8 +282,8 @@ def _sets(problem: Problem) -> Array:
     pair = np.stack([known["inclination"][0], known["azimuth"][0]], -1)
     key = np.round(np.nan_to_num(pair, nan=-1.0), 6)
     _, number, count = np.unique(key, axis=0, return_inverse=True, return_counts=True)
-    usable = np.flatnonzero(count >= SET)
-    if len(usable) > len(key) / SET:
+    usable = np.flatnonzero(count >= SMALLEST_SET)
+    if len(usable) > len(key) / SMALLEST_SET:
         usable = usable[:0]
     return np.asarray(number.reshape(-1)[:, None] == usable, float)
 
@@ -294,8 +298,8 @@ def _courses(problem: Problem, state: State) -> Iterator[tuple[str, Array]]:
     for index, triad in enumerate(problem.triads):
         order = triad.model.basis.order
         if order < highest:
-            own = columns[..., 6 * index : 6 * index + 6]
-            yield f"{TRIADS[index]}{COURSE}", _products(own, powers[:, order:])
+            of_triad = columns[..., 6 * index : 6 * index + 6]
+            yield f"{TRIADS[index]}{COURSE_SUFFIX}", _products(of_triad, powers[:, order:])
 
 
 def _turns(problem: Problem, state: State, turns: Array) -> dict[str, Array]:
@@ -315,13 +319,13 @@ def _products(columns: Array, factors: Array) -> Array:
 
 def _approach(problem: Problem) -> dict[str, Array]:
     """From which side (n, 1) each angle of the stand was reached: 1, -1, or 0 where it did not move."""
-    found = {}
+    sides = {}
     for name in ("inclination", "azimuth", "toolface"):
         angle = problem.evidence.known[name][0]
         step = np.diff(angle, prepend=angle[:1])
         step = np.nan_to_num((step + np.pi) % (2 * np.pi) - np.pi)
-        found[f"{name}-zero"] = np.where(np.abs(step) > 1e-6, np.sign(step), 0.0)[:, None]
-    return found
+        sides[f"{name}-zero"] = np.where(np.abs(step) > 1e-6, np.sign(step), 0.0)[:, None]
+    return sides
 
 
 def _of_sensor(
@@ -353,14 +357,14 @@ def suspected(result: Fit, chance: Array) -> Bools:
     `chance` (B, t) is that of residuals as large as each triad's, NaN where noise is not declared.
     """
     estimated = np.isfinite(result.noise).any(-1)
-    return np.asarray(estimated | (np.nan_to_num(chance, nan=1.0) < WORTH).any(-1))
+    return np.asarray(estimated | (np.nan_to_num(chance, nan=1.0) < STRUCTURE_CHANCE).any(-1))
 
 
 def described(effect: Effect, unit: str) -> str:
     """An effect in words; `unit` is that of the magnetometer."""
     triad, _, kind = effect.name.partition("-")
-    own = triad in TRIADS
-    looks = TEXTS[kind if own else effect.name]
+    of_triad = triad in TRIADS
+    looks = EFFECTS[kind if of_triad else effect.name]
     if effect.name in ZEROS:
         size = f"{np.degrees(effect.values[0]):+.3g}° ± {np.degrees(effect.uncertainties[0]):.2g}°"
         size += (
@@ -373,8 +377,8 @@ def described(effect: Effect, unit: str) -> str:
     else:
         parts = [(1e3, "mg"), (1.0, unit)][: len(effect.size)]
         each = [f"{s * f:.3g} {u} rms" for s, (f, u) in zip(effect.size, parts, strict=True)]
-        size = " and ".join(each[TRIADS.index(triad) :][:1] if own else each)
-    whose = f"{triad}: the" if own else "The"
+        size = " and ".join(each[TRIADS.index(triad) :][:1] if of_triad else each)
+    whose = f"{triad}: the" if of_triad else "The"
     return (
         f"{whose} residuals look like {looks}. Size {size}, {effect.share:.0%} of the misfit; chance in "
         f"noise {effect.chance:.0e}."

@@ -7,7 +7,7 @@ linear in Φ = [S o], separately for each axis, and the model's own parameters �
 
 so that all covariances and ranks are products of 3 × 3 and 4 × 4 matrices. These are the same
 figures as the general way gives, for a hundredth of the work; they are tested against it. Moosavi's
-factors come apart by axis as well: `separable` has them.
+factors come apart by axis as well (`closed_form_factors`).
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ import numpy as np
 
 from mwdcal.estimation.minimisers import closed_form_factors
 from mwdcal.estimation.problem import GEOMETRIC_NOISE, Problem, State, Triad
+from mwdcal.estimation.regression import regress
 from mwdcal.estimation.solvers import RANK_TOLERANCE, Determined
 from mwdcal.estimation.uncertainty import Analysis
-from mwdcal.geometry.vectors import Array, Bools, eigen, eigenvalues, inverse, tool_from_earth
-from mwdcal.sensor.models import Factors, Polynomial
+from mwdcal.geometry.vectors import Array, Bools, eigenvalues, inverse, tool_from_earth
+from mwdcal.sensor.models import Factors, Polynomial, affine_terms
 
-ORDER = np.array([4 * i + j for i in range(3) for j in range(3)] + [4 * i + 3 for i in range(3)])
-"""Places of the parameters (gains row by row, then offsets) among those of Θ, row by row."""
-SPANNED = 1e-6
-"""Smallest eigenvalue of the normalised 4 × 4 information with which this way is taken."""
+_ROWS = np.arange(12).reshape(3, 4)
+PLACES = affine_terms(_ROWS[:, :3], _ROWS[:, 3])
+"""Places of the parameters among the elements of Θ, row by row."""
 
 
 def applies(problem: Problem) -> bool:
@@ -51,7 +51,7 @@ def _is_closed(triad: Triad) -> bool:
 
 
 @dataclass(frozen=True)
-class Half:
+class AffineMinimum:
     """One triad: terms f̃ = [f 1] (B, n, 4), Φ (B, 3, 4), F⁻¹ by axis (B, 3, 4, 4), M and T.
 
     `include` (B, n, 1) is 1 for stations that count; `left` (B, n, 3) are whitened residuals, `open`
@@ -71,7 +71,7 @@ class Half:
     @property
     def params(self) -> Array:
         """Parameters (B, 12) of the model."""
-        return np.asarray(self.turn[:, :3].reshape(-1, 12)[:, ORDER])
+        return np.asarray(self.turn[:, :3].reshape(-1, 12)[:, PLACES])
 
     @property
     def covariance(self) -> Array:
@@ -80,7 +80,7 @@ class Half:
         outer = self.back[:, :, None] * self.back[:, None]
         whole = outer.reshape(-1, 9, 3) @ inner.reshape(-1, 3, 16)
         whole = np.swapaxes(whole.reshape(-1, 3, 3, 4, 4), 2, 3).reshape(-1, 12, 12)
-        return np.asarray(whole[:, ORDER[:, None], ORDER])
+        return np.asarray(whole[:, PLACES[:, None], PLACES])
 
     @property
     def known(self) -> tuple[Array, Array]:
@@ -103,29 +103,29 @@ class Half:
             for m, s in zip(parts, sizes, strict=True)
         ]
         squares, norms = (np.einsum("bi,bj->bij", *p).reshape(batch, 12) for p in (pair, sizes))
-        return np.sqrt(np.clip(squares, 0, None)), norms[:, ORDER]
+        return np.sqrt(np.clip(squares, 0, None)), norms[:, PLACES]
 
 
-Halves = list[Half | closed_form_factors.Half]
+Minima = list[AffineMinimum | closed_form_factors.FactorsMinimum]
 
 
-def halves(problem: Problem, at: State) -> Halves:
+def minima(problem: Problem, at: State) -> Minima:
     """The minimum of each triad at known attitudes, where the stations span what a model needs."""
     include = problem.evidence.include
     pairs = list(zip(problem.triads, problem.targets(at), strict=False))
     factored = [pair for pair in pairs if isinstance(pair[0].model, Factors)]
-    apart = iter(closed_form_factors.halves(factored, problem.temperature, include))
+    apart = iter(closed_form_factors.minima(factored, problem.temperature, include))
     return [
         next(apart)
         if isinstance(triad.model, Factors)
-        else _half(triad, target, include[..., None])
+        else _affine_minimum(triad, target, include[..., None])
         for triad, target in pairs
     ]
 
 
-def settled(halfs: Halves) -> Bools:
+def settled(triads: Minima) -> Bools:
     """Members (B,) of which all triads are at their minimum."""
-    return np.asarray(np.all([half.settled for half in halfs], axis=0))
+    return np.asarray(np.all([triad.settled for triad in triads], axis=0))
 
 
 def start(problem: Problem) -> State:
@@ -139,44 +139,36 @@ def start(problem: Problem) -> State:
     return State(np.zeros((batch, size)), attitude, nothing, own)
 
 
-def solution(problem: Problem, at: State, halfs: Halves) -> tuple[State, Analysis]:
+def solution(problem: Problem, at: State, triads: Minima) -> tuple[State, Analysis]:
     """State and analysis at the minimum."""
     include = problem.evidence.include
-    state = replace(at, params=np.concatenate([h.params for h in halfs], -1))
+    state = replace(at, params=np.concatenate([h.params for h in triads], -1))
     p = state.params.shape[-1]
     covariance = np.zeros((len(include), p, p))
-    for half, where in zip(halfs, problem.slices(), strict=True):
-        covariance[:, where, where] = half.covariance
-    left, free = (np.concatenate([getattr(h, n) for h in halfs], -1) for n in ("left", "open"))
+    for triad, where in zip(triads, problem.slices(), strict=True):
+        covariance[:, where, where] = triad.covariance
+    left, free = (np.concatenate([getattr(h, n) for h in triads], -1) for n in ("left", "open"))
     spread = np.zeros((*free.shape, free.shape[-1]))
     np.einsum("...ii->...i", spread)[...] = free
     squares, freedom = (
-        np.stack([np.sum(getattr(h, n) ** k, (1, 2)) for h in halfs], -1)
+        np.stack([np.sum(getattr(h, n) ** k, (1, 2)) for h in triads], -1)
         for n, k in (("left", 2), ("open", 1))
     )
     factor = squares / np.where(freedom > 1e-9, freedom, np.nan)
     none = np.zeros((len(include), p, 0))
-    known = determined(halfs)
+    known = determined(triads)
     return state, Analysis(covariance, known, factor, freedom, left, spread, none[:, :0], none)
 
 
-def _half(triad: Triad, target: Array, include: Array) -> Half:
-    terms = np.concatenate([target, np.ones_like(target[..., :1])], -1)
+def _affine_minimum(triad: Triad, target: Array, include: Array) -> AffineMinimum:
     weight = include / triad.sd**2
     alike = bool((weight == weight[..., :1]).all())
-    across, unlike = np.swapaxes(terms, -1, -2), weight[..., :1] if alike else weight
-    information = (across[:, None] * np.swapaxes(unlike, -1, -2)[:, :, None]) @ terms[:, None]
-    size = np.sqrt(np.maximum(np.diagonal(information, axis1=-2, axis2=-1), 1e-300))
-    outer = size[..., :, None] * size[..., None, :]
-    values, vectors = eigen(information / outer)
-    spanned = np.all(values[..., 0] > SPANNED, -1)
-    apart = (vectors / values[..., None, :]) @ np.swapaxes(vectors, -1, -2) / outer
-    spread = np.broadcast_to(apart, (len(terms), 3, 4, 4))
-    forward = np.einsum("bajk,bka->baj", spread, across @ (weight * triad.raw))
+    fit = regress(triad.raw, target, weight[..., :1] if alike else weight)
+    terms, forward, spread = fit.terms, np.swapaxes(fit.forward, -1, -2), fit.cofactor
     left = (triad.raw - terms @ np.swapaxes(forward, -1, -2)) * np.sqrt(weight)
-    share = np.einsum("banj,bnj->bna", terms[:, None] @ apart, terms) * weight
-    return Half(
-        include, terms, forward, spread, *_own(triad, forward), left, include - share, spanned
+    share = np.einsum("banj,bnj->bna", terms[:, None] @ spread, terms) * weight
+    return AffineMinimum(
+        include, terms, forward, spread, *_own(triad, forward), left, include - share, fit.spanned
     )
 
 
@@ -192,10 +184,10 @@ def _own(triad: Triad, forward: Array) -> tuple[Array, Array]:
     return back, turn
 
 
-def determined(halfs: Halves) -> Determined:
+def determined(triads: Minima) -> Determined:
     """How well all triads' parameters are determined; the directions themselves are not worked out."""
     values, norms = (
-        np.concatenate(each, -1) for each in zip(*(h.known for h in halfs), strict=True)
+        np.concatenate(each, -1) for each in zip(*(h.known for h in triads), strict=True)
     )
     values = -np.sort(-values, -1)
     values = values / np.maximum(values[:, :1], 1e-300)

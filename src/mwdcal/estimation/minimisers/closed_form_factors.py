@@ -21,15 +21,13 @@ import numpy as np
 
 from mwdcal.estimation.problem import GEOMETRIC_NOISE, Triad
 from mwdcal.geometry.vectors import Array, Bools, eigenvalues, inverse, solved
-from mwdcal.sensor.models import OFF_DIAGONAL
+from mwdcal.sensor.models import OFF_COLUMNS, OFF_ROWS, factor_params, factor_parts
 
 OTHERS = np.array([[1, 2], [0, 2], [0, 1]])
 """The two axes that an axis is misaligned with."""
-FIRST, SECOND = np.array(OFF_DIAGONAL).transpose()
-"""The axes of each misalignment."""
-STEPS = 12
+MOST_STEPS = 12
 """Most steps to the minimum; a sound run takes three to five."""
-SMALL = 1e-8
+LAST_STEP = 1e-8
 """Step, squared and in standard uncertainties, that is the last: steps shrink quadratically."""
 
 
@@ -92,14 +90,14 @@ def minimum(axes: Axes) -> Point:
     count = axes.phi.shape[-2]
     unknowns = np.zeros((len(axes.raw), 3, 2 * count + 2))
     unknowns[..., 0] = 1.0
-    for turn in range(STEPS):
+    for turn in range(MOST_STEPS):
         scale, unit = axes.predicted(unknowns)
         rows = axes.slopes(scale, unit)
         left = axes.raw - scale * unit
         gradient = rows @ left[..., None]
         information = rows @ np.swapaxes(rows, -1, -2)
         step = solved(information, gradient)
-        settled = np.all(np.sum(step * gradient, (-1, -2)) < SMALL, -1) & (turn > 0)
+        settled = np.all(np.sum(step * gradient, (-1, -2)) < LAST_STEP, -1) & (turn > 0)
         if settled.all():
             break
         unknowns = unknowns + np.where(settled[:, None, None], 0.0, step[..., 0])
@@ -110,7 +108,7 @@ def minimum(axes: Axes) -> Point:
 
 
 @dataclass(frozen=True)
-class Half:
+class FactorsMinimum:
     """One triad at its minimum: factors (B, 6K + 6), their covariance, and what stations show.
 
     `left` (B, n, 3) are whitened residuals, `open` (B, n, 3) their expected variances; `values`
@@ -131,20 +129,22 @@ class Half:
         """Singular values of the evidence, and the norms of its columns."""
         return self.values, self.norms
 
-    def parted(self, count: int) -> list[Half]:
+    def parted(self, count: int) -> list[FactorsMinimum]:
         """As many triads as were put together along the batch axis."""
         arrays, batch = [getattr(self, f.name) for f in fields(self)], len(self.params) // count
         places = [slice(k * batch, (k + 1) * batch) for k in range(count)]
-        return [Half(*(array[place] for array in arrays)) for place in places]
+        return [FactorsMinimum(*(array[place] for array in arrays)) for place in places]
 
 
-def halves(triads: Sequence[tuple[Triad, Array]], temperature: Array, include: Array) -> list[Half]:
+def minima(
+    triads: Sequence[tuple[Triad, Array]], temperature: Array, include: Array
+) -> list[FactorsMinimum]:
     """Every triad, with the vectors it should read, at its minimum.
 
     Triads of one order are done together.
     """
     if len({triad.model.basis.order for triad, _ in triads}) > 1:
-        return [halves([pair], temperature, include)[0] for pair in triads]
+        return [minima([pair], temperature, include)[0] for pair in triads]
     if not triads:
         return []
     count, phi = len(triads), triads[0][0].model.basis(temperature)
@@ -155,10 +155,10 @@ def halves(triads: Sequence[tuple[Triad, Array]], temperature: Array, include: A
         np.concatenate([triad.sd for triad, _ in triads]),
         include := np.concatenate([include] * count),
     )
-    return _half(axes, minimum(axes), include).parted(count)
+    return _minimum(axes, minimum(axes), include).parted(count)
 
 
-def _half(axes: Axes, at: Point, include: Array) -> Half:
+def _minimum(axes: Axes, at: Point, include: Array) -> FactorsMinimum:
     """The analysis at the minimum."""
     spread = inverse(at.information)
     share = np.sum((spread @ at.rows) * at.rows, -2)
@@ -168,7 +168,7 @@ def _half(axes: Axes, at: Point, include: Array) -> Half:
     by_axis = np.swapaxes(back.reshape(batch, size, 3, -1), 1, 2)
     moved = np.swapaxes(by_axis @ spread, 1, 2).reshape(batch, size, size)
     strength = np.linalg.norm(at.scale * (shares @ axes.vectors), axis=-2)[:, None]
-    return Half(
+    return FactorsMinimum(
         params,
         moved @ np.swapaxes(back, -1, -2),
         np.swapaxes(at.left, -1, -2),
@@ -179,7 +179,7 @@ def _half(axes: Axes, at: Point, include: Array) -> Half:
 
 
 def _evidence(rows: Array, louder: Array, slope: Array) -> tuple[Array, Array]:
-    """Singular values and norms (see `Half`), at another noise: ours over it is (B, 3, n)."""
+    """Singular values and norms (see `FactorsMinimum`), at another noise: ours over it is (B, 3, n)."""
     rows *= louder[..., None, :]  # in place: they are large, and done with
     own = rows @ np.swapaxes(rows, -1, -2)
     information = (np.swapaxes(slope, -1, -2) @ own @ slope).sum(1)
@@ -197,20 +197,19 @@ def factors(unknowns: Array) -> tuple[Array, Array, Array]:
     shares[:, np.arange(3)[:, None], OTHERS] = cross
     back = inverse(shares)
     own = np.diagonal(back, axis1=-2, axis2=-1)
-    linear = np.concatenate([scale / own[..., None], bias * own[..., None]], 1)
-    params = np.concatenate(
-        [linear.reshape(batch, -1), -back[:, FIRST, SECOND] / own[:, SECOND]], -1
-    )
-    slope = np.zeros((batch, 3, 2 * count + 2, 6 * count + 6))
-    at, k = np.arange(3)[:, None], np.arange(count)
-    slope[:, at, k, at * count + k] = own[..., None]
-    slope[:, at, count + 2 + k, (3 + at) * count + k] = 1 / own[..., None]
+    params = factor_params(scale / own[..., None], bias * own[..., None], -back / own[:, None, :])
+    slope = np.zeros((batch, 3, 2 * count + 2, params.shape[-1]))
+    scales, biases, misalignments = factor_parts(np.arange(params.shape[-1]))
+    axis, k = np.arange(3)[:, None], np.arange(count)
+    slope[:, axis, k, scales] = own[..., None]
+    slope[:, axis, count + 2 + k, biases] = 1 / own[..., None]
     turn = shares * own[..., None]  # N; dN = N dm N
-    pulled, moved = turn[:, :, FIRST] / own[..., None], turn[:, SECOND]
+    pulled, moved = turn[:, :, OFF_ROWS] / own[..., None], turn[:, OFF_COLUMNS]
     grown = (pulled * np.swapaxes(moved, -1, -2))[:, :, None]
-    by_mixing = slope[..., 6 * count :]
+    by_mixing = np.zeros((batch, 3, 2 * count + 2, 6))
     by_mixing[:, :, :count] = scale[..., None] * grown
     by_mixing[:, :, count + 2 :] = -bias[..., None] * grown
     each = pulled[:, :, None] * moved[:, :, OTHERS].transpose(0, 2, 3, 1)
     by_mixing[:, :, count : count + 2] = each - cross[..., None] * grown
+    slope[..., misalignments[OFF_ROWS, OFF_COLUMNS]] = by_mixing
     return params, shares, slope

@@ -32,30 +32,30 @@ from math import prod
 
 import numpy as np
 
+from mwdcal.estimation.batch import take
 from mwdcal.estimation.solvers import Determined, Normal, Status
-from mwdcal.estimation.uncertainty import COUPLED, free_share
+from mwdcal.estimation.uncertainty import COUPLED, ROTATIONS, free_share
 from mwdcal.geometry.observables import OBSERVABLES, VERTICAL, is_vertical
 from mwdcal.geometry.vectors import AnyArray, Array, ArrayLike, Bools, Ints, inverse, rotation
 from mwdcal.sensor.models import Model
 
 THRESHOLD = 1.5e-6
 """Criterion 22: the largest relative change of a parameter at which the iteration ends."""
-FLOOR = 1e-3
+CRITERION_FLOOR = 1e-3
 """Floor of its denominator, as a share of the change that moves the observables by one unit."""
 BOTH_VERTICAL = 1e-9
 """A vertical reading this close to its reference, rad, has the curvature of the limit."""
-SMALLEST = 1e-12
+SMALLEST_EIGENVALUE = 1e-12
 """Eigenvalues below this share of the largest are taken as that."""
 DECREASE = 1e-4
 """Share of the decrease promised by the gradient with which the line search is content."""
-HALVINGS = 40
-TURNS = ("rotation-x", "rotation-y", "toolface-zero")
-TINY = 1e-5
+MOST_HALVINGS = 40
+TANGENT_STEP = 1e-5
 EPSILON = float(np.finfo(float).eps)
 
 
 @dataclass(frozen=True)
-class Stations:
+class Compared:
     """What is compared: raw (B, n, 3), temperature, gravity, inclination (B, n), weights (B, n, 2).
 
     A reference of weight zero has a harmless value: nothing here is NaN for being unknown.
@@ -72,16 +72,6 @@ class Stations:
         """Which of |g| and inclination count (B, n, 2)."""
         return np.asarray(self.weights > 0)
 
-    def take(self, index: Ints) -> Stations:
-        """The stations of some members of the batch."""
-        return Stations(
-            self.raw[index],
-            self.temperature[index],
-            self.gravity[index],
-            self.inclination[index],
-            self.weights[index],
-        )
-
 
 @dataclass(frozen=True)
 class Local:
@@ -90,10 +80,6 @@ class Local:
     cost: Array
     gradient: Array
     hessian: Array
-
-    def take(self, index: Ints) -> Local:
-        """Those of some members of the batch."""
-        return Local(self.cost[index], self.gradient[index], self.hessian[index])
 
 
 @dataclass(frozen=True)
@@ -140,10 +126,10 @@ def newton(
     lead = np.broadcast_shapes(
         params.shape[:-1], raw.shape[:-2], shares.shape[:-2], model.lead, *shapes
     )
-    stations = _stations(raw, known, shares, lead)
+    stations = _compared(raw, known, shares, lead)
     start = np.broadcast_to(params, (*lead, model.size)).reshape(prod(lead), model.size)
     with np.errstate(all="ignore"):
-        descent = _Descent.at(model.flat(lead), stations, start, limit)
+        descent = _NewtonDescent.at(model.flat(lead), stations, start, limit)
         for _ in range(limit):
             if descent.active.size:
                 descent.step()
@@ -159,7 +145,7 @@ def propagated(gravity: ArrayLike, noise: ArrayLike, stand: ArrayLike = 0.0) -> 
     return np.stack([1 / (2 * strength * sd) ** 2, 1 / ((sd / strength) ** 2 + angle**2)], -1)
 
 
-def _stations(raw: Array, known: list[Array], shares: Array, lead: tuple[int, ...]) -> Stations:
+def _compared(raw: Array, known: list[Array], shares: Array, lead: tuple[int, ...]) -> Compared:
     """Everything with one batch axis; what is not known has weight zero."""
     count = raw.shape[-2]
 
@@ -171,7 +157,7 @@ def _stations(raw: Array, known: list[Array], shares: Array, lead: tuple[int, ..
     weights = np.where(absent, 0.0, flat(shares, 2))
     strong, inclined = weights[..., 0] > 0, weights[..., 1] > 0
     counts = strong | inclined
-    return Stations(
+    return Compared(
         np.where(counts[..., None], flat(raw, 3), np.array([0.0, 0.0, 1.0])),
         np.where(counts, temperature, 0.0),
         np.where(strong, gravity, 1.0),
@@ -218,7 +204,7 @@ def half_square_inclination(g: Array, inclination: Array) -> tuple[Array, Array,
     return error, error[..., None] * up / strength, second
 
 
-def cost(model: Model, params: Array, stations: Stations) -> Array:
+def cost(model: Model, params: Array, stations: Compared) -> Array:
     """E (B,): the mean over stations of both weighted squares."""
     g = model.fields(params, stations.raw, stations.temperature)
     strength = np.sum(g * g, -1) - stations.gravity**2
@@ -227,7 +213,7 @@ def cost(model: Model, params: Array, stations: Stations) -> Array:
     return np.asarray(np.sum(squares, (-1, -2)) / g.shape[-2])
 
 
-def local(model: Model, params: Array, stations: Stations) -> Local:
+def local(model: Model, params: Array, stations: Compared) -> Local:
     """E and its exact derivatives: those of the two squares, chained with those of the model."""
     raw, temperature = stations.raw, stations.temperature
     g = model.fields(params, raw, temperature)
@@ -247,14 +233,14 @@ def local(model: Model, params: Array, stations: Stations) -> Local:
     return Local(0.5 * np.sum(squares, (-1, -2)), gradient, hessian)
 
 
-def determines(model: Model, params: Array, stations: Stations) -> Determined:
+def determines(model: Model, params: Array, stations: Compared) -> Determined:
     """Which directions of parameter space the stations determine, however noisy they are."""
     gram, norms = geometry(model, params, stations)
     nothing = np.zeros_like(params)
     return Determined.by(Normal(gram, nothing, nothing[:, 0], model.size), norms)
 
 
-def geometry(model: Model, params: Array, stations: Stations) -> tuple[Array, Array]:
+def geometry(model: Model, params: Array, stations: Compared) -> tuple[Array, Array]:
     """Information (B, p, p) of what the stations compare, and norms (B, p) of the whole columns.
 
     Rows are the logarithm of |g| and the inclination; at a vertical reference, where the
@@ -275,7 +261,7 @@ def geometry(model: Model, params: Array, stations: Stations) -> tuple[Array, Ar
     return gram, norms
 
 
-def _target(g: Array, stations: Stations) -> Array:
+def _target(g: Array, stations: Compared) -> Array:
     """The vector (B, n, 3) nearest to g of which the known references hold exactly."""
     used, across = stations.used, np.hypot(g[..., 0], g[..., 1])
     strength = np.where(used[..., 0], stations.gravity, np.linalg.norm(g, axis=-1))
@@ -288,7 +274,7 @@ def _target(g: Array, stations: Stations) -> Array:
     )
 
 
-def _rows(target: Array, stations: Stations) -> Array:
+def _rows(target: Array, stations: Compared) -> Array:
     """What each station compares, as rows (B, n, 3, 3) on the field, in units of gravity."""
     along, up, turn = _directions(target)
     used = stations.used[..., None]
@@ -303,7 +289,7 @@ def downhill(here: Local, determined: Determined) -> Array:
     inner = np.swapaxes(kept, -1, -2) @ (here.hessian / _outer(norms, norms)) @ kept
     values, vectors = np.linalg.eigh(inner)
     size = np.abs(values)
-    size = np.maximum(size, SMALLEST * np.max(size, -1, keepdims=True))
+    size = np.maximum(size, SMALLEST_EIGENVALUE * np.max(size, -1, keepdims=True))
     axes = kept @ vectors
     along = np.swapaxes(axes, -1, -2) @ (here.gradient / norms)[..., None]
     length = np.where(size > 0, along[..., 0] / np.where(size > 0, size, 1.0), 0.0)
@@ -311,7 +297,7 @@ def downhill(here: Local, determined: Determined) -> Array:
 
 
 def search(
-    model: Model, params: Array, stations: Stations, here: Local, step: Array
+    model: Model, params: Array, stations: Compared, here: Local, step: Array
 ) -> tuple[Array, Array]:
     """The largest α (B,) of 1, 1/2, 1/4, … that lowers E enough, and E there; 0 where none does."""
     promised = DECREASE * np.sum(here.gradient * step, -1)
@@ -319,7 +305,7 @@ def search(
     digits = np.sum(stations.weights * sizes, (-1, -2)) / sizes.shape[-2]
     bound = here.cost * (1 + 4 * EPSILON) + digits * (4 * EPSILON) ** 2
     share = np.ones_like(here.cost)
-    for _ in range(HALVINGS):
+    for _ in range(MOST_HALVINGS):
         trial = cost(model, params + share[:, None] * step, stations)
         good = trial <= bound + share * promised
         if good.all():
@@ -328,8 +314,8 @@ def search(
     return np.where(good, share, 0.0), np.where(good, trial, here.cost)
 
 
-def criterion(params: Array, step: Array, determined: Determined, stations: Stations) -> Array:
-    """Number 22 (B,), its denominator no less than `FLOOR` of each parameter's own scale.
+def criterion(params: Array, step: Array, determined: Determined, stations: Compared) -> Array:
+    """Number 22 (B,), its denominator no less than `CRITERION_FLOOR` of each parameter's own scale.
 
     That scale is the change which moves |g| by itself or the inclination by a radian, in the
     root mean square over the stations: about 1 g for a bias, 1 for a scale or a misalignment.
@@ -337,15 +323,15 @@ def criterion(params: Array, step: Array, determined: Determined, stations: Stat
     comparisons = np.sum(stations.used, (-1, -2))[:, None]
     scale = np.sqrt(comparisons) / determined.norms
     mean = np.abs(params + step / 2)
-    return np.asarray(np.max(np.abs(step) / np.maximum(mean, FLOOR * scale), -1))
+    return np.asarray(np.max(np.abs(step) / np.maximum(mean, CRITERION_FLOOR * scale), -1))
 
 
 @dataclass
-class _Descent:
+class _NewtonDescent:
     """Steps of one batch, each member until it has stopped."""
 
     model: Model
-    stations: Stations
+    stations: Compared
     params: Array
     status: Ints
     iterations: Ints
@@ -354,7 +340,7 @@ class _Descent:
     active: Ints
 
     @classmethod
-    def at(cls, model: Model, stations: Stations, params: Array, limit: int) -> _Descent:
+    def at(cls, model: Model, stations: Compared, params: Array, limit: int) -> _NewtonDescent:
         """At the start values."""
         count = len(params)
         costs = np.full((count, limit + 1), np.nan)
@@ -374,7 +360,7 @@ class _Descent:
         """One iteration of the members that have not stopped."""
         here = self._local()
         active, params = self.active, self.params[self.active]
-        model, stations = self.model.take(active), self.stations.take(active)
+        model, stations = take((self.model, self.stations), active)
         determined = determines(model, params, stations)
         step = downhill(here, determined)
         share, after = search(model, params, stations, here, step)
@@ -390,21 +376,21 @@ class _Descent:
     def _local(self) -> Local:
         """Derivatives of the active members; those that are not finite stop."""
         active = self.active
-        here = local(self.model.take(active), self.params[active], self.stations.take(active))
+        here = local(*take((self.model, self.params, self.stations), active))
         finite = np.isfinite(here.cost) & np.isfinite(here.hessian).all((-1, -2))
         self.status[active[~finite]] = Status.NOT_FINITE
         self.active = active[finite]
-        return here.take(np.flatnonzero(finite))
+        return take(here, np.flatnonzero(finite))
 
     def free(self, determined: Determined) -> dict[str, Bools]:
         """Whether a turn of all readings about an axis, or their scale, is free (B,), by name."""
-        turns = zip(TURNS, np.eye(3), strict=True)
-        changes = {name: rotation(TINY * axis) for name, axis in turns}
-        changes["scale"] = np.eye(3) * (1 + TINY)
+        turns = zip(ROTATIONS, np.eye(3), strict=True)
+        changes = {name: rotation(TANGENT_STEP * axis) for name, axis in turns}
+        changes["scale"] = np.eye(3) * (1 + TANGENT_STEP)
         result = {}
         for name, change in changes.items():
             moved = self.model.transformed(self.params, change)
-            share = free_share(determined, (moved - self.params) / TINY)
+            share = free_share(determined, (moved - self.params) / TANGENT_STEP)
             result[name] = np.asarray(share > COUPLED)
         return result
 

@@ -6,7 +6,7 @@ least_squares_forward  where the error in the reading is least: one linear solve
 least_squares_affine   where the error in the field is least: another one
 swarm_forward          the swarm on either cost, in coordinates that suit it
 
-Forward parameters (..., 12) of a triad: S row by row, then o, of reading = S · field + o.
+Forward parameters (..., 12) of a triad: S and o of reading = S · field + o, as `affine_parts` has them.
 
 Moradi's equations 12 and 13 are two estimators. Each is a convex quadratic (13 in the matrix
 that takes readings to fields), so swarm and least squares meet on either, and neither
@@ -21,7 +21,9 @@ from typing import Literal
 
 import numpy as np
 
+from mwdcal.estimation.regression import regress
 from mwdcal.geometry.vectors import Array, ArrayLike, inverse
+from mwdcal.sensor.models import affine_parts, affine_terms
 
 ACCELERATION = 2.05
 """Pull towards a particle's own best and towards the swarm's best, each."""
@@ -150,21 +152,11 @@ def swarm(
             flight.step(one)
             history[:, index] = flight.lowest
     lead = flight.lead
-    found = flight.aims[1].reshape(*lead, *shape)[..., :1, :]
-    position = (middle + half * found)[..., 0, :]
+    leader = flight.aims[1].reshape(*lead, *shape)[..., :1, :]
+    position = (middle + half * leader)[..., 0, :]
     return Swarm(
         position, flight.lowest.reshape(lead), history.reshape(*lead, iterations), iterations
     )
-
-
-def forward_parts(params: Array) -> tuple[Array, Array]:
-    """S (..., 3, 3) and o (..., 3) of forward parameters (..., 12)."""
-    return params[..., :9].reshape(*params.shape[:-1], 3, 3), params[..., 9:]
-
-
-def _joined(matrix: Array, offset: Array) -> Array:
-    flat = matrix.reshape(*matrix.shape[:-2], 9)
-    return np.concatenate([flat, offset], -1)
 
 
 def vector_cost(raw: Array, reference: Array, error: Error = "field") -> Cost:
@@ -180,19 +172,19 @@ def vector_cost(raw: Array, reference: Array, error: Error = "field") -> Cost:
     readings, known = raw[..., None, :, :], reference[..., None, :, :]
 
     def in_reading(params: Array) -> Array:
-        matrix, offset = forward_parts(params)
+        matrix, offset = affine_parts(params)
         return (readings - offset[..., None, :]) - known @ np.swapaxes(matrix, -1, -2)
 
     def in_field(params: Array) -> Array:
-        matrix, offset = forward_parts(params)
+        matrix, offset = affine_parts(params)
         back = np.swapaxes(inverse(matrix), -1, -2)
         return (readings - offset[..., None, :]) @ back - known
 
     misfit = {"field": in_field, "reading": in_reading}[error]
 
     def cost(params: Array) -> Array:
-        found = misfit(params)
-        return np.asarray(np.einsum("...ni,...ni->...", found, found) / raw.shape[-2])
+        error = misfit(params)
+        return np.asarray(np.einsum("...ni,...ni->...", error, error) / raw.shape[-2])
 
     return cost
 
@@ -203,25 +195,13 @@ def _centred(vectors: Array) -> tuple[Array, Array]:
     return vectors - mean, mean
 
 
-def _regressed(target: Array, terms: Array) -> Array:
-    """Matrix K (..., 3, 3) of least squares target = K · terms, both centred."""
-    q, r = np.linalg.qr(terms)
-    return np.swapaxes(inverse(r) @ (np.swapaxes(q, -1, -2) @ target), -1, -2)
-
-
-def _through_means(matrix: Array, raw: Array, reference: Array) -> Array:
-    """Forward parameters of S and the offset that takes the mean reference to the mean reading."""
-    return _joined(matrix, (raw - reference @ np.swapaxes(matrix, -1, -2))[..., 0, :])
-
-
 def least_squares_forward(raw: Array, reference: Array) -> Array:
     """Forward parameters (..., 12) with the least error in the readings (Moradi 12).
 
-    Shapes: `raw`, `reference` (..., n, 3). Singular: NaN or meaningless where the reference
-    vectors do not span space about their mean (fewer than four stations, or all in a plane).
+    Shapes: `raw`, `reference` (..., n, 3). Singular: as `regress`.
     """
-    (x, mean_x), (a, mean_a) = _centred(raw), _centred(reference)
-    return _through_means(_regressed(x, a), mean_x, mean_a)
+    forward = regress(raw, reference, np.ones((*raw.shape[:-1], 1))).forward
+    return affine_terms(np.swapaxes(forward[..., :3, :], -1, -2), forward[..., 3, :])
 
 
 def least_squares_affine(raw: Array, reference: Array) -> Array:
@@ -231,8 +211,12 @@ def least_squares_affine(raw: Array, reference: Array) -> Array:
     noise in the readings M is a little too small, by (noise / signal)².
     Shapes and singular cases: as `least_squares_forward`.
     """
-    (x, mean_x), (a, mean_a) = _centred(raw), _centred(reference)
-    return _through_means(inverse(_regressed(a, x)), mean_x, mean_a)
+    centred, mean = _centred(raw)
+    back = regress(reference, centred, np.ones((*raw.shape[:-1], 1))).forward
+    matrix = inverse(np.swapaxes(back[..., :3, :], -1, -2))
+    return affine_terms(
+        matrix, mean[..., 0, :] - np.einsum("...ij,...j->...i", matrix, back[..., 3, :])
+    )
 
 
 @dataclass(frozen=True)
@@ -265,7 +249,7 @@ class Coordinates:
 
     def parts(self, place: Array) -> tuple[Array, Array]:
         """K (..., particles, 3, 3) and middle (..., particles, 3) at u (..., particles, 12)."""
-        turn, shift = forward_parts(place)
+        turn, shift = affine_parts(place)
         spread = self.spread[..., None, None]
         matrix = (turn @ self.whiten[..., None, :, :]) * spread[..., None]
         matrix = matrix + self.gain[..., None, None, None] * np.eye(3)
@@ -305,7 +289,9 @@ def _field_search(raw: Array, reference: Array) -> tuple[Cost, Callable[[Array],
     def params(place: Array) -> Array:
         matrix, middle = coordinates.parts(place)
         back = inverse(matrix)
-        return _joined(back, coordinates.mean_terms - np.einsum("...ij,...j->...i", back, middle))
+        return affine_terms(
+            back, coordinates.mean_terms - np.einsum("...ij,...j->...i", back, middle)
+        )
 
     return coordinates.cost(reference, raw), params
 
@@ -317,7 +303,7 @@ def _reading_search(raw: Array, reference: Array) -> tuple[Cost, Callable[[Array
     def params(place: Array) -> Array:
         matrix, middle = coordinates.parts(place)
         mean = np.einsum("...ij,...j->...i", matrix, coordinates.mean_terms)
-        return _joined(matrix, middle - mean)
+        return affine_terms(matrix, middle - mean)
 
     return coordinates.cost(raw, reference), params
 
@@ -350,7 +336,7 @@ def swarm_forward(
     Singular: as `least_squares_forward`.
     """
     cost, params = _SEARCHES[error](raw, reference)
-    found = swarm(
+    flight = swarm(
         cost,
         np.full(12, -reach),
         np.full(12, reach),
@@ -358,4 +344,4 @@ def swarm_forward(
         iterations=iterations,
         seed=seed,
     )
-    return replace(found, position=params(found.position[..., None, :])[..., 0, :])
+    return replace(flight, position=params(flight.position[..., None, :])[..., 0, :])
