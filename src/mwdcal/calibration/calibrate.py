@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cached_property
@@ -12,8 +12,8 @@ import msgspec
 import numpy as np
 
 from mwdcal import __version__
-from mwdcal.calibration.automatic.nonlinearity import with_nonlinearity
-from mwdcal.calibration.automatic.stand import check_names, check_separable, stand_errors
+from mwdcal.calibration.automatic.auto import Choice, choose
+from mwdcal.calibration.automatic.stand import check_separable, stand_errors
 from mwdcal.calibration.covariance import (
     PRIOR,
     assumed_exact,
@@ -24,7 +24,7 @@ from mwdcal.calibration.covariance import (
     stated_covariance,
 )
 from mwdcal.calibration.diagnosis.findings import Findings, described
-from mwdcal.calibration.diagnosis.refusals import check_fit, check_readings
+from mwdcal.calibration.diagnosis.refusals import check_fit
 from mwdcal.calibration.estimate import Fit, fit
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.prediction import typical_budget
@@ -35,7 +35,6 @@ from mwdcal.calibration.record import (
     Calibration,
     Choices,
     Constant,
-    OrderScore,
     TriadCalibration,
     Undetermined,
     rounded,
@@ -57,22 +56,32 @@ def calibrate(
     *,
     profile_sha256: str = "",
     run_sha256: str = "",
-    orders: Sequence[OrderScore] = (),
-    excluded: Sequence[str] = (),
     progress: Callable[[str], None] = lambda text: None,
 ) -> Calibration:
     """Fit the sensor model to a run and state what it is worth.
 
-    For the record: `orders`, what chose the order and left-out temperatures say of it
-    (`mwdcal.calibration.automatic.order_selection`), and `excluded`, labels of stations of the run
-    that the readings no longer have.
-    Raises `FitError` where the data cannot give a calibration to be trusted.
+    What the options leave to the software is chosen as `mwdcal calibrate` does
+    (`mwdcal.calibration.automatic.auto`); `progress` gets a line for each trial.
+    Raises `InputError` for options that do not go together, `FitError` where the data cannot give a
+    calibration to be trusted.
     """
-    options = with_nonlinearity(options or Options(), profile)
-    check_readings(readings, options)
-    check_names(options.estimate, options.method)
-    progress(f"fitting {readings.count} stations, method {options.method}, order {options.order}")
-    result = fit(readings, options)
+    choice = choose(readings, profile, options or Options(), progress)
+    return recorded(
+        choice,
+        fit(choice.readings, choice.options),
+        profile_sha256=profile_sha256,
+        run_sha256=run_sha256,
+    )
+
+
+def recorded(
+    choice: Choice, result: Fit, *, profile_sha256: str = "", run_sha256: str = ""
+) -> Calibration:
+    """The record of a fit with the options chosen for a run.
+
+    Raises `FitError` where the fit is not to be trusted.
+    """
+    readings, profile, options = choice.readings, choice.profile, choice.options
     if options.estimate:
         check_separable(result, options.estimate)
     free = free_directions(result.problem, result.state, result.analysis.determined)
@@ -80,8 +89,8 @@ def calibrate(
     made = _Record(readings, profile, options, result, free)
     record = made.calibration(profile_sha256, run_sha256)
     also = {
-        "orders": list(orders),
-        "excluded": list(excluded),
+        "orders": choice.orders,
+        "excluded": choice.excluded,
         "budget": made.budget(record),
     }
     return rounded(msgspec.structs.replace(record, **also))
@@ -114,7 +123,7 @@ class _Record:
                 ignore=list(options.ignore),
                 robust=options.robust,
                 paper_weights=options.paper_weights,
-                prior=options.prior.source if options.prior else None,
+                prior=options.knowledge.source if options.knowledge else None,
             ),
             seed=options.seed if options.method == "swarm" else None,
             time=datetime.now(UTC).isoformat(timespec="seconds"),
@@ -133,7 +142,7 @@ class _Record:
             errors=error_rows(readings, result),
             measures=measure_rows(readings, result),
             station_rows=stations,
-            inherited=list(options.prior.stations) if options.prior else [],
+            inherited=list(options.knowledge.stations) if options.knowledge else [],
             findings=self._findings.all(stations),
         )
 
@@ -144,7 +153,7 @@ class _Record:
     @property
     def temperatures(self) -> tuple[float, float] | None:
         """Coldest and hottest station, °C; those behind the prior count too."""
-        temperature, prior = self.readings.temperature, self.options.prior
+        temperature, prior = self.readings.temperature, self.options.knowledge
         if temperature is None:
             return None
         low, high = float(temperature.min()), float(temperature.max())
@@ -237,7 +246,7 @@ class _Record:
         triad, where, mine = problem.triads[index], problem.slices()[index], self.slices[index]
         free = [f for f in self.free if index in f.triads]
         noise, declared = self.result.noise[0, index], np.isnan(self.result.noise[0, index])
-        curved = TRIADS[index] in (self.options.nonlinearity or {})
+        curved = TRIADS[index] in self.options.curved
         finished, _ = triad.model.finished(self.profile.reference_temperature_c)
         freedom, chance = float(analysis.freedom[0, index]), self._findings.chances[0, index]
         return TriadCalibration(

@@ -97,7 +97,7 @@ def _problem(
     """The problem, and for each triad whether its noise is declared."""
     cold = np.zeros(readings.count)
     temperature = flat(cold if readings.temperature is None else readings.temperature, lead)
-    curved = options.nonlinearity or {}
+    curved = options.curved
     triads: list[Triad] = []
     for name, order in zip(TRIADS, options.orders, strict=True):
         values = getattr(readings, name)
@@ -111,7 +111,7 @@ def _problem(
             flat(readings.sd[name], lead, 3) if name in readings.sd else 1e-3 * _size(raw) + 0 * raw
         )
         triads.append(Triad(restricted(whole, options.parameters), raw, sd))
-    prior = prior_of(options.prior, [t.model for t in triads], len(evidence.include))
+    prior = prior_of(options.knowledge, [t.model for t in triads], len(evidence.include))
     problem = Problem(tuple(triads), temperature, evidence, prior)
     _bound_curves(problem, curved)
     return problem, [name in readings.sd for name in TRIADS[: len(triads)]]

@@ -50,6 +50,18 @@ def shown_in(name: str, relative: bool = False) -> tuple[float, str]:
     return (1.0, "nT") if name == "field" else (float(np.degrees(1)), "°")
 
 
+def nominal(readings: Readings) -> tuple[Array, Array]:
+    """Vectors (n, 3) that a run reads uncalibrated; the field has a mean of one if unknown.
+
+    Singular: the field is NaN without magnetometer.
+    """
+    raw = readings.magnetometer
+    if raw is None:
+        return readings.accelerometer, np.full_like(readings.accelerometer, np.nan)
+    scale = np.linalg.norm(raw, axis=-1).mean() if readings.relative else 1.0
+    return readings.accelerometer, raw / scale
+
+
 def angle_weight(name: str, inclination: Array) -> Array:
     """What an error of an observable counts at inclinations (…, n), radians; NaN: it has none there.
 
@@ -100,11 +112,7 @@ class Residuals:
     @cached_property
     def before(self) -> tuple[Array, Array]:
         """Nominal readings as vectors: what the tool says uncalibrated."""
-        triads = [t.raw[0] for t in self.fit.problem.triads]
-        if len(triads) == 1:
-            return triads[0], np.full_like(triads[0], np.nan)
-        scale = np.linalg.norm(triads[1], axis=-1).mean() if self.readings.relative else 1.0
-        return triads[0], triads[1] / scale
+        return nominal(self.readings)
 
     def known(self, name: str) -> Array:
         """Reference (n,) of an observable: given, or the estimated constant; NaN where unknown.
@@ -256,18 +264,15 @@ def measure_rows(readings: Readings, fit: Fit) -> list[Measures]:
         for when, fields in (("before", residuals.before), ("after", residuals.after)):
             error = np.linalg.norm((fields[index] - residuals.targets[index])[whole], axis=-1)
             error = error / np.linalg.norm(residuals.targets[index][whole], axis=-1)
-            mse = float(np.mean(error**2))
-            rows.append(
-                Measures(
-                    triad=name,
-                    when=when,
-                    mean=float(error.mean()),
-                    std=float(error.std(ddof=1)),
-                    mse=mse,
-                    rmse=mse**0.5,
-                )
-            )
+            rows.append(vector_measures(name, when, error))
     return rows
+
+
+def vector_measures(triad: str, when: str, error: Array) -> Measures:
+    """Moradi's measures of vector errors (n,), shares of the field."""
+    mse = float(np.mean(error**2))
+    mean, std = float(error.mean()), float(error.std(ddof=1))
+    return Measures(triad=triad, when=when, mean=mean, std=std, mse=mse, rmse=mse**0.5)
 
 
 def _judged(fit: Fit) -> Analysis:

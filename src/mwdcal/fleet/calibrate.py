@@ -3,33 +3,36 @@
 Every tool of a `Batch` has the same number of stations and the same kinds of evidence. What
 `calibrate` would refuse is refused here with the same words: a screen of array operations
 picks the suspects, and the check of a single run decides and speaks. What `calibrate` leaves to
-the data is decided for each tool (`fleet_choices`). Results are columns, not objects: `names`
+the data is decided for each tool (`mwdcal.fleet.choices`). Results are columns, not objects: `names`
 says which.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import numpy as np
 
+from mwdcal.calibration.automatic.auto import known_before
+from mwdcal.calibration.automatic.nonlinearity import offered
 from mwdcal.calibration.automatic.order_selection import mapped
 from mwdcal.calibration.automatic.stand import check_separable, stand_errors
 from mwdcal.calibration.covariance import stated_covariance
 from mwdcal.calibration.diagnosis.refusals import check_readings, fit_checks
 from mwdcal.calibration.estimate import Fit, fit
 from mwdcal.calibration.methods import ESTIMABLE
-from mwdcal.calibration.options import Options
+from mwdcal.calibration.options import AUTO, Options
 from mwdcal.calibration.readings import TRIADS, Readings
 from mwdcal.calibration.record import FREE_SHARE, StandErrors
+from mwdcal.calibration.soaks import HIGHEST
 from mwdcal.errors import MwdcalError
 from mwdcal.estimation.rank import Free
 from mwdcal.estimation.uncertainty import marginal_rank
 from mwdcal.fleet.accuracy import ANGLES, typical_sd
-from mwdcal.fleet.choices import CHUNK, Alone, PerTool, halved, with_curves, with_orders
+from mwdcal.fleet.choices import in_chunks, with_curves, with_orders
 from mwdcal.fleet.curves import curved_sd
 from mwdcal.fleet.findings import findings_of_batch
 from mwdcal.fleet.refusals import free_of_batch, member, suspect_fits, suspect_readings
@@ -38,8 +41,8 @@ from mwdcal.sensor.models import Basis, Factors, Polynomial, Whole
 from mwdcal.sensor.profile import Profile
 
 OK, BAD_INPUT, FAILED = "ok", "bad-input", "failed"
-ALIKE = PerTool()
-"""Nothing is left to each tool."""
+Alone = Callable[[int], tuple[Readings, Profile]]
+"""Readings and profile of one tool of a batch by themselves, as `calibrate` takes them."""
 FACTS = ("rank", "size", "noise", "variance_factor", "degrees_of_freedom")
 """Columns of a triad besides its parameters and their standard uncertainties."""
 EARTH = ("gravity_g", "field", "dip_deg")
@@ -74,16 +77,22 @@ class Outcome:
         return np.asarray(tools[self.status[tools] == OK])
 
 
-def model_parameters(options: Options, triad: int, per_tool: PerTool = ALIKE) -> tuple[str, ...]:
+def model_parameters(options: Options, profile: Profile, triad: int) -> tuple[str, ...]:
     """Names of the parameters that a triad may have, as in its calibration file."""
-    found: dict[str, None] = {}
-    highest = {options.kind(order): order for order in per_tool.orders(options, triad)}
-    for kind, order in highest.items():
-        curved = kind == "polynomial" and per_tool.curved(options, triad)
+    tried = options.order == AUTO and options.method != "swarm"
+    orders = range(HIGHEST + 1) if tried else (options.orders[triad],)
+    names: dict[str, None] = {}
+    for kind, order in {options.kind(order): order for order in orders}.items():
+        curved = kind == "polynomial" and may_be_curved(options, profile, triad)
         basis = Basis(order)
         model: Whole = Factors(basis) if kind == "factors" else Polynomial(basis, curved=curved)
-        found |= dict.fromkeys(model.names)
-    return tuple(found)
+        names |= dict.fromkeys(model.names)
+    return tuple(names)
+
+
+def may_be_curved(options: Options, profile: Profile, triad: int) -> bool:
+    """Whether a triad has own-axis terms, or may come to have them."""
+    return TRIADS[triad] in {*offered(profile, options), *options.curved}
 
 
 def column(triad: str, parameter: str) -> str:
@@ -95,13 +104,13 @@ def column(triad: str, parameter: str) -> str:
     return f"{triad}_{parameter}".replace("-", "_").replace("·", "_t")
 
 
-def names(options: Options, triads: Sequence[str] = TRIADS, per_tool: PerTool = ALIKE) -> list[str]:
+def names(options: Options, profile: Profile, triads: Sequence[str] = TRIADS) -> list[str]:
     """The columns of results, in order."""
     found: list[str] = []
     for index, triad in enumerate(triads):
-        own = [column(triad, name) for name in model_parameters(options, index, per_tool)]
+        own = [column(triad, name) for name in model_parameters(options, profile, index)]
         found += [f"{triad}_{fact}" for fact in (*FACTS, "order")]
-        if per_tool.curved(options, index):
+        if may_be_curved(options, profile, index):
             found += [f"{triad}_{name}" for name in (*CENTRES, "radius")]
         found += [name for pair in zip(own, (f"{n}_sd" for n in own), strict=True) for name in pair]
     last = (ANGLES, EARTH) if len(triads) > 1 else (ANGLES[:2], EARTH[:1])
@@ -110,33 +119,28 @@ def names(options: Options, triads: Sequence[str] = TRIADS, per_tool: PerTool = 
 
 
 def calibrate_batch(
-    readings: Readings,
-    options: Options,
-    profile: Profile,
-    alone: Alone,
-    per_tool: PerTool = ALIKE,
+    readings: Readings, options: Options, profile: Profile, alone: Alone
 ) -> Outcome:
     """Calibrate tools of the same shape: readings (B, n, ...), at the profile's temperature.
 
     `alone` gives one tool's own readings where a check needs words for it.
     """
     count = len(readings.accelerometer)
-    blank = {name: np.full(count, np.nan) for name in names(options, per_tool=per_tool)}
+    blank = {name: np.full(count, np.nan) for name in names(options, profile)}
     free: list[tuple[list[str], ...]] = [([], []) for _ in range(count)]
     status, message = np.full(count, OK, object), np.full(count, "", object)
     none: list[list[Any]] = [[] for _ in range(count)]
     outcome = Outcome(status, message, blank, free, list(none), list(none))
-    options = per_tool.known(options, readings, profile)
-    first, every = per_tool.before(options), np.arange(count)
-    _refuse(outcome, every, suspect_readings(readings, first), alone, first)
-    for some, chosen in with_orders(readings, outcome.sound(every), options, per_tool):
+    options, every = known_before(options, readings, profile), np.arange(count)
+    _refuse(outcome, every, suspect_readings(readings, options), alone, options)
+    for some, chosen in with_orders(readings, outcome.sound(every), options):
         if isinstance(chosen, Exception):
             _fail(outcome, some, chosen)
             continue
-        if chosen != first:
+        if chosen.order != options.order:
             suspects = suspect_readings(taken(readings, some), chosen)
             _refuse(outcome, some, suspects, alone, chosen)
-        for part, final in with_curves(outcome.sound(some), chosen, readings, per_tool, alone):
+        for part, final in with_curves(readings, outcome.sound(some), chosen, profile):
             if isinstance(final, Exception):
                 _fail(outcome, part, final)
             else:
@@ -153,13 +157,11 @@ def _fit(
     profile: Profile,
 ) -> None:
     """Fit the given tools, and write down what came of it."""
-    for start in range(0, len(tools), CHUNK):
-        part = tools[start : start + CHUNK]
-        for which, result in halved(readings, part, lambda r: fit(r, options)):
-            if isinstance(result, Exception):
-                _fail(outcome, which, result)
-            else:
-                _record(outcome, which, result, options, readings, profile, alone)
+    for part, result in in_chunks(readings, tools, lambda r: fit(r, options)):
+        if isinstance(result, Exception):
+            _fail(outcome, part, result)
+        else:
+            _record(outcome, part, result, options, readings, profile, alone)
 
 
 def _fail(outcome: Outcome, tools: Ints, error: Exception) -> None:

@@ -56,7 +56,7 @@ def suspect_readings(readings: Readings, options: Options) -> dict[str, Bools]:
 
 def _size(options: Options) -> int:
     """Parameters of a triad that stations must determine: with a prior, none."""
-    if options.prior is not None:
+    if options.knowledge is not None:
         return 0
     highest = max(options.orders)
     factors, fewer = options.kind(highest) == "factors", 12 - options.parameters

@@ -33,12 +33,12 @@ LOWEST_RANK = 8
 def choose_order(
     readings: Readings, options: Options, progress: Callable[[str], None]
 ) -> tuple[Orders, list[OrderScore]]:
-    """Each triad's lowest order above which noise explains all terms, and the tables.
+    """Each triad's lowest order above which noise explains all terms, and the tables, of one run.
 
     Order 0 without a table where there is no temperature, or too short a span of it.
     """
-    batch = _batch_of_one(readings)
-    levels = int(judged_soaks(batch, options)[0])
+    batch = batch_of_one(readings)
+    levels = int(_judged_soaks(batch, options)[0])
     if levels < 2:
         return 0, []
     progress(f"temperature order: testing its terms over {levels} temperatures")
@@ -58,23 +58,23 @@ def choose_order(
     return pair, _tables(readings, orders, every, chosen[0], chance[0])
 
 
-def judged_soaks(readings: Readings, options: Options) -> Ints:
+def choose_orders(readings: Readings, options: Options) -> Ints:
+    """Orders (B, 2) of accelerometer and magnetometer of a batch, as `choose_order` has them."""
+    levels = _judged_soaks(readings, options)
+    orders = np.zeros((len(levels), 2), int)
+    for count in np.unique(levels[levels > 1]):
+        alike = levels == count
+        members = mapped(readings, lambda value, alike=alike: value[alike])  # type: ignore[misc]
+        orders[alike] = _tested(members, options)[0][:, [0, -1]]
+    return orders
+
+
+def _judged_soaks(readings: Readings, options: Options) -> Ints:
     """Soaks (B,) by which the order of each member is judged; 1: it has order 0 without a trial."""
     levels = _usable_soaks(readings).max(-1) + 1
-    wide = np.flatnonzero(levels > 1)
-    if wide.size:
+    if (levels > 1).any():
         levels = np.where(_hopeless(readings, options), 1, levels)
     return np.asarray(levels)
-
-
-def choose_orders(readings: Readings, options: Options, levels: int) -> Ints:
-    """Orders (B, 2) of accelerometer and magnetometer, as `choose_order` has them for each alone.
-
-    All members have the same number of `judged_soaks`.
-    """
-    if levels < 2:
-        return np.zeros((len(readings.accelerometer), 2), int)
-    return _tested(readings, options)[0][:, [0, -1]]
 
 
 def _tested(readings: Readings, options: Options) -> tuple[Ints, Array]:
@@ -106,8 +106,8 @@ def order_errors(
 
     None where there are too few soaks to leave one out.
     """
-    batch = _batch_of_one(readings)
-    levels = int(judged_soaks(batch, options)[0])
+    batch = batch_of_one(readings)
+    levels = int(_judged_soaks(batch, options)[0])
     if levels < max(FEWEST, max(options.orders) + 2):
         return []
     yardstick = options if options.prior else replace(options, order=_highest(batch, options))
@@ -118,8 +118,8 @@ def order_errors(
     return _tables(readings, [options.orders], found, chosen, unknown)
 
 
-def _batch_of_one(readings: Readings) -> Readings:
-    """A run without leading axes as a batch."""
+def batch_of_one(readings: Readings) -> Readings:
+    """A run without leading axes as a batch of one tool."""
     return mapped(readings, lambda value: np.asarray(value)[None])
 
 

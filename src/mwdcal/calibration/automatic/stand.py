@@ -20,20 +20,20 @@ LOOSE = 0.1
 
 
 def check_names(names: Sequence[str], method: str) -> None:
-    """Refuse what `--estimate` cannot find, whatever the stations."""
+    """Refuse errors of the stand that cannot be estimated, whatever the stations."""
     for name in names:
         if name == "toolface-zero":
             raise FitError(
-                "--estimate toolface-zero: a zero of the stand's toolface can never be told from a "
+                "`estimate` toolface-zero: a zero of the stand's toolface can never be told from a "
                 "rotation of the sensors in the tool, whatever the stations. Set it by an index mark."
             )
         if name not in ESTIMABLE:
             raise InputError(
-                f"--estimate must be of {', '.join(ESTIMABLE)}; got {name!r}. Unknown field and dip "
+                f"`estimate` must be of {', '.join(ESTIMABLE)}; got {name!r}. Unknown field and dip "
                 "are estimated without being asked for."
             )
     if names and method != "joint":
-        raise InputError(f"--estimate needs --method joint; got {method!r}.")
+        raise InputError(f"`estimate` needs `method` joint; got {method!r}.")
 
 
 def check_separable(result: Fit, names: Sequence[str]) -> None:

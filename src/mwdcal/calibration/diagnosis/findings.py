@@ -323,7 +323,7 @@ class Findings:
     def model(self) -> list[Finding]:
         """What the chosen model cannot say."""
         found = []
-        bent = self.options.nonlinearity or {}
+        bent = self.options.curved
         ignored = [
             name
             for name, triad in zip(TRIADS, self.result.problem.triads, strict=False)
@@ -351,7 +351,7 @@ class Findings:
 
     def prior(self) -> list[Finding]:
         """What rests on the prior alone, and whether run and prior agree."""
-        knowledge = self.options.prior
+        knowledge = self.options.knowledge
         if knowledge is None:
             return []
         return [*self._shared(knowledge), *self._resting(knowledge)]

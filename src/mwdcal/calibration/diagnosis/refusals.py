@@ -22,7 +22,7 @@ from mwdcal.calibration.methods import EVIDENCE
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import CONSTANTS, EARTH, TRIADS, Readings
 from mwdcal.calibration.residuals import shown_in
-from mwdcal.calibration.soaks import HIGHEST, soaks
+from mwdcal.calibration.soaks import soaks
 from mwdcal.errors import FitError, InputError
 from mwdcal.estimation.rank import Free
 from mwdcal.estimation.robust import LOSSES
@@ -93,7 +93,7 @@ def check_options(options: Options) -> None:
         raise InputError(
             f"--robust cannot weigh the stations of {own}. Use --method joint with it."
         )
-    if options.own_solver and options.nonlinearity:
+    if options.own_solver and options.curved:
         raise InputError(
             f"--nonlinearity cannot be combined with {own}: own-axis terms need their prior. Use "
             "--method joint, or --nonlinearity none."
@@ -113,8 +113,8 @@ def check_options(options: Options) -> None:
             "--paper-weights: method joint is of no paper. Name the paper's method: least-squares, "
             "swarm, newton, toolface-inclination or scalar."
         )
-    if options.prior and (options.own_solver or options.nonlinearity):
-        what = "own-axis nonlinearity" if options.nonlinearity else own
+    if options.prior and (options.own_solver or options.curved):
+        what = "own-axis nonlinearity" if options.curved else own
         raise InputError(
             f"--prior cannot be combined with {what}. Use --method joint, without "
             "--paper-weights and with --nonlinearity none."
@@ -124,25 +124,11 @@ def check_options(options: Options) -> None:
 def _check_curved_models(options: Options) -> None:
     """Refuse own-axis terms of a model that has none."""
     for name, order in zip(TRIADS, options.orders, strict=True):
-        if name in (options.nonlinearity or {}) and options.kind(order) != "polynomial":
+        if name in options.curved and options.kind(order) != "polynomial":
             raise InputError(
                 f"--nonlinearity {name}: the model of factors has no own-axis terms. Use "
                 "--model polynomial with it."
             )
-
-
-def check_order(asked: str) -> None:
-    """Refuse what is no temperature order."""
-    if asked not in ("auto", *map(str, range(HIGHEST + 1))):
-        raise InputError(f"--order must be 0, 1, 2, 3 or auto; got {asked!r}.")
-
-
-def check_curve_names(asked: str, wanted: Sequence[str]) -> None:
-    """Refuse own-axis terms of what is no triad."""
-    if not wanted or not set(wanted) <= set(TRIADS):
-        raise InputError(
-            f"--nonlinearity must be auto, none, {' or '.join(TRIADS)}; got {asked!r}."
-        )
 
 
 def check_curves(readings: Readings, wanted: Sequence[str]) -> None:
@@ -172,7 +158,7 @@ def check_readings(readings: Readings, options: Options) -> None:
     factors = options.kind(highest) == "factors"
     size = 6 * (highest + 1) + 6 if factors else 12 * (highest + 1)
     size -= (12 - options.parameters) * (1 if factors else highest + 1)
-    if 3 * readings.count < size and options.prior is None:
+    if 3 * readings.count < size and options.knowledge is None:
         raise FitError(
             f"{readings.source or 'the run'} has {readings.count} stations; the model has {size} "
             f"parameters per triad and needs {-(-size // 3)} or more. Add stations at other "
@@ -180,8 +166,8 @@ def check_readings(readings: Readings, options: Options) -> None:
         )
     _check_common_errors(readings, options)
     for triad in TRIADS:
-        _check_channels(readings, triad, options.prior is not None)
-    if options.prior is None or options.prior.temperature is None:
+        _check_channels(readings, triad, options.knowledge is not None)
+    if options.knowledge is None or options.knowledge.temperature is None:
         _check_temperature(readings, highest)
     _check_needs(readings, method)
 
