@@ -320,8 +320,8 @@ def test_errors_of_a_relative_field_are_per_mille(words):
 
 
 def test_a_course_that_nothing_tests_says_so(words, whole):
-    page = words(heated())
-    assert 'id="orders"' not in words(whole)
+    page = words(msgspec.structs.replace(heated(), orders=[]))
+    assert 'id="orders"' not in page
     assert "nothing tests its course" in page
     assert "--outside extrapolate" in page
     assert "--outside" not in words(whole)
