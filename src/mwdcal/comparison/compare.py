@@ -144,7 +144,7 @@ def compare(
         tuple(options.curved),
         judge.parts,
         options.seed,
-        judge.units(),
+        judge.units,
         judge.summary(*bare),
         tuple(judge.measures("before", *bare)),
         {name: gauge.names(i) for i, name in enumerate(TRIADS) if gauge.names(i)},
@@ -193,12 +193,12 @@ def _row(calibrated: _Calibrated, judge: _Judge, gauge: Gauge) -> Row:
         seconds=calibrated.seconds,
         in_sample=judge.summary(*inside),
         held_out=judge.summary(*left_out),
-        resting=tuple(n for n in judge.units() if _rests(n, record, readings)),
+        resting=tuple(n for n in judge.units if _rests(n, record, readings)),
         lost=int(np.isnan(left_out[0]).any(-1).sum()),
         measures=(*judge.measures("after", *inside), *judge.measures("left out", *left_out)),
         parameters=parameters,
         taken_out=taken_out,
-        station_errors={n: e * judge.factor(n) for n, e in errors(readings, *left_out).items()},
+        station_errors=judge.errors(*left_out),
         course=_course(calibrated) if calibrated.options.method == "swarm" else {},
     )
 
@@ -267,26 +267,22 @@ class _Judge:
         return int(self.part.max()) + 1
 
     @property
-    def names(self) -> list[str]:
-        """Observables that have a reference somewhere in the run."""
-        return _referenced(self.readings)
-
-    @property
     def grouped(self) -> bool:
         """Whether directions within groups can be compared."""
         return bool((self.readings.groups >= 0).any()) and self.readings.magnetometer is not None
 
-    def _shown(self, name: str) -> tuple[float, str]:
-        return shown_in(name, self.readings.relative)
-
-    def factor(self, name: str) -> float:
-        """Factor from an observable's own unit to the one it is shown in."""
-        return self._shown(name)[0]
-
+    @property
     def units(self) -> dict[str, str]:
         """Units in which errors are shown."""
-        units = {name: self._shown(name)[1] for name in self.names}
+        relative = self.readings.relative
+        units = {name: shown_in(name, relative)[1] for name in _referenced(self.readings)}
         return {**units, SCATTER: "°"} if self.grouped else units
+
+    def errors(self, g: Array, b: Array) -> dict[str, Array]:
+        """Errors (n,) of two vectors by observable, in shown units."""
+        relative = self.readings.relative
+        each = errors(self.readings, g, b)
+        return {name: error * shown_in(name, relative)[0] for name, error in each.items()}
 
     def left_out(self, options: Options) -> tuple[Array, Array]:
         """Vectors (n, 3) of each station from the fit that left its part out; NaN if that failed."""
@@ -301,19 +297,11 @@ class _Judge:
 
     def summary(self, g: Array, b: Array) -> dict[str, float]:
         """Root mean square errors by observable, and the scatter within groups, in shown units."""
-        result = {n: rms(e) * self.factor(n) for n, e in errors(self.readings, g, b).items()}
+        result = {name: rms(error) for name, error in self.errors(g, b).items()}
         if self.grouped:
-            result[SCATTER] = self._scatter(g, b)
+            scatter = group_scatter(directions(g, b), self.readings.groups)
+            result[SCATTER] = float(np.degrees(scatter))
         return result
-
-    def _scatter(self, g: Array, b: Array) -> float:
-        """Scatter of directions within groups of two stations or more, degrees."""
-        group = np.where(np.isnan(g).any(-1), -1, self.readings.groups)
-        numbers, place, count = np.unique(group, return_inverse=True, return_counts=True)
-        usable = (numbers >= 0) & (count > 1)
-        group = np.where(usable, np.cumsum(usable) - 1, -1)[place]
-        axis = directions(g, b)
-        return float(np.degrees(group_scatter(axis, group))) if usable.any() else float("nan")
 
     def measures(self, when: str, *fields: Array) -> list[Measures]:
         """Moradi's measures of the vector error, as a share of the reference vector."""

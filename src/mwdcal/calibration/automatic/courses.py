@@ -54,7 +54,7 @@ class Terms:
     @property
     def chance(self) -> Array:
         """Probability (B, t, k) of so large a term by noise alone; NaN where there is none to test."""
-        return _chance(self.square, self.freedom, self.scatter[..., None], self.rest[..., None])
+        return f_test(self.square, self.freedom, self.scatter[..., None], self.rest[..., None])
 
     @property
     def present(self) -> Bools:
@@ -74,8 +74,11 @@ class Terms:
         return np.where(usable[..., None], np.maximum(excess, 0.0), 0.0)
 
 
-def _chance(square: Array, freedom: Array, scatter: Array, rest: Array) -> Array:
-    """Probability of so large a χ² by noise alone: Fisher's F."""
+def f_test(square: Array, freedom: Array, scatter: Array, rest: Array) -> Array:
+    """Probability of so large a χ² of `freedom` by noise alone: Fisher's F.
+
+    Against a `scatter` that `rest` degrees of freedom tell of. NaN where there is nothing to test.
+    """
     from scipy.special import fdtrc
 
     tested = (freedom > 0) & (rest >= 1)

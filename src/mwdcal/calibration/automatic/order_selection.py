@@ -213,26 +213,17 @@ def _scored(
     means[:, 1:] = np.sqrt(means[:, 1:]) * np.array([scale, scale, degree, degree])[:, None]
     known = {k: float(v) for k, v in enumerate(chance, 1) if not np.isnan(v)}
     rows = []
-    for index, order in enumerate(orders):
-        stated = [[None if np.isnan(v) else float(v) for v in row] for row in means[index]]
+    for order, mean in zip(orders, means, strict=True):
+        stated = [[None if np.isnan(v) else float(v) for v in row] for row in mean]
         chi, noise, error, noise_deg, error_deg = stated
         rows.append(
             OrderScore(
-                triad=triad,
-                order=order,
-                chosen=order == chosen,
-                chance=known.get(order),
-                inside=chi[1],
-                ends=chi[2],
-                unit=shown[1],
-                noise=noise[0],
-                error_inside=error[1],
-                error_ends=error[2],
-                noise_deg=noise_deg[0],
-                error_inside_deg=error_deg[1],
+                triad=triad, order=order, chosen=order == chosen, chance=known.get(order),
+                inside=chi[1], ends=chi[2], unit=shown[1], noise=noise[0], error_inside=error[1],
+                error_ends=error[2], noise_deg=noise_deg[0], error_inside_deg=error_deg[1],
                 error_ends_deg=error_deg[2],
             )
-        )
+        )  # fmt: skip
     return rows
 
 

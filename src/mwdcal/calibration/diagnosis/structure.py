@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mwdcal.calibration.automatic.courses import TRIED, steady_columns, temperature_powers
+from mwdcal.calibration.automatic.courses import TRIED, f_test, steady_columns, temperature_powers
 from mwdcal.calibration.covariance import variance_scales
 from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.evidence import TURNS, acts_on
@@ -173,8 +173,6 @@ def _trial(
     scores: _Scores, chosen: list[str], name: str, left: float, freedom: float
 ) -> tuple[float, float, int]:
     """Chance in noise, gain and directions of one more family, of misfit `left`."""
-    from scipy.special import fdtrc
-
     before = scores.gain(chosen) if chosen else (0.0, 0)
     after = scores.gain([*chosen, name])
     gain, directions = after[0] - before[0], after[1] - before[1]
@@ -182,11 +180,8 @@ def _trial(
     if directions < 1 or rest < 1:
         return 1.0, 0.0, 0
     gain = min(gain, left * (1 - 1e-9))
-    return (
-        float(fdtrc(directions, rest, gain / directions / ((left - gain) / rest))),
-        gain,
-        directions,
-    )
+    chance = f_test(*np.array([gain, directions, (left - gain) / rest, rest]))
+    return float(chance), gain, directions
 
 
 def _described(result: Fit, shown: list[tuple[str, float, float]]) -> list[Effect]:
