@@ -10,16 +10,16 @@ import pytest
 from cli_support import EXAMPLE, mwdcal, servo_run, write_csv
 from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.covariance import assumed_exact, shares, stated_covariance
-from mwdcal.calibration.diagnosis.findings import misfit_chances
+from mwdcal.calibration.diagnosis.misfit import misfit_chances
 from mwdcal.calibration.estimate import fit
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.prediction import typical_accuracy
 from mwdcal.calibration.prior import from_calibration
 from mwdcal.calibration.readings import Readings
 from mwdcal.errors import FitError
+from mwdcal.estimation.batch import take
 from mwdcal.files import documents
 from mwdcal.files.runs import read_run as runs_of
-from mwdcal.fleet.refusals import member
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import centred
 from mwdcal.sensor.profile import Profile
@@ -224,7 +224,7 @@ def test_estimated_inclination_zero_is_unbiased_with_honest_uncertainty():
 def test_fits_of_one_member_and_of_a_batch_state_the_same():
     _, data = runs("tilt", SIZES["tilt"], count=3)
     result = fit(data)
-    one = stated_covariance(member(result, np.array([1])))[0]
+    one = stated_covariance(take(result, np.array([1])))[0]
     np.testing.assert_allclose(one, stated_covariance(result)[1], rtol=1e-9, atol=1e-20)
 
 

@@ -9,11 +9,12 @@ import pytest
 from scipy import stats
 
 from mwdcal.calibration.automatic.courses import course_misfit, misfit_covariance, terms_beyond
-from mwdcal.calibration.automatic.order_selection import choose_order, choose_orders, mapped
+from mwdcal.calibration.automatic.order_selection import choose_order, choose_orders
 from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.estimate import fit
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import TRIADS, Readings
+from mwdcal.estimation.batch import mapped, take
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.planning.simulate import servo
 from mwdcal.sensor.profile import Profile
@@ -74,8 +75,7 @@ def fitted(readings, orders):
     """Fits of the members, by the orders that each has, with the places of the members."""
     for pair in np.unique(orders, axis=0):
         index = np.flatnonzero((orders == pair).all(-1))
-        own = mapped(readings, lambda value, some=index: np.asarray(value)[some])
-        yield index, fit(own, Options(order=(int(pair[0]), int(pair[1]))))
+        yield index, fit(take(readings, index), Options(order=(int(pair[0]), int(pair[1]))))
 
 
 def covariance_of(result):
@@ -203,7 +203,7 @@ def test_the_size_of_what_is_left_out_is_that_of_the_truth_simulated():
 def alone(soaks, seed=0):
     """One tool's run, as from a table."""
     readings = runs(tools(1, seed), SOAKS[soaks], seed)
-    one = mapped(readings, lambda value: np.asarray(value)[0])
+    one = mapped(lambda value: value[0], readings)
     return replace(one, metadata={"simulated": True})
 
 

@@ -238,7 +238,7 @@ def rests_on_free(result: Fit, readings: Readings) -> bool:
         return group_scatter(directions(g[0], b[0]), readings.groups)
 
     step = 1e-3
-    free = free_directions(result.problem, result.state, result.analysis.determined)
+    free = free_directions(result.problem, result.state, result.analysis.determined)[0]
     changes = [abs(spread(step * f.direction) - spread(0.0)) / step for f in free]
     return max(changes, default=0.0) > MOVES
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from mwdcal import __version__
 from mwdcal.calibration.automatic.auto import Choice, choose
-from mwdcal.calibration.automatic.stand import check_separable, stand_errors
+from mwdcal.calibration.automatic.stand import stand_errors
 from mwdcal.calibration.covariance import (
     PRIOR,
     assumed_exact,
@@ -23,8 +23,9 @@ from mwdcal.calibration.covariance import (
     shares,
     stated_covariance,
 )
-from mwdcal.calibration.diagnosis.findings import Findings, described
-from mwdcal.calibration.diagnosis.refusals import check_fit
+from mwdcal.calibration.diagnosis.findings import described, findings
+from mwdcal.calibration.diagnosis.flags import FittedRuns
+from mwdcal.calibration.diagnosis.refusals import check, fit_refusals
 from mwdcal.calibration.estimate import Fit, fit
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.prediction import typical_budget
@@ -39,9 +40,9 @@ from mwdcal.calibration.record import (
     Undetermined,
     rounded,
 )
-from mwdcal.calibration.residuals import error_rows, measure_rows, station_rows
+from mwdcal.calibration.residuals import error_rows, measure_rows
 from mwdcal.estimation.evidence import STAND_ERRORS
-from mwdcal.estimation.rank import Free, free_directions
+from mwdcal.estimation.rank import Free
 from mwdcal.estimation.uncertainty import marginal_rank
 from mwdcal.geometry.vectors import Array
 from mwdcal.sensor.profile import Profile
@@ -82,11 +83,9 @@ def recorded(
     Raises `FitError` where the fit is not to be trusted.
     """
     readings, profile, options = choice.readings, choice.profile, choice.options
-    if options.estimate:
-        check_separable(result, options.estimate)
-    free = free_directions(result.problem, result.state, result.analysis.determined)
-    check_fit(result, free, profile, readings)
-    made = _Record(readings, profile, options, result, free)
+    fitted = FittedRuns.single(readings, profile, options, result)
+    check(fit_refusals(fitted))
+    made = _Record(readings, profile, options, result, fitted)
     record = made.calibration(profile_sha256, run_sha256)
     also = {
         "orders": choice.orders,
@@ -104,12 +103,16 @@ class _Record:
     profile: Profile
     options: Options
     result: Fit
-    free: list[Free]
+    fitted: FittedRuns
+
+    @property
+    def free(self) -> list[Free]:
+        """Directions of the parameters that nothing determines."""
+        return self.fitted.free[0]
 
     def calibration(self, profile_sha256: str, run_sha256: str) -> Calibration:
         """The whole record."""
         readings, result, options = self.readings, self.result, self.options
-        stations = station_rows(readings, result)
         return Calibration(
             tool={k: str(v) for k, v in readings.metadata.items() if k in IDENTITY},
             profile=self.profile,
@@ -141,14 +144,10 @@ class _Record:
             assumed_exact=self.assumed,
             errors=error_rows(readings, result),
             measures=measure_rows(readings, result),
-            station_rows=stations,
+            station_rows=self.fitted.rows(0),
             inherited=list(options.knowledge.stations) if options.knowledge else [],
-            findings=self._findings.all(stations),
+            findings=findings(self.fitted),
         )
-
-    @cached_property
-    def _findings(self) -> Findings:
-        return Findings(self.readings, self.profile, self.options, self.result, self.free)
 
     @property
     def temperatures(self) -> tuple[float, float] | None:
@@ -248,7 +247,7 @@ class _Record:
         noise, declared = self.result.noise[0, index], np.isnan(self.result.noise[0, index])
         curved = TRIADS[index] in self.options.curved
         finished, _ = triad.model.finished(self.profile.reference_temperature_c)
-        freedom, chance = float(analysis.freedom[0, index]), self._findings.chances[0, index]
+        freedom, chance = float(analysis.freedom[0, index]), self.fitted.chances[0, index]
         return TriadCalibration(
             name=TRIADS[index],
             unit="g" if index == 0 else ("1 (field = 1)" if self.readings.relative else "nT"),

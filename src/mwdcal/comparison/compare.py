@@ -176,7 +176,7 @@ def _calibrated(readings: Readings, profile: Profile, options: Options) -> _Cali
         return str(error)
     except np.linalg.LinAlgError as error:
         return f"the stations are too weak to fit the model ({error}). Add stations."
-    free = free_directions(result.problem, result.state, result.analysis.determined)
+    free = free_directions(result.problem, result.state, result.analysis.determined)[0]
     return _Calibrated(options, record, result, seconds, free)
 
 

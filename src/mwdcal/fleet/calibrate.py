@@ -9,19 +9,19 @@ says which.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import partial
-from typing import Any
 
+import msgspec
 import numpy as np
 
 from mwdcal.calibration.automatic.auto import known_before
 from mwdcal.calibration.automatic.nonlinearity import offered
-from mwdcal.calibration.automatic.order_selection import mapped
-from mwdcal.calibration.automatic.stand import check_separable, stand_errors
+from mwdcal.calibration.automatic.stand import stand_errors
 from mwdcal.calibration.covariance import stated_covariance
-from mwdcal.calibration.diagnosis.refusals import check_readings, fit_checks
+from mwdcal.calibration.diagnosis.findings import finding_flags
+from mwdcal.calibration.diagnosis.flags import Alone, FittedRuns, Flag
+from mwdcal.calibration.diagnosis.refusals import BAD_INPUT, fit_refusals, reading_refusals
 from mwdcal.calibration.estimate import Fit, fit
 from mwdcal.calibration.methods import ESTIMABLE
 from mwdcal.calibration.options import AUTO, Options
@@ -29,20 +29,17 @@ from mwdcal.calibration.readings import TRIADS, Readings
 from mwdcal.calibration.record import FREE_SHARE, StandErrors
 from mwdcal.calibration.soaks import HIGHEST
 from mwdcal.errors import MwdcalError
+from mwdcal.estimation.batch import take
 from mwdcal.estimation.rank import Free
 from mwdcal.estimation.uncertainty import marginal_rank
 from mwdcal.fleet.accuracy import ANGLES, typical_sd
 from mwdcal.fleet.choices import in_chunks, with_curves, with_orders
 from mwdcal.fleet.curves import curved_sd
-from mwdcal.fleet.findings import findings_of_batch
-from mwdcal.fleet.refusals import free_of_batch, member, suspect_fits, suspect_readings
 from mwdcal.geometry.vectors import AnyArray, Array, Ints
 from mwdcal.sensor.models import Basis, Factors, Polynomial, Whole
 from mwdcal.sensor.profile import Profile
 
-OK, BAD_INPUT, FAILED = "ok", "bad-input", "failed"
-Alone = Callable[[int], tuple[Readings, Profile]]
-"""Readings and profile of one tool of a batch by themselves, as `calibrate` takes them."""
+OK, FAILED = "ok", "failed"
 FACTS = ("rank", "size", "noise", "variance_factor", "degrees_of_freedom")
 """Columns of a triad besides its parameters and their standard uncertainties."""
 EARTH = ("gravity_g", "field", "dip_deg")
@@ -125,21 +122,21 @@ def calibrate_batch(
 
     `alone` gives one tool's own readings where a check needs words for it.
     """
-    count = len(readings.accelerometer)
+    count, profile = len(readings.accelerometer), _with_scales(profile)
     blank = {name: np.full(count, np.nan) for name in names(options, profile)}
     free: list[tuple[list[str], ...]] = [([], []) for _ in range(count)]
     status, message = np.full(count, OK, object), np.full(count, "", object)
-    none: list[list[Any]] = [[] for _ in range(count)]
-    outcome = Outcome(status, message, blank, free, list(none), list(none))
+    none: list[list[str]] = [[] for _ in range(count)]
+    again: list[list[int]] = [[] for _ in range(count)]
+    outcome = Outcome(status, message, blank, free, none, again)
     options, every = known_before(options, readings, profile), np.arange(count)
-    _refuse(outcome, every, suspect_readings(readings, options), alone, options)
+    _screen(outcome, every, readings, options, alone)
     for some, chosen in with_orders(readings, outcome.sound(every), options):
         if isinstance(chosen, Exception):
             _fail(outcome, some, chosen)
             continue
         if chosen.order != options.order:
-            suspects = suspect_readings(taken(readings, some), chosen)
-            _refuse(outcome, some, suspects, alone, chosen)
+            _screen(outcome, some, readings, chosen, alone)
         for part, final in with_curves(readings, outcome.sound(some), chosen, profile):
             if isinstance(final, Exception):
                 _fail(outcome, part, final)
@@ -173,21 +170,27 @@ def _fail(outcome: Outcome, tools: Ints, error: Exception) -> None:
     outcome.message[tools] = f"the fit failed: {error}. Calibrate this tool alone to see why."
 
 
-def _refuse(
-    outcome: Outcome, tools: Ints, suspects: dict[str, Any], alone: Alone, options: Options
+def _screen(
+    outcome: Outcome, tools: Ints, readings: Readings, options: Options, alone: Alone
 ) -> None:
-    """Give the suspects that the check of a single run refuses their status and message."""
-    for name, flags in suspects.items():
-        for tool in outcome.sound(tools[flags & (outcome.status[tools] == OK)]):
-            try:
-                check_readings(alone(int(tool))[0], options)
-            except MwdcalError as error:
-                outcome.status[tool], outcome.message[tool] = name, str(error)
+    """Refuse those of some tools that no fit could mend."""
+    refusals = reading_refusals(take(readings, tools), options, lambda i: alone(int(tools[i]))[0])
+    _refuse(outcome, tools, refusals)
 
 
-def taken(readings: Readings, index: Ints) -> Readings:
-    """Some members of a batch."""
-    return mapped(readings, lambda value: value[index])
+def _with_scales(profile: Profile) -> Profile:
+    """The profile with its scales stated: the readings are divided by those that it leaves open."""
+    triads = {name: getattr(profile, name) for name in TRIADS}
+    stated = {n: msgspec.structs.replace(t, scale=t.scale or 1.0) for n, t in triads.items()}
+    return msgspec.structs.replace(profile, **stated)
+
+
+def _refuse(outcome: Outcome, tools: Ints, refusals: Iterable[Flag]) -> None:
+    """Give the first refusal of each of some tools as its status and message."""
+    for refusal in refusals:
+        for place in np.flatnonzero(refusal.members & (outcome.status[tools] == OK)).tolist():
+            outcome.status[tools[place]] = refusal.id
+            outcome.message[tools[place]] = refusal.sentence(place)
 
 
 def _record(
@@ -200,53 +203,41 @@ def _record(
     alone: Alone,
 ) -> None:
     """Check a fit of some tools and write down the results of the sound ones."""
-    free = free_of_batch(result)
-    _doubt(outcome, members, result, free, options, alone, profile)
+    own = take(readings, members)
+    fitted = FittedRuns.of(own, profile, options, result, lambda i: alone(int(members[i])))
+    _refuse(outcome, members, fit_refusals(fitted))
     good = np.flatnonzero(outcome.status[members] == OK)
     if not good.size:
         return
     if good.size < len(members):
-        result, free = member(result, good), [free[index] for index in good]
-    findings, again = findings_of_batch(readings, profile, options, result, free)
-    for place, own, stations in zip(members[good], findings, again, strict=True):
-        outcome.findings[place], outcome.reshoot[place] = own, stations
+        fitted, members = fitted.take(good), members[good]
+    _note(outcome, members, fitted)
+    result, free = fitted.result, fitted.free
     reference = profile.reference_temperature_c
     covariance = stated_covariance(result)
     found = _columns(result, covariance, free, reference)
     found |= _besides(result, covariance, free, options, reference)
     for name, values in found.items():
-        outcome.columns[name][members[good]] = values
-    for place, each in zip(members[good], free, strict=True):
-        if each:
-            outcome.free[place] = tuple(
-                [f.id for f in each if triad in f.triads] for triad in range(len(TRIADS))
+        outcome.columns[name][members] = values
+
+
+def _note(outcome: Outcome, members: Ints, fitted: FittedRuns) -> None:
+    """Write down the findings of sound tools; what is undetermined, by triad."""
+    free = [{entry.id for entry in each} for each in fitted.free]
+    ids: list[dict[str, None]] = [{} for _ in members]
+    for flag in finding_flags(fitted):
+        for place in np.flatnonzero(flag.members).tolist():
+            if flag.id not in free[place]:
+                ids[place][flag.id] = None
+            if flag.station is not None:
+                outcome.reshoot[members[place]].append(flag.station)
+    for place, tool in enumerate(members):
+        outcome.findings[tool] = [*ids[place]]
+        if free[place]:
+            outcome.free[tool] = tuple(
+                [f.id for f in fitted.free[place] if triad in f.triads]
+                for triad in range(len(TRIADS))
             )
-
-
-def _doubt(
-    outcome: Outcome,
-    members: Ints,
-    result: Fit,
-    free: list[list[Free]],
-    options: Options,
-    alone: Alone,
-    profile: Profile,
-) -> None:
-    """Give the suspects that the checks of a single fit refuse their status and message."""
-    suspect = suspect_fits(result, free, options, profile) & (outcome.status[members] == OK)
-    for index in np.flatnonzero(suspect):
-        tool = int(members[index])
-        readings, own_profile = alone(tool)
-        own = member(result, np.array([index]))
-        checks = [*fit_checks(own, free[index], own_profile, readings)]
-        if options.estimate:
-            checks.insert(0, ("inseparable", partial(check_separable, own, options.estimate)))
-        for status, check in checks:
-            try:
-                check()
-            except MwdcalError as error:
-                outcome.status[tool], outcome.message[tool] = status, str(error)
-                break
 
 
 def _besides(
@@ -265,7 +256,7 @@ def _besides(
         rows = free_rows(free, result.state.params.shape[-1])
         found |= curved_sd(result, covariance, rows, reference)
     if options.estimate:
-        errors = [stand_errors(member(result, np.array([i]))) for i in range(count)]
+        errors = [stand_errors(take(result, np.array([i]))) for i in range(count)]
         for name in (name for error in options.estimate for name in STAND[error]):
             found[name] = np.array([getattr(each, name) for each in errors])
     return found
@@ -312,7 +303,7 @@ def _triad_columns(
     size, rank = triad.model.size, np.full(len(params), triad.model.size)
     some = np.flatnonzero([bool(each) for each in free])
     if some.size:
-        part = member(result, some)
+        part = take(result, some)
         rank[some] = marginal_rank(part.analysis.determined, where)
         directions = free_rows([free[i] for i in some], problem.slices()[-1].stop)[..., where]
         moved = np.einsum("bij,bkj->bki", one[some], directions)

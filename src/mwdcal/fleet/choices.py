@@ -12,12 +12,13 @@ from typing import TypeVar
 import numpy as np
 
 from mwdcal.calibration.automatic.nonlinearity import PARTS, compare_curves, offered, scattered
-from mwdcal.calibration.automatic.order_selection import choose_orders, mapped
+from mwdcal.calibration.automatic.order_selection import choose_orders
 from mwdcal.calibration.diagnosis.refusals import check_curves, check_options
 from mwdcal.calibration.estimate import temperature_ranges
 from mwdcal.calibration.options import AUTO, Options
 from mwdcal.calibration.readings import Readings
 from mwdcal.errors import MwdcalError
+from mwdcal.estimation.batch import take
 from mwdcal.geometry.vectors import Ints
 from mwdcal.sensor.profile import Profile
 
@@ -111,7 +112,7 @@ def _halved(
 ) -> Iterator[tuple[Ints, _T | Exception]]:
     """The work on given members of a batch, done in halves where one member stops the whole."""
     try:
-        yield tools, work(mapped(readings, lambda value: value[tools]))
+        yield tools, work(take(readings, tools))
     except (ArithmeticError, ValueError, np.linalg.LinAlgError) as error:
         if len(tools) == 1:
             yield tools, error

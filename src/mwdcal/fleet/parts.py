@@ -12,13 +12,14 @@ import msgspec
 import numpy as np
 
 from mwdcal import __version__
+from mwdcal.calibration.diagnosis.refusals import BAD_INPUT
 from mwdcal.calibration.options import AUTO, Options
 from mwdcal.calibration.readings import TRIADS
 from mwdcal.calibration.soaks import HIGHEST
 from mwdcal.errors import InputError
 from mwdcal.files.contract import AZIMUTH_KEYS, CHANNELS
 from mwdcal.files.formats import parquet
-from mwdcal.fleet.calibrate import BAD_INPUT, OK, Outcome, calibrate_batch, names
+from mwdcal.fleet.calibrate import OK, Outcome, calibrate_batch, names
 from mwdcal.fleet.runs import Batch, Rows, batches, refused_tools
 from mwdcal.fleet.sources import SERIAL, Source
 from mwdcal.fleet.tables import Partition, read

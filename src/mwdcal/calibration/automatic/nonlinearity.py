@@ -13,10 +13,11 @@ from itertools import combinations
 
 import numpy as np
 
-from mwdcal.calibration.automatic.order_selection import batch_of_one, mapped, misfit
+from mwdcal.calibration.automatic.order_selection import misfit
 from mwdcal.calibration.estimate import fit, scatters
 from mwdcal.calibration.options import AUTO, USUAL, Options
 from mwdcal.calibration.readings import TRIADS, Readings
+from mwdcal.estimation.batch import batch_of_one, mapped
 from mwdcal.estimation.variance import log_evidence
 from mwdcal.geometry.vectors import Array, Ints
 from mwdcal.sensor.profile import Profile
@@ -196,6 +197,6 @@ def _left_out(readings: Readings, options: Options) -> Array:
     parts = min(readings.count, PARTS)
     part = np.arange(readings.count) % parts
     include = (np.arange(parts)[:, None] != part).astype(float)
-    result = fit(mapped(readings, lambda value: np.expand_dims(value, 1)), options, include)
+    result = fit(mapped(lambda value: np.expand_dims(value, 1), readings), options, include)
     square = misfit(result).mean(-1).reshape(-1, parts, readings.count) / 3
     return np.asarray(square[:, part, np.arange(readings.count)])

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -19,10 +18,11 @@ from mwdcal.calibration.readings import TRIADS, Readings
 from mwdcal.calibration.record import OrderScore
 from mwdcal.calibration.residuals import shown_in
 from mwdcal.calibration.soaks import HIGHEST, highest_order, usable_soaks
+from mwdcal.estimation.batch import batch_of_one, mapped, take
 from mwdcal.estimation.problem import Problem, State
 from mwdcal.estimation.solvers import Linear
 from mwdcal.estimation.uncertainty import TESTED, marginal_rank, readjusted
-from mwdcal.geometry.vectors import AnyArray, Array, Bools, Ints
+from mwdcal.geometry.vectors import Array, Bools, Ints
 
 FEWEST = 3
 """Fewest soaks among which one can be left out."""
@@ -63,9 +63,8 @@ def choose_orders(readings: Readings, options: Options) -> Ints:
     levels = _judged_soaks(readings, options)
     orders = np.zeros((len(levels), 2), int)
     for count in np.unique(levels[levels > 1]):
-        alike = levels == count
-        members = mapped(readings, lambda value, alike=alike: value[alike])  # type: ignore[misc]
-        orders[alike] = _tested(members, options)[0][:, [0, -1]]
+        alike = np.flatnonzero(levels == count)
+        orders[alike] = _tested(take(readings, alike), options)[0][:, [0, -1]]
     return orders
 
 
@@ -116,28 +115,6 @@ def order_errors(
     unknown = np.full((triads, HIGHEST), np.nan)
     chosen = np.array(options.orders[:triads])
     return _tables(readings, [options.orders], found, chosen, unknown)
-
-
-def batch_of_one(readings: Readings) -> Readings:
-    """A run without leading axes as a batch of one tool."""
-    return mapped(readings, lambda value: np.asarray(value)[None])
-
-
-def mapped(readings: Readings, change: Callable[[AnyArray], AnyArray]) -> Readings:
-    """The readings with every array changed."""
-
-    def own(value: AnyArray | None) -> Any:
-        return None if value is None else change(value)
-
-    return replace(
-        readings,
-        accelerometer=change(readings.accelerometer),
-        magnetometer=own(readings.magnetometer),
-        temperature=own(readings.temperature),
-        known={k: change(v) for k, v in readings.known.items()},
-        sd={k: change(v) for k, v in readings.sd.items()},
-        group=own(readings.group),
-    )
 
 
 def _usable_soaks(readings: Readings) -> Ints:
@@ -259,7 +236,7 @@ def _held_out(readings: Readings, options: Options, numbers: Ints) -> Array:
     """
     soak = np.arange(int(numbers.max()) + 1)
     include = (soak[:, None] != numbers[:, None, :]).astype(float)
-    result = fit(mapped(readings, lambda v: np.expand_dims(v, 1)), options, include)
+    result = fit(mapped(lambda value: np.expand_dims(value, 1), readings), options, include)
     held = 1 - include.reshape(-1, readings.count)
     problem, state = _everyone(result)
     linear = problem.linear(state)
