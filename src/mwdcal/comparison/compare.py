@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from mwdcal.calibration.automatic.auto import Choice, resolved
+from mwdcal.calibration.automatic.auto import Choice, resolved, without
 from mwdcal.calibration.calibrate import recorded
 from mwdcal.calibration.diagnosis.refusals import check_readings
 from mwdcal.calibration.estimate import Fit, fit
@@ -119,7 +119,9 @@ def compare(
     methods; their method does not count. A method that is refused gives its reason and leaves the
     others alone.
     """
-    options = _options(readings, profile, options or Options(), progress)
+    options = options or Options()
+    readings = without(readings, options.exclude)
+    options = _options(readings, profile, options, progress)
     results: dict[str, _Calibrated | str] = {}
     for method in EVIDENCE:
         progress(f"{method}: fit")
@@ -212,7 +214,7 @@ def _rests(name: str, record: Calibration, readings: Readings) -> bool:
 def _course(calibrated: _Calibrated) -> dict[str, Array]:
     """Excess of the swarm's best cost over the least one, as a share of it, by triad."""
     problem, state = calibrated.fit.problem, calibrated.fit.state
-    found = {}
+    courses = {}
     for name, triad, earth in zip(TRIADS, problem.triads, problem.earth(state)[0], strict=False):
         target = np.einsum("bnij,bnj->bni", state.attitude, earth)
         swarm = swarm_forward(
@@ -220,8 +222,8 @@ def _course(calibrated: _Calibrated) -> dict[str, Array]:
         )
         least = least_squares_forward(triad.raw, target)[:, None]
         cost = vector_cost(triad.raw, target, "reading")(least)[0, 0]
-        found[name] = swarm.history[0] / cost - 1
-    return found
+        courses[name] = swarm.history[0] / cost - 1
+    return courses
 
 
 def _referenced(readings: Readings) -> list[str]:
@@ -292,8 +294,8 @@ class _Judge:
         g, b = (
             np.where(failed[:, None, None], np.nan, v) for v in result.problem.fields(result.state)
         )
-        own = np.arange(self.readings.count)
-        return g[self.part, own], b[self.part, own]
+        every = np.arange(self.readings.count)
+        return g[self.part, every], b[self.part, every]
 
     def summary(self, g: Array, b: Array) -> dict[str, float]:
         """Root mean square errors by observable, and the scatter within groups, in shown units."""

@@ -13,7 +13,7 @@ from itertools import combinations
 
 import numpy as np
 
-from mwdcal.calibration.automatic.order_selection import misfit
+from mwdcal.calibration.automatic.order_selection import misfit, with_noise
 from mwdcal.calibration.estimate import fit, scatters
 from mwdcal.calibration.options import AUTO, USUAL, Options
 from mwdcal.calibration.readings import TRIADS, Readings
@@ -153,11 +153,11 @@ def log_odds(
 
     `include` (B, n) as of `fit`.
     """
-    found = []
+    evidence = []
     for curved in ({}, terms):
         result = fit(readings, replace(options, robust=None, nonlinearity=curved), include)
-        found.append(log_evidence(result.problem, result.state))
-    return np.nan_to_num(found[1] - found[0], nan=-np.inf)
+        evidence.append(log_evidence(result.problem, result.state))
+    return np.nan_to_num(evidence[1] - evidence[0], nan=-np.inf)
 
 
 def _trusted(readings: Readings, options: Options, terms: Mapping[str, float]) -> Array:
@@ -175,15 +175,9 @@ def _by_left_out(
     More terms are taken only if they lower χ² clearly below that of fewer: by 2 %, and by two
     standard errors.
     """
-    noise = fit(readings, replace(options, nonlinearity=choices[-1])).noise
-    estimated = {
-        name: noise[:, index, None, None]
-        for index, name in enumerate(TRIADS[: noise.shape[-1]])
-        if name not in readings.sd
-    }
-    readings = replace(readings, sd={**readings.sd, **estimated})
+    readings = with_noise(readings, replace(options, nonlinearity=choices[-1]))
     scores = [_left_out(readings, replace(options, nonlinearity=terms)) for terms in choices]
-    best, least = np.zeros(len(noise), int), scores[0]
+    best, least = np.zeros(len(scores[0]), int), scores[0]
     for index, score in enumerate(scores):
         gain = least - score
         error = gain.std(-1, ddof=1) / np.sqrt(readings.count)
