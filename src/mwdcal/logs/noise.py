@@ -163,7 +163,7 @@ def find_noise(
     used; `station_seconds` by default 30, or a tenth of a shorter log.
     Errors: a log without time, with gaps, too short, or without a channel that can be used.
     """
-    check(between, station_seconds)
+    check(between, station_seconds, sampling_hz)
     findings: list[Finding] = []
     first, last, rate = _section(log, sampling_hz, between, findings)
     seconds = (last - first) / rate
@@ -194,8 +194,10 @@ def find_noise(
     )
 
 
-def check(between: tuple[float, float], station_seconds: float | None) -> None:
-    """Refuse seconds that no log can have."""
+def check(
+    between: tuple[float, float], station_seconds: float | None, sampling_hz: float | None
+) -> None:
+    """Refuse seconds and a rate that no log can have."""
     start, end = between
     for option, value in (("--from", start), ("--to", end)):
         if np.isnan(value):
@@ -209,6 +211,10 @@ def check(between: tuple[float, float], station_seconds: float | None) -> None:
     if station_seconds is not None and not 0 < station_seconds < np.inf:
         raise InputError(
             f"--station-seconds must be above 0 and finite; got {station_seconds:g}. Correct it."
+        )
+    if sampling_hz is not None and not 0 < sampling_hz <= 1e9:
+        raise InputError(
+            f"`sampling_hz` must be above 0 and at most 1e9 Hz; got {sampling_hz:g}. Correct it."
         )
 
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mwdcal.app.pages import fleet_plots, report
+from mwdcal.app.pages import fleet_plots
 from mwdcal.app.pages.fleet_plots import FAR, FEWEST
 from mwdcal.app.pages.fleet_summary import (
     ERRORS,
@@ -24,7 +24,8 @@ from mwdcal.app.pages.fleet_summary import (
     orders_table,
     unusual,
 )
-from mwdcal.app.text import number, plural
+from mwdcal.app.pages.page import environment
+from mwdcal.app.text import number, plural, raised
 from mwdcal.calibration.diagnosis.findings import SUSPECT
 from mwdcal.calibration.readings import TRIADS, is_simulated
 from mwdcal.files.formats import atomic, parquet
@@ -33,7 +34,7 @@ from mwdcal.fleet.sources import SERIAL
 from mwdcal.geometry.vectors import Array, Bools, Ints
 
 if TYPE_CHECKING:
-    from jinja2 import Environment
+    from matplotlib.figure import Figure
 
 RELATIVE = "field = 1"
 """The kind of magnetometers of which the strength of the field is not known."""
@@ -80,11 +81,6 @@ class Outlier:
     median: float
     unit: str
     distance: float
-
-
-def environment() -> Environment:
-    """The templates; refuses, before any work, where what draws the page is missing."""
-    return report._environment()
 
 
 def write_report(path: str | os.PathLike[str], calibrations: Path, summary: Summary) -> None:
@@ -245,8 +241,7 @@ def _unit(name: str, triad: str, relative: bool, nominal: str) -> tuple[str, flo
     theirs, and a gain one over it.
     """
     kind, _, rest = name.partition("_")
-    power = rest.partition("_t")[2]
-    per = f"/°C{_raised(power)}" if power else ""
+    per = raised("/°C", int(rest.partition("_t")[2] or 0))
     if kind in ("offset", "bias", "square", "cube"):
         field = "of the field" if relative else "nT"
         return (f"mg{per}", 1e3) if triad == TRIADS[0] else (f"{field}{per}", 1.0)
@@ -262,18 +257,13 @@ def _title(name: str) -> str:
     'gain xy·τ'
     """
     steady, _, power = name.partition("_t")
-    course = f"·τ{_raised(power)}" if power else ""
-    return steady.replace("_", " ") + course
-
-
-def _raised(power: str) -> str:
-    """An exponent, none for the first power."""
-    return power.translate(report.SUPERSCRIPT) if power != "1" else ""
+    return steady.replace("_", " ") + raised("·τ", int(power or 0))
 
 
 def _figures(
     path: Path, parameters: list[Parameter], sound: Ints, estimated: list[str]
-) -> dict[str, str]:
+) -> dict[str, Figure]:
+    """The figures of the sound tools."""
     if not sound.size:
         return {}
     triads = dict.fromkeys(p.triad for p in parameters)
