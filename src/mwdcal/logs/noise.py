@@ -206,13 +206,11 @@ def check(
         got = f"`start` {start:g} and `end` {end:g}"
         raise InputError(f"`start` must be less than `end`; got {got}. Swap them?")
     if station_seconds is not None and not 0 < station_seconds < np.inf:
-        raise InputError(
-            f"`station_seconds` must be above 0 and finite; got {station_seconds:g}. Correct it."
-        )
+        rule = "`station_seconds` must be above 0 and finite"
+        raise InputError(f"{rule}; got {station_seconds:g}. Correct it.")
     if sampling_hz is not None and not 0 < sampling_hz <= 1e9:
-        raise InputError(
-            f"`sampling_hz` must be above 0 and at most 1e9 Hz; got {sampling_hz:g}. Correct it."
-        )
+        rule = "`sampling_hz` must be above 0 and at most 1e9 Hz"
+        raise InputError(f"{rule}; got {sampling_hz:g}. Correct it.")
 
 
 def _section(

@@ -153,12 +153,6 @@ def unusual(options: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def column(path: Path, name: str) -> Array:
-    """One column of numbers of a table of calibrations, NaN where there is none."""
-    _, pq = parquet.modules(path.name)
-    return numbers(pq.ParquetFile(path), name)
-
-
 def numbers(whole: Any, name: str) -> Array:
     """One column of numbers of an opened Parquet file, NaN where there is none."""
     arrow, _ = parquet.modules(name)
