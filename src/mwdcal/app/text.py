@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, is_dataclass
-from typing import Any
-
 import numpy as np
 
 WIDE = 300
@@ -69,14 +66,3 @@ def raised(symbol: str, power: int) -> str:
     ['', 'τ', 'τ²']
     """
     return symbol + superscript(power) if power > 1 else symbol * power
-
-
-def plain(value: Any) -> Any:
-    """Dataclasses and arrays as what JSON can hold."""
-    if isinstance(value, np.ndarray):
-        return value.tolist()
-    if is_dataclass(value):
-        return {f.name: plain(getattr(value, f.name)) for f in fields(value)}
-    if isinstance(value, dict):
-        return {key: plain(item) for key, item in value.items()}
-    return [plain(item) for item in value] if isinstance(value, list | tuple) else value

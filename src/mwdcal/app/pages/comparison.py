@@ -7,15 +7,16 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import msgspec
 import numpy as np
 
 from mwdcal import __version__
 from mwdcal.app.pages import plots
 from mwdcal.app.pages.page import environment, measured, number
-from mwdcal.app.text import plain, raised, superscript, table
+from mwdcal.app.text import raised, superscript, table
 from mwdcal.calibration.methods import EVIDENCE
 from mwdcal.calibration.readings import SIMULATED
 from mwdcal.comparison.common_gauge import SCALE, TURNS
@@ -204,12 +205,11 @@ def _stated(value: float, sd: float) -> tuple[str, str]:
 
 def document(comparison: Comparison) -> dict[str, Any]:
     """The result for machines, without the errors of single stations."""
-    rows = tuple(replace(row, station_errors={}, course={}) for row in comparison.rows)
-    made: dict[str, Any] = plain(replace(comparison, rows=rows, labels=()))
-    for row in made["rows"]:
+    shown: dict[str, Any] = msgspec.to_builtins(comparison, enc_hook=np.ndarray.tolist)
+    for row in shown["rows"]:
         del row["station_errors"], row["course"]
-    del made["labels"]
-    return made
+    del shown["labels"]
+    return shown
 
 
 def write_report(
@@ -236,6 +236,7 @@ def render(comparison: Comparison, trace: Sequence[tuple[str, str, str]] = ()) -
     headline, _, why = comparison.advice.partition(": ")
     return template.render(
         found=comparison,
+        simulated=comparison.simulated,
         headline=headline,
         why=why,
         rows=rows,

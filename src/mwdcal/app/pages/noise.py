@@ -165,6 +165,7 @@ def render(noise: Noise) -> str:
         .get_template("noise.html")
         .render(
             found=noise,
+            simulated=noise.simulated,
             heading=heading(noise),
             figure=figure(noise),
             tables=tables(noise),
