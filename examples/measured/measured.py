@@ -18,7 +18,7 @@ from pathlib import Path
 import nulls
 import numpy as np
 
-from mwdcal.app import cli
+from mwdcal.app.commands import calibrate as command
 from mwdcal.app.commands.choices import Typed, options_of
 from mwdcal.calibration.automatic.auto import Choice, choose
 from mwdcal.calibration.automatic.nonlinearity import ODDS, choices_of, declared, log_odds
@@ -100,10 +100,8 @@ def ways(curved: str) -> list[str]:
 
 def typed(words: str) -> Typed:
     """The options that the command line makes of these words."""
-    command = cli.calibrate.make_context(
-        "calibrate", ["-", "-o", "-", *words.split()], **cli.cli.context_settings
-    )
-    return Typed(**{name: command.params[name] for name in Typed.__annotations__})
+    context = command.command.make_context("calibrate", ["-", "-o", "-", *words.split()])
+    return Typed(**{name: context.params[name] for name in Typed.__annotations__})
 
 
 @cache

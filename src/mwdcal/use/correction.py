@@ -64,8 +64,8 @@ def correct(
     `magnetic_toolface_deg` stands beside them. A strength of zero has no direction: NaN.
     Temperatures outside the calibrated range are blanked, refused or extrapolated as `outside` says.
     """
-    columns, _, told = counted(calibration, readings, outside)
-    return columns, told
+    columns, _, remarks = counted(calibration, readings, outside)
+    return columns, remarks
 
 
 def counted(
@@ -84,11 +84,11 @@ def counted(
         rows, int(beyond.sum()), moved, lacking, (),
         strengths.judged(calibration, columns, readings.known), warmth(readings.temperature),
     )  # fmt: skip
-    told = findings(calibration, readings, tally, outside)
+    remarks = findings(calibration, readings, tally, outside)
     strengths.check(calibration, tally.strengths, readings.source)
     if outside == "extrapolate":
         columns[MARK] = beyond
-    return columns, tally, told
+    return columns, tally, remarks
 
 
 def warmth(temperature: Array | None) -> tuple[float, float]:
@@ -106,7 +106,7 @@ def result_names(outside: str) -> tuple[str, ...]:
 def check_outside(outside: str) -> None:
     """Refuse a word that says nothing about temperatures outside the calibrated range."""
     if outside not in OUTSIDE:
-        raise InputError(f"--outside must be one of {', '.join(OUTSIDE)}; got {outside!r}.")
+        raise InputError(f"`outside` must be one of {', '.join(OUTSIDE)}; got {outside!r}.")
 
 
 def reference(calibration: Calibration, readings: Readings) -> dict[str, Array]:
@@ -142,8 +142,8 @@ def compiled(
     flat = np.ascontiguousarray(np.broadcast_to(warmth, shape), float).reshape(-1)
     g, b = readings.accelerometer, readings.magnetometer
     vectors = [*_axes(g), *(_axes(b) if b is not None else [np.full(flat.shape, np.nan)] * 3)]
-    found = correction_numba.run([*vectors, flat], triads, zero)
-    return {n: c.reshape(shape) for n, c in zip(NAMES, found.columns, strict=True)}
+    result = correction_numba.run([*vectors, flat], triads, zero)
+    return {n: c.reshape(shape) for n, c in zip(NAMES, result.columns, strict=True)}
 
 
 def _axes(vectors: Array) -> list[Array]:
@@ -156,13 +156,13 @@ def numbers(
     calibration: Calibration,
 ) -> tuple[correction_numba.Numbers, correction_numba.Numbers] | None:
     """Both triads for the compiled loops; None where a model is not for them."""
-    found = [
+    triads = [
         correction_numba.numbers(
             t.functions(calibration.reference_temperature), np.array(t.parameters)
         )
         for t in calibration.triads
     ]
-    first, second = [*found, correction_numba.NOTHING][:2]
+    first, second = [*triads, correction_numba.NOTHING][:2]
     return None if first is None or second is None else (first, second)
 
 
@@ -173,32 +173,32 @@ def findings(
 
     Of the readings only their metadata count, and whether there is a magnetometer.
     """
-    found = []
+    remarks = []
     if calibration.has_field and readings.magnetometer is None:
         text = "no columns mx, my, mz: magnetic results are blank."
-        found.append(Finding(id="no-magnetometer", text=text))
-    found += _other_tool(calibration, readings)
+        remarks.append(Finding(id="no-magnetometer", text=text))
+    remarks += _other_tool(calibration, readings)
     if tally.lacking:
         text = f"{tally.lacking} of {tally.rows} rows lack a reading: their results are blank."
-        found.append(Finding(id="missing-reading", text=text))
+        remarks.append(Finding(id="missing-reading", text=text))
     if tally.beyond:
-        found.append(_outside(calibration, readings.source, outside, tally))
+        remarks.append(_outside(calibration, readings.source, outside, tally))
     if calibration.unrecorded(readings):
         at = "…".join(dict.fromkeys(f"{end:.1f}" for end in tally.warmth))
         text = (
             "the calibration was made at unrecorded temperatures, without temperature terms: nothing says how "
             f"good the results are at the readings' {at} °C."
         )
-        found.append(Finding(id="no-temperature", text=text))
-    found += strengths.findings(tally.strengths)
+        remarks.append(Finding(id="no-temperature", text=text))
+    remarks += strengths.findings(tally.strengths)
     if calibration.relative:
         text = "the magnetometer is calibrated to field = 1: bx_nt, by_nt, bz_nt and field_nt are relative, not nT."
-        found.append(Finding(id="field-relative", text=text))
+        remarks.append(Finding(id="field-relative", text=text))
     if tally.moved:
         free = ", ".join(dict.fromkeys(u.id for u in calibration.undetermined()))
         text = f"{', '.join(tally.moved)} rest on what the calibration leaves undetermined ({free})"
-        found.append(Finding(id="undetermined", text=f"{text}: no uncertainty can be stated."))
-    return found
+        remarks.append(Finding(id="undetermined", text=f"{text}: no uncertainty can be stated."))
+    return remarks
 
 
 def _other_tool(calibration: Calibration, readings: Readings) -> list[Finding]:
@@ -217,7 +217,7 @@ def _outside(calibration: Calibration, source: str, how: str, tally: Tally) -> F
     text = f"{tally.beyond} of {tally.rows} rows lie outside the calibrated range {low:.1f}…{high:.1f} °C"
     if how == "refuse":
         raise InputError(
-            f"{source}: {text}. Use --outside blank or extrapolate, or calibrate over a wider range."
+            f"{source}: {text}. Use `outside` blank or extrapolate, or calibrate over a wider range."
         )
     done = (
         "their results are blank"
