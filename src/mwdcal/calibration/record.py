@@ -414,14 +414,15 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
         """Where (…, n) an observable moves with a direction that no evidence determines."""
         shape = readings.accelerometer.shape[:-1]
         g, b = self.fields(readings)
-        moved = np.einsum("...nip,kp->...nki", self.jacobian(readings), self._free_rows())
+        moved = np.einsum("...nip,kp->...nki", self.jacobian(readings), self.free_rows())
         gradient = np.nan_to_num(OBSERVABLES[name].gradient(g, b))
         change = np.abs(np.einsum("...ni,...nki->...nk", gradient, moved))
         scale = {"g": np.linalg.norm(g, axis=-1), "nT": np.linalg.norm(b, axis=-1)}
         limit = FREE_SHARE * scale.get(OBSERVABLES[name].unit, np.ones(shape))
         return np.asarray(np.any(change > np.nan_to_num(limit)[..., None], -1))
 
-    def _free_rows(self) -> Array:
+    def free_rows(self) -> Array:
+        """Directions (k, p) of the parameters that no evidence determines."""
         size = sum(len(t.parameters) for t in self.triads)
         return np.array(self.free, float).reshape(len(self.free), size)
 
@@ -460,6 +461,11 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
     def unrecorded(self, readings: Readings) -> bool:
         """Whether the readings have temperatures and the run of the calibration recorded none."""
         return self.temperature_c is None and readings.temperature is not None
+
+
+def stated(value: float) -> float | None:
+    """A number as a file has it: None for NaN, which nothing can be stated of."""
+    return None if np.isnan(value) else float(value)
 
 
 def rounded(calibration: Calibration) -> Calibration:

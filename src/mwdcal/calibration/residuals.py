@@ -11,7 +11,7 @@ import numpy as np
 
 from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.readings import TRIADS, Readings
-from mwdcal.calibration.record import ErrorRow, Measures, StationRow
+from mwdcal.calibration.record import ErrorRow, Measures, StationRow, stated
 from mwdcal.estimation.evidence import STAND_ERRORS
 from mwdcal.estimation.uncertainty import Analysis, station_misfit, without_station
 from mwdcal.geometry.observables import OBSERVABLES, VERTICAL
@@ -363,9 +363,9 @@ def station_rows(readings: Readings, fit: Fit) -> list[StationRow]:
                 temperature_c=None
                 if readings.temperature is None
                 else float(readings.temperature[i]),
-                inclination_deg=_plain(attitude["inclination"][i]),
-                toolface_deg=_plain(attitude["toolface"][i]),
-                azimuth_deg=_plain(attitude["azimuth"][i]),
+                inclination_deg=stated(attitude["inclination"][i]),
+                toolface_deg=stated(attitude["toolface"][i]),
+                azimuth_deg=stated(attitude["azimuth"][i]),
                 errors=_scaled(after, factors, i),
                 errors_before=_scaled(before, factors, i),
                 errors_left_out=_scaled(left_out, factors, i),
@@ -377,10 +377,6 @@ def station_rows(readings: Readings, fit: Fit) -> list[StationRow]:
             )
         )
     return rows
-
-
-def _plain(value: float) -> float | None:
-    return None if np.isnan(value) else float(value)
 
 
 def _scaled(errors: dict[str, Array], factors: dict[str, float], index: int) -> dict[str, float]:

@@ -9,7 +9,6 @@ from functools import cached_property
 import numpy as np
 
 from mwdcal.calibration.automatic.courses import Terms, misfit_size, terms_beyond, untested
-from mwdcal.calibration.covariance import common_source
 from mwdcal.calibration.diagnosis.structure import described as seen_as
 from mwdcal.calibration.diagnosis.structure import effects, suspected
 from mwdcal.calibration.estimate import Fit
@@ -18,6 +17,7 @@ from mwdcal.calibration.prior import Knowledge
 from mwdcal.calibration.readings import TRIADS, Readings
 from mwdcal.calibration.record import Finding, StationRow
 from mwdcal.calibration.residuals import REASONS, chi_chance, shown_in, tail
+from mwdcal.calibration.results import common_source
 from mwdcal.calibration.soaks import HIGHEST
 from mwdcal.estimation.minimisers import closed_form
 from mwdcal.estimation.problem import Prior
