@@ -31,7 +31,7 @@ from mwdcal.calibration.record import (
     rounded,
     stated,
 )
-from mwdcal.calibration.residuals import error_rows, measure_rows, station_rows
+from mwdcal.calibration.residuals import Residuals, error_rows, measure_rows, station_rows
 from mwdcal.estimation.evidence import STAND_ERRORS
 from mwdcal.estimation.rank import Free, free_directions
 from mwdcal.geometry.vectors import Array
@@ -91,7 +91,8 @@ class _Record:
     ) -> Calibration:
         """The whole record."""
         readings, result, options = self.readings, self.result, self.options
-        stations = station_rows(readings, result)
+        residuals = Residuals(readings, result)
+        stations = station_rows(residuals)
         return Calibration(
             tool={k: str(v) for k, v in readings.metadata.items() if k in IDENTITY},
             profile=self.profile,
@@ -125,8 +126,8 @@ class _Record:
             earth=_first(results.earth(result)),
             budget=self.budget(),
             assumed_exact=results.assumed_exact(result, readings.relative),
-            errors=error_rows(readings, result),
-            measures=measure_rows(readings, result),
+            errors=error_rows(residuals),
+            measures=measure_rows(residuals),
             orders=list(orders),
             station_rows=stations,
             inherited=list(options.prior.stations) if options.prior else [],

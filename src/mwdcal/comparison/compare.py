@@ -19,7 +19,7 @@ from mwdcal.calibration.methods import EVIDENCE, ITERATIONS
 from mwdcal.calibration.options import Options, Orders
 from mwdcal.calibration.readings import ANGLES, TRIADS, Readings, is_simulated
 from mwdcal.calibration.record import Calibration, Measures
-from mwdcal.calibration.residuals import SHOWN, departure, rms, shown_in
+from mwdcal.calibration.residuals import SHOWN, departure, nominal, rms, shown_in, vector_measures
 from mwdcal.comparison.common_gauge import Gauge, in_gauge
 from mwdcal.errors import FitError
 from mwdcal.estimation.minimisers.swarm import least_squares_forward, swarm_forward, vector_cost
@@ -243,15 +243,6 @@ def _course(made: _Made) -> dict[str, Array]:
     return found
 
 
-def nominal(readings: Readings) -> tuple[Array, Array]:
-    """Vectors (n, 3) that the tool reads uncalibrated; the field has a mean of one if unknown."""
-    raw = readings.magnetometer
-    if raw is None:
-        return readings.accelerometer, np.full_like(readings.accelerometer, np.nan)
-    scale = np.linalg.norm(raw, axis=-1).mean() if readings.relative else 1.0
-    return readings.accelerometer, raw / scale
-
-
 def _referenced(readings: Readings) -> list[str]:
     """Observables that have a reference somewhere in the run."""
     magnetic = ("azimuth", "field", "dip")
@@ -355,20 +346,8 @@ class _Judge:
             reference_vectors(**blind, gravity=gravity)[0],
             reference_vectors(**known, field=field, dip=dip)[1],
         ]
-        found = []
-        for name, target, actual in zip(TRIADS, ideal, fields, strict=True):
-            error = np.linalg.norm(actual - target, axis=-1) / np.linalg.norm(target, axis=-1)
-            error = error[~np.isnan(error)]
-            if len(error) < 2:
-                continue
-            mse = float(np.mean(error**2))
-            found.append(
-                Measures(
-                    triad=name, when=when, mean=float(error.mean()),
-                    std=float(error.std(ddof=1)), mse=mse, rmse=mse**0.5,
-                )
-            )  # fmt: skip
-        return found
+        each = zip(TRIADS, fields, ideal, strict=True)
+        return [row for triad in each for row in vector_measures(triad[0], when, *triad[1:])]
 
 
 def score(row: Row, best: Mapping[str, float]) -> float:
