@@ -14,7 +14,6 @@ import numpy as np
 
 from mwdcal.calibration.readings import ANGLES, Readings
 from mwdcal.calibration.record import FREE_SHARE, Calibration
-from mwdcal.calibration.residuals import angle_error
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array, Bools, Ints, centred
 from mwdcal.use.roll_sets import ROLL_SET, RollSet, near_vertical, roll_sets
@@ -120,7 +119,9 @@ class Test:
     def _error(self, name: str) -> Array:
         """Departure (n,) from the reference that the run itself gives; NaN where it gives none."""
         known = self.readings.known.get(name, np.full(self.readings.count, np.nan))
-        return angle_error(name, *self.fields, known)
+        error = np.asarray(self.value(name) - known)
+        period = OBSERVABLES[name].period
+        return centred(error, period) if period else error
 
     def _coverage(self, index: Ints) -> Coverage | None:
         """How the toolfaces of stations cover the circle; None where none of them is known."""
@@ -263,7 +264,7 @@ class Test:
         return Outcome(tuple(shown), "", blocked, unrolled, apart, unseen)
 
     def _relative(self, name: str) -> bool:
-        return name == "field" and self.calibration.relative
+        return name == "field" and self.calibration.field_unit != "nT"
 
     def _unusable(self, name: str, free: bool) -> str:
         """Why no limit on an observable can be passed; empty where it can."""
