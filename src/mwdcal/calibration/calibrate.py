@@ -116,7 +116,7 @@ class _Record:
             temperature_c=self.temperatures,
             accelerometer=self.triad(0),
             magnetometer=self.triad(1) if readings.magnetometer is not None else None,
-            covariance=(
+            covariance_rows=(
                 self.to_file @ self.covariance.total[0] @ self.to_file.transpose()
             ).tolist(),
             free=[(self.to_file @ entry.direction).tolist() for entry in self.free],

@@ -137,7 +137,7 @@ class CalibratedTools:
             parameters=tuple(np.array([t.parameters]) for t in triads),
             earth=np.array([_earth(calibration)]),
             temperature=np.array([at]),
-            free=calibration.free_rows()[None],
+            free=calibration.free_directions[None],
             noise=np.array([[t.noise for t in triads]]),
         )
 
@@ -278,7 +278,7 @@ def accuracy_at(
     Units: radians; °C, by default `middle_temperature`.
     """
     tools = CalibratedTools.of(calibration, temperature)
-    covariance = np.array([calibration.covariance])
+    covariance = calibration.parameter_covariance[None]
     each = [accuracy(tools, covariance, angle, noise) for angle in inclinations]
     return {name: np.concatenate([sd[name] for sd in each]) for name in tools.angles}
 
