@@ -15,7 +15,7 @@ from mwdcal.calibration.record import ErrorRow, Measures, StationRow, stated
 from mwdcal.estimation.evidence import STAND_ERRORS
 from mwdcal.estimation.uncertainty import Analysis, station_misfit, without_station
 from mwdcal.geometry.observables import OBSERVABLES, VERTICAL
-from mwdcal.geometry.vectors import Array, Bools, centred
+from mwdcal.geometry.vectors import Array, Bools
 
 SHOWN = ("gravity", "inclination", "toolface", "azimuth", "field", "dip")
 RESHOOT = 0.01
@@ -49,16 +49,6 @@ def shown_in(name: str, relative: bool = False) -> tuple[float, str]:
     return (1.0, "nT") if name == "field" else (float(np.degrees(1)), "°")
 
 
-def angle_error(name: str, g: Array, b: Array, reference: Array) -> Array:
-    """Error (…, n) of an observable of two vectors, radians, g or nT; of angles the shortest way round.
-
-    Singular: NaN where the reference is.
-    """
-    observable = OBSERVABLES[name]
-    error = np.asarray(observable.value(g, b) - reference)
-    return centred(error, observable.period) if observable.period else error
-
-
 def error_weight(name: str, inclination: Array, g: Array) -> Array:
     """What an error of an observable counts at reference inclinations (…, n), radians.
 
@@ -76,10 +66,10 @@ def error_weight(name: str, inclination: Array, g: Array) -> Array:
 def departure(name: str, g: Array, b: Array, known: Mapping[str, Array]) -> Array:
     """Error (…, n) of an observable of two vectors against its reference, radians, g or nT.
 
-    Definition: `angle_error` times `error_weight`, with the references `known` by name.
+    Definition: the difference times its `error_weight`, with the references `known` by name.
     Singular: NaN where there is no reference, and for toolface and azimuth exactly at vertical.
     """
-    error = angle_error(name, g, b, known[name])
+    error = OBSERVABLES[name].difference(OBSERVABLES[name].value(g, b), known[name])
     return error * error_weight(name, known.get("inclination", np.full(error.shape, np.nan)), g)
 
 
