@@ -111,21 +111,24 @@ class CalibratedTools:
         """Whether an axis of a triad is curved."""
         return any(model.curved for model in self.models)
 
-    def changes(self, fields: Sequence[Array], noise: bool) -> list[tuple[int, Array]]:
-        """Changes (B, n, 3, c) of triads' fields, where these are `fields` (B, n, 3).
+    def changes(self, fields: Sequence[Array], noise: bool) -> Array:
+        """Changes (B, t, n, 3, c) of each triad's field, where these are `fields` (B, n, 3).
 
-        First by the parameters of each triad in turn, then, with `noise`, by that of its readings.
+        By the parameters of all triads and, with `noise`, by that of three readings of each.
         """
-        by_parameters, by_noise = [], []
+        starts = np.cumsum([0, *(params.shape[-1] for params in self.parameters)])
+        size = starts[-1] + 3 * noise * len(self.models)
+        result = np.zeros((len(self.earth), len(self.models), *fields[0].shape[1:], size))
         for triad, (model, params) in enumerate(zip(self.models, self.parameters, strict=True)):
             warmth = np.broadcast_to(self.temperature[:, None], fields[triad].shape[:-1])
-            steps = _STEPS if model.curved else 1
-            raw = _reading(model, params, fields[triad], warmth, steps)
-            by_parameters.append((triad, model.jacobian(params, raw, warmth)))
+            raw = _reading(model, params, fields[triad], warmth, _STEPS if model.curved else 1)
+            own = slice(starts[triad], starts[triad + 1])
+            result[:, triad, ..., own] = model.jacobian(params, raw, warmth)
             if noise:
+                own = slice(starts[-1] + 3 * triad, starts[-1] + 3 * triad + 3)
                 slope = model.slope(params, raw, warmth)
-                by_noise.append((triad, slope * self.noise[:, triad, None, None, None]))
-        return by_parameters + by_noise
+                result[:, triad, ..., own] = slope * self.noise[:, triad, None, None, None]
+        return result
 
     @classmethod
     def of(cls, calibration: Calibration, temperature: float | None = None) -> CalibratedTools:
@@ -158,21 +161,38 @@ def accuracy(
         earth, number = np.unique(earth, axis=0, return_inverse=True)
     grid = np.meshgrid([inclination], CIRCLE, CIRCLE, indexing="ij")
     attitudes = [angle.reshape(1, -1) for angle in grid]
-    vectors = reference_vectors(*attitudes, *(earth[:, i, None] for i in range(3)))
-    size = 3 * len(tools.models)
-    gradients = {n: OBSERVABLES[n].gradient(*vectors)[..., :size] for n in tools.angles}
+    both = reference_vectors(*attitudes, *(earth[:, i, None] for i in range(3)))
+    vectors = np.stack(both[: len(tools.models)], -2)
+    gradients = {
+        name: OBSERVABLES[name].gradient(*both)[..., : 3 * len(tools.models)].reshape(vectors.shape)
+        for name in tools.angles
+    }
     free = tools.free
     if noise:
-        covariance, free = _with_noise(covariance, free, size)
+        covariance, free = _with_noise(covariance, free, 3 * len(tools.models))
     if tools.curved:
-        changes = tools.changes(vectors, noise)
-        rows = {n: _rows(gradient, changes) for n, gradient in gradients.items()}
+        change = tools.changes(both, noise)
+        rows = {n: np.einsum("bati,btaic->bac", g, change) for n, g in gradients.items()}
     else:
-        change = _at_corners(tools, noise)
+        change = tools.changes(
+            [s[:, None, None] * CORNERS for s in tools.earth[:, :2].transpose()], noise
+        )
+        change = change.reshape(len(change), -1, change.shape[-1])
         covariance = change @ covariance @ np.swapaxes(change, -1, -2)
         free = np.einsum("bip,bkp->bki", change, free)
-        rows = {n: _corner_rows(gradient, vectors, earth) for n, gradient in gradients.items()}
+        share = _corner_shares(vectors / earth[:, None, : len(tools.models), None])
+        rows = {n: _flat(share[..., None] * g[..., None, :]) for n, g in gradients.items()}
     return {n: _root_mean_square(each, number, covariance, free) for n, each in rows.items()}
+
+
+def _corner_shares(unit: Array) -> Array:
+    """Shares (…, 4) of the fields at `CORNERS` in a field of unit components (…, 3)."""
+    return np.asarray(np.concatenate([np.ones_like(unit[..., :1]), unit], -1) @ SHARES.transpose())
+
+
+def _flat(rows: Array) -> Array:
+    """Rows (E, a, c) of what each triad does at each corner along each axis (E, a, t, 4, 3)."""
+    return rows.reshape(*rows.shape[:2], -1)
 
 
 def _root_mean_square(rows: Array, number: Ints, covariance: Array, free: Array) -> Array:
@@ -187,41 +207,6 @@ def _root_mean_square(rows: Array, number: Ints, covariance: Array, free: Array)
         return np.asarray(sd)
     moved = np.abs(np.einsum("bai,bki->bak", rows[number], free)).max((-1, -2))
     return np.where(moved > FREE_SHARE, np.nan, sd)
-
-
-def _rows(gradient: Array, changes: list[tuple[int, Array]]) -> Array:
-    """Change (B, a, c) of an angle of this gradient (B, a, 6), by `CalibratedTools.changes`."""
-    each = [
-        np.einsum("bai,baic->bac", gradient[..., 3 * triad : 3 * triad + 3], change)
-        for triad, change in changes
-    ]
-    return np.concatenate(each, -1)
-
-
-def _at_corners(tools: CalibratedTools, noise: bool) -> Array:
-    """Changes (B, 12 t, c) of each triad's field at `CORNERS`, all in one matrix."""
-    strengths = (tools.earth[:, triad, None, None] for triad in range(len(tools.models)))
-    changes = tools.changes([strength * CORNERS for strength in strengths], noise)
-    columns = sum(change.shape[-1] for _, change in changes)
-    whole = np.zeros((len(tools.earth), 12 * len(tools.models), columns))
-    at = 0
-    for triad, change in changes:
-        size = change.shape[-1]
-        whole[:, 12 * triad : 12 * triad + 12, at : at + size] = change.reshape(-1, 12, size)
-        at += size
-    return whole
-
-
-def _corner_rows(gradient: Array, vectors: Sequence[Array], earth: Array) -> Array:
-    """Change (E, a, 12 t) of an angle of this gradient by what `_at_corners` lists."""
-    result = []
-    for triad in range(gradient.shape[-1] // 3):
-        unit = vectors[triad] / earth[:, triad, None, None]
-        affine = np.concatenate([np.ones_like(unit[..., :1]), unit], -1)
-        share = (affine @ SHARES.transpose())[..., None]
-        rows = share * gradient[..., None, 3 * triad : 3 * triad + 3]
-        result.append(rows.reshape(*gradient.shape[:-1], 12))
-    return np.concatenate(result, -1)
 
 
 def _with_noise(covariance: Array, free: Array, count: int) -> tuple[Array, Array]:

@@ -6,7 +6,7 @@ a calibration in memory and one read back give the same results.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from html import escape
 from typing import Any, ClassVar
 
@@ -339,48 +339,46 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
             return np.full(readings.accelerometer.shape[:-1], self.reference_temperature)
         return readings.temperature
 
+    def _measured(
+        self, readings: Readings
+    ) -> Iterator[tuple[TriadCalibration, slice, slice, Array]]:
+        """Triads with readings: where their vector and their parameters lie, and the readings."""
+        start = 0
+        for index, triad in enumerate(self.triads):
+            end, raw = start + len(triad.parameters), getattr(readings, triad.name)
+            if raw is not None:
+                yield triad, slice(3 * index, 3 * index + 3), slice(start, end), raw
+            start = end
+
     def fields(self, readings: Readings) -> tuple[Array, Array]:
         """Gravity (…, n, 3), g, and magnetic field (…, n, 3), nT: NaN without magnetometer."""
         temperature = self._temperature(readings)
-        found = []
-        for triad in self.triads:
+        result = [np.full_like(readings.accelerometer, np.nan) for _ in range(2)]
+        for triad, vector, _, raw in self._measured(readings):
             model = triad.functions(self.reference_temperature)
-            raw = getattr(readings, triad.name)
-            if raw is None:
-                found.append(np.full_like(readings.accelerometer, np.nan))
-            else:
-                found.append(model.fields(np.array(triad.parameters), raw, temperature))
-        while len(found) < 2:
-            found.append(np.full_like(readings.accelerometer, np.nan))
-        return found[0], found[1]
+            fields = model.fields(np.array(triad.parameters), raw, temperature)
+            result[vector.start // 3] = fields
+        return result[0], result[1]
 
     def jacobian(self, readings: Readings) -> Array:
         """Derivative (…, n, 6, p) of both vectors with respect to the parameters of all triads."""
         temperature = self._temperature(readings)
         size = sum(len(t.parameters) for t in self.triads)
         result = np.zeros((*readings.accelerometer.shape[:-1], 6, size))
-        at = 0
-        for index, triad in enumerate(self.triads):
-            model, raw = triad.functions(self.reference_temperature), getattr(readings, triad.name)
-            if raw is not None:
-                block = model.jacobian(np.array(triad.parameters), raw, temperature)
-                result[..., 3 * index : 3 * index + 3, at : at + block.shape[-1]] = block
-            at += len(triad.parameters)
+        for triad, vector, own, raw in self._measured(readings):
+            model = triad.functions(self.reference_temperature)
+            result[..., vector, own] = model.jacobian(np.array(triad.parameters), raw, temperature)
         return result
 
     def noise_covariance(self, readings: Readings) -> Array:
         """Covariance (…, n, 6, 6) of both vectors from the noise of one reading."""
         temperature = self._temperature(readings)
         result = np.zeros((*readings.accelerometer.shape[:-1], 6, 6))
-        for index, triad in enumerate(self.triads):
-            raw = getattr(readings, triad.name)
-            if raw is None:
-                continue
+        for triad, vector, _, raw in self._measured(readings):
             model = triad.functions(self.reference_temperature)
             slope = model.slope(np.array(triad.parameters), raw, temperature)
             sd = np.broadcast_to(readings.sd.get(triad.name, np.array(triad.noise)), raw.shape)
-            block = slice(3 * index, 3 * index + 3)
-            result[..., block, block] = slope * sd[..., None, :] ** 2 @ np.swapaxes(slope, -1, -2)
+            result[..., vector, vector] = slope * sd[..., None, :] ** 2 @ np.swapaxes(slope, -1, -2)
         return result
 
     def _gradient(self, name: str, readings: Readings) -> Array:
