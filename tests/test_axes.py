@@ -8,13 +8,13 @@ import pytest
 
 from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.diagnosis.axes import explaining, named
+from mwdcal.calibration.diagnosis.flags import FittedRuns
 from mwdcal.calibration.diagnosis.plausibility import excessive_errors
-from mwdcal.calibration.diagnosis.refusals import check_fit
+from mwdcal.calibration.diagnosis.refusals import fit_refusals
 from mwdcal.calibration.estimate import fit
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import TRIADS, Readings
 from mwdcal.errors import FitError
-from mwdcal.fleet.refusals import free_of_batch, member, suspect_fits
 from mwdcal.sensor.profile import Profile, StandProfile
 from simulation import DEG, attitude, factor_readings, factors_within_limits, plan
 
@@ -76,13 +76,12 @@ CASES = [
 def test_wrong_axes_are_refused_and_the_right_ones_named(triad, order, model, unknown, wrong):
     runs, options = miswired(triad, unknown, order, wrong), Options(order=order, model=model)
     result = fit(runs, options)
-    free = free_of_batch(result)
-    assert suspect_fits(result, free, options, PROFILE).all()  # so that a fleet refuses them too
+    fitted = FittedRuns.of(runs, PROFILE, options, result, lambda i: (one(runs, i), PROFILE))
+    refusals = [*fit_refusals(fitted)]
     for index, each in enumerate(wrong):
-        with pytest.raises(FitError) as error:
-            check_fit(member(result, np.array([index])), free[index], PROFILE, one(runs, index))
+        first = next(refusal for refusal in refusals if refusal.members[index])
         axes = ", ".join(f'"{axis}"' for axis in right(each))
-        assert str(error.value).endswith(
+        assert first.sentence(index).endswith(
             f" The run fits with axes = [{axes}] of [{TRIADS[triad]}]."
         )
 

@@ -9,7 +9,7 @@ import pytest
 
 from cli_support import EXAMPLE, mwdcal, servo_run, write_csv
 from mwdcal.calibration.calibrate import calibrate
-from mwdcal.calibration.diagnosis.findings import misfit_chances
+from mwdcal.calibration.diagnosis.misfit import misfit_chances
 from mwdcal.calibration.estimate import fit
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.prediction import typical_accuracy
@@ -17,9 +17,9 @@ from mwdcal.calibration.prior import from_calibration
 from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.results import StatedCovariance, assumed_exact
 from mwdcal.errors import FitError
+from mwdcal.estimation.batch import take
 from mwdcal.files import documents
 from mwdcal.files.runs import read_run as runs_of
-from mwdcal.fleet.refusals import member
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import centred
 from mwdcal.sensor.profile import Profile
@@ -227,7 +227,7 @@ def test_estimated_inclination_zero_is_unbiased_with_honest_uncertainty():
 def test_fits_of_one_member_and_of_a_batch_state_the_same():
     _, data = runs("tilt", SIZES["tilt"], count=3)
     result = fit(data)
-    one = StatedCovariance(member(result, np.array([1]))).total[0]
+    one = StatedCovariance(take(result, np.array([1]))).total[0]
     np.testing.assert_allclose(one, StatedCovariance(result).total[1], rtol=1e-9, atol=1e-20)
 
 

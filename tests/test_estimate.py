@@ -28,7 +28,7 @@ def readings(tool, stations, known, seed=0, count=1, group=None, sd=NOISE):
 
 def names(result):
     determined = result.analysis.determined
-    free = free_directions(result.problem, result.state, determined)
+    free = free_directions(result.problem, result.state, determined)[0]
     return {(f.id, f.triads) for f in free}
 
 

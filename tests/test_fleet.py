@@ -29,12 +29,12 @@ from mwdcal.calibration.options import Options
 from mwdcal.calibration.prediction import typical_accuracy
 from mwdcal.calibration.readings import Readings
 from mwdcal.errors import InputError, MwdcalError
+from mwdcal.estimation.batch import take
 from mwdcal.estimation.rank import free_directions
 from mwdcal.files.formats import table as tables
 from mwdcal.files.profiles import load_profile
 from mwdcal.files.runs import to_readings
-from mwdcal.fleet.calibrate import column, names, taken
-from mwdcal.fleet.refusals import free_of_batch
+from mwdcal.fleet.calibrate import column, names
 from simulation import DEG, Tool, attitude, plan
 
 MWDCAL = (sys.executable, "-m", "mwdcal")
@@ -101,7 +101,7 @@ def alone(columns, source, first=1, metadata=None, tool="servo", **options):
     table = tables.Table(cells, metadata or {}, source, lines)
     try:
         readings, profile = to_readings(table, load_profile(tool)[0])
-        return calibrate(readings, profile, Options(nonlinearity={}, **options))
+        return calibrate(readings, profile, Options(**{"order": 0, "nonlinearity": (), **options}))
     except MwdcalError as error:
         return error
 
@@ -275,7 +275,7 @@ def test_the_table_says_what_it_is(tmp_path):
     assert made.metadata["simulated"] is True
     assert made.metadata["profile"] == load_profile("servo")[0].name
     assert list(made.columns)[:4] == ["serial", "status", "message", "stations"]
-    assert set(names(Options())) <= set(made.columns)
+    assert set(names(Options(order=0), load_profile("servo")[0])) <= set(made.columns)
 
 
 # Bad tools
@@ -405,15 +405,14 @@ def test_free_directions_of_a_batch_are_those_of_each_member(method):
     sd = {"accelerometer": np.full((6, 18, 3), 1e-4), "magnetometer": np.full((6, 18, 3), 5.0)}
     readings = Readings(a, m, known=known, sd=sd)
     result = fit(readings, Options(method=method))
-    found = free_of_batch(result)
+    parts = result.problem, result.state, result.analysis.determined
+    found = free_directions(*parts)
     for index in range(6):
-        one = np.array([index])
-        part = [v.take(one) for v in (result.problem, result.state, result.analysis.determined)]
-        expected = free_directions(*part)
+        (expected,) = free_directions(*take(parts, np.array([index])))
         assert [(f.id, f.triads) for f in found[index]] == [(f.id, f.triads) for f in expected]
         for ours, theirs in zip(found[index], expected, strict=True):
             assert ours.direction == pytest.approx(theirs.direction, 1e-6, 1e-9)
-    some = taken(readings, np.array([4, 1]))
+    some = take(readings, np.array([4, 1]))
     assert (some.accelerometer == a[[4, 1]]).all()
 
 

@@ -11,8 +11,9 @@ from mwdcal.calibration.estimate import fit
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.prediction import typical_accuracy
 from mwdcal.calibration.readings import Readings
+from mwdcal.estimation.batch import take
 from mwdcal.files import documents
-from mwdcal.fleet.calibrate import column, taken
+from mwdcal.fleet.calibrate import column
 from simulation import DEG, Tool, plan
 from test_fleet import bad_tools, calibrated, roll_run, short_run, write_fleet
 
@@ -336,7 +337,7 @@ def test_a_tool_does_not_depend_on_its_neighbours(options):
     readings = of_different_noise(100)
     many = fit(readings, options)
     for index in range(0, 100, 9):
-        one = fit(taken(readings, np.array([index])), options)
+        one = fit(take(readings, np.array([index])), options)
         sd = np.sqrt(np.diagonal(one.analysis.covariance[0]))
         assert np.abs((many.state.params[index] - one.state.params[0]) / sd).max() < 1e-6
         np.testing.assert_allclose(many.noise[index], one.noise[0], 1e-7)

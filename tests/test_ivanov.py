@@ -154,7 +154,7 @@ def stations_of(tool, count=1, seed=0, lowest=5):
 
 
 def free(result):
-    found = free_directions(result.problem, result.state, result.analysis.determined)
+    found = free_directions(result.problem, result.state, result.analysis.determined)[0]
     return sorted((f.id, f.triads) for f in found)
 
 

@@ -15,10 +15,9 @@ import pytest
 
 from mwdcal.app import text
 from mwdcal.app.commands import calibrate as command
-from mwdcal.app.commands.choices import Chosen
 from mwdcal.app.pages import plots, report
 from mwdcal.app.pages.report import css_string, measured, number, render, signed, write_report
-from mwdcal.calibration.automatic.order_selection import choose_order, order_errors
+from mwdcal.calibration.automatic.auto import Choice
 from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.prediction import accuracy_at, accuracy_map, readings_at, typical_accuracy
@@ -86,12 +85,7 @@ def heated(model=None):
 @cache
 def judged(order="auto", unknown=()):
     """Calibrated with the table of errors at temperatures left out."""
-    data = soaked(unknown)
-    if order == "auto":
-        order, scores = choose_order(data, Options(), lambda text: None)
-    else:
-        scores = order_errors(data, Options(order=order), lambda text: None)
-    return calibrate(data, SERVO, Options(order=order), orders=scores)
+    return calibrate(soaked(unknown), SERVO, Options(order=order))
 
 
 @dataclass
@@ -326,7 +320,7 @@ def test_errors_of_a_relative_field_are_per_mille(words):
 
 
 def test_a_course_that_nothing_tests_says_so(words, whole):
-    page = words(heated())
+    page = words(msgspec.structs.replace(heated(), orders=[]))
     assert 'id="orders"' not in page
     assert "nothing tests its course" in page
     assert "--outside extrapolate" in page
@@ -419,7 +413,7 @@ def test_zero_has_no_sign():
 
 def test_summary_says_what_was_asked_for(tmp_path):
     made = asked()
-    found = command.summary(made, Chosen(Options(), [], []), tmp_path / "tool.json", None)
+    found = command.summary(made, Choice(run(), SERVO, Options()), tmp_path / "tool.json", None)
     found = msgspec.to_builtins(found)
     assert found["options"]["parameters"] == 9
     assert found["options"]["robust"] == "huber"
@@ -434,7 +428,7 @@ def test_curved_axes_have_the_parameters_of_the_record(words):
     curved = msgspec.structs.replace(
         SERVO, accelerometer=TriadProfile(scale=3.0, noise=3e-4, nonlinearity=1e-3)
     )
-    made = calibrated(moved=False, profile=curved)
+    made = calibrate(run(moved=False), curved, Options(nonlinearity=("accelerometer",)))
     assert "square<sub>x</sub>" in words(made)
     check_inverse(made)
 

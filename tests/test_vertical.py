@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from mwdcal.calibration.calibrate import calibrate
+from mwdcal.calibration.diagnosis.flags import FittedRuns
+from mwdcal.calibration.diagnosis.refusals import fit_refusals
 from mwdcal.calibration.estimate import fit
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import Readings
-from mwdcal.fleet.refusals import free_of_batch, suspect_fits
 from mwdcal.sensor.profile import Profile
 from simulation import DEG, Tool, attitude, plan
 
@@ -84,7 +85,8 @@ def test_roll_sets_at_vertical_are_neither_refused_nor_wrong(inclinations, known
         made, matrix, offset = roll_sets(inclinations, known, seed, off=off)
         result = fit(made)
         assert (result.status == 0).all()
-        assert not suspect_fits(result, free_of_batch(result), Options(), PROFILE).any()
+        fitted = FittedRuns.of(made, PROFILE, Options(), result, alone=lambda _: None)
+        assert not any(refusal.members.any() for refusal in fit_refusals(fitted))
         squares.append(normalised_error(result, matrix, offset))
     whole = np.concatenate(squares)
     assert whole.max() < 3.0  # 24 times it is χ² of 24, which exceeds 72 once in a million

@@ -19,12 +19,13 @@ import nulls
 import numpy as np
 
 from mwdcal.app import cli
-from mwdcal.app.commands.choices import Typed, choose
-from mwdcal.calibration.automatic.nonlinearity import ODDS, USUAL, choices_of, declared, log_odds
-from mwdcal.calibration.calibrate import calibrate
+from mwdcal.app.commands.choices import Typed, options_of
+from mwdcal.calibration.automatic.auto import Choice, choose
+from mwdcal.calibration.automatic.nonlinearity import ODDS, choices_of, declared, log_odds
+from mwdcal.calibration.calibrate import recorded
 from mwdcal.calibration.estimate import Fit, fit
 from mwdcal.calibration.methods import EVIDENCE
-from mwdcal.calibration.options import Options
+from mwdcal.calibration.options import USUAL, Options
 from mwdcal.calibration.readings import TRIADS, Readings
 from mwdcal.calibration.record import Calibration
 from mwdcal.errors import MwdcalError
@@ -106,16 +107,21 @@ def typed(words: str) -> Typed:
 
 
 @cache
-def options(name: str, words: str = "") -> Options:
+def choice(name: str, words: str = "") -> Choice:
     """What the command line makes of its words on a set."""
-    return choose(*run(name), typed(words), lambda text: None).options
+    return choose(*run(name), options_of(typed(words)), lambda text: None)
+
+
+def options(name: str, words: str = "") -> Options:
+    """The options of a fit that the command line makes of its words on a set."""
+    return choice(name, words).options
 
 
 @cache
 def trial(name: str, words: str = "") -> Trial:
     """A set calibrated with the words of a command line."""
     try:
-        return Trial(made=calibrate(*run(name), options(name, words)))
+        return Trial(made=recorded(choice(name, words), _fitted(name, words)))
     except MwdcalError as error:
         return Trial(str(error))
 
@@ -210,7 +216,7 @@ def fields(name: str, words: str, left_out: bool) -> tuple[np.ndarray, np.ndarra
     own = np.arange(readings.count)
     each = nested(name) if not words else (options(name, words),) * len(own)
     g, b = np.full((2, len(own), 3), np.nan)
-    kinds = [tuple(one.nonlinearity or ()) for one in each]
+    kinds = [tuple(one.curved) for one in each]
     for kind in dict.fromkeys(kinds):
         some = np.array([k for k in own if kinds[k] == kind])
         found = _of(fit(readings, each[some[0]], 1 - np.eye(len(own))[some]))
@@ -232,7 +238,7 @@ def rests_on_free(result: Fit, readings: Readings) -> bool:
         return group_scatter(directions(g[0], b[0]), readings.groups)
 
     step = 1e-3
-    free = free_directions(result.problem, result.state, result.analysis.determined)
+    free = free_directions(result.problem, result.state, result.analysis.determined)[0]
     changes = [abs(spread(step * f.direction) - spread(0.0)) / step for f in free]
     return max(changes, default=0.0) > MOVES
 

@@ -647,7 +647,7 @@ def imucal() -> Measured:
     return Measured(
         int(determined.rank[0]),
         int(theirs.analysis.determined.rank[0]),
-        tuple(free.id for free in free_directions(ours_.problem, ours_.state, determined)),
+        tuple(free.id for free in free_directions(ours_.problem, ours_.state, determined)[0]),
         refusal,
         *_differences(affine(ours_), affine(theirs), readings),
         float(max(s.std(0, ddof=1).max() / np.sqrt(len(s)) for s in samples)) / COUNTS,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import sys
 import time
@@ -42,6 +43,19 @@ PATIENCE = 5.0
 """Seconds after which another signal ends at once a command that is still tidying up."""
 
 
+class Command(click.Command):
+    """A command whose errors name its options as they are typed: the library has arguments in backticks."""
+
+    def invoke(self, context: click.Context) -> Any:
+        """Run the command."""
+        options = {p.name: p.opts[-1] for p in self.params if isinstance(p, click.Option)}
+        try:
+            return super().invoke(context)
+        except MwdcalError as error:
+            error.args = (re.sub(r"`(\w+)`", lambda m: options.get(m[1], m[0]), str(error)),)
+            raise
+
+
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
 @click.version_option(__version__, prog_name="mwdcal")
 def cli() -> None:
@@ -52,6 +66,9 @@ def cli() -> None:
     mwdcal verify tool.json rolltest.csv
     mwdcal apply tool.json surveys.csv -o corrected.csv
     """
+
+
+cli.command_class = Command
 
 
 def say(text: str) -> None:

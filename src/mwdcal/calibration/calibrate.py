@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cached_property
@@ -11,10 +11,10 @@ import numpy as np
 
 from mwdcal import __version__
 from mwdcal.calibration import results
-from mwdcal.calibration.automatic.nonlinearity import with_nonlinearity
-from mwdcal.calibration.automatic.stand import check_names, check_separable
-from mwdcal.calibration.diagnosis.findings import Findings, described
-from mwdcal.calibration.diagnosis.refusals import check_fit, check_readings
+from mwdcal.calibration.automatic.auto import Choice, choose
+from mwdcal.calibration.diagnosis.findings import described, findings
+from mwdcal.calibration.diagnosis.flags import FittedRuns
+from mwdcal.calibration.diagnosis.refusals import check, fit_refusals
 from mwdcal.calibration.estimate import Fit, fit
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.prediction import accuracy
@@ -24,16 +24,15 @@ from mwdcal.calibration.record import (
     Calibration,
     Choices,
     Constant,
-    OrderScore,
     StandErrors,
     TriadCalibration,
     Undetermined,
     rounded,
     stated,
 )
-from mwdcal.calibration.residuals import Residuals, error_rows, measure_rows, station_rows
+from mwdcal.calibration.residuals import error_rows, measure_rows
 from mwdcal.estimation.evidence import STAND_ERRORS
-from mwdcal.estimation.rank import Free, free_directions
+from mwdcal.estimation.rank import Free
 from mwdcal.geometry.vectors import Array
 from mwdcal.sensor.models import Polynomial
 from mwdcal.sensor.profile import Profile
@@ -48,51 +47,73 @@ def calibrate(
     *,
     profile_sha256: str = "",
     run_sha256: str = "",
-    orders: Sequence[OrderScore] = (),
-    excluded: Sequence[str] = (),
     progress: Callable[[str], None] = lambda text: None,
 ) -> Calibration:
     """Fit the sensor model to a run and state what it is worth.
 
-    For the record: `orders`, what chose the order and left-out temperatures say of it
-    (`mwdcal.calibration.automatic.order_selection`), and `excluded`, labels of stations of the run
-    that the readings no longer have.
-    Raises `FitError` where the data cannot give a calibration to be trusted.
+    What the options leave to the software is chosen as `mwdcal calibrate` does
+    (`mwdcal.calibration.automatic.auto`); `progress` gets a line for each trial.
+    Raises `InputError` for options that do not go together, `FitError` where the data cannot give a
+    calibration to be trusted.
     """
-    options = with_nonlinearity(options or Options(), profile)
-    check_readings(readings, options)
-    check_names(options.estimate, options.method)
-    progress(f"fitting {readings.count} stations, method {options.method}, order {options.order}")
-    result = fit(readings, options)
-    if options.estimate:
-        check_separable(result, options.estimate)
-    free = free_directions(result.problem, result.state, result.analysis.determined)
-    check_fit(result, free, profile, readings)
-    record = _Record(readings, profile, options, result, free)
-    return rounded(record.calibration(profile_sha256, run_sha256, orders, excluded))
+    choice = choose(readings, profile, options or Options(), progress)
+    return recorded(
+        choice,
+        fit(choice.readings, choice.options),
+        profile_sha256=profile_sha256,
+        run_sha256=run_sha256,
+    )
+
+
+def recorded(
+    choice: Choice, result: Fit, *, profile_sha256: str = "", run_sha256: str = ""
+) -> Calibration:
+    """The record of a fit with the options chosen for a run.
+
+    Raises `FitError` where the fit is not to be trusted.
+    """
+    fitted = FittedRuns.single(choice.readings, choice.profile, choice.options, result)
+    check(fit_refusals(fitted))
+    record = _Record(choice, fitted)
+    return rounded(record.calibration(profile_sha256, run_sha256))
 
 
 @dataclass(frozen=True)
 class _Record:
     """The parts of a calibration file, from one fit."""
 
-    readings: Readings
-    profile: Profile
-    options: Options
-    result: Fit
-    free: list[Free]
+    choice: Choice
+    fitted: FittedRuns
 
-    def calibration(
-        self,
-        profile_sha256: str,
-        run_sha256: str,
-        orders: Sequence[OrderScore],
-        excluded: Sequence[str],
-    ) -> Calibration:
+    @property
+    def readings(self) -> Readings:
+        """The readings that were fitted."""
+        return self.choice.readings
+
+    @property
+    def profile(self) -> Profile:
+        """The profile of the tool."""
+        return self.choice.profile
+
+    @property
+    def options(self) -> Options:
+        """The options that were chosen."""
+        return self.choice.options
+
+    @property
+    def result(self) -> Fit:
+        """The fit."""
+        return self.fitted.result
+
+    @property
+    def free(self) -> list[Free]:
+        """Directions of the parameters that nothing determines."""
+        return self.fitted.free[0]
+
+    def calibration(self, profile_sha256: str, run_sha256: str) -> Calibration:
         """The whole record."""
         readings, result, options = self.readings, self.result, self.options
-        residuals = Residuals(readings, result)
-        stations = station_rows(residuals)
+        residuals = self.fitted.residuals(0)
         return Calibration(
             tool={k: str(v) for k, v in readings.metadata.items() if k in IDENTITY},
             profile=self.profile,
@@ -106,13 +127,13 @@ class _Record:
                 ignore=list(options.ignore),
                 robust=options.robust,
                 paper_weights=options.paper_weights,
-                prior=options.prior.source if options.prior else None,
+                prior=options.knowledge.source if options.knowledge else None,
             ),
             seed=options.seed if options.method == "swarm" else None,
             time=datetime.now(UTC).isoformat(timespec="seconds"),
             field_unit=readings.field_unit,
             stations=readings.count,
-            excluded=list(excluded),
+            excluded=list(self.choice.excluded),
             temperature_c=self.temperatures,
             accelerometer=self.triad(0),
             magnetometer=self.triad(1) if readings.magnetometer is not None else None,
@@ -128,15 +149,11 @@ class _Record:
             assumed_exact=results.assumed_exact(result, readings.relative),
             errors=error_rows(residuals),
             measures=measure_rows(residuals),
-            orders=list(orders),
-            station_rows=stations,
-            inherited=list(options.prior.stations) if options.prior else [],
-            findings=self._findings.all(stations),
+            orders=list(self.choice.orders),
+            station_rows=self.fitted.rows(0),
+            inherited=list(options.knowledge.stations) if options.knowledge else [],
+            findings=findings(self.fitted),
         )
-
-    @cached_property
-    def _findings(self) -> Findings:
-        return Findings(self.readings, self.profile, self.options, self.result, self.free)
 
     @cached_property
     def covariance(self) -> results.StatedCovariance:
@@ -153,7 +170,7 @@ class _Record:
         """Coldest and hottest station, °C; those behind the prior count too."""
         if self.readings.temperature is None:
             return None
-        low, high = results.temperature_range(self.result, self.options.prior)
+        low, high = results.temperature_range(self.result, self.options.knowledge)
         return float(low[0]), float(high[0])
 
     def budget(self) -> list[BudgetRow]:
@@ -163,7 +180,9 @@ class _Record:
             source = results.common_source(name)
             shares[source] = shares.get(source, 0.0) + share
         reference = self.profile.reference_temperature_c
-        tools = results.calibrated_tools(self.result, [self.free], reference, self.options.prior)
+        tools = results.calibrated_tools(
+            self.result, [self.free], reference, self.options.knowledge
+        )
         sd = accuracy(tools, np.stack([*shares.values()]))
         degrees = {f"{angle}_deg": np.degrees(values[:, 0]) for angle, values in sd.items()}
         return [
@@ -222,7 +241,7 @@ class _Record:
             noise_source="declared" if triad.declared[0] else "estimated from the residuals",
             variance_factor=stated(triad.variance_factor[0]),
             degrees_of_freedom=float(triad.degrees_of_freedom[0]),
-            misfit_probability=stated(self._findings.chances[0, index]),
+            misfit_probability=stated(self.fitted.chances[0, index]),
         )
 
 

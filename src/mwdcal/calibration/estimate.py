@@ -12,6 +12,7 @@ from mwdcal.calibration.methods import EVIDENCE, Solved, solve, with_stand_error
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.prior import prior_of
 from mwdcal.calibration.readings import ANGLES, TRIADS, Readings
+from mwdcal.estimation.batch import put, take
 from mwdcal.estimation.evidence import Evidence
 from mwdcal.estimation.minimisers import closed_form
 from mwdcal.estimation.problem import Problem, State, Triad
@@ -27,7 +28,7 @@ from mwdcal.estimation.uncertainty import (
     station_misfit,
 )
 from mwdcal.estimation.variance import LEAST, START, scatter_ratios, with_scatter
-from mwdcal.geometry.vectors import Array, Bools, Ints, placed
+from mwdcal.geometry.vectors import Array, Bools, Ints
 from mwdcal.sensor.models import Basis, Factors, Polynomial, Restricted, Whole, restricted
 
 FLOOR = 1e-9
@@ -97,7 +98,7 @@ def _problem(
     """The problem, and for each triad whether its noise is declared."""
     cold = np.zeros(readings.count)
     temperature = flat(cold if readings.temperature is None else readings.temperature, lead)
-    curved = options.nonlinearity or {}
+    curved = options.curved
     triads: list[Triad] = []
     for name, order in zip(TRIADS, options.orders, strict=True):
         values = getattr(readings, name)
@@ -111,7 +112,7 @@ def _problem(
             flat(readings.sd[name], lead, 3) if name in readings.sd else 1e-3 * _size(raw) + 0 * raw
         )
         triads.append(Triad(restricted(whole, options.parameters), raw, sd))
-    prior = prior_of(options.prior, [t.model for t in triads], len(evidence.include))
+    prior = prior_of(options.knowledge, [t.model for t in triads], len(evidence.include))
     problem = Problem(tuple(triads), temperature, evidence, prior)
     _bound_curves(problem, curved)
     return problem, [name in readings.sd for name in TRIADS[: len(triads)]]
@@ -156,7 +157,7 @@ def _fit(readings: Readings, options: Options, include: Array | None) -> Fit:
     if alone.all():
         return closed
     rest = np.flatnonzero(~alone)
-    return _joined(closed, rest, _general(problem.take(rest), declared, options, finite[rest]))
+    return put(closed, rest, _general(take(problem, rest), declared, options, finite[rest]))
 
 
 def scatters(readings: Readings, options: Options) -> bool:
@@ -232,33 +233,6 @@ def _closed(
     once = np.ones(len(status), int)
     noise = _noise(problem, declared)
     return Fit(problem, state, status, once, noise, trust, analysis), good
-
-
-def _joined(ours: Fit, index: Ints, other: Fit) -> Fit:
-    """Our fit with some members of another."""
-    ends = {
-        name: placed(getattr(ours, name), index, getattr(other, name))
-        for name in ("status", "iterations", "noise", "trust")
-    }
-    mine, theirs = ours.analysis, other.analysis
-    names = ("covariance", "variance_factor", "freedom", "residual", "spread")
-    found = {n: placed(getattr(mine, n), index, getattr(theirs, n)) for n in names}
-    determined = mine.determined.put(index, theirs.determined)
-    return Fit(
-        problem=_with_noise_of(ours.problem, index, other.problem),
-        state=ours.state.put(index, other.state),
-        analysis=replace(mine, determined=determined, **found),
-        **ends,
-    )
-
-
-def _with_noise_of(problem: Problem, index: Ints, other: Problem) -> Problem:
-    """The problem with the noise that some members have in another, which is the same besides."""
-    pairs = zip(problem.triads, other.triads, strict=True)
-    triads = tuple(replace(t, sd=placed(t.sd, index, o.sd)) for t, o in pairs)
-    ours, theirs = problem.evidence.scatter, other.evidence.scatter
-    scatter = {name: placed(value, index, theirs[name]) for name, value in ours.items()}
-    return replace(problem, triads=triads, evidence=replace(problem.evidence, scatter=scatter))
 
 
 def _noise(problem: Problem, declared: list[bool]) -> Array:
@@ -354,40 +328,6 @@ class _Stage:
     solved: Solved
     trust: Array
 
-    def take(self, index: Ints) -> _Stage:
-        """Some members of the batch."""
-        solved = replace(
-            self.solved,
-            state=self.solved.state.take(index),
-            status=self.solved.status[index],
-            iterations=self.solved.iterations[index],
-            sums={k: v.take(index) for k, v in self.solved.sums.items()},
-            known={k: v[index] for k, v in self.solved.known.items()},
-        )
-        return _Stage(self.problem.take(index), solved, self.trust[index])
-
-    def put(self, index: Ints, other: _Stage) -> _Stage:
-        """Ours with some members replaced."""
-        ours, new = self.solved, other.solved
-        sums = {
-            k: replace(
-                v,
-                reference=placed(v.reference, index, new.sums[k].reference),
-                weights=placed(v.weights, index, new.sums[k].weights),
-            )
-            for k, v in ours.sums.items()
-        }
-        solved = replace(
-            ours,
-            state=ours.state.put(index, new.state),
-            status=placed(ours.status, index, new.status),
-            iterations=placed(ours.iterations, index, new.iterations),
-            sums=sums,
-            known={k: placed(v, index, new.known[k]) for k, v in ours.known.items()},
-        )
-        problem = _with_noise_of(self.problem, index, other.problem)
-        return _Stage(problem, solved, placed(self.trust, index, other.trust))
-
 
 def _in_turn(stage: _Stage, rounds: int, turn: Callable[[_Stage], tuple[_Stage, Bools]]) -> _Stage:
     """The stage after turns that also say who has settled: each member ends as if it were alone."""
@@ -398,9 +338,9 @@ def _in_turn(stage: _Stage, rounds: int, turn: Callable[[_Stage], tuple[_Stage, 
             break
         if settled.any():
             done, rest = np.flatnonzero(settled), np.flatnonzero(~settled)
-            whole = whole.put(active[done], stage.take(done))
-            stage, active = stage.take(rest), active[rest]
-    return stage if len(active) == len(whole.trust) else whole.put(active, stage)
+            whole = put(whole, active[done], take(stage, done))
+            stage, active = take(stage, rest), active[rest]
+    return stage if len(active) == len(whole.trust) else put(whole, active, stage)
 
 
 def _estimate_noise(stage: _Stage, declared: list[bool], options: Options) -> _Stage:

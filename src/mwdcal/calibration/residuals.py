@@ -213,6 +213,11 @@ class Residuals:
         weight = np.nan_to_num(self._weight(name)[some])
         return np.asarray(np.abs(change * weight[:, None]).max(0))
 
+    @cached_property
+    def stations(self) -> list[StationRow]:
+        """Errors of every station, with the ones to take again."""
+        return station_rows(self)
+
     def names(self) -> list[str]:
         """Observables with an error that is known somewhere in this run."""
         usable = SHOWN if len(self.fit.problem.triads) > 1 else SHOWN[:3]

@@ -21,6 +21,7 @@ from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.prediction import CalibratedTools
 from mwdcal.calibration.prior import Knowledge
 from mwdcal.calibration.record import FREE_SHARE
+from mwdcal.estimation.batch import take
 from mwdcal.estimation.rank import Free
 from mwdcal.estimation.uncertainty import marginal_rank
 from mwdcal.geometry.vectors import Array, Bools
@@ -212,10 +213,10 @@ def triad_results(
     rank = size.copy()
     some = np.flatnonzero([bool(each) for each in free])
     if some.size:
-        rank[some] = marginal_rank(result.analysis.determined.take(some), where)
+        rank[some] = marginal_rank(take(result.analysis.determined, some), where)
         rows = free_rows([free[i] for i in some.tolist()], covariance.shape[-1])[..., where]
         moved = np.abs(np.einsum("bij,bkj->bki", to_file[some], rows)).max(1)
-        part = result.problem.take(some)
+        part = take(result.problem, some)
         own = part.triads[index].model.finished(reference)[0]
         effect = _effect(own, values[some], part.triads[index].raw, part.temperature)
         sd[some] = np.where(moved * effect > FREE_SHARE, np.nan, sd[some])

@@ -19,7 +19,8 @@ import numpy as np
 from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import FREE_SHARE, Calibration, TriadCalibration
 from mwdcal.estimation.rank import Free
-from mwdcal.geometry.vectors import Array, rotation
+from mwdcal.estimation.uncertainty import turn_back
+from mwdcal.geometry.vectors import Array
 from mwdcal.sensor.models import Basis, Model, Polynomial
 from mwdcal.use.notation import Notation, convert
 
@@ -159,12 +160,8 @@ class _Settle:
         """The turn that leaves the first triad's gain without rotation about the free axes."""
         axes, first = self.gauge.turns(triads), triads[0]
         gain = self.models[first].slope(params, self.raw[first], self.temperature).mean(0)
-        u, _, vt = np.linalg.svd(gain)
-        polar = u @ vt
-        if len(axes) == len(TURNS):
-            return np.asarray(polar.transpose())
-        about = np.arctan2(polar[0, 1] - polar[1, 0], polar[0, 0] + polar[1, 1])
-        return rotation(np.array([0.0, 0.0, about if "toolface-zero" in axes else 0.0]))
+        free = np.array([[name in axes for name in TURNS]])
+        return np.asarray(turn_back(gain[None], free)[0])
 
     def _factor(self, params: Array, triad: int) -> float:
         """What brings the triad's mean strength to that of the references, if its scale is free."""

@@ -28,12 +28,10 @@ from mwdcal.estimation.solvers import Linear
 from mwdcal.geometry.vectors import (
     Array,
     Bools,
-    Ints,
     earth_field,
     earth_gravity,
     eigen,
     inverse,
-    placed,
     rotation,
     skew,
 )
@@ -66,18 +64,6 @@ class State:
     constants: Array
     own: Array
 
-    def take(self, index: Ints) -> State:
-        """Some members of the batch."""
-        return State(
-            self.params[index], self.attitude[index], self.constants[index], self.own[index]
-        )
-
-    def put(self, index: Ints, other: State) -> State:
-        """Ours with some members replaced."""
-        ours = (self.params, self.attitude, self.constants, self.own)
-        theirs = (other.params, other.attitude, other.constants, other.own)
-        return State(*(placed(a, index, b) for a, b in zip(ours, theirs, strict=True)))
-
 
 @dataclass(frozen=True)
 class Prediction:
@@ -101,10 +87,6 @@ class Prior:
 
     precision: Array
     expected: Array
-
-    def take(self, index: Ints) -> Prior:
-        """That of some members of the batch."""
-        return Prior(self.precision[index], self.expected[index])
 
     def informed(self, norms: Array) -> Array:
         """Precision (B, p, p) as large as the data's wherever it is not zero.
@@ -148,26 +130,6 @@ class Problem:
     evidence: Evidence
     prior: Prior
     memo: Memo = field(init=False, repr=False, compare=False, default_factory=Memo)
-
-    def take(self, index: Ints) -> Problem:
-        """The problem of some members of the batch."""
-        evidence = self.evidence
-        constants = tuple(
-            replace(c, mask=c.mask[index], value=c.value[index], sd=c.sd[index])
-            for c in evidence.constants
-        )
-        chosen = replace(
-            evidence,
-            known={k: v[index] for k, v in evidence.known.items()},
-            sd={k: v[index] for k, v in evidence.sd.items()},
-            group=evidence.group[index],
-            include=evidence.include[index],
-            constants=constants,
-            stand={k: v[index] for k, v in evidence.stand.items()},
-            scatter={k: v[index] for k, v in evidence.scatter.items()},
-        )
-        triads = tuple(Triad(t.model.take(index), t.raw[index], t.sd[index]) for t in self.triads)
-        return Problem(triads, self.temperature[index], chosen, self.prior.take(index))
 
     def slices(self) -> list[slice]:
         """Where each triad's parameters lie."""

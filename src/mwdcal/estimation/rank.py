@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 
+from mwdcal.estimation.batch import take
 from mwdcal.estimation.problem import Problem, State
 from mwdcal.estimation.solvers import Determined
 from mwdcal.estimation.uncertainty import COUPLED, candidates
@@ -13,6 +15,8 @@ from mwdcal.geometry.vectors import Array
 
 EXACT = 1 - 1e-6
 """A named direction with this share in the null space is taken as it is, free of rounding."""
+MOVED = 0.01
+"""A direction without a name moves a triad that has more than this share of its square."""
 
 
 @dataclass(frozen=True)
@@ -24,66 +28,75 @@ class Free:
     direction: Array
 
 
-def free_directions(problem: Problem, state: State, determined: Determined) -> list[Free]:
-    """Name every free direction of a problem of one member (B = 1).
+def free_directions(problem: Problem, state: State, determined: Determined) -> list[list[Free]]:
+    """Name the free directions of every member of a batch.
 
     Each triad's own turns and scale are tried first, then common ones, then single
     parameters; a direction that is none of these is called `weak` after its largest part.
     """
-    norms = determined.norms[0]
-    null = determined.basis[0][:, ~determined.keep[0]]
-    named = _named(problem, state)
-    found: list[Free] = []
-    while null.shape[-1]:
-        scores = [_share(null, free.direction * norms) for free in named]
-        best = int(np.argmax(np.round(scores, 3)))
-        clear = scores[best] > COUPLED
-        chosen = named.pop(best) if clear else _weakest(problem, null, norms)
-        if clear and scores[best] < EXACT:
-            chosen = _inside(chosen, null, norms)
-        found.append(chosen)
-        null = _without(null, chosen.direction * norms)
+    found: list[list[Free]] = [[] for _ in determined.keep]
+    missing = np.sum(~determined.keep, -1)
+    for count in np.unique(missing[missing > 0]):
+        index = np.flatnonzero(missing == count)
+        every = _named(*take((problem, state, determined), index), int(count))
+        for place, each in zip(index, every, strict=True):
+            found[place] = each
     return found
 
 
-def _named(problem: Problem, state: State) -> list[Free]:
+def _named(problem: Problem, state: State, determined: Determined, count: int) -> list[list[Free]]:
+    """Names of the `count` free directions of each member.
+
+    The best candidate is taken in turn, and the null space goes on without it.
+    """
+    ids, directions = _candidates(problem, state)
+    norms, members = determined.norms, np.arange(len(state.params))
+    scaled = directions * norms[:, None]
+    length = np.sum(scaled**2, -1)
+    null = determined.basis[..., -count:]
+    found: list[list[Free]] = [[] for _ in members]
+    used = np.zeros(length.shape, bool)
+    for _ in range(count):
+        inside = np.sum((scaled @ null) ** 2, -1) / np.where(length > 0, length, 1.0)
+        best = np.argmax(np.where(used, -1.0, np.round(inside, 3)), -1)
+        score = inside[members, best]
+        clear = score > COUPLED
+        used[members, best] |= clear
+        chosen = scaled[members, best]
+        part = (null @ (np.swapaxes(null, -1, -2) @ chosen[..., None]))[..., 0]
+        chosen = np.where((score < EXACT)[:, None], part, chosen)
+        chosen = np.where(clear[:, None], chosen, null[..., -1])
+        for place, index in enumerate(best):
+            name, triads = ids[index] if clear[place] else _weak(problem, chosen[place])
+            found[place].append(Free(name, triads, chosen[place] / norms[place]))
+        null = _without(null, chosen)
+    return found
+
+
+def _candidates(problem: Problem, state: State) -> tuple[list[tuple[str, tuple[int, ...]]], Array]:
+    """Directions (B, c, p) that have a name, and their names and triads, in order of preference."""
     every = tuple(range(len(problem.triads)))
-    groups = [(t,) for t in every] + ([every] if len(every) > 1 else [])
-    result = [
-        Free(name, group, direction[0])
-        for group in groups
-        for name, direction in candidates(problem, state, list(group)).items()
-    ]
+    groups = dict.fromkeys([*product(every), every])
+    turns = {(n, g): d for g in groups for n, d in candidates(problem, state, list(g)).items()}
+    alone = [(n, (t,)) for t in every for n in problem.triads[t].model.names]
+    unit = np.broadcast_to(np.eye(len(alone)), (*state.params.shape, len(alone)))
+    return [*turns, *alone], np.concatenate([np.stack([*turns.values()], 1), unit], 1)
+
+
+def _weak(problem: Problem, direction: Array) -> tuple[str, tuple[int, ...]]:
+    """Name and triads of a direction (p,), in normalised units, that is no candidate."""
     names = [name for triad in problem.triads for name in triad.model.names]
-    for triad, where in enumerate(problem.slices()):
-        unit = np.eye(len(names))
-        result += [Free(names[i], (triad,), unit[i]) for i in range(where.start, where.stop)]
-    return result
-
-
-def _share(null: Array, direction: Array) -> float:
-    total = float(np.sum(direction**2))
-    return float(np.sum((null.transpose() @ direction) ** 2)) / total if total > 0 else 0.0
-
-
-def _weakest(problem: Problem, null: Array, norms: Array) -> Free:
-    direction = null[:, -1]
-    names = [name for triad in problem.triads for name in triad.model.names]
-    triads = tuple(
-        t for t, where in enumerate(problem.slices()) if np.sum(direction[where] ** 2) > 0.01
-    )
-    return Free(f"weak-{names[int(np.argmax(np.abs(direction)))]}", triads, direction / norms)
-
-
-def _inside(free: Free, null: Array, norms: Array) -> Free:
-    """A named direction's part in the null space: own-axis terms do not turn with the rest."""
-    part = null @ (null.transpose() @ (free.direction * norms))
-    return replace(free, direction=part / norms)
+    shares = [np.sum(direction[where] ** 2) for where in problem.slices()]
+    triads = tuple(triad for triad, share in enumerate(shares) if share > MOVED)
+    return f"weak-{names[int(np.argmax(np.abs(direction)))]}", triads
 
 
 def _without(null: Array, direction: Array) -> Array:
-    """The null space less its part along a direction, as an orthonormal basis."""
-    inside = null.transpose() @ direction
-    inside = inside / np.linalg.norm(inside)
-    rest = np.linalg.qr(np.column_stack([inside, np.eye(len(inside))]))[0][:, 1:]
-    return np.asarray(null @ rest[:, : len(inside) - 1])
+    """Null spaces (B, p, k) less their part along a direction (B, p), as orthonormal bases."""
+    inside = (np.swapaxes(null, -1, -2) @ direction[..., None])[..., 0]
+    length = np.linalg.norm(inside, axis=-1, keepdims=True)
+    inside = inside / np.where(length > 0, length, 1.0)
+    size = null.shape[-1]
+    unit = np.broadcast_to(np.eye(size), (len(null), size, size))
+    whole = np.linalg.qr(np.concatenate([inside[..., None], unit], -1))[0]
+    return np.asarray(null @ whole[..., 1:size])

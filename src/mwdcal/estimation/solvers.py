@@ -12,7 +12,6 @@ Shared unknowns (field strength, dip, group directions) are eliminated by a Schu
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property
@@ -21,7 +20,8 @@ from typing import Any, Protocol
 import numpy as np
 
 from mwdcal.estimation import fit_numba
-from mwdcal.geometry.vectors import Array, Bools, Ints, eigen, inverse, placed
+from mwdcal.estimation.batch import put, take
+from mwdcal.geometry.vectors import Array, Bools, Ints, eigen, inverse
 
 RANK_TOLERANCE = 2e-2
 """Singular values of the column-normalised design below this share of the largest are free."""
@@ -87,30 +87,6 @@ class Linear:
             row, column = row + height, column + width
         whole[..., self.size :] = self.shared
         return whole
-
-    def take(self, index: Ints) -> Linear:
-        """That of some members of the batch."""
-        return self._mapped(lambda mine: mine[index])
-
-    def put(self, index: Ints, other: Linear) -> Linear:
-        """Ours with some members replaced."""
-        return self._mapped(lambda mine, theirs: placed(mine, index, theirs), other)
-
-    def _mapped(self, change: Callable[..., Array], *others: Linear) -> Linear:
-        """A change of every array, given the same ones of others."""
-
-        def every(name: str) -> Array:
-            return change(getattr(self, name), *(getattr(other, name) for other in others))
-
-        pairs = zip(self.blocks, *(other.blocks for other in others), strict=True)
-        return Linear(
-            every("residual"),
-            tuple(change(*pair) for pair in pairs),
-            every("shared"),
-            every("own"),
-            every("prior"),
-            every("pull"),
-        )
 
     @property
     def norms(self) -> Array:
@@ -235,21 +211,6 @@ class Determined:
         linear = problem.linear(state, geometry=True)
         return linear.determined
 
-    def take(self, index: Ints) -> Determined:
-        """That of some members of the batch."""
-        return Determined(
-            self.basis[index], self.values[index], self.norms[index], self.keep[index]
-        )
-
-    def put(self, index: Ints, other: Determined) -> Determined:
-        """Ours with some members replaced."""
-        return Determined(
-            placed(self.basis, index, other.basis),
-            placed(self.values, index, other.values),
-            placed(self.norms, index, other.norms),
-            placed(self.keep, index, other.keep),
-        )
-
     @property
     def rank(self) -> Ints:
         """Number of determined directions (B,)."""
@@ -279,9 +240,6 @@ class Problem(Protocol):
 
     def move(self, state: Any, linear: Linear, step: Array) -> Any:
         """The state after a step of X's unknowns, private unknowns re-adjusted."""
-
-    def take(self, index: Ints) -> Problem:
-        """The problem of some members of the batch."""
 
     def size_of(self, state: Any) -> Array:
         """Magnitude (B, p) below 1e-12 of which a parameter step is rounding."""
@@ -344,8 +302,8 @@ class _Descent:
             self.state, self.linear = trial, after
             return
         which = np.flatnonzero(better)
-        self.state = self.state.put(which, trial.take(which))
-        self.linear = self.linear.put(which, after.take(which))
+        self.state = put(self.state, which, take(trial, which))
+        self.linear = put(self.linear, which, take(after, which))
 
     def settled(self, converged: Bools) -> Bools:
         """Which converged members still have the rank that their steps were taken with.
@@ -358,10 +316,10 @@ class _Descent:
         if converged.all():
             now = Determined.of(self.problem, self.state)
         else:
-            now = Determined.of(self.problem.take(which), self.state.take(which))
+            now = Determined.of(take(self.problem, which), take(self.state, which))
         same = now.rank == self.determined.rank[which]
         if not same.all():
-            self.determined = self.determined.put(which, now)
+            self.determined = put(self.determined, which, now)
         settled = converged.copy()
         settled[which] = same
         return settled
@@ -371,8 +329,8 @@ class _Descent:
         if not stopped.any():
             return
         rest = np.flatnonzero(~stopped)
-        self.problem, self.state = self.problem.take(rest), self.state.take(rest)
-        self.linear, self.determined = self.linear.take(rest), self.determined.take(rest)
+        self.problem, self.state = take((self.problem, self.state), rest)
+        self.linear, self.determined = take((self.linear, self.determined), rest)
         self.damping, self.active = self.damping[rest], self.active[rest]
 
 
@@ -413,8 +371,8 @@ def gauss_newton(problem: Problem, state: Any, limit: int = 60) -> tuple[Any, In
         stopped = settled | broken
         if len(stopped) == count and stopped.all():
             return descent.state, status, iterations
-        state = state.put(descent.active[stopped], descent.state.take(np.flatnonzero(stopped)))
+        state = put(state, descent.active[stopped], take(descent.state, np.flatnonzero(stopped)))
         descent.drop(stopped)
     if descent.active.size:
         status[descent.active[descent.arrived()]] = Status.OK
-    return state.put(descent.active, descent.state), status, iterations
+    return put(state, descent.active, descent.state), status, iterations

@@ -402,6 +402,14 @@ def _polar_turn(problem: Problem, state: State, triad: int, free: AnyArray) -> A
     where = problem.slices()[triad]
     chosen = problem.triads[triad]
     gain = chosen.model.slope(state.params[:, where], chosen.raw, problem.temperature).mean(1)
+    return turn_back(gain, free)
+
+
+def turn_back(gain: Array, free: Bools) -> Array:
+    """Rotation (B, 3, 3) about the free axes (B, 3) that leaves gains (B, 3, 3) without rotation.
+
+    All axes being free, the transpose of the gain's polar factor; a reflection in it is left.
+    """
     gain = np.where(np.isfinite(gain), gain, np.eye(3))
     u, _, vt = np.linalg.svd(gain)
     sign = np.where(np.linalg.det(u @ vt) < 0, -1.0, 1.0)

@@ -3,41 +3,39 @@
 Every tool of a `Batch` has the same number of stations and the same kinds of evidence. What
 `calibrate` would refuse is refused here with the same words: a screen of array operations
 picks the suspects, and the check of a single run decides and speaks. What `calibrate` leaves to
-the data is decided for each tool (`fleet_choices`). Results are columns, not objects: `names`
+the data is decided for each tool (`mwdcal.fleet.choices`). Results are columns, not objects: `names`
 says which.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import partial
-from typing import Any
 
+import msgspec
 import numpy as np
 
 from mwdcal.calibration import results
-from mwdcal.calibration.automatic.order_selection import mapped
-from mwdcal.calibration.automatic.stand import check_separable
-from mwdcal.calibration.diagnosis.refusals import check_readings, fit_checks
+from mwdcal.calibration.automatic.auto import known_before
+from mwdcal.calibration.automatic.nonlinearity import offered
+from mwdcal.calibration.diagnosis.findings import finding_flags
+from mwdcal.calibration.diagnosis.flags import Alone, FittedRuns, Flag
+from mwdcal.calibration.diagnosis.refusals import BAD_INPUT, fit_refusals, reading_refusals
 from mwdcal.calibration.estimate import Fit, fit
 from mwdcal.calibration.methods import ESTIMABLE
-from mwdcal.calibration.options import Options
+from mwdcal.calibration.options import AUTO, Options
 from mwdcal.calibration.prediction import STATED_ANGLES, accuracy
 from mwdcal.calibration.readings import TRIADS, Readings
 from mwdcal.calibration.record import StandErrors
+from mwdcal.calibration.soaks import HIGHEST
 from mwdcal.errors import MwdcalError
-from mwdcal.estimation.rank import Free
-from mwdcal.fleet.choices import CHUNK, Alone, PerTool, halved, with_curves, with_orders
-from mwdcal.fleet.findings import findings_of_batch
-from mwdcal.fleet.refusals import free_of_batch, member, suspect_fits, suspect_readings
+from mwdcal.estimation.batch import take
+from mwdcal.fleet.choices import in_chunks, with_curves, with_orders
 from mwdcal.geometry.vectors import AnyArray, Array, Ints
 from mwdcal.sensor.models import Basis, Factors, Polynomial, Whole
 from mwdcal.sensor.profile import Profile
 
-OK, BAD_INPUT, FAILED = "ok", "bad-input", "failed"
-ALIKE = PerTool()
-"""Nothing is left to each tool."""
+OK, FAILED = "ok", "failed"
 FACTS = ("rank", "size", "noise", "variance_factor", "degrees_of_freedom")
 """Columns of a triad besides its parameters and their standard uncertainties."""
 EARTH = ("gravity_g", "field", "dip_deg")
@@ -72,16 +70,22 @@ class Outcome:
         return np.asarray(tools[self.status[tools] == OK])
 
 
-def model_parameters(options: Options, triad: int, per_tool: PerTool = ALIKE) -> tuple[str, ...]:
+def model_parameters(options: Options, profile: Profile, triad: int) -> tuple[str, ...]:
     """Names of the parameters that a triad may have, as in its calibration file."""
-    found: dict[str, None] = {}
-    highest = {options.kind(order): order for order in per_tool.orders(options, triad)}
-    for kind, order in highest.items():
-        curved = kind == "polynomial" and per_tool.curved(options, triad)
+    tried = options.order == AUTO and options.method != "swarm"
+    orders = range(HIGHEST + 1) if tried else (options.orders[triad],)
+    names: dict[str, None] = {}
+    for kind, order in {options.kind(order): order for order in orders}.items():
+        curved = kind == "polynomial" and may_be_curved(options, profile, triad)
         basis = Basis(order)
         model: Whole = Factors(basis) if kind == "factors" else Polynomial(basis, curved=curved)
-        found |= dict.fromkeys(model.names)
-    return tuple(found)
+        names |= dict.fromkeys(model.names)
+    return tuple(names)
+
+
+def may_be_curved(options: Options, profile: Profile, triad: int) -> bool:
+    """Whether a triad has own-axis terms, or may come to have them."""
+    return TRIADS[triad] in {*offered(profile, options), *options.curved}
 
 
 def column(triad: str, parameter: str) -> str:
@@ -93,13 +97,13 @@ def column(triad: str, parameter: str) -> str:
     return f"{triad}_{parameter}".replace("-", "_").replace("·", "_t")
 
 
-def names(options: Options, triads: Sequence[str] = TRIADS, per_tool: PerTool = ALIKE) -> list[str]:
+def names(options: Options, profile: Profile, triads: Sequence[str] = TRIADS) -> list[str]:
     """The columns of results, in order."""
     found: list[str] = []
     for index, triad in enumerate(triads):
-        own = [column(triad, name) for name in model_parameters(options, index, per_tool)]
+        own = [column(triad, name) for name in model_parameters(options, profile, index)]
         found += [f"{triad}_{fact}" for fact in (*FACTS, "order")]
-        if per_tool.curved(options, index):
+        if may_be_curved(options, profile, index):
             found += [f"{triad}_{name}" for name in (*CENTRES, "radius")]
         found += [name for pair in zip(own, (f"{n}_sd" for n in own), strict=True) for name in pair]
     last = (STATED_ANGLES, EARTH) if len(triads) > 1 else (STATED_ANGLES[:2], EARTH[:1])
@@ -108,33 +112,28 @@ def names(options: Options, triads: Sequence[str] = TRIADS, per_tool: PerTool = 
 
 
 def calibrate_batch(
-    readings: Readings,
-    options: Options,
-    profile: Profile,
-    alone: Alone,
-    per_tool: PerTool = ALIKE,
+    readings: Readings, options: Options, profile: Profile, alone: Alone
 ) -> Outcome:
     """Calibrate tools of the same shape: readings (B, n, ...), at the profile's temperature.
 
     `alone` gives one tool's own readings where a check needs words for it.
     """
-    count = len(readings.accelerometer)
-    blank = {name: np.full(count, np.nan) for name in names(options, per_tool=per_tool)}
+    count, profile = len(readings.accelerometer), _with_scales(profile)
+    blank = {name: np.full(count, np.nan) for name in names(options, profile)}
     free: list[tuple[list[str], ...]] = [([], []) for _ in range(count)]
     status, message = np.full(count, OK, object), np.full(count, "", object)
-    none: list[list[Any]] = [[] for _ in range(count)]
-    outcome = Outcome(status, message, blank, free, list(none), list(none))
-    options = per_tool.known(options, readings, profile)
-    first, every = per_tool.before(options), np.arange(count)
-    _refuse(outcome, every, suspect_readings(readings, first), alone, first)
-    for some, chosen in with_orders(readings, outcome.sound(every), options, per_tool):
+    none: list[list[str]] = [[] for _ in range(count)]
+    again: list[list[int]] = [[] for _ in range(count)]
+    outcome = Outcome(status, message, blank, free, none, again)
+    options, every = known_before(options, readings, profile), np.arange(count)
+    _screen(outcome, every, readings, options, alone)
+    for some, chosen in with_orders(readings, outcome.sound(every), options):
         if isinstance(chosen, Exception):
             _fail(outcome, some, chosen)
             continue
-        if chosen != first:
-            suspects = suspect_readings(taken(readings, some), chosen)
-            _refuse(outcome, some, suspects, alone, chosen)
-        for part, final in with_curves(outcome.sound(some), chosen, readings, per_tool, alone):
+        if chosen.order != options.order:
+            _screen(outcome, some, readings, chosen, alone)
+        for part, final in with_curves(readings, outcome.sound(some), chosen, profile):
             if isinstance(final, Exception):
                 _fail(outcome, part, final)
             else:
@@ -151,13 +150,11 @@ def _fit(
     profile: Profile,
 ) -> None:
     """Fit the given tools, and write down what came of it."""
-    for start in range(0, len(tools), CHUNK):
-        part = tools[start : start + CHUNK]
-        for which, result in halved(readings, part, lambda r: fit(r, options)):
-            if isinstance(result, Exception):
-                _fail(outcome, which, result)
-            else:
-                _record(outcome, which, result, options, readings, profile, alone)
+    for part, result in in_chunks(readings, tools, lambda r: fit(r, options)):
+        if isinstance(result, Exception):
+            _fail(outcome, part, result)
+        else:
+            _record(outcome, part, result, options, readings, profile, alone)
 
 
 def _fail(outcome: Outcome, tools: Ints, error: Exception) -> None:
@@ -169,21 +166,27 @@ def _fail(outcome: Outcome, tools: Ints, error: Exception) -> None:
     outcome.message[tools] = f"the fit failed: {error}. Calibrate this tool alone to see why."
 
 
-def _refuse(
-    outcome: Outcome, tools: Ints, suspects: dict[str, Any], alone: Alone, options: Options
+def _screen(
+    outcome: Outcome, tools: Ints, readings: Readings, options: Options, alone: Alone
 ) -> None:
-    """Give the suspects that the check of a single run refuses their status and message."""
-    for name, flags in suspects.items():
-        for tool in outcome.sound(tools[flags & (outcome.status[tools] == OK)]):
-            try:
-                check_readings(alone(int(tool))[0], options)
-            except MwdcalError as error:
-                outcome.status[tool], outcome.message[tool] = name, str(error)
+    """Refuse those of some tools that no fit could mend."""
+    refusals = reading_refusals(take(readings, tools), options, lambda i: alone(int(tools[i]))[0])
+    _refuse(outcome, tools, refusals)
 
 
-def taken(readings: Readings, index: Ints) -> Readings:
-    """Some members of a batch."""
-    return mapped(readings, lambda value: value[index])
+def _with_scales(profile: Profile) -> Profile:
+    """The profile with its scales stated: the readings are divided by those that it leaves open."""
+    triads = {name: getattr(profile, name) for name in TRIADS}
+    stated = {n: msgspec.structs.replace(t, scale=t.scale or 1.0) for n, t in triads.items()}
+    return msgspec.structs.replace(profile, **stated)
+
+
+def _refuse(outcome: Outcome, tools: Ints, refusals: Iterable[Flag]) -> None:
+    """Give the first refusal of each of some tools as its status and message."""
+    for refusal in refusals:
+        for place in np.flatnonzero(refusal.members & (outcome.status[tools] == OK)).tolist():
+            outcome.status[tools[place]] = refusal.id
+            outcome.message[tools[place]] = refusal.sentence(place)
 
 
 def _record(
@@ -196,61 +199,47 @@ def _record(
     alone: Alone,
 ) -> None:
     """Check a fit of some tools and write down the results of the sound ones."""
-    free = free_of_batch(result)
-    _doubt(outcome, members, result, free, options, alone, profile)
+    own = take(readings, members)
+    fitted = FittedRuns.of(own, profile, options, result, lambda i: alone(int(members[i])))
+    _refuse(outcome, members, fit_refusals(fitted))
     good = np.flatnonzero(outcome.status[members] == OK)
     if not good.size:
         return
     if good.size < len(members):
-        result, free = member(result, good), [free[index] for index in good]
-    findings, again = findings_of_batch(readings, profile, options, result, free)
-    for place, own, stations in zip(members[good], findings, again, strict=True):
-        outcome.findings[place], outcome.reshoot[place] = own, stations
-    for name, values in _columns(result, free, options, profile.reference_temperature_c).items():
-        outcome.columns[name][members[good]] = values
-    for place, each in zip(members[good], free, strict=True):
-        if each:
-            outcome.free[place] = tuple(
-                [f.id for f in each if triad in f.triads] for triad in range(len(TRIADS))
+        fitted, members = fitted.take(good), members[good]
+    _note(outcome, members, fitted)
+    for name, values in _columns(fitted, profile.reference_temperature_c).items():
+        outcome.columns[name][members] = values
+
+
+def _note(outcome: Outcome, members: Ints, fitted: FittedRuns) -> None:
+    """Write down the findings of sound tools; what is undetermined, by triad."""
+    free = [{entry.id for entry in each} for each in fitted.free]
+    ids: list[dict[str, None]] = [{} for _ in members]
+    for flag in finding_flags(fitted):
+        for place in np.flatnonzero(flag.members).tolist():
+            if flag.id not in free[place]:
+                ids[place][flag.id] = None
+            if flag.station is not None:
+                outcome.reshoot[members[place]].append(flag.station)
+    for place, tool in enumerate(members):
+        outcome.findings[tool] = [*ids[place]]
+        if free[place]:
+            outcome.free[tool] = tuple(
+                [f.id for f in fitted.free[place] if triad in f.triads]
+                for triad in range(len(TRIADS))
             )
 
 
-def _doubt(
-    outcome: Outcome,
-    members: Ints,
-    result: Fit,
-    free: list[list[Free]],
-    options: Options,
-    alone: Alone,
-    profile: Profile,
-) -> None:
-    """Give the suspects that the checks of a single fit refuse their status and message."""
-    suspect = suspect_fits(result, free, options, profile) & (outcome.status[members] == OK)
-    for index in np.flatnonzero(suspect):
-        tool = int(members[index])
-        readings, own_profile = alone(tool)
-        own = member(result, np.array([index]))
-        checks = [*fit_checks(own, free[index], own_profile, readings)]
-        if options.estimate:
-            checks.insert(0, ("inseparable", partial(check_separable, own, options.estimate)))
-        for status, check in checks:
-            try:
-                check()
-            except MwdcalError as error:
-                outcome.status[tool], outcome.message[tool] = status, str(error)
-                break
-
-
-def _columns(
-    result: Fit, free: list[list[Free]], options: Options, reference: float
-) -> dict[str, Array]:
+def _columns(fitted: FittedRuns, reference: float) -> dict[str, Array]:
     """Columns of the results of sound fits."""
+    result, free = fitted.result, fitted.free
     covariance = results.StatedCovariance(result).total
     columns: dict[str, Array] = {}
     for index, name in enumerate(TRIADS[: len(result.problem.triads)]):
         triad = results.triad_results(result, index, covariance, free, reference)
         columns |= _triad_columns(name, triad)
-    tools = results.calibrated_tools(result, free, reference, options.prior)
+    tools = results.calibrated_tools(result, free, reference, fitted.options.knowledge)
     sd = accuracy(tools, covariance)
     columns |= {f"{angle}_sd_deg": np.degrees(values) for angle, values in sd.items()}
     return columns | results.earth(result) | results.stand_errors(result)

@@ -96,13 +96,6 @@ def rotation(turn: Array) -> Array:
     )
 
 
-def placed(ours: AnyArray, index: Ints, theirs: AnyArray) -> AnyArray:
-    """A copy of ours (B, ...) with theirs at some members of the batch."""
-    changed = ours.copy()
-    changed[index] = theirs
-    return changed
-
-
 def inverse(matrix: Array) -> Array:
     """Inverse (..., k, k) of every matrix of a stack; NaN for a singular one, never an exception."""
     try:

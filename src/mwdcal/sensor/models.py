@@ -20,7 +20,7 @@ from math import prod
 
 import numpy as np
 
-from mwdcal.geometry.vectors import Array, Ints, inverse
+from mwdcal.geometry.vectors import Array, inverse
 
 OFF_DIAGONAL = tuple((i, j) for i in range(3) for j in range(3) if i != j)
 
@@ -176,10 +176,6 @@ class Polynomial:
         centre, scale = (np.broadcast_to(x, (*lead, 1, 3)) for x in (self.centre, self.scale))
         return replace(self, centre=centre.reshape(count, 1, 3), scale=scale.reshape(count, 1, 3))
 
-    def take(self, index: Ints) -> Polynomial:
-        """The model of some members of a batch."""
-        return replace(self, centre=self.centre[index], scale=self.scale[index])
-
     def finished(self, reference: float) -> tuple[Polynomial, Array]:
         """The same model on plain readings and powers of T - reference, and the linear map to it.
 
@@ -328,10 +324,6 @@ class Factors:
         """The model with one batch axis: the same for all."""
         return self
 
-    def take(self, index: Ints) -> Factors:
-        """The model of some members of a batch: the same for all."""
-        return self
-
     def finished(self, reference: float) -> tuple[Factors, Array]:
         """The same model in powers of T - reference, and the linear map to it."""
         count = self.basis.order + 1
@@ -421,10 +413,6 @@ class Restricted:
     def flat(self, lead: tuple[int, ...]) -> Restricted:
         """The model with one batch axis for these leading axes."""
         return replace(self, whole=self.whole.flat(lead))
-
-    def take(self, index: Ints) -> Restricted:
-        """The model of some members of a batch."""
-        return replace(self, whole=self.whole.take(index))
 
     def finished(self, reference: float) -> tuple[Whole, Array]:
         """The whole model on plain readings, and the linear map (..., all, p) to it."""

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypedDict
+from typing import Any, Literal, TypedDict
 
 import msgspec
-import numpy as np
 
 from mwdcal.app import text
-from mwdcal.app.commands.choices import Chosen, Typed, choose, prior_profile
-from mwdcal.calibration.calibrate import calibrate
+from mwdcal.app.commands.choices import Typed, options_of, prior_of
+from mwdcal.calibration.automatic.auto import Choice, choose
+from mwdcal.calibration.calibrate import recorded
 from mwdcal.calibration.diagnosis.findings import UNUSED
+from mwdcal.calibration.estimate import fit
 from mwdcal.calibration.prediction import typical_accuracy
+from mwdcal.calibration.prior import profile_for
 from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import Calibration, Finding
-from mwdcal.errors import InputError
 from mwdcal.files import documents, profiles, runs
 from mwdcal.files.formats import table
 from mwdcal.sensor.profile import Profile
@@ -33,11 +34,14 @@ class Digests(TypedDict):
 
 
 def load(
-    run: Path, tool: str | None, decimal: str, prior: str | None = None
+    run: Path,
+    tool: str | None,
+    decimal: str,
+    prior: Calibration | Literal["datasheet"] | None = None,
 ) -> tuple[Readings, Profile, Digests]:
     """A run with its tool profile, and the digests of both files."""
     profile, profile_sha256 = profiles.load_profile(tool)
-    profile = prior_profile(prior, profile)
+    profile = profile_for(prior, profile)
     read = table.read(run, decimal=decimal)
     runs.check_run(read)
     readings, profile = runs.to_readings(read, profile)
@@ -52,33 +56,12 @@ def run(
     decimal: str,
     typed: Typed,
     say: Callable[[str], None],
-) -> tuple[Chosen, Calibration]:
+) -> tuple[Choice, Calibration]:
     """What was chosen for a run, and its calibration."""
-    readings, profile, digests = load(source, tool, decimal, typed["prior"])
-    excluded = [label for label in readings.station if label in exclude]
-    readings = without(readings, exclude)
-    chosen = choose(readings, profile, typed, say)
-    made = calibrate(
-        readings, profile, chosen.options, orders=chosen.orders, excluded=excluded, **digests
-    )
-    return chosen, made
-
-
-def without(readings: Readings, exclude: tuple[str, ...]) -> Readings:
-    """The readings less the stations of these labels."""
-    twice = [label for label in exclude if readings.station.count(label) > 1]
-    if twice:
-        raise InputError(
-            f"--exclude {twice[0]}: {readings.station.count(twice[0])} stations of {readings.source} "
-            "have this label. Give each its own in the column 'station'."
-        )
-    missing = [label for label in exclude if label not in readings.station]
-    if missing:
-        raise InputError(
-            f"--exclude {missing[0]}: no such station in {readings.source}; "
-            f"stations are {readings.station[0]} … {readings.station[-1]}."
-        )
-    return readings.select(np.array([label not in exclude for label in readings.station]))
+    prior = prior_of(typed["prior"])
+    readings, profile, digests = load(source, tool, decimal, prior)
+    choice = choose(readings, profile, options_of(typed, prior, exclude), say)
+    return choice, recorded(choice, fit(choice.readings, choice.options), **digests)
 
 
 def write(made: Calibration, output: Path, report: Path | None) -> None:
@@ -90,7 +73,7 @@ def write(made: Calibration, output: Path, report: Path | None) -> None:
     documents.write(output, made)
 
 
-def summary(made: Calibration, chosen: Chosen, output: Path, report: Path | None) -> dict[str, Any]:
+def summary(made: Calibration, chosen: Choice, output: Path, report: Path | None) -> dict[str, Any]:
     """The result for machines."""
     named = (
         "model",
@@ -133,7 +116,7 @@ def _told(found: list[Finding]) -> list[str]:
     return lines + ([f"! … and {len(left)} more to re-shoot"] if left else [])
 
 
-def screen(made: Calibration, chosen: Chosen, output: Path, report: Path | None) -> str:
+def screen(made: Calibration, chosen: Choice, output: Path, report: Path | None) -> str:
     """The result for people."""
     tables = [
         text.heading(made),

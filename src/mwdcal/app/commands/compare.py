@@ -5,16 +5,18 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from mwdcal import __version__
+from mwdcal.app.commands.choices import order_of
 from mwdcal.app.commands.options import AskedToCompare
 from mwdcal.app.pages import comparison_plots as plots
 from mwdcal.app.pages import report
 from mwdcal.app.text import WEIGHED, plain, table
 from mwdcal.calibration.diagnosis.findings import unused_columns
+from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import SIMULATED, Readings
 from mwdcal.comparison.compare import Comparison, Row, able, compare
 from mwdcal.files.formats import atomic
@@ -38,8 +40,8 @@ def run(
 
     Whether any method could calibrate it; text, or what JSON shows.
     """
-    order: int | Literal["auto"] = "auto" if asked["order"] == "auto" else int(asked["order"])
-    found = compare(readings, profile, order, seed=asked["seed"], progress=say)
+    options = Options(order=order_of(asked["order"]), seed=asked["seed"])
+    found = compare(readings, profile, options, progress=say)
     path = asked["report"]
     if path:
         write_report(path, found, profile.name, **digests)

@@ -6,7 +6,6 @@ import contextlib
 import shutil
 import time
 from collections.abc import Callable, Generator, Iterator
-from dataclasses import replace
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -16,19 +15,19 @@ import msgspec
 
 from mwdcal import __version__
 from mwdcal.app import pool
-from mwdcal.app.commands.choices import DATASHEET, curves_of, prior_profile, stated
+from mwdcal.app.commands.choices import options_of, prior_of
 from mwdcal.app.commands.fleet_options import Asked
 from mwdcal.app.pages.fleet_summary import Summary, document, options_asked, summarise, text
 from mwdcal.app.text import plural
-from mwdcal.calibration.automatic.nonlinearity import declared
+from mwdcal.calibration.automatic.nonlinearity import with_strengths
+from mwdcal.calibration.automatic.stand import check_names
 from mwdcal.calibration.diagnosis.findings import unused_columns
 from mwdcal.calibration.diagnosis.refusals import check_options, no_temperature
 from mwdcal.calibration.options import Options
-from mwdcal.calibration.prior import from_datasheet
+from mwdcal.calibration.prior import DATASHEET, profile_for
 from mwdcal.errors import InputError
 from mwdcal.files import profiles
 from mwdcal.files.formats import atomic, parquet
-from mwdcal.fleet.choices import PerTool
 from mwdcal.fleet.parts import Plan, is_whole, load, solve
 from mwdcal.fleet.sources import SERIAL, Source, open_source
 from mwdcal.fleet.tables import Partition, Tools, find_tools, in_several_folders, partitions
@@ -58,9 +57,9 @@ def calibrate_table(asked: Asked, say: Callable[[str], None]) -> Summary:
     """Calibrate every tool of the table; the output is written at the end, as a whole."""
     begun = time.perf_counter()
     profile, digest = profiles.load_profile(asked["tool"])
-    options, per_tool = _options(asked, profile)
+    options = _options(asked, profile)
     source = open_source(asked["runs"])
-    if options.order and "temperature_c" not in source.columns:
+    if max(options.orders) and "temperature_c" not in source.columns:
         raise no_temperature(max(options.orders))
     unused = unused_columns(source.unused)
     for finding in unused:
@@ -68,7 +67,7 @@ def calibrate_table(asked: Asked, say: Callable[[str], None]) -> Summary:
     target = atomic.target(asked["output"])
     _check_target(target, asked["runs"])
     folder = target.with_name(target.name + ".parts")
-    plan = Plan.of(source, profile, options, per_tool)
+    plan = Plan.of(source, profile, options)
     with _alone(folder, asked["output"]):
         tools = find_tools(source)
         if not tools.together:
@@ -124,33 +123,18 @@ def _split(source: Source, tools: Tools) -> list[str]:
     ]
 
 
-def _options(asked: Asked, profile: Profile) -> tuple[Options, PerTool]:
-    """Options of every fit, and what is left to each tool; refuses what could be right for none."""
-    _check_prior(asked["prior"], profile)
-    auto = asked["order"] == "auto"
-    options = replace(stated(asked), order=0 if auto else int(asked["order"]))
-    options, tried = _curves(options, asked["nonlinearity"], profile)
-    per_tool = PerTool(auto, () if asked["prior"] else tried, bool(asked["prior"]))
-    check_options(replace(options, prior=from_datasheet(profile) if asked["prior"] else None))
-    return options, per_tool
-
-
-def _check_prior(prior: str | None, profile: Profile) -> None:
-    """Refuse a prior that is of one tool, or that the profile does not have."""
-    if prior and prior != DATASHEET:
+def _options(asked: Asked, profile: Profile) -> Options:
+    """Options of the fleet; refuses what could be right for no tool, and the prior of a single one."""
+    if asked["prior"] not in (None, DATASHEET):
         raise InputError(
-            f"--prior {prior}: the prior of a fleet is 'datasheet', the tolerances in the tool profile. "
-            "A previous calibration is of one tool: use it with mwdcal calibrate."
+            f"--prior {asked['prior']}: the prior of a fleet is 'datasheet', the tolerances in the tool "
+            "profile. A previous calibration is of one tool: use it with mwdcal calibrate."
         )
-    prior_profile(prior, profile)
-
-
-def _curves(options: Options, asked: str, profile: Profile) -> tuple[Options, tuple[str, ...]]:
-    """The options with the own-axis terms asked for, or the triads of which each tool tries them."""
-    offered = declared(profile, options)
-    if asked in ("auto", "none"):
-        return options, tuple(offered) if asked == "auto" else ()
-    return replace(options, nonlinearity=curves_of(asked, offered)), ()
+    options = with_strengths(options_of(asked, prior_of(asked["prior"])), profile)
+    profile_for(options.prior, profile)
+    check_names(options.estimate, options.method)
+    check_options(options)
+    return options
 
 
 def _check_target(target: Path, runs: Path) -> None:

@@ -25,7 +25,7 @@ from mwdcal.app.pages.fleet_summary import (
     unusual,
 )
 from mwdcal.app.text import number, plural
-from mwdcal.calibration.diagnosis.findings import SUSPECT
+from mwdcal.calibration.diagnosis.misfit import NOISE_RATIO
 from mwdcal.calibration.readings import TRIADS, is_simulated
 from mwdcal.files.formats import atomic, parquet
 from mwdcal.fleet.calibrate import OK
@@ -114,7 +114,7 @@ def render(calibrations: Path, summary: Summary) -> str:
         suspects=_suspects(calibrations, sound),
         far=FAR,
         fewest=FEWEST,
-        suspect=SUSPECT,
+        suspect=NOISE_RATIO,
     )
 
 
@@ -341,5 +341,7 @@ def _suspects(path: Path, sound: Ints) -> list[tuple[Any, str, float]]:
     for triad in TRIADS:
         if f"{triad}_variance_factor" in names:
             s = np.sqrt(column(path, f"{triad}_variance_factor")[sound])
-            found += [(serials[sound[i]], triad, float(s[i])) for i in np.flatnonzero(s > SUSPECT)]
+            found += [
+                (serials[sound[i]], triad, float(s[i])) for i in np.flatnonzero(s > NOISE_RATIO)
+            ]
     return sorted(found, key=lambda row: -row[2])

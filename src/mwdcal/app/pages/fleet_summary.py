@@ -136,7 +136,7 @@ def options_asked(asked: Asked) -> dict[str, Any]:
     """How a fleet was asked for, under the names that a calibration file and the command have."""
     also = Choices(
         parameters=int(asked["parameters"] or 12),
-        ignore=names(asked["ignore"]),
+        ignore=list(names(asked["ignore"])),
         robust=asked["robust"],
         paper_weights=asked["paper_weights"],
         prior=asked["prior"],
@@ -147,7 +147,7 @@ def options_asked(asked: Asked) -> dict[str, Any]:
         "model": asked["model"],
         "order": asked["order"] if asked["order"] == "auto" else int(asked["order"]),
         "nonlinearity": asked["nonlinearity"],
-        "estimate": names(asked["estimate"]),
+        "estimate": list(names(asked["estimate"])),
         **msgspec.to_builtins(also),
     }
 

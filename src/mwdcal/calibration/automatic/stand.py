@@ -10,48 +10,47 @@ import numpy as np
 from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.methods import ESTIMABLE
 from mwdcal.errors import FitError, InputError
+from mwdcal.estimation.batch import take
 from mwdcal.estimation.evidence import STAND_ERRORS, UNKNOWN
 from mwdcal.estimation.solvers import Determined
+from mwdcal.geometry.vectors import Bools
 
 LOOSE = 0.1
 """A turn known no better than this share of no knowledge at all is not separated."""
 
 
 def check_names(names: Sequence[str], method: str) -> None:
-    """Refuse what `--estimate` cannot find, whatever the stations."""
+    """Refuse errors of the stand that cannot be estimated, whatever the stations."""
     for name in names:
         if name == "toolface-zero":
             raise FitError(
-                "--estimate toolface-zero: a zero of the stand's toolface can never be told from a "
+                "`estimate` toolface-zero: a zero of the stand's toolface can never be told from a "
                 "rotation of the sensors in the tool, whatever the stations. Set it by an index mark."
             )
         if name not in ESTIMABLE:
             raise InputError(
-                f"--estimate must be of {', '.join(ESTIMABLE)}; got {name!r}. Unknown field and dip "
+                f"`estimate` must be of {', '.join(ESTIMABLE)}; got {name!r}. Unknown field and dip "
                 "are estimated without being asked for."
             )
     if names and method != "joint":
-        raise InputError(f"--estimate needs --method joint; got {method!r}.")
+        raise InputError(f"`estimate` needs `method` joint; got {method!r}.")
 
 
-def check_separable(result: Fit, names: Sequence[str]) -> None:
-    """Refuse stand errors that these stations cannot tell from the sensors' own errors."""
-    problem, state = result.problem, result.state
-    evidence = problem.evidence
-    asked = [c.unknown and c.name in STAND_ERRORS for c in evidence.constants]
-    keep = [i for i, stand in enumerate(asked) if not stand]
-    fewer = replace(evidence, constants=tuple(evidence.constants[i] for i in keep))
-    bare = replace(problem, evidence=fewer)
-    still = replace(state, constants=state.constants[:, keep])
-    ranks = [int(Determined.of(p, s).rank[0]) for p, s in ((problem, state), (bare, still))]
-    sd = np.sqrt(np.diag(result.analysis.constants[0]))
-    loose = [
-        c.name
-        for c, s, stand in zip(evidence.constants, sd, asked, strict=True)
-        if stand and s > LOOSE * UNKNOWN
-    ]
-    if loose or ranks[0] < ranks[1]:
-        raise FitError(
-            f"--estimate {','.join(names)}: these stations cannot tell it from the sensors' own "
-            "errors. Add stations at other azimuths and inclinations with references, or leave it out."
-        )
+def inseparable(result: Fit) -> Bools:
+    """Fits (B,) whose stand errors the stations cannot tell from the sensors' own errors.
+
+    One of these is as good as unknown, or the rank is higher without them.
+    """
+    constants = result.problem.evidence.constants
+    stand = np.array([c.unknown and c.name in STAND_ERRORS for c in constants])
+    sd = np.sqrt(np.diagonal(result.analysis.constants, axis1=-2, axis2=-1)[:, stand])
+    found = np.any(sd > LOOSE * UNKNOWN, -1)
+    some = np.flatnonzero(~found & ~result.analysis.determined.keep.all(-1))
+    if some.size:
+        problem, state = take((result.problem, result.state), some)
+        kept = np.flatnonzero(~stand)
+        fewer = tuple(problem.evidence.constants[index] for index in kept)
+        bare = replace(problem, evidence=replace(problem.evidence, constants=fewer))
+        still = replace(state, constants=state.constants[:, kept])
+        found[some] = Determined.of(problem, state).rank < Determined.of(bare, still).rank
+    return np.asarray(found)

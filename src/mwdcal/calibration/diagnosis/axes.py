@@ -20,9 +20,9 @@ from mwdcal.estimation.solvers import Status
 from mwdcal.geometry.vectors import Array
 from mwdcal.sensor.profile import Profile
 
-NEAR = 0.3
+CROSS_GAIN = 0.3
 """Largest gain across the axes, as a share of those along them, of a triad in its right axes."""
-FITS = 0.05
+FITTING_SHARE = 0.05
 """Residuals of a run in its right axes are less than this share of the field."""
 SIGNED = np.array(
     [
@@ -64,7 +64,7 @@ def explaining(readings: Readings, profile: Profile) -> dict[str, tuple[str, ...
         return {}
     if found.status[0] != Status.OK or not _fits(found):
         return {}
-    if any(map(is_bad, free_directions(found.problem, found.state, found.analysis.determined))):
+    if any(map(is_bad, free_directions(found.problem, found.state, found.analysis.determined)[0])):
         return {}
     result = {}
     for index, gain in enumerate(_gains(found)):
@@ -91,7 +91,7 @@ def _is_near(gain: Array) -> bool:
     """Whether a gain is along its axes."""
     own = np.diagonal(gain)
     across = np.abs(gain - np.diag(own)).max()
-    return bool(own.min() > 0 and across < NEAR * own.min())
+    return bool(own.min() > 0 and across < CROSS_GAIN * own.min())
 
 
 def _fits(found: Fit) -> bool:
@@ -99,6 +99,6 @@ def _fits(found: Fit) -> bool:
     for index, triad in enumerate(found.problem.triads):
         noise = np.sqrt(found.analysis.variance_factor[0, index]) * triad.sd.mean()
         size = np.linalg.norm(triad.raw[0] - triad.raw[0].mean(0), axis=-1).mean()
-        if not noise < FITS * size:
+        if not noise < FITTING_SHARE * size:
             return False
     return True

@@ -14,21 +14,21 @@ from mwdcal.calibration.residuals import Residuals
 from mwdcal.estimation.rank import Free
 from mwdcal.geometry.vectors import Array, Bools, centred
 
-BENIGN = ("rotation-x", "rotation-y", "toolface-zero", "scale")
+BENIGN_DIRECTIONS = ("rotation-x", "rotation-y", "toolface-zero", "scale")
 """Directions that may stay free."""
-EXCESS = 10.0
+EXCESS_RATIO = 10.0
 """An error after calibration of more than this many times its expectation is no error of a sensor."""
-CERTAIN = 4.0
+DIP_CERTAINTY = 4.0
 """Standard uncertainties by which a dip must lie beyond vertical, not to be noise at a pole."""
-STRAY = 5.0
+STRAY_DEVIATIONS = 5.0
 """Standard deviations of one reading's residual from which the errors of a run are looked at."""
-SMALLEST = 1e-12
+SMALLEST_EXPECTATION = 1e-12
 """Expectations below this, in the observable's own unit, are rounding."""
 
 
 def is_bad(direction: Free) -> bool:
     """Whether a free direction means that the design is too weak."""
-    return direction.id.partition("-temperature-")[0] not in BENIGN
+    return direction.id.partition("-temperature-")[0] not in BENIGN_DIRECTIONS
 
 
 def gain_shares(result: Fit, index: int) -> tuple[Array, Array]:
@@ -77,7 +77,7 @@ def overturned(result: Fit) -> Array:
             continue
         dip = centred(result.state.constants[:, index], 2 * np.pi)
         sd = np.sqrt(np.nan_to_num(result.analysis.constants[:, index, index]))
-        beyond = np.abs(dip) - np.pi / 2 > CERTAIN * np.minimum(sd, 1.0)
+        beyond = np.abs(dip) - np.pi / 2 > DIP_CERTAINTY * np.minimum(sd, 1.0)
         found = np.where(told & beyond, dip, found)
     return np.asarray(found)
 
@@ -103,7 +103,7 @@ def excessive_errors(readings: Readings, result: Fit) -> dict[str, tuple[float, 
             float(np.sqrt(np.average(e[known] ** 2, weights=weight[known] ** 2)))
             for e in (after, expected)
         ]
-        if both[0] > EXCESS * max(both[1] * misfit, SMALLEST):
+        if both[0] > EXCESS_RATIO * max(both[1] * misfit, SMALLEST_EXPECTATION):
             found[name] = (both[0], float(both[1] * misfit))
     return found
 
@@ -112,5 +112,5 @@ def straying(result: Fit) -> Bools:
     """Members (B,) of which a reading is so far off that their errors have to be looked at."""
     analysis = result.analysis
     variance = np.diagonal(analysis.spread, axis1=-2, axis2=-1)
-    stray = analysis.residual**2 > STRAY**2 * np.maximum(variance, 1e-30)
+    stray = analysis.residual**2 > STRAY_DEVIATIONS**2 * np.maximum(variance, 1e-30)
     return np.asarray(stray.any((-1, -2)))

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mwdcal.calibration.automatic.courses import TRIED, steady_columns, temperature_powers
+from mwdcal.calibration.automatic.courses import TRIED, f_test, steady_columns, temperature_powers
 from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.evidence import TURNS, acts_on
 from mwdcal.calibration.readings import TRIADS
@@ -26,28 +26,28 @@ from mwdcal.estimation.problem import Problem, State
 from mwdcal.estimation.uncertainty import whole_covariance
 from mwdcal.geometry.vectors import Array, Bools, eigen
 
-UNLIKELY = 1e-4
+EFFECT_CHANCE = 1e-4
 """Chance of so much common structure in noise, below which an effect is named."""
-WORTH = 0.01
+STRUCTURE_CHANCE = 0.01
 """Chance of residuals as large in declared noise, below which their structure is looked at."""
-FEW = 0.1
+BAD_SHARE = 0.1
 """Share of bad stations up to which they are left out."""
-APART = 1e-3
+LEFT_BY_FIT = 1e-3
 """A column counts if the fit leaves this share of its square: what is left of others is rounding."""
-STAND = ("azimuth-zero", "inclination-zero", "tilt")
+STAND_EFFECTS = ("azimuth-zero", "inclination-zero", "tilt")
 """Errors of the stand that leave residuals; a toolface zero does not."""
 DRIFTS = 2
 """Degree of the polynomial of order (or of the row) that a drift is looked for as."""
 
 
-SET = 3
+SMALLEST_SET = 3
 """Fewest stations of one direction that may share an error of its setting."""
 SET_TURNS = ("inclination-zero", "azimuth-zero")
-COURSE = "-temperature"
+COURSE_SUFFIX = "-temperature"
 """What ends the names of the powers of temperature that the order of a triad leaves out."""
 ZEROS = ("azimuth-zero", "inclination-zero", "dip-reference")
 """Effects that are one angle."""
-TEXTS = {
+EFFECTS = {
     "azimuth-zero": "an azimuth zero of the stand: set the index, or fit it with --estimate azimuth-zero, or declare "
     "its uncertainty (azimuth_zero_deg under [stand])",
     "inclination-zero": "an inclination zero of the stand: set the level, or fit it with --estimate inclination-zero, "
@@ -114,7 +114,7 @@ class _Scores:
     def _spanned(self, names: list[str]) -> tuple[Array, Array, Array]:
         index = self._index(names)
         value, vector = eigen(self.information[np.ix_(index, index)])
-        return value, vector, np.asarray(value > APART)
+        return value, vector, np.asarray(value > LEFT_BY_FIT)
 
     def _index(self, names: list[str]) -> Array:
         return np.concatenate([np.arange(self.places[n].start, self.places[n].stop) for n in names])
@@ -138,9 +138,9 @@ def effects(result: Fit) -> list[Effect]:
     shown: list[tuple[str, float, float]] = []
     while True:
         trials = {n: _trial(scores, chosen, n, left, freedom - used) for n in scores.places}
-        open_ = {n: t for n, t in trials.items() if n not in chosen and t[0] < UNLIKELY}
+        open_ = {n: t for n, t in trials.items() if n not in chosen and t[0] < EFFECT_CHANCE}
         if not open_:
-            return [e for e in _described(result, shown) if not e.name.endswith(COURSE)]
+            return [e for e in _described(result, shown) if not e.name.endswith(COURSE_SUFFIX)]
         best = min(open_, key=lambda name: (open_[name][0], -open_[name][1]))
         chance, gain, directions = open_[best]
         chosen, left, used = [*chosen, best], left - gain, used + directions
@@ -150,7 +150,7 @@ def effects(result: Fit) -> list[Effect]:
 def _without_bad_stations(result: Fit) -> Fit:
     """The fit less its stations to take again, if they are few: one bad station looks like anything."""
     bad = to_reshoot(chances(result))
-    if bad.mean() > FEW:
+    if bad.mean() > BAD_SHARE:
         return result
     evidence = result.problem.evidence
     fewer = replace(evidence, include=evidence.include * ~bad)
@@ -173,8 +173,6 @@ def _trial(
     scores: _Scores, chosen: list[str], name: str, left: float, freedom: float
 ) -> tuple[float, float, int]:
     """Chance in noise, gain and directions of one more family, of misfit `left`."""
-    from scipy.special import fdtrc
-
     before = scores.gain(chosen) if chosen else (0.0, 0)
     after = scores.gain([*chosen, name])
     gain, directions = after[0] - before[0], after[1] - before[1]
@@ -182,11 +180,8 @@ def _trial(
     if directions < 1 or rest < 1:
         return 1.0, 0.0, 0
     gain = min(gain, left * (1 - 1e-9))
-    return (
-        float(fdtrc(directions, rest, gain / directions / ((left - gain) / rest))),
-        gain,
-        directions,
-    )
+    chance = f_test(*np.array([gain, directions, (left - gain) / rest, rest]))
+    return float(chance), gain, directions
 
 
 def _described(result: Fit, shown: list[tuple[str, float, float]]) -> list[Effect]:
@@ -243,7 +238,7 @@ def _families(problem: Problem, state: State) -> Iterator[tuple[str, Array]]:
     turns = np.concatenate([p.by_turn * w[..., None] for p, w in pairs], -2)
     by_earth = np.concatenate([p.by_earth * w[..., None] for p, w in pairs], -2)
     known = {n: turn for n, turn in _turns(problem, state, turns).items() if turn.any()}
-    for name in STAND:
+    for name in STAND_EFFECTS:
         each = [known[turn] for turn in TURNS.get(name, (name,)) if turn in known]
         if each:
             yield name, np.stack(each, -1)
@@ -278,8 +273,8 @@ def _sets(problem: Problem) -> Array:
     pair = np.stack([known["inclination"][0], known["azimuth"][0]], -1)
     key = np.round(np.nan_to_num(pair, nan=-1.0), 6)
     _, number, count = np.unique(key, axis=0, return_inverse=True, return_counts=True)
-    usable = np.flatnonzero(count >= SET)
-    if len(usable) > len(key) / SET:
+    usable = np.flatnonzero(count >= SMALLEST_SET)
+    if len(usable) > len(key) / SMALLEST_SET:
         usable = usable[:0]
     return np.asarray(number.reshape(-1)[:, None] == usable, float)
 
@@ -295,7 +290,7 @@ def _courses(problem: Problem, state: State) -> Iterator[tuple[str, Array]]:
         order = triad.model.basis.order
         if order < highest:
             own = columns[..., 6 * index : 6 * index + 6]
-            yield f"{TRIADS[index]}{COURSE}", _products(own, powers[:, order:])
+            yield f"{TRIADS[index]}{COURSE_SUFFIX}", _products(own, powers[:, order:])
 
 
 def _turns(problem: Problem, state: State, turns: Array) -> dict[str, Array]:
@@ -353,14 +348,14 @@ def suspected(result: Fit, chance: Array) -> Bools:
     `chance` (B, t) is that of residuals as large as each triad's, NaN where noise is not declared.
     """
     estimated = np.isfinite(result.noise).any(-1)
-    return np.asarray(estimated | (np.nan_to_num(chance, nan=1.0) < WORTH).any(-1))
+    return np.asarray(estimated | (np.nan_to_num(chance, nan=1.0) < STRUCTURE_CHANCE).any(-1))
 
 
 def described(effect: Effect, unit: str) -> str:
     """An effect in words; `unit` is that of the magnetometer."""
     triad, _, kind = effect.name.partition("-")
     own = triad in TRIADS
-    looks = TEXTS[kind if own else effect.name]
+    looks = EFFECTS[kind if own else effect.name]
     if effect.name in ZEROS:
         size = f"{np.degrees(effect.values[0]):+.3g}° ± {np.degrees(effect.uncertainties[0]):.2g}°"
         size += (

@@ -32,6 +32,7 @@ from math import prod
 
 import numpy as np
 
+from mwdcal.estimation.batch import take
 from mwdcal.estimation.solvers import Determined, Normal, Status
 from mwdcal.estimation.uncertainty import COUPLED, free_share
 from mwdcal.geometry.observables import OBSERVABLES, VERTICAL, is_vertical
@@ -72,16 +73,6 @@ class Stations:
         """Which of |g| and inclination count (B, n, 2)."""
         return np.asarray(self.weights > 0)
 
-    def take(self, index: Ints) -> Stations:
-        """The stations of some members of the batch."""
-        return Stations(
-            self.raw[index],
-            self.temperature[index],
-            self.gravity[index],
-            self.inclination[index],
-            self.weights[index],
-        )
-
 
 @dataclass(frozen=True)
 class Local:
@@ -90,10 +81,6 @@ class Local:
     cost: Array
     gradient: Array
     hessian: Array
-
-    def take(self, index: Ints) -> Local:
-        """Those of some members of the batch."""
-        return Local(self.cost[index], self.gradient[index], self.hessian[index])
 
 
 @dataclass(frozen=True)
@@ -374,7 +361,7 @@ class _Descent:
         """One iteration of the members that have not stopped."""
         here = self._local()
         active, params = self.active, self.params[self.active]
-        model, stations = self.model.take(active), self.stations.take(active)
+        model, stations = take((self.model, self.stations), active)
         determined = determines(model, params, stations)
         step = downhill(here, determined)
         share, after = search(model, params, stations, here, step)
@@ -390,11 +377,11 @@ class _Descent:
     def _local(self) -> Local:
         """Derivatives of the active members; those that are not finite stop."""
         active = self.active
-        here = local(self.model.take(active), self.params[active], self.stations.take(active))
+        here = local(*take((self.model, self.params, self.stations), active))
         finite = np.isfinite(here.cost) & np.isfinite(here.hessian).all((-1, -2))
         self.status[active[~finite]] = Status.NOT_FINITE
         self.active = active[finite]
-        return here.take(np.flatnonzero(finite))
+        return take(here, np.flatnonzero(finite))
 
     def free(self, determined: Determined) -> dict[str, Bools]:
         """Whether a turn of all readings about an axis, or their scale, is free (B,), by name."""

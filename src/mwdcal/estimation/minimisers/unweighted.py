@@ -11,14 +11,14 @@ toolface of a reference or a reading that is vertical has weight zero, as it has
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from mwdcal.estimation.problem import Triad
 from mwdcal.estimation.solvers import Determined, Linear, Normal
 from mwdcal.geometry.observables import OBSERVABLES, is_vertical
-from mwdcal.geometry.vectors import Array, Bools, Ints, centred
+from mwdcal.geometry.vectors import Array, Bools, centred
 
 STRENGTH = "strength-squared"
 
@@ -28,16 +28,6 @@ class Params:
     """The state of such a sum: parameters (B, p) alone."""
 
     params: Array
-
-    def take(self, index: Ints) -> Params:
-        """Some members of the batch."""
-        return Params(self.params[index])
-
-    def put(self, index: Ints, other: Params) -> Params:
-        """Ours with some members replaced."""
-        changed = self.params.copy()
-        changed[index] = other.params
-        return Params(changed)
 
 
 @dataclass(frozen=True)
@@ -49,17 +39,6 @@ class Sums:
     names: tuple[str, ...]
     reference: Array
     weights: Array
-
-    def take(self, index: Ints) -> Sums:
-        """The sums of some members of the batch."""
-        triad = Triad(self.triad.model.take(index), self.triad.raw[index], self.triad.sd[index])
-        return replace(
-            self,
-            triad=triad,
-            temperature=self.temperature[index],
-            reference=self.reference[index],
-            weights=self.weights[index],
-        )
 
     def compared(self, params: Array) -> tuple[Array, Array, Bools]:
         """Differences (B, n, m), gradients (B, n, m, 3) by the field, and whether each counts."""

@@ -1,0 +1,107 @@
+"""Flags: what holds of some members of a batch, and the sentence that says it of one of them.
+
+Refusals and findings are both flags, raised by operations on arrays with a leading tool axis. A single
+run is a batch of one, and its sentences are made of the same numbers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+
+from mwdcal.calibration.diagnosis.misfit import misfit_chances
+from mwdcal.calibration.estimate import Fit
+from mwdcal.calibration.options import Options
+from mwdcal.calibration.readings import Readings
+from mwdcal.calibration.record import StationRow
+from mwdcal.calibration.residuals import Residuals
+from mwdcal.estimation.batch import batch_of_one, take
+from mwdcal.estimation.rank import Free, free_directions
+from mwdcal.geometry.vectors import Array, Bools, Ints
+from mwdcal.sensor.profile import Profile
+
+Alone = Callable[[int], tuple[Readings, Profile]]
+"""Readings and profile of one member of a batch, without leading axis, as `calibrate` takes them."""
+
+
+@dataclass(frozen=True)
+class Flag:
+    """A refusal or a finding: its `id`, the `members` (B,) it holds of, and a sentence for one.
+
+    `station` is the number of the station that it is about, if it is about one.
+    """
+
+    id: str
+    members: Bools
+    sentence: Callable[[int], str]
+    station: int | None = None
+
+
+@dataclass(frozen=True)
+class FittedRuns:
+    """Fitted runs of one shape, as refusals and findings look at them.
+
+    `readings` (B, n, ...), the `profile` with its scales stated, the fit, and the free directions
+    of each member. `alone` gives a member by itself, for its sentences.
+    """
+
+    readings: Readings
+    profile: Profile
+    options: Options
+    result: Fit
+    free: list[list[Free]]
+    alone: Alone
+    _residuals: dict[int, Residuals] = field(init=False, repr=False, default_factory=dict)
+
+    @classmethod
+    def of(
+        cls, readings: Readings, profile: Profile, options: Options, result: Fit, alone: Alone
+    ) -> FittedRuns:
+        """Runs with a leading axis and their fit."""
+        free = free_directions(result.problem, result.state, result.analysis.determined)
+        return cls(readings, profile, options, result, free, alone)
+
+    @classmethod
+    def single(
+        cls, readings: Readings, profile: Profile, options: Options, result: Fit
+    ) -> FittedRuns:
+        """One run, whose readings have no leading axis, and its fit."""
+        alone = readings, profile
+        return cls.of(batch_of_one(readings), profile, options, result, lambda _: alone)
+
+    @property
+    def count(self) -> int:
+        """Number of runs."""
+        return len(self.result.status)
+
+    @cached_property
+    def chances(self) -> Array:
+        """`misfit_chances` (B, t) of the fit."""
+        return misfit_chances(self.result)
+
+    def take(self, index: Ints) -> FittedRuns:
+        """Some of the runs."""
+        return replace(
+            self,
+            readings=take(self.readings, index),
+            result=take(self.result, index),
+            free=[self.free[place] for place in index],
+            alone=lambda place: self.alone(int(index[place])),
+        )
+
+    def member(self, place: int) -> Fit:
+        """The fit of one run, as a batch of one."""
+        return self.result if self.count == 1 else take(self.result, np.array([place]))
+
+    def residuals(self, place: int) -> Residuals:
+        """The errors of one run."""
+        if place not in self._residuals:
+            self._residuals[place] = Residuals(self.alone(place)[0], self.member(place))
+        return self._residuals[place]
+
+    def rows(self, place: int) -> list[StationRow]:
+        """The stations of one run."""
+        return self.residuals(place).stations

@@ -1,0 +1,69 @@
+"""Members of a batch: some of them taken out of nested dataclasses of arrays, and put back.
+
+Every array in a batch has a leading axis of members, one for each tool. Whatever is not an array
+is common to all of them: names, orders, flags.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import fields, is_dataclass
+from functools import cache
+from typing import Any, TypeVar
+
+import numpy as np
+
+from mwdcal.geometry.vectors import AnyArray, Ints
+
+_T = TypeVar("_T")
+
+
+def take(batch: _T, index: Ints) -> _T:
+    """The members at `index`, as a batch of their own."""
+    return mapped(lambda array: array[index], batch)
+
+
+def put(batch: _T, index: Ints, members: _T) -> _T:
+    """A copy of a batch with other `members` at `index`."""
+
+    def placed(ours: AnyArray, theirs: AnyArray) -> AnyArray:
+        changed = ours.copy()
+        changed[index] = theirs
+        return changed
+
+    return mapped(placed, batch, members)
+
+
+def batch_of_one(member: _T) -> _T:
+    """A batch whose only member is one without a leading axis."""
+    return mapped(lambda array: array[None], member)
+
+
+def mapped(change: Callable[..., AnyArray], tree: _T, *others: _T) -> _T:
+    """A tree of dataclasses, mappings and tuples with every array changed.
+
+    `change` is given an array and those at the same place of the `others`. Fields that the
+    constructor does not take are not carried over.
+    """
+    return _mapped(change, tree, *others)  # type: ignore[no-any-return]
+
+
+def _mapped(change: Callable[..., AnyArray], *trees: Any) -> Any:
+    tree = trees[0]
+    if isinstance(tree, np.ndarray):
+        return change(*trees)
+    if isinstance(tree, Mapping):
+        return {key: _mapped(change, *(each[key] for each in trees)) for key in tree}
+    if isinstance(tree, tuple):
+        return tuple(_mapped(change, *parts) for parts in zip(*trees, strict=True))
+    names = _names(tree.__class__)
+    if not names:
+        return tree
+    parts = {n: _mapped(change, *(getattr(each, n) for each in trees)) for n in names}
+    return type(tree)(**parts)
+
+
+@cache
+def _names(kind: type) -> tuple[str, ...]:
+    """What the constructor of a dataclass takes, in order; nothing for any other type."""
+    return tuple(f.name for f in fields(kind) if f.init) if is_dataclass(kind) else ()
