@@ -317,14 +317,8 @@ class _Judge:
             reference_vectors(**blind, gravity=gravity)[0],
             reference_vectors(**known, field=field, dip=dip)[1],
         ]
-        found = []
-        for name, target, actual in zip(TRIADS, ideal, fields, strict=True):
-            error = np.linalg.norm(actual - target, axis=-1) / np.linalg.norm(target, axis=-1)
-            error = error[~np.isnan(error)]
-            if len(error) < 2:
-                continue
-            found.append(vector_measures(name, when, error))
-        return found
+        each = zip(TRIADS, fields, ideal, strict=True)
+        return [row for triad in each for row in vector_measures(triad[0], when, *triad[1:])]
 
 
 def score(row: Row, best: Mapping[str, float]) -> float:

@@ -15,26 +15,22 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 
+from mwdcal.calibration import results
 from mwdcal.calibration.automatic.auto import known_before
 from mwdcal.calibration.automatic.nonlinearity import offered
-from mwdcal.calibration.automatic.stand import stand_errors
-from mwdcal.calibration.covariance import stated_covariance
 from mwdcal.calibration.diagnosis.findings import finding_flags
 from mwdcal.calibration.diagnosis.flags import Alone, FittedRuns, Flag
 from mwdcal.calibration.diagnosis.refusals import BAD_INPUT, fit_refusals, reading_refusals
 from mwdcal.calibration.estimate import Fit, fit
 from mwdcal.calibration.methods import ESTIMABLE
 from mwdcal.calibration.options import AUTO, Options
+from mwdcal.calibration.prediction import STATED_ANGLES, accuracy
 from mwdcal.calibration.readings import TRIADS, Readings
-from mwdcal.calibration.record import FREE_SHARE, StandErrors
+from mwdcal.calibration.record import StandErrors
 from mwdcal.calibration.soaks import HIGHEST
 from mwdcal.errors import MwdcalError
 from mwdcal.estimation.batch import take
-from mwdcal.estimation.rank import Free
-from mwdcal.estimation.uncertainty import marginal_rank
-from mwdcal.fleet.accuracy import ANGLES, typical_sd
 from mwdcal.fleet.choices import in_chunks, with_curves, with_orders
-from mwdcal.fleet.curves import curved_sd
 from mwdcal.geometry.vectors import AnyArray, Array, Ints
 from mwdcal.sensor.models import Basis, Factors, Polynomial, Whole
 from mwdcal.sensor.profile import Profile
@@ -110,7 +106,7 @@ def names(options: Options, profile: Profile, triads: Sequence[str] = TRIADS) ->
         if may_be_curved(options, profile, index):
             found += [f"{triad}_{name}" for name in (*CENTRES, "radius")]
         found += [name for pair in zip(own, (f"{n}_sd" for n in own), strict=True) for name in pair]
-    last = (ANGLES, EARTH) if len(triads) > 1 else (ANGLES[:2], EARTH[:1])
+    last = (STATED_ANGLES, EARTH) if len(triads) > 1 else (STATED_ANGLES[:2], EARTH[:1])
     stand = [name for error in options.estimate for name in STAND[error]]
     return [*found, *(f"{angle}_sd_deg" for angle in last[0]), *last[1], *stand]
 
@@ -212,12 +208,7 @@ def _record(
     if good.size < len(members):
         fitted, members = fitted.take(good), members[good]
     _note(outcome, members, fitted)
-    result, free = fitted.result, fitted.free
-    reference = profile.reference_temperature_c
-    covariance = stated_covariance(result)
-    found = _columns(result, covariance, free, reference)
-    found |= _besides(result, covariance, free, options, reference)
-    for name, values in found.items():
+    for name, values in _columns(fitted, profile.reference_temperature_c).items():
         outcome.columns[name][members] = values
 
 
@@ -240,95 +231,30 @@ def _note(outcome: Outcome, members: Ints, fitted: FittedRuns) -> None:
             )
 
 
-def _besides(
-    result: Fit, covariance: Array, free: list[list[Free]], options: Options, reference: float
-) -> dict[str, Array]:
-    """Columns of what was chosen for these tools, and of what they were asked for besides."""
-    count, found = len(result.status), {}
-    for index, (name, triad) in enumerate(zip(TRIADS, result.problem.triads, strict=False)):
-        found[f"{name}_order"] = np.full(count, float(options.orders[index]))
-        model, _ = triad.model.finished(reference)
-        if isinstance(model, Polynomial) and model.curved:
-            ends = zip(CENTRES, model.centre[:, 0].transpose(), strict=True)
-            found |= {f"{name}_{end}": values for end, values in ends}
-            found[f"{name}_radius"] = model.scale[:, 0, 0]
-    if any(f"{name}_radius" in found for name in TRIADS):
-        rows = free_rows(free, result.state.params.shape[-1])
-        found |= curved_sd(result, covariance, rows, reference)
-    if options.estimate:
-        errors = [stand_errors(take(result, np.array([i]))) for i in range(count)]
-        for name in (name for error in options.estimate for name in STAND[error]):
-            found[name] = np.array([getattr(each, name) for each in errors])
-    return found
-
-
-def _columns(
-    result: Fit, covariance: Array, free: list[list[Free]], reference: float
-) -> dict[str, Array]:
+def _columns(fitted: FittedRuns, reference: float) -> dict[str, Array]:
     """Columns of the results of sound fits."""
-    found: dict[str, Array] = {}
-    for index in range(len(result.problem.triads)):
-        found |= _triad_columns(result, index, covariance, free, reference)
-    found |= typical_sd(result, covariance, free_rows(free, covariance.shape[-1]), reference)
-    problem, state = result.problem, result.state
-    found["gravity_g"] = problem.constant(state, "gravity").mean(-1)
-    if len(problem.triads) > 1:
-        found["field"] = problem.constant(state, "field").mean(-1)
-        found["dip_deg"] = np.degrees(problem.constant(state, "dip").mean(-1))
-    return found
+    result, free = fitted.result, fitted.free
+    covariance = results.StatedCovariance(result).total
+    columns: dict[str, Array] = {}
+    for index, name in enumerate(TRIADS[: len(result.problem.triads)]):
+        triad = results.triad_results(result, index, covariance, free, reference)
+        columns |= _triad_columns(name, triad)
+    tools = results.calibrated_tools(result, free, reference, fitted.options.knowledge)
+    sd = accuracy(tools, covariance)
+    columns |= {f"{angle}_sd_deg": np.degrees(values) for angle, values in sd.items()}
+    return columns | results.earth(result) | results.stand_errors(result)
 
 
-def free_rows(free: list[list[Free]], size: int) -> Array:
-    """Free directions (B, k, p) of every member, rows of zeros where there are fewer than k."""
-    most = max((len(each) for each in free), default=0)
-    rows = np.zeros((len(free), most, size))
-    for index, each in enumerate(free):
-        for place, entry in enumerate(each):
-            rows[index, place] = entry.direction
-    return rows
-
-
-def _triad_columns(
-    result: Fit, index: int, covariance: Array, free: list[list[Free]], reference: float
-) -> dict[str, Array]:
-    """Parameters at the reference temperature, uncertainties, rank and noise of one triad."""
-    problem, analysis = result.problem, result.analysis
-    triad, where = problem.triads[index], problem.slices()[index]
-    name, params = TRIADS[index], result.state.params[:, where]
-    finished, one = triad.model.finished(reference)
-    one = np.broadcast_to(one, (len(params), *one.shape[-2:]))
-    values = np.einsum("bij,bj->bi", one, params)
-    inner = one @ covariance[:, where, where]
-    sd = np.sqrt(np.einsum("bij,bij->bi", inner, one))
-    size, rank = triad.model.size, np.full(len(params), triad.model.size)
-    some = np.flatnonzero([bool(each) for each in free])
-    if some.size:
-        part = take(result, some)
-        rank[some] = marginal_rank(part.analysis.determined, where)
-        directions = free_rows([free[i] for i in some], problem.slices()[-1].stop)[..., where]
-        moved = np.einsum("bij,bkj->bki", one[some], directions)
-        triad = part.problem.triads[index]
-        effect = _effect(finished, values[some], triad.raw, part.problem.temperature)
-        sd[some] = np.where(np.abs(moved).max(1) * effect > FREE_SHARE, np.nan, sd[some])
-    declared = np.isnan(result.noise[:, index])
-    noise = np.where(declared, problem.triads[index].sd.mean((-1, -2)), result.noise[:, index])
-    freedom = analysis.freedom[:, index]
-    facts = (
-        rank,
-        np.full(len(params), size),
-        noise,
-        np.where(freedom >= 1, analysis.variance_factor[:, index], np.nan),
-        freedom,
-    )
-    found = {f"{name}_{fact}": np.asarray(v, float) for fact, v in zip(FACTS, facts, strict=True)}
-    for place, parameter in enumerate(finished.names):
-        found[column(name, parameter)] = values[:, place]
-        found[f"{column(name, parameter)}_sd"] = sd[:, place]
-    return found
-
-
-def _effect(model: Whole, params: Array, raw: Array, temperature: Array) -> Array:
-    """By how much of the field each parameter (B, p) changes it, per unit."""
-    strength = np.linalg.norm(model.fields(params, raw, temperature), axis=-1).mean(-1)
-    squares = np.sum(model.jacobian(params, raw, temperature) ** 2, -2)
-    return np.asarray(np.sqrt(squares.mean(-2)) / strength[:, None])
+def _triad_columns(name: str, triad: results.TriadResults) -> dict[str, Array]:
+    """Columns of one triad: facts, parameters and their standard uncertainties."""
+    count, model = len(triad.rank), triad.model
+    columns = {f"{name}_{fact}": np.asarray(getattr(triad, fact), float) for fact in FACTS}
+    columns[f"{name}_order"] = np.full(count, float(model.basis.order))
+    if isinstance(model, Polynomial) and model.curved:
+        centre = model.centre[:, 0].transpose()
+        columns |= {f"{name}_{end}": values for end, values in zip(CENTRES, centre, strict=True)}
+        columns[f"{name}_radius"] = model.scale[:, 0, 0]
+    for place, parameter in enumerate(model.names):
+        columns[column(name, parameter)] = triad.parameters[:, place]
+        columns[f"{column(name, parameter)}_sd"] = triad.sd[:, place]
+    return columns

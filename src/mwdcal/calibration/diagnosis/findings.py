@@ -8,7 +8,6 @@ from functools import partial
 import numpy as np
 
 from mwdcal.calibration.automatic.courses import Terms, misfit_size, terms_beyond, untested
-from mwdcal.calibration.covariance import common_source
 from mwdcal.calibration.diagnosis import misfit
 from mwdcal.calibration.diagnosis.flags import FittedRuns, Flag
 from mwdcal.calibration.diagnosis.structure import described as seen_as
@@ -16,6 +15,7 @@ from mwdcal.calibration.diagnosis.structure import effects, suspected
 from mwdcal.calibration.readings import TRIADS
 from mwdcal.calibration.record import Finding
 from mwdcal.calibration.residuals import REASONS, shown_in
+from mwdcal.calibration.results import common_source
 from mwdcal.calibration.soaks import HIGHEST
 from mwdcal.estimation.rank import free_directions
 from mwdcal.geometry.vectors import Bools

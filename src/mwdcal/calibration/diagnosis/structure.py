@@ -16,11 +16,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mwdcal.calibration.automatic.courses import TRIED, f_test, steady_columns, temperature_powers
-from mwdcal.calibration.covariance import variance_scales
 from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.evidence import TURNS, acts_on
 from mwdcal.calibration.readings import TRIADS
 from mwdcal.calibration.residuals import chances, to_reshoot
+from mwdcal.calibration.results import variance_scales
 from mwdcal.calibration.soaks import HIGHEST, SPAN, highest_order
 from mwdcal.estimation.problem import Problem, State
 from mwdcal.estimation.uncertainty import whole_covariance
