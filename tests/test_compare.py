@@ -12,7 +12,7 @@ from scipy.linalg import polar
 from scipy.spatial.transform import Rotation
 
 from cli_support import mwdcal, refused, servo_run, write_csv
-from mwdcal.app.commands import compare as command
+from mwdcal.app.pages import comparison as command
 from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.methods import EVIDENCE
 from mwdcal.calibration.options import Options
@@ -21,7 +21,9 @@ from mwdcal.comparison import compare as module
 from mwdcal.comparison.common_gauge import Gauge, in_gauge
 from mwdcal.comparison.compare import SCATTER, compare
 from mwdcal.estimation.rank import Free
+from mwdcal.estimation.uncertainty import turn_back
 from mwdcal.planning import simulate
+from mwdcal.use.roll_scatter import group_scatter
 from simulation import Tool, attitude, plan
 from test_calibrate import NOISE, PROFILE, make
 
@@ -206,6 +208,21 @@ def test_a_turn_of_both_triads_together_is_taken_out_together():
     assert abs(turns[0][2]) > 1e-3
 
 
+@pytest.mark.parametrize("reflected", [False, True])
+def test_a_gain_is_turned_back_by_a_rotation_even_where_it_reflects(reflected):
+    turn = Rotation.from_euler("zyx", [0.3, -0.2, 0.1]).as_matrix()
+    stretch = np.diag([1.1, 0.9, -0.02 if reflected else 1.0])
+    back = turn_back((turn @ stretch)[None], np.ones((1, 3), bool))[0]
+    assert np.linalg.det(back) == pytest.approx(1.0)
+    np.testing.assert_allclose(back @ turn, np.eye(3), atol=1e-12)
+
+
+def test_scatter_is_that_of_groups_of_two_stations_or_more():
+    axis = np.array([[0.0, 0, 1], [0.02, 0, 1], [0, 0.5, 1], [9, 9, 9], [np.nan] * 3])
+    assert group_scatter(axis, np.array([3, 3, 5, -1, 3])) == pytest.approx(0.02 / np.sqrt(2))
+    assert np.isnan(group_scatter(axis, np.array([0, 1, 2, -1, 0])))
+
+
 def test_own_axis_terms_leave_the_tangent():
     readings = make(1)
     raw = readings.accelerometer
@@ -331,7 +348,7 @@ def test_the_page_says_what_is_simulated_and_what_is_refused():
 
 
 def test_long_runs_show_the_worst_of_each_part():
-    from mwdcal.app.pages.comparison_plots import MOST_STATIONS, _largest
+    from mwdcal.app.pages.comparison import MOST_STATIONS, _largest
 
     values = np.sin(np.arange(1000) ** 2) * 1e-3
     values[737] = 9.0

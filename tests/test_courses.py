@@ -127,7 +127,7 @@ def fields_of(result, raw, warmth):
 def servo_runs(soaks, declared=True):
     factors = tools(50, soaks)
     readings = runs(factors, SOAKS[soaks], soaks, declared)
-    return factors, readings, choose_orders(readings, Options(), soaks)
+    return factors, readings, choose_orders(readings, Options())
 
 
 @pytest.mark.parametrize("soaks", [3, 4, 5, 7])
@@ -142,7 +142,7 @@ def test_powers_as_large_as_each_other_are_stated_too_simulated(soaks):
     """Tools of which each power reaches the datasheet's limits by itself."""
     factors = factors_within_limits(np.random.default_rng(soaks), 40)
     readings = runs(factors, SOAKS[soaks], soaks)
-    ratios = error_ratios(factors, readings, choose_orders(readings, Options(), soaks), soaks)
+    ratios = error_ratios(factors, readings, choose_orders(readings, Options()), soaks)
     assert all(0.85 < ratio < 1.15 for ratio in ratios.values()), ratios
 
 
@@ -159,7 +159,7 @@ def test_terms_that_are_not_there_are_not_taken_simulated(soaks, order):
     """Rarely: one of 160 triads at most, with estimated noise."""
     factors = tools(80, 10 * soaks + order, order)
     readings = runs(factors, SOAKS[soaks], soaks, declared=False)
-    chosen = choose_orders(readings, Options(), soaks)
+    chosen = choose_orders(readings, Options())
     assert (chosen >= order).all()
     assert np.sum(chosen > order) <= 1, Counter(map(tuple, chosen.tolist()))
 
@@ -177,7 +177,7 @@ def test_scatter_between_soaks_is_stated_simulated(soaks):
     """Gains and offsets that differ by 3e-4 from soak to soak: at another temperature they do again."""
     factors = tools(40, soaks, 1)
     readings = runs(factors, SOAKS[soaks], soaks, scatter=3e-4)
-    orders = choose_orders(readings, Options(), soaks)
+    orders = choose_orders(readings, Options())
     ratios = error_ratios(factors, readings, orders, soaks, scatter=3e-4)
     assert all(0.85 < ratio < 1.15 for ratio in ratios.values()), ratios
 
@@ -222,8 +222,7 @@ def test_an_order_too_low_is_a_finding_simulated():
 @pytest.mark.parametrize(("soaks", "words"), [(2, "no uncertainty here"), (3, "falls off")])
 def test_a_course_that_takes_all_temperatures_is_untested_simulated(soaks, words):
     data = alone(soaks)
-    order, table = choose_order(data, Options(), lambda said: None)
-    record = calibrate(data, PROFILE, Options(order=order), orders=table)
+    record = calibrate(data, PROFILE)
     (text,) = (f.text for f in record.findings if f.id == "temperature-untested")
     assert words.replace("falls", "fall") in text
     last = [row for row in record.orders if row.order == soaks - 1]

@@ -101,7 +101,7 @@ def alone(columns, source, first=1, metadata=None, tool="servo", **options):
     table = tables.Table(cells, metadata or {}, source, lines)
     try:
         readings, profile = to_readings(table, load_profile(tool)[0])
-        return calibrate(readings, profile, Options(nonlinearity={}, **options))
+        return calibrate(readings, profile, Options(**{"order": 0, "nonlinearity": (), **options}))
     except MwdcalError as error:
         return error
 
@@ -275,7 +275,7 @@ def test_the_table_says_what_it_is(tmp_path):
     assert made.metadata["simulated"] is True
     assert made.metadata["profile"] == load_profile("servo")[0].name
     assert list(made.columns)[:4] == ["serial", "status", "message", "stations"]
-    assert set(names(Options())) <= set(made.columns)
+    assert set(names(Options(order=0), load_profile("servo")[0])) <= set(made.columns)
 
 
 # Bad tools

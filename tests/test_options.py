@@ -8,7 +8,7 @@ import pytest
 from scipy.optimize import least_squares
 
 from cli_support import mwdcal
-from mwdcal.calibration.automatic.nonlinearity import choose_curves
+from mwdcal.calibration.automatic.nonlinearity import choose_curves, compare_curves
 from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.estimate import fit
 from mwdcal.calibration.options import Options
@@ -177,6 +177,30 @@ def test_own_axis_terms_are_taken_only_where_left_out_stations_improve():
         curved, table = choose_curves(bent(seed, 0.004), Options(), offered)
         assert curved == {"magnetometer": 0.005}
         assert min(table, key=lambda s: s.left_out).left_out < 0.9 * table[0].left_out
+
+
+@pytest.mark.parametrize("declared", [True, False])
+def test_a_batch_of_runs_is_compared_as_each_run_alone(declared):
+    terms = {"accelerometer": 0.005, "magnetometer": 0.005}
+    runs = [bent(seed, size) for seed, size in ((0, 0.0), (1, 0.004), (2, 0.0))]
+    runs = [run if declared else replace(run, sd={}) for run in runs]
+    batch = replace(
+        runs[0],
+        accelerometer=np.stack([run.accelerometer for run in runs]),
+        magnetometer=np.stack([run.magnetometer for run in runs]),
+        known={n: np.stack([run.reference(n) for run in runs]) for n in runs[0].known},
+        sd={n: np.stack([np.broadcast_to(run.sd[n], (48, 3)) for run in runs]) for n in runs[0].sd},
+    )
+    curves = compare_curves(batch, Options(), terms)
+    for place, run in enumerate(runs):
+        chosen, table = choose_curves(run, Options(), terms)
+        assert curves.choices[curves.chosen[place]] == tuple(chosen)
+        for ours, alone in zip(curves.table(place), table, strict=True):
+            assert (ours.triads, ours.chosen) == (alone.triads, alone.chosen)
+            assert (ours.left_out is None) == (ours.odds is not None) == (not declared)
+            scores = (ours.left_out or ours.odds, alone.left_out or alone.odds)
+            assert scores[0] == pytest.approx(scores[1], rel=1e-6, abs=1e-6)
+    assert [bool(place) for place in curves.chosen] == [False, True, False]
 
 
 SERVO = "examples/servo"

@@ -58,8 +58,8 @@ def test_two_runs_in_turn_are_as_good_as_both_together(unknown):
     before = fit(first)  # the file's covariance carries s² of its run: undone here
     record = calibrate(first, PROFILE)
     scale = np.sqrt(np.repeat(before.analysis.variance_factor[0], 12))
-    bare = (np.array(record.covariance) / np.outer(scale, scale)).tolist()
-    record = msgspec.structs.replace(record, covariance=bare)
+    bare = (record.parameter_covariance / np.outer(scale, scale)).tolist()
+    record = msgspec.structs.replace(record, covariance_rows=bare)
     turned = fit(second, Options(prior=from_calibration(record)))
     whole = fit(both)
     assert turned.analysis.determined.rank[0] == whole.analysis.determined.rank[0]
@@ -142,13 +142,13 @@ def test_no_false_alarm_of_a_changed_tool():
 
 def test_what_does_not_fit_together_is_refused():
     curved = Profile(name="bent", magnetometer=TriadProfile(nonlinearity=0.01))
-    with pytest.raises(InputError, match="nonlinearity none"):
-        from_calibration(calibrate(make(1), curved))
+    with pytest.raises(InputError, match="`nonlinearity` none"):
+        from_calibration(calibrate(make(1), curved, Options(nonlinearity=("magnetometer",))))
     relative = calibrate(make(1, unknown=("field",)), PROFILE)
     with pytest.raises(InputError, match="ref_field_nt"):
         from_calibration(relative)
     previous = from_calibration(calibrate(make(1), PROFILE))
-    with pytest.raises(FitError, match="--parameters"):
+    with pytest.raises(FitError, match="`parameters`"):
         calibrate(make(2), PROFILE, Options(prior=previous, parameters=9))
     with pytest.raises(InputError, match="--prior"):
         calibrate(make(2), PROFILE, Options("newton", prior=previous))

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import builtins
 import re
+import sys
 import warnings
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -12,13 +12,14 @@ from html.parser import HTMLParser
 import msgspec
 import numpy as np
 import pytest
+from markupsafe import Markup
 
 from mwdcal.app import text
-from mwdcal.app.commands import calibrate as command
-from mwdcal.app.commands.choices import Chosen
-from mwdcal.app.pages import plots, report
-from mwdcal.app.pages.report import css_string, measured, number, render, signed, write_report
-from mwdcal.calibration.automatic.order_selection import choose_order, order_errors
+from mwdcal.app.pages import calibration as screen
+from mwdcal.app.pages import conversion, plots, report
+from mwdcal.app.pages.page import css_string, fixed, measured, number, signed
+from mwdcal.app.pages.report import render, write_report
+from mwdcal.calibration.automatic.auto import Choice
 from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.prediction import accuracy_at, accuracy_map, readings_at, typical_accuracy
@@ -86,12 +87,7 @@ def heated(model=None):
 @cache
 def judged(order="auto", unknown=()):
     """Calibrated with the table of errors at temperatures left out."""
-    data = soaked(unknown)
-    if order == "auto":
-        order, scores = choose_order(data, Options(), lambda text: None)
-    else:
-        scores = order_errors(data, Options(order=order), lambda text: None)
-    return calibrate(data, SERVO, Options(order=order), orders=scores)
+    return calibrate(soaked(unknown), SERVO, Options(order=order))
 
 
 @dataclass
@@ -128,6 +124,7 @@ def words(monkeypatch):
     """`render` without its pictures, for tests of what it says."""
     for name in ("station_errors", "deviations", "accuracy", "order_errors"):
         monkeypatch.setattr(plots, name, lambda *arguments: "")
+    monkeypatch.setattr(plots, "svg", lambda figure, key: Markup(figure))
     monkeypatch.setattr(report, "accuracy_map", lambda calibration: None)
     return render
 
@@ -196,7 +193,7 @@ def test_user_settings_of_matplotlib_change_nothing(whole, page):
     import matplotlib as mpl
 
     with mpl.rc_context({"font.size": 20, "axes.facecolor": "red", "svg.fonttype": "none"}):
-        assert plots.station_errors(whole, "gravity") in page
+        assert plots.svg(plots.station_errors(whole, "gravity"), "error-gravity") in page
         assert mpl.rcParams["font.size"] == 20
 
 
@@ -228,7 +225,8 @@ def test_station_labels_may_be_anything(whole):
     odd = msgspec.structs.replace(whole, station_rows=rows)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        found = plots.station_errors(odd, "field") + plots.deviations(odd, 3.7)
+        figures = {"a": plots.station_errors(odd, "field"), "b": plots.deviations(odd, 3.7)}
+        found = "".join(plots.svg(figure, key) for key, figure in figures.items())
     assert "<script" not in found
     parsed(found)
 
@@ -326,7 +324,7 @@ def test_errors_of_a_relative_field_are_per_mille(words):
 
 
 def test_a_course_that_nothing_tests_says_so(words, whole):
-    page = words(heated())
+    page = words(msgspec.structs.replace(heated(), orders=[]))
     assert 'id="orders"' not in page
     assert "nothing tests its course" in page
     assert "--outside extrapolate" in page
@@ -335,11 +333,12 @@ def test_a_course_that_nothing_tests_says_so(words, whole):
 
 def test_picture_of_the_orders_has_both_triads():
     scores = judged().orders
-    parsed(plots.order_errors(scores))
+    both = plots.order_errors(scores)
+    parsed(plots.svg(both, "orders"))
     alone = plots.order_errors([s for s in scores if s.triad == "accelerometer"])
-    assert len(alone) < len(plots.order_errors(scores))
+    assert (len(alone.axes), len(both.axes)) == (1, 2)
     blank = [msgspec.structs.replace(s, error_inside=None) for s in scores]
-    parsed(plots.order_errors(blank))
+    parsed(plots.svg(plots.order_errors(blank), "orders"))
 
 
 @cache
@@ -358,10 +357,10 @@ def test_different_orders_name_their_triad(words):
     other = msgspec.structs.replace(made.magnetometer, order=2)
     made = msgspec.structs.replace(made, magnetometer=other)
     wanted = "accelerometer: factors of order 1, magnetometer: factors of order 2"
-    assert text.model(made) == wanted
-    assert wanted in text.heading(made)
+    assert screen.model(made) == wanted
+    assert wanted in screen.heading(made)
     assert ("Method", f"joint; {wanted}") in report._facts(made)
-    assert "factors of order 1   " in text.heading(heated())
+    assert "factors of order 1   " in screen.heading(heated())
 
 
 def left_out_rows(page):
@@ -379,7 +378,7 @@ def test_every_station_shows_its_error_left_out_and_what_it_does(words, whole):
     assert len(rows) == 48
     for cells, station in zip(rows, whole.station_rows, strict=True):
         alone = [signed(station.errors_left_out[n], decimals[n]) for n in names]
-        moves = [report.fixed(station.influence[n], decimals[n] + 1) for n in names]
+        moves = [fixed(station.influence[n], decimals[n] + 1) for n in names]
         assert cells == [station.station, *alone, *moves]
     assert "weight</th>" not in page
 
@@ -389,7 +388,7 @@ def test_the_weight_of_a_station_is_shown_where_the_fit_was_robust(words):
     page = words(made)
     assert "weight</th>" in page
     shown = [cells[-1] for cells in left_out_rows(page)]
-    assert shown == [report.fixed(row.weight, 2) for row in made.station_rows]
+    assert shown == [fixed(row.weight, 2) for row in made.station_rows]
 
 
 def test_a_record_without_errors_left_out_has_no_such_table(words, whole):
@@ -408,7 +407,7 @@ def test_held_parameters_are_said_to_be_held(words, parameters):
     assert page.count("<td>0</td><td>held</td>") == count
     assert ("A held parameter" in page) == (parameters != 12)
     for notation in ("factors", "forward", "affine"):
-        shown = text.notation(convert(made, notation))
+        shown = conversion.notation(convert(made, notation))
         assert len(re.findall(r" 0 +held$", shown, re.MULTILINE)) == count
         assert not re.search(r" -0( |$)", shown, re.MULTILINE)
 
@@ -419,7 +418,7 @@ def test_zero_has_no_sign():
 
 def test_summary_says_what_was_asked_for(tmp_path):
     made = asked()
-    found = command.summary(made, Chosen(Options(), [], []), tmp_path / "tool.json", None)
+    found = screen.summary(made, Choice(run(), SERVO, Options()), tmp_path / "tool.json", None)
     found = msgspec.to_builtins(found)
     assert found["options"]["parameters"] == 9
     assert found["options"]["robust"] == "huber"
@@ -434,7 +433,7 @@ def test_curved_axes_have_the_parameters_of_the_record(words):
     curved = msgspec.structs.replace(
         SERVO, accelerometer=TriadProfile(scale=3.0, noise=3e-4, nonlinearity=1e-3)
     )
-    made = calibrated(moved=False, profile=curved)
+    made = calibrate(run(moved=False), curved, Options(nonlinearity=("accelerometer",)))
     assert "square<sub>x</sub>" in words(made)
     check_inverse(made)
 
@@ -444,14 +443,7 @@ def test_real_data_is_not_called_simulated(page):
 
 
 def test_missing_extra_says_what_to_install(whole, monkeypatch):
-    real = builtins.__import__
-
-    def without(name, *rest, **more):
-        if name.startswith("jinja2"):
-            raise ImportError(name=name)
-        return real(name, *rest, **more)
-
-    monkeypatch.setattr(builtins, "__import__", without)
+    monkeypatch.setitem(sys.modules, "jinja2", None)
     with pytest.raises(InputError, match=r"install 'mwdcal\[report\]'"):
         render(whole)
 

@@ -195,9 +195,9 @@ def replaced(row, **changes):
 def test_the_record_keeps_the_table():
     data, _ = made(11)
     order, scores = choose_order(data, Options(), quiet)
-    record = calibrate(data, PROFILE, Options(order=order), orders=scores)
+    record = calibrate(data, PROFILE)
     assert msgspec.json.decode(msgspec.json.encode(record), type=Calibration) == record
-    assert calibrate(data, PROFILE, Options(order=order)).orders == []
+    assert [s.order for s in calibrate(data, PROFILE, Options(order=order)).orders] == [*order]
     for kept, score in zip(record.orders, scores, strict=True):
         assert isinstance(kept, OrderScore)
         assert kept.error_ends == float(f"{score.error_ends:.11e}")

@@ -18,13 +18,14 @@ from pathlib import Path
 import nulls
 import numpy as np
 
-from mwdcal.app import cli
-from mwdcal.app.commands.choices import Typed, choose
-from mwdcal.calibration.automatic.nonlinearity import ODDS, USUAL, choices_of, declared, log_odds
-from mwdcal.calibration.calibrate import calibrate
+from mwdcal.app.commands import calibrate as command
+from mwdcal.app.commands.choices import Typed, options_of
+from mwdcal.calibration.automatic.auto import Choice, choose
+from mwdcal.calibration.automatic.nonlinearity import ODDS, choices_of, declared, log_odds
+from mwdcal.calibration.calibrate import recorded
 from mwdcal.calibration.estimate import Fit, fit
 from mwdcal.calibration.methods import EVIDENCE
-from mwdcal.calibration.options import Options
+from mwdcal.calibration.options import USUAL, Options
 from mwdcal.calibration.readings import TRIADS, Readings
 from mwdcal.calibration.record import Calibration
 from mwdcal.errors import MwdcalError
@@ -104,23 +105,26 @@ def ways(curved: str) -> list[str]:
 
 def typed(words: str) -> Typed:
     """The options that the command line makes of these words."""
-    command = cli.calibrate.make_context(
-        "calibrate", ["-", "-o", "-", *words.split()], **cli.cli.context_settings
-    )
-    return Typed(**{name: command.params[name] for name in Typed.__annotations__})
+    context = command.command.make_context("calibrate", ["-", "-o", "-", *words.split()])
+    return Typed(**{name: context.params[name] for name in Typed.__annotations__})
 
 
 @cache
-def options(name: str, words: str = "") -> Options:
+def choice(name: str, words: str = "") -> Choice:
     """What the command line makes of its words on a set."""
-    return choose(*run(name), typed(words), lambda text: None).options
+    return choose(*run(name), options_of(typed(words)), lambda text: None)
+
+
+def options(name: str, words: str = "") -> Options:
+    """The options of a fit that the command line makes of its words on a set."""
+    return choice(name, words).options
 
 
 @cache
 def trial(name: str, words: str = "") -> Trial:
     """A set calibrated with the words of a command line."""
     try:
-        return Trial(made=calibrate(*run(name), options(name, words)))
+        return Trial(made=recorded(choice(name, words), _fitted(name, words)))
     except MwdcalError as error:
         return Trial(str(error))
 
@@ -215,7 +219,7 @@ def fields(name: str, words: str, left_out: bool) -> tuple[np.ndarray, np.ndarra
     own = np.arange(readings.count)
     each = nested(name) if not words else (options(name, words),) * len(own)
     g, b = np.full((2, len(own), 3), np.nan)
-    kinds = [tuple(one.nonlinearity or ()) for one in each]
+    kinds = [tuple(one.curved) for one in each]
     for kind in dict.fromkeys(kinds):
         some = np.array([k for k in own if kinds[k] == kind])
         found = _of(fit(readings, each[some[0]], 1 - np.eye(len(own))[some]))

@@ -2,50 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cached_property
-from itertools import pairwise
 
-import msgspec
 import numpy as np
 
 from mwdcal import __version__
-from mwdcal.calibration.automatic.nonlinearity import with_nonlinearity
-from mwdcal.calibration.automatic.stand import check_names, stand_errors
-from mwdcal.calibration.covariance import (
-    PRIOR,
-    assumed_exact,
-    common_source,
-    constants_covariance,
-    error_name,
-    shares,
-    stated_covariance,
-)
+from mwdcal.calibration import results
+from mwdcal.calibration.automatic.auto import Choice, choose
 from mwdcal.calibration.diagnosis.findings import described, findings
 from mwdcal.calibration.diagnosis.flags import FittedRuns
-from mwdcal.calibration.diagnosis.refusals import check, check_readings, fit_refusals
+from mwdcal.calibration.diagnosis.refusals import check, fit_refusals
 from mwdcal.calibration.estimate import Fit, fit
 from mwdcal.calibration.options import Options
-from mwdcal.calibration.prediction import typical_budget
+from mwdcal.calibration.prediction import accuracy
 from mwdcal.calibration.readings import TRIADS, Readings
 from mwdcal.calibration.record import (
-    FREE_SHARE,
     BudgetRow,
     Calibration,
     Choices,
     Constant,
-    OrderScore,
+    StandErrors,
     TriadCalibration,
     Undetermined,
     rounded,
+    stated,
 )
 from mwdcal.calibration.residuals import error_rows, measure_rows
 from mwdcal.estimation.evidence import STAND_ERRORS
 from mwdcal.estimation.rank import Free
-from mwdcal.estimation.uncertainty import marginal_rank
 from mwdcal.geometry.vectors import Array
+from mwdcal.sensor.models import Polynomial
 from mwdcal.sensor.profile import Profile
 
 IDENTITY = ("serial", "tool", "operator", "lab", "date", "stand", "simulated")
@@ -58,43 +47,63 @@ def calibrate(
     *,
     profile_sha256: str = "",
     run_sha256: str = "",
-    orders: Sequence[OrderScore] = (),
-    excluded: Sequence[str] = (),
     progress: Callable[[str], None] = lambda text: None,
 ) -> Calibration:
     """Fit the sensor model to a run and state what it is worth.
 
-    For the record: `orders`, what chose the order and left-out temperatures say of it
-    (`mwdcal.calibration.automatic.order_selection`), and `excluded`, labels of stations of the run
-    that the readings no longer have.
-    Raises `FitError` where the data cannot give a calibration to be trusted.
+    What the options leave to the software is chosen as `mwdcal calibrate` does
+    (`mwdcal.calibration.automatic.auto`); `progress` gets a line for each trial.
+    Raises `InputError` for options that do not go together, `FitError` where the data cannot give a
+    calibration to be trusted.
     """
-    options = with_nonlinearity(options or Options(), profile)
-    check_readings(readings, options)
-    check_names(options.estimate, options.method)
-    progress(f"fitting {readings.count} stations, method {options.method}, order {options.order}")
-    result = fit(readings, options)
-    fitted = FittedRuns.single(readings, profile, options, result)
+    choice = choose(readings, profile, options or Options(), progress)
+    return recorded(
+        choice,
+        fit(choice.readings, choice.options),
+        profile_sha256=profile_sha256,
+        run_sha256=run_sha256,
+    )
+
+
+def recorded(
+    choice: Choice, result: Fit, *, profile_sha256: str = "", run_sha256: str = ""
+) -> Calibration:
+    """The record of a fit with the options chosen for a run.
+
+    Raises `FitError` where the fit is not to be trusted.
+    """
+    fitted = FittedRuns.single(choice.readings, choice.profile, choice.options, result)
     check(fit_refusals(fitted))
-    made = _Record(readings, profile, options, result, fitted)
-    record = made.calibration(profile_sha256, run_sha256)
-    also = {
-        "orders": list(orders),
-        "excluded": list(excluded),
-        "budget": made.budget(record),
-    }
-    return rounded(msgspec.structs.replace(record, **also))
+    record = _Record(choice, fitted)
+    return rounded(record.calibration(profile_sha256, run_sha256))
 
 
 @dataclass(frozen=True)
 class _Record:
     """The parts of a calibration file, from one fit."""
 
-    readings: Readings
-    profile: Profile
-    options: Options
-    result: Fit
+    choice: Choice
     fitted: FittedRuns
+
+    @property
+    def readings(self) -> Readings:
+        """The readings that were fitted."""
+        return self.choice.readings
+
+    @property
+    def profile(self) -> Profile:
+        """The profile of the tool."""
+        return self.choice.profile
+
+    @property
+    def options(self) -> Options:
+        """The options that were chosen."""
+        return self.choice.options
+
+    @property
+    def result(self) -> Fit:
+        """The fit."""
+        return self.fitted.result
 
     @property
     def free(self) -> list[Free]:
@@ -104,6 +113,7 @@ class _Record:
     def calibration(self, profile_sha256: str, run_sha256: str) -> Calibration:
         """The whole record."""
         readings, result, options = self.readings, self.result, self.options
+        residuals = self.fitted.residuals(0)
         return Calibration(
             tool={k: str(v) for k, v in readings.metadata.items() if k in IDENTITY},
             profile=self.profile,
@@ -117,186 +127,124 @@ class _Record:
                 ignore=list(options.ignore),
                 robust=options.robust,
                 paper_weights=options.paper_weights,
-                prior=options.prior.source if options.prior else None,
+                prior=options.knowledge.source if options.knowledge else None,
             ),
             seed=options.seed if options.method == "swarm" else None,
             time=datetime.now(UTC).isoformat(timespec="seconds"),
             field_unit=readings.field_unit,
             stations=readings.count,
+            excluded=list(self.choice.excluded),
             temperature_c=self.temperatures,
             accelerometer=self.triad(0),
             magnetometer=self.triad(1) if readings.magnetometer is not None else None,
-            covariance=self.covariance.tolist(),
-            free=[d.tolist() for d in self.directions],
+            covariance_rows=(
+                self.to_file @ self.covariance.total[0] @ self.to_file.transpose()
+            ).tolist(),
+            free=[(self.to_file @ entry.direction).tolist() for entry in self.free],
             singular_values=result.analysis.determined.values[0].tolist(),
             constants=self.constants(),
-            stand=stand_errors(result),
-            earth=self.earth(),
-            assumed_exact=self.assumed,
-            errors=error_rows(readings, result),
-            measures=measure_rows(readings, result),
+            stand=StandErrors(**_first(results.stand_errors(result))),
+            earth=_first(results.earth(result)),
+            budget=self.budget(),
+            assumed_exact=results.assumed_exact(result, readings.relative),
+            errors=error_rows(residuals),
+            measures=measure_rows(residuals),
+            orders=list(self.choice.orders),
             station_rows=self.fitted.rows(0),
-            inherited=list(options.prior.stations) if options.prior else [],
+            inherited=list(options.knowledge.stations) if options.knowledge else [],
             findings=findings(self.fitted),
         )
+
+    @cached_property
+    def covariance(self) -> results.StatedCovariance:
+        """The covariance of the fit's parameters."""
+        return results.StatedCovariance(self.result)
+
+    @cached_property
+    def to_file(self) -> Array:
+        """Linear map from the fit's parameters (p,) to the file's."""
+        return np.asarray(results.to_file(self.result, self.profile.reference_temperature_c)[0])
 
     @property
     def temperatures(self) -> tuple[float, float] | None:
         """Coldest and hottest station, °C; those behind the prior count too."""
-        temperature, prior = self.readings.temperature, self.options.prior
-        if temperature is None:
+        if self.readings.temperature is None:
             return None
-        low, high = float(temperature.min()), float(temperature.max())
-        known = (prior.temperature if prior else None) or (low, high)
-        return min(low, known[0]), max(high, known[1])
+        low, high = results.temperature_range(self.result, self.options.knowledge)
+        return float(low[0]), float(high[0])
 
-    @cached_property
-    def map(self) -> Array:
-        """Linear map from the fit's parameters (p,) to the file's, held ones included."""
-        slices, ours = self.result.problem.slices(), self.slices
-        whole = np.zeros((ours[-1].stop, slices[-1].stop))
-        for triad, mine, where in zip(self.result.problem.triads, ours, slices, strict=True):
-            model, one = triad.model.finished(self.profile.reference_temperature_c)
-            whole[mine, where] = one.reshape(-1, model.size, triad.model.size)[0]
-        return whole
-
-    @cached_property
-    def slices(self) -> list[slice]:
-        """Where each triad's parameters lie in the file."""
-        reference = self.profile.reference_temperature_c
-        sizes = [t.model.finished(reference)[0].size for t in self.result.problem.triads]
-        ends = np.cumsum([0, *sizes])
-        return [slice(int(a), int(b)) for a, b in pairwise(ends)]
-
-    @cached_property
-    def covariance(self) -> Array:
-        """Covariance (p, p) of the file's parameters."""
-        return self._mapped(stated_covariance(self.result))
-
-    def _mapped(self, covariance: Array) -> Array:
-        """A covariance (1, p, p) of the fit's parameters as one of the file's."""
-        return np.asarray(self.map @ covariance[0] @ self.map.transpose())
-
-    def budget(self, record: Calibration) -> list[BudgetRow]:
+    def budget(self) -> list[BudgetRow]:
         """What each source of error adds to the accuracy to expect; tilt is one source."""
-        found: dict[str, Array] = {}
-        for name, share in shares(self.result).items():
-            source = name if " " in name or name == PRIOR else common_source(name)
-            found[source] = found.get(source, 0.0) + self._mapped(share)
-        rows = typical_budget(record, found)
+        shares: dict[str, Array] = {}
+        for name, share in self.covariance.by_source().items():
+            source = results.common_source(name)
+            shares[source] = shares.get(source, 0.0) + share
+        reference = self.profile.reference_temperature_c
+        tools = results.calibrated_tools(
+            self.result, [self.free], reference, self.options.knowledge
+        )
+        sd = accuracy(tools, np.stack([*shares.values()]))
+        degrees = {f"{angle}_deg": np.degrees(values[:, 0]) for angle, values in sd.items()}
         return [
-            BudgetRow(source=source, **{f"{n}_deg": sd for n, sd in row.items()})
-            for source, row in rows.items()
+            BudgetRow(source=source, **{name: stated(sd[place]) for name, sd in degrees.items()})
+            for place, source in enumerate(shares)
         ]
-
-    @cached_property
-    def directions(self) -> list[Array]:
-        """Free directions (p,) in the file's parameters, turning or stretching by one."""
-        return [self.map @ entry.direction for entry in self.free]
-
-    @property
-    def assumed(self) -> list[str]:
-        """References taken as exact that no residual tests; a field of one is no reference."""
-        found = assumed_exact(self.result)
-        return [n for n in found if not (n.startswith("field") and self.readings.relative)]
-
-    def earth(self) -> dict[str, float]:
-        """Mean gravity, field and dip of the run: given or estimated."""
-        state, problem = self.result.state, self.result.problem
-        found = {"gravity_g": float(problem.constant(state, "gravity").mean())}
-        if len(problem.triads) > 1:
-            found["field"] = float(problem.constant(state, "field").mean())
-            found["dip_deg"] = float(np.degrees(problem.constant(state, "dip").mean()))
-        return found
 
     def constants(self) -> list[Constant]:
         """Estimated constants of the run with their uncertainty."""
-        found = []
-        spread = np.sqrt(np.diag(constants_covariance(self.result)[0]))
+        constants = []
+        sd = np.sqrt(np.diag(results.constants_covariance(self.result)[0]))
         for index, constant in enumerate(self.result.problem.evidence.constants):
             lone = constant.name == "dip" and len(self.result.problem.triads) == 1
-            asked = constant.unknown and constant.name in STAND_ERRORS  # these stand in `stand`
-            if lone or asked:
+            if lone or (constant.unknown and constant.name in STAND_ERRORS):  # those are in `stand`
                 continue
             unit = {"gravity": "g", "field": "nT"}.get(constant.name, "°")
             degrees = float(np.degrees(1)) if unit == "°" else 1.0
-            found.append(
+            constants.append(
                 Constant(
-                    name=constant.name if constant.unknown else error_name(constant.name),
+                    name=constant.name if constant.unknown else results.error_name(constant.name),
                     value=float(self.result.state.constants[0, index]) * degrees,
-                    standard_uncertainty=float(spread[index]) * degrees,
+                    standard_uncertainty=float(sd[index]) * degrees,
                     unit=unit,
                 )
             )
-        return found
+        return constants
 
     def triad(self, index: int) -> TriadCalibration:
         """The record of one triad."""
-        problem, analysis = self.result.problem, self.result.analysis
-        triad, where, mine = problem.triads[index], problem.slices()[index], self.slices[index]
-        free = [f for f in self.free if index in f.triads]
-        noise, declared = self.result.noise[0, index], np.isnan(self.result.noise[0, index])
-        curved = TRIADS[index] in (self.options.nonlinearity or {})
-        finished, _ = triad.model.finished(self.profile.reference_temperature_c)
-        freedom, chance = float(analysis.freedom[0, index]), self.fitted.chances[0, index]
+        name, reference = TRIADS[index], self.profile.reference_temperature_c
+        triad = results.triad_results(
+            self.result, index, self.covariance.total, [self.free], reference
+        )
+        model = triad.model
+        powers = model if isinstance(model, Polynomial) else Polynomial(model.basis)
         return TriadCalibration(
-            name=TRIADS[index],
+            name=name,
             unit="g" if index == 0 else ("1 (field = 1)" if self.readings.relative else "nT"),
-            model=triad.model.kind,
-            order=triad.model.basis.order,
-            curved=curved,
-            centre=(finished.centre.reshape(-1, 3)[0]).tolist() if curved else [0.0, 0.0, 0.0],  # type: ignore[union-attr]
-            radius=float(finished.scale.ravel()[0]) if curved else 1.0,  # type: ignore[union-attr]
-            parameter_names=list(finished.names),
-            parameters=(self.map[mine, where] @ self.result.state.params[0, where]).tolist(),
-            standard_uncertainties=self._uncertainties(index),
-            rank=int(marginal_rank(analysis.determined, where)[0]),
-            size=triad.model.size,
-            singular_values=(_own_values(self.result, where)).tolist(),
+            model=model.kind,
+            order=model.basis.order,
+            curved=model.curved,
+            centre=powers.centre.ravel().tolist(),
+            radius=float(powers.scale.ravel()[0]),
+            parameter_names=list(model.names),
+            parameters=triad.parameters[0].tolist(),
+            standard_uncertainties=[stated(sd) for sd in triad.sd[0].tolist()],
+            rank=int(triad.rank[0]),
+            size=int(triad.size[0]),
+            singular_values=results.triad_singular_values(self.result, index)[0].tolist(),
             undetermined=[
-                Undetermined(id=f.id, text=f"{TRIADS[index]}: {described(f.id)}") for f in free
+                Undetermined(id=f.id, text=f"{name}: {described(f.id)}")
+                for f in self.free
+                if index in f.triads
             ],
-            noise=float(triad.sd[0].mean() if declared else noise),
-            noise_source="declared" if declared else "estimated from the residuals",
-            variance_factor=float(analysis.variance_factor[0, index]) if freedom >= 1 else None,
-            degrees_of_freedom=freedom,
-            misfit_probability=None if np.isnan(chance) else float(chance),
+            noise=float(triad.noise[0]),
+            noise_source="declared" if triad.declared[0] else "estimated from the residuals",
+            variance_factor=stated(triad.variance_factor[0]),
+            degrees_of_freedom=float(triad.degrees_of_freedom[0]),
+            misfit_probability=stated(self.fitted.chances[0, index]),
         )
 
-    def _uncertainties(self, index: int) -> list[float | None]:
-        """Standard uncertainties; None for parameters that a free direction moves.
 
-        A parameter is moved if its share of the direction changes the field by more than
-        `FREE_SHARE` of its strength, over the stations of the run.
-        """
-        problem, where = self.result.problem, self.result.problem.slices()[index]
-        triad, temperature = problem.triads[index], problem.temperature
-        params = self.result.state.params[:, where]
-        strength = np.linalg.norm(triad.model.fields(params, triad.raw, temperature)[0], axis=-1)
-        finished, mine = (
-            triad.model.finished(self.profile.reference_temperature_c)[0],
-            self.slices[index],
-        )
-        moved = self.map[mine, where] @ params[0]
-        columns = finished.jacobian(moved, triad.raw[0], temperature[0]).reshape(-1, 3, len(moved))
-        effect = np.sqrt(np.mean(np.sum(columns**2, 1), 0)) / strength.mean()
-        share = np.abs([d[mine] for d in self.directions] or [np.zeros(len(effect))]).max(0)
-        values = np.sqrt(np.diag(self.covariance)[mine])
-        return [
-            None if s * e > FREE_SHARE else float(v)
-            for v, s, e in zip(values, share, effect, strict=True)
-        ]
-
-
-def _own_values(result: Fit, where: slice) -> Array:
-    """Singular values of one triad when all that is shared with the other is free."""
-    reduced, _, _ = result.problem.linear(result.state, geometry=True).normal.reduced()
-    norms = result.analysis.determined.norms[0]
-    scaled = reduced[0] / np.outer(norms, norms)
-    other = np.ones(len(norms), bool)
-    other[where] = False
-    cross = scaled[other][:, where]
-    inverse = np.linalg.pinv(scaled[np.ix_(other, other)], rcond=1e-6, hermitian=True)
-    values = np.linalg.eigvalsh(scaled[where, where] - cross.transpose() @ inverse @ cross)
-    values = np.sqrt(np.clip(values[::-1], 0, None))
-    return np.asarray(values / values[0])
+def _first(values: dict[str, Array]) -> dict[str, float]:
+    """The values of the first tool."""
+    return {name: float(value[0]) for name, value in values.items()}

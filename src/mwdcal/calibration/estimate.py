@@ -104,7 +104,7 @@ def _problem(
     """
     cold = np.zeros(readings.count)
     temperature = flat(cold if readings.temperature is None else readings.temperature, lead)
-    curved = options.nonlinearity or {}
+    curved = options.curved
     names = [name for name in TRIADS if getattr(readings, name) is not None]
     raws = [flat(getattr(readings, name), lead, 3) for name in names]
     finite = np.all([np.isfinite(raw).all((-1, -2)) for raw in raws], axis=0)
@@ -114,7 +114,7 @@ def _problem(
         whole = model_of(kind, order, sound, temperature, evidence.include, name in curved)
         sd = flat(readings.sd[name], lead, 3) if name in readings.sd else _first_noise(raw)
         triads.append(Triad(restricted(whole, options.parameters), sound, sd))
-    prior = prior_of(options.prior, [t.model for t in triads], len(evidence.include))
+    prior = prior_of(options.knowledge, [t.model for t in triads], len(evidence.include))
     problem = Problem(tuple(triads), temperature, evidence, prior)
     _bound_curves(problem, curved)
     return problem, [name in readings.sd for name in names], finite

@@ -1,57 +1,107 @@
-"""How a run is to be fitted: the choices that a calibration is made with, all in one place."""
+"""How a run is to be calibrated: all options in one place, `auto` among their values."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Literal
 
 from mwdcal.calibration.prior import Knowledge
+from mwdcal.calibration.readings import TRIADS
+from mwdcal.calibration.record import Calibration
+from mwdcal.calibration.soaks import HIGHEST
+from mwdcal.errors import InputError
 
+AUTO: Literal["auto"] = "auto"
+"""What an option is whose value the software chooses (`mwdcal.calibration.automatic.auto`)."""
+USUAL = 0.005
+"""Prior of own-axis terms, as a share of the field, where the profile declares none."""
 Orders = int | tuple[int, int]
 """Temperature order of both triads, or of accelerometer and magnetometer."""
 
 
 @dataclass(frozen=True)
 class Options:
-    """Choices of a fit; the defaults are right for most runs.
+    """Options of a calibration; the defaults are right for most runs.
 
     Attributes:
         method: "joint", "least-squares", "swarm", "newton", "toolface-inclination", "scalar".
-        model: "polynomial" or "factors"; None: polynomial at order 0, factors above.
-        order: temperature order 0…3 of both triads, or of each.
-        parameters: per triad at one temperature: 12, 9 (sensor frame) or 6 (scale and bias).
-        nonlinearity: triads with own-axis quadratic and cubic terms, and their prior as a share
-            of the field; None: what the profile declares.
+        model: "polynomial" or "factors"; None: that of a previous calibration that is the prior,
+            else polynomial at order 0, factors above.
+        order: temperature order 0…3 of both triads, or of each; "auto": the lowest that leaves no
+            term which noise does not explain, or that of the prior.
+        parameters: per triad at one temperature: 12, 9 (sensor frame) or 6 (scale and bias). 12: as
+            many as a previous calibration that is the prior.
+        nonlinearity: triads with own-axis quadratic and cubic terms; a mapping also states their
+            prior as a share of the field. "auto": of the triads whose profile declares them, where
+            the run shows them clearly.
         scatter: estimate how far strengths, dip and the direction of a group depart from station to
             station, beside the noise; only where the noise of both triads is estimated.
-        estimate: errors of the stand to find as well: "azimuth-zero", "inclination-zero", "tilt".
+        estimate: errors of the stand to estimate as well: "azimuth-zero", "inclination-zero", "tilt".
         ignore: what may not be used at any station, of "gravity", "field", "dip": each station then
             has its own.
         robust: None, "huber" or "student-t": weights that bound what a bad station can do.
         paper_weights: sum the squares as the method's paper does, unweighted.
-        prior: what is known of the parameters beforehand.
+        prior: what is known beforehand: "datasheet" (the tolerances in the profile), a previous
+            calibration of the same tool, or knowledge of its parameters.
+        exclude: labels of stations to leave out.
         seed: of the swarm.
         rounds: most repetitions of fit and estimate of the noise.
+
+    A fit takes `auto` as order 0 without own-axis terms; a calibration chooses first.
     """
 
     method: str = "joint"
     model: str | None = None
-    order: Orders = 0
+    order: Orders | Literal["auto"] = AUTO
     parameters: int = 12
-    nonlinearity: Mapping[str, float] | None = None
+    nonlinearity: Mapping[str, float] | tuple[str, ...] | Literal["auto"] = AUTO
     scatter: bool = False
     estimate: tuple[str, ...] = ()
     ignore: tuple[str, ...] = ()
     robust: str | None = None
     paper_weights: bool = False
-    prior: Knowledge | None = None
+    prior: Knowledge | Calibration | Literal["datasheet"] | None = None
+    exclude: tuple[str, ...] = ()
     seed: int = 0
     rounds: int = 8
+
+    def __post_init__(self) -> None:
+        """Refuse an order or a triad that does not exist.
+
+        Raises `InputError`.
+        """
+        if self.order != AUTO and not {*self.orders} <= {*range(HIGHEST + 1)}:
+            raise InputError(f"`order` must be 0, 1, 2, 3 or auto; got {self.order!r}.")
+        if self.nonlinearity != AUTO and not {*self.nonlinearity} <= {*TRIADS}:
+            names = ",".join(self.nonlinearity)
+            raise InputError(
+                f"`nonlinearity` must be auto, none, {' or '.join(TRIADS)}; got {names!r}."
+            )
 
     @property
     def orders(self) -> tuple[int, int]:
         """Temperature order of accelerometer and magnetometer."""
-        return (self.order, self.order) if isinstance(self.order, int) else self.order
+        if self.order == AUTO:
+            return 0, 0
+        return self.order if isinstance(self.order, tuple) else (self.order, self.order)
+
+    @property
+    def curved(self) -> Mapping[str, float]:
+        """Triads with own-axis terms, and the prior of these as a share of the field."""
+        if isinstance(self.nonlinearity, Mapping):
+            return self.nonlinearity
+        return {} if self.nonlinearity == AUTO else dict.fromkeys(self.nonlinearity, USUAL)
+
+    @property
+    def knowledge(self) -> Knowledge | None:
+        """What is known of the parameters beforehand.
+
+        Raises `TypeError` for a prior that needs the readings to become knowledge of parameters.
+        """
+        if self.prior is None or isinstance(self.prior, Knowledge):
+            return self.prior
+        raise TypeError("this prior needs the readings: use calibrate, not fit")
 
     @property
     def own_solver(self) -> bool:

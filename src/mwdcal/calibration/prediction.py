@@ -6,26 +6,33 @@ Everything here is of the calibration at the run's mean gravity, field and dip
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from mwdcal.calibration.readings import Readings
-from mwdcal.calibration.record import Calibration, TriadCalibration
-from mwdcal.geometry.vectors import Array, ArrayLike, reference_vectors
+from mwdcal.calibration.record import FREE_SHARE, Calibration, stated
+from mwdcal.geometry.observables import OBSERVABLES
+from mwdcal.geometry.vectors import Array, ArrayLike, Ints, reference_vectors
+from mwdcal.sensor.models import Model
 
-ANGLES = ("inclination", "toolface", "azimuth")
-TOOLFACES = np.arange(12) * np.pi / 6
-"""Toolfaces over which an uncertainty is averaged (root mean square)."""
-TYPICAL = np.radians(45)
+STATED_ANGLES = ("inclination", "toolface", "azimuth")
+"""Angles whose accuracy is stated; the first two need no magnetometer."""
+CIRCLE = np.arange(12) * np.pi / 6
+"""Azimuths, and toolfaces, over which an uncertainty is averaged (root mean square)."""
+TYPICAL = float(np.radians(45))
 """The inclination that stands for a tool's accuracy where one number must do."""
+CORNERS = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+"""Four fields, in units of their strength, from which an affine function of the field is known."""
+SHARES = np.array([[1.0, -1, -1, -1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+"""Shares of these four in the field of unit components (1, x, y, z)."""
 _STEPS = 8
 
 
 def angles(calibration: Calibration) -> tuple[str, ...]:
     """Names of the angles that the calibrated triads can give."""
-    return ANGLES if calibration.has_field else ANGLES[:2]
+    return STATED_ANGLES[: 1 + len(calibration.triads)]
 
 
 def middle_temperature(calibration: Calibration) -> float:
@@ -44,34 +51,171 @@ def readings_at(
     """The readings (…, n) that this calibration turns into given attitudes (…, n).
 
     Units: radians; °C, by default `middle_temperature`. Singular: nowhere; a vertical tool
-    reads a definite vector. Reference: the sensor model inverted by Newton steps, one of
-    which is exact unless an axis is curved.
+    reads a definite vector.
     """
     inc, azi, face = np.broadcast_arrays(inclination, azimuth, toolface)
-    earth = calibration.earth
-    dip = np.radians(earth.get("dip_deg", 0.0))
-    strength = earth.get("field", 1.0)
-    g, b = reference_vectors(inc, azi, face, earth["gravity_g"], strength, dip)
+    vectors = reference_vectors(inc, azi, face, *_earth(calibration))
     at = middle_temperature(calibration) if temperature is None else temperature
-    warmth = np.full(g.shape[:-1], at)
-    reference = calibration.reference_temperature
-    magnetometer = calibration.magnetometer
-    return Readings(
-        accelerometer=_inverse(calibration.accelerometer, reference, g, warmth),
-        magnetometer=None if magnetometer is None else _inverse(magnetometer, reference, b, warmth),
-        temperature=warmth,
-    )
+    warmth = np.full(vectors[0].shape[:-1], at)
+    raw = [
+        _reading(t.functions(calibration.reference_temperature), np.array(t.parameters), v, warmth)
+        for t, v in zip(calibration.triads, vectors, strict=False)
+    ]
+    return Readings(raw[0], raw[1] if len(raw) > 1 else None, temperature=warmth)
 
 
-def _inverse(triad: TriadCalibration, reference: float, target: Array, warmth: Array) -> Array:
-    """Readings (…, n, 3) that the triad's model turns into `target`."""
-    model, params = triad.functions(reference), np.array(triad.parameters)
-    raw = target
-    for _ in range(_STEPS):
-        error = model.fields(params, raw, warmth) - target
-        step = np.linalg.solve(model.slope(params, raw, warmth), error[..., None])[..., 0]
-        raw = raw - step
+def _earth(calibration: Calibration) -> tuple[float, float, float]:
+    """Gravity, g, field, nT, and dip, radians, of a calibration; 1 and 0 where it has no field."""
+    earth = calibration.earth
+    return earth["gravity_g"], earth.get("field", 1.0), np.radians(earth.get("dip_deg", 0.0))
+
+
+def _reading(
+    model: Model, params: Array, field: Array, temperature: Array, steps: int = _STEPS
+) -> Array:
+    """Readings (…, n, 3) that a triad's model turns into `field` (…, n, 3).
+
+    Reference: the sensor model inverted by Newton steps, one of which is exact unless an axis is
+    curved.
+    """
+    raw = np.zeros(field.shape)
+    for _ in range(steps):
+        error = field - model.fields(params, raw, temperature)
+        raw = raw + np.linalg.solve(model.slope(params, raw, temperature), error[..., None])[..., 0]
     return raw
+
+
+@dataclass(frozen=True)
+class CalibratedTools:
+    """Calibrated tools as arrays with a leading tool axis B.
+
+    `models` and `parameters` (B, k) by triad; `earth` (B, 3): gravity, field, dip; `temperature`
+    (B,), °C; `free` (B, f, p): directions of all parameters that no evidence determines; `noise`
+    (B, t): standard deviation of one reading.
+    """
+
+    models: tuple[Model, ...]
+    parameters: tuple[Array, ...]
+    earth: Array
+    temperature: Array
+    free: Array
+    noise: Array
+
+    @property
+    def angles(self) -> tuple[str, ...]:
+        """Names of the angles that the triads can give."""
+        return STATED_ANGLES[: 1 + len(self.models)]
+
+    @property
+    def curved(self) -> bool:
+        """Whether an axis of a triad is curved."""
+        return any(model.curved for model in self.models)
+
+    def changes(self, fields: Sequence[Array], noise: bool) -> Array:
+        """Changes (B, t, n, 3, c) of each triad's field, where these are `fields` (B, n, 3).
+
+        By the parameters of all triads and, with `noise`, by that of three readings of each.
+        """
+        starts = np.cumsum([0, *(params.shape[-1] for params in self.parameters)])
+        size = starts[-1] + 3 * noise * len(self.models)
+        result = np.zeros((len(self.earth), len(self.models), *fields[0].shape[1:], size))
+        for triad, (model, params) in enumerate(zip(self.models, self.parameters, strict=True)):
+            warmth = np.broadcast_to(self.temperature[:, None], fields[triad].shape[:-1])
+            raw = _reading(model, params, fields[triad], warmth, _STEPS if model.curved else 1)
+            own = slice(starts[triad], starts[triad + 1])
+            result[:, triad, ..., own] = model.jacobian(params, raw, warmth)
+            if noise:
+                own = slice(starts[-1] + 3 * triad, starts[-1] + 3 * triad + 3)
+                slope = model.slope(params, raw, warmth)
+                result[:, triad, ..., own] = slope * self.noise[:, triad, None, None, None]
+        return result
+
+    @classmethod
+    def of(cls, calibration: Calibration, temperature: float | None = None) -> CalibratedTools:
+        """One calibration as a batch of one, at `middle_temperature` unless another is given."""
+        triads, reference = calibration.triads, calibration.reference_temperature
+        at = middle_temperature(calibration) if temperature is None else temperature
+        return cls(
+            models=tuple(t.functions(reference) for t in triads),
+            parameters=tuple(np.array([t.parameters]) for t in triads),
+            earth=np.array([_earth(calibration)]),
+            temperature=np.array([at]),
+            free=calibration.free_directions[None],
+            noise=np.array([[t.noise for t in triads]]),
+        )
+
+
+def accuracy(
+    tools: CalibratedTools, covariance: Array, inclination: float = TYPICAL, noise: bool = False
+) -> dict[str, Array]:
+    """1σ (…, B) by angle, radians, at an inclination: root mean square over azimuth and toolface.
+
+    `covariance` (…, B, p, p) is of all parameters; `noise` adds that of one reading.
+    Singular: NaN at exactly vertical for toolface and azimuth, and where an angle rests on a free
+    direction.
+    Method: unless an axis is curved, a field is affine in the reading at one temperature, and so
+    is its change by the parameters in the field: four fields tell it everywhere.
+    """
+    earth, number = tools.earth, np.arange(len(tools.earth))
+    if not tools.curved:
+        earth, number = np.unique(earth, axis=0, return_inverse=True)
+    grid = np.meshgrid([inclination], CIRCLE, CIRCLE, indexing="ij")
+    attitudes = [angle.reshape(1, -1) for angle in grid]
+    both = reference_vectors(*attitudes, *(earth[:, i, None] for i in range(3)))
+    vectors = np.stack(both[: len(tools.models)], -2)
+    gradients = {
+        name: OBSERVABLES[name].gradient(*both)[..., : 3 * len(tools.models)].reshape(vectors.shape)
+        for name in tools.angles
+    }
+    free = tools.free
+    if noise:
+        covariance, free = _with_noise(covariance, free, 3 * len(tools.models))
+    if tools.curved:
+        change = tools.changes(both, noise)
+        rows = {n: np.einsum("bati,btaic->bac", g, change) for n, g in gradients.items()}
+    else:
+        change = tools.changes(
+            [s[:, None, None] * CORNERS for s in tools.earth[:, :2].transpose()], noise
+        )
+        change = change.reshape(len(change), -1, change.shape[-1])
+        covariance = change @ covariance @ np.swapaxes(change, -1, -2)
+        free = np.einsum("bip,bkp->bki", change, free)
+        share = _corner_shares(vectors / earth[:, None, : len(tools.models), None])
+        rows = {n: _flat(share[..., None] * g[..., None, :]) for n, g in gradients.items()}
+    return {n: _root_mean_square(each, number, covariance, free) for n, each in rows.items()}
+
+
+def _corner_shares(unit: Array) -> Array:
+    """Shares (…, 4) of the fields at `CORNERS` in a field of unit components (…, 3)."""
+    return np.asarray(np.concatenate([np.ones_like(unit[..., :1]), unit], -1) @ SHARES.transpose())
+
+
+def _flat(rows: Array) -> Array:
+    """Rows (E, a, c) of what each triad does at each corner along each axis (E, a, t, 4, 3)."""
+    return rows.reshape(*rows.shape[:2], -1)
+
+
+def _root_mean_square(rows: Array, number: Ints, covariance: Array, free: Array) -> Array:
+    """1σ (…, B) of what changes by `rows` (E, a, c), those of each tool having a `number` (B,).
+
+    NaN where a row moves with a direction in `free` (B, f, c).
+    """
+    weights = np.swapaxes(rows, -1, -2) @ rows / rows.shape[1]
+    variance = np.einsum("bij,...bij->...b", weights[number], covariance)
+    sd = np.sqrt(np.maximum(variance, 0.0))
+    if not free.size:
+        return np.asarray(sd)
+    moved = np.abs(np.einsum("bai,bki->bak", rows[number], free)).max((-1, -2))
+    return np.where(moved > FREE_SHARE, np.nan, sd)
+
+
+def _with_noise(covariance: Array, free: Array, count: int) -> tuple[Array, Array]:
+    """Covariance and free directions with `count` more parameters: readings in units of their noise."""
+    size = covariance.shape[-1]
+    whole = np.zeros((*covariance.shape[:-2], size + count, size + count))
+    whole[..., :size, :size] = covariance
+    whole[..., np.arange(size, size + count), np.arange(size, size + count)] = 1.0
+    return whole, np.pad(free, ((0, 0), (0, 0), (0, count)))
 
 
 @dataclass(frozen=True)
@@ -97,18 +241,14 @@ def accuracy_map(calibration: Calibration) -> AccuracyMap:
 
 
 def _over_toolface(
-    calibration: Calibration,
-    inclination: Array,
-    azimuth: Array,
-    temperature: float | None = None,
-    noise: bool = False,
+    calibration: Calibration, inclination: Array, azimuth: Array
 ) -> dict[str, Array]:
-    """1σ (…, n) by angle, root mean square over `TOOLFACES`: one toolface at a time, for memory."""
+    """1σ (…, n) by angle, root mean square over toolface: one toolface at a time, for memory."""
     square = {name: np.zeros(inclination.shape) for name in angles(calibration)}
-    for toolface in TOOLFACES:
-        readings = readings_at(calibration, inclination, azimuth, toolface, temperature)
+    for toolface in CIRCLE:
+        readings = readings_at(calibration, inclination, azimuth, toolface)
         for name, total in square.items():
-            total += calibration.uncertainty(name, readings, noise) ** 2 / len(TOOLFACES)
+            total += calibration.uncertainty(name, readings) ** 2 / len(CIRCLE)
     return {name: np.sqrt(total) for name, total in square.items()}
 
 
@@ -118,37 +258,17 @@ def accuracy_at(
     noise: bool = False,
     temperature: float | None = None,
 ) -> dict[str, Array]:
-    """1σ (n,) by angle at inclinations (n,), root mean square over azimuth and toolface.
+    """1σ (n,) by angle at inclinations (n,), by `accuracy`, of the calibration or one reading.
 
-    Units: radians. Singular: NaN at exactly vertical for toolface and azimuth, and where
-    an angle rests on an undetermined direction.
+    Units: radians; °C, by default `middle_temperature`.
     """
-    azimuth = np.arange(12) * np.pi / 6
-    grid = np.meshgrid(np.asarray(inclinations, float), azimuth, indexing="ij")
-    found = _over_toolface(calibration, grid[0], grid[1], temperature, noise)
-    return {name: np.sqrt(np.mean(sd**2, -1)) for name, sd in found.items()}
-
-
-def typical_budget(
-    calibration: Calibration, shares: Mapping[str, Array]
-) -> dict[str, dict[str, float | None]]:
-    """What each share (p, p) of the covariance adds to `typical_accuracy`, degrees, by source and angle."""
-    azimuth = np.arange(12) * np.pi / 6
-    grid = np.meshgrid(azimuth, TOOLFACES)
-    readings = readings_at(calibration, TYPICAL, grid[0].ravel(), grid[1].ravel())
-    found: dict[str, dict[str, float | None]] = {source: {} for source in shares}
-    for name in angles(calibration):
-        rows = calibration.sensitivity(name, readings)
-        free = bool(calibration.rests_on_free(name, readings).any())
-        for source, share in shares.items():
-            variance = np.einsum("ni,ij,nj->n", rows, share, rows).mean()
-            sd = float(np.degrees(np.sqrt(max(variance, 0.0))))
-            found[source][name] = None if free else sd
-    return found
+    tools = CalibratedTools.of(calibration, temperature)
+    covariance = calibration.parameter_covariance[None]
+    each = [accuracy(tools, covariance, angle, noise) for angle in inclinations]
+    return {name: np.concatenate([sd[name] for sd in each]) for name in tools.angles}
 
 
 def typical_accuracy(calibration: Calibration) -> dict[str, float | None]:
     """1σ of the calibration alone by angle, degrees, at 45° inclination; None: undetermined."""
-    found = accuracy_at(calibration, [TYPICAL])
-    values = {name: float(np.degrees(sd[0])) for name, sd in found.items()}
-    return {name: None if np.isnan(value) else value for name, value in values.items()}
+    sd = accuracy_at(calibration, [TYPICAL])
+    return {name: stated(np.degrees(value[0])) for name, value in sd.items()}

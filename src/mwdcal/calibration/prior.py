@@ -7,11 +7,13 @@ into the parameters of a fit, where it is one more block of residuals.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
+from msgspec.structs import replace as replace_struct
 
-from mwdcal.calibration.readings import TRIADS
+from mwdcal.calibration.readings import TRIADS, Readings
 from mwdcal.calibration.record import Calibration
 from mwdcal.errors import FitError, InputError
 from mwdcal.estimation.problem import Prior
@@ -19,6 +21,8 @@ from mwdcal.geometry.vectors import Array
 from mwdcal.sensor.models import Model, Restricted
 from mwdcal.sensor.profile import Datasheet, Profile
 
+DATASHEET: Literal["datasheet"] = "datasheet"
+"""The prior that the tolerances in the tool profile are."""
 FAR = 50.0
 """A datasheet's drift per °C holds to this far from the reference: later powers add no more, °C."""
 
@@ -66,7 +70,7 @@ def prior_of(knowledge: Knowledge | None, models: Sequence[Model], batch: int) -
     if strange and not knowledge.loose:
         raise FitError(
             f"the prior ({knowledge.source}) has parameters that this model lacks, such as "
-            f"{strange[0]}. Use the same --model, --order and --parameters as it had."
+            f"{strange[0]}. Use the same `model`, `order` and `parameters` as it had."
         )
     rows = [i for i, name in enumerate(names) if name in knowledge.names]
     theirs = [knowledge.names.index(names[i]) for i in rows]
@@ -105,27 +109,102 @@ def from_datasheet(profile: Profile, relative: bool = False) -> Knowledge:
     )
 
 
+def profile_for(
+    prior: Knowledge | Calibration | Literal["datasheet"] | None, profile: Profile
+) -> Profile:
+    """The profile with what a prior needs of it: a previous calibration's scale where it has none.
+
+    Knowledge is of readings in nominal units; scales guessed from the run would give others.
+    Raises `InputError` where profile and prior do not belong together.
+    """
+    if prior == DATASHEET:
+        _check_datasheet(profile)
+    if not isinstance(prior, Calibration):
+        return profile
+    known = {}
+    for name in TRIADS:
+        present, previous = getattr(profile, name), getattr(prior.profile, name)
+        scale = previous.scale if present.scale is None else present.scale
+        known[name] = replace_struct(present, scale=scale)
+        if previous.scale is not None and (present.axes, scale) != (previous.axes, previous.scale):
+            raise InputError(
+                f"`prior`: the calibration of {prior.run} was made with {name} axes "
+                f"{list(previous.axes)} and scale {previous.scale:g}; the tool profile "
+                f"'{profile.name}' has {list(present.axes)} and {scale:g}. Use the tool profile that "
+                "the previous calibration had."
+            )
+    return replace_struct(profile, **known)
+
+
+def _check_datasheet(profile: Profile) -> None:
+    """Refuse a profile without tolerances, or without the scale that they are a share of."""
+    sheets = [t for t in TRIADS if getattr(profile, t).datasheet is not None]
+    if not sheets:
+        raise InputError(
+            f"`prior` datasheet: the tool profile '{profile.name}' has none. Add a section "
+            "[accelerometer.datasheet] with scale, bias and misalignment_deg (1 sigma)."
+        )
+    bare = [t for t in sheets if getattr(profile, t).scale is None]
+    if bare:
+        raise InputError(
+            f"`prior` datasheet: the tool profile '{profile.name}' has no 'scale' in [{bare[0]}], "
+            "which the tolerances are a share of. Add it."
+        )
+
+
+def for_run(previous: Calibration, readings: Readings) -> Knowledge:
+    """A previous calibration as knowledge of the triads that a run has.
+
+    A run without a magnetometer has no unit of the field that could differ.
+    Raises `InputError` for a run of another tool, or of stations that the calibration has used.
+    """
+    where = f"`prior`: the calibration of {previous.run}"
+    other = previous.other_tool(readings)
+    if other:
+        raise InputError(
+            f"{where} is of tool {other[0]}, the run is of {other[1]}. Give the previous calibration "
+            "of the same tool."
+        )
+    if any(previous.used(readings.digest)):
+        raise InputError(
+            f"{where} was made from stations of this run, which would count twice. Give a "
+            "calibration from an earlier run."
+        )
+    alone = readings.magnetometer is None
+    known = from_calibration(previous, previous.relative if alone else readings.relative)
+    if not alone or not previous.has_field:
+        return known
+    kept = [i for i, name in enumerate(known.names) if name.startswith(TRIADS[0])]
+    covariance = np.linalg.pinv(known.precision, hermitian=True)[np.ix_(kept, kept)]
+    return replace(
+        known,
+        names=tuple(known.names[i] for i in kept),
+        expected=known.expected[kept],
+        precision=np.linalg.pinv(covariance, hermitian=True),
+    )
+
+
 def from_calibration(previous: Calibration, relative: bool = False) -> Knowledge:
     """A previous calibration of the same tool, with its covariance and what it left undetermined.
 
     Raises `InputError` for one with own-axis terms (they are centred on their own run), or in
     another unit of the field than this run's.
     """
-    where = f"--prior {previous.run}"
+    where = f"`prior`: the calibration of {previous.run}"
     if any(triad.curved for triad in previous.triads):
         raise InputError(
-            f"{where}: its own-axis quadratic and cubic terms belong to the readings of its own run. "
-            "Calibrate that run with --nonlinearity none to use it as a prior."
+            f"{where} has own-axis quadratic and cubic terms, which belong to the readings of its own "
+            "run. Calibrate that run with `nonlinearity` none to use it as a prior."
         )
     if previous.has_field and previous.relative != relative:
         raise InputError(
-            f"{where}: it is in {previous.field_unit}, this run is not. Give both runs ref_field_nt, "
-            "or neither."
+            f"{where} is in {previous.field_unit}, this run is not. Give both runs ref_field_nt, or "
+            "neither."
         )
     names = [f"{t.name} {name}" for t in previous.triads for name in t.parameter_names]
-    expected = np.concatenate([t.parameters for t in previous.triads])
-    covariance = np.array(previous.covariance)
-    free = np.array(previous.free, float).reshape(len(previous.free), len(expected))
+    expected = previous.parameters
+    covariance = previous.parameter_covariance
+    free = previous.free_directions
     moving = np.flatnonzero(np.diag(covariance) > 0)
     return Knowledge(
         previous.run,

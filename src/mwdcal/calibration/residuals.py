@@ -11,14 +11,13 @@ import numpy as np
 
 from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.readings import TRIADS, Readings
-from mwdcal.calibration.record import ErrorRow, Measures, StationRow
+from mwdcal.calibration.record import ErrorRow, Measures, StationRow, stated
 from mwdcal.estimation.evidence import STAND_ERRORS
 from mwdcal.estimation.uncertainty import Analysis, station_misfit, without_station
 from mwdcal.geometry.observables import OBSERVABLES, VERTICAL
-from mwdcal.geometry.vectors import Array, Bools, centred
+from mwdcal.geometry.vectors import Array, Bools
 
 SHOWN = ("gravity", "inclination", "toolface", "azimuth", "field", "dip")
-UNITS = {"gravity": "mg", "field": "nT"}
 RESHOOT = 0.01
 """A station is marked when one in a hundred runs would have any station as bad as it."""
 LEAST_ACROSS = 1e-9
@@ -50,31 +49,47 @@ def shown_in(name: str, relative: bool = False) -> tuple[float, str]:
     return (1.0, "nT") if name == "field" else (float(np.degrees(1)), "°")
 
 
-def angle_weight(name: str, inclination: Array) -> Array:
-    """What an error of an observable counts at inclinations (…, n), radians; NaN: it has none there.
+def error_weight(name: str, inclination: Array, g: Array) -> Array:
+    """What an error of an observable counts at reference inclinations (…, n), radians.
 
-    Definition: sin(inclination) for toolface and azimuth, 1 for all else.
-    Singular: NaN exactly at vertical, where toolface and azimuth do not exist.
+    Definition: sin(inclination) for toolface and azimuth, 1 for all else; where the inclination is
+    NaN, that of g (…, n, 3) counts. Singular: NaN exactly at vertical, where toolface and azimuth
+    do not exist.
     """
+    own = OBSERVABLES["inclination"].value(g, g)
     if name not in ("toolface", "azimuth"):
-        return np.ones(inclination.shape)
-    across = np.sin(inclination)
+        return np.ones(own.shape)
+    across = np.sin(np.where(np.isnan(inclination), own, inclination))
     return np.where(across < LEAST_ACROSS, np.nan, across)
 
 
 def departure(name: str, g: Array, b: Array, known: Mapping[str, Array]) -> Array:
     """Error (…, n) of an observable of two vectors against its reference, radians, g or nT.
 
-    Definition: value - known[name], times its `angle_weight` at the reference inclination; at the
-    vectors' own where that is unknown.
+    Definition: the difference times its `error_weight`, with the references `known` by name.
     Singular: NaN where there is no reference, and for toolface and azimuth exactly at vertical.
     """
-    observable = OBSERVABLES[name]
-    error = observable.value(g, b) - known[name]
-    error = centred(error, observable.period) if observable.period else error
-    stated = known.get("inclination", np.full(error.shape, np.nan))
-    own = OBSERVABLES["inclination"].value(g, b)
-    return np.asarray(error * angle_weight(name, np.where(np.isnan(stated), own, stated)))
+    error = OBSERVABLES[name].difference(OBSERVABLES[name].value(g, b), known[name])
+    return error * error_weight(name, known.get("inclination", np.full(error.shape, np.nan)), g)
+
+
+def nominal(readings: Readings) -> tuple[Array, Array]:
+    """Vectors (n, 3) that the tool reads uncalibrated; a field of unknown strength has a mean of one."""
+    raw = readings.magnetometer
+    if raw is None:
+        return readings.accelerometer, np.full_like(readings.accelerometer, np.nan)
+    scale = np.linalg.norm(raw, axis=-1).mean() if readings.relative else 1.0
+    return readings.accelerometer, raw / scale
+
+
+def vector_measures(triad: str, when: str, actual: Array, target: Array) -> list[Measures]:
+    """Moradi's measures of the vector error (n, 3), as a share of the target; none of one station."""
+    error = np.linalg.norm(actual - target, axis=-1) / np.linalg.norm(target, axis=-1)
+    error = error[~np.isnan(error)]
+    if len(error) < 2:
+        return []
+    mean, std, mse = float(error.mean()), float(error.std(ddof=1)), float(np.mean(error**2))
+    return [Measures(triad=triad, when=when, mean=mean, std=std, mse=mse, rmse=mse**0.5)]
 
 
 @dataclass(frozen=True)
@@ -96,15 +111,6 @@ class Residuals:
         attitude, (g, b) = self.fit.state.attitude[0], self.fit.problem.earth(self.fit.state)[0]
         first, second = (np.einsum("nij,nj->ni", attitude, e[0]) for e in (g, b))
         return first, second
-
-    @cached_property
-    def before(self) -> tuple[Array, Array]:
-        """Nominal readings as vectors: what the tool says uncalibrated."""
-        triads = [t.raw[0] for t in self.fit.problem.triads]
-        if len(triads) == 1:
-            return triads[0], np.full_like(triads[0], np.nan)
-        scale = np.linalg.norm(triads[1], axis=-1).mean() if self.readings.relative else 1.0
-        return triads[0], triads[1] / scale
 
     def known(self, name: str) -> Array:
         """Reference (n,) of an observable: given, or the estimated constant; NaN where unknown.
@@ -133,10 +139,7 @@ class Residuals:
 
     def _weight(self, name: str) -> Array:
         """The weight (n,) of errors after the fit, zero where an observable does not exist."""
-        inclination = self.known("inclination")
-        guess = OBSERVABLES["inclination"].value(*self.after)
-        found = angle_weight(name, np.where(np.isnan(inclination), guess, inclination))
-        return np.nan_to_num(found)
+        return np.nan_to_num(error_weight(name, self.known("inclination"), self.after[0]))
 
     def judged(self, name: str) -> Bools:
         """Stations (n,) whose error of an observable is known."""
@@ -210,63 +213,52 @@ class Residuals:
         weight = np.nan_to_num(self._weight(name)[some])
         return np.asarray(np.abs(change * weight[:, None]).max(0))
 
+    @cached_property
+    def stations(self) -> list[StationRow]:
+        """Errors of every station, with the ones to take again."""
+        return station_rows(self)
+
     def names(self) -> list[str]:
         """Observables with an error that is known somewhere in this run."""
         usable = SHOWN if len(self.fit.problem.triads) > 1 else SHOWN[:3]
         return [n for n in usable if self.judged(n).any()]
 
 
-def error_rows(readings: Readings, fit: Fit) -> list[ErrorRow]:
+def error_rows(residuals: Residuals) -> list[ErrorRow]:
     """Root mean square errors before and after, and what was to be expected after."""
-    residuals = Residuals(readings, fit)
-    rows = []
-    for name in residuals.names():
-        factor, unit = shown_in(name, readings.relative)
-        known = residuals.judged(name)
-        before, after, expected = (
-            rms(values[known]) * factor
-            for values in (
-                residuals.errors(name, residuals.before),
-                residuals.errors(name, residuals.after),
-                residuals.expected(name),
-            )
-        )
-        rows.append(
-            ErrorRow(
-                observable=name,
-                unit=unit,
-                stations=int(known.sum()),
-                before=before,
-                after=after,
-                expected=None if np.isnan(expected) else expected,
-            )
-        )
-    return rows
+    return [_error_row(residuals, name) for name in residuals.names()]
 
 
-def measure_rows(readings: Readings, fit: Fit) -> list[Measures]:
-    """Moradi's mean, STD, MSE and RMSE of the vector error, where reference vectors are whole."""
-    residuals, problem = Residuals(readings, fit), fit.problem
+def _error_row(residuals: Residuals, name: str) -> ErrorRow:
+    factor, unit = shown_in(name, residuals.readings.relative)
+    judged = residuals.judged(name)
+    before, after, expected = (
+        rms(values[judged]) * factor
+        for values in (
+            residuals.errors(name, nominal(residuals.readings)),
+            residuals.errors(name, residuals.after),
+            residuals.expected(name),
+        )
+    )
+    return ErrorRow(
+        observable=name,
+        unit=unit,
+        stations=int(judged.sum()),
+        before=before,
+        after=after,
+        expected=stated(expected),
+    )
+
+
+def measure_rows(residuals: Residuals) -> list[Measures]:
+    """Moradi's measures of the vector error, where reference vectors are whole."""
     rows = []
-    for index, name in enumerate(TRIADS[: len(problem.triads)]):
+    for index, name in enumerate(TRIADS[: len(residuals.fit.problem.triads)]):
         needed = ("inclination", "toolface", "azimuth")[: 2 + index]
         whole = np.all([~np.isnan(residuals.known(n)) for n in needed], axis=0)
-        if whole.sum() < 2:
-            continue
-        for when, fields in (("before", residuals.before), ("after", residuals.after)):
-            error = np.linalg.norm((fields[index] - residuals.targets[index])[whole], axis=-1)
-            error = error / np.linalg.norm(residuals.targets[index][whole], axis=-1)
-            mse = float(np.mean(error**2))
-            rows.append(
-                Measures(
-                    triad=name,
-                    when=when,
-                    mean=float(error.mean()),
-                    std=float(error.std(ddof=1)),
-                    mse=mse,
-                    rmse=mse**0.5,
-                )
-            )
+        target = np.where(whole[:, None], residuals.targets[index], np.nan)
+        for when, fields in (("before", nominal(residuals.readings)), ("after", residuals.after)):
+            rows += vector_measures(name, when, fields[index], target)
     return rows
 
 
@@ -336,16 +328,16 @@ def chi_chance(square: Array, freedom: Array) -> Array:
     return np.asarray(0.5 * np.vectorize(erfc, otypes=[float])(normal))
 
 
-def station_rows(readings: Readings, fit: Fit) -> list[StationRow]:
+def station_rows(residuals: Residuals) -> list[StationRow]:
     """Errors of every station, with the ones to take again."""
     from scipy.special import ndtri
 
-    residuals = Residuals(readings, fit)
+    readings, fit = residuals.readings, residuals.fit
     names = residuals.names()
     chance = chances(fit)[0]
     again, deviation = to_reshoot(chance), -ndtri(np.maximum(chance, 1e-300) / 2)
     after = {n: residuals.errors(n, residuals.after) for n in names}
-    before = {n: residuals.errors(n, residuals.before) for n in names}
+    before = {n: residuals.errors(n, nominal(readings)) for n in names}
     left_out = {n: residuals.errors(n, residuals.left_out) for n in names}
     influence = {n: residuals.influence(n) for n in names}
     expected = {n: np.nan_to_num(residuals.expected(n), nan=np.inf) for n in names}
@@ -363,9 +355,9 @@ def station_rows(readings: Readings, fit: Fit) -> list[StationRow]:
                 temperature_c=None
                 if readings.temperature is None
                 else float(readings.temperature[i]),
-                inclination_deg=_plain(attitude["inclination"][i]),
-                toolface_deg=_plain(attitude["toolface"][i]),
-                azimuth_deg=_plain(attitude["azimuth"][i]),
+                inclination_deg=stated(attitude["inclination"][i]),
+                toolface_deg=stated(attitude["toolface"][i]),
+                azimuth_deg=stated(attitude["azimuth"][i]),
                 errors=_scaled(after, factors, i),
                 errors_before=_scaled(before, factors, i),
                 errors_left_out=_scaled(left_out, factors, i),
@@ -377,10 +369,6 @@ def station_rows(readings: Readings, fit: Fit) -> list[StationRow]:
             )
         )
     return rows
-
-
-def _plain(value: float) -> float | None:
-    return None if np.isnan(value) else float(value)
 
 
 def _scaled(errors: dict[str, Array], factors: dict[str, float], index: int) -> dict[str, float]:

@@ -5,21 +5,19 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Literal
 
 import numpy as np
 
-from mwdcal.calibration.automatic.nonlinearity import declared, with_chosen_curves
-from mwdcal.calibration.automatic.order_selection import choose_order
-from mwdcal.calibration.calibrate import calibrate
+from mwdcal.calibration.automatic.auto import Choice, resolved, without
+from mwdcal.calibration.calibrate import recorded
 from mwdcal.calibration.diagnosis.refusals import check_readings
 from mwdcal.calibration.estimate import Fit, fit
 from mwdcal.calibration.evidence import evidence_of
 from mwdcal.calibration.methods import EVIDENCE, SWARM_ITERATIONS
-from mwdcal.calibration.options import Options, Orders
+from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import ANGLES, TRIADS, Readings, is_simulated
 from mwdcal.calibration.record import Calibration, Measures
-from mwdcal.calibration.residuals import SHOWN, departure, rms, shown_in
+from mwdcal.calibration.residuals import SHOWN, departure, nominal, rms, shown_in, vector_measures
 from mwdcal.comparison.common_gauge import Gauge, in_gauge
 from mwdcal.errors import FitError
 from mwdcal.estimation.minimisers.swarm import least_squares_forward, swarm_forward, vector_cost
@@ -98,12 +96,12 @@ class Comparison:
 
 
 @dataclass(frozen=True)
-class _Made:
+class _Calibrated:
     """One method's calibration, its fit and the time that took, and the free directions."""
 
     options: Options
-    calibration: Calibration
-    whole: Fit
+    record: Calibration
+    fit: Fit
     seconds: float
     free: list[Free]
 
@@ -111,26 +109,28 @@ class _Made:
 def compare(
     readings: Readings,
     profile: Profile,
-    order: Orders | Literal["auto"] = "auto",
+    options: Options | None = None,
     *,
-    seed: int = 0,
     progress: Progress = lambda text: None,
 ) -> Comparison:
     """Calibrate a run by every method and judge each by stations left out of its fit.
 
-    `order` "auto": as the joint method chooses it, the same for all
-    methods. A method that is refused gives its reason and leaves the others alone.
+    What the `options` leave to the software is chosen as the joint method does, the same for all
+    methods; their method does not count. A method that is refused gives its reason and leaves the
+    others alone.
     """
-    options = _options(readings, profile, order, seed, progress)
-    made: dict[str, _Made | str] = {}
+    options = options or Options()
+    readings = without(readings, options.exclude)
+    options = _options(readings, profile, options, progress)
+    results: dict[str, _Calibrated | str] = {}
     for method in EVIDENCE:
         progress(f"{method}: fit")
-        made[method] = _made(readings, profile, replace(options, method=method))
-    usable = [one for one in made.values() if isinstance(one, _Made)]
+        results[method] = _calibrated(readings, profile, replace(options, method=method))
+    usable = [one for one in results.values() if isinstance(one, _Calibrated)]
     gauge = Gauge.of(entry for one in usable for entry in one.free)
-    judge = _Judge.of(readings, usable[0].calibration.earth if usable else {})
+    judge = _Judge.of(readings, usable[0].record.earth if usable else {})
     rows = []
-    for method, one in made.items():
+    for method, one in results.items():
         if isinstance(one, str):
             rows.append(Row(method, refused=one))
         else:
@@ -143,10 +143,10 @@ def compare(
         readings.labels,
         is_simulated(readings.metadata),
         options.orders,
-        tuple(options.nonlinearity or ()),
+        tuple(options.curved),
         judge.parts,
-        seed,
-        judge.units(),
+        options.seed,
+        judge.units,
         judge.summary(*bare),
         tuple(judge.measures("before", *bare)),
         {name: gauge.names(i) for i, name in enumerate(TRIADS) if gauge.names(i)},
@@ -155,101 +155,75 @@ def compare(
     )
 
 
-def _options(
-    readings: Readings,
-    profile: Profile,
-    order: Orders | Literal["auto"],
-    seed: int,
-    progress: Progress,
-) -> Options:
-    """Order and own-axis terms, chosen by the joint method where they are left to the data.
-
-    A run that cannot be chosen for is left to the methods, each of which then says why.
-    """
-    options = Options(nonlinearity={}, seed=seed)
+def _options(readings: Readings, profile: Profile, options: Options, progress: Progress) -> Options:
+    """The options without `auto`; a run that cannot be chosen for is left to the methods to refuse."""
+    options = replace(options, method="joint")
     try:
-        if order == "auto":
-            check_readings(readings, options)
-            order, _ = choose_order(readings, options, progress)
-        options = replace(options, order=order)
-        offered = declared(profile, options)
-        if offered:
-            check_readings(readings, options)
-            progress("own-axis nonlinearity: comparing fits with and without it")
-            options = with_chosen_curves(readings, options, offered)[0]
+        return resolved(options, readings, profile, progress)[0]
     except FitError:
-        pass
-    return options
+        return replace(options, order=options.orders, nonlinearity=options.curved)
 
 
-def _made(readings: Readings, profile: Profile, options: Options) -> _Made | str:
+def _calibrated(readings: Readings, profile: Profile, options: Options) -> _Calibrated | str:
     """A method's calibration, or the reason why there is none."""
     if options.method == "swarm":
         options = replace(options, nonlinearity={})
     try:
-        found = calibrate(readings, profile, options)
+        check_readings(readings, options)
+        started = time.perf_counter()
+        result = fit(readings, options)
+        seconds = time.perf_counter() - started
+        record = recorded(Choice(readings, profile, options), result)
     except FitError as error:
         return str(error)
     except np.linalg.LinAlgError as error:
         return f"the stations are too weak to fit the model ({error}). Add stations."
-    started = time.perf_counter()
-    whole = fit(readings, options)
-    seconds = time.perf_counter() - started
-    free = free_directions(whole.problem, whole.state, whole.analysis.determined)[0]
-    return _Made(options, found, whole, seconds, free)
+    free = free_directions(result.problem, result.state, result.analysis.determined)[0]
+    return _Calibrated(options, record, result, seconds, free)
 
 
-def _row(made: _Made, judge: _Judge, gauge: Gauge) -> Row:
-    found, readings = made.calibration, judge.readings
-    left_out = judge.left_out(made.options)
-    inside = found.fields(readings)
-    parameters, taken_out = in_gauge(found, readings, gauge)
+def _row(calibrated: _Calibrated, judge: _Judge, gauge: Gauge) -> Row:
+    record, readings = calibrated.record, judge.readings
+    left_out = judge.left_out(calibrated.options)
+    inside = record.fields(readings)
+    parameters, taken_out = in_gauge(record, readings, gauge)
     return Row(
-        made.options.method,
-        ranks={t.name: (t.rank, t.size) for t in found.triads},
-        undetermined=tuple(dict.fromkeys(u.id for u in found.undetermined())),
-        iterations=int(made.whole.iterations[0]),
-        seconds=made.seconds,
+        calibrated.options.method,
+        ranks={t.name: (t.rank, t.size) for t in record.triads},
+        undetermined=tuple(dict.fromkeys(u.id for u in record.undetermined())),
+        iterations=int(calibrated.fit.iterations[0]),
+        seconds=calibrated.seconds,
         in_sample=judge.summary(*inside),
         held_out=judge.summary(*left_out),
-        resting=tuple(n for n in judge.units() if _rests(n, found, readings)),
+        resting=tuple(n for n in judge.units if _rests(n, record, readings)),
         lost=int(np.isnan(left_out[0]).any(-1).sum()),
         measures=(*judge.measures("after", *inside), *judge.measures("left out", *left_out)),
         parameters=parameters,
         taken_out=taken_out,
-        station_errors={n: e * judge.factor(n) for n, e in errors(readings, *left_out).items()},
-        course=_course(made) if made.options.method == "swarm" else {},
+        station_errors=judge.errors(*left_out),
+        course=_course(calibrated) if calibrated.options.method == "swarm" else {},
     )
 
 
-def _rests(name: str, made: Calibration, readings: Readings) -> bool:
+def _rests(name: str, record: Calibration, readings: Readings) -> bool:
     """Whether an error moves with a direction that a method leaves free."""
     moving = ("inclination", "azimuth") if name == SCATTER else (name,)
-    return any(bool(made.rests_on_free(n, readings).any()) for n in moving)
+    return any(bool(record.rests_on_free(n, readings).any()) for n in moving)
 
 
-def _course(made: _Made) -> dict[str, Array]:
+def _course(calibrated: _Calibrated) -> dict[str, Array]:
     """Excess of the swarm's best cost over the least one, as a share of it, by triad."""
-    problem, state = made.whole.problem, made.whole.state
-    found = {}
+    problem, state = calibrated.fit.problem, calibrated.fit.state
+    courses = {}
     for name, triad, earth in zip(TRIADS, problem.triads, problem.earth(state)[0], strict=False):
         target = np.einsum("bnij,bnj->bni", state.attitude, earth)
         swarm = swarm_forward(
-            triad.raw, target, "reading", iterations=SWARM_ITERATIONS, seed=made.options.seed
+            triad.raw, target, "reading", iterations=SWARM_ITERATIONS, seed=calibrated.options.seed
         )
         least = least_squares_forward(triad.raw, target)[:, None]
         cost = vector_cost(triad.raw, target, "reading")(least)[0, 0]
-        found[name] = swarm.history[0] / cost - 1
-    return found
-
-
-def nominal(readings: Readings) -> tuple[Array, Array]:
-    """Vectors (n, 3) that the tool reads uncalibrated; the field has a mean of one if unknown."""
-    raw = readings.magnetometer
-    if raw is None:
-        return readings.accelerometer, np.full_like(readings.accelerometer, np.nan)
-    scale = np.linalg.norm(raw, axis=-1).mean() if readings.relative else 1.0
-    return readings.accelerometer, raw / scale
+        courses[name] = swarm.history[0] / cost - 1
+    return courses
 
 
 def _referenced(readings: Readings) -> list[str]:
@@ -295,26 +269,22 @@ class _Judge:
         return int(self.part.max()) + 1
 
     @property
-    def names(self) -> list[str]:
-        """Observables that have a reference somewhere in the run."""
-        return _referenced(self.readings)
-
-    @property
     def grouped(self) -> bool:
         """Whether directions within groups can be compared."""
         return bool((self.readings.groups >= 0).any()) and self.readings.magnetometer is not None
 
-    def _shown(self, name: str) -> tuple[float, str]:
-        return shown_in(name, self.readings.relative)
-
-    def factor(self, name: str) -> float:
-        """Factor from an observable's own unit to the one it is shown in."""
-        return self._shown(name)[0]
-
+    @property
     def units(self) -> dict[str, str]:
         """Units in which errors are shown."""
-        units = {name: self._shown(name)[1] for name in self.names}
+        relative = self.readings.relative
+        units = {name: shown_in(name, relative)[1] for name in _referenced(self.readings)}
         return {**units, SCATTER: "°"} if self.grouped else units
+
+    def errors(self, g: Array, b: Array) -> dict[str, Array]:
+        """Errors (n,) of two vectors by observable, in shown units."""
+        relative = self.readings.relative
+        each = errors(self.readings, g, b)
+        return {name: error * shown_in(name, relative)[0] for name, error in each.items()}
 
     def left_out(self, options: Options) -> tuple[Array, Array]:
         """Vectors (n, 3) of each station from the fit that left its part out; NaN if that failed."""
@@ -324,24 +294,16 @@ class _Judge:
         g, b = (
             np.where(failed[:, None, None], np.nan, v) for v in result.problem.fields(result.state)
         )
-        own = np.arange(self.readings.count)
-        return g[self.part, own], b[self.part, own]
+        every = np.arange(self.readings.count)
+        return g[self.part, every], b[self.part, every]
 
     def summary(self, g: Array, b: Array) -> dict[str, float]:
         """Root mean square errors by observable, and the scatter within groups, in shown units."""
-        result = {n: rms(e) * self.factor(n) for n, e in errors(self.readings, g, b).items()}
+        result = {name: rms(error) for name, error in self.errors(g, b).items()}
         if self.grouped:
-            result[SCATTER] = self._scatter(g, b)
+            scatter = group_scatter(directions(g, b), self.readings.groups)
+            result[SCATTER] = float(np.degrees(scatter))
         return result
-
-    def _scatter(self, g: Array, b: Array) -> float:
-        """Scatter of directions within groups of two stations or more, degrees."""
-        group = np.where(np.isnan(g).any(-1), -1, self.readings.groups)
-        numbers, place, count = np.unique(group, return_inverse=True, return_counts=True)
-        usable = (numbers >= 0) & (count > 1)
-        group = np.where(usable, np.cumsum(usable) - 1, -1)[place]
-        axis = directions(g, b)
-        return float(np.degrees(group_scatter(axis, group))) if usable.any() else float("nan")
 
     def measures(self, when: str, *fields: Array) -> list[Measures]:
         """Moradi's measures of the vector error, as a share of the reference vector."""
@@ -355,20 +317,8 @@ class _Judge:
             reference_vectors(**blind, gravity=gravity)[0],
             reference_vectors(**known, field=field, dip=dip)[1],
         ]
-        found = []
-        for name, target, actual in zip(TRIADS, ideal, fields, strict=True):
-            error = np.linalg.norm(actual - target, axis=-1) / np.linalg.norm(target, axis=-1)
-            error = error[~np.isnan(error)]
-            if len(error) < 2:
-                continue
-            mse = float(np.mean(error**2))
-            found.append(
-                Measures(
-                    triad=name, when=when, mean=float(error.mean()),
-                    std=float(error.std(ddof=1)), mse=mse, rmse=mse**0.5,
-                )
-            )  # fmt: skip
-        return found
+        each = zip(TRIADS, fields, ideal, strict=True)
+        return [row for triad in each for row in vector_measures(triad[0], when, *triad[1:])]
 
 
 def score(row: Row, best: Mapping[str, float]) -> float:

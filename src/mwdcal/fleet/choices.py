@@ -1,25 +1,23 @@
-"""What is decided for each tool of a fleet by itself: prior, temperature orders, own-axis terms.
+"""Tools of a fleet by what is chosen for each: temperature orders, then own-axis terms.
 
-As `mwdcal calibrate` decides it for a run; orders are tried for many tools in one fit.
+As for a single run; many tools are tried in one fit.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
 
-from mwdcal.calibration.automatic.nonlinearity import declared, with_chosen_curves
-from mwdcal.calibration.automatic.order_selection import choose_orders, judged_soaks
-from mwdcal.calibration.diagnosis.flags import Alone
-from mwdcal.calibration.diagnosis.refusals import check_curves, check_options, check_readings
+from mwdcal.calibration.automatic.nonlinearity import PARTS, compare_curves, offered, scattered
+from mwdcal.calibration.automatic.order_selection import choose_orders
+from mwdcal.calibration.diagnosis.refusals import check_curves, check_options
 from mwdcal.calibration.estimate import temperature_ranges
-from mwdcal.calibration.options import Options
-from mwdcal.calibration.prior import from_datasheet
-from mwdcal.calibration.readings import TRIADS, Readings
-from mwdcal.calibration.soaks import HIGHEST
+from mwdcal.calibration.options import AUTO, Options
+from mwdcal.calibration.readings import Readings
+from mwdcal.errors import MwdcalError
 from mwdcal.estimation.batch import take
 from mwdcal.geometry.vectors import Ints
 from mwdcal.sensor.profile import Profile
@@ -29,65 +27,21 @@ CHUNK = 320
 _T = TypeVar("_T")
 
 
-@dataclass(frozen=True)
-class PerTool:
-    """What the options leave to each tool.
-
-    `order`: its temperature orders, by the terms that noise does not explain. `nonlinearity`:
-    triads whose own-axis terms are tried, by what the run says of them. `datasheet`: the prior is
-    the profile's tolerances, in the unit of the tool's field.
-    """
-
-    order: bool = False
-    nonlinearity: tuple[str, ...] = ()
-    datasheet: bool = False
-
-    def orders(self, options: Options, triad: int) -> tuple[int, ...]:
-        """Orders that a triad may come to have."""
-        tried = self.order and options.method != "swarm"
-        return tuple(range(HIGHEST + 1)) if tried else (options.orders[triad],)
-
-    def curved(self, options: Options, triad: int) -> bool:
-        """Whether a triad may come to have own-axis terms."""
-        return TRIADS[triad] in (*self.nonlinearity, *(options.nonlinearity or {}))
-
-    def known(self, options: Options, readings: Readings, profile: Profile) -> Options:
-        """The options with the prior of a whole batch."""
-        if not self.datasheet:
-            return options
-        return replace(options, prior=from_datasheet(profile, readings.relative))
-
-    def before(self, options: Options) -> Options:
-        """The options that a tool must meet before its order is chosen."""
-        if not self.order:
-            return options
-        return replace(options, model=options.model or "polynomial", nonlinearity={})
-
-
 def with_orders(
-    readings: Readings, tools: Ints, options: Options, per_tool: PerTool
+    readings: Readings, tools: Ints, options: Options
 ) -> Iterator[tuple[Ints, Options | Exception]]:
     """Those of the given tools that have orders, and a range of temperatures, in common.
 
     An exception where one of a tool's trials failed.
     """
-    if not per_tool.order and not max(options.orders):
+    if not max(options.orders) and options.order != AUTO:
         yield tools, options
         return
-    for each in _alike(readings, tools):
-        if not per_tool.order:
-            yield each, options
-            continue
-        orders = np.full((len(readings.accelerometer), 2), -1)
-        for which, found in _tried_orders(readings, each, options):
-            if isinstance(found, Exception):
-                yield which, found
-            else:
-                orders[which] = found
-        for pair in np.unique(orders[each], axis=0):
-            if pair.min() >= 0:
-                chosen = replace(options, order=(int(pair[0]), int(pair[1])))
-                yield each[(orders[each] == pair).all(-1)], chosen
+    for alike in _alike(readings, tools):
+        if options.order == AUTO:
+            yield from _by_order(readings, alike, options)
+        else:
+            yield alike, options
 
 
 def _alike(readings: Readings, tools: Ints) -> list[Ints]:
@@ -99,62 +53,61 @@ def _alike(readings: Readings, tools: Ints) -> list[Ints]:
     return [tools[number == k] for k in range(number.max(initial=-1) + 1)]
 
 
-def _tried_orders(
+def _by_order(
     readings: Readings, tools: Ints, options: Options
-) -> Iterator[tuple[Ints, Ints | Exception]]:
-    """Orders (B, 2) of the given tools, many in one call."""
+) -> Iterator[tuple[Ints, Options | Exception]]:
+    """The given tools by the orders that are chosen for them."""
     trial = replace(options, nonlinearity={})
-    for first in range(0, len(tools), CHUNK):
-        part = tools[first : first + CHUNK]
-        for some, levels in halved(readings, part, lambda r: judged_soaks(r, trial)):
-            if isinstance(levels, Exception):
-                yield some, levels
-                continue
-            for count in np.unique(levels):
-                yield from _of_soaks(readings, some[levels == count], trial, int(count))
-
-
-def _of_soaks(
-    readings: Readings, tools: Ints, options: Options, levels: int
-) -> Iterator[tuple[Ints, Ints | Exception]]:
-    """The same for tools that are judged by one number of soaks."""
-    size = max(CHUNK // levels, 1)
-    for first in range(0, len(tools), size):
-        part = tools[first : first + size]
-        yield from halved(readings, part, lambda r: choose_orders(r, options, levels))
+    orders = np.full((len(readings.accelerometer), 2), -1)
+    for part, chosen in in_chunks(readings, tools, lambda r: choose_orders(r, trial)):
+        if isinstance(chosen, Exception):
+            yield part, chosen
+        else:
+            orders[part] = chosen
+    for pair in np.unique(orders[tools], axis=0):
+        if pair.min() >= 0:
+            order = (int(pair[0]), int(pair[1]))
+            yield tools[(orders[tools] == pair).all(-1)], replace(options, order=order)
 
 
 def with_curves(
-    tools: Ints, options: Options, readings: Readings, per_tool: PerTool, alone: Alone
+    readings: Readings, tools: Ints, options: Options, profile: Profile
 ) -> Iterator[tuple[Ints, Options | Exception]]:
-    """The given tools by the own-axis terms that their runs speak for."""
-    if not per_tool.nonlinearity or options.prior:
+    """The given tools by the own-axis terms that their runs show."""
+    terms = offered(profile, options)
+    if not terms:
+        options = replace(options, nonlinearity=options.curved)
         try:
-            check_curves(readings, tuple(options.nonlinearity or {}))
+            check_curves(readings, tuple(options.curved))
             check_options(options)
-        except Exception as error:
+        except MwdcalError as error:
             yield tools, error
-            return
-        yield tools, options
+        else:
+            yield tools, options
         return
-    groups: dict[tuple[bool, tuple[tuple[str, float], ...]], list[int]] = {}
-    for tool in tools.tolist():
-        try:
-            own, profile = alone(tool)
-            offered = declared(profile, options)
-            if offered:
-                check_readings(own, options)
-            found = with_chosen_curves(own, options, offered)[0]
-        except Exception as error:
-            yield np.array([tool]), error
+    options = scattered(readings, options)
+    groups: dict[tuple[str, ...], list[Ints]] = {}
+    trials = in_chunks(readings, tools, lambda r: compare_curves(r, options, terms), CHUNK // PARTS)
+    for part, curves in trials:
+        if isinstance(curves, Exception):
+            yield part, curves
             continue
-        terms = tuple((found.nonlinearity or {}).items())
-        groups.setdefault((found.scatter, terms), []).append(tool)
-    for (scatter, terms), members in groups.items():
-        yield np.array(members), replace(options, nonlinearity=dict(terms), scatter=scatter)
+        for place in np.unique(curves.chosen):
+            groups.setdefault(curves.choices[place], []).append(part[curves.chosen == place])
+    for names, parts in groups.items():
+        chosen = {name: terms[name] for name in names}
+        yield np.concatenate(parts), replace(options, nonlinearity=chosen)
 
 
-def halved(
+def in_chunks(
+    readings: Readings, tools: Ints, work: Callable[[Readings], _T], size: int = CHUNK
+) -> Iterator[tuple[Ints, _T | Exception]]:
+    """The work on given members of a batch, `size` at a time; in halves where one stops the whole."""
+    for start in range(0, len(tools), size):
+        yield from _halved(readings, tools[start : start + size], work)
+
+
+def _halved(
     readings: Readings, tools: Ints, work: Callable[[Readings], _T]
 ) -> Iterator[tuple[Ints, _T | Exception]]:
     """The work on given members of a batch, done in halves where one member stops the whole."""
@@ -166,4 +119,4 @@ def halved(
             return
         middle = len(tools) // 2
         for part in (tools[:middle], tools[middle:]):
-            yield from halved(readings, part, work)
+            yield from _halved(readings, part, work)

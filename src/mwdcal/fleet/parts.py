@@ -13,14 +13,13 @@ import numpy as np
 
 from mwdcal import __version__
 from mwdcal.calibration.diagnosis.refusals import BAD_INPUT
-from mwdcal.calibration.options import Options
+from mwdcal.calibration.options import AUTO, Options
 from mwdcal.calibration.readings import TRIADS
 from mwdcal.calibration.soaks import HIGHEST
 from mwdcal.errors import InputError
 from mwdcal.files.contract import AZIMUTH_KEYS, CHANNELS
 from mwdcal.files.formats import parquet
-from mwdcal.fleet.calibrate import ALIKE, OK, Outcome, calibrate_batch, names
-from mwdcal.fleet.choices import PerTool
+from mwdcal.fleet.calibrate import OK, Outcome, calibrate_batch, names
 from mwdcal.fleet.runs import Batch, Rows, batches, refused_tools
 from mwdcal.fleet.sources import SERIAL, Source
 from mwdcal.fleet.tables import Partition, read
@@ -45,16 +44,13 @@ class Plan:
     columns: tuple[str, ...]
     profile: Profile
     options: Options
-    per_tool: PerTool = ALIKE
     version: str = __version__
 
     @classmethod
-    def of(
-        cls, source: Source, profile: Profile, options: Options, per_tool: PerTool = ALIKE
-    ) -> Plan:
+    def of(cls, source: Source, profile: Profile, options: Options) -> Plan:
         """For a table: of its columns those that a run file has; which north is one of them."""
         metadata = {k: v for k, v in source.metadata.items() if k not in AZIMUTH_KEYS}
-        return cls(source.name, metadata, source.used, profile, options, per_tool)
+        return cls(source.name, metadata, source.used, profile, options)
 
     @property
     def triads(self) -> tuple[str, ...]:
@@ -117,7 +113,7 @@ def packed(table: Any) -> bytes:
 def _result(rows: Rows, plan: Plan) -> Any:
     """The result table of some tools."""
     count = len(rows.counts)
-    every = names(plan.options, plan.triads, plan.per_tool)
+    every = names(plan.options, plan.profile, plan.triads)
     filled = {name: np.full(count, np.nan) for name in every}
     status, message = np.full(count, OK, object), np.full(count, "", object)
     unit = np.full(count, None, object)
@@ -145,7 +141,6 @@ def _calibrated(rows: Rows, batch: Batch, plan: Plan) -> Outcome:
         plan.options,
         plan.profile,
         lambda i: rows.alone(int(batch.tools[i])),
-        plan.per_tool,
     )
 
 
@@ -189,7 +184,7 @@ def _table(
     columns["field_unit"] = arrow.array(unit, arrow.string())
     columns["method"] = arrow.array([options.method] * count, arrow.string())
     order = np.fmax.reduce([filled[f"{triad}_order"] for triad in plan.triads])
-    if not plan.per_tool.order:
+    if plan.options.order != AUTO:
         order = np.full(count, float(max(options.orders)))
     kinds = np.array([None, *(options.kind(k) for k in range(HIGHEST + 1))], object)
     model = kinds[np.nan_to_num(order + 1).astype(int)]

@@ -233,6 +233,7 @@ class Factors:
 
     basis: Basis
     kind = "factors"
+    curved = False
 
     @property
     def size(self) -> int:
@@ -357,6 +358,11 @@ class Restricted:
     def kind(self) -> str:
         """The whole model's kind."""
         return self.whole.kind
+
+    @property
+    def curved(self) -> bool:
+        """Whether the whole model has own-axis terms."""
+        return self.whole.curved
 
     @property
     def basis(self) -> Basis:

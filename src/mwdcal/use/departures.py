@@ -119,9 +119,7 @@ class Test:
     def _error(self, name: str) -> Array:
         """Departure (n,) from the reference that the run itself gives; NaN where it gives none."""
         known = self.readings.known.get(name, np.full(self.readings.count, np.nan))
-        error = np.asarray(self.value(name) - known)
-        period = OBSERVABLES[name].period
-        return centred(error, period) if period else error
+        return OBSERVABLES[name].difference(self.value(name), known)
 
     def _coverage(self, index: Ints) -> Coverage | None:
         """How the toolfaces of stations cover the circle; None where none of them is known."""
@@ -264,7 +262,7 @@ class Test:
         return Outcome(tuple(shown), "", blocked, unrolled, apart, unseen)
 
     def _relative(self, name: str) -> bool:
-        return name == "field" and self.calibration.field_unit != "nT"
+        return name == "field" and self.calibration.relative
 
     def _unusable(self, name: str, free: bool) -> str:
         """Why no limit on an observable can be passed; empty where it can."""
@@ -277,7 +275,7 @@ class Test:
         if not self.calibration.free:
             return False
         rows = np.nan_to_num(self.calibration.sensitivity(name, self.readings)[index])
-        moved = rows @ np.array(self.calibration.free).transpose()
+        moved = rows @ self.calibration.free_directions.transpose()
         size = {"g": 1.0, "nT": self.calibration.earth.get("field", 1.0)}.get(
             OBSERVABLES[name].unit, 1.0
         )

@@ -28,12 +28,13 @@ def directions(g: Array, b: Array) -> Array:
 def group_scatter(axis: Array, group: Ints) -> float:
     """Mean over groups of the norm of the (N - 1) standard deviations of `axis`, radians.
 
-    Shapes: axis (n, 3), group (n,), -1: in no group. Reference: the accuracy measure of
-    CircuitPython_mag_cal, so that results compare.
+    Shapes: axis (n, 3), NaN where there is none; group (n,), -1: in no group. NaN without a group
+    of two. Reference: the accuracy measure of CircuitPython_mag_cal, so that results compare.
     """
-    numbers = range(int(group.max(initial=-1)) + 1)
-    each = [np.linalg.norm(axis[group == k].std(axis=0, ddof=1)) for k in numbers]
-    return float(np.mean(each))
+    group = np.where(np.isnan(axis).any(-1), -1, group)
+    each = [axis[group == k] for k in np.unique(group[group >= 0])]
+    spread = [np.linalg.norm(v.std(axis=0, ddof=1)) for v in each if len(v) > 1]
+    return float(np.mean(spread)) if spread else float("nan")
 
 
 def _fields(result: Fit) -> tuple[Array, Array]:

@@ -13,9 +13,9 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from mwdcal.app.commands.choices import names
-from mwdcal.app.commands.fleet_options import Asked
-from mwdcal.app.text import choices, number, plural, table
+from mwdcal.app.commands.choices import Typed, names
+from mwdcal.app.pages.calibration import choices
+from mwdcal.app.text import number, plural, table
 from mwdcal.calibration.readings import TRIADS
 from mwdcal.calibration.record import Choices, Finding
 from mwdcal.calibration.soaks import HIGHEST
@@ -87,67 +87,55 @@ class Summary:
         return sum(kind.tools for kind in self.statuses if kind.status == OK)
 
 
-def summarise(
-    asked: Asked,
-    target: Path,
-    stations: int,
-    parts: int,
-    before: int,
-    seconds: float,
-    notes: list[str],
-    unused: list[Finding],
-) -> Summary:
-    """What the output says, read column by column."""
+def summarise(target: Path, typed: Typed, notes: list[str], **facts: Any) -> Summary:
+    """What the table of calibrations `target` says, read column by column, beside other `facts`."""
     _, pq = parquet.modules(target.name)
     whole = pq.ParquetFile(target)
     head = whole.read([SERIAL, "status", "message", "findings"])
-    columns = whole.schema_arrow.names
+    columns, options = whole.schema_arrow.names, stated_options(typed)
     shown = [n for n in columns if n.endswith(("_sd_deg", "_variance_factor")) or n in ERRORS]
-    spread = {name: _quantiles(numbers(whole, name)) for name in shown}
-    if asked["order"] == "0":
-        span = numbers(whole, "temperature_max_c") - numbers(whole, "temperature_min_c")
-        wide = int(np.sum(span > SPAN))
-        if wide:
-            spans = f"{plural(wide, 'tool')} {'spans' if wide == 1 else 'span'}"
-            notes.append(f"{spans} more than {SPAN:g} °C, and --order 0 has no temperature terms.")
     return Summary(
-        runs=asked["runs"].name,
-        output=str(asked["output"]),
+        **facts,
         tools=head.num_rows,
-        stations=stations,
-        method=asked["method"],
-        order=asked["order"] if asked["order"] == "auto" else int(asked["order"]),
-        options=options_asked(asked),
-        orders=_orders(whole, columns) if asked["order"] == "auto" else {},
+        method=typed["method"],
+        order=options["order"],
+        options=options,
+        orders=_orders(whole, columns) if typed["order"] == "auto" else {},
         nonlinear=_nonlinear(whole, columns),
         statuses=_kinds(head),
         findings=_findings(head),
-        spread=spread,
+        spread={name: _quantiles(numbers(whole, name)) for name in shown},
         undetermined=_undetermined(whole, columns),
-        parts=parts,
-        parts_done_before=before,
-        seconds=round(seconds, 3),
-        notes=notes,
-        unused=unused,
+        notes=notes + (_wide(whole) if typed["order"] == "0" else []),
     )
 
 
-def options_asked(asked: Asked) -> dict[str, Any]:
-    """How a fleet was asked for, under the names that a calibration file and the command have."""
+def _wide(whole: Any) -> list[str]:
+    """What to say of tools whose temperatures differ, where there are no temperature terms."""
+    span = numbers(whole, "temperature_max_c") - numbers(whole, "temperature_min_c")
+    wide = int(np.sum(span > SPAN))
+    if not wide:
+        return []
+    spans = f"{plural(wide, 'tool')} {'spans' if wide == 1 else 'span'}"
+    return [f"{spans} more than {SPAN:g} °C, and --order 0 has no temperature terms."]
+
+
+def stated_options(typed: Typed) -> dict[str, Any]:
+    """The options of a fleet, under the names that a calibration file and the command have."""
     also = Choices(
-        parameters=int(asked["parameters"] or 12),
-        ignore=names(asked["ignore"]),
-        robust=asked["robust"],
-        paper_weights=asked["paper_weights"],
-        prior=asked["prior"],
+        parameters=int(typed["parameters"] or 12),
+        ignore=list(names(typed["ignore"])),
+        robust=typed["robust"],
+        paper_weights=typed["paper_weights"],
+        prior=typed["prior"],
     )
     return {
-        "method": asked["method"],
-        "seed": asked["seed"] if asked["method"] == "swarm" else None,
-        "model": asked["model"],
-        "order": asked["order"] if asked["order"] == "auto" else int(asked["order"]),
-        "nonlinearity": asked["nonlinearity"],
-        "estimate": names(asked["estimate"]),
+        "method": typed["method"],
+        "seed": typed["seed"] if typed["method"] == "swarm" else None,
+        "model": typed["model"],
+        "order": typed["order"] if typed["order"] == "auto" else int(typed["order"]),
+        "nonlinearity": typed["nonlinearity"],
+        "estimate": list(names(typed["estimate"])),
         **msgspec.to_builtins(also),
     }
 
@@ -163,12 +151,6 @@ def unusual(options: Mapping[str, Any]) -> list[str]:
         *choices(also),
         *([f"seed {options['seed']}"] if options["seed"] else []),
     ]
-
-
-def column(path: Path, name: str) -> Array:
-    """One column of numbers of a table of calibrations, NaN where there is none."""
-    _, pq = parquet.modules(path.name)
-    return numbers(pq.ParquetFile(path), name)
 
 
 def numbers(whole: Any, name: str) -> Array:
@@ -187,11 +169,13 @@ def _quantiles(values: Array) -> list[float]:
 def _kinds(head: Any) -> list[Kind]:
     """Statuses with their tools, sound ones first, then by number."""
     counted = head.column("status").value_counts().to_pylist()
-    found = []
+    kinds = []
     for each in sorted(counted, key=lambda c: (c["values"] != OK, -c["counts"])):
-        own = head.filter(_equal(head.column("status"), each["values"])).slice(0, SHOWN).to_pydict()
-        found.append(Kind(each["values"], each["counts"], own[SERIAL], own["message"][0]))
-    return found
+        tools = (
+            head.filter(_equal(head.column("status"), each["values"])).slice(0, SHOWN).to_pydict()
+        )
+        kinds.append(Kind(each["values"], each["counts"], tools[SERIAL], tools["message"][0]))
+    return kinds
 
 
 def _findings(head: Any) -> list[Said]:
@@ -200,12 +184,12 @@ def _findings(head: Any) -> list[Said]:
     column = one_chunk(head.column("findings"))
     ids = column.flatten().dictionary_encode()
     tool = np.repeat(np.arange(len(column)), column.value_lengths().fill_null(0).to_numpy())
-    found = []
+    findings = []
     for code, name in enumerate(ids.dictionary.to_pylist()):
-        own = tool[ids.indices.to_numpy() == code]
-        serials = head.column(SERIAL).take(arrow.array(own[:SHOWN])).to_pylist()
-        found.append(Said(name, len(own), serials))
-    return sorted(found, key=lambda said: (not is_doubt(said.id), -said.tools, said.id))
+        tools = tool[ids.indices.to_numpy() == code]
+        serials = head.column(SERIAL).take(arrow.array(tools[:SHOWN])).to_pylist()
+        findings.append(Said(name, len(tools), serials))
+    return sorted(findings, key=lambda said: (not is_doubt(said.id), -said.tools, said.id))
 
 
 def is_doubt(finding: str) -> bool:
@@ -215,12 +199,12 @@ def is_doubt(finding: str) -> bool:
 
 def _orders(whole: Any, columns: list[str]) -> dict[str, dict[str, int]]:
     """Tools by triad and the order that was chosen."""
-    found: dict[str, dict[str, int]] = {}
+    orders: dict[str, dict[str, int]] = {}
     for triad in TRIADS:
         if f"{triad}_order" in columns:
             values = numbers(whole, f"{triad}_order")
-            found[triad] = {str(k): int(np.sum(values == k)) for k in range(HIGHEST + 1)}
-    return {triad: own for triad, own in found.items() if any(own.values())}
+            orders[triad] = {str(k): int(np.sum(values == k)) for k in range(HIGHEST + 1)}
+    return {triad: counts for triad, counts in orders.items() if any(counts.values())}
 
 
 def _nonlinear(whole: Any, columns: list[str]) -> dict[str, int]:
@@ -241,23 +225,23 @@ def _equal(cells: Any, value: str) -> Any:
 
 def _undetermined(whole: Any, columns: list[str]) -> dict[str, int]:
     """Tools by triad and direction that nothing determines."""
-    found: dict[str, int] = {}
+    counts: dict[str, int] = {}
     for name in columns:
         if name.endswith("_undetermined"):
             cells = whole.read([name]).column(0)
             for each in cells.combine_chunks().flatten().value_counts().to_pylist():
                 value, count = each["values"], each["counts"]
-                found[f"{name.removesuffix('_undetermined')}: {value}"] = count
-    return found
+                counts[f"{name.removesuffix('_undetermined')}: {value}"] = count
+    return counts
 
 
 def document(summary: Summary, report: Path | None) -> dict[str, Any]:
     """The summary for machines."""
-    found: dict[str, Any] = msgspec.to_builtins(summary)
+    shown: dict[str, Any] = msgspec.to_builtins(summary)
     whole = {"tools": summary.tools, "serials": []}
-    found["findings"] += [{**each, **whole} for each in found.pop("unused")]
-    found["tools_per_second"] = round(summary.tools / summary.seconds, 1)
-    return {**found, "calibrated": summary.sound, "report": str(report or "")}
+    shown["findings"] += [{**each, **whole} for each in shown.pop("unused")]
+    shown["tools_per_second"] = round(summary.tools / summary.seconds, 1)
+    return {**shown, "calibrated": summary.sound, "report": str(report or "")}
 
 
 def text(summary: Summary, report: Path | None) -> str:
@@ -296,7 +280,7 @@ def text(summary: Summary, report: Path | None) -> str:
 def orders_table(summary: Summary) -> tuple[list[str], list[list[str]]]:
     """Header and rows of the tools by chosen order, a triad in each row."""
     header = ["tools of order", *map(str, range(HIGHEST + 1))]
-    return header, [[triad, *map(str, own.values())] for triad, own in summary.orders.items()]
+    return header, [[triad, *map(str, counts.values())] for triad, counts in summary.orders.items()]
 
 
 def _count(said: Said) -> str:

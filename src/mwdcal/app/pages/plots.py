@@ -1,7 +1,8 @@
-"""Figures of the report, as SVG to be put into HTML: deterministic, no text left to fonts.
+"""Figures of a calibration, and the style of all figures: deterministic, no text left to fonts.
 
-Colours are told apart by colour-blind readers, and never carry a meaning alone: every
-series has a marker of its own and every contour its number.
+A figure is a Matplotlib figure whose label says what it shows; `svg` puts it into HTML. Colours are
+told apart by colour-blind readers, and never carry a meaning alone: every series has a marker of its
+own and every contour its number.
 """
 
 from __future__ import annotations
@@ -9,15 +10,20 @@ from __future__ import annotations
 import io
 import re
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, Literal
+from functools import wraps
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, ParamSpec
 
 import numpy as np
 
+from mwdcal.errors import InputError
 from mwdcal.geometry.vectors import Array
 
 if TYPE_CHECKING:
+    from markupsafe import Markup
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from matplotlib.patheffects import AbstractPathEffect
@@ -35,7 +41,10 @@ TITLES = {
 }
 """How an observable's error is called: toolface and azimuth are weighted by sin I."""
 BEFORE, AFTER, MARKED, BAND = "#6b7280", "#0072b2", "#d55e00", "#dbe7f0"
+AXES = {"x": AFTER, "y": MARKED, "z": "#111827"}
+"""Colours of the channels of a triad."""
 WIDTH = 7.1
+"""Of a figure, inches."""
 STYLE: dict[Any, Any] = {
     "axes.axisbelow": True,
     "axes.edgecolor": "#4b5563",
@@ -67,8 +76,23 @@ STYLE: dict[Any, Any] = {
 }
 
 
+Arguments = ParamSpec("Arguments")
+
+
+def require(what: str, *libraries: str) -> None:
+    """Refuse to draw without the libraries that draw."""
+    for name in libraries:
+        try:
+            import_module(name)
+        except ImportError as error:
+            raise InputError(
+                f"{what} needs {error.name}, which is not installed. Install mwdcal[report]: "
+                "pip install 'mwdcal[report]'"
+            ) from None
+
+
 @contextmanager
-def _style() -> Iterator[None]:
+def style() -> Iterator[None]:
     """Our style on matplotlib's own defaults, whatever the user's settings are."""
     import matplotlib as mpl
 
@@ -79,17 +103,45 @@ def _style() -> Iterator[None]:
         yield
 
 
-def _figure(height: float, layout: Literal["constrained"] | None = "constrained") -> Figure:
+def styled(draw: Callable[Arguments, Figure]) -> Callable[Arguments, Figure]:
+    """A function that draws a figure, in our style."""
+
+    @wraps(draw)
+    def draw_in_style(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Figure:
+        with style():
+            return draw(*args, **kwargs)
+
+    return draw_in_style
+
+
+def new_figure(
+    label: str, height: float, layout: Literal["constrained"] | None = "constrained"
+) -> Figure:
+    """An empty figure as wide as a page; `height` in inches, `label`: what it shows."""
     from matplotlib.figure import Figure
 
-    return Figure(figsize=(WIDTH, height), layout=layout)
+    figure = Figure(figsize=(WIDTH, height), layout=layout)
+    figure.set_label(label)
+    return figure
 
 
-def _svg(figure: Figure, key: str, title: str) -> str:
-    """An element to put into HTML: no prologue, no names of schemas, ids of its own."""
+def picture(figure: Figure, path: Path) -> bytes:
+    """The figure as PNG or SVG, by the suffix; the same figure, the same bytes."""
+    kind, stream = path.suffix.lower()[1:], io.BytesIO()
+    nothing = {"Software": None} if kind == "png" else {"Date": None, "Creator": None}
+    with style():
+        figure.savefig(stream, format=kind, dpi=160, metadata=nothing)
+    return stream.getvalue()
+
+
+def svg(figure: Figure, key: str) -> Markup:
+    """An element to put into HTML: no prologue, no names of schemas, ids that start with `key`."""
+    from markupsafe import Markup
+
     stream = io.StringIO()
-    nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
-    figure.savefig(stream, format="svg", metadata=nothing)
+    with style():
+        nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
+        figure.savefig(stream, format="svg", metadata=nothing)
     text = stream.getvalue()
     text = text[text.index("<svg") :]
     text = re.sub(
@@ -101,7 +153,7 @@ def _svg(figure: Figure, key: str, title: str) -> str:
     text = re.sub(r'<g([^<>]*)>\s*((?:<use [^<>]* style="([^"]*)"/>\s*)+)</g>', _gathered, text)
     head, rest = text.split(">", 1)
     text = re.sub(r' (width|height|version)="[^"]*"', "", head) + ">" + rest
-    return text.replace("<svg", f'<svg role="img" aria-label="{title}"', 1)
+    return Markup(text.replace("<svg", f'<svg role="img" aria-label="{figure.get_label()}"', 1))
 
 
 def _shortened(path: re.Match[str]) -> str:
@@ -111,11 +163,11 @@ def _shortened(path: re.Match[str]) -> str:
 
 def _gathered(group: re.Match[str]) -> str:
     """Markers of one series: their style said once."""
-    own, markers, style = group.groups()
-    if markers.count(f' style="{style}"') != markers.count("<use "):
+    attributes, markers, look = group.groups()
+    if markers.count(f' style="{look}"') != markers.count("<use "):
         return group[0]
-    markers = re.sub(r"\s*\n\s*", "", markers.replace(f' style="{style}"', ""))
-    return f'<g{own} style="{style}">{markers}</g>'
+    markers = re.sub(r"\s*\n\s*", "", markers.replace(f' style="{look}"', ""))
+    return f'<g{attributes} style="{look}">{markers}</g>'
 
 
 def quantity(value: float, digits: int, unit: str) -> str:
@@ -123,57 +175,57 @@ def quantity(value: float, digits: int, unit: str) -> str:
     return f"{value:.{digits}g}{'' if unit == '°' else ' '}{unit}"
 
 
-def station_errors(calibration: Calibration, name: str) -> str:
+@styled
+def station_errors(calibration: Calibration, name: str) -> Figure:
     """Errors of one observable per station: before and after, each on its own scale."""
     row = next(r for r in calibration.errors if r.observable == name)
     stations, unit = calibration.station_rows, row.unit.partition(" ")[0]
     label = f"{TITLES[name]}, {unit}"
-    with _style():
-        figure = _figure(1.5, layout=None)
-        place = {"left": 0.095, "right": 0.995, "bottom": 0.27, "top": 0.87, "wspace": 0.24}
-        first, second = figure.subplots(1, 2, gridspec_kw=place)
-        _stems(first, stations, [s.errors_before.get(name, np.nan) for s in stations], BEFORE, "o")
-        first.set_title(f"before: rms {quantity(row.before, 3, unit)}")
-        if row.expected:
-            second.axhspan(-row.expected, row.expected, color=BAND, lw=0, zorder=0.5)
-        _stems(second, stations, [s.errors.get(name, np.nan) for s in stations], AFTER, "s")
-        expected = "  (band: ±1σ expected)" if row.expected else ""
-        second.set_title(f"after: rms {quantity(row.after, 3, unit)}{expected}")
-        for axes in (first, second):
-            axes.set_ylabel(label)
-            axes.axhline(0, color="#4b5563", lw=0.6, zorder=1)
-        return _svg(figure, f"error-{name}", f"Error of {label}, per station, before and after")
+    figure = new_figure(f"Error of {label}, per station, before and after", 1.5, layout=None)
+    place = {"left": 0.095, "right": 0.995, "bottom": 0.27, "top": 0.87, "wspace": 0.24}
+    first, second = figure.subplots(1, 2, gridspec_kw=place)
+    _stems(first, stations, [s.errors_before.get(name, np.nan) for s in stations], BEFORE, "o")
+    first.set_title(f"before: rms {quantity(row.before, 3, unit)}")
+    if row.expected:
+        second.axhspan(-row.expected, row.expected, color=BAND, lw=0, zorder=0.5)
+    _stems(second, stations, [s.errors.get(name, np.nan) for s in stations], AFTER, "s")
+    expected = "  (band: ±1σ expected)" if row.expected else ""
+    second.set_title(f"after: rms {quantity(row.after, 3, unit)}{expected}")
+    for axes in (first, second):
+        axes.set_ylabel(label)
+        axes.axhline(0, color="#4b5563", lw=0.6, zorder=1)
+    return figure
 
 
-def deviations(calibration: Calibration, limit: float) -> str:
+@styled
+def deviations(calibration: Calibration, limit: float) -> Figure:
     """Each station's misfit in σ, with the limit above which it is to be taken again."""
     rows = calibration.station_rows
-    with _style():
-        figure = _figure(1.7)
-        axes = figure.subplots()
-        _stems(axes, rows, [row.deviation for row in rows], AFTER, "s")
-        axes.axhline(limit, color=MARKED, lw=1, ls=(0, (5, 3)))
-        top = max(limit, *(row.deviation for row in rows)) * 1.2
-        axes.set_ylim(0, top)
-        axes.annotate(
-            f"re-shoot above {limit:.1f}σ", (1, limit), (-2, 3), xycoords=("axes fraction", "data"),
-            textcoords="offset points", ha="right", va="bottom", color="#9a3d00", fontsize=7,
-        )  # fmt: skip
-        axes.set_ylabel("misfit of the station, σ")
-        return _svg(figure, "deviation", "Misfit of each station in standard deviations")
+    figure = new_figure("Misfit of each station in standard deviations", 1.7)
+    axes = figure.subplots()
+    _stems(axes, rows, [row.deviation for row in rows], AFTER, "s")
+    axes.axhline(limit, color=MARKED, lw=1, ls=(0, (5, 3)))
+    top = max(limit, *(row.deviation for row in rows)) * 1.2
+    axes.set_ylim(0, top)
+    axes.annotate(
+        f"re-shoot above {limit:.1f}σ", (1, limit), (-2, 3), xycoords=("axes fraction", "data"),
+        textcoords="offset points", ha="right", va="bottom", color="#9a3d00", fontsize=7,
+    )  # fmt: skip
+    axes.set_ylabel("misfit of the station, σ")
+    return figure
 
 
-def order_errors(scores: Sequence[OrderScore]) -> str:
+@styled
+def order_errors(scores: Sequence[OrderScore]) -> Figure:
     """Error at temperatures left out of the fit by order, inside and at the ends, per triad."""
     triads = list(dict.fromkeys(row.triad for row in scores))
-    with _style():
-        figure = _figure(2.0)
-        panels = figure.subplots(1, len(triads), squeeze=False)[0]
-        for axes, triad in zip(panels, triads, strict=True):
-            _by_order(axes, [row for row in scores if row.triad == triad])
-            axes.set_title(triad)
-        panels[0].legend(loc="upper right")
-        return _svg(figure, "orders", "Error at left-out temperatures by temperature order")
+    figure = new_figure("Error at left-out temperatures by temperature order", 2.0)
+    panels = figure.subplots(1, len(triads), squeeze=False)[0]
+    for axes, triad in zip(panels, triads, strict=True):
+        _by_order(axes, [row for row in scores if row.triad == triad])
+        axes.set_title(triad)
+    panels[0].legend(loc="upper right")
+    return figure
 
 
 def _by_order(axes: Axes, rows: Sequence[OrderScore]) -> None:
@@ -245,15 +297,15 @@ def _columns(axes: Axes) -> int:
     return 1 if place is None else int(place.get_gridspec().ncols)
 
 
-def accuracy(chart: AccuracyMap, names: Sequence[str]) -> str:
+@styled
+def accuracy(chart: AccuracyMap, names: Sequence[str]) -> Figure:
     """1σ of the angles over inclination and azimuth, degrees, in contours with their numbers."""
-    with _style():
-        figure = _figure(2.75)
-        panels = figure.subplots(1, len(names), sharey=True, squeeze=False)[0]
-        for axes, name in zip(panels, names, strict=True):
-            _sphere(axes, chart, np.degrees(chart.sd[name]), name)
-        panels[0].set_ylabel("inclination, °")
-        return _svg(figure, "accuracy", "Predicted 1σ over inclination and azimuth")
+    figure = new_figure("Predicted 1σ over inclination and azimuth", 2.75)
+    panels = figure.subplots(1, len(names), sharey=True, squeeze=False)[0]
+    for axes, name in zip(panels, names, strict=True):
+        _sphere(axes, chart, np.degrees(chart.sd[name]), name)
+    panels[0].set_ylabel("inclination, °")
+    return figure
 
 
 def _sphere(axes: Axes, chart: AccuracyMap, values: Array, name: str) -> None:

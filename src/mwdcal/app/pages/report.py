@@ -13,8 +13,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mwdcal.app.pages import plots
-from mwdcal.app.text import HELD, chance, choices, is_held, plural
-from mwdcal.app.text import model as model_of
+from mwdcal.app.pages.calibration import choices
+from mwdcal.app.pages.calibration import model as model_of
+from mwdcal.app.pages.page import (
+    HELD,
+    environment,
+    exponent,
+    fixed,
+    is_held,
+    measured,
+    number,
+    unit,
+)
+from mwdcal.app.text import plural, raised
 from mwdcal.calibration.prediction import accuracy_at, accuracy_map, angles, middle_temperature
 from mwdcal.calibration.readings import is_simulated
 from mwdcal.calibration.record import Calibration, TriadCalibration
@@ -25,12 +36,9 @@ from mwdcal.files.formats import atomic
 from mwdcal.use.notation import Notation, convert
 
 if TYPE_CHECKING:
-    from jinja2 import Environment
-
     from mwdcal.calibration.record import Finding
     from mwdcal.use.verification import Verdict
 
-SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 LONG_TABLE = 60
 """A run of more stations has its station table at the end, as an annex."""
 ROWS = (5.0, 45.0, 90.0)
@@ -46,7 +54,7 @@ def write_report(
 
 def render(calibration: Calibration, verdict: Verdict | None = None) -> str:
     """The report as HTML: the same input gives the same text, byte for byte."""
-    template = _environment().get_template("report.html")
+    template = environment().get_template("report.html")
     return template.render(
         cal=calibration,
         name=calibration.tool.get("serial") or calibration.profile.name,
@@ -72,98 +80,6 @@ def render(calibration: Calibration, verdict: Verdict | None = None) -> str:
         earth=_earth(calibration),
         when=_when(calibration.time),
     )
-
-
-def _environment() -> Environment:
-    try:
-        import matplotlib  # noqa: F401
-        from jinja2 import Environment, PackageLoader, StrictUndefined
-    except ImportError as error:
-        raise InputError(
-            f"the report needs {error.name}, which is not installed. Install mwdcal[report]: "
-            "pip install 'mwdcal[report]'"
-        ) from None
-    made = Environment(
-        loader=PackageLoader("mwdcal.app.pages"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    made.filters |= {
-        "number": number,
-        "signed": signed,
-        "fixed": fixed,
-        "css": css_string,
-        "svg": svg,
-        "plural": plural,
-        "unit": unit,
-        "chance": chance,
-    }
-    return made
-
-
-def number(value: float | None, digits: int = 3) -> str:
-    """A number to some significant digits, without E notation; a dash where there is none."""
-    if value is None or not np.isfinite(value):
-        return "–"
-    if value == 0:
-        return "0"
-    mantissa, power = f"{value:.{digits - 1}e}".split("e")
-    exponent = int(power)
-    if not -5 < exponent < 7:
-        return f"{mantissa}×10{str(exponent).translate(SUPERSCRIPT)}".replace("-", "−")
-    return fixed(value, max(digits - 1 - exponent, 0))
-
-
-def fixed(value: float | None, decimals: int) -> str:
-    """A number to some decimals, with a true minus sign; a dash where there is none."""
-    if value is None or not np.isfinite(value):
-        return "–"
-    return f"{round(value, decimals) + 0.0:.{max(decimals, 0)}f}".replace("-", "−")
-
-
-def signed(value: float | None, decimals: int) -> str:
-    """As `fixed`, with a plus sign too."""
-    text = fixed(value, decimals)
-    return text if text[0] in "−–" or not float(text) else f"+{text}"
-
-
-def measured(value: float, uncertainty: float | None) -> tuple[str, str]:
-    """Value and standard uncertainty as text, both to two significant digits of the latter."""
-    if uncertainty is None or not np.isfinite(uncertainty):
-        return number(value, 6), "undetermined"
-    if uncertainty == 0:
-        return number(value, 9), "0"
-    decimals = 1 - _exponent(uncertainty)
-    power = _exponent(max(abs(value), uncertainty))
-    if decimals <= 7 and power < 7:
-        return fixed(value, decimals), fixed(uncertainty, decimals)
-    factor, times = 10.0**-power, f"×10{str(power).translate(SUPERSCRIPT)}"
-    pair = (fixed(v * factor, decimals + power) for v in (value, uncertainty))
-    first, second = (f"{text}{times}" for text in pair)
-    return first, second
-
-
-def _exponent(value: float) -> int:
-    return int(f"{value:.1e}".split("e")[1])
-
-
-def unit(symbol: str) -> str:
-    """A unit as it follows a number: the degree sign without a space."""
-    return symbol if symbol in ("", "°") else f" {symbol}"
-
-
-def css_string(text: str) -> str:
-    """Text as the inside of a CSS string: nothing but letters and digits is left bare."""
-    return "".join(c if c.isascii() and c.isalnum() else f"\\{ord(c):x} " for c in text)
-
-
-def svg(text: str) -> Any:
-    """A figure of our own making, which needs no escaping."""
-    from markupsafe import Markup
-
-    return Markup(text)
 
 
 def banner(calibration: Calibration, verdict: Verdict | None) -> dict[str, str]:
@@ -206,12 +122,12 @@ def _fit_outcome(calibration: Calibration) -> tuple[str, str]:
 
 def _findings(calibration: Calibration, verdict: Verdict | None) -> list[Finding]:
     """What to know and do, each thing once; stations to re-shoot first."""
-    found = {f.text: f for f in calibration.findings}
+    findings = {f.text: f for f in calibration.findings}
     ids = {f.id for f in calibration.findings}
     for extra in verdict.findings if verdict else ():
         if extra.id not in ids:
-            found.setdefault(extra.text, extra)
-    return sorted(found.values(), key=lambda f: f.id != "reshoot")
+            findings.setdefault(extra.text, extra)
+    return sorted(findings.values(), key=lambda f: f.id != "reshoot")
 
 
 def _when(time: str) -> str:
@@ -253,10 +169,10 @@ def _temperatures(calibration: Calibration) -> str:
 
 def _attitudes(calibration: Calibration) -> str:
     rows = calibration.station_rows
-    found = [r.inclination_deg for r in rows if r.inclination_deg is not None]
-    if not found:
+    inclinations = [r.inclination_deg for r in rows if r.inclination_deg is not None]
+    if not inclinations:
         return str(calibration.stations)
-    return f"{calibration.stations}, at inclinations {min(found):.0f} to {max(found):.0f}°"
+    return f"{calibration.stations}, at inclinations {min(inclinations):.0f} to {max(inclinations):.0f}°"
 
 
 def _limit(calibration: Calibration) -> float:
@@ -267,6 +183,7 @@ def _limit(calibration: Calibration) -> float:
 
 
 def _figures(calibration: Calibration) -> dict[str, Any]:
+    """Figures by name, and the observables that have none."""
     names = [row.observable for row in calibration.errors]
     missing = [
         name
@@ -274,13 +191,13 @@ def _figures(calibration: Calibration) -> dict[str, Any]:
         if name not in names and (calibration.has_field or name not in ("azimuth", "field", "dip"))
     ]
     return {
-        "errors": [plots.station_errors(calibration, name) for name in names],
+        "errors": {name: plots.station_errors(calibration, name) for name in names},
         "missing": missing,
         "deviations": plots.deviations(calibration, _limit(calibration)),
         "orders": (
             plots.order_errors(calibration.orders)
             if _compared(calibration) and _judged(calibration)
-            else ""
+            else None
         ),
         "accuracy": plots.accuracy(accuracy_map(calibration), angles(calibration)),
     }
@@ -299,7 +216,7 @@ def _judged(calibration: Calibration) -> bool:
 def _decimals(calibration: Calibration) -> dict[str, int]:
     """Decimals of the station table: two significant digits of what is left after the fit."""
     return {
-        row.observable: min(max(1 - _exponent(row.after), 0), 9) if row.after > 0 else 3
+        row.observable: min(max(1 - exponent(row.after), 0), 9) if row.after > 0 else 3
         for row in calibration.errors
     }
 
@@ -307,25 +224,25 @@ def _decimals(calibration: Calibration) -> dict[str, int]:
 def _parameters(calibration: Calibration) -> dict[str, Any]:
     """Parameters of each triad as rows: as factors of the raw channels where there are any."""
     try:
-        found = convert(calibration, "factors")
+        notations = convert(calibration, "factors")
     except InputError:
         tables = {triad.name: _own_rows(triad) for triad in calibration.triads}
         return {"notation": "record", "tables": tables}
-    tables = {triad.name: _factor_rows(triad, found[triad.name]) for triad in calibration.triads}
+    tables = {
+        triad.name: _factor_rows(triad, notations[triad.name]) for triad in calibration.triads
+    }
     return {"notation": "factors", "tables": tables}
 
 
 def _row(name: str, index: str, power: int, value: float, sd: float | None, symbol: str) -> Any:
-    per = "" if power == 0 else "/°C" + (str(power).translate(SUPERSCRIPT) if power > 1 else "")
-    shown = ("0", HELD) if is_held(value, sd) else measured(value, sd)
-    course = "" if power == 0 else "τ" + (str(power).translate(SUPERSCRIPT) if power > 1 else "")
+    shown, uncertainty = ("0", HELD) if is_held(value, sd) else measured(value, sd)
     return {
         "name": name,
         "index": index,
-        "course": course,
-        "value": shown[0],
-        "sd": shown[1],
-        "unit": symbol + per,
+        "course": raised("τ", power),
+        "value": shown,
+        "sd": uncertainty,
+        "unit": symbol + raised("/°C", power),
     }
 
 
@@ -351,15 +268,15 @@ def _stated(uncertainty: float) -> float | None:
     return None if np.isnan(uncertainty) else uncertainty
 
 
-def _factor_rows(triad: TriadCalibration, found: Notation) -> list[Any]:
+def _factor_rows(triad: TriadCalibration, notation: Notation) -> list[Any]:
     raw = "raw" if _unit(triad) == "1" else f"raw/{triad.unit}"
     units, channels = {"SF": raw, "B": _unit(triad), "m": "1"}, "xyz"
     rows = []
-    for name, values in found.values.items():
+    for name, values in notation.values.items():
         for i, j in np.ndindex(values.shape):
             if name == "m" and i == j:
                 continue
-            sd = _stated(float(found.uncertainty[name][i, j]))
+            sd = _stated(float(notation.uncertainty[name][i, j]))
             index = channels[i] + channels[j] if name == "m" else channels[i]
             power = 0 if name == "m" else j
             rows.append(_row(name, index, power, float(values[i, j]), sd, units[name]))
@@ -377,7 +294,7 @@ def _accuracy(calibration: Calibration) -> dict[str, Any]:
     for inclination, temperature in cases:
         at = [float(np.radians(inclination))]
         both = [accuracy_at(calibration, at, noise, temperature) for noise in (False, True)]
-        pairs = [[_degrees(found[name][0]) for found in both] for name in names]
+        pairs = [[_degrees(sd[name][0]) for sd in both] for name in names]
         rows.append({"inclination": inclination, "temperature": temperature, "pairs": pairs})
     return {"names": names, "rows": rows, "temperature": middle}
 

@@ -54,7 +54,7 @@ class Terms:
     @property
     def chance(self) -> Array:
         """Probability (B, t, k) of so large a term by noise alone; NaN where there is none to test."""
-        return _chance(self.square, self.freedom, self.scatter[..., None], self.rest[..., None])
+        return f_test(self.square, self.freedom, self.scatter[..., None], self.rest[..., None])
 
     @property
     def present(self) -> Bools:
@@ -74,8 +74,11 @@ class Terms:
         return np.where(usable[..., None], np.maximum(excess, 0.0), 0.0)
 
 
-def _chance(square: Array, freedom: Array, scatter: Array, rest: Array) -> Array:
-    """Probability of so large a χ² by noise alone: Fisher's F."""
+def f_test(square: Array, freedom: Array, scatter: Array, rest: Array) -> Array:
+    """Probability of so large a χ² of `freedom` by noise alone: Fisher's F.
+
+    Against a `scatter` that `rest` degrees of freedom tell of. NaN where there is nothing to test.
+    """
     from scipy.special import fdtrc
 
     tested = (freedom > 0) & (rest >= 1)
@@ -94,9 +97,9 @@ def terms_beyond(result: Fit) -> Terms:
     memo = result.problem.memo.at(result.state)
     if "terms" not in memo.besides:
         memo.besides["terms"] = _every_term(result)
-    found = memo.besides["terms"]
-    square, freedom = found[:2]
-    size, noise = (np.moveaxis(found[at : at + 2], 0, -1) for at in (2, 4))
+    each = memo.besides["terms"]
+    square, freedom = each[:2]
+    size, noise = (np.moveaxis(each[at : at + 2], 0, -1) for at in (2, 4))
     factor, known = result.analysis.variance_factor, result.analysis.freedom
     rest = known - freedom.sum(-1)
     left = np.nan_to_num(factor * known) - square.sum(-1)
@@ -112,20 +115,20 @@ def _every_term(result: Fit) -> Array:
     highest = highest_order(result.problem.temperature)
     count = min(int(highest.max()), TRIED)
     triads, orders = len(result.problem.triads), orders_of(result)
-    found = np.zeros((6, len(highest), triads, TRIED))
+    each = np.zeros((6, len(highest), triads, TRIED))
     least = min(orders)
     if count <= least:
-        return found
+        return each
     shown = (np.arange(1, count + 1) <= highest[:, None])[:, least:]
     whole, pulled = _with_terms(result, shown, least)
     every = np.arange(whole.shape[-1])
     columns = every[-6 * triads * (count - least) :].reshape(count - least, triads, 6)
     for index, order in enumerate(orders):
         if order < count:
-            own = columns[:, index].ravel()
-            fitted, tested = np.setdiff1d(every, own), own[6 * (order - least) :]
-            found[:, :, index, order:count] = _in_turn(whole, pulled, tested, fitted)
-    return found
+            higher = columns[:, index].ravel()
+            fitted, tested = np.setdiff1d(every, higher), higher[6 * (order - least) :]
+            each[:, :, index, order:count] = _in_turn(whole, pulled, tested, fitted)
+    return each
 
 
 def _with_terms(result: Fit, shown: Bools, least: int) -> tuple[Array, Array]:
@@ -150,13 +153,13 @@ def _with_terms(result: Fit, shown: Bools, least: int) -> tuple[Array, Array]:
     width = columns.shape[-1]
     cross = summed(weighed @ linear.design, turned).reshape(members, count * width, -1)
     pairs = (powers[..., None] * powers[..., None, :]).reshape(members, stations, -1)
-    own = summed(weighed @ columns, np.swapaxes(pairs, -1, -2))
-    own = np.swapaxes(own.reshape(members, count, count, width, width), 2, 3)
-    own = own.reshape(members, count * width, count * width)
+    powered = summed(weighed @ columns, np.swapaxes(pairs, -1, -2))
+    powered = np.swapaxes(powered.reshape(members, count, count, width, width), 2, 3)
+    powered = powered.reshape(members, count * width, count * width)
     pulled = -summed(weighed @ linear.residual[..., None], turned).reshape(members, -1)
     normal = linear.normal
     top = np.concatenate([normal.information, np.swapaxes(cross, -1, -2)], -1)
-    whole = np.concatenate([top, np.concatenate([cross, own], -1)], -2)
+    whole = np.concatenate([top, np.concatenate([cross, powered], -1)], -2)
     return whole, np.concatenate([-normal.gradient, pulled], -1)
 
 
@@ -169,10 +172,10 @@ def steady_columns(problem: Problem, state: State) -> Array:
         slope = triad.model.slope(state.params[:, where], triad.raw, problem.temperature)
         weight = problem.evidence.include[..., None] / triad.sd
         back = inverse(slope) * weight[..., None]
-        own, first = slice(3 * index, 3 * index + 3), 6 * index
-        columns[..., own, first : first + 3] = back * target[..., None, :]
+        axes, first = slice(3 * index, 3 * index + 3), 6 * index
+        columns[..., axes, first : first + 3] = back * target[..., None, :]
         strength = np.linalg.norm(target, axis=-1)[..., None, None]
-        columns[..., own, first + 3 : first + 6] = back * strength
+        columns[..., axes, first + 3 : first + 6] = back * strength
     return columns
 
 
@@ -204,7 +207,7 @@ def _in_turn(whole: Array, pulled: Array, tested: Ints, fitted: Ints) -> Array:
     right = np.concatenate([cross, pulled[:, fitted, None]], -1)
     both = np.concatenate([whole[:, tested][:, :, tested], pulled[:, tested, None]], -1)
     both = both - np.swapaxes(cross, -1, -2) @ np.linalg.solve(base, right)
-    found = []
+    terms = []
     for first in range(0, len(tested), 6):
         at = slice(first, first + 6)
         values, vectors = eigen(both[:, at, at])
@@ -218,9 +221,9 @@ def _in_turn(whole: Array, pulled: Array, tested: Ints, fitted: Ints) -> Array:
         scale = norm[:, tested[at]] ** 2
         sizes = [step[..., -1] ** 2, np.einsum("bii->bi", back)]
         means = [_mean(each / scale, worth * scale) for each in sizes]
-        found.append(np.concatenate([np.stack([square, kept.sum(-1)]), *means]))
+        terms.append(np.concatenate([np.stack([square, kept.sum(-1)]), *means]))
         both = both - both[:, :, at] @ step
-    return np.stack(found, -1)
+    return np.stack(terms, -1)
 
 
 def untested(result: Fit) -> Bools:
@@ -245,7 +248,7 @@ def course_misfit(result: Fit, terms: Terms | None = None) -> Array:
     passes its share of it on to the fit.
     """
     terms = terms or terms_beyond(result)
-    problem, found = result.problem, []
+    problem, variances = result.problem, []
     for index, order in enumerate(orders_of(result)):
         powers = np.arange(1, TRIED + 1)
         counted = terms.present[:, index] | (powers == order + 1)
@@ -255,8 +258,8 @@ def course_misfit(result: Fit, terms: Terms | None = None) -> Array:
         known = np.einsum("bk,bks->bs", share, terms.variance[:, index])
         untested = (terms.freedom[:, index, order : order + 1] == 0) & (order > 1)
         expected = smooth[:, order : order + 1] * _next_term(result, index)
-        found.append(np.where(untested, expected, known))
-    return np.stack(found, 1)
+        variances.append(np.where(untested, expected, known))
+    return np.stack(variances, 1)
 
 
 def _next_term(result: Fit, index: int) -> Array:
@@ -306,9 +309,9 @@ def _left_out(problem: Problem, order: int) -> tuple[Array, Array]:
 def misfit_covariance(result: Fit, terms: Terms | None = None) -> Array:
     """Covariance (B, p, p) of the fit's parameters that stands for what its order leaves out."""
     problem, params = result.problem, result.state.params
-    found = np.zeros((*params.shape, params.shape[-1]))
+    covariance = np.zeros((*params.shape, params.shape[-1]))
     if not highest_order(problem.temperature).any():
-        return found
+        return covariance
     variance = course_misfit(result, terms)
     for index, (triad, where) in enumerate(zip(problem.triads, problem.slices(), strict=True)):
         target = problem.targets(result.state)[index]
@@ -321,5 +324,5 @@ def misfit_covariance(result: Fit, terms: Terms | None = None) -> Array:
         every = [np.stack(gains, 1), offsets * strength[:, None, None]]
         for place, rows in enumerate(every):
             spread = np.swapaxes(rows, -1, -2) @ rows
-            found[:, where, where] += spread * variance[:, index, place, None, None]
-    return found
+            covariance[:, where, where] += spread * variance[:, index, place, None, None]
+    return covariance

@@ -13,16 +13,15 @@ from itertools import combinations
 
 import numpy as np
 
-from mwdcal.calibration.automatic.order_selection import misfit
+from mwdcal.calibration.automatic.order_selection import misfit, with_noise
 from mwdcal.calibration.estimate import fit, scatters
-from mwdcal.calibration.options import Options
+from mwdcal.calibration.options import AUTO, USUAL, Options
 from mwdcal.calibration.readings import TRIADS, Readings
+from mwdcal.estimation.batch import batch_of_one, mapped
 from mwdcal.estimation.variance import log_evidence
-from mwdcal.geometry.vectors import Array
+from mwdcal.geometry.vectors import Array, Ints
 from mwdcal.sensor.profile import Profile
 
-USUAL = 0.005
-"""Prior of own-axis terms, as a share of the field, where they are asked for and none is declared."""
 BETTER = 0.98
 """Left-out χ² must fall to this share before own-axis terms are taken…"""
 CLEAR = 2.0
@@ -52,124 +51,146 @@ class CurveScore:
     odds: float | None = None
 
 
+@dataclass(frozen=True)
+class Curves:
+    """The choice of own-axis terms of B tools among `choices`, by what speaks for each.
+
+    `chosen` (B,) is the place of the choice; `score` (B, choices) are χ² of stations left out, or
+    `odds`: natural logarithms of the probability over that without terms.
+    """
+
+    choices: list[tuple[str, ...]]
+    chosen: Ints
+    score: Array
+    odds: bool
+
+    def table(self, member: int) -> list[CurveScore]:
+        """What spoke for each choice of one tool; nothing where there was none to make."""
+        if len(self.choices) < 2:
+            return []
+        values = self.score[member] / (np.log(10) if self.odds else 1.0)
+        return [
+            CurveScore(
+                triads,
+                None if self.odds else float(value),
+                place == self.chosen[member],
+                float(value) if self.odds else None,
+            )
+            for place, (triads, value) in enumerate(zip(self.choices, values, strict=True))
+        ]
+
+
 def declared(profile: Profile, options: Options) -> dict[str, float]:
     """Triads whose profile declares a nonlinearity and whose model can have it, with its prior.
 
     Only the polynomial model has such terms, and only the common estimator their prior.
     """
-    found: dict[str, float] = {}
-    if options.own_solver:
-        return found
-    for name, order in zip(TRIADS, options.orders, strict=True):
-        value = getattr(profile, name).nonlinearity
-        if value and options.kind(order) == "polynomial":
-            found[name] = value
-    return found
+    values = {name: getattr(profile, name).nonlinearity for name in TRIADS}
+    return {
+        name: values[name]
+        for name, order in zip(TRIADS, options.orders, strict=True)
+        if values[name] and options.kind(order) == "polynomial" and not options.own_solver
+    }
 
 
-def with_nonlinearity(options: Options, profile: Profile) -> Options:
-    """The options with the own-axis terms that the profile declares, unless they say otherwise."""
-    if options.nonlinearity is not None:
+def offered(profile: Profile, options: Options) -> dict[str, float]:
+    """Own-axis terms that are left to the run to take or leave: none beside a prior."""
+    auto = options.nonlinearity == AUTO and options.prior is None
+    return declared(profile, options) if auto else {}
+
+
+def with_strengths(options: Options, profile: Profile) -> Options:
+    """The options with the prior of own-axis terms asked for by name: the profile's, or the usual."""
+    if isinstance(options.nonlinearity, Mapping) or options.nonlinearity == AUTO:
         return options
-    return replace(options, nonlinearity=declared(profile, options))
+    strength = {n: getattr(profile, n).nonlinearity or USUAL for n in options.nonlinearity}
+    return replace(options, nonlinearity=strength)
 
 
-def with_chosen_curves(
-    readings: Readings, options: Options, offered: Mapping[str, float]
-) -> tuple[Options, list[CurveScore]]:
-    """The options with those of the offered own-axis terms that the run speaks for, and the table.
+def scattered(readings: Readings, options: Options) -> Options:
+    """The options under which own-axis terms are tried, and fitted or not.
 
-    Where terms are offered and the noise is estimated, so is the scatter from station to station.
+    Where the noise is estimated, so is the scatter from station to station.
     """
-    if not offered:
-        return replace(options, nonlinearity={}), []
-    options = replace(options, scatter=True)
-    options = replace(options, scatter=scatters(readings, options))
-    found, table = choose_curves(readings, options, offered)
-    return replace(options, nonlinearity=found), table
+    options = replace(options, nonlinearity={}, scatter=True)
+    return replace(options, scatter=scatters(readings, options))
 
 
 def choose_curves(
-    readings: Readings, options: Options, offered: Mapping[str, float]
+    readings: Readings, options: Options, terms: Mapping[str, float]
 ) -> tuple[dict[str, float], list[CurveScore]]:
-    """Of the offered own-axis terms those that the run speaks for clearly, and the table."""
-    choices = choices_of(readings, offered)
+    """Of the offered own-axis terms those that one run shows clearly, and the table."""
+    curves = compare_curves(batch_of_one(readings), options, terms)
+    chosen = curves.choices[curves.chosen[0]]
+    return {name: terms[name] for name in chosen}, curves.table(0)
+
+
+def compare_curves(readings: Readings, options: Options, terms: Mapping[str, float]) -> Curves:
+    """Which of the offered own-axis terms each run (B, n, …) shows clearly."""
+    choices, count = choices_of(readings, terms), len(readings.accelerometer)
     if len(choices) == 1:
-        return {}, []
-    if not any(name in readings.sd for name in TRIADS):
-        every = {name: offered[name] for name in choices[-1]}
-        odds = float(log_odds(readings, options, every, _trusted(readings, options, every))[0])
-        taken = odds > ODDS
-        table = [
-            CurveScore((), None, not taken, 0.0),
-            CurveScore(choices[-1], None, taken, odds / float(np.log(10))),
-        ]
-        return (every if taken else {}), table
-    best, table = _by_left_out(readings, options, offered, choices)
-    return {n: offered[n] for n in choices[best]}, table
+        return Curves(choices, np.zeros(count, int), np.zeros((count, 1)), False)
+    every = {name: terms[name] for name in choices[-1]}
+    if any(name in readings.sd for name in TRIADS):
+        each = [{name: terms[name] for name in choice} for choice in choices]
+        chosen, score = _by_left_out(readings, options, each)
+        return Curves(choices, chosen, score, False)
+    odds = log_odds(readings, options, every, _trusted(readings, options, every))
+    score = np.stack([np.zeros(count), odds], -1)
+    return Curves([(), choices[-1]], np.asarray(odds > ODDS, int), score, True)
 
 
-def choices_of(readings: Readings, offered: Mapping[str, float]) -> list[tuple[str, ...]]:
+def choices_of(readings: Readings, terms: Mapping[str, float]) -> list[tuple[str, ...]]:
     """Which triads may have terms: none first, then each offered one that the run has, then both."""
-    names = [name for name in TRIADS if name in offered and getattr(readings, name) is not None]
+    names = [name for name in TRIADS if name in terms and getattr(readings, name) is not None]
     return [c for count in range(len(names) + 1) for c in combinations(names, count)]
 
 
 def log_odds(
-    readings: Readings, options: Options, offered: Mapping[str, float], include: Array
+    readings: Readings, options: Options, terms: Mapping[str, float], include: Array
 ) -> Array:
     """Logarithm (B,) of how much more probable all offered terms make the readings than none.
 
     `include` (B, n) as of `fit`.
     """
-    found = []
-    for terms in ({}, dict(offered)):
-        result = fit(readings, replace(options, robust=None, nonlinearity=terms), include)
-        found.append(log_evidence(result.problem, result.state))
-    return np.nan_to_num(found[1] - found[0], nan=-np.inf)
+    evidence = []
+    for curved in ({}, terms):
+        result = fit(readings, replace(options, robust=None, nonlinearity=curved), include)
+        evidence.append(log_evidence(result.problem, result.state))
+    return np.nan_to_num(evidence[1] - evidence[0], nan=-np.inf)
 
 
-def _trusted(readings: Readings, options: Options, offered: Mapping[str, float]) -> Array:
-    """Stations (1, n) that may decide: all, or those that a robust fit with all terms trusts."""
+def _trusted(readings: Readings, options: Options, terms: Mapping[str, float]) -> Array:
+    """Stations (B, n) that may decide: all, or those that a robust fit with all terms trusts."""
     if not options.robust:
-        return np.ones((1, readings.count))
-    every = replace(options, nonlinearity=dict(offered))
-    return np.asarray(fit(readings, every).trust > TRUSTED, float)
+        return np.ones(readings.accelerometer.shape[:-1])
+    return np.asarray(fit(readings, replace(options, nonlinearity=terms)).trust > TRUSTED, float)
 
 
 def _by_left_out(
-    readings: Readings,
-    options: Options,
-    offered: Mapping[str, float],
-    choices: Sequence[tuple[str, ...]],
-) -> tuple[int, list[CurveScore]]:
-    """The choice by χ² of stations left out, and the table.
+    readings: Readings, options: Options, choices: Sequence[Mapping[str, float]]
+) -> tuple[Ints, Array]:
+    """The choices (B,) by χ² of stations left out, and its mean (B, choices).
 
     More terms are taken only if they lower χ² clearly below that of fewer: by 2 %, and by two
     standard errors.
     """
-    every = replace(options, nonlinearity={n: offered[n] for n in choices[-1]})
-    noise = dict(zip(TRIADS, fit(readings, every).noise[0], strict=False))
-    found = {name: np.array(sd) for name, sd in noise.items() if np.isfinite(sd)}
-    readings = replace(readings, sd={**readings.sd, **found})
-    scores = [
-        _left_out(readings, replace(options, nonlinearity={n: offered[n] for n in choice}))
-        for choice in choices
-    ]
-    best = 0
+    readings = with_noise(readings, replace(options, nonlinearity=choices[-1]))
+    scores = [_left_out(readings, replace(options, nonlinearity=terms)) for terms in choices]
+    best, least = np.zeros(len(scores[0]), int), scores[0]
     for index, score in enumerate(scores):
-        gain = scores[best] - score
-        error = gain.std(ddof=1) / np.sqrt(len(gain))
-        if score.mean() < BETTER * scores[best].mean() and gain.mean() > CLEAR * error:
-            best = index
-    pairs = enumerate(zip(choices, scores, strict=True))
-    return best, [CurveScore(c, float(score.mean()), i == best) for i, (c, score) in pairs]
+        gain = least - score
+        error = gain.std(-1, ddof=1) / np.sqrt(readings.count)
+        better = (score.mean(-1) < BETTER * least.mean(-1)) & (gain.mean(-1) > CLEAR * error)
+        best, least = np.where(better, index, best), np.where(better[:, None], score, least)
+    return best, np.stack([score.mean(-1) for score in scores], -1)
 
 
 def _left_out(readings: Readings, options: Options) -> Array:
-    """χ² per reading (n,) of stations, each judged by the fit without its part."""
+    """χ² per reading (B, n) of stations, each judged by the fit without its part."""
     parts = min(readings.count, PARTS)
-    own = np.arange(readings.count) % parts
-    include = (np.arange(parts)[:, None] != own).astype(float)
-    result = fit(readings, options, include)
-    return np.asarray(misfit(result)[own, np.arange(readings.count)].mean(-1) / 3)
+    part = np.arange(readings.count) % parts
+    include = (np.arange(parts)[:, None] != part).astype(float)
+    result = fit(mapped(lambda value: np.expand_dims(value, 1), readings), options, include)
+    square = misfit(result).mean(-1).reshape(-1, parts, readings.count) / 3
+    return np.asarray(square[:, part, np.arange(readings.count)])

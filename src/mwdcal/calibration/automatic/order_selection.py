@@ -18,7 +18,7 @@ from mwdcal.calibration.readings import TRIADS, Readings
 from mwdcal.calibration.record import OrderScore
 from mwdcal.calibration.residuals import shown_in
 from mwdcal.calibration.soaks import HIGHEST, highest_order, usable_soaks
-from mwdcal.estimation.batch import batch_of_one, mapped
+from mwdcal.estimation.batch import batch_of_one, mapped, take
 from mwdcal.estimation.problem import Problem, State
 from mwdcal.estimation.solvers import Linear
 from mwdcal.estimation.uncertainty import TESTED, marginal_rank, readjusted
@@ -33,12 +33,12 @@ LOWEST_RANK = 8
 def choose_order(
     readings: Readings, options: Options, progress: Callable[[str], None]
 ) -> tuple[Orders, list[OrderScore]]:
-    """Each triad's lowest order above which noise explains all terms, and the tables.
+    """Each triad's lowest order above which noise explains all terms, and the tables, of one run.
 
     Order 0 without a table where there is no temperature, or too short a span of it.
     """
     batch = batch_of_one(readings)
-    levels = int(judged_soaks(batch, options)[0])
+    levels = int(_judged_soaks(batch, options)[0])
     if levels < 2:
         return 0, []
     progress(f"temperature order: testing its terms over {levels} temperatures")
@@ -49,32 +49,27 @@ def choose_order(
             "residuals beyond the noise. A third temperature would test the course between."
         )
     orders = [(order, order) for order in range(_highest(batch, options) + 1)]
-    judged = [pair for pair in orders if pair[0] + 2 <= levels and levels >= FEWEST]
-    batch = _with_noise(batch, replace(options, order=orders[-1]))
-    found = _compared(batch, options, judged, progress)
-    every = np.full((len(orders), *found.shape[1:]), np.nan)
-    every[: len(judged)] = found
+    batch = with_noise(batch, replace(options, order=orders[-1]))
     pair = (int(chosen[0, 0]), int(chosen[0, -1]))
-    return pair, _tables(readings, orders, every, chosen[0], chance[0])
+    return pair, _scores(batch, options, orders, chosen[0], chance[0], progress)
 
 
-def judged_soaks(readings: Readings, options: Options) -> Ints:
+def choose_orders(readings: Readings, options: Options) -> Ints:
+    """Orders (B, 2) of accelerometer and magnetometer of a batch, as `choose_order` has them."""
+    levels = _judged_soaks(readings, options)
+    orders = np.zeros((len(levels), 2), int)
+    for count in np.unique(levels[levels > 1]):
+        alike = np.flatnonzero(levels == count)
+        orders[alike] = _tested(take(readings, alike), options)[0][:, [0, -1]]
+    return orders
+
+
+def _judged_soaks(readings: Readings, options: Options) -> Ints:
     """Soaks (B,) by which the order of each member is judged; 1: it has order 0 without a trial."""
     levels = _usable_soaks(readings).max(-1) + 1
-    wide = np.flatnonzero(levels > 1)
-    if wide.size:
+    if (levels > 1).any():
         levels = np.where(_hopeless(readings, options), 1, levels)
     return np.asarray(levels)
-
-
-def choose_orders(readings: Readings, options: Options, levels: int) -> Ints:
-    """Orders (B, 2) of accelerometer and magnetometer, as `choose_order` has them for each alone.
-
-    All members have the same number of `judged_soaks`.
-    """
-    if levels < 2:
-        return np.zeros((len(readings.accelerometer), 2), int)
-    return _tested(readings, options)[0][:, [0, -1]]
 
 
 def _tested(readings: Readings, options: Options) -> tuple[Ints, Array]:
@@ -107,15 +102,18 @@ def order_errors(
     None where there are too few soaks to leave one out.
     """
     batch = batch_of_one(readings)
-    levels = int(judged_soaks(batch, options)[0])
-    if levels < max(FEWEST, max(options.orders) + 2):
+    if _judged_soaks(batch, options)[0] < _needed(options.orders):
         return []
     yardstick = options if options.prior else replace(options, order=_highest(batch, options))
-    found = _compared(_with_noise(batch, yardstick), options, [options.orders], progress)
-    triads = found.shape[2]
-    unknown = np.full((triads, HIGHEST), np.nan)
-    chosen = np.array(options.orders[:triads])
-    return _tables(readings, [options.orders], found, chosen, unknown)
+    chosen = np.array(options.orders[: 1 + (readings.magnetometer is not None)])
+    untested = np.full((len(chosen), HIGHEST), np.nan)
+    batch = with_noise(batch, yardstick)
+    return _scores(batch, options, [options.orders], chosen, untested, progress)
+
+
+def _needed(orders: tuple[int, int]) -> int:
+    """Soaks with which orders can be judged by one left out."""
+    return max(FEWEST, max(orders) + 2)
 
 
 def _usable_soaks(readings: Readings) -> Ints:
@@ -137,81 +135,55 @@ def _highest(readings: Readings, options: Options) -> int:
     return int(_highest_each(readings, options).max())
 
 
-def _compared(
+def _scores(
     readings: Readings,
     options: Options,
     orders: Sequence[tuple[int, int]],
-    progress: Callable[[str], None],
-) -> Array:
-    """Mean squares (orders, B, triads, 5, soaks) of `_held_out` at some orders."""
-    numbers, found = _usable_soaks(readings), []
-    if not orders:
-        triads = sum(getattr(readings, name) is not None for name in TRIADS)
-        return np.zeros((0, len(numbers), triads, 5, int(numbers.max()) + 1))
-    for pair in orders:
-        name = " and ".join(str(order) for order in dict.fromkeys(pair))
-        progress(f"order {name}: leaving out each of {int(numbers.max()) + 1} temperatures")
-        found.append(_held_out(readings, replace(options, order=pair), numbers))
-    return np.stack(found)
-
-
-def _tables(
-    readings: Readings,
-    orders: Sequence[tuple[int, int]],
-    found: Array,
     chosen: Ints,
     chance: Array,
+    progress: Callable[[str], None],
 ) -> list[OrderScore]:
-    """The tables of all triads over some orders, from `_compared` of a batch of one.
+    """The tables of all triads over some orders, of a batch of one; blank where soaks are too few.
 
-    `chosen` (t,) and the `chance` (t, k) of each term by triad.
+    `chosen` (t,) orders and the `chance` (t, k) of each term by triad.
     """
+    numbers = _usable_soaks(readings)
+    count, squares = int(numbers.max()) + 1, []
+    for pair in orders:
+        if count < _needed(pair):
+            squares.append(np.full((len(chosen), 5, count), np.nan))
+            continue
+        name = " and ".join(str(order) for order in dict.fromkeys(pair))
+        progress(f"order {name}: leaving out each of {count} temperatures")
+        squares.append(_held_out(readings, replace(options, order=pair), numbers))
     shown = [shown_in("gravity"), shown_in("field", readings.relative)]
     return [
-        score
-        for t, name in enumerate(TRIADS[: len(chosen)])
-        for score in _scored(
-            name, [p[t] for p in orders], int(chosen[t]), found[:, 0, t], shown[t], chance[t]
-        )
+        _score(triad, pair[triad], chosen[triad], each[triad], shown[triad], chance[triad])
+        for triad in range(len(chosen))
+        for pair, each in zip(orders, squares, strict=True)
     ]
 
 
-def _scored(
-    triad: str,
-    orders: Sequence[int],
-    chosen: int,
-    found: Array,
-    shown: tuple[float, str],
-    chance: Array,
-) -> list[OrderScore]:
-    """The table of one triad from the mean squares (orders, 5, soaks) of `_held_out`."""
-    parts = (found, found[..., 1:-1] if found.shape[-1] > 2 else found, found[..., [0, -1]])
-    means = np.stack([f.mean(-1) for f in parts], -1)
+def _score(
+    triad: int, order: int, chosen: int, squares: Array, shown: tuple[float, str], chance: Array
+) -> OrderScore:
+    """One row of the table from the mean squares (5, soaks) of `_held_out`."""
+    inner = squares[:, 1:-1] if squares.shape[-1] > 2 else squares
+    means = np.stack([part.mean(-1) for part in (squares, inner, squares[:, [0, -1]])], -1)
     scale, degree = shown[0], float(np.degrees(1))
-    means[:, 1:] = np.sqrt(means[:, 1:]) * np.array([scale, scale, degree, degree])[:, None]
-    known = {k: float(v) for k, v in enumerate(chance, 1) if not np.isnan(v)}
-    rows = []
-    for index, order in enumerate(orders):
-        stated = [[None if np.isnan(v) else float(v) for v in row] for row in means[index]]
-        chi, noise, error, noise_deg, error_deg = stated
-        rows.append(
-            OrderScore(
-                triad=triad,
-                order=order,
-                chosen=order == chosen,
-                chance=known.get(order),
-                inside=chi[1],
-                ends=chi[2],
-                unit=shown[1],
-                noise=noise[0],
-                error_inside=error[1],
-                error_ends=error[2],
-                noise_deg=noise_deg[0],
-                error_inside_deg=error_deg[1],
-                error_ends_deg=error_deg[2],
-            )
-        )
-    return rows
+    means[1:] = np.sqrt(means[1:]) * np.array([scale, scale, degree, degree])[:, None]
+    chi, noise, error, noise_deg, error_deg = ([_stated(v) for v in row] for row in means)
+    return OrderScore(
+        triad=TRIADS[triad], order=order, chosen=bool(order == chosen),
+        chance=_stated(chance[order - 1]) if order else None,
+        inside=chi[1], ends=chi[2], unit=shown[1], noise=noise[0], error_inside=error[1],
+        error_ends=error[2], noise_deg=noise_deg[0], error_inside_deg=error_deg[1],
+        error_ends_deg=error_deg[2],
+    )  # fmt: skip
+
+
+def _stated(value: float) -> float | None:
+    return None if np.isnan(value) else float(value)
 
 
 def _hopeless(readings: Readings, options: Options) -> Bools:
@@ -221,25 +193,21 @@ def _hopeless(readings: Readings, options: Options) -> Bools:
     return np.asarray(np.min(ranks, 0) < LOWEST_RANK)
 
 
-def _with_noise(readings: Readings, options: Options) -> Readings:
+def with_noise(readings: Readings, options: Options) -> Readings:
     """The readings (B, n) with noise declared: where it was not, as a fit leaves it.
 
-    Every order is then judged by the same yardstick.
+    Every choice is then judged by the same yardstick.
     """
     names = [name for name in TRIADS if getattr(readings, name) is not None]
     if all(name in readings.sd for name in names):
         return readings
-    noise = fit(readings, options).noise
-    found = {
-        name: noise[:, index, None, None]
-        for index, name in enumerate(names)
-        if name not in readings.sd
-    }
-    return replace(readings, sd={**readings.sd, **found})
+    noise = dict(zip(names, np.moveaxis(fit(readings, options).noise, -1, 0), strict=True))
+    estimated = {n: sd[:, None, None] for n, sd in noise.items() if n not in readings.sd}
+    return replace(readings, sd={**readings.sd, **estimated})
 
 
 def _held_out(readings: Readings, options: Options, numbers: Ints) -> Array:
-    """Mean squares (B, triads, 5, soaks) of each soak's stations, fitted without them.
+    """Mean squares (triads, 5, soaks) of each soak's stations, fitted without them, of a batch of one.
 
     Of the reading, in units of its noise (χ²); then of noise and error per axis of the vector
     (g, nT), and of noise and error across the field (rad).
@@ -255,20 +223,17 @@ def _held_out(readings: Readings, options: Options, numbers: Ints) -> Array:
     share = linear.weigh(
         np.broadcast_to(np.eye(left.shape[-2]), (*left.shape[:-1], left.shape[-2]))
     )
-    found = []
+    squares = []
     for index, (triad, where) in enumerate(zip(problem.triads, problem.slices(), strict=True)):
-        params, own = state.params[:, where], slice(3 * index, 3 * index + 3)
+        params, axes = state.params[:, where], slice(3 * index, 3 * index + 3)
         vector = triad.model.fields(params, triad.raw, problem.temperature)[..., None]
         slope = triad.model.slope(params, triad.raw, problem.temperature) * triad.sd[..., None, :]
         strength = np.linalg.norm(vector, axis=-2, keepdims=True)
         along = vector / strength
         across = (slope - along @ (np.swapaxes(along, -1, -2) @ slope)) / strength
-        parts = left[..., own, :], share[..., own, own], held
-        found.append(
-            np.stack([chi[:, index], *_squares(slope, *parts, 3), *_squares(across, *parts, 2)])
-        )
-    whole = np.stack(found).reshape(len(found), 5, len(numbers), len(soak))
-    return np.moveaxis(whole, 2, 0)
+        parts = left[..., axes, :], share[..., axes, axes], held
+        squares.append([chi[:, index], *_squares(slope, *parts, 3), *_squares(across, *parts, 2)])
+    return np.array(squares)
 
 
 def _squares(

@@ -1,4 +1,4 @@
-"""Errors of the stand as extra unknowns: names, whether they can be told apart, what came out."""
+"""Errors of the stand as extra unknowns: their names, and whether they can be told apart."""
 
 from __future__ import annotations
 
@@ -7,10 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from mwdcal.calibration.covariance import constants_covariance
 from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.methods import ESTIMABLE
-from mwdcal.calibration.record import StandErrors
 from mwdcal.errors import FitError, InputError
 from mwdcal.estimation.batch import take
 from mwdcal.estimation.evidence import STAND_ERRORS, UNKNOWN
@@ -22,20 +20,20 @@ LOOSE = 0.1
 
 
 def check_names(names: Sequence[str], method: str) -> None:
-    """Refuse what `--estimate` cannot find, whatever the stations."""
+    """Refuse errors of the stand that cannot be estimated, whatever the stations."""
     for name in names:
         if name == "toolface-zero":
             raise FitError(
-                "--estimate toolface-zero: a zero of the stand's toolface can never be told from a "
+                "`estimate` toolface-zero: a zero of the stand's toolface can never be told from a "
                 "rotation of the sensors in the tool, whatever the stations. Set it by an index mark."
             )
         if name not in ESTIMABLE:
             raise InputError(
-                f"--estimate must be of {', '.join(ESTIMABLE)}; got {name!r}. Unknown field and dip "
+                f"`estimate` must be of {', '.join(ESTIMABLE)}; got {name!r}. Unknown field and dip "
                 "are estimated without being asked for."
             )
     if names and method != "joint":
-        raise InputError(f"--estimate needs --method joint; got {method!r}.")
+        raise InputError(f"`estimate` needs `method` joint; got {method!r}.")
 
 
 def inseparable(result: Fit) -> Bools:
@@ -56,30 +54,3 @@ def inseparable(result: Fit) -> Bools:
         still = replace(state, constants=state.constants[:, kept])
         lost[some] = Determined.of(problem, state).rank < Determined.of(bare, still).rank
     return np.asarray(lost)
-
-
-def stand_errors(result: Fit) -> StandErrors:
-    """Errors of the stand that were asked for: zeros, and tilt as amplitude and azimuth."""
-    names = [c.name if c.unknown else "" for c in result.problem.evidence.constants]
-    value = dict(zip(names, np.degrees(result.state.constants[0]), strict=True))
-    covariance = np.degrees(np.degrees(constants_covariance(result)[0]))
-    found: dict[str, float] = {}
-    for place, name in enumerate(names):
-        if name.endswith("-zero"):
-            word = name.replace("-", "_")
-            found[f"{word}_deg"] = float(value[name])
-            found[f"{word}_uncertainty_deg"] = float(np.sqrt(covariance[place, place]))
-    if "stand-north" in names:
-        pair = [names.index("stand-north"), names.index("stand-east")]
-        turn = np.array([value["stand-north"], value["stand-east"]])
-        tilt = float(np.linalg.norm(turn))
-        along = turn / tilt
-        across = np.array([-along[1], along[0]])
-        block = covariance[np.ix_(pair, pair)]
-        found["tilt_deg"] = tilt
-        found["tilt_uncertainty_deg"] = float(np.sqrt(along @ block @ along))
-        found["tilt_azimuth_deg"] = float(np.degrees(np.arctan2(-turn[0], turn[1])) % 360)
-        found["tilt_azimuth_uncertainty_deg"] = float(
-            np.degrees(np.sqrt(across @ block @ across) / tilt)
-        )
-    return StandErrors(**found)

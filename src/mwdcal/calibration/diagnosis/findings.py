@@ -8,7 +8,6 @@ from functools import partial
 import numpy as np
 
 from mwdcal.calibration.automatic.courses import Terms, misfit_size, terms_beyond, untested
-from mwdcal.calibration.covariance import common_source
 from mwdcal.calibration.diagnosis import plausibility
 from mwdcal.calibration.diagnosis.flags import FittedRuns, Flag
 from mwdcal.calibration.diagnosis.structure import described as seen_as
@@ -16,6 +15,7 @@ from mwdcal.calibration.diagnosis.structure import effects, suspected
 from mwdcal.calibration.readings import TRIADS
 from mwdcal.calibration.record import Finding
 from mwdcal.calibration.residuals import REASONS, shown_in
+from mwdcal.calibration.results import common_source
 from mwdcal.calibration.soaks import HIGHEST
 from mwdcal.estimation.rank import free_directions
 from mwdcal.geometry.vectors import Bools
@@ -268,7 +268,7 @@ def _undetermined(fitted: FittedRuns) -> Iterator[Flag]:
 
 def _prior(fitted: FittedRuns) -> Iterator[Flag]:
     """Parameters that rest on the prior alone, and whether run and prior agree."""
-    prior, constants = fitted.options.prior, fitted.result.problem.evidence.constants
+    prior, constants = fitted.options.knowledge, fitted.result.problem.evidence.constants
     if prior is None:
         return
     declared = {common_source(c.name) for c in constants if not c.unknown}
@@ -321,7 +321,7 @@ def _model(fitted: FittedRuns) -> Iterator[Flag]:
     ignored = [
         name
         for name, triad in zip(TRIADS, fitted.result.problem.triads, strict=False)
-        if name not in (options.nonlinearity or {})
+        if name not in options.curved
         and triad.model.kind == "factors"
         and getattr(fitted.profile, name).nonlinearity
     ]

@@ -17,7 +17,7 @@ from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import StationRow
-from mwdcal.calibration.residuals import station_rows
+from mwdcal.calibration.residuals import Residuals
 from mwdcal.estimation.batch import batch_of_one, take
 from mwdcal.estimation.rank import Free, free_directions
 from mwdcal.geometry.vectors import Array, Bools, Ints
@@ -54,7 +54,7 @@ class FittedRuns:
     result: Fit
     free: list[list[Free]]
     alone: Alone
-    _rows: dict[int, list[StationRow]] = field(init=False, repr=False, default_factory=dict)
+    _residuals: dict[int, Residuals] = field(init=False, repr=False, default_factory=dict)
 
     @classmethod
     def of(
@@ -96,8 +96,12 @@ class FittedRuns:
         """The fit of one run, as a batch of one."""
         return self.result if self.count == 1 else take(self.result, np.array([place]))
 
+    def residuals(self, place: int) -> Residuals:
+        """The errors of one run."""
+        if place not in self._residuals:
+            self._residuals[place] = Residuals(self.alone(place)[0], self.member(place))
+        return self._residuals[place]
+
     def rows(self, place: int) -> list[StationRow]:
         """The stations of one run."""
-        if place not in self._rows:
-            self._rows[place] = station_rows(self.alone(place)[0], self.member(place))
-        return self._rows[place]
+        return self.residuals(place).stations

@@ -29,7 +29,7 @@ from mwdcal.calibration.methods import EVIDENCE
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import CONSTANTS, EARTH, TRIADS, Readings
 from mwdcal.calibration.residuals import shown_in
-from mwdcal.calibration.soaks import HIGHEST, soaks
+from mwdcal.calibration.soaks import soaks
 from mwdcal.errors import FitError, InputError
 from mwdcal.estimation.batch import batch_of_one
 from mwdcal.estimation.robust import LOSSES
@@ -96,7 +96,7 @@ def check_options(options: Options) -> None:
         raise InputError(
             f"--robust cannot weigh the stations of {minimiser}. Use --method joint with it."
         )
-    if options.own_solver and options.nonlinearity:
+    if options.own_solver and options.curved:
         raise InputError(
             f"--nonlinearity cannot be combined with {minimiser}: own-axis terms need their prior. Use "
             "--method joint, or --nonlinearity none."
@@ -116,8 +116,8 @@ def check_options(options: Options) -> None:
             "--paper-weights: method joint does not come from a paper. Name the paper's method: least-squares, "
             "swarm, newton, toolface-inclination or scalar."
         )
-    if options.prior and (options.own_solver or options.nonlinearity):
-        what = "own-axis nonlinearity" if options.nonlinearity else minimiser
+    if options.prior and (options.own_solver or options.curved):
+        what = "own-axis nonlinearity" if options.curved else minimiser
         raise InputError(
             f"--prior cannot be combined with {what}. Use --method joint, without "
             "--paper-weights and with --nonlinearity none."
@@ -127,25 +127,11 @@ def check_options(options: Options) -> None:
 def _check_curved_models(options: Options) -> None:
     """Refuse own-axis terms of a model that has none."""
     for name, order in zip(TRIADS, options.orders, strict=True):
-        if name in (options.nonlinearity or {}) and options.kind(order) != "polynomial":
+        if name in options.curved and options.kind(order) != "polynomial":
             raise InputError(
                 f"--nonlinearity {name}: the model of factors has no own-axis terms. Use "
                 "--model polynomial with it."
             )
-
-
-def check_order(asked: str) -> None:
-    """Refuse anything but a temperature order or "auto"."""
-    if asked not in ("auto", *map(str, range(HIGHEST + 1))):
-        raise InputError(f"--order must be 0, 1, 2, 3 or auto; got {asked!r}.")
-
-
-def check_curve_names(asked: str, wanted: Sequence[str]) -> None:
-    """Refuse own-axis terms of anything but a triad."""
-    if not wanted or not set(wanted) <= set(TRIADS):
-        raise InputError(
-            f"--nonlinearity must be auto, none, {' or '.join(TRIADS)}; got {asked!r}."
-        )
 
 
 def check_curves(readings: Readings, wanted: Sequence[str]) -> None:
@@ -173,8 +159,8 @@ def reading_refusals(readings: Readings, options: Options, run: Run) -> Iterator
     yield _few_stations(readings, options, run)
     yield _common_errors(readings, options)
     for triad in TRIADS:
-        yield from _channels(readings, triad, options.prior is not None, run)
-    if options.prior is None or options.prior.temperature is None:
+        yield from _channels(readings, triad, options.knowledge is not None, run)
+    if options.knowledge is None or options.knowledge.temperature is None:
         yield from _temperatures(readings, max(options.orders))
     needed = _references(options.method, readings.magnetometer is not None)
     for name in needed:
@@ -200,7 +186,7 @@ def _few_stations(readings: Readings, options: Options, run: Run) -> Flag:
             f"attitudes{', or lower --order' if highest else ''}."
         )
 
-    few = 3 * readings.count < size and options.prior is None
+    few = 3 * readings.count < size and options.knowledge is None
     return Flag("too-few-stations", _all(readings, few), sentence)
 
 

@@ -15,12 +15,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mwdcal.calibration.automatic.courses import TRIED, steady_columns, temperature_powers
-from mwdcal.calibration.covariance import variance_scales
+from mwdcal.calibration.automatic.courses import TRIED, f_test, steady_columns, temperature_powers
 from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.evidence import STAND_TURNS, acts_on
 from mwdcal.calibration.readings import TRIADS
 from mwdcal.calibration.residuals import chances, to_reshoot
+from mwdcal.calibration.results import variance_scales
 from mwdcal.calibration.soaks import HIGHEST, SPAN, highest_order
 from mwdcal.estimation.problem import Problem, State
 from mwdcal.estimation.uncertainty import whole_covariance
@@ -175,8 +175,6 @@ def _trial(
     scores: _Scores, chosen: list[str], name: str, left: float, freedom: float
 ) -> tuple[float, float, int]:
     """Chance in noise, gain and directions of one more family, of misfit `left`."""
-    from scipy.special import fdtrc
-
     before = scores.gain(chosen) if chosen else (0.0, 0)
     after = scores.gain([*chosen, name])
     gain, directions = after[0] - before[0], after[1] - before[1]
@@ -184,11 +182,8 @@ def _trial(
     if directions < 1 or rest < 1:
         return 1.0, 0.0, 0
     gain = min(gain, left * (1 - 1e-9))
-    return (
-        float(fdtrc(directions, rest, gain / directions / ((left - gain) / rest))),
-        gain,
-        directions,
-    )
+    chance = f_test(*np.array([gain, directions, (left - gain) / rest, rest]))
+    return float(chance), gain, directions
 
 
 def _described(result: Fit, shown: list[tuple[str, float, float]]) -> list[Effect]:

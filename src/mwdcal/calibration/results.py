@@ -1,0 +1,344 @@
+"""What a fit states of its tools, as arrays: a calibration file is one row of them, a fleet table all.
+
+Parameters, their uncertainties, constants of the run, errors of the stand; and the covariance, by
+source of error. What the readings' noise and the settings of the stand do is independent from
+station to station and scales with s². Errors that all stations have in common (zeros and tilt of
+the stand, the references for gravity, field and dip) and a prior are as large as they were
+declared: no residual says how large they are. What the order of the temperature terms leaves out
+is added to both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from mwdcal.calibration.automatic.courses import misfit_covariance
+from mwdcal.calibration.estimate import Fit
+from mwdcal.calibration.prediction import CalibratedTools
+from mwdcal.calibration.prior import Knowledge
+from mwdcal.calibration.record import FREE_SHARE
+from mwdcal.estimation.batch import take
+from mwdcal.estimation.rank import Free
+from mwdcal.estimation.uncertainty import marginal_rank
+from mwdcal.geometry.vectors import Array, Bools
+from mwdcal.sensor.models import Whole
+
+NOISE, SETTINGS, PRIOR = "noise of the readings", "settings of the stand", "prior"
+ORDER = "order of the temperature terms"
+
+
+def variance_scales(result: Fit) -> Array:
+    """What scales each triad's variances (B, t): s², or 1 where there is no redundancy."""
+    usable = result.analysis.freedom >= 1
+    return np.where(usable, np.nan_to_num(result.analysis.variance_factor, nan=1.0), 1.0)
+
+
+@dataclass(frozen=True)
+class StatedCovariance:
+    """The covariance of a fit's parameters that is stated, and what each source of error adds to it."""
+
+    result: Fit
+
+    @cached_property
+    def total(self) -> Array:
+        """Covariance (B, p, p): independent errors times s², others as they are."""
+        return np.asarray(self._independent + self._common + self._order)
+
+    def by_source(self) -> dict[str, Array]:
+        """Covariance (B, p, p) by source; all together they are `total`.
+
+        A common error comes under the name of its constant of the run.
+        """
+        result = self.result
+        settings = _scaled(result, _of_settings(result))
+        shares = {NOISE: self._independent - settings, SETTINGS: settings}
+        for index, constant in enumerate(result.problem.evidence.constants):
+            effect = result.analysis.effects[..., index]
+            outer = effect[:, :, None] * effect[:, None, :]
+            shares[constant.name] = shares.get(constant.name, 0.0) + outer
+        shares |= {ORDER: self._order, PRIOR: _of_prior(result)}
+        return {name: share for name, share in shares.items() if name == NOISE or share.any()}
+
+    @cached_property
+    def _common(self) -> Array:
+        """From errors that all stations share, and from a prior."""
+        effects = self.result.analysis.effects
+        return np.asarray(effects @ np.swapaxes(effects, -1, -2) + _of_prior(self.result))
+
+    @cached_property
+    def _independent(self) -> Array:
+        """From errors that are independent from station to station."""
+        return _scaled(self.result, self.result.analysis.covariance - self._common)
+
+    @cached_property
+    def _order(self) -> Array:
+        """From what the order of the temperature terms leaves out."""
+        return misfit_covariance(self.result)
+
+
+def constants_covariance(result: Fit) -> Array:
+    """Covariance (B, q, q) of the constants of the run, times s².
+
+    The error of a reference is never more uncertain than it was declared.
+    """
+    analysis, constants = result.analysis, result.problem.evidence.constants
+    scaled = analysis.constants * variance_scales(result).max(-1)[:, None, None]
+    most = [np.full(len(scaled), np.inf) if c.unknown else c.sd for c in constants]
+    if not most:
+        return np.asarray(scaled)
+    sd = np.sqrt(np.maximum(np.diagonal(scaled, axis1=-2, axis2=-1), 1e-300))
+    less = np.minimum(np.stack(most, -1) / sd, 1.0)
+    return np.asarray(scaled * less[:, :, None] * less[:, None, :])
+
+
+def error_name(constant: str) -> str:
+    """What a common error is called: of a reference, or of the stand.
+
+    >>> [error_name(name) for name in ("dip", "azimuth-zero", "stand-north")]
+    ['dip reference error', 'azimuth zero of the stand', 'tilt of the stand about north']
+    """
+    if constant.endswith("-zero"):
+        return f"{constant.replace('-', ' ')} of the stand"
+    if constant.startswith("stand-"):
+        return f"tilt of the stand about {constant.removeprefix('stand-')}"
+    return f"{constant} reference error"
+
+
+def common_source(name: str) -> str:
+    """What a budget calls a source of error: a tilt is one source.
+
+    >>> [common_source(name) for name in ("stand-north", "azimuth-zero", "gravity", "prior")]
+    ['tilt of the stand', 'azimuth zero of the stand', 'gravity reference error', 'prior']
+    """
+    if name in (NOISE, SETTINGS, ORDER, PRIOR):
+        return name
+    return "tilt of the stand" if name.startswith("stand-") else error_name(name)
+
+
+def assumed_exact(result: Fit, relative: bool) -> list[str]:
+    """References taken as exact whose error moves no residual: it goes into the calibration whole.
+
+    A toolface zero turns both triads, and a strength scales one, as sensors of other mounting or
+    scale would have it. The field = 1 of a `relative` magnetometer is no reference.
+    """
+    evidence, names = result.problem.evidence, ("toolface", "gravity", "field")
+    declared = {c.name.removesuffix("-zero") for c in evidence.constants} | set(evidence.absent)
+    if relative:
+        declared.add("field")
+    exact = [
+        name
+        for name in names[: 1 + len(result.problem.triads)]
+        if evidence.is_known(name).any() and name not in declared
+    ]
+    return ["toolface zero of the stand" if n == "toolface" else f"{n} reference" for n in exact]
+
+
+def _scaled(result: Fit, covariance: Array) -> Array:
+    sizes = [t.model.size for t in result.problem.triads]
+    grown = np.repeat(np.sqrt(variance_scales(result)), sizes, axis=-1)
+    return np.asarray(covariance * grown[:, :, None] * grown[:, None, :])
+
+
+def _of_prior(result: Fit) -> Array:
+    """V Λ V: what errors of a prior of precision Λ do to a fit of covariance V."""
+    precision, covariance = result.problem.prior.precision, result.analysis.covariance
+    return covariance @ precision @ covariance if precision.any() else np.zeros_like(covariance)
+
+
+def _of_settings(result: Fit) -> Array:
+    """Covariance (B, p, p) from independent errors of the stand's angles, before scaling.
+
+    A station's reading has the covariance C = I + GGᵀ in units of its noise, the columns of G being
+    what its own unknowns do; those of known angles are meant here.
+    """
+    analysis, problem = result.analysis, result.problem
+    if not any(problem.evidence.sd[n].any() for n in ("inclination", "azimuth", "toolface")):
+        return np.zeros_like(analysis.covariance)
+    linear = problem.linear(result.state)
+    if analysis.influence is None:
+        rows = np.swapaxes(linear.weigh(linear.design), -1, -2)
+        p = linear.size
+        moved = analysis.covariance[:, None] @ _reduced(rows, linear.normal.information, p)
+    else:
+        moved = analysis.influence[:, :, : linear.size]
+    own = moved @ linear.own
+    return np.asarray(np.einsum("bnia,bnja->bij", own, own, optimize=True))
+
+
+def _reduced(rows: Array, information: Array, p: int) -> Array:
+    """Rows (B, n, u, m) of XᵀC⁻¹ with the unknowns behind the first p eliminated: (B, n, p, m)."""
+    if rows.shape[2] == p:
+        return rows
+    cross = np.linalg.solve(information[:, p:, p:], information[:, p:, :p])
+    return np.asarray(rows[:, :, :p] - np.swapaxes(cross, -1, -2)[:, None] @ rows[:, :, p:])
+
+
+@dataclass(frozen=True)
+class TriadResults:
+    """One triad of B tools, at the reference temperature.
+
+    `model` is that of the calibration file, of `parameters` (B, k); `sd` (B, k) are their standard
+    uncertainties, NaN where a free direction moves one. By tool (B,): `rank` of the `size` fitted
+    parameters, `noise` of one reading and whether it was `declared`, s² as `variance_factor` with
+    its `degrees_of_freedom`, NaN where there are none.
+    """
+
+    model: Whole
+    parameters: Array
+    sd: Array
+    rank: Array
+    size: Array
+    noise: Array
+    declared: Bools
+    variance_factor: Array
+    degrees_of_freedom: Array
+
+
+def triad_results(
+    result: Fit, index: int, covariance: Array, free: Sequence[list[Free]], reference: float
+) -> TriadResults:
+    """The results of one triad, `free` directions of each tool and `covariance` (B, p, p) being known."""
+    triad, where = result.problem.triads[index], result.problem.slices()[index]
+    model, to_file = triad.model.finished(reference)
+    params = result.state.params[:, where]
+    to_file = np.broadcast_to(to_file, (len(params), *to_file.shape[-2:]))
+    inner = to_file @ covariance[:, where, where]
+    sd = np.sqrt(np.einsum("bij,bij->bi", inner, to_file))
+    values = np.einsum("bij,bj->bi", to_file, params)
+    size = np.full(len(params), triad.model.size)
+    rank = size.copy()
+    some = np.flatnonzero([bool(each) for each in free])
+    if some.size:
+        rank[some] = marginal_rank(take(result.analysis.determined, some), where)
+        rows = free_rows([free[i] for i in some.tolist()], covariance.shape[-1])[..., where]
+        moved = np.abs(np.einsum("bij,bkj->bki", to_file[some], rows)).max(1)
+        part = take(result.problem, some)
+        own = part.triads[index].model.finished(reference)[0]
+        effect = _effect(own, values[some], part.triads[index].raw, part.temperature)
+        sd[some] = np.where(moved * effect > FREE_SHARE, np.nan, sd[some])
+    declared, freedom = np.isnan(result.noise[:, index]), result.analysis.freedom[:, index]
+    noise = reading_noise(result)[:, index]
+    factor = np.where(freedom >= 1, result.analysis.variance_factor[:, index], np.nan)
+    return TriadResults(model, values, sd, rank, size, noise, declared, factor, freedom)
+
+
+def reading_noise(result: Fit) -> Array:
+    """Standard deviation (B, t) of one reading of each triad, estimated or the mean of what is declared."""
+    declared = [triad.sd.mean((-1, -2)) for triad in result.problem.triads]
+    return np.where(np.isnan(result.noise), np.stack(declared, -1), result.noise)
+
+
+def _effect(model: Whole, params: Array, raw: Array, temperature: Array) -> Array:
+    """By how much of the field each parameter (B, k) changes it, per unit, over the run's stations."""
+    strength = np.linalg.norm(model.fields(params, raw, temperature), axis=-1).mean(-1)
+    squares = np.sum(model.jacobian(params, raw, temperature) ** 2, -2)
+    return np.asarray(np.sqrt(squares.mean(-2)) / strength[:, None])
+
+
+def free_rows(free: Sequence[list[Free]], size: int) -> Array:
+    """Free directions (B, k, p) of every tool, rows of zeros where there are fewer than k."""
+    rows = np.zeros((len(free), max((len(each) for each in free), default=0), size))
+    for index, each in enumerate(free):
+        for place, entry in enumerate(each):
+            rows[index, place] = entry.direction
+    return rows
+
+
+def to_file(result: Fit, reference: float) -> Array:
+    """Linear maps (B, k, p) from the fit's parameters to the file's, of all triads, held ones included."""
+    maps = [triad.model.finished(reference)[1] for triad in result.problem.triads]
+    rows = np.cumsum([0, *(each.shape[-2] for each in maps)])
+    whole = np.zeros((len(result.status), rows[-1], result.state.params.shape[-1]))
+    for start, each, where in zip(rows, maps, result.problem.slices(), strict=False):
+        whole[:, start : start + each.shape[-2], where] = each
+    return whole
+
+
+def triad_singular_values(result: Fit, index: int) -> Array:
+    """Singular values (B, p_t) of one triad when all that is shared with the other is free.
+
+    Largest first, as shares of it.
+    """
+    reduced, _, _ = result.problem.linear(result.state, geometry=True).normal.reduced()
+    norms, where = result.analysis.determined.norms, result.problem.slices()[index]
+    scaled = reduced / (norms[:, :, None] * norms[:, None, :])
+    other = np.ones(norms.shape[-1], bool)
+    other[where] = False
+    cross = scaled[:, other][..., where]
+    inverse = np.linalg.pinv(scaled[:, other][..., other], rcond=1e-6, hermitian=True)
+    values = np.linalg.eigvalsh(
+        scaled[:, where, where] - np.swapaxes(cross, -1, -2) @ inverse @ cross
+    )
+    values = np.sqrt(np.clip(values[:, ::-1], 0, None))
+    return np.asarray(values / values[:, :1])
+
+
+def temperature_range(result: Fit, prior: Knowledge | None) -> tuple[Array, Array]:
+    """Coldest and hottest station (B,) each, °C; those behind the prior count too."""
+    low, high = result.problem.temperature.min(-1), result.problem.temperature.max(-1)
+    known = prior.temperature if prior else None
+    if known is None:
+        return low, high
+    return np.minimum(low, known[0]), np.maximum(high, known[1])
+
+
+def calibrated_tools(
+    result: Fit, free: Sequence[list[Free]], reference: float, prior: Knowledge | None
+) -> CalibratedTools:
+    """The tools at the reference temperature, moved into their range where it lies outside."""
+    problem, state = result.problem, result.state
+    means = [problem.constant(state, name).mean(-1) for name in ("gravity", "field", "dip")]
+    return CalibratedTools(
+        models=tuple(triad.model for triad in problem.triads),
+        parameters=tuple(state.params[:, where] for where in problem.slices()),
+        earth=np.stack(means, -1),
+        temperature=np.clip(reference, *temperature_range(result, prior)),
+        free=free_rows(free, state.params.shape[-1]),
+        noise=reading_noise(result),
+    )
+
+
+def earth(result: Fit) -> dict[str, Array]:
+    """Mean gravity, g, field and dip (B,) of each run, given or estimated."""
+    problem, state = result.problem, result.state
+    gravity, field, dip = (problem.constant(state, n).mean(-1) for n in ("gravity", "field", "dip"))
+    magnetic = {"field": field, "dip_deg": np.degrees(dip)} if len(problem.triads) > 1 else {}
+    return {"gravity_g": gravity, **magnetic}
+
+
+def stand_errors(result: Fit) -> dict[str, Array]:
+    """Estimated errors (B,) of the stand by field of `StandErrors`, degrees: those that are unknowns."""
+    constants = result.problem.evidence.constants
+    names = [c.name if c.unknown else "" for c in constants]
+    value, covariance = np.degrees(result.state.constants), constants_covariance(result)
+    covariance = np.degrees(np.degrees(covariance))
+    errors = {}
+    for place, name in enumerate(names):
+        if name.endswith("-zero"):
+            word = name.replace("-", "_")
+            errors[f"{word}_deg"] = value[:, place]
+            errors[f"{word}_uncertainty_deg"] = np.sqrt(covariance[:, place, place])
+    if "stand-north" not in names:
+        return errors
+    pair = [names.index("stand-north"), names.index("stand-east")]
+    return errors | _tilt(value[:, pair], covariance[:, pair][..., pair])
+
+
+def _tilt(turn: Array, covariance: Array) -> dict[str, Array]:
+    """Size and azimuth of a tilt from its turns (B, 2) about north and east, degrees."""
+    size = np.linalg.norm(turn, axis=-1)
+    along = turn / size[:, None]
+    across = np.stack([-along[:, 1], along[:, 0]], -1)
+    sd, sd_across = (
+        np.sqrt(np.einsum("bi,bij,bj->b", axis, covariance, axis)) for axis in (along, across)
+    )
+    return {
+        "tilt_deg": size,
+        "tilt_uncertainty_deg": sd,
+        "tilt_azimuth_deg": np.degrees(np.arctan2(-turn[:, 0], turn[:, 1])) % 360,
+        "tilt_azimuth_uncertainty_deg": np.degrees(sd_across / size),
+    }
