@@ -162,7 +162,7 @@ def test_gradient_and_hessian_of_the_cost_by_differences(kind):
         model = Polynomial(model.basis, 0.1 * model.centre, model.scale, model.curved)
     known = [plan.temperature, np.ones(()), plan.inclination]
     weights = rng.uniform(0.5, 2.0, (len(plan.inclination), 2))
-    stations = core._stations(raw, known, weights, (2,))
+    stations = core._compared(raw, known, weights, (2,))
     here = core.local(model, params, stations)
     np.testing.assert_allclose(here.cost, core.cost(model, params, stations), rtol=1e-13)
     for j, unit in enumerate(np.eye(model.size)):
@@ -232,7 +232,7 @@ def test_the_pseudo_inverse_alone_lets_toolface_zero_wander(cold):
     plan, raw, _, found = cold
     some = slice(0, 40)
     known = [np.full(48, 25.0), np.ones(()), plan.inclination]
-    stations = core._stations(raw[some], known, np.ones(2), (40,))
+    stations = core._compared(raw[some], known, np.ones(2), (40,))
     start = np.broadcast_to(datasheet(TWELVE), (40, 12))
     wandered = pseudo_inverse(TWELVE, start, stations)
     reached = core.cost(TWELVE, wandered, stations)

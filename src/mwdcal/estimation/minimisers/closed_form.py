@@ -24,8 +24,8 @@ from mwdcal.estimation.uncertainty import Analysis
 from mwdcal.geometry.vectors import Array, Bools, eigenvalues, inverse, tool_from_earth
 from mwdcal.sensor.models import Factors, Polynomial, affine_terms
 
-_ROWS = np.arange(12).reshape(3, 4)
-PLACES = affine_terms(_ROWS[:, :3], _ROWS[:, 3])
+_ELEMENTS = np.arange(12).reshape(3, 4)
+PLACES = affine_terms(_ELEMENTS[:, :3], _ELEMENTS[:, 3])
 """Places of the parameters among the elements of Θ, row by row."""
 
 
