@@ -352,7 +352,7 @@ def test_long_runs_show_the_worst_of_each_part():
     ],
 )
 def test_uncertainty_in_parentheses(pair, text):
-    assert compare._joined(*pair) == text
+    assert command._joined(*pair) == text
 
 
 def test_command_prints_the_same_as_its_json(tmp_path):
