@@ -223,7 +223,7 @@ def second(calibration, axes, model):
 
 def covariances(calibration):
     """Covariance of each triad's own parameters."""
-    whole, count = np.array(calibration.covariance), len(calibration.accelerometer.parameters)
+    whole, count = calibration.parameter_covariance, len(calibration.accelerometer.parameters)
     return whole[:count, :count], whole[count:, count:]
 
 

@@ -190,5 +190,7 @@ def test_one_misread_toolface_leaves_what_is_stated_as_it_is(loss):
         assert other.variance_factor == pytest.approx(one.variance_factor, rel=0.3)
     for one, other in zip(good.errors, bad.errors, strict=True):
         assert other.expected == pytest.approx(one.expected, rel=0.05)
-    for one, other in zip(np.diag(good.covariance), np.diag(bad.covariance), strict=True):
+    for one, other in zip(
+        np.diag(good.parameter_covariance), np.diag(bad.parameter_covariance), strict=True
+    ):
         assert other == pytest.approx(one, rel=0.5)

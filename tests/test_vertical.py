@@ -138,7 +138,7 @@ def test_95_percent_of_inclinations_near_vertical_are_within_what_is_stated():
     known |= {"field": np.full(len(inc), tool.field), "dip": np.full(len(inc), tool.dip)}
     record = calibrate(Readings(a[0], m[0], known=known, sd=NOISE), PROFILE)
     rng, count, size = np.random.default_rng(1), 8000, 12
-    covariance = np.array(record.covariance)[:size, :size]
+    covariance = record.parameter_covariance[:size, :size]
     freedom = record.accelerometer.degrees_of_freedom
     drawn = rng.multivariate_normal(np.zeros(size), covariance, count)
     drawn *= np.sqrt(freedom / rng.chisquare(freedom, count))[:, None]

@@ -123,7 +123,7 @@ class _Record:
             temperature_c=self.temperatures,
             accelerometer=self.triad(0),
             magnetometer=self.triad(1) if readings.magnetometer is not None else None,
-            covariance=self.covariance.tolist(),
+            covariance_rows=self.covariance.tolist(),
             free=[d.tolist() for d in self.directions],
             singular_values=result.analysis.determined.values[0].tolist(),
             constants=self.constants(),

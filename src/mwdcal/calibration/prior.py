@@ -123,9 +123,9 @@ def from_calibration(previous: Calibration, relative: bool = False) -> Knowledge
             "or neither."
         )
     names = [f"{t.name} {name}" for t in previous.triads for name in t.parameter_names]
-    expected = np.concatenate([t.parameters for t in previous.triads])
-    covariance = np.array(previous.covariance)
-    free = np.array(previous.free, float).reshape(len(previous.free), len(expected))
+    expected = previous.parameters
+    covariance = previous.parameter_covariance
+    free = previous.free_directions
     moving = np.flatnonzero(np.diag(covariance) > 0)
     return Knowledge(
         previous.run,

@@ -6,13 +6,14 @@ a calibration in memory and one read back give the same results.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import Any
+from collections.abc import Iterable, Sequence
+from html import escape
+from typing import Any, ClassVar
 
 import msgspec
 import numpy as np
 
-from mwdcal.calibration.readings import NANOTESLA, Readings
+from mwdcal.calibration.readings import NANOTESLA, Readings, simulated
 from mwdcal.calibration.soaks import GAP
 from mwdcal.errors import InputError
 from mwdcal.geometry.observables import OBSERVABLES
@@ -235,7 +236,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
     temperature_c: tuple[float, float] | None
     accelerometer: TriadCalibration
     magnetometer: TriadCalibration | None = None
-    covariance: list[list[float]]
+    covariance_rows: list[list[float]] = msgspec.field(name="covariance")
     free: list[list[float]]
     singular_values: list[float]
     constants: list[Constant]
@@ -249,6 +250,38 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
     station_rows: list[StationRow]
     inherited: list[str] = []
     findings: list[Finding]
+
+    plot: ClassVar[Any]
+    """Figures of the calibration: `use.plots` puts them here, so that a record needs no drawing."""
+
+    def __repr__(self) -> str:
+        return f"<Calibration: {'; '.join(f'{k} {v}' for k, v in self.summary().items())}>"
+
+    def _repr_html_(self) -> str:
+        return html_table("Calibration", self.summary().items())
+
+    def summary(self) -> dict[str, str]:
+        """The calibration at a glance: tool, run, rank, accuracy and findings, in words."""
+        rank = ", ".join(f"{t.name} {t.rank} of {t.size}" for t in self.triads)
+        accuracy = ", ".join(f"{name} {text}" for name, text in self._accuracy().items())
+        findings = ", ".join(dict.fromkeys(finding.id for finding in self.findings))
+        return {
+            "tool": " ".join([self.tool.get("serial", self.profile.name), *simulated(self.tool)]),
+            "run": f"{self.stations} stations, method {self.method}",
+            "rank": rank,
+            "1σ at 45° inclination": accuracy or "not stated",
+            "findings": findings or "none",
+        }
+
+    def _accuracy(self) -> dict[str, str]:
+        """1σ of the calibration alone by angle, in words: all sources of the budget together."""
+        found = {}
+        for name in ("inclination", "toolface", "azimuth")[: 1 + len(self.triads)]:
+            parts = [getattr(row, f"{name}_deg") for row in self.budget]
+            if parts:
+                free = None in parts
+                found[name] = "undetermined" if free else f"{np.linalg.norm(parts):.2g}°"
+        return found
 
     @property
     def reference_temperature(self) -> float:
@@ -264,6 +297,22 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
             d in fitted or (("-" not in d or not whole) and d.partition("-")[0] in first)
             for d in digests
         ]
+
+    @property
+    def parameters(self) -> Array:
+        """The parameters (p,) of all triads in order."""
+        return np.concatenate([triad.parameters for triad in self.triads])
+
+    @property
+    def parameter_covariance(self) -> Array:
+        """Covariance (p, p) of `parameters`."""
+        return np.array(self.covariance_rows)
+
+    @property
+    def free_directions(self) -> Array:
+        """Directions (k, p) of parameter space that no evidence determines."""
+        size = sum(len(t.parameters) for t in self.triads)
+        return np.array(self.free, float).reshape(len(self.free), size)
 
     @property
     def triads(self) -> list[TriadCalibration]:
@@ -334,28 +383,42 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
             result[..., block, block] = slope * sd[..., None, :] ** 2 @ np.swapaxes(slope, -1, -2)
         return result
 
+    def _gradient(self, name: str, readings: Readings) -> Array:
+        """Gradient (…, n, 6) of an observable with respect to both vectors."""
+        gradient = OBSERVABLES[name].gradient(*self.fields(readings))
+        return np.where(np.isnan(gradient), 0.0, gradient) if not self.has_field else gradient
+
     def sensitivity(self, name: str, readings: Readings) -> Array:
         """Gradient (…, n, p) of an observable with respect to the parameters."""
-        gradient = OBSERVABLES[name].gradient(*self.fields(readings))
-        gradient = np.where(np.isnan(gradient), 0.0, gradient) if not self.has_field else gradient
+        gradient = self._gradient(name, readings)
         return np.asarray(np.einsum("...ni,...nip->...np", gradient, self.jacobian(readings)))
 
     def uncertainty(self, name: str, readings: Readings, noise: bool = False) -> Array:
-        """Standard uncertainty (…, n) of an observable, of the calibration or of one reading too.
+        """Standard uncertainty (…, n) of an observable: of the calibration, or of a reading too.
 
-        NaN where the observable rests on a free direction: no uncertainty can be quoted.
+        Units: radians, g or nT. `noise` adds that of one reading.
+        NaN where the observable rests on a free direction: no uncertainty can be stated.
         """
-        rows = self.sensitivity(name, readings)
-        variance = np.einsum("...ni,ij,...nj->...n", rows, np.array(self.covariance), rows)
+        return np.sqrt(self.covariance((name,), readings, noise)[..., 0, 0])
+
+    def covariance(self, names: Sequence[str], readings: Readings, noise: bool = False) -> Array:
+        """Covariance (…, n, k, k) of k observables at one reading, as `uncertainty` states each.
+
+        Units: products of radians, g and nT. Singular: NaN in the rows and columns of an observable
+        without a stated uncertainty.
+
+        Raises:
+            InputError: an observable is unknown.
+        """
+        _check_observables(names)
+        rows = np.stack([self.sensitivity(name, readings) for name in names], -2)
+        total = np.einsum("...ai,ij,...bj->...ab", rows, self.parameter_covariance, rows)
         if noise:
-            gradient = OBSERVABLES[name].gradient(*self.fields(readings))
-            gradient = (
-                np.where(np.isnan(gradient), 0.0, gradient) if not self.has_field else gradient
-            )
-            spread = self.noise_covariance(readings)
-            variance = variance + np.einsum("...ni,...nij,...nj->...n", gradient, spread, gradient)
-        blank = self.rests_on_free(name, readings) | self._lacks(name)
-        return np.where(blank, np.nan, np.sqrt(variance))
+            rows = np.stack([self._gradient(name, readings) for name in names], -2)
+            reading = self.noise_covariance(readings)
+            total = total + np.einsum("...ai,...ij,...bj->...ab", rows, reading, rows)
+        blank = np.stack([self.rests_on_free(n, readings) | self._lacks(n) for n in names], -1)
+        return np.where(blank[..., :, None] | blank[..., None, :], np.nan, total)
 
     def _lacks(self, name: str) -> bool:
         """Whether an observable needs a magnetometer that was not calibrated."""
@@ -373,7 +436,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
         """
         from scipy.special import stdtrit
 
-        rows, covariance = self.sensitivity(name, readings), np.array(self.covariance)
+        rows, covariance = self.sensitivity(name, readings), self.parameter_covariance
         start, spread = 0, np.zeros(rows.shape[:-1])
         for triad in self.triads:
             own = slice(start, start + len(triad.parameters))
@@ -400,7 +463,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
         """
         g, _ = self.fields(readings)
         rows = self.jacobian(readings)[..., :2, :] / np.linalg.norm(g, axis=-1)[..., None, None]
-        spread = rows @ np.array(self.covariance) @ np.swapaxes(rows, -1, -2)
+        spread = rows @ self.parameter_covariance @ np.swapaxes(rows, -1, -2)
         half, odd = (spread[..., 0, 0] + spread[..., 1, 1]) / 2, spread[..., 0, 1]
         largest = half + np.hypot((spread[..., 0, 0] - spread[..., 1, 1]) / 2, odd)
         factor = freedom * np.expm1(-2 / freedom * np.log1p(-probability))
@@ -414,16 +477,12 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
         """Where (…, n) an observable moves with a direction that no evidence determines."""
         shape = readings.accelerometer.shape[:-1]
         g, b = self.fields(readings)
-        moved = np.einsum("...nip,kp->...nki", self.jacobian(readings), self._free_rows())
+        moved = np.einsum("...nip,kp->...nki", self.jacobian(readings), self.free_directions)
         gradient = np.nan_to_num(OBSERVABLES[name].gradient(g, b))
         change = np.abs(np.einsum("...ni,...nki->...nk", gradient, moved))
         scale = {"g": np.linalg.norm(g, axis=-1), "nT": np.linalg.norm(b, axis=-1)}
         limit = FREE_SHARE * scale.get(OBSERVABLES[name].unit, np.ones(shape))
         return np.asarray(np.any(change > np.nan_to_num(limit)[..., None], -1))
-
-    def _free_rows(self) -> Array:
-        size = sum(len(t.parameters) for t in self.triads)
-        return np.array(self.free, float).reshape(len(self.free), size)
 
     def other_tool(self, readings: Readings) -> tuple[str, str] | None:
         """Our serial and the readings', where both are stated and differ."""
@@ -460,6 +519,23 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
     def unrecorded(self, readings: Readings) -> bool:
         """Whether the readings have temperatures and the run of the calibration recorded none."""
         return self.temperature_c is None and readings.temperature is not None
+
+
+def html_table(caption: str, rows: Iterable[tuple[str, ...]]) -> str:
+    """A table for notebooks: a heading, then the cells of each row as text."""
+    lines = ("".join(f"<td>{escape(cell)}</td>" for cell in row) for row in rows)
+    body = "".join(f"<tr>{line}</tr>" for line in lines)
+    return f"<table><caption>{escape(caption)}</caption>{body}</table>"
+
+
+def _check_observables(names: Sequence[str]) -> None:
+    """Refuse names that are not observables."""
+    unknown = [name for name in names if name not in OBSERVABLES]
+    if unknown:
+        raise InputError(
+            f"`names` must be observables ({', '.join(OBSERVABLES)}); got {unknown[0]!r}. "
+            "Correct the name."
+        )
 
 
 def rounded(calibration: Calibration) -> Calibration:

@@ -61,10 +61,10 @@ def in_gauge(
     """
     made = _straight(made)
     settle = _Settle.of(made, readings, gauge)
-    params = np.concatenate([t.parameters for t in made.triads])
+    params = made.parameters
     found, slope = settle(params), settle.slope(made, readings, params)
-    covariance = slope @ np.array(made.covariance) @ slope.transpose()
-    free = np.array(made.free, float).reshape(len(made.free), len(params)) @ slope.transpose()
+    covariance = slope @ made.parameter_covariance @ slope.transpose()
+    free = made.free_directions @ slope.transpose()
     size = len(params)
     triads = [
         msgspec.structs.replace(t, parameters=found[w].tolist())
@@ -74,7 +74,7 @@ def in_gauge(
         made,
         accelerometer=triads[0],
         magnetometer=triads[1] if len(triads) > 1 else None,
-        covariance=covariance[:size, :size].tolist(),
+        covariance_rows=covariance[:size, :size].tolist(),
         free=free[:, :size].tolist(),
     )
     moved = np.abs(free[:, size:]).max(0, initial=0.0)
@@ -201,12 +201,12 @@ def _straight(made: Calibration) -> Calibration:
         )
         for t, block in zip(made.triads, blocks, strict=True)
     ]
-    free = np.array(made.free, float).reshape(len(made.free), whole.shape[1])
+    free = made.free_directions
     return msgspec.structs.replace(
         made,
         accelerometer=triads[0],
         magnetometer=triads[1] if len(triads) > 1 else None,
-        covariance=(whole @ np.array(made.covariance) @ whole.transpose()).tolist(),
+        covariance_rows=(whole @ made.parameter_covariance @ whole.transpose()).tolist(),
         free=(free @ whole.transpose()).tolist(),
     )
 

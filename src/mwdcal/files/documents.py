@@ -93,7 +93,7 @@ def _misfit(calibration: Calibration) -> str:
         if not 0 <= triad.rank <= triad.size <= len(names):
             return f"rank and size of the {triad.name} are not those of its parameters"
     size = sum(len(t.parameters) for t in calibration.triads)
-    if [len(row) for row in calibration.covariance] != [size] * size:
+    if [len(row) for row in calibration.covariance_rows] != [size] * size:
         return "parameters and covariance do not fit together"
     if any(len(row) != size for row in calibration.free):
         return "parameters and undetermined directions do not fit together"
@@ -106,7 +106,7 @@ def _misfit(calibration: Calibration) -> str:
 
 def _unusable(calibration: Calibration) -> str:
     """Which numbers could not be computed with."""
-    covariance = np.array(calibration.covariance)
+    covariance = calibration.parameter_covariance
     lists = [[t.radius, t.noise, *t.centre, *t.parameters] for t in calibration.triads]
     lists += [*calibration.free, covariance.ravel().tolist(), list(calibration.earth.values())]
     if max(abs(v) for numbers in lists for v in numbers) > LARGEST:

@@ -277,7 +277,7 @@ class Test:
         if not self.calibration.free:
             return False
         rows = np.nan_to_num(self.calibration.sensitivity(name, self.readings)[index])
-        moved = rows @ np.array(self.calibration.free).transpose()
+        moved = rows @ self.calibration.free_directions.transpose()
         size = {"g": 1.0, "nT": self.calibration.earth.get("field", 1.0)}.get(
             OBSERVABLES[name].unit, 1.0
         )

@@ -101,13 +101,11 @@ class _Part:
         triad, start = triads[index], sum(len(t.parameters) for t in triads[:index])
         where = slice(start, start + len(triad.parameters))
         low, high = calibration.temperature_c or (0.0, 0.0)
-        total = sum(len(t.parameters) for t in triads)
-        free = np.array(calibration.free, float).reshape(len(calibration.free), total)
         return cls(
             triad,
             getattr(calibration.profile, triad.name),
-            np.array(calibration.covariance)[where, where],
-            free[:, where],
+            calibration.parameter_covariance[where, where],
+            calibration.free_directions[:, where],
             calibration.earth.get("field", 1.0) if index else 1.0,
             calibration.reference_temperature,
             max((high - low) / 2, 1.0),
