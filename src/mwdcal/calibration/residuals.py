@@ -15,7 +15,7 @@ from mwdcal.calibration.record import ErrorRow, Measures, StationRow
 from mwdcal.estimation.evidence import STAND_ERRORS
 from mwdcal.estimation.uncertainty import Analysis, station_misfit, without_station
 from mwdcal.geometry.observables import OBSERVABLES, VERTICAL
-from mwdcal.geometry.vectors import Array, Bools, centred
+from mwdcal.geometry.vectors import Array, Bools
 
 SHOWN = ("gravity", "inclination", "toolface", "azimuth", "field", "dip")
 UNITS = {"gravity": "mg", "field": "nT"}
@@ -69,9 +69,7 @@ def departure(name: str, g: Array, b: Array, known: Mapping[str, Array]) -> Arra
     vectors' own where that is unknown.
     Singular: NaN where there is no reference, and for toolface and azimuth exactly at vertical.
     """
-    observable = OBSERVABLES[name]
-    error = observable.value(g, b) - known[name]
-    error = centred(error, observable.period) if observable.period else error
+    error = OBSERVABLES[name].difference(OBSERVABLES[name].value(g, b), known[name])
     stated = known.get("inclination", np.full(error.shape, np.nan))
     own = OBSERVABLES["inclination"].value(g, b)
     return np.asarray(error * angle_weight(name, np.where(np.isnan(stated), own, stated)))

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mwdcal.geometry.vectors import Array, wrap
+from mwdcal.geometry.vectors import Array, ArrayLike, centred, wrap
 
 VERTICAL = 1e-12
 """A transverse share of gravity below this is an exactly vertical attitude."""
@@ -153,6 +153,11 @@ class Observable:
     gradient: Callable[[Array, Array], Array]
     period: float
     unit: str
+
+    def difference(self, value: Array, reference: ArrayLike) -> Array:
+        """Value minus reference (...), angles with a period in the half turn about zero."""
+        error = np.asarray(value - np.asarray(reference))
+        return centred(error, self.period) if self.period else error
 
 
 OBSERVABLES: dict[str, Observable] = {

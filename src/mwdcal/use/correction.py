@@ -34,10 +34,11 @@ MANY = 300_000
 """From this number of rows on the compiled loops are worth their start."""
 
 
-class Tally(NamedTuple):
-    """What the findings need to know of the rows: their number, and what was seen in them.
+class RowCounts(NamedTuple):
+    """Rows of a table, counted by what the findings report of them.
 
-    `warmth` are the lowest and the highest temperature of readings, °C.
+    `beyond`: outside the calibrated temperatures; `moved`: outputs that rest on a free direction;
+    `lacking`: without a reading; `warmth`: lowest and highest temperature, °C.
     """
 
     rows: int
@@ -49,29 +50,30 @@ class Tally(NamedTuple):
     warmth: tuple[float, float] = (np.inf, -np.inf)
 
     def blank(self, outside: str) -> int:
-        """Number of rows without results: for want of a reading, or `outside` the temperatures."""
+        """Number of rows without results: without a reading, or `outside` the temperatures."""
         return self.lacking + (self.beyond if outside == "blank" else 0)
 
 
 def correct(
     calibration: Calibration, readings: Readings, outside: str = "blank"
 ) -> tuple[dict[str, AnyArray], list[Finding]]:
-    """Output columns (n,) by name, and what the reader should know.
+    """Output columns (n,) by name, and the findings.
 
-    Refuses readings of which most have a strength that no place on Earth has, or not their own reference.
+    Refuses readings most of which have a strength that no place on Earth has, or that is off their
+    reference.
 
     Singular: at exactly vertical attitudes azimuth and toolface are NaN (blank in files);
     `magnetic_toolface_deg` stands beside them. A strength of zero has no direction: NaN.
     Temperatures outside the calibrated range are blanked, refused or extrapolated as `outside` says.
     """
-    columns, _, told = counted(calibration, readings, outside)
-    return columns, told
+    columns, _, about = counted(calibration, readings, outside)
+    return columns, about
 
 
 def counted(
     calibration: Calibration, readings: Readings, outside: str, lacking: int = 0
-) -> tuple[dict[str, AnyArray], Tally, list[Finding]]:
-    """The same, and between what was seen in the rows; `lacking` more were left out unread."""
+) -> tuple[dict[str, AnyArray], RowCounts, list[Finding]]:
+    """Output columns, counts of the rows and findings; `lacking` more rows were left out unread."""
     check_outside(outside)
     columns: dict[str, AnyArray] = {
         **(compiled(calibration, readings) or reference(calibration, readings))
@@ -80,15 +82,15 @@ def counted(
     rows, moved = readings.count + lacking, undetermined(calibration, readings)
     if outside == "blank" and beyond.any():
         columns = {name: np.where(beyond, np.nan, value) for name, value in columns.items()}
-    tally = Tally(
+    tally = RowCounts(
         rows, int(beyond.sum()), moved, lacking, (),
         strengths.judged(calibration, columns, readings.known), warmth(readings.temperature),
     )  # fmt: skip
-    told = findings(calibration, readings, tally, outside)
-    strengths.check(calibration, tally.strengths, readings.source)
+    about = findings(calibration, readings, tally, outside)
+    strengths.check(calibration, tally.strengths, readings.name)
     if outside == "extrapolate":
         columns[MARK] = beyond
-    return columns, tally, told
+    return columns, tally, about
 
 
 def warmth(temperature: Array | None) -> tuple[float, float]:
@@ -104,7 +106,7 @@ def result_names(outside: str) -> tuple[str, ...]:
 
 
 def check_outside(outside: str) -> None:
-    """Refuse a word that says nothing about temperatures outside the calibrated range."""
+    """Refuse an unknown choice for temperatures outside the calibrated range."""
     if outside not in OUTSIDE:
         raise InputError(f"--outside must be one of {', '.join(OUTSIDE)}; got {outside!r}.")
 
@@ -142,8 +144,8 @@ def compiled(
     flat = np.ascontiguousarray(np.broadcast_to(warmth, shape), float).reshape(-1)
     g, b = readings.accelerometer, readings.magnetometer
     vectors = [*_axes(g), *(_axes(b) if b is not None else [np.full(flat.shape, np.nan)] * 3)]
-    found = correction_numba.run([*vectors, flat], triads, zero)
-    return {n: c.reshape(shape) for n, c in zip(NAMES, found.columns, strict=True)}
+    results = correction_numba.run([*vectors, flat], triads, zero)
+    return {n: c.reshape(shape) for n, c in zip(NAMES, results.columns, strict=True)}
 
 
 def _axes(vectors: Array) -> list[Array]:
@@ -156,49 +158,48 @@ def numbers(
     calibration: Calibration,
 ) -> tuple[correction_numba.Numbers, correction_numba.Numbers] | None:
     """Both triads for the compiled loops; None where a model is not for them."""
-    found = [
-        correction_numba.numbers(
-            t.functions(calibration.reference_temperature), np.array(t.parameters)
-        )
+    reference = calibration.reference_temperature
+    triads = [
+        correction_numba.numbers(t.functions(reference), np.array(t.parameters))
         for t in calibration.triads
     ]
-    first, second = [*found, correction_numba.NOTHING][:2]
+    first, second = [*triads, correction_numba.NOTHING][:2]
     return None if first is None or second is None else (first, second)
 
 
 def findings(
-    calibration: Calibration, readings: Readings, tally: Tally, outside: str
+    calibration: Calibration, readings: Readings, tally: RowCounts, outside: str
 ) -> list[Finding]:
-    """What the reader should know of the results; refuses rows outside if `outside` says so.
+    """Findings about corrected rows; refuses rows outside the temperatures if `outside` says so.
 
-    Of the readings only their metadata count, and whether there is a magnetometer.
+    Of the readings only the metadata are used, and whether there is a magnetometer.
     """
-    found = []
+    about = []
     if calibration.has_field and readings.magnetometer is None:
         text = "no columns mx, my, mz: magnetic results are blank."
-        found.append(Finding(id="no-magnetometer", text=text))
-    found += _other_tool(calibration, readings)
+        about.append(Finding(id="no-magnetometer", text=text))
+    about += _other_tool(calibration, readings)
     if tally.lacking:
         text = f"{tally.lacking} of {tally.rows} rows lack a reading: their results are blank."
-        found.append(Finding(id="missing-reading", text=text))
+        about.append(Finding(id="missing-reading", text=text))
     if tally.beyond:
-        found.append(_outside(calibration, readings.source, outside, tally))
+        about.append(_outside(calibration, readings.source, outside, tally))
     if calibration.unrecorded(readings):
         at = "…".join(dict.fromkeys(f"{end:.1f}" for end in tally.warmth))
         text = (
             "the calibration was made at unrecorded temperatures, without temperature terms: nothing says how "
             f"good the results are at the readings' {at} °C."
         )
-        found.append(Finding(id="no-temperature", text=text))
-    found += strengths.findings(tally.strengths)
+        about.append(Finding(id="no-temperature", text=text))
+    about += strengths.findings(tally.strengths)
     if calibration.relative:
         text = "the magnetometer is calibrated to field = 1: bx_nt, by_nt, bz_nt and field_nt are relative, not nT."
-        found.append(Finding(id="field-relative", text=text))
+        about.append(Finding(id="field-relative", text=text))
     if tally.moved:
         free = ", ".join(dict.fromkeys(u.id for u in calibration.undetermined()))
         text = f"{', '.join(tally.moved)} rest on what the calibration leaves undetermined ({free})"
-        found.append(Finding(id="undetermined", text=f"{text}: no uncertainty can be stated."))
-    return found
+        about.append(Finding(id="undetermined", text=f"{text}: no uncertainty can be stated."))
+    return about
 
 
 def _other_tool(calibration: Calibration, readings: Readings) -> list[Finding]:
@@ -212,20 +213,20 @@ def _other_tool(calibration: Calibration, readings: Readings) -> list[Finding]:
     return [Finding(id="other-tool", text=text)]
 
 
-def _outside(calibration: Calibration, source: str, how: str, tally: Tally) -> Finding:
+def _outside(calibration: Calibration, source: str, how: str, tally: RowCounts) -> Finding:
     low, high = calibration.temperature_c or (np.nan, np.nan)
     text = f"{tally.beyond} of {tally.rows} rows lie outside the calibrated range {low:.1f}…{high:.1f} °C"
     if how == "refuse":
         raise InputError(
             f"{source}: {text}. Use --outside blank or extrapolate, or calibrate over a wider range."
         )
-    done = (
-        "their results are blank"
-        if how == "blank"
-        else "their results are extrapolated, with no statement of accuracy, and marked in the "
-        f"column '{MARK}'"
-    )
-    return Finding(id="outside-temperature", text=f"{text}: {done}.")
+    results = "their results are blank"
+    if how == "extrapolate":
+        results = (
+            "their results are extrapolated, with no statement of accuracy, and marked in the column "
+            f"'{MARK}'"
+        )
+    return Finding(id="outside-temperature", text=f"{text}: {results}.")
 
 
 def undetermined(

@@ -27,7 +27,7 @@ from mwdcal.files.formats import table
 from mwdcal.files.formats.columns import as_text
 from mwdcal.files.formats.table import Table
 from mwdcal.files.runs import to_readings
-from mwdcal.use.correction import MARK, Tally, counted
+from mwdcal.use.correction import MARK, RowCounts, counted
 
 
 def apply_to_any(
@@ -38,7 +38,7 @@ def apply_to_any(
     missing: str,
     decimal: str,
     advance: Callable[[int, int], None],
-) -> tuple[Tally, list[Finding]]:
+) -> tuple[RowCounts, list[Finding]]:
     """Correct a file into another: part by part, or whole where it is short text or a workbook.
 
     What was seen in the rows, and what the reader should know. `advance` is told how much of a long
@@ -59,7 +59,7 @@ def apply_to_any(
 
 def apply_to_table(
     calibration: Calibration, source: Table, outside: str, missing: str = "refuse"
-) -> tuple[Table, Tally, list[Finding]]:
+) -> tuple[Table, RowCounts, list[Finding]]:
     """The input's columns and metadata, the results, and what the calibration was."""
     check_columns(list(source.columns), source.source)
     check_warmth(calibration, list(source.columns), source.source)

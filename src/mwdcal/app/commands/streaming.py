@@ -39,7 +39,7 @@ from mwdcal.use.correction import (
     JUDGED,
     MARK,
     NAMES,
-    Tally,
+    RowCounts,
     check_outside,
     findings,
     numbers,
@@ -82,7 +82,7 @@ class Corrected(NamedTuple):
 
     rendered: Any
     size: int
-    tally: Tally
+    tally: RowCounts
 
 
 def in_parts(readings: Path, output: Path, decimal: str) -> bool:
@@ -102,7 +102,7 @@ def apply_to_file(
     least: int = MANY,
     missing: str = "refuse",
     decimal: str = ".",
-) -> tuple[Tally, list[Finding]]:
+) -> tuple[RowCounts, list[Finding]]:
     """Correct a file into another; what was seen in the rows, and what the reader should know.
 
     `advance` is told how much of the whole is done. `rows` of a part of a Parquet table, by
@@ -199,12 +199,12 @@ def _loaded(source: Source, piece: Any) -> Part:
         return source.load(piece, True)
 
 
-def _total(tallies: Sequence[Tally]) -> Tally:
+def _total(tallies: Sequence[RowCounts]) -> RowCounts:
     moved = {name for tally in tallies for name in tally.moved}
     rows, beyond, lacking = np.sum([(t.rows, t.beyond, t.lacking) for t in tallies], 0).tolist()
     serials = runs.serials({}, chain.from_iterable(tally.serials for tally in tallies))
     lows, highs = zip(*(tally.warmth for tally in tallies), strict=True)
-    return Tally(
+    return RowCounts(
         rows, beyond, tuple(name for name in JUDGED if name in moved), lacking, tuple(serials),
         strengths.total(tally.strengths for tally in tallies), (min(lows), max(highs)),
     )  # fmt: skip
@@ -277,7 +277,9 @@ class _Worker:
         said = self.heard(("\0" * LONGEST, "\1" * LONGEST, "…"))
         worst = strengths.Strengths(_MOST, _MOST, _MOST, _MOST, -1.23e-100, -1.24e-100)
         off = dict.fromkeys(strengths.COLUMNS, worst)
-        tally = Tally(_MOST, _MOST, judged, lacking, (), off, (TEMPERATURE.low, TEMPERATURE.high))
+        tally = RowCounts(
+            _MOST, _MOST, judged, lacking, (), off, (TEMPERATURE.low, TEMPERATURE.high)
+        )
         most = findings(self.calibration, said, tally, how)
         longest = [finding.text for finding in most]
         delimiter = "," if suffix == ".csv" else "\t"
@@ -312,7 +314,7 @@ class _Worker:
         if whole is not None:
             results = [spread(values, whole) for values in results]
         rendered = sink.render(part.carried, results, bool(found.empty) or whole is not None)
-        tally = Tally(
+        tally = RowCounts(
             rows, found.beyond, moved, rows - table.count, self._serials(part.carried),
             strengths.judged(self.calibration, columns, known),
             warmth(channels["temperature"][0] if channels["temperature"] else None),
