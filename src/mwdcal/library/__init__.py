@@ -19,6 +19,7 @@ from mwdcal.library.tasks import (
     verify,
 )
 from mwdcal.sensor.profile import Profile
+from mwdcal.use import plots as plots  # puts `plot` on calibrations
 
 __all__ = [
     "Calibration",

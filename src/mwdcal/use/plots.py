@@ -1,0 +1,363 @@
+"""Figures of a calibration, and the style of all figures: the same input, the same figure.
+
+A figure is a Matplotlib figure whose label says what it shows. Colours are told apart by
+colour-blind readers, and never carry a meaning alone: every series has a marker of its own and
+every contour its number.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import wraps
+from typing import TYPE_CHECKING, Any, Literal, ParamSpec
+
+import numpy as np
+
+from mwdcal.calibration.prediction import AccuracyMap, accuracy_map, angles
+from mwdcal.calibration.record import Calibration, OrderScore, StationRow
+from mwdcal.calibration.residuals import RESHOOT
+from mwdcal.errors import InputError
+from mwdcal.geometry.vectors import Array
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.patheffects import AbstractPathEffect
+
+TITLES = {
+    "gravity": "|g|",
+    "inclination": "inclination",
+    "toolface": "toolface·sin I",
+    "azimuth": "azimuth·sin I",
+    "field": "|b|",
+    "dip": "dip",
+}
+"""How an observable's error is called: toolface and azimuth are weighted by sin I."""
+BEFORE, AFTER, MARKED, BAND = "#6b7280", "#0072b2", "#d55e00", "#dbe7f0"
+AXES = {"x": AFTER, "y": MARKED, "z": "#111827"}
+"""Colours of the channels of a triad."""
+WIDTH = 7.1
+"""Of a figure, inches."""
+STYLE: dict[Any, Any] = {
+    "axes.axisbelow": True,
+    "axes.edgecolor": "#4b5563",
+    "axes.grid": True,
+    "axes.labelsize": 7.5,
+    "axes.linewidth": 0.6,
+    "axes.spines.right": False,
+    "axes.spines.top": False,
+    "axes.titlelocation": "left",
+    "axes.titlesize": 8,
+    "axes.unicode_minus": True,
+    "font.family": "DejaVu Sans",
+    "font.size": 7.5,
+    "grid.color": "#e5e7eb",
+    "grid.linewidth": 0.5,
+    "hatch.color": "#d1d5db",
+    "hatch.linewidth": 0.5,
+    "legend.fontsize": 7,
+    "legend.frameon": False,
+    "lines.linewidth": 0.8,
+    "lines.markersize": 3.6,
+    "svg.fonttype": "path",
+    "svg.hashsalt": "mwdcal",
+    "text.parse_math": False,
+    "xtick.labelsize": 7,
+    "xtick.major.width": 0.6,
+    "ytick.labelsize": 7,
+    "ytick.major.width": 0.6,
+}
+
+
+Arguments = ParamSpec("Arguments")
+
+
+@contextmanager
+def style() -> Iterator[None]:
+    """Our style on matplotlib's own defaults, whatever the user's settings are."""
+    import matplotlib as mpl
+
+    with mpl.rc_context(), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Glyph .* missing from")
+        mpl.rcdefaults()
+        mpl.rcParams.update(STYLE)
+        yield
+
+
+def styled(draw: Callable[Arguments, Figure]) -> Callable[Arguments, Figure]:
+    """A function that draws a figure, in our style."""
+
+    @wraps(draw)
+    def draw_in_style(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Figure:
+        with style():
+            return draw(*args, **kwargs)
+
+    return draw_in_style
+
+
+def new_figure(
+    label: str, height: float, layout: Literal["constrained"] | None = "constrained"
+) -> Figure:
+    """An empty figure as wide as a page; `height` in inches, `label`: what it shows."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(WIDTH, height), layout=layout)
+    figure.set_label(label)
+    return figure
+
+
+def quantity(value: float, digits: int, unit: str) -> str:
+    """A number with its unit: 0.52°, 8.4 mg."""
+    return f"{value:.{digits}g}{'' if unit == '°' else ' '}{unit}"
+
+
+@styled
+def station_errors(calibration: Calibration, name: str) -> Figure:
+    """Errors of one observable per station: before and after, each on its own scale."""
+    row = next(r for r in calibration.errors if r.observable == name)
+    stations, unit = calibration.station_rows, row.unit.partition(" ")[0]
+    label = f"{TITLES[name]}, {unit}"
+    figure = new_figure(f"Error of {label}, per station, before and after", 1.5, layout=None)
+    place = {"left": 0.095, "right": 0.995, "bottom": 0.27, "top": 0.87, "wspace": 0.24}
+    first, second = figure.subplots(1, 2, gridspec_kw=place)
+    _stems(first, stations, [s.errors_before.get(name, np.nan) for s in stations], BEFORE, "o")
+    first.set_title(f"before: rms {quantity(row.before, 3, unit)}")
+    if row.expected:
+        second.axhspan(-row.expected, row.expected, color=BAND, lw=0, zorder=0.5)
+    _stems(second, stations, [s.errors.get(name, np.nan) for s in stations], AFTER, "s")
+    expected = "  (band: ±1σ expected)" if row.expected else ""
+    second.set_title(f"after: rms {quantity(row.after, 3, unit)}{expected}")
+    for axes in (first, second):
+        axes.set_ylabel(label)
+        axes.axhline(0, color="#4b5563", lw=0.6, zorder=1)
+    return figure
+
+
+@styled
+def deviations(calibration: Calibration, limit: float) -> Figure:
+    """Each station's misfit in σ, with the limit above which it is to be taken again."""
+    rows = calibration.station_rows
+    figure = new_figure("Misfit of each station in standard deviations", 1.7)
+    axes = figure.subplots()
+    _stems(axes, rows, [row.deviation for row in rows], AFTER, "s")
+    axes.axhline(limit, color=MARKED, lw=1, ls=(0, (5, 3)))
+    top = max(limit, *(row.deviation for row in rows)) * 1.2
+    axes.set_ylim(0, top)
+    axes.annotate(
+        f"re-shoot above {limit:.1f}σ", (1, limit), (-2, 3), xycoords=("axes fraction", "data"),
+        textcoords="offset points", ha="right", va="bottom", color="#9a3d00", fontsize=7,
+    )  # fmt: skip
+    axes.set_ylabel("misfit of the station, σ")
+    return figure
+
+
+@styled
+def order_errors(scores: Sequence[OrderScore]) -> Figure:
+    """Error at temperatures left out of the fit by order, inside and at the ends, per triad."""
+    triads = list(dict.fromkeys(row.triad for row in scores))
+    figure = new_figure("Error at left-out temperatures by temperature order", 2.0)
+    panels = figure.subplots(1, len(triads), squeeze=False)[0]
+    for axes, triad in zip(panels, triads, strict=True):
+        _by_order(axes, [row for row in scores if row.triad == triad])
+        axes.set_title(triad)
+    panels[0].legend(loc="upper right")
+    return figure
+
+
+def _by_order(axes: Axes, rows: Sequence[OrderScore]) -> None:
+    """One triad's errors over the order, on a logarithmic scale, with the noise below them."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    where = [row.order for row in rows]
+    inside, ends, noise = (
+        np.array([getattr(row, name) for row in rows], float)
+        for name in ("error_inside", "error_ends", "noise")
+    )
+    axes.plot(where, ends, "^--", color=MARKED, label="at the ends (extrapolation)")
+    axes.plot(where, inside, "s-", color=AFTER, label="inside (interpolation)")
+    axes.plot(where, noise, ":", color=BEFORE, lw=1.2, label="noise of a reading")
+    axes.set_yscale("log")
+    wide = np.nanmax([inside, ends, noise]) > 30 * np.nanmin([inside, ends, noise])
+    axes.yaxis.set_major_locator(LogLocator(subs=(1.0,) if wide else (1.0, 2.0, 5.0)))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.yaxis.set_minor_formatter(NullFormatter())
+    axes.set_xticks(
+        where, [f"{row.order}\nchosen" if row.chosen else str(row.order) for row in rows]
+    )
+    axes.margins(x=0.08, y=0.12)
+    axes.set_xlabel("order")
+    axes.set_ylabel("error, " + rows[0].unit.partition(" ")[0])
+
+
+def _stems(
+    axes: Axes, rows: Sequence[StationRow], values: Sequence[float], colour: str, marker: str
+) -> None:
+    """Stems over the stations; the ones to re-shoot have a triangle and their label."""
+    from matplotlib.patheffects import withStroke
+
+    where, heights = np.arange(len(rows)), np.asarray(values, float)
+    marked = np.array([row.reshoot for row in rows])
+    small = 3.6 if len(rows) <= 80 else 2.2
+    gaps = np.full(len(rows), np.nan)
+    stems = np.stack([np.zeros(len(rows)), heights, gaps], -1).ravel()
+    axes.plot(np.repeat(where, 3), stems, color=colour, lw=0.7, alpha=0.6)
+    axes.plot(
+        where[~marked], heights[~marked], marker, color=colour, ms=small, mfc="white", mew=0.9
+    )
+    axes.plot(where[marked], heights[marked], "^", color=MARKED, ms=6)
+    halo = [withStroke(linewidth=2, foreground="white")]
+    for index in np.flatnonzero(marked & ~np.isnan(heights)).tolist():
+        below = heights[index] < 0
+        axes.annotate(
+            f"station {rows[index].station}", (float(where[index]), float(heights[index])),
+            (5, -3 if below else 3), textcoords="offset points", va="top" if below else "bottom",
+            color="#9a3d00", fontsize=7, path_effects=halo,
+        )  # fmt: skip
+    axes.grid(axis="x", visible=False)
+    axes.margins(x=0.02, y=0.16)
+    _station_axis(axes, [row.station for row in rows])
+
+
+def _station_axis(axes: Axes, labels: Sequence[str]) -> None:
+    """Station labels below: as many as are legible."""
+    room = 96 if axes.get_subplotspec() is None or _columns(axes) == 1 else 40
+    longest = max(len(label) for label in labels)
+    step = max(1, -(-len(labels) * (min(longest, 12) + 1) // room))
+    shown = [i for i in range(len(labels)) if i % step == 0]
+    axes.set_xticks(shown, [labels[i][:12] for i in shown])
+    axes.set_xlabel("station")
+
+
+def _columns(axes: Axes) -> int:
+    place = axes.get_subplotspec()
+    return 1 if place is None else int(place.get_gridspec().ncols)
+
+
+@styled
+def accuracy(chart: AccuracyMap, names: Sequence[str]) -> Figure:
+    """1σ of the angles over inclination and azimuth, degrees, in contours with their numbers."""
+    figure = new_figure("Predicted 1σ over inclination and azimuth", 2.75)
+    panels = figure.subplots(1, len(names), sharey=True, squeeze=False)[0]
+    for axes, name in zip(panels, names, strict=True):
+        _sphere(axes, chart, np.degrees(chart.sd[name]), name)
+    panels[0].set_ylabel("inclination, °")
+    return figure
+
+
+def _sphere(axes: Axes, chart: AccuracyMap, values: Array, name: str) -> None:
+    axes.set_title(f"{name}, 1σ in °")
+    axes.set_xlabel("azimuth, °")
+    axes.set(xlim=(0, 360), ylim=(0, 180), xticks=range(0, 361, 90), yticks=range(0, 181, 30))
+    axes.grid(visible=False)
+    if np.isnan(values).all():
+        axes.set_facecolor("#f3f4f6")
+        text = "undetermined:\nno uncertainty\ncan be quoted"
+        axes.patch.set_hatch("////")
+        box = {"facecolor": "white", "edgecolor": "#9ca3af", "boxstyle": "round,pad=0.5"}
+        axes.text(180, 90, text, ha="center", va="center", fontsize=8, bbox=box)
+        return
+    _contours(axes, np.degrees(chart.azimuth), np.degrees(chart.inclination), values)
+
+
+def _contours(axes: Axes, x: Array, y: Array, values: Array) -> None:
+    from matplotlib.colors import BoundaryNorm, ListedColormap
+    from matplotlib.patheffects import withStroke
+
+    levels = contour_levels(values)
+    colours = ListedColormap(_shades(len(levels) - 1))
+    drawn = np.ma.masked_invalid(values)
+    norm = BoundaryNorm(levels, len(levels) - 1)
+    axes.set_facecolor("#f3f4f6")
+    filled = axes.contourf(x, y, drawn, levels=levels, cmap=colours, norm=norm, extend="neither")
+    lines = axes.contour(x, y, drawn, levels=levels[1:-1], colors="#374151", linewidths=0.4)
+    halo: list[AbstractPathEffect] = [withStroke(linewidth=1.6, foreground="white")]
+    for text in axes.clabel(lines, fmt=_short, fontsize=6, colors="#111827"):
+        text.set_path_effects(halo)
+    bar = axes.figure.colorbar(
+        filled, ax=axes, orientation="horizontal", aspect=22, pad=0.03, spacing="uniform"
+    )
+    every = -(-len(levels) // 6)
+    bar.set_ticks(levels[::every].tolist(), labels=[_short(v) for v in levels[::every]])
+    bar.ax.tick_params(labelsize=6, length=2)
+    bar.set_label("1σ, °", fontsize=7)
+
+
+def _shades(count: int) -> list[Any]:
+    """Light to dark: a grey print keeps the order."""
+    import matplotlib as mpl
+
+    return list(mpl.colormaps["Blues"](np.linspace(0.06, 0.72, count)))
+
+
+def contour_levels(values: Array) -> Array:
+    """Round levels that enclose the values: 1-2-5 over a wide range, equal steps over a narrow."""
+    low, high = float(np.nanmin(values)), float(np.nanmax(values))
+    low, high = max(low, 1e-9), max(high, 1.02e-9)
+    if high / low > 4:
+        decades = np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1)
+        parts = [1, 2, 5] if high / low > 12 else [1, 1.5, 2, 3, 5, 7]
+        steps = np.outer(10.0**decades, parts).ravel()
+    else:
+        rough = max(high - low, 0.02 * high) / 6
+        power = 10.0 ** np.floor(np.log10(rough))
+        width = power * min(n for n in (1, 2, 5, 10) if n * power >= rough)
+        steps = np.arange(np.floor(low / width), np.ceil(high / width) + 1) * width
+        steps = np.append(steps, steps[-1] + width)
+    first = max(int(np.searchsorted(steps, low, "right")) - 1, 0)
+    last = int(np.searchsorted(steps, high, "left"))
+    return np.asarray(steps[first : max(last, first + 2) + 1])
+
+
+def _short(value: float) -> str:
+    return f"{value:.3g}" if value >= 1e-4 else f"{value:.1e}"
+
+
+def reshoot_limit(calibration: Calibration) -> float:
+    """The deviation above which a station is marked, in standard deviations."""
+    from scipy.special import ndtri
+
+    return float(-ndtri(RESHOOT / max(len(calibration.station_rows), 1) / 2))
+
+
+@dataclass(frozen=True)
+class Plots:
+    """Figures of one calibration, as `calibration.plot`: Matplotlib figures, in the style of the report.
+
+    Raises:
+        InputError: the calibration has nothing to draw of that kind.
+    """
+
+    calibration: Calibration
+
+    def accuracy(self) -> Figure:
+        """1σ of each angle over inclination and azimuth, degrees, root mean square over toolface."""
+        return accuracy(accuracy_map(self.calibration), angles(self.calibration))
+
+    def errors(self, observable: str) -> Figure:
+        """Errors of an observable at each station of the run, before and after the calibration."""
+        known = [row.observable for row in self.calibration.errors]
+        if observable not in known:
+            raise InputError(
+                f"`observable` must be one with references in the run ({', '.join(known)}); got "
+                f"{observable!r}. Name another."
+            )
+        return station_errors(self.calibration, observable)
+
+    def deviations(self) -> Figure:
+        """Misfit of each station in standard deviations, and the limit for measuring it again."""
+        return deviations(self.calibration, reshoot_limit(self.calibration))
+
+    def orders(self) -> Figure:
+        """Error at temperatures left out of the fit, by temperature order."""
+        if not any(row.ends is not None for row in self.calibration.orders):
+            raise InputError(
+                "no temperature orders were compared in this calibration: the run needs stations at "
+                "three temperatures or more."
+            )
+        return order_errors(self.calibration.orders)
+
+
+Calibration.plot = property(Plots)
