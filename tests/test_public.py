@@ -73,6 +73,11 @@ def test_every_public_name_is_there_and_has_a_docstring():
         mwdcal.reading  # noqa: B018
 
 
+def test_the_citation_states_the_version():
+    text = (EXAMPLE.parents[1] / "CITATION.cff").read_text("utf-8")
+    assert f"version: {mwdcal.__version__}\n" in text
+
+
 def test_ten_lines(simulated, rolltest, tmp_path, monkeypatch):
     """The script of the design, with its own names."""
     pytest.importorskip("matplotlib")
@@ -283,7 +288,7 @@ def test_short_representations(cal, rolltest):
 def test_accuracy_of_the_representation_is_the_typical_one(cal):
     from mwdcal.calibration.prediction import typical_accuracy
 
-    accuracy = cal.summary()["1σ at 45° inclination"]
+    accuracy = cal.summary()["accuracy"]
     for name, value in typical_accuracy(cal).items():
         assert f"{name} {value:.2g}°" in accuracy
 

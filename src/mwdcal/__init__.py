@@ -9,6 +9,8 @@ Units: radians, g, nT and °C. Keywords that end in `_deg` take degrees.
 Axes of arrays: the component axis (x, y, z) is last, stations before it, repetitions lead: readings
 are (n, 3), angles (n,). NaN is unknown.
 
+A first script::
+
     run = mwdcal.readings(a, m, temperature=t, inclination=inc, azimuth=azi, toolface=tf, field=48_000.0)
     cal = mwdcal.calibrate(run)
     g, b = cal.fields(survey)

@@ -269,7 +269,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
             "tool": " ".join([self.tool.get("serial", self.profile.name), *simulated(self.tool)]),
             "run": f"{self.stations} stations, method {self.method}",
             "rank": rank,
-            "1σ at 45° inclination": accuracy or "not stated",
+            "accuracy": f"{accuracy} (1σ at 45° inclination)" if accuracy else "not stated",
             "findings": findings or "none",
         }
 
