@@ -18,22 +18,20 @@ from pathlib import Path
 import nulls
 import numpy as np
 
+from mwdcal import Calibration, Options, Profile, Readings, calibrate
 from mwdcal.app import cli
 from mwdcal.app.commands.choices import Typed, choose
 from mwdcal.calibration.automatic.nonlinearity import ODDS, USUAL, choices_of, declared, log_odds
-from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.estimate import Fit, fit
 from mwdcal.calibration.methods import EVIDENCE
-from mwdcal.calibration.options import Options
-from mwdcal.calibration.readings import TRIADS, Readings
-from mwdcal.calibration.record import Calibration
+from mwdcal.calibration.readings import TRIADS
 from mwdcal.errors import MwdcalError
 from mwdcal.estimation.rank import free_directions
 from mwdcal.files.datasets import fetch
 from mwdcal.files.formats.table import Table
 from mwdcal.files.profiles import load_profile
 from mwdcal.files.runs import read_run, to_readings
-from mwdcal.sensor.profile import Profile, TriadProfile
+from mwdcal.sensor.profile import TriadProfile
 from mwdcal.use.notation import Notation, convert
 from mwdcal.use.roll_scatter import directions, group_scatter
 
