@@ -12,8 +12,8 @@ import time
 import pytest
 
 from cli_support import EXAMPLE, mwdcal, process
-from mwdcal.app import cli
-from mwdcal.app.commands import fleet
+from mwdcal.app import fleet_table
+from mwdcal.app.interruption import Ended
 
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="POSIX signals")
 
@@ -138,15 +138,14 @@ def test_every_orderly_end_tells_its_status_and_leaves_nothing(tmp_path, name, w
 
 TIDYING = """
 import time
-from mwdcal.app import cli
-from mwdcal.app.commands import fleet
-from mwdcal.files import atomic
+from mwdcal.app import fleet_table, interruption
+from mwdcal.files.formats import atomic
 real_remove = atomic._remove
 def remove(path):
     print("tidying", flush=True)
     time.sleep({seconds})
     real_remove(path)
-atomic._remove, cli.PATIENCE = remove, {patience}
+atomic._remove, interruption.PATIENCE = remove, {patience}
 """
 
 
@@ -192,15 +191,15 @@ def test_an_ignored_hang_up_stays_ignored(tmp_path):
     assert (tmp_path / "cal.json").exists()
 
 
-@pytest.mark.parametrize("stop", [KeyboardInterrupt(), cli.Ended(signal.SIGTERM)], ids=repr)
+@pytest.mark.parametrize("stop", [KeyboardInterrupt(), Ended(signal.SIGTERM)], ids=repr)
 def test_an_interrupted_fleet_says_that_finished_parts_are_kept(tmp_path, monkeypatch, stop):
     def interrupt(*given):
         raise stop
 
-    monkeypatch.setattr(fleet, "run", interrupt)
+    monkeypatch.setattr(fleet_table, "calibrate_table", interrupt)
     before = [signal.getsignal(getattr(signal, name)) for name in ENDINGS]
     ran = mwdcal("fleet", tmp_path / "runs.parquet", "-o", tmp_path / "cals.parquet")
-    assert ran.code == 128 + (signal.SIGTERM if isinstance(stop, cli.Ended) else signal.SIGINT)
+    assert ran.code == 128 + (signal.SIGTERM if isinstance(stop, Ended) else signal.SIGINT)
     word = ran.err.strip().removeprefix("mwdcal: ")
     assert word.endswith("ed. Finished parts are kept: the same command goes on from there.")
     assert [signal.getsignal(getattr(signal, name)) for name in ENDINGS] == before

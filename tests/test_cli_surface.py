@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 
+import click
 import numpy as np
 import pytest
 
@@ -21,6 +22,8 @@ from cli_support import (
     write_csv,
 )
 from mwdcal.app.cli import cli
+from mwdcal.app.commands import options
+from mwdcal.errors import InputError
 from mwdcal.files import documents
 from mwdcal.use.correction import OUTSIDE
 
@@ -480,3 +483,33 @@ def test_excluded_stations_may_verify_the_calibration(tmp_path):
         part = {name: np.asarray(values)[rows] for name, values in columns.items()}
         test = write_csv(tmp_path / "roll.csv", part)
         assert mwdcal("verify", made, test).code in codes
+
+
+# Options by name
+
+
+@options.command()
+@click.option("--sampling-hz", type=float)
+@click.option("--from", "start")
+@click.argument("log")
+def failing(sampling_hz, start, log):
+    raise InputError("`sampling_hz` and `start` of `log`; see `# key = value`, `order` and -o.")
+
+
+def test_errors_name_options_as_they_are_typed():
+    with pytest.raises(InputError) as refusal:
+        failing.main(["run.csv"], standalone_mode=False)
+    wanted = "--sampling-hz and --from of `log`; see `# key = value`, `order` and -o."
+    assert str(refusal.value) == wanted
+
+
+def test_a_command_imports_no_other_command():
+    script = (
+        "import sys\nfrom mwdcal.app.cli import main\n"
+        "try:\n    main(['verify', '--help'])\nexcept SystemExit:\n    pass\n"
+        "names = {n.removeprefix('mwdcal.app.commands.') for n in sys.modules}\n"
+        f"print(sorted(names & set({COMMANDS})), 'numpy' in sys.modules, file=sys.stderr)\n"
+    )
+    command = [sys.executable, "-c", script]
+    done = subprocess.run(command, capture_output=True, encoding="utf-8", check=True)
+    assert done.stderr.strip() == "['verify'] False"

@@ -12,7 +12,7 @@ from scipy.linalg import polar
 from scipy.spatial.transform import Rotation
 
 from cli_support import mwdcal, refused, servo_run, write_csv
-from mwdcal.app.commands import compare as command
+from mwdcal.app.pages import comparison as command
 from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.methods import EVIDENCE
 from mwdcal.calibration.options import Options
@@ -330,7 +330,7 @@ def test_the_page_says_what_is_simulated_and_what_is_refused():
 
 
 def test_long_runs_show_the_worst_of_each_part():
-    from mwdcal.app.pages.comparison_plots import MOST_STATIONS, _largest
+    from mwdcal.app.pages.comparison import MOST_STATIONS, _largest
 
     values = np.sin(np.arange(1000) ** 2) * 1e-3
     values[737] = 9.0

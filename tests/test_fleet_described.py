@@ -14,6 +14,7 @@ pq = pytest.importorskip("pyarrow.parquet")
 
 from mwdcal.app.pages import fleet_plots  # noqa: E402
 from mwdcal.files.formats import table as tables  # noqa: E402
+from mwdcal.use import plots  # noqa: E402
 
 
 def test_table_screen_page_and_summary_name_the_options(tmp_path):
@@ -75,7 +76,7 @@ def test_estimated_noise_is_shown_where_residuals_cannot_be_judged(
 
     def quality(panels):
         drawn.extend(panels)
-        return "<svg></svg>"
+        return plots.new_figure("", 1.0)
 
     monkeypatch.setattr(fleet_plots, "quality", quality)
     _, page = said(tmp_path, {f"T{i}": short_run(i) for i in range(4)}, "--tool", tool)

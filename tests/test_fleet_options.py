@@ -374,11 +374,10 @@ def test_what_could_be_right_for_no_tool_is_refused_at_once(tmp_path):
 
 
 def test_an_option_that_both_commands_have_is_one():
-    from mwdcal.app.cli import cli
+    from mwdcal.app.commands import calibrate as run
+    from mwdcal.app.commands import fleet as table
 
-    calibrate, fleet = (
-        {p.name: p for p in cli.commands[name].params} for name in ("calibrate", "fleet")
-    )
+    calibrate, fleet = ({p.name: p for p in module.command.params} for module in (run, table))
     own = {"runs", "workers", "scheduler"}
     assert set(fleet) - set(calibrate) == own
     assert set(calibrate) - set(fleet) == {"run", "exclude", "decimal"}

@@ -12,7 +12,7 @@ from test_fleet_findings import said
 pa = pytest.importorskip("pyarrow")
 pq = pytest.importorskip("pyarrow.parquet")
 
-from mwdcal.app.pages import fleet_plots, fleet_report  # noqa: E402
+from mwdcal.app.pages import fleet_plots, fleet_report, pictures  # noqa: E402
 
 
 def unknown(seed):
@@ -118,12 +118,13 @@ def test_numbers_along_an_axis_do_not_run_into_each_other(monkeypatch):
 
     monkeypatch.setattr(Figure, "savefig", savefig)
     values = np.linspace(-0.0051, 0.0057, 40)
-    fleet_plots.parameters(
+    figure = fleet_plots.parameters(
         [
             fleet_report.Parameter("magnetometer", "field = 1", name, "of the field", values, 0.0)
             for name in ("gain xx", "gain xy", "offset x")
         ]
     )
+    pictures.svg(figure, "parameters")
     assert len(panels) == 3
     for boxes in panels:
         assert len(boxes) >= 2

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import builtins
 import re
+import sys
 import warnings
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -12,12 +12,14 @@ from html.parser import HTMLParser
 import msgspec
 import numpy as np
 import pytest
+from markupsafe import Markup
 
 from mwdcal.app import text
-from mwdcal.app.commands import calibrate as command
 from mwdcal.app.commands.choices import Chosen
-from mwdcal.app.pages import plots, report
-from mwdcal.app.pages.report import css_string, measured, number, render, signed, write_report
+from mwdcal.app.pages import calibration as screen
+from mwdcal.app.pages import conversion, pictures, report
+from mwdcal.app.pages.page import css_string, fixed, measured, number, signed
+from mwdcal.app.pages.report import render, write_report
 from mwdcal.calibration.automatic.order_selection import choose_order, order_errors
 from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.options import Options
@@ -27,6 +29,7 @@ from mwdcal.errors import InputError
 from mwdcal.geometry.vectors import reference_vectors
 from mwdcal.planning import simulate
 from mwdcal.sensor.profile import Profile, TriadProfile
+from mwdcal.use import plots
 from mwdcal.use.notation import convert
 from simulation import DEG, Tool, plan
 
@@ -128,6 +131,7 @@ def words(monkeypatch):
     """`render` without its pictures, for tests of what it says."""
     for name in ("station_errors", "deviations", "accuracy", "order_errors"):
         monkeypatch.setattr(plots, name, lambda *arguments: "")
+    monkeypatch.setattr(plots, "svg", lambda figure, key: Markup(figure))
     monkeypatch.setattr(report, "accuracy_map", lambda calibration: None)
     return render
 
@@ -196,7 +200,7 @@ def test_user_settings_of_matplotlib_change_nothing(whole, page):
     import matplotlib as mpl
 
     with mpl.rc_context({"font.size": 20, "axes.facecolor": "red", "svg.fonttype": "none"}):
-        assert plots.station_errors(whole, "gravity") in page
+        assert pictures.svg(plots.station_errors(whole, "gravity"), "error-gravity") in page
         assert mpl.rcParams["font.size"] == 20
 
 
@@ -228,7 +232,8 @@ def test_station_labels_may_be_anything(whole):
     odd = msgspec.structs.replace(whole, station_rows=rows)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        found = plots.station_errors(odd, "field") + plots.deviations(odd, 3.7)
+        figures = {"a": plots.station_errors(odd, "field"), "b": plots.deviations(odd, 3.7)}
+        found = "".join(pictures.svg(figure, key) for key, figure in figures.items())
     assert "<script" not in found
     parsed(found)
 
@@ -335,11 +340,12 @@ def test_a_course_that_nothing_tests_says_so(words, whole):
 
 def test_picture_of_the_orders_has_both_triads():
     scores = judged().orders
-    parsed(plots.order_errors(scores))
+    both = plots.order_errors(scores)
+    parsed(pictures.svg(both, "orders"))
     alone = plots.order_errors([s for s in scores if s.triad == "accelerometer"])
-    assert len(alone) < len(plots.order_errors(scores))
+    assert (len(alone.axes), len(both.axes)) == (1, 2)
     blank = [msgspec.structs.replace(s, error_inside=None) for s in scores]
-    parsed(plots.order_errors(blank))
+    parsed(pictures.svg(plots.order_errors(blank), "orders"))
 
 
 @cache
@@ -358,10 +364,10 @@ def test_different_orders_name_their_triad(words):
     other = msgspec.structs.replace(made.magnetometer, order=2)
     made = msgspec.structs.replace(made, magnetometer=other)
     wanted = "accelerometer: factors of order 1, magnetometer: factors of order 2"
-    assert text.model(made) == wanted
-    assert wanted in text.heading(made)
+    assert screen.model(made) == wanted
+    assert wanted in screen.heading(made)
     assert ("Method", f"joint; {wanted}") in report._facts(made)
-    assert "factors of order 1   " in text.heading(heated())
+    assert "factors of order 1   " in screen.heading(heated())
 
 
 def left_out_rows(page):
@@ -379,7 +385,7 @@ def test_every_station_shows_its_error_left_out_and_what_it_does(words, whole):
     assert len(rows) == 48
     for cells, station in zip(rows, whole.station_rows, strict=True):
         alone = [signed(station.errors_left_out[n], decimals[n]) for n in names]
-        moves = [report.fixed(station.influence[n], decimals[n] + 1) for n in names]
+        moves = [fixed(station.influence[n], decimals[n] + 1) for n in names]
         assert cells == [station.station, *alone, *moves]
     assert "weight</th>" not in page
 
@@ -389,7 +395,7 @@ def test_the_weight_of_a_station_is_shown_where_the_fit_was_robust(words):
     page = words(made)
     assert "weight</th>" in page
     shown = [cells[-1] for cells in left_out_rows(page)]
-    assert shown == [report.fixed(row.weight, 2) for row in made.station_rows]
+    assert shown == [fixed(row.weight, 2) for row in made.station_rows]
 
 
 def test_a_record_without_errors_left_out_has_no_such_table(words, whole):
@@ -408,7 +414,7 @@ def test_held_parameters_are_said_to_be_held(words, parameters):
     assert page.count("<td>0</td><td>held</td>") == count
     assert ("A held parameter" in page) == (parameters != 12)
     for notation in ("factors", "forward", "affine"):
-        shown = text.notation(convert(made, notation))
+        shown = conversion.notation(convert(made, notation))
         assert len(re.findall(r" 0 +held$", shown, re.MULTILINE)) == count
         assert not re.search(r" -0( |$)", shown, re.MULTILINE)
 
@@ -419,7 +425,7 @@ def test_zero_has_no_sign():
 
 def test_summary_says_what_was_asked_for(tmp_path):
     made = asked()
-    found = command.summary(made, Chosen(Options(), [], []), tmp_path / "tool.json", None)
+    found = screen.summary(made, Chosen(Options(), [], []), tmp_path / "tool.json", None)
     found = msgspec.to_builtins(found)
     assert found["options"]["parameters"] == 9
     assert found["options"]["robust"] == "huber"
@@ -444,14 +450,7 @@ def test_real_data_is_not_called_simulated(page):
 
 
 def test_missing_extra_says_what_to_install(whole, monkeypatch):
-    real = builtins.__import__
-
-    def without(name, *rest, **more):
-        if name.startswith("jinja2"):
-            raise ImportError(name=name)
-        return real(name, *rest, **more)
-
-    monkeypatch.setattr(builtins, "__import__", without)
+    monkeypatch.setitem(sys.modules, "jinja2", None)
     with pytest.raises(InputError, match=r"install 'mwdcal\[report\]'"):
         render(whole)
 

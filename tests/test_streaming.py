@@ -24,9 +24,8 @@ from cli_support import (
     servo_run,
     write_csv,
 )
-from mwdcal.app import progress
-from mwdcal.app.commands import streaming
-from mwdcal.app.commands.apply import apply_to_table
+from mwdcal.app import progress, streaming
+from mwdcal.app.correction import apply_to_table
 from mwdcal.errors import InputError
 from mwdcal.files import documents, streams
 from mwdcal.files.formats import sinks, table

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from cli_support import calibrated, channels, mwdcal, read_csv, refused, servo_run, write_csv
-from mwdcal.app.commands import streaming
-from mwdcal.app.commands.streaming import apply_to_file
+from mwdcal.app import streaming
+from mwdcal.app.streaming import apply_to_file
 from mwdcal.errors import InputError
 from mwdcal.files import documents
 from mwdcal.use import strengths

@@ -19,7 +19,7 @@ import nulls
 import numpy as np
 
 from mwdcal import Calibration, Options, Profile, Readings, calibrate
-from mwdcal.app import cli
+from mwdcal.app.commands import calibrate as command
 from mwdcal.app.commands.choices import Typed, choose
 from mwdcal.calibration.automatic.nonlinearity import ODDS, USUAL, choices_of, declared, log_odds
 from mwdcal.calibration.estimate import Fit, fit
@@ -102,10 +102,8 @@ def ways(curved: str) -> list[str]:
 
 def typed(words: str) -> Typed:
     """The options that the command line makes of these words."""
-    command = cli.calibrate.make_context(
-        "calibrate", ["-", "-o", "-", *words.split()], **cli.cli.context_settings
-    )
-    return Typed(**{name: command.params[name] for name in Typed.__annotations__})
+    context = command.command.make_context("calibrate", ["-", "-o", "-", *words.split()])
+    return Typed(**{name: context.params[name] for name in Typed.__annotations__})
 
 
 @cache

@@ -141,7 +141,7 @@ def _on_cores(steps: Steps, tasks: Sequence[Any], workers: int) -> Iterator[tupl
         return
     raise InputError(
         f"a worker process died {ATTEMPTS} times, most likely for want of memory. Finished parts are "
-        "kept: run the same command again with fewer --workers."
+        "kept: run the same command again with fewer `workers`."
     )
 
 
@@ -176,7 +176,7 @@ def _on_cluster(steps: Steps, tasks: Sequence[Any], address: str) -> Iterator[tu
         distributed: Any = import_module("distributed")
     except ImportError:
         raise InputError(
-            "--scheduler needs the extra 'cluster'. Install it, here and on every worker: "
+            "`scheduler` needs the extra 'cluster'. Install it, here and on every worker: "
             "pip install 'mwdcal[parquet,cluster]'"
         ) from None
     client_of = partial(distributed.Client, address, timeout=PATIENCE)
@@ -209,7 +209,7 @@ def _connected(connect: Callable[[], Any], address: str) -> Iterator[Any]:
         client = connect()
     except (OSError, ValueError, TimeoutError) as error:
         raise InputError(
-            f"--scheduler {address}: no Dask scheduler answers there ({str(error)[:120]}). Start "
+            f"`scheduler` {address}: no Dask scheduler answers there ({str(error)[:120]}). Start "
             "one with `dask scheduler`, and workers with `dask worker ADDRESS`."
         ) from error
     try:
@@ -217,7 +217,7 @@ def _connected(connect: Callable[[], Any], address: str) -> Iterator[Any]:
         yield client
     except TimeoutError as error:
         raise InputError(
-            f"--scheduler {address}: the scheduler has no workers. Start some: dask worker {address}"
+            f"`scheduler` {address}: the scheduler has no workers. Start some: dask worker {address}"
         ) from error
     finally:
         client.close()

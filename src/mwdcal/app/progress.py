@@ -46,14 +46,14 @@ def bar(label: str) -> Iterator[Callable[[int, int], None]]:
             each.stop()
 
 
-def slowly(say: Callable[[str], None]) -> Callable[[str], None]:
-    """The same voice, silent for the first seconds and between two words."""
-    spoken = time.monotonic()
+def slowly(say: Callable[[str], None], every: float = PATIENCE) -> Callable[[str], None]:
+    """`say`, but silent for the first seconds and between two messages."""
+    last = time.monotonic()
 
     def say_slowly(text: str) -> None:
-        nonlocal spoken
-        if time.monotonic() - spoken >= PATIENCE:
-            spoken = time.monotonic()
+        nonlocal last
+        if time.monotonic() - last >= every:
+            last = time.monotonic()
             say(text)
 
     return say_slowly

@@ -163,7 +163,7 @@ def find_noise(
     used; `station_seconds` by default 30, or a tenth of a shorter log.
     Errors: a log without time, with gaps, too short, or without a channel that can be used.
     """
-    check(between, station_seconds)
+    check(between, station_seconds, sampling_hz)
     findings: list[Finding] = []
     first, last, rate = _section(log, sampling_hz, between, findings)
     seconds = (last - first) / rate
@@ -194,22 +194,23 @@ def find_noise(
     )
 
 
-def check(between: tuple[float, float], station_seconds: float | None) -> None:
-    """Refuse seconds that no log can have."""
+def check(
+    between: tuple[float, float], station_seconds: float | None, sampling_hz: float | None
+) -> None:
+    """Refuse seconds and a rate that no log can have."""
     start, end = between
-    for option, value in (("--from", start), ("--to", end)):
-        if np.isnan(value):
-            raise InputError(
-                f"{option} must be seconds from the start of the log; got nan. Correct it."
-            )
+    if np.isnan(between).any():
+        name = "`start`" if np.isnan(start) else "`end`"
+        raise InputError(f"{name} must be seconds from the start of the log; got nan. Correct it.")
     if not start < end:
-        raise InputError(
-            f"--from must be less than --to; got --from {start:g} and --to {end:g}. Swap them?"
-        )
+        got = f"`start` {start:g} and `end` {end:g}"
+        raise InputError(f"`start` must be less than `end`; got {got}. Swap them?")
     if station_seconds is not None and not 0 < station_seconds < np.inf:
-        raise InputError(
-            f"--station-seconds must be above 0 and finite; got {station_seconds:g}. Correct it."
-        )
+        rule = "`station_seconds` must be above 0 and finite"
+        raise InputError(f"{rule}; got {station_seconds:g}. Correct it.")
+    if sampling_hz is not None and not 0 < sampling_hz <= 1e9:
+        rule = "`sampling_hz` must be above 0 and at most 1e9 Hz"
+        raise InputError(f"{rule}; got {sampling_hz:g}. Correct it.")
 
 
 def _section(
@@ -221,7 +222,7 @@ def _section(
     if len(inside) < FEWEST:
         problem, advice = f"got {len(time)}", "Record for longer."
         if len(time) >= FEWEST:
-            problem = f"--from and --to leave {len(inside)} of {len(time)} rows"
+            problem = f"`start` and `end` leave {len(inside)} of {len(time)} rows"
             advice = f"The log lasts {time[-1] - time[0]:.4g} s: widen them."
         raise InputError(
             f"{log.source}: at least {FEWEST} samples are needed for an Allan deviation; {problem}. "
@@ -233,13 +234,13 @@ def _section(
     if step <= 0:
         raise InputError(
             f"{log.source}, column '{TIME}': most samples have the time of the one before; written "
-            "with too few digits? Give the rate: --sampling-hz 100."
+            "with too few digits? Give the rate: `sampling_hz` 100."
         )
     for row in np.flatnonzero(np.abs(steps - step) > JITTER * step)[:1]:
         got = f"{steps[row]:.4g} s after {shown(float(time[first + row]))} s, not {step:.4g} s"
         advice = (
-            "An Allan deviation needs regular samples: choose a part without gaps by --from and "
-            "--to (seconds from the start), or give the rate if only the clock is coarse."
+            "An Allan deviation needs regular samples: choose a part without gaps by `start` and "
+            "`end` (seconds from the start), or give the rate if only the clock is coarse."
         )
         raise cell_error(log, TIME, first + int(row) + 1, f"the next sample came {got}. {advice}")
     rate = (last - first - 1) / float(time[last - 1] - time[first])
@@ -274,12 +275,12 @@ def _station_seconds(given: float | None, seconds: float, rate: float, source: s
         return max(min(STATION_SECONDS, seconds / SOUND), 1 / rate)
     if given < 1 / rate:
         raise InputError(
-            f"--station-seconds must be at least one sample of {source}, {1 / rate:g} s; got {given:g}. "
+            f"`station_seconds` must be at least one sample of {source}, {1 / rate:g} s; got {given:g}. "
             "Ask for a longer station."
         )
     if given > longest:
         raise InputError(
-            f"--station-seconds must be at most a quarter of {source}, {longest:.4g} s; got {given:g}. "
+            f"`station_seconds` must be at most a quarter of {source}, {longest:.4g} s; got {given:g}. "
             f"Record for at least {AVERAGES * given:g} s, better {SOUND * given:g} s, or ask for a "
             "shorter station."
         )

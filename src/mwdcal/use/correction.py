@@ -108,7 +108,7 @@ def result_names(outside: str) -> tuple[str, ...]:
 def check_outside(outside: str) -> None:
     """Refuse an unknown choice for temperatures outside the calibrated range."""
     if outside not in OUTSIDE:
-        raise InputError(f"--outside must be one of {', '.join(OUTSIDE)}; got {outside!r}.")
+        raise InputError(f"`outside` must be one of {', '.join(OUTSIDE)}; got {outside!r}.")
 
 
 def reference(calibration: Calibration, readings: Readings) -> dict[str, Array]:
@@ -218,7 +218,7 @@ def _outside(calibration: Calibration, source: str, how: str, tally: RowCounts) 
     text = f"{tally.beyond} of {tally.rows} rows lie outside the calibrated range {low:.1f}…{high:.1f} °C"
     if how == "refuse":
         raise InputError(
-            f"{source}: {text}. Use --outside blank or extrapolate, or calibrate over a wider range."
+            f"{source}: {text}. Use `outside` blank or extrapolate, or calibrate over a wider range."
         )
     results = "their results are blank"
     if how == "extrapolate":

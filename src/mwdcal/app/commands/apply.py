@@ -1,80 +1,68 @@
-"""A table of readings through a calibration, to a table with the results beside the input."""
+"""`mwdcal apply`: readings corrected by a calibration."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
+import click
 
-from mwdcal.app.commands.streaming import (
-    apply_to_file,
-    check_free,
-    check_warmth,
-    chosen,
-    described,
-    in_parts,
-    lacking,
-    nothing,
-    spread,
-    wholly_blank,
+from mwdcal.app.commands import options
+from mwdcal.app.messages import print_result
+from mwdcal.errors import InputError
+
+
+@options.command()
+@options.CALIBRATION
+@options.argument("readings")
+@options.output("OUT", "Table to write; format by suffix.")
+@click.option(
+    "--outside",
+    default="blank",
+    show_default=True,
+    metavar="blank|refuse|extrapolate",
+    help="Results of rows more than 1 °C (without temperature terms: 5 °C) outside the calibrated "
+    "temperatures: none; refuse the file; or extrapolated, and marked in a column 'extrapolated'.",
 )
-from mwdcal.calibration.diagnosis.findings import unused_columns
-from mwdcal.calibration.record import Calibration, Finding
-from mwdcal.files.contract import check_columns
-from mwdcal.files.formats import table
-from mwdcal.files.formats.columns import as_text
-from mwdcal.files.formats.table import Table
-from mwdcal.files.runs import to_readings
-from mwdcal.use.correction import MARK, RowCounts, counted
+@click.option(
+    "--missing",
+    type=click.Choice(["refuse", "blank"]),
+    default="refuse",
+    show_default=True,
+    help="Rows with a blank reading or temperature: refuse the file, or leave their results blank.",
+)
+@options.DECIMAL
+@options.JSON
+def command(
+    calibration: Path, readings: Path, output: Path, outside: str, missing: str, decimal: str,
+    as_json: bool,
+) -> None:  # fmt: skip
+    """Correct READINGS (CSV, TSV, Parquet or XLSX) with the CALIBRATION of their tool.
 
+    Writes the columns of READINGS as they are and, beside them: gravity and field along the tool
+    axes, inclination, azimuth (magnetic), toolface, dip and strengths.
 
-def apply_to_any(
-    calibration: Calibration,
-    readings: Path,
-    output: Path,
-    outside: str,
-    missing: str,
-    decimal: str,
-    advance: Callable[[int, int], None],
-) -> tuple[RowCounts, list[Finding]]:
-    """Correct a file into another: part by part, or whole where it is short text or a workbook.
-
-    What was seen in the rows, and what the reader should know. `advance` is told how much of a long
-    table is done, and of how much.
+    \b
+    Example: mwdcal apply tool.json surveys.csv -o corrected.csv
+    Exit: 0 written, 2 input cannot be read, or does not belong to the calibration.
     """
-    if in_parts(readings, output, decimal):
-        return apply_to_file(
-            calibration, readings, output, outside, advance, missing=missing, decimal=decimal
-        )
-    source = table.read(readings, decimal=decimal)
-    result, tally, findings = apply_to_table(calibration, source, outside, missing)
-    if MARK in result.columns and output.suffix.lower() != ".parquet":
-        words = [as_text(bool(mark)) for mark in result.columns[MARK]]
-        result = replace(result, columns={**result.columns, MARK: words})
-    table.write(output, result)
-    return tally, findings
+    from mwdcal.app.correction import apply_to_any
+    from mwdcal.app.progress import bar
+    from mwdcal.calibration.readings import simulated
+    from mwdcal.files import documents
+    from mwdcal.files.runs import BlankReadingError
 
-
-def apply_to_table(
-    calibration: Calibration, source: Table, outside: str, missing: str = "refuse"
-) -> tuple[Table, RowCounts, list[Finding]]:
-    """The input's columns and metadata, the results, and what the calibration was."""
-    check_columns(list(source.columns), source.source)
-    check_warmth(calibration, list(source.columns), source.source)
-    whole = np.ones(source.count, bool)
-    if missing == "blank":
-        whole = ~lacking(source, wholly_blank([source]))
-    if not whole.any():
-        raise nothing(source.source)
-    kept = source if whole.all() else chosen(source, whole)
-    readings, _ = to_readings(kept, calibration.profile)
-    found, tally, findings = counted(calibration, readings, outside, source.count - kept.count)
-    check_free(source.columns, list(found), source.source)
-    columns = found if whole.all() else {n: spread(values, whole) for n, values in found.items()}
-    metadata = {**source.metadata, **described(calibration)}
-    if findings:
-        metadata["findings"] = [finding.text for finding in findings]
-    made = replace(source, columns={**source.columns, **columns}, metadata=metadata)
-    return made, tally, findings + unused_columns(readings.unused)
+    options.check_outputs([output], [calibration, readings])
+    fitted = documents.read(calibration)
+    try:
+        with bar("correcting") as advance:
+            tally, findings = apply_to_any(
+                fitted, readings, output, outside, missing, decimal, advance
+            )
+    except BlankReadingError as error:
+        advice = "Or leave the results of such rows blank: --missing blank."
+        raise InputError(f"{error} {advice}") from None
+    blank = tally.blank(outside)
+    document = {"rows": tally.rows, "blank": blank, "output": str(output), "findings": findings}
+    corrected = f"{tally.rows} rows corrected" + (f", {blank} of them blank" if blank else "")
+    screen = "   ".join([corrected, f"wrote {output}", *simulated(fitted.tool)])
+    print_result(document if as_json else screen, findings)

@@ -1,149 +1,63 @@
-"""`mwdcal convert`: what is printed and written of a calibration in another notation."""
+"""`mwdcal convert`: a calibration in another notation."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, NamedTuple
 
-import numpy as np
+import click
 
-from mwdcal.app import text
-from mwdcal.calibration.readings import TRIADS, Readings, is_simulated, simulated
-from mwdcal.calibration.record import Calibration, Finding
-from mwdcal.files import documents
-from mwdcal.use.notation import COURSE, Notation, convert
-
-SCHEMA_VERSION = 1
-"""Version of the JSON document."""
+from mwdcal.app.commands import options
+from mwdcal.app.messages import print_result, to_json
+from mwdcal.errors import InputError
 
 
-class Converted(NamedTuple):
-    """A calibration in one notation: where from, at which temperature, and what to know of it.
+@options.command()
+@options.CALIBRATION
+@click.option(
+    "--notation",
+    required=True,
+    type=click.Choice(["factors", "forward", "affine"]),
+    help="Form to print.",
+)
+@click.option(
+    "--temperature",
+    metavar="°C|course",
+    help="One temperature, or 'course': coefficients by power of T - reference. "
+    "Default: the reference temperature.",
+)
+@options.output("OUT.json", "Write JSON here instead of printing.", required=False)
+@options.JSON
+def command(
+    calibration: Path, notation: str, temperature: str | None, output: Path | None, as_json: bool
+) -> None:
+    """Print a CALIBRATION in another notation, in raw units, with covariance.
 
-    `sha256` is of the bytes of the calibration file; `temperature` is None where none was given.
+    \b
+    forward: raw = S·field + o    affine: field = M·raw + b    factors: SF, B, m (Moosavi)
+    Example: mwdcal convert tool.json --notation forward --json
+    Example: mwdcal convert tool.json --notation forward --temperature course
     """
+    from mwdcal.app.pages import conversion
+    from mwdcal.files.formats import atomic
 
-    path: Path
-    sha256: str
-    calibration: Calibration
-    notation: str
-    temperature: float | str | None
-    triads: dict[str, Notation]
-    findings: list[Finding]
-
-
-def run(path: Path, notation: str, temperature: float | str | None) -> Converted:
-    """Read a calibration file and convert it."""
-    calibration, sha256 = documents.load(path)
-    triads = convert(calibration, notation, temperature)
-    findings = temperature_findings(calibration, notation, temperature)
-    return Converted(path, sha256, calibration, notation, temperature, triads, findings)
+    options.check_outputs([output], [calibration])
+    converted = conversion.convert_file(calibration, notation, _temperature(temperature))
+    result = conversion.document(converted) if as_json or output else conversion.screen(converted)
+    if output:
+        atomic.write(output, to_json(result) + "\n")
+        result = f"wrote {output}"
+    print_result(result, converted.findings)
 
 
-def temperature_findings(
-    calibration: Calibration, notation: str, temperature: float | str | None
-) -> list[Finding]:
-    """What to know where the values are asked for at a temperature without calibration.
+def _temperature(typed: str | None) -> float | str | None:
+    """A temperature in °C if it is a number; a word is left to the conversion."""
+    try:
+        value = None if typed is None else float(typed)
+    except ValueError:
+        return typed
+    from mwdcal.files.contract import TEMPERATURE
 
-    The reference temperature counts as asked for where the values depend on it.
-    """
-    if isinstance(temperature, str):
-        return []
-    varies = notation != "factors" and any(t.order for t in calibration.triads)
-    if temperature is None and not varies:
-        return []
-    at = calibration.reference_temperature if temperature is None else temperature
-    there = Readings(np.zeros((1, 3)), temperature=np.array([at]))
-    if calibration.unrecorded(there):
-        text = (
-            "the calibration was made at unrecorded temperatures, without temperature terms: the values are "
-            f"the same at any temperature, and nothing says how good they are at {at:g} °C."
-        )
-        return [Finding(id="no-temperature", text=text)]
-    if not calibration.outside(there).any():
-        return []
-    low, high = calibration.temperature_c or (np.nan, np.nan)
-    text = (
-        f"{at:g} °C lies outside the calibrated range {low:.1f}…{high:.1f} °C: the values are extrapolated, and "
-        "their uncertainties do not hold. Choose a temperature inside, or calibrate over a wider range."
-    )
-    return [Finding(id="outside-temperature", text=text)]
-
-
-def document(made: Converted) -> dict[str, Any]:
-    """The result for machines: identity, units and conditions, then the values of each triad."""
-    return {**_identity(made), **{name: _triad(made, name) for name in made.triads}}
-
-
-def _identity(made: Converted) -> dict[str, Any]:
-    calibration, at = made.calibration, made.temperature
-    found: dict[str, Any] = {
-        "schema_version": SCHEMA_VERSION,
-        "tool": calibration.tool,
-        "serial": calibration.tool.get("serial"),
-        "profile": calibration.profile.name,
-        "run": calibration.run,
-        "run_sha256": calibration.run_sha256,
-        "calibration": made.path.name,
-        "calibration_sha256": made.sha256,
-        "calibrated": calibration.time,
-        "software": calibration.software,
-        "simulated": is_simulated(calibration.tool),
-        "calibrated_temperature_c": calibration.temperature_c,
-        "field_unit": calibration.field_unit,
-        "notation": made.notation,
-        "temperature_c": at,
-        "findings": made.findings,
-    }
-    if isinstance(at, str):
-        found["powers_of"] = "T - reference_temperature_c"
-    elif made.notation == "factors" or at is None:
-        found["temperature_c"] = calibration.reference_temperature
-    return found
-
-
-def _triad(made: Converted, name: str) -> dict[str, Any]:
-    item, profile = made.triads[name], getattr(made.calibration.profile, name)
-    triad = next(t for t in made.calibration.triads if t.name == name)
-    return {
-        **{k: v.tolist() for k, v in item.values.items()},
-        "reference_temperature_c": made.calibration.reference_temperature,
-        "axes": profile.axes,
-        "unit": triad.unit,
-        "nominal_raw_per_unit": profile.scale,
-        "standard_uncertainty": {k: v.tolist() for k, v in item.uncertainty.items()},
-        "covariance": item.covariance.tolist(),
-    }
-
-
-def screen(made: Converted) -> str:
-    """The result for people: whose calibration it is, in which units, then the values."""
-    calibration, at = made.calibration, made.temperature
-    reference = calibration.reference_temperature
-    serial = calibration.tool.get("serial", calibration.profile.name)
-    first = [f"{made.path.name}", serial, f"run {calibration.run}", calibration.software]
-    lines = ["   ".join([*first, *simulated(calibration.tool)]), f"SHA-256 {made.sha256}"]
-    units = [
-        f"{name} raw per {triad.unit}{_nominal(calibration, name)}"
-        for name, triad in zip(TRIADS, calibration.triads, strict=False)
-    ]
-    stated = reference if at is None or made.notation == "factors" else at
-    shown = "course" if isinstance(stated, str) else f"{stated:g} °C"
-    conditions = [f"notation {made.notation}", f"temperature {shown}", _calibrated(made)]
-    lines += ["   ".join(conditions), "   ".join(units)]
-    values = text.notation(made.triads, reference if at == COURSE else None)
-    return "\n".join(lines) + "\n\n" + values
-
-
-def _calibrated(made: Converted) -> str:
-    """The calibrated temperatures, and whether the values lie outside them."""
-    if made.calibration.temperature_c is None:
-        return "calibrated at unrecorded temperatures"
-    low, high = made.calibration.temperature_c
-    outside = "extrapolated: " if made.findings else ""
-    return f"{outside}calibrated at {low:.1f}…{high:.1f} °C"
-
-
-def _nominal(calibration: Calibration, name: str) -> str:
-    scale = getattr(calibration.profile, name).scale
-    return "" if scale is None else f" (nominal {scale:.6g})"
+    low, high = TEMPERATURE.low, TEMPERATURE.high
+    if value is not None and not low <= value <= high:
+        raise InputError(f"`temperature` must be between {low:g} and {high:g} °C; got {value:g}.")
+    return value

@@ -1,62 +1,76 @@
-"""What `mwdcal stations` and `mwdcal compare` ask for: apart from the work, so that help is quick."""
+"""Arguments and options of the commands: each is declared once, as a decorator."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
+from functools import partial, wraps
 from pathlib import Path
-from typing import Any, TypedDict
+from typing import TYPE_CHECKING, Any
 
 import click
 
+from mwdcal.app.messages import Command
+from mwdcal.errors import InputError
 
-class Asked(TypedDict):
-    """What was typed."""
+if TYPE_CHECKING:
+    from mwdcal.app.commands.choices import Typed
 
-    log: Path
-    output: Path
-    columns: str
-    sampling_hz: float | None
-    min_seconds: float | None
-    trim_seconds: float | None
-    threshold: float | None
-    plot: Path | None
-    decimal: str
-    as_json: bool
-
-
-class AskedToCompare(TypedDict):
-    """What was typed at `mwdcal compare`."""
-
-    run: Path
-    tool: str | None
-    order: str
-    seed: int
-    parameters: bool
-    report: Path | None
-    decimal: str
-    as_json: bool
-
-
-Option = Callable[[Callable[..., Any]], Callable[..., Any]]
+Function = Callable[..., Any]
+Decorator = Callable[[Function], Function]
 FILE = click.Path(path_type=Path)
+PICTURES = (".png", ".svg")
+"""Suffixes of pictures."""
+
+command = partial(click.command, cls=Command)
+argument = partial(click.argument, type=FILE)
+CALIBRATION = argument("calibration")
+RUN = argument("run")
+LOG = argument("log")
 DECIMAL = click.option(
     "--decimal", default=".", show_default=True, metavar="SIGN",
     help="Decimal sign of numbers in text files.",
 )  # fmt: skip
 JSON = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
-TOOL = click.option(
-    "--tool", metavar="NAME|FILE", help="Tool profile: a shipped name or a TOML file."
-)
 SEED = click.option(
     "--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of the swarm."
 )
-REPORT = click.option(
-    "--report", type=FILE, metavar="R.html", help="Also write a self-contained HTML report."
+COLUMN_NAMES = click.option(
+    "--columns", default="", metavar="NAMES",
+    help="Columns of a text log without column names, such as time_s,ax,ay,az.",
+)  # fmt: skip
+SAMPLING_HZ = click.option(
+    "--sampling-hz", type=float, metavar="HZ", help="Rate of the log; wins over its column time_s."
 )
 
 
-_FIT: tuple[Option, ...] = (
-    TOOL,
+def output(metavar: str, text: str, required: bool = True) -> Decorator:
+    """The option `-o`."""
+    return click.option("-o", "--output", type=FILE, required=required, metavar=metavar, help=text)
+
+
+def tool(text: str = "Tool profile: a shipped name or a TOML file.") -> Decorator:
+    """The option `--tool`."""
+    return click.option("--tool", metavar="NAME|FILE", help=text)
+
+
+def report(
+    text: str = "Also write a self-contained HTML report.", metavar: str = "R.html"
+) -> Decorator:
+    """The option `--report`."""
+    return click.option("--report", type=FILE, metavar=metavar, help=text)
+
+
+def plot(text: str) -> Decorator:
+    """The option `--plot`."""
+    return click.option("--plot", type=FILE, metavar="FILE.png|svg", help=text)
+
+
+def number(name: str, metavar: str, text: str, *variable: str) -> Decorator:
+    """An option with a number; `variable` where it is not named as the option."""
+    return click.option(name, *variable, type=float, metavar=metavar, help=text)
+
+
+_FIT = (
     click.option(
         "--method", default="joint", show_default=True, metavar="METHOD",
         help="joint: all evidence, weighted. least-squares: reference vectors only. swarm: the same "
@@ -91,14 +105,19 @@ _FIT: tuple[Option, ...] = (
         "6: scale and bias alone.",
     ),
 )  # fmt: skip
+FITTING = (
+    *("method", "model", "order", "parameters", "nonlinearity", "estimate", "ignore", "robust"),
+    *("paper_weights", "prior", "seed"),
+)
+"""Names of the options that say how to fit."""
 
 
-def fit_options(order: str, nonlinearity: str, prior: str, known: str) -> tuple[Option, ...]:
-    """The options of `calibrate` and `fleet` that say how to fit.
+def fit_options(order: str, nonlinearity: str, prior: str, known: str) -> Decorator:
+    """The options that say how to fit, which the command gets as one argument, `typed`.
 
     With the defaults of two of them, and what a prior may be, as metavar and in words.
     """
-    return (
+    declared = (
         *_FIT,
         click.option("--prior", metavar=prior, help=f"What is known beforehand: {known}."),
         click.option(
@@ -113,93 +132,51 @@ def fit_options(order: str, nonlinearity: str, prior: str, known: str) -> tuple[
         ),
     )  # fmt: skip
 
+    def decorate(function: Function) -> Function:
+        @wraps(function)
+        def gathered(**given: Any) -> Any:
+            typed: Typed = {name: given.pop(name) for name in FITTING}  # type: ignore[assignment]
+            return function(typed=typed, **given)
 
-COLUMN_NAMES = click.option(
-    "--columns", default="", metavar="NAMES",
-    help="Columns of a text log without column names, such as time_s,ax,ay,az.",
-)  # fmt: skip
-SAMPLING_HZ = click.option(
-    "--sampling-hz", type=float, metavar="HZ", help="Rate of the log; wins over its column time_s."
-)
-_OPTIONS = (
-    click.argument("log", type=FILE),
-    click.option(
-        "-o", "--output", type=FILE, required=True, metavar="STATIONS.csv",
-        help="Run file to write; format by suffix.",
-    ),
-    COLUMN_NAMES,
-    SAMPLING_HZ,
-    click.option(
-        "--min-seconds", type=float, metavar="S",
-        help="Shortest station, trimmed. Default: 1, or 15 samples of a slow log.",
-    ),
-    click.option(
-        "--trim-seconds", type=float, metavar="S",
-        help="What is cut off each end. Default: 1, or 3 samples of a slow log.",
-    ),
-    click.option(
-        "--threshold", type=float, metavar="FLOORS",
-        help="Movement that is still rest, in noise floors. Default: found from the log.",
-    ),
-    click.option(
-        "--plot", type=FILE, metavar="FILE.png|svg", help="Also draw what was taken and left."
-    ),
-    DECIMAL,
-    JSON,
-)  # fmt: skip
-_CALIBRATE: tuple[Option, ...] = (
-    click.argument("run", type=FILE),
-    click.option(
-        "-o", "--output", type=FILE, required=True, metavar="CAL.json",
-        help="Calibration file to write.",
-    ),
-    *fit_options(
-        "auto", "auto", "CAL.json|datasheet",
-        "a previous calibration of this tool, with its covariance, or the tolerances in the tool profile",
-    ),
-    click.option(
-        "--exclude", multiple=True, metavar="STATION", help="Leave a station out; may be repeated."
-    ),
-    REPORT,
-    DECIMAL,
-    JSON,
-)  # fmt: skip
-_COMPARE = (
-    click.argument("run", type=FILE),
-    TOOL,
-    click.option(
-        "--order", type=click.Choice(["0", "1", "2", "3", "auto"]), default="auto",
-        show_default=True, help="Order of temperature terms, the same for all methods.",
-    ),
-    SEED,
-    click.option(
-        "--parameters", is_flag=True, help="Print the parameters of every method as well."
-    ),
-    REPORT,
-    DECIMAL,
-    JSON,
-)  # fmt: skip
+        command: Function = gathered
+        for option in reversed(declared):
+            command = option(command)
+        return command
+
+    return decorate
 
 
-def calibration_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """The command `calibrate` with its argument and options, in this order."""
-    return taking(_CALIBRATE, command)
+def check_outputs(
+    outputs: Iterable[Path | None],
+    inputs: Iterable[str | Path | None],
+    picture: Path | None = None,
+    page: Path | None = None,
+) -> None:
+    """Refuse, before any work, an output that cannot be made or written, or would replace an input."""
+    from mwdcal.files.formats import atomic
+
+    taken = [Path(name).resolve() for name in inputs if name and Path(name).is_file()]
+    for path in filter(None, [*outputs, picture, page]):
+        target = atomic.target(path)
+        if target in taken:
+            raise InputError(
+                f"cannot write '{path}': it is named twice, or is an input that would be lost. "
+                "Name another file."
+            )
+        taken.append(target)
+    if picture:
+        from mwdcal.app.pages.pictures import require
+
+        if picture.suffix.lower() not in PICTURES:
+            allowed = ", ".join(PICTURES)
+            raise InputError(f"`plot` {picture}: the suffix must be one of {allowed}. Rename it.")
+        require("a picture", "matplotlib")
+    if page:
+        from mwdcal.app.pages.page import environment
+
+        environment()
 
 
-def standstill_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """The command `stations` with its argument and options, in this order."""
-    return taking(_OPTIONS, command)
-
-
-def comparison_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """The command `compare` with its argument and options, in this order."""
-    return taking(_COMPARE, command)
-
-
-def taking(
-    options: Sequence[Callable[..., Any]], command: Callable[..., Any]
-) -> Callable[..., Any]:
-    """A command with its arguments and options, in this order."""
-    for option in reversed(options):
-        command = option(command)
-    return command
+def names(text: str) -> list[str]:
+    """The names of a list with commas, each as typed."""
+    return [name.strip() for name in text.split(",")] if text else []

@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mwdcal.app.pages import plots
 from mwdcal.geometry.vectors import Array
+from mwdcal.use import plots
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#4b5563")
 DASHES: tuple[Any, ...] = ("-", "--", ":", "-.", (0, (5, 1)), (0, (1, 1)))
@@ -48,50 +49,50 @@ def distance(values: Array) -> Array:
     return away / spread if spread > 0 else np.zeros(len(values))
 
 
-def parameters(found: Sequence[Any]) -> str:
+@plots.styled
+def parameters(found: Sequence[Any]) -> Figure:
     """Number of tools by value of each steady parameter: a row of panels for each triad."""
     panels: dict[str, dict[str, list[Any]]] = {}
     for each in found:
         kind, _, axes = each.title.partition(" ")
         title = KINDS[kind][len(set(axes)) > 1]
         panels.setdefault(each.kind or each.triad, {}).setdefault(title, []).append(each)
-    with plots._style():
-        lines = [
-            (triad, list(own.items())[first : first + ABREAST])
-            for triad, own in panels.items()
-            for first in range(0, len(own), ABREAST)
-        ]
-        figure = plots._figure(2.1 * len(lines))
-        columns = max(len(line) for _, line in lines)
-        grid = figure.subplots(len(lines), columns, squeeze=False)
-        for row, (triad, line) in zip(grid, lines, strict=True):
-            row[0].set_ylabel("tools")
-            for axes in row[len(line) :]:
-                axes.set_axis_off()
-            for axes, (title, members) in zip(row, line, strict=False):
-                axes.set_title(f"{triad}: {title}")
-                _steps(axes, {m.title.partition(" ")[2]: m.values for m in members})
-                unit = members[0].unit
-                axes.set_xlabel(unit or "share of nominal")
-                axes.locator_params(axis="x", nbins=TICKS // columns)
-        return plots._svg(figure, "parameters", "Distributions of the fleet's parameters")
+    lines = [
+        (triad, list(own.items())[first : first + ABREAST])
+        for triad, own in panels.items()
+        for first in range(0, len(own), ABREAST)
+    ]
+    figure = plots.new_figure("Distributions of the fleet's parameters", 2.1 * len(lines))
+    columns = max(len(line) for _, line in lines)
+    grid = figure.subplots(len(lines), columns, squeeze=False)
+    for row, (triad, line) in zip(grid, lines, strict=True):
+        row[0].set_ylabel("tools")
+        for axes in row[len(line) :]:
+            axes.set_axis_off()
+        for axes, (title, members) in zip(row, line, strict=False):
+            axes.set_title(f"{triad}: {title}")
+            _steps(axes, {m.title.partition(" ")[2]: m.values for m in members})
+            unit = members[0].unit
+            axes.set_xlabel(unit or "share of nominal")
+            axes.locator_params(axis="x", nbins=TICKS // columns)
+    return figure
 
 
-def quality(panels: Sequence[tuple[str, str, Mapping[str, Array]]]) -> str:
+@plots.styled
+def quality(panels: Sequence[tuple[str, str, Mapping[str, Array]]]) -> Figure:
     """Number of tools by residuals over noise or by noise, and by 1σ of each angle.
 
     A panel has a title, the name of its axis, and values by name.
     """
-    with plots._style():
-        figure = plots._figure(2.2)
-        row = figure.subplots(1, len(panels), squeeze=False)[0]
-        row[0].set_ylabel("tools")
-        for axes, (title, label, series) in zip(row, panels, strict=True):
-            axes.set_title(title)
-            axes.set_xlabel(label)
-            axes.locator_params(axis="x", nbins=TICKS // len(panels))
-            _steps(axes, series, abreast=3 if len(panels) < 3 else 1)
-        return plots._svg(figure, "quality", "Distributions of residuals and accuracy")
+    figure = plots.new_figure("Distributions of residuals and accuracy", 2.2)
+    row = figure.subplots(1, len(panels), squeeze=False)[0]
+    row[0].set_ylabel("tools")
+    for axes, (title, label, series) in zip(row, panels, strict=True):
+        axes.set_title(title)
+        axes.set_xlabel(label)
+        axes.locator_params(axis="x", nbins=TICKS // len(panels))
+        _steps(axes, series, abreast=3 if len(panels) < 3 else 1)
+    return figure
 
 
 def _steps(axes: Axes, series: Mapping[str, Array], abreast: int = 3) -> None:

@@ -13,27 +13,28 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mwdcal.app.pages import fleet_plots, report
+from mwdcal.app.pages import fleet_plots
 from mwdcal.app.pages.fleet_plots import FAR, FEWEST
 from mwdcal.app.pages.fleet_summary import (
     ERRORS,
     Said,
     Summary,
-    column,
     is_doubt,
+    numbers,
     orders_table,
     unusual,
 )
-from mwdcal.app.text import number, plural
+from mwdcal.app.pages.page import environment
+from mwdcal.app.text import number, plural, raised
 from mwdcal.calibration.diagnosis.findings import SUSPECT
 from mwdcal.calibration.readings import TRIADS, is_simulated
 from mwdcal.files.formats import atomic, parquet
 from mwdcal.fleet.calibrate import OK
 from mwdcal.fleet.sources import SERIAL
-from mwdcal.geometry.vectors import Array, Bools, Ints
+from mwdcal.geometry.vectors import AnyArray, Array, Bools
 
 if TYPE_CHECKING:
-    from jinja2 import Environment
+    from matplotlib.figure import Figure
 
 RELATIVE = "field = 1"
 """The kind of magnetometers of which the strength of the field is not known."""
@@ -82,9 +83,27 @@ class Outlier:
     distance: float
 
 
-def environment() -> Environment:
-    """The templates; refuses, before any work, where what draws the page is missing."""
-    return report._environment()
+class SoundTools:
+    """The calibrated tools of a table of calibrations, read column by column."""
+
+    def __init__(self, path: Path) -> None:
+        _, pq = parquet.modules(path.name)
+        self._file = pq.ParquetFile(path)
+        self.names: list[str] = self._file.schema_arrow.names
+        self.metadata = parquet.metadata_of(self._file.schema_arrow.metadata, path.name)
+        self._rows: Bools = np.array(self._column("status").to_pylist(), object) == OK
+        self.count = int(self._rows.sum())
+
+    def _column(self, name: str) -> Any:
+        return self._file.read([name]).column(0)
+
+    def numbers(self, name: str) -> Array:
+        """A column of numbers, NaN where there is none."""
+        return numbers(self._file, name)[self._rows]
+
+    def words(self, name: str) -> AnyArray:
+        """A column of text or labels."""
+        return np.array(self._column(name).to_pylist(), object)[self._rows]
 
 
 def write_report(path: str | os.PathLike[str], calibrations: Path, summary: Summary) -> None:
@@ -95,38 +114,27 @@ def write_report(path: str | os.PathLike[str], calibrations: Path, summary: Summ
 def render(calibrations: Path, summary: Summary) -> str:
     """The page as HTML: the same table gives the same text but for the time it took."""
     template = environment().get_template("fleet.html")
-    metadata = _metadata(calibrations)
-    sound = np.flatnonzero(_text(calibrations, "status") == OK)
-    parameters = _parameters(calibrations, sound) if sound.size else []
-    estimated = [triad for triad in TRIADS if triad in _list(metadata, "noise_estimated")]
+    tools = SoundTools(calibrations)
+    parameters = _parameters(tools) if tools.count else []
+    noisy = tools.metadata.get("noise_estimated")
+    estimated = [triad for triad in TRIADS if isinstance(noisy, list) and triad in noisy]
     return template.render(
         found=summary,
-        metadata=metadata,
-        simulated=is_simulated(metadata),
+        metadata=tools.metadata,
+        simulated=is_simulated(tools.metadata),
         banner=_banner(summary),
-        facts=_facts(summary, metadata),
+        facts=_facts(summary, tools.metadata),
         orders=orders_table(summary) if summary.orders else None,
         stand=_stand(summary),
         estimated=estimated,
-        figures=_figures(calibrations, parameters, sound, estimated),
+        figures=_figures(tools, parameters, estimated) if tools.count else {},
         parameters=parameters,
-        outliers=_outliers(calibrations, parameters, sound),
-        suspects=_suspects(calibrations, sound),
+        outliers=_outliers(tools, parameters),
+        suspects=_suspects(tools),
         far=FAR,
         fewest=FEWEST,
         suspect=SUSPECT,
     )
-
-
-def _metadata(path: Path) -> Mapping[str, object]:
-    _, pq = parquet.modules(path.name)
-    return parquet.metadata_of(pq.read_schema(path).metadata, path.name)
-
-
-def _list(metadata: Mapping[str, object], name: str) -> list[object]:
-    """A list in the metadata, empty where there is none."""
-    found = metadata.get(name)
-    return found if isinstance(found, list) else []
 
 
 def _stand(summary: Summary) -> list[list[str]]:
@@ -137,11 +145,6 @@ def _stand(summary: Summary) -> list[list[str]]:
         for name, values in known.items()
         if values
     ]
-
-
-def _text(path: Path, name: str) -> Any:
-    _, pq = parquet.modules(path.name)
-    return np.array(pq.read_table(path, columns=[name]).column(0).to_pylist(), object)
 
 
 def _banner(summary: Summary) -> dict[str, str]:
@@ -166,7 +169,7 @@ def _doubt(said: Said) -> str:
 
 def _facts(summary: Summary, metadata: Mapping[str, object]) -> list[tuple[str, str]]:
     profile = str(metadata.get("profile", ""))
-    found = [
+    facts = [
         ("method", summary.method),
         ("stations", str(summary.stations)),
         ("order", str(summary.order)),
@@ -176,66 +179,63 @@ def _facts(summary: Summary, metadata: Mapping[str, object]) -> list[tuple[str, 
     if summary.nonlinear:
         pairs = summary.nonlinear.items()
         terms = ", ".join(f"{triad} of {plural(count, 'tool')}" for triad, count in pairs)
-        found.append(("own-axis terms", terms))
+        facts.append(("own-axis terms", terms))
     if summary.order:
-        found.append(("τ", f"temperature − {metadata.get('reference_temperature_c')} °C"))
-    return found
+        facts.append(("τ", f"temperature − {metadata.get('reference_temperature_c')} °C"))
+    return facts
 
 
-def _parameters(path: Path, sound: Ints) -> list[Parameter]:
+def _parameters(tools: SoundTools) -> list[Parameter]:
     """All columns of parameters, with units that people use."""
-    _, pq = parquet.modules(path.name)
-    found, names = [], pq.read_schema(path).names
-    kinds = _kinds(path, sound)
-    nominal = _nominal(path, sound, kinds)
-    for name in names:
+    parameters = []
+    kinds = _kinds(tools)
+    nominal = _nominal(tools, kinds)
+    for name in tools.names:
         triad = next((t for t in TRIADS if name.startswith(f"{t}_")), "")
         rest = name.removeprefix(f"{triad}_")
-        if not triad or f"{name}_sd" not in names:
+        if not triad or f"{name}_sd" not in tools.names:
             continue
-        every = _comparable(path, triad, rest, column(path, name), names)[sound]
-        spread = column(path, f"{name}_sd")[sound]
+        every, spread = _comparable(tools, triad, rest), tools.numbers(f"{name}_sd")
         for kind, which in kinds.items() if triad != TRIADS[0] else [("", slice(None))]:
-            values, sd = (np.full(len(sound), np.nan) for _ in range(2))
+            values, sd = (np.full(tools.count, np.nan) for _ in range(2))
             values[which], sd[which] = every[which], spread[which]
             if np.isnan(values).all():
                 continue
             unit, factor = _unit(rest, triad, bool(kind), nominal)
             middle = float(np.nanmedian(sd)) * factor if not np.isnan(sd).all() else float("nan")
-            found.append(Parameter(triad, kind, _title(rest), unit, values * factor, middle))
-    return sorted(found, key=lambda each: each.sensors)
+            parameters.append(Parameter(triad, kind, _title(rest), unit, values * factor, middle))
+    return sorted(parameters, key=lambda each: each.sensors)
 
 
-def _kinds(path: Path, sound: Ints) -> dict[str, Bools]:
+def _kinds(tools: SoundTools) -> dict[str, Bools]:
     """Which tools are calibrated to nT, and which to a field of one: they do not compare."""
-    units = _text(path, "field_unit")[sound]
+    units = tools.words("field_unit")
     relative = np.array([unit not in (None, "nT") for unit in units])
-    found = {"": units == "nT", RELATIVE: relative}
-    return {name: which for name, which in found.items() if which.any()}
+    kinds = {"": units == "nT", RELATIVE: relative}
+    return {name: which for name, which in kinds.items() if which.any()}
 
 
-def _nominal(path: Path, sound: Ints, kinds: Mapping[str, Bools]) -> str:
+def _nominal(tools: SoundTools, kinds: Mapping[str, Bools]) -> str:
     """Unit of the nominal readings of magnetometers calibrated to a field of one.
 
     nT, or none where the profile states no scale: then they are relative too, and gains near 1, as
     the fit refuses others. In nT a gain is one over the strength, and a scale is the strength.
     """
-    _, pq = parquet.modules(path.name)
-    names, triad = pq.read_schema(path).names, TRIADS[1]
-    which = kinds.get(RELATIVE, np.zeros(len(sound), bool))
+    which = kinds.get(RELATIVE, np.zeros(tools.count, bool))
     for name in ("gain_xx", "scale_x", "radius"):
-        if f"{triad}_{name}" in names:
-            every = _comparable(path, triad, name, column(path, f"{triad}_{name}"), names)
-            if not np.isnan(values := every[sound][which]).all():
+        if f"{TRIADS[1]}_{name}" in tools.names:
+            values = _comparable(tools, TRIADS[1], name)[which]
+            if not np.isnan(values).all():
                 return "" if 0.01 < abs(np.nanmedian(values)) < 100.0 else "nT"
     return "nT"
 
 
-def _comparable(path: Path, triad: str, name: str, values: Array, names: list[str]) -> Array:
-    """Values but for tools with own-axis terms, whose other parameters are of scaled readings."""
-    if f"{triad}_radius" not in names or name.startswith(("square", "cube", "radius")):
+def _comparable(tools: SoundTools, triad: str, name: str) -> Array:
+    """A column but for tools with own-axis terms, whose other parameters are of scaled readings."""
+    values, radius = tools.numbers(f"{triad}_{name}"), f"{triad}_radius"
+    if radius not in tools.names or name.startswith(("square", "cube", "radius")):
         return values
-    return np.where(np.isnan(column(path, f"{triad}_radius")), values, np.nan)
+    return np.where(np.isnan(tools.numbers(radius)), values, np.nan)
 
 
 def _unit(name: str, triad: str, relative: bool, nominal: str) -> tuple[str, float]:
@@ -245,8 +245,7 @@ def _unit(name: str, triad: str, relative: bool, nominal: str) -> tuple[str, flo
     theirs, and a gain one over it.
     """
     kind, _, rest = name.partition("_")
-    power = rest.partition("_t")[2]
-    per = f"/°C{_raised(power)}" if power else ""
+    per = raised("/°C", int(rest.partition("_t")[2] or 0))
     if kind in ("offset", "bias", "square", "cube"):
         field = "of the field" if relative else "nT"
         return (f"mg{per}", 1e3) if triad == TRIADS[0] else (f"{field}{per}", 1.0)
@@ -262,31 +261,24 @@ def _title(name: str) -> str:
     'gain xy·τ'
     """
     steady, _, power = name.partition("_t")
-    course = f"·τ{_raised(power)}" if power else ""
-    return steady.replace("_", " ") + course
-
-
-def _raised(power: str) -> str:
-    """An exponent, none for the first power."""
-    return power.translate(report.SUPERSCRIPT) if power != "1" else ""
+    return steady.replace("_", " ") + raised("·τ", int(power or 0))
 
 
 def _figures(
-    path: Path, parameters: list[Parameter], sound: Ints, estimated: list[str]
-) -> dict[str, str]:
-    if not sound.size:
-        return {}
+    tools: SoundTools, parameters: list[Parameter], estimated: list[str]
+) -> dict[str, Figure]:
+    """Distributions of the parameters, and of residuals, noise and accuracy."""
     triads = dict.fromkeys(p.triad for p in parameters)
     residuals = {
-        f"{triad} s": np.sqrt(column(path, f"{triad}_variance_factor")[sound])
+        f"{triad} s": np.sqrt(tools.numbers(f"{triad}_variance_factor"))
         for triad in triads
         if triad not in estimated
     }
     panels = [("residuals ÷ what the noise lets one expect, s", "s", residuals)]
     panels = panels if residuals else []
-    panels += [_noise(path, triad, sound) for triad in triads if triad in estimated]
+    panels += [_noise(tools, triad) for triad in triads if triad in estimated]
     accuracy = {
-        angle: column(path, f"{angle}_sd_deg")[sound]
+        angle: tools.numbers(f"{angle}_sd_deg")
         for angle in ("inclination", "toolface", "azimuth")
         if angle != "azimuth" or len(triads) > 1
     }
@@ -298,48 +290,48 @@ def _figures(
     }
 
 
-def _noise(path: Path, triad: str, sound: Ints) -> tuple[str, str, dict[str, Array]]:
+def _noise(tools: SoundTools, triad: str) -> tuple[str, str, dict[str, Array]]:
     """The panel of a noise that each tool's residuals tell; of one kind of magnetometers."""
-    values = column(path, f"{triad}_noise")[sound]
+    values = tools.numbers(f"{triad}_noise")
     title = f"{triad}: estimated noise"
     if triad == TRIADS[0]:
         return title, "1σ, mg", {triad: 1e3 * values}
-    kinds = _kinds(path, sound)
+    kinds = _kinds(tools)
     kind, which = next(iter(kinds.items()))
-    relative = kind == RELATIVE and not _nominal(path, sound, kinds)
+    relative = kind == RELATIVE and not _nominal(tools, kinds)
     return title, "1σ of the field" if relative else "1σ, nT", {triad: values[which]}
 
 
-def _outliers(path: Path, parameters: list[Parameter], sound: Ints) -> list[Outlier]:
+def _outliers(tools: SoundTools, parameters: list[Parameter]) -> list[Outlier]:
     """Tools of which some parameter is far from the fleet's, the farthest first."""
-    if len(sound) < FEWEST:
+    if tools.count < FEWEST:
         return []
-    distance, which = np.zeros(len(sound)), np.zeros(len(sound), int)
+    distance, which = np.zeros(tools.count), np.zeros(tools.count, int)
     for index, each in enumerate(parameters):
-        mine = fleet_plots.distance(each.values)
-        which = np.where(mine > distance, index, which)
-        distance = np.fmax(mine, distance)
+        away = fleet_plots.distance(each.values)
+        which = np.where(away > distance, index, which)
+        distance = np.fmax(away, distance)
     far = np.argsort(-distance, kind="stable")[: int(np.sum(distance > FAR))]
-    serials = _text(path, SERIAL)
-    found = []
-    for place in far:
-        each = parameters[which[place]]
-        title = f"{each.sensors} {each.title}"
-        middle = float(np.nanmedian(each.values))
-        value = float(each.values[place])
-        serial = serials[sound[place]]
-        found.append(Outlier(serial, title, value, middle, each.unit, float(distance[place])))
-    return found
+    serials = tools.words(SERIAL)
+    return [
+        Outlier(
+            serial=serials[place],
+            title=f"{each.sensors} {each.title}",
+            value=float(each.values[place]),
+            median=float(np.nanmedian(each.values)),
+            unit=each.unit,
+            distance=float(distance[place]),
+        )
+        for place in far
+        for each in [parameters[which[place]]]
+    ]
 
 
-def _suspects(path: Path, sound: Ints) -> list[tuple[Any, str, float]]:
+def _suspects(tools: SoundTools) -> list[tuple[Any, str, float]]:
     """Sound tools with large residuals: serial, triad, s; the largest first."""
-    serials = _text(path, SERIAL)
-    _, pq = parquet.modules(path.name)
-    names = pq.read_schema(path).names
-    found = []
+    serials, suspects = tools.words(SERIAL), []
     for triad in TRIADS:
-        if f"{triad}_variance_factor" in names:
-            s = np.sqrt(column(path, f"{triad}_variance_factor")[sound])
-            found += [(serials[sound[i]], triad, float(s[i])) for i in np.flatnonzero(s > SUSPECT)]
-    return sorted(found, key=lambda row: -row[2])
+        if f"{triad}_variance_factor" in tools.names:
+            s = np.sqrt(tools.numbers(f"{triad}_variance_factor"))
+            suspects += [(serials[i], triad, float(s[i])) for i in np.flatnonzero(s > SUSPECT)]
+    return sorted(suspects, key=lambda row: -row[2])

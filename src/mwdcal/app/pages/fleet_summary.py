@@ -13,9 +13,9 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from mwdcal.app.commands.choices import names
-from mwdcal.app.commands.fleet_options import Asked
-from mwdcal.app.text import choices, number, plural, table
+from mwdcal.app.commands.choices import Typed, names
+from mwdcal.app.pages.calibration import choices
+from mwdcal.app.text import number, plural, table
 from mwdcal.calibration.readings import TRIADS
 from mwdcal.calibration.record import Choices, Finding
 from mwdcal.calibration.soaks import HIGHEST
@@ -87,67 +87,55 @@ class Summary:
         return sum(kind.tools for kind in self.statuses if kind.status == OK)
 
 
-def summarise(
-    asked: Asked,
-    target: Path,
-    stations: int,
-    parts: int,
-    before: int,
-    seconds: float,
-    notes: list[str],
-    unused: list[Finding],
-) -> Summary:
-    """What the output says, read column by column."""
+def summarise(target: Path, typed: Typed, notes: list[str], **facts: Any) -> Summary:
+    """What the table of calibrations `target` says, read column by column, beside other `facts`."""
     _, pq = parquet.modules(target.name)
     whole = pq.ParquetFile(target)
     head = whole.read([SERIAL, "status", "message", "findings"])
-    columns = whole.schema_arrow.names
+    columns, options = whole.schema_arrow.names, stated_options(typed)
     shown = [n for n in columns if n.endswith(("_sd_deg", "_variance_factor")) or n in ERRORS]
-    spread = {name: _quantiles(numbers(whole, name)) for name in shown}
-    if asked["order"] == "0":
-        span = numbers(whole, "temperature_max_c") - numbers(whole, "temperature_min_c")
-        wide = int(np.sum(span > SPAN))
-        if wide:
-            spans = f"{plural(wide, 'tool')} {'spans' if wide == 1 else 'span'}"
-            notes.append(f"{spans} more than {SPAN:g} °C, and --order 0 has no temperature terms.")
     return Summary(
-        runs=asked["runs"].name,
-        output=str(asked["output"]),
+        **facts,
         tools=head.num_rows,
-        stations=stations,
-        method=asked["method"],
-        order=asked["order"] if asked["order"] == "auto" else int(asked["order"]),
-        options=options_asked(asked),
-        orders=_orders(whole, columns) if asked["order"] == "auto" else {},
+        method=typed["method"],
+        order=options["order"],
+        options=options,
+        orders=_orders(whole, columns) if typed["order"] == "auto" else {},
         nonlinear=_nonlinear(whole, columns),
         statuses=_kinds(head),
         findings=_findings(head),
-        spread=spread,
+        spread={name: _quantiles(numbers(whole, name)) for name in shown},
         undetermined=_undetermined(whole, columns),
-        parts=parts,
-        parts_done_before=before,
-        seconds=round(seconds, 3),
-        notes=notes,
-        unused=unused,
+        notes=notes + (_wide(whole) if typed["order"] == "0" else []),
     )
 
 
-def options_asked(asked: Asked) -> dict[str, Any]:
-    """How a fleet was asked for, under the names that a calibration file and the command have."""
+def _wide(whole: Any) -> list[str]:
+    """What to say of tools whose temperatures differ, where there are no temperature terms."""
+    span = numbers(whole, "temperature_max_c") - numbers(whole, "temperature_min_c")
+    wide = int(np.sum(span > SPAN))
+    if not wide:
+        return []
+    spans = f"{plural(wide, 'tool')} {'spans' if wide == 1 else 'span'}"
+    return [f"{spans} more than {SPAN:g} °C, and --order 0 has no temperature terms."]
+
+
+def stated_options(typed: Typed) -> dict[str, Any]:
+    """The options of a fleet, under the names that a calibration file and the command have."""
     also = Choices(
-        parameters=int(asked["parameters"] or 12),
-        ignore=names(asked["ignore"]),
-        robust=asked["robust"],
-        paper_weights=asked["paper_weights"],
-        prior=asked["prior"],
+        parameters=int(typed["parameters"] or 12),
+        ignore=names(typed["ignore"]),
+        robust=typed["robust"],
+        paper_weights=typed["paper_weights"],
+        prior=typed["prior"],
     )
     return {
-        "method": asked["method"],
-        "seed": asked["seed"] if asked["method"] == "swarm" else None,
-        "model": asked["model"],
-        "order": asked["order"] if asked["order"] == "auto" else int(asked["order"]),
-        "nonlinearity": asked["nonlinearity"],
-        "estimate": names(asked["estimate"]),
+        "method": typed["method"],
+        "seed": typed["seed"] if typed["method"] == "swarm" else None,
+        "model": typed["model"],
+        "order": typed["order"] if typed["order"] == "auto" else int(typed["order"]),
+        "nonlinearity": typed["nonlinearity"],
+        "estimate": names(typed["estimate"]),
         **msgspec.to_builtins(also),
     }
 
@@ -163,12 +151,6 @@ def unusual(options: Mapping[str, Any]) -> list[str]:
         *choices(also),
         *([f"seed {options['seed']}"] if options["seed"] else []),
     ]
-
-
-def column(path: Path, name: str) -> Array:
-    """One column of numbers of a table of calibrations, NaN where there is none."""
-    _, pq = parquet.modules(path.name)
-    return numbers(pq.ParquetFile(path), name)
 
 
 def numbers(whole: Any, name: str) -> Array:

@@ -12,25 +12,33 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mwdcal.app.pages import plots
-from mwdcal.app.text import HELD, chance, choices, is_held, plural
-from mwdcal.app.text import model as model_of
+from mwdcal.app.pages.calibration import choices
+from mwdcal.app.pages.calibration import model as model_of
+from mwdcal.app.pages.page import (
+    HELD,
+    environment,
+    exponent,
+    fixed,
+    is_held,
+    measured,
+    number,
+    unit,
+)
+from mwdcal.app.text import plural, raised
 from mwdcal.calibration.prediction import accuracy_at, accuracy_map, angles, middle_temperature
 from mwdcal.calibration.readings import is_simulated
 from mwdcal.calibration.record import Calibration, TriadCalibration
 from mwdcal.errors import InputError
 from mwdcal.estimation.solvers import RANK_TOLERANCE
 from mwdcal.files.formats import atomic
+from mwdcal.use import plots
 from mwdcal.use.notation import Notation, convert
 from mwdcal.use.plots import reshoot_limit
 
 if TYPE_CHECKING:
-    from jinja2 import Environment
-
     from mwdcal.calibration.record import Finding
     from mwdcal.use.verification import Verdict
 
-SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 LONG_TABLE = 60
 """A run of more stations has its station table at the end, as an annex."""
 ROWS = (5.0, 45.0, 90.0)
@@ -46,7 +54,7 @@ def write_report(
 
 def render(calibration: Calibration, verdict: Verdict | None = None) -> str:
     """The report as HTML: the same input gives the same text, byte for byte."""
-    template = _environment().get_template("report.html")
+    template = environment().get_template("report.html")
     return template.render(
         cal=calibration,
         name=calibration.tool.get("serial") or calibration.profile.name,
@@ -72,98 +80,6 @@ def render(calibration: Calibration, verdict: Verdict | None = None) -> str:
         earth=_earth(calibration),
         when=_when(calibration.time),
     )
-
-
-def _environment() -> Environment:
-    try:
-        import matplotlib  # noqa: F401
-        from jinja2 import Environment, PackageLoader, StrictUndefined
-    except ImportError as error:
-        raise InputError(
-            f"the report needs {error.name}, which is not installed. Install mwdcal[report]: "
-            "pip install 'mwdcal[report]'"
-        ) from None
-    made = Environment(
-        loader=PackageLoader("mwdcal.app.pages"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    made.filters |= {
-        "number": number,
-        "signed": signed,
-        "fixed": fixed,
-        "css": css_string,
-        "svg": svg,
-        "plural": plural,
-        "unit": unit,
-        "chance": chance,
-    }
-    return made
-
-
-def number(value: float | None, digits: int = 3) -> str:
-    """A number to some significant digits, without E notation; a dash where there is none."""
-    if value is None or not np.isfinite(value):
-        return "–"
-    if value == 0:
-        return "0"
-    mantissa, power = f"{value:.{digits - 1}e}".split("e")
-    exponent = int(power)
-    if not -5 < exponent < 7:
-        return f"{mantissa}×10{str(exponent).translate(SUPERSCRIPT)}".replace("-", "−")
-    return fixed(value, max(digits - 1 - exponent, 0))
-
-
-def fixed(value: float | None, decimals: int) -> str:
-    """A number to some decimals, with a true minus sign; a dash where there is none."""
-    if value is None or not np.isfinite(value):
-        return "–"
-    return f"{round(value, decimals) + 0.0:.{max(decimals, 0)}f}".replace("-", "−")
-
-
-def signed(value: float | None, decimals: int) -> str:
-    """As `fixed`, with a plus sign too."""
-    text = fixed(value, decimals)
-    return text if text[0] in "−–" or not float(text) else f"+{text}"
-
-
-def measured(value: float, uncertainty: float | None) -> tuple[str, str]:
-    """Value and standard uncertainty as text, both to two significant digits of the latter."""
-    if uncertainty is None or not np.isfinite(uncertainty):
-        return number(value, 6), "undetermined"
-    if uncertainty == 0:
-        return number(value, 9), "0"
-    decimals = 1 - _exponent(uncertainty)
-    power = _exponent(max(abs(value), uncertainty))
-    if decimals <= 7 and power < 7:
-        return fixed(value, decimals), fixed(uncertainty, decimals)
-    factor, times = 10.0**-power, f"×10{str(power).translate(SUPERSCRIPT)}"
-    pair = (fixed(v * factor, decimals + power) for v in (value, uncertainty))
-    first, second = (f"{text}{times}" for text in pair)
-    return first, second
-
-
-def _exponent(value: float) -> int:
-    return int(f"{value:.1e}".split("e")[1])
-
-
-def unit(symbol: str) -> str:
-    """A unit as it follows a number: the degree sign without a space."""
-    return symbol if symbol in ("", "°") else f" {symbol}"
-
-
-def css_string(text: str) -> str:
-    """Text as the inside of a CSS string: nothing but letters and digits is left bare."""
-    return "".join(c if c.isascii() and c.isalnum() else f"\\{ord(c):x} " for c in text)
-
-
-def svg(text: str) -> Any:
-    """A figure of our own making, which needs no escaping."""
-    from markupsafe import Markup
-
-    return Markup(text)
 
 
 def banner(calibration: Calibration, verdict: Verdict | None) -> dict[str, str]:
@@ -260,6 +176,7 @@ def _attitudes(calibration: Calibration) -> str:
 
 
 def _figures(calibration: Calibration) -> dict[str, Any]:
+    """Figures by name, and the observables that have none."""
     names = [row.observable for row in calibration.errors]
     missing = [
         name
@@ -267,13 +184,13 @@ def _figures(calibration: Calibration) -> dict[str, Any]:
         if name not in names and (calibration.has_field or name not in ("azimuth", "field", "dip"))
     ]
     return {
-        "errors": [plots.station_errors(calibration, name) for name in names],
+        "errors": {name: plots.station_errors(calibration, name) for name in names},
         "missing": missing,
         "deviations": plots.deviations(calibration, reshoot_limit(calibration)),
         "orders": (
             plots.order_errors(calibration.orders)
             if _compared(calibration) and _judged(calibration)
-            else ""
+            else None
         ),
         "accuracy": plots.accuracy(accuracy_map(calibration), angles(calibration)),
     }
@@ -292,7 +209,7 @@ def _judged(calibration: Calibration) -> bool:
 def _decimals(calibration: Calibration) -> dict[str, int]:
     """Decimals of the station table: two significant digits of what is left after the fit."""
     return {
-        row.observable: min(max(1 - _exponent(row.after), 0), 9) if row.after > 0 else 3
+        row.observable: min(max(1 - exponent(row.after), 0), 9) if row.after > 0 else 3
         for row in calibration.errors
     }
 
@@ -309,16 +226,14 @@ def _parameters(calibration: Calibration) -> dict[str, Any]:
 
 
 def _row(name: str, index: str, power: int, value: float, sd: float | None, symbol: str) -> Any:
-    per = "" if power == 0 else "/°C" + (str(power).translate(SUPERSCRIPT) if power > 1 else "")
-    shown = ("0", HELD) if is_held(value, sd) else measured(value, sd)
-    course = "" if power == 0 else "τ" + (str(power).translate(SUPERSCRIPT) if power > 1 else "")
+    shown, uncertainty = ("0", HELD) if is_held(value, sd) else measured(value, sd)
     return {
         "name": name,
         "index": index,
-        "course": course,
-        "value": shown[0],
-        "sd": shown[1],
-        "unit": symbol + per,
+        "course": raised("τ", power),
+        "value": shown,
+        "sd": uncertainty,
+        "unit": symbol + raised("/°C", power),
     }
 
 

@@ -1,0 +1,51 @@
+"""`mwdcal verify`: a calibration against a roll test."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import click
+
+from mwdcal.app.commands import options
+from mwdcal.app.messages import print_result
+
+
+@options.command()
+@options.CALIBRATION
+@options.RUN
+@click.option(
+    "--limits", default="roll-test", show_default=True, metavar="NAME|FILE", help="Limits profile."
+)
+@options.report("Also write the report, with this verdict.")
+@options.DECIMAL
+@options.JSON
+def command(
+    calibration: Path, run: Path, limits: str, report: Path | None, decimal: str, as_json: bool
+) -> None:
+    """Prove a CALIBRATION by a roll test: a RUN whose stations were not in the fit.
+
+    \b
+    Example: mwdcal verify tool.json rolltest.csv --limits roll-test
+    Exit: 0 pass, 1 fail, 2 input cannot be read or is not independent.
+    """
+    from msgspec.structs import replace
+
+    from mwdcal.app.pages.verification import screen
+    from mwdcal.calibration.diagnosis.findings import unused_columns
+    from mwdcal.files import documents, runs
+    from mwdcal.files.limits import load_limits
+    from mwdcal.use.verification import verify
+
+    options.check_outputs([], [calibration, run], page=report)
+    fitted = documents.read(calibration)
+    readings, _ = runs.read_run(run, fitted.profile, decimal=decimal)
+    result = verify(fitted, readings, load_limits(limits))
+    result = replace(result, findings=result.findings + unused_columns(readings.unused))
+    if report:
+        from mwdcal.app.pages.report import write_report
+
+        write_report(report, fitted, result)
+    shown = result if as_json else screen(result, fitted.tool, readings.metadata)
+    print_result(shown, result.findings)
+    sys.exit(0 if result.passed else 1)

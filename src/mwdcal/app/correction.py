@@ -1,0 +1,80 @@
+"""A table of readings through a calibration, to a table with the results beside the input."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from mwdcal.app.streaming import (
+    apply_to_file,
+    check_free,
+    check_warmth,
+    chosen,
+    described,
+    in_parts,
+    lacking,
+    nothing,
+    spread,
+    wholly_blank,
+)
+from mwdcal.calibration.diagnosis.findings import unused_columns
+from mwdcal.calibration.record import Calibration, Finding
+from mwdcal.files.contract import check_columns
+from mwdcal.files.formats import table
+from mwdcal.files.formats.columns import as_text
+from mwdcal.files.formats.table import Table
+from mwdcal.files.runs import to_readings
+from mwdcal.use.correction import MARK, RowCounts, counted
+
+
+def apply_to_any(
+    calibration: Calibration,
+    readings: Path,
+    output: Path,
+    outside: str,
+    missing: str,
+    decimal: str,
+    advance: Callable[[int, int], None],
+) -> tuple[RowCounts, list[Finding]]:
+    """Correct a file into another: part by part, or whole where it is short text or a workbook.
+
+    What was seen in the rows, and what the reader should know. `advance` is told how much of a long
+    table is done, and of how much.
+    """
+    if in_parts(readings, output, decimal):
+        return apply_to_file(
+            calibration, readings, output, outside, advance, missing=missing, decimal=decimal
+        )
+    source = table.read(readings, decimal=decimal)
+    result, tally, findings = apply_to_table(calibration, source, outside, missing)
+    if MARK in result.columns and output.suffix.lower() != ".parquet":
+        words = [as_text(bool(mark)) for mark in result.columns[MARK]]
+        result = replace(result, columns={**result.columns, MARK: words})
+    table.write(output, result)
+    return tally, findings
+
+
+def apply_to_table(
+    calibration: Calibration, source: Table, outside: str, missing: str = "refuse"
+) -> tuple[Table, RowCounts, list[Finding]]:
+    """The input's columns and metadata, the results, and what the calibration was."""
+    check_columns(list(source.columns), source.source)
+    check_warmth(calibration, list(source.columns), source.source)
+    whole = np.ones(source.count, bool)
+    if missing == "blank":
+        whole = ~lacking(source, wholly_blank([source]))
+    if not whole.any():
+        raise nothing(source.source)
+    kept = source if whole.all() else chosen(source, whole)
+    readings, _ = to_readings(kept, calibration.profile)
+    found, tally, findings = counted(calibration, readings, outside, source.count - kept.count)
+    check_free(source.columns, list(found), source.source)
+    columns = found if whole.all() else {n: spread(values, whole) for n, values in found.items()}
+    metadata = {**source.metadata, **described(calibration)}
+    if findings:
+        metadata["findings"] = [finding.text for finding in findings]
+    made = replace(source, columns={**source.columns, **columns}, metadata=metadata)
+    return made, tally, findings + unused_columns(readings.unused)

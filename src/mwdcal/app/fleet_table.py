@@ -1,0 +1,242 @@
+"""A table of many tools to a table of calibrations, in parts that are kept."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import time
+from collections.abc import Callable, Generator, Iterator
+from dataclasses import replace
+from functools import partial
+from importlib import import_module
+from pathlib import Path
+
+import msgspec
+
+from mwdcal import __version__
+from mwdcal.app import pool, progress
+from mwdcal.app.commands.choices import DATASHEET, Typed, curves_of, prior_profile, stated
+from mwdcal.app.messages import lines
+from mwdcal.app.pages.fleet_summary import Summary, stated_options, summarise
+from mwdcal.app.text import plural
+from mwdcal.calibration.automatic.nonlinearity import declared
+from mwdcal.calibration.diagnosis.findings import unused_columns
+from mwdcal.calibration.diagnosis.refusals import check_options, no_temperature
+from mwdcal.calibration.options import Options
+from mwdcal.calibration.prior import from_datasheet
+from mwdcal.errors import InputError
+from mwdcal.files import profiles
+from mwdcal.files.formats import atomic, parquet
+from mwdcal.fleet.choices import PerTool
+from mwdcal.fleet.parts import Plan, is_whole, load, solve
+from mwdcal.fleet.sources import SERIAL, Source, open_source
+from mwdcal.fleet.tables import Partition, Tools, find_tools, in_several_folders, partitions
+from mwdcal.sensor.profile import Profile
+from mwdcal.use.correction_numba import cores
+
+EVERY = 5.0
+"""Seconds between two lines of progress."""
+
+
+def calibrate_table(
+    runs: Path,
+    output: Path,
+    tool: str | None,
+    typed: Typed,
+    workers: int | None,
+    scheduler: str | None,
+    say: Callable[[str], None],
+) -> Summary:
+    """Calibrate every tool of the table; the output is written at the end, as a whole."""
+    begun = time.perf_counter()
+    profile, digest = profiles.load_profile(tool)
+    options, per_tool = _options(typed, profile)
+    source = open_source(runs)
+    if options.order and "temperature_c" not in source.columns:
+        raise no_temperature(max(options.orders))
+    unused = unused_columns(source.unused)
+    for line in lines(unused):
+        say(line)
+    target = atomic.target(output)
+    _check_target(target, runs)
+    folder = target.with_name(target.name + ".parts")
+    plan = Plan.of(source, profile, options, per_tool)
+    with _alone(folder, output):
+        tools = find_tools(source)
+        if not tools.together:
+            say("the rows of a tool are not together: dealing them into files of whole tools first")
+        parts = {f"{plan.key(part)}.arrow": part for part in partitions(source, tools, folder)}
+        before = sum(is_whole(folder / name) for name in parts)
+        counts = {"tool": tools.count, "station": source.rows, "part": len(parts)}
+        counted = ", ".join(plural(count, noun) for noun, count in counts.items())
+        say(f"{counted}, {before} done before")
+        paths = [folder / name for name in parts]
+        steps = pool.Steps(partial(load, plan), partial(solve, plan))
+        with contextlib.closing(
+            _missing_parts(steps, list(parts.values()), paths, workers, scheduler, say)
+        ) as finished:
+            _merge(paths, finished, target, _metadata(source, plan, typed, digest))
+        _tidy(folder)
+    return summarise(
+        target,
+        typed,
+        notes=[*source.notes, *_split(source, tools)],
+        runs=runs.name,
+        output=str(output),
+        stations=source.rows,
+        parts=len(parts),
+        parts_done_before=before,
+        seconds=round(time.perf_counter() - begun, 3),
+        unused=unused,
+    )
+
+
+@contextlib.contextmanager
+def _alone(folder: Path, output: Path) -> Iterator[None]:
+    """Refuse a second command with the same output, as long as the first one lives."""
+    with atomic.holding(folder / "lock") as ours:
+        if not ours:
+            raise InputError(
+                f"cannot write '{output}': another fleet is writing this output. Wait for it, or choose "
+                "another -o."
+            )
+        yield
+
+
+def _metadata(source: Source, plan: Plan, typed: Typed, digest: str) -> dict[str, object]:
+    """What the table of calibrations says of itself: the input's own, and how it was made."""
+    return {
+        **{k: v for k, v in source.metadata.items() if k != SERIAL},
+        "fleet": source.name,
+        "software": f"mwdcal {__version__}",
+        "options": stated_options(typed),
+        "profile": plan.profile.name,
+        "profile_sha256": digest,
+        "reference_temperature_c": plan.profile.reference_temperature_c,
+        "noise_estimated": list(plan.noise_estimated),
+    }
+
+
+def _split(source: Source, tools: Tools) -> list[str]:
+    """What to say of tools of which several folders have rows."""
+    count = in_several_folders(source, tools)
+    if not count:
+        return []
+    return [
+        f"tools with rows in several folders: {count}. All rows of a serial are one run; where they are "
+        "runs of their own, calibrate folder by folder."
+    ]
+
+
+def _options(typed: Typed, profile: Profile) -> tuple[Options, PerTool]:
+    """Options of every fit, and what is left to each tool; refuses what could be right for none."""
+    prior, auto = typed["prior"], typed["order"] == "auto"
+    _check_prior(prior, profile)
+    options = replace(stated(typed), order=0 if auto else int(typed["order"]))
+    options, tried = _curves(options, typed["nonlinearity"], profile)
+    check_options(replace(options, prior=from_datasheet(profile) if prior else None))
+    return options, PerTool(auto, () if prior else tried, bool(prior))
+
+
+def _check_prior(prior: str | None, profile: Profile) -> None:
+    """Refuse a prior that is of one tool, or that the profile does not have."""
+    if prior and prior != DATASHEET:
+        raise InputError(
+            f"`prior` {prior}: the prior of a fleet is 'datasheet', the tolerances in the tool profile. "
+            "A previous calibration is of one tool: use it with mwdcal calibrate."
+        )
+    prior_profile(prior, profile)
+
+
+def _curves(options: Options, terms: str, profile: Profile) -> tuple[Options, tuple[str, ...]]:
+    """The options with the own-axis terms asked for, or the triads of which each tool tries them."""
+    offered = declared(profile, options)
+    if terms in ("auto", "none"):
+        return options, tuple(offered) if terms == "auto" else ()
+    return replace(options, nonlinearity=curves_of(terms, offered)), ()
+
+
+def _check_target(target: Path, runs: Path) -> None:
+    """Refuse an output that is no Parquet file or would become part of the input."""
+    if target.suffix.lower() != ".parquet":
+        raise InputError(
+            f"cannot write '{target}': a fleet's calibrations are a Parquet table. Name a file "
+            "that ends in .parquet."
+        )
+    if runs.is_dir() and runs.resolve() in target.parents:
+        raise InputError(
+            f"cannot write '{target}': it would become part of the input folder. Name a file "
+            "outside it."
+        )
+
+
+def _missing_parts(
+    steps: pool.Steps,
+    parts: list[Partition],
+    paths: list[Path],
+    workers: int | None,
+    scheduler: str | None,
+    say: Callable[[str], None],
+) -> Generator[Path, None, None]:
+    """Do the parts that are not there yet, one by one; each is written when it is whole."""
+    missing = [index for index, path in enumerate(paths) if not is_whole(path)]
+    if not missing:
+        return
+    begun, tools, slowly = time.perf_counter(), 0, progress.slowly(say, EVERY)
+    tasks = [parts[index] for index in missing]
+    _load_what_the_end_needs()
+    results = pool.results(steps, tasks, workers or cores(), scheduler)
+    for count, (index, content) in enumerate(results, 1):
+        atomic.write(paths[missing[index]], content, durable=False)
+        tools += tasks[index].tools
+        rate = tools / (time.perf_counter() - begun)
+        slowly(f"part {count} of {len(missing)}   {rate:.0f} tools/s")
+        yield paths[missing[index]]
+
+
+def _load_what_the_end_needs() -> None:
+    """While the workers start: at the end nothing else is left to do, and it would be waited for."""
+    for name in ("pyarrow.compute", "rich.console", "rich.table"):
+        import_module(name)
+
+
+def _merge(
+    paths: list[Path], finished: Iterator[Path], target: Path, metadata: dict[str, object]
+) -> None:
+    """One Parquet table of all parts, in their order; one part in memory at a time.
+
+    A part is added when it and all before it are `finished`, while workers go on with others.
+    """
+    arrow, pq = parquet.modules(target.name)
+    described = {parquet.KEY: msgspec.json.encode(metadata, enc_hook=str)}
+    writer = None
+    with atomic.replacing(target) as stream:
+        try:
+            for path in paths:
+                while not is_whole(path) and next(finished, None):
+                    continue
+                with arrow.memory_map(str(path)) as file:
+                    part = arrow.ipc.open_stream(file).read_all()
+                    if writer is None:
+                        schema = part.schema.with_metadata(described)
+                        texts = [f.name for f in schema if not arrow.types.is_floating(f.type)]
+                        writer = pq.ParquetWriter(stream.name, schema, use_dictionary=texts)
+                    writer.write_table(part.cast(writer.schema))
+            for _ in finished:
+                pass
+            if writer is not None:
+                writer.close()
+        except OSError as error:
+            raise InputError(
+                f"cannot write '{target}': {error.strerror or error}. Finished parts are kept: make "
+                "room, or choose another place, and run the same command again."
+            ) from error
+
+
+def _tidy(folder: Path) -> None:
+    """Remove what was kept for a restart, and nothing that is not ours."""
+    atomic.sweep(folder)
+    for path in folder.glob("*.arrow"):
+        path.unlink()
+    for path in folder.glob("sorted-*"):
+        shutil.rmtree(path)

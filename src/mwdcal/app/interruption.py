@@ -1,0 +1,61 @@
+"""The orderly end of a command that is interrupted or told to terminate."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+SIGNAL = 128
+"""Exit status of a command ended by a signal, less the number of the signal."""
+PATIENCE = 5.0
+"""Seconds of cleaning up after which another signal ends the command at once."""
+
+
+class Ended(KeyboardInterrupt):
+    """The command is asked to end, by Ctrl-C or otherwise; the argument is the signal's number."""
+
+
+@contextmanager
+def orderly_end() -> Iterator[None]:
+    """Raise `Ended` at the first signal to end; later ones do not interrupt the cleaning up."""
+    received: list[float] = []
+
+    def end(number: int, frame: object) -> None:
+        if not received:
+            received.append(time.monotonic())
+            raise Ended(number)
+        if time.monotonic() - received[0] > PATIENCE:
+            os._exit(SIGNAL + number)
+
+    handlers = _default_handlers()
+    try:
+        for each in handlers:
+            signal.signal(each, end)
+    except ValueError:  # signals belong to the main thread
+        handlers = {}
+    try:
+        yield
+    finally:
+        for each, handler in handlers.items():
+            signal.signal(each, signal.SIG_IGN if received else handler)  # only the exit is left
+
+
+def _default_handlers() -> dict[signal.Signals, Any]:
+    """The signals that ask a process to end and are neither ignored nor handled by others."""
+    names = ("SIGINT", "SIGTERM", "SIGHUP")
+    signals = [getattr(signal, name) for name in names if hasattr(signal, name)]
+    handlers = {each: signal.getsignal(each) for each in signals}
+    defaults = (signal.SIG_DFL, signal.default_int_handler)
+    return {each: handler for each, handler in handlers.items() if handler in defaults}
+
+
+def report(stop: BaseException) -> tuple[str, int]:
+    """What an interruption leaves, in words, and the exit status."""
+    left = getattr(stop, "__notes__", ["Files are as they were before."])
+    number = stop.args[0] if isinstance(stop, Ended) else signal.SIGINT
+    word = "interrupted" if number == signal.SIGINT else "terminated"
+    return f"{word}. {' '.join(left)}", SIGNAL + int(number)

@@ -1,0 +1,220 @@
+"""A calibration on the screen and for machines: one screen that a technician can act on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+
+from mwdcal.app.messages import lines
+from mwdcal.app.text import chance, number, quantity, table
+from mwdcal.calibration.automatic.nonlinearity import CurveScore
+from mwdcal.calibration.diagnosis.findings import UNUSED
+from mwdcal.calibration.prediction import typical_accuracy
+from mwdcal.calibration.readings import simulated
+from mwdcal.calibration.record import (
+    Calibration,
+    Choices,
+    ErrorRow,
+    Finding,
+    OrderScore,
+    StandErrors,
+)
+from mwdcal.use.plots import TITLES
+
+if TYPE_CHECKING:
+    from mwdcal.app.commands.choices import Chosen
+
+MOST_RESHOOTS = 12
+"""Most stations to re-shoot that the screen names."""
+PROFILE = " (see [stand] of the tool profile)"
+_OF_A_CALIBRATION = (
+    *("run", "stations", "excluded", "temperature_c", "method", "options", "seed"),
+)
+_OF_A_TRIAD = (
+    *("model", "order", "rank", "size", "undetermined", "variance_factor", "misfit_probability"),
+)
+
+
+def summary(made: Calibration, chosen: Chosen, output: Path, report: Path | None) -> dict[str, Any]:
+    """The result for machines."""
+    triads = {t.name: {name: getattr(t, name) for name in _OF_A_TRIAD} for t in made.triads}
+    shown = {name: getattr(made, name) for name in _OF_A_CALIBRATION}
+    return {
+        **shown,
+        "triads": triads,
+        "errors": made.errors,
+        "measures": made.measures,
+        "accuracy_1sigma_deg": typical_accuracy(made),
+        "budget": made.budget,
+        "assumed_exact": made.assumed_exact,
+        "constants": made.constants,
+        "stand": made.stand,
+        "findings": made.findings,
+        "orders": made.orders,
+        "nonlinearity": [msgspec.to_builtins(score) for score in chosen.curves],
+        "calibration": str(output),
+        "report": str(report or ""),
+    }
+
+
+def screen(made: Calibration, chosen: Chosen, output: Path, report: Path | None) -> str:
+    """The result for people."""
+    blocks = [
+        heading(made),
+        *([orders(made.orders)] if made.orders else []),
+        *([curves(chosen.curves)] if chosen.curves else []),
+        errors(made.errors),
+        "\n".join([*remarks(made), *_findings(made.findings), _written(output, report)]),
+    ]
+    return "\n\n".join(blocks)
+
+
+def _written(output: Path, report: Path | None) -> str:
+    written = f"wrote {output} (calibration)" + (f"   {report} (report)" if report else "")
+    return f"{written}   next: mwdcal verify {output} ROLLTEST.csv"
+
+
+def _findings(findings: list[Finding]) -> list[str]:
+    """The findings, of stations to re-shoot the first ones; unused columns are said before."""
+    again = [finding for finding in findings if finding.id == "reshoot"]
+    left = again[MOST_RESHOOTS:]
+    shown = lines(f for f in findings if f not in left and f.id != UNUSED)
+    return shown + ([f"! … and {len(left)} more to re-shoot"] if left else [])
+
+
+def remarks(made: Calibration) -> list[str]:
+    """Size of the residuals, accuracy to expect, what was taken as exact, and estimated constants."""
+    accuracy = "  ".join(
+        f"{name} {number(sd)}{'°' if sd is not None else ''}"
+        for name, sd in typical_accuracy(made).items()
+    )
+    exact = ", ".join(made.assumed_exact)
+    return [
+        *residuals(made),
+        f"accuracy to expect (1σ, calibration alone, typical): {accuracy}",
+        *([f"taken as exact, and no residual tests it: {exact}{PROFILE}"] if exact else []),
+        *(
+            f"estimated constant of the run: {c.name} {c.value:.6g} ± {c.standard_uncertainty:.2g} {c.unit}"
+            for c in made.constants
+        ),
+        *stand(made.stand),
+    ]
+
+
+def heading(calibration: Calibration) -> str:
+    """What was calibrated, from what, and how much of it is determined."""
+    serial = calibration.tool.get("serial", calibration.profile.name)
+    inclinations = [
+        r.inclination_deg for r in calibration.station_rows if r.inclination_deg is not None
+    ]
+    parts = [calibration.run, serial, f"{calibration.stations} stations"]
+    if calibration.temperature_c:
+        parts.append("{:.1f}–{:.1f} °C".format(*calibration.temperature_c))
+    parts.append(f"I {min(inclinations):.0f}–{max(inclinations):.0f}°")
+    parts += simulated(calibration.tool)
+    ranks = [f"{t.name} {t.rank} of {t.size} determined" for t in calibration.triads]
+    how = ", ".join(
+        [f"method {calibration.method}", model(calibration), *choices(calibration.options)]
+    )
+    left_out = ["left out by --exclude: station " + ", ".join(calibration.excluded)]
+    lines = ["   ".join(parts), "   ".join([how, *ranks])]
+    return "\n".join(lines + (left_out if calibration.excluded else []))
+
+
+def model(calibration: Calibration) -> str:
+    """Model and temperature order, of each triad where they differ."""
+    found = {t.name: f"{t.model} of order {t.order}" for t in calibration.triads}
+    if len(set(found.values())) == 1:
+        return found["accelerometer"]
+    return ", ".join(f"{name}: {how}" for name, how in found.items())
+
+
+def choices(made: Choices) -> list[str]:
+    """What was asked for beyond method, model and order."""
+    return [
+        *([f"{made.parameters} parameters"] if made.parameters != 12 else []),
+        *([f"without {' and '.join(made.ignore)}"] if made.ignore else []),
+        *([f"robust ({made.robust})"] if made.robust else []),
+        *(["the paper's weights"] if made.paper_weights else []),
+        *([f"prior {made.prior}"] if made.prior else []),
+    ]
+
+
+def errors(rows: list[ErrorRow]) -> str:
+    """Errors before and after, with what was to be expected."""
+    cells = [
+        [
+            f"{TITLES.get(row.observable, row.observable)} error, rms",
+            *(quantity(value, row.unit) for value in (row.before, row.after, row.expected)),
+        ]
+        for row in rows
+    ]
+    return table(cells, ["", "before", "after", "1σ expected"])
+
+
+def residuals(calibration: Calibration) -> list[str]:
+    """The size of the residuals over the declared noise, and how likely it is, where it is declared."""
+    each = [
+        f"{t.name} {number((t.variance_factor or 0.0) ** 0.5)} (chance {chance(t.misfit_probability)})"
+        for t in calibration.triads
+        if t.misfit_probability is not None
+    ]
+    return [f"residuals over declared noise, s: {'   '.join(each)}"] if each else []
+
+
+def stand(errors: StandErrors) -> list[str]:
+    """Estimated errors of the stand."""
+    lines = []
+    for name in ("azimuth", "inclination"):
+        zero = getattr(errors, f"{name}_zero_deg")
+        if zero is not None:
+            sd = number(getattr(errors, f"{name}_zero_uncertainty_deg"))
+            lines.append(f"stand: {name} zero {zero:+.4g}° ± {sd}°")
+    if errors.tilt_deg is not None:
+        lean = f"{errors.tilt_deg:.3g}° ± {number(errors.tilt_uncertainty_deg)}°"
+        azimuth = f"{errors.tilt_azimuth_deg:.0f}° ± {number(errors.tilt_azimuth_uncertainty_deg)}°"
+        lines.append(f"stand: its vertical leans by {lean} towards azimuth {azimuth}")
+    return lines
+
+
+def orders(scores: list[OrderScore]) -> str:
+    """Error at temperatures left out of the fit, by triad and order, and what chose the order."""
+    word = "" if all(s.chosen for s in scores) else "chosen"
+    rows = []
+    for s in scores:
+        values = (s.error_inside, s.error_ends, s.noise)
+        shown = [quantity(value, s.unit.partition(" ")[0]) for value in values]
+        row = [s.triad, str(s.order), number(s.inside), number(s.ends), *shown, chance(s.chance)]
+        rows.append([*row, word if s.chosen else ""])
+    header = [
+        "temperatures left out",
+        "order",
+        "χ² inside",
+        "χ² ends",
+        "error inside",
+        "at the ends",
+    ]
+    note = "error: rms per axis, with the noise; inside: interpolation, at the ends: extrapolation"
+    if word:
+        note += (
+            "\nby chance: probability that noise alone gives such a term; chosen: the lowest order "
+            "above which none is below 0.001"
+        )
+    return table(rows, [*header, "noise", "by chance", ""]) + "\n" + note
+
+
+def curves(scores: list[CurveScore]) -> str:
+    """The table that took or left the own-axis terms."""
+    judged = any(s.odds is not None for s in scores)
+    rows = [
+        [
+            " and ".join(s.triads) or "none",
+            f"{s.odds:+.1f}" if s.odds is not None else number(s.left_out),
+            "chosen" if s.chosen else "",
+        ]
+        for s in scores
+    ]
+    measure = "odds, powers of ten" if judged else "χ² left out"
+    return table(rows, ["own-axis nonlinearity of", measure, ""])

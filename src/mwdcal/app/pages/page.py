@@ -1,0 +1,103 @@
+"""What all pages share: templates, and numbers as they are written there."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mwdcal.app.pages import pictures
+from mwdcal.app.text import chance, plural, superscript
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
+
+HELD = "held"
+"""In place of the uncertainty of a parameter that a model of 9 or 6 keeps at zero."""
+
+
+def is_held(value: float, uncertainty: float | None) -> bool:
+    """Whether a parameter was not fitted but kept at zero."""
+    return value == 0 and uncertainty == 0
+
+
+def environment() -> Environment:
+    """The templates, and what they call; refuses where what draws a page is missing."""
+    pictures.require("the report", "matplotlib", "jinja2")
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    environment = Environment(
+        loader=PackageLoader("mwdcal.app.pages"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= {
+        "number": number,
+        "signed": signed,
+        "fixed": fixed,
+        "css": css_string,
+        "svg": pictures.svg,
+        "plural": plural,
+        "unit": unit,
+        "chance": chance,
+    }
+    return environment
+
+
+def number(value: float | None, digits: int = 3) -> str:
+    """A number to some significant digits, without E notation; a dash where there is none."""
+    if value is None or not np.isfinite(value):
+        return "–"
+    if value == 0:
+        return "0"
+    mantissa, _, digits_of_power = f"{value:.{digits - 1}e}".partition("e")
+    power = int(digits_of_power)
+    if not -5 < power < 7:
+        return f"{mantissa}×10{superscript(power)}".replace("-", "−")
+    return fixed(value, max(digits - 1 - power, 0))
+
+
+def fixed(value: float | None, decimals: int) -> str:
+    """A number to some decimals, with a true minus sign; a dash where there is none."""
+    if value is None or not np.isfinite(value):
+        return "–"
+    return f"{round(value, decimals) + 0.0:.{max(decimals, 0)}f}".replace("-", "−")
+
+
+def signed(value: float | None, decimals: int) -> str:
+    """As `fixed`, with a plus sign too."""
+    text = fixed(value, decimals)
+    return text if text[0] in "−–" or not float(text) else f"+{text}"
+
+
+def measured(value: float, uncertainty: float | None) -> tuple[str, str]:
+    """Value and standard uncertainty as text, both to two significant digits of the latter."""
+    if uncertainty is None or not np.isfinite(uncertainty):
+        return number(value, 6), "undetermined"
+    if uncertainty == 0:
+        return number(value, 9), "0"
+    decimals = 1 - exponent(uncertainty)
+    power = exponent(max(abs(value), uncertainty))
+    if decimals <= 7 and power < 7:
+        return fixed(value, decimals), fixed(uncertainty, decimals)
+    factor, times = 10.0**-power, f"×10{superscript(power)}"
+    pair = (fixed(v * factor, decimals + power) for v in (value, uncertainty))
+    first, second = (f"{text}{times}" for text in pair)
+    return first, second
+
+
+def exponent(value: float) -> int:
+    """The power of ten of a number rounded to two digits."""
+    return int(f"{value:.1e}".split("e")[1])
+
+
+def unit(symbol: str) -> str:
+    """A unit as it follows a number: the degree sign without a space."""
+    return symbol if symbol in ("", "°") else f" {symbol}"
+
+
+def css_string(text: str) -> str:
+    """Text as the inside of a CSS string: nothing but letters and digits is left bare."""
+    return "".join(c if c.isascii() and c.isalnum() else f"\\{ord(c):x} " for c in text)

@@ -1,0 +1,217 @@
+"""Stations found in a log: on the screen, for machines, and as a picture."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mwdcal.app.pages import pictures
+from mwdcal.app.text import table
+from mwdcal.files.contract import CHANNELS
+from mwdcal.geometry.vectors import Array
+from mwdcal.logs.stations import Stations
+from mwdcal.use import plots
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+MOST_LINES = 40
+"""Stations of a table on screen."""
+POINTS = 2000
+"""Points of a line in the picture."""
+LINES = ("-", (0, (5, 1.5)), (0, (1.5, 1.2)))
+"""Line styles of x, y and z."""
+
+
+def summary(stations: Stations) -> dict[str, Any]:
+    """The result for machines: one entry per station, and what was left."""
+    columns = {
+        name: column if isinstance(column, list) else [_finite(v) for v in column.tolist()]
+        for name, column in stations.table.columns.items()
+    }
+    rows = zip(*columns.values(), strict=True)
+    return {
+        "log": stations.table.source,
+        "rows": len(stations.time),
+        "seconds": float(stations.time[-1] - stations.time[0]),
+        "threshold": stations.threshold,
+        "stretch": stations.stretch,
+        "min_seconds": stations.min_seconds,
+        "trim_seconds": stations.trim_seconds,
+        "stations": [dict(zip(columns, row, strict=True)) for row in rows],
+        "left": [
+            {"start_s": start, "end_s": end, "reason": "short" if short else "moves slowly"}
+            for start, end, short in _left(stations)
+        ],
+        "findings": stations.findings,
+    }
+
+
+def _finite(value: float) -> float | None:
+    return None if np.isnan(value) else value
+
+
+def _left(stations: Stations) -> list[tuple[float, float, bool]]:
+    """Intervals that look still and were not taken: start, end, whether they are short."""
+    intervals = stations.found
+    return [
+        (float(intervals.start[i]), float(intervals.end[i]), bool(intervals.short[i]))
+        for i in np.flatnonzero(~intervals.taken)
+    ]
+
+
+def screen(stations: Stations, files: dict[str, str]) -> str:
+    """What was found, for people."""
+    columns = stations.table.columns
+    start, end = (np.asarray(columns[name]) for name in ("start_s", "end_s"))
+    whole = float(stations.time[-1] - stations.time[0])
+    left = _left(stations)
+    short = sum(is_short for *_, is_short in left)
+    lines = [
+        f"{stations.table.source}   {len(stations.time)} rows   {whole:.6g} s   "
+        f"{stations.table.count} stations, {100 * float((end - start).sum()) / whole:.0f} % of the time",
+        f"threshold {stations.threshold:.3g} noise floors{_stretch(stations)}   at least "
+        f"{stations.min_seconds:g} s after {stations.trim_seconds:g} s trimmed off each end   "
+        f"left: {short} too short, {len(left) - short} moving slowly",
+        "",
+        _stations_table(stations),
+        f"wrote {files['output']}"
+        + (f"   {files['plot']} (picture)" if files["plot"] else "")
+        + f"   next: mwdcal calibrate {files['output']} -o CAL.json",
+    ]
+    return "\n".join(lines)
+
+
+def _stretch(stations: Stations) -> str:
+    if stations.stretch is None:
+        return " (given)"
+    return " (the same stations from {:.3g} to {:.3g})".format(*stations.stretch)
+
+
+def _stations_table(stations: Stations) -> str:
+    columns = stations.table.columns
+    names = [name for kind in CHANNELS.values() for name in kind if name in columns]
+    warm = ["temperature_c"] if "temperature_c" in columns else []
+    rows = []
+    for i in range(min(stations.table.count, MOST_LINES)):
+        ends = [f"{float(columns[name][i]):.2f}" for name in ("start_s", "end_s")]
+        samples = f"{float(columns['samples'][i]):.0f}"
+        warmth = [f"{float(columns[name][i]):.2f}" for name in warm]
+        values = [_to_sd(float(columns[n][i]), float(columns[f"sd_{n}"][i])) for n in names]
+        drifting = str(columns["drifting"][i])
+        rows.append([str(i + 1), *ends, samples, *warmth, *values, drifting])
+    header = ["station", "start s", "end s", "samples", *(["°C"] if warm else []), *names, "drifts"]
+    more = stations.table.count - len(rows)
+    return table(rows, header) + (f"\n… and {more} more" if more > 0 else "")
+
+
+def _to_sd(value: float, sd: float) -> str:
+    """A mean to two digits of its standard uncertainty."""
+    if not 0 < sd < np.inf:
+        return f"{value:.7g}"
+    digits = max(0, 1 - int(np.floor(np.log10(sd))))
+    return f"{value:.{digits}f}"
+
+
+@plots.styled
+def figure(stations: Stations) -> Figure:
+    """The log with what was taken and what was left: a panel for each triad and for the activity."""
+    triads = [t for t in CHANNELS.values() if any(name in stations.traces for name in t)]
+    figure = plots.new_figure("Stations taken and left in a log", 1.5 + 1.5 * len(triads))
+    panels = figure.subplots(len(triads) + 1, 1, sharex=True, squeeze=False)[:, 0]
+    for axes, triad in zip(panels, triads, strict=False):
+        _draw_triad(axes, stations, triad)
+    _draw_activity(panels[-1], stations)
+    for axes in panels:
+        _shade(axes, stations)
+    _number_stations(panels[0], stations)
+    return figure
+
+
+def picture(stations: Stations, path: Path) -> bytes:
+    """The figure as PNG or SVG, by the suffix."""
+    return pictures.picture(figure(stations), path)
+
+
+def _thinned(x: Array, y: Array) -> tuple[Array, Array]:
+    """At most `POINTS` points: the lowest and the highest of each of equal runs."""
+    step = -(-2 * len(x) // POINTS)
+    if step <= 2:
+        return x, y
+    count = len(x) // step
+    blocks = y[: count * step].reshape(count, step)
+    ends = np.stack([blocks.min(-1), blocks.max(-1)], -1).ravel()
+    return np.repeat(x[: count * step : step], 2), ends
+
+
+def _draw_triad(axes: Axes, stations: Stations, triad: tuple[str, ...]) -> None:
+    """Medians of short cells of the channels that have them, else the samples."""
+    names = list(stations.traces)
+    cells = {
+        names[i]: c
+        for i, c in zip(stations.activity.channels, stations.activity.cells, strict=True)
+    }
+    for name, line in zip(triad, LINES, strict=True):
+        if name in cells:
+            x, y = cells[name].start, cells[name].level
+        else:
+            x, y = stations.traces[name]
+        colour = plots.AXES[name[-1]]
+        axes.plot(*_thinned(x, y), color=colour, ls=line, lw=0.9, label=name)
+    axes.set_ylabel("accelerometer,\nraw" if triad[0] == "ax" else "magnetometer,\nraw")
+    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), handlelength=2.6)
+
+
+def _draw_activity(axes: Axes, stations: Stations) -> None:
+    edge, value = stations.activity.edge, stations.activity.value
+    fine = np.isfinite(value) & (value > 0)
+    x, y = _thinned(edge[:-1], np.where(fine, value, value[fine].min(initial=np.inf)))
+    axes.plot(x, np.where(np.isinf(y), np.nan, y), color=plots.BEFORE, lw=0.7)
+    axes.set_yscale("log")
+    axes.set_ylabel("activity,\nnoise floors")
+    axes.set_xlabel("time, s")
+    axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    axes.yaxis.set_minor_formatter(lambda value, _: "")
+    axes.axhline(stations.threshold, color=plots.MARKED, lw=1, ls=(0, (5, 3)))
+    axes.annotate(
+        f"threshold {stations.threshold:.3g}", (1.0, stations.threshold), (6, 0), va="center",
+        xycoords=("axes fraction", "data"), textcoords="offset points", color="#9a3d00", fontsize=7,
+    )  # fmt: skip
+    if stations.stretch:
+        axes.axhspan(*stations.stretch, color="#fde8d4", lw=0, zorder=0.4)
+
+
+def _shade(axes: Axes, stations: Stations) -> None:
+    """Taken intervals filled, left ones hatched."""
+    intervals = stations.found
+    bars = np.stack([intervals.start, intervals.end - intervals.start], -1)
+    place: dict[str, Any] = {
+        "yrange": (0, 1),
+        "transform": axes.get_xaxis_transform(),
+        "zorder": 0.5,
+    }
+    axes.broken_barh(bars[intervals.taken].tolist(), fc=plots.BAND, lw=0, **place)
+    left = bars[~intervals.taken].tolist()
+    axes.broken_barh(left, fc="none", ec=plots.BEFORE, hatch="////", lw=0.4, **place)
+    axes.set_xlim(float(stations.time[0]), float(stations.time[-1]))
+
+
+def _number_stations(axes: Axes, stations: Stations) -> None:
+    intervals = stations.found
+    middle = (intervals.start + intervals.end)[intervals.taken] / 2
+    every = max(1, -(-len(middle) // 30))
+    for i in range(0, len(middle), every):
+        place = (float(middle[i]), 1.0)
+        axes.annotate(
+            str(i + 1), place, (0, 2), xycoords=("data", "axes fraction"), ha="center",
+            textcoords="offset points", fontsize=6,
+        )  # fmt: skip
+    left = int(np.count_nonzero(~intervals.taken))
+    axes.set_title(
+        f"{stations.table.source}: stations taken {stations.table.count} (filled, numbered), "
+        f"calm intervals left {left} (hatched)",
+        pad=12,
+    )
