@@ -70,10 +70,10 @@ def convert(
     affine of the model of factors, both of order 1 or more.
     """
     if notation not in NOTATIONS:
-        raise InputError(f"--notation must be one of {', '.join(NOTATIONS)}; got {notation!r}.")
+        raise InputError(f"`notation` must be one of {', '.join(NOTATIONS)}; got {notation!r}.")
     if isinstance(temperature, str) and temperature != COURSE:
         raise InputError(
-            "--temperature must be a number in °C, or the word 'course' for coefficients by power "
+            "`temperature` must be a number in °C, or the word 'course' for coefficients by power "
             f"of temperature; got {temperature!r}."
         )
     at = calibration.reference_temperature if temperature is None else temperature
@@ -158,16 +158,16 @@ def _refuse(triad: TriadCalibration, notation: str, temperature: float | str) ->
     what = f"the {triad.name} has the model '{triad.model}' of order {triad.order} in temperature"
     if notation == "factors":
         raise InputError(
-            f"{what}: its factors are no polynomials of temperature. Use --notation affine, "
-            "for one temperature or with --temperature course, or --notation forward for one "
+            f"{what}: its factors are no polynomials of temperature. Use `notation` affine, "
+            "for one temperature or with `temperature` course, or `notation` forward for one "
             "temperature, or calibrate with --model factors."
         )
     if temperature == COURSE:
         able = "affine" if model == "factors" else "forward or factors"
         raise InputError(
             f"{what}: its {notation} notation is a quotient of polynomials of temperature and has "
-            f"no coefficients by power. Use --notation {able}, or a number in °C for "
-            f"--temperature, or calibrate with --model {model}."
+            f"no coefficients by power. Use `notation` {able}, or a number in °C for "
+            f"`temperature`, or calibrate with --model {model}."
         )
 
 

@@ -147,7 +147,7 @@ def verify(calibration: Calibration, readings: Readings, limits: Limits) -> Verd
     if not judged:
         raise InputError(
             f"{readings.name}: no limit of '{limits.name}' applies: {'; '.join(skipped)}. Add what "
-            "is missing, or choose other --limits."
+            "is missing, or choose other `limits`."
         )
     return Verdict(
         passed=all(row.passed for row, _ in judged),
