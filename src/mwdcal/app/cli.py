@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Iterator, Mapping
 from importlib import import_module
 
 import click
@@ -23,20 +24,27 @@ COMMANDS = (
 """Modules of `mwdcal.app.commands` with a command of their name."""
 
 
-class LazyGroup(click.Group):
-    """A group that imports a command's module when the command is named."""
+class Commands(Mapping[str, click.Command]):
+    """The commands by name; each is imported when it is asked for."""
 
-    def get_command(self, context: click.Context, name: str) -> click.Command | None:
+    def __getitem__(self, name: str) -> click.Command:
         """The command of the module of that name."""
-        if name not in self.commands:
-            return None
+        if name not in COMMANDS:
+            raise KeyError(name)
         command: click.Command = import_module(f"mwdcal.app.commands.{name}").command
         return command
 
+    def __iter__(self) -> Iterator[str]:
+        """The names of the commands."""
+        return iter(COMMANDS)
+
+    def __len__(self) -> int:
+        """The number of commands."""
+        return len(COMMANDS)
+
 
 @click.group(
-    cls=LazyGroup,
-    commands=dict.fromkeys(COMMANDS),
+    commands=Commands(),
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
 @click.version_option(__version__, prog_name="mwdcal")

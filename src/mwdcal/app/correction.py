@@ -41,8 +41,8 @@ def apply_to_any(
 ) -> tuple[RowCounts, list[Finding]]:
     """Correct a file into another: part by part, or whole where it is short text or a workbook.
 
-    What was seen in the rows, and what the reader should know. `advance` is told how much of a long
-    table is done, and of how much.
+    What was seen in the rows, and what the reader should know. `advance` gets how much of a long
+    table is done, and the whole.
     """
     if in_parts(readings, output, decimal):
         return apply_to_file(
@@ -70,11 +70,13 @@ def apply_to_table(
         raise nothing(source.source)
     kept = source if whole.all() else chosen(source, whole)
     readings, _ = to_readings(kept, calibration.profile)
-    found, tally, findings = counted(calibration, readings, outside, source.count - kept.count)
-    check_free(source.columns, list(found), source.source)
-    columns = found if whole.all() else {n: spread(values, whole) for n, values in found.items()}
+    results, tally, findings = counted(calibration, readings, outside, source.count - kept.count)
+    check_free(source.columns, list(results), source.source)
+    columns = (
+        results if whole.all() else {n: spread(values, whole) for n, values in results.items()}
+    )
     metadata = {**source.metadata, **described(calibration)}
     if findings:
         metadata["findings"] = [finding.text for finding in findings]
-    made = replace(source, columns={**source.columns, **columns}, metadata=metadata)
-    return made, tally, findings + unused_columns(readings.unused)
+    corrected = replace(source, columns={**source.columns, **columns}, metadata=metadata)
+    return corrected, tally, findings + unused_columns(readings.unused)

@@ -3,7 +3,7 @@
 Every Parquet table that becomes Parquet or text goes this way, so that its columns keep their
 types. Reading, computing and writing overlap: one thread reads, some compute, the caller writes,
 and only a few parts are in memory at any time. Results, findings and refusals are those of
-`app.tables.apply_to_table`, which is for short text and for workbooks, but for two: which outputs
+`mwdcal.app.correction.apply_to_table`, which is for short text and for workbooks, but for two: which outputs
 rest on undetermined directions is judged on a sample of each part, and blank `sd_` cells are
 compared with others of their part.
 """
@@ -70,7 +70,7 @@ OPTIONAL = {
 }
 """Columns that are blank on all rows or on none, and what to do where they are neither."""
 LONGEST = 60
-"""Characters of another tool's serial that are told of a column."""
+"""Most characters of another tool's serial that a finding names."""
 _MOST = 10**15
 
 Item = TypeVar("Item")
@@ -105,7 +105,7 @@ def apply_to_file(
 ) -> tuple[RowCounts, list[Finding]]:
     """Correct a file into another; what was seen in the rows, and what the reader should know.
 
-    `advance` is told how much of the whole is done. `rows` of a part of a Parquet table, by
+    `advance` gets how much of the whole is done, and the whole. `rows` of a part of a Parquet table, by
     default as many as memory bears; `least` rows of the whole from which loops are compiled.
     """
     check_outside(outside)
@@ -129,10 +129,10 @@ def apply_to_file(
         total = _total(tallies)
         if total.lacking == total.rows:
             raise nothing(source.name)
-        found = findings(calibration, worker.heard(total.serials), total, outside)
+        remarks = findings(calibration, worker.heard(total.serials), total, outside)
         strengths.check(calibration, total.strengths, source.name)
-        sink.finish([finding.text for finding in found])
-    return total, found + unused_columns(synonyms.unused(source.names, COLUMNS))
+        sink.finish([finding.text for finding in remarks])
+    return total, remarks + unused_columns(synonyms.unused(source.names, COLUMNS))
 
 
 def overlapped(items: Iterator[Item], work: Callable[[Item], Made]) -> Iterator[Made]:
@@ -294,28 +294,28 @@ class _Worker:
 
     def _corrected(self, part: Part, sink: Sink) -> Corrected:
         table, rows = part.table, part.table.count
-        channels, found = self._found(table)
+        channels, corrected = self._compute(table)
         whole: Bools | None = None
-        if found.unsound and self.rules.missing == "blank":
+        if corrected.unsound and self.rules.missing == "blank":
             whole = ~lacking(table, self.absent)
             table = chosen(table, whole)
-            channels, found = self._found(table)
-        if found.unsound:
+            channels, corrected = self._compute(table)
+        if corrected.unsound:
             self._refuse(table)
         known: Mapping[str, Array] = {}
         if any(name.startswith(("ref_", "sd_")) for name in table.columns):
             kinds = [kind for kind in TRIADS if channels[kind] is not None]
             known = runs.check_references(table, self.calibration.profile, kinds)
         moved = self._undetermined(channels, table.count)
-        columns = dict(zip(NAMES, found.columns, strict=True))
+        columns = dict(zip(NAMES, corrected.columns, strict=True))
         results: list[AnyArray] = [*columns.values()]
         if self.rules.outside == "extrapolate":
             results.append(self._beyond(channels, table.count))
         if whole is not None:
             results = [spread(values, whole) for values in results]
-        rendered = sink.render(part.carried, results, bool(found.empty) or whole is not None)
+        rendered = sink.render(part.carried, results, bool(corrected.empty) or whole is not None)
         tally = RowCounts(
-            rows, found.beyond, moved, rows - table.count, self._serials(part.carried),
+            rows, corrected.beyond, moved, rows - table.count, self._serials(part.carried),
             strengths.judged(self.calibration, columns, known),
             warmth(channels["temperature"][0] if channels["temperature"] else None),
         )  # fmt: skip
@@ -334,8 +334,10 @@ class _Worker:
         """What the findings need to know of the source, with the tools that its parts named."""
         return replace(self.said, metadata=runs.identified(self.source.metadata, serials))
 
-    def _found(self, table: Table) -> tuple[dict[str, list[Array] | None], correction_numba.Found]:
-        """The channels of a table, and what is made of them."""
+    def _compute(
+        self, table: Table
+    ) -> tuple[dict[str, list[Array] | None], correction_numba.Found]:
+        """The channels of a table, and their results."""
         channels = self._channels(table)
         compute = self._compiled if self.triads else self._plain
         return channels, compute(channels, table.count)
@@ -349,13 +351,13 @@ class _Worker:
     def _channels(self, table: Table) -> dict[str, list[Array] | None]:
         """Columns of each triad, and of the temperature; None where there are none."""
         groups = {**CHANNELS, "temperature": ("temperature_c",)}
-        found: dict[str, list[Array] | None] = {}
+        channels: dict[str, list[Array] | None] = {}
         for kind, names in groups.items():
             lacking = names in self.absent or names[0] not in table.columns
-            found[kind] = None if lacking else [_column(table, name) for name in names]
+            channels[kind] = None if lacking else [_column(table, name) for name in names]
             if names in self.absent and not all(_is_blank(table, name) for name in names):
                 raise _blank(self.source.load(self.first, True).table, names)
-        return found
+        return channels
 
     def _limits(self) -> correction_numba.Limits:
         low, high = self.calibration.temperature_c or (-np.inf, np.inf)
@@ -377,8 +379,10 @@ class _Worker:
             units += unit
         zero = self.calibration.reference_temperature
         columns += channels["temperature"] or [np.full(count, zero)]
-        found = correction_numba.run(columns, self.triads, zero, units, self._limits(), workers=1)
-        return found._replace(unsound=found.unsound - blank * count)
+        corrected = correction_numba.run(
+            columns, self.triads, zero, units, self._limits(), workers=1
+        )
+        return corrected._replace(unsound=corrected.unsound - blank * count)
 
     def _plain(
         self, channels: Mapping[str, list[Array] | None], count: int

@@ -135,13 +135,13 @@ def open_text(path: Path, typed: bool = False) -> Source:
 
     def load(piece: Any, exact: bool) -> Part:
         data, above, size = piece
-        found = None if exact else _plain(data, top, arrow)
-        if found is None:
+        both = None if exact else _plain(data, top, arrow)
+        if both is None:
             parts = text.rows(data, top, above, path.name)
             table = Table(parts.columns, top.metadata, path.name, parts.lines)
             strings = {n: arrow.array(c, arrow.string()) for n, c in parts.columns.items()}
-            found = arrow.table(strings), table
-        carried, table = found
+            both = arrow.table(strings), table
+        carried, table = both
         if typed:
             carried = _typed(carried, table, numeric, arrow)
         kept = {n: c for n, c in table.columns.items() if n in _NUMERIC}
@@ -190,8 +190,8 @@ def _plain(data: bytes, top: text.Head, arrow: Any) -> tuple[Any, Table] | None:
             csv.ConvertOptions(column_types=strings, strings_can_be_null=False),
         )
         if order is not None:
-            found = text.rows(odd, top, 1, "").columns
-            few = arrow.table({n: arrow.array(c, arrow.string()) for n, c in found.items()})
+            unusual = text.rows(odd, top, 1, "").columns
+            few = arrow.table({n: arrow.array(c, arrow.string()) for n, c in unusual.items()})
             both = arrow.concat_tables([carried, few]).combine_chunks()
             if len(both) != len(order):  # lines that are blank are no rows
                 return None

@@ -50,11 +50,11 @@ def command(
     try:
         stations = find_stations(readings, say=slowly, **search)
     except StandstillError as error:  # the picture helps most then
-        told = [str(error), *lines(error.made.findings)]
+        message = [str(error), *lines(error.made.findings)]
         if plot:
             atomic.write(plot, page.picture(error.made, plot))
-            told.append(f"wrote {plot} (picture)")
-        raise InputError("\n".join(told)) from None
+            message.append(f"wrote {plot} (picture)")
+        raise InputError("\n".join(message)) from None
     drawn = page.picture(stations, plot) if plot else b""
     table.write(output, stations.table)
     if plot:

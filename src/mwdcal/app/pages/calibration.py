@@ -37,36 +37,40 @@ _OF_A_TRIAD = (
 )
 
 
-def summary(made: Calibration, chosen: Chosen, output: Path, report: Path | None) -> dict[str, Any]:
+def summary(
+    calibration: Calibration, chosen: Chosen, output: Path, report: Path | None
+) -> dict[str, Any]:
     """The result for machines."""
-    triads = {t.name: {name: getattr(t, name) for name in _OF_A_TRIAD} for t in made.triads}
-    shown = {name: getattr(made, name) for name in _OF_A_CALIBRATION}
+    triads = {t.name: {name: getattr(t, name) for name in _OF_A_TRIAD} for t in calibration.triads}
+    shown = {name: getattr(calibration, name) for name in _OF_A_CALIBRATION}
     return {
         **shown,
         "triads": triads,
-        "errors": made.errors,
-        "measures": made.measures,
-        "accuracy_1sigma_deg": typical_accuracy(made),
-        "budget": made.budget,
-        "assumed_exact": made.assumed_exact,
-        "constants": made.constants,
-        "stand": made.stand,
-        "findings": made.findings,
-        "orders": made.orders,
+        "errors": calibration.errors,
+        "measures": calibration.measures,
+        "accuracy_1sigma_deg": typical_accuracy(calibration),
+        "budget": calibration.budget,
+        "assumed_exact": calibration.assumed_exact,
+        "constants": calibration.constants,
+        "stand": calibration.stand,
+        "findings": calibration.findings,
+        "orders": calibration.orders,
         "nonlinearity": [msgspec.to_builtins(score) for score in chosen.curves],
         "calibration": str(output),
         "report": str(report or ""),
     }
 
 
-def screen(made: Calibration, chosen: Chosen, output: Path, report: Path | None) -> str:
+def screen(calibration: Calibration, chosen: Chosen, output: Path, report: Path | None) -> str:
     """The result for people."""
     blocks = [
-        heading(made),
-        *([orders(made.orders)] if made.orders else []),
+        heading(calibration),
+        *([orders(calibration.orders)] if calibration.orders else []),
         *([curves(chosen.curves)] if chosen.curves else []),
-        errors(made.errors),
-        "\n".join([*remarks(made), *_findings(made.findings), _written(output, report)]),
+        errors(calibration.errors),
+        "\n".join(
+            [*remarks(calibration), *_findings(calibration.findings), _written(output, report)]
+        ),
     ]
     return "\n\n".join(blocks)
 
@@ -84,22 +88,22 @@ def _findings(findings: list[Finding]) -> list[str]:
     return shown + ([f"! … and {len(left)} more to re-shoot"] if left else [])
 
 
-def remarks(made: Calibration) -> list[str]:
+def remarks(calibration: Calibration) -> list[str]:
     """Size of the residuals, accuracy to expect, what was taken as exact, and estimated constants."""
     accuracy = "  ".join(
         f"{name} {number(sd)}{'°' if sd is not None else ''}"
-        for name, sd in typical_accuracy(made).items()
+        for name, sd in typical_accuracy(calibration).items()
     )
-    exact = ", ".join(made.assumed_exact)
+    exact = ", ".join(calibration.assumed_exact)
     return [
-        *residuals(made),
+        *residuals(calibration),
         f"accuracy to expect (1σ, calibration alone, typical): {accuracy}",
         *([f"taken as exact, and no residual tests it: {exact}{PROFILE}"] if exact else []),
         *(
             f"estimated constant of the run: {c.name} {c.value:.6g} ± {c.standard_uncertainty:.2g} {c.unit}"
-            for c in made.constants
+            for c in calibration.constants
         ),
-        *stand(made.stand),
+        *stand(calibration.stand),
     ]
 
 
@@ -125,20 +129,20 @@ def heading(calibration: Calibration) -> str:
 
 def model(calibration: Calibration) -> str:
     """Model and temperature order, of each triad where they differ."""
-    found = {t.name: f"{t.model} of order {t.order}" for t in calibration.triads}
-    if len(set(found.values())) == 1:
-        return found["accelerometer"]
-    return ", ".join(f"{name}: {how}" for name, how in found.items())
+    models = {t.name: f"{t.model} of order {t.order}" for t in calibration.triads}
+    if len(set(models.values())) == 1:
+        return models["accelerometer"]
+    return ", ".join(f"{name}: {model}" for name, model in models.items())
 
 
-def choices(made: Choices) -> list[str]:
+def choices(options: Choices) -> list[str]:
     """What was asked for beyond method, model and order."""
     return [
-        *([f"{made.parameters} parameters"] if made.parameters != 12 else []),
-        *([f"without {' and '.join(made.ignore)}"] if made.ignore else []),
-        *([f"robust ({made.robust})"] if made.robust else []),
-        *(["the paper's weights"] if made.paper_weights else []),
-        *([f"prior {made.prior}"] if made.prior else []),
+        *([f"{options.parameters} parameters"] if options.parameters != 12 else []),
+        *([f"without {' and '.join(options.ignore)}"] if options.ignore else []),
+        *([f"robust ({options.robust})"] if options.robust else []),
+        *(["the paper's weights"] if options.paper_weights else []),
+        *([f"prior {options.prior}"] if options.prior else []),
     ]
 
 

@@ -52,8 +52,10 @@ def text(comparison: Comparison, parameters: bool = False) -> str:
     lines += [f"{who} refused: {why}" for who, why in refusals(comparison)]
     if parameters and rows:
         lines += ["", gauge(comparison) + " In parentheses: 1σ of the last digits."]
-        for name, own in parameter_pairs(comparison).items():
-            joined = [(what, unit, [_joined(*pair) for pair in pairs]) for what, unit, pairs in own]
+        for name, stated in parameter_pairs(comparison).items():
+            joined = [
+                (what, unit, [_joined(*pair) for pair in pairs]) for what, unit, pairs in stated
+            ]
             lines += ["", _table(joined, [name, *methods])]
     return "\n".join(lines)
 
@@ -131,9 +133,9 @@ def measures(comparison: Comparison) -> list[Line]:
 
 
 def _measure(row: Row, triad: str, when: str, key: str) -> str:
-    found = [getattr(m, key) for m in row.measures if (m.triad, m.when) == (triad, when)]
+    values = [getattr(m, key) for m in row.measures if (m.triad, m.when) == (triad, when)]
     rank, size = row.ranks[triad]
-    return number(found[0] if found else None) + MARK * (rank < size)
+    return number(values[0] if values else None) + MARK * (rank < size)
 
 
 def effort(comparison: Comparison) -> list[Line]:
@@ -235,7 +237,7 @@ def render(comparison: Comparison, trace: Sequence[tuple[str, str, str]] = ()) -
     rows = able(comparison.rows)
     headline, _, why = comparison.advice.partition(": ")
     return template.render(
-        found=comparison,
+        result=comparison,
         simulated=comparison.simulated,
         headline=headline,
         why=why,

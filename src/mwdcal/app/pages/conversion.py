@@ -71,44 +71,44 @@ def temperature_findings(
     return [Finding(id="outside-temperature", text=text)]
 
 
-def document(made: Converted) -> dict[str, Any]:
+def document(converted: Converted) -> dict[str, Any]:
     """The result for machines: identity, units and conditions, then the values of each triad."""
-    return {**_identity(made), **{name: _triad(made, name) for name in made.triads}}
+    return {**_identity(converted), **{name: _triad(converted, name) for name in converted.triads}}
 
 
-def _identity(made: Converted) -> dict[str, Any]:
-    calibration, at = made.calibration, made.temperature
-    found: dict[str, Any] = {
+def _identity(converted: Converted) -> dict[str, Any]:
+    calibration, at = converted.calibration, converted.temperature
+    identity: dict[str, Any] = {
         "schema_version": SCHEMA_VERSION,
         "tool": calibration.tool,
         "serial": calibration.tool.get("serial"),
         "profile": calibration.profile.name,
         "run": calibration.run,
         "run_sha256": calibration.run_sha256,
-        "calibration": made.path.name,
-        "calibration_sha256": made.sha256,
+        "calibration": converted.path.name,
+        "calibration_sha256": converted.sha256,
         "calibrated": calibration.time,
         "software": calibration.software,
         "simulated": is_simulated(calibration.tool),
         "calibrated_temperature_c": calibration.temperature_c,
         "field_unit": calibration.field_unit,
-        "notation": made.notation,
+        "notation": converted.notation,
         "temperature_c": at,
-        "findings": made.findings,
+        "findings": converted.findings,
     }
     if isinstance(at, str):
-        found["powers_of"] = "T - reference_temperature_c"
-    elif made.notation == "factors" or at is None:
-        found["temperature_c"] = calibration.reference_temperature
-    return found
+        identity["powers_of"] = "T - reference_temperature_c"
+    elif converted.notation == "factors" or at is None:
+        identity["temperature_c"] = calibration.reference_temperature
+    return identity
 
 
-def _triad(made: Converted, name: str) -> dict[str, Any]:
-    item, profile = made.triads[name], getattr(made.calibration.profile, name)
-    triad = next(t for t in made.calibration.triads if t.name == name)
+def _triad(converted: Converted, name: str) -> dict[str, Any]:
+    item, profile = converted.triads[name], getattr(converted.calibration.profile, name)
+    triad = next(t for t in converted.calibration.triads if t.name == name)
     return {
         **{k: v.tolist() for k, v in item.values.items()},
-        "reference_temperature_c": made.calibration.reference_temperature,
+        "reference_temperature_c": converted.calibration.reference_temperature,
         "axes": profile.axes,
         "unit": triad.unit,
         "nominal_raw_per_unit": profile.scale,
@@ -117,31 +117,31 @@ def _triad(made: Converted, name: str) -> dict[str, Any]:
     }
 
 
-def screen(made: Converted) -> str:
+def screen(converted: Converted) -> str:
     """The result for people: whose calibration it is, in which units, then the values."""
-    calibration, at = made.calibration, made.temperature
+    calibration, at = converted.calibration, converted.temperature
     reference = calibration.reference_temperature
     serial = calibration.tool.get("serial", calibration.profile.name)
-    first = [f"{made.path.name}", serial, f"run {calibration.run}", calibration.software]
-    lines = ["   ".join([*first, *simulated(calibration.tool)]), f"SHA-256 {made.sha256}"]
+    first = [f"{converted.path.name}", serial, f"run {calibration.run}", calibration.software]
+    lines = ["   ".join([*first, *simulated(calibration.tool)]), f"SHA-256 {converted.sha256}"]
     units = [
         f"{name} raw per {triad.unit}{_nominal(calibration, name)}"
         for name, triad in zip(TRIADS, calibration.triads, strict=False)
     ]
-    stated = reference if at is None or made.notation == "factors" else at
+    stated = reference if at is None or converted.notation == "factors" else at
     shown = "course" if isinstance(stated, str) else f"{stated:g} °C"
-    conditions = [f"notation {made.notation}", f"temperature {shown}", _calibrated(made)]
+    conditions = [f"notation {converted.notation}", f"temperature {shown}", _calibrated(converted)]
     lines += ["   ".join(conditions), "   ".join(units)]
-    values = notation(made.triads, reference if at == COURSE else None)
+    values = notation(converted.triads, reference if at == COURSE else None)
     return "\n".join(lines) + "\n\n" + values
 
 
-def _calibrated(made: Converted) -> str:
+def _calibrated(converted: Converted) -> str:
     """The calibrated temperatures, and whether the values lie outside them."""
-    if made.calibration.temperature_c is None:
+    if converted.calibration.temperature_c is None:
         return "calibrated at unrecorded temperatures"
-    low, high = made.calibration.temperature_c
-    outside = "extrapolated: " if made.findings else ""
+    low, high = converted.calibration.temperature_c
+    outside = "extrapolated: " if converted.findings else ""
     return f"{outside}calibrated at {low:.1f}…{high:.1f} °C"
 
 
@@ -150,22 +150,22 @@ def _nominal(calibration: Calibration, name: str) -> str:
     return "" if scale is None else f" (nominal {scale:.6g})"
 
 
-def notation(found: dict[str, Notation], reference: float | None = None) -> str:
+def notation(triads: dict[str, Notation], reference: float | None = None) -> str:
     """Values with standard uncertainties, in as many digits as a firmware can hold.
 
-    A course is told by its `reference` temperature: each coefficient then names its power of τ.
+    A course is stated by its `reference` temperature: each coefficient then names its power of τ.
     """
     blocks = [] if reference is None else [f"τ = T - {reference:g} °C"]
-    for triad, item in found.items():
+    for triad, notation in triads.items():
         rows = []
-        for name, value in item.values.items():
+        for name, value in notation.values.items():
             power = powers(name, value)
             for index in np.ndindex(value.shape):
                 label = _label(name, index, None if reference is None else int(power[index]))
-                sd = float(item.uncertainty[name][index])
-                own = name == "m" and index[0] == index[1]  # zero in every model
+                sd = float(notation.uncertainty[name][index])
+                diagonal = name == "m" and index[0] == index[1]  # zero in every model
                 stated = "undetermined" if np.isnan(sd) else f"{sd:.2g}"
-                if is_held(float(value[index]), sd) and not own:
+                if is_held(float(value[index]), sd) and not diagonal:
                     stated = HELD
                 rows.append([label, f"{value[index] + 0.0:.12g}", stated])
         blocks.append(f"{triad}\n" + table(rows, ["", "value", "1σ"]))

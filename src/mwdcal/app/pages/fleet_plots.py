@@ -50,17 +50,17 @@ def distance(values: Array) -> Array:
 
 
 @plots.styled
-def parameters(found: Sequence[Any]) -> Figure:
+def parameters(parameters: Sequence[Any]) -> Figure:
     """Number of tools by value of each steady parameter: a row of panels for each triad."""
     panels: dict[str, dict[str, list[Any]]] = {}
-    for each in found:
+    for each in parameters:
         kind, _, axes = each.title.partition(" ")
         title = KINDS[kind][len(set(axes)) > 1]
         panels.setdefault(each.kind or each.triad, {}).setdefault(title, []).append(each)
     lines = [
-        (triad, list(own.items())[first : first + ABREAST])
-        for triad, own in panels.items()
-        for first in range(0, len(own), ABREAST)
+        (triad, list(titles.items())[first : first + ABREAST])
+        for triad, titles in panels.items()
+        for first in range(0, len(titles), ABREAST)
     ]
     figure = plots.new_figure("Distributions of the fleet's parameters", 2.1 * len(lines))
     columns = max(len(line) for _, line in lines)

@@ -119,7 +119,7 @@ def render(calibrations: Path, summary: Summary) -> str:
     noisy = tools.metadata.get("noise_estimated")
     estimated = [triad for triad in TRIADS if isinstance(noisy, list) and triad in noisy]
     return template.render(
-        found=summary,
+        result=summary,
         metadata=tools.metadata,
         simulated=is_simulated(tools.metadata),
         banner=_banner(summary),

@@ -169,11 +169,13 @@ def _quantiles(values: Array) -> list[float]:
 def _kinds(head: Any) -> list[Kind]:
     """Statuses with their tools, sound ones first, then by number."""
     counted = head.column("status").value_counts().to_pylist()
-    found = []
+    kinds = []
     for each in sorted(counted, key=lambda c: (c["values"] != OK, -c["counts"])):
-        own = head.filter(_equal(head.column("status"), each["values"])).slice(0, SHOWN).to_pydict()
-        found.append(Kind(each["values"], each["counts"], own[SERIAL], own["message"][0]))
-    return found
+        tools = (
+            head.filter(_equal(head.column("status"), each["values"])).slice(0, SHOWN).to_pydict()
+        )
+        kinds.append(Kind(each["values"], each["counts"], tools[SERIAL], tools["message"][0]))
+    return kinds
 
 
 def _findings(head: Any) -> list[Said]:
@@ -182,12 +184,12 @@ def _findings(head: Any) -> list[Said]:
     column = one_chunk(head.column("findings"))
     ids = column.flatten().dictionary_encode()
     tool = np.repeat(np.arange(len(column)), column.value_lengths().fill_null(0).to_numpy())
-    found = []
+    findings = []
     for code, name in enumerate(ids.dictionary.to_pylist()):
-        own = tool[ids.indices.to_numpy() == code]
-        serials = head.column(SERIAL).take(arrow.array(own[:SHOWN])).to_pylist()
-        found.append(Said(name, len(own), serials))
-    return sorted(found, key=lambda said: (not is_doubt(said.id), -said.tools, said.id))
+        tools = tool[ids.indices.to_numpy() == code]
+        serials = head.column(SERIAL).take(arrow.array(tools[:SHOWN])).to_pylist()
+        findings.append(Said(name, len(tools), serials))
+    return sorted(findings, key=lambda said: (not is_doubt(said.id), -said.tools, said.id))
 
 
 def is_doubt(finding: str) -> bool:
@@ -197,12 +199,12 @@ def is_doubt(finding: str) -> bool:
 
 def _orders(whole: Any, columns: list[str]) -> dict[str, dict[str, int]]:
     """Tools by triad and the order that was chosen."""
-    found: dict[str, dict[str, int]] = {}
+    orders: dict[str, dict[str, int]] = {}
     for triad in TRIADS:
         if f"{triad}_order" in columns:
             values = numbers(whole, f"{triad}_order")
-            found[triad] = {str(k): int(np.sum(values == k)) for k in range(HIGHEST + 1)}
-    return {triad: own for triad, own in found.items() if any(own.values())}
+            orders[triad] = {str(k): int(np.sum(values == k)) for k in range(HIGHEST + 1)}
+    return {triad: counts for triad, counts in orders.items() if any(counts.values())}
 
 
 def _nonlinear(whole: Any, columns: list[str]) -> dict[str, int]:
@@ -223,23 +225,23 @@ def _equal(cells: Any, value: str) -> Any:
 
 def _undetermined(whole: Any, columns: list[str]) -> dict[str, int]:
     """Tools by triad and direction that nothing determines."""
-    found: dict[str, int] = {}
+    counts: dict[str, int] = {}
     for name in columns:
         if name.endswith("_undetermined"):
             cells = whole.read([name]).column(0)
             for each in cells.combine_chunks().flatten().value_counts().to_pylist():
                 value, count = each["values"], each["counts"]
-                found[f"{name.removesuffix('_undetermined')}: {value}"] = count
-    return found
+                counts[f"{name.removesuffix('_undetermined')}: {value}"] = count
+    return counts
 
 
 def document(summary: Summary, report: Path | None) -> dict[str, Any]:
     """The summary for machines."""
-    found: dict[str, Any] = msgspec.to_builtins(summary)
+    shown: dict[str, Any] = msgspec.to_builtins(summary)
     whole = {"tools": summary.tools, "serials": []}
-    found["findings"] += [{**each, **whole} for each in found.pop("unused")]
-    found["tools_per_second"] = round(summary.tools / summary.seconds, 1)
-    return {**found, "calibrated": summary.sound, "report": str(report or "")}
+    shown["findings"] += [{**each, **whole} for each in shown.pop("unused")]
+    shown["tools_per_second"] = round(summary.tools / summary.seconds, 1)
+    return {**shown, "calibrated": summary.sound, "report": str(report or "")}
 
 
 def text(summary: Summary, report: Path | None) -> str:
@@ -278,7 +280,7 @@ def text(summary: Summary, report: Path | None) -> str:
 def orders_table(summary: Summary) -> tuple[list[str], list[list[str]]]:
     """Header and rows of the tools by chosen order, a triad in each row."""
     header = ["tools of order", *map(str, range(HIGHEST + 1))]
-    return header, [[triad, *map(str, own.values())] for triad, own in summary.orders.items()]
+    return header, [[triad, *map(str, counts.values())] for triad, counts in summary.orders.items()]
 
 
 def _count(said: Said) -> str:

@@ -148,13 +148,13 @@ def profile_lines(noise: Noise) -> str:
             lines.append(f"# [{kind}] no noise from {noise.log}: {noise.withheld[kind]}")
         if kind not in noise.profile:
             continue
-        own = [
+        each = [
             f"{n} {_number(noise.channels[n].station.noise)}" for n in names if n in noise.channels
         ]
         lines += [
             f"[{kind}]",
             f"noise = {noise.profile[kind]:.3g}   # raw, 1 sigma of one station of "
-            f"{noise.station_seconds:.3g} s; {', '.join(own)}; from {noise.log}",
+            f"{noise.station_seconds:.3g} s; {', '.join(each)}; from {noise.log}",
         ]
     return "\n".join(lines)
 
@@ -165,7 +165,7 @@ def render(noise: Noise) -> str:
         environment()
         .get_template("noise.html")
         .render(
-            found=noise,
+            result=noise,
             simulated=noise.simulated,
             heading=heading(noise),
             figure=figure(noise),

@@ -122,12 +122,12 @@ def _fit_outcome(calibration: Calibration) -> tuple[str, str]:
 
 def _findings(calibration: Calibration, verdict: Verdict | None) -> list[Finding]:
     """What to know and do, each thing once; stations to re-shoot first."""
-    found = {f.text: f for f in calibration.findings}
+    findings = {f.text: f for f in calibration.findings}
     ids = {f.id for f in calibration.findings}
     for extra in verdict.findings if verdict else ():
         if extra.id not in ids:
-            found.setdefault(extra.text, extra)
-    return sorted(found.values(), key=lambda f: f.id != "reshoot")
+            findings.setdefault(extra.text, extra)
+    return sorted(findings.values(), key=lambda f: f.id != "reshoot")
 
 
 def _when(time: str) -> str:
@@ -169,10 +169,10 @@ def _temperatures(calibration: Calibration) -> str:
 
 def _attitudes(calibration: Calibration) -> str:
     rows = calibration.station_rows
-    found = [r.inclination_deg for r in rows if r.inclination_deg is not None]
-    if not found:
+    inclinations = [r.inclination_deg for r in rows if r.inclination_deg is not None]
+    if not inclinations:
         return str(calibration.stations)
-    return f"{calibration.stations}, at inclinations {min(found):.0f} to {max(found):.0f}°"
+    return f"{calibration.stations}, at inclinations {min(inclinations):.0f} to {max(inclinations):.0f}°"
 
 
 def _figures(calibration: Calibration) -> dict[str, Any]:
@@ -217,11 +217,13 @@ def _decimals(calibration: Calibration) -> dict[str, int]:
 def _parameters(calibration: Calibration) -> dict[str, Any]:
     """Parameters of each triad as rows: as factors of the raw channels where there are any."""
     try:
-        found = convert(calibration, "factors")
+        notations = convert(calibration, "factors")
     except InputError:
         tables = {triad.name: _own_rows(triad) for triad in calibration.triads}
         return {"notation": "record", "tables": tables}
-    tables = {triad.name: _factor_rows(triad, found[triad.name]) for triad in calibration.triads}
+    tables = {
+        triad.name: _factor_rows(triad, notations[triad.name]) for triad in calibration.triads
+    }
     return {"notation": "factors", "tables": tables}
 
 
@@ -259,15 +261,15 @@ def _stated(uncertainty: float) -> float | None:
     return None if np.isnan(uncertainty) else uncertainty
 
 
-def _factor_rows(triad: TriadCalibration, found: Notation) -> list[Any]:
+def _factor_rows(triad: TriadCalibration, notation: Notation) -> list[Any]:
     raw = "raw" if _unit(triad) == "1" else f"raw/{triad.unit}"
     units, channels = {"SF": raw, "B": _unit(triad), "m": "1"}, "xyz"
     rows = []
-    for name, values in found.values.items():
+    for name, values in notation.values.items():
         for i, j in np.ndindex(values.shape):
             if name == "m" and i == j:
                 continue
-            sd = _stated(float(found.uncertainty[name][i, j]))
+            sd = _stated(float(notation.uncertainty[name][i, j]))
             index = channels[i] + channels[j] if name == "m" else channels[i]
             power = 0 if name == "m" else j
             rows.append(_row(name, index, power, float(values[i, j]), sd, units[name]))
@@ -285,7 +287,7 @@ def _accuracy(calibration: Calibration) -> dict[str, Any]:
     for inclination, temperature in cases:
         at = [float(np.radians(inclination))]
         both = [accuracy_at(calibration, at, noise, temperature) for noise in (False, True)]
-        pairs = [[_degrees(found[name][0]) for found in both] for name in names]
+        pairs = [[_degrees(sd[name][0]) for sd in both] for name in names]
         rows.append({"inclination": inclination, "temperature": temperature, "pairs": pairs})
     return {"names": names, "rows": rows, "temperature": middle}
 
