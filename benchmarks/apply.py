@@ -35,9 +35,9 @@ BLOCK = 250_000
 PLAIN = """
 import sys
 import numpy, pyarrow, pyarrow.parquet
-from mwdcal.correction import reference
+from mwdcal.use.correction import reference
 from mwdcal.files import documents
-from mwdcal.readings import Readings
+from mwdcal.calibration.readings import Readings
 made = documents.read(sys.argv[1])
 table = pyarrow.parquet.read_table(sys.argv[2])
 g = numpy.stack([table[name].to_numpy() for name in ("ax", "ay", "az")], -1) / 3.0

@@ -47,7 +47,7 @@ html_show_sphinx = False
 
 # A section of a page whose only content is the documentation of one module.
 MODULE_SECTION = re.compile(
-    r"^## [^\n]+\n\n```\{eval-rst\}\n\.\. (?:automodule|click):: ([\w.]+).*?\n```\n", re.M | re.S
+    r"^##+ [^\n]+\n\n```\{eval-rst\}\n\.\. (?:automodule|click):: ([\w.]+).*?\n```\n", re.M | re.S
 )
 
 

@@ -25,6 +25,7 @@ FLOORS = (
     ("use",),
     ("files", "profiles"),
     ("comparison", "fleet", "logs", "planning", "registry", "survey"),
+    ("library",),
     ("",),  # the package itself: its public names
     ("app",),
     ("__main__",),

@@ -12,8 +12,9 @@ from test_fleet_options import bent, drifting
 
 pq = pytest.importorskip("pyarrow.parquet")
 
-from mwdcal.app.pages import fleet_plots, plots  # noqa: E402
+from mwdcal.app.pages import fleet_plots  # noqa: E402
 from mwdcal.files.formats import table as tables  # noqa: E402
+from mwdcal.use import plots  # noqa: E402
 
 
 def test_table_screen_page_and_summary_name_the_options(tmp_path):

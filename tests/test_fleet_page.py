@@ -12,7 +12,7 @@ from test_fleet_findings import said
 pa = pytest.importorskip("pyarrow")
 pq = pytest.importorskip("pyarrow.parquet")
 
-from mwdcal.app.pages import fleet_plots, fleet_report, plots  # noqa: E402
+from mwdcal.app.pages import fleet_plots, fleet_report, pictures  # noqa: E402
 
 
 def unknown(seed):
@@ -124,7 +124,7 @@ def test_numbers_along_an_axis_do_not_run_into_each_other(monkeypatch):
             for name in ("gain xx", "gain xy", "offset x")
         ]
     )
-    plots.svg(figure, "parameters")
+    pictures.svg(figure, "parameters")
     assert len(panels) == 3
     for boxes in panels:
         assert len(boxes) >= 2

@@ -16,7 +16,7 @@ from markupsafe import Markup
 
 from mwdcal.app import text
 from mwdcal.app.pages import calibration as screen
-from mwdcal.app.pages import conversion, plots, report
+from mwdcal.app.pages import conversion, pictures, report
 from mwdcal.app.pages.page import css_string, fixed, measured, number, signed
 from mwdcal.app.pages.report import render, write_report
 from mwdcal.calibration.automatic.auto import Choice
@@ -28,6 +28,7 @@ from mwdcal.errors import InputError
 from mwdcal.geometry.vectors import reference_vectors
 from mwdcal.planning import simulate
 from mwdcal.sensor.profile import Profile, TriadProfile
+from mwdcal.use import plots
 from mwdcal.use.notation import convert
 from simulation import DEG, Tool, plan
 
@@ -193,7 +194,7 @@ def test_user_settings_of_matplotlib_change_nothing(whole, page):
     import matplotlib as mpl
 
     with mpl.rc_context({"font.size": 20, "axes.facecolor": "red", "svg.fonttype": "none"}):
-        assert plots.svg(plots.station_errors(whole, "gravity"), "error-gravity") in page
+        assert pictures.svg(plots.station_errors(whole, "gravity"), "error-gravity") in page
         assert mpl.rcParams["font.size"] == 20
 
 
@@ -226,7 +227,7 @@ def test_station_labels_may_be_anything(whole):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         figures = {"a": plots.station_errors(odd, "field"), "b": plots.deviations(odd, 3.7)}
-        found = "".join(plots.svg(figure, key) for key, figure in figures.items())
+        found = "".join(pictures.svg(figure, key) for key, figure in figures.items())
     assert "<script" not in found
     parsed(found)
 
@@ -334,11 +335,11 @@ def test_a_course_that_nothing_tests_says_so(words, whole):
 def test_picture_of_the_orders_has_both_triads():
     scores = judged().orders
     both = plots.order_errors(scores)
-    parsed(plots.svg(both, "orders"))
+    parsed(pictures.svg(both, "orders"))
     alone = plots.order_errors([s for s in scores if s.triad == "accelerometer"])
     assert (len(alone.axes), len(both.axes)) == (1, 2)
     blank = [msgspec.structs.replace(s, error_inside=None) for s in scores]
-    parsed(plots.svg(plots.order_errors(blank), "orders"))
+    parsed(pictures.svg(plots.order_errors(blank), "orders"))
 
 
 @cache

@@ -18,6 +18,7 @@ from pathlib import Path
 import nulls
 import numpy as np
 
+from mwdcal import Calibration, Options, Profile, Readings
 from mwdcal.app.commands import calibrate as command
 from mwdcal.app.commands.choices import Typed, options_of
 from mwdcal.calibration.automatic.auto import Choice, choose
@@ -25,16 +26,15 @@ from mwdcal.calibration.automatic.nonlinearity import ODDS, choices_of, declared
 from mwdcal.calibration.calibrate import recorded
 from mwdcal.calibration.estimate import Fit, fit
 from mwdcal.calibration.methods import EVIDENCE
-from mwdcal.calibration.options import USUAL, Options
-from mwdcal.calibration.readings import TRIADS, Readings
-from mwdcal.calibration.record import Calibration
+from mwdcal.calibration.options import USUAL
+from mwdcal.calibration.readings import TRIADS
 from mwdcal.errors import MwdcalError
 from mwdcal.estimation.rank import free_directions
 from mwdcal.files.datasets import fetch
 from mwdcal.files.formats.table import Table
 from mwdcal.files.profiles import load_profile
 from mwdcal.files.runs import read_run, to_readings
-from mwdcal.sensor.profile import Profile, TriadProfile
+from mwdcal.sensor.profile import TriadProfile
 from mwdcal.use.notation import Notation, convert
 from mwdcal.use.roll_scatter import directions, group_scatter
 

@@ -3,12 +3,11 @@
 Run from the repository: .venv/bin/python examples/noise/noise.py [FOLDER]
 """
 
+import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
-
-from mwdcal.app.cli import cli
 
 ROOT = Path(__file__).resolve().parents[2]
 RATE, COUNT = 50.0, 180_000
@@ -42,7 +41,8 @@ def main(folder: Path) -> None:
     log = folder / "static.csv"
     head = f"# simulated = true\n# sampling_hz = {RATE:g}\n{','.join(LEVEL)}"
     np.savetxt(log, np.stack(columns, -1), "%.6f", ",", header=head, comments="")
-    cli.main(["noise", str(log), "--tool", "servo", "--plot", str(ROOT / "docs" / "noise.svg")])
+    command = [sys.executable, "-m", "mwdcal", "noise", log, "--tool", "servo"]
+    subprocess.run([*command, "--plot", ROOT / "docs" / "noise.svg"], check=True)
 
 
 if __name__ == "__main__":

@@ -18,16 +18,13 @@ from pathlib import Path
 
 import numpy as np
 
-from mwdcal.calibration.calibrate import calibrate
+from mwdcal import FitError, Options, Profile, Readings, calibrate
 from mwdcal.calibration.estimate import Fit, fit
-from mwdcal.calibration.options import Options
-from mwdcal.calibration.readings import Readings
-from mwdcal.errors import FitError
 from mwdcal.estimation.rank import free_directions
 from mwdcal.files.datasets import fetch
 from mwdcal.geometry.vectors import Array, centred, earth_gravity, rotation, tool_from_earth
 from mwdcal.planning.simulate import Truth, grid, run, servo
-from mwdcal.sensor.profile import Profile, TriadProfile
+from mwdcal.sensor.profile import TriadProfile
 
 DEG = np.pi / 180
 PAPER_AXES = np.diag([-1.0, -1.0, 1.0])

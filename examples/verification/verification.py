@@ -15,13 +15,10 @@ from pathlib import Path
 
 import numpy as np
 
-from mwdcal.calibration.calibrate import calibrate
-from mwdcal.calibration.readings import Readings
-from mwdcal.calibration.record import Calibration
+import mwdcal
 from mwdcal.files.limits import load_limits
-from mwdcal.sensor.profile import Profile
 from mwdcal.use.roll_test import extent, fitted
-from mwdcal.use.verification import COVERAGE, Limits, VerdictRow, verify
+from mwdcal.use.verification import COVERAGE, Limits, VerdictRow
 
 FIELD, DIP = 48_000.0, np.radians(63.0)
 NOISES = ((1e-4, 15.0), (5e-4, 75.0))
@@ -103,19 +100,22 @@ def calibration(sensors: Sensors, rng: np.random.Generator, noise: tuple[float, 
     inclination = np.repeat(np.radians([5.0, 45.0, 90.0, 135.0]), 12)
     azimuth, toolface = np.arange(48) * 77.0 % 360 * np.pi / 180, np.tile(ROLL, 4)
     a, m = run(sensors, vectors(inclination, azimuth, toolface), rng, noise)
-    known = {"inclination": inclination, "azimuth": azimuth, "toolface": toolface,
-             "field": np.full(48, FIELD), "dip": np.full(48, DIP)}  # fmt: skip
-    return calibrate(Readings(a, m, known=known, sd=stated(noise)), Profile(name="simulated"))
+    known = {"inclination": inclination, "azimuth": azimuth, "toolface": toolface}
+    return mwdcal.calibrate(
+        mwdcal.readings(a, m, **known, field=FIELD, dip=DIP, sd=stated(noise)), order=0
+    )
 
 
-def stated(noise: tuple[float, float]) -> dict[str, np.ndarray]:
+def stated(noise: tuple[float, float]) -> dict[str, float]:
     """The noise as a profile declares it."""
-    return {n: np.array(s) for n, s in zip(("accelerometer", "magnetometer"), noise, strict=True)}
+    return dict(zip(("accelerometer", "magnetometer"), noise, strict=True))
 
 
-def truth(made: Calibration, a: np.ndarray, m: np.ndarray, azimuth: float) -> dict[str, float]:
+def truth(
+    made: mwdcal.Calibration, a: np.ndarray, m: np.ndarray, azimuth: float
+) -> dict[str, float]:
     """The figures that `verify` judges, without noise, over the whole turn."""
-    found = measured(*made.fields(Readings(a, m)))
+    found = measured(*made.fields(mwdcal.Readings(a, m)))
     found["azimuth"] = (found["azimuth"] - np.degrees(azimuth) + 180) % 360 - 180
     spreads = {f"spread of {name}": float(np.ptp(value)) for name, value in found.items()}
     return spreads | {
@@ -171,7 +171,7 @@ def trials(rng: np.random.Generator, count: int, noise: tuple[float, float], kno
 def trial(
     rng: np.random.Generator,
     sensors: Sensors,
-    made: Calibration,
+    made: mwdcal.Calibration,
     limits: Limits,
     noise: tuple[float, float],
     kind: str,
@@ -191,8 +191,8 @@ def trial(
         for _ in range(3):
             size *= wanted / worst(size)
     a, m = run(sensors, change(size, vectors(np.radians(45.0), azimuth, ROLL)), rng, noise)
-    known = {"inclination": np.full(12, np.radians(45.0)), "azimuth": np.full(12, azimuth)}
-    result = verify(made, Readings(a, m, known=known, sd=stated(noise), source="roll test"), limits)
+    roll_test = mwdcal.readings(a, m, inclination_deg=45.0, azimuth=azimuth, sd=stated(noise))
+    result = mwdcal.verify(made, roll_test, limits)
     return Trial(truth(made, *sensors(change(size, turn)), azimuth), result.rows)
 
 

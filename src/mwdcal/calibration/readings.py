@@ -1,19 +1,21 @@
-"""`Readings`: the noun of input. What the sensors said, and what is known about it.
+"""`Readings`: what the sensors of a tool read at each station, and what is known about it.
 
-Inside the package raw channels have already been mapped to the tool axes and divided
-by their nominal scale (`files.tables` does it): values are nominal g and nominal nT,
-angles are radians, temperatures are °C. A blank cell is NaN, never zero.
+Raw channels have already been mapped to the tool axes and divided by their nominal scale
+(`files.runs` does it): values are nominal g and nominal nT, angles are radians, temperatures
+are °C. An unknown value is NaN, never zero.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import hashlib
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from mwdcal.geometry.vectors import AnyArray, Array, ArrayLike, Bools, Ints
+from mwdcal.sensor.profile import Profile
 
 ANGLES = ("inclination", "azimuth", "toolface")
 TRIADS = ("accelerometer", "magnetometer")
@@ -21,19 +23,45 @@ SIMULATED = "SIMULATED DATA"
 CONSTANTS = ("gravity", "field", "dip")
 EARTH = {"gravity": (0.9, 1.1), "field": (15_000.0, 80_000.0)}
 """Least and greatest strength of any place on Earth, with room for a doubtful unit: g, nT."""
+DIGEST_LENGTH = 16
 NANOTESLA = "nT"
 RELATIVE = "relative (field = 1)"
 """Unit of the calibrated field where its strength is known at no station."""
 
 
 def is_simulated(metadata: Mapping[str, object]) -> bool:
-    """Whether what a file says of itself says that no real tool was measured."""
+    """Whether metadata say that the data are simulated."""
     return str(metadata.get("simulated", "")).lower() not in ("", "0", "false", "no")
 
 
 def simulated(*metadata: Mapping[str, object]) -> list[str]:
-    """What a heading says where calibration, run or log is simulated; else nothing."""
+    """`SIMULATED`, for a heading, if the calibration, run or log is simulated; else nothing."""
     return [SIMULATED] if any(map(is_simulated, metadata)) else []
+
+
+def group_numbers(labels: Sequence[str]) -> Ints | None:
+    """Group numbers (n,) in order of appearance, -1 for a blank label; None if all are blank.
+
+    >>> group_numbers(["B", "", "A", "B"]).tolist()
+    [0, -1, 1, 0]
+    """
+    order = {name: number for number, name in enumerate(dict.fromkeys(filter(None, labels)))}
+    return np.array([order.get(name, -1) for name in labels], int) if order else None
+
+
+def fingerprints(triads: Sequence[Array]) -> tuple[str, ...]:
+    """One hash per station and triad (n, 3) over the reading to 12 significant digits.
+
+    Accelerometer first, then after a dash the magnetometer: stations of a fit are recognised
+    without their magnetometer too.
+    """
+    parts = [[_fingerprint(row) for row in (triad + 0.0).tolist()] for triad in triads]
+    return tuple("-".join(pair) for pair in zip(*parts, strict=True))
+
+
+def _fingerprint(row: Sequence[float]) -> str:
+    text = ",".join(f"{value:.12g}" for value in row)
+    return hashlib.sha256(text.encode()).hexdigest()[:DIGEST_LENGTH]
 
 
 @dataclass(frozen=True)
@@ -57,10 +85,12 @@ class Readings:
         group: stations of the same non-negative number share one direction of the tool
             axis; -1 is none.
         station: labels, for messages and tables.
-        digest: SHA-256 of each station's raw reading: tells fit from verification data.
-        metadata: what the file said about itself (serial, date, operator, …).
+        digest: `fingerprints` of the raw readings: they tell verification data from the fit's.
+        metadata: serial, date, operator, …, as the file states them.
         source: name of the file.
         unused: columns of the file that are not used, each with what it resembles.
+        profile: the tool profile by which raw channels became these readings, if there was one.
+        run_sha256, profile_sha256: of the files that both come from.
     """
 
     accelerometer: Array
@@ -74,6 +104,19 @@ class Readings:
     metadata: Mapping[str, object] = field(default_factory=dict)
     source: str = ""
     unused: tuple[str, ...] = ()
+    profile: Profile | None = None
+    run_sha256: str = ""
+    profile_sha256: str = ""
+
+    def __repr__(self) -> str:
+        known = ", ".join(self.known) or "none"
+        triads = TRIADS[: 1 if self.magnetometer is None else 2]
+        return f"<{self.name}: {self.count} stations; {' and '.join(triads)}; references: {known}>"
+
+    @property
+    def name(self) -> str:
+        """What messages call the readings: the name of the file, if there is one."""
+        return self.source or "the readings"
 
     @property
     def count(self) -> int:

@@ -269,7 +269,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
             "tool": " ".join([self.tool.get("serial", self.profile.name), *simulated(self.tool)]),
             "run": f"{self.stations} stations, method {self.method}",
             "rank": rank,
-            "1σ at 45° inclination": accuracy or "not stated",
+            "accuracy": f"{accuracy} (1σ at 45° inclination)" if accuracy else "not stated",
             "findings": findings or "none",
         }
 
@@ -332,7 +332,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
     def _temperature(self, readings: Readings) -> Array:
         if readings.temperature is None and any(t.order for t in self.triads):
             raise InputError(
-                f"{readings.source or 'the readings'}: the calibration has temperature terms, and the "
+                f"{readings.name}: the calibration has temperature terms, and the "
                 "column 'temperature_c' is missing or blank. Add it, or calibrate with --order 0."
             )
         if readings.temperature is None:

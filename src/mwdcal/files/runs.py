@@ -6,14 +6,13 @@ become radians; true and grid azimuths become magnetic ones.
 
 from __future__ import annotations
 
-import hashlib
 import os
 from collections.abc import Iterable, Mapping, Sequence
 
 import msgspec
 import numpy as np
 
-from mwdcal.calibration.readings import Readings
+from mwdcal.calibration.readings import Readings, fingerprints, group_numbers
 from mwdcal.errors import InputError
 from mwdcal.files import synonyms
 from mwdcal.files.azimuths import magnetic_offset
@@ -30,7 +29,7 @@ from mwdcal.files.contract import (
 from mwdcal.files.formats import table as tables
 from mwdcal.files.formats.columns import Column
 from mwdcal.files.formats.table import Table, cell_error, labels, numbers, shown
-from mwdcal.geometry.vectors import AnyArray, Array, Bools
+from mwdcal.geometry.vectors import Array, Bools
 from mwdcal.sensor.profile import Profile, TriadProfile
 
 
@@ -41,7 +40,6 @@ class BlankReadingError(InputError):
 MANY = 1000
 """Rows of a table with times from which it is a log."""
 _TURN = 360.0
-_DIGEST_LENGTH = 16
 
 
 def read_run(
@@ -119,9 +117,9 @@ def to_readings(table: Table, profile: Profile) -> tuple[Readings, Profile]:
         temperature=temperature,
         known=known,
         sd=_uncertainties(table, profile, list(triads), list(known)),
-        group=_group(table),
+        group=group_numbers(labels(table, "group") if "group" in table.columns else []),
         station=_stations(table),
-        digest=_digests([*triads.values()]),
+        digest=fingerprints([*triads.values()]),
         metadata=identified(table.metadata, _serial_cells(table)),
         source=table.source,
         unused=synonyms.unused(list(table.columns), COLUMNS),
@@ -343,32 +341,10 @@ def _quantity(name: str) -> str:
     return REFERENCES[name].column.removeprefix("ref_")
 
 
-def _group(table: Table) -> AnyArray | None:
-    """Group numbers in order of appearance, -1 for none."""
-    names = labels(table, "group") if "group" in table.columns else []
-    order = {name: i for i, name in enumerate(dict.fromkeys(filter(None, names)))}
-    return np.array([order.get(name, -1) for name in names], int) if order else None
-
-
 def _stations(table: Table) -> tuple[str, ...]:
     """Labels of the stations; a blank one is the number of its row."""
     given = labels(table, "station") if "station" in table.columns else [""] * table.count
     return tuple(label or str(i) for i, label in enumerate(given, 1))
-
-
-def _digests(triads: list[Array]) -> tuple[str, ...]:
-    """One hash per station and triad over the raw reading to 12 significant digits.
-
-    Accelerometer first, then after a dash the magnetometer: data of a fit are known again
-    without their magnetometer too.
-    """
-    parts = [[_digest(row) for row in (triad + 0.0).tolist()] for triad in triads]
-    return tuple("-".join(pair) for pair in zip(*parts, strict=True))
-
-
-def _digest(row: list[float]) -> str:
-    text = ",".join(f"{value:.12g}" for value in row)
-    return hashlib.sha256(text.encode()).hexdigest()[:_DIGEST_LENGTH]
 
 
 def _raw_columns(readings: Readings, profile: Profile, kind: str) -> dict[str, Column]:

@@ -13,7 +13,7 @@ from mwdcal.sensor.models import Basis, Factors
 
 @dataclass(frozen=True)
 class Plan:
-    """Attitudes (n,) in radians and temperatures (n,) in °C, in the order they are shot."""
+    """Attitudes (n,) in radians and temperatures (n,) in °C, in the order they are measured."""
 
     inclination: Array
     azimuth: Array

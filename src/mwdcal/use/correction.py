@@ -35,9 +35,10 @@ COMPILED_ROWS = 300_000
 
 
 class RowCounts(NamedTuple):
-    """Counts over the rows that the findings are made from.
+    """Rows of a table, counted by what the findings report of them.
 
-    `warmth` are the lowest and the highest temperature of readings, °C.
+    `beyond`: outside the calibrated temperatures; `moved`: outputs that rest on a free direction;
+    `lacking`: without a reading; `warmth`: lowest and highest temperature, °C.
     """
 
     rows: int
@@ -49,29 +50,30 @@ class RowCounts(NamedTuple):
     warmth: tuple[float, float] = (np.inf, -np.inf)
 
     def blank(self, outside: str) -> int:
-        """Number of rows without results: a reading is missing, or the temperature is outside."""
+        """Number of rows without results: without a reading, or `outside` the temperatures."""
         return self.lacking + (self.beyond if outside == "blank" else 0)
 
 
 def correct(
     calibration: Calibration, readings: Readings, outside: str = "blank"
 ) -> tuple[dict[str, AnyArray], list[Finding]]:
-    """Output columns (n,) by name, and what the reader should know.
+    """Output columns (n,) by name, and the findings.
 
-    Refuses readings of which most have a strength that no place on Earth has, or not their own reference.
+    Refuses readings most of which have a strength that no place on Earth has, or that is off their
+    reference.
 
     Singular: at exactly vertical attitudes azimuth and toolface are NaN (blank in files);
     `magnetic_toolface_deg` stands beside them. A strength of zero has no direction: NaN.
     Temperatures outside the calibrated range are blanked, refused or extrapolated as `outside` says.
     """
-    columns, _, notes = counted(calibration, readings, outside)
-    return columns, notes
+    columns, _, about = counted(calibration, readings, outside)
+    return columns, about
 
 
 def counted(
     calibration: Calibration, readings: Readings, outside: str, lacking: int = 0
 ) -> tuple[dict[str, AnyArray], RowCounts, list[Finding]]:
-    """As `correct`, with the counts in between; `lacking` further rows had no complete reading."""
+    """Output columns, counts of the rows and findings; `lacking` more rows were left out unread."""
     check_outside(outside)
     columns: dict[str, AnyArray] = {
         **(compiled(calibration, readings) or reference(calibration, readings))
@@ -84,11 +86,11 @@ def counted(
         rows, int(beyond.sum()), moved, lacking, (),
         strengths.judged(calibration, columns, readings.known), warmth(readings.temperature),
     )  # fmt: skip
-    notes = findings(calibration, readings, tally, outside)
-    strengths.check(calibration, tally.strengths, readings.source)
+    about = findings(calibration, readings, tally, outside)
+    strengths.check(calibration, tally.strengths, readings.name)
     if outside == "extrapolate":
         columns[EXTRAPOLATED] = beyond
-    return columns, tally, notes
+    return columns, tally, about
 
 
 def warmth(temperature: Array | None) -> tuple[float, float]:
@@ -104,7 +106,7 @@ def result_names(outside: str) -> tuple[str, ...]:
 
 
 def check_outside(outside: str) -> None:
-    """Raise `InputError` unless `outside` is one of `OUTSIDE`."""
+    """Refuse an unknown choice for temperatures outside the calibrated range."""
     if outside not in OUTSIDE:
         raise InputError(f"`outside` must be one of {', '.join(OUTSIDE)}; got {outside!r}.")
 
@@ -142,8 +144,8 @@ def compiled(
     flat = np.ascontiguousarray(np.broadcast_to(warmth, shape), float).reshape(-1)
     g, b = readings.accelerometer, readings.magnetometer
     vectors = [*_axes(g), *(_axes(b) if b is not None else [np.full(flat.shape, np.nan)] * 3)]
-    rows = correction_numba.run([*vectors, flat], triads, zero)
-    return {n: c.reshape(shape) for n, c in zip(NAMES, rows.columns, strict=True)}
+    results = correction_numba.run([*vectors, flat], triads, zero)
+    return {n: c.reshape(shape) for n, c in zip(NAMES, results.columns, strict=True)}
 
 
 def _axes(vectors: Array) -> list[Array]:
@@ -155,11 +157,10 @@ def _axes(vectors: Array) -> list[Array]:
 def numbers(
     calibration: Calibration,
 ) -> tuple[correction_numba.Numbers, correction_numba.Numbers] | None:
-    """Both triads for the compiled loops; None for a model that they do not have."""
+    """Both triads for the compiled loops; None where a model is not for them."""
+    reference = calibration.reference_temperature
     triads = [
-        correction_numba.numbers(
-            t.functions(calibration.reference_temperature), np.array(t.parameters)
-        )
+        correction_numba.numbers(t.functions(reference), np.array(t.parameters))
         for t in calibration.triads
     ]
     first, second = [*triads, correction_numba.NOTHING][:2]
@@ -169,36 +170,36 @@ def numbers(
 def findings(
     calibration: Calibration, readings: Readings, tally: RowCounts, outside: str
 ) -> list[Finding]:
-    """What the reader should know of the results; refuses rows outside if `outside` says so.
+    """Findings about corrected rows; refuses rows outside the temperatures if `outside` says so.
 
-    Of the readings only their metadata count, and whether there is a magnetometer.
+    Of the readings only the metadata are used, and whether there is a magnetometer.
     """
-    notes = []
+    about = []
     if calibration.has_field and readings.magnetometer is None:
         text = "no columns mx, my, mz: magnetic results are blank."
-        notes.append(Finding(id="no-magnetometer", text=text))
-    notes += _other_tool(calibration, readings)
+        about.append(Finding(id="no-magnetometer", text=text))
+    about += _other_tool(calibration, readings)
     if tally.lacking:
         text = f"{tally.lacking} of {tally.rows} rows lack a reading: their results are blank."
-        notes.append(Finding(id="missing-reading", text=text))
+        about.append(Finding(id="missing-reading", text=text))
     if tally.beyond:
-        notes.append(_outside(calibration, readings.source, outside, tally))
+        about.append(_outside(calibration, readings.source, outside, tally))
     if calibration.unrecorded(readings):
         at = "…".join(dict.fromkeys(f"{end:.1f}" for end in tally.warmth))
         text = (
             "the calibration was made at unrecorded temperatures, without temperature terms: nothing says how "
             f"good the results are at the readings' {at} °C."
         )
-        notes.append(Finding(id="no-temperature", text=text))
-    notes += strengths.findings(tally.strengths)
+        about.append(Finding(id="no-temperature", text=text))
+    about += strengths.findings(tally.strengths)
     if calibration.relative:
         text = "the magnetometer is calibrated to field = 1: bx_nt, by_nt, bz_nt and field_nt are relative, not nT."
-        notes.append(Finding(id="field-relative", text=text))
+        about.append(Finding(id="field-relative", text=text))
     if tally.moved:
         free = ", ".join(dict.fromkeys(u.id for u in calibration.undetermined()))
         text = f"{', '.join(tally.moved)} rest on what the calibration leaves undetermined ({free})"
-        notes.append(Finding(id="undetermined", text=f"{text}: no uncertainty can be stated."))
-    return notes
+        about.append(Finding(id="undetermined", text=f"{text}: no uncertainty can be stated."))
+    return about
 
 
 def _other_tool(calibration: Calibration, readings: Readings) -> list[Finding]:
@@ -219,13 +220,13 @@ def _outside(calibration: Calibration, source: str, how: str, tally: RowCounts) 
         raise InputError(
             f"{source}: {text}. Use `outside` blank or extrapolate, or calibrate over a wider range."
         )
-    done = (
-        "their results are blank"
-        if how == "blank"
-        else "their results are extrapolated, with no statement of accuracy, and marked in the "
-        f"column '{EXTRAPOLATED}'"
-    )
-    return Finding(id="outside-temperature", text=f"{text}: {done}.")
+    results = "their results are blank"
+    if how == "extrapolate":
+        results = (
+            "their results are extrapolated, with no statement of accuracy, and marked in the column "
+            f"'{EXTRAPOLATED}'"
+        )
+    return Finding(id="outside-temperature", text=f"{text}: {results}.")
 
 
 def undetermined(

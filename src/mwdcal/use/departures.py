@@ -1,8 +1,8 @@
-"""What a test run shows of a calibrated tool: noise-free spreads and departures from references.
+"""Noise-free spreads and errors of a calibrated tool in a test run.
 
-The uncertainty of each figure is that of the test: noise of its readings, references, setting
-of the stand. That of the calibration is not part of it, for an error of the calibration is
-part of what is measured.
+The uncertainty of each statistic is that of the test: noise of its readings, references, setting
+of the stand. That of the calibration is not part of it: an error of the calibration is part of
+what is measured.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ import numpy as np
 from mwdcal.calibration.readings import ANGLES, Readings
 from mwdcal.calibration.record import FREE_SHARE, Calibration
 from mwdcal.geometry.observables import OBSERVABLES
-from mwdcal.geometry.vectors import Array, Bools, Ints, centred
+from mwdcal.geometry.vectors import Array, Bools, Ints
 from mwdcal.use.roll_sets import ROLL_SET, RollSet, near_vertical, roll_sets
 from mwdcal.use.roll_test import GAP, OPEN, SLACK, Coverage, Curve, coverage, ends, extent, fitted
 
 TURNING = ("azimuth", "toolface")
-"""Angles that lose their meaning near vertical."""
+"""Angles that do not exist at vertical."""
 LEVEL = ("inclination", "gravity")
 """Observables that stations of one inclination share at every azimuth."""
 COLUMNS = {
@@ -36,8 +36,11 @@ TINY = 1e-15
 
 
 @dataclass(frozen=True)
-class Shown:
-    """What a roll set, or a single station, shows of an observable, in inside units."""
+class Statistic:
+    """Spread or error of an observable in a roll set, or error of one station: radians, g or nT.
+
+    `value` is without noise, `raw` with it; `where` says in words what was judged.
+    """
 
     value: float
     uncertainty: float
@@ -48,15 +51,15 @@ class Shown:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a run shows of one observable, or why it shows nothing.
+    """All statistics of one observable in a run, or why there are none.
 
-    `skipped`: why it cannot be judged. `blocked`: why no limit on it can be passed; `unrolled`
-    where that is because the tool was not rolled all round: then there is no noise-free value,
-    and `shown` has the raw one. `apart`: parts of the run that were left out, and why. `unseen`:
+    `skipped`: why it cannot be judged. `blocked`: why no limit on it can be passed; `unrolled`:
+    because the tool was not rolled all round: there is no noise-free value, and `statistics` have
+    the raw one. `apart`: parts of the run that were left out, and why. `unseen`:
     the toolfaces hardly show one of the harmonics.
     """
 
-    shown: tuple[Shown, ...] = ()
+    statistics: tuple[Statistic, ...] = ()
     skipped: str = ""
     blocked: str = ""
     unrolled: bool = False
@@ -65,7 +68,7 @@ class Outcome:
 
 
 @dataclass(frozen=True)
-class Test:
+class RollTest:
     """Readings that a fit has not seen, through its calibration."""
 
     calibration: Calibration
@@ -122,17 +125,17 @@ class Test:
         return OBSERVABLES[name].difference(self.value(name), known)
 
     def _coverage(self, index: Ints) -> Coverage | None:
-        """How the toolfaces of stations cover the circle; None where none of them is known."""
+        """How the toolfaces of stations cover the circle; None if none is known."""
         toolface = self.toolface[index]
         known = ~np.isnan(toolface)
         return coverage(toolface[known]) if known.any() else None
 
     def _loose(self, index: Ints) -> str:
         """Why stations do not determine a curve of two harmonics; empty where they do."""
-        found = None if np.isnan(self.toolface[index]).any() else self._coverage(index)
-        if found is None or found.rolled:
-            return "" if found else NO_TOOLFACE
-        return _gap(found, GAP) or (
+        circle = None if np.isnan(self.toolface[index]).any() else self._coverage(index)
+        if circle is None or circle.rolled:
+            return "" if circle else NO_TOOLFACE
+        return _gap(circle, GAP) or (
             "the toolfaces do not determine a mean and two harmonics. Add toolfaces between them: "
             "five or more, well apart"
         )
@@ -170,9 +173,9 @@ class Test:
         blocked = self._unusable(name, any(self._free_spread(name, s.index) for s in fit))
         if wrong and not blocked:
             blocked = f"{wrong[0]} was not rolled: {gaps[wrong[0]]}"
-        shown = [self._curve_of(name, s, False) for s in rolled]
-        shown += [self._raw_spread(name, s) for s in fit if s.label in wrong]
-        return self._outcome(name, shown, blocked, bool(wrong), (*unfit, *apart))
+        statistics = [self._curve_of(name, s, False) for s in rolled]
+        statistics += [self._raw_spread(name, s) for s in fit if s.label in wrong]
+        return self._outcome(name, statistics, blocked, bool(wrong), (*unfit, *apart))
 
     def error(self, name: str) -> Outcome:
         """The largest noise-free departure from the reference: of rolled sets, and other stations.
@@ -187,18 +190,18 @@ class Test:
             steep = "every station within 5° of vertical" if near.any() else f"no {COLUMNS[name]}"
             return Outcome(skipped=lacks or steep)
         free = bool(self.calibration.rests_on_free(name, self.readings)[judged].any())
-        found, blocked = self._coverage(judged), self._unusable(name, free)
-        gap = NO_TOOLFACE if found is None else _gap(found, OPEN)
+        circle, blocked = self._coverage(judged), self._unusable(name, free)
+        gap = NO_TOOLFACE if circle is None else _gap(circle, OPEN)
         if gap and not blocked:
             blocked = f"the stations were not rolled: {gap}"
         left = f"{near.sum()} of {given.sum()} stations lie within 5° of vertical"
-        unseen = found is not None and not gap and bool(found.seen.min() < SEEN)
-        shown = self._departures(name, judged)
+        unseen = circle is not None and not gap and bool(circle.seen.min() < SEEN)
+        statistics = self._errors(name, judged)
         apart = (left,) if near.any() else ()
-        return self._outcome(name, shown, blocked, bool(gap), apart, unseen)
+        return self._outcome(name, statistics, blocked, bool(gap), apart, unseen)
 
-    def _departures(self, name: str, judged: Ints) -> list[Shown]:
-        """Largest departures of rolled sets, and of each station outside of them."""
+    def _errors(self, name: str, judged: Ints) -> list[Statistic]:
+        """Largest errors of rolled sets, and of each station outside of them."""
         seen = [replace(s, index=s.index[np.isin(s.index, judged)]) for s in self.sets]
         whole = [s for s in seen if not self._loose(s.index) and (s.one_azimuth or name in LEVEL)]
         inside = np.concatenate([s.index for s in whole]) if whole else np.zeros(0, int)
@@ -206,27 +209,27 @@ class Test:
         reference = np.hypot(self.readings.uncertainty(name), self._common(name))
         sd = np.hypot(self._noise(name), reference)
         return [self._curve_of(name, s, True) for s in whole] + [
-            Shown(float(error[i]), float(sd[i]), float(error[i]), f"station {labels[i]}")
+            Statistic(float(error[i]), float(sd[i]), float(error[i]), f"station {labels[i]}")
             for i in judged[~np.isin(judged, inside)].tolist()
         ]
 
-    def _curve_of(self, name: str, roll_set: RollSet, error: bool) -> Shown:
+    def _curve_of(self, name: str, roll_set: RollSet, error: bool) -> Statistic:
         """Noise-free spread, or largest error, of a rolled set."""
         index = roll_set.index
         part = self._error(name)[index] if error else self._centred(name, index)
         each, common = self._reference_sd(name, roll_set, error)
         sd = np.hypot(self._noise(name)[index], each)
         curve = fitted(part, sd, self.toolface[index])
-        found, (most, least, farthest) = extent(curve), np.degrees(ends(curve))
+        turn, (most, least, farthest) = extent(curve), np.degrees(ends(curve))
         raw = float(np.abs(part).max() if error else np.ptp(part))
-        value = float(found.largest if error else found.range)
-        noise = float(found.largest_sd if error else found.range_sd)
+        value = float(turn.largest if error else turn.range)
+        noise = float(turn.largest_sd if error else turn.range_sd)
         at = f"toolface {farthest:.0f}°" if error else f"toolfaces {least:.0f}° to {most:.0f}°"
         where = f"{roll_set.label}; {at}"
         if curve.rough:
             where += f"; raw figure judged: {float(curve.scale):.2g} × the noise is left about a smooth curve"
             value, noise = raw, noise * float(curve.scale)
-        return Shown(value, float(np.hypot(noise, common)), raw, where, curve)
+        return Statistic(value, float(np.hypot(noise, common)), raw, where, curve)
 
     def _reference_sd(self, name: str, roll_set: RollSet, error: bool) -> tuple[Array, float]:
         """Standard uncertainty of the reference: per station (k,), and what the set shares."""
@@ -240,18 +243,18 @@ class Test:
     def _centred(self, name: str, index: Ints) -> Array:
         """Values (k,) of a set about their middle; of toolface its errors."""
         part = (self._error(name) if name == "toolface" else self.value(name))[index]
-        period = OBSERVABLES[name].period
-        middle = np.angle(np.mean(np.exp(1j * part))) if period else part.mean()
-        return centred(part - middle, period) if period else np.asarray(part - middle)
+        periodic = OBSERVABLES[name].period
+        middle = np.angle(np.mean(np.exp(1j * part))) if periodic else part.mean()
+        return OBSERVABLES[name].difference(part, middle)
 
-    def _raw_spread(self, name: str, roll_set: RollSet) -> Shown:
+    def _raw_spread(self, name: str, roll_set: RollSet) -> Statistic:
         raw = float(np.ptp(self._centred(name, roll_set.index)))
-        return Shown(raw, 0.0, raw, roll_set.label)
+        return Statistic(raw, 0.0, raw, roll_set.label)
 
     def _outcome(
         self,
         name: str,
-        shown: list[Shown],
+        statistics: list[Statistic],
         blocked: str,
         unrolled: bool,
         apart: tuple[str, ...],
@@ -259,7 +262,7 @@ class Test:
     ) -> Outcome:
         if self._relative(name):
             return Outcome(blocked=blocked, apart=apart)
-        return Outcome(tuple(shown), "", blocked, unrolled, apart, unseen)
+        return Outcome(tuple(statistics), "", blocked, unrolled, apart, unseen)
 
     def _relative(self, name: str) -> bool:
         return name == "field" and self.calibration.relative
@@ -282,10 +285,10 @@ class Test:
         return bool((np.ptp(moved, axis=0) > FREE_SHARE * size).any())
 
 
-def _gap(found: Coverage, most: float) -> str:
-    """What is wrong where the toolfaces leave a gap wider than `most` (radians); empty if not."""
-    if found.gap <= most + SLACK:
+def _gap(circle: Coverage, most: float) -> str:
+    """The sentence on toolfaces that leave a gap wider than `most` (radians); empty if they do not."""
+    if circle.gap <= most + SLACK:
         return ""
-    width, start = round(float(np.degrees(found.gap))), round(float(np.degrees(found.start)))
+    width, start = round(float(np.degrees(circle.gap))), round(float(np.degrees(circle.start)))
     span = f"{width}° from {start % 360}° to {(start + width) % 360}°"
     return f"the toolfaces leave a gap of {span} (at most {np.degrees(most):.0f}°). Add toolfaces there"

@@ -6,10 +6,10 @@ factors   SF, B, m                     (Moosavi 1-8, in the order of the raw cha
 
 Raw units, channels in the order of the file; fields in g and nT (or a field of one).
 
-At one temperature all three say the same. The whole course of temperature is given by power
-of τ = T - reference where it is a polynomial: factors of order n have SF and B of degree n,
+At one temperature all three are equivalent. Over temperature they are given as coefficients by
+power of τ = T - reference where these are polynomials: factors of order n have SF and B of degree n,
 hence S of degree n and o = SF · B of degree 2n; the model that is linear in its parameters has
-M and b of degree n. The other pairs are quotients of polynomials, and refused.
+M and b of degree n. The other pairs are quotients of polynomials, and are refused.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from mwdcal.sensor.profile import TriadProfile
 
 NOTATIONS = ("factors", "forward", "affine")
 COURSE = "course"
-"""In place of a temperature: the whole course, by power of T - reference."""
+"""In place of a temperature: coefficients by power of T - reference."""
 AXES = {"S": 2, "o": 1, "M": 2, "b": 1, "SF": 1, "B": 1, "m": 2}
 """Axes of each value at one temperature."""
 
@@ -70,10 +70,10 @@ def convert(
     affine of the model of factors, both of order 1 or more.
     """
     if notation not in NOTATIONS:
-        raise InputError(f"--notation must be one of {', '.join(NOTATIONS)}; got {notation!r}.")
+        raise InputError(f"`notation` must be one of {', '.join(NOTATIONS)}; got {notation!r}.")
     if isinstance(temperature, str) and temperature != COURSE:
         raise InputError(
-            "--temperature must be a number in °C, or the word 'course' for coefficients by power "
+            "`temperature` must be a number in °C, or the word 'course' for coefficients by power "
             f"of temperature; got {temperature!r}."
         )
     at = calibration.reference_temperature if temperature is None else temperature
@@ -115,12 +115,12 @@ class _Part:
         """What each value is compared with to see whether a free direction moves it."""
         name, value = next((n, v) for n, v in values.items() if n in ("S", "SF", "M"))
         gain = np.abs(value[powers(name, value) == 0]).max()
-        own = {"m": 1.0, "b": self.strength, "B": self.strength, "o": gain * self.strength}
-        found = []
-        for name, value in values.items():
-            size = own.get(name, gain) / self.half_range ** powers(name, value)
-            found.append(size.ravel())
-        return np.concatenate(found)
+        scale = {"m": 1.0, "b": self.strength, "B": self.strength, "o": gain * self.strength}
+        sizes = [
+            scale.get(name, gain) / self.half_range ** powers(name, value)
+            for name, value in values.items()
+        ]
+        return np.concatenate([size.ravel() for size in sizes])
 
 
 def _one(part: _Part, notation: str, temperature: float | str) -> Notation:
@@ -137,9 +137,9 @@ def _one(part: _Part, notation: str, temperature: float | str) -> Notation:
         if course and triad.order:
             return _COURSES[notation](params, permutation, scale)
         matrix, offset = _affine(params, triad, tau)
-        found = _FORMS[notation](matrix @ permutation / scale, offset, permutation)
+        forms = _FORMS[notation](matrix @ permutation / scale, offset, permutation)
         lead = course and notation != "factors"
-        return {name: value[None] for name, value in found.items()} if lead else found
+        return {name: value[None] for name, value in forms.items()} if lead else forms
 
     return _propagate(values, part)
 
@@ -158,16 +158,16 @@ def _refuse(triad: TriadCalibration, notation: str, temperature: float | str) ->
     what = f"the {triad.name} has the model '{triad.model}' of order {triad.order} in temperature"
     if notation == "factors":
         raise InputError(
-            f"{what}: its factors are no polynomials of temperature. Use --notation affine, "
-            "for one temperature or with --temperature course, or --notation forward for one "
+            f"{what}: its factors are no polynomials of temperature. Use `notation` affine, "
+            "for one temperature or with `temperature` course, or `notation` forward for one "
             "temperature, or calibrate with --model factors."
         )
     if temperature == COURSE:
         able = "affine" if model == "factors" else "forward or factors"
         raise InputError(
             f"{what}: its {notation} notation is a quotient of polynomials of temperature and has "
-            f"no coefficients by power. Use --notation {able}, or a number in °C for "
-            f"--temperature, or calibrate with --model {model}."
+            f"no coefficients by power. Use `notation` {able}, or a number in °C for "
+            f"`temperature`, or calibrate with --model {model}."
         )
 
 
@@ -236,7 +236,7 @@ _COURSES: dict[str, _Form] = {"affine": _affine_course, "forward": _forward_cour
 def _propagate(values: Callable[[AnyArray], dict[str, AnyArray]], part: _Part) -> Notation:
     """Values and covariance; derivatives by complex step, exact to rounding."""
     params = np.array(part.triad.parameters)
-    found = {name: np.asarray(value.real) + 0.0 for name, value in values(params).items()}
+    notation = {name: np.asarray(value.real) + 0.0 for name, value in values(params).items()}
     columns = []
     for index in range(len(params)):
         step = np.zeros(len(params), complex)
@@ -248,9 +248,9 @@ def _propagate(values: Callable[[AnyArray], dict[str, AnyArray]], part: _Part) -
     jacobian = np.stack(columns, -1)
     spread = jacobian @ part.covariance @ jacobian.transpose()
     moved = np.abs(jacobian @ part.free.transpose()).max(-1, initial=0.0)
-    loose = moved > FREE_SHARE * part.sizes(found)
+    loose = moved > FREE_SHARE * part.sizes(notation)
     sd = np.where(loose, np.nan, np.sqrt(np.maximum(np.diag(spread), 0.0)))
-    ends = np.cumsum([value.size for value in found.values()])[:-1]
-    parts = zip(found.items(), np.split(sd, ends), strict=True)
+    ends = np.cumsum([value.size for value in notation.values()])[:-1]
+    parts = zip(notation.items(), np.split(sd, ends), strict=True)
     uncertainty = {name: part.reshape(value.shape) for (name, value), part in parts}
-    return Notation(found, uncertainty, spread)
+    return Notation(notation, uncertainty, spread)

@@ -1,15 +1,9 @@
-"""Scatter of the tool direction in groups of one direction, in sample and leave-one-out.
-
-In-sample scatter flatters a model with many parameters: judge by the left-out one.
-"""
+"""Scatter of the tool axis within groups of stations that share its direction."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from mwdcal.calibration.estimate import Fit, fit
-from mwdcal.calibration.options import Options
-from mwdcal.calibration.readings import Readings
 from mwdcal.geometry.vectors import Array, Ints
 
 
@@ -35,16 +29,3 @@ def group_scatter(axis: Array, group: Ints) -> float:
     each = [axis[group == k] for k in np.unique(group[group >= 0])]
     spread = [np.linalg.norm(v.std(axis=0, ddof=1)) for v in each if len(v) > 1]
     return float(np.mean(spread)) if spread else float("nan")
-
-
-def _fields(result: Fit) -> tuple[Array, Array]:
-    return result.problem.fields(result.state)
-
-
-def scatter(readings: Readings, options: Options | None = None) -> tuple[float, float]:
-    """Direction scatter of a run's groups, radians: in sample, and with each station left out."""
-    whole = directions(*_fields(fit(readings, options)))[0]
-    left_out = fit(readings, options, 1 - np.eye(readings.count))
-    own = np.arange(readings.count)
-    axis = directions(*_fields(left_out))[own, own]
-    return group_scatter(whole, readings.groups), group_scatter(axis, readings.groups)

@@ -1,4 +1,4 @@
-"""Which stations of a run were taken in one direction of the tool axis and one soak: roll sets."""
+"""Roll sets: stations of a run in one direction of the tool axis and at one temperature."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _ROUNDING = 1e-9
 
 @dataclass(frozen=True)
 class RollSet:
-    """Stations of one direction and one soak.
+    """Stations of one direction and one temperature.
 
     `index` (k,) are their numbers. `declared`: the run says that they are a roll set, by `group`
     or by naming no direction at all. `one_azimuth`: they are known to share an azimuth too.
@@ -39,12 +39,12 @@ class RollSet:
 def roll_sets(readings: Readings) -> list[RollSet]:
     """Roll sets of a run: by group, else by equal reference angles, else all stations.
 
-    Stations of different soaks are never of one set. Equal inclinations without azimuth make
-    a set that does not share an azimuth.
+    Stations of different temperatures are never in one set. Equal inclinations without azimuth
+    make a set that does not share an azimuth.
     """
     warmth = readings.temperature
     soak = np.zeros(readings.count, int) if warmth is None else soaks(warmth)
-    found = []
+    sets = []
     for label, members, declared, one_azimuth in _directions(readings):
         for number in np.unique(soak[members]):
             index = np.flatnonzero(members & (soak == number))
@@ -52,8 +52,8 @@ def roll_sets(readings: Readings) -> list[RollSet]:
                 continue
             at = f", {warmth[index].mean():.1f} °C" if warmth is not None and soak.any() else ""
             set_each = not declared
-            found.append(RollSet(label + at, index, declared, one_azimuth, set_each))
-    return found
+            sets.append(RollSet(label + at, index, declared, one_azimuth, set_each))
+    return sets
 
 
 def _directions(readings: Readings) -> Iterator[tuple[str, Bools, bool, bool]]:
@@ -77,8 +77,8 @@ def _directions(readings: Readings) -> Iterator[tuple[str, Bools, bool, bool]]:
 def near_vertical(readings: Readings, inclination: Array) -> Bools:
     """Stations (n,) within `NEAR_VERTICAL` of vertical.
 
-    By the reference, else by the mean measured `inclination` (n,) of the group, else by the
-    station's own.
+    By the reference inclination, else the mean measured `inclination` (n,) of the group, else that
+    of the station.
     """
     steep, group = np.sin(inclination), readings.groups
     for number in range(int(group.max(initial=-1)) + 1):

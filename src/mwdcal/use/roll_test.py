@@ -1,9 +1,9 @@
-"""Roll tests as statistics: what a tool's error does over a turn, without the noise of the readings.
+"""Statistics of a roll test: the error of a tool over a turn of toolface, without noise.
 
 A tool's error is smooth in toolface: a bias across the tool axis is the first harmonic, a
 difference of scales or a misalignment of x and y the second. So a mean and two harmonics
 are fitted to the values of a roll set, and judged instead of the largest and the smallest
-value, which noise only drives apart. Arrays in, arrays out; angles are radians.
+value, which noise drives apart. Arrays in, arrays out; angles are radians.
 """
 
 from __future__ import annotations
@@ -23,20 +23,20 @@ GAP = np.radians(90.0)
 OPEN = np.radians(120.0)
 """The widest part of the circle without a toolface on which limits on errors can be passed."""
 SLACK = np.radians(5.0)
-"""How far a toolface may lie from where it was meant to be: a gap of 90° set by hand is one."""
+"""Tolerance of a gap: toolfaces set by hand are off by some degrees."""
 CARRIED = 2.0
 """Largest standard uncertainty of the curve anywhere on the circle, in noises of one reading."""
 CHANCE = 1e-3
-"""Residuals from the curve less likely than this are not what the stated noise leaves."""
+"""Residuals from the curve that are less likely than this are not noise alone."""
 STEPS = 120
-"""Toolfaces at which a curve is looked at: its range comes out at most 0.14 % too small."""
+"""Toolfaces at which a curve is evaluated: its range is at most 0.14 % too small."""
 PAIRS = 500
 SEED = 1
 
 
 @dataclass(frozen=True)
 class Coverage:
-    """How toolfaces (..., n) cover the circle: widest gap (...), where it starts, what it shows.
+    """How toolfaces (..., n) cover the circle: the widest gap (...), and where it starts.
 
     `carried`: largest standard uncertainty of the curve over the circle, in noises of one
     reading; infinite where the toolfaces do not determine its five coefficients. `seen`
@@ -81,17 +81,17 @@ class Curve:
 
     @property
     def rough(self) -> Bools:
-        """Where the residuals are larger than the noise leaves: the error is not smooth."""
+        """Where the residuals are larger than noise alone would give: the error is not smooth."""
         return np.asarray(self._chance() < CHANCE)
 
     @property
     def calm(self) -> Bools:
-        """Where the residuals are smaller than the noise leaves: it is overstated."""
+        """Where the residuals are smaller than the stated noise would give: it is overstated."""
         return np.asarray((self._chance() > 1 - CHANCE) & (self.freedom > 0))
 
     @property
     def scale(self) -> Array:
-        """Residuals divided by what the noise leaves (...); 1 where there is nothing to tell."""
+        """Residuals divided by what noise alone would give (...); 1 without degrees of freedom."""
         return np.sqrt(self.square / self.freedom) if self.freedom else np.ones(self.square.shape)
 
     def _chance(self) -> Array:
@@ -150,10 +150,10 @@ def fitted(value: Array, sd: Array, toolface: Array) -> Curve:
     rows = basis(toolface) / sd[..., None]
     seen = value / sd
     covariance = inverse(np.swapaxes(rows, -1, -2) @ rows)
-    found = np.einsum("...ij,...nj,...n->...i", covariance, rows, seen)
-    left = seen - np.einsum("...ni,...i->...n", rows, found)
+    coefficients = np.einsum("...ij,...nj,...n->...i", covariance, rows, seen)
+    left = seen - np.einsum("...ni,...i->...n", rows, coefficients)
     return Curve(
-        coefficients=found,
+        coefficients=coefficients,
         covariance=covariance,
         square=np.sum(left**2, -1),
         freedom=value.shape[-1] - COEFFICIENTS,
@@ -161,13 +161,13 @@ def fitted(value: Array, sd: Array, toolface: Array) -> Curve:
 
 
 def extent(curve: Curve) -> Extent:
-    """Range and largest departure over the whole circle, without the bias that noise gives them.
+    """Range and largest departure over the whole circle, corrected for the bias by noise.
 
-    Definition: both are computed once for the fitted curve, c, and for many curves drawn about
-    it with its covariance; 2 c - (their mean) is the noise-free value (0 at least), their root mean
-    square distance from c its standard uncertainty (parametric bootstrap): the scatter, and the
-    size of the correction. The draws are always the same.
-    Where the stated noise is far above what the residuals show, theirs is used.
+    Definition (parametric bootstrap): both are computed for the fitted curve, c, and for many
+    curves drawn about it with its covariance. 2 c - (their mean) is the noise-free value, at least
+    0; their root mean square distance from c, which includes the correction, is its standard
+    uncertainty. The draws are always the same. Where the stated noise is far above that of the
+    residuals, the latter is used.
     """
     scale = np.where(curve.calm, curve.scale, 1.0)
     root = _root(curve.covariance) * scale[..., None, None]

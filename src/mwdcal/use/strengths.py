@@ -1,7 +1,7 @@
-"""Corrected strengths of gravity and field against the Earth's, and against a table's own references.
+"""Corrected strengths of gravity and field against the Earth's, and against references of the table.
 
-What is off at a few rows is shock, iron or a bad reading; what is off at most of them is a calibration
-that does not belong to the readings, or readings in another unit.
+A strength that is off at a few rows means shock, iron or a bad reading; off at most rows it means a
+calibration that does not belong to the readings, or readings in another unit.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from mwdcal.errors import InputError
 from mwdcal.geometry.vectors import AnyArray, Array
 
 SHARE = 0.05
-"""Departure from the table's own reference, as a share of it, from which a strength is off."""
+"""Departure from the reference of the row, as a share of it, from which a strength is off."""
 MOST = 0.5
 """A table of which more than this share of the rows is off is refused."""
 ALIKE = {"gravity": 1.5, "field": 6.0}
@@ -38,13 +38,13 @@ REASONS = {
 class Strengths(NamedTuple):
     """One corrected strength over the rows that have it.
 
-    `earth` counts rows that no place on Earth has, `own` those off the table's own reference,
-    `off` those of either kind; `low` and `high` are the extremes of these.
+    `earth` counts rows with a strength that no place on Earth has, `reference` those off their
+    reference, `off` those of either kind; `low` and `high` are the extremes of these.
     """
 
     rows: int = 0
     earth: int = 0
-    own: int = 0
+    reference: int = 0
     off: int = 0
     low: float = np.inf
     high: float = -np.inf
@@ -53,13 +53,13 @@ class Strengths(NamedTuple):
 def judged(
     calibration: Calibration, columns: Mapping[str, AnyArray], known: Mapping[str, Array]
 ) -> dict[str, Strengths]:
-    """Both strengths of corrected rows; `known` are the table's own references, NaN where blank.
+    """Both strengths of corrected rows; `known` are references of the rows, NaN where blank.
 
     A field that is relative is not judged, that of a coil not by the Earth's, and a scale that
     the calibration leaves free not by references.
     """
     triads = dict(zip(COLUMNS, calibration.triads, strict=False))
-    found = {}
+    strengths = {}
     for name, triad in triads.items():
         if name == "field" and calibration.relative:
             continue
@@ -68,20 +68,20 @@ def judged(
         coil = name == "field" and calibration.profile.stand.coil
         low, high = (-np.inf, np.inf) if coil else EARTH[name]
         earth = (values < low) | (values > high)
-        own = np.zeros(values.shape, bool)
+        reference = np.zeros(values.shape, bool)
         if name in known and not free:
-            own = np.abs(values - known[name]) > SHARE * known[name]
-        found[name] = _counted(values, earth, own)
-    return found
+            reference = np.abs(values - known[name]) > SHARE * known[name]
+        strengths[name] = _counted(values, earth, reference)
+    return strengths
 
 
-def _counted(values: Array, earth: AnyArray, own: AnyArray) -> Strengths:
-    off = earth | own
+def _counted(values: Array, earth: AnyArray, reference: AnyArray) -> Strengths:
+    off = earth | reference
     which = values[off]
     return Strengths(
         rows=int(np.count_nonzero(~np.isnan(values))),
         earth=int(np.count_nonzero(earth)),
-        own=int(np.count_nonzero(own)),
+        reference=int(np.count_nonzero(reference)),
         off=int(np.count_nonzero(off)),
         low=float(which.min(initial=np.inf)),
         high=float(which.max(initial=-np.inf)),
@@ -90,26 +90,26 @@ def _counted(values: Array, earth: AnyArray, own: AnyArray) -> Strengths:
 
 def total(parts: Iterable[Mapping[str, Strengths]]) -> dict[str, Strengths]:
     """The strengths of all parts of a table."""
-    found: dict[str, Strengths] = {}
+    each: dict[str, list[Strengths]] = {}
     for part in parts:
-        for name, each in part.items():
-            found[name] = _both(found.get(name, Strengths()), each)
-    return found
+        for name, strengths in part.items():
+            each.setdefault(name, []).append(strengths)
+    return {name: _sum(some) for name, some in each.items()}
 
 
-def _both(first: Strengths, second: Strengths) -> Strengths:
+def _sum(parts: list[Strengths]) -> Strengths:
     return Strengths(
-        rows=first.rows + second.rows,
-        earth=first.earth + second.earth,
-        own=first.own + second.own,
-        off=first.off + second.off,
-        low=min(first.low, second.low),
-        high=max(first.high, second.high),
+        rows=sum(part.rows for part in parts),
+        earth=sum(part.earth for part in parts),
+        reference=sum(part.reference for part in parts),
+        off=sum(part.off for part in parts),
+        low=min(part.low for part in parts),
+        high=max(part.high for part in parts),
     )
 
 
 def findings(strengths: Mapping[str, Strengths]) -> list[Finding]:
-    """What to know of rows whose strength is off."""
+    """Findings about rows whose strength is off."""
     return [
         Finding(
             id=f"implausible-{name}",
@@ -126,7 +126,7 @@ def _departure(name: str, each: Strengths) -> str:
     reasons = []
     if each.earth:
         reasons.append(f"no place on Earth has it ({low:g}…{high:g} {unit})")
-    if each.own:
+    if each.reference:
         reasons.append(f"it is more than {SHARE:.0%} off the table's own ref_{COLUMNS[name]}")
     ends = dict.fromkeys(f"{end:.3g}" for end in (each.low, each.high))
     extent = "…".join(ends)
@@ -138,13 +138,13 @@ def check(calibration: Calibration, strengths: Mapping[str, Strengths], source: 
     for name, each in strengths.items():
         if each.off > MOST * each.rows:
             raise InputError(
-                f"{source or 'the readings'}: at {each.off} of {each.rows} rows "
+                f"{source}: at {each.off} of {each.rows} rows "
                 f"{_departure(name, each)}. {_advice(calibration, name, each)}"
             )
 
 
 def _advice(calibration: Calibration, name: str, each: Strengths) -> str:
-    """What most likely is wrong with a table, and what to do."""
+    """The likely cause, and what to do."""
     triad = "accelerometer" if name == "gravity" else "magnetometer"
     scale = getattr(calibration.profile, triad).scale
     unit = "g" if name == "gravity" else "nT"
@@ -165,7 +165,7 @@ def _advice(calibration: Calibration, name: str, each: Strengths) -> str:
 
 
 def _likely(name: str, each: Strengths, scale: float) -> str:
-    """The unit that would explain the strengths; empty where none does, or the scale is that unit's."""
+    """The unit of the readings that would explain the strengths; empty where none does."""
     if not 0 < each.low <= each.high <= ALIKE[name] * each.low:
         return ""
     low, high = EARTH[name]

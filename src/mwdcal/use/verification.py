@@ -9,15 +9,15 @@ import msgspec
 import numpy as np
 
 from mwdcal.calibration.readings import Readings
-from mwdcal.calibration.record import MARGIN, Calibration, Finding
+from mwdcal.calibration.record import MARGIN, Calibration, Finding, html_table
 from mwdcal.errors import InputError
 from mwdcal.geometry.observables import OBSERVABLES
-from mwdcal.use.departures import Outcome, Shown, Test
+from mwdcal.use.departures import Outcome, RollTest, Statistic
 
 COVERAGE = 2.0
 """Coverage factor of the guard band and of the remark that a value is close to its limit."""
 WEAK = 0.5
-"""A test whose 1σ is a larger share of the limit can hardly tell a good tool from a bad one."""
+"""A test whose 1σ is a larger share of the limit hardly distinguishes a good tool from a bad one."""
 CLEAR = 3.0
 """Standard uncertainties above which a harmonic is named as a cause."""
 CAUSES = {
@@ -70,7 +70,7 @@ class Limits(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 
 
 class VerdictRow(msgspec.Struct, frozen=True, kw_only=True):
-    """One limit: the noise-free value found, its standard uncertainty, and the decision.
+    """One limit: the noise-free value, its standard uncertainty, and the decision.
 
     `raw` is the same figure with the noise in it: largest minus smallest value of a set as the
     papers define a spread, or the largest departure of any station. `harmonics` are the
@@ -101,6 +101,23 @@ class Verdict(msgspec.Struct, frozen=True, kw_only=True):
     rows: list[VerdictRow]
     findings: list[Finding]
 
+    def __repr__(self) -> str:
+        failed = ", ".join(row.name for row in self.rows if not row.passed)
+        decision = "passed" if self.passed else f"failed ({failed})"
+        return f"<Verdict: {decision}, {len(self.rows)} limits of {self.limits}>"
+
+    def _repr_html_(self) -> str:
+        header = ("", "value", "1σ", "limit", "")
+        lines = [
+            (
+                f"{row.name}, {row.unit}",
+                *("" if v is None else f"{v:.3g}" for v in (row.value, row.uncertainty, row.limit)),
+                "pass" if row.passed else "fail",
+            )
+            for row in self.rows
+        ]
+        return html_table("Passed" if self.passed else "Failed", [header, *lines])
+
 
 RULES = {
     "simple": "simple acceptance: a noise-free value passes up to its limit; its 1σ is stated beside it",
@@ -109,27 +126,28 @@ RULES = {
 
 
 def verify(calibration: Calibration, readings: Readings, limits: Limits) -> Verdict:
-    """Apply a calibration to independent readings and judge by a limits profile.
+    """Apply a calibration to independent readings, and judge the result by a limits profile.
 
-    Errors: stations of the fit, temperatures outside the calibrated range, or nothing that
-    any of the limits could be applied to.
+    Raises:
+        InputError: stations of the fit, temperatures outside the calibrated range, or readings to
+            which no limit applies.
     """
     _check_tool(calibration, readings)
     _check_independent(calibration, readings)
     _check_temperature(calibration, readings)
-    test = Test(calibration, readings)
-    asked = [("spread", n, limit, test.spread(n)) for n, limit in limits.spread.items()]
-    asked += [("error", n, limit, test.error(n)) for n, limit in limits.error.items()]
-    skipped = _skipped({f"{kind} of {n}": found.skipped for kind, n, _, found in asked})
+    test = RollTest(calibration, readings)
+    outcomes = [("spread", n, limit, test.spread(n)) for n, limit in limits.spread.items()]
+    outcomes += [("error", n, limit, test.error(n)) for n, limit in limits.error.items()]
+    skipped = _skipped({f"{kind} of {n}": outcome.skipped for kind, n, _, outcome in outcomes})
     judged = [
-        _judged(f"{kind} of {n}", n, limit, found, limits.rule == "guarded")
-        for kind, n, limit, found in asked
-        if not found.skipped
+        _judged(f"{kind} of {n}", n, limit, outcome, limits.rule == "guarded")
+        for kind, n, limit, outcome in outcomes
+        if not outcome.skipped
     ]
     if not judged:
         raise InputError(
-            f"{readings.source}: no limit of '{limits.name}' applies: {'; '.join(skipped)}. Add what "
-            "is missing, or choose other --limits."
+            f"{readings.name}: no limit of '{limits.name}' applies: {'; '.join(skipped)}. Add what "
+            "is missing, or choose other `limits`."
         )
     return Verdict(
         passed=all(row.passed for row, _ in judged),
@@ -141,7 +159,7 @@ def verify(calibration: Calibration, readings: Readings, limits: Limits) -> Verd
         rows=[row for row, _ in judged],
         findings=[
             *_findings(calibration, readings, test, skipped),
-            *(finding for _, found in judged for finding in found),
+            *(finding for _, findings in judged for finding in findings),
         ],
     )
 
@@ -155,16 +173,16 @@ def _skipped(reasons: dict[str, str]) -> list[str]:
 
 
 def _findings(
-    calibration: Calibration, readings: Readings, test: Test, skipped: Sequence[str]
+    calibration: Calibration, readings: Readings, test: RollTest, skipped: Sequence[str]
 ) -> list[Finding]:
-    """What the verdict as a whole rests on, and what was left out."""
-    found = [*_temperature_findings(calibration, readings)]
-    found += [Finding(id=u.id, text=f"{u.text}.") for u in calibration.undetermined()]
+    """Findings about the verdict as a whole, and about limits that were not judged."""
+    findings = [*_temperature_findings(calibration, readings)]
+    findings += [Finding(id=u.id, text=f"{u.text}.") for u in calibration.undetermined()]
     if skipped:
-        found.append(Finding(id="not-judged", text=f"not judged: {'; '.join(skipped)}."))
+        findings.append(Finding(id="not-judged", text=f"not judged: {'; '.join(skipped)}."))
     if not test.sets:
-        found.append(Finding(id="no-roll-set", text="no roll set: spreads were not judged."))
-    return found
+        findings.append(Finding(id="no-roll-set", text="no roll set: spreads were not judged."))
+    return findings
 
 
 def _temperature_findings(calibration: Calibration, readings: Readings) -> Iterable[Finding]:
@@ -197,7 +215,7 @@ def _check_tool(calibration: Calibration, readings: Readings) -> None:
     if other is not None:
         ours, theirs = other
         raise InputError(
-            f"{readings.source} is of tool {theirs}, the calibration of tool {ours}. Verify with a "
+            f"{readings.name} is of tool {theirs}, the calibration of tool {ours}. Verify with a "
             "run of the same tool, or correct 'serial' in the file."
         )
 
@@ -210,7 +228,7 @@ def _check_independent(calibration: Calibration, readings: Readings) -> None:
     ]
     if used:
         raise InputError(
-            f"{readings.source}: {len(used)} of {readings.count} stations were in the fit (first: "
+            f"{readings.name}: {len(used)} of {readings.count} stations were in the fit (first: "
             f"station {used[0]}). Verification needs data that the fit has not seen: take a roll "
             "test of its own."
         )
@@ -222,34 +240,34 @@ def _check_temperature(calibration: Calibration, readings: Readings) -> None:
         low, high = calibration.temperature_c
         first = int(np.flatnonzero(outside)[0])
         raise InputError(
-            f"{readings.source}: {int(outside.sum())} stations lie outside the calibrated range "
+            f"{readings.name}: {int(outside.sum())} stations lie outside the calibrated range "
             f"{low:.1f}…{high:.1f} °C (first: station {readings.labels[first]}). Verify within "
             "the range, or calibrate over a wider one."
         )
 
 
 def _judged(
-    title: str, name: str, limit: float, found: Outcome, guarded: bool
+    title: str, name: str, limit: float, outcome: Outcome, guarded: bool
 ) -> tuple[VerdictRow, list[Finding]]:
-    """The decision on one limit, by the worst set or station, and what the reader should know."""
+    """The decision on one limit, by the worst set or station, and the findings about it."""
     guard = COVERAGE if guarded else 0.0
     inside = OBSERVABLES[name].unit
     factor, unit = (float(np.degrees(1)), "°") if inside == "rad" else (1.0, inside)
-    told = [Finding(id="partly-judged", text=f"{title}: {text}.") for text in found.apart]
-    if found.unseen:
+    findings = [Finding(id="partly-judged", text=f"{title}: {text}.") for text in outcome.apart]
+    if outcome.unseen:
         text = (
             f"{title}: the toolfaces hardly show one of the two harmonics of a turn (four at right "
             "angles do not show a misalignment of x and y): add toolfaces between them."
         )
-        told.append(Finding(id="harmonic-unseen", text=text))
-    most = max((shown.raw * factor for shown in found.shown), default=None)
-    if found.blocked:
+        findings.append(Finding(id="harmonic-unseen", text=text))
+    most = max((each.raw * factor for each in outcome.statistics), default=None)
+    if outcome.blocked:
         row = VerdictRow(
-            name=title, unit=unit, value=None if found.unrolled else most, uncertainty=None,
-            limit=limit, passed=False, note=f"cannot be passed: {found.blocked}", raw=most,
+            name=title, unit=unit, value=None if outcome.unrolled else most, uncertainty=None,
+            limit=limit, passed=False, note=f"cannot be passed: {outcome.blocked}", raw=most,
         )  # fmt: skip
-        return row, told
-    worst = max(found.shown, key=lambda shown: shown.value + guard * shown.uncertainty)
+        return row, findings
+    worst = max(outcome.statistics, key=lambda each: each.value + guard * each.uncertainty)
     value, sd = worst.value * factor, worst.uncertainty * factor
     passed = value + guard * sd <= limit
     row = VerdictRow(
@@ -257,7 +275,7 @@ def _judged(
         note=f"{worst.where}{_remark(value, sd, limit, passed)}", raw=most,
         harmonics=_harmonics(worst, factor),
     )  # fmt: skip
-    return row, [*told, *_weak(row), *_causes(row, name, worst)]
+    return row, [*findings, *_weak(row), *_causes(row, name, worst)]
 
 
 def _remark(value: float, sd: float, limit: float, passed: bool) -> str:
@@ -268,7 +286,7 @@ def _remark(value: float, sd: float, limit: float, passed: bool) -> str:
     return "; closer to the limit than twice its uncertainty" if close else ""
 
 
-def _harmonics(worst: Shown, factor: float) -> tuple[float, float] | None:
+def _harmonics(worst: Statistic, factor: float) -> tuple[float, float] | None:
     if worst.curve is None:
         return None
     first, second = (float(a) * factor for a in worst.curve.amplitudes)
@@ -285,8 +303,8 @@ def _weak(row: VerdictRow) -> Iterable[Finding]:
         yield Finding(id="weak-test", text=text)
 
 
-def _causes(row: VerdictRow, name: str, worst: Shown) -> Iterable[Finding]:
-    """What the harmonics of a failed set say is wrong."""
+def _causes(row: VerdictRow, name: str, worst: Statistic) -> Iterable[Finding]:
+    """The likely causes of a failed limit, from the harmonics of the set that decided."""
     if row.passed or row.harmonics is None or worst.curve is None:
         return
     unit = row.unit if row.unit == "°" else f" {row.unit}"

@@ -165,7 +165,7 @@ def check_outputs(
             )
         taken.append(target)
     if picture:
-        from mwdcal.app.pages.plots import require
+        from mwdcal.app.pages.pictures import require
 
         if picture.suffix.lower() not in PICTURES:
             allowed = ", ".join(PICTURES)

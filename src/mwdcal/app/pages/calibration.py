@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from mwdcal.app.messages import lines
-from mwdcal.app.pages.plots import TITLES
 from mwdcal.app.text import chance, number, quantity, table
 from mwdcal.calibration.automatic.nonlinearity import CurveScore
 from mwdcal.calibration.diagnosis.findings import UNUSED
@@ -22,6 +21,7 @@ from mwdcal.calibration.record import (
     OrderScore,
     StandErrors,
 )
+from mwdcal.use.plots import TITLES
 
 if TYPE_CHECKING:
     from mwdcal.calibration.automatic.auto import Choice

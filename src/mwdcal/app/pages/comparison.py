@@ -14,7 +14,6 @@ import msgspec
 import numpy as np
 
 from mwdcal import __version__
-from mwdcal.app.pages import plots
 from mwdcal.app.pages.page import environment, measured, number
 from mwdcal.app.text import raised, superscript, table
 from mwdcal.calibration.methods import EVIDENCE
@@ -24,6 +23,7 @@ from mwdcal.comparison.compare import Comparison, Row, able
 from mwdcal.estimation.uncertainty import ROTATIONS
 from mwdcal.files.formats import atomic
 from mwdcal.geometry.vectors import Array
+from mwdcal.use import plots
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

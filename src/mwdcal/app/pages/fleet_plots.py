@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mwdcal.app.pages import plots
 from mwdcal.geometry.vectors import Array
+from mwdcal.use import plots
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

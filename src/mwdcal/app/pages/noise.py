@@ -10,12 +10,13 @@ import msgspec
 import numpy as np
 
 from mwdcal import __version__
-from mwdcal.app.pages import plots
+from mwdcal.app.pages import pictures
 from mwdcal.app.pages.page import environment
 from mwdcal.app.text import table
 from mwdcal.calibration.readings import SIMULATED
 from mwdcal.files.contract import CHANNELS
 from mwdcal.logs.noise import ChannelNoise, Noise, Term
+from mwdcal.use import plots
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -216,7 +217,7 @@ def figure(noise: Noise) -> Figure:
 
 def picture(noise: Noise, path: Path) -> bytes:
     """The figure as PNG or SVG, by the suffix."""
-    return plots.picture(figure(noise), path)
+    return pictures.picture(figure(noise), path)
 
 
 def _draw(axes: Axes, noise: Noise, names: list[str]) -> None:

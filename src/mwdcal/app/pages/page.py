@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mwdcal.app.pages import plots
+from mwdcal.app.pages import pictures
 from mwdcal.app.text import chance, plural, superscript
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ def is_held(value: float, uncertainty: float | None) -> bool:
 
 def environment() -> Environment:
     """The templates, and what they call; refuses where what draws a page is missing."""
-    plots.require("the report", "matplotlib", "jinja2")
+    pictures.require("the report", "matplotlib", "jinja2")
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     environment = Environment(
@@ -38,7 +38,7 @@ def environment() -> Environment:
         "signed": signed,
         "fixed": fixed,
         "css": css_string,
-        "svg": plots.svg,
+        "svg": pictures.svg,
         "plural": plural,
         "unit": unit,
         "chance": chance,

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mwdcal.app.pages import plots
 from mwdcal.app.pages.calibration import choices
 from mwdcal.app.pages.calibration import model as model_of
 from mwdcal.app.pages.page import (
@@ -29,11 +28,12 @@ from mwdcal.app.text import plural, raised
 from mwdcal.calibration.prediction import accuracy_at, accuracy_map, angles, middle_temperature
 from mwdcal.calibration.readings import is_simulated
 from mwdcal.calibration.record import Calibration, TriadCalibration
-from mwdcal.calibration.residuals import RESHOOT
 from mwdcal.errors import InputError
 from mwdcal.estimation.solvers import RANK_TOLERANCE
 from mwdcal.files.formats import atomic
+from mwdcal.use import plots
 from mwdcal.use.notation import Notation, convert
+from mwdcal.use.plots import reshoot_limit
 
 if TYPE_CHECKING:
     from mwdcal.calibration.record import Finding
@@ -67,7 +67,7 @@ def render(calibration: Calibration, verdict: Verdict | None = None) -> str:
         figures=_figures(calibration),
         compared=_compared(calibration),
         judged=_judged(calibration),
-        limit=_limit(calibration),
+        limit=reshoot_limit(calibration),
         decimals=_decimals(calibration),
         left_out=any(row.errors_left_out for row in calibration.station_rows),
         annex=len(calibration.station_rows) > LONG_TABLE,
@@ -175,13 +175,6 @@ def _attitudes(calibration: Calibration) -> str:
     return f"{calibration.stations}, at inclinations {min(inclinations):.0f} to {max(inclinations):.0f}°"
 
 
-def _limit(calibration: Calibration) -> float:
-    """The deviation above which a station is marked, σ."""
-    from scipy.special import ndtri
-
-    return float(-ndtri(RESHOOT / max(len(calibration.station_rows), 1) / 2))
-
-
 def _figures(calibration: Calibration) -> dict[str, Any]:
     """Figures by name, and the observables that have none."""
     names = [row.observable for row in calibration.errors]
@@ -193,7 +186,7 @@ def _figures(calibration: Calibration) -> dict[str, Any]:
     return {
         "errors": {name: plots.station_errors(calibration, name) for name in names},
         "missing": missing,
-        "deviations": plots.deviations(calibration, _limit(calibration)),
+        "deviations": plots.deviations(calibration, reshoot_limit(calibration)),
         "orders": (
             plots.order_errors(calibration.orders)
             if _compared(calibration) and _judged(calibration)

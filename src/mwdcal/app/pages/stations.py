@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mwdcal.app.pages import plots
+from mwdcal.app.pages import pictures
 from mwdcal.app.text import table
 from mwdcal.files.contract import CHANNELS
 from mwdcal.geometry.vectors import Array
 from mwdcal.logs.stations import Stations
+from mwdcal.use import plots
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -132,7 +133,7 @@ def figure(stations: Stations) -> Figure:
 
 def picture(stations: Stations, path: Path) -> bytes:
     """The figure as PNG or SVG, by the suffix."""
-    return plots.picture(figure(stations), path)
+    return pictures.picture(figure(stations), path)
 
 
 def _thinned(x: Array, y: Array) -> tuple[Array, Array]:

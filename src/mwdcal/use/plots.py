@@ -1,35 +1,31 @@
-"""Figures of a calibration, and the style of all figures: deterministic, no text left to fonts.
+"""Figures of a calibration, and the style of all figures: the same input, the same figure.
 
-A figure is a Matplotlib figure whose label says what it shows; `svg` puts it into HTML. Colours are
-told apart by colour-blind readers, and never carry a meaning alone: every series has a marker of its
-own and every contour its number.
+A figure is a Matplotlib figure whose label says what it shows. Colours are told apart by
+colour-blind readers, and never carry a meaning alone: every series has a marker of its own and
+every contour its number.
 """
 
 from __future__ import annotations
 
-import io
-import re
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import wraps
-from importlib import import_module
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, ParamSpec
 
 import numpy as np
 
+from mwdcal.calibration.prediction import AccuracyMap, accuracy_map, angles
+from mwdcal.calibration.record import Calibration, OrderScore, StationRow
+from mwdcal.calibration.residuals import RESHOOT
 from mwdcal.errors import InputError
 from mwdcal.geometry.vectors import Array
 
 if TYPE_CHECKING:
-    from markupsafe import Markup
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from matplotlib.patheffects import AbstractPathEffect
-
-    from mwdcal.calibration.prediction import AccuracyMap
-    from mwdcal.calibration.record import Calibration, OrderScore, StationRow
 
 TITLES = {
     "gravity": "|g|",
@@ -79,18 +75,6 @@ STYLE: dict[Any, Any] = {
 Arguments = ParamSpec("Arguments")
 
 
-def require(what: str, *libraries: str) -> None:
-    """Refuse to draw without the libraries that draw."""
-    for name in libraries:
-        try:
-            import_module(name)
-        except ImportError as error:
-            raise InputError(
-                f"{what} needs {error.name}, which is not installed. Install mwdcal[report]: "
-                "pip install 'mwdcal[report]'"
-            ) from None
-
-
 @contextmanager
 def style() -> Iterator[None]:
     """Our style on matplotlib's own defaults, whatever the user's settings are."""
@@ -123,51 +107,6 @@ def new_figure(
     figure = Figure(figsize=(WIDTH, height), layout=layout)
     figure.set_label(label)
     return figure
-
-
-def picture(figure: Figure, path: Path) -> bytes:
-    """The figure as PNG or SVG, by the suffix; the same figure, the same bytes."""
-    kind, stream = path.suffix.lower()[1:], io.BytesIO()
-    nothing = {"Software": None} if kind == "png" else {"Date": None, "Creator": None}
-    with style():
-        figure.savefig(stream, format=kind, dpi=160, metadata=nothing)
-    return stream.getvalue()
-
-
-def svg(figure: Figure, key: str) -> Markup:
-    """An element to put into HTML: no prologue, no names of schemas, ids that start with `key`."""
-    from markupsafe import Markup
-
-    stream = io.StringIO()
-    with style():
-        nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
-        figure.savefig(stream, format="svg", metadata=nothing)
-    text = stream.getvalue()
-    text = text[text.index("<svg") :]
-    text = re.sub(
-        r"<!--.*?-->\s*|<metadata>.*?</metadata>\s*|<style.*?</style>\s*", "", text, flags=re.DOTALL
-    )
-    text = re.sub(r' xmlns(:\w+)?="[^"]*"', "", text)
-    text = re.sub(r'(\bid="|href="#|url\(#)', rf"\g<1>{key}-", text)
-    text = re.sub(r'\b(d|x|y)="[^"]*"', _shortened, text)
-    text = re.sub(r'<g([^<>]*)>\s*((?:<use [^<>]* style="([^"]*)"/>\s*)+)</g>', _gathered, text)
-    head, rest = text.split(">", 1)
-    text = re.sub(r' (width|height|version)="[^"]*"', "", head) + ">" + rest
-    return Markup(text.replace("<svg", f'<svg role="img" aria-label="{figure.get_label()}"', 1))
-
-
-def _shortened(path: re.Match[str]) -> str:
-    """Coordinates of a path to a hundredth of a point, on fewer lines."""
-    return re.sub(r"(\.\d\d)\d+", r"\1", path[0]).replace("\n", "")
-
-
-def _gathered(group: re.Match[str]) -> str:
-    """Markers of one series: their style said once."""
-    attributes, markers, look = group.groups()
-    if markers.count(f' style="{look}"') != markers.count("<use "):
-        return group[0]
-    markers = re.sub(r"\s*\n\s*", "", markers.replace(f' style="{look}"', ""))
-    return f'<g{attributes} style="{look}">{markers}</g>'
 
 
 def quantity(value: float, digits: int, unit: str) -> str:
@@ -374,3 +313,51 @@ def contour_levels(values: Array) -> Array:
 
 def _short(value: float) -> str:
     return f"{value:.3g}" if value >= 1e-4 else f"{value:.1e}"
+
+
+def reshoot_limit(calibration: Calibration) -> float:
+    """The deviation above which a station is marked, in standard deviations."""
+    from scipy.special import ndtri
+
+    return float(-ndtri(RESHOOT / max(len(calibration.station_rows), 1) / 2))
+
+
+@dataclass(frozen=True)
+class Plots:
+    """Figures of one calibration, as `calibration.plot`: Matplotlib figures, in the style of the report.
+
+    Raises:
+        InputError: the calibration has nothing to draw of that kind.
+    """
+
+    calibration: Calibration
+
+    def accuracy(self) -> Figure:
+        """1σ of each angle over inclination and azimuth, degrees, root mean square over toolface."""
+        return accuracy(accuracy_map(self.calibration), angles(self.calibration))
+
+    def errors(self, observable: str) -> Figure:
+        """Errors of an observable at each station of the run, before and after the calibration."""
+        known = [row.observable for row in self.calibration.errors]
+        if observable not in known:
+            raise InputError(
+                f"`observable` must be one with references in the run ({', '.join(known)}); got "
+                f"{observable!r}. Name another."
+            )
+        return station_errors(self.calibration, observable)
+
+    def deviations(self) -> Figure:
+        """Misfit of each station in standard deviations, and the limit for measuring it again."""
+        return deviations(self.calibration, reshoot_limit(self.calibration))
+
+    def orders(self) -> Figure:
+        """Error at temperatures left out of the fit, by temperature order."""
+        if not any(row.ends is not None for row in self.calibration.orders):
+            raise InputError(
+                "no temperature orders were compared in this calibration: the run needs stations at "
+                "three temperatures or more."
+            )
+        return order_errors(self.calibration.orders)
+
+
+Calibration.plot = property(Plots)

@@ -1,0 +1,73 @@
+"""Figures as files, and as elements of a page: the same figure, the same bytes."""
+
+from __future__ import annotations
+
+import io
+import re
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from mwdcal.errors import InputError
+from mwdcal.use.plots import style
+
+if TYPE_CHECKING:
+    from markupsafe import Markup
+    from matplotlib.figure import Figure
+
+
+def require(what: str, *libraries: str) -> None:
+    """Refuse to draw without the libraries that draw."""
+    for name in libraries:
+        try:
+            import_module(name)
+        except ImportError as error:
+            raise InputError(
+                f"{what} needs {error.name}, which is not installed. Install mwdcal[report]: "
+                "pip install 'mwdcal[report]'"
+            ) from None
+
+
+def picture(figure: Figure, path: Path) -> bytes:
+    """The figure as PNG or SVG, by the suffix; the same figure, the same bytes."""
+    kind, stream = path.suffix.lower()[1:], io.BytesIO()
+    nothing = {"Software": None} if kind == "png" else {"Date": None, "Creator": None}
+    with style():
+        figure.savefig(stream, format=kind, dpi=160, metadata=nothing)
+    return stream.getvalue()
+
+
+def svg(figure: Figure, key: str) -> Markup:
+    """An element to put into HTML: no prologue, no names of schemas, ids that start with `key`."""
+    from markupsafe import Markup
+
+    stream = io.StringIO()
+    with style():
+        nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
+        figure.savefig(stream, format="svg", metadata=nothing)
+    text = stream.getvalue()
+    text = text[text.index("<svg") :]
+    text = re.sub(
+        r"<!--.*?-->\s*|<metadata>.*?</metadata>\s*|<style.*?</style>\s*", "", text, flags=re.DOTALL
+    )
+    text = re.sub(r' xmlns(:\w+)?="[^"]*"', "", text)
+    text = re.sub(r'(\bid="|href="#|url\(#)', rf"\g<1>{key}-", text)
+    text = re.sub(r'\b(d|x|y)="[^"]*"', _shortened, text)
+    text = re.sub(r'<g([^<>]*)>\s*((?:<use [^<>]* style="([^"]*)"/>\s*)+)</g>', _gathered, text)
+    head, rest = text.split(">", 1)
+    text = re.sub(r' (width|height|version)="[^"]*"', "", head) + ">" + rest
+    return Markup(text.replace("<svg", f'<svg role="img" aria-label="{figure.get_label()}"', 1))
+
+
+def _shortened(path: re.Match[str]) -> str:
+    """Coordinates of a path to a hundredth of a point, on fewer lines."""
+    return re.sub(r"(\.\d\d)\d+", r"\1", path[0]).replace("\n", "")
+
+
+def _gathered(group: re.Match[str]) -> str:
+    """Markers of one series: their style said once."""
+    attributes, markers, look = group.groups()
+    if markers.count(f' style="{look}"') != markers.count("<use "):
+        return group[0]
+    markers = re.sub(r"\s*\n\s*", "", markers.replace(f' style="{look}"', ""))
+    return f'<g{attributes} style="{look}">{markers}</g>'

@@ -1,0 +1,43 @@
+"""What `import mwdcal` offers: arrays converted and checked, and one function for each task."""
+
+from mwdcal.calibration.options import Options
+from mwdcal.calibration.readings import Readings
+from mwdcal.calibration.record import Calibration
+from mwdcal.errors import FitError, InputError
+from mwdcal.library.arrays import readings
+from mwdcal.library.tasks import (
+    apply,
+    calibrate,
+    compare,
+    load,
+    load_profile,
+    noise,
+    read_run,
+    save,
+    simulate,
+    stations,
+    verify,
+)
+from mwdcal.sensor.profile import Profile
+from mwdcal.use import plots as plots  # puts `plot` on calibrations
+
+__all__ = [
+    "Calibration",
+    "FitError",
+    "InputError",
+    "Options",
+    "Profile",
+    "Readings",
+    "apply",
+    "calibrate",
+    "compare",
+    "load",
+    "load_profile",
+    "noise",
+    "read_run",
+    "readings",
+    "save",
+    "simulate",
+    "stations",
+    "verify",
+]

@@ -1,0 +1,234 @@
+"""Arrays, lists and table columns to `Readings`: converted once, checked once."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping, Sequence
+from typing import Any, TypedDict, Unpack
+
+import numpy as np
+
+from mwdcal.calibration.readings import TRIADS, Readings, fingerprints, group_numbers
+from mwdcal.errors import InputError
+from mwdcal.files.contract import RAW_SPREAD, REFERENCES, TEMPERATURE, Range
+from mwdcal.geometry.vectors import Array, ArrayLike, Bools, wrap
+from mwdcal.sensor.profile import COMMON
+
+DEGREES = "_deg"
+"""Ending of the keyword twins that take degrees."""
+TURNING = ("azimuth", "toolface")
+"""Angles that come as -360…360° and are kept as 0…360°."""
+
+
+class References(TypedDict, total=False):
+    """Reference values at each station; NaN where unknown."""
+
+    inclination: ArrayLike
+    inclination_deg: ArrayLike
+    azimuth: ArrayLike
+    azimuth_deg: ArrayLike
+    toolface: ArrayLike
+    toolface_deg: ArrayLike
+    gravity: ArrayLike
+    field: ArrayLike
+    dip: ArrayLike
+    dip_deg: ArrayLike
+
+
+def readings(
+    accelerometer: ArrayLike,
+    magnetometer: ArrayLike | None = None,
+    *,
+    temperature: ArrayLike | None = None,
+    sd: Mapping[str, ArrayLike] | None = None,
+    group: Sequence[object] | None = None,
+    station: Sequence[object] | None = None,
+    metadata: Mapping[str, object] | None = None,
+    **references: Unpack[References],
+) -> Readings:
+    """Readings of one tool from arrays, lists, or columns of a pandas or polars table.
+
+    Shapes: `accelerometer` and `magnetometer` (n, 3), stations by axes x, y, z; everything else (n,)
+    or a scalar for all stations. Leading axes (repetitions) are kept.
+
+    Units: g and nT along the tool axes, °C, radians; `inclination_deg`, `azimuth_deg`, `toolface_deg`
+    and `dip_deg` take degrees instead. Azimuths are magnetic.
+
+    Args:
+        accelerometer: gravity, positive along an axis that points down.
+        magnetometer: magnetic field.
+        temperature: needed for models with temperature terms.
+        sd: standard uncertainties by name, in the same units: of `accelerometer` and `magnetometer`
+            (scalar, (3,) per axis or (n, 3)), of references, and of errors that all stations share:
+            `azimuth_zero`, `toolface_zero`, `inclination_zero` and `tilt`. Names may end in `_deg`.
+            The noise of a triad that is not named is estimated from the residuals.
+        group: numbers or names; stations of one group share a direction of the tool axis. Blank, None,
+            NaN or negative: no group.
+        station: labels, for messages and tables.
+        metadata: `serial`, `date`, `operator`, …; `simulated` marks data of no real tool.
+        references: `inclination`, `azimuth`, `toolface`, `gravity`, `field` and `dip`, where known.
+
+    Raises:
+        InputError: an unknown name, a shape that does not fit, a value out of range, or NaN in a
+            reading; the message says which station.
+    """
+    g = _vectors("accelerometer", accelerometer)
+    b = None if magnetometer is None else _vectors("magnetometer", magnetometer)
+    if b is not None and b.shape != g.shape:
+        raise InputError(
+            f"`magnetometer` must have the shape of `accelerometer`, {g.shape}; got {b.shape}. Give "
+            "both at the same stations."
+        )
+    shape, triads = g.shape[:-1], [g] if b is None else [g, b]
+    return Readings(
+        accelerometer=g,
+        magnetometer=b,
+        temperature=None if temperature is None else _temperature(temperature, shape),
+        known=_known(references, shape),
+        sd=_uncertainties(sd or {}, shape),
+        group=None if group is None else group_numbers(_labels("group", group, shape)),
+        station=() if station is None else tuple(_labels("station", station, shape)),
+        digest=fingerprints(triads) if len(shape) == 1 else (),
+        metadata=dict(metadata or {}),
+    )
+
+
+def _numbers(name: str, values: ArrayLike) -> Array:
+    """Values as an array of its own; NaN where a table has a null."""
+    try:
+        return np.array(values, float)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"`{name}` must be numbers; {error}. Use NaN where unknown.") from None
+
+
+def _vectors(name: str, values: ArrayLike) -> Array:
+    """Readings (..., n, 3) of a triad, all of them finite."""
+    vectors = _numbers(name, values)
+    if vectors.shape[-1:] != (3,) or vectors.ndim < 2 or not vectors.size:
+        advice = "Put the axes last: np.stack([x, y, z], axis=-1)."
+        raise InputError(f"`{name}` must have the shape (n, 3); got {vectors.shape}. {advice}")
+    advice = "Leave such a station out of every argument."
+    _refuse(~np.isfinite(vectors), name, vectors, "finite", advice, axis=-2)
+    return vectors
+
+
+def _refuse(bad: Bools, name: str, values: Array, expected: str, advice: str, axis: int) -> None:
+    """Refuse the first bad value, if there is one; `axis` is that of stations."""
+    if bad.any():
+        place = tuple(np.argwhere(bad)[0])
+        raise InputError(
+            f"`{name}` must be {expected}; got {values[place]:g} at station {place[axis] + 1}. {advice}"
+        )
+
+
+def _broadcast(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:
+    """Values, or one for all, in a shape."""
+    array = _numbers(name, values)
+    try:
+        return np.array(np.broadcast_to(array, shape))
+    except ValueError:
+        advice = "Give one value for each station."
+        raise InputError(
+            f"`{name}` must be a scalar or have the shape {shape}; got {array.shape}. {advice}"
+        ) from None
+
+
+def _within(name: str, values: Array, limits: Range, advice: str, axis: int = -1) -> Array:
+    """Values that are all within limits, or NaN."""
+    low = values <= limits.low if limits.positive else values < limits.low
+    _refuse(low | (values > limits.high), name, values, str(limits), advice, axis)
+    return values
+
+
+def _temperature(values: ArrayLike, shape: tuple[int, ...]) -> Array:
+    """Temperatures (..., n), °C, none of them unknown."""
+    name, array = "temperature", _broadcast("temperature", values, shape)
+    advice = "Leave such a station out of every argument, or `temperature` out altogether."
+    _refuse(np.isnan(array), name, array, "a number", advice, axis=-1)
+    return _within(name, array, TEMPERATURE, "Give degrees Celsius.")
+
+
+def _by_name(values: Mapping[str, ArrayLike], limits: Mapping[str, Range]) -> dict[str, str]:
+    """For each quantity the name that it is given by: its own, or that of its twin in degrees."""
+    spelled = {name.replace("-", "_"): name for name in limits}
+    angles = [key for key, name in spelled.items() if limits[name].unit == "°"]
+    spelled |= {f"{key}{DEGREES}": spelled[key] for key in angles}
+    found: dict[str, str] = {}
+    for key in values:
+        if key not in spelled:
+            near = difflib.get_close_matches(key, spelled, 1)
+            meant = f" Did you mean '{near[0]}'?" if near else ""
+            names = ", ".join(name for name in spelled if not name.endswith(DEGREES))
+            raise InputError(
+                f"unknown name '{key}'; expected one of {names}, or of an angle with _deg.{meant}"
+            )
+        if spelled[key] in found:
+            raise InputError(
+                f"`{found[spelled[key]]}` and `{key}` are the same quantity. Give one of them."
+            )
+        found[spelled[key]] = key
+    return found
+
+
+def _angle(name: str, values: Array, limits: Range, degrees: bool, turning: bool) -> Array:
+    """Angles in radians, from degrees or radians; `turning` ones in 0…360°."""
+    factor, whole = (float(np.radians(1)), 360.0) if degrees else (1.0, 2 * np.pi)
+    if not degrees:
+        low, high = np.radians((limits.low, limits.high)).tolist()
+        limits = Range(low, high, "rad")
+    advice = "Check the value." if degrees else f"Degrees go to `{name}{DEGREES}`."
+    values = _within(name, values, limits, advice)
+    outside = (values < 0) | (values >= whole)
+    return np.where(outside, wrap(values, whole), values) * factor if turning else values * factor
+
+
+def _known(references: Mapping[str, Any], shape: tuple[int, ...]) -> dict[str, Array]:
+    """Reference values by name in inside units, without those that are unknown everywhere."""
+    given = {key: value for key, value in references.items() if value is not None}
+    limits, known = {name: reference.values for name, reference in REFERENCES.items()}, {}
+    for name, key in _by_name(given, limits).items():
+        values = _broadcast(key, given[key], shape)
+        if limits[name].unit == "°":
+            values = _angle(key, values, limits[name], key.endswith(DEGREES), name in TURNING)
+        else:
+            values = _within(key, values, limits[name], "Check the unit.")
+        if not np.isnan(values).all():
+            known[name] = values
+    return known
+
+
+def _uncertainties(sd: Mapping[str, ArrayLike], shape: tuple[int, ...]) -> dict[str, Array]:
+    """Standard uncertainties by name in inside units; unknown ones of references are zero."""
+    limits = {name: RAW_SPREAD._replace(positive=True) for name in TRIADS}
+    limits |= {name: reference.spread for name, reference in REFERENCES.items()}
+    limits |= dict.fromkeys(COMMON, Range(0.0, 180.0, "°"))
+    found = {}
+    for name, key in _by_name(sd, limits).items():
+        label, advice = f"sd {key}", "State one standard uncertainty."
+        if name in TRIADS:
+            values = _broadcast(label, sd[key], (*shape, 3))
+            _refuse(np.isnan(values), label, values, "a number", advice, axis=-2)
+            found[name] = _within(label, values, limits[name], advice, axis=-2)
+            continue
+        values = np.nan_to_num(_broadcast(label, sd[key], shape))
+        found[name] = (
+            _angle(label, values, limits[name], key.endswith(DEGREES), False)
+            if limits[name].unit == "°"
+            else _within(label, values, limits[name], advice)
+        )
+    return found
+
+
+def _labels(name: str, values: Sequence[object], shape: tuple[int, ...]) -> list[str]:
+    """One label for each station; blank for None, NaN and a negative number."""
+    cells = list(values)
+    if len(cells) != shape[-1]:
+        raise InputError(
+            f"`{name}` must have one value for each of {shape[-1]} stations; got {len(cells)}."
+        )
+    return ["" if _blank(cell) else str(cell) for cell in cells]
+
+
+def _blank(cell: Any) -> bool:
+    number = isinstance(cell, int | float | np.number)
+    return cell is None or (number and not cell >= 0)

@@ -1,0 +1,276 @@
+"""One function for each task: simulate, read, calibrate, verify, correct, and logs."""
+
+from __future__ import annotations
+
+import difflib
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from mwdcal.calibration.calibrate import calibrate as fit_and_judge
+from mwdcal.calibration.options import Options
+from mwdcal.calibration.readings import Readings
+from mwdcal.calibration.record import Calibration, Finding
+from mwdcal.comparison.compare import Comparison
+from mwdcal.comparison.compare import compare as compare_methods
+from mwdcal.errors import InputError
+from mwdcal.files import documents, logs, profiles, runs
+from mwdcal.files.formats import table as tables
+from mwdcal.files.formats.columns import LABELS, Column
+from mwdcal.files.formats.table import Table
+from mwdcal.files.limits import load_limits
+from mwdcal.geometry.vectors import AnyArray, Array
+from mwdcal.logs.noise import Noise, find_noise
+from mwdcal.logs.stations import Stations, find_stations
+from mwdcal.planning import simulate as simulation
+from mwdcal.planning.simulate import Truth
+from mwdcal.sensor.profile import Profile, TriadProfile
+from mwdcal.use.correction import correct
+from mwdcal.use.verification import Limits, Verdict
+from mwdcal.use.verification import verify as judge
+
+NOMINAL = Profile(
+    name="nominal",
+    accelerometer=TriadProfile(scale=1.0),
+    magnetometer=TriadProfile(scale=1.0),
+)
+"""The profile of arrays: raw readings are nominal g and nT along the tool axes."""
+
+ANGLES = ("inclination", "azimuth", "toolface", "dip", "magnetic_toolface")
+"""Angles of corrected readings."""
+Path = str | os.PathLike[str]
+Source = Path | Table | Mapping[str, Any]
+"""A file, a table, or columns by name: a dictionary of arrays, a pandas or a polars table."""
+
+
+def load_profile(name: Path = "generic") -> Profile:
+    """A tool profile: a built-in one by name, or a TOML file by path.
+
+    Raises:
+        InputError: no such profile, or a file that is not one.
+    """
+    return profiles.load_profile(os.fspath(name))[0]
+
+
+def read_run(
+    source: Source, profile: Path | Profile = "generic", *, decimal: str = "."
+) -> Readings:
+    """The readings of a run: of a CSV, TSV, Parquet or XLSX file, or of columns with the same names.
+
+    `profile` says which tool axis each raw channel measures and in which unit; it goes with the
+    readings to `calibrate`. Readings to be corrected or verified are read with the profile of their
+    calibration: `read_run("survey.csv", calibration.profile)`.
+
+    Raises:
+        InputError: a file that cannot be read, or a cell that is missing or out of range.
+    """
+    profile_sha256 = ""
+    if not isinstance(profile, Profile):
+        profile, profile_sha256 = profiles.load_profile(os.fspath(profile))
+    table = _table(source, "the run", lambda path: tables.read(path, decimal=decimal))
+    runs.check_run(table)
+    readings, profile = runs.to_readings(table, profile)
+    return replace(
+        readings, profile=profile, run_sha256=table.digest, profile_sha256=profile_sha256
+    )
+
+
+def _table(source: Source, name: str, read: Callable[[Path], Table]) -> Table:
+    """The table of a file, or of columns that are in memory."""
+    if isinstance(source, Table):
+        return source
+    if isinstance(source, str | os.PathLike):
+        return read(source)
+    names = getattr(source, "columns", source)
+    columns = {str(key): _column(str(key), source[key]) for key in names}
+    count = max(map(len, columns.values()), default=0)
+    return Table(columns, source=name, lines=range(1, count + 1))
+
+
+def _column(name: str, values: Any) -> Column:
+    """Numbers, or the text of a column of labels; other text stays text."""
+    array = np.asarray(values)
+    if name in LABELS or array.dtype.kind in "OUS":
+        return ["" if cell is None or cell != cell else str(cell) for cell in array.tolist()]
+    return np.asarray(array, float)
+
+
+def simulate(
+    inclination_deg: Sequence[float] = (5, 45, 90, 135),
+    toolfaces: int = 12,
+    azimuth_deg: Sequence[float] = (0, 90, 180, 270),
+    temperature: Sequence[float] = (25.0,),
+    *,
+    tool: int | Truth = 0,
+    noise: tuple[float, float] = (1e-4, 15.0),
+    seed: int = 0,
+) -> Readings:
+    """A simulated run, marked as such: every toolface at every inclination and temperature.
+
+    Azimuths come in turn, one to each inclination. `tool` is a number, the same one for the same
+    tool, or a tool of `mwdcal.planning.simulate`; `noise` is of one reading, g and nT; `seed` is that
+    of the noise.
+    """
+    truth = simulation.servo(np.random.default_rng(tool)) if isinstance(tool, int) else tool
+    plan = simulation.grid([*inclination_deg], toolfaces, [*azimuth_deg], [*temperature])
+    return simulation.run(truth, plan, np.random.default_rng([seed, 1]), noise)
+
+
+def calibrate(
+    run: Readings,
+    profile: Path | Profile | None = None,
+    options: Options | None = None,
+    **choices: Any,
+) -> Calibration:
+    """Fit the sensor model to a run, and state what the calibration is worth.
+
+    `profile` is by default the one that the run was read with, else a nominal one: channels along
+    the tool axes in g and nT. `choices` are attributes of `Options` by name, such as
+    `method="scalar"` or `robust="huber"`; what is not chosen is chosen as by the command.
+
+    Raises:
+        FitError: the run cannot give a calibration to be trusted; the message says what to add.
+        InputError: an option is unknown.
+    """
+    _check_run(run)
+    return fit_and_judge(
+        run,
+        _profile(run, profile),
+        _options(options, choices),
+        run_sha256=run.run_sha256,
+        profile_sha256=run.profile_sha256 if profile is None else "",
+    )
+
+
+def _profile(run: Readings, profile: Path | Profile | None) -> Profile:
+    """A profile as it is given, else that of the run, else `NOMINAL`."""
+    if profile is None:
+        return run.profile or NOMINAL
+    return profile if isinstance(profile, Profile) else load_profile(profile)
+
+
+def _check_run(run: object) -> None:
+    """Refuse what is not the run of one tool."""
+    if not isinstance(run, Readings):
+        raise InputError(
+            f"`run` must be readings; got {type(run).__name__}. Make them by mwdcal.readings(…), or "
+            "mwdcal.read_run(…) of a file."
+        )
+    if run.accelerometer.ndim != 2:
+        raise InputError(
+            f"`run` must have readings of one run, (n, 3); got {run.accelerometer.shape}. Many runs at "
+            "once are fitted by mwdcal.calibration.estimate.fit."
+        )
+
+
+def _options(options: Options | None, choices: Mapping[str, Any]) -> Options | None:
+    """Options with choices by name; None where nothing was chosen."""
+    names = [field.name for field in fields(Options)]
+    for name in choices:
+        if name not in names:
+            near = difflib.get_close_matches(name, names, 1)
+            meant = f" Did you mean '{near[0]}'?" if near else ""
+            raise InputError(f"unknown option '{name}'; expected one of {', '.join(names)}.{meant}")
+    return replace(options or Options(), **choices) if choices else options
+
+
+def compare(run: Readings, profile: Path | Profile | None = None, **choices: Any) -> Comparison:
+    """Calibrate a run by every method, and judge each by stations left out of its fit.
+
+    `choices`: `order`, `seed` and `progress` of `mwdcal.comparison.compare.compare`.
+    """
+    _check_run(run)
+    return compare_methods(run, _profile(run, profile), **choices)
+
+
+def verify(
+    calibration: Calibration, rolltest: Readings, limits: Path | Limits = "roll-test"
+) -> Verdict:
+    """Judge a calibration by readings that its fit has not seen: `.passed`, and `.rows` with each figure.
+
+    `limits` is a shipped limits profile by name, a TOML file by path, or `Limits`.
+
+    Raises:
+        InputError: stations of the fit, temperatures outside the calibrated range, or readings to
+            which no limit applies.
+    """
+    return judge(
+        calibration, rolltest, limits if isinstance(limits, Limits) else load_limits(limits)
+    )
+
+
+@dataclass(frozen=True)
+class Corrected:
+    """Corrected readings: vectors (n, 3) in g and nT, angles (n,) in radians, NaN where there is none.
+
+    `columns` are all results by the names of files, with their units (`inclination_deg`, `gx_g`, …),
+    ready for a table; `findings` are what the reader should know.
+    """
+
+    gravity: Array
+    field: Array
+    inclination: Array
+    azimuth: Array
+    toolface: Array
+    dip: Array
+    magnetic_toolface: Array
+    columns: dict[str, AnyArray]
+    findings: list[Finding]
+
+
+def apply(
+    calibration: Calibration,
+    survey: Readings,
+    outside: Literal["blank", "refuse", "extrapolate"] = "blank",
+) -> Corrected:
+    """Correct readings: vectors and angles.
+
+    `outside`: what becomes of readings outside the calibrated temperatures. Singular: azimuth and
+    toolface are NaN exactly at vertical; the magnetic toolface is not.
+
+    Raises:
+        InputError: readings that do not belong to the calibration.
+    """
+    columns, findings = correct(calibration, survey, outside)
+    return Corrected(
+        gravity=np.stack([columns[f"g{axis}_g"] for axis in "xyz"], -1),
+        field=np.stack([columns[f"b{axis}_nt"] for axis in "xyz"], -1),
+        **{name: np.radians(columns[f"{name}_deg"]) for name in ANGLES},
+        columns=columns,
+        findings=findings,
+    )
+
+
+def save(calibration: Calibration, path: Path) -> None:
+    """Write a calibration file (JSON), whole or not at all."""
+    documents.write(path, calibration)
+
+
+def load(path: Path) -> Calibration:
+    """Read a calibration file.
+
+    Raises:
+        InputError: the file cannot be read, is not a calibration file, or was damaged.
+    """
+    return documents.read(path)
+
+
+def stations(log: Source, **options: Any) -> Stations:
+    """The standstills of a continuous log, each as a station: `.table` is a run for `read_run`.
+
+    `log` is a file, or columns by the names of log files: `time_s`, `ax`, …, `temperature_c`. `options`
+    are those of `mwdcal.logs.stations.find_stations`.
+    """
+    return find_stations(_table(log, "the log", logs.read), **options)
+
+
+def noise(log: Source, **options: Any) -> Noise:
+    """The noise of each raw channel of a log of a tool at rest, by Allan deviation.
+
+    `log` is a file, or columns by the names of log files. `options` are those of
+    `mwdcal.logs.noise.find_noise`.
+    """
+    return find_noise(_table(log, "the log", logs.read), **options)

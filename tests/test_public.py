@@ -1,0 +1,401 @@
+"""`import mwdcal`: the public names, conversion and refusal of arrays, and the ten lines of a first script."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import mwdcal
+from cli_support import EXAMPLE, numbers, read_csv
+from cli_support import mwdcal as command
+from mwdcal.calibration.record import Calibration
+from mwdcal.files import documents
+
+TOOL = 3
+
+
+@pytest.fixture(scope="module")
+def simulated():
+    return mwdcal.simulate(tool=TOOL, noise=(1e-4, 15.0), seed=1)
+
+
+@pytest.fixture(scope="module")
+def rolltest():
+    return mwdcal.simulate([45], 12, [60], tool=TOOL, seed=2)
+
+
+@pytest.fixture(scope="module")
+def run(simulated):
+    known = {n: simulated.known[n] for n in ("inclination", "azimuth", "toolface")}
+    return mwdcal.readings(
+        simulated.accelerometer, simulated.magnetometer, temperature=25.0, field=48_000.0, **known
+    )
+
+
+@pytest.fixture(scope="module")
+def cal(run):
+    return mwdcal.calibrate(run)
+
+
+def columns(simulated):
+    """Arguments of `readings` as arrays."""
+    return simulated.accelerometer, simulated.magnetometer
+
+
+def process(code):
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+
+
+def test_importing_the_package_loads_no_numpy():
+    loaded = "import sys, mwdcal; mwdcal.__version__, dir(mwdcal); print('numpy' in sys.modules)"
+    assert process(loaded).stdout.strip() == "False"
+    assert (
+        process("import sys, mwdcal; mwdcal.readings; print('numpy' in sys.modules)").stdout
+        == "True\n"
+    )
+
+
+def test_drawing_and_its_library_wait_until_they_are_used():
+    code = "import sys, mwdcal; mwdcal.calibrate; print('matplotlib' in sys.modules)"
+    assert process(code).stdout.strip() == "False"
+
+
+def test_every_public_name_is_there_and_has_a_docstring():
+    from mwdcal import library
+
+    assert sorted(mwdcal.__all__) == sorted(library.__all__)
+    assert len(mwdcal.__all__) <= 20
+    for name in mwdcal.__all__:
+        assert getattr(mwdcal, name).__doc__, name
+        assert name in dir(mwdcal)
+    with pytest.raises(AttributeError, match="no attribute 'reading'"):
+        mwdcal.reading  # noqa: B018
+
+
+def test_the_citation_states_the_version():
+    text = (EXAMPLE.parents[1] / "CITATION.cff").read_text("utf-8")
+    assert f"version: {mwdcal.__version__}\n" in text
+
+
+def test_ten_lines(simulated, rolltest, tmp_path, monkeypatch):
+    """The script of the design, with its own names."""
+    pytest.importorskip("matplotlib")
+    monkeypatch.chdir(tmp_path)
+    a, m, t = simulated.accelerometer, simulated.magnetometer, simulated.temperature
+    inc, azi, tf = (simulated.known[n] for n in ("inclination", "azimuth", "toolface"))
+    survey = rolltest
+
+    run = mwdcal.readings(
+        a, m, temperature=t, inclination=inc, azimuth=azi, toolface=tf, field=48_000.0
+    )
+    cal = mwdcal.calibrate(run)
+    g, b = cal.fields(survey)
+    sd = cal.uncertainty("azimuth", survey, noise=True)
+    both = cal.covariance(("inclination", "azimuth"), survey)
+    passed = mwdcal.verify(cal, rolltest).passed
+    mwdcal.save(cal, "tool.json")
+    cal = mwdcal.load("tool.json")
+    figure = cal.plot.accuracy()
+
+    assert g.shape == b.shape == (12, 3)
+    assert sd.shape == (12,)
+    assert both.shape == (12, 2, 2)
+    assert passed is True
+    assert type(figure).__module__ == "matplotlib.figure"
+    assert np.abs(np.linalg.norm(g, axis=-1) - 1).max() < 1e-3
+
+
+def test_covariance_of_two_angles_is_that_of_their_sensitivities(cal, rolltest):
+    names = ("inclination", "azimuth")
+    both = cal.covariance(names, rolltest)
+    rows = np.stack([cal.sensitivity(n, rolltest) for n in names], -2)
+    expected = rows @ cal.parameter_covariance @ np.swapaxes(rows, -1, -2)
+    np.testing.assert_allclose(both, expected, rtol=1e-9)
+    for index, name in enumerate(names):
+        sd = np.sqrt(both[:, index, index])
+        np.testing.assert_array_equal(sd, cal.uncertainty(name, rolltest))
+    assert np.abs(both[:, 0, 1]).max() > 0
+    with pytest.raises(mwdcal.InputError, match="`names` must be observables"):
+        cal.covariance(("inclination", "yaw"), rolltest)
+
+
+def test_covariance_with_noise_is_what_many_readings_scatter(cal):
+    """Sample covariance of corrected inclination and azimuth of one attitude read 4,000 times."""
+    one = mwdcal.simulate([60], 1, [30], tool=TOOL, noise=(0.0, 0.0))
+    rng = np.random.default_rng(5)
+    shape = (4000, 3)
+    many = mwdcal.readings(
+        one.accelerometer + cal.accelerometer.noise * rng.normal(size=shape),
+        one.magnetometer + cal.magnetometer.noise * rng.normal(size=shape),
+        temperature=25.0,
+    )
+    corrected = mwdcal.apply(cal, many)
+    sample = np.cov(corrected.inclination, corrected.azimuth)
+    names = ("inclination", "azimuth")
+    stated = cal.covariance(names, one, noise=True)[0] - cal.covariance(names, one)[0]
+    scale = np.sqrt(np.outer(np.diag(stated), np.diag(stated)))
+    assert np.abs((sample - stated) / scale).max() < 5 / np.sqrt(4000)
+
+
+def test_an_observable_without_uncertainty_leaves_those_of_the_others(simulated):
+    """That method leaves the scale of the accelerometer free: gravity rests on it, no angle does."""
+    known = {n: simulated.known[n] for n in ("inclination", "toolface")}
+    run = mwdcal.readings(*columns(simulated), field=48_000.0, **known)
+    cal = mwdcal.calibrate(run, method="toolface-inclination")
+    both = cal.covariance(("inclination", "gravity"), simulated)
+    assert np.isfinite(both[:, 0, 0]).all()
+    assert np.isnan(both[:, 1]).all()
+    assert np.isnan(both[:, 0, 1]).all()
+
+
+def test_lists_degrees_and_scalars_give_the_same_readings(simulated):
+    a, m = columns(simulated)
+    known = {n: simulated.known[n] for n in ("inclination", "azimuth", "toolface", "dip")}
+    arrays = mwdcal.readings(a, m, temperature=25.0, field=48_000.0, **known)
+    degrees = {f"{n}_deg": np.degrees(v).tolist() for n, v in known.items()}
+    lists = mwdcal.readings(
+        a.tolist(), m.tolist(), temperature=[25] * 48, field=[48_000] * 48, **degrees
+    )
+    assert arrays.digest == lists.digest
+    for name, values in arrays.known.items():
+        np.testing.assert_allclose(lists.known[name], values, rtol=1e-15, atol=1e-15)
+        assert lists.known[name].shape == (48,)
+    np.testing.assert_array_equal(arrays.temperature, lists.temperature)
+
+
+def test_the_arrays_given_are_neither_kept_nor_changed(simulated):
+    a = simulated.accelerometer.copy()
+    azimuth = np.full(48, -np.pi / 2)
+    made = mwdcal.readings(a, azimuth=azimuth)
+    a[:] = 0
+    assert np.abs(made.accelerometer).max() > 0.5
+    np.testing.assert_allclose(made.known["azimuth"], 1.5 * np.pi)
+    assert (azimuth == -np.pi / 2).all()
+
+
+def test_unknown_references_are_left_out_and_blank_ones_stay_nan(simulated):
+    inclination = np.where(np.arange(48) < 40, 0.5, np.nan)
+    made = mwdcal.readings(
+        *columns(simulated), inclination=inclination, azimuth=np.nan, toolface=None
+    )
+    assert list(made.known) == ["inclination"]
+    assert np.isnan(made.known["inclination"]).sum() == 8
+
+
+def test_uncertainties_by_name_and_unit(simulated):
+    sd = {
+        "accelerometer": 1e-4,
+        "magnetometer": (14.0, 15.0, 16.0),
+        "inclination_deg": 0.02,
+        "azimuth": np.full(48, 0.001),
+        "azimuth_zero_deg": 0.5,
+        "tilt": 1e-4,
+        "field": 50.0,
+    }
+    made = mwdcal.readings(*columns(simulated), sd=sd)
+    assert made.sd["accelerometer"].shape == made.sd["magnetometer"].shape == (48, 3)
+    assert made.sd["magnetometer"][7].tolist() == [14.0, 15.0, 16.0]
+    np.testing.assert_allclose(made.sd["inclination"], np.radians(0.02))
+    np.testing.assert_allclose(made.sd["azimuth-zero"], np.radians(0.5))
+    assert made.sd["tilt"][0] == 1e-4
+    assert made.sd["field"][0] == 50.0
+
+
+def test_groups_by_number_or_name(simulated):
+    names = ["B", "", "A", None, float("nan"), "B"] * 8
+    numbers = [7, -1, 2, -1, -1, 7] * 8
+    for group in (names, numbers, np.array(numbers)):
+        made = mwdcal.readings(*columns(simulated), group=group)
+        assert made.group[:6].tolist() == [0, -1, 1, -1, -1, 0]
+
+
+def worse(values, at=(5, 1), bad=np.nan):
+    values = values.copy()
+    values[at] = bad
+    return values
+
+
+REFUSED = {
+    "reading": (lambda a, m: ((worse(a), m), {}), r"`accelerometer` must be finite; got nan at station 6"),
+    "infinite": (lambda a, m: ((a, worse(m, bad=np.inf)), {}), r"`magnetometer` must be finite; got inf"),
+    "axes first": (lambda a, m: ((a.T, m.T), {}), r"shape \(n, 3\); got \(3, 48\). Put the axes last"),
+    "stations": (lambda a, m: ((a, m[:9]), {}), r"shape of `accelerometer`, \(48, 3\); got \(9, 3\)"),
+    "text": (lambda a, m: ((a, m), {"dip": "steep"}), r"`dip` must be numbers"),
+    "name": (lambda a, m: ((a, m), {"inclinaton": 1}), r"unknown name 'inclinaton'.*Did you mean 'incl"),
+    "degrees": (lambda a, m: ((a, m), {"inclination": 90}), r"rad; got 90 .* Degrees go to `inclination_deg`"),
+    "range": (lambda a, m: ((a, m), {"dip_deg": -91}), r"between -90 and 90 °; got -91 at station 1"),
+    "field": (lambda a, m: ((a, m), {"field": 0}), r"`field` must be above 0 and at most 200000 nT; got 0"),
+    "twice": (lambda a, m: ((a, m), {"dip_deg": 1, "dip": 0.1}), r"are the same quantity"),
+    "length": (lambda a, m: ((a, m), {"azimuth": [1, 2]}), r"the shape \(48,\); got \(2,\)"),
+    "temperature": (lambda a, m: ((a, m), {"temperature": np.nan}), r"`temperature` must be a number; got nan"),
+    "kelvin": (lambda a, m: ((a, m), {"temperature": 2980}), r"at most 1000|and 1000 °C; got 2980"),
+    "group": (lambda a, m: ((a, m), {"group": [1, 2]}), r"`group` must have one value for each of 48"),
+    "sd name": (lambda a, m: ((a, m), {"sd": {"noise": 1}}), r"unknown name 'noise'"),
+    "sd zero": (lambda a, m: ((a, m), {"sd": {"accelerometer": 0}}), r"must be above 0 .*; got 0"),
+    "sd blank": (lambda a, m: ((a, m), {"sd": {"magnetometer": np.nan}}), r"must be a number; got nan"),
+    "sd below zero": (lambda a, m: ((a, m), {"sd": {"tilt": -1}}), r"must be between 0 and 3.14159 rad; got -1"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_refused_arrays(case, simulated):
+    given, message = REFUSED[case]
+    arrays, keywords = given(*columns(simulated))
+    with pytest.raises(mwdcal.InputError, match=message) as caught:
+        mwdcal.readings(*arrays, **keywords)
+    assert "\n" not in str(caught.value)
+
+
+def test_calibrate_refuses_what_is_no_run(simulated):
+    with pytest.raises(mwdcal.InputError, match=r"got ndarray. Make them by mwdcal.readings"):
+        mwdcal.calibrate(simulated.accelerometer)
+    many = mwdcal.readings(np.stack([simulated.accelerometer] * 2))
+    with pytest.raises(mwdcal.InputError, match=r"one run, \(n, 3\); got \(2, 48, 3\)"):
+        mwdcal.calibrate(many)
+    with pytest.raises(mwdcal.InputError, match="unknown option 'methd'.*Did you mean 'method'"):
+        mwdcal.calibrate(simulated, methd="scalar")
+
+
+def test_options_by_name_are_those_of_options(run):
+    by_name = mwdcal.calibrate(run, robust="huber", ignore=("field",))
+    whole = mwdcal.calibrate(run, options=mwdcal.Options(robust="huber", ignore=("field",)))
+    assert by_name.options == whole.options
+    assert by_name.parameters.tolist() == whole.parameters.tolist()
+    assert by_name.options.robust == "huber"
+
+
+def test_a_calibration_knows_the_stations_of_its_fit(cal, run):
+    with pytest.raises(
+        mwdcal.InputError, match=r"^the readings: 48 of 48 stations were in the fit"
+    ):
+        mwdcal.verify(cal, run)
+
+
+def test_short_representations(cal, rolltest):
+    verdict = mwdcal.verify(cal, rolltest)
+    for thing in (cal, verdict, rolltest):
+        assert len(repr(thing)) < 400
+        assert "\n" not in repr(thing)
+    assert "accelerometer 12 of 12" in repr(cal)
+    assert "findings none" in repr(cal)
+    assert repr(verdict).startswith("<Verdict: passed, ")
+    for html in (cal._repr_html_(), verdict._repr_html_()):
+        assert html.startswith("<table>")
+        assert html.count("<tr>") == html.count("</tr>") > 2
+
+
+def test_accuracy_of_the_representation_is_the_typical_one(cal):
+    from mwdcal.calibration.prediction import typical_accuracy
+
+    accuracy = cal.summary()["accuracy"]
+    for name, value in typical_accuracy(cal).items():
+        assert f"{name} {value:.2g}°" in accuracy
+
+
+def test_a_run_file_brings_its_profile_along(tmp_path):
+    tool, source = EXAMPLE / "tool.toml", EXAMPLE / "run.csv"
+    run = mwdcal.read_run(source, tool)
+    cal = mwdcal.calibrate(run)
+    assert cal.profile.accelerometer.scale == mwdcal.load_profile(tool).accelerometer.scale == 3.0
+    assert (len(cal.run_sha256), len(cal.profile_sha256)) == (64, 64)
+    survey = mwdcal.read_run(EXAMPLE / "rolltest.csv", cal.profile)
+    mwdcal.save(cal, tmp_path / "tool.json")
+    ran = command(
+        "apply", tmp_path / "tool.json", EXAMPLE / "rolltest.csv", "-o", tmp_path / "out.csv"
+    )
+    assert ran.code == 0
+    cells = read_csv(tmp_path / "out.csv")
+    written = {name: numbers(cells[name]) for name in ("azimuth_deg", "by_nt")}
+    corrected = mwdcal.apply(cal, survey)
+    np.testing.assert_allclose(np.degrees(corrected.azimuth), written["azimuth_deg"], rtol=1e-9)
+    np.testing.assert_allclose(corrected.field[:, 1], written["by_nt"], rtol=1e-9)
+    assert corrected.gravity.shape == (12, 3)
+
+
+def test_columns_in_memory_are_read_like_a_file():
+    from mwdcal.files.formats import table
+
+    whole = table.read(EXAMPLE / "run.csv")
+    columns = {
+        name: cells if name in ("station", "group") else [float(cell) for cell in cells]
+        for name, cells in whole.columns.items()
+    }
+    file = mwdcal.read_run(EXAMPLE / "run.csv", EXAMPLE / "tool.toml")
+    memory = mwdcal.read_run(columns, EXAMPLE / "tool.toml")
+    assert memory.digest == file.digest
+    assert memory.station == file.station
+    np.testing.assert_array_equal(memory.accelerometer, file.accelerometer)
+    for name, values in file.known.items():
+        np.testing.assert_array_equal(memory.known[name], values)
+
+
+def test_saved_and_loaded_is_the_same(cal, tmp_path):
+    path = tmp_path / "tool.json"
+    mwdcal.save(cal, path)
+    assert mwdcal.load(path) == cal
+    assert isinstance(mwdcal.load(path), Calibration)
+    assert path.read_bytes() == documents.encode(cal)
+    assert b'"covariance":' in path.read_bytes()
+
+
+def test_compare_takes_arrays(run):
+    found = mwdcal.compare(run, order=0)
+    assert "joint" in [row.method for row in found.rows]
+    assert found.advice.startswith("use ")
+
+
+def log(seconds=40.0, rate=50.0):
+    """A simulated log: two rests with a move between them."""
+    rng = np.random.default_rng(1)
+    time = np.arange(int(seconds * rate)) / rate
+    turn = np.clip((time - 18) / 4, 0, 1) * np.pi / 2
+    vectors = {"ax": np.sin(turn), "ay": 0 * turn, "az": np.cos(turn)}
+    return {"time_s": time} | {n: v + 1e-3 * rng.normal(size=len(time)) for n, v in vectors.items()}
+
+
+def test_stations_of_columns_are_those_of_the_file(tmp_path):
+    columns = log()
+    found = mwdcal.stations(columns)
+    assert found.table.count == 2
+    np.savetxt(
+        tmp_path / "log.csv", np.stack([*columns.values()], -1), "%.17g", ",",
+        header=",".join(columns), comments="",
+    )  # fmt: skip
+    file = mwdcal.stations(tmp_path / "log.csv")
+    np.testing.assert_array_equal(file.table.columns["ax"], found.table.columns["ax"])
+    run = mwdcal.read_run(found.table)
+    assert run.count == 2
+    assert np.abs(np.degrees(run.accelerometer[0, 2]) - np.degrees(run.accelerometer[1, 0])) < 1
+
+
+def test_noise_of_columns():
+    rng = np.random.default_rng(2)
+    columns = {n: rng.normal(0.1, 2e-3, 6000) for n in ("ax", "ay", "az")}
+    found = mwdcal.noise(columns, sampling_hz=100.0)
+    white = found.channels["ax"].terms["white"].value
+    assert white == pytest.approx(2e-3 / 10, rel=0.1)
+
+
+def test_pandas_columns(simulated):
+    pandas = pytest.importorskip("pandas")
+    a, m = columns(simulated)
+    frame = pandas.DataFrame({"inc": np.degrees(simulated.known["inclination"]), "t": 25})
+    axes = pandas.DataFrame(a, columns=["x", "y", "z"])
+    frame.loc[3, "inc"] = None
+    made = mwdcal.readings(axes, m, temperature=frame["t"], inclination_deg=frame["inc"])
+    np.testing.assert_array_equal(made.accelerometer, a)
+    assert np.flatnonzero(np.isnan(made.known["inclination"])).tolist() == [3]
+    assert mwdcal.stations(pandas.DataFrame(log())).table.count == 2
+
+
+def test_polars_columns(simulated):
+    polars = pytest.importorskip("polars")
+    a, m = columns(simulated)
+    inclination = [None, *np.degrees(simulated.known["inclination"])[1:]]
+    frame = polars.DataFrame({"inc": inclination, "t": [25] * 48})
+    axes = polars.DataFrame({"x": a[:, 0], "y": a[:, 1], "z": a[:, 2]})
+    made = mwdcal.readings(axes, m, temperature=frame["t"], inclination_deg=frame["inc"])
+    np.testing.assert_array_equal(made.accelerometer, a)
+    assert np.flatnonzero(np.isnan(made.known["inclination"])).tolist() == [0]
+    assert mwdcal.stations(polars.DataFrame(log())).table.count == 2
