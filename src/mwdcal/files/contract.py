@@ -8,8 +8,11 @@ from collections.abc import Collection, Sequence
 from math import pi
 from typing import NamedTuple
 
+import numpy as np
+
 from mwdcal.errors import InputError
 from mwdcal.files.synonyms import CONVERSIONS, resembled
+from mwdcal.geometry.vectors import Array, Bools
 
 CHANNELS = {"accelerometer": ("ax", "ay", "az"), "magnetometer": ("mx", "my", "mz")}
 RAW = tuple(name for triad in CHANNELS.values() for name in triad)
@@ -25,6 +28,11 @@ class Range(NamedTuple):
     high: float
     unit: str
     positive: bool = False
+
+    def outside(self, values: Array) -> Bools:
+        """Which of the values (...) are not accepted; NaN, a blank cell, is."""
+        low = values <= self.low if self.positive else values < self.low
+        return np.asarray(low | (values > self.high))
 
     def __str__(self) -> str:
         if self.positive:
@@ -57,6 +65,15 @@ TEMPERATURE = Range(-273.15, 1000.0, "°C")
 RAW_RANGE = Range(-1e15, 1e15, "")
 RAW_SPREAD = Range(0.0, 1e15, "")
 ROTATION = Range(-180.0, 180.0, "°")
+
+RANGES = {
+    **dict.fromkeys(RAW, RAW_RANGE),
+    **{f"sd_{name}": RAW_SPREAD for name in RAW},
+    "temperature_c": TEMPERATURE,
+    **{reference.column: reference.values for reference in REFERENCES.values()},
+    **{f"sd_{reference.column}": reference.spread for reference in REFERENCES.values()},
+}
+"""Accepted values of every column of numbers."""
 
 _MEASURED = (*RAW, *(reference.column for reference in REFERENCES.values()))
 COLUMNS = (

@@ -1,0 +1,165 @@
+"""Cells that a run may not have, in rows of one tool or of many.
+
+The rows of T tools stand one tool after the other: `starts` (T + 1,) are the first row of each,
+and the number of rows. A run file is one tool. What must be filled in where other cells of a tool
+are is judged tool by tool.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from mwdcal.calibration.readings import TRIADS
+from mwdcal.files.contract import CHANNELS, RANGES, REFERENCES
+from mwdcal.files.formats.table import shown
+from mwdcal.geometry.vectors import Array, Bools, Ints
+from mwdcal.sensor.profile import Profile
+
+Cells = Callable[[str], Array | None]
+"""The numbers (R,) of a column by its name, NaN where blank; None where there is no such column."""
+
+
+class Fault(NamedTuple):
+    """Cells that break one rule: where `cells` (k, R) is true, of the `columns` (k).
+
+    `problem` says of a column and a row what is wrong with the cell, and what to do.
+    `missing_reading`: the rule is that readings and temperatures may not be blank.
+    """
+
+    columns: tuple[str, ...]
+    cells: Bools
+    problem: Callable[[int, int], str]
+    missing_reading: bool = False
+
+
+def faults(cells: Cells, starts: Ints, profile: Profile) -> Iterator[Fault]:
+    """The rules that are broken, in the order in which they are reported.
+
+    A column is not read before its turn.
+    """
+    for kind in TRIADS:
+        yield from _reading_faults(cells, starts, kind)
+    yield from _temperature_faults(cells, starts)
+    yield from faults_beside_readings(cells, starts, profile, TRIADS)
+
+
+def faults_beside_readings(
+    cells: Cells, starts: Ints, profile: Profile, kinds: Iterable[str]
+) -> Iterator[Fault]:
+    """The same of references, and of uncertainties of these and of the triads `kinds`."""
+    for reference in REFERENCES.values():
+        yield from _range_faults(cells, reference.column)
+    for kind in kinds:
+        if _some(cells, CHANNELS[kind]):
+            for fault in _noise_faults(cells, starts, profile, kind):
+                yield from _within(fault, _of_tools_with(cells, CHANNELS[kind], starts))
+    for name, reference in REFERENCES.items():
+        if name == "gravity":
+            yield from _range_faults(cells, f"sd_{reference.column}")
+        elif _some(cells, (reference.column,)):
+            for fault in _range_faults(cells, f"sd_{reference.column}"):
+                yield from _within(fault, _of_tools_with(cells, (reference.column,), starts))
+
+
+def _reading_faults(cells: Cells, starts: Ints, kind: str) -> Iterator[Fault]:
+    """Channels out of range, or blank; the magnetometer may be blank for a whole tool."""
+    names = CHANNELS[kind]
+    for name in names:
+        yield from _range_faults(cells, name)
+    advice = "Fill it in, or remove the station."
+    for fault in _blank_faults(cells, starts, names, advice):
+        fault = fault._replace(missing_reading=True)
+        if kind == "accelerometer":
+            yield fault
+        else:
+            yield from _within(fault, _of_tools_with(cells, names, starts))
+
+
+def _temperature_faults(cells: Cells, starts: Ints) -> Iterator[Fault]:
+    names = ("temperature_c",)
+    yield from _range_faults(cells, *names)
+    advice = "Fill it in, or leave the whole column blank."
+    for fault in _blank_faults(cells, starts, names, advice):
+        fault = fault._replace(missing_reading=True)
+        yield from _within(fault, _of_tools_with(cells, names, starts))
+
+
+def _noise_faults(cells: Cells, starts: Ints, profile: Profile, kind: str) -> Iterator[Fault]:
+    """Noise of a triad out of range, stated for some cells of a tool and not for others, or zero."""
+    names, triad = tuple(f"sd_{name}" for name in CHANNELS[kind]), getattr(profile, kind)
+    for name in names:
+        yield from _range_faults(cells, name)
+    if triad.noise is None:
+        advice = (
+            f"Other sd_ cells of the {kind} are filled. Fill it in, or state `noise` under [{kind}] in the "
+            "tool profile."
+        )
+        for fault in _blank_faults(cells, starts, names, advice):
+            yield from _within(fault, _of_tools_with(cells, names, starts))
+
+    def problem(column: int, row: int) -> str:
+        return f"must be above 0; got 0. State the noise of the {kind}, or leave it blank."
+
+    if triad.repeatability == 0.0 and _some(cells, names):
+        zero = _stacked(cells, names, starts) == 0.0
+        if zero.any():
+            yield Fault(names, zero, problem)
+
+
+def _range_faults(cells: Cells, name: str) -> Iterator[Fault]:
+    """Values that the column may not have."""
+    values, limits = cells(name), RANGES[name]
+    if values is None:
+        return
+
+    def problem(column: int, row: int, values: Array = values) -> str:
+        got = f"{shown(float(values[row]))} {limits.unit}".rstrip()
+        return f"must be {limits}; got {got}. Check the cell, and the unit of the column."
+
+    outside = limits.outside(values)
+    if outside.any():
+        yield Fault((name,), outside[None], problem)
+
+
+def _blank_faults(
+    cells: Cells, starts: Ints, names: tuple[str, ...], advice: str
+) -> Iterator[Fault]:
+    """Cells that are blank."""
+
+    def problem(column: int, row: int) -> str:
+        got = "no such column" if cells(names[column]) is None else "a blank cell"
+        return f"must be filled in; got {got}. {advice}"
+
+    blank = np.isnan(_stacked(cells, names, starts))
+    if blank.any():
+        yield Fault(names, blank, problem)
+
+
+def _within(fault: Fault, rows: Bools) -> Iterator[Fault]:
+    """The fault in some rows (R,), if it is there."""
+    wrong = fault.cells & rows
+    if wrong.any():
+        yield fault._replace(cells=wrong)
+
+
+def _some(cells: Cells, names: tuple[str, ...]) -> bool:
+    """Whether any cell of the columns is filled in."""
+    columns = (cells(name) for name in names)
+    return any(values is not None and not np.isnan(values).all() for values in columns)
+
+
+def _of_tools_with(cells: Cells, names: tuple[str, ...], starts: Ints) -> Bools:
+    """Rows (R,) of tools that have any cell of the columns filled in."""
+    filled = ~np.isnan(_stacked(cells, names, starts)).all(0)
+    if filled.all() or not filled.any():
+        return np.asarray(filled)
+    return np.repeat(np.logical_or.reduceat(filled, starts[:-1]), np.diff(starts))
+
+
+def _stacked(cells: Cells, names: tuple[str, ...], starts: Ints) -> Array:
+    """The columns (k, R); those that are not there are blank."""
+    columns = (cells(name) for name in names)
+    return np.stack([np.full(starts[-1], np.nan) if c is None else c for c in columns])
