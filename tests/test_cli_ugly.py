@@ -191,7 +191,7 @@ OPTIONS = {
     "order unknown": (("--order", "4"), 2, "0, 1, 2, 3 or auto"),
     "order below": (("--order", "-1"), 2, "0, 1, 2, 3 or auto"),
     "tool unknown": (("--tool", "servoo"), 2, "Did you mean 'servo'"),
-    "tool is a folder": (("--tool", "."), 2, "is no tool profile"),
+    "tool is a folder": (("--tool", "."), 2, "is not a tool profile"),
     "station unknown": (("--exclude", "49"), 2, "no such station"),
     "all stations left out": ([f"--exclude={i}" for i in range(1, 49)], 3, "0 stations"),
     "decimal unknown": (("--decimal", ";"), 2, "must be '.' or ','"),

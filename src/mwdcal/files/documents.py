@@ -15,7 +15,7 @@ import numpy as np
 
 from mwdcal.calibration.readings import TRIADS
 from mwdcal.calibration.record import SCHEMA_VERSION, Calibration
-from mwdcal.errors import InputError
+from mwdcal.errors import InputError, reason
 from mwdcal.files.formats import atomic
 from mwdcal.files.profiles import check_profile
 
@@ -48,8 +48,7 @@ def load(path: str | os.PathLike[str]) -> tuple[Calibration, str]:
     try:
         data = Path(path).read_bytes()
     except OSError as error:
-        reason = error.strerror or str(error)
-        raise InputError(f"{path}: cannot be read ({reason}). Check the path.") from None
+        raise InputError(f"{path}: cannot be read ({reason(error)}). Check the path.") from None
     try:
         version = msgspec.json.decode(data, type=dict[str, Any]).get("schema_version")
         if version != SCHEMA_VERSION:

@@ -7,18 +7,18 @@ the one that is wrong.
 
 from __future__ import annotations
 
-import csv
 import hashlib
 import os
 import re
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
 import numpy as np
 
-from mwdcal.errors import InputError
+from mwdcal.errors import InputError, reason
 from mwdcal.files import metadata as meta
 from mwdcal.files.contract import COLUMNS, check_columns, check_near_misses
 from mwdcal.files.formats import table as tables
@@ -29,8 +29,10 @@ from mwdcal.files.formats.columns import (
     check_names,
     looks_numeric,
     no_stations,
+    of_texts,
 )
 from mwdcal.files.formats.table import Table, shown
+from mwdcal.files.formats.text import comment, is_preamble, split
 from mwdcal.geometry.vectors import Array
 
 TIME = "time_s"
@@ -91,8 +93,9 @@ def read(
         with file.open("rb") as stream:
             return _text(stream, list(names), decimal, file.name, say)
     except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or str(error)
-        raise InputError(f"cannot read '{path}': {reason}. Check the name and the file.") from None
+        raise InputError(
+            f"cannot read '{path}': {reason(error)}. Check the name and the file."
+        ) from None
 
 
 def _empty(source: str) -> InputError:
@@ -103,11 +106,8 @@ def _empty(source: str) -> InputError:
 def _numeric(table: Table) -> Table:
     """The table with the columns that mean something as numbers, the others as they are."""
     _check(list(table.columns), table.source)
-    columns: dict[str, Column] = {
-        name: _numbers(table, name) if name in READ else column
-        for name, column in table.columns.items()
-    }
-    return Table(columns, table.metadata, table.source, table.lines, table.digest, table.decimal)
+    numbers = {name: _numbers(table, name) for name in table.columns if name in READ}
+    return replace(table, columns={**table.columns, **numbers})
 
 
 def _numbers(table: Table, name: str) -> Array:
@@ -154,16 +154,12 @@ def _text(
 
 def _top(stream: BinaryIO, source: str) -> tuple[list[tuple[int, str]], str, int]:
     """Numbered comments above the table, and its first line with its number."""
-    comments = []
+    comments: list[tuple[int, str]] = []
     for number, data in enumerate(stream, 1):
         line = _decoded(data, number, source).lstrip("\ufeff").strip("\r\n")
-        text = line.strip()
-        if text.startswith('"#'):  # a spreadsheet has saved it
-            text = ",".join(next(csv.reader([text])))
-        if text.startswith("#"):
-            comments.append((number, text.rstrip(",;\t ")))
-        elif text:
+        if not is_preamble(line):
             return comments, line, number
+        comments.append((number, comment(line)))
     raise InputError(
         f"{source}: the file is empty. A log needs a line with the column names, such as "
         f"time_s,ax,ay,az, or {_EXAMPLE}; and one row per sample."
@@ -191,7 +187,8 @@ def _layout(first: str, number: int, names: list[str], decimal: str, source: str
     marks = [mark for mark in ",;\t" if mark != decimal]
     best = max(marks, key=first.count)
     delimiter = best if best in first else None
-    cells = [cell.strip() for cell in _cells([first], delimiter, number, source)[0]]
+    _, header = next(_rows([first], delimiter, number - 1, source))
+    cells = [str(cell).strip() for cell in header]
     numeric = all(looks_numeric(cell, decimal) or not cell for cell in cells)
     if names:
         _check(names, "--columns")
@@ -242,14 +239,9 @@ def _piece(text: str, done: int, layout: _Layout) -> tuple[Array, Sequence[int],
     values = _plain(text, len(lines), layout)
     if values is not None and len(values) == len(lines):
         return values, range(done + 1, done + len(lines) + 1), after
-    rows = enumerate(_cells(lines, layout.delimiter, done + 1, layout.source), done + 1)
-    head: tuple[int, Sequence[object]] = (done, layout.names)
-    names, cells, numbers = assemble(chain([head], rows), layout.source, "line")
-    columns: dict[str, Column] = {
-        name: [str(cell) for cell in column]
-        for name, column in zip(names, zip(*cells, strict=True), strict=True)
-    }
-    table = Table(columns, {}, layout.source, numbers, "", layout.decimal)
+    rows = _rows(lines, layout.delimiter, done, layout.source)
+    names, cells, numbers = assemble(chain([(done, layout.names)], rows), layout.source, "line")
+    table = Table(of_texts(names, cells), {}, layout.source, numbers, "", layout.decimal)
     values = np.stack([_numbers(table, name) for name in _wanted(layout)], -1)
     return values, numbers, after
 
@@ -293,22 +285,13 @@ def _filled(text: str, mark: str) -> str:
     return text + "nan" if text.endswith(mark) else text
 
 
-def _cells(
-    lines: Sequence[str], delimiter: str | None, first: int, source: str
-) -> list[Sequence[str]]:
-    """The cells of each line."""
+def _rows(
+    lines: Sequence[str], delimiter: str | None, above: int, source: str
+) -> Iterator[tuple[int, Sequence[object]]]:
+    """The cells of each line with its number; the delimiter None is white space."""
     if delimiter is None:
-        return [line.split() for line in lines]
-    try:
-        reader = csv.reader(lines, delimiter=delimiter, strict=True, skipinitialspace=True)
-        rows: list[Sequence[str]] = list(reader)
-    except csv.Error as error:
-        raise InputError(f"{source}, from line {first}: {error}. Remove the quotes.") from None
-    if len(rows) != len(lines):
-        raise InputError(
-            f"{source}, from line {first}: a cell in quotes must end on its line. Remove the quotes."
-        )
-    return rows
+        return ((number, line.split()) for number, line in enumerate(lines, above + 1))
+    return split(lines, above, delimiter, source)
 
 
 def _joined(lines: Sequence[Sequence[int]]) -> Sequence[int]:

@@ -8,16 +8,16 @@ import math
 import re
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
-from mwdcal.errors import InputError
+from mwdcal.errors import InputError, reason
 from mwdcal.files.contract import TEMPERATURE
 from mwdcal.files.formats.table import shown
 from mwdcal.sensor.profile import Datasheet, Profile, StandProfile, TriadProfile
 
 _DEFAULT = "generic"
-_PACKAGE = "mwdcal.profiles"
 _SUFFIX = ".toml"
 _LARGEST = 1_000_000
 _STRUCTS: dict[str, type[msgspec.Struct]] = {
@@ -50,8 +50,7 @@ def list_profiles() -> list[str]:
     >>> "generic" in list_profiles()
     True
     """
-    files = (file.name for file in resources.files(_PACKAGE).iterdir())
-    return sorted(name.removesuffix(_SUFFIX) for name in files if name.endswith(_SUFFIX))
+    return built_in("profiles")
 
 
 def load_profile(name_or_path: str | None = None) -> tuple[Profile, str]:
@@ -60,39 +59,43 @@ def load_profile(name_or_path: str | None = None) -> tuple[Profile, str]:
     None is the built-in `generic`: channels along the tool axes, nothing else known.
     """
     name = _DEFAULT if name_or_path is None else name_or_path
-    if name in list_profiles():
-        data = resources.files(_PACKAGE).joinpath(name + _SUFFIX).read_bytes()
-    else:
-        data = _content(name)
-    return _profile(data, Path(name).name), hashlib.sha256(data).hexdigest()
+    data, digest = read_toml(name, "profiles", "tool profile")
+    return _profile(data, Path(name).name), digest
 
 
-def _content(name: str) -> bytes:
-    """The bytes of a profile given by path."""
-    path = Path(name)
+def built_in(folder: str) -> list[str]:
+    """Names of the TOML files in a folder of the package."""
+    files = (file.name for file in resources.files("mwdcal").joinpath(folder).iterdir())
+    return sorted(name.removesuffix(_SUFFIX) for name in files if name.endswith(_SUFFIX))
+
+
+def read_toml(name: str, folder: str, kind: str) -> tuple[bytes, str]:
+    """The text of a TOML file, built in by name in a folder of the package, or by path.
+
+    Without a byte order mark; with it the SHA-256 of the file. `kind` is what the file should hold.
+    """
+    path: Any = Path(name)
+    if name in built_in(folder):
+        path = resources.files("mwdcal").joinpath(folder, name + _SUFFIX)
     try:
-        if path.is_file() and path.stat().st_size <= _LARGEST:
-            return path.read_bytes()
-        found = path.exists()
+        data = path.read_bytes() if path.is_file() else None
+        if data is not None and len(data) <= _LARGEST:
+            return data.removeprefix(b"\xef\xbb\xbf"), hashlib.sha256(data).hexdigest()
+        exists = path.exists()
     except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or str(error)
         raise InputError(
-            f"cannot read the tool profile '{name}': {reason}. Check its permissions."
+            f"cannot read the {kind} '{name}': {reason(error)}. Check its permissions."
         ) from error
-    if found:
+    if exists:
         raise InputError(
-            f"'{name}' is no tool profile: expected a TOML file of at most {_LARGEST} bytes. "
+            f"'{name}' is not a {kind}: expected a TOML file of at most {_LARGEST} bytes. "
             "Name a file such as tool.toml."
         )
-    raise _unknown(name)
-
-
-def _unknown(name: str) -> InputError:
-    builtin = list_profiles()
-    near = difflib.get_close_matches(name.lower(), builtin, n=2)
+    names = built_in(folder)
+    near = difflib.get_close_matches(name.lower(), names, n=2)
     meant = f" Did you mean {' or '.join(repr(n) for n in near)}?" if near else ""
-    return InputError(
-        f"tool profile must be a built-in name ({', '.join(builtin)}) or the path of a TOML "
+    raise InputError(
+        f"{kind} must be a built-in name ({', '.join(names)}) or the path of a TOML "
         f"file; got '{name}', which is neither.{meant} Check the name or the path."
     )
 
@@ -100,7 +103,7 @@ def _unknown(name: str) -> InputError:
 def _profile(data: bytes, source: str) -> Profile:
     """The checked profile in the bytes of a TOML file."""
     try:
-        profile = msgspec.toml.decode(data.removeprefix(b"\xef\xbb\xbf"), type=Profile)
+        profile = msgspec.toml.decode(data, type=Profile)
     except msgspec.ValidationError as error:
         raise _invalid(str(error), source) from None
     except UnicodeDecodeError as error:

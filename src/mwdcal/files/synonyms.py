@@ -75,7 +75,7 @@ _INSTEAD = {
     "fieldtotal fieldstrength magtotal totalmag",
     "ref_dip_deg": "dip magdip mdip",
     "temperature_c": "temp temperature temperatur tmp tempc tempf temperaturec temperaturef degc degf",
-    "serial": "sn serialno serialnumber serialnr toolserial toolsn",
+    "serial": "serial sn serialno serialnumber serialnr tool toolid toolserial toolsn",
     "group": "rollset",
     **{f"a{i}": f"acc{i} accel{i} acceleration{i} accelerometer{i} g{i}" for i in "xyz"},
     **{f"m{i}": f"mag{i} magnetometer{i} b{i} h{i} flux{i}" for i in "xyz"},

@@ -245,7 +245,7 @@ def _check_numeric(kind: Any, name: str, file: Path) -> None:
 def _check_columns(names: Sequence[str], source: str) -> None:
     """Refuse a table that does not tell its tools apart, or lacks the channels."""
     if SERIAL not in names:
-        near = [n for n in names if n.strip().lower().replace("_", " ") in _NEAR]
+        near = [n for n in names if synonyms.resembled(n) == (SERIAL, "")]
         hint = f" Is it '{near[0]}'? Rename it." if near else " Add it."
         raise InputError(
             f"{source}: a fleet needs the column '{SERIAL}', which tells its tools apart; found "
@@ -253,15 +253,3 @@ def _check_columns(names: Sequence[str], source: str) -> None:
         )
     contract.check_columns(list(names), source)
     synonyms.check_evidence(names, source)
-
-
-_NEAR = (
-    "sn",
-    "serial no",
-    "serial number",
-    "serialno",
-    "serialnumber",
-    "serial",
-    "tool",
-    "tool id",
-)

@@ -17,7 +17,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import IO, Any
 
-from mwdcal.errors import InputError
+from mwdcal.errors import InputError, reason
 
 try:
     fcntl: Any = import_module("fcntl")
@@ -177,5 +177,4 @@ def _refusal(path: str | os.PathLike[str], error: Exception) -> InputError:
         advice = "Close the program that has it open, or choose a folder you may write to."
     else:
         advice = "Choose another place, or make room on this one."
-    reason = getattr(error, "strerror", None) or str(error)
-    return InputError(f"cannot write '{path}': {reason}. {advice}")
+    return InputError(f"cannot write '{path}': {reason(error)}. {advice}")

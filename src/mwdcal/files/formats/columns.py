@@ -31,6 +31,18 @@ class Parts(NamedTuple):
     lines: Sequence[int]
 
 
+def of_texts(names: Sequence[str], rows: Sequence[Sequence[object]]) -> dict[str, Column]:
+    """Rows of text cells as columns."""
+    columns = zip(*rows, strict=True)
+    return {name: [str(cell) for cell in cells] for name, cells in zip(names, columns, strict=True)}
+
+
+def damaged(source: str, expected: str, error: Exception, advice: str) -> InputError:
+    """Whatever a library raises on a foreign or damaged file means the same to the user."""
+    reason = (str(error).strip() or type(error).__name__).splitlines()[0][:120]
+    return InputError(f"{source}: expected {expected}; reading it failed ({reason}). {advice}")
+
+
 def looks_numeric(text: str, decimal: str = ".") -> bool:
     """Whether the text is one plain decimal number, with the given decimal sign."""
     other = "," if decimal == "." else "."
@@ -79,7 +91,7 @@ def assemble(
 ) -> tuple[list[str], list[Sequence[object]], list[int]]:
     """Names, rows of equal length, and their line numbers; the first row is the header.
 
-    Rows without any content are no stations and are left out.
+    Rows without any content are left out.
     """
     number, header = next(rows, (1, ()))
     names = [as_text(cell).strip() for cell in header]

@@ -10,7 +10,15 @@ import msgspec
 import numpy as np
 
 from mwdcal.errors import InputError
-from mwdcal.files.formats.columns import LABELS, Column, Parts, as_text, check_names, no_stations
+from mwdcal.files.formats.columns import (
+    LABELS,
+    Column,
+    Parts,
+    as_text,
+    check_names,
+    damaged,
+    no_stations,
+)
 
 KEY = b"mwdcal"
 _MAX_CELLS = 100_000_000
@@ -68,12 +76,8 @@ def modules(source: str) -> tuple[Any, Any]:
 
 
 def unreadable(source: str, error: Exception) -> InputError:
-    """Whatever the reader raises on a foreign or damaged file means the same to the user."""
-    reason = (str(error).strip() or type(error).__name__).splitlines()[0][:120]
-    return InputError(
-        f"{source}: expected a complete Parquet file; reading it failed ({reason}). "
-        "Copy or export it again."
-    )
+    """A foreign or damaged Parquet file."""
+    return damaged(source, "a complete Parquet file", error, "Copy or export it again.")
 
 
 def is_index(name: str) -> bool:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mwdcal.errors import InputError
+from mwdcal.errors import InputError, reason
 from mwdcal.files.formats import atomic, parquet, text, workbook
 from mwdcal.files.formats.columns import LABELS, Column, as_text, check_names, looks_numeric
 from mwdcal.geometry.vectors import Array
@@ -160,9 +160,8 @@ def _content(path: Path) -> bytes:
         _check_size(path.stat().st_size, path)
         return path.read_bytes()
     except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or str(error)
         raise InputError(
-            f"cannot read '{path}': {reason}. Check that the file may be read and is not "
+            f"cannot read '{path}': {reason(error)}. Check that the file may be read and is not "
             "locked by another program."
         ) from error
 

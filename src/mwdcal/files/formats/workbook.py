@@ -13,7 +13,7 @@ from typing import Any
 
 from mwdcal.errors import InputError
 from mwdcal.files import metadata as meta
-from mwdcal.files.formats.columns import Column, Parts, assemble, number, typed
+from mwdcal.files.formats.columns import Column, Parts, assemble, damaged, number, typed
 
 _LARGEST_UNPACKED = 100_000_000
 _MAX_ROWS = 1_048_576
@@ -87,7 +87,8 @@ def _rows(data: bytes, source: str) -> list[Row]:
     except InputError:
         raise
     except Exception as error:
-        raise _unreadable(source, error) from error
+        advice = "Save it again as .xlsx, or as CSV UTF-8."
+        raise damaged(source, "an Excel workbook (.xlsx)", error, advice) from error
     if len(rows) > _MAX_ROWS:
         raise InputError(f"{source}: a sheet must have at most {_MAX_ROWS} rows. Split it.")
     return rows
@@ -102,15 +103,6 @@ def _check_size(data: bytes, source: str) -> None:
             f"{source}: a workbook must unpack to at most {_LARGEST_UNPACKED} bytes; "
             f"got {size}. Save the sheet with the run alone, or as CSV UTF-8."
         )
-
-
-def _unreadable(source: str, error: Exception) -> InputError:
-    """Whatever the reader raises on a foreign or damaged file means the same to the user."""
-    reason = (str(error).strip() or type(error).__name__).splitlines()[0][:120]
-    return InputError(
-        f"{source}: expected an Excel workbook (.xlsx); reading it failed ({reason}). "
-        "Save it again as .xlsx, or as CSV UTF-8."
-    )
 
 
 def _trimmed(row: Sequence[object]) -> Sequence[object]:
