@@ -75,11 +75,9 @@ def open_parquet(path: Path, rows: int = 0, decimal: str = ".") -> Source:
     columns of text that are read as numbers.
     """
     arrow, parquets = parquet.modules(path.name)
-    try:
+    with parquet.reading(path.name):
         file = parquets.ParquetFile(path, buffer_size=1 << 20, pre_buffer=False)
         stored, count = file.schema_arrow, file.metadata.num_rows
-    except Exception as error:
-        raise parquet.unreadable(path.name, error) from error
     check_names(list(stored.names), path.name)
     if count == 0:
         raise no_stations(path.name)
@@ -90,12 +88,10 @@ def open_parquet(path: Path, rows: int = 0, decimal: str = ".") -> Source:
     def pieces() -> Iterator[Any]:
         first = 1
         batches = file.iter_batches(step, use_threads=True)
-        try:
+        with parquet.reading(path.name):
             for batch in batches:
                 yield first, batch
                 first += len(batch)
-        except OSError as error:
-            raise parquet.unreadable(path.name, error) from error
 
     def load(piece: Any, exact: bool) -> Part:
         first, batch = piece

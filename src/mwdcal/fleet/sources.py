@@ -171,11 +171,7 @@ def _paths(path: Path) -> list[Path]:
 def _look(file: Path, root: Path) -> _File:
     """Pieces, columns and metadata of one file."""
     arrow, pq = parquet.modules(str(file))
-    try:
-        opened = pq.ParquetFile(file)
-    except Exception as error:
-        raise parquet.unreadable(str(file), error) from error
-    with opened:
+    with parquet.reading(str(file)), pq.ParquetFile(file) as opened:
         schema, keys = opened.schema_arrow, _keys(file, root)
         every = dict.fromkeys((*schema.names, *dict(keys)))
         names = tuple(n for n in every if not n.startswith("__index"))

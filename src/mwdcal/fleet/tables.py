@@ -75,16 +75,17 @@ def find_tools(source: Source) -> Tools:
     starts: list[Ints] = []
     heads: list[Any] = []
     row, last = 0, None
-    for values in _serials(source):
-        codes = values.indices.to_numpy(zero_copy_only=False)
-        change = np.flatnonzero(np.diff(codes, prepend=codes[0] - 1))
-        if values[0].as_py() == last:
-            change = change[1:]
-        starts.append(change + row)
-        indices = arrow.array(codes[change], values.indices.type)
-        heads.append(arrow.DictionaryArray.from_arrays(indices, values.dictionary))
-        row, last = row + len(codes), values[-1].as_py()
-        _check_stretches(sum(map(len, starts)), source.name)
+    with parquet.reading(source.name):
+        for values in _serials(source):
+            codes = values.indices.to_numpy(zero_copy_only=False)
+            change = np.flatnonzero(np.diff(codes, prepend=codes[0] - 1))
+            if values[0].as_py() == last:
+                change = change[1:]
+            starts.append(change + row)
+            indices = arrow.array(codes[change], values.indices.type)
+            heads.append(arrow.DictionaryArray.from_arrays(indices, values.dictionary))
+            row, last = row + len(codes), values[-1].as_py()
+            _check_stretches(sum(map(len, starts)), source.name)
     every = one_chunk(arrow.chunked_array(heads))
     codes = every.indices.to_numpy(zero_copy_only=False)
     used, first, number = np.unique(codes, return_index=True, return_inverse=True)
@@ -136,7 +137,10 @@ def _serials(source: Source) -> Iterator[Any]:
             yield one.take(arrow.array(np.zeros(piece.rows, int)))
             row += piece.rows
             continue
-        with pq.ParquetFile(piece.path, read_dictionary=[SERIAL]) as file:
+        with (
+            parquet.reading(piece.path),
+            pq.ParquetFile(piece.path, read_dictionary=[SERIAL]) as file,
+        ):
             for batch in file.iter_batches(500_000, row_groups=[piece.group], columns=[SERIAL]):
                 column = _encoded(batch.column(0), piece)
                 _check_filled(column, row, source.name)
@@ -338,17 +342,17 @@ def _batches(piece: Piece, columns: tuple[str, ...]) -> Iterator[Any]:
     keys = dict(piece.keys)
     wanted = [name for name in columns if name not in keys]
     labels = [name for name in LABELS if name in wanted]
-    try:
-        with pq.ParquetFile(piece.path, memory_map=True, read_dictionary=labels) as file:
-            for batch in file.iter_batches(BATCH, [piece.group], wanted):
-                yield _complete(arrow.Table.from_batches([batch]), piece, columns)
-    except FileNotFoundError:
+    if not Path(piece.path).exists():
         raise InputError(
             f"'{piece.path}': no such file on this machine. Workers on other machines must see "
             "the table, and the folder of the output, under the same paths."
-        ) from None
-    except OSError as error:
-        raise parquet.unreadable(piece.path, error) from error
+        )
+    with (
+        parquet.reading(piece.path),
+        pq.ParquetFile(piece.path, memory_map=True, read_dictionary=labels) as file,
+    ):
+        for batch in file.iter_batches(BATCH, [piece.group], wanted):
+            yield _complete(arrow.Table.from_batches([batch]), piece, columns)
 
 
 def _complete(table: Any, piece: Piece, columns: tuple[str, ...]) -> Any:

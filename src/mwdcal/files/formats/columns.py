@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from datetime import date, time
 from typing import NamedTuple
 
@@ -37,10 +38,18 @@ def of_texts(names: Sequence[str], rows: Sequence[Sequence[object]]) -> dict[str
     return {name: [str(cell) for cell in cells] for name, cells in zip(names, columns, strict=True)}
 
 
-def damaged(source: str, expected: str, error: Exception, advice: str) -> InputError:
+@contextmanager
+def damaged_unless_read(source: str, expected: str, advice: str) -> Iterator[None]:
     """Whatever a library raises on a foreign or damaged file means the same to the user."""
-    reason = (str(error).strip() or type(error).__name__).splitlines()[0][:120]
-    return InputError(f"{source}: expected {expected}; reading it failed ({reason}). {advice}")
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0][:120]
+        raise InputError(
+            f"{source}: expected {expected}; reading it failed ({reason}). {advice}"
+        ) from error
 
 
 def looks_numeric(text: str, decimal: str = ".") -> bool:

@@ -13,7 +13,7 @@ from typing import Any
 
 from mwdcal.errors import InputError
 from mwdcal.files import metadata as meta
-from mwdcal.files.formats.columns import Column, Parts, assemble, damaged, number, typed
+from mwdcal.files.formats.columns import Column, Parts, assemble, damaged_unless_read, number, typed
 
 _LARGEST_UNPACKED = 100_000_000
 _MAX_ROWS = 1_048_576
@@ -75,7 +75,8 @@ def _module(source: str) -> Any:
 def _rows(data: bytes, source: str) -> list[Row]:
     """Row numbers and cells of the first sheet, without the blank cells at the end."""
     openpyxl = _module(source)
-    try:
+    advice = "Save it again as .xlsx, or as CSV UTF-8."
+    with damaged_unless_read(source, "an Excel workbook (.xlsx)", advice):
         _check_size(data, source)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -84,11 +85,6 @@ def _rows(data: bytes, source: str) -> list[Row]:
             sheet.reset_dimensions()
             cells = islice(sheet.iter_rows(values_only=True), _MAX_ROWS + 1)
             rows = [(line, _trimmed(row)) for line, row in enumerate(cells, 1)]
-    except InputError:
-        raise
-    except Exception as error:
-        advice = "Save it again as .xlsx, or as CSV UTF-8."
-        raise damaged(source, "an Excel workbook (.xlsx)", error, advice) from error
     if len(rows) > _MAX_ROWS:
         raise InputError(f"{source}: a sheet must have at most {_MAX_ROWS} rows. Split it.")
     return rows
