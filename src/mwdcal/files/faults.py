@@ -8,18 +8,24 @@ are is judged tool by tool.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 
 from mwdcal.calibration.readings import TRIADS
+from mwdcal.errors import InputError
 from mwdcal.files.contract import CHANNELS, RANGES, REFERENCES
-from mwdcal.files.formats.table import shown
+from mwdcal.files.formats.table import Table, cell_error, numbers, shown
 from mwdcal.geometry.vectors import Array, Bools, Ints
 from mwdcal.sensor.profile import Profile
 
 Cells = Callable[[str], Array | None]
 """The numbers (R,) of a column by its name, NaN where blank; None where there is no such column."""
+
+
+class BlankReadingError(InputError):
+    """A blank cell among readings or temperatures: `apply` may leave the results of its row blank."""
 
 
 class Fault(NamedTuple):
@@ -51,24 +57,38 @@ def faults_beside_readings(
 ) -> Iterator[Fault]:
     """The same of references, and of uncertainties of these and of the triads `kinds`."""
     for reference in REFERENCES.values():
-        yield from _range_faults(cells, reference.column)
+        yield from range_faults(cells, reference.column)
     for kind in kinds:
         if _some(cells, CHANNELS[kind]):
             for fault in _noise_faults(cells, starts, profile, kind):
                 yield from _within(fault, _of_tools_with(cells, CHANNELS[kind], starts))
     for name, reference in REFERENCES.items():
         if name == "gravity":
-            yield from _range_faults(cells, f"sd_{reference.column}")
+            yield from range_faults(cells, f"sd_{reference.column}")
         elif _some(cells, (reference.column,)):
-            for fault in _range_faults(cells, f"sd_{reference.column}"):
+            for fault in range_faults(cells, f"sd_{reference.column}"):
                 yield from _within(fault, _of_tools_with(cells, (reference.column,), starts))
+
+
+def columns_of(table: Table) -> Cells:
+    """The columns of numbers of a table, each read when it is asked for the first time."""
+    return cache(lambda name: numbers(table, name) if name in table.columns else None)
+
+
+def refuse(table: Table, rules: Iterable[Fault]) -> None:
+    """Refuse the first cell that breaks a rule."""
+    for fault in rules:
+        row = int(np.argmax(fault.cells.any(0)))
+        column = int(np.argmax(fault.cells[:, row]))
+        error = cell_error(table, fault.columns[column], row, fault.problem(column, row))
+        raise BlankReadingError(str(error)) if fault.missing_reading else error
 
 
 def _reading_faults(cells: Cells, starts: Ints, kind: str) -> Iterator[Fault]:
     """Channels out of range, or blank; the magnetometer may be blank for a whole tool."""
     names = CHANNELS[kind]
     for name in names:
-        yield from _range_faults(cells, name)
+        yield from range_faults(cells, name)
     advice = "Fill it in, or remove the station."
     for fault in _blank_faults(cells, starts, names, advice):
         fault = fault._replace(missing_reading=True)
@@ -80,7 +100,7 @@ def _reading_faults(cells: Cells, starts: Ints, kind: str) -> Iterator[Fault]:
 
 def _temperature_faults(cells: Cells, starts: Ints) -> Iterator[Fault]:
     names = ("temperature_c",)
-    yield from _range_faults(cells, *names)
+    yield from range_faults(cells, *names)
     advice = "Fill it in, or leave the whole column blank."
     for fault in _blank_faults(cells, starts, names, advice):
         fault = fault._replace(missing_reading=True)
@@ -91,7 +111,7 @@ def _noise_faults(cells: Cells, starts: Ints, profile: Profile, kind: str) -> It
     """Noise of a triad out of range, stated for some cells of a tool and not for others, or zero."""
     names, triad = tuple(f"sd_{name}" for name in CHANNELS[kind]), getattr(profile, kind)
     for name in names:
-        yield from _range_faults(cells, name)
+        yield from range_faults(cells, name)
     if triad.noise is None:
         advice = (
             f"Other sd_ cells of the {kind} are filled. Fill it in, or state `noise` under [{kind}] in the "
@@ -109,7 +129,7 @@ def _noise_faults(cells: Cells, starts: Ints, profile: Profile, kind: str) -> It
             yield Fault(names, zero, problem)
 
 
-def _range_faults(cells: Cells, name: str) -> Iterator[Fault]:
+def range_faults(cells: Cells, name: str) -> Iterator[Fault]:
     """Values that the column may not have."""
     values, limits = cells(name), RANGES[name]
     if values is None:

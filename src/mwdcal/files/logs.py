@@ -20,7 +20,8 @@ import numpy as np
 
 from mwdcal.errors import InputError, reason
 from mwdcal.files import metadata as meta
-from mwdcal.files.contract import COLUMNS, check_columns, check_near_misses
+from mwdcal.files.contract import COLUMNS, RAW, check_columns, check_near_misses
+from mwdcal.files.faults import columns_of, range_faults, refuse
 from mwdcal.files.formats import table as tables
 from mwdcal.files.formats.columns import (
     LABELS,
@@ -47,7 +48,11 @@ _BINARY = re.compile(rb"[\x00-\x08\x0e-\x1f]")
 _EXAMPLE = "--columns time_s,ax,ay,az"
 
 
-def _silent(text: str) -> None:
+Say = Callable[[str], None]
+"""Where a long computation says how far it has come."""
+
+
+def silent(text: str) -> None:
     """Say nothing."""
 
 
@@ -65,7 +70,7 @@ def read(
     names: Sequence[str] = (),
     *,
     decimal: str = ".",
-    say: Callable[[str], None] = _silent,
+    say: Say = silent,
 ) -> Table:
     """The columns of a log that mean something, as numbers (NaN: blank), and its metadata.
 
@@ -73,41 +78,49 @@ def read(
     far the reading has come. Errors name file, line and column.
     """
     file = Path(path)
-    if file.suffix.lower() in _TYPED:
-        if names:
-            raise InputError(
-                f"--columns names the columns of a text log without column names; '{path}' has "
-                "names of its own. Leave --columns out."
-            )
-        try:
-            return _numeric(tables.read(file, decimal=decimal))
-        except InputError as error:
-            if str(error) != str(no_stations(file.name)):
-                raise
-            raise _empty(file.name) from None
+    typed = file.suffix.lower() in _TYPED
+    table = _typed(file, names, decimal) if typed else _text(file, [*names], decimal, say)
+    cells = columns_of(table)
+    refuse(table, chain.from_iterable(range_faults(cells, name) for name in RAW))
+    return table
+
+
+def _typed(file: Path, names: Sequence[str], decimal: str) -> Table:
+    """The table of a log of typed columns, its numbers as numbers."""
+    if names:
+        raise InputError(
+            f"--columns names the columns of a text log without column names; '{file}' has "
+            "names of its own. Leave --columns out."
+        )
+    try:
+        table = tables.read(file, decimal=decimal)
+    except InputError as error:
+        if str(error) != str(no_stations(file.name)):
+            raise
+        raise _empty(file.name) from None
+    _check(list(table.columns), table.source)
+    numbers = {name: _numbers(table, name) for name in table.columns if name in READ}
+    return replace(table, columns={**table.columns, **numbers})
+
+
+def _text(file: Path, names: list[str], decimal: str, say: Say) -> Table:
+    """The table of a text log."""
     if decimal not in (".", ","):
         raise InputError(f"--decimal must be '.' or ','; got {shown(decimal)}.")
     try:
         if file.exists() and not file.is_file():
-            raise InputError(f"'{path}' is not a regular file. Name a file with a log.")
+            raise InputError(f"'{file}' is not a regular file. Name a file with a log.")
         with file.open("rb") as stream:
-            return _text(stream, list(names), decimal, file.name, say)
+            return _read_text(stream, names, decimal, file.name, say)
     except (OSError, ValueError) as error:
         raise InputError(
-            f"cannot read '{path}': {reason(error)}. Check the name and the file."
+            f"cannot read '{file}': {reason(error)}. Check the name and the file."
         ) from None
 
 
 def _empty(source: str) -> InputError:
     """A log with nothing below its column names."""
     return InputError(f"{source}: the log has no samples. Is the file complete?")
-
-
-def _numeric(table: Table) -> Table:
-    """The table with the columns that mean something as numbers, the others as they are."""
-    _check(list(table.columns), table.source)
-    numbers = {name: _numbers(table, name) for name in table.columns if name in READ}
-    return replace(table, columns={**table.columns, **numbers})
 
 
 def _numbers(table: Table, name: str) -> Array:
@@ -124,10 +137,8 @@ def _numbers(table: Table, name: str) -> Array:
     return tables.numbers(table, name)
 
 
-def _text(
-    stream: BinaryIO, names: list[str], decimal: str, source: str, say: Callable[[str], None]
-) -> Table:
-    """The table of a text log."""
+def _read_text(stream: BinaryIO, names: list[str], decimal: str, source: str, say: Say) -> Table:
+    """The table in the text of a log."""
     comments, first, number = _top(stream, source)
     metadata = meta.parse(comments, source)
     layout = _layout(first, number, names, decimal, source)

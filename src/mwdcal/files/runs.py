@@ -10,7 +10,6 @@ import hashlib
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from functools import cache
 
 import msgspec
 import numpy as np
@@ -20,17 +19,13 @@ from mwdcal.errors import InputError
 from mwdcal.files import synonyms
 from mwdcal.files.azimuths import magnetic_offset
 from mwdcal.files.contract import CHANNELS, COLUMNS, REFERENCES, Range, check_columns
-from mwdcal.files.faults import Cells, Fault, faults, faults_beside_readings
+from mwdcal.files.faults import BlankReadingError as BlankReadingError
+from mwdcal.files.faults import Cells, columns_of, faults, faults_beside_readings, refuse
 from mwdcal.files.formats import table as tables
 from mwdcal.files.formats.columns import Column
-from mwdcal.files.formats.table import Table, cell_error, labels, numbers
+from mwdcal.files.formats.table import Table, labels
 from mwdcal.geometry.vectors import AnyArray, Array, Ints
 from mwdcal.sensor.profile import Profile, TriadProfile
-
-
-class BlankReadingError(InputError):
-    """A blank cell among readings or temperatures: `apply` may leave the results of its row blank."""
-
 
 MANY = 1000
 """Rows of a table with times from which it is a log."""
@@ -101,8 +96,8 @@ def to_readings(table: Table, profile: Profile) -> tuple[Readings, Profile]:
     also where the metadata state a declination.
     """
     check_columns(list(table.columns), table.source)
-    cells = _cells(table)
-    _refuse(table, faults(cells, _one_tool(table), profile))
+    cells = columns_of(table)
+    refuse(table, faults(cells, _one_tool(table), profile))
     readings, scales = convert(cells, (table.count,), profile, _azimuth_offset(table))
     raw = [_stacked(cells, kind) for kind in scales]
     readings = replace(
@@ -123,27 +118,13 @@ def to_readings(table: Table, profile: Profile) -> tuple[Readings, Profile]:
 
 def check_references(table: Table, profile: Profile, kinds: list[str]) -> dict[str, Array]:
     """The references of a table; refuses what `to_readings` refuses in them and in triads `kinds`."""
-    cells = _cells(table)
-    _refuse(table, faults_beside_readings(cells, _one_tool(table), profile, kinds))
+    cells = columns_of(table)
+    refuse(table, faults_beside_readings(cells, _one_tool(table), profile, kinds))
     return references(cells, _azimuth_offset(table))
-
-
-def _cells(table: Table) -> Cells:
-    """The columns of numbers of a table, each read when it is asked for the first time."""
-    return cache(lambda name: numbers(table, name) if name in table.columns else None)
 
 
 def _one_tool(table: Table) -> Ints:
     return np.array([0, table.count])
-
-
-def _refuse(table: Table, rules: Iterable[Fault]) -> None:
-    """Refuse the first cell that breaks a rule."""
-    for fault in rules:
-        row = int(np.argmax(fault.cells.any(0)))
-        column = int(np.argmax(fault.cells[:, row]))
-        error = cell_error(table, fault.columns[column], row, fault.problem(column, row))
-        raise BlankReadingError(str(error)) if fault.missing_reading else error
 
 
 def _azimuth_offset(table: Table) -> float:

@@ -11,7 +11,7 @@ at T itself.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import msgspec
 import numpy as np
@@ -21,7 +21,7 @@ from mwdcal.calibration.record import Finding
 from mwdcal.errors import InputError
 from mwdcal.files.contract import CHANNELS, RAW
 from mwdcal.files.formats.table import Table, cell_error, numbers, shown
-from mwdcal.files.logs import TIME
+from mwdcal.files.logs import TIME, Say, silent
 from mwdcal.geometry.vectors import Array, Ints
 from mwdcal.logs import allan, noise_terms
 from mwdcal.logs.allan import Kind, Moments
@@ -143,10 +143,6 @@ class Noise(msgspec.Struct, frozen=True, kw_only=True):
     findings: list[Finding]
 
 
-def _silent(text: str) -> None:
-    """Say nothing."""
-
-
 def find_noise(
     log: Table,
     *,
@@ -155,7 +151,7 @@ def find_noise(
     between: tuple[float, float] = (-np.inf, np.inf),
     station_seconds: float | None = None,
     kind: Kind = "overlapping",
-    say: Callable[[str], None] = _silent,
+    say: Say = silent,
 ) -> Noise:
     """The noise of each raw channel of a log (`files.logs.read`) of a tool at rest.
 
@@ -216,7 +212,7 @@ def _section(
     log: Table, given: float | None, between: tuple[float, float], findings: list[Finding]
 ) -> tuple[int, int, float]:
     """First row, row after the last, and rows a second, of what is to be used of a log."""
-    time = row_times(_without_time(log) if given else log, given)
+    time = row_times(log, given)
     inside = np.flatnonzero((time - time[0] >= between[0]) & (time - time[0] <= between[1]))
     if len(inside) < FEWEST:
         problem, advice = f"got {len(time)}", "Record for longer."
@@ -246,11 +242,6 @@ def _section(
     if given and TIME in log.columns:
         _compare_rates(log, first, last, given, findings)
     return first, last, given or rate
-
-
-def _without_time(log: Table) -> Table:
-    columns = {name: column for name, column in log.columns.items() if name != TIME}
-    return Table(columns, log.metadata, log.source, log.lines, log.digest, log.decimal)
 
 
 def _compare_rates(

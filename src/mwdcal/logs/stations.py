@@ -7,7 +7,6 @@ slower still: it never decides what stands still. See `core.standstill` for the 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,7 +17,7 @@ from mwdcal.errors import InputError
 from mwdcal.files.contract import CHANNELS, RAW, TEMPERATURE
 from mwdcal.files.formats.columns import Column
 from mwdcal.files.formats.table import Table, cell_error, numbers, shown
-from mwdcal.files.logs import READ, TIME
+from mwdcal.files.logs import READ, TIME, Say, silent
 from mwdcal.files.synonyms import unused
 from mwdcal.geometry.vectors import Array, Ints
 from mwdcal.logs import standstill
@@ -91,10 +90,6 @@ class StandstillError(InputError):
         self.made = made
 
 
-def _silent(text: str) -> None:
-    """Say nothing."""
-
-
 def find_stations(
     log: Table,
     *,
@@ -102,7 +97,7 @@ def find_stations(
     min_seconds: float | None = None,
     trim_seconds: float | None = None,
     threshold: float | None = None,
-    say: Callable[[str], None] = _silent,
+    say: Say = silent,
 ) -> Stations:
     """The standstills of a log (`files.logs.read`) as the rows of a run.
 
@@ -392,7 +387,7 @@ def _with_samples(
 
 def _summaries(
     traces: dict[str, Trace], start: Array, end: Array, findings: list[Finding],
-    say: Callable[[str], None],
+    say: Say,
 ) -> dict[str, list[Summary]]:  # fmt: skip
     """What each channel read at each station."""
     summaries: dict[str, list[Summary]] = {}
