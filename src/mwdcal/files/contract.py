@@ -141,10 +141,10 @@ def _missing(missing: Sequence[str], names: Sequence[str], source: str) -> Input
     closest = {m: difflib.get_close_matches(m, names[:100], n=1, cutoff=0.5) for m in missing}
     hints = [f"'{near[0]}' for '{name}'" for name, near in closest.items() if near]
     meant = f" Did you mean {', '.join(hints)}?" if hints else ""
-    found = ", ".join(f"'{name[:40]}'" for name in names[:20]) + (" …" if names[20:] else "")
+    present = ", ".join(f"'{name[:40]}'" for name in names[:20]) + (" …" if names[20:] else "")
     return InputError(
         f"{source}: the columns ax, ay, az must be present; {_listed(missing)} missing; "
-        f"found {found}.{meant} Rename the columns, or check the delimiter of the file."
+        f"found {present}.{meant} Rename the columns, or check the delimiter of the file."
     )
 
 

@@ -56,12 +56,12 @@ def load(path: str | os.PathLike[str]) -> tuple[Calibration, str]:
                 f"{name}: 'schema_version' must be {SCHEMA_VERSION}; got {version!r}. It is no "
                 "calibration file, or one of another version of mwdcal: calibrate again."
             )
-        found = check(msgspec.json.decode(data, type=Calibration), name)
+        calibration = check(msgspec.json.decode(data, type=Calibration), name)
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
         raise InputError(
             f"{name} is not a calibration file: {error}. Use a file that mwdcal calibrate wrote."
         ) from None
-    return found, hashlib.sha256(data).hexdigest()
+    return calibration, hashlib.sha256(data).hexdigest()
 
 
 def check(calibration: Calibration, name: str) -> Calibration:
@@ -129,11 +129,11 @@ def _unusable(calibration: Calibration) -> str:
 
 def schema() -> dict[str, Any]:
     """JSON Schema of a calibration file, from its definition in code."""
-    made = _cleaned(json.loads(msgspec.json.encode(msgspec.json.schema(Calibration))))
+    described = _cleaned(json.loads(msgspec.json.encode(msgspec.json.schema(Calibration))))
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": f"mwdcal calibration file, schema version {SCHEMA_VERSION}",
-        **made,
+        **described,
     }
 
 

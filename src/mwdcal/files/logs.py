@@ -147,9 +147,9 @@ def _read_text(stream: BinaryIO, names: list[str], decimal: str, source: str, sa
     pieces, lines = [], []
     ahead = first + "\n" if names else ""
     for piece in _pieces(stream, ahead, done, source):
-        values, own, done = _piece(piece, done, layout)
+        values, numbers, done = _piece(piece, done, layout)
         pieces.append(values)
-        lines.append(own)
+        lines.append(numbers)
         say(f"reading {source}: {100 * stream.tell() / size:.0f} %")
     if not sum(map(len, lines)):
         raise _empty(source)
@@ -307,7 +307,7 @@ def _rows(
 
 def _joined(lines: Sequence[Sequence[int]]) -> Sequence[int]:
     """Line numbers of all pieces; a range where they follow each other."""
-    full = [own for own in lines if len(own)]
-    if all(isinstance(own, range) for own in full):
+    full = [numbers for numbers in lines if len(numbers)]
+    if all(isinstance(numbers, range) for numbers in full):
         return range(full[0][0], full[-1][-1] + 1)
     return list(chain.from_iterable(lines))

@@ -49,16 +49,16 @@ def _entry(text: str, where: str) -> tuple[str, object]:
     """Key and value of one line."""
     bare = _BARE.fullmatch(text)
     try:
-        found = {} if text.startswith("[") else tomllib.loads(text)
+        pairs = {} if text.startswith("[") else tomllib.loads(text)
     except (ValueError, RecursionError):
-        found = {bare[1]: bare[2]} if bare else {}
-    if len(found) != 1:
+        pairs = {bare[1]: bare[2]} if bare else {}
+    if len(pairs) != 1:
         raise InputError(
             f"{where}: a line that starts with '#' must read `# key = value`, the key of "
             f"letters, digits, '_' and '-', the value as in TOML; got {_shown(text)}. "
             "Correct or remove the line."
         )
-    ((key, value),) = found.items()
+    ((key, value),) = pairs.items()
     return key, _plain(value, bare[2] if bare else "")
 
 

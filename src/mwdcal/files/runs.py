@@ -47,10 +47,10 @@ def check_run(table: Table) -> None:
     names = list(table.columns)
     check_columns(names, table.source)
     synonyms.check_evidence(names, table.source)
-    found = serials(table.metadata, _serial_cells(table))
-    if len(found) > 1:
+    tools = serials(table.metadata, _serial_cells(table))
+    if len(tools) > 1:
         raise InputError(
-            f"{table.source} has rows of more than one tool (serial {', '.join(found)}). Take the "
+            f"{table.source} has rows of more than one tool (serial {', '.join(tools)}). Take the "
             "rows of one, or use mwdcal fleet."
         )
     if table.count > MANY and ("time_s" in table.columns or "sampling_hz" in table.metadata):
@@ -70,8 +70,8 @@ def serials(metadata: Mapping[str, object], cells: Iterable[str]) -> list[str]:
 
 def identified(metadata: Mapping[str, object], cells: Sequence[str]) -> Mapping[str, object]:
     """The metadata, with the serials that cells state beside their own."""
-    found = serials(metadata, cells) if cells else []
-    return {**metadata, "serial": ", ".join(found)} if found else metadata
+    tools = serials(metadata, cells) if cells else []
+    return {**metadata, "serial": ", ".join(tools)} if tools else metadata
 
 
 def _serial_cells(table: Table) -> list[str]:
@@ -356,12 +356,12 @@ def _reference_columns(
             _turned(values) if name == "azimuth" else _trimmed(values, reference.values)
         )
     if name in readings.sd and (columns or name == "gravity"):
-        spread = readings.uncertainty(name)
+        sd = readings.uncertainty(name)
         usual = _reference_uncertainty(profile, name, np.array(np.nan))
-        if not np.allclose(spread, usual, rtol=1e-12, atol=0.0):
+        if not np.allclose(sd, usual, rtol=1e-12, atol=0.0):
             repeated = profile.stand.repeatability(_quantity(name))
-            own = (spread / reference.factor) ** 2 - repeated**2
-            columns[f"sd_{reference.column}"] = np.sqrt(np.maximum(own, 0.0))
+            variance = (sd / reference.factor) ** 2 - repeated**2
+            columns[f"sd_{reference.column}"] = np.sqrt(np.maximum(variance, 0.0))
     return columns
 
 

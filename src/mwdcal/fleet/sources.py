@@ -100,9 +100,9 @@ def open_source(path: Path) -> Source:
     paths = _paths(path)
     files = [_look(file, path) for file in paths]
     columns = files[0].columns
-    for file, found in zip(paths, files, strict=True):
-        if set(found.columns) != set(columns):
-            odd = sorted(set(found.columns) ^ set(columns))[0]
+    for file, described in zip(paths, files, strict=True):
+        if set(described.columns) != set(columns):
+            odd = sorted(set(described.columns) ^ set(columns))[0]
             raise InputError(
                 f"{file}: all files of '{path.name}' must have the same columns; '{odd}' is in some "
                 f"and not in others ({paths[0].name} …). Write the table again."
@@ -142,22 +142,22 @@ def _joined(name: str, files: Sequence[_File]) -> Source:
 
 def _agreed(stated: Sequence[Mapping[str, object]]) -> dict[str, object]:
     """Metadata on which all files agree; simulated is a fleet of which one file is."""
-    found = {k: v for k, v in stated[0].items() if all(k in s and s[k] == v for s in stated)}
-    return found | next(({"simulated": s["simulated"]} for s in stated if is_simulated(s)), {})
+    agreed = {k: v for k, v in stated[0].items() if all(k in s and s[k] == v for s in stated)}
+    return agreed | next(({"simulated": s["simulated"]} for s in stated if is_simulated(s)), {})
 
 
 def _paths(path: Path) -> list[Path]:
     """The Parquet files of a table: itself, or all in a folder, in order of their names."""
     if path.is_dir():
         hidden = ("_", ".")
-        found = sorted(
+        paths = sorted(
             file
             for file in path.rglob("*.parquet")
             if not any(part.startswith(hidden) for part in file.relative_to(path).parts)
         )
-        if not found:
+        if not paths:
             raise InputError(f"'{path}' is a folder without .parquet files. Name a Parquet table.")
-        return found
+        return paths
     if not path.exists():
         raise InputError(f"'{path}': no such file. Check the name and the folder.")
     if path.suffix.lower() != ".parquet":
@@ -173,8 +173,8 @@ def _look(file: Path, root: Path) -> _File:
     arrow, pq = parquet.modules(str(file))
     with parquet.reading(str(file)), pq.ParquetFile(file) as opened:
         schema, keys = opened.schema_arrow, _keys(file, root)
-        every = dict.fromkeys((*schema.names, *dict(keys)))
-        names = tuple(n for n in every if not n.startswith("__index"))
+        columns = dict.fromkeys((*schema.names, *dict(keys)))
+        names = tuple(n for n in columns if not n.startswith("__index"))
         for name in set(contract.COLUMNS).difference(LABELS).intersection(schema.names):
             _check_numeric(schema.field(name).type, name, file)
         kind = schema.field(SERIAL).type if SERIAL in schema.names else arrow.string()
@@ -199,20 +199,20 @@ def pieces_of(file: Path, about: Any, keys: Keys = ()) -> list[Piece]:
 def _keys(file: Path, root: Path) -> Keys:
     """The columns that the names of a file's folders state, below the folder of the table."""
     folders = file.relative_to(root).parent.parts if root.is_dir() else ()
-    found: dict[str, str | float | None] = {}
+    keys: dict[str, str | float | None] = {}
     for folder in folders:
         name, equals, value = (unquote(part) for part in folder.partition("="))
         if not equals:
             continue
-        found[name] = None if value in BLANK else value
+        keys[name] = None if value in BLANK else value
         if name == SERIAL and value in BLANK:
             raise InputError(
                 f"{file.parent}, column '{SERIAL}': must be filled in; the folder '{folder}' stands for "
                 "a blank cell. Say which tool these stations belong to."
             )
-        if name in contract.COLUMNS and name not in LABELS and found[name] is not None:
-            found[name] = _number(value, name, file)
-    return tuple(found.items())
+        if name in contract.COLUMNS and name not in LABELS and keys[name] is not None:
+            keys[name] = _number(value, name, file)
+    return tuple(keys.items())
 
 
 def _number(value: str, name: str, file: Path) -> float:

@@ -164,27 +164,27 @@ def find_noise(
     first, last, rate = _section(log, sampling_hz, between, findings)
     seconds = (last - first) / rate
     station = _station_seconds(station_seconds, seconds, rate, log.source)
-    found: dict[str, ChannelNoise] = {}
+    channels: dict[str, ChannelNoise] = {}
     for name in (name for name in RAW if name in log.columns):
         say(f"Allan variances of {name}, {last - first} samples")
         taken = _samples(log, name, first, last, rate, findings)
         if taken is not None:
-            found[name] = _channel(name, *taken, station, kind, findings)
-    if not found:
+            channels[name] = _channel(name, *taken, station, kind, findings)
+    if not channels:
         raise InputError(
             f"{log.source}: no channel that could be used. {' '.join(f.text for f in findings)}"
         )
     if profile is not None:
-        found = {name: _physical(name, channel, profile) for name, channel in found.items()}
-    withheld = _withheld(found)
+        channels = {name: _physical(name, channel, profile) for name, channel in channels.items()}
+    withheld = _withheld(channels)
     return Noise(
         log=log.source,
         seconds=seconds,
         kind=kind,
         station_seconds=station,
         simulated=is_simulated(log.metadata),
-        channels=found,
-        profile=_recommended(found, withheld, findings),
+        channels=channels,
+        profile=_recommended(channels, withheld, findings),
         withheld=withheld,
         findings=findings,
     )
@@ -250,11 +250,11 @@ def _compare_rates(
     """A word where the column of times says something else than the rate that was given."""
     time = numbers(log, TIME)[first:last]
     whole = float(time[-1] - time[0])
-    own = (len(time) - 1) / whole if whole > 0 else np.inf
-    if not abs(own / given - 1) < RATE:
+    measured = (len(time) - 1) / whole if whole > 0 else np.inf
+    if not abs(measured / given - 1) < RATE:
         text = (
             f"--sampling-hz {given:g} was used, but {TIME} goes from {time[0]:g} to {time[-1]:g} s in "
-            f"{len(time)} rows ({own:.6g} Hz): all times and densities rest on the rate given."
+            f"{len(time)} rows ({measured:.6g} Hz): all times and densities rest on the rate given."
         )
         findings.append(Finding(id="rate", text=text))
 
@@ -327,19 +327,19 @@ def _channel(
     """The noise of one channel; samples are counted inside, seconds outside."""
     factors = allan.octaves(len(value))
     moments = allan.moments(len(value), factors)
-    asked = moments if kind == "overlapping" else allan.moments(len(value), factors, kind)
+    requested = moments if kind == "overlapping" else allan.moments(len(value), factors, kind)
     centred = allan.variance(value, factors, centred=True)
     slope = np.asarray(allan.drift(value))
     terms = noise_terms.fit(centred[None], slope[None], moments)
     plain = allan.deviation(value, factors, kind)
-    freedom = allan.freedom(asked, terms.bounded, terms.steady, terms.covariance)[0]
+    freedom = allan.freedom(requested, terms.bounded, terms.steady, terms.covariance)[0]
     lower, upper = allan.band(plain, freedom)
-    fitted = terms.bounded @ np.swapaxes(asked.plain_mean, -1, -2)
+    fitted = terms.bounded @ np.swapaxes(requested.plain_mean, -1, -2)
     fitted = np.sqrt(fitted[0] + (terms.steady * moments.averaging) ** 2 / 2)
     named = _terms(terms, rate)
     white = named["white"].value
-    said = _findings(name, value, rate, station, moments, terms)
-    findings += said
+    remarks = _findings(name, value, rate, station, moments, terms)
+    findings += remarks
     return ChannelNoise(
         samples=len(value),
         sampling_hz=rate,
@@ -354,7 +354,7 @@ def _channel(
         white_density=None if white is None else float(np.sqrt(2)) * white,
         fit_from_s=float(moments.averaging[terms.start[0]] / rate),
         chance=float(terms.chance[0]),
-        doubts=[finding.id for finding in said if finding.id in DOUBTS],
+        doubts=[finding.id for finding in remarks if finding.id in DOUBTS],
         station=_station(value, station * rate, moments, terms),
     )
 
@@ -370,19 +370,19 @@ def _drifts(terms: Terms) -> Array:
 def _terms(terms: Terms, rate: float) -> dict[str, Term]:
     """The terms of the one record, in units of the channel and seconds."""
     factors = dict(zip(UNITS, (1 / rate, rate**-0.5, 1.0, rate**0.5, rate), strict=True))
-    found = {}
+    by_name = {}
     for i, name in enumerate(allan.TERMS):
         shown = bool(terms.determined[0, i])
         size = float(np.sqrt(max(terms.square[0, i], 0.0))) * factors[name]
         spread = float(np.sqrt(terms.covariance[0, i, i])) * factors[name] ** 2
-        found[name] = Term(
+        by_name[name] = Term(
             value=size if shown else None,
             standard_uncertainty=spread / (2 * size) if shown else None,
             lower=float(np.sqrt(terms.lower[0, i])) * factors[name],
             upper=float(np.sqrt(terms.upper[0, i])) * factors[name],
             unit=UNITS[name],
         )
-    return {**found, "drift": _drift(terms, rate)}
+    return {**by_name, "drift": _drift(terms, rate)}
 
 
 def _drift(terms: Terms, rate: float) -> Term:
@@ -473,33 +473,36 @@ def _physical(name: str, channel: ChannelNoise, profile: Profile) -> ChannelNois
     return msgspec.structs.replace(channel, unit=PHYSICAL[kind], scale=float(scale))
 
 
-def _withheld(found: dict[str, ChannelNoise]) -> dict[str, str]:
+def _withheld(channels: dict[str, ChannelNoise]) -> dict[str, str]:
     """Why there is no noise to recommend, for each triad where that is so."""
     reasons = {}
     for kind, names in CHANNELS.items():
-        own: dict[str, list[str]] = {}
-        for name in (name for name in names if name in found and found[name].doubts):
-            reason = " and ".join(DOUBTS[doubt] for doubt in found[name].doubts)
-            own.setdefault(reason, []).append(name)
-        if own:
-            reasons[kind] = "; ".join(f"{', '.join(who)}: {why}" for why, who in own.items())
+        by_reason: dict[str, list[str]] = {}
+        for name in (name for name in names if name in channels and channels[name].doubts):
+            reason = " and ".join(DOUBTS[doubt] for doubt in channels[name].doubts)
+            by_reason.setdefault(reason, []).append(name)
+        if by_reason:
+            reasons[kind] = "; ".join(f"{', '.join(who)}: {why}" for why, who in by_reason.items())
     return reasons
 
 
 def _recommended(
-    found: dict[str, ChannelNoise], withheld: dict[str, str], findings: list[Finding]
+    channels: dict[str, ChannelNoise], withheld: dict[str, str], findings: list[Finding]
 ) -> dict[str, float]:
     """The noise of one station for each triad that holds: root mean square of its channels."""
     profile = {}
     for kind, names in CHANNELS.items():
-        own = {name: found[name].station.noise for name in names if name in found}
-        if not own or kind in withheld:
+        stations = {name: channels[name].station.noise for name in names if name in channels}
+        if not stations or kind in withheld:
             continue
-        profile[kind] = root_mean_square(list(own.values()))
-        noisy, quiet = max(own, key=lambda n: own[n]), min(own, key=lambda n: own[n])
-        if own[noisy] > UNEVEN * own[quiet]:
+        profile[kind] = root_mean_square(list(stations.values()))
+        noisy, quiet = (
+            max(stations, key=lambda n: stations[n]),
+            min(stations, key=lambda n: stations[n]),
+        )
+        if stations[noisy] > UNEVEN * stations[quiet]:
             text = (
-                f"{noisy} has {own[noisy] / own[quiet]:.1f} times the noise of {quiet}; the profile has one "
+                f"{noisy} has {stations[noisy] / stations[quiet]:.1f} times the noise of {quiet}; the profile has one "
                 f"figure for the {kind}, their root mean square. Is {noisy} in order?"
             )
             findings.append(Finding(id="uneven", text=text))

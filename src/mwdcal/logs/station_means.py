@@ -116,15 +116,15 @@ def _silent(done: int) -> None:
 
 
 def summarise_all(
-    rests: Sequence[Rest], resolution: float, said: Callable[[int], None] = _silent
+    rests: Sequence[Rest], resolution: float, say: Callable[[int], None] = _silent
 ) -> list[Summary]:
     """What a channel read at each standstill; `said` is told how many are done."""
     noise = pooled(rests, resolution)
-    made = []
+    summaries = []
     for rest in rests:
-        made.append(summarise(*rest, resolution, noise))
-        said(len(made))
-    return made
+        summaries.append(summarise(*rest, resolution, noise))
+        say(len(summaries))
+    return summaries
 
 
 class Correlated(NamedTuple):
@@ -149,19 +149,25 @@ def correlated(channels: Sequence[Sequence[Summary]]) -> Correlated:
     """
     from scipy.special import chdtri, fdtri
 
-    clear = [[m for m in own if not m.stuck] for own in channels]
+    clear = [[m for m in summaries if not m.stuck] for summaries in channels]
     count = sum(map(len, clear))
     if count < HALVES or not all(clear):
         return Correlated(np.zeros(len(channels)), False)
-    halves: Array = np.array([_typical([m.halves * m.used for m in own]) for own in clear])
-    told = [m for own in clear for m in own if m.quarters == m.quarters]
-    quarters = _typical([m.quarters * m.used for m in told]) if told else 0.0
-    growth = _typical([m.halves * m.used for m in told]) / quarters if quarters else 0.5
-    claimed = np.array([float(np.median([m.sd**2 * m.used for m in own])) for own in clear])
-    parts = claimed / [len(own) for own in clear]
+    halves: Array = np.array(
+        [_typical([m.halves * m.used for m in summaries]) for summaries in clear]
+    )
+    quartered = [m for summaries in clear for m in summaries if m.quarters == m.quarters]
+    quarters = _typical([m.quarters * m.used for m in quartered]) if quartered else 0.0
+    growth = _typical([m.halves * m.used for m in quartered]) / quarters if quarters else 0.5
+    claimed = np.array(
+        [float(np.median([m.sd**2 * m.used for m in summaries])) for summaries in clear]
+    )
+    parts = claimed / [len(summaries) for summaries in clear]
     freedom = claimed.sum() ** 2 / (claimed @ parts)  # Satterthwaite: a noisy channel counts most
     more = halves.sum() > chdtri(freedom, CHANCE) / freedom * claimed.sum()
-    more |= growth > 0.5 * fdtri(max(len(told), 1), max(2 * len(told), 1), 1 - np.array(GROWN))
+    more |= growth > 0.5 * fdtri(
+        max(len(quartered), 1), max(2 * len(quartered), 1), 1 - np.array(GROWN)
+    )
     widens, plain = (bool(one) for one in more & (growth < GROWTH))
     return Correlated(halves * beyond(growth) if widens else 0 * halves, plain)
 
@@ -189,10 +195,11 @@ def beyond(growth: float) -> float:
     return float(np.interp(growth, halves / quarters, variance(time) / halves))
 
 
-def widened(made: Sequence[Summary], variance: float) -> list[Summary]:
+def widened(summaries: Sequence[Summary], variance: float) -> list[Summary]:
     """The same with at least this variance of a sample's worth of mean."""
     return [
-        m if m.stuck else m._replace(sd=max(m.sd, (float(variance) / m.used) ** 0.5)) for m in made
+        m if m.stuck else m._replace(sd=max(m.sd, (float(variance) / m.used) ** 0.5))
+        for m in summaries
     ]
 
 
@@ -367,15 +374,15 @@ def _shared_spread(value: Array, step: float, noise: Noise) -> float:
     """
     from scipy.special import chdtri
 
-    own, freedom = float(value.std()), max(len(value) - 1, 1)
+    spread, freedom = float(value.std()), max(len(value) - 1, 1)
     if not noise.freedom:
-        return own
+        return spread
     least = noise.least**2
     if noise.least < 2 * step:
         variances, _, lowest = _dither()
         least = step**2 * float(np.interp((noise.least / step) ** 2, variances, lowest))
     quiet = least * chdtri(freedom, 1 - SIGNIFICANT) / UNUSUAL**2
-    return own if len(value) * own**2 < quiet else noise.least
+    return spread if len(value) * spread**2 < quiet else noise.least
 
 
 def _spike_scale(count: int, spread: float, noise: Noise) -> float:
@@ -408,8 +415,8 @@ def _is_unsteady(value: Array, resolution: float, noise: Noise) -> bool:
     spreads = len(value) * value.var() > usual**2 * limit
     if len(value) < 3 * PARTS:
         return bool(spreads)
-    own = max(noise.rough, resolution) / (len(value) / PARTS) ** 0.5
-    return bool(spreads or np.ptp(_blocks(value)) > WANDERS * own)
+    scatter = max(noise.rough, resolution) / (len(value) / PARTS) ** 0.5
+    return bool(spreads or np.ptp(_blocks(value)) > WANDERS * scatter)
 
 
 def _mean_variance(value: Array, noise: Noise, lost: int = 1) -> tuple[float, float, float]:

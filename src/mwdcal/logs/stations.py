@@ -128,23 +128,23 @@ def find_stations(
         value, stretch = standstill.choose_threshold(activity.value, least, highest)
         if np.isnan(value):  # nothing lasts: what comes nearest
             value, stretch = highest, None
-    found = standstill.standstills(activity, limits, value, shortest, trim, slow)
-    found = _with_samples(found, traces, findings)
-    findings += noisy_rests(activity, limits, found, value, shortest + 2 * trim)
-    made = Stations(
-        Table({}, log.metadata, log.source), found, activity, value, stretch, shortest, trim, time,
+    standstills = standstill.standstills(activity, limits, value, shortest, trim, slow)
+    standstills = _with_samples(standstills, traces, findings)
+    findings += noisy_rests(activity, limits, standstills, value, shortest + 2 * trim)
+    stations = Stations(
+        Table({}, log.metadata, log.source), standstills, activity, value, stretch, shortest, trim, time,
         traces, findings,
     )  # fmt: skip
-    if not found.taken.any():
-        raise StandstillError(_none(made), made)
-    start, end = found.start[found.taken], found.end[found.taken]
+    if not standstills.taken.any():
+        raise StandstillError(_none(stations), stations)
+    start, end = standstills.start[standstills.taken], standstills.end[standstills.taken]
     rows = _summaries(traces, start, end, findings, say)
     columns = _columns(log, time, rows, start, end)
     columns |= _temperatures(temperature, start, end, findings)
-    findings += about(rows, found, float(time[-1] - time[0]) - 2 * trim)
+    findings += about(rows, standstills, float(time[-1] - time[0]) - 2 * trim)
     metadata = {**log.metadata, "log": log.source, "log_sha256": log.digest}
     table = Table(_ordered(columns), metadata, log.source, range(1, len(start) + 1))
-    return replace(made, table=table)
+    return replace(stations, table=table)
 
 
 def _check(name: str, value: float | None) -> None:
@@ -166,11 +166,11 @@ def _short(log: Table, time: Array, traces: dict[str, Trace]) -> InputError:
     )
 
 
-def _none(made: Stations) -> str:
+def _none(stations: Stations) -> str:
     """Why there is no station."""
-    longest = float((made.found.end - made.found.start).max(initial=0.0))
-    moving = int(np.count_nonzero(~made.found.short))
-    trimmed = f"after {made.trim_seconds:g} s trimmed off each end"
+    longest = float((stations.found.end - stations.found.start).max(initial=0.0))
+    moving = int(np.count_nonzero(~stations.found.short))
+    trimmed = f"after {stations.trim_seconds:g} s trimmed off each end"
     if moving:
         word = "interval moves" if moving == 1 else "intervals move"
         seen = f"{moving} long calm {word} on slowly by more than a standstill can"
@@ -179,7 +179,7 @@ def _none(made: Stations) -> str:
     else:
         seen = f"nothing is left {trimmed}"
     return (
-        f"{made.table.source}: no standstill of at least {made.min_seconds:g} s; {seen}. Stand still "
+        f"{stations.table.source}: no standstill of at least {stations.min_seconds:g} s; {seen}. Stand still "
         "for longer, lower --min-seconds or --trim-seconds, or set --threshold; --plot shows the log."
     )
 
@@ -236,29 +236,31 @@ def _traces(
     log: Table, time: Array, findings: list[Finding]
 ) -> tuple[dict[str, Trace], Trace | None]:
     """The raw channels that have samples, and the temperature."""
-    own = {name: _trace(log, time, name) for name in (*RAW, "temperature_c") if name in log.columns}
-    magnetometer = [name for name in CHANNELS["magnetometer"] if name in own]
-    if magnetometer and not any(len(own[name][0]) for name in magnetometer):
+    traces = {
+        name: _trace(log, time, name) for name in (*RAW, "temperature_c") if name in log.columns
+    }
+    magnetometer = [name for name in CHANNELS["magnetometer"] if name in traces]
+    if magnetometer and not any(len(traces[name][0]) for name in magnetometer):
         text = "mx, my and mz are blank from end to end: the stations have no magnetometer."
         findings.append(Finding(id="no-magnetometer", text=text))
-        own = {name: trace for name, trace in own.items() if name not in magnetometer}
-    for name, (values, _) in own.items():
+        traces = {name: trace for name, trace in traces.items() if name not in magnetometer}
+    for name, (values, _) in traces.items():
         if not len(values) and name in RAW:
             raise InputError(
                 f"{log.source}, column '{name}': must have samples; every cell is blank. Check the "
                 "logger and the order of the columns, or leave out the triad."
             )
-        if name in RAW and np.ptp(own[name][1]) == 0:
-            text = f"{name} reads {own[name][1][0] + 0.0:g} from end to end: a dead channel?"
+        if name in RAW and np.ptp(traces[name][1]) == 0:
+            text = f"{name} reads {traces[name][1][0] + 0.0:g} from end to end: a dead channel?"
             findings.append(Finding(id="dead-channel", text=text))
-    temperature = own.pop("temperature_c", None)
+    temperature = traces.pop("temperature_c", None)
     if temperature is not None:
         temperature = _possible(temperature, findings)
     if temperature is not None and not len(temperature[0]):
         text = "temperature_c is blank from end to end: the stations have no temperature."
         findings.append(Finding(id="no-temperature", text=text))
         temperature = None
-    return own, temperature
+    return traces, temperature
 
 
 def _trace(log: Table, time: Array, name: str) -> Trace:
@@ -314,9 +316,9 @@ def _torn(activity: Activity, names: list[str], findings: list[Finding]) -> list
         return []
     cell = float(activity.edge[1] - activity.edge[0])
     torn = []
-    for own in activity.cells:
-        between = np.append(own.start[1:] - own.end[:-1], 0.0)
-        torn.append(own.torn | (between > max(cell, standstill.FEWEST * own.step)))
+    for channel in activity.cells:
+        between = np.append(channel.start[1:] - channel.end[:-1], 0.0)
+        torn.append(channel.torn | (between > max(cell, standstill.FEWEST * channel.step)))
     worst = max(range(len(torn)), key=lambda i: np.count_nonzero(torn[i]))
     if not torn[worst].any():
         return []
@@ -329,8 +331,10 @@ def _torn(activity: Activity, names: list[str], findings: list[Finding]) -> list
 
 def _equal_times(log: Table, time: Array, names: list[str]) -> list[Finding]:
     """Samples of a channel at one time; rows of different channels may share theirs."""
-    there = {name: ~np.isnan(numbers(log, name)) for name in names}
-    twice = {name: int(np.count_nonzero(np.diff(time[own]) == 0)) for name, own in there.items()}
+    present = {name: ~np.isnan(numbers(log, name)) for name in names}
+    twice = {
+        name: int(np.count_nonzero(np.diff(time[filled]) == 0)) for name, filled in present.items()
+    }
     name = max(twice, key=lambda n: twice[n])
     if not twice[name]:
         return []
@@ -350,14 +354,14 @@ def _limits(activity: Activity, traces: dict[str, Trace]) -> tuple[Array, list[S
         for name, trace in traces.items()
     }
     limits, slow = [], []
-    for name, own in cut.items():
+    for name, channel in cut.items():
         triad = next(kind for kind in CHANNELS.values() if name in kind)
         levels = [cut[n].level for n in triad if n in cut and len(cut[n].level)]
         size = standstill.triad_size(levels) if levels else 0.0
         if name in cells:
-            limits.append(standstill.rest_limit(own, size))
+            limits.append(standstill.rest_limit(channel, size))
         else:
-            noise = max(own.rough, own.resolution)
+            noise = max(channel.rough, channel.resolution)
             slow.append(Slow(*traces[name], max(standstill.STEP * size, standstill.NOISE * noise)))
     return np.array(limits), slow
 
@@ -368,21 +372,21 @@ def _within(time: Array, start: Array, end: Array) -> tuple[Ints, Ints]:
 
 
 def _with_samples(
-    found: Standstills, traces: dict[str, Trace], findings: list[Finding]
+    standstills: Standstills, traces: dict[str, Trace], findings: list[Finding]
 ) -> Standstills:
     """The same, without stations for which a slow channel has hardly a sample."""
-    enough = np.ones(len(found.start), bool)
+    enough = np.ones(len(standstills.start), bool)
     for time, _ in traces.values():
-        first, last = _within(time, found.start, found.end)
+        first, last = _within(time, standstills.start, standstills.end)
         enough &= last - first >= LEAST_SAMPLES
-    poor = int(np.count_nonzero(found.taken & ~enough))
+    poor = int(np.count_nonzero(standstills.taken & ~enough))
     if poor:
         text = (
             f"{count(poor, 'standstill')} left out: a channel has fewer than {LEAST_SAMPLES} samples there. "
             "Stand still for longer, or sample it faster."
         )
         findings.append(Finding(id="few-samples", text=text))
-    return found._replace(taken=found.taken & enough, short=found.short | ~enough)
+    return standstills._replace(taken=standstills.taken & enough, short=standstills.short | ~enough)
 
 
 def _summaries(
@@ -396,20 +400,23 @@ def _summaries(
         places = zip(*_within(time, start, end), strict=True)
         rests = [(time[a:b], value[a:b]) for a, b in places]
 
-        def said(done: int, name: str = name) -> None:
+        def progress(done: int, name: str = name) -> None:
             say(f"station {done} of {len(start)}, {name}")
 
-        summaries[name] = summarise_all(rests, float(resolution), said)
+        summaries[name] = summarise_all(rests, float(resolution), progress)
     for triad in CHANNELS.values():
-        own = [name for name in triad if name in summaries]
-        told = correlated([summaries[name] for name in own])
-        made = {n: widened(summaries[n], float(v)) for n, v in zip(own, told.variance, strict=True)}
+        names = [name for name in triad if name in summaries]
+        correlation = correlated([summaries[name] for name in names])
+        wider = {
+            n: widened(summaries[n], float(v))
+            for n, v in zip(names, correlation.variance, strict=True)
+        }
         grown = [
-            a.sd > TOLD * b.sd for n in own for a, b in zip(made[n], summaries[n], strict=True)
+            a.sd > TOLD * b.sd for n in names for a, b in zip(wider[n], summaries[n], strict=True)
         ]
-        if told.plain and 2 * sum(grown) > len(grown):
-            findings.append(correlated_noise(own))
-        summaries |= made
+        if correlation.plain and 2 * sum(grown) > len(grown):
+            findings.append(correlated_noise(names))
+        summaries |= wider
     return summaries
 
 
@@ -425,8 +432,8 @@ def _columns(
         "samples": np.asarray(last - first, float),
     }
     for prefix, part in PARTS.items():
-        for name, found in rows.items():
-            columns[prefix + name] = np.array([float(getattr(row, part)) for row in found])
+        for name, summaries in rows.items():
+            columns[prefix + name] = np.array([float(getattr(row, part)) for row in summaries])
     columns["drifting"] = [
         " ".join(n for n in rows if rows[n][i].drifts) for i in range(len(start))
     ]
@@ -444,7 +451,7 @@ def _temperatures(
         return {}
     ends = zip(start, end, strict=True)
     lag = GAP * standstill.time_step(temperature[0])
-    warmth = np.array([_temperature(*temperature, *own, lag) for own in ends])
+    warmth = np.array([_temperature(*temperature, *interval, lag) for interval in ends])
     blank = np.flatnonzero(np.isnan(warmth[:, 0])) + 1
     if blank.size:
         text = (
@@ -464,8 +471,8 @@ def _temperature(
     """
     first, last = np.searchsorted(time, [start, end])
     if last - first >= standstill.WINDOW:
-        found = summarise(time[first:last], value[first:last], 0.0)
-        return found.mean, found.drift
+        summary = summarise(time[first:last], value[first:last], 0.0)
+        return summary.mean, summary.drift
     before = time[first - 1] if first else -np.inf
     after = time[last] if last < len(time) else np.inf
     if last == first and min(start - before, after - end) > lag:

@@ -148,8 +148,8 @@ class TextSink:
         odd = np.zeros(len(rows), bool)
         for cells in rows.columns:
             if self._arrow.types.is_string(cells.type):
-                found = compute.match_substring_regex(cells, f'["\r\n{self._delimiter}]')
-                odd |= found.fill_null(False).to_numpy()
+                quoted = compute.match_substring_regex(cells, f'["\r\n{self._delimiter}]')
+                odd |= quoted.fill_null(False).to_numpy()
         return odd
 
     def write(self, rendered: bytes) -> None:
