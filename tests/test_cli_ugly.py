@@ -317,7 +317,7 @@ def test_a_log_is_no_run(tmp_path, mark):
     metadata = ["sampling_hz = 100"] if mark == "sampling_hz" else []
     path = write_csv(tmp_path / "run.csv", many, *metadata)
     message = refused(calibrate(tmp_path, path, "--order", 0), 2)
-    assert "run.csv is a continuous log (1004 rows): its rows are no stations." in message
+    assert "run.csv is a continuous log (1004 rows): its rows are not stations." in message
     assert message.endswith("If each row is a station, remove time_s and sampling_hz.")
     assert "continuous log" in refused(mwdcal("compare", path), 2)
     assert not left(tmp_path)

@@ -107,7 +107,7 @@ def check_columns(names: Sequence[str], source: str) -> None:
 def check_near_misses(names: Collection[str], contract: Sequence[str], what: str) -> None:
     """Refuse a name that differs from an absent one of the contract in case or unit only.
 
-    Such a column would be ignored in silence; any other unknown column is the user's own.
+    Such a column would be ignored silently; any other unknown column is the user's.
     """
     present = set(names)
     expected = {form: name for name in contract if name not in present for form in _forms(name)}

@@ -49,7 +49,7 @@ _EXAMPLE = "--columns time_s,ax,ay,az"
 
 
 Say = Callable[[str], None]
-"""Where a long computation says how far it has come."""
+"""Called with the progress of a long computation, in words."""
 
 
 def silent(text: str) -> None:
@@ -74,8 +74,8 @@ def read(
 ) -> Table:
     """The columns of a log that mean something, as numbers (NaN: blank), and its metadata.
 
-    `names` are the columns of a text log without a line of column names. `say` is told how
-    far the reading has come. Errors name file, line and column.
+    `names` are the columns of a text log without a line of column names. `say` receives
+    the progress. Errors name file, line and column.
     """
     file = Path(path)
     typed = file.suffix.lower() in _TYPED

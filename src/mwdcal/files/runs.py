@@ -55,21 +55,21 @@ def check_run(table: Table) -> None:
         )
     if table.count > MANY and ("time_s" in table.columns or "sampling_hz" in table.metadata):
         raise InputError(
-            f"{table.source} is a continuous log ({table.count} rows): its rows are no stations. Find "
+            f"{table.source} is a continuous log ({table.count} rows): its rows are not stations. Find "
             f"the standstills first: mwdcal stations {table.source} -o run.csv. If each row is a "
             "station, remove time_s and sampling_hz."
         )
 
 
 def serials(metadata: Mapping[str, object], cells: Iterable[str]) -> list[str]:
-    """Serials of the tools, that of the metadata first; behind two of them '…' stands for the rest."""
+    """Serials of the tools, that of the metadata first; at most two, then '…' for the rest."""
     stated = metadata.get("serial")
     known = dict.fromkeys([*([] if stated is None else [str(stated)]), *filter(None, cells)])
     return [*[*known][:2], *["…"] * (len(known) > 2)]
 
 
 def identified(metadata: Mapping[str, object], cells: Sequence[str]) -> Mapping[str, object]:
-    """The metadata, with the serials that cells state beside their own."""
+    """The metadata, with the serials of a column joined to its own."""
     tools = serials(metadata, cells) if cells else []
     return {**metadata, "serial": ", ".join(tools)} if tools else metadata
 

@@ -1,8 +1,8 @@
 """Columns that are not of the contract, and which column of the contract each resembles.
 
 A name is taken apart into words and a unit: `Azi (deg)`, `ref_azm`, `AZIMUTH_TRUE` all resemble
-`ref_azimuth_deg`. What resembles a reference or the temperature would be missed in silence, and is
-refused where the contract's own column is absent. Nothing is ever taken for what it resembles.
+`ref_azimuth_deg`. A column that resembles a reference or the temperature would be ignored silently, and is
+refused where the contract's own column is absent. A column is never used under the name it resembles.
 """
 
 from __future__ import annotations
@@ -53,11 +53,11 @@ CONVERSIONS = {
     "mT": "nT = mT · 1e6",
     "gauss": "nT = gauss · 1e5",
 }
-"""What makes the contract's unit of another one."""
+"""How another unit is converted into that of the contract."""
 _WARM = ("°C", "°F", "K")
 _MAGNETIC = ("nT", "µT", "mT", "gauss")
 _STATED = {"ref", "reference", "local"}
-"""Words that say that a column is given, not measured."""
+"""Words of columns that are known, not measured."""
 _BYWORDS = _STATED | {
     *("true", "grid", "mag", "magnetic", "stand", "nominal", "target", "given", "set", "angle"),
     *("value", "tool", "mwd", "survey", "measured", "meas", "calc", "calculated", "computed"),
@@ -82,7 +82,7 @@ _INSTEAD = {
 }
 _SYNONYMS = {word: column for column, words in _INSTEAD.items() for word in words.split()}
 _NEVER = {"mtf", "magnetictoolface", "magtoolface"}
-"""A magnetic toolface is no reference of the contract."""
+"""A magnetic toolface is not a reference of the contract."""
 SHOWN = {
     "ref_inclination_deg": "°",
     "ref_azimuth_deg": "° from magnetic north, or from what the metadata azimuth_reference says",
@@ -92,7 +92,7 @@ SHOWN = {
     "ref_dip_deg": "°",
     "temperature_c": "°C",
 }
-"""Columns that may not be missed, with their units."""
+"""Columns that must not be overlooked, with their units."""
 OURS = ("time_s", "start_s", "end_s", "samples", "drifting", "serial")
 """Columns beyond the contract that mwdcal itself reads or writes in run files."""
 _LONGEST = 40
@@ -159,7 +159,7 @@ def _words(name: str) -> list[str]:
 
 
 def _without_unit(words: list[str]) -> tuple[list[str], str]:
-    """The words before a unit, and the unit; a lone word is no unit."""
+    """The words before a unit, and the unit; a single word is not a unit."""
     left, unit = list(words), ""
     while len(left) > 1 and left[-1] in UNITS and not set(left[:-1]) <= _STATED | {"total"}:
         unit = unit or UNITS[left[-1]]

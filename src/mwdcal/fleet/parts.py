@@ -82,7 +82,7 @@ def solve(plan: Plan, loaded: bytes) -> bytes:
     """Calibrate the tools of loaded rows: a table in Arrow's stream format, one row per tool."""
     if plan.version != __version__:
         raise InputError(
-            f"the worker has mwdcal {__version__}, the command is of {plan.version}. Install the "
+            f"the worker runs mwdcal {__version__}, the command {plan.version}. Install the "
             "same version everywhere."
         )
     arrow, _ = parquet.modules(plan.source)

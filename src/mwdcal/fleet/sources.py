@@ -1,4 +1,4 @@
-"""What a fleet is read from: a Parquet file or a folder of them, and what these say of their rows.
+"""The input of a fleet: a Parquet file or a folder of them, and what they state about their rows.
 
 Names of folders (`serial=MWD-17`) state a column of the rows below them. The metadata of a file
 hold for its own rows: which north their azimuths count from becomes a column of the table.
@@ -28,7 +28,7 @@ OFFSET = "#offset"
 """Column of stated azimuth minus magnetic azimuth, °; there where a file's metadata say so."""
 AZIMUTH = REFERENCES["azimuth"].column
 BLANK = ("", "__HIVE_DEFAULT_PARTITION__")
-"""What folder names say of a blank cell."""
+"""How folder names spell a blank cell."""
 LARGEST_GROUP = 20_000_000
 """Rows of the largest row group that is read; it is dealt as a whole."""
 
@@ -96,7 +96,7 @@ class _File:
 
 
 def open_source(path: Path) -> Source:
-    """The table at `path`, its columns checked; refuses what is no table of many tools."""
+    """The table at `path`, its columns checked; refuses what is not a table of many tools."""
     paths = _paths(path)
     files = [_look(file, path) for file in paths]
     columns = files[0].columns
@@ -141,7 +141,7 @@ def _joined(name: str, files: Sequence[_File]) -> Source:
 
 
 def _agreed(stated: Sequence[Mapping[str, object]]) -> dict[str, object]:
-    """Metadata on which all files agree; simulated is a fleet of which one file is."""
+    """Metadata on which all files agree; a fleet is simulated if one file is."""
     agreed = {k: v for k, v in stated[0].items() if all(k in s and s[k] == v for s in stated)}
     return agreed | next(({"simulated": s["simulated"]} for s in stated if is_simulated(s)), {})
 

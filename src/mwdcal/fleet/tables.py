@@ -56,7 +56,7 @@ class Partition:
 class Tools:
     """The `count` tools of a table, in order of first appearance.
 
-    `runs` are the first rows (r,) of stretches of one tool, `tool` (r,) whose each is.
+    `runs` are the first rows (r,) of stretches of one tool, `tool` (r,) the tool of each.
     """
 
     count: int
@@ -102,7 +102,7 @@ def one_chunk(column: Any) -> Any:
 
 
 def _check_stretches(count: int, source: str) -> None:
-    """Refuse rows so mixed that to remember where the tools are would fill the memory."""
+    """Refuse rows so mixed that an index of the tools would fill the memory."""
     if count > MOST_STRETCHES:
         raise InputError(
             f"{source}: the rows change from tool to tool more than {MOST_STRETCHES} times. Sort the "
@@ -224,7 +224,7 @@ def _part(source: Source, first: int, stop: int, tools: int) -> Partition:
 
 
 def _dealt(source: Source, tools: Tools, folder: Path, size: int) -> list[Partition]:
-    """Rows dealt into files by tool; done once, whatever interrupts it."""
+    """Rows dealt into files by tool; what an interrupted command has finished is not done again."""
     _, pq = parquet.modules(source.name)
     rows = np.bincount(tools.tool, np.diff(tools.runs, append=source.rows), tools.count)
     share = max(size, -(-source.rows // MOST_FILES))
@@ -321,7 +321,7 @@ _ONE_AT_A_TIME = Lock()
 
 
 def _rows(piece: Piece, columns: tuple[str, ...], start: int, stop: int) -> list[Any]:
-    """Rows of a row group; partitions next to each other go on where the last one ended."""
+    """Rows of a row group; the next partition continues where the last one ended."""
     with _ONE_AT_A_TIME:
         try:
             if _reading(piece, columns).row > start:

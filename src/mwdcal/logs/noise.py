@@ -30,7 +30,7 @@ from mwdcal.logs.stations import row_times
 from mwdcal.sensor.profile import Profile
 
 FEWEST = 128
-"""Samples of a channel below which the terms cannot be told apart at all."""
+"""Samples of a channel below which the terms cannot be separated."""
 STATION_SECONDS = 30.0
 """Duration of a station, unless the log is too short for it."""
 AVERAGES = 4
@@ -38,22 +38,22 @@ AVERAGES = 4
 SOUND = 10
 """Stations that a log holds where their duration is chosen for it."""
 SPARSE = 1e-3
-"""Share of single blanks that are filled in: they change less than the noise of the noise."""
+"""Largest share of single blanks that are filled in: the change is below the uncertainty of the noise."""
 JITTER = 0.5
 """Share of the sampling interval by which one may differ: more is a gap."""
 EVENT = 8.0
 """Size of a difference, in robust standard deviations, that no noise reaches."""
 ROUNDING = 1e-6
-"""Of a whole number of steps of the converter over another."""
+"""Rounding error of a ratio of whole numbers of steps of the converter."""
 PARTS = 256
 """Averages in a log between which events are looked for."""
 UNEVEN = 2.0
-"""Ratio of the noise of two channels of a triad that is worth a word."""
+"""Ratio of the noise of two channels of a triad that is reported."""
 COARSE = 0.5
 """Noise of one sample, in steps of the converter, below which the steps hide it."""
 DOUBTS = {
     "event": "a spike or a move",
-    "misfit": "noise that is none of the five terms",
+    "misfit": "noise that the five terms do not describe",
     "slow": "less than a sample in a station",
 }
 """Findings after which the figures of a channel do not hold, in words; `slow`: that of a station."""
@@ -191,7 +191,7 @@ def find_noise(
 
 
 def check(between: tuple[float, float], station_seconds: float | None) -> None:
-    """Refuse seconds that no log can have."""
+    """Refuse times that are not possible in any log."""
     start, end = between
     for option, value in (("--from", start), ("--to", end)):
         if np.isnan(value):
@@ -247,7 +247,7 @@ def _section(
 def _compare_rates(
     log: Table, first: int, last: int, given: float, findings: list[Finding]
 ) -> None:
-    """A word where the column of times says something else than the rate that was given."""
+    """A finding where the column of times contradicts the rate that was given."""
     time = numbers(log, TIME)[first:last]
     whole = float(time[-1] - time[0])
     measured = (len(time) - 1) / whole if whole > 0 else np.inf
@@ -287,7 +287,7 @@ def _samples(
     if not there.size:
         problem = f"{name} is blank from end to end."
     elif len(there) < FEWEST:
-        problem = f"{name} has {len(there)} samples, of {FEWEST} needed."
+        problem = f"{name} has {len(there)} samples; {FEWEST} are needed."
     elif np.ptp(value[there]) == 0:
         problem = f"{name} reads {value[there[0]] + 0.0:g} from end to end: a dead channel?"
     elif not (odd := np.flatnonzero(steps != np.median(steps))).size:
@@ -446,7 +446,7 @@ def _findings(
 
 
 def _event(name: str, value: Array, rate: float, least: float, coarse: bool) -> str:
-    """A word on a difference between averages that is no noise: a spike, or a move.
+    """The finding, if any, on a difference between averages too large for noise: a spike, or a move.
 
     `least` is the noise that the steps of the converter can hide: in single samples, and if they
     are `coarse` in averages.
@@ -474,7 +474,7 @@ def _physical(name: str, channel: ChannelNoise, profile: Profile) -> ChannelNois
 
 
 def _withheld(channels: dict[str, ChannelNoise]) -> dict[str, str]:
-    """Why there is no noise to recommend, for each triad where that is so."""
+    """Why no noise is recommended, for each triad that has none."""
     reasons = {}
     for kind, names in CHANNELS.items():
         by_reason: dict[str, list[str]] = {}
@@ -503,7 +503,7 @@ def _recommended(
         if stations[noisy] > UNEVEN * stations[quiet]:
             text = (
                 f"{noisy} has {stations[noisy] / stations[quiet]:.1f} times the noise of {quiet}; the profile has one "
-                f"figure for the {kind}, their root mean square. Is {noisy} in order?"
+                f"figure for the {kind}, their root mean square. Is {noisy} working properly?"
             )
             findings.append(Finding(id="uneven", text=text))
     return profile

@@ -7,7 +7,7 @@ them and C(θ) (m, m) their covariance under noise of the squares θ = (Q², N²
     θ̂ = W V,   W = (Eᵀ C⁻¹ E)⁻¹ Eᵀ C⁻¹,   C at the best θ >= 0, found by iteration.
 
 θ̂ is linear in V, and so unbiased; it may be negative where a term is absent. θ >= 0 (`bounded`)
-is what draws the curve. An interval of one term holds the values t for which θ̂ is no surprise:
+gives the curve. The interval of a term holds the values t under which θ̂ is not improbable:
 its variance under t, with the other terms as bounded, is a quadratic in t, and its law that of a
 gamma variable of that variance, as skew as the term's own share makes it. A term that might be
 absent with a chance of more than `DETECTED` has an upper bound instead; so has one without which
@@ -37,7 +37,7 @@ FEWEST = 6
 ITERATIONS = 8
 """Of the weights; three would do."""
 DETECTED = 0.005
-"""Chance under which a term is no longer taken for absent."""
+"""Chance below which a term counts as present."""
 LEVEL = 0.95
 """Probability of the intervals."""
 CONTRADICTED = 1e-3
@@ -50,7 +50,7 @@ Near 1, where both come from the same readings, to take the larger is to take th
 HALVINGS = 60
 """Of an interval's limit: to the last digits of a number."""
 ALONE = 1e-9
-"""Share of its own variance that a term keeps where it is absent and so are all others."""
+"""Share of its variance that a term keeps where all terms are absent."""
 SMALLEST = 1e-4
 """Eigenvalue of the correlation between averaging factors below which rounding decides."""
 SUBSETS = [s for size in range(1, 5) for s in combinations(range(4), size)]
@@ -240,7 +240,7 @@ def _whitening(unit: Array, squares: Array) -> Array:
 
 
 def _inverse(design: Array) -> Array:
-    """Least-squares inverse (B, 4, m) of designs (B, m, 4), whatever the units of the columns."""
+    """Least-squares inverse (B, 4, m) of designs (B, m, 4), independent of the units of the columns."""
     size = np.sqrt(np.sum(design**2, -2, keepdims=True))
     return np.asarray(np.linalg.pinv(design / size) / np.swapaxes(size, -1, -2))
 

@@ -58,8 +58,8 @@ INTO = 0.15
 class Cells(NamedTuple):
     """One channel in short cells (m,): start, end, median, and whether there is a gap within.
 
-    `step` is the time between samples, `rough` the robust standard deviation of a sample as
-    the difference of successive ones tells it: noise, whatever the tool does. `resolution` is
+    `step` is the time between samples, `rough` the robust standard deviation of a sample from
+    the difference of successive ones: noise, even while the tool moves. `resolution` is
     the step in which readings come.
     """
 
@@ -232,7 +232,7 @@ def activity(channels: Sequence[tuple[Array, Array]]) -> Activity:
     floors, value = [], np.zeros(len(edge) - 1)
     for channel in cells:
         ranges = quietest_range(channel.level)
-        # One step of the readings up or down is no movement.
+        # One step of the readings up or down is not movement.
         floor = max(noise_floor(ranges), (1 + AGREE) * channel.resolution)
         ranges = np.where(channel.torn, np.inf, ranges)
         value = np.maximum(value, on_grid(edge, channel, ranges) / floor)
@@ -380,7 +380,7 @@ def _steps(start: float, end: float, slow: Slow, room: float) -> list[tuple[floa
     """When a slow channel steps within an interval: from when to when nothing is at rest.
 
     Definition: a step is where the medians of three samples before and after differ by more than
-    the channel's limit, all of them within the interval; a spike is none. It lasts from two
+    the channel's limit, all of them within the interval; a spike is not a step. A step lasts from two
     samples before to two after, and `room` seconds more to each side.
     """
     first, last = np.searchsorted(slow.time, [start, end])

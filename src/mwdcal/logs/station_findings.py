@@ -1,4 +1,4 @@
-"""What the reader of a log's stations should know: what was missed, and what is odd at a station."""
+"""Findings about the stations of a log: what was left out, and what is unusual at a station."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mwdcal.logs.standstill import Activity, Standstills
 from mwdcal.logs.station_means import Summary
 
 MANY_SPIKES = 0.01
-"""Share of spikes that is worth a word."""
+"""Share of spikes that is reported."""
 MOST_LISTED = 12
 """Stations, or stretches of time, that a finding names."""
 DAY = 86_400.0

@@ -1,9 +1,10 @@
 """Means of a channel at rest: what it read at each standstill, and how well that is known.
 
-The standstills of one channel share its noise. A long one tells its own, correlation included: the
-autocovariances add up. A short one borrows: its variance is drawn to that of all standstills, as
-if the others had given it some samples more, and its spikes are judged by the spread of all.
-A drift that all of them share is none of it. Readings in coarse steps hide the mean by what their
+The standstills of one channel share its noise. The noise of a long one, with its correlation, is
+estimated from its autocovariances. A short one borrows: its variance is drawn to that of all
+standstills, as if the others had given it some samples more, and its spikes are judged by the
+spread of all.
+A drift that all of them share is not part of it. Readings in coarse steps hide the mean by what their
 noise, all together again, does not dither away.
 Whether the means then scatter as they claim is asked of the halves of all standstills of a triad:
 noise that is correlated over a second or more shows there, and not in one standstill alone.
@@ -27,13 +28,13 @@ from mwdcal.geometry.vectors import Array
 CLEAR = 4.0
 """Distance from the median, in robust standard deviations, above which a sample is a spike."""
 BLOCKS = 64
-"""Blocks whose means tell the long-run variance."""
+"""Blocks whose means give the long-run variance."""
 LONG = 16
-"""Samples from which on a standstill tells its own noise; the most that the others lend it."""
+"""Samples from which on the noise of a standstill is taken from itself; the most it borrows."""
 SIGNIFICANT = 1e-4
 """Chance that a steady channel is said to drift, or to be less steady than usual."""
 UNUSUAL = 2.0
-"""Times the usual spread that is worth a word."""
+"""Ratio to the usual spread that is reported."""
 LENT = 0.01
 """Chance that a standstill of the usual noise is taken for noisier, and lent none."""
 COURSE = 0.01
@@ -78,14 +79,14 @@ class Noise(NamedTuple):
 
 
 ALONE = Noise(np.nan, np.nan, np.nan, 0.0, np.nan, np.inf, 0.0)
-"""Of a standstill without others."""
+"""The shared noise where a channel has one standstill only."""
 
 
 class Summary(NamedTuple):
     """What one channel read during one standstill.
 
     Attributes:
-        mean: of the samples that are no spikes.
+        mean: of the samples that are not spikes.
         sd: standard uncertainty of the mean, correlation of the noise included.
         spread: robust standard deviation of one sample, from the median of deviations.
         drift: change over the standstill by the straight line.
@@ -118,7 +119,7 @@ def _silent(done: int) -> None:
 def summarise_all(
     rests: Sequence[Rest], resolution: float, say: Callable[[int], None] = _silent
 ) -> list[Summary]:
-    """What a channel read at each standstill; `said` is told how many are done."""
+    """What a channel read at each standstill; `say` receives how many are done."""
     noise = pooled(rests, resolution)
     summaries = []
     for rest in rests:
@@ -132,7 +133,7 @@ class Correlated(NamedTuple):
 
     Attributes:
         variance: of a sample's worth of mean, sd² times samples, of each channel; 0 for none.
-        plain: whether it is worth a word; the uncertainty is widened before that (`CHANCE`).
+        plain: whether it is reported; the uncertainty is widened before that (`CHANCE`).
     """
 
     variance: Array
@@ -300,7 +301,7 @@ def summarise(time: Array, value: Array, resolution: float, noise: Noise = ALONE
     """What a channel read: `time` and `value` (n,) of the samples of one standstill, n >= 2.
 
     `resolution` is the step of the channel, in which noise far below it hides the mean (`hidden`).
-    The mean is that of the middle of the standstill: the course that all share is no part of its
+    The mean is that of the middle of the standstill: the course that all share is not part of its
     uncertainty. A stuck channel is known to its reach/√12.
     """
     distance = np.abs(value - np.median(value))

@@ -1,7 +1,7 @@
 """Stations from a continuous log: its standstills, each as one row of a run file.
 
 Channels may have rates of their own (blank cells in one table), and the temperature may be
-slower still: it never decides what stands still. See `core.standstill` for the method.
+slower still: it never decides what stands still. See `standstill` for the method.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ from mwdcal.logs.station_means import Summary, correlated, summarise, summarise_
 MIN_SECONDS, TRIM_SECONDS = 1.0, 1.0
 """Defaults for a fast log; one sampled slowly needs a window, and a cell, respectively."""
 LEAST_SAMPLES = 3
-"""Samples of each channel below which there is no station."""
+"""Fewest samples of each channel at a station."""
 GAP = 5.0
 """Times the usual step between samples that are a gap."""
 MOST_CELLS = 50_000_000
 """Cells of the longest log: four months at 15 samples a second or more."""
-TOLD = 1.2
-"""Times the uncertainty of most means of a triad that correlated noise adds, worth a word."""
+REPORTED = 1.2
+"""Factor by which correlated noise widens most means of a triad before it is reported."""
 CLOCK = re.compile(r"^t(?![A-Za-z0-9])|(?i:time|stamp|clock|epoch|seconds|millis|micros)")
 """Names of columns that may hold the time."""
 SMALLEST = 1e-12
@@ -67,7 +67,7 @@ class Stations:
         min_seconds, trim_seconds: as used.
         time: of each row of the log, s.
         traces: the channels that have samples.
-        findings: what the reader should know.
+        findings: what is reported beside the stations.
     """
 
     table: Table
@@ -83,7 +83,7 @@ class Stations:
 
 
 class StandstillError(InputError):
-    """A log without a standstill; `made` holds what was looked at, with an empty table."""
+    """A log without a standstill; `made` holds the analysis, with an empty table."""
 
     def __init__(self, text: str, made: Stations) -> None:
         super().__init__(text)
@@ -155,7 +155,7 @@ def _check(name: str, value: float | None) -> None:
 def _short(log: Table, time: Array, traces: dict[str, Trace]) -> InputError:
     if len(time) > 1 and not any(np.ptp(value) for _, value in traces.values()):
         return InputError(
-            f"{log.source}: no channel ever changes, so that nothing tells rest from movement. "
+            f"{log.source}: no channel ever changes, so rest and movement cannot be told apart. "
             "Check the logger and the order of the columns."
         )
     window = standstill.WINDOW
@@ -167,13 +167,13 @@ def _short(log: Table, time: Array, traces: dict[str, Trace]) -> InputError:
 
 
 def _none(stations: Stations) -> str:
-    """Why there is no station."""
+    """The message of a log without a station."""
     longest = float((stations.found.end - stations.found.start).max(initial=0.0))
     moving = int(np.count_nonzero(~stations.found.short))
     trimmed = f"after {stations.trim_seconds:g} s trimmed off each end"
     if moving:
         word = "interval moves" if moving == 1 else "intervals move"
-        seen = f"{moving} long calm {word} on slowly by more than a standstill can"
+        seen = f"{moving} long calm {word} slowly, by more than a tool at rest can"
     elif longest:
         seen = f"the longest calm interval lasts {longest:.3g} s {trimmed}"
     else:
@@ -211,7 +211,7 @@ def row_times(log: Table, sampling_hz: float | None) -> Array:
 
 
 def _timeless(log: Table) -> InputError:
-    """A log without time, or with one of another name."""
+    """The refusal of a log without a time, or with one of another name."""
     clock = next((name for name in log.columns if CLOCK.search(name)), None)
     got = "neither. Add"
     if clock is not None:
@@ -273,13 +273,13 @@ def _trace(log: Table, time: Array, name: str) -> Trace:
 
 
 def _possible(temperature: Trace, findings: list[Finding]) -> Trace:
-    """The temperatures that can be some; others, such as -999, are left out and told."""
+    """The temperatures that are possible; others, such as -999, are left out and reported."""
     time, value = temperature
     fine = (value >= TEMPERATURE.low) & (value <= TEMPERATURE.high)
     if not fine.all():
         wrong = np.flatnonzero(~fine)
         text = (
-            f"{wrong.size} of {len(value)} values of temperature_c are none between {TEMPERATURE.low:g} "
+            f"{wrong.size} of {len(value)} values of temperature_c are not between {TEMPERATURE.low:g} "
             f"and {TEMPERATURE.high:g} °C, such as {value[wrong[0]]:g}: left out."
         )
         findings.append(Finding(id="impossible-temperature", text=text))
@@ -412,7 +412,9 @@ def _summaries(
             for n, v in zip(names, correlation.variance, strict=True)
         }
         grown = [
-            a.sd > TOLD * b.sd for n in names for a, b in zip(wider[n], summaries[n], strict=True)
+            a.sd > REPORTED * b.sd
+            for n in names
+            for a, b in zip(wider[n], summaries[n], strict=True)
         ]
         if correlation.plain and 2 * sum(grown) > len(grown):
             findings.append(correlated_noise(names))

@@ -81,7 +81,10 @@ def target(path: str | os.PathLike[str]) -> Path:
 
 @contextlib.contextmanager
 def holding(path: Path) -> Iterator[bool]:
-    """Whether this process alone has the file, its folder made; both go afterwards, if that is empty."""
+    """Whether this process holds the file, whose folder is made if need be.
+
+    Both are removed afterwards, the folder if it is empty.
+    """
     try:
         stream = _held(path)
     except OSError as error:
@@ -172,7 +175,7 @@ def _remove(path: Path) -> None:
 
 
 def _refusal(path: str | os.PathLike[str], error: Exception) -> InputError:
-    """The error of the operating system in our form."""
+    """An error of the operating system, with advice."""
     if isinstance(error, PermissionError):
         advice = "Close the program that has it open, or choose a folder you may write to."
     else:

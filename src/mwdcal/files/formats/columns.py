@@ -120,7 +120,7 @@ def assemble(
 
 
 def no_stations(source: str) -> InputError:
-    """A table with a header and nothing below it."""
+    """The refusal of a table with a header and nothing below it."""
     return InputError(
         f"{source}: the file has column names but no stations. Add one row per station."
     )

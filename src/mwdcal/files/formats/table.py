@@ -61,8 +61,8 @@ def read(
 ) -> Table:
     """The table in a .csv, .tsv, .parquet or .xlsx file.
 
-    `decimal` is the decimal sign of text cells, '.' or ','; without `delimiter` the header
-    line of a text file tells it.
+    `decimal` is the decimal sign of text cells, '.' or ','; without `delimiter` it is
+    read from the header line of a text file.
     """
     _check_options(decimal, delimiter)
     file = Path(path)
@@ -149,7 +149,7 @@ def _suffix(path: Path) -> str:
 
 
 def _content(path: Path) -> bytes:
-    """The bytes of an existing, regular file of bearable size and known suffix."""
+    """The bytes of a regular file of a known suffix that is not too large."""
     try:
         if path.is_dir():
             raise InputError(f"'{path}' is a folder. Name a file in it.")
@@ -188,7 +188,7 @@ def _floats(cells: Sequence[str], decimal: str) -> Array | None:
 
 
 def _one_by_one(table: Table, name: str, cells: Sequence[str]) -> Array:
-    """The same, for cells with unusual blanks, or to find the one that is no number."""
+    """The same, for cells with unusual blanks; refuses the first cell that is not a number."""
     values = np.full(len(cells), np.nan)
     for row, cell in enumerate(cells):
         stripped = cell.strip()
@@ -206,7 +206,7 @@ def _one_by_one(table: Table, name: str, cells: Sequence[str]) -> Array:
 
 
 def _advice(cell: str, decimal: str) -> str:
-    """What to do about a cell that is no number."""
+    """What to do about a cell that is not a number."""
     if decimal == "." and looks_numeric(cell, ","):
         return "Is the decimal comma intended? Use --decimal=,"
     if decimal == "," and looks_numeric(cell, "."):

@@ -38,7 +38,7 @@ class Head(NamedTuple):
 
 
 def parse(data: bytes, source: str, delimiter: str | None = None) -> Parts:
-    """The table in the bytes of a text file; without `delimiter` the header line tells it."""
+    """The table in the bytes of a text file; without `delimiter` it is read from the header line."""
     lines = _lines(data, source)
     top = _head(lines, source, delimiter)
     return _parts(lines[top.lines :], top, top.lines, source)._replace(metadata=top.metadata)

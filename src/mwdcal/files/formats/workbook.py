@@ -126,7 +126,7 @@ def _check_texts(rows: Iterable[Sequence[str | float]], source: str) -> None:
 
 
 def _cell(sheet: Any, value: str | float) -> Any:
-    """A cell with all digits of a number, or text that stays text, whatever it looks like."""
+    """A cell with all digits of a number, or text that stays text even if it looks like a number."""
     from openpyxl.cell import WriteOnlyCell
 
     content = value if isinstance(value, str) else number(value)
