@@ -67,22 +67,14 @@ RAW_SPREAD = Range(0.0, 1e15, "")
 ROTATION = Range(-180.0, 180.0, "°")
 
 RANGES = {
-    **dict.fromkeys(RAW, RAW_RANGE),
-    **{f"sd_{name}": RAW_SPREAD for name in RAW},
     "temperature_c": TEMPERATURE,
+    **dict.fromkeys(RAW, RAW_RANGE),
     **{reference.column: reference.values for reference in REFERENCES.values()},
+    **{f"sd_{name}": RAW_SPREAD for name in RAW},
     **{f"sd_{reference.column}": reference.spread for reference in REFERENCES.values()},
 }
-"""Accepted values of every column of numbers."""
-
-_MEASURED = (*RAW, *(reference.column for reference in REFERENCES.values()))
-COLUMNS = (
-    "station",
-    "group",
-    "temperature_c",
-    *_MEASURED,
-    *(f"sd_{name}" for name in _MEASURED),
-)
+"""The columns of numbers, and their accepted values."""
+COLUMNS = ("station", "group", *RANGES)
 
 _UNIT = re.compile(
     r"[\s_(\[-]+(°|°?c|deg|degc|degrees?|rad|f|k|m?g|m/?s2|[nµu]t|gauss|m?v|counts?|raw)[)\]]?$"

@@ -90,8 +90,7 @@ def _reading_faults(cells: Cells, starts: Ints, kind: str) -> Iterator[Fault]:
     for name in names:
         yield from range_faults(cells, name)
     advice = "Fill it in, or remove the station."
-    for fault in _blank_faults(cells, starts, names, advice):
-        fault = fault._replace(missing_reading=True)
+    for fault in _blank_faults(cells, starts, names, advice, missing_reading=True):
         if kind == "accelerometer":
             yield fault
         else:
@@ -102,8 +101,7 @@ def _temperature_faults(cells: Cells, starts: Ints) -> Iterator[Fault]:
     names = ("temperature_c",)
     yield from range_faults(cells, *names)
     advice = "Fill it in, or leave the whole column blank."
-    for fault in _blank_faults(cells, starts, names, advice):
-        fault = fault._replace(missing_reading=True)
+    for fault in _blank_faults(cells, starts, names, advice, missing_reading=True):
         yield from _within(fault, _of_tools_with(cells, names, starts))
 
 
@@ -145,7 +143,7 @@ def range_faults(cells: Cells, name: str) -> Iterator[Fault]:
 
 
 def _blank_faults(
-    cells: Cells, starts: Ints, names: tuple[str, ...], advice: str
+    cells: Cells, starts: Ints, names: tuple[str, ...], advice: str, missing_reading: bool = False
 ) -> Iterator[Fault]:
     """Cells that are blank."""
 
@@ -155,7 +153,7 @@ def _blank_faults(
 
     blank = np.isnan(_stacked(cells, names, starts))
     if blank.any():
-        yield Fault(names, blank, problem)
+        yield Fault(names, blank, problem, missing_reading)
 
 
 def _within(fault: Fault, rows: Bools) -> Iterator[Fault]:

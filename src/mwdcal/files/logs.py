@@ -20,11 +20,10 @@ import numpy as np
 
 from mwdcal.errors import InputError, reason
 from mwdcal.files import metadata as meta
-from mwdcal.files.contract import COLUMNS, RAW, check_columns, check_near_misses
+from mwdcal.files.contract import COLUMNS, RANGES, RAW, check_columns, check_near_misses
 from mwdcal.files.faults import columns_of, range_faults, refuse
 from mwdcal.files.formats import table as tables
 from mwdcal.files.formats.columns import (
-    LABELS,
     Column,
     assemble,
     check_names,
@@ -37,7 +36,7 @@ from mwdcal.files.formats.text import comment, is_preamble, split
 from mwdcal.geometry.vectors import Array
 
 TIME = "time_s"
-READ = tuple(name for name in (TIME, *COLUMNS) if name not in LABELS)
+READ = (TIME, *RANGES)
 """Columns of a log that mean something, all of them numbers."""
 
 _PIECE = 16_000_000

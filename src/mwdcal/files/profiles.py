@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import difflib
 import hashlib
-import math
 import re
 from importlib import resources
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Any
 
 import msgspec
 
+from mwdcal.calibration.readings import TRIADS
 from mwdcal.errors import InputError, reason
 from mwdcal.files.contract import TEMPERATURE
 from mwdcal.files.formats.table import shown
@@ -28,7 +28,6 @@ _STRUCTS: dict[str, type[msgspec.Struct]] = {
     "accelerometer.datasheet": Datasheet,
     "magnetometer.datasheet": Datasheet,
 }
-_STAND_SIGMAS = tuple(n for n in StandProfile.__struct_fields__ if n != "coil")
 _WORDS = {
     "float": "a number",
     "int": "a whole number",
@@ -40,8 +39,29 @@ _WORDS = {
     "datetime": "a date with time",
     "time": "a time of day",
 }
-_STAND_UNITS = {"g": ("g", 2.0), "nt": ("nT", 200_000.0)}
-_SMALLEST_SCALE, _LARGEST_SCALE = 1e-15, 1e15
+_Limits = tuple[float, float, str]
+"""Least and greatest value of a key, and what to do about another one."""
+_TRIAD_LIMITS: dict[str, _Limits] = {
+    "scale": (
+        1e-15, 1e15,
+        'Put the sign into `axes`, for example "-x"; leave it out where it is unknown.',
+    ),
+    "noise": (1e-15, 1e15, "1 sigma in raw units; leave it out where it is unknown."),
+    "nonlinearity": (
+        1e-9, 1.0,
+        "1 sigma as a share of the field, such as 0.005; leave it out for a linear axis.",
+    ),
+    "repeatability": (0.0, 1e15, "1 sigma in raw units; leave it out where it is unknown."),
+}  # fmt: skip
+_DATASHEET_LIMITS: dict[str, _Limits] = dict.fromkeys(
+    Datasheet.__struct_fields__,
+    (1e-15, 1e15, "1 sigma, more than zero; leave it out where it is unknown."),
+)
+_STAND_LIMITS: dict[str, _Limits] = {
+    name: (0.0, 180.0, "1 sigma, in degrees.")
+    for name in StandProfile.__struct_fields__
+    if name != "coil"
+} | {"gravity_g": (0.0, 2.0, "1 sigma, in g."), "field_nt": (0.0, 200_000.0, "1 sigma, in nT.")}
 
 
 def list_profiles() -> list[str]:
@@ -186,51 +206,26 @@ def check_profile(profile: Profile, source: str) -> None:
     """Refuse values that no tool can have."""
     if not profile.name.strip():
         raise InputError(f"{source}, key 'name': must not be blank; got ''. Name the tool.")
-    temperature = profile.reference_temperature_c
-    _check_number(
-        temperature,
-        (TEMPERATURE.low, TEMPERATURE.high),
-        source,
-        "reference_temperature_c",
-        "In °C.",
-    )
-    _check_triad(profile.accelerometer, "accelerometer", source)
-    _check_triad(profile.magnetometer, "magnetometer", source)
-    for field in _STAND_SIGMAS:
-        sigma = getattr(profile.stand, field)
-        unit, most = _STAND_UNITS.get(field.rpartition("_")[2], ("degrees", 180.0))
-        _check_number(sigma, (0.0, most), source, f"stand.{field}", f"1 sigma, in {unit}.")
+    limits = (TEMPERATURE.low, TEMPERATURE.high)
+    _check_numbers(profile, {"reference_temperature_c": (*limits, "In °C.")}, source)
+    for name in TRIADS:
+        triad: TriadProfile = getattr(profile, name)
+        if len({axis[1] for axis in triad.axes}) < len(triad.axes):
+            raise _axes_error(f"{name}.axes", " ".join(triad.axes), source)
+        _check_numbers(triad, _TRIAD_LIMITS, source, f"{name}.")
+        if triad.datasheet is not None:
+            _check_numbers(triad.datasheet, _DATASHEET_LIMITS, source, f"{name}.datasheet.")
+    _check_numbers(profile.stand, _STAND_LIMITS, source, "stand.")
 
 
-def _check_triad(triad: TriadProfile, name: str, source: str) -> None:
-    """Axes form a signed permutation (either hand); scale and noise are positive."""
-    if len({axis[1] for axis in triad.axes}) < len(triad.axes):
-        raise _axes_error(f"{name}.axes", " ".join(triad.axes), source)
-    limits = (_SMALLEST_SCALE, _LARGEST_SCALE)
-    advice = 'Put the sign into `axes`, for example "-x"; leave it out where it is unknown.'
-    if triad.scale is not None:
-        _check_number(triad.scale, limits, source, f"{name}.scale", advice)
-    advice = "1 sigma in raw units; leave it out where it is unknown."
-    if triad.noise is not None:
-        _check_number(triad.noise, limits, source, f"{name}.noise", advice)
-    if triad.nonlinearity is not None:
-        share = "1 sigma as a share of the field, such as 0.005; leave it out for a linear axis."
-        _check_number(triad.nonlinearity, (1e-9, 1.0), source, f"{name}.nonlinearity", share)
-    sheet = "1 sigma, more than zero; leave it out where it is unknown."
-    for field in Datasheet.__struct_fields__:
-        value = getattr(triad.datasheet, field, None)
-        if value is not None:
-            _check_number(value, limits, source, f"{name}.datasheet.{field}", sheet)
-    limits = (0.0, _LARGEST_SCALE)
-    _check_number(triad.repeatability, limits, source, f"{name}.repeatability", advice)
-
-
-def _check_number(
-    value: float, limits: tuple[float, float], source: str, key: str, advice: str
+def _check_numbers(
+    section: msgspec.Struct, limits: dict[str, _Limits], source: str, prefix: str = ""
 ) -> None:
-    low, high = limits
-    if not (math.isfinite(value) and low <= value <= high):
-        raise InputError(
-            f"{source}, key '{key}': must be between {low:g} and {high:g}; "
-            f"got {shown(value)}. {advice}"
-        )
+    """Refuse the first number that is outside its limits; None is not stated."""
+    for field, (low, high, advice) in limits.items():
+        value = getattr(section, field)
+        if value is not None and not low <= value <= high:
+            raise InputError(
+                f"{source}, key '{prefix}{field}': must be between {low:g} and {high:g}; "
+                f"got {shown(value)}. {advice}"
+            )

@@ -15,7 +15,7 @@ import numpy as np
 
 from mwdcal.calibration.readings import Readings
 from mwdcal.errors import InputError, MwdcalError
-from mwdcal.files.contract import COLUMNS
+from mwdcal.files.contract import COLUMNS, RANGES
 from mwdcal.files.faults import faults
 from mwdcal.files.formats import parquet
 from mwdcal.files.formats.columns import as_text
@@ -63,7 +63,7 @@ class Rows:
         arrow, _ = parquet.modules(self.source)
         numbers = {}
         for name in self.table.column_names:
-            if name in COLUMNS and name not in (GROUP, STATION):
+            if name in RANGES:
                 cells = self.table.column(name).cast(arrow.float64(), safe=False)
                 values = np.asarray(cells.to_numpy(), float)
                 if not np.isnan(values).all():

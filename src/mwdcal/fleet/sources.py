@@ -21,7 +21,6 @@ from mwdcal.files import contract, synonyms
 from mwdcal.files.azimuths import magnetic_offset
 from mwdcal.files.contract import REFERENCES
 from mwdcal.files.formats import parquet
-from mwdcal.files.formats.columns import LABELS
 
 SERIAL = "serial"
 OFFSET = "#offset"
@@ -175,7 +174,7 @@ def _look(file: Path, root: Path) -> _File:
         schema, keys = opened.schema_arrow, _keys(file, root)
         columns = dict.fromkeys((*schema.names, *dict(keys)))
         names = tuple(n for n in columns if not n.startswith("__index"))
-        for name in set(contract.COLUMNS).difference(LABELS).intersection(schema.names):
+        for name in sorted({*contract.RANGES}.intersection(schema.names)):
             _check_numeric(schema.field(name).type, name, file)
         kind = schema.field(SERIAL).type if SERIAL in schema.names else arrow.string()
         kind = kind.value_type if arrow.types.is_dictionary(kind) else kind
@@ -210,7 +209,7 @@ def _keys(file: Path, root: Path) -> Keys:
                 f"{file.parent}, column '{SERIAL}': must be filled in; the folder '{folder}' stands for "
                 "a blank cell. Say which tool these stations belong to."
             )
-        if name in contract.COLUMNS and name not in LABELS and keys[name] is not None:
+        if name in contract.RANGES and value not in BLANK:
             keys[name] = _number(value, name, file)
     return tuple(keys.items())
 

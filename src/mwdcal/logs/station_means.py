@@ -112,12 +112,8 @@ class Summary(NamedTuple):
     stuck: bool
 
 
-def _silent(done: int) -> None:
-    """Say nothing."""
-
-
 def summarise_all(
-    rests: Sequence[Rest], resolution: float, say: Callable[[int], None] = _silent
+    rests: Sequence[Rest], resolution: float, say: Callable[[int], None] = lambda done: None
 ) -> list[Summary]:
     """What a channel read at each standstill; `say` receives how many are done."""
     noise = pooled(rests, resolution)

@@ -58,7 +58,8 @@ def replacing(path: str | os.PathLike[str], durable: bool = True) -> Iterator[IO
     except OSError as error:
         raise _refusal(path, error) from error
     finally:
-        _remove(temporary)
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
 
 
 def target(path: str | os.PathLike[str]) -> Path:
@@ -166,12 +167,6 @@ def _machine() -> str:
     """Eight digits for the machine."""
     name = os.uname().nodename if hasattr(os, "uname") else ""
     return f"{zlib.crc32(name.encode()):08x}"
-
-
-def _remove(path: Path) -> None:
-    """Remove what an error or an interruption left; nothing is left after a success."""
-    with contextlib.suppress(OSError):
-        path.unlink(missing_ok=True)
 
 
 def _refusal(path: str | os.PathLike[str], error: Exception) -> InputError:
