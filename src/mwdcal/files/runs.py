@@ -10,6 +10,7 @@ import hashlib
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from itertools import pairwise
 
 import msgspec
 import numpy as np
@@ -24,7 +25,7 @@ from mwdcal.files.faults import Cells, columns_of, faults, faults_beside_reading
 from mwdcal.files.formats import table as tables
 from mwdcal.files.formats.columns import Column
 from mwdcal.files.formats.table import Table, labels
-from mwdcal.geometry.vectors import AnyArray, Array, Ints
+from mwdcal.geometry.vectors import Array, Ints
 from mwdcal.sensor.profile import Profile, TriadProfile
 
 MANY = 1000
@@ -295,11 +296,19 @@ def _quantity(name: str) -> str:
     return REFERENCES[name].column.removeprefix("ref_")
 
 
-def _group(table: Table) -> AnyArray | None:
-    """Group numbers in order of appearance, -1 for none."""
+def _group(table: Table) -> Ints | None:
+    """Group numbers (n,), -1 for none; None where there are no groups."""
     names = labels(table, "group") if "group" in table.columns else []
-    order = {name: i for i, name in enumerate(dict.fromkeys(filter(None, names)))}
-    return np.array([order.get(name, -1) for name in names], int) if order else None
+    return group_numbers(names, _one_tool(table)) if any(names) else None
+
+
+def group_numbers(names: Sequence[str], starts: Ints) -> Ints:
+    """Numbers (R,) of groups in order of appearance within each tool, -1 where the name is blank."""
+    numbers: list[int] = []
+    for first, last in pairwise(starts.tolist()):
+        known: dict[str, int] = {}
+        numbers += [known.setdefault(n, len(known)) if n else -1 for n in names[first:last]]
+    return np.array(numbers, int)
 
 
 def _stations(table: Table) -> tuple[str, ...]:

@@ -116,8 +116,8 @@ def packed(table: Any) -> bytes:
 def _result(rows: Rows, plan: Plan) -> Any:
     """The result table of some tools."""
     count = len(rows.counts)
-    columns = names(plan.options, plan.triads, plan.per_tool)
-    filled = {name: np.full(count, np.nan) for name in columns}
+    every = names(plan.options, plan.triads, plan.per_tool)
+    filled = {name: np.full(count, np.nan) for name in every}
     status, message = np.full(count, OK, object), np.full(count, "", object)
     unit = np.full(count, None, object)
     free: list[tuple[list[str], ...]] = [([], [])] * count

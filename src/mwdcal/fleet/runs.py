@@ -20,7 +20,7 @@ from mwdcal.files.faults import faults
 from mwdcal.files.formats import parquet
 from mwdcal.files.formats.columns import as_text
 from mwdcal.files.formats.table import Table
-from mwdcal.files.runs import convert, to_readings
+from mwdcal.files.runs import convert, group_numbers, to_readings
 from mwdcal.fleet.sources import AZIMUTH, OFFSET, SERIAL
 from mwdcal.fleet.tables import one_chunk
 from mwdcal.geometry.vectors import AnyArray, Array, Bools, Ints
@@ -85,17 +85,8 @@ class Rows:
     def groups(self) -> Ints:
         """Number (R,) of the group of each row within its tool, -1 for none."""
         arrow, _ = parquet.modules(self.source)
-        cells = parquet.as_column(GROUP, self.table.column(GROUP), arrow)
-        names = arrow.array([str(cell).strip() for cell in cells]).dictionary_encode()
-        blank = names.dictionary.index("").as_py()
-        codes = names.indices.to_numpy(zero_copy_only=False).astype(int)
-        codes = np.where(codes == blank, -1, codes)
-        tool = np.repeat(np.arange(len(self.counts)), self.counts)
-        keys = tool * (codes.max(initial=0) + 2) + codes + 1
-        _, place = np.unique(keys, return_inverse=True)
-        lowest = np.minimum.reduceat(place, self.starts[:-1])
-        ungrouped = np.logical_or.reduceat(codes < 0, self.starts[:-1])
-        return np.where(codes < 0, -1, place - (lowest + ungrouped)[tool])
+        names = parquet.as_column(GROUP, self.table.column(GROUP), arrow)
+        return group_numbers([str(name).strip() for name in names], self.starts)
 
     def alone(self, tool: int) -> tuple[Readings, Profile]:
         """One tool's readings as a single run has them; raises what a single run would."""
