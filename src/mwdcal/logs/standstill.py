@@ -97,6 +97,11 @@ class Activity(NamedTuple):
     cells: tuple[Cells, ...]
     floor: Array
 
+    @property
+    def cell(self) -> float:
+        """Length of a cell, s."""
+        return float(self.edge[1] - self.edge[0])
+
 
 class Threshold(NamedTuple):
     """The threshold in noise floors, and the stretch (first, last) over which it hardly matters."""
@@ -116,6 +121,11 @@ class Standstills(NamedTuple):
     end: Array
     taken: Bools
     short: Bools
+
+    @property
+    def stations(self) -> tuple[Array, Array]:
+        """Start and end of those that are taken."""
+        return self.start[self.taken], self.end[self.taken]
 
 
 def cells_of(time: Array, value: Array, length: float) -> Cells:
@@ -347,11 +357,15 @@ def standstills(
     for channel, limit in zip(activity.cells, limits, strict=True):
         creeps |= _travels(channel.start, channel.level, start, end) > 2 * limit
     for time, value, limit in slow:
-        middle = np.median(np.stack([value[:-2], value[1:-1], value[2:]]), axis=0)
         step = time_step(time)
-        creeps |= _travels(time[1:-1], middle, start + step, end - step) > 4 * limit
+        creeps |= _travels(time[1:-1], _despiked(value), start + step, end - step) > 4 * limit
     short = end - start < shortest
     return Standstills(start, end, ~short & ~creeps, short)
+
+
+def _despiked(value: Array) -> Array:
+    """Medians (n - 2,) of three samples (n,) next to each other."""
+    return np.asarray(np.median(np.stack([value[:-2], value[1:-1], value[2:]]), axis=0))
 
 
 def _travels(time: Array, level: Array, start: Array, end: Array) -> Array:
@@ -387,7 +401,7 @@ def _steps(start: float, end: float, slow: Slow, room: float) -> list[tuple[floa
     time, value = slow.time[first:last], slow.value[first:last]
     if len(time) < 2 * FEWEST:
         return []
-    middle = np.median(np.stack([value[:-2], value[1:-1], value[2:]]), axis=0)
+    middle = _despiked(value)
     stepped = np.abs(middle[FEWEST:] - middle[:-FEWEST]) > slow.limit
     return [
         (float(time[i + FEWEST - 2] - room), float(time[min(j + FEWEST, len(time) - 1)] + room))

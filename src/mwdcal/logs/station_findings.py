@@ -44,7 +44,7 @@ def _between(start: Array, end: Array) -> str:
 
 def about(rows: Rows, standstills: Standstills, seconds: float) -> list[Finding]:
     """Findings about the stations, and about what was left; `seconds` lasts the log once trimmed."""
-    start, end = standstills.start[standstills.taken], standstills.end[standstills.taken]
+    start, end = standstills.stations
     findings = []
     creeping = ~standstills.taken & ~standstills.short
     if creeping.any():
@@ -152,8 +152,8 @@ def noisy_rests(
     for channel, limit in zip(activity.cells, limits, strict=True):
         ranges = np.where(channel.torn, np.inf, standstill.quietest_range(channel.level))
         can_rest &= standstill.on_grid(activity.edge, channel, ranges) <= limit
-    cell = activity.edge[1] - activity.edge[0]
-    first, last = standstill.stretches(can_rest, max(ceil(least / cell), standstill.WINDOW))
+    shortest = max(ceil(least / activity.cell), standstill.WINDOW)
+    first, last = standstill.stretches(can_rest, shortest)
     start, end = activity.edge[first], activity.edge[last]
     kept = [
         i

@@ -116,18 +116,13 @@ def find_stations(
     activity = standstill.activity(list(traces.values()))
     if not activity.cells:
         raise _short(log, time, traces)
-    cell = float(activity.edge[1] - activity.edge[0])
-    shortest = max(MIN_SECONDS, standstill.WINDOW * cell) if min_seconds is None else min_seconds
-    trim = max(TRIM_SECONDS, cell) if trim_seconds is None else trim_seconds
+    shortest = min_seconds
+    if shortest is None:
+        shortest = max(MIN_SECONDS, standstill.WINDOW * activity.cell)
+    trim = max(TRIM_SECONDS, activity.cell) if trim_seconds is None else trim_seconds
     findings += _torn(activity, list(traces), findings)
     limits, slow = _limits(activity, traces)
-    highest = float(np.min(limits / activity.floor))
-    value, stretch = threshold, None
-    if value is None:
-        least = int(np.ceil((shortest + 2 * trim) / cell))
-        value, stretch = standstill.choose_threshold(activity.value, least, highest)
-        if np.isnan(value):  # nothing lasts: what comes nearest
-            value, stretch = highest, None
+    value, stretch = _threshold(activity, limits, threshold, shortest + 2 * trim)
     standstills = standstill.standstills(activity, limits, value, shortest, trim, slow)
     standstills = _with_samples(standstills, traces, findings)
     findings += noisy_rests(activity, limits, standstills, value, shortest + 2 * trim)
@@ -137,14 +132,29 @@ def find_stations(
     )  # fmt: skip
     if not standstills.taken.any():
         raise StandstillError(_none(stations), stations)
-    start, end = standstills.start[standstills.taken], standstills.end[standstills.taken]
-    rows = _summaries(traces, start, end, findings, say)
-    columns = _columns(log, time, rows, start, end)
-    columns |= _temperatures(temperature, start, end, findings)
+    rows = _summaries(traces, *standstills.stations, findings, say)
+    columns = _columns(log, time, rows, *standstills.stations)
+    columns |= _temperatures(temperature, *standstills.stations, findings)
     findings += about(rows, standstills, float(time[-1] - time[0]) - 2 * trim)
     metadata = {**log.metadata, "log": log.source, "log_sha256": log.digest}
-    table = Table(_ordered(columns), metadata, log.source, range(1, len(start) + 1))
-    return replace(stations, table=table)
+    lines = range(1, len(columns["station"]) + 1)
+    return replace(stations, table=Table(_ordered(columns), metadata, log.source, lines))
+
+
+def _threshold(
+    activity: Activity, limits: Array, given: float | None, least: float
+) -> tuple[float, tuple[float, float] | None]:
+    """The threshold, and the stretch over which it hardly matters; None where it was given.
+
+    `least` is the shortest standstill, s. Where nothing lasts as long, the threshold is the highest
+    one at which every channel can be at rest.
+    """
+    if given is not None:
+        return given, None
+    highest = float(np.min(limits / activity.floor))
+    cells = int(np.ceil(least / activity.cell))
+    value, stretch = standstill.choose_threshold(activity.value, cells, highest)
+    return (highest, None) if np.isnan(value) else (value, stretch)
 
 
 def _check(name: str, value: float | None) -> None:
@@ -301,7 +311,7 @@ def _time_findings(
     if gaps.size:
         widest = int(gaps[np.argmax(steps[gaps])])
         text = (
-            f"{gaps.size} gap{'s' if gaps.size > 1 else ''} in time, the widest {steps[widest]:.3g} s after "
+            f"{count(gaps.size, 'gap')} in time, the widest {steps[widest]:.3g} s after "
             f"{TIME} = {time[widest]:.10g} (line {log.lines[widest]}): no standstill goes across one."
         )
         findings.append(Finding(id="gaps", text=text))
@@ -314,11 +324,10 @@ def _torn(activity: Activity, names: list[str], findings: list[Finding]) -> list
     """Stretches without samples that the times of the rows do not show, as gaps."""
     if any(finding.id == "gaps" for finding in findings):
         return []
-    cell = float(activity.edge[1] - activity.edge[0])
     torn = []
     for channel in activity.cells:
         between = np.append(channel.start[1:] - channel.end[:-1], 0.0)
-        torn.append(channel.torn | (between > max(cell, standstill.FEWEST * channel.step)))
+        torn.append(channel.torn | (between > max(activity.cell, standstill.FEWEST * channel.step)))
     worst = max(range(len(torn)), key=lambda i: np.count_nonzero(torn[i]))
     if not torn[worst].any():
         return []
