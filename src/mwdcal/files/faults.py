@@ -46,9 +46,17 @@ def faults(cells: Cells, starts: Ints, profile: Profile) -> Iterator[Fault]:
 
     A column is not read before its turn.
     """
-    for kind in TRIADS:
-        yield from _reading_faults(cells, starts, kind)
-    yield from _temperature_faults(cells, starts)
+    for kind, names in CHANNELS.items():
+        for name in names:
+            yield from range_faults(cells, name)
+        blank = _blank_faults(cells, starts, names, "Fill it in, or remove the station.", True)
+        optional = kind == "magnetometer"
+        yield from _where_filled(cells, starts, names, blank) if optional else blank
+    name = "temperature_c"
+    yield from range_faults(cells, name)
+    advice = "Fill it in, or leave the whole column blank."
+    blank = _blank_faults(cells, starts, (name,), advice, True)
+    yield from _where_filled(cells, starts, (name,), blank)
     yield from faults_beside_readings(cells, starts, profile, TRIADS)
 
 
@@ -59,15 +67,12 @@ def faults_beside_readings(
     for reference in REFERENCES.values():
         yield from range_faults(cells, reference.column)
     for kind in kinds:
-        if _some(cells, CHANNELS[kind]):
-            for fault in _noise_faults(cells, starts, profile, kind):
-                yield from _within(fault, _of_tools_with(cells, CHANNELS[kind], starts))
+        noise = _noise_faults(cells, starts, profile, kind)
+        yield from _where_filled(cells, starts, CHANNELS[kind], noise)
     for name, reference in REFERENCES.items():
-        if name == "gravity":
-            yield from range_faults(cells, f"sd_{reference.column}")
-        elif _some(cells, (reference.column,)):
-            for fault in range_faults(cells, f"sd_{reference.column}"):
-                yield from _within(fault, _of_tools_with(cells, (reference.column,), starts))
+        sd = range_faults(cells, f"sd_{reference.column}")
+        optional = name != "gravity"
+        yield from _where_filled(cells, starts, (reference.column,), sd) if optional else sd
 
 
 def columns_of(table: Table) -> Cells:
@@ -84,30 +89,11 @@ def refuse(table: Table, rules: Iterable[Fault]) -> None:
         raise BlankReadingError(str(error)) if fault.missing_reading else error
 
 
-def _reading_faults(cells: Cells, starts: Ints, kind: str) -> Iterator[Fault]:
-    """Channels out of range, or blank; the magnetometer may be blank for a whole tool."""
-    names = CHANNELS[kind]
-    for name in names:
-        yield from range_faults(cells, name)
-    advice = "Fill it in, or remove the station."
-    for fault in _blank_faults(cells, starts, names, advice, missing_reading=True):
-        if kind == "accelerometer":
-            yield fault
-        else:
-            yield from _within(fault, _of_tools_with(cells, names, starts))
-
-
-def _temperature_faults(cells: Cells, starts: Ints) -> Iterator[Fault]:
-    names = ("temperature_c",)
-    yield from range_faults(cells, *names)
-    advice = "Fill it in, or leave the whole column blank."
-    for fault in _blank_faults(cells, starts, names, advice, missing_reading=True):
-        yield from _within(fault, _of_tools_with(cells, names, starts))
-
-
 def _noise_faults(cells: Cells, starts: Ints, profile: Profile, kind: str) -> Iterator[Fault]:
     """Noise of a triad out of range, stated for some cells of a tool and not for others, or zero."""
     names, triad = tuple(f"sd_{name}" for name in CHANNELS[kind]), getattr(profile, kind)
+    if all(cells(name) is None for name in names):
+        return
     for name in names:
         yield from range_faults(cells, name)
     if triad.noise is None:
@@ -115,16 +101,15 @@ def _noise_faults(cells: Cells, starts: Ints, profile: Profile, kind: str) -> It
             f"Other sd_ cells of the {kind} are filled. Fill it in, or state `noise` under [{kind}] in the "
             "tool profile."
         )
-        for fault in _blank_faults(cells, starts, names, advice):
-            yield from _within(fault, _of_tools_with(cells, names, starts))
+        blank = _blank_faults(cells, starts, names, advice)
+        yield from _where_filled(cells, starts, names, blank)
 
     def problem(column: int, row: int) -> str:
         return f"must be above 0; got 0. State the noise of the {kind}, or leave it blank."
 
-    if triad.repeatability == 0.0 and _some(cells, names):
-        zero = _stacked(cells, names, starts) == 0.0
-        if zero.any():
-            yield Fault(names, zero, problem)
+    zero = _stacked(cells, names, starts) == 0.0
+    if triad.repeatability == 0.0 and zero.any():
+        yield Fault(names, zero, problem)
 
 
 def range_faults(cells: Cells, name: str) -> Iterator[Fault]:
@@ -156,25 +141,18 @@ def _blank_faults(
         yield Fault(names, blank, problem, missing_reading)
 
 
-def _within(fault: Fault, rows: Bools) -> Iterator[Fault]:
-    """The fault in some rows (R,), if it is there."""
-    wrong = fault.cells & rows
-    if wrong.any():
-        yield fault._replace(cells=wrong)
-
-
-def _some(cells: Cells, names: tuple[str, ...]) -> bool:
-    """Whether any cell of the columns is filled in."""
-    columns = (cells(name) for name in names)
-    return any(values is not None and not np.isnan(values).all() for values in columns)
-
-
-def _of_tools_with(cells: Cells, names: tuple[str, ...], starts: Ints) -> Bools:
-    """Rows (R,) of tools that have any cell of the columns filled in."""
+def _where_filled(
+    cells: Cells, starts: Ints, names: tuple[str, ...], rules: Iterator[Fault]
+) -> Iterator[Fault]:
+    """What is broken of the rules in tools that have any cell of the columns filled in."""
     filled = ~np.isnan(_stacked(cells, names, starts)).all(0)
-    if filled.all() or not filled.any():
-        return np.asarray(filled)
-    return np.repeat(np.logical_or.reduceat(filled, starts[:-1]), np.diff(starts))
+    if not filled.any():
+        return
+    for fault in rules:
+        tools = np.logical_or.reduceat(filled, starts[:-1])
+        wrong = fault.cells & np.repeat(tools, np.diff(starts))
+        if wrong.any():
+            yield fault._replace(cells=wrong)
 
 
 def _stacked(cells: Cells, names: tuple[str, ...], starts: Ints) -> Array:

@@ -107,8 +107,7 @@ def _text(file: Path, names: list[str], decimal: str, say: Say) -> Table:
     if decimal not in (".", ","):
         raise InputError(f"--decimal must be '.' or ','; got {shown(decimal)}.")
     try:
-        if file.exists() and not file.is_file():
-            raise InputError(f"'{file}' is not a regular file. Name a file with a log.")
+        tables.check_file(file)
         with file.open("rb") as stream:
             return _read_text(stream, names, decimal, file.name, say)
     except (OSError, ValueError) as error:

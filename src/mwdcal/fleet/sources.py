@@ -21,6 +21,7 @@ from mwdcal.files import contract, synonyms
 from mwdcal.files.azimuths import magnetic_offset
 from mwdcal.files.contract import REFERENCES
 from mwdcal.files.formats import parquet
+from mwdcal.files.formats.table import check_file
 
 SERIAL = "serial"
 OFFSET = "#offset"
@@ -157,8 +158,7 @@ def _paths(path: Path) -> list[Path]:
         if not paths:
             raise InputError(f"'{path}' is a folder without .parquet files. Name a Parquet table.")
         return paths
-    if not path.exists():
-        raise InputError(f"'{path}': no such file. Check the name and the folder.")
+    check_file(path)
     if path.suffix.lower() != ".parquet":
         raise InputError(
             f"'{path}': a fleet is read from a Parquet file or a folder of them; got "

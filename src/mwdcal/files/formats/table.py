@@ -151,12 +151,7 @@ def _suffix(path: Path) -> str:
 def _content(path: Path) -> bytes:
     """The bytes of a regular file of a known suffix that is not too large."""
     try:
-        if path.is_dir():
-            raise InputError(f"'{path}' is a folder. Name a file in it.")
-        if not path.exists():
-            raise InputError(f"'{path}': no such file. Check the name and the folder.")
-        if not path.is_file():
-            raise InputError(f"'{path}' is not a regular file. Name a file with readings.")
+        check_file(path)
         _check_size(path.stat().st_size, path)
         return path.read_bytes()
     except (OSError, ValueError) as error:
@@ -164,6 +159,16 @@ def _content(path: Path) -> bytes:
             f"cannot read '{path}': {reason(error)}. Check that the file may be read and is not "
             "locked by another program."
         ) from error
+
+
+def check_file(path: Path) -> None:
+    """Refuse a path at which there is no regular file."""
+    if path.is_dir():
+        raise InputError(f"'{path}' is a folder. Name a file in it.")
+    if not path.exists():
+        raise InputError(f"'{path}': no such file. Check the name and the folder.")
+    if not path.is_file():
+        raise InputError(f"'{path}' is not a regular file. Name a file with readings.")
 
 
 def _check_size(size: int, path: Path) -> None:
