@@ -140,7 +140,7 @@ TIDYING = """
 import time
 from mwdcal.app import cli
 from mwdcal.app.commands import fleet
-from mwdcal.files import atomic
+from mwdcal.files.formats import atomic
 real_remove = atomic._remove
 def remove(path):
     print("tidying", flush=True)
