@@ -1,16 +1,22 @@
-"""The columns of a run file: names, units, accepted ranges, near misses."""
+"""The columns of a run file: names, units, accepted ranges, near misses; the north of its azimuths.
+
+True azimuth = magnetic + declination; grid azimuth = true - convergence. Metadata
+`azimuth_reference` is "magnetic" (the default), "true" or "grid". `declination_deg` without
+`azimuth_reference` changes nothing: the azimuths are magnetic.
+"""
 
 from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from math import pi
 from typing import NamedTuple
 
 import numpy as np
 
 from mwdcal.errors import InputError
+from mwdcal.files.formats.table import shown
 from mwdcal.files.synonyms import CONVERSIONS, resembled
 from mwdcal.geometry.vectors import Array, Bools
 
@@ -19,6 +25,11 @@ RAW = tuple(name for triad in CHANNELS.values() for name in triad)
 
 # Metadata that changes what the numbers mean.
 AZIMUTH_KEYS = ("azimuth_reference", "declination_deg", "convergence_deg")
+_NORTHS: dict[str, tuple[str, ...]] = {
+    "magnetic": (),
+    "true": ("declination_deg",),
+    "grid": ("declination_deg", "convergence_deg"),
+}
 
 
 class Range(NamedTuple):
@@ -45,7 +56,7 @@ class Reference(NamedTuple):
 
     column: str
     values: Range
-    spread: Range
+    uncertainty: Range
     factor: float
 
 
@@ -71,7 +82,7 @@ RANGES = {
     **dict.fromkeys(RAW, RAW_RANGE),
     **{reference.column: reference.values for reference in REFERENCES.values()},
     **{f"sd_{name}": RAW_SPREAD for name in RAW},
-    **{f"sd_{reference.column}": reference.spread for reference in REFERENCES.values()},
+    **{f"sd_{reference.column}": reference.uncertainty for reference in REFERENCES.values()},
 }
 """The columns of numbers, and their accepted values."""
 COLUMNS = ("station", "group", *RANGES)
@@ -143,3 +154,41 @@ def _missing(missing: Sequence[str], names: Sequence[str], source: str) -> Input
 def _listed(names: Sequence[str]) -> str:
     quoted = ", ".join(f"'{name}'" for name in names)
     return f"{quoted} {'is' if len(names) == 1 else 'are'}"
+
+
+def magnetic_offset(metadata: Mapping[str, object], source: str) -> float:
+    """Stated azimuth minus magnetic azimuth, degrees.
+
+    >>> magnetic_offset({"azimuth_reference": "true", "declination_deg": 3.0}, "run.csv")
+    3.0
+    """
+    check_near_misses(list(metadata), AZIMUTH_KEYS, f"{source}: metadata")
+    kind = metadata.get("azimuth_reference", "magnetic")
+    if kind is True:  # the bare word `true` in a metadata line
+        kind = "true"
+    stated = {
+        key: _degrees(metadata[key], key, source) for key in AZIMUTH_KEYS[1:] if key in metadata
+    }
+    if not isinstance(kind, str) or kind not in _NORTHS:
+        raise InputError(
+            f"{source}, metadata 'azimuth_reference': must be one of "
+            f"{', '.join(_NORTHS)}; got {shown(kind)}. Say which north the azimuths count from."
+        )
+    for key in _NORTHS[kind]:
+        if key not in stated:
+            raise InputError(
+                f"{source}: {kind} azimuths need the metadata '{key}'; got none. Add a line "
+                f"`# {key} = …`, or give magnetic azimuths."
+            )
+    sign = {"declination_deg": 1.0, "convergence_deg": -1.0}
+    return sum((sign[key] * stated[key] for key in _NORTHS[kind]), 0.0)
+
+
+def _degrees(value: object, key: str, source: str) -> float:
+    number = float(value) if isinstance(value, int | float) else float("nan")
+    if isinstance(value, bool) or not ROTATION.low <= number <= ROTATION.high:
+        raise InputError(
+            f"{source}, metadata '{key}': must be a number {ROTATION}; got {shown(value)}. "
+            "East is positive; write it with a decimal point."
+        )
+    return number

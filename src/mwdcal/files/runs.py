@@ -18,8 +18,14 @@ import numpy as np
 from mwdcal.calibration.readings import Readings
 from mwdcal.errors import InputError
 from mwdcal.files import synonyms
-from mwdcal.files.azimuths import magnetic_offset
-from mwdcal.files.contract import CHANNELS, COLUMNS, REFERENCES, Range, check_columns
+from mwdcal.files.contract import (
+    CHANNELS,
+    COLUMNS,
+    REFERENCES,
+    Range,
+    check_columns,
+    magnetic_offset,
+)
 from mwdcal.files.faults import BlankReadingError as BlankReadingError
 from mwdcal.files.faults import Cells, columns_of, faults, faults_beside_readings, refuse
 from mwdcal.files.formats import table as tables

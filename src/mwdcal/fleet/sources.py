@@ -18,8 +18,7 @@ import msgspec
 from mwdcal.calibration.readings import is_simulated
 from mwdcal.errors import InputError
 from mwdcal.files import contract, synonyms
-from mwdcal.files.azimuths import magnetic_offset
-from mwdcal.files.contract import REFERENCES
+from mwdcal.files.contract import REFERENCES, magnetic_offset
 from mwdcal.files.formats import parquet
 from mwdcal.files.formats.table import check_file
 
