@@ -115,12 +115,12 @@ def test_a_folder_and_a_huge_file_are_no_profiles(tmp_path):
 
 
 def test_a_profile_that_may_not_be_read(tmp_path, monkeypatch):
-    def refuse(self):
+    def refuse(self, *mode):
         raise PermissionError(13, "Permission denied", str(self))
 
     path = tmp_path / "tool.toml"
     path.write_text('name = "a"')
-    monkeypatch.setattr(type(path), "read_bytes", refuse)
+    monkeypatch.setattr(type(path), "open", refuse)
     with pytest.raises(InputError, match=r"Permission denied\. Check its permissions"):
         load_profile(str(path))
 

@@ -98,9 +98,11 @@ def read_toml(name: str, folder: str, kind: str) -> tuple[bytes, str]:
     if name in built_in(folder):
         path = resources.files("mwdcal").joinpath(folder, name + _SUFFIX)
     try:
-        data = path.read_bytes() if path.is_file() else None
-        if data is not None and len(data) <= _LARGEST:
-            return data.removeprefix(b"\xef\xbb\xbf"), hashlib.sha256(data).hexdigest()
+        if path.is_file():
+            with path.open("rb") as stream:
+                data = stream.read(_LARGEST + 1)
+            if len(data) <= _LARGEST:
+                return data.removeprefix(b"\xef\xbb\xbf"), hashlib.sha256(data).hexdigest()
         exists = path.exists()
     except (OSError, ValueError) as error:
         raise InputError(
