@@ -520,7 +520,7 @@ def test_a_station_of_a_slow_log_has_a_sample(tmp_path):
         (lambda c: c["ay"].fill(np.nan), "ay is blank from end to end"),
         (lambda c: c["ay"].__setitem__(slice(70, 72), np.nan), "first in line 73"),
         (lambda c: c["ay"].__setitem__(slice(70, 75, 2), np.nan), "first in line 73"),
-        (lambda c: c["ay"].__setitem__(slice(50, None), np.nan), "ay has 50 samples, of 128"),
+        (lambda c: c["ay"].__setitem__(slice(50, None), np.nan), "ay has 50 samples; 128"),
     ],
 )
 def test_a_bad_channel_is_left_out_and_the_others_go_on(tmp_path, change, part):

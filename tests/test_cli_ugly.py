@@ -191,7 +191,7 @@ OPTIONS = {
     "order unknown": (("--order", "4"), 2, "0, 1, 2, 3 or auto"),
     "order below": (("--order", "-1"), 2, "0, 1, 2, 3 or auto"),
     "tool unknown": (("--tool", "servoo"), 2, "Did you mean 'servo'"),
-    "tool is a folder": (("--tool", "."), 2, "is no tool profile"),
+    "tool is a folder": (("--tool", "."), 2, "is not a tool profile"),
     "station unknown": (("--exclude", "49"), 2, "no such station"),
     "all stations left out": ([f"--exclude={i}" for i in range(1, 49)], 3, "0 stations"),
     "decimal unknown": (("--decimal", ";"), 2, "must be '.' or ','"),
@@ -317,7 +317,7 @@ def test_a_log_is_no_run(tmp_path, mark):
     metadata = ["sampling_hz = 100"] if mark == "sampling_hz" else []
     path = write_csv(tmp_path / "run.csv", many, *metadata)
     message = refused(calibrate(tmp_path, path, "--order", 0), 2)
-    assert "run.csv is a continuous log (1004 rows): its rows are no stations." in message
+    assert "run.csv is a continuous log (1004 rows): its rows are not stations." in message
     assert message.endswith("If each row is a station, remove time_s and sampling_hz.")
     assert "continuous log" in refused(mwdcal("compare", path), 2)
     assert not left(tmp_path)

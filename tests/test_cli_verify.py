@@ -281,7 +281,7 @@ LIMITS = {
     "nan": ('name = "x"\n[spread]\ndip_deg = nan\n', "must be positive"),
     "infinite": ('name = "x"\n[spread]\ndip_deg = inf\n', "must be positive"),
     "no TOML": ("\x00\xff", "is not a limits profile"),
-    "a folder": (".", "Is a directory"),
+    "a folder": (".", "is not a limits profile"),
 }
 
 

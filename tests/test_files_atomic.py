@@ -103,7 +103,7 @@ def test_a_refused_permission_is_an_input_error(tmp_path, monkeypatch):
 
 KILLED = """
 import os, sys
-from mwdcal.files import atomic
+from mwdcal.files.formats import atomic
 with atomic.replacing(sys.argv[1]) as stream:
     stream.write(b"half")
     stream.flush()

@@ -58,7 +58,7 @@ def test_a_left_handed_instrument_is_a_real_one(tmp_path):
         ("servoo", "built-in name (distox, generic, moosavi-servo, sap5, sap6, servo)"),
         ("servoo", "Did you mean 'servo'"),
         ("nowhere/tool.toml", "or the path of a TOML file; got 'nowhere/tool.toml'"),
-        ("", "is no tool profile"),
+        ("", "is not a tool profile"),
         ("x" * 5000, "File name too long"),
     ],
 )
@@ -108,19 +108,19 @@ def test_refusals_name_the_file_the_key_and_the_remedy(tmp_path, text, part):
 
 
 def test_a_folder_and_a_huge_file_are_no_profiles(tmp_path):
-    with pytest.raises(InputError, match="is no tool profile"):
+    with pytest.raises(InputError, match="is not a tool profile"):
         load_profile(str(tmp_path))
     with pytest.raises(InputError, match="at most 1000000 bytes"):
         load(tmp_path, b"#" * 1_000_001)
 
 
 def test_a_profile_that_may_not_be_read(tmp_path, monkeypatch):
-    def refuse(self):
+    def refuse(self, *mode):
         raise PermissionError(13, "Permission denied", str(self))
 
     path = tmp_path / "tool.toml"
     path.write_text('name = "a"')
-    monkeypatch.setattr(type(path), "read_bytes", refuse)
+    monkeypatch.setattr(type(path), "open", refuse)
     with pytest.raises(InputError, match=r"Permission denied\. Check its permissions"):
         load_profile(str(path))
 

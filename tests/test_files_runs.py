@@ -13,6 +13,8 @@ from hypothesis.extra.numpy import arrays
 
 from mwdcal.calibration.readings import Readings
 from mwdcal.errors import InputError
+from mwdcal.files.contract import RAW
+from mwdcal.files.faults import faults
 from mwdcal.files.formats.table import SUFFIXES, Table
 from mwdcal.files.profiles import list_profiles, load_profile
 from mwdcal.files.runs import check_run, from_readings, read_run, to_readings, write_run
@@ -387,3 +389,34 @@ def test_rows_of_several_tools_are_no_run(table, named):
         check_run(table)
     assert f"(serial {named}" in str(refusal.value)
     assert "mwdcal fleet" in str(refusal.value)
+
+
+DAMAGES = [
+    ("az", np.nan), ("ax", 2e15), ("mx", np.nan), ("temperature_c", np.nan), ("sd_ay", np.nan),
+    ("temperature_c", 2000.0), ("sd_ax", 0.0), ("sd_ax", -1.0), ("sd_mx", -1.0), ("ref_gravity_g", 0.0),
+    ("ref_azimuth_deg", 400.0), ("sd_ref_azimuth_deg", -1.0), ("sd_ref_gravity_g", 3.0),
+    ("sd_ref_dip_deg", -1.0), ("ref_dip_deg", np.nan), ("group", 1.0),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("count", [1, 4])
+def test_the_cells_of_a_tool_are_judged_without_those_of_others(count):
+    """Rows of many tools have the faults of each tool's own rows."""
+    names = (*RAW, "temperature_c", "ref_azimuth_deg", "ref_gravity_g", "sd_ax", "sd_ay", "sd_az")
+    tools = []
+    for name, value in DAMAGES:
+        for rows in (slice(0, 1), slice(0, count)):
+            tool = dict.fromkeys(names, np.ones(count)) | {name: np.ones(count)}
+            tool[name] = np.where(np.arange(count) < rows.stop, value, tool[name])
+            tools.append(tool)
+    every = {
+        name: np.concatenate([tool.get(name, np.full(count, np.nan)) for tool in tools])
+        for name in dict.fromkeys(name for tool in tools for name in tool)
+    }
+    starts = np.arange(0, count * len(tools) + 1, count)
+    wrong = np.zeros(starts[-1], bool)
+    for fault in faults(every.get, starts, BARE):
+        wrong |= fault.cells.any(0)
+    alone = [bool([*faults(tool.get, np.array([0, count]), BARE)]) for tool in tools]
+    assert wrong.reshape(-1, count).any(-1).tolist() == alone
+    assert {True, False} == set(alone)

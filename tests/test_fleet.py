@@ -463,6 +463,21 @@ def test_wrong_paths(tmp_path):
     assert "complete Parquet file" in refused(mwdcal("fleet", good, "-o", output), 2)
 
 
+@pytest.mark.parametrize("column", ["serial", "az"])
+def test_a_table_with_damaged_pages(tmp_path, column):
+    """The footer is whole: the damage shows only where the rows of a column are read."""
+    path = write_fleet(tmp_path / "runs.parquet", {f"T{i}": short_run(i) for i in range(3)})
+    group = pq.read_metadata(path).row_group(0)
+    chunks = (group.column(i) for i in range(group.num_columns))
+    chunk = next(c for c in chunks if c.path_in_schema == column)
+    data = bytearray(path.read_bytes())
+    start = chunk.dictionary_page_offset or chunk.data_page_offset
+    data[start : start + 12] = b"\xff" * 12
+    path.write_bytes(data)
+    message = refused(mwdcal("fleet", path, "-o", tmp_path / "out.parquet"), 2)
+    assert "complete Parquet file" in message
+
+
 def _empty(folder):
     found = folder / "empty"
     found.mkdir()

@@ -265,6 +265,19 @@ def test_a_parquet_log_without_rows(tmp_path, command):
 # Standstills that are not taken
 
 
+@pytest.mark.parametrize("command", ["stations", "noise"])
+@pytest.mark.parametrize("value", ["1e200", "-1e308"])
+def test_numbers_that_no_channel_reads_are_refused(tmp_path, command, value):
+    """Their squares would overflow; a run file may not have them either."""
+    log, *_ = tumble(2)
+    columns = {name: [f"{v:.6f}" for v in log.columns[name]] for name in ("time_s", *ACC)}
+    columns["ay"][300] = value
+    path = write_csv(tmp_path / "log.csv", columns)
+    output = ["-o", tmp_path / "run.csv"] if command == "stations" else []
+    message = refused(mwdcal(command, path, *output), 2)
+    assert "log.csv, line 302, column 'ay': must be between -1e+15 and 1e+15" in message
+
+
 def test_noisy_rests_are_told_with_the_threshold_that_takes_them():
     log, starts, ends, _ = tumble(6, stations=20, still=(8, 14), noise=1e-3)
     time = log.columns["time_s"]

@@ -20,3 +20,8 @@ class FitError(MwdcalError):
     """The input is understood but not calibratable or not trustworthy (exit code 3)."""
 
     exit_code = 3
+
+
+def reason(error: Exception) -> str:
+    """What the operating system says went wrong, without its error number and the path."""
+    return getattr(error, "strerror", None) or str(error)

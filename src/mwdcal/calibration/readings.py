@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -39,14 +40,20 @@ def simulated(*metadata: Mapping[str, object]) -> list[str]:
     return [SIMULATED] if any(map(is_simulated, metadata)) else []
 
 
-def group_numbers(labels: Sequence[str]) -> Ints | None:
+def group_numbers(labels: Sequence[str], starts: Sequence[int] = ()) -> Ints | None:
     """Group numbers (n,) in order of appearance, -1 for a blank label; None if all are blank.
+
+    `starts`: where each tool's labels begin, and the end, if they are of several tools: each then
+    has numbers of its own.
 
     >>> group_numbers(["B", "", "A", "B"]).tolist()
     [0, -1, 1, 0]
     """
-    order = {name: number for number, name in enumerate(dict.fromkeys(filter(None, labels)))}
-    return np.array([order.get(name, -1) for name in labels], int) if order else None
+    numbers: list[int] = []
+    for first, last in pairwise(starts or (0, len(labels))):
+        seen: dict[str, int] = {}
+        numbers += [seen.setdefault(n, len(seen)) if n else -1 for n in labels[first:last]]
+    return np.array(numbers, int) if any(labels) else None
 
 
 def fingerprints(triads: Sequence[Array]) -> tuple[str, ...]:

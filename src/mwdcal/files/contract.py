@@ -1,21 +1,35 @@
-"""The columns of a run file: names, units, accepted ranges, near misses."""
+"""The columns of a run file: names, units, accepted ranges, near misses; the north of its azimuths.
+
+True azimuth = magnetic + declination; grid azimuth = true - convergence. Metadata
+`azimuth_reference` is "magnetic" (the default), "true" or "grid". `declination_deg` without
+`azimuth_reference` changes nothing: the azimuths are magnetic.
+"""
 
 from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from math import pi
 from typing import NamedTuple
 
+import numpy as np
+
 from mwdcal.errors import InputError
+from mwdcal.files.formats.table import shown
 from mwdcal.files.synonyms import CONVERSIONS, resembled
+from mwdcal.geometry.vectors import Array, Bools
 
 CHANNELS = {"accelerometer": ("ax", "ay", "az"), "magnetometer": ("mx", "my", "mz")}
 RAW = tuple(name for triad in CHANNELS.values() for name in triad)
 
 # Metadata that changes what the numbers mean.
 AZIMUTH_KEYS = ("azimuth_reference", "declination_deg", "convergence_deg")
+_NORTHS: dict[str, tuple[str, ...]] = {
+    "magnetic": (),
+    "true": ("declination_deg",),
+    "grid": ("declination_deg", "convergence_deg"),
+}
 
 
 class Range(NamedTuple):
@@ -25,6 +39,11 @@ class Range(NamedTuple):
     high: float
     unit: str
     positive: bool = False
+
+    def outside(self, values: Array) -> Bools:
+        """Which of the values (...) are not accepted; NaN, a blank cell, is."""
+        low = values <= self.low if self.positive else values < self.low
+        return np.asarray(low | (values > self.high))
 
     def __str__(self) -> str:
         if self.positive:
@@ -37,7 +56,7 @@ class Reference(NamedTuple):
 
     column: str
     values: Range
-    spread: Range
+    uncertainty: Range
     factor: float
 
 
@@ -58,14 +77,15 @@ RAW_RANGE = Range(-1e15, 1e15, "")
 RAW_SPREAD = Range(0.0, 1e15, "")
 ROTATION = Range(-180.0, 180.0, "°")
 
-_MEASURED = (*RAW, *(reference.column for reference in REFERENCES.values()))
-COLUMNS = (
-    "station",
-    "group",
-    "temperature_c",
-    *_MEASURED,
-    *(f"sd_{name}" for name in _MEASURED),
-)
+RANGES = {
+    "temperature_c": TEMPERATURE,
+    **dict.fromkeys(RAW, RAW_RANGE),
+    **{reference.column: reference.values for reference in REFERENCES.values()},
+    **{f"sd_{name}": RAW_SPREAD for name in RAW},
+    **{f"sd_{reference.column}": reference.uncertainty for reference in REFERENCES.values()},
+}
+"""The columns of numbers, and their accepted values."""
+COLUMNS = ("station", "group", *RANGES)
 
 _UNIT = re.compile(
     r"[\s_(\[-]+(°|°?c|deg|degc|degrees?|rad|f|k|m?g|m/?s2|[nµu]t|gauss|m?v|counts?|raw)[)\]]?$"
@@ -90,7 +110,7 @@ def check_columns(names: Sequence[str], source: str) -> None:
 def check_near_misses(names: Collection[str], contract: Sequence[str], what: str) -> None:
     """Refuse a name that differs from an absent one of the contract in case or unit only.
 
-    Such a column would be ignored in silence; any other unknown column is the user's own.
+    Such a column would be ignored silently; any other unknown column is the user's.
     """
     present = set(names)
     expected = {form: name for name in contract if name not in present for form in _forms(name)}
@@ -124,13 +144,51 @@ def _missing(missing: Sequence[str], names: Sequence[str], source: str) -> Input
     closest = {m: difflib.get_close_matches(m, names[:100], n=1, cutoff=0.5) for m in missing}
     hints = [f"'{near[0]}' for '{name}'" for name, near in closest.items() if near]
     meant = f" Did you mean {', '.join(hints)}?" if hints else ""
-    found = ", ".join(f"'{name[:40]}'" for name in names[:20]) + (" …" if names[20:] else "")
+    present = ", ".join(f"'{name[:40]}'" for name in names[:20]) + (" …" if names[20:] else "")
     return InputError(
         f"{source}: the columns ax, ay, az must be present; {_listed(missing)} missing; "
-        f"found {found}.{meant} Rename the columns, or check the delimiter of the file."
+        f"found {present}.{meant} Rename the columns, or check the delimiter of the file."
     )
 
 
 def _listed(names: Sequence[str]) -> str:
     quoted = ", ".join(f"'{name}'" for name in names)
     return f"{quoted} {'is' if len(names) == 1 else 'are'}"
+
+
+def magnetic_offset(metadata: Mapping[str, object], source: str) -> float:
+    """Stated azimuth minus magnetic azimuth, degrees.
+
+    >>> magnetic_offset({"azimuth_reference": "true", "declination_deg": 3.0}, "run.csv")
+    3.0
+    """
+    check_near_misses(list(metadata), AZIMUTH_KEYS, f"{source}: metadata")
+    kind = metadata.get("azimuth_reference", "magnetic")
+    if kind is True:  # the bare word `true` in a metadata line
+        kind = "true"
+    stated = {
+        key: _degrees(metadata[key], key, source) for key in AZIMUTH_KEYS[1:] if key in metadata
+    }
+    if not isinstance(kind, str) or kind not in _NORTHS:
+        raise InputError(
+            f"{source}, metadata 'azimuth_reference': must be one of "
+            f"{', '.join(_NORTHS)}; got {shown(kind)}. Say which north the azimuths count from."
+        )
+    for key in _NORTHS[kind]:
+        if key not in stated:
+            raise InputError(
+                f"{source}: {kind} azimuths need the metadata '{key}'; got none. Add a line "
+                f"`# {key} = …`, or give magnetic azimuths."
+            )
+    sign = {"declination_deg": 1.0, "convergence_deg": -1.0}
+    return sum((sign[key] * stated[key] for key in _NORTHS[kind]), 0.0)
+
+
+def _degrees(value: object, key: str, source: str) -> float:
+    number = float(value) if isinstance(value, int | float) else float("nan")
+    if isinstance(value, bool) or not ROTATION.low <= number <= ROTATION.high:
+        raise InputError(
+            f"{source}, metadata '{key}': must be a number {ROTATION}; got {shown(value)}. "
+            "East is positive; write it with a decimal point."
+        )
+    return number

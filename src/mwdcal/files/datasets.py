@@ -31,7 +31,7 @@ def fetch(name: str) -> Path:
     known = registry()
     if name not in known:
         raise InputError(
-            f"{name!r} is no measured file of the registry; see mwdcal.files.datasets.registry()."
+            f"{name!r} is not a file of the measured sets; see mwdcal.files.datasets.registry()."
         )
     if FOLDER not in os.environ and ADDRESS not in os.environ:
         raise InputError(

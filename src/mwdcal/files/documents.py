@@ -15,16 +15,16 @@ import numpy as np
 
 from mwdcal.calibration.readings import TRIADS
 from mwdcal.calibration.record import SCHEMA_VERSION, Calibration
-from mwdcal.errors import InputError
+from mwdcal.errors import InputError, reason
 from mwdcal.files.formats import atomic
 from mwdcal.files.profiles import check_profile
 
 HIGHEST = 3
 """The highest order of temperature terms."""
 LARGEST = 1e30
-"""No number of a calibration comes near this one."""
+"""Magnitude that no number of a calibration reaches."""
 WORST = 1e4
-"""Gains with a greater condition number are those of no sensor."""
+"""Condition number that the gains of a real sensor never reach."""
 
 
 def encode(calibration: Calibration) -> bytes:
@@ -43,30 +43,29 @@ def read(path: str | os.PathLike[str]) -> Calibration:
 
 
 def load(path: str | os.PathLike[str]) -> tuple[Calibration, str]:
-    """The same, with the SHA-256 of the file's bytes."""
+    """A calibration file, and the SHA-256 of its bytes."""
     name = Path(path).name
     try:
         data = Path(path).read_bytes()
     except OSError as error:
-        reason = error.strerror or str(error)
-        raise InputError(f"{path}: cannot be read ({reason}). Check the path.") from None
+        raise InputError(f"{path}: cannot be read ({reason(error)}). Check the path.") from None
     try:
         version = msgspec.json.decode(data, type=dict[str, Any]).get("schema_version")
         if version != SCHEMA_VERSION:
             raise InputError(
-                f"{name}: 'schema_version' must be {SCHEMA_VERSION}; got {version!r}. It is no "
-                "calibration file, or one of another version of mwdcal: calibrate again."
+                f"{name}: 'schema_version' must be {SCHEMA_VERSION}; got {version!r}. It is not "
+                "a calibration file, or another version of mwdcal wrote it: calibrate again."
             )
-        found = check(msgspec.json.decode(data, type=Calibration), name)
+        calibration = check(msgspec.json.decode(data, type=Calibration), name)
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
         raise InputError(
             f"{name} is not a calibration file: {error}. Use a file that mwdcal calibrate wrote."
         ) from None
-    return found, hashlib.sha256(data).hexdigest()
+    return calibration, hashlib.sha256(data).hexdigest()
 
 
 def check(calibration: Calibration, name: str) -> Calibration:
-    """Refuse a file whose parts do not fit together, or whose numbers no calibration has."""
+    """Refuse a file whose parts do not fit together, or whose numbers are not possible."""
     problem = _misfit(calibration)
     if problem:
         raise InputError(
@@ -105,7 +104,7 @@ def _misfit(calibration: Calibration) -> str:
 
 
 def _unusable(calibration: Calibration) -> str:
-    """Which numbers could not be computed with."""
+    """Which numbers cannot be used; empty where all can."""
     covariance = calibration.parameter_covariance
     lists = [[t.radius, t.noise, *t.centre, *t.parameters] for t in calibration.triads]
     lists += [*calibration.free, covariance.ravel().tolist(), list(calibration.earth.values())]
@@ -116,7 +115,7 @@ def _unusable(calibration: Calibration) -> str:
     scaled = covariance / np.outer(norm, norm)
     even = np.allclose(scaled, scaled.transpose(), atol=1e-6)
     if not even or (diagonal < 0).any() or np.linalg.eigvalsh(scaled)[0] < -1e-6:
-        return "the covariance is none: it is not symmetric, or has negative variances"
+        return "the covariance is not a valid covariance matrix: it is not symmetric, or has negative variances"
     middle = np.array([calibration.reference_temperature])
     for triad in calibration.triads:
         parameters = np.array(triad.parameters)
@@ -130,11 +129,11 @@ def _unusable(calibration: Calibration) -> str:
 
 def schema() -> dict[str, Any]:
     """JSON Schema of a calibration file, from its definition in code."""
-    made = _cleaned(json.loads(msgspec.json.encode(msgspec.json.schema(Calibration))))
+    described = _cleaned(json.loads(msgspec.json.encode(msgspec.json.schema(Calibration))))
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": f"mwdcal calibration file, schema version {SCHEMA_VERSION}",
-        **made,
+        **described,
     }
 
 

@@ -7,34 +7,36 @@ the one that is wrong.
 
 from __future__ import annotations
 
-import csv
 import hashlib
 import os
 import re
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
 import numpy as np
 
-from mwdcal.errors import InputError
+from mwdcal.errors import InputError, reason
 from mwdcal.files import metadata as meta
-from mwdcal.files.contract import COLUMNS, check_columns, check_near_misses
+from mwdcal.files.contract import COLUMNS, RANGES, RAW, check_columns, check_near_misses
+from mwdcal.files.faults import columns_of, range_faults, refuse
 from mwdcal.files.formats import table as tables
 from mwdcal.files.formats.columns import (
-    LABELS,
     Column,
     assemble,
     check_names,
     looks_numeric,
     no_stations,
+    of_texts,
 )
 from mwdcal.files.formats.table import Table, shown
+from mwdcal.files.formats.text import comment, is_preamble, split
 from mwdcal.geometry.vectors import Array
 
 TIME = "time_s"
-READ = tuple(name for name in (TIME, *COLUMNS) if name not in LABELS)
+READ = (TIME, *RANGES)
 """Columns of a log that mean something, all of them numbers."""
 
 _PIECE = 16_000_000
@@ -45,7 +47,11 @@ _BINARY = re.compile(rb"[\x00-\x08\x0e-\x1f]")
 _EXAMPLE = "--columns time_s,ax,ay,az"
 
 
-def _silent(text: str) -> None:
+Say = Callable[[str], None]
+"""Called with the progress of a long computation, in words."""
+
+
+def silent(text: str) -> None:
     """Say nothing."""
 
 
@@ -63,51 +69,56 @@ def read(
     names: Sequence[str] = (),
     *,
     decimal: str = ".",
-    say: Callable[[str], None] = _silent,
+    say: Say = silent,
 ) -> Table:
     """The columns of a log that mean something, as numbers (NaN: blank), and its metadata.
 
-    `names` are the columns of a text log without a line of column names. `say` is told how
-    far the reading has come. Errors name file, line and column.
+    `names` are the columns of a text log without a line of column names. `say` receives
+    the progress. Errors name file, line and column.
     """
     file = Path(path)
-    if file.suffix.lower() in _TYPED:
-        if names:
-            raise InputError(
-                f"--columns names the columns of a text log without column names; '{path}' has "
-                "names of its own. Leave --columns out."
-            )
-        try:
-            return _numeric(tables.read(file, decimal=decimal))
-        except InputError as error:
-            if str(error) != str(no_stations(file.name)):
-                raise
-            raise _empty(file.name) from None
+    typed = file.suffix.lower() in _TYPED
+    table = _typed(file, names, decimal) if typed else _text(file, [*names], decimal, say)
+    cells = columns_of(table)
+    refuse(table, chain.from_iterable(range_faults(cells, name) for name in RAW))
+    return table
+
+
+def _typed(file: Path, names: Sequence[str], decimal: str) -> Table:
+    """The table of a log of typed columns, its numbers as numbers."""
+    if names:
+        raise InputError(
+            f"--columns names the columns of a text log without column names; '{file}' has "
+            "names of its own. Leave --columns out."
+        )
+    try:
+        table = tables.read(file, decimal=decimal)
+    except InputError as error:
+        if str(error) != str(no_stations(file.name)):
+            raise
+        raise _empty(file.name) from None
+    _check(list(table.columns), table.source)
+    numbers = {name: _numbers(table, name) for name in table.columns if name in READ}
+    return replace(table, columns={**table.columns, **numbers})
+
+
+def _text(file: Path, names: list[str], decimal: str, say: Say) -> Table:
+    """The table of a text log."""
     if decimal not in (".", ","):
         raise InputError(f"--decimal must be '.' or ','; got {shown(decimal)}.")
     try:
-        if file.exists() and not file.is_file():
-            raise InputError(f"'{path}' is not a regular file. Name a file with a log.")
+        tables.check_file(file)
         with file.open("rb") as stream:
-            return _text(stream, list(names), decimal, file.name, say)
+            return _read_text(stream, names, decimal, file.name, say)
     except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or str(error)
-        raise InputError(f"cannot read '{path}': {reason}. Check the name and the file.") from None
+        raise InputError(
+            f"cannot read '{file}': {reason(error)}. Check the name and the file."
+        ) from None
 
 
 def _empty(source: str) -> InputError:
     """A log with nothing below its column names."""
     return InputError(f"{source}: the log has no samples. Is the file complete?")
-
-
-def _numeric(table: Table) -> Table:
-    """The table with the columns that mean something as numbers, the others as they are."""
-    _check(list(table.columns), table.source)
-    columns: dict[str, Column] = {
-        name: _numbers(table, name) if name in READ else column
-        for name, column in table.columns.items()
-    }
-    return Table(columns, table.metadata, table.source, table.lines, table.digest, table.decimal)
 
 
 def _numbers(table: Table, name: str) -> Array:
@@ -124,10 +135,8 @@ def _numbers(table: Table, name: str) -> Array:
     return tables.numbers(table, name)
 
 
-def _text(
-    stream: BinaryIO, names: list[str], decimal: str, source: str, say: Callable[[str], None]
-) -> Table:
-    """The table of a text log."""
+def _read_text(stream: BinaryIO, names: list[str], decimal: str, source: str, say: Say) -> Table:
+    """The table in the text of a log."""
     comments, first, number = _top(stream, source)
     metadata = meta.parse(comments, source)
     layout = _layout(first, number, names, decimal, source)
@@ -136,9 +145,9 @@ def _text(
     pieces, lines = [], []
     ahead = first + "\n" if names else ""
     for piece in _pieces(stream, ahead, done, source):
-        values, own, done = _piece(piece, done, layout)
+        values, numbers, done = _piece(piece, done, layout)
         pieces.append(values)
-        lines.append(own)
+        lines.append(numbers)
         say(f"reading {source}: {100 * stream.tell() / size:.0f} %")
     if not sum(map(len, lines)):
         raise _empty(source)
@@ -154,16 +163,12 @@ def _text(
 
 def _top(stream: BinaryIO, source: str) -> tuple[list[tuple[int, str]], str, int]:
     """Numbered comments above the table, and its first line with its number."""
-    comments = []
+    comments: list[tuple[int, str]] = []
     for number, data in enumerate(stream, 1):
         line = _decoded(data, number, source).lstrip("\ufeff").strip("\r\n")
-        text = line.strip()
-        if text.startswith('"#'):  # a spreadsheet has saved it
-            text = ",".join(next(csv.reader([text])))
-        if text.startswith("#"):
-            comments.append((number, text.rstrip(",;\t ")))
-        elif text:
+        if not is_preamble(line):
             return comments, line, number
+        comments.append((number, comment(line)))
     raise InputError(
         f"{source}: the file is empty. A log needs a line with the column names, such as "
         f"time_s,ax,ay,az, or {_EXAMPLE}; and one row per sample."
@@ -191,7 +196,8 @@ def _layout(first: str, number: int, names: list[str], decimal: str, source: str
     marks = [mark for mark in ",;\t" if mark != decimal]
     best = max(marks, key=first.count)
     delimiter = best if best in first else None
-    cells = [cell.strip() for cell in _cells([first], delimiter, number, source)[0]]
+    _, header = next(_rows([first], delimiter, number - 1, source))
+    cells = [str(cell).strip() for cell in header]
     numeric = all(looks_numeric(cell, decimal) or not cell for cell in cells)
     if names:
         _check(names, "--columns")
@@ -242,14 +248,9 @@ def _piece(text: str, done: int, layout: _Layout) -> tuple[Array, Sequence[int],
     values = _plain(text, len(lines), layout)
     if values is not None and len(values) == len(lines):
         return values, range(done + 1, done + len(lines) + 1), after
-    rows = enumerate(_cells(lines, layout.delimiter, done + 1, layout.source), done + 1)
-    head: tuple[int, Sequence[object]] = (done, layout.names)
-    names, cells, numbers = assemble(chain([head], rows), layout.source, "line")
-    columns: dict[str, Column] = {
-        name: [str(cell) for cell in column]
-        for name, column in zip(names, zip(*cells, strict=True), strict=True)
-    }
-    table = Table(columns, {}, layout.source, numbers, "", layout.decimal)
+    rows = _rows(lines, layout.delimiter, done, layout.source)
+    names, cells, numbers = assemble(chain([(done, layout.names)], rows), layout.source, "line")
+    table = Table(of_texts(names, cells), {}, layout.source, numbers, "", layout.decimal)
     values = np.stack([_numbers(table, name) for name in _wanted(layout)], -1)
     return values, numbers, after
 
@@ -293,27 +294,18 @@ def _filled(text: str, mark: str) -> str:
     return text + "nan" if text.endswith(mark) else text
 
 
-def _cells(
-    lines: Sequence[str], delimiter: str | None, first: int, source: str
-) -> list[Sequence[str]]:
-    """The cells of each line."""
+def _rows(
+    lines: Sequence[str], delimiter: str | None, above: int, source: str
+) -> Iterator[tuple[int, Sequence[object]]]:
+    """The cells of each line with its number; the delimiter None is white space."""
     if delimiter is None:
-        return [line.split() for line in lines]
-    try:
-        reader = csv.reader(lines, delimiter=delimiter, strict=True, skipinitialspace=True)
-        rows: list[Sequence[str]] = list(reader)
-    except csv.Error as error:
-        raise InputError(f"{source}, from line {first}: {error}. Remove the quotes.") from None
-    if len(rows) != len(lines):
-        raise InputError(
-            f"{source}, from line {first}: a cell in quotes must end on its line. Remove the quotes."
-        )
-    return rows
+        return ((number, line.split()) for number, line in enumerate(lines, above + 1))
+    return split(lines, above, delimiter, source)
 
 
 def _joined(lines: Sequence[Sequence[int]]) -> Sequence[int]:
     """Line numbers of all pieces; a range where they follow each other."""
-    full = [own for own in lines if len(own)]
-    if all(isinstance(own, range) for own in full):
+    full = [numbers for numbers in lines if len(numbers)]
+    if all(isinstance(numbers, range) for numbers in full):
         return range(full[0][0], full[-1][-1] + 1)
     return list(chain.from_iterable(lines))

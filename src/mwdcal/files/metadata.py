@@ -1,6 +1,6 @@
 """Metadata lines `# key = value`, with values in TOML, at the head of text tables and sheets.
 
-A bare word that is no TOML value (`serial = MWD-123`) is taken as text. Dates become ISO
+A bare word that is not a TOML value (`serial = MWD-123`) is taken as text. Dates become ISO
 text, so that every format holds the same values: text, numbers, booleans, lists, tables.
 """
 
@@ -20,7 +20,7 @@ _LONGEST_SHOWN = 60
 
 
 def parse(lines: Iterable[tuple[int, str]], source: str, word: str = "line") -> dict[str, object]:
-    """The metadata of numbered `#` lines; an empty comment line says nothing.
+    """The metadata of numbered `#` lines; an empty comment line is skipped.
 
     >>> parse([(1, "# serial = MWD-123"), (2, "# declination_deg = 3.5")], "run.csv")
     {'serial': 'MWD-123', 'declination_deg': 3.5}
@@ -49,21 +49,21 @@ def _entry(text: str, where: str) -> tuple[str, object]:
     """Key and value of one line."""
     bare = _BARE.fullmatch(text)
     try:
-        found = {} if text.startswith("[") else tomllib.loads(text)
+        pairs = {} if text.startswith("[") else tomllib.loads(text)
     except (ValueError, RecursionError):
-        found = {bare[1]: bare[2]} if bare else {}
-    if len(found) != 1:
+        pairs = {bare[1]: bare[2]} if bare else {}
+    if len(pairs) != 1:
         raise InputError(
             f"{where}: a line that starts with '#' must read `# key = value`, the key of "
             f"letters, digits, '_' and '-', the value as in TOML; got {_shown(text)}. "
             "Correct or remove the line."
         )
-    ((key, value),) = found.items()
+    ((key, value),) = pairs.items()
     return key, _plain(value, bare[2] if bare else "")
 
 
 def _plain(value: object, text: str = "") -> object:
-    """The value without the types that JSON has not: dates, and numbers beyond its range."""
+    """The value in types that JSON has: dates, and numbers beyond its range, as text."""
     if isinstance(value, list):
         return [_plain(item) for item in value]
     if isinstance(value, dict):

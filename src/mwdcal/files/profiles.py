@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import difflib
 import hashlib
-import math
 import re
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
-from mwdcal.errors import InputError
+from mwdcal.calibration.readings import TRIADS
+from mwdcal.errors import InputError, reason
 from mwdcal.files.contract import TEMPERATURE
 from mwdcal.files.formats.table import shown
 from mwdcal.sensor.profile import Datasheet, Profile, StandProfile, TriadProfile
 
 _DEFAULT = "generic"
-_PACKAGE = "mwdcal.profiles"
 _SUFFIX = ".toml"
 _LARGEST = 1_000_000
 _STRUCTS: dict[str, type[msgspec.Struct]] = {
@@ -28,7 +28,6 @@ _STRUCTS: dict[str, type[msgspec.Struct]] = {
     "accelerometer.datasheet": Datasheet,
     "magnetometer.datasheet": Datasheet,
 }
-_STAND_SIGMAS = tuple(n for n in StandProfile.__struct_fields__ if n != "coil")
 _WORDS = {
     "float": "a number",
     "int": "a whole number",
@@ -40,8 +39,29 @@ _WORDS = {
     "datetime": "a date with time",
     "time": "a time of day",
 }
-_STAND_UNITS = {"g": ("g", 2.0), "nt": ("nT", 200_000.0)}
-_SMALLEST_SCALE, _LARGEST_SCALE = 1e-15, 1e15
+_Limits = tuple[float, float, str]
+"""Least and greatest value of a key, and what to do about another one."""
+_TRIAD_LIMITS: dict[str, _Limits] = {
+    "scale": (
+        1e-15, 1e15,
+        'Put the sign into `axes`, for example "-x"; leave it out where it is unknown.',
+    ),
+    "noise": (1e-15, 1e15, "1 sigma in raw units; leave it out where it is unknown."),
+    "nonlinearity": (
+        1e-9, 1.0,
+        "1 sigma as a share of the field, such as 0.005; leave it out for a linear axis.",
+    ),
+    "repeatability": (0.0, 1e15, "1 sigma in raw units; leave it out where it is unknown."),
+}  # fmt: skip
+_DATASHEET_LIMITS: dict[str, _Limits] = dict.fromkeys(
+    Datasheet.__struct_fields__,
+    (1e-15, 1e15, "1 sigma, more than zero; leave it out where it is unknown."),
+)
+_STAND_LIMITS: dict[str, _Limits] = {
+    name: (0.0, 180.0, "1 sigma, in degrees.")
+    for name in StandProfile.__struct_fields__
+    if name != "coil"
+} | {"gravity_g": (0.0, 2.0, "1 sigma, in g."), "field_nt": (0.0, 200_000.0, "1 sigma, in nT.")}
 
 
 def list_profiles() -> list[str]:
@@ -50,8 +70,7 @@ def list_profiles() -> list[str]:
     >>> "generic" in list_profiles()
     True
     """
-    files = (file.name for file in resources.files(_PACKAGE).iterdir())
-    return sorted(name.removesuffix(_SUFFIX) for name in files if name.endswith(_SUFFIX))
+    return built_in("profiles")
 
 
 def load_profile(name_or_path: str | None = None) -> tuple[Profile, str]:
@@ -60,39 +79,45 @@ def load_profile(name_or_path: str | None = None) -> tuple[Profile, str]:
     None is the built-in `generic`: channels along the tool axes, nothing else known.
     """
     name = _DEFAULT if name_or_path is None else name_or_path
-    if name in list_profiles():
-        data = resources.files(_PACKAGE).joinpath(name + _SUFFIX).read_bytes()
-    else:
-        data = _content(name)
-    return _profile(data, Path(name).name), hashlib.sha256(data).hexdigest()
+    data, digest = read_toml(name, "profiles", "tool profile")
+    return _profile(data, Path(name).name), digest
 
 
-def _content(name: str) -> bytes:
-    """The bytes of a profile given by path."""
-    path = Path(name)
+def built_in(folder: str) -> list[str]:
+    """Names of the TOML files in a folder of the package."""
+    files = (file.name for file in resources.files("mwdcal").joinpath(folder).iterdir())
+    return sorted(name.removesuffix(_SUFFIX) for name in files if name.endswith(_SUFFIX))
+
+
+def read_toml(name: str, folder: str, kind: str) -> tuple[bytes, str]:
+    """The text of a TOML file, built in by name in a folder of the package, or by path.
+
+    Without a byte order mark; with it the SHA-256 of the file. `kind` is what the file should hold.
+    """
+    path: Any = Path(name)
+    if name in built_in(folder):
+        path = resources.files("mwdcal").joinpath(folder, name + _SUFFIX)
     try:
-        if path.is_file() and path.stat().st_size <= _LARGEST:
-            return path.read_bytes()
-        found = path.exists()
+        if path.is_file():
+            with path.open("rb") as stream:
+                data = stream.read(_LARGEST + 1)
+            if len(data) <= _LARGEST:
+                return data.removeprefix(b"\xef\xbb\xbf"), hashlib.sha256(data).hexdigest()
+        exists = path.exists()
     except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or str(error)
         raise InputError(
-            f"cannot read the tool profile '{name}': {reason}. Check its permissions."
+            f"cannot read the {kind} '{name}': {reason(error)}. Check its permissions."
         ) from error
-    if found:
+    if exists:
         raise InputError(
-            f"'{name}' is no tool profile: expected a TOML file of at most {_LARGEST} bytes. "
+            f"'{name}' is not a {kind}: expected a TOML file of at most {_LARGEST} bytes. "
             "Name a file such as tool.toml."
         )
-    raise _unknown(name)
-
-
-def _unknown(name: str) -> InputError:
-    builtin = list_profiles()
-    near = difflib.get_close_matches(name.lower(), builtin, n=2)
+    names = built_in(folder)
+    near = difflib.get_close_matches(name.lower(), names, n=2)
     meant = f" Did you mean {' or '.join(repr(n) for n in near)}?" if near else ""
-    return InputError(
-        f"tool profile must be a built-in name ({', '.join(builtin)}) or the path of a TOML "
+    raise InputError(
+        f"{kind} must be a built-in name ({', '.join(names)}) or the path of a TOML "
         f"file; got '{name}', which is neither.{meant} Check the name or the path."
     )
 
@@ -100,7 +125,7 @@ def _unknown(name: str) -> InputError:
 def _profile(data: bytes, source: str) -> Profile:
     """The checked profile in the bytes of a TOML file."""
     try:
-        profile = msgspec.toml.decode(data.removeprefix(b"\xef\xbb\xbf"), type=Profile)
+        profile = msgspec.toml.decode(data, type=Profile)
     except msgspec.ValidationError as error:
         raise _invalid(str(error), source) from None
     except UnicodeDecodeError as error:
@@ -183,51 +208,26 @@ def check_profile(profile: Profile, source: str) -> None:
     """Refuse values that no tool can have."""
     if not profile.name.strip():
         raise InputError(f"{source}, key 'name': must not be blank; got ''. Name the tool.")
-    temperature = profile.reference_temperature_c
-    _check_number(
-        temperature,
-        (TEMPERATURE.low, TEMPERATURE.high),
-        source,
-        "reference_temperature_c",
-        "In °C.",
-    )
-    _check_triad(profile.accelerometer, "accelerometer", source)
-    _check_triad(profile.magnetometer, "magnetometer", source)
-    for field in _STAND_SIGMAS:
-        sigma = getattr(profile.stand, field)
-        unit, most = _STAND_UNITS.get(field.rpartition("_")[2], ("degrees", 180.0))
-        _check_number(sigma, (0.0, most), source, f"stand.{field}", f"1 sigma, in {unit}.")
+    limits = (TEMPERATURE.low, TEMPERATURE.high)
+    _check_numbers(profile, {"reference_temperature_c": (*limits, "In °C.")}, source)
+    for name in TRIADS:
+        triad: TriadProfile = getattr(profile, name)
+        if len({axis[1] for axis in triad.axes}) < len(triad.axes):
+            raise _axes_error(f"{name}.axes", " ".join(triad.axes), source)
+        _check_numbers(triad, _TRIAD_LIMITS, source, f"{name}.")
+        if triad.datasheet is not None:
+            _check_numbers(triad.datasheet, _DATASHEET_LIMITS, source, f"{name}.datasheet.")
+    _check_numbers(profile.stand, _STAND_LIMITS, source, "stand.")
 
 
-def _check_triad(triad: TriadProfile, name: str, source: str) -> None:
-    """Axes form a signed permutation (either hand); scale and noise are positive."""
-    if len({axis[1] for axis in triad.axes}) < len(triad.axes):
-        raise _axes_error(f"{name}.axes", " ".join(triad.axes), source)
-    limits = (_SMALLEST_SCALE, _LARGEST_SCALE)
-    advice = 'Put the sign into `axes`, for example "-x"; leave it out where it is unknown.'
-    if triad.scale is not None:
-        _check_number(triad.scale, limits, source, f"{name}.scale", advice)
-    advice = "1 sigma in raw units; leave it out where it is unknown."
-    if triad.noise is not None:
-        _check_number(triad.noise, limits, source, f"{name}.noise", advice)
-    if triad.nonlinearity is not None:
-        share = "1 sigma as a share of the field, such as 0.005; leave it out for a linear axis."
-        _check_number(triad.nonlinearity, (1e-9, 1.0), source, f"{name}.nonlinearity", share)
-    sheet = "1 sigma, more than zero; leave it out where it is unknown."
-    for field in Datasheet.__struct_fields__:
-        value = getattr(triad.datasheet, field, None)
-        if value is not None:
-            _check_number(value, limits, source, f"{name}.datasheet.{field}", sheet)
-    limits = (0.0, _LARGEST_SCALE)
-    _check_number(triad.repeatability, limits, source, f"{name}.repeatability", advice)
-
-
-def _check_number(
-    value: float, limits: tuple[float, float], source: str, key: str, advice: str
+def _check_numbers(
+    section: msgspec.Struct, limits: dict[str, _Limits], source: str, prefix: str = ""
 ) -> None:
-    low, high = limits
-    if not (math.isfinite(value) and low <= value <= high):
-        raise InputError(
-            f"{source}, key '{key}': must be between {low:g} and {high:g}; "
-            f"got {shown(value)}. {advice}"
-        )
+    """Refuse the first number that is outside its limits; None is not stated."""
+    for field, (low, high, advice) in limits.items():
+        value = getattr(section, field)
+        if value is not None and not low <= value <= high:
+            raise InputError(
+                f"{source}, key '{prefix}{field}': must be between {low:g} and {high:g}; "
+                f"got {shown(value)}. {advice}"
+            )

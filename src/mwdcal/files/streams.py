@@ -18,9 +18,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mwdcal.errors import InputError
-from mwdcal.files.contract import COLUMNS, RAW
+from mwdcal.files.contract import RANGES, RAW
 from mwdcal.files.formats import parquet, text
-from mwdcal.files.formats.columns import LABELS, Column, check_names, no_stations
+from mwdcal.files.formats.columns import Column, check_names, no_stations
 from mwdcal.files.formats.table import Table, numbers
 from mwdcal.geometry.vectors import Ints
 from mwdcal.use.correction import NAMES
@@ -32,7 +32,6 @@ PART = 16 << 20
 PIECE = 1 << 20
 """Bytes of a piece of text."""
 _LONGEST = 1 << 20
-_NUMERIC = tuple(name for name in COLUMNS if name not in LABELS)
 
 
 class Part(NamedTuple):
@@ -75,11 +74,9 @@ def open_parquet(path: Path, rows: int = 0, decimal: str = ".") -> Source:
     columns of text that are read as numbers.
     """
     arrow, parquets = parquet.modules(path.name)
-    try:
+    with parquet.reading(path.name):
         file = parquets.ParquetFile(path, buffer_size=1 << 20, pre_buffer=False)
         stored, count = file.schema_arrow, file.metadata.num_rows
-    except Exception as error:
-        raise parquet.unreadable(path.name, error) from error
     check_names(list(stored.names), path.name)
     if count == 0:
         raise no_stations(path.name)
@@ -90,17 +87,15 @@ def open_parquet(path: Path, rows: int = 0, decimal: str = ".") -> Source:
     def pieces() -> Iterator[Any]:
         first = 1
         batches = file.iter_batches(step, use_threads=True)
-        try:
+        with parquet.reading(path.name):
             for batch in batches:
                 yield first, batch
                 first += len(batch)
-        except OSError as error:
-            raise parquet.unreadable(path.name, error) from error
 
     def load(piece: Any, exact: bool) -> Part:
         first, batch = piece
         carried = arrow.Table.from_batches([batch]).select(names)
-        wanted = [name for name in names if name in _NUMERIC]
+        wanted = [name for name in names if name in RANGES]
         columns = {n: parquet.as_column(n, carried.column(n), arrow) for n in wanted}
         lines = range(first, first + len(batch))
         table = Table(columns, metadata, path.name, lines, decimal=decimal)
@@ -120,7 +115,7 @@ def open_text(path: Path, typed: bool = False) -> Source:
         raise InputError(f"cannot read '{path}': {error.strerror}.") from error
     start = _newlines(first)
     top = text.head(start, path.name)
-    numeric = [name for name in top.names if typed and name in _NUMERIC]
+    numeric = [name for name in top.names if typed and name in RANGES]
     types = {n: arrow.float64() if n in numeric else arrow.string() for n in top.names}
 
     def pieces() -> Iterator[Any]:
@@ -144,7 +139,7 @@ def open_text(path: Path, typed: bool = False) -> Source:
         carried, table = both
         if typed:
             carried = _typed(carried, table, numeric, arrow)
-        kept = {n: c for n, c in table.columns.items() if n in _NUMERIC}
+        kept = {n: c for n, c in table.columns.items() if n in RANGES}
         return Part(carried, Table(kept, top.metadata, path.name, table.lines), size)
 
     schema, total = arrow.schema(list(types.items())), path.stat().st_size
@@ -196,7 +191,7 @@ def _plain(data: bytes, top: text.Head, arrow: Any) -> tuple[Any, Table] | None:
             if len(both) != len(order):  # lines that are blank are no rows
                 return None
             carried = both.take(order)
-        columns = {n: _numbers(n, carried.column(n), arrow) for n in top.names if n in _NUMERIC}
+        columns = {n: _numbers(n, carried.column(n), arrow) for n in top.names if n in RANGES}
     except (arrow.ArrowInvalid, arrow.ArrowKeyError):
         return None
     return carried, Table(columns, {}, "", range(carried.num_rows))

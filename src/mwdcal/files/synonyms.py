@@ -1,8 +1,8 @@
 """Columns that are not of the contract, and which column of the contract each resembles.
 
 A name is taken apart into words and a unit: `Azi (deg)`, `ref_azm`, `AZIMUTH_TRUE` all resemble
-`ref_azimuth_deg`. What resembles a reference or the temperature would be missed in silence, and is
-refused where the contract's own column is absent. Nothing is ever taken for what it resembles.
+`ref_azimuth_deg`. A column that resembles a reference or the temperature would be ignored silently, and is
+refused where the contract's own column is absent. A column is never used under the name it resembles.
 """
 
 from __future__ import annotations
@@ -53,11 +53,11 @@ CONVERSIONS = {
     "mT": "nT = mT · 1e6",
     "gauss": "nT = gauss · 1e5",
 }
-"""What makes the contract's unit of another one."""
+"""How another unit is converted into that of the contract."""
 _WARM = ("°C", "°F", "K")
 _MAGNETIC = ("nT", "µT", "mT", "gauss")
 _STATED = {"ref", "reference", "local"}
-"""Words that say that a column is given, not measured."""
+"""Words of columns that are known, not measured."""
 _BYWORDS = _STATED | {
     *("true", "grid", "mag", "magnetic", "stand", "nominal", "target", "given", "set", "angle"),
     *("value", "tool", "mwd", "survey", "measured", "meas", "calc", "calculated", "computed"),
@@ -75,14 +75,14 @@ _INSTEAD = {
     "fieldtotal fieldstrength magtotal totalmag",
     "ref_dip_deg": "dip magdip mdip",
     "temperature_c": "temp temperature temperatur tmp tempc tempf temperaturec temperaturef degc degf",
-    "serial": "sn serialno serialnumber serialnr toolserial toolsn",
+    "serial": "serial sn serialno serialnumber serialnr tool toolid toolserial toolsn",
     "group": "rollset",
     **{f"a{i}": f"acc{i} accel{i} acceleration{i} accelerometer{i} g{i}" for i in "xyz"},
     **{f"m{i}": f"mag{i} magnetometer{i} b{i} h{i} flux{i}" for i in "xyz"},
 }
 _SYNONYMS = {word: column for column, words in _INSTEAD.items() for word in words.split()}
 _NEVER = {"mtf", "magnetictoolface", "magtoolface"}
-"""A magnetic toolface is no reference of the contract."""
+"""A magnetic toolface is not a reference of the contract."""
 SHOWN = {
     "ref_inclination_deg": "°",
     "ref_azimuth_deg": "° from magnetic north, or from what the metadata azimuth_reference says",
@@ -92,7 +92,7 @@ SHOWN = {
     "ref_dip_deg": "°",
     "temperature_c": "°C",
 }
-"""Columns that may not be missed, with their units."""
+"""Columns that must not be overlooked, with their units."""
 OURS = ("time_s", "start_s", "end_s", "samples", "drifting", "serial")
 """Columns beyond the contract that mwdcal itself reads or writes in run files."""
 _LONGEST = 40
@@ -112,19 +112,19 @@ def resembled(name: str) -> Resemblance | None:
     >>> [resembled(n) for n in ("Azi (°)", "Temp (°F)", "comment")]
     [Resemblance(column='ref_azimuth_deg', unit='°'), Resemblance(column='temperature_c', unit='°F'), None]
     """
-    every = _words(name)
-    words, unit = _without_unit([word for word in every if not word.isdigit()])
+    spelled = _words(name)
+    words, unit = _without_unit([word for word in spelled if not word.isdigit()])
     spread = any(word in _SPREADS for word in words)
     words = [word for word in words if word not in _SPREADS]
     whole = "".join(words)
     bare = "".join(word for word in words if word not in _BYWORDS)
-    found = _column(whole, bare, set(words), unit)
-    if found is None:
+    column = _column(whole, bare, set(words), unit)
+    if column is None:
         return None
     if not spread:
-        implied = "°F" if "f" in (whole[-1:], bare[-1:]) and found == "temperature_c" else ""
-        return Resemblance(found, unit or implied)
-    return Resemblance(f"sd_{found}", unit) if found.startswith(("ref_", "a", "m")) else None
+        implied = "°F" if "f" in (whole[-1:], bare[-1:]) and column == "temperature_c" else ""
+        return Resemblance(column, unit or implied)
+    return Resemblance(f"sd_{column}", unit) if column.startswith(("ref_", "a", "m")) else None
 
 
 def _column(whole: str, bare: str, words: set[str], unit: str) -> str | None:
@@ -154,12 +154,12 @@ def _words(name: str) -> list[str]:
         text = text.replace(sign, word)
     for cased, word in _CASED.items():
         text = re.sub(rf"(?<![A-Za-z]){cased}(?![A-Za-z])", word, text)
-    found = re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+", text)
-    return [word.lower() for word in found]
+    words = re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+", text)
+    return [word.lower() for word in words]
 
 
 def _without_unit(words: list[str]) -> tuple[list[str], str]:
-    """The words before a unit, and the unit; a lone word is no unit."""
+    """The words before a unit, and the unit; a single word is not a unit."""
     left, unit = list(words), ""
     while len(left) > 1 and left[-1] in UNITS and not set(left[:-1]) <= _STATED | {"total"}:
         unit = unit or UNITS[left[-1]]
@@ -170,18 +170,18 @@ def _without_unit(words: list[str]) -> tuple[list[str], str]:
 def unused(names: Sequence[str], used: Collection[str]) -> tuple[str, ...]:
     """Columns that are not used, each with what it resembles; those that resemble something first."""
     results = _results(names)
-    told = []
+    entries = []
     for name in names:
         if name in used or name in OURS or name.startswith("drift_"):
             continue
-        found = resembled(name)
+        resemblance = resembled(name)
         shown = f"'{name[:_LONGEST]}'"
         if name in results:
             shown += " (a result of mwdcal apply)"
-        elif found is not None:
-            shown += f" (resembles '{found.column}')"
-        told.append((found is None, shown))
-    return tuple(shown for _, shown in sorted(told, key=lambda each: each[0]))
+        elif resemblance is not None:
+            shown += f" (resembles '{resemblance.column}')"
+        entries.append((resemblance is None, shown))
+    return tuple(shown for _, shown in sorted(entries, key=lambda each: each[0]))
 
 
 def _results(names: Collection[str]) -> set[str]:
@@ -201,29 +201,31 @@ def check_temperature(names: Sequence[str], source: str) -> None:
 
 
 def _refuse(names: Sequence[str], absent: Collection[str], source: str) -> None:
-    found = [(name, resembled(name)) for name in names]
-    meant = [(name, one) for name, one in found if one is not None and one.column in absent]
+    resembling = {name: resembled(name) for name in names}
+    meant = [(name, each) for name, each in resembling.items() if each and each.column in absent]
     if not meant:
         return
-    name, one = meant[0]
+    name, resemblance = meant[0]
     others = [
         f"'{n[:_LONGEST]}' ({other.column}, {SHOWN[other.column]})" for n, other in meant[1:6]
     ]
     likewise = f" Likewise {', '.join(others)}." if others else ""
     raise InputError(
-        f"{source}: the column '{name[:_LONGEST]}' resembles '{one.column}', which is absent, and would not "
-        f"be used. {remedy(one)}; if it is something else, give it a name that says so, or remove it."
+        f"{source}: the column '{name[:_LONGEST]}' resembles '{resemblance.column}', which is absent, and would not "
+        f"be used. {remedy(resemblance)}; if it is something else, give it a name that says so, or remove it."
         f"{likewise}"
     )
 
 
-def remedy(one: Resemblance) -> str:
+def remedy(resemblance: Resemblance) -> str:
     """What to do with a column that is one of the contract under another name or in another unit.
 
     >>> remedy(Resemblance("temperature_c", "°F"))
     "Convert it (°C = (°F - 32) · 5/9) and name it 'temperature_c' (°C)"
     """
-    unit = f" ({SHOWN[one.column]})" if one.column in SHOWN else ""
-    if one.unit in CONVERSIONS:
-        return f"Convert it ({CONVERSIONS[one.unit]}) and name it '{one.column}'{unit}"
-    return f"Rename it to '{one.column}'{unit}"
+    unit = f" ({SHOWN[resemblance.column]})" if resemblance.column in SHOWN else ""
+    if resemblance.unit in CONVERSIONS:
+        return (
+            f"Convert it ({CONVERSIONS[resemblance.unit]}) and name it '{resemblance.column}'{unit}"
+        )
+    return f"Rename it to '{resemblance.column}'{unit}"

@@ -79,7 +79,7 @@ def solve(plan: Plan, loaded: bytes) -> bytes:
     """Calibrate the tools of loaded rows: a table in Arrow's stream format, one row per tool."""
     if plan.version != __version__:
         raise InputError(
-            f"the worker has mwdcal {__version__}, the command is of {plan.version}. Install the "
+            f"the worker runs mwdcal {__version__}, the command {plan.version}. Install the "
             "same version everywhere."
         )
     arrow, _ = parquet.modules(plan.source)
@@ -103,11 +103,11 @@ def packed(table: Any) -> bytes:
     size = arrow.MockOutputStream()
     with arrow.ipc.new_stream(size, table.schema) as writer:
         writer.write_table(table)
-    found = bytearray(size.size())
-    stream = arrow.FixedSizeBufferWriter(arrow.py_buffer(found))
+    buffer = bytearray(size.size())
+    stream = arrow.FixedSizeBufferWriter(arrow.py_buffer(buffer))
     with arrow.ipc.new_stream(stream, table.schema) as writer:
         writer.write_table(table)
-    return bytes(found)
+    return bytes(buffer)
 
 
 def _result(rows: Rows, plan: Plan) -> Any:
@@ -118,7 +118,7 @@ def _result(rows: Rows, plan: Plan) -> Any:
     status, message = np.full(count, OK, object), np.full(count, "", object)
     unit = np.full(count, None, object)
     free: list[tuple[list[str], ...]] = [([], [])] * count
-    said: list[tuple[list[str], list[str]]] = [([], [])] * count
+    reports: list[tuple[list[str], list[str]]] = [([], [])] * count
     for tool, text in refused_tools(rows).items():
         status[tool], message[tool] = BAD_INPUT, text
     for batch in batches(rows, np.flatnonzero(status == OK)):
@@ -129,10 +129,10 @@ def _result(rows: Rows, plan: Plan) -> Any:
             values[batch.tools] = outcome.columns[name]
         for tool, each in zip(batch.tools, outcome.free, strict=True):
             free[tool] = each
-        for tool, found, again in zip(batch.tools, outcome.findings, outcome.reshoot, strict=True):
-            said[tool] = found, [rows.label(int(tool), station) for station in again]
+        for tool, ids, again in zip(batch.tools, outcome.findings, outcome.reshoot, strict=True):
+            reports[tool] = ids, [rows.label(int(tool), station) for station in again]
     unit[status != OK] = None
-    return _table(rows, plan, (status, message, unit), filled, free, said)
+    return _table(rows, plan, (status, message, unit), filled, free, reports)
 
 
 def _calibrated(rows: Rows, batch: Batch, plan: Plan) -> Outcome:
@@ -157,7 +157,7 @@ def _table(
     texts: tuple[AnyArray, AnyArray, AnyArray],
     filled: dict[str, Array],
     free: list[tuple[list[str], ...]],
-    said: list[tuple[list[str], list[str]]],
+    reports: list[tuple[list[str], list[str]]],
 ) -> Any:
     """The Arrow table of results, in the order of the columns."""
     arrow, _ = parquet.modules(plan.source)
@@ -172,7 +172,7 @@ def _table(
     columns["temperature_min_c"] = arrow.array(low, mask=np.isnan(low))
     columns["temperature_max_c"] = arrow.array(high, mask=np.isnan(high))
     for index, name in enumerate(LISTS):
-        lists = [each[index] if ok else None for each, ok in zip(said, good, strict=True)]
+        lists = [each[index] if ok else None for each, ok in zip(reports, good, strict=True)]
         columns[name] = arrow.array(lists, arrow.list_(arrow.string()))
     for name, values in filled.items():
         whole = name.rpartition("_")[2] in WHOLE

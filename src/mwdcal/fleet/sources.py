@@ -1,4 +1,4 @@
-"""What a fleet is read from: a Parquet file or a folder of them, and what these say of their rows.
+"""The input of a fleet: a Parquet file or a folder of them, and what they state about their rows.
 
 Names of folders (`serial=MWD-17`) state a column of the rows below them. The metadata of a file
 hold for its own rows: which north their azimuths count from becomes a column of the table.
@@ -18,17 +18,16 @@ import msgspec
 from mwdcal.calibration.readings import is_simulated
 from mwdcal.errors import InputError
 from mwdcal.files import contract, synonyms
-from mwdcal.files.azimuths import magnetic_offset
-from mwdcal.files.contract import REFERENCES
+from mwdcal.files.contract import REFERENCES, magnetic_offset
 from mwdcal.files.formats import parquet
-from mwdcal.files.formats.columns import LABELS
+from mwdcal.files.formats.table import check_file
 
 SERIAL = "serial"
 OFFSET = "#offset"
 """Column of stated azimuth minus magnetic azimuth, °; there where a file's metadata say so."""
 AZIMUTH = REFERENCES["azimuth"].column
 BLANK = ("", "__HIVE_DEFAULT_PARTITION__")
-"""What folder names say of a blank cell."""
+"""How folder names spell a blank cell."""
 LARGEST_GROUP = 20_000_000
 """Rows of the largest row group that is read; it is dealt as a whole."""
 
@@ -96,13 +95,13 @@ class _File:
 
 
 def open_source(path: Path) -> Source:
-    """The table at `path`, its columns checked; refuses what is no table of many tools."""
+    """The table at `path`, its columns checked; refuses what is not a table of many tools."""
     paths = _paths(path)
     files = [_look(file, path) for file in paths]
     columns = files[0].columns
-    for file, found in zip(paths, files, strict=True):
-        if set(found.columns) != set(columns):
-            odd = sorted(set(found.columns) ^ set(columns))[0]
+    for file, described in zip(paths, files, strict=True):
+        if set(described.columns) != set(columns):
+            odd = sorted(set(described.columns) ^ set(columns))[0]
             raise InputError(
                 f"{file}: all files of '{path.name}' must have the same columns; '{odd}' is in some "
                 f"and not in others ({paths[0].name} …). Write the table again."
@@ -141,25 +140,24 @@ def _joined(name: str, files: Sequence[_File]) -> Source:
 
 
 def _agreed(stated: Sequence[Mapping[str, object]]) -> dict[str, object]:
-    """Metadata on which all files agree; simulated is a fleet of which one file is."""
-    found = {k: v for k, v in stated[0].items() if all(k in s and s[k] == v for s in stated)}
-    return found | next(({"simulated": s["simulated"]} for s in stated if is_simulated(s)), {})
+    """Metadata on which all files agree; a fleet is simulated if one file is."""
+    agreed = {k: v for k, v in stated[0].items() if all(k in s and s[k] == v for s in stated)}
+    return agreed | next(({"simulated": s["simulated"]} for s in stated if is_simulated(s)), {})
 
 
 def _paths(path: Path) -> list[Path]:
     """The Parquet files of a table: itself, or all in a folder, in order of their names."""
     if path.is_dir():
         hidden = ("_", ".")
-        found = sorted(
+        paths = sorted(
             file
             for file in path.rglob("*.parquet")
             if not any(part.startswith(hidden) for part in file.relative_to(path).parts)
         )
-        if not found:
+        if not paths:
             raise InputError(f"'{path}' is a folder without .parquet files. Name a Parquet table.")
-        return found
-    if not path.exists():
-        raise InputError(f"'{path}': no such file. Check the name and the folder.")
+        return paths
+    check_file(path)
     if path.suffix.lower() != ".parquet":
         raise InputError(
             f"'{path}': a fleet is read from a Parquet file or a folder of them; got "
@@ -171,15 +169,11 @@ def _paths(path: Path) -> list[Path]:
 def _look(file: Path, root: Path) -> _File:
     """Pieces, columns and metadata of one file."""
     arrow, pq = parquet.modules(str(file))
-    try:
-        opened = pq.ParquetFile(file)
-    except Exception as error:
-        raise parquet.unreadable(str(file), error) from error
-    with opened:
+    with parquet.reading(str(file)), pq.ParquetFile(file) as opened:
         schema, keys = opened.schema_arrow, _keys(file, root)
-        every = dict.fromkeys((*schema.names, *dict(keys)))
-        names = tuple(n for n in every if not n.startswith("__index"))
-        for name in set(contract.COLUMNS).difference(LABELS).intersection(schema.names):
+        columns = dict.fromkeys((*schema.names, *dict(keys)))
+        names = tuple(n for n in columns if not n.startswith("__index"))
+        for name in sorted({*contract.RANGES}.intersection(schema.names)):
             _check_numeric(schema.field(name).type, name, file)
         kind = schema.field(SERIAL).type if SERIAL in schema.names else arrow.string()
         kind = kind.value_type if arrow.types.is_dictionary(kind) else kind
@@ -203,20 +197,20 @@ def pieces_of(file: Path, about: Any, keys: Keys = ()) -> list[Piece]:
 def _keys(file: Path, root: Path) -> Keys:
     """The columns that the names of a file's folders state, below the folder of the table."""
     folders = file.relative_to(root).parent.parts if root.is_dir() else ()
-    found: dict[str, str | float | None] = {}
+    keys: dict[str, str | float | None] = {}
     for folder in folders:
         name, equals, value = (unquote(part) for part in folder.partition("="))
         if not equals:
             continue
-        found[name] = None if value in BLANK else value
+        keys[name] = None if value in BLANK else value
         if name == SERIAL and value in BLANK:
             raise InputError(
                 f"{file.parent}, column '{SERIAL}': must be filled in; the folder '{folder}' stands for "
                 "a blank cell. Say which tool these stations belong to."
             )
-        if name in contract.COLUMNS and name not in LABELS and found[name] is not None:
-            found[name] = _number(value, name, file)
-    return tuple(found.items())
+        if name in contract.RANGES and value not in BLANK:
+            keys[name] = _number(value, name, file)
+    return tuple(keys.items())
 
 
 def _number(value: str, name: str, file: Path) -> float:
@@ -245,7 +239,7 @@ def _check_numeric(kind: Any, name: str, file: Path) -> None:
 def _check_columns(names: Sequence[str], source: str) -> None:
     """Refuse a table that does not tell its tools apart, or lacks the channels."""
     if SERIAL not in names:
-        near = [n for n in names if n.strip().lower().replace("_", " ") in _NEAR]
+        near = [n for n in names if synonyms.resembled(n) == (SERIAL, "")]
         hint = f" Is it '{near[0]}'? Rename it." if near else " Add it."
         raise InputError(
             f"{source}: a fleet needs the column '{SERIAL}', which tells its tools apart; found "
@@ -253,15 +247,3 @@ def _check_columns(names: Sequence[str], source: str) -> None:
         )
     contract.check_columns(list(names), source)
     synonyms.check_evidence(names, source)
-
-
-_NEAR = (
-    "sn",
-    "serial no",
-    "serial number",
-    "serialno",
-    "serialnumber",
-    "serial",
-    "tool",
-    "tool id",
-)

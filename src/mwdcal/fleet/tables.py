@@ -56,7 +56,7 @@ class Partition:
 class Tools:
     """The `count` tools of a table, in order of first appearance.
 
-    `runs` are the first rows (r,) of stretches of one tool, `tool` (r,) whose each is.
+    `runs` are the first rows (r,) of stretches of one tool, `tool` (r,) the tool of each.
     """
 
     count: int
@@ -75,18 +75,19 @@ def find_tools(source: Source) -> Tools:
     starts: list[Ints] = []
     heads: list[Any] = []
     row, last = 0, None
-    for values in _serials(source):
-        codes = values.indices.to_numpy(zero_copy_only=False)
-        change = np.flatnonzero(np.diff(codes, prepend=codes[0] - 1))
-        if values[0].as_py() == last:
-            change = change[1:]
-        starts.append(change + row)
-        indices = arrow.array(codes[change], values.indices.type)
-        heads.append(arrow.DictionaryArray.from_arrays(indices, values.dictionary))
-        row, last = row + len(codes), values[-1].as_py()
-        _check_stretches(sum(map(len, starts)), source.name)
-    every = one_chunk(arrow.chunked_array(heads))
-    codes = every.indices.to_numpy(zero_copy_only=False)
+    with parquet.reading(source.name):
+        for values in _serials(source):
+            codes = values.indices.to_numpy(zero_copy_only=False)
+            change = np.flatnonzero(np.diff(codes, prepend=codes[0] - 1))
+            if values[0].as_py() == last:
+                change = change[1:]
+            starts.append(change + row)
+            indices = arrow.array(codes[change], values.indices.type)
+            heads.append(arrow.DictionaryArray.from_arrays(indices, values.dictionary))
+            row, last = row + len(codes), values[-1].as_py()
+            _check_stretches(sum(map(len, starts)), source.name)
+    serials = one_chunk(arrow.chunked_array(heads))
+    codes = serials.indices.to_numpy(zero_copy_only=False)
     used, first, number = np.unique(codes, return_index=True, return_inverse=True)
     order = np.argsort(first)
     rank = np.empty(len(order), int)
@@ -101,7 +102,7 @@ def one_chunk(column: Any) -> Any:
 
 
 def _check_stretches(count: int, source: str) -> None:
-    """Refuse rows so mixed that to remember where the tools are would fill the memory."""
+    """Refuse rows so mixed that an index of the tools would fill the memory."""
     if count > MOST_STRETCHES:
         raise InputError(
             f"{source}: the rows change from tool to tool more than {MOST_STRETCHES} times. Sort the "
@@ -112,8 +113,10 @@ def _check_stretches(count: int, source: str) -> None:
 def in_several_folders(source: Source, tools: Tools) -> int:
     """Number of tools with rows in folders that state different values of a column."""
     numbers: dict[Any, int] = {}
-    own = [tuple(k for k in p.keys if k[0] not in (SERIAL, OFFSET)) for p in source.pieces]
-    folder = np.array([numbers.setdefault(keys, len(numbers)) for keys in own])
+    keys_of_pieces = [
+        tuple(k for k in p.keys if k[0] not in (SERIAL, OFFSET)) for p in source.pieces
+    ]
+    folder = np.array([numbers.setdefault(keys, len(numbers)) for keys in keys_of_pieces])
     if len(numbers) == 1:
         return 0
     ends = np.cumsum([piece.rows for piece in source.pieces])
@@ -132,11 +135,14 @@ def _serials(source: Source) -> Iterator[Any]:
     for piece in filter(lambda p: p.rows, source.pieces):
         stated = dict(piece.keys).get(SERIAL)
         if stated is not None:
-            one = arrow.array([stated]).dictionary_encode()
-            yield one.take(arrow.array(np.zeros(piece.rows, int)))
+            label = arrow.array([stated]).dictionary_encode()
+            yield label.take(arrow.array(np.zeros(piece.rows, int)))
             row += piece.rows
             continue
-        with pq.ParquetFile(piece.path, read_dictionary=[SERIAL]) as file:
+        with (
+            parquet.reading(piece.path),
+            pq.ParquetFile(piece.path, read_dictionary=[SERIAL]) as file,
+        ):
             for batch in file.iter_batches(500_000, row_groups=[piece.group], columns=[SERIAL]):
                 column = _encoded(batch.column(0), piece)
                 _check_filled(column, row, source.name)
@@ -195,12 +201,12 @@ def partitions(source: Source, tools: Tools, folder: Path) -> list[Partition]:
         return _dealt(source, tools, folder, size)
     ends = np.append(tools.runs[1:], source.rows)
     cuts = _cuts(ends, size)
-    found, before = [], 0
+    parts, before = [], 0
     for cut in cuts:
         first = int(tools.runs[before])
-        found.append(_part(source, first, int(ends[cut]), cut + 1 - before))
+        parts.append(_part(source, first, int(ends[cut]), cut + 1 - before))
         before = cut + 1
-    return found
+    return parts
 
 
 def _cuts(ends: Ints, size: int) -> list[int]:
@@ -218,7 +224,7 @@ def _part(source: Source, first: int, stop: int, tools: int) -> Partition:
 
 
 def _dealt(source: Source, tools: Tools, folder: Path, size: int) -> list[Partition]:
-    """Rows dealt into files by tool; done once, whatever interrupts it."""
+    """Rows dealt into files by tool; what an interrupted command has finished is not done again."""
     _, pq = parquet.modules(source.name)
     rows = np.bincount(tools.tool, np.diff(tools.runs, append=source.rows), tools.count)
     share = max(size, -(-source.rows // MOST_FILES))
@@ -231,7 +237,7 @@ def _dealt(source: Source, tools: Tools, folder: Path, size: int) -> list[Partit
         unfinished.mkdir(parents=True)
         _deal(source, tools, number, unfinished)
         unfinished.rename(done)
-    found = []
+    parts = []
     for each in np.unique(number):
         file = done / f"{each:04d}.parquet"
         pieces = tuple(
@@ -240,8 +246,8 @@ def _dealt(source: Source, tools: Tools, folder: Path, size: int) -> list[Partit
         )
         total = sum(piece.rows for piece in pieces)
         count = int(np.sum(number == each))
-        found.append(Partition(pieces, 0, total, 0, count, dealt=True))
-    return found
+        parts.append(Partition(pieces, 0, total, 0, count, dealt=True))
+    return parts
 
 
 def _deal(source: Source, tools: Tools, number: Ints, folder: Path) -> None:
@@ -256,12 +262,12 @@ def _deal(source: Source, tools: Tools, number: Ints, folder: Path) -> None:
             tool = tools.tool[np.searchsorted(tools.runs, rows, "right") - 1]
             table = table.append_column(TOOL, arrow.array(tool))
             table = table.append_column("#row", arrow.array(rows))
-            own = number[tool]
-            order = np.argsort(own, kind="stable")
-            sorted_own = own[order]
+            target = number[tool]
+            order = np.argsort(target, kind="stable")
+            sorted_own = target[order]
             table = table.take(arrow.array(order))
             bounds = np.flatnonzero(np.diff(sorted_own, prepend=-1))
-            for start, stop in zip(bounds, [*bounds[1:], len(own)], strict=True):
+            for start, stop in zip(bounds, [*bounds[1:], len(target)], strict=True):
                 key = int(sorted_own[start])
                 if key not in writers:
                     path = folder / f"{key:04d}.parquet"
@@ -300,14 +306,14 @@ class _Reading:
 
     def rows(self, start: int, stop: int) -> list[Any]:
         """The rows `start` to `stop`, in stretches; those before are passed over."""
-        found = []
+        stretches = []
         while True:
             end = self.row + len(self.held)
             if end > start:
                 first = max(start - self.row, 0)
-                found.append(self.held.slice(first, min(stop, end) - self.row - first))
+                stretches.append(self.held.slice(first, min(stop, end) - self.row - first))
             if end >= stop:
-                return found
+                return stretches
             self.row, self.held = end, next(self.batches)
 
 
@@ -315,7 +321,7 @@ _ONE_AT_A_TIME = Lock()
 
 
 def _rows(piece: Piece, columns: tuple[str, ...], start: int, stop: int) -> list[Any]:
-    """Rows of a row group; partitions next to each other go on where the last one ended."""
+    """Rows of a row group; the next partition continues where the last one ended."""
     with _ONE_AT_A_TIME:
         try:
             if _reading(piece, columns).row > start:
@@ -338,24 +344,24 @@ def _batches(piece: Piece, columns: tuple[str, ...]) -> Iterator[Any]:
     keys = dict(piece.keys)
     wanted = [name for name in columns if name not in keys]
     labels = [name for name in LABELS if name in wanted]
-    try:
-        with pq.ParquetFile(piece.path, memory_map=True, read_dictionary=labels) as file:
-            for batch in file.iter_batches(BATCH, [piece.group], wanted):
-                yield _complete(arrow.Table.from_batches([batch]), piece, columns)
-    except FileNotFoundError:
+    if not Path(piece.path).exists():
         raise InputError(
             f"'{piece.path}': no such file on this machine. Workers on other machines must see "
             "the table, and the folder of the output, under the same paths."
-        ) from None
-    except OSError as error:
-        raise parquet.unreadable(piece.path, error) from error
+        )
+    with (
+        parquet.reading(piece.path),
+        pq.ParquetFile(piece.path, memory_map=True, read_dictionary=labels) as file,
+    ):
+        for batch in file.iter_batches(BATCH, [piece.group], wanted):
+            yield _complete(arrow.Table.from_batches([batch]), piece, columns)
 
 
 def _complete(table: Any, piece: Piece, columns: tuple[str, ...]) -> Any:
     """Rows with the columns that their piece states: labels as text, encoded, the rest as numbers."""
     arrow, _ = parquet.modules(piece.path)
     stated = dict(piece.keys)
-    found = {}
+    arrays = {}
     for name in columns:
         if name in stated:
             kind = arrow.string() if name in LABELS else arrow.float64()
@@ -369,5 +375,5 @@ def _complete(table: Any, piece: Piece, columns: tuple[str, ...]) -> Any:
             column = _texts(column)
         elif name not in (TOOL, "#row"):
             column = column.cast(arrow.float64(), safe=False)
-        found[name] = column
-    return arrow.table(found)
+        arrays[name] = column
+    return arrow.table(arrays)

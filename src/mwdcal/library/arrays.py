@@ -200,7 +200,7 @@ def _known(references: Mapping[str, Any], shape: tuple[int, ...]) -> dict[str, A
 def _uncertainties(sd: Mapping[str, ArrayLike], shape: tuple[int, ...]) -> dict[str, Array]:
     """Standard uncertainties by name in inside units; unknown ones of references are zero."""
     limits = {name: RAW_SPREAD._replace(positive=True) for name in TRIADS}
-    limits |= {name: reference.spread for name, reference in REFERENCES.items()}
+    limits |= {name: reference.uncertainty for name, reference in REFERENCES.items()}
     limits |= dict.fromkeys(COMMON, Range(0.0, 180.0, "°"))
     found = {}
     for name, key in _by_name(sd, limits).items():

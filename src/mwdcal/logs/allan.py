@@ -97,8 +97,8 @@ def variance(
 ) -> Array:
     """Allan variance (..., m), see `deviation`; `centred` takes off the mean difference first."""
     phase = _phase(values)
-    found = [_variance(phase, int(m), kind, centred) for m in averaging]
-    return np.stack(found, -1) if found else np.zeros((*phase.shape[:-1], 0))
+    variances = [_variance(phase, int(m), kind, centred) for m in averaging]
+    return np.stack(variances, -1) if variances else np.zeros((*phase.shape[:-1], 0))
 
 
 def _phase(values: Array) -> Array:

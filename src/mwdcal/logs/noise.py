@@ -11,7 +11,7 @@ at T itself.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import msgspec
 import numpy as np
@@ -21,7 +21,7 @@ from mwdcal.calibration.record import Finding
 from mwdcal.errors import InputError
 from mwdcal.files.contract import CHANNELS, RAW
 from mwdcal.files.formats.table import Table, cell_error, numbers, shown
-from mwdcal.files.logs import TIME
+from mwdcal.files.logs import TIME, Say, silent
 from mwdcal.geometry.vectors import Array, Ints
 from mwdcal.logs import allan, noise_terms
 from mwdcal.logs.allan import Kind, Moments
@@ -30,7 +30,7 @@ from mwdcal.logs.stations import row_times
 from mwdcal.sensor.profile import Profile
 
 FEWEST = 128
-"""Samples of a channel below which the terms cannot be told apart at all."""
+"""Samples of a channel below which the terms cannot be separated."""
 STATION_SECONDS = 30.0
 """Duration of a station, unless the log is too short for it."""
 AVERAGES = 4
@@ -38,22 +38,22 @@ AVERAGES = 4
 SOUND = 10
 """Stations that a log holds where their duration is chosen for it."""
 SPARSE = 1e-3
-"""Share of single blanks that are filled in: they change less than the noise of the noise."""
+"""Largest share of single blanks that are filled in: the change is below the uncertainty of the noise."""
 JITTER = 0.5
 """Share of the sampling interval by which one may differ: more is a gap."""
 EVENT = 8.0
 """Size of a difference, in robust standard deviations, that no noise reaches."""
 ROUNDING = 1e-6
-"""Of a whole number of steps of the converter over another."""
+"""Rounding error of a ratio of whole numbers of steps of the converter."""
 PARTS = 256
 """Averages in a log between which events are looked for."""
 UNEVEN = 2.0
-"""Ratio of the noise of two channels of a triad that is worth a word."""
+"""Ratio of the noise of two channels of a triad that is reported."""
 COARSE = 0.5
 """Noise of one sample, in steps of the converter, below which the steps hide it."""
 DOUBTS = {
     "event": "a spike or a move",
-    "misfit": "noise that is none of the five terms",
+    "misfit": "noise that the five terms do not describe",
     "slow": "less than a sample in a station",
 }
 """Findings after which the figures of a channel do not hold, in words; `slow`: that of a station."""
@@ -143,10 +143,6 @@ class Noise(msgspec.Struct, frozen=True, kw_only=True):
     findings: list[Finding]
 
 
-def _silent(text: str) -> None:
-    """Say nothing."""
-
-
 def find_noise(
     log: Table,
     *,
@@ -155,7 +151,7 @@ def find_noise(
     between: tuple[float, float] = (-np.inf, np.inf),
     station_seconds: float | None = None,
     kind: Kind = "overlapping",
-    say: Callable[[str], None] = _silent,
+    say: Say = silent,
 ) -> Noise:
     """The noise of each raw channel of a log (`files.logs.read`) of a tool at rest.
 
@@ -168,27 +164,27 @@ def find_noise(
     first, last, rate = _section(log, sampling_hz, between, findings)
     seconds = (last - first) / rate
     station = _station_seconds(station_seconds, seconds, rate, log.source)
-    found: dict[str, ChannelNoise] = {}
+    channels: dict[str, ChannelNoise] = {}
     for name in (name for name in RAW if name in log.columns):
         say(f"Allan variances of {name}, {last - first} samples")
         taken = _samples(log, name, first, last, rate, findings)
         if taken is not None:
-            found[name] = _channel(name, *taken, station, kind, findings)
-    if not found:
+            channels[name] = _channel(name, *taken, station, kind, findings)
+    if not channels:
         raise InputError(
             f"{log.source}: no channel that could be used. {' '.join(f.text for f in findings)}"
         )
     if profile is not None:
-        found = {name: _physical(name, channel, profile) for name, channel in found.items()}
-    withheld = _withheld(found)
+        channels = {name: _physical(name, channel, profile) for name, channel in channels.items()}
+    withheld = _withheld(channels)
     return Noise(
         log=log.source,
         seconds=seconds,
         kind=kind,
         station_seconds=station,
         simulated=is_simulated(log.metadata),
-        channels=found,
-        profile=_recommended(found, withheld, findings),
+        channels=channels,
+        profile=_recommended(channels, withheld, findings),
         withheld=withheld,
         findings=findings,
     )
@@ -197,7 +193,7 @@ def find_noise(
 def check(
     between: tuple[float, float], station_seconds: float | None, sampling_hz: float | None
 ) -> None:
-    """Refuse seconds and a rate that no log can have."""
+    """Refuse times and a rate that are not possible in any log."""
     start, end = between
     if np.isnan(between).any():
         name = "`start`" if np.isnan(start) else "`end`"
@@ -217,7 +213,7 @@ def _section(
     log: Table, given: float | None, between: tuple[float, float], findings: list[Finding]
 ) -> tuple[int, int, float]:
     """First row, row after the last, and rows a second, of what is to be used of a log."""
-    time = row_times(_without_time(log) if given else log, given)
+    time = row_times(log, given)
     inside = np.flatnonzero((time - time[0] >= between[0]) & (time - time[0] <= between[1]))
     if len(inside) < FEWEST:
         problem, advice = f"got {len(time)}", "Record for longer."
@@ -249,22 +245,17 @@ def _section(
     return first, last, given or rate
 
 
-def _without_time(log: Table) -> Table:
-    columns = {name: column for name, column in log.columns.items() if name != TIME}
-    return Table(columns, log.metadata, log.source, log.lines, log.digest, log.decimal)
-
-
 def _compare_rates(
     log: Table, first: int, last: int, given: float, findings: list[Finding]
 ) -> None:
-    """A word where the column of times says something else than the rate that was given."""
+    """A finding where the column of times contradicts the rate that was given."""
     time = numbers(log, TIME)[first:last]
     whole = float(time[-1] - time[0])
-    own = (len(time) - 1) / whole if whole > 0 else np.inf
-    if not abs(own / given - 1) < RATE:
+    measured = (len(time) - 1) / whole if whole > 0 else np.inf
+    if not abs(measured / given - 1) < RATE:
         text = (
             f"--sampling-hz {given:g} was used, but {TIME} goes from {time[0]:g} to {time[-1]:g} s in "
-            f"{len(time)} rows ({own:.6g} Hz): all times and densities rest on the rate given."
+            f"{len(time)} rows ({measured:.6g} Hz): all times and densities rest on the rate given."
         )
         findings.append(Finding(id="rate", text=text))
 
@@ -297,7 +288,7 @@ def _samples(
     if not there.size:
         problem = f"{name} is blank from end to end."
     elif len(there) < FEWEST:
-        problem = f"{name} has {len(there)} samples, of {FEWEST} needed."
+        problem = f"{name} has {len(there)} samples; {FEWEST} are needed."
     elif np.ptp(value[there]) == 0:
         problem = f"{name} reads {value[there[0]] + 0.0:g} from end to end: a dead channel?"
     elif not (odd := np.flatnonzero(steps != np.median(steps))).size:
@@ -337,19 +328,19 @@ def _channel(
     """The noise of one channel; samples are counted inside, seconds outside."""
     factors = allan.octaves(len(value))
     moments = allan.moments(len(value), factors)
-    asked = moments if kind == "overlapping" else allan.moments(len(value), factors, kind)
+    requested = moments if kind == "overlapping" else allan.moments(len(value), factors, kind)
     centred = allan.variance(value, factors, centred=True)
     slope = np.asarray(allan.drift(value))
     terms = noise_terms.fit(centred[None], slope[None], moments)
     plain = allan.deviation(value, factors, kind)
-    freedom = allan.freedom(asked, terms.bounded, terms.steady, terms.covariance)[0]
+    freedom = allan.freedom(requested, terms.bounded, terms.steady, terms.covariance)[0]
     lower, upper = allan.band(plain, freedom)
-    fitted = terms.bounded @ np.swapaxes(asked.plain_mean, -1, -2)
+    fitted = terms.bounded @ np.swapaxes(requested.plain_mean, -1, -2)
     fitted = np.sqrt(fitted[0] + (terms.steady * moments.averaging) ** 2 / 2)
     named = _terms(terms, rate)
     white = named["white"].value
-    said = _findings(name, value, rate, station, moments, terms)
-    findings += said
+    remarks = _findings(name, value, rate, station, moments, terms)
+    findings += remarks
     return ChannelNoise(
         samples=len(value),
         sampling_hz=rate,
@@ -364,7 +355,7 @@ def _channel(
         white_density=None if white is None else float(np.sqrt(2)) * white,
         fit_from_s=float(moments.averaging[terms.start[0]] / rate),
         chance=float(terms.chance[0]),
-        doubts=[finding.id for finding in said if finding.id in DOUBTS],
+        doubts=[finding.id for finding in remarks if finding.id in DOUBTS],
         station=_station(value, station * rate, moments, terms),
     )
 
@@ -380,19 +371,19 @@ def _drifts(terms: Terms) -> Array:
 def _terms(terms: Terms, rate: float) -> dict[str, Term]:
     """The terms of the one record, in units of the channel and seconds."""
     factors = dict(zip(UNITS, (1 / rate, rate**-0.5, 1.0, rate**0.5, rate), strict=True))
-    found = {}
+    by_name = {}
     for i, name in enumerate(allan.TERMS):
         shown = bool(terms.determined[0, i])
         size = float(np.sqrt(max(terms.square[0, i], 0.0))) * factors[name]
         spread = float(np.sqrt(terms.covariance[0, i, i])) * factors[name] ** 2
-        found[name] = Term(
+        by_name[name] = Term(
             value=size if shown else None,
             standard_uncertainty=spread / (2 * size) if shown else None,
             lower=float(np.sqrt(terms.lower[0, i])) * factors[name],
             upper=float(np.sqrt(terms.upper[0, i])) * factors[name],
             unit=UNITS[name],
         )
-    return {**found, "drift": _drift(terms, rate)}
+    return {**by_name, "drift": _drift(terms, rate)}
 
 
 def _drift(terms: Terms, rate: float) -> Term:
@@ -456,7 +447,7 @@ def _findings(
 
 
 def _event(name: str, value: Array, rate: float, least: float, coarse: bool) -> str:
-    """A word on a difference between averages that is no noise: a spike, or a move.
+    """The finding, if any, on a difference between averages too large for noise: a spike, or a move.
 
     `least` is the noise that the steps of the converter can hide: in single samples, and if they
     are `coarse` in averages.
@@ -483,34 +474,37 @@ def _physical(name: str, channel: ChannelNoise, profile: Profile) -> ChannelNois
     return msgspec.structs.replace(channel, unit=PHYSICAL[kind], scale=float(scale))
 
 
-def _withheld(found: dict[str, ChannelNoise]) -> dict[str, str]:
-    """Why there is no noise to recommend, for each triad where that is so."""
+def _withheld(channels: dict[str, ChannelNoise]) -> dict[str, str]:
+    """Why no noise is recommended, for each triad that has none."""
     reasons = {}
     for kind, names in CHANNELS.items():
-        own: dict[str, list[str]] = {}
-        for name in (name for name in names if name in found and found[name].doubts):
-            reason = " and ".join(DOUBTS[doubt] for doubt in found[name].doubts)
-            own.setdefault(reason, []).append(name)
-        if own:
-            reasons[kind] = "; ".join(f"{', '.join(who)}: {why}" for why, who in own.items())
+        by_reason: dict[str, list[str]] = {}
+        for name in (name for name in names if name in channels and channels[name].doubts):
+            reason = " and ".join(DOUBTS[doubt] for doubt in channels[name].doubts)
+            by_reason.setdefault(reason, []).append(name)
+        if by_reason:
+            reasons[kind] = "; ".join(f"{', '.join(who)}: {why}" for why, who in by_reason.items())
     return reasons
 
 
 def _recommended(
-    found: dict[str, ChannelNoise], withheld: dict[str, str], findings: list[Finding]
+    channels: dict[str, ChannelNoise], withheld: dict[str, str], findings: list[Finding]
 ) -> dict[str, float]:
     """The noise of one station for each triad that holds: root mean square of its channels."""
     profile = {}
     for kind, names in CHANNELS.items():
-        own = {name: found[name].station.noise for name in names if name in found}
-        if not own or kind in withheld:
+        stations = {name: channels[name].station.noise for name in names if name in channels}
+        if not stations or kind in withheld:
             continue
-        profile[kind] = root_mean_square(list(own.values()))
-        noisy, quiet = max(own, key=lambda n: own[n]), min(own, key=lambda n: own[n])
-        if own[noisy] > UNEVEN * own[quiet]:
+        profile[kind] = root_mean_square(list(stations.values()))
+        noisy, quiet = (
+            max(stations, key=lambda n: stations[n]),
+            min(stations, key=lambda n: stations[n]),
+        )
+        if stations[noisy] > UNEVEN * stations[quiet]:
             text = (
-                f"{noisy} has {own[noisy] / own[quiet]:.1f} times the noise of {quiet}; the profile has one "
-                f"figure for the {kind}, their root mean square. Is {noisy} in order?"
+                f"{noisy} has {stations[noisy] / stations[quiet]:.1f} times the noise of {quiet}; the profile has one "
+                f"figure for the {kind}, their root mean square. Is {noisy} working properly?"
             )
             findings.append(Finding(id="uneven", text=text))
     return profile

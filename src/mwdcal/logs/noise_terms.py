@@ -7,7 +7,7 @@ them and C(θ) (m, m) their covariance under noise of the squares θ = (Q², N²
     θ̂ = W V,   W = (Eᵀ C⁻¹ E)⁻¹ Eᵀ C⁻¹,   C at the best θ >= 0, found by iteration.
 
 θ̂ is linear in V, and so unbiased; it may be negative where a term is absent. θ >= 0 (`bounded`)
-is what draws the curve. An interval of one term holds the values t for which θ̂ is no surprise:
+gives the curve. The interval of a term holds the values t under which θ̂ is not improbable:
 its variance under t, with the other terms as bounded, is a quadratic in t, and its law that of a
 gamma variable of that variance, as skew as the term's own share makes it. A term that might be
 absent with a chance of more than `DETECTED` has an upper bound instead; so has one without which
@@ -37,7 +37,7 @@ FEWEST = 6
 ITERATIONS = 8
 """Of the weights; three would do."""
 DETECTED = 0.005
-"""Chance under which a term is no longer taken for absent."""
+"""Chance below which a term counts as present."""
 LEVEL = 0.95
 """Probability of the intervals."""
 CONTRADICTED = 1e-3
@@ -50,7 +50,7 @@ Near 1, where both come from the same readings, to take the larger is to take th
 HALVINGS = 60
 """Of an interval's limit: to the last digits of a number."""
 ALONE = 1e-9
-"""Share of its own variance that a term keeps where it is absent and so are all others."""
+"""Share of its variance that a term keeps where all terms are absent."""
 SMALLEST = 1e-4
 """Eigenvalue of the correlation between averaging factors below which rounding decides."""
 SUBSETS = [s for size in range(1, 5) for s in combinations(range(4), size)]
@@ -108,8 +108,8 @@ def fit(variance: Array, slope: Array, moments: Moments) -> Terms:
             break
         other = _fit(variance[doubtful], slope[doubtful], moments, start)
         better = other.chance >= CONTRADICTED
-        for own, new in zip(best, other, strict=True):
-            own[doubtful[better]] = new[better]
+        for kept, refitted in zip(best, other, strict=True):
+            kept[doubtful[better]] = refitted[better]
     return best
 
 
@@ -128,13 +128,13 @@ def single(
     spread = spread + length**4 * doubt * (terms.steady**2 + doubt / 2)
     known = 2 * variance**2 / spread
     whole = max(round(length), 1)
-    own = freedom(moments, terms.bounded, terms.steady, terms.covariance)
+    measurable = freedom(moments, terms.bounded, terms.steady, terms.covariance)
     places = np.log(moments.averaging)
-    own = own @ [np.interp(np.log(whole), places, one) for one in np.eye(len(places))]
+    measurable = measurable @ [np.interp(np.log(whole), places, one) for one in np.eye(len(places))]
     described = (terms.chance >= CONTRADICTED) & (length >= moments.averaging[terms.start])
-    measured = ~described | (own > BETTER * known)
-    found = np.where(measured, deviation(values, [whole])[:, 0], np.sqrt(variance))
-    return found, np.where(measured, own, known), measured
+    measured = ~described | (measurable > BETTER * known)
+    size = np.where(measured, deviation(values, [whole])[:, 0], np.sqrt(variance))
+    return size, np.where(measured, measurable, known), measured
 
 
 def _fit(variance: Array, slope: Array, moments: Moments, start: int) -> Terms:
@@ -194,13 +194,13 @@ class _Used(NamedTuple):
 def _bounded(used: _Used, present: tuple[int, ...]) -> Array:
     """Best fit (B, 4) without negative terms, of those `present`, under its own weights."""
     weight = 1 / (used.variance * np.sqrt(used.share))
-    found = _nonnegative(used.mean * weight[..., None], used.variance * weight, present)
+    squares = _nonnegative(used.mean * weight[..., None], used.variance * weight, present)
     for _ in range(ITERATIONS):
-        whiten = _whitening(used.unit, found)
+        whiten = _whitening(used.unit, squares)
         data = np.einsum("bij,bj->bi", whiten, used.variance)
         better = _nonnegative(whiten @ used.mean, data, present)
-        found = np.where(better.any(-1, keepdims=True), better, found)
-    return found
+        squares = np.where(better.any(-1, keepdims=True), better, squares)
+    return squares
 
 
 def _estimate(used: _Used, bounded: Array) -> tuple[Array, Array, Array]:
@@ -240,7 +240,7 @@ def _whitening(unit: Array, squares: Array) -> Array:
 
 
 def _inverse(design: Array) -> Array:
-    """Least-squares inverse (B, 4, m) of designs (B, m, 4), whatever the units of the columns."""
+    """Least-squares inverse (B, 4, m) of designs (B, m, 4), independent of the units of the columns."""
     size = np.sqrt(np.sum(design**2, -2, keepdims=True))
     return np.asarray(np.linalg.pinv(design / size) / np.swapaxes(size, -1, -2))
 
@@ -254,12 +254,12 @@ def _nonnegative(design: Array, data: Array, present: tuple[int, ...]) -> Array:
     cost = np.sum(data**2, -1)
     for subset in (s for s in SUBSETS if set(s) <= set(present)):
         part = design[..., subset]
-        found = np.einsum("bjm,bm->bj", _inverse(part), data)
-        rest = np.sum((data - np.einsum("bmj,bj->bm", part, found)) ** 2, -1)
-        better = (found >= 0).all(-1) & (rest < cost)
+        solution = np.einsum("bjm,bm->bj", _inverse(part), data)
+        rest = np.sum((data - np.einsum("bmj,bj->bm", part, solution)) ** 2, -1)
+        better = (solution >= 0).all(-1) & (rest < cost)
         cost = np.where(better, rest, cost)
         whole = np.zeros_like(best)
-        whole[:, subset] = found
+        whole[:, subset] = solution
         best = np.where(better[:, None], whole, best)
     return best
 
@@ -270,10 +270,10 @@ def _spread(each: Array, bounded: Array) -> Array:
     `each` (B, 4, 4, 4) is that variance for unit noise; the other terms are as bounded.
     """
     others = bounded[:, None, :] * (1 - np.eye(4))
-    own = np.einsum("bjjj->bj", each)
+    quadratic = np.einsum("bjjj->bj", each)
     constant = np.einsum("bja,bjac,bjc->bj", others, each, others)
     linear = 2 * np.einsum("bjjc,bjc->bj", each, others)
-    return np.stack([np.maximum(constant, ALONE * own * bounded**2), linear, own])
+    return np.stack([np.maximum(constant, ALONE * quadratic * bounded**2), linear, quadratic])
 
 
 def _chance(observed: Array, value: Array, spread: Array) -> Array:

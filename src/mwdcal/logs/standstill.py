@@ -58,8 +58,8 @@ INTO = 0.15
 class Cells(NamedTuple):
     """One channel in short cells (m,): start, end, median, and whether there is a gap within.
 
-    `step` is the time between samples, `rough` the robust standard deviation of a sample as
-    the difference of successive ones tells it: noise, whatever the tool does. `resolution` is
+    `step` is the time between samples, `rough` the robust standard deviation of a sample from
+    the difference of successive ones: noise, even while the tool moves. `resolution` is
     the step in which readings come.
     """
 
@@ -97,6 +97,11 @@ class Activity(NamedTuple):
     cells: tuple[Cells, ...]
     floor: Array
 
+    @property
+    def cell(self) -> float:
+        """Length of a cell, s."""
+        return float(self.edge[1] - self.edge[0])
+
 
 class Threshold(NamedTuple):
     """The threshold in noise floors, and the stretch (first, last) over which it hardly matters."""
@@ -117,6 +122,11 @@ class Standstills(NamedTuple):
     taken: Bools
     short: Bools
 
+    @property
+    def stations(self) -> tuple[Array, Array]:
+        """Start and end of those that are taken."""
+        return self.start[self.taken], self.end[self.taken]
+
 
 def cells_of(time: Array, value: Array, length: float) -> Cells:
     """A channel in cells of about `length` seconds, but of no fewer than `FEWEST` samples.
@@ -128,7 +138,7 @@ def cells_of(time: Array, value: Array, length: float) -> Cells:
     rough = float(np.median(np.abs(np.diff(value)))) / 0.6745 / np.sqrt(2)
     bounds = [*_rate_changes(time), len(time)]
     parts = [_even(time[a:b], value[a:b], length) for a, b in pairwise(bounds)]
-    start, end, level, torn = (np.concatenate(own) for own in zip(*parts, strict=True))
+    start, end, level, torn = (np.concatenate(column) for column in zip(*parts, strict=True))
     return Cells(start, end, level, torn, step, rough, resolution(value))
 
 
@@ -173,9 +183,9 @@ def resolution(value: Array) -> float:
     if not steps.size:
         return 0.0
     for least in (0.0, 1e-3 * float(np.quantile(steps, 0.99))):
-        own = _agreed(steps[np.searchsorted(steps, least) :])
-        if own:
-            return own
+        step = _agreed(steps[np.searchsorted(steps, least) :])
+        if step:
+            return step
     return float(np.quantile(steps, 0.01, method="lower"))
 
 
@@ -187,9 +197,9 @@ def _agreed(steps: Array) -> float:
         return 0.0
     first = common[np.searchsorted(steps[common], steps[common[-1]] / 20)]
     first = first + int(np.argmax(count[first : first + count[first]]))
-    own = float(steps[first + count[first] // 2])
-    between = np.searchsorted(steps, [0.05 * own, 0.9 * own])
-    return own if between[1] - between[0] <= SHARE * count[first] else 0.0
+    step = float(steps[first + count[first] // 2])
+    between = np.searchsorted(steps, [0.05 * step, 0.9 * step])
+    return step if between[1] - between[0] <= SHARE * count[first] else 0.0
 
 
 def time_step(time: Array) -> float:
@@ -205,11 +215,11 @@ def distinct(time: Array) -> Array:
     if later.all() or not later.any():
         return time
     first = np.concatenate([[0], np.flatnonzero(later) + 1])
-    own = time[first]
+    ticks = time[first]
     many = np.diff(first, append=len(time))
-    room = np.minimum(np.diff(own, append=np.inf), time_step(own))
+    room = np.minimum(np.diff(ticks, append=np.inf), time_step(ticks))
     rank = np.arange(len(time)) - np.repeat(first, many)
-    return np.asarray(np.repeat(own, many) + rank * np.repeat(room / many, many))
+    return np.asarray(np.repeat(ticks, many) + rank * np.repeat(room / many, many))
 
 
 def activity(channels: Sequence[tuple[Array, Array]]) -> Activity:
@@ -222,7 +232,7 @@ def activity(channels: Sequence[tuple[Array, Array]]) -> Activity:
     length = max(CELL, FEWEST * min((s for s in steps if s > 0), default=0.0))
     fast = [i for i, s in enumerate(steps) if 0 < FEWEST * s <= WINDOW * length]
     cut = {i: cells_of(*channels[i], length) for i in fast if np.ptp(channels[i][1]) > 0}
-    cut = {i: own for i, own in cut.items() if len(own.level) >= WINDOW}
+    cut = {i: channel for i, channel in cut.items() if len(channel.level) >= WINDOW}
     cells = tuple(cut.values())
     if not cells:
         return Activity(np.zeros(1), np.zeros(0), (), (), np.zeros(0))
@@ -230,12 +240,12 @@ def activity(channels: Sequence[tuple[Array, Array]]) -> Activity:
     count = round(float(max(c.end[-1] for c in cells) - start) / length)
     edge = start + length * np.arange(max(count, 1) + 1)
     floors, value = [], np.zeros(len(edge) - 1)
-    for own in cells:
-        ranges = quietest_range(own.level)
-        # One step of the readings up or down is no movement.
-        floor = max(noise_floor(ranges), (1 + AGREE) * own.resolution)
-        ranges = np.where(own.torn, np.inf, ranges)
-        value = np.maximum(value, on_grid(edge, own, ranges) / floor)
+    for channel in cells:
+        ranges = quietest_range(channel.level)
+        # One step of the readings up or down is not movement.
+        floor = max(noise_floor(ranges), (1 + AGREE) * channel.resolution)
+        ranges = np.where(channel.torn, np.inf, ranges)
+        value = np.maximum(value, on_grid(edge, channel, ranges) / floor)
         floors.append(floor)
     return Activity(edge, value, tuple(cut), cells, np.array(floors))
 
@@ -323,16 +333,16 @@ def _changes(before: Ints, after: Ints) -> int:
     return len(before) + len(after) - 2 * shared
 
 
-def calm(found: Activity, threshold: float, trim: float) -> tuple[Array, Array]:
+def calm(activity: Activity, threshold: float, trim: float) -> tuple[Array, Array]:
     """Start and end of the intervals whose activity stays at or below the threshold, trimmed."""
-    first, last = stretches(found.value <= threshold)
-    start, end = found.edge[first] + trim, found.edge[last] - trim
+    first, last = stretches(activity.value <= threshold)
+    start, end = activity.edge[first] + trim, activity.edge[last] - trim
     some = end > start
     return start[some], end[some]
 
 
 def standstills(
-    found: Activity, limits: Array, threshold: float, shortest: float, trim: float,
+    activity: Activity, limits: Array, threshold: float, shortest: float, trim: float,
     slow: Sequence[Slow] = (),
 ) -> Standstills:  # fmt: skip
     """The intervals whose activity stays at or below the threshold, cut and judged.
@@ -341,17 +351,21 @@ def standstills(
     (`rest_limit`); twice that over a whole interval is slow movement. `trim` seconds are cut
     off each end; `shortest` seconds must remain. Slow channels cut intervals where they step.
     """
-    start, end = calm(found, threshold, trim)
+    start, end = calm(activity, threshold, trim)
     start, end = cut_at_steps(start, end, slow, trim)
     creeps = np.zeros(len(start), bool)
-    for own, limit in zip(found.cells, limits, strict=True):
-        creeps |= _travels(own.start, own.level, start, end) > 2 * limit
+    for channel, limit in zip(activity.cells, limits, strict=True):
+        creeps |= _travels(channel.start, channel.level, start, end) > 2 * limit
     for time, value, limit in slow:
-        middle = np.median(np.stack([value[:-2], value[1:-1], value[2:]]), axis=0)
         step = time_step(time)
-        creeps |= _travels(time[1:-1], middle, start + step, end - step) > 4 * limit
+        creeps |= _travels(time[1:-1], _despiked(value), start + step, end - step) > 4 * limit
     short = end - start < shortest
     return Standstills(start, end, ~short & ~creeps, short)
+
+
+def _despiked(value: Array) -> Array:
+    """Medians (n - 2,) of three samples (n,) next to each other."""
+    return np.asarray(np.median(np.stack([value[:-2], value[1:-1], value[2:]]), axis=0))
 
 
 def _travels(time: Array, level: Array, start: Array, end: Array) -> Array:
@@ -364,10 +378,10 @@ def cut_at_steps(
     start: Array, end: Array, slow: Sequence[Slow], trim: float
 ) -> tuple[Array, Array]:
     """The intervals (k,), without the times at which slow channels step from one level to another."""
-    rooms = [max(trim - 2 * time_step(own.time), 0.0) for own in slow]
+    rooms = [max(trim - 2 * time_step(channel.time), 0.0) for channel in slow]
     pieces = []
     for a, b in zip(start, end, strict=True):
-        spans = [_steps(a, b, own, room) for own, room in zip(slow, rooms, strict=True)]
+        spans = [_steps(a, b, channel, room) for channel, room in zip(slow, rooms, strict=True)]
         for first, last in sorted(chain.from_iterable(spans)):
             pieces.append((a, first))
             a = max(a, last)
@@ -380,14 +394,14 @@ def _steps(start: float, end: float, slow: Slow, room: float) -> list[tuple[floa
     """When a slow channel steps within an interval: from when to when nothing is at rest.
 
     Definition: a step is where the medians of three samples before and after differ by more than
-    the channel's limit, all of them within the interval; a spike is none. It lasts from two
+    the channel's limit, all of them within the interval; a spike is not a step. A step lasts from two
     samples before to two after, and `room` seconds more to each side.
     """
     first, last = np.searchsorted(slow.time, [start, end])
     time, value = slow.time[first:last], slow.value[first:last]
     if len(time) < 2 * FEWEST:
         return []
-    middle = np.median(np.stack([value[:-2], value[1:-1], value[2:]]), axis=0)
+    middle = _despiked(value)
     stepped = np.abs(middle[FEWEST:] - middle[:-FEWEST]) > slow.limit
     return [
         (float(time[i + FEWEST - 2] - room), float(time[min(j + FEWEST, len(time) - 1)] + room))

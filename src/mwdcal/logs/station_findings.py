@@ -1,4 +1,4 @@
-"""What the reader of a log's stations should know: what was missed, and what is odd at a station."""
+"""Findings about the stations of a log: what was left out, and what is unusual at a station."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mwdcal.logs.standstill import Activity, Standstills
 from mwdcal.logs.station_means import Summary
 
 MANY_SPIKES = 0.01
-"""Share of spikes that is worth a word."""
+"""Share of spikes that is reported."""
 MOST_LISTED = 12
 """Stations, or stretches of time, that a finding names."""
 DAY = 86_400.0
@@ -42,21 +42,25 @@ def _between(start: Array, end: Array) -> str:
     return listed(f"{a:.1f}–{b:.1f} s" for a, b in zip(start, end, strict=True))
 
 
-def about(rows: Rows, found: Standstills, seconds: float) -> list[Finding]:
+def about(rows: Rows, standstills: Standstills, seconds: float) -> list[Finding]:
     """Findings about the stations, and about what was left; `seconds` lasts the log once trimmed."""
-    start, end = found.start[found.taken], found.end[found.taken]
+    start, end = standstills.stations
     findings = []
-    creeping = ~found.taken & ~found.short
+    creeping = ~standstills.taken & ~standstills.short
     if creeping.any():
-        where = _between(found.start[creeping], found.end[creeping])
+        where = _between(standstills.start[creeping], standstills.end[creeping])
         text = f"left out, as the tool moves slowly there: {where}."
         findings.append(Finding(id="slow-movement", text=text))
     if len(start) == 1 and end[0] - start[0] > 0.9 * seconds:
         text = "the log stands still from end to end: one station. A calibration needs several attitudes."
         findings.append(Finding(id="all-still", text=text))
     findings += _spikes(rows)
-    for name, own in rows.items():
-        findings += _stuck(name, own) + _unsteady(name, own) + _drifting(name, own, end - start)
+    for name, summaries in rows.items():
+        findings += (
+            _stuck(name, summaries)
+            + _unsteady(name, summaries)
+            + _drifting(name, summaries, end - start)
+        )
     return findings
 
 
@@ -85,8 +89,8 @@ def correlated_noise(names: list[str]) -> Finding:
 
 def _spikes(rows: Rows) -> list[Finding]:
     share = {
-        n: sum(r.spikes for r in own) / sum(r.spikes + r.used for r in own)
-        for n, own in rows.items()
+        n: sum(r.spikes for r in summaries) / sum(r.spikes + r.used for r in summaries)
+        for n, summaries in rows.items()
     }
     name = max(share, key=lambda n: share[n])
     if share[name] <= MANY_SPIKES:
@@ -95,49 +99,49 @@ def _spikes(rows: Rows) -> list[Finding]:
     return [Finding(id="spikes", text=text)]
 
 
-def _stuck(name: str, own: list[Summary]) -> list[Finding]:
+def _stuck(name: str, summaries: list[Summary]) -> list[Finding]:
     """A channel at its limit, or frozen."""
-    stations = [i + 1 for i, row in enumerate(own) if row.stuck]
+    stations = [i + 1 for i, row in enumerate(summaries) if row.stuck]
     if not stations:
         return []
-    first = own[stations[0] - 1]
+    first = summaries[stations[0] - 1]
     text = (
-        f"{name} stands at its limit, or is frozen, at {count(len(stations), 'station')} of {len(own)} "
+        f"{name} stands at its limit, or is frozen, at {count(len(stations), 'station')} of {len(summaries)} "
         f"({listed(stations)}): too many equal readings for its noise, such as {first.mean + 0.0:.6g}. Its sd_ "
         "there is that of a reading known to the channel's range only."
     )
     return [Finding(id="stuck-channel", text=text, station=str(stations[0]))]
 
 
-def _unsteady(name: str, own: list[Summary]) -> list[Finding]:
+def _unsteady(name: str, summaries: list[Summary]) -> list[Finding]:
     """A channel that is less steady than usual, or steps within a standstill."""
-    stations = [i + 1 for i, row in enumerate(own) if row.unsteady and not row.stuck]
+    stations = [i + 1 for i, row in enumerate(summaries) if row.unsteady and not row.stuck]
     if not stations:
         return []
-    usual = float(np.median([row.spread for row in own]))
+    usual = float(np.median([row.spread for row in summaries]))
     text = (
-        f"{name} is less steady than usual at {count(len(stations), 'station')} of {len(own)} "
+        f"{name} is less steady than usual at {count(len(stations), 'station')} of {len(summaries)} "
         f"({listed(stations)}): it spreads more than at the others, or moves within the standstill "
         f"(usual spread of one sample {usual:.2g}). Was the tool knocked, turned or shaken?"
     )
     return [Finding(id="unsteady", text=text, station=str(stations[0]))]
 
 
-def _drifting(name: str, own: list[Summary], seconds: Array) -> list[Finding]:
-    drifting = [i for i, row in enumerate(own) if row.drifts]
+def _drifting(name: str, summaries: list[Summary], seconds: Array) -> list[Finding]:
+    drifting = [i for i, row in enumerate(summaries) if row.drifts]
     if not drifting:
         return []
-    worst = max(drifting, key=lambda i: abs(own[i].drift))
+    worst = max(drifting, key=lambda i: abs(summaries[i].drift))
     text = (
-        f"{name} drifts at {len(drifting)} of {len(own)} stations, most at station {worst + 1}: by "
-        f"{own[worst].drift:.3g} over {seconds[worst]:.1f} s (noise of one sample "
-        f"{own[worst].spread:.2g}). See the columns drift_."
+        f"{name} drifts at {len(drifting)} of {len(summaries)} stations, most at station {worst + 1}: by "
+        f"{summaries[worst].drift:.3g} over {seconds[worst]:.1f} s (noise of one sample "
+        f"{summaries[worst].spread:.2g}). See the columns drift_."
     )
     return [Finding(id="drift", text=text, station=str(worst + 1))]
 
 
 def noisy_rests(
-    activity: Activity, limits: Array, found: Standstills, threshold: float, least: float
+    activity: Activity, limits: Array, standstills: Standstills, threshold: float, least: float
 ) -> list[Finding]:
     """Stretches of at least `least` seconds that are steady on average, but above the threshold.
 
@@ -145,17 +149,17 @@ def noisy_rests(
     none changes by more than `STEADY` times what its cells scatter about that line.
     """
     can_rest = activity.value > threshold
-    for own, limit in zip(activity.cells, limits, strict=True):
-        ranges = np.where(own.torn, np.inf, standstill.quietest_range(own.level))
-        can_rest &= standstill.on_grid(activity.edge, own, ranges) <= limit
-    cell = activity.edge[1] - activity.edge[0]
-    first, last = standstill.stretches(can_rest, max(ceil(least / cell), standstill.WINDOW))
+    for channel, limit in zip(activity.cells, limits, strict=True):
+        ranges = np.where(channel.torn, np.inf, standstill.quietest_range(channel.level))
+        can_rest &= standstill.on_grid(activity.edge, channel, ranges) <= limit
+    shortest = max(ceil(least / activity.cell), standstill.WINDOW)
+    first, last = standstill.stretches(can_rest, shortest)
     start, end = activity.edge[first], activity.edge[last]
     kept = [
         i
         for i, (a, b) in enumerate(zip(start, end, strict=True))
-        if not np.any((found.start < b) & (found.end > a))
-        and all(_is_steady(own.start, own.level, a, b) for own in activity.cells)
+        if not np.any((standstills.start < b) & (standstills.end > a))
+        and all(_is_steady(channel.start, channel.level, a, b) for channel in activity.cells)
     ]
     if not kept:
         return []
@@ -172,9 +176,9 @@ def noisy_rests(
 def _is_steady(time: Array, level: Array, start: float, end: float) -> bool:
     """Whether the levels between these times scatter about a constant."""
     first, last = np.searchsorted(time, [start, end])
-    own, clock = level[first:last], time[first:last] - start
-    if len(own) < standstill.WINDOW:
+    levels, clock = level[first:last], time[first:last] - start
+    if len(levels) < standstill.WINDOW:
         return True
-    slope, constant = np.polyfit(clock, own, 1)
-    scatter = np.std(own - slope * clock - constant)
+    slope, constant = np.polyfit(clock, levels, 1)
+    scatter = np.std(levels - slope * clock - constant)
     return bool(abs(slope) * (clock[-1] - clock[0]) <= STEADY * scatter)

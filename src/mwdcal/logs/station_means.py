@@ -1,9 +1,10 @@
 """Means of a channel at rest: what it read at each standstill, and how well that is known.
 
-The standstills of one channel share its noise. A long one tells its own, correlation included: the
-autocovariances add up. A short one borrows: its variance is drawn to that of all standstills, as
-if the others had given it some samples more, and its spikes are judged by the spread of all.
-A drift that all of them share is none of it. Readings in coarse steps hide the mean by what their
+The standstills of one channel share its noise. The noise of a long one, with its correlation, is
+estimated from its autocovariances. A short one borrows: its variance is drawn to that of all
+standstills, as if the others had given it some samples more, and its spikes are judged by the
+spread of all.
+A drift that all of them share is not part of it. Readings in coarse steps hide the mean by what their
 noise, all together again, does not dither away.
 Whether the means then scatter as they claim is asked of the halves of all standstills of a triad:
 noise that is correlated over a second or more shows there, and not in one standstill alone.
@@ -27,13 +28,13 @@ from mwdcal.geometry.vectors import Array
 CLEAR = 4.0
 """Distance from the median, in robust standard deviations, above which a sample is a spike."""
 BLOCKS = 64
-"""Blocks whose means tell the long-run variance."""
+"""Blocks whose means give the long-run variance."""
 LONG = 16
-"""Samples from which on a standstill tells its own noise; the most that the others lend it."""
+"""Samples from which on the noise of a standstill is taken from itself; the most it borrows."""
 SIGNIFICANT = 1e-4
 """Chance that a steady channel is said to drift, or to be less steady than usual."""
 UNUSUAL = 2.0
-"""Times the usual spread that is worth a word."""
+"""Ratio to the usual spread that is reported."""
 LENT = 0.01
 """Chance that a standstill of the usual noise is taken for noisier, and lent none."""
 COURSE = 0.01
@@ -78,14 +79,14 @@ class Noise(NamedTuple):
 
 
 ALONE = Noise(np.nan, np.nan, np.nan, 0.0, np.nan, np.inf, 0.0)
-"""Of a standstill without others."""
+"""The shared noise where a channel has one standstill only."""
 
 
 class Summary(NamedTuple):
     """What one channel read during one standstill.
 
     Attributes:
-        mean: of the samples that are no spikes.
+        mean: of the samples that are not spikes.
         sd: standard uncertainty of the mean, correlation of the noise included.
         spread: robust standard deviation of one sample, from the median of deviations.
         drift: change over the standstill by the straight line.
@@ -111,20 +112,16 @@ class Summary(NamedTuple):
     stuck: bool
 
 
-def _silent(done: int) -> None:
-    """Say nothing."""
-
-
 def summarise_all(
-    rests: Sequence[Rest], resolution: float, said: Callable[[int], None] = _silent
+    rests: Sequence[Rest], resolution: float, say: Callable[[int], None] = lambda done: None
 ) -> list[Summary]:
-    """What a channel read at each standstill; `said` is told how many are done."""
+    """What a channel read at each standstill; `say` receives how many are done."""
     noise = pooled(rests, resolution)
-    made = []
+    summaries = []
     for rest in rests:
-        made.append(summarise(*rest, resolution, noise))
-        said(len(made))
-    return made
+        summaries.append(summarise(*rest, resolution, noise))
+        say(len(summaries))
+    return summaries
 
 
 class Correlated(NamedTuple):
@@ -132,7 +129,7 @@ class Correlated(NamedTuple):
 
     Attributes:
         variance: of a sample's worth of mean, sd² times samples, of each channel; 0 for none.
-        plain: whether it is worth a word; the uncertainty is widened before that (`CHANCE`).
+        plain: whether it is reported; the uncertainty is widened before that (`CHANCE`).
     """
 
     variance: Array
@@ -149,19 +146,25 @@ def correlated(channels: Sequence[Sequence[Summary]]) -> Correlated:
     """
     from scipy.special import chdtri, fdtri
 
-    clear = [[m for m in own if not m.stuck] for own in channels]
+    clear = [[m for m in summaries if not m.stuck] for summaries in channels]
     count = sum(map(len, clear))
     if count < HALVES or not all(clear):
         return Correlated(np.zeros(len(channels)), False)
-    halves: Array = np.array([_typical([m.halves * m.used for m in own]) for own in clear])
-    told = [m for own in clear for m in own if m.quarters == m.quarters]
-    quarters = _typical([m.quarters * m.used for m in told]) if told else 0.0
-    growth = _typical([m.halves * m.used for m in told]) / quarters if quarters else 0.5
-    claimed = np.array([float(np.median([m.sd**2 * m.used for m in own])) for own in clear])
-    parts = claimed / [len(own) for own in clear]
+    halves: Array = np.array(
+        [_typical([m.halves * m.used for m in summaries]) for summaries in clear]
+    )
+    quartered = [m for summaries in clear for m in summaries if m.quarters == m.quarters]
+    quarters = _typical([m.quarters * m.used for m in quartered]) if quartered else 0.0
+    growth = _typical([m.halves * m.used for m in quartered]) / quarters if quarters else 0.5
+    claimed = np.array(
+        [float(np.median([m.sd**2 * m.used for m in summaries])) for summaries in clear]
+    )
+    parts = claimed / [len(summaries) for summaries in clear]
     freedom = claimed.sum() ** 2 / (claimed @ parts)  # Satterthwaite: a noisy channel counts most
     more = halves.sum() > chdtri(freedom, CHANCE) / freedom * claimed.sum()
-    more |= growth > 0.5 * fdtri(max(len(told), 1), max(2 * len(told), 1), 1 - np.array(GROWN))
+    more |= growth > 0.5 * fdtri(
+        max(len(quartered), 1), max(2 * len(quartered), 1), 1 - np.array(GROWN)
+    )
     widens, plain = (bool(one) for one in more & (growth < GROWTH))
     return Correlated(halves * beyond(growth) if widens else 0 * halves, plain)
 
@@ -189,10 +192,11 @@ def beyond(growth: float) -> float:
     return float(np.interp(growth, halves / quarters, variance(time) / halves))
 
 
-def widened(made: Sequence[Summary], variance: float) -> list[Summary]:
+def widened(summaries: Sequence[Summary], variance: float) -> list[Summary]:
     """The same with at least this variance of a sample's worth of mean."""
     return [
-        m if m.stuck else m._replace(sd=max(m.sd, (float(variance) / m.used) ** 0.5)) for m in made
+        m if m.stuck else m._replace(sd=max(m.sd, (float(variance) / m.used) ** 0.5))
+        for m in summaries
     ]
 
 
@@ -293,7 +297,7 @@ def summarise(time: Array, value: Array, resolution: float, noise: Noise = ALONE
     """What a channel read: `time` and `value` (n,) of the samples of one standstill, n >= 2.
 
     `resolution` is the step of the channel, in which noise far below it hides the mean (`hidden`).
-    The mean is that of the middle of the standstill: the course that all share is no part of its
+    The mean is that of the middle of the standstill: the course that all share is not part of its
     uncertainty. A stuck channel is known to its reach/√12.
     """
     distance = np.abs(value - np.median(value))
@@ -367,15 +371,15 @@ def _shared_spread(value: Array, step: float, noise: Noise) -> float:
     """
     from scipy.special import chdtri
 
-    own, freedom = float(value.std()), max(len(value) - 1, 1)
+    spread, freedom = float(value.std()), max(len(value) - 1, 1)
     if not noise.freedom:
-        return own
+        return spread
     least = noise.least**2
     if noise.least < 2 * step:
         variances, _, lowest = _dither()
         least = step**2 * float(np.interp((noise.least / step) ** 2, variances, lowest))
     quiet = least * chdtri(freedom, 1 - SIGNIFICANT) / UNUSUAL**2
-    return own if len(value) * own**2 < quiet else noise.least
+    return spread if len(value) * spread**2 < quiet else noise.least
 
 
 def _spike_scale(count: int, spread: float, noise: Noise) -> float:
@@ -408,8 +412,8 @@ def _is_unsteady(value: Array, resolution: float, noise: Noise) -> bool:
     spreads = len(value) * value.var() > usual**2 * limit
     if len(value) < 3 * PARTS:
         return bool(spreads)
-    own = max(noise.rough, resolution) / (len(value) / PARTS) ** 0.5
-    return bool(spreads or np.ptp(_blocks(value)) > WANDERS * own)
+    scatter = max(noise.rough, resolution) / (len(value) / PARTS) ** 0.5
+    return bool(spreads or np.ptp(_blocks(value)) > WANDERS * scatter)
 
 
 def _mean_variance(value: Array, noise: Noise, lost: int = 1) -> tuple[float, float, float]:

@@ -1,13 +1,12 @@
 """Stations from a continuous log: its standstills, each as one row of a run file.
 
 Channels may have rates of their own (blank cells in one table), and the temperature may be
-slower still: it never decides what stands still. See `core.standstill` for the method.
+slower still: it never decides what stands still. See `standstill` for the method.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,7 +17,7 @@ from mwdcal.errors import InputError
 from mwdcal.files.contract import CHANNELS, RAW, TEMPERATURE
 from mwdcal.files.formats.columns import Column
 from mwdcal.files.formats.table import Table, cell_error, numbers, shown
-from mwdcal.files.logs import READ, TIME
+from mwdcal.files.logs import READ, TIME, Say, silent
 from mwdcal.files.synonyms import unused
 from mwdcal.geometry.vectors import Array, Ints
 from mwdcal.logs import standstill
@@ -36,13 +35,13 @@ from mwdcal.logs.station_means import Summary, correlated, summarise, summarise_
 MIN_SECONDS, TRIM_SECONDS = 1.0, 1.0
 """Defaults for a fast log; one sampled slowly needs a window, and a cell, respectively."""
 LEAST_SAMPLES = 3
-"""Samples of each channel below which there is no station."""
+"""Fewest samples of each channel at a station."""
 GAP = 5.0
 """Times the usual step between samples that are a gap."""
 MOST_CELLS = 50_000_000
 """Cells of the longest log: four months at 15 samples a second or more."""
-TOLD = 1.2
-"""Times the uncertainty of most means of a triad that correlated noise adds, worth a word."""
+REPORTED = 1.2
+"""Factor by which correlated noise widens most means of a triad before it is reported."""
 CLOCK = re.compile(r"^t(?![A-Za-z0-9])|(?i:time|stamp|clock|epoch|seconds|millis|micros)")
 """Names of columns that may hold the time."""
 SMALLEST = 1e-12
@@ -68,7 +67,7 @@ class Stations:
         min_seconds, trim_seconds: as used.
         time: of each row of the log, s.
         traces: the channels that have samples.
-        findings: what the reader should know.
+        findings: what is reported beside the stations.
     """
 
     table: Table
@@ -84,15 +83,11 @@ class Stations:
 
 
 class StandstillError(InputError):
-    """A log without a standstill; `made` holds what was looked at, with an empty table."""
+    """A log without a standstill; `made` holds the analysis, with an empty table."""
 
     def __init__(self, text: str, made: Stations) -> None:
         super().__init__(text)
         self.made = made
-
-
-def _silent(text: str) -> None:
-    """Say nothing."""
 
 
 def find_stations(
@@ -102,7 +97,7 @@ def find_stations(
     min_seconds: float | None = None,
     trim_seconds: float | None = None,
     threshold: float | None = None,
-    say: Callable[[str], None] = _silent,
+    say: Say = silent,
 ) -> Stations:
     """The standstills of a log (`files.logs.read`) as the rows of a run.
 
@@ -121,35 +116,45 @@ def find_stations(
     activity = standstill.activity(list(traces.values()))
     if not activity.cells:
         raise _short(log, time, traces)
-    cell = float(activity.edge[1] - activity.edge[0])
-    shortest = max(MIN_SECONDS, standstill.WINDOW * cell) if min_seconds is None else min_seconds
-    trim = max(TRIM_SECONDS, cell) if trim_seconds is None else trim_seconds
+    shortest = min_seconds
+    if shortest is None:
+        shortest = max(MIN_SECONDS, standstill.WINDOW * activity.cell)
+    trim = max(TRIM_SECONDS, activity.cell) if trim_seconds is None else trim_seconds
     findings += _torn(activity, list(traces), findings)
     limits, slow = _limits(activity, traces)
-    highest = float(np.min(limits / activity.floor))
-    value, stretch = threshold, None
-    if value is None:
-        least = int(np.ceil((shortest + 2 * trim) / cell))
-        value, stretch = standstill.choose_threshold(activity.value, least, highest)
-        if np.isnan(value):  # nothing lasts: what comes nearest
-            value, stretch = highest, None
-    found = standstill.standstills(activity, limits, value, shortest, trim, slow)
-    found = _with_samples(found, traces, findings)
-    findings += noisy_rests(activity, limits, found, value, shortest + 2 * trim)
-    made = Stations(
-        Table({}, log.metadata, log.source), found, activity, value, stretch, shortest, trim, time,
+    value, stretch = _threshold(activity, limits, threshold, shortest + 2 * trim)
+    standstills = standstill.standstills(activity, limits, value, shortest, trim, slow)
+    standstills = _with_samples(standstills, traces, findings)
+    findings += noisy_rests(activity, limits, standstills, value, shortest + 2 * trim)
+    stations = Stations(
+        Table({}, log.metadata, log.source), standstills, activity, value, stretch, shortest, trim, time,
         traces, findings,
     )  # fmt: skip
-    if not found.taken.any():
-        raise StandstillError(_none(made), made)
-    start, end = found.start[found.taken], found.end[found.taken]
-    rows = _summaries(traces, start, end, findings, say)
-    columns = _columns(log, time, rows, start, end)
-    columns |= _temperatures(temperature, start, end, findings)
-    findings += about(rows, found, float(time[-1] - time[0]) - 2 * trim)
+    if not standstills.taken.any():
+        raise StandstillError(_none(stations), stations)
+    rows = _summaries(traces, *standstills.stations, findings, say)
+    columns = _columns(log, time, rows, *standstills.stations)
+    columns |= _temperatures(temperature, *standstills.stations, findings)
+    findings += about(rows, standstills, float(time[-1] - time[0]) - 2 * trim)
     metadata = {**log.metadata, "log": log.source, "log_sha256": log.digest}
-    table = Table(_ordered(columns), metadata, log.source, range(1, len(start) + 1))
-    return replace(made, table=table)
+    lines = range(1, len(columns["station"]) + 1)
+    return replace(stations, table=Table(_ordered(columns), metadata, log.source, lines))
+
+
+def _threshold(
+    activity: Activity, limits: Array, given: float | None, least: float
+) -> tuple[float, tuple[float, float] | None]:
+    """The threshold, and the stretch over which it hardly matters; None where it was given.
+
+    `least` is the shortest standstill, s. Where nothing lasts as long, the threshold is the highest
+    one at which every channel can be at rest.
+    """
+    if given is not None:
+        return given, None
+    highest = float(np.min(limits / activity.floor))
+    cells = int(np.ceil(least / activity.cell))
+    value, stretch = standstill.choose_threshold(activity.value, cells, highest)
+    return (highest, None) if np.isnan(value) else (value, stretch)
 
 
 def _check(name: str, value: float | None) -> None:
@@ -160,7 +165,7 @@ def _check(name: str, value: float | None) -> None:
 def _short(log: Table, time: Array, traces: dict[str, Trace]) -> InputError:
     if len(time) > 1 and not any(np.ptp(value) for _, value in traces.values()):
         return InputError(
-            f"{log.source}: no channel ever changes, so that nothing tells rest from movement. "
+            f"{log.source}: no channel ever changes, so rest and movement cannot be told apart. "
             "Check the logger and the order of the columns."
         )
     window = standstill.WINDOW
@@ -171,20 +176,20 @@ def _short(log: Table, time: Array, traces: dict[str, Trace]) -> InputError:
     )
 
 
-def _none(made: Stations) -> str:
-    """Why there is no station."""
-    longest = float((made.found.end - made.found.start).max(initial=0.0))
-    moving = int(np.count_nonzero(~made.found.short))
-    trimmed = f"after {made.trim_seconds:g} s trimmed off each end"
+def _none(stations: Stations) -> str:
+    """The message of a log without a station."""
+    longest = float((stations.found.end - stations.found.start).max(initial=0.0))
+    moving = int(np.count_nonzero(~stations.found.short))
+    trimmed = f"after {stations.trim_seconds:g} s trimmed off each end"
     if moving:
         word = "interval moves" if moving == 1 else "intervals move"
-        seen = f"{moving} long calm {word} on slowly by more than a standstill can"
+        seen = f"{moving} long calm {word} slowly, by more than a tool at rest can"
     elif longest:
         seen = f"the longest calm interval lasts {longest:.3g} s {trimmed}"
     else:
         seen = f"nothing is left {trimmed}"
     return (
-        f"{made.table.source}: no standstill of at least {made.min_seconds:g} s; {seen}. Stand still "
+        f"{stations.table.source}: no standstill of at least {stations.min_seconds:g} s; {seen}. Stand still "
         "for longer, lower --min-seconds or --trim-seconds, or set --threshold; --plot shows the log."
     )
 
@@ -216,7 +221,7 @@ def row_times(log: Table, sampling_hz: float | None) -> Array:
 
 
 def _timeless(log: Table) -> InputError:
-    """A log without time, or with one of another name."""
+    """The refusal of a log without a time, or with one of another name."""
     clock = next((name for name in log.columns if CLOCK.search(name)), None)
     got = "neither. Add"
     if clock is not None:
@@ -241,29 +246,31 @@ def _traces(
     log: Table, time: Array, findings: list[Finding]
 ) -> tuple[dict[str, Trace], Trace | None]:
     """The raw channels that have samples, and the temperature."""
-    own = {name: _trace(log, time, name) for name in (*RAW, "temperature_c") if name in log.columns}
-    magnetometer = [name for name in CHANNELS["magnetometer"] if name in own]
-    if magnetometer and not any(len(own[name][0]) for name in magnetometer):
+    traces = {
+        name: _trace(log, time, name) for name in (*RAW, "temperature_c") if name in log.columns
+    }
+    magnetometer = [name for name in CHANNELS["magnetometer"] if name in traces]
+    if magnetometer and not any(len(traces[name][0]) for name in magnetometer):
         text = "mx, my and mz are blank from end to end: the stations have no magnetometer."
         findings.append(Finding(id="no-magnetometer", text=text))
-        own = {name: trace for name, trace in own.items() if name not in magnetometer}
-    for name, (values, _) in own.items():
+        traces = {name: trace for name, trace in traces.items() if name not in magnetometer}
+    for name, (values, _) in traces.items():
         if not len(values) and name in RAW:
             raise InputError(
                 f"{log.source}, column '{name}': must have samples; every cell is blank. Check the "
                 "logger and the order of the columns, or leave out the triad."
             )
-        if name in RAW and np.ptp(own[name][1]) == 0:
-            text = f"{name} reads {own[name][1][0] + 0.0:g} from end to end: a dead channel?"
+        if name in RAW and np.ptp(traces[name][1]) == 0:
+            text = f"{name} reads {traces[name][1][0] + 0.0:g} from end to end: a dead channel?"
             findings.append(Finding(id="dead-channel", text=text))
-    temperature = own.pop("temperature_c", None)
+    temperature = traces.pop("temperature_c", None)
     if temperature is not None:
         temperature = _possible(temperature, findings)
     if temperature is not None and not len(temperature[0]):
         text = "temperature_c is blank from end to end: the stations have no temperature."
         findings.append(Finding(id="no-temperature", text=text))
         temperature = None
-    return own, temperature
+    return traces, temperature
 
 
 def _trace(log: Table, time: Array, name: str) -> Trace:
@@ -276,13 +283,13 @@ def _trace(log: Table, time: Array, name: str) -> Trace:
 
 
 def _possible(temperature: Trace, findings: list[Finding]) -> Trace:
-    """The temperatures that can be some; others, such as -999, are left out and told."""
+    """The temperatures that are possible; others, such as -999, are left out and reported."""
     time, value = temperature
     fine = (value >= TEMPERATURE.low) & (value <= TEMPERATURE.high)
     if not fine.all():
         wrong = np.flatnonzero(~fine)
         text = (
-            f"{wrong.size} of {len(value)} values of temperature_c are none between {TEMPERATURE.low:g} "
+            f"{wrong.size} of {len(value)} values of temperature_c are not between {TEMPERATURE.low:g} "
             f"and {TEMPERATURE.high:g} °C, such as {value[wrong[0]]:g}: left out."
         )
         findings.append(Finding(id="impossible-temperature", text=text))
@@ -304,7 +311,7 @@ def _time_findings(
     if gaps.size:
         widest = int(gaps[np.argmax(steps[gaps])])
         text = (
-            f"{gaps.size} gap{'s' if gaps.size > 1 else ''} in time, the widest {steps[widest]:.3g} s after "
+            f"{count(gaps.size, 'gap')} in time, the widest {steps[widest]:.3g} s after "
             f"{TIME} = {time[widest]:.10g} (line {log.lines[widest]}): no standstill goes across one."
         )
         findings.append(Finding(id="gaps", text=text))
@@ -317,11 +324,10 @@ def _torn(activity: Activity, names: list[str], findings: list[Finding]) -> list
     """Stretches without samples that the times of the rows do not show, as gaps."""
     if any(finding.id == "gaps" for finding in findings):
         return []
-    cell = float(activity.edge[1] - activity.edge[0])
     torn = []
-    for own in activity.cells:
-        between = np.append(own.start[1:] - own.end[:-1], 0.0)
-        torn.append(own.torn | (between > max(cell, standstill.FEWEST * own.step)))
+    for channel in activity.cells:
+        between = np.append(channel.start[1:] - channel.end[:-1], 0.0)
+        torn.append(channel.torn | (between > max(activity.cell, standstill.FEWEST * channel.step)))
     worst = max(range(len(torn)), key=lambda i: np.count_nonzero(torn[i]))
     if not torn[worst].any():
         return []
@@ -334,8 +340,10 @@ def _torn(activity: Activity, names: list[str], findings: list[Finding]) -> list
 
 def _equal_times(log: Table, time: Array, names: list[str]) -> list[Finding]:
     """Samples of a channel at one time; rows of different channels may share theirs."""
-    there = {name: ~np.isnan(numbers(log, name)) for name in names}
-    twice = {name: int(np.count_nonzero(np.diff(time[own]) == 0)) for name, own in there.items()}
+    present = {name: ~np.isnan(numbers(log, name)) for name in names}
+    twice = {
+        name: int(np.count_nonzero(np.diff(time[filled]) == 0)) for name, filled in present.items()
+    }
     name = max(twice, key=lambda n: twice[n])
     if not twice[name]:
         return []
@@ -355,14 +363,14 @@ def _limits(activity: Activity, traces: dict[str, Trace]) -> tuple[Array, list[S
         for name, trace in traces.items()
     }
     limits, slow = [], []
-    for name, own in cut.items():
+    for name, channel in cut.items():
         triad = next(kind for kind in CHANNELS.values() if name in kind)
         levels = [cut[n].level for n in triad if n in cut and len(cut[n].level)]
         size = standstill.triad_size(levels) if levels else 0.0
         if name in cells:
-            limits.append(standstill.rest_limit(own, size))
+            limits.append(standstill.rest_limit(channel, size))
         else:
-            noise = max(own.rough, own.resolution)
+            noise = max(channel.rough, channel.resolution)
             slow.append(Slow(*traces[name], max(standstill.STEP * size, standstill.NOISE * noise)))
     return np.array(limits), slow
 
@@ -373,26 +381,26 @@ def _within(time: Array, start: Array, end: Array) -> tuple[Ints, Ints]:
 
 
 def _with_samples(
-    found: Standstills, traces: dict[str, Trace], findings: list[Finding]
+    standstills: Standstills, traces: dict[str, Trace], findings: list[Finding]
 ) -> Standstills:
     """The same, without stations for which a slow channel has hardly a sample."""
-    enough = np.ones(len(found.start), bool)
+    enough = np.ones(len(standstills.start), bool)
     for time, _ in traces.values():
-        first, last = _within(time, found.start, found.end)
+        first, last = _within(time, standstills.start, standstills.end)
         enough &= last - first >= LEAST_SAMPLES
-    poor = int(np.count_nonzero(found.taken & ~enough))
+    poor = int(np.count_nonzero(standstills.taken & ~enough))
     if poor:
         text = (
             f"{count(poor, 'standstill')} left out: a channel has fewer than {LEAST_SAMPLES} samples there. "
             "Stand still for longer, or sample it faster."
         )
         findings.append(Finding(id="few-samples", text=text))
-    return found._replace(taken=found.taken & enough, short=found.short | ~enough)
+    return standstills._replace(taken=standstills.taken & enough, short=standstills.short | ~enough)
 
 
 def _summaries(
     traces: dict[str, Trace], start: Array, end: Array, findings: list[Finding],
-    say: Callable[[str], None],
+    say: Say,
 ) -> dict[str, list[Summary]]:  # fmt: skip
     """What each channel read at each station."""
     summaries: dict[str, list[Summary]] = {}
@@ -401,20 +409,25 @@ def _summaries(
         places = zip(*_within(time, start, end), strict=True)
         rests = [(time[a:b], value[a:b]) for a, b in places]
 
-        def said(done: int, name: str = name) -> None:
+        def progress(done: int, name: str = name) -> None:
             say(f"station {done} of {len(start)}, {name}")
 
-        summaries[name] = summarise_all(rests, float(resolution), said)
+        summaries[name] = summarise_all(rests, float(resolution), progress)
     for triad in CHANNELS.values():
-        own = [name for name in triad if name in summaries]
-        told = correlated([summaries[name] for name in own])
-        made = {n: widened(summaries[n], float(v)) for n, v in zip(own, told.variance, strict=True)}
+        names = [name for name in triad if name in summaries]
+        correlation = correlated([summaries[name] for name in names])
+        wider = {
+            n: widened(summaries[n], float(v))
+            for n, v in zip(names, correlation.variance, strict=True)
+        }
         grown = [
-            a.sd > TOLD * b.sd for n in own for a, b in zip(made[n], summaries[n], strict=True)
+            a.sd > REPORTED * b.sd
+            for n in names
+            for a, b in zip(wider[n], summaries[n], strict=True)
         ]
-        if told.plain and 2 * sum(grown) > len(grown):
-            findings.append(correlated_noise(own))
-        summaries |= made
+        if correlation.plain and 2 * sum(grown) > len(grown):
+            findings.append(correlated_noise(names))
+        summaries |= wider
     return summaries
 
 
@@ -430,8 +443,8 @@ def _columns(
         "samples": np.asarray(last - first, float),
     }
     for prefix, part in PARTS.items():
-        for name, found in rows.items():
-            columns[prefix + name] = np.array([float(getattr(row, part)) for row in found])
+        for name, summaries in rows.items():
+            columns[prefix + name] = np.array([float(getattr(row, part)) for row in summaries])
     columns["drifting"] = [
         " ".join(n for n in rows if rows[n][i].drifts) for i in range(len(start))
     ]
@@ -449,7 +462,7 @@ def _temperatures(
         return {}
     ends = zip(start, end, strict=True)
     lag = GAP * standstill.time_step(temperature[0])
-    warmth = np.array([_temperature(*temperature, *own, lag) for own in ends])
+    warmth = np.array([_temperature(*temperature, *interval, lag) for interval in ends])
     blank = np.flatnonzero(np.isnan(warmth[:, 0])) + 1
     if blank.size:
         text = (
@@ -469,8 +482,8 @@ def _temperature(
     """
     first, last = np.searchsorted(time, [start, end])
     if last - first >= standstill.WINDOW:
-        found = summarise(time[first:last], value[first:last], 0.0)
-        return found.mean, found.drift
+        summary = summarise(time[first:last], value[first:last], 0.0)
+        return summary.mean, summary.drift
     before = time[first - 1] if first else -np.inf
     after = time[last] if last < len(time) else np.inf
     if last == first and min(start - before, after - end) > lag:

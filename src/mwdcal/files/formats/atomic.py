@@ -17,7 +17,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import IO, Any
 
-from mwdcal.errors import InputError
+from mwdcal.errors import InputError, reason
 
 try:
     fcntl: Any = import_module("fcntl")
@@ -58,7 +58,8 @@ def replacing(path: str | os.PathLike[str], durable: bool = True) -> Iterator[IO
     except OSError as error:
         raise _refusal(path, error) from error
     finally:
-        _remove(temporary)
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
 
 
 def target(path: str | os.PathLike[str]) -> Path:
@@ -81,7 +82,10 @@ def target(path: str | os.PathLike[str]) -> Path:
 
 @contextlib.contextmanager
 def holding(path: Path) -> Iterator[bool]:
-    """Whether this process alone has the file, its folder made; both go afterwards, if that is empty."""
+    """Whether this process holds the file, whose folder is made if need be.
+
+    Both are removed afterwards, the folder if it is empty.
+    """
     try:
         stream = _held(path)
     except OSError as error:
@@ -165,17 +169,10 @@ def _machine() -> str:
     return f"{zlib.crc32(name.encode()):08x}"
 
 
-def _remove(path: Path) -> None:
-    """Remove what an error or an interruption left; nothing is left after a success."""
-    with contextlib.suppress(OSError):
-        path.unlink(missing_ok=True)
-
-
 def _refusal(path: str | os.PathLike[str], error: Exception) -> InputError:
-    """The error of the operating system in our form."""
+    """An error of the operating system, with advice."""
     if isinstance(error, PermissionError):
         advice = "Close the program that has it open, or choose a folder you may write to."
     else:
         advice = "Choose another place, or make room on this one."
-    reason = getattr(error, "strerror", None) or str(error)
-    return InputError(f"cannot write '{path}': {reason}. {advice}")
+    return InputError(f"cannot write '{path}': {reason(error)}. {advice}")

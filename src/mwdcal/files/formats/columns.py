@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from datetime import date, time
 from typing import NamedTuple
 
@@ -29,6 +30,26 @@ class Parts(NamedTuple):
     columns: dict[str, Column]
     metadata: dict[str, object]
     lines: Sequence[int]
+
+
+def of_texts(names: Sequence[str], rows: Sequence[Sequence[object]]) -> dict[str, Column]:
+    """Rows of text cells as columns."""
+    columns = zip(*rows, strict=True)
+    return {name: [str(cell) for cell in cells] for name, cells in zip(names, columns, strict=True)}
+
+
+@contextmanager
+def damaged_unless_read(source: str, expected: str, advice: str) -> Iterator[None]:
+    """Whatever a library raises on a foreign or damaged file means the same to the user."""
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0][:120]
+        raise InputError(
+            f"{source}: expected {expected}; reading it failed ({reason}). {advice}"
+        ) from error
 
 
 def looks_numeric(text: str, decimal: str = ".") -> bool:
@@ -79,7 +100,7 @@ def assemble(
 ) -> tuple[list[str], list[Sequence[object]], list[int]]:
     """Names, rows of equal length, and their line numbers; the first row is the header.
 
-    Rows without any content are no stations and are left out.
+    Rows without any content are left out.
     """
     number, header = next(rows, (1, ()))
     names = [as_text(cell).strip() for cell in header]
@@ -99,7 +120,7 @@ def assemble(
 
 
 def no_stations(source: str) -> InputError:
-    """A table with a header and nothing below it."""
+    """The refusal of a table with a header and nothing below it."""
     return InputError(
         f"{source}: the file has column names but no stations. Add one row per station."
     )

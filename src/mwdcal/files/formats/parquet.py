@@ -3,14 +3,23 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 import msgspec
 import numpy as np
 
 from mwdcal.errors import InputError
-from mwdcal.files.formats.columns import LABELS, Column, Parts, as_text, check_names, no_stations
+from mwdcal.files.formats.columns import (
+    LABELS,
+    Column,
+    Parts,
+    as_text,
+    check_names,
+    damaged_unless_read,
+    no_stations,
+)
 
 KEY = b"mwdcal"
 _MAX_CELLS = 100_000_000
@@ -20,11 +29,9 @@ _PANDAS_INDEX = re.compile(r"__index_level_\d+__")
 def parse(data: bytes, source: str, delimiter: str | None = None) -> Parts:
     """The table in the bytes of a Parquet file; `delimiter` has no meaning here."""
     arrow, parquet = modules(source)
-    try:
+    with reading(source):
         file = parquet.ParquetFile(arrow.BufferReader(data))
         rows, names = file.metadata.num_rows, list(file.schema_arrow.names)
-    except Exception as error:
-        raise unreadable(source, error) from error
     check_names(names, source)
     if rows == 0:
         raise no_stations(source)
@@ -33,13 +40,11 @@ def parse(data: bytes, source: str, delimiter: str | None = None) -> Parts:
             f"{source}: a table must have at most {_MAX_CELLS} cells; got {rows} rows of "
             f"{len(names)} columns. Split the file."
         )
-    try:
+    with reading(source):
         table = file.read(use_pandas_metadata=False)
         columns = {
             name: as_column(name, table.column(name), arrow) for name in names if not is_index(name)
         }
-    except Exception as error:
-        raise unreadable(source, error) from error
     return Parts(columns, metadata_of(table.schema.metadata, source), range(1, rows + 1))
 
 
@@ -67,13 +72,11 @@ def modules(source: str) -> tuple[Any, Any]:
     return pyarrow, pyarrow.parquet
 
 
-def unreadable(source: str, error: Exception) -> InputError:
-    """Whatever the reader raises on a foreign or damaged file means the same to the user."""
-    reason = (str(error).strip() or type(error).__name__).splitlines()[0][:120]
-    return InputError(
-        f"{source}: expected a complete Parquet file; reading it failed ({reason}). "
-        "Copy or export it again."
-    )
+@contextmanager
+def reading(source: str) -> Iterator[None]:
+    """Whatever PyArrow raises in the block, the file is foreign or damaged."""
+    with damaged_unless_read(source, "a complete Parquet file", "Copy or export it again."):
+        yield
 
 
 def is_index(name: str) -> bool:

@@ -9,7 +9,7 @@ import base64
 import csv
 import io
 from collections.abc import Mapping, Sequence
-from typing import IO, Any, Protocol
+from typing import IO, Any
 
 import msgspec
 import numpy as np
@@ -19,19 +19,6 @@ from mwdcal.files.formats import parquet, text
 from mwdcal.geometry.vectors import AnyArray, Bools
 
 _ARROW_SCHEMA = b"ARROW:schema"
-
-
-class Sink(Protocol):
-    """A table being written: `carried` columns, then results beside them."""
-
-    def render(self, carried: Any, results: Sequence[AnyArray], blank: bool) -> Any:
-        """What is written of a part; without `blank` no result is NaN."""
-
-    def write(self, rendered: Any) -> None:
-        """Append a part."""
-
-    def finish(self, findings: Sequence[str]) -> None:
-        """Complete the table; `findings` are known only now."""
 
 
 class ParquetSink:
@@ -148,8 +135,8 @@ class TextSink:
         odd = np.zeros(len(rows), bool)
         for cells in rows.columns:
             if self._arrow.types.is_string(cells.type):
-                matches = compute.match_substring_regex(cells, f'["\r\n{self._delimiter}]')
-                odd |= matches.fill_null(False).to_numpy()
+                quoted = compute.match_substring_regex(cells, f'["\r\n{self._delimiter}]')
+                odd |= quoted.fill_null(False).to_numpy()
         return odd
 
     def write(self, rendered: bytes) -> None:
@@ -184,6 +171,10 @@ class TextSink:
             values = cells.cast(self._arrow.float64(), safe=False)
             return compute.if_else(compute.is_nan(values), None, values)
         return self._arrow.array(parquet.texts(cells, self._arrow), self._arrow.string())
+
+
+Sink = ParquetSink | TextSink
+"""A table being written: the columns of the input, then results beside them."""
 
 
 def _line(findings: Sequence[str]) -> bytes:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mwdcal.errors import InputError
+from mwdcal.errors import InputError, reason
 from mwdcal.files.formats import atomic, parquet, text, workbook
 from mwdcal.files.formats.columns import LABELS, Column, as_text, check_names, looks_numeric
 from mwdcal.geometry.vectors import Array
@@ -61,8 +61,8 @@ def read(
 ) -> Table:
     """The table in a .csv, .tsv, .parquet or .xlsx file.
 
-    `decimal` is the decimal sign of text cells, '.' or ','; without `delimiter` the header
-    line of a text file tells it.
+    `decimal` is the decimal sign of text cells, '.' or ','; without `delimiter` it is
+    read from the header line of a text file.
     """
     _check_options(decimal, delimiter)
     file = Path(path)
@@ -149,22 +149,26 @@ def _suffix(path: Path) -> str:
 
 
 def _content(path: Path) -> bytes:
-    """The bytes of an existing, regular file of bearable size and known suffix."""
+    """The bytes of a regular file of a known suffix that is not too large."""
     try:
-        if path.is_dir():
-            raise InputError(f"'{path}' is a folder. Name a file in it.")
-        if not path.exists():
-            raise InputError(f"'{path}': no such file. Check the name and the folder.")
-        if not path.is_file():
-            raise InputError(f"'{path}' is not a regular file. Name a file with readings.")
+        check_file(path)
         _check_size(path.stat().st_size, path)
         return path.read_bytes()
     except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or str(error)
         raise InputError(
-            f"cannot read '{path}': {reason}. Check that the file may be read and is not "
+            f"cannot read '{path}': {reason(error)}. Check that the file may be read and is not "
             "locked by another program."
         ) from error
+
+
+def check_file(path: Path) -> None:
+    """Refuse a path at which there is no regular file."""
+    if path.is_dir():
+        raise InputError(f"'{path}' is a folder. Name a file in it.")
+    if not path.exists():
+        raise InputError(f"'{path}': no such file. Check the name and the folder.")
+    if not path.is_file():
+        raise InputError(f"'{path}' is not a regular file. Name a file with readings.")
 
 
 def _check_size(size: int, path: Path) -> None:
@@ -189,7 +193,7 @@ def _floats(cells: Sequence[str], decimal: str) -> Array | None:
 
 
 def _one_by_one(table: Table, name: str, cells: Sequence[str]) -> Array:
-    """The same, for cells with unusual blanks, or to find the one that is no number."""
+    """The same, for cells with unusual blanks; refuses the first cell that is not a number."""
     values = np.full(len(cells), np.nan)
     for row, cell in enumerate(cells):
         stripped = cell.strip()
@@ -207,7 +211,7 @@ def _one_by_one(table: Table, name: str, cells: Sequence[str]) -> Array:
 
 
 def _advice(cell: str, decimal: str) -> str:
-    """What to do about a cell that is no number."""
+    """What to do about a cell that is not a number."""
     if decimal == "." and looks_numeric(cell, ","):
         return "Is the decimal comma intended? Use --decimal=,"
     if decimal == "," and looks_numeric(cell, "."):

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from mwdcal.errors import InputError
 from mwdcal.files import metadata as meta
-from mwdcal.files.formats.columns import Column, Parts, assemble, check_names, number
+from mwdcal.files.formats.columns import Column, Parts, assemble, check_names, number, of_texts
 
 _LONGEST_LINE = 100_000
 _MAX_LINES = 1_000_000
@@ -27,24 +27,6 @@ _FOREIGN = {
 }
 
 
-def parse(data: bytes, source: str, delimiter: str | None = None) -> Parts:
-    """The table in the bytes of a text file; without `delimiter` the header line tells it."""
-    lines = _lines(data, source)
-    comments = list(takewhile(_is_preamble, lines))
-    entries = [(i, _comment(line)) for i, line in enumerate(comments, 1)]
-    metadata = meta.parse(entries, source)
-    start = len(comments)
-    if start < len(lines):
-        delimiter = delimiter or _delimiter(lines[start], source)
-    rows = _rows(lines[start:], start, delimiter or ",", source)
-    names, cells, numbers = assemble(rows, source, "line")
-    columns: dict[str, Column] = {
-        name: [str(cell) for cell in column]
-        for name, column in zip(names, zip(*cells, strict=True), strict=True)
-    }
-    return Parts(columns, metadata, numbers)
-
-
 class Head(NamedTuple):
     """What stands above the rows of a text table, and the rest of the piece it was read from."""
 
@@ -55,29 +37,45 @@ class Head(NamedTuple):
     body: bytes
 
 
+def parse(data: bytes, source: str, delimiter: str | None = None) -> Parts:
+    """The table in the bytes of a text file; without `delimiter` it is read from the header line."""
+    lines = _lines(data, source)
+    top = _head(lines, source, delimiter)
+    return _parts(lines[top.lines :], top, top.lines, source)._replace(metadata=top.metadata)
+
+
 def head(data: bytes, source: str, delimiter: str | None = None) -> Head:
     """The head of a text table of which `data` is the beginning, whole lines."""
     lines = _lines(data, source)
-    comments = list(takewhile(_is_preamble, lines))
-    metadata = meta.parse([(i, _comment(line)) for i, line in enumerate(comments, 1)], source)
+    top = _head(lines, source, delimiter)
+    return top._replace(body="\n".join(lines[top.lines :]).encode())
+
+
+def _head(lines: Sequence[str], source: str, delimiter: str | None) -> Head:
+    """The head of a table of these lines, without a body."""
+    comments = list(takewhile(is_preamble, lines))
+    metadata = meta.parse([(i, comment(line)) for i, line in enumerate(comments, 1)], source)
     start = len(comments)
     header = lines[start : start + 1]
     delimiter = delimiter or (_delimiter(header[0], source) if header else ",")
-    cells = next(_rows(header, start, delimiter, source), (start + 1, ()))[1]
+    cells = next(split(header, start, delimiter, source), (start + 1, ()))[1]
     names = [str(cell).strip() for cell in cells]
     check_names(names, f"{source}, line {start + 1}")
-    return Head(names, metadata, delimiter, start + 1, "\n".join(lines[start + 1 :]).encode())
+    return Head(names, metadata, delimiter, start + 1, b"")
 
 
 def rows(data: bytes, top: Head, above: int, source: str) -> Parts:
     """The rows of a piece of a text table, whole lines with `above` lines of the file before."""
-    columns: dict[str, Column] = {name: [] for name in top.names}
     if not data.strip(top.delimiter.encode() + b" \t\r\n"):
-        return Parts(columns, {}, ())
-    entries = _rows(_lines(data, source, above), above, top.delimiter, source)
-    _, cells, numbers = assemble(chain([(above, top.names)], entries), source, "line")
-    texts = [[str(cell) for cell in column] for column in zip(*cells, strict=True)]
-    return Parts(dict(zip(columns, texts, strict=True)), {}, numbers)
+        return Parts({name: [] for name in top.names}, {}, ())
+    return _parts(_lines(data, source, above), top, above, source)
+
+
+def _parts(lines: Sequence[str], top: Head, above: int, source: str) -> Parts:
+    """The rows in some lines, which `above` lines of the file stand before."""
+    entries = split(lines, above, top.delimiter, source)
+    names, cells, numbers = assemble(chain([(above, top.names)], entries), source, "line")
+    return Parts(of_texts(names, cells), {}, numbers)
 
 
 def render(columns: Mapping[str, Column], metadata: Mapping[str, object], delimiter: str) -> str:
@@ -155,7 +153,7 @@ def _line_of(data: bytes, position: int) -> int:
     return data.count(b"\n", 0, position) + 1
 
 
-def _is_preamble(line: str) -> bool:
+def is_preamble(line: str) -> bool:
     """Whether the line stands above the header: a comment, or blank.
 
     A spreadsheet that saves the file again may have put quotes around a comment.
@@ -163,7 +161,7 @@ def _is_preamble(line: str) -> bool:
     return line.lstrip().startswith(("#", '"#')) or not line.strip()
 
 
-def _comment(line: str) -> str:
+def comment(line: str) -> str:
     """The comment without what a spreadsheet adds: quotes, and delimiters at the end."""
     if line.lstrip().startswith('"'):
         line = ",".join(next(csv.reader([line], skipinitialspace=True)))
@@ -176,7 +174,7 @@ def _delimiter(header: str, source: str) -> str:
     return max(order, key=header.count)
 
 
-def _rows(
+def split(
     lines: Sequence[str], start: int, delimiter: str, source: str
 ) -> Iterator[tuple[int, Sequence[object]]]:
     """The cells of each line with its line number; `start` lines stand above."""

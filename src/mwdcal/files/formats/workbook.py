@@ -13,7 +13,7 @@ from typing import Any
 
 from mwdcal.errors import InputError
 from mwdcal.files import metadata as meta
-from mwdcal.files.formats.columns import Column, Parts, assemble, number, typed
+from mwdcal.files.formats.columns import Column, Parts, assemble, damaged_unless_read, number, typed
 
 _LARGEST_UNPACKED = 100_000_000
 _MAX_ROWS = 1_048_576
@@ -75,7 +75,8 @@ def _module(source: str) -> Any:
 def _rows(data: bytes, source: str) -> list[Row]:
     """Row numbers and cells of the first sheet, without the blank cells at the end."""
     openpyxl = _module(source)
-    try:
+    advice = "Save it again as .xlsx, or as CSV UTF-8."
+    with damaged_unless_read(source, "an Excel workbook (.xlsx)", advice):
         _check_size(data, source)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -84,10 +85,6 @@ def _rows(data: bytes, source: str) -> list[Row]:
             sheet.reset_dimensions()
             cells = islice(sheet.iter_rows(values_only=True), _MAX_ROWS + 1)
             rows = [(line, _trimmed(row)) for line, row in enumerate(cells, 1)]
-    except InputError:
-        raise
-    except Exception as error:
-        raise _unreadable(source, error) from error
     if len(rows) > _MAX_ROWS:
         raise InputError(f"{source}: a sheet must have at most {_MAX_ROWS} rows. Split it.")
     return rows
@@ -102,15 +99,6 @@ def _check_size(data: bytes, source: str) -> None:
             f"{source}: a workbook must unpack to at most {_LARGEST_UNPACKED} bytes; "
             f"got {size}. Save the sheet with the run alone, or as CSV UTF-8."
         )
-
-
-def _unreadable(source: str, error: Exception) -> InputError:
-    """Whatever the reader raises on a foreign or damaged file means the same to the user."""
-    reason = (str(error).strip() or type(error).__name__).splitlines()[0][:120]
-    return InputError(
-        f"{source}: expected an Excel workbook (.xlsx); reading it failed ({reason}). "
-        "Save it again as .xlsx, or as CSV UTF-8."
-    )
 
 
 def _trimmed(row: Sequence[object]) -> Sequence[object]:
@@ -138,7 +126,7 @@ def _check_texts(rows: Iterable[Sequence[str | float]], source: str) -> None:
 
 
 def _cell(sheet: Any, value: str | float) -> Any:
-    """A cell with all digits of a number, or text that stays text, whatever it looks like."""
+    """A cell with all digits of a number, or text that stays text even if it looks like a number."""
     from openpyxl.cell import WriteOnlyCell
 
     content = value if isinstance(value, str) else number(value)

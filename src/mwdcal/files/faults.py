@@ -1,0 +1,161 @@
+"""Cells that a run may not have, in rows of one tool or of many.
+
+The rows of T tools stand one tool after the other: `starts` (T + 1,) are the first row of each,
+and the number of rows. A run file is one tool. What must be filled in where other cells of a tool
+are is judged tool by tool.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+
+from mwdcal.calibration.readings import TRIADS
+from mwdcal.errors import InputError
+from mwdcal.files.contract import CHANNELS, RANGES, REFERENCES
+from mwdcal.files.formats.table import Table, cell_error, numbers, shown
+from mwdcal.geometry.vectors import Array, Bools, Ints
+from mwdcal.sensor.profile import Profile
+
+Cells = Callable[[str], Array | None]
+"""The numbers (R,) of a column by its name, NaN where blank; None where there is no such column."""
+
+
+class BlankReadingError(InputError):
+    """A blank cell among readings or temperatures: `apply` may leave the results of its row blank."""
+
+
+class Fault(NamedTuple):
+    """Cells that break one rule: where `cells` (k, R) is true, of the `columns` (k).
+
+    `problem` says of a column and a row what is wrong with the cell, and what to do.
+    `missing_reading`: the rule is that readings and temperatures may not be blank.
+    """
+
+    columns: tuple[str, ...]
+    cells: Bools
+    problem: Callable[[int, int], str]
+    missing_reading: bool = False
+
+
+def faults(cells: Cells, starts: Ints, profile: Profile) -> Iterator[Fault]:
+    """The rules that are broken, in the order in which they are reported.
+
+    A column is not read before its turn.
+    """
+    for kind, names in CHANNELS.items():
+        for name in names:
+            yield from range_faults(cells, name)
+        blank = _blank_faults(cells, starts, names, "Fill it in, or remove the station.", True)
+        optional = kind == "magnetometer"
+        yield from _where_filled(cells, starts, names, blank) if optional else blank
+    name = "temperature_c"
+    yield from range_faults(cells, name)
+    advice = "Fill it in, or leave the whole column blank."
+    blank = _blank_faults(cells, starts, (name,), advice, True)
+    yield from _where_filled(cells, starts, (name,), blank)
+    yield from faults_beside_readings(cells, starts, profile, TRIADS)
+
+
+def faults_beside_readings(
+    cells: Cells, starts: Ints, profile: Profile, kinds: Iterable[str]
+) -> Iterator[Fault]:
+    """The same of references, and of uncertainties of these and of the triads `kinds`."""
+    for reference in REFERENCES.values():
+        yield from range_faults(cells, reference.column)
+    for kind in kinds:
+        noise = _noise_faults(cells, starts, profile, kind)
+        yield from _where_filled(cells, starts, CHANNELS[kind], noise)
+    for name, reference in REFERENCES.items():
+        sd = range_faults(cells, f"sd_{reference.column}")
+        optional = name != "gravity"
+        yield from _where_filled(cells, starts, (reference.column,), sd) if optional else sd
+
+
+def columns_of(table: Table) -> Cells:
+    """The columns of numbers of a table, each read when it is asked for the first time."""
+    return cache(lambda name: numbers(table, name) if name in table.columns else None)
+
+
+def refuse(table: Table, rules: Iterable[Fault]) -> None:
+    """Refuse the first cell that breaks a rule."""
+    for fault in rules:
+        row = int(np.argmax(fault.cells.any(0)))
+        column = int(np.argmax(fault.cells[:, row]))
+        error = cell_error(table, fault.columns[column], row, fault.problem(column, row))
+        raise BlankReadingError(str(error)) if fault.missing_reading else error
+
+
+def _noise_faults(cells: Cells, starts: Ints, profile: Profile, kind: str) -> Iterator[Fault]:
+    """Noise of a triad out of range, stated for some cells of a tool and not for others, or zero."""
+    names, triad = tuple(f"sd_{name}" for name in CHANNELS[kind]), getattr(profile, kind)
+    if all(cells(name) is None for name in names):
+        return
+    for name in names:
+        yield from range_faults(cells, name)
+    if triad.noise is None:
+        advice = (
+            f"Other sd_ cells of the {kind} are filled. Fill it in, or state `noise` under [{kind}] in the "
+            "tool profile."
+        )
+        blank = _blank_faults(cells, starts, names, advice)
+        yield from _where_filled(cells, starts, names, blank)
+
+    def problem(column: int, row: int) -> str:
+        return f"must be above 0; got 0. State the noise of the {kind}, or leave it blank."
+
+    zero = _stacked(cells, names, starts) == 0.0
+    if triad.repeatability == 0.0 and zero.any():
+        yield Fault(names, zero, problem)
+
+
+def range_faults(cells: Cells, name: str) -> Iterator[Fault]:
+    """Values that the column may not have."""
+    values, limits = cells(name), RANGES[name]
+    if values is None:
+        return
+
+    def problem(column: int, row: int, values: Array = values) -> str:
+        got = f"{shown(float(values[row]))} {limits.unit}".rstrip()
+        return f"must be {limits}; got {got}. Check the cell, and the unit of the column."
+
+    outside = limits.outside(values)
+    if outside.any():
+        yield Fault((name,), outside[None], problem)
+
+
+def _blank_faults(
+    cells: Cells, starts: Ints, names: tuple[str, ...], advice: str, missing_reading: bool = False
+) -> Iterator[Fault]:
+    """Cells that are blank."""
+
+    def problem(column: int, row: int) -> str:
+        got = "no such column" if cells(names[column]) is None else "a blank cell"
+        return f"must be filled in; got {got}. {advice}"
+
+    blank = np.isnan(_stacked(cells, names, starts))
+    if blank.any():
+        yield Fault(names, blank, problem, missing_reading)
+
+
+def _where_filled(
+    cells: Cells, starts: Ints, names: tuple[str, ...], rules: Iterator[Fault]
+) -> Iterator[Fault]:
+    """What is broken of the rules in tools that have any cell of the columns filled in."""
+    filled = ~np.isnan(_stacked(cells, names, starts)).all(0)
+    if not filled.any():
+        return
+    for fault in rules:
+        tools = np.logical_or.reduceat(filled, starts[:-1])
+        wrong = fault.cells & np.repeat(tools, np.diff(starts))
+        if wrong.any():
+            yield fault._replace(cells=wrong)
+
+
+def _stacked(cells: Cells, names: tuple[str, ...], starts: Ints) -> Array:
+    """The columns (k, R); those that are not there are blank."""
+    columns = (cells(name) for name in names)
+    return np.stack([np.full(starts[-1], np.nan) if c is None else c for c in columns])
