@@ -86,24 +86,14 @@ class _Record:
     fitted: FittedRuns
 
     @property
-    def readings(self) -> Readings:
-        """The readings that were fitted."""
-        return self.choice.readings
-
-    @property
-    def profile(self) -> Profile:
-        """The profile of the tool."""
-        return self.choice.profile
-
-    @property
-    def options(self) -> Options:
-        """The options that were chosen."""
-        return self.choice.options
-
-    @property
     def result(self) -> Fit:
         """The fit."""
         return self.fitted.result
+
+    @property
+    def reference(self) -> float:
+        """The temperature τ = 0 of the file's models, °C."""
+        return self.choice.profile.reference_temperature_c
 
     @property
     def free(self) -> list[Free]:
@@ -112,11 +102,11 @@ class _Record:
 
     def calibration(self, profile_sha256: str, run_sha256: str) -> Calibration:
         """The whole record."""
-        readings, result, options = self.readings, self.result, self.options
+        readings, result, options = self.choice.readings, self.result, self.choice.options
         residuals = self.fitted.residuals(0)
         return Calibration(
             tool={k: str(v) for k, v in readings.metadata.items() if k in IDENTITY},
-            profile=self.profile,
+            profile=self.choice.profile,
             profile_sha256=profile_sha256,
             run=readings.source,
             run_sha256=run_sha256,
@@ -163,14 +153,14 @@ class _Record:
     @cached_property
     def to_file(self) -> Array:
         """Linear map from the fit's parameters (p,) to the file's."""
-        return np.asarray(results.to_file(self.result, self.profile.reference_temperature_c)[0])
+        return np.asarray(results.to_file(self.result, self.reference)[0])
 
     @property
     def temperatures(self) -> tuple[float, float] | None:
         """Coldest and hottest station, °C; those behind the prior count too."""
-        if self.readings.temperature is None:
+        if self.choice.readings.temperature is None:
             return None
-        low, high = results.temperature_range(self.result, self.options.knowledge)
+        low, high = results.temperature_range(self.result, self.choice.options.knowledge)
         return float(low[0]), float(high[0])
 
     def budget(self) -> list[BudgetRow]:
@@ -179,10 +169,8 @@ class _Record:
         for name, share in self.covariance.by_source().items():
             source = results.common_source(name)
             shares[source] = shares.get(source, 0.0) + share
-        reference = self.profile.reference_temperature_c
-        tools = results.calibrated_tools(
-            self.result, [self.free], reference, self.options.knowledge
-        )
+        free, prior = self.fitted.free, self.choice.options.knowledge
+        tools = results.calibrated_tools(self.result, free, self.reference, prior)
         sd = accuracy(tools, np.stack([*shares.values()]))
         degrees = {f"{angle}_deg": np.degrees(values[:, 0]) for angle, values in sd.items()}
         return [
@@ -212,15 +200,15 @@ class _Record:
 
     def triad(self, index: int) -> TriadCalibration:
         """The record of one triad."""
-        name, reference = TRIADS[index], self.profile.reference_temperature_c
-        triad = results.triad_results(
-            self.result, index, self.covariance.total, [self.free], reference
-        )
+        name, total = TRIADS[index], self.covariance.total
+        triad = results.triad_results(self.result, index, total, self.fitted.free, self.reference)
         model = triad.model
         powers = model if isinstance(model, Polynomial) else Polynomial(model.basis)
         return TriadCalibration(
             name=name,
-            unit="g" if index == 0 else ("1 (field = 1)" if self.readings.relative else "nT"),
+            unit="g"
+            if index == 0
+            else ("1 (field = 1)" if self.choice.readings.relative else "nT"),
             model=model.kind,
             order=model.basis.order,
             curved=model.curved,
