@@ -553,7 +553,11 @@ def test_a_single_blank_is_the_mean_of_its_neighbours_and_told(tmp_path, every):
     ("change", "doubt", "words"),
     [
         (lambda c: c["ax"] + 0.1 * (np.arange(6000) > 3000), "event", "a spike or a move"),
-        (lambda c: c["ax"] + 3e-3 * np.sin(np.arange(6000) / 9), "misfit", "none of the five"),
+        (
+            lambda c: c["ax"] + 3e-3 * np.sin(np.arange(6000) / 9),
+            "misfit",
+            "five terms do not describe",
+        ),
     ],
 )
 def test_what_does_not_hold_is_marked_and_not_recommended(tmp_path, change, doubt, words):

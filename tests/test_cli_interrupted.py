@@ -138,14 +138,14 @@ def test_every_orderly_end_tells_its_status_and_leaves_nothing(tmp_path, name, w
 
 TIDYING = """
 import time
-from mwdcal.app import fleet_table, interruption
-from mwdcal.files.formats import atomic
-real_remove = atomic._remove
-def remove(path):
+from pathlib import Path
+from mwdcal.app import interruption
+real_unlink = Path.unlink
+def unlink(path, missing_ok=False):
     print("tidying", flush=True)
     time.sleep({seconds})
-    real_remove(path)
-atomic._remove, interruption.PATIENCE = remove, {patience}
+    real_unlink(path, missing_ok=missing_ok)
+Path.unlink, interruption.PATIENCE = unlink, {patience}
 """
 
 

@@ -21,7 +21,7 @@ from mwdcal.comparison import compare as module
 from mwdcal.comparison.common_gauge import Gauge, in_gauge
 from mwdcal.comparison.compare import SCATTER, compare
 from mwdcal.estimation.rank import Free
-from mwdcal.estimation.uncertainty import turn_back
+from mwdcal.estimation.uncertainty import unrotating
 from mwdcal.planning import simulate
 from mwdcal.use.roll_scatter import group_scatter
 from simulation import Tool, attitude, plan
@@ -212,7 +212,7 @@ def test_a_turn_of_both_triads_together_is_taken_out_together():
 def test_a_gain_is_turned_back_by_a_rotation_even_where_it_reflects(reflected):
     turn = Rotation.from_euler("zyx", [0.3, -0.2, 0.1]).as_matrix()
     stretch = np.diag([1.1, 0.9, -0.02 if reflected else 1.0])
-    back = turn_back((turn @ stretch)[None], np.ones((1, 3), bool))[0]
+    back = unrotating(turn @ stretch, np.ones(3, bool))
     assert np.linalg.det(back) == pytest.approx(1.0)
     np.testing.assert_allclose(back @ turn, np.eye(3), atol=1e-12)
 

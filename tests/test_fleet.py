@@ -773,7 +773,7 @@ def test_a_process_that_dies_loses_nothing(tmp_path):
     once = pool.Steps(int, partial(_die_once, str(tmp_path / "mark")))
     found = dict(pool.results(once, list(range(6)), 2, None))
     assert found == {i: bytes([i]) for i in range(6)}
-    with pytest.raises(InputError, match="fewer --workers"):
+    with pytest.raises(InputError, match="fewer `workers`"):
         list(pool.results(pool.Steps(int, _die), [0, 1], 2, None))
 
 

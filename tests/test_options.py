@@ -157,7 +157,7 @@ def test_intervals_of_paper_weights_cover(method):
 
 
 def test_paper_weights_are_of_papers():
-    with pytest.raises(InputError, match="no paper"):
+    with pytest.raises(InputError, match="does not come from a paper"):
         calibrate(make(), PROFILE, Options(paper_weights=True))
 
 
@@ -228,7 +228,7 @@ def test_choices_reach_the_file_and_the_screen(tmp_path):
         (("--prior", "a.json"), 2, "count twice"),
         (("--prior", "datasheet"), 2, "datasheet"),
         (("--prior", "missing.json"), 2, "missing.json"),
-        (("--paper-weights",), 2, "no paper"),
+        (("--paper-weights",), 2, "does not come from a paper"),
         (("--robust", "huber", "--method", "swarm"), 2, "--robust"),
         (("--nonlinearity", "thermometer"), 2, "--nonlinearity"),
         (("--nonlinearity", "magnetometer", "--model", "factors"), 2, "--model polynomial"),

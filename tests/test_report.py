@@ -125,7 +125,7 @@ def words(monkeypatch):
     """`render` without its pictures, for tests of what it says."""
     for name in ("station_errors", "deviations", "accuracy", "order_errors"):
         monkeypatch.setattr(plots, name, lambda *arguments: "")
-    monkeypatch.setattr(plots, "svg", lambda figure, key: Markup(figure))
+    monkeypatch.setattr(pictures, "svg", lambda figure, key: Markup(figure))
     monkeypatch.setattr(report, "accuracy_map", lambda calibration: None)
     return render
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.special import stdtrit
 
-from mwdcal.calibration import covariance as covariances
+from mwdcal.calibration import results
 from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.estimate import fit
 from mwdcal.calibration.options import Options
@@ -166,7 +166,7 @@ def _calibrate_states_the_same(readings, raw, half, tool):
 
     assert (widened()[0] > 1 - 1e-4).all()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(covariances, "misfit_covariance", lambda r: 0 * r.analysis.covariance)
+        patch.setattr(results, "misfit_covariance", lambda r: 0 * r.analysis.covariance)
         wider, record = widened()
     freedom = min(triad.degrees_of_freedom for triad in record.triads)
     assert (wider > 1 - 1e-4).all()

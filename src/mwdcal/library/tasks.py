@@ -177,13 +177,22 @@ def _options(options: Options | None, choices: Mapping[str, Any]) -> Options | N
     return replace(options or Options(), **choices) if choices else options
 
 
-def compare(run: Readings, profile: Path | Profile | None = None, **choices: Any) -> Comparison:
+def compare(
+    run: Readings,
+    profile: Path | Profile | None = None,
+    options: Options | None = None,
+    *,
+    progress: Callable[[str], None] = lambda text: None,
+    **choices: Any,
+) -> Comparison:
     """Calibrate a run by every method, and judge each by stations left out of its fit.
 
-    `choices`: `order`, `seed` and `progress` of `mwdcal.comparison.compare.compare`.
+    `options` and `choices` as of `calibrate`, the same for all methods; their method does not
+    count. `progress` is called with a sentence at each step.
     """
     _check_run(run)
-    return compare_methods(run, _profile(run, profile), **choices)
+    given = _options(options, choices)
+    return compare_methods(run, _profile(run, profile), given, progress=progress)
 
 
 def verify(
