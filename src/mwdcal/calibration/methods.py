@@ -160,8 +160,7 @@ def _alike(problem: Problem) -> Problem:
 def _swarmed(problem: Problem, state: State, seed: int) -> Solved:
     """Parameters by particle swarm on the error in the readings, directions and strengths known."""
     parts = []
-    for triad, earth in zip(problem.triads, problem.earth(state)[0], strict=False):
-        target = np.einsum("bnij,bnj->bni", state.attitude, earth)
+    for triad, target in zip(problem.triads, problem.targets(state), strict=False):
         forward = _swarm_forward(triad.raw, target, problem.evidence.include > 0, seed)
         matrix, offset = affine_parts(forward)
         back = inverse(matrix)

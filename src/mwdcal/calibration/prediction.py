@@ -178,21 +178,13 @@ def accuracy(
             [s[:, None, None] * CORNERS for s in tools.earth[:, :2].transpose()], noise
         )
         change = change.reshape(len(change), -1, change.shape[-1])
-        covariance = change @ covariance @ np.swapaxes(change, -1, -2)
+        covariance = change @ covariance @ change.mT
         free = np.einsum("bip,bkp->bki", change, free)
-        share = _corner_shares(vectors / earth[:, None, : len(tools.models), None])
-        rows = {n: _flat(share[..., None] * g[..., None, :]) for n, g in gradients.items()}
+        unit = vectors / earth[:, None, : len(tools.models), None]
+        share = np.concatenate([np.ones_like(unit[..., :1]), unit], -1) @ SHARES.transpose()
+        each = {n: share[..., None] * g[..., None, :] for n, g in gradients.items()}
+        rows = {n: row.reshape(*row.shape[:2], -1) for n, row in each.items()}
     return {n: _root_mean_square(each, number, covariance, free) for n, each in rows.items()}
-
-
-def _corner_shares(unit: Array) -> Array:
-    """Shares (…, 4) of the fields at `CORNERS` in a field of unit components (…, 3)."""
-    return np.asarray(np.concatenate([np.ones_like(unit[..., :1]), unit], -1) @ SHARES.transpose())
-
-
-def _flat(rows: Array) -> Array:
-    """Rows (E, a, c) of what each triad does at each corner along each axis (E, a, t, 4, 3)."""
-    return rows.reshape(*rows.shape[:2], -1)
 
 
 def _root_mean_square(rows: Array, number: Ints, covariance: Array, free: Array) -> Array:
@@ -200,7 +192,7 @@ def _root_mean_square(rows: Array, number: Ints, covariance: Array, free: Array)
 
     NaN where a row moves with a direction in `free` (B, f, c).
     """
-    weights = np.swapaxes(rows, -1, -2) @ rows / rows.shape[1]
+    weights = rows.mT @ rows / rows.shape[1]
     variance = np.einsum("bij,...bij->...b", weights[number], covariance)
     sd = np.sqrt(np.maximum(variance, 0.0))
     if not free.size:

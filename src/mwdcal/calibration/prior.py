@@ -78,7 +78,7 @@ def prior_of(knowledge: Knowledge | None, models: Sequence[Model], batch: int) -
     values[rows] = knowledge.expected[theirs]
     known[np.ix_(rows, rows)] = knowledge.precision[np.ix_(theirs, theirs)]
     centre = np.linalg.solve(whole, np.broadcast_to(values, (batch, size))[..., None])[..., 0]
-    return Prior(np.swapaxes(whole, -1, -2) @ known @ whole, np.asarray(centre))
+    return Prior(whole.mT @ known @ whole, np.asarray(centre))
 
 
 def from_datasheet(profile: Profile, relative: bool = False) -> Knowledge:

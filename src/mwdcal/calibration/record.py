@@ -378,7 +378,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
             model = triad.functions(self.reference_temperature)
             slope = model.slope(np.array(triad.parameters), raw, temperature)
             sd = np.broadcast_to(readings.sd.get(triad.name, np.array(triad.noise)), raw.shape)
-            result[..., vector, vector] = slope * sd[..., None, :] ** 2 @ np.swapaxes(slope, -1, -2)
+            result[..., vector, vector] = slope * sd[..., None, :] ** 2 @ slope.mT
         return result
 
     def _gradient(self, name: str, readings: Readings) -> Array:
@@ -461,7 +461,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
         """
         g, _ = self.fields(readings)
         rows = self.jacobian(readings)[..., :2, :] / np.linalg.norm(g, axis=-1)[..., None, None]
-        spread = rows @ self.parameter_covariance @ np.swapaxes(rows, -1, -2)
+        spread = rows @ self.parameter_covariance @ rows.mT
         half, odd = (spread[..., 0, 0] + spread[..., 1, 1]) / 2, spread[..., 0, 1]
         largest = half + np.hypot((spread[..., 0, 0] - spread[..., 1, 1]) / 2, odd)
         factor = freedom * np.expm1(-2 / freedom * np.log1p(-probability))

@@ -14,7 +14,7 @@ from mwdcal.calibration.readings import TRIADS, Readings
 from mwdcal.calibration.record import ErrorRow, Measures, StationRow, stated
 from mwdcal.estimation.evidence import STAND_ERRORS
 from mwdcal.estimation.uncertainty import Analysis, station_misfit, without_station
-from mwdcal.geometry.observables import OBSERVABLES, VERTICAL
+from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array, Bools
 
 SHOWN = ("gravity", "inclination", "toolface", "azimuth", "field", "dip")
@@ -108,9 +108,8 @@ class Residuals:
     @cached_property
     def targets(self) -> tuple[Array, Array]:
         """Vectors (n, 3) each that a perfect tool would read at the fitted attitudes."""
-        attitude, (g, b) = self.fit.state.attitude[0], self.fit.problem.earth(self.fit.state)[0]
-        first, second = (np.einsum("nij,nj->ni", attitude, e[0]) for e in (g, b))
-        return first, second
+        g, b = self.fit.problem.targets(self.fit.state)
+        return g[0], b[0]
 
     def known(self, name: str) -> Array:
         """Reference (n,) of an observable: given, or the estimated constant; NaN where unknown.
@@ -128,14 +127,9 @@ class Residuals:
 
     def _stood(self, name: str) -> Array:
         """An angle (n,) of the fitted attitudes; at vertical, where two do not exist, as given."""
-        attitude, given = self.fit.state.attitude[0], self.fit.problem.evidence.known[name][0]
-        axis, down = attitude[:, 2], attitude[:, :, 2]
-        across = np.hypot(axis[:, 0], axis[:, 1])
-        if name == "inclination":
-            return np.asarray(np.arctan2(across, axis[:, 2]))
-        pair = (axis[:, 1], axis[:, 0]) if name == "azimuth" else (-down[:, 0], -down[:, 1])
-        angle = np.mod(np.arctan2(*pair), 2 * np.pi)
-        return np.asarray(np.where(across > VERTICAL, angle, given))
+        north, _, down = np.moveaxis(self.fit.state.attitude[0], -1, 0)
+        angle = OBSERVABLES[name].value(down, north)
+        return np.where(np.isnan(angle), self.fit.problem.evidence.known[name][0], angle)
 
     def _weight(self, name: str) -> Array:
         """The weight (n,) of errors after the fit, zero where an observable does not exist."""
@@ -157,7 +151,7 @@ class Residuals:
         In units of the noise itself, whatever weight a station has.
         """
         own = self.fit.problem.linear(self.fit.state).own
-        total = np.eye(own.shape[-2]) + own @ np.swapaxes(own, -1, -2)
+        total = np.eye(own.shape[-2]) + own @ own.mT
         inner = total @ _judged(self.fit).spread @ total
         return np.asarray(inner[0])
 

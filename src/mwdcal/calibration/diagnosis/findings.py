@@ -14,7 +14,7 @@ from mwdcal.calibration.diagnosis.structure import described as seen_as
 from mwdcal.calibration.diagnosis.structure import effects, suspected
 from mwdcal.calibration.readings import TRIADS
 from mwdcal.calibration.record import Finding
-from mwdcal.calibration.residuals import REASONS, shown_in
+from mwdcal.calibration.residuals import REASONS, shown_in, tail
 from mwdcal.calibration.results import common_source
 from mwdcal.calibration.soaks import HIGHEST
 from mwdcal.estimation.rank import free_directions
@@ -304,6 +304,7 @@ def _prior_only(fitted: FittedRuns, source: str) -> Flag:
 def _prior_conflict(fitted: FittedRuns, source: str) -> Flag:
     """A departure from the prior that is unlikely."""
     square, tested = plausibility.departures(fitted.result)
+    unlikely = tail(square, np.maximum(tested, 1)) <= plausibility.MISFIT_CHANCE
 
     def sentence(place: int) -> str:
         ratio = np.sqrt(square[place] / tested[place])
@@ -312,7 +313,7 @@ def _prior_conflict(fitted: FittedRuns, source: str) -> Flag:
             "changed, or the prior is too narrow. Leave --prior out, or widen it."
         )
 
-    return Flag("prior-conflict", plausibility.conflicting(square, tested), sentence)
+    return Flag("prior-conflict", unlikely, sentence)
 
 
 def _model(fitted: FittedRuns) -> Iterator[Flag]:
@@ -373,7 +374,7 @@ def _reshoot(fitted: FittedRuns) -> Iterator[Flag]:
 
 def _distrusted(fitted: FittedRuns) -> Flag:
     """Stations that a robust fit has nearly left out."""
-    low = plausibility.distrusted(fitted.result)
+    low = fitted.result.trust < plausibility.LOW_WEIGHT
 
     def sentence(place: int) -> str:
         labels, weight = fitted.alone(place)[0].labels, fitted.result.trust[place]

@@ -214,7 +214,7 @@ def _channels(readings: Readings, triad: str, prior: bool, run: Run) -> Iterator
     values = getattr(readings, triad)
     if values is None:
         return
-    spread = np.ptp(np.ascontiguousarray(np.swapaxes(values, -1, -2)), axis=-1)
+    spread = np.ptp(np.ascontiguousarray(values.mT), axis=-1)
     dead = spread <= 1e-12 * np.abs(values).max((-1, -2))[:, None]
     name, unit = ("gravity", "g") if triad == "accelerometer" else ("field", "nT")
     known = readings.reference(name)
