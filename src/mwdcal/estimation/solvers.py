@@ -124,6 +124,12 @@ class Linear:
         """C⁻¹ times columns (B, n, m, k)."""
         return np.asarray(columns - self.own @ (self.core @ (self.own.mT @ columns)))
 
+    @property
+    def weight(self) -> Array:
+        """C⁻¹ (B, n, m, m)."""
+        shape = (*self.residual.shape, self.residual.shape[-1])
+        return self.weigh(np.broadcast_to(np.eye(shape[-1]), shape))
+
     def private(self, step: Array) -> Array:
         """Private unknowns (B, n, a), in their prior's units, after a step of X's unknowns."""
         moved = self.residual + np.einsum("bnms,bs->bnm", self.shared, step[:, self.size :])

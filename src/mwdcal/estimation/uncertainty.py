@@ -102,8 +102,7 @@ def _remaining(linear: Linear, covariance: Array) -> tuple[Array, Array]:
     """Whitened residuals C⁻¹ρ (B, n, m), and their covariance C⁻¹ - C⁻¹X V XᵀC⁻¹ (B, n, m, m)."""
     weighed = linear.weigh(linear.design)
     left = linear.weigh(linear.residual[..., None])[..., 0]
-    spread = linear.weigh(np.broadcast_to(np.eye(left.shape[-1]), (*left.shape, left.shape[-1])))
-    return left, spread - weighed @ covariance[:, None] @ weighed.mT
+    return left, linear.weight - weighed @ covariance[:, None] @ weighed.mT
 
 
 def determined_apart(problem: Problem, state: State, known: dict[int, Array]) -> Determined:
@@ -159,8 +158,7 @@ def sandwich(
     crossed = design @ moved @ noise
     left = noise + design @ own[:, None] @ design.mT
     left = left + crossed + crossed.mT
-    weight = linear.weigh(np.broadcast_to(np.eye(noise.shape[-1]), noise.shape))
-    spread = weight @ left @ weight * problem.evidence.include[..., None, None]
+    spread = linear.weight @ left @ linear.weight * problem.evidence.include[..., None, None]
     factor, freedom = _variance_factors(analysis.residual, spread)
     q = len(constants)
     return replace(
@@ -252,8 +250,7 @@ def effective_freedom(problem: Problem, state: State, analysis: Analysis) -> Arr
     linear = problem.linear(state)
     whole = whole_covariance(linear, analysis.determined)
     weighed, count = linear.weigh(linear.design), linear.residual.shape[-1]
-    inner = linear.weigh(np.broadcast_to(np.eye(count), (*linear.residual.shape, count)))
-    inner = inner * problem.evidence.include[..., None, None]
+    inner = linear.weight * problem.evidence.include[..., None, None]
     each = []
     for first in range(0, count, 3):
         own = slice(first, first + 3)

@@ -215,10 +215,7 @@ def _held_out(readings: Readings, options: Options, numbers: Ints) -> Array:
     problem, state = _everyone(result)
     linear = problem.linear(state)
     chi = np.sum(_chi(linear) * held[..., None], 1) / (3 * held.sum(1))[:, None]
-    left = linear.weigh(linear.residual[..., None])
-    share = linear.weigh(
-        np.broadcast_to(np.eye(left.shape[-2]), (*left.shape[:-1], left.shape[-2]))
-    )
+    left, share = linear.weigh(linear.residual[..., None]), linear.weight
     squares = []
     for index, (triad, where) in enumerate(zip(problem.triads, problem.slices(), strict=True)):
         params, axes = state.params[:, where], slice(3 * index, 3 * index + 3)
