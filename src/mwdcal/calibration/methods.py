@@ -200,10 +200,10 @@ def _by_newton(problem: Problem, state: State, paper: bool) -> Solved:
         triad.model, nominal, triad.raw, problem.temperature, gravity,
         evidence.known["inclination"], weights=weights,
     )  # fmt: skip
-    own = _sums(problem, state, 0, (STRENGTH, "inclination"), weights)
+    sums = _sums(problem, state, 0, (STRENGTH, "inclination"), weights)
     later = _magnetometer(problem, state, minimum.params)
     status = np.maximum(later.status, minimum.status)
-    return Solved(later.state, status, minimum.iterations, {0: own}, {0: minimum.information})
+    return Solved(later.state, status, minimum.iterations, {0: sums}, {0: minimum.information})
 
 
 def _by_sums(problem: Problem, state: State, method: str) -> Solved:

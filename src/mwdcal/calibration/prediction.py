@@ -19,13 +19,13 @@ from mwdcal.sensor.models import Model
 
 STATED_ANGLES = ("inclination", "toolface", "azimuth")
 """Angles whose accuracy is stated; the first two need no magnetometer."""
-CIRCLE = np.arange(12) * np.pi / 6
+TWELFTHS = np.arange(12) * np.pi / 6
 """Azimuths, and toolfaces, over which an uncertainty is averaged (root mean square)."""
 TYPICAL = float(np.radians(45))
 """The inclination that stands for a tool's accuracy where one number must do."""
 CORNERS = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
 """Four fields, in units of their strength, from which an affine function of the field is known."""
-SHARES = np.array([[1.0, -1, -1, -1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+CORNER_SHARES = np.array([[1.0, -1, -1, -1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
 """Shares of these four in the field of unit components (1, x, y, z)."""
 _STEPS = 8
 
@@ -122,12 +122,12 @@ class CalibratedTools:
         for triad, (model, params) in enumerate(zip(self.models, self.parameters, strict=True)):
             warmth = np.broadcast_to(self.temperature[:, None], fields[triad].shape[:-1])
             raw = _reading(model, params, fields[triad], warmth, _STEPS if model.curved else 1)
-            own = slice(starts[triad], starts[triad + 1])
-            result[:, triad, ..., own] = model.jacobian(params, raw, warmth)
+            columns = slice(starts[triad], starts[triad + 1])
+            result[:, triad, ..., columns] = model.jacobian(params, raw, warmth)
             if noise:
-                own = slice(starts[-1] + 3 * triad, starts[-1] + 3 * triad + 3)
+                columns = slice(starts[-1] + 3 * triad, starts[-1] + 3 * triad + 3)
                 slope = model.slope(params, raw, warmth)
-                result[:, triad, ..., own] = slope * self.noise[:, triad, None, None, None]
+                result[:, triad, ..., columns] = slope * self.noise[:, triad, None, None, None]
         return result
 
     @classmethod
@@ -159,7 +159,7 @@ def accuracy(
     earth, number = tools.earth, np.arange(len(tools.earth))
     if not tools.curved:
         earth, number = np.unique(earth, axis=0, return_inverse=True)
-    grid = np.meshgrid([inclination], CIRCLE, CIRCLE, indexing="ij")
+    grid = np.meshgrid([inclination], TWELFTHS, TWELFTHS, indexing="ij")
     attitudes = [angle.reshape(1, -1) for angle in grid]
     both = reference_vectors(*attitudes, *(earth[:, i, None] for i in range(3)))
     vectors = np.stack(both[: len(tools.models)], -2)
@@ -181,7 +181,7 @@ def accuracy(
         covariance = change @ covariance @ change.mT
         free = np.einsum("bip,bkp->bki", change, free)
         unit = vectors / earth[:, None, : len(tools.models), None]
-        share = np.concatenate([np.ones_like(unit[..., :1]), unit], -1) @ SHARES.transpose()
+        share = np.concatenate([np.ones_like(unit[..., :1]), unit], -1) @ CORNER_SHARES.transpose()
         each = {n: share[..., None] * g[..., None, :] for n, g in gradients.items()}
         rows = {n: row.reshape(*row.shape[:2], -1) for n, row in each.items()}
     return {n: _root_mean_square(each, number, covariance, free) for n, each in rows.items()}
@@ -237,10 +237,10 @@ def _over_toolface(
 ) -> dict[str, Array]:
     """1σ (…, n) by angle, root mean square over toolface: one toolface at a time, for memory."""
     square = {name: np.zeros(inclination.shape) for name in angles(calibration)}
-    for toolface in CIRCLE:
+    for toolface in TWELFTHS:
         readings = readings_at(calibration, inclination, azimuth, toolface)
         for name, total in square.items():
-            total += calibration.uncertainty(name, readings) ** 2 / len(CIRCLE)
+            total += calibration.uncertainty(name, readings) ** 2 / len(TWELFTHS)
     return {name: np.sqrt(total) for name, total in square.items()}
 
 

@@ -22,7 +22,7 @@ ANGLES = ("inclination", "azimuth", "toolface")
 TRIADS = ("accelerometer", "magnetometer")
 SIMULATED = "SIMULATED DATA"
 CONSTANTS = ("gravity", "field", "dip")
-EARTH = {"gravity": (0.9, 1.1), "field": (15_000.0, 80_000.0)}
+EARTH_RANGES = {"gravity": (0.9, 1.1), "field": (15_000.0, 80_000.0)}
 """Least and greatest strength of any place on Earth, with room for a doubtful unit: g, nT."""
 DIGEST_LENGTH = 16
 NANOTESLA = "nT"

@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 
 from mwdcal.calibration.readings import NANOTESLA, Readings, simulated
-from mwdcal.calibration.soaks import GAP
+from mwdcal.calibration.soaks import SOAK_GAP
 from mwdcal.errors import InputError
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array, Bools
@@ -492,9 +492,9 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
     def margin(self) -> float:
         """Degrees Celsius by which a reading may lie outside the calibrated range.
 
-        A calibration without temperature terms holds for the soak it was made in: `soaks.GAP`.
+        A calibration without temperature terms holds for the soak it was made in: `soaks.SOAK_GAP`.
         """
-        return MARGIN if any(t.order for t in self.triads) else GAP
+        return MARGIN if any(t.order for t in self.triads) else SOAK_GAP
 
     def outside(self, readings: Readings, margin: float | None = None) -> Bools:
         """Stations (…, n) outside the calibrated temperature range by more than a margin, °C.

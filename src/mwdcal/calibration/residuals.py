@@ -150,8 +150,8 @@ class Residuals:
 
         In units of the noise itself, whatever weight a station has.
         """
-        own = self.fit.problem.linear(self.fit.state).own
-        total = np.eye(own.shape[-2]) + own @ own.mT
+        private = self.fit.problem.linear(self.fit.state).private
+        total = np.eye(private.shape[-2]) + private @ private.mT
         inner = total @ _judged(self.fit).spread @ total
         return np.asarray(inner[0])
 

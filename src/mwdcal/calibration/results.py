@@ -164,8 +164,8 @@ def _of_settings(result: Fit) -> Array:
         moved = analysis.covariance[:, None] @ _reduced(rows, linear.normal.information, p)
     else:
         moved = analysis.influence[:, :, : linear.size]
-    own = moved @ linear.own
-    return np.asarray(np.einsum("bnia,bnja->bij", own, own, optimize=True))
+    effect = moved @ linear.private
+    return np.asarray(np.einsum("bnia,bnja->bij", effect, effect, optimize=True))
 
 
 def _reduced(rows: Array, information: Array, p: int) -> Array:
@@ -216,8 +216,8 @@ def triad_results(
         rows = free_rows([free[i] for i in some.tolist()], covariance.shape[-1])[..., where]
         moved = np.abs(np.einsum("bij,bkj->bki", to_file[some], rows)).max(1)
         part = take(result.problem, some)
-        own = part.triads[index].model.finished(reference)[0]
-        effect = _effect(own, values[some], part.triads[index].raw, part.temperature)
+        file_model = part.triads[index].model.finished(reference)[0]
+        effect = _effect(file_model, values[some], part.triads[index].raw, part.temperature)
         sd[some] = np.where(moved * effect > FREE_SHARE, np.nan, sd[some])
     declared, freedom = np.isnan(result.noise[:, index]), result.analysis.freedom[:, index]
     noise = reading_noise(result)[:, index]

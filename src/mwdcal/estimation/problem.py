@@ -56,13 +56,13 @@ class Triad:
 class State:
     """Where a fit stands: parameters (B, p), attitudes (B, n, 3, 3), constants (B, q).
 
-    `own` (B, n, a) are the stations' own departures of the absent strengths and dip.
+    `departures` (B, n, a) are what each station's own strengths and dip add where they are absent.
     """
 
     params: Array
     attitude: Array
     constants: Array
-    own: Array
+    departures: Array
 
 
 @dataclass(frozen=True)
@@ -151,7 +151,7 @@ class Problem:
             if constant.name == name:
                 value = value + constant.mask * state.constants[:, index, None]
         if name in self.evidence.absent:
-            value = value + state.own[..., self.evidence.absent.index(name)]
+            value = value + state.departures[..., self.evidence.absent.index(name)]
         return np.asarray(value)
 
     def _by_earth(self, state: State) -> list[Array]:
@@ -219,9 +219,8 @@ class Problem:
         if self.evidence.scatter and not geometry:
             columns, scatter = self.scatter_columns(state), self.evidence.scatter
             private += [c * scatter[name][..., None, None] for name, c in columns.items()]
-        own = np.concatenate(private, -1)
         prior, pull = self._prior(state, blocks, shared.shape[-1], geometry)
-        return Linear(residual, tuple(blocks), shared, own, prior, pull)
+        return Linear(residual, tuple(blocks), shared, np.concatenate(private, -1), prior, pull)
 
     def station_columns(self, state: State, geometry: bool = False) -> tuple[Array, Array]:
         """Whitened rows (B, n, m, 3) by a turn of the station, and by its gravity, field and dip."""
@@ -306,12 +305,12 @@ class Problem:
         p, constants = state.params.shape[-1], self.evidence.constants
         pull = np.zeros((len(state.params), p + shared))
         pull[:, :p] = state.params - self.prior.expected
-        own = np.full(pull.shape, UNKNOWN**-2)
+        diagonal = np.full(pull.shape, UNKNOWN**-2)
         for index, constant in enumerate(constants):
-            own[:, p + index] = constant.sd**-2
+            diagonal[:, p + index] = constant.sd**-2
             if not constant.unknown:
                 pull[:, p + index] = state.constants[:, index] - constant.value
-        precision = own[..., None] * np.eye(own.shape[-1])
+        precision = diagonal[..., None] * np.eye(diagonal.shape[-1])
         known = self.prior.precision
         if geometry and known.any():
             norms = [np.sqrt(np.sum(block**2, (1, 2))) for block in blocks]
@@ -401,14 +400,14 @@ class Problem:
     def move(self, state: State, linear: Linear, step: Array) -> State:
         """The state after a step; unknown private angles follow, known ones stay at their reference."""
         p, q = linear.size, len(self.evidence.constants)
-        private = linear.private(step)
+        private = linear.private_step(step)
         attitude = self._turn_stand(state, step[:, p : p + q])
         attitude = self._turn_groups(replace(state, attitude=attitude), step[:, p + q :])
         attitude = self._turn_stations(state, attitude, private[..., :3])
-        absent = private[..., 3 : 3 + state.own.shape[-1]]
-        own = state.own + absent * self._own_scales(state)
+        absent = private[..., 3 : 3 + state.departures.shape[-1]]
+        departures = state.departures + absent * self._own_scales(state)
         constants = state.constants + step[:, p : p + q]
-        return State(state.params + step[:, :p], attitude, constants, own)
+        return State(state.params + step[:, :p], attitude, constants, departures)
 
     def _turn_stand(self, state: State, constants: Array) -> Array:
         attitude = state.attitude
@@ -431,10 +430,10 @@ class Problem:
         return attitude
 
     def _turn_stations(self, state: State, attitude: Array, private: Array) -> Array:
-        own = self._own_turns(state, geometry=True)
-        if not own.any():
+        axes = self._own_turns(state, geometry=True)
+        if not axes.any():
             return attitude
-        turn = own * private[..., None, :]
+        turn = axes * private[..., None, :]
         free = rotation(np.sum(turn, -1)) @ attitude
         about_down = np.zeros_like(turn[..., 0])
         about_down[..., 2] = np.einsum("bni,bni->bn", turn[..., 1], state.attitude[..., :, 2])

@@ -1,10 +1,10 @@
 """Gauss-Newton with Levenberg-Marquardt damping, on the determined subspace, for a batch.
 
 A problem linearises to residual rows per station, ρ + X δ, where X holds the columns of
-all parameters and shared unknowns, and `own` the columns of the station's private unknowns
+all parameters and shared unknowns, and `private` the columns of the station's private unknowns
 (attitude turns scaled to unit prior variance). Private unknowns are marginalised exactly:
 
-    C⁻¹ = I - G (I + GᵀG)⁻¹ Gᵀ,     G = own columns
+    C⁻¹ = I - G (I + GᵀG)⁻¹ Gᵀ,     G = private columns
 
 so a known angle (small σ), an unknown one (σ = π/√3) and everything between is one path.
 Shared unknowns (field strength, dip, group directions) are eliminated by a Schur complement.
@@ -57,7 +57,7 @@ class Linear:
     """A problem at one state: ρ (B, n, m) and its columns X by u unknowns, private ones apart.
 
     X has the columns of each triad's parameters in `blocks`, (B, n, m_t, p_t) for the rows of that
-    triad alone, then `shared` (B, n, m, s). `own` (B, n, m, a) are the private unknowns. `prior`
+    triad alone, then `shared` (B, n, m, s). `private` (B, n, m, a) are the private unknowns. `prior`
     (B, u, u) is the precision of X's unknowns, `pull` (B, u) their departure from the prior value
     (zero where unknown).
     """
@@ -65,7 +65,7 @@ class Linear:
     residual: Array
     blocks: tuple[Array, ...]
     shared: Array
-    own: Array
+    private: Array
     prior: Array
     pull: Array
 
@@ -95,8 +95,8 @@ class Linear:
     def norms(self) -> Array:
         """Column norms (B, p) of the parameters, prior in: the scale in which rank is counted."""
         squares = np.concatenate([np.sum(b**2, (-3, -2)) for b in self.blocks], -1)
-        own = diagonal(self.prior)[..., : self.size]
-        return np.asarray(np.sqrt(squares + own))
+        known = diagonal(self.prior)[..., : self.size]
+        return np.asarray(np.sqrt(squares + known))
 
     @cached_property
     def normal(self) -> Normal:
@@ -117,12 +117,12 @@ class Linear:
     @cached_property
     def core(self) -> Array:
         """(I + GᵀG)⁻¹ (B, n, a, a)."""
-        gram = self.own.mT @ self.own
+        gram = self.private.mT @ self.private
         return np.asarray(inverse(np.eye(gram.shape[-1]) + gram))
 
     def weigh(self, columns: Array) -> Array:
         """C⁻¹ times columns (B, n, m, k)."""
-        return np.asarray(columns - self.own @ (self.core @ (self.own.mT @ columns)))
+        return np.asarray(columns - self.private @ (self.core @ (self.private.mT @ columns)))
 
     @property
     def weight(self) -> Array:
@@ -130,12 +130,12 @@ class Linear:
         shape = (*self.residual.shape, self.residual.shape[-1])
         return self.weigh(np.broadcast_to(np.eye(shape[-1]), shape))
 
-    def private(self, step: Array) -> Array:
+    def private_step(self, step: Array) -> Array:
         """Private unknowns (B, n, a), in their prior's units, after a step of X's unknowns."""
         moved = self.residual + np.einsum("bnms,bs->bnm", self.shared, step[:, self.size :])
         for block, rows, columns in self._placed():
             moved[..., rows] += np.einsum("bnmp,bp->bnm", block, step[:, columns])
-        pulled = self.own.mT @ moved[..., None]
+        pulled = self.private.mT @ moved[..., None]
         return np.asarray(-(self.core @ pulled)[..., 0])
 
 
@@ -168,9 +168,9 @@ class Normal:
         shared = -(H_ss⁻¹ g_s + E · step).
         """
         p = self.size
-        own, cross = self.information[..., :p, :p], self.information[..., p:, :p]
+        block, cross = self.information[..., :p, :p], self.information[..., p:, :p]
         eliminate = inverse(self.information[..., p:, p:]) @ cross
-        reduced = own - cross.mT @ eliminate
+        reduced = block - cross.mT @ eliminate
         offset = eliminate.mT @ self.gradient[..., p:, None]
         return reduced, self.gradient[..., :p] - offset[..., 0], eliminate
 

@@ -236,8 +236,8 @@ def _by_toolface(
         members = evidence.shared(name) * faced[..., None]
         total = evidence.members @ (members.mT @ turned)
         some = np.einsum("bnk,bk->bn", evidence.members, members.sum(-2)) > 0
-        own = lone & ~evidence.is_known(name)
-        return np.where(own[..., None], turned, total), some | own
+        alone = lone & ~evidence.is_known(name)
+        return np.where(alone[..., None], turned, total), some | alone
 
     down, known = mean("inclination", np.zeros(faced.shape), g)
     inclination = np.where(known, np.arctan2(-down[..., 0], down[..., 2]), angles["inclination"])
@@ -248,11 +248,11 @@ def _by_toolface(
 
 def _with_own(problem: Problem, state: State, g: Array, b: Array) -> State:
     """The state with each station's own strength and dip as its corrected fields have them."""
-    own = state.own.copy()
+    departures = state.departures.copy()
     for index, name in enumerate(problem.evidence.absent):
         value = observables.OBSERVABLES[name].value(g, b)
-        own[..., index] = value - problem.constant(state, name)
-    return replace(state, own=own)
+        departures[..., index] = value - problem.constant(state, name)
+    return replace(state, departures=departures)
 
 
 def _with_dip(problem: Problem, state: State, g: Array, b: Array) -> State:

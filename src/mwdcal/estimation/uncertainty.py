@@ -142,9 +142,9 @@ def sandwich(
     linear = problem.linear(state)
     design, u = linear.design, linear.prior.shape[-1]
     moved, follow, back, fixed = _followed(problem, linear, pulls)
-    noise = np.eye(design.shape[2]) + linear.own @ linear.own.mT
+    noise = np.eye(design.shape[2]) + linear.private @ linear.private.mT
     covariance = np.einsum("bnim,bnmk,bnjk->bij", moved, noise, moved, optimize=True)
-    own = covariance
+    independent = covariance
     p, constants, rest = linear.size, problem.evidence.constants, ~fixed
     effects = np.zeros((len(moved), p, len(constants)))
     for column in [p + i for i, c in enumerate(constants) if not c.unknown]:
@@ -156,7 +156,7 @@ def sandwich(
         covariance = covariance + outer(common)
         effects[..., column - p] = common[:, :p]
     crossed = design @ moved @ noise
-    left = noise + design @ own[:, None] @ design.mT
+    left = noise + design @ independent[:, None] @ design.mT
     left = left + crossed + crossed.mT
     spread = linear.weight @ left @ linear.weight * problem.evidence.include[..., None, None]
     factor, freedom = _variance_factors(analysis.residual, spread)
@@ -192,8 +192,8 @@ def _followed(
     whole = np.einsum("bnmi,bnmj->bij", design, weighed, optimize=True)
     back = _inverse_where_known((whole + linear.prior)[:, rest][:, :, rest])
     follow = whole[:, rest][:, :, fixed]
-    own = weighed[..., rest].mT
-    moved[:, :, rest] = -back[:, None] @ (follow[:, None] @ moved[:, :, fixed] + own)
+    pull_columns = weighed[..., rest].mT
+    moved[:, :, rest] = -back[:, None] @ (follow[:, None] @ moved[:, :, fixed] + pull_columns)
     return moved, follow, back, fixed
 
 
@@ -222,11 +222,11 @@ def whole_covariance(linear: Linear, determined: Determined) -> Array:
     """Covariance (B, p + s, p + s) of parameters and shared unknowns."""
     normal = linear.normal
     reduced, _, eliminate = normal.reduced()
-    own = determined.inverse(reduced)
-    cross = -own @ eliminate.mT
+    params = determined.inverse(reduced)
+    cross = -params @ eliminate.mT
     p = normal.size
     shared = inverse(normal.information[..., p:, p:]) - eliminate @ cross
-    top = np.concatenate([own, cross], -1)
+    top = np.concatenate([params, cross], -1)
     return np.concatenate([top, np.concatenate([cross.mT, shared], -1)], -2)
 
 
@@ -253,8 +253,8 @@ def effective_freedom(problem: Problem, state: State, analysis: Analysis) -> Arr
     inner = linear.weight * problem.evidence.include[..., None, None]
     each = []
     for first in range(0, count, 3):
-        own = slice(first, first + 3)
-        rows, block = weighed[..., own, :], inner[..., own, own]
+        axes = slice(first, first + 3)
+        rows, block = weighed[..., axes, :], inner[..., axes, axes]
         mixed = np.einsum("bnij,bnjp,bnip->bp", block, rows @ whole[:, None], rows, optimize=True)
         gram = np.einsum("bnip,bniq->bpq", rows, rows, optimize=True) @ whole
         twice = np.einsum("bpq,bqp->b", gram, gram)
@@ -283,8 +283,8 @@ def without_station(problem: Problem, state: State, analysis: Analysis) -> Array
     linear = problem.linear(state)
     if analysis.influence is not None:
         p = linear.size
-        own = linear.design @ analysis.influence
-        stay = inverse(np.eye(own.shape[-1]) + own) @ linear.residual[..., None]
+        leverage = linear.design @ analysis.influence
+        stay = inverse(np.eye(leverage.shape[-1]) + leverage) @ linear.residual[..., None]
         return np.asarray(-(analysis.influence[:, :, :p] @ stay)[..., 0])
     whole = whole_covariance(linear, analysis.determined)[:, : linear.size]
     values, vectors = eigen(analysis.spread)
@@ -378,12 +378,12 @@ def _rescale(problem: Problem, state: State, triad: int, free: Bools) -> State:
     where, params = problem.slices()[triad], state.params.copy()
     matrix = factor[:, None, None] * np.eye(3)
     params[:, where] = problem.triads[triad].model.transformed(params[:, where], matrix)
-    own = state.own.copy()
+    departures = state.departures.copy()
     if name in problem.evidence.absent:
         place = problem.evidence.absent.index(name)
-        base = problem.constant(state, name) - own[..., place]
-        own[..., place] = factor[:, None] * problem.constant(state, name) - base
-    return replace(state, params=params, own=own)
+        base = problem.constant(state, name) - departures[..., place]
+        departures[..., place] = factor[:, None] * problem.constant(state, name) - base
+    return replace(state, params=params, departures=departures)
 
 
 def _polar_turn(problem: Problem, state: State, triad: int, free: Bools) -> Array:

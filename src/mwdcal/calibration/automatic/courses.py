@@ -23,7 +23,7 @@ TRIED = 5
 """The highest power that is tried, if there are soaks enough."""
 UNLIKELY = 1e-3
 """A term is there if noise alone gives one as large with a probability below this."""
-WEAK = 1e-6
+LEFT_TO_TERM = 1e-6
 """A direction of a term counts if the fit leaves this share of its information to it."""
 RIDGE = 1e-11
 """Added to the information of the fit's own unknowns, that it has an inverse: free ones stay free."""
@@ -34,7 +34,7 @@ GRID = 64
 
 
 @dataclass(frozen=True)
-class Terms:
+class OmittedTerms:
     """Powers 1…`TRIED` of temperature that a fit has not, by member and triad: arrays (B, t, k).
 
     `square` is χ² of a term, all lower ones being fitted, `freedom` its degrees of freedom: 0 where
@@ -91,7 +91,7 @@ def orders_of(result: Fit) -> list[int]:
     return [triad.model.basis.order for triad in result.problem.triads]
 
 
-def terms_beyond(result: Fit) -> Terms:
+def terms_beyond(result: Fit) -> OmittedTerms:
     """The powers of temperature that a fit has not."""
     memo = result.problem.memo.at(result.state)
     if "terms" not in memo.besides:
@@ -106,7 +106,7 @@ def terms_beyond(result: Fit) -> Terms:
     scatter = np.maximum(left / np.maximum(rest, 1.0), np.maximum(least, 1e-300))
     declared = np.isnan(result.noise) & (rest < 1)
     scatter, rest = np.where(declared, 1.0, scatter), np.where(declared, 1e9, rest)
-    return Terms(square, freedom, size, noise, scatter, rest)
+    return OmittedTerms(square, freedom, size, noise, scatter, rest)
 
 
 def _every_term(result: Fit) -> Array:
@@ -210,7 +210,7 @@ def _in_turn(whole: Array, pulled: Array, tested: Ints, fitted: Ints) -> Array:
     for first in range(0, len(tested), 6):
         at = slice(first, first + 6)
         values, vectors = eigen(both[:, at, at])
-        kept = values > WEAK
+        kept = values > LEFT_TO_TERM
         back = (vectors * quotient(np.ones_like(values), values, kept)[:, None]) @ vectors.mT
         step = back @ both[:, at]
         square = np.einsum("bi,bi->b", both[:, at, -1], step[..., -1])
@@ -230,13 +230,13 @@ def untested(result: Fit) -> Bools:
     return np.asarray((levels > 1) & (orders > 0) & (levels <= orders + 1))
 
 
-def misfit_size(result: Fit, terms: Terms) -> Array:
+def misfit_size(result: Fit, terms: OmittedTerms) -> Array:
     """Root mean square (B, t), per axis, of what the orders leave out, as a share of the field."""
     gains, offsets = np.moveaxis(course_misfit(result, terms), -1, 0)
     return np.asarray(np.sqrt(gains / 3 + offsets))
 
 
-def course_misfit(result: Fit, terms: Terms | None = None) -> Array:
+def course_misfit(result: Fit, terms: OmittedTerms | None = None) -> Array:
     """Variance (B, t, 2) of gains and offsets that the order leaves out, shares of the field squared.
 
     Mean square over the range of temperatures of all terms that are there, and of the next one
@@ -303,7 +303,7 @@ def _left_out(problem: Problem, order: int) -> tuple[Array, Array]:
     return np.mean(remainder**2, -2), mean * levels / freedom * (1 + (order + 1) / levels)
 
 
-def misfit_covariance(result: Fit, terms: Terms | None = None) -> Array:
+def misfit_covariance(result: Fit, terms: OmittedTerms | None = None) -> Array:
     """Covariance (B, p, p) of the fit's parameters that stands for what its order leaves out."""
     problem, params = result.problem, result.state.params
     covariance = np.zeros((*params.shape, params.shape[-1]))

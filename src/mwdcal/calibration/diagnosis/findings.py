@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from mwdcal.calibration.automatic.courses import Terms, misfit_size, terms_beyond, untested
+from mwdcal.calibration.automatic.courses import OmittedTerms, misfit_size, terms_beyond, untested
 from mwdcal.calibration.diagnosis import plausibility
 from mwdcal.calibration.diagnosis.flags import FittedRuns, Flag
 from mwdcal.calibration.diagnosis.structure import described as seen_as
@@ -205,7 +205,7 @@ def _repeated(fitted: FittedRuns) -> Flag:
     return Flag("repeated-readings", np.any(copies, -1), sentence)
 
 
-def _beyond_order(fitted: FittedRuns, index: int, terms: Terms) -> Flag:
+def _beyond_order(fitted: FittedRuns, index: int, terms: OmittedTerms) -> Flag:
     """A variation with temperature that the order of a triad does not follow."""
     problem, state = fitted.result.problem, fitted.result.state
     order, observable = problem.triads[index].model.basis.order, ("gravity", "field")[index]

@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 
 from mwdcal.calibration.estimate import Fit
-from mwdcal.calibration.readings import EARTH, Readings
+from mwdcal.calibration.readings import EARTH_RANGES, Readings
 from mwdcal.calibration.residuals import RESHOOT, Residuals, chances, chi_chance, tail, to_reshoot
 from mwdcal.estimation.batch import take
 from mwdcal.estimation.minimisers import closed_form
@@ -74,7 +74,7 @@ def off_earth(result: Fit, name: str, coil: bool) -> Bools:
     value = problem.constant(result.state, name)
     if name == "field" and (coil or len(problem.triads) == 1):
         return np.zeros(value.shape, bool)
-    low, high = EARTH[name]
+    low, high = EARTH_RANGES[name]
     relative = (problem.evidence.known["field"] == 1.0).all(-1, keepdims=True)
     outside = ~((value >= low) & (value <= high)) & (problem.evidence.include > 0)
     return np.asarray(outside & ~(relative & (name == "field")))

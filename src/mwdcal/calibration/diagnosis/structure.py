@@ -21,7 +21,7 @@ from mwdcal.calibration.evidence import STAND_TURNS, acts_on
 from mwdcal.calibration.readings import TRIADS
 from mwdcal.calibration.residuals import chances, to_reshoot
 from mwdcal.calibration.results import variance_scales
-from mwdcal.calibration.soaks import HIGHEST, SPAN, highest_order
+from mwdcal.calibration.soaks import HIGHEST, LEAST_TEMPERATURE_SPAN, highest_order
 from mwdcal.estimation.problem import Problem, State
 from mwdcal.estimation.uncertainty import whole_covariance
 from mwdcal.geometry.vectors import Array, Bools, eigen
@@ -162,7 +162,7 @@ def _misfit(problem: Problem, result: Fit) -> tuple[float, float]:
     linear, include = problem.linear(result.state), problem.evidence.include
     whole, normal = whole_covariance(linear, result.analysis.determined)[0], linear.normal
     gradient = normal.gradient[0]
-    private = problem.linear(result.state, geometry=True).own
+    private = problem.linear(result.state, geometry=True).private
     unknown = np.sum(
         np.linalg.svd(private, compute_uv=False) > 1.0
     )  # 0 where a station is left out
@@ -278,7 +278,7 @@ def _sets(problem: Problem) -> Array:
 
 def _courses(problem: Problem, state: State) -> Iterator[tuple[str, Array]]:
     """Powers of temperature that a triad's order leaves out: another finding names these."""
-    if np.ptp(problem.temperature) < SPAN:
+    if np.ptp(problem.temperature) < LEAST_TEMPERATURE_SPAN:
         return
     highest = int(np.clip(highest_order(problem.temperature)[0], HIGHEST, TRIED))
     columns = steady_columns(problem, state)

@@ -140,8 +140,8 @@ def start(problem: Problem) -> State:
     attitude = tool_from_earth(known["inclination"], azimuth, known["toolface"])
     nothing = np.zeros((batch, 0))
     size = sum(triad.model.size for triad in problem.triads)
-    own = np.zeros((*problem.temperature.shape, 0))
-    return State(np.zeros((batch, size)), attitude, nothing, own)
+    departures = np.zeros((*problem.temperature.shape, 0))
+    return State(np.zeros((batch, size)), attitude, nothing, departures)
 
 
 def solution(problem: Problem, at: State, triads: Minima) -> tuple[State, Analysis]:

@@ -181,8 +181,8 @@ def _minimum(axes: Axes, at: Point, include: Array) -> FactorsMinimum:
 def _evidence(rows: Array, louder: Array, slope: Array) -> tuple[Array, Array]:
     """Singular values and norms (see `FactorsMinimum`), at another noise: ours over it is (B, 3, n)."""
     rows *= louder[..., None, :]  # in place: they are large, and done with
-    own = rows @ rows.mT
-    information = (slope.mT @ own @ slope).sum(1)
+    by_axis = rows @ rows.mT
+    information = (slope.mT @ by_axis @ slope).sum(1)
     norms = np.sqrt(diagonal(information))
     norms = np.where(norms > 0, norms, 1.0)
     values = eigenvalues(information / outer(norms))
@@ -196,15 +196,17 @@ def factors(unknowns: Array) -> tuple[Array, Array, Array]:
     shares = np.broadcast_to(np.eye(3), (batch, 3, 3)).copy()
     shares[:, np.arange(3)[:, None], OTHERS] = cross
     back = inverse(shares)
-    own = diagonal(back)
-    params = factor_params(scale / own[..., None], bias * own[..., None], -back / own[:, None, :])
+    pivots = diagonal(back)
+    params = factor_params(
+        scale / pivots[..., None], bias * pivots[..., None], -back / pivots[:, None, :]
+    )
     slope = np.zeros((batch, 3, 2 * count + 2, params.shape[-1]))
     scales, biases, misalignments = factor_parts(np.arange(params.shape[-1]))
     axis, k = np.arange(3)[:, None], np.arange(count)
-    slope[:, axis, k, scales] = own[..., None]
-    slope[:, axis, count + 2 + k, biases] = 1 / own[..., None]
-    turn = shares * own[..., None]  # N; dN = N dm N
-    pulled, moved = turn[:, :, OFF_ROWS] / own[..., None], turn[:, OFF_COLUMNS]
+    slope[:, axis, k, scales] = pivots[..., None]
+    slope[:, axis, count + 2 + k, biases] = 1 / pivots[..., None]
+    turn = shares * pivots[..., None]  # N; dN = N dm N
+    pulled, moved = turn[:, :, OFF_ROWS] / pivots[..., None], turn[:, OFF_COLUMNS]
     grown = (pulled * moved.mT)[:, :, None]
     by_mixing = np.zeros((batch, 3, 2 * count + 2, 6))
     by_mixing[:, :, :count] = scale[..., None] * grown
