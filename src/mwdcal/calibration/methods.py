@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
@@ -174,15 +175,11 @@ def _swarmed(problem: Problem, state: State, seed: int) -> Solved:
 
 def _swarm_forward(raw: Array, target: Array, include: Bools, seed: int) -> Array:
     """Forward parameters (B, 12); members that leave stations out fly one by one."""
+    fly = partial(swarm_forward, error="reading", iterations=SWARM_ITERATIONS, seed=seed)
     if include.all():
-        return swarm_forward(
-            raw, target, "reading", iterations=SWARM_ITERATIONS, seed=seed
-        ).position
-    each = [
-        swarm_forward(r[keep], t[keep], "reading", iterations=SWARM_ITERATIONS, seed=seed).position
-        for r, t, keep in zip(raw, target, include, strict=True)
-    ]
-    return np.stack(each)
+        return fly(raw, target).position
+    members = zip(raw, target, include, strict=True)
+    return np.stack([fly(r[keep], t[keep]).position for r, t, keep in members])
 
 
 def _by_newton(problem: Problem, state: State, paper: bool) -> Solved:

@@ -158,7 +158,8 @@ def sandwich(
     crossed = design @ moved @ noise
     left = noise + design @ independent[:, None] @ design.mT
     left = left + crossed + crossed.mT
-    spread = linear.weight @ left @ linear.weight * problem.evidence.include[..., None, None]
+    weight = linear.weight
+    spread = weight @ left @ weight * problem.evidence.include[..., None, None]
     factor, freedom = _variance_factors(analysis.residual, spread)
     q = len(constants)
     return replace(

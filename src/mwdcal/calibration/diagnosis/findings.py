@@ -171,15 +171,12 @@ def _scatter(fitted: FittedRuns) -> Flag:
     def sentence(place: int) -> str:
         scatter = fitted.result.problem.evidence.scatter
         sizes = {name: float(values[place].max()) for name, values in scatter.items()}
+        shown = {n: f"{100 * size:.2f} %" for n, size in sizes.items()}
+        angles = {n: f"{np.degrees(sizes[n]):.2f}°" for n in ("dip", "direction") if n in sizes}
         words = [
-            f"{SCATTERED[name]} by "
-            + (
-                f"{np.degrees(size):.2f}°"
-                if name in ("dip", "direction")
-                else f"{100 * size:.2f} %"
-            )
-            for name, size in sizes.items()
-            if size > plausibility.SCATTER_SHARE
+            f"{SCATTERED[name]} by {size}"
+            for name, size in (shown | angles).items()
+            if sizes[name] > plausibility.SCATTER_SHARE
         ]
         return (
             f"beyond sensor noise, these vary from station to station: {', '.join(words)} "
