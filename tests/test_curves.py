@@ -147,7 +147,7 @@ def test_evidence_is_the_density_of_the_readings():
         precision = given + np.append(np.full(linear.size, PIN**-2.0), 0 * given[linear.size :])
         covariance = design / precision @ design.transpose()
         for k in range(24):
-            own, rows = linear.own[0, k], slice(6 * k, 6 * k + 6)
+            own, rows = linear.private[0, k], slice(6 * k, 6 * k + 6)
             covariance[rows, rows] += np.eye(6) + own @ own.transpose()
         # unpriored parameters are integrated about the fit itself
         y = linear.residual[0].ravel() - design @ np.where(free, 0, linear.pull[0])

@@ -173,12 +173,8 @@ def fit(readings: Readings, options: Options | None = None, include: Array | Non
 def scatters(readings: Readings, options: Options) -> bool:
     """Whether a scatter from station to station is estimated: with a joint fit's own noise of both."""
     noisy = not any(name in readings.sd for name in TRIADS) and readings.magnetometer is not None
-    return (
-        options.scatter
-        and noisy
-        and options.method == "joint"
-        and bool((readings.groups >= 0).any())
-    )
+    grouped = bool((readings.groups >= 0).any())
+    return options.scatter and noisy and options.method == "joint" and grouped
 
 
 def _scattered(evidence: Evidence, readings: Readings, options: Options) -> Evidence:
@@ -200,19 +196,19 @@ def _general(problem: Problem, declared: list[bool], options: Options, finite: B
     if options.robust:
         stage = _downweigh(stage, declared, options)
     problem, solved, trust = stage.problem, stage.solved, stage.trust
-    trusted = _trusting(problem, trust)
-    state = solved.state
+    trusted, state = _trusting(problem, trust), solved.state
     determined = _determined(trusted, state, solved)
     if len(state.params) and not determined.keep.all():
         state = settle_gauge(trusted, state, determined)
         determined = _determined(trusted, state, solved)
-    status = np.where(finite, solved.status, int(Status.NOT_FINITE))
-    noise = _noise(problem, declared)
-    analysis = _analysed(
-        analyse(trusted, state, determined), trusted, state, solved, options, trust
-    )
+    analysis, pulls = analyse(trusted, state, determined), solved.pulls(trusted, state)
+    if pulls:
+        analysis = sandwich(analysis, trusted, state, pulls)
+    if options.robust:
+        analysis = _robustly(analysis, trusted, state, options.robust, trust)
     trusted.memo.at(None)
-    return Fit(trusted, state, status, iterations, noise, trust, analysis)
+    status = np.where(finite, solved.status, int(Status.NOT_FINITE))
+    return Fit(trusted, state, status, iterations, _noise(problem, declared), trust, analysis)
 
 
 def _closed(
@@ -259,23 +255,6 @@ def _determined(problem: Problem, state: State, solved: Solved) -> Determined:
     if solved.known:
         return determined_apart(problem, state, solved.known)
     return Determined.of(problem, state)
-
-
-def _analysed(
-    analysis: Analysis,
-    problem: Problem,
-    state: State,
-    solved: Solved,
-    options: Options,
-    trust: Array,
-) -> Analysis:
-    """The likelihood's analysis as it changes with the papers' sums and with robust weights."""
-    pulls = solved.pulls(problem, state)
-    if pulls:
-        analysis = sandwich(analysis, problem, state, pulls)
-    if options.robust:
-        analysis = _robustly(analysis, problem, state, options.robust, trust)
-    return analysis
 
 
 def _robustly(
@@ -423,13 +402,9 @@ def _louder(problem: Problem, factor: Array) -> Problem:
 
 def _rescaled(problem: Problem, scale: Array, declared: list[bool]) -> Problem:
     """The problem with the noise of triads that declare none times `scale` (B, triads)."""
+    factors = np.moveaxis(np.where(np.isfinite(scale), scale, 1.0), -1, 0)[..., None, None]
     triads = tuple(
-        t if known else replace(t, sd=_scaled_noise(t, scale[:, i]))
-        for i, (t, known) in enumerate(zip(problem.triads, declared, strict=True))
+        t if known else replace(t, sd=np.maximum(t.sd * factor, LEAST_NOISE * _size(t.raw)))
+        for t, factor, known in zip(problem.triads, factors, declared, strict=True)
     )
     return replace(problem, triads=triads)
-
-
-def _scaled_noise(triad: Triad, scale: Array) -> Array:
-    factor = np.where(np.isfinite(scale), scale, 1.0)[:, None, None]
-    return np.maximum(triad.sd * factor, LEAST_NOISE * _size(triad.raw))

@@ -106,9 +106,8 @@ def constants(evidence: Evidence) -> tuple[SharedConstant, ...]:
             continue
         known = evidence.is_known(name)
         if not known.all():
-            value = np.nan_to_num(
-                np.nansum(evidence.known[name], -1) / np.maximum(known.sum(-1), 1)
-            )
+            value = np.nansum(evidence.known[name], -1) / np.maximum(known.sum(-1), 1)
+            value = np.nan_to_num(value)
             scale = np.full(len(value), size) if size else np.where(value > 0, value, 1.0)
             shared.append(SharedConstant(name, (~known).astype(float), value, scale, unknown=True))
         sd = np.max(np.where(known, evidence.sd[name], 0.0), -1)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
@@ -160,8 +161,7 @@ def _alike(problem: Problem) -> Problem:
 def _swarmed(problem: Problem, state: State, seed: int) -> Solved:
     """Parameters by particle swarm on the error in the readings, directions and strengths known."""
     parts = []
-    for triad, earth in zip(problem.triads, problem.earth(state)[0], strict=False):
-        target = np.einsum("bnij,bnj->bni", state.attitude, earth)
+    for triad, target in zip(problem.triads, problem.targets(state), strict=False):
         forward = _swarm_forward(triad.raw, target, problem.evidence.include > 0, seed)
         matrix, offset = affine_parts(forward)
         back = inverse(matrix)
@@ -175,15 +175,11 @@ def _swarmed(problem: Problem, state: State, seed: int) -> Solved:
 
 def _swarm_forward(raw: Array, target: Array, include: Bools, seed: int) -> Array:
     """Forward parameters (B, 12); members that leave stations out fly one by one."""
+    fly = partial(swarm_forward, error="reading", iterations=SWARM_ITERATIONS, seed=seed)
     if include.all():
-        return swarm_forward(
-            raw, target, "reading", iterations=SWARM_ITERATIONS, seed=seed
-        ).position
-    each = [
-        swarm_forward(r[keep], t[keep], "reading", iterations=SWARM_ITERATIONS, seed=seed).position
-        for r, t, keep in zip(raw, target, include, strict=True)
-    ]
-    return np.stack(each)
+        return fly(raw, target).position
+    members = zip(raw, target, include, strict=True)
+    return np.stack([fly(r[keep], t[keep]).position for r, t, keep in members])
 
 
 def _by_newton(problem: Problem, state: State, paper: bool) -> Solved:
@@ -201,10 +197,10 @@ def _by_newton(problem: Problem, state: State, paper: bool) -> Solved:
         triad.model, nominal, triad.raw, problem.temperature, gravity,
         evidence.known["inclination"], weights=weights,
     )  # fmt: skip
-    own = _sums(problem, state, 0, (STRENGTH, "inclination"), weights)
+    sums = _sums(problem, state, 0, (STRENGTH, "inclination"), weights)
     later = _magnetometer(problem, state, minimum.params)
     status = np.maximum(later.status, minimum.status)
-    return Solved(later.state, status, minimum.iterations, {0: own}, {0: minimum.information})
+    return Solved(later.state, status, minimum.iterations, {0: sums}, {0: minimum.information})
 
 
 def _by_sums(problem: Problem, state: State, method: str) -> Solved:

@@ -19,13 +19,13 @@ from mwdcal.sensor.models import Model
 
 STATED_ANGLES = ("inclination", "toolface", "azimuth")
 """Angles whose accuracy is stated; the first two need no magnetometer."""
-CIRCLE = np.arange(12) * np.pi / 6
+TWELFTHS = np.arange(12) * np.pi / 6
 """Azimuths, and toolfaces, over which an uncertainty is averaged (root mean square)."""
 TYPICAL = float(np.radians(45))
 """The inclination that stands for a tool's accuracy where one number must do."""
 CORNERS = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
 """Four fields, in units of their strength, from which an affine function of the field is known."""
-SHARES = np.array([[1.0, -1, -1, -1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+CORNER_SHARES = np.array([[1.0, -1, -1, -1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
 """Shares of these four in the field of unit components (1, x, y, z)."""
 _STEPS = 8
 
@@ -122,12 +122,12 @@ class CalibratedTools:
         for triad, (model, params) in enumerate(zip(self.models, self.parameters, strict=True)):
             warmth = np.broadcast_to(self.temperature[:, None], fields[triad].shape[:-1])
             raw = _reading(model, params, fields[triad], warmth, _STEPS if model.curved else 1)
-            own = slice(starts[triad], starts[triad + 1])
-            result[:, triad, ..., own] = model.jacobian(params, raw, warmth)
+            columns = slice(starts[triad], starts[triad + 1])
+            result[:, triad, ..., columns] = model.jacobian(params, raw, warmth)
             if noise:
-                own = slice(starts[-1] + 3 * triad, starts[-1] + 3 * triad + 3)
+                columns = slice(starts[-1] + 3 * triad, starts[-1] + 3 * triad + 3)
                 slope = model.slope(params, raw, warmth)
-                result[:, triad, ..., own] = slope * self.noise[:, triad, None, None, None]
+                result[:, triad, ..., columns] = slope * self.noise[:, triad, None, None, None]
         return result
 
     @classmethod
@@ -159,7 +159,7 @@ def accuracy(
     earth, number = tools.earth, np.arange(len(tools.earth))
     if not tools.curved:
         earth, number = np.unique(earth, axis=0, return_inverse=True)
-    grid = np.meshgrid([inclination], CIRCLE, CIRCLE, indexing="ij")
+    grid = np.meshgrid([inclination], TWELFTHS, TWELFTHS, indexing="ij")
     attitudes = [angle.reshape(1, -1) for angle in grid]
     both = reference_vectors(*attitudes, *(earth[:, i, None] for i in range(3)))
     vectors = np.stack(both[: len(tools.models)], -2)
@@ -178,21 +178,13 @@ def accuracy(
             [s[:, None, None] * CORNERS for s in tools.earth[:, :2].transpose()], noise
         )
         change = change.reshape(len(change), -1, change.shape[-1])
-        covariance = change @ covariance @ np.swapaxes(change, -1, -2)
+        covariance = change @ covariance @ change.mT
         free = np.einsum("bip,bkp->bki", change, free)
-        share = _corner_shares(vectors / earth[:, None, : len(tools.models), None])
-        rows = {n: _flat(share[..., None] * g[..., None, :]) for n, g in gradients.items()}
+        unit = vectors / earth[:, None, : len(tools.models), None]
+        share = np.concatenate([np.ones_like(unit[..., :1]), unit], -1) @ CORNER_SHARES.transpose()
+        each = {n: share[..., None] * g[..., None, :] for n, g in gradients.items()}
+        rows = {n: row.reshape(*row.shape[:2], -1) for n, row in each.items()}
     return {n: _root_mean_square(each, number, covariance, free) for n, each in rows.items()}
-
-
-def _corner_shares(unit: Array) -> Array:
-    """Shares (…, 4) of the fields at `CORNERS` in a field of unit components (…, 3)."""
-    return np.asarray(np.concatenate([np.ones_like(unit[..., :1]), unit], -1) @ SHARES.transpose())
-
-
-def _flat(rows: Array) -> Array:
-    """Rows (E, a, c) of what each triad does at each corner along each axis (E, a, t, 4, 3)."""
-    return rows.reshape(*rows.shape[:2], -1)
 
 
 def _root_mean_square(rows: Array, number: Ints, covariance: Array, free: Array) -> Array:
@@ -200,7 +192,7 @@ def _root_mean_square(rows: Array, number: Ints, covariance: Array, free: Array)
 
     NaN where a row moves with a direction in `free` (B, f, c).
     """
-    weights = np.swapaxes(rows, -1, -2) @ rows / rows.shape[1]
+    weights = rows.mT @ rows / rows.shape[1]
     variance = np.einsum("bij,...bij->...b", weights[number], covariance)
     sd = np.sqrt(np.maximum(variance, 0.0))
     if not free.size:
@@ -245,10 +237,10 @@ def _over_toolface(
 ) -> dict[str, Array]:
     """1σ (…, n) by angle, root mean square over toolface: one toolface at a time, for memory."""
     square = {name: np.zeros(inclination.shape) for name in angles(calibration)}
-    for toolface in CIRCLE:
+    for toolface in TWELFTHS:
         readings = readings_at(calibration, inclination, azimuth, toolface)
         for name, total in square.items():
-            total += calibration.uncertainty(name, readings) ** 2 / len(CIRCLE)
+            total += calibration.uncertainty(name, readings) ** 2 / len(TWELFTHS)
     return {name: np.sqrt(total) for name, total in square.items()}
 
 

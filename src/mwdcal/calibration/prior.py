@@ -23,7 +23,7 @@ from mwdcal.sensor.profile import Datasheet, Profile
 
 DATASHEET: Literal["datasheet"] = "datasheet"
 """The prior that the tolerances in the tool profile are."""
-FAR = 50.0
+DRIFT_REACH = 50.0
 """A datasheet's drift per °C holds to this far from the reference: later powers add no more, °C."""
 
 
@@ -78,7 +78,7 @@ def prior_of(knowledge: Knowledge | None, models: Sequence[Model], batch: int) -
     values[rows] = knowledge.expected[theirs]
     known[np.ix_(rows, rows)] = knowledge.precision[np.ix_(theirs, theirs)]
     centre = np.linalg.solve(whole, np.broadcast_to(values, (batch, size))[..., None])[..., 0]
-    return Prior(np.swapaxes(whole, -1, -2) @ known @ whole, np.asarray(centre))
+    return Prior(whole.mT @ known @ whole, np.asarray(centre))
 
 
 def from_datasheet(profile: Profile, relative: bool = False) -> Knowledge:
@@ -237,21 +237,23 @@ def _precision(covariance: Array, free: Array) -> Array:
 def _tolerances(sheet: Datasheet) -> list[tuple[str, float, float | None]]:
     """Name, expected value and standard deviation of every parameter, for both models."""
     turn = None if sheet.misalignment_deg is None else float(np.radians(sheet.misalignment_deg))
-    found: list[tuple[str, float, float | None]] = []
+    tolerances: list[tuple[str, float, float | None]] = []
     for power in range(4):
         scale = _at(power, sheet.scale, sheet.scale_per_c)
         bias = _at(power, sheet.bias, sheet.bias_per_c)
         suffix = f"·{power}" if power else ""
         across = turn if power == 0 else (turn * scale if turn and scale else None)
         for i in "xyz":
-            found += [(f"scale-{i}{suffix}", float(power == 0), scale)]
-            found += [(f"gain-{i}{i}{suffix}", float(power == 0), scale)]
-            found += [(f"bias-{i}{suffix}", 0.0, bias), (f"offset-{i}{suffix}", 0.0, bias)]
-            found += [(f"gain-{i}{j}{suffix}", 0.0, across) for j in "xyz" if j != i]
-    return found + [(f"misalignment-{i}{j}", 0.0, turn) for i in "xyz" for j in "xyz" if j != i]
+            tolerances += [(f"scale-{i}{suffix}", float(power == 0), scale)]
+            tolerances += [(f"gain-{i}{i}{suffix}", float(power == 0), scale)]
+            tolerances += [(f"bias-{i}{suffix}", 0.0, bias), (f"offset-{i}{suffix}", 0.0, bias)]
+            tolerances += [(f"gain-{i}{j}{suffix}", 0.0, across) for j in "xyz" if j != i]
+    return tolerances + [
+        (f"misalignment-{i}{j}", 0.0, turn) for i in "xyz" for j in "xyz" if j != i
+    ]
 
 
 def _at(power: int, steady: float | None, drift: float | None) -> float | None:
     if power == 0 or drift is None:
         return steady if power == 0 else None
-    return drift / FAR ** (power - 1)
+    return drift / DRIFT_REACH ** (power - 1)

@@ -22,7 +22,7 @@ ANGLES = ("inclination", "azimuth", "toolface")
 TRIADS = ("accelerometer", "magnetometer")
 SIMULATED = "SIMULATED DATA"
 CONSTANTS = ("gravity", "field", "dip")
-EARTH = {"gravity": (0.9, 1.1), "field": (15_000.0, 80_000.0)}
+EARTH_RANGES = {"gravity": (0.9, 1.1), "field": (15_000.0, 80_000.0)}
 """Least and greatest strength of any place on Earth, with room for a doubtful unit: g, nT."""
 DIGEST_LENGTH = 16
 NANOTESLA = "nT"
@@ -202,19 +202,16 @@ class Readings:
         def rows(value: AnyArray | None) -> Any:
             return None if value is None else np.asarray(value)[chosen]
 
-        per_station = {k: np.broadcast_to(v, self._shape(k)) for k, v in self.sd.items()}
+        whole = self.accelerometer.shape
+        shapes = {k: whole if k.endswith("meter") else whole[:-1] for k in self.sd}
         return replace(
             self,
             accelerometer=self.accelerometer[chosen],
             magnetometer=rows(self.magnetometer),
             temperature=rows(self.temperature),
             known={k: self.reference(k)[chosen] for k in self.known},
-            sd={k: v[chosen] for k, v in per_station.items()},
+            sd={k: np.broadcast_to(v, shapes[k])[chosen] for k, v in self.sd.items()},
             group=rows(self.group),
             station=tuple(self.station[i] for i in chosen) if self.station else (),
             digest=tuple(self.digest[i] for i in chosen) if self.digest else (),
         )
-
-    def _shape(self, name: str) -> tuple[int, ...]:
-        shape = self.accelerometer.shape
-        return shape if name.endswith("meter") else shape[:-1]

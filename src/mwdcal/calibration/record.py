@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from html import escape
+from itertools import pairwise
 from typing import Any, ClassVar
 
 import msgspec
 import numpy as np
 
 from mwdcal.calibration.readings import NANOTESLA, Readings, simulated
-from mwdcal.calibration.soaks import GAP
+from mwdcal.calibration.soaks import SOAK_GAP
 from mwdcal.errors import InputError
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array, Bools
@@ -275,13 +276,13 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
 
     def _accuracy(self) -> dict[str, str]:
         """1σ of the calibration alone by angle, in words: all sources of the budget together."""
-        found = {}
+        words = {}
         for name in ("inclination", "toolface", "azimuth")[: 1 + len(self.triads)]:
             parts = [getattr(row, f"{name}_deg") for row in self.budget]
             if parts:
                 free = None in parts
-                found[name] = "undetermined" if free else f"{np.linalg.norm(parts):.2g}°"
-        return found
+                words[name] = "undetermined" if free else f"{np.linalg.norm(parts):.2g}°"
+        return words
 
     @property
     def reference_temperature(self) -> float:
@@ -311,8 +312,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
     @property
     def free_directions(self) -> Array:
         """Directions (k, p) of parameter space that no evidence determines."""
-        size = sum(len(t.parameters) for t in self.triads)
-        return np.array(self.free, float).reshape(len(self.free), size)
+        return np.array(self.free, float).reshape(len(self.free), len(self.parameters))
 
     @property
     def triads(self) -> list[TriadCalibration]:
@@ -341,44 +341,40 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
 
     def _measured(
         self, readings: Readings
-    ) -> Iterator[tuple[TriadCalibration, slice, slice, Array]]:
-        """Triads with readings: where their vector and their parameters lie, and the readings."""
-        start = 0
+    ) -> Iterator[tuple[TriadCalibration, Model, tuple[Array, Array, Array], slice]]:
+        """Triads with readings, their models and what these take, and where their vectors lie."""
+        temperature = self._temperature(readings)
         for index, triad in enumerate(self.triads):
-            end, raw = start + len(triad.parameters), getattr(readings, triad.name)
+            raw, model = getattr(readings, triad.name), triad.functions(self.reference_temperature)
             if raw is not None:
-                yield triad, slice(3 * index, 3 * index + 3), slice(start, end), raw
-            start = end
+                at = np.array(triad.parameters), raw, temperature
+                yield triad, model, at, slice(3 * index, 3 * index + 3)
+
+    def _places(self) -> dict[str, slice]:
+        """Where the parameters of each triad lie."""
+        ends = np.cumsum([0, *(len(triad.parameters) for triad in self.triads)]).tolist()
+        return {t.name: slice(*pair) for t, pair in zip(self.triads, pairwise(ends), strict=True)}
 
     def fields(self, readings: Readings) -> tuple[Array, Array]:
         """Gravity (…, n, 3), g, and magnetic field (…, n, 3), nT: NaN without magnetometer."""
-        temperature = self._temperature(readings)
-        result = [np.full_like(readings.accelerometer, np.nan) for _ in range(2)]
-        for triad, vector, _, raw in self._measured(readings):
-            model = triad.functions(self.reference_temperature)
-            fields = model.fields(np.array(triad.parameters), raw, temperature)
-            result[vector.start // 3] = fields
-        return result[0], result[1]
+        fields = [model.fields(*at) for _, model, at, _ in self._measured(readings)]
+        return fields[0], fields[1] if len(fields) > 1 else np.full_like(fields[0], np.nan)
 
     def jacobian(self, readings: Readings) -> Array:
         """Derivative (…, n, 6, p) of both vectors with respect to the parameters of all triads."""
-        temperature = self._temperature(readings)
-        size = sum(len(t.parameters) for t in self.triads)
-        result = np.zeros((*readings.accelerometer.shape[:-1], 6, size))
-        for triad, vector, own, raw in self._measured(readings):
-            model = triad.functions(self.reference_temperature)
-            result[..., vector, own] = model.jacobian(np.array(triad.parameters), raw, temperature)
+        places = self._places()
+        result = np.zeros((*readings.accelerometer.shape[:-1], 6, len(self.parameters)))
+        for triad, model, at, vector in self._measured(readings):
+            result[..., vector, places[triad.name]] = model.jacobian(*at)
         return result
 
     def noise_covariance(self, readings: Readings) -> Array:
         """Covariance (…, n, 6, 6) of both vectors from the noise of one reading."""
-        temperature = self._temperature(readings)
         result = np.zeros((*readings.accelerometer.shape[:-1], 6, 6))
-        for triad, vector, _, raw in self._measured(readings):
-            model = triad.functions(self.reference_temperature)
-            slope = model.slope(np.array(triad.parameters), raw, temperature)
-            sd = np.broadcast_to(readings.sd.get(triad.name, np.array(triad.noise)), raw.shape)
-            result[..., vector, vector] = slope * sd[..., None, :] ** 2 @ np.swapaxes(slope, -1, -2)
+        for triad, model, at, vector in self._measured(readings):
+            slope = model.slope(*at)
+            sd = np.broadcast_to(readings.sd.get(triad.name, np.array(triad.noise)), at[1].shape)
+            result[..., vector, vector] = slope * sd[..., None, :] ** 2 @ slope.mT
         return result
 
     def _gradient(self, name: str, readings: Readings) -> Array:
@@ -408,19 +404,21 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
         Raises:
             InputError: an observable is unknown.
         """
-        _check_observables(names)
+        for name in names:
+            if name not in OBSERVABLES:
+                raise InputError(
+                    f"`names` must be observables ({', '.join(OBSERVABLES)}); got {name!r}. "
+                    "Correct the name."
+                )
         rows = np.stack([self.sensitivity(name, readings) for name in names], -2)
         total = np.einsum("...ai,ij,...bj->...ab", rows, self.parameter_covariance, rows)
         if noise:
             rows = np.stack([self._gradient(name, readings) for name in names], -2)
             reading = self.noise_covariance(readings)
             total = total + np.einsum("...ai,...ij,...bj->...ab", rows, reading, rows)
-        blank = np.stack([self.rests_on_free(n, readings) | self._lacks(n) for n in names], -1)
+        lacking = () if self.has_field else MAGNETIC
+        blank = np.stack([self.rests_on_free(n, readings) | (n in lacking) for n in names], -1)
         return np.where(blank[..., :, None] | blank[..., None, :], np.nan, total)
-
-    def _lacks(self, name: str) -> bool:
-        """Whether an observable needs a magnetometer that was not calibrated."""
-        return name in MAGNETIC and not self.has_field
 
     def expanded_uncertainty(
         self, name: str, readings: Readings, probability: float = 0.95
@@ -435,14 +433,11 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
         from scipy.special import stdtrit
 
         rows, covariance = self.sensitivity(name, readings), self.parameter_covariance
-        start, spread = 0, np.zeros(rows.shape[:-1])
-        for triad in self.triads:
-            own = slice(start, start + len(triad.parameters))
-            part = np.einsum(
-                "...i,ij,...j->...", rows[..., own], covariance[own, own], rows[..., own]
-            )
-            spread = spread + part**2 / max(triad.degrees_of_freedom, 1.0)
-            start += len(triad.parameters)
+        spread = np.zeros(rows.shape[:-1])
+        for triad, where in zip(self.triads, self._places().values(), strict=True):
+            part = rows[..., where]
+            variance = np.einsum("...i,ij,...j->...", part, covariance[where, where], part)
+            spread = spread + variance**2 / max(triad.degrees_of_freedom, 1.0)
         sd = self.uncertainty(name, readings)
         freedom = np.maximum(sd**4 / np.where(spread > 0, spread, 1.0), 1.0)
         width = np.asarray(sd * stdtrit(freedom, (1 + probability) / 2))
@@ -461,7 +456,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
         """
         g, _ = self.fields(readings)
         rows = self.jacobian(readings)[..., :2, :] / np.linalg.norm(g, axis=-1)[..., None, None]
-        spread = rows @ self.parameter_covariance @ np.swapaxes(rows, -1, -2)
+        spread = rows @ self.parameter_covariance @ rows.mT
         half, odd = (spread[..., 0, 0] + spread[..., 1, 1]) / 2, spread[..., 0, 1]
         largest = half + np.hypot((spread[..., 0, 0] - spread[..., 1, 1]) / 2, odd)
         factor = freedom * np.expm1(-2 / freedom * np.log1p(-probability))
@@ -497,9 +492,9 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
     def margin(self) -> float:
         """Degrees Celsius by which a reading may lie outside the calibrated range.
 
-        A calibration without temperature terms holds for the soak it was made in: `soaks.GAP`.
+        A calibration without temperature terms holds for the soak it was made in: `soaks.SOAK_GAP`.
         """
-        return MARGIN if any(t.order for t in self.triads) else GAP
+        return MARGIN if any(t.order for t in self.triads) else SOAK_GAP
 
     def outside(self, readings: Readings, margin: float | None = None) -> Bools:
         """Stations (…, n) outside the calibrated temperature range by more than a margin, °C.
@@ -524,16 +519,6 @@ def html_table(caption: str, rows: Iterable[tuple[str, ...]]) -> str:
     lines = ("".join(f"<td>{escape(cell)}</td>" for cell in row) for row in rows)
     body = "".join(f"<tr>{line}</tr>" for line in lines)
     return f"<table><caption>{escape(caption)}</caption>{body}</table>"
-
-
-def _check_observables(names: Sequence[str]) -> None:
-    """Refuse names that are not observables."""
-    unknown = [name for name in names if name not in OBSERVABLES]
-    if unknown:
-        raise InputError(
-            f"`names` must be observables ({', '.join(OBSERVABLES)}); got {unknown[0]!r}. "
-            "Correct the name."
-        )
 
 
 def rounded(calibration: Calibration) -> Calibration:

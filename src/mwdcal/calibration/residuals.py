@@ -14,7 +14,7 @@ from mwdcal.calibration.readings import TRIADS, Readings
 from mwdcal.calibration.record import ErrorRow, Measures, StationRow, stated
 from mwdcal.estimation.evidence import STAND_ERRORS
 from mwdcal.estimation.uncertainty import Analysis, station_misfit, without_station
-from mwdcal.geometry.observables import OBSERVABLES, VERTICAL
+from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array, Bools
 
 SHOWN = ("gravity", "inclination", "toolface", "azimuth", "field", "dip")
@@ -56,10 +56,10 @@ def error_weight(name: str, inclination: Array, g: Array) -> Array:
     NaN, that of g (…, n, 3) counts. Singular: NaN exactly at vertical, where toolface and azimuth
     do not exist.
     """
-    own = OBSERVABLES["inclination"].value(g, g)
     if name not in ("toolface", "azimuth"):
-        return np.ones(own.shape)
-    across = np.sin(np.where(np.isnan(inclination), own, inclination))
+        return np.ones(g.shape[:-1])
+    measured = OBSERVABLES["inclination"].value(g, g)
+    across = np.sin(np.where(np.isnan(inclination), measured, inclination))
     return np.where(across < LEAST_ACROSS, np.nan, across)
 
 
@@ -108,9 +108,8 @@ class Residuals:
     @cached_property
     def targets(self) -> tuple[Array, Array]:
         """Vectors (n, 3) each that a perfect tool would read at the fitted attitudes."""
-        attitude, (g, b) = self.fit.state.attitude[0], self.fit.problem.earth(self.fit.state)[0]
-        first, second = (np.einsum("nij,nj->ni", attitude, e[0]) for e in (g, b))
-        return first, second
+        g, b = self.fit.problem.targets(self.fit.state)
+        return g[0], b[0]
 
     def known(self, name: str) -> Array:
         """Reference (n,) of an observable: given, or the estimated constant; NaN where unknown.
@@ -128,14 +127,9 @@ class Residuals:
 
     def _stood(self, name: str) -> Array:
         """An angle (n,) of the fitted attitudes; at vertical, where two do not exist, as given."""
-        attitude, given = self.fit.state.attitude[0], self.fit.problem.evidence.known[name][0]
-        axis, down = attitude[:, 2], attitude[:, :, 2]
-        across = np.hypot(axis[:, 0], axis[:, 1])
-        if name == "inclination":
-            return np.asarray(np.arctan2(across, axis[:, 2]))
-        pair = (axis[:, 1], axis[:, 0]) if name == "azimuth" else (-down[:, 0], -down[:, 1])
-        angle = np.mod(np.arctan2(*pair), 2 * np.pi)
-        return np.asarray(np.where(across > VERTICAL, angle, given))
+        north, _, down = np.moveaxis(self.fit.state.attitude[0], -1, 0)
+        angle = OBSERVABLES[name].value(down, north)
+        return np.where(np.isnan(angle), self.fit.problem.evidence.known[name][0], angle)
 
     def _weight(self, name: str) -> Array:
         """The weight (n,) of errors after the fit, zero where an observable does not exist."""
@@ -156,8 +150,8 @@ class Residuals:
 
         In units of the noise itself, whatever weight a station has.
         """
-        own = self.fit.problem.linear(self.fit.state).own
-        total = np.eye(own.shape[-2]) + own @ np.swapaxes(own, -1, -2)
+        private = self.fit.problem.linear(self.fit.state).private
+        total = np.eye(private.shape[-2]) + private @ private.mT
         inner = total @ _judged(self.fit).spread @ total
         return np.asarray(inner[0])
 
@@ -192,12 +186,12 @@ class Residuals:
     def left_out(self) -> tuple[Array, Array]:
         """Corrected vectors (n, 3) of each station, by the fit without it."""
         problem, state = self.fit.problem, self.fit.state
-        found = []
+        fields = []
         for triad, where, moved in zip(problem.triads, problem.slices(), self._moves, strict=True):
             params = state.params[:, where] + moved
             raw, temperature = triad.raw[0][:, None], problem.temperature[0][:, None]
-            found.append(triad.model.fields(params, raw, temperature)[:, 0])
-        return found[0], found[1] if len(found) > 1 else np.full_like(found[0], np.nan)
+            fields.append(triad.model.fields(params, raw, temperature)[:, 0])
+        return fields[0], fields[1] if len(fields) > 1 else np.full_like(fields[0], np.nan)
 
     def influence(self, name: str) -> Array:
         """Largest change (n,) that each station makes to an observable, at stations of the run."""
@@ -216,7 +210,45 @@ class Residuals:
     @cached_property
     def stations(self) -> list[StationRow]:
         """Errors of every station, with the ones to take again."""
-        return station_rows(self)
+        from scipy.special import ndtri
+
+        readings, fit = self.readings, self.fit
+        names = self.names()
+        chance = chances(fit)[0]
+        again, deviation = to_reshoot(chance), -ndtri(np.maximum(chance, 1e-300) / 2)
+        after = {n: self.errors(n, self.after) for n in names}
+        before = {n: self.errors(n, nominal(readings)) for n in names}
+        left_out = {n: self.errors(n, self.left_out) for n in names}
+        influence = {n: self.influence(n) for n in names}
+        expected = {n: np.nan_to_num(self.expected(n), nan=np.inf) for n in names}
+        ratio = {n: np.abs(after[n]) / np.maximum(expected[n], 1e-30) for n in names}
+        factors = {n: shown_in(n, readings.relative)[0] for n in names}
+        attitude = {n: np.degrees(OBSERVABLES[n].value(*self.after)) for n in SHOWN[1:4]}
+        rows = []
+        for i in range(readings.count):
+            bad = bool(again[i])
+            scores = {n: float(ratio[n][i]) for n in names if not np.isnan(after[n][i])}
+            rows.append(
+                StationRow(
+                    station=readings.labels[i],
+                    digest=readings.digest[i] if readings.digest else "",
+                    temperature_c=None
+                    if readings.temperature is None
+                    else float(readings.temperature[i]),
+                    inclination_deg=stated(attitude["inclination"][i]),
+                    toolface_deg=stated(attitude["toolface"][i]),
+                    azimuth_deg=stated(attitude["azimuth"][i]),
+                    errors=_scaled(after, factors, i),
+                    errors_before=_scaled(before, factors, i),
+                    errors_left_out=_scaled(left_out, factors, i),
+                    influence=_scaled(influence, factors, i),
+                    weight=float(fit.trust[0, i]),
+                    deviation=float(deviation[i]),
+                    reshoot=bad,
+                    worst=max(scores, key=lambda n: scores[n]) if bad and scores else None,
+                )
+            )
+        return rows
 
     def names(self) -> list[str]:
         """Observables with an error that is known somewhere in this run."""
@@ -226,28 +258,21 @@ class Residuals:
 
 def error_rows(residuals: Residuals) -> list[ErrorRow]:
     """Root mean square errors before and after, and what was to be expected after."""
-    return [_error_row(residuals, name) for name in residuals.names()]
-
-
-def _error_row(residuals: Residuals, name: str) -> ErrorRow:
-    factor, unit = shown_in(name, residuals.readings.relative)
-    judged = residuals.judged(name)
-    before, after, expected = (
-        rms(values[judged]) * factor
-        for values in (
-            residuals.errors(name, nominal(residuals.readings)),
-            residuals.errors(name, residuals.after),
-            residuals.expected(name),
+    rows, before = [], nominal(residuals.readings)
+    for name in residuals.names():
+        factor, unit = shown_in(name, residuals.readings.relative)
+        judged = residuals.judged(name)
+        rows.append(
+            ErrorRow(
+                observable=name,
+                unit=unit,
+                stations=int(judged.sum()),
+                before=rms(residuals.errors(name, before)[judged]) * factor,
+                after=rms(residuals.errors(name, residuals.after)[judged]) * factor,
+                expected=stated(rms(residuals.expected(name)[judged]) * factor),
+            )
         )
-    )
-    return ErrorRow(
-        observable=name,
-        unit=unit,
-        stations=int(judged.sum()),
-        before=before,
-        after=after,
-        expected=stated(expected),
-    )
+    return rows
 
 
 def measure_rows(residuals: Residuals) -> list[Measures]:
@@ -268,16 +293,15 @@ def _judged(fit: Fit) -> Analysis:
     A weight w takes a station's pull on the fit, not its noise: with V = C⁻¹ the residual V ρ has
     the covariance V + (1 - 2 w) V X Cov XᵀV, from V - … at w = 1 to V + … where it is left out.
     """
-    trust, found = fit.trust[..., None, None], fit.analysis
+    trust, analysis = fit.trust[..., None, None], fit.analysis
     if (trust == 1).all():
-        return found
-    linear = fit.problem.linear(fit.state)
-    count = found.residual.shape[-1]
-    weight = linear.weigh(np.broadcast_to(np.eye(count), (*found.residual.shape, count)))
-    pulled = (weight - found.spread) / trust
+        return analysis
+    weight = fit.problem.linear(fit.state).weight
+    pulled = (weight - analysis.spread) / trust
     include = fit.problem.evidence.include[..., None, None]
     spread = (weight + (1 - 2 * trust) * pulled) * include
-    return replace(found, residual=found.residual / np.sqrt(fit.trust[..., None]), spread=spread)
+    residual = analysis.residual / np.sqrt(fit.trust[..., None])
+    return replace(analysis, residual=residual, spread=spread)
 
 
 def chances(fit: Fit) -> Array:
@@ -302,7 +326,7 @@ def tail(square: Array, freedom: Array) -> Array:
     >>> tail(np.array([3.841459, 5.991465]), np.array([1, 2])).round(6)
     array([0.05, 0.05])
     """
-    found = np.ones(square.shape)
+    chance = np.ones(square.shape)
     for degrees in np.unique(freedom[freedom > 0]):
         some = freedom == degrees
         half = np.minimum(square[some] / 2, 700)
@@ -311,8 +335,8 @@ def tail(square: Array, freedom: Array) -> Array:
         total = np.vectorize(erfc)(np.sqrt(half)) if degrees % 2 else small
         while power < degrees / 2:
             total, power = total + half**power * small / gamma(power + 1), power + 1
-        found[some] = total
-    return found
+        chance[some] = total
+    return chance
 
 
 def chi_chance(square: Array, freedom: Array) -> Array:
@@ -326,49 +350,6 @@ def chi_chance(square: Array, freedom: Array) -> Array:
     spread = 2 / (9 * np.maximum(freedom, 1e-9))
     normal = (np.cbrt(square / np.maximum(freedom, 1e-9)) - 1 + spread) / np.sqrt(2 * spread)
     return np.asarray(0.5 * np.vectorize(erfc, otypes=[float])(normal))
-
-
-def station_rows(residuals: Residuals) -> list[StationRow]:
-    """Errors of every station, with the ones to take again."""
-    from scipy.special import ndtri
-
-    readings, fit = residuals.readings, residuals.fit
-    names = residuals.names()
-    chance = chances(fit)[0]
-    again, deviation = to_reshoot(chance), -ndtri(np.maximum(chance, 1e-300) / 2)
-    after = {n: residuals.errors(n, residuals.after) for n in names}
-    before = {n: residuals.errors(n, nominal(readings)) for n in names}
-    left_out = {n: residuals.errors(n, residuals.left_out) for n in names}
-    influence = {n: residuals.influence(n) for n in names}
-    expected = {n: np.nan_to_num(residuals.expected(n), nan=np.inf) for n in names}
-    ratio = {n: np.abs(after[n]) / np.maximum(expected[n], 1e-30) for n in names}
-    factors = {n: shown_in(n, readings.relative)[0] for n in names}
-    attitude = {n: np.degrees(OBSERVABLES[n].value(*residuals.after)) for n in SHOWN[1:4]}
-    rows = []
-    for i in range(readings.count):
-        bad = bool(again[i])
-        scores = {n: float(ratio[n][i]) for n in names if not np.isnan(after[n][i])}
-        rows.append(
-            StationRow(
-                station=readings.labels[i],
-                digest=readings.digest[i] if readings.digest else "",
-                temperature_c=None
-                if readings.temperature is None
-                else float(readings.temperature[i]),
-                inclination_deg=stated(attitude["inclination"][i]),
-                toolface_deg=stated(attitude["toolface"][i]),
-                azimuth_deg=stated(attitude["azimuth"][i]),
-                errors=_scaled(after, factors, i),
-                errors_before=_scaled(before, factors, i),
-                errors_left_out=_scaled(left_out, factors, i),
-                influence=_scaled(influence, factors, i),
-                weight=float(fit.trust[0, i]),
-                deviation=float(deviation[i]),
-                reshoot=bad,
-                worst=max(scores, key=lambda n: scores[n]) if bad and scores else None,
-            )
-        )
-    return rows
 
 
 def _scaled(errors: dict[str, Array], factors: dict[str, float], index: int) -> dict[str, float]:

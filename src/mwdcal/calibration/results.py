@@ -24,7 +24,7 @@ from mwdcal.calibration.record import FREE_SHARE
 from mwdcal.estimation.batch import take
 from mwdcal.estimation.rank import Free
 from mwdcal.estimation.uncertainty import marginal_rank
-from mwdcal.geometry.vectors import Array, Bools
+from mwdcal.geometry.vectors import Array, Bools, diagonal, outer
 from mwdcal.sensor.models import Whole
 
 NOISE, SETTINGS, PRIOR = "noise of the readings", "settings of the stand", "prior"
@@ -58,8 +58,7 @@ class StatedCovariance:
         shares = {NOISE: self._independent - settings, SETTINGS: settings}
         for index, constant in enumerate(result.problem.evidence.constants):
             effect = result.analysis.effects[..., index]
-            outer = effect[:, :, None] * effect[:, None, :]
-            shares[constant.name] = shares.get(constant.name, 0.0) + outer
+            shares[constant.name] = shares.get(constant.name, 0.0) + outer(effect)
         shares |= {ORDER: self._order, PRIOR: _of_prior(result)}
         return {name: share for name, share in shares.items() if name == NOISE or share.any()}
 
@@ -67,7 +66,7 @@ class StatedCovariance:
     def _common(self) -> Array:
         """From errors that all stations share, and from a prior."""
         effects = self.result.analysis.effects
-        return np.asarray(effects @ np.swapaxes(effects, -1, -2) + _of_prior(self.result))
+        return np.asarray(effects @ effects.mT + _of_prior(self.result))
 
     @cached_property
     def _independent(self) -> Array:
@@ -90,9 +89,9 @@ def constants_covariance(result: Fit) -> Array:
     most = [np.full(len(scaled), np.inf) if c.unknown else c.sd for c in constants]
     if not most:
         return np.asarray(scaled)
-    sd = np.sqrt(np.maximum(np.diagonal(scaled, axis1=-2, axis2=-1), 1e-300))
+    sd = np.sqrt(np.maximum(diagonal(scaled), 1e-300))
     less = np.minimum(np.stack(most, -1) / sd, 1.0)
-    return np.asarray(scaled * less[:, :, None] * less[:, None, :])
+    return np.asarray(scaled * outer(less))
 
 
 def error_name(constant: str) -> str:
@@ -140,7 +139,7 @@ def assumed_exact(result: Fit, relative: bool) -> list[str]:
 def _scaled(result: Fit, covariance: Array) -> Array:
     sizes = [t.model.size for t in result.problem.triads]
     grown = np.repeat(np.sqrt(variance_scales(result)), sizes, axis=-1)
-    return np.asarray(covariance * grown[:, :, None] * grown[:, None, :])
+    return np.asarray(covariance * outer(grown))
 
 
 def _of_prior(result: Fit) -> Array:
@@ -160,13 +159,13 @@ def _of_settings(result: Fit) -> Array:
         return np.zeros_like(analysis.covariance)
     linear = problem.linear(result.state)
     if analysis.influence is None:
-        rows = np.swapaxes(linear.weigh(linear.design), -1, -2)
+        rows = linear.weigh(linear.design).mT
         p = linear.size
         moved = analysis.covariance[:, None] @ _reduced(rows, linear.normal.information, p)
     else:
         moved = analysis.influence[:, :, : linear.size]
-    own = moved @ linear.own
-    return np.asarray(np.einsum("bnia,bnja->bij", own, own, optimize=True))
+    effect = moved @ linear.private
+    return np.asarray(np.einsum("bnia,bnja->bij", effect, effect, optimize=True))
 
 
 def _reduced(rows: Array, information: Array, p: int) -> Array:
@@ -174,7 +173,7 @@ def _reduced(rows: Array, information: Array, p: int) -> Array:
     if rows.shape[2] == p:
         return rows
     cross = np.linalg.solve(information[:, p:, p:], information[:, p:, :p])
-    return np.asarray(rows[:, :, :p] - np.swapaxes(cross, -1, -2)[:, None] @ rows[:, :, p:])
+    return np.asarray(rows[:, :, :p] - cross.mT[:, None] @ rows[:, :, p:])
 
 
 @dataclass(frozen=True)
@@ -217,8 +216,8 @@ def triad_results(
         rows = free_rows([free[i] for i in some.tolist()], covariance.shape[-1])[..., where]
         moved = np.abs(np.einsum("bij,bkj->bki", to_file[some], rows)).max(1)
         part = take(result.problem, some)
-        own = part.triads[index].model.finished(reference)[0]
-        effect = _effect(own, values[some], part.triads[index].raw, part.temperature)
+        file_model = part.triads[index].model.finished(reference)[0]
+        effect = _effect(file_model, values[some], part.triads[index].raw, part.temperature)
         sd[some] = np.where(moved * effect > FREE_SHARE, np.nan, sd[some])
     declared, freedom = np.isnan(result.noise[:, index]), result.analysis.freedom[:, index]
     noise = reading_noise(result)[:, index]
@@ -265,14 +264,12 @@ def triad_singular_values(result: Fit, index: int) -> Array:
     """
     reduced, _, _ = result.problem.linear(result.state, geometry=True).normal.reduced()
     norms, where = result.analysis.determined.norms, result.problem.slices()[index]
-    scaled = reduced / (norms[:, :, None] * norms[:, None, :])
+    scaled = reduced / outer(norms)
     other = np.ones(norms.shape[-1], bool)
     other[where] = False
     cross = scaled[:, other][..., where]
     inverse = np.linalg.pinv(scaled[:, other][..., other], rcond=1e-6, hermitian=True)
-    values = np.linalg.eigvalsh(
-        scaled[:, where, where] - np.swapaxes(cross, -1, -2) @ inverse @ cross
-    )
+    values = np.linalg.eigvalsh(scaled[:, where, where] - cross.mT @ inverse @ cross)
     values = np.sqrt(np.clip(values[:, ::-1], 0, None))
     return np.asarray(values / values[:, :1])
 

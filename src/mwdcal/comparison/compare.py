@@ -215,8 +215,7 @@ def _course(calibrated: _Calibrated) -> dict[str, Array]:
     """Excess of the swarm's best cost over the least one, as a share of it, by triad."""
     problem, state = calibrated.fit.problem, calibrated.fit.state
     courses = {}
-    for name, triad, earth in zip(TRIADS, problem.triads, problem.earth(state)[0], strict=False):
-        target = np.einsum("bnij,bnj->bni", state.attitude, earth)
+    for name, triad, target in zip(TRIADS, problem.triads, problem.targets(state), strict=False):
         swarm = swarm_forward(
             triad.raw, target, "reading", iterations=SWARM_ITERATIONS, seed=calibrated.options.seed
         )

@@ -31,6 +31,7 @@ from mwdcal.geometry.vectors import (
     earth_gravity,
     eigen,
     inverse,
+    outer,
     rotation,
     skew,
 )
@@ -55,13 +56,13 @@ class Triad:
 class State:
     """Where a fit stands: parameters (B, p), attitudes (B, n, 3, 3), constants (B, q).
 
-    `own` (B, n, a) are the stations' own departures of the absent strengths and dip.
+    `departures` (B, n, a) are what each station's own strengths and dip add where they are absent.
     """
 
     params: Array
     attitude: Array
     constants: Array
-    own: Array
+    departures: Array
 
 
 @dataclass(frozen=True)
@@ -94,11 +95,11 @@ class Prior:
         those of the data's columns.
         """
         norms = np.where(norms > 0, norms, 1.0)  # of what the data say nothing of
-        outer = norms[:, :, None] * norms[:, None, :]
-        values, vectors = eigen(self.precision / outer)
+        scales = outer(norms)
+        values, vectors = eigen(self.precision / scales)
         informed = values > INFORMED * np.maximum(values[:, -1:], 1e-300)
         known = vectors * informed[:, None, :]
-        return np.asarray(known @ np.swapaxes(known, -1, -2) * outer)
+        return np.asarray(known @ known.mT * scales)
 
 
 @dataclass
@@ -137,11 +138,11 @@ class Problem:
 
     def fields(self, state: State) -> tuple[Array, Array]:
         """Corrected vectors (B, n, 3) of both triads, left-out stations too; NaN for a missing one."""
-        found = [
+        fields = [
             triad.model.fields(state.params[:, where], triad.raw, self.temperature)
             for triad, where in zip(self.triads, self.slices(), strict=True)
         ]
-        return found[0], found[1] if len(found) > 1 else np.full_like(found[0], np.nan)
+        return fields[0], fields[1] if len(fields) > 1 else np.full_like(fields[0], np.nan)
 
     def constant(self, state: State, name: str) -> Array:
         """Value (B, n) of gravity, field or dip at each station."""
@@ -150,28 +151,24 @@ class Problem:
             if constant.name == name:
                 value = value + constant.mask * state.constants[:, index, None]
         if name in self.evidence.absent:
-            value = value + state.own[..., self.evidence.absent.index(name)]
+            value = value + state.departures[..., self.evidence.absent.index(name)]
         return np.asarray(value)
 
-    def earth(self, state: State) -> tuple[list[Array], list[Array]]:
-        """Earth vectors (B, n, 3) of each triad, and (B, n, 3, 3) by gravity, field and dip."""
+    def _by_earth(self, state: State) -> list[Array]:
+        """Derivatives (B, n, 3, 3) of both earth vectors by gravity, field and dip."""
         gravity, field, dip = (self.constant(state, c) for c in EARTH)
-        vectors = self.vectors(state)
-        zero = np.zeros_like(vectors[0])
+        zero = np.zeros((*gravity.shape, 3))
         slopes = [
             [earth_gravity(np.ones_like(gravity)), zero, zero],
             [zero, earth_field(np.ones_like(field), dip), earth_field(field, dip + np.pi / 2)],
         ]
-        return vectors, [np.stack(columns, -1) for columns in slopes]
-
-    def vectors(self, state: State) -> list[Array]:
-        """Earth vectors (B, n, 3) of each triad: gravity, then the field."""
-        gravity, field, dip = (self.constant(state, c) for c in EARTH)
-        return [earth_gravity(gravity), earth_field(field, dip)]
+        return [np.stack(columns, -1) for columns in slopes]
 
     def targets(self, state: State) -> list[Array]:
         """Vectors (B, n, 3) that perfect triads would read: gravity, then the field."""
-        return [np.einsum("bnij,bnj->bni", state.attitude, e) for e in self.vectors(state)]
+        gravity, field, dip = (self.constant(state, c) for c in EARTH)
+        earth = earth_gravity(gravity), earth_field(field, dip)
+        return [np.einsum("bnij,bnj->bni", state.attitude, vector) for vector in earth]
 
     def predictions(self, state: State) -> list[Prediction]:
         """Compare each triad's readings with the reference vectors; the last answer is kept."""
@@ -180,13 +177,11 @@ class Problem:
         return memo.predictions
 
     def _predictions(self, state: State) -> list[Prediction]:
-        vectors, slopes = self.earth(state)
         result = []
-        for triad, where, earth, change in zip(
-            self.triads, self.slices(), vectors, slopes, strict=False
+        for triad, where, target, change in zip(
+            self.triads, self.slices(), self.targets(state), self._by_earth(state), strict=False
         ):
             params = state.params[:, where]
-            target = np.einsum("bnij,bnj->bni", state.attitude, earth)
             field = triad.model.fields(params, triad.raw, self.temperature)
             back = inverse(triad.model.slope(params, triad.raw, self.temperature))
             misfit = np.einsum("bnij,bnj->bni", back, field - target)
@@ -213,50 +208,41 @@ class Problem:
         return memo.linear[geometry]
 
     def _linear(self, state: State, geometry: bool) -> Linear:
-        predictions = self.predictions(state)
-        weights = self._weights(predictions, geometry)
-        residual = np.concatenate(
-            [p.misfit * w for p, w in zip(predictions, weights, strict=True)], -1
-        )
-        turns, by_earth = self._station_columns(predictions, weights)
-        blocks = [p.by_params * w[..., None] for p, w in zip(predictions, weights, strict=True)]
+        pairs = self._weighted(state, geometry)
+        residual = np.concatenate([p.misfit * w for p, w in pairs], -1)
+        blocks = [p.by_params * w[..., None] for p, w in pairs]
+        turns, by_earth = self.station_columns(state, geometry)
         groups = np.concatenate(self._group_turns(state, turns), -1)
         constants = self._constant_columns(state, by_earth, turns, geometry)
         shared = np.concatenate([constants, groups], -1)
         private = [turns @ self._own_turns(state, geometry), self._own_earth(state, by_earth)]
         if self.evidence.scatter and not geometry:
-            columns = self._scatter_columns(state, turns, by_earth)
-            scatter = self.evidence.scatter
+            columns, scatter = self.scatter_columns(state), self.evidence.scatter
             private += [c * scatter[name][..., None, None] for name, c in columns.items()]
-        own = np.concatenate(private, -1)
         prior, pull = self._prior(state, blocks, shared.shape[-1], geometry)
-        return Linear(residual, tuple(blocks), shared, own, prior, pull)
+        return Linear(residual, tuple(blocks), shared, np.concatenate(private, -1), prior, pull)
 
-    def _station_columns(
-        self, predictions: list[Prediction], weights: list[Array]
-    ) -> tuple[Array, Array]:
+    def station_columns(self, state: State, geometry: bool = False) -> tuple[Array, Array]:
         """Whitened rows (B, n, m, 3) by a turn of the station, and by its gravity, field and dip."""
-        pairs = list(zip(predictions, weights, strict=True))
+        pairs = self._weighted(state, geometry)
         turns = np.concatenate([p.by_turn * w[..., None] for p, w in pairs], -2)
         return turns, np.concatenate([p.by_earth * w[..., None] for p, w in pairs], -2)
 
     def scatter_columns(self, state: State) -> dict[str, Array]:
-        """Whitened rows (B, n, m, k) by a departure of one in each of the evidence's `scatter`."""
-        predictions = self.predictions(state)
-        columns = self._station_columns(predictions, self._weights(predictions, geometry=False))
-        return self._scatter_columns(state, *columns)
+        """Whitened rows (B, n, m, k) by a departure of one in each of the evidence's `scatter`.
 
-    def _scatter_columns(self, state: State, turns: Array, by_earth: Array) -> dict[str, Array]:
-        """The same from the rows by a turn and by the earth: a direction turns about x and y."""
-        found = {}
+        A direction turns about x and y.
+        """
+        turns, by_earth = self.station_columns(state)
+        columns = {}
         for name in self.evidence.scatter:
             if name == "direction":
                 sharing = self.evidence.shared("inclination").sum(-1)
-                found[name] = turns[..., :2] * sharing[..., None, None]
+                columns[name] = turns[..., :2] * sharing[..., None, None]
                 continue
             size = 1.0 if name == "dip" else self.constant(state, name)[..., None, None]
-            found[name] = by_earth[..., [EARTH.index(name)]] * size
-        return found
+            columns[name] = by_earth[..., [EARTH.index(name)]] * size
+        return columns
 
     def _constant_columns(
         self, state: State, by_earth: Array, turns: Array, geometry: bool
@@ -300,15 +286,14 @@ class Problem:
         chosen = [EARTH.index(name) for name in self.evidence.absent]
         return np.asarray(by_earth[..., chosen] * self._own_scales(state)[..., None, :])
 
-    def _weights(self, predictions: list[Prediction], geometry: bool) -> list[Array]:
-        """One over the noise (B, n, 3), zero for stations left out."""
-        include = self.evidence.include[..., None]
+    def _weighted(self, state: State, geometry: bool) -> list[tuple[Prediction, Array]]:
+        """Predictions, each with one over its noise (B, n, 3), zero for stations left out."""
+        include, predictions = self.evidence.include[..., None], self.predictions(state)
+        weights = [include / t.sd for t in self.triads]
         if geometry:
-            return [
-                np.broadcast_to(include / (GEOMETRIC_NOISE * p.strength[..., None]), p.misfit.shape)
-                for p in predictions
-            ]
-        return [include / t.sd for t in self.triads]
+            noise = [GEOMETRIC_NOISE * p.strength[..., None] for p in predictions]
+            weights = [include / each + np.zeros(3) for each in noise]
+        return list(zip(predictions, weights, strict=True))
 
     def _prior(
         self, state: State, blocks: list[Array], shared: int, geometry: bool
@@ -320,12 +305,12 @@ class Problem:
         p, constants = state.params.shape[-1], self.evidence.constants
         pull = np.zeros((len(state.params), p + shared))
         pull[:, :p] = state.params - self.prior.expected
-        own = np.full(pull.shape, UNKNOWN**-2)
+        diagonal = np.full(pull.shape, UNKNOWN**-2)
         for index, constant in enumerate(constants):
-            own[:, p + index] = constant.sd**-2
+            diagonal[:, p + index] = constant.sd**-2
             if not constant.unknown:
                 pull[:, p + index] = state.constants[:, index] - constant.value
-        precision = own[..., None] * np.eye(own.shape[-1])
+        precision = diagonal[..., None] * np.eye(diagonal.shape[-1])
         known = self.prior.precision
         if geometry and known.any():
             norms = [np.sqrt(np.sum(block**2, (1, 2))) for block in blocks]
@@ -415,14 +400,14 @@ class Problem:
     def move(self, state: State, linear: Linear, step: Array) -> State:
         """The state after a step; unknown private angles follow, known ones stay at their reference."""
         p, q = linear.size, len(self.evidence.constants)
-        private = linear.private(step)
+        private = linear.private_step(step)
         attitude = self._turn_stand(state, step[:, p : p + q])
         attitude = self._turn_groups(replace(state, attitude=attitude), step[:, p + q :])
         attitude = self._turn_stations(state, attitude, private[..., :3])
-        absent = private[..., 3 : 3 + state.own.shape[-1]]
-        own = state.own + absent * self._own_scales(state)
+        absent = private[..., 3 : 3 + state.departures.shape[-1]]
+        departures = state.departures + absent * self._own_scales(state)
         constants = state.constants + step[:, p : p + q]
-        return State(state.params + step[:, :p], attitude, constants, own)
+        return State(state.params + step[:, :p], attitude, constants, departures)
 
     def _turn_stand(self, state: State, constants: Array) -> Array:
         attitude = state.attitude
@@ -437,21 +422,18 @@ class Problem:
         half = turns.shape[-1] // 2
         if not half:
             return state.attitude
-        first, second = self._group_axes(state)
-        attitude = state.attitude
-        for axis, name, turn in (
-            (first, "inclination", turns[:, :half]),
-            (second, "azimuth", turns[:, half:]),
-        ):
+        attitude, parts = state.attitude, (turns[:, :half], turns[:, half:])
+        names = ("inclination", "azimuth")
+        for axis, name, turn in zip(self._group_axes(state), names, parts, strict=True):
             vector = np.einsum("bnk,bk,bki->bni", self.evidence.shared(name), turn, axis)
             attitude = attitude @ rotation(vector)
         return attitude
 
     def _turn_stations(self, state: State, attitude: Array, private: Array) -> Array:
-        own = self._own_turns(state, geometry=True)
-        if not own.any():
+        axes = self._own_turns(state, geometry=True)
+        if not axes.any():
             return attitude
-        turn = own * private[..., None, :]
+        turn = axes * private[..., None, :]
         free = rotation(np.sum(turn, -1)) @ attitude
         about_down = np.zeros_like(turn[..., 0])
         about_down[..., 2] = np.einsum("bni,bni->bn", turn[..., 1], state.attitude[..., :, 2])
@@ -460,10 +442,5 @@ class Problem:
 
     def size_of(self, state: State) -> Array:
         """Largest parameter of each triad (B, p): steps far below it are rounding."""
-        parts = [
-            np.broadcast_to(
-                np.max(np.abs(state.params[:, w]), -1, keepdims=True), state.params[:, w].shape
-            )
-            for w in self.slices()
-        ]
-        return np.concatenate(parts, -1)
+        parts = [state.params[:, where] for where in self.slices()]
+        return np.concatenate([0 * p + np.abs(p).max(-1, keepdims=True) for p in parts], -1)

@@ -63,7 +63,7 @@ def _named(problem: Problem, state: State, determined: Determined, count: int) -
         clear = score > COUPLED
         used[members, best] |= clear
         chosen = scaled[members, best]
-        part = (null @ (np.swapaxes(null, -1, -2) @ chosen[..., None]))[..., 0]
+        part = (null @ (null.mT @ chosen[..., None]))[..., 0]
         chosen = np.where((score < EXACT)[:, None], part, chosen)
         chosen = np.where(clear[:, None], chosen, null[..., -1])
         for place, index in enumerate(best):
@@ -93,7 +93,7 @@ def _weak(problem: Problem, direction: Array) -> tuple[str, tuple[int, ...]]:
 
 def _without(null: Array, direction: Array) -> Array:
     """Null spaces (B, p, k) less their part along a direction (B, p), as orthonormal bases."""
-    inside = (np.swapaxes(null, -1, -2) @ direction[..., None])[..., 0]
+    inside = (null.mT @ direction[..., None])[..., 0]
     length = np.linalg.norm(inside, axis=-1, keepdims=True)
     inside = inside / np.where(length > 0, length, 1.0)
     size = null.shape[-1]

@@ -38,9 +38,9 @@ def regress(raw: Array, vectors: Array, weight: Array) -> Regression:
     size = np.sqrt(np.einsum("...na,...ni->...ai", weight, terms**2))
     size = np.where(size > 0, size, 1.0)
     scaled = terms[..., None, :, :] / size[..., None, :]
-    weighed = scaled * np.swapaxes(weight, -1, -2)[..., None]
-    information = np.swapaxes(weighed, -1, -2) @ scaled
-    sums = np.swapaxes(scaled, -1, -2) @ (weight * raw)[..., None, :, :]
+    weighed = scaled * weight.mT[..., None]
+    information = weighed.mT @ scaled
+    sums = scaled.mT @ (weight * raw)[..., None, :, :]
     cofactor = inverse(information)
     by_axis = cofactor @ sums / size[..., None]
     by_axis = np.broadcast_to(by_axis, (*by_axis.shape[:-3], 3, 4, 3))

@@ -1,10 +1,10 @@
 """Gauss-Newton with Levenberg-Marquardt damping, on the determined subspace, for a batch.
 
 A problem linearises to residual rows per station, ρ + X δ, where X holds the columns of
-all parameters and shared unknowns, and `own` the columns of the station's private unknowns
+all parameters and shared unknowns, and `private` the columns of the station's private unknowns
 (attitude turns scaled to unit prior variance). Private unknowns are marginalised exactly:
 
-    C⁻¹ = I - G (I + GᵀG)⁻¹ Gᵀ,     G = own columns
+    C⁻¹ = I - G (I + GᵀG)⁻¹ Gᵀ,     G = private columns
 
 so a known angle (small σ), an unknown one (σ = π/√3) and everything between is one path.
 Shared unknowns (field strength, dip, group directions) are eliminated by a Schur complement.
@@ -12,6 +12,7 @@ Shared unknowns (field strength, dip, group directions) are eliminated by a Schu
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property
@@ -20,7 +21,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from mwdcal.estimation.batch import put, take
-from mwdcal.geometry.vectors import Array, Bools, Ints, eigen, inverse
+from mwdcal.geometry.vectors import Array, Bools, Ints, diagonal, eigen, inverse, outer
 
 RANK_TOLERANCE = 2e-2
 """Singular values of the column-normalised design below this share of the largest are free."""
@@ -56,7 +57,7 @@ class Linear:
     """A problem at one state: ρ (B, n, m) and its columns X by u unknowns, private ones apart.
 
     X has the columns of each triad's parameters in `blocks`, (B, n, m_t, p_t) for the rows of that
-    triad alone, then `shared` (B, n, m, s). `own` (B, n, m, a) are the private unknowns. `prior`
+    triad alone, then `shared` (B, n, m, s). `private` (B, n, m, a) are the private unknowns. `prior`
     (B, u, u) is the precision of X's unknowns, `pull` (B, u) their departure from the prior value
     (zero where unknown).
     """
@@ -64,7 +65,7 @@ class Linear:
     residual: Array
     blocks: tuple[Array, ...]
     shared: Array
-    own: Array
+    private: Array
     prior: Array
     pull: Array
 
@@ -73,17 +74,20 @@ class Linear:
         """Number p of model parameters, at the head of X."""
         return sum(block.shape[-1] for block in self.blocks)
 
+    def _placed(self) -> Iterator[tuple[Array, slice, slice]]:
+        """Each triad's block of X, with the rows and columns where it lies."""
+        row = column = 0
+        for block in self.blocks:
+            below, right = row + block.shape[-2], column + block.shape[-1]
+            yield block, slice(row, below), slice(column, right)
+            row, column = below, right
+
     @cached_property
     def design(self) -> Array:
         """X (B, n, m, u) as one array."""
-        rows = sum(block.shape[-2] for block in self.blocks)
-        lead = self.residual.shape[:-1]
-        whole = np.zeros((*lead, rows, self.size + self.shared.shape[-1]))
-        row = column = 0
-        for block in self.blocks:
-            height, width = block.shape[-2:]
-            whole[..., row : row + height, column : column + width] = block
-            row, column = row + height, column + width
+        whole = np.zeros((*self.residual.shape, self.size + self.shared.shape[-1]))
+        for block, rows, columns in self._placed():
+            whole[..., rows, columns] = block
         whole[..., self.size :] = self.shared
         return whole
 
@@ -91,8 +95,8 @@ class Linear:
     def norms(self) -> Array:
         """Column norms (B, p) of the parameters, prior in: the scale in which rank is counted."""
         squares = np.concatenate([np.sum(b**2, (-3, -2)) for b in self.blocks], -1)
-        own = np.diagonal(self.prior, axis1=-2, axis2=-1)[..., : self.size]
-        return np.asarray(np.sqrt(squares + own))
+        known = diagonal(self.prior)[..., : self.size]
+        return np.asarray(np.sqrt(squares + known))
 
     @cached_property
     def normal(self) -> Normal:
@@ -113,25 +117,25 @@ class Linear:
     @cached_property
     def core(self) -> Array:
         """(I + GᵀG)⁻¹ (B, n, a, a)."""
-        gram = np.swapaxes(self.own, -1, -2) @ self.own
+        gram = self.private.mT @ self.private
         return np.asarray(inverse(np.eye(gram.shape[-1]) + gram))
 
     def weigh(self, columns: Array) -> Array:
         """C⁻¹ times columns (B, n, m, k)."""
-        return np.asarray(
-            columns - self.own @ (self.core @ (np.swapaxes(self.own, -1, -2) @ columns))
-        )
+        return np.asarray(columns - self.private @ (self.core @ (self.private.mT @ columns)))
 
-    def private(self, step: Array) -> Array:
+    @property
+    def weight(self) -> Array:
+        """C⁻¹ (B, n, m, m)."""
+        shape = (*self.residual.shape, self.residual.shape[-1])
+        return self.weigh(np.broadcast_to(np.eye(shape[-1]), shape))
+
+    def private_step(self, step: Array) -> Array:
         """Private unknowns (B, n, a), in their prior's units, after a step of X's unknowns."""
         moved = self.residual + np.einsum("bnms,bs->bnm", self.shared, step[:, self.size :])
-        row = column = 0
-        for block in self.blocks:
-            height, width = block.shape[-2:]
-            part = np.einsum("bnmp,bp->bnm", block, step[:, column : column + width])
-            moved[..., row : row + height] += part
-            row, column = row + height, column + width
-        pulled = np.swapaxes(self.own, -1, -2) @ moved[..., None]
+        for block, rows, columns in self._placed():
+            moved[..., rows] += np.einsum("bnmp,bp->bnm", block, step[:, columns])
+        pulled = self.private.mT @ moved[..., None]
         return np.asarray(-(self.core @ pulled)[..., 0])
 
 
@@ -164,10 +168,10 @@ class Normal:
         shared = -(H_ss⁻¹ g_s + E · step).
         """
         p = self.size
-        own, cross = self.information[..., :p, :p], self.information[..., p:, :p]
+        block, cross = self.information[..., :p, :p], self.information[..., p:, :p]
         eliminate = inverse(self.information[..., p:, p:]) @ cross
-        reduced = own - np.swapaxes(cross, -1, -2) @ eliminate
-        offset = np.swapaxes(eliminate, -1, -2) @ self.gradient[..., p:, None]
+        reduced = block - cross.mT @ eliminate
+        offset = eliminate.mT @ self.gradient[..., p:, None]
         return reduced, self.gradient[..., :p] - offset[..., 0], eliminate
 
 
@@ -195,7 +199,7 @@ class Determined:
         """
         norms = np.where(norms > 0, norms, 1.0)
         reduced, _, _ = geometry.reduced()
-        scaled = np.nan_to_num(reduced / (norms[..., :, None] * norms[..., None, :]))
+        scaled = np.nan_to_num(reduced / outer(norms))
         values, basis = eigen(scaled)
         values = np.sqrt(np.clip(values[..., ::-1], 0, None))
         values = values / np.maximum(values[..., :1], 1e-300)
@@ -204,8 +208,7 @@ class Determined:
     @classmethod
     def of(cls, problem: Linearisable, state: Any) -> Determined:
         """Of a problem at a state."""
-        linear = problem.linear(state, geometry=True)
-        return linear.determined
+        return problem.linear(state, geometry=True).determined
 
     @property
     def rank(self) -> Ints:
@@ -214,14 +217,12 @@ class Determined:
 
     def inverse(self, information: Array, damping: Array | float = 0.0) -> Array:
         """Inverse (B, p, p) of an information matrix on the determined subspace."""
-        scaled = information / (self.norms[..., :, None] * self.norms[..., None, :])
+        scales = outer(self.norms)
         kept = self.basis * self.keep[..., None, :]
-        inner = np.swapaxes(kept, -1, -2) @ scaled @ kept
-        diagonal = np.arange(inner.shape[-1])
-        extra = np.asarray(damping)[..., None] * inner[..., diagonal, diagonal]
-        inner[..., diagonal, diagonal] += np.where(self.keep, extra, 1.0)
-        outer = kept @ inverse(inner) @ np.swapaxes(kept, -1, -2)
-        return np.asarray(outer / (self.norms[..., :, None] * self.norms[..., None, :]))
+        inner = kept.mT @ (information / scales) @ kept
+        extra = np.asarray(damping)[..., None] * diagonal(inner)
+        np.einsum("...ii->...i", inner)[...] += np.where(self.keep, extra, 1.0)
+        return np.asarray(kept @ inverse(inner) @ kept.mT / scales)
 
     def null(self) -> Array:
         """Free directions (B, p, p) as columns in normalised units; determined ones are zero."""
@@ -309,10 +310,8 @@ class _Descent:
         if not converged.any():
             return converged
         which = np.flatnonzero(converged)
-        if converged.all():
-            now = Determined.of(self.problem, self.state)
-        else:
-            now = Determined.of(take(self.problem, which), take(self.state, which))
+        here = self.problem, self.state
+        now = Determined.of(*(here if converged.all() else take(here, which)))
         same = now.rank == self.determined.rank[which]
         if not same.all():
             self.determined = put(self.determined, which, now)

@@ -6,7 +6,7 @@ nominal values but for the orientation of the axes, and where all else fails.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -18,10 +18,12 @@ from mwdcal.geometry import observables
 from mwdcal.geometry.vectors import (
     Array,
     Bools,
+    diagonal,
     earth_field,
     earth_gravity,
     eigen,
     inverse,
+    quotient,
     rotation,
     tool_from_earth,
 )
@@ -49,7 +51,7 @@ def start(problem: Problem) -> State:
     params = [_triad_start(problem, empty, index) for index in range(len(problem.triads))]
     values = np.concatenate(params, -1)
     for where in problem.slices():
-        known = np.diagonal(problem.prior.precision[:, where, where], axis1=-2, axis2=-1) > 0
+        known = diagonal(problem.prior.precision[:, where, where]) > 0
         whole = known.all(-1, keepdims=True)
         values[:, where] = np.where(whole, problem.prior.expected[:, where], values[:, where])
     state = replace(empty, params=values)
@@ -77,7 +79,7 @@ def _ellipsoid(x: Array, strength: Array, include: Array) -> tuple[Array, Array]
     i, j = np.triu_indices(3)
     features = np.concatenate([x[..., i] * x[..., j] * np.where(i == j, 1.0, 2.0), 2 * x], -1)
     weighed = features * include[..., None]
-    gram = np.swapaxes(weighed, -1, -2) @ features
+    gram = weighed.mT @ features
     size = np.sum(x * x * include[..., None], (-2, -1)) / np.sum(include, -1)
     sphere = np.concatenate([np.eye(3)[i, j], np.zeros(3)]) / np.maximum(size, 1e-300)[:, None]
     left = np.sum(weighed, -2) - np.einsum("bij,bj->bi", gram, sphere)
@@ -107,8 +109,7 @@ def _where_determined(gram: Array, right: Array) -> Array:
     values, vectors = eigen(gram)
     kept = values > ELLIPSOID_SPAN**2 * values[:, -1:]
     along = np.einsum("bij,bi->bj", vectors, right)
-    along = np.where(kept, along / np.where(kept, values, 1.0), 0.0)
-    return np.asarray(np.einsum("bij,bj->bi", vectors, along))
+    return np.asarray(np.einsum("bij,bj->bi", vectors, quotient(along, values, kept)))
 
 
 def _linear(problem: Problem, state: State, index: int, x: Array) -> tuple[Array, Array, Bools]:
@@ -139,7 +140,7 @@ def _linear(problem: Problem, state: State, index: int, x: Array) -> tuple[Array
     forward = regress(x, target, weight[..., None]).forward
     usable = usable & np.isfinite(forward).all((-1, -2))
     forward = np.where(usable[:, None, None], forward, np.eye(4, 3))
-    back = inverse(np.swapaxes(forward[:, :3], -1, -2))
+    back = inverse(forward[:, :3].mT)
     return back, -np.einsum("bij,bj->bi", back, forward[:, 3]), np.asarray(usable)
 
 
@@ -172,10 +173,7 @@ def _unknown_dip(
 def _attitudes(problem: Problem, state: State) -> State:
     """Fill unknown angles from the start's own fields, share directions, find unknown turns."""
     evidence = problem.evidence
-    fields = [
-        triad.model.fields(state.params[:, where], triad.raw, problem.temperature)
-        for triad, where in zip(problem.triads, problem.slices(), strict=True)
-    ]
+    fields = problem.fields(state)[: len(problem.triads)]
     g = fields[0]
     b = fields[1] if len(fields) > 1 else np.broadcast_to(np.array([0.0, 0.0, 1.0]), g.shape)
     guess = {name: np.nan_to_num(observables.OBSERVABLES[name].value(g, b)) for name in ANGLES}
@@ -184,16 +182,15 @@ def _attitudes(problem: Problem, state: State) -> State:
     state = _with_own(problem, _with_dip(problem, state, g, b), g, b)
     attitude = tool_from_earth(*(angles[name] for name in ANGLES))
     weights = [1 / np.maximum(np.linalg.norm(f, axis=-1), 1e-30) ** 2 for f in fields]
-    earth = problem.earth(state)[0]
-    targets = [np.einsum("bnij,bnj->bni", attitude, each) for each in earth]
+    targets = problem.targets(replace(state, attitude=attitude))
     along = np.broadcast_to(np.array([0.0, 0.0, 1.0]), g.shape)
     turn = best_turn(fields, targets, weights, along)
-    attitude = _turned(attitude, along, np.where(evidence.is_known("toolface"), 0.0, turn))
-    return replace(state, attitude=attitude)
+    turn = np.where(evidence.is_known("toolface"), 0.0, turn)
+    return replace(state, attitude=rotation(along * turn[..., None]) @ attitude)
 
 
 def best_turn(
-    fields: list[Array], targets: list[Array], weights: list[Array], axis: Array
+    fields: Sequence[Array], targets: Sequence[Array], weights: Sequence[Array], axis: Array
 ) -> Array:
     """Angle (B, n) about a unit axis that brings targets closest to fields, in closed form."""
     sine, cosine = np.zeros(axis.shape[:-1]), np.zeros(axis.shape[:-1])
@@ -204,17 +201,13 @@ def best_turn(
     return np.asarray(np.arctan2(sine, cosine))
 
 
-def _turned(attitude: Array, axis: Array, angle: Array) -> Array:
-    return rotation(axis * angle[..., None]) @ attitude
-
-
 def _share(problem: Problem, angles: dict[str, Array]) -> dict[str, Array]:
     """Stations of a group whose direction is unknown start from their mean direction."""
     evidence = problem.evidence
     inc, azi = angles["inclination"], angles["azimuth"]
     axis = tool_from_earth(inc, azi, np.zeros_like(inc))[..., 2, :]
     members = evidence.members
-    mean = members @ (np.swapaxes(members, -1, -2) @ axis)
+    mean = members @ (members.mT @ axis)
     shared = {n: evidence.shared(n).sum(-1) > 0 for n in ("inclination", "azimuth")}
     means = {
         "inclination": np.arctan2(np.hypot(mean[..., 0], mean[..., 1]), mean[..., 2]),
@@ -241,10 +234,10 @@ def _by_toolface(
         back = tool_from_earth(inclination, np.zeros_like(inclination), angles["toolface"])
         turned = np.einsum("bnji,bnj->bni", back, field)
         members = evidence.shared(name) * faced[..., None]
-        total = evidence.members @ (np.swapaxes(members, -1, -2) @ turned)
+        total = evidence.members @ (members.mT @ turned)
         some = np.einsum("bnk,bk->bn", evidence.members, members.sum(-2)) > 0
-        own = lone & ~evidence.is_known(name)
-        return np.where(own[..., None], turned, total), some | own
+        alone = lone & ~evidence.is_known(name)
+        return np.where(alone[..., None], turned, total), some | alone
 
     down, known = mean("inclination", np.zeros(faced.shape), g)
     inclination = np.where(known, np.arctan2(-down[..., 0], down[..., 2]), angles["inclination"])
@@ -255,11 +248,11 @@ def _by_toolface(
 
 def _with_own(problem: Problem, state: State, g: Array, b: Array) -> State:
     """The state with each station's own strength and dip as its corrected fields have them."""
-    own = state.own.copy()
+    departures = state.departures.copy()
     for index, name in enumerate(problem.evidence.absent):
         value = observables.OBSERVABLES[name].value(g, b)
-        own[..., index] = value - problem.constant(state, name)
-    return replace(state, own=own)
+        departures[..., index] = value - problem.constant(state, name)
+    return replace(state, departures=departures)
 
 
 def _with_dip(problem: Problem, state: State, g: Array, b: Array) -> State:

@@ -15,11 +15,15 @@ from mwdcal.geometry.vectors import (
     Array,
     Bools,
     Ints,
+    diagonal,
     eigen,
     inverse,
     nearest_rotation,
+    outer,
+    quotient,
     rotation,
 )
+from mwdcal.sensor.models import Model
 
 LEAST_SHARE = 0.05
 """A free direction with less than this share on a triad does not move the triad."""
@@ -27,6 +31,13 @@ TESTED = 1e-3
 """A direction of a station's readings counts if this share of its variance is left by the fit."""
 ROTATIONS = ("rotation-x", "rotation-y", "toolface-zero")
 """Names of the turns of a triad about the tool's three axes."""
+TANGENT_STEP = 1e-5
+"""Turn, or stretch, of all fields by which its direction among the parameters is taken."""
+CHANGES = {
+    **dict(zip(ROTATIONS, rotation(TANGENT_STEP * np.eye(3)), strict=True)),
+    "scale": np.eye(3) * (1 + TANGENT_STEP),
+}
+"""Turns of all fields about the tool's axes, and a stretch: what evidence may leave free, by name."""
 COUPLED = 0.9
 """Share of a candidate direction that must lie in the null space to be called free."""
 
@@ -91,40 +102,37 @@ def _remaining(linear: Linear, covariance: Array) -> tuple[Array, Array]:
     """Whitened residuals C⁻¹ρ (B, n, m), and their covariance C⁻¹ - C⁻¹X V XᵀC⁻¹ (B, n, m, m)."""
     weighed = linear.weigh(linear.design)
     left = linear.weigh(linear.residual[..., None])[..., 0]
-    spread = linear.weigh(np.broadcast_to(np.eye(left.shape[-1]), (*left.shape, left.shape[-1])))
-    return left, spread - weighed @ covariance[:, None] @ np.swapaxes(weighed, -1, -2)
+    return left, linear.weight - weighed @ covariance[:, None] @ weighed.mT
 
 
-def determined_apart(problem: Problem, state: State, own: dict[int, Array]) -> Determined:
+def determined_apart(problem: Problem, state: State, known: dict[int, Array]) -> Determined:
     """Which directions are determined when some triads are fitted to less than all evidence.
 
-    `own` (B, p_t, p_t), by triad, is the information of what those are fitted to, in relative
+    `known` (B, p_t, p_t), by triad, is the information of what those are fitted to, in relative
     units and radians. The other triad follows them: what is free in them is free in both, however
     much its own evidence would say of it.
     """
     linear = problem.linear(state, geometry=True)
     whole, _, _ = linear.normal.reduced()
-    slices, found = problem.slices(), np.zeros_like(whole)
+    slices, information = problem.slices(), np.zeros_like(whole)
     for index, where in enumerate(slices):
-        ours = own.get(index)
-        found[:, where, where] = (
-            whole[:, where, where] if ours is None else ours / GEOMETRIC_NOISE**2
-        )
-    if len(own) < len(slices):
-        (first, second), norms = slices, linear.norms
-        outer = norms[:, :, None] * norms[:, None, :]
-        scaled = whole / np.where(outer > 0, outer, 1.0)
+        fitted = known[index] / GEOMETRIC_NOISE**2 if index in known else whole[:, where, where]
+        information[:, where, where] = fitted
+    if len(known) < len(slices):
+        (first, second), scales = slices, outer(linear.norms)
+        scaled = whole / np.where(scales > 0, scales, 1.0)
         cross, block = scaled[:, second, first], scaled[:, second, second]
         back = np.linalg.pinv(block, rcond=RANK_TOLERANCE**2, hermitian=True)
-        follow = np.swapaxes(cross, -1, -2) @ back
-        found[:, first, first] += follow @ cross * outer[:, first, first]
-        found[:, second, first] = block @ back @ cross * outer[:, second, first]
-        found[:, first, second] = np.swapaxes(found[:, second, first], -1, -2)
+        information[:, first, first] += cross.mT @ back @ cross * scales[:, first, first]
+        information[:, second, first] = block @ back @ cross * scales[:, second, first]
+        information[:, first, second] = information[:, second, first].mT
     nothing = np.zeros_like(state.params)
-    return Determined.by(Normal(found, nothing, nothing[:, 0], linear.size), linear.norms)
+    return Determined.by(Normal(information, nothing, nothing[:, 0], linear.size), linear.norms)
 
 
-def sandwich(found: Analysis, problem: Problem, state: State, pulls: dict[int, Array]) -> Analysis:
+def sandwich(
+    analysis: Analysis, problem: Problem, state: State, pulls: dict[int, Array]
+) -> Analysis:
     """The analysis when triads minimise sums of their own: covariance, residuals' spread and s².
 
     `pulls` (B, n, p_t, 3), by triad, is how an error of a station's whitened reading moves those.
@@ -134,9 +142,9 @@ def sandwich(found: Analysis, problem: Problem, state: State, pulls: dict[int, A
     linear = problem.linear(state)
     design, u = linear.design, linear.prior.shape[-1]
     moved, follow, back, fixed = _followed(problem, linear, pulls)
-    noise = np.eye(design.shape[2]) + linear.own @ np.swapaxes(linear.own, -1, -2)
+    noise = np.eye(design.shape[2]) + linear.private @ linear.private.mT
     covariance = np.einsum("bnim,bnmk,bnjk->bij", moved, noise, moved, optimize=True)
-    own = covariance
+    independent = covariance
     p, constants, rest = linear.size, problem.evidence.constants, ~fixed
     effects = np.zeros((len(moved), p, len(constants)))
     for column in [p + i for i, c in enumerate(constants) if not c.unknown]:
@@ -145,17 +153,17 @@ def sandwich(found: Analysis, problem: Problem, state: State, pulls: dict[int, A
         pulled = np.einsum("bij,bj->bi", follow, common[:, fixed]) + linear.prior[:, rest, column]
         common[:, rest] = -np.einsum("bij,bj->bi", back, pulled)
         common = common / np.sqrt(linear.prior[:, column, column])[:, None]
-        covariance = covariance + common[:, :, None] * common[:, None, :]
+        covariance = covariance + outer(common)
         effects[..., column - p] = common[:, :p]
     crossed = design @ moved @ noise
-    left = noise + design @ own[:, None] @ np.swapaxes(design, -1, -2)
-    left = left + crossed + np.swapaxes(crossed, -1, -2)
-    weight = linear.weigh(np.broadcast_to(np.eye(noise.shape[-1]), noise.shape))
+    left = noise + design @ independent[:, None] @ design.mT
+    left = left + crossed + crossed.mT
+    weight = linear.weight
     spread = weight @ left @ weight * problem.evidence.include[..., None, None]
-    factor, freedom = _variance_factors(found.residual, spread)
+    factor, freedom = _variance_factors(analysis.residual, spread)
     q = len(constants)
     return replace(
-        found,
+        analysis,
         covariance=covariance[:, :p, :p],
         variance_factor=factor,
         freedom=freedom,
@@ -185,8 +193,8 @@ def _followed(
     whole = np.einsum("bnmi,bnmj->bij", design, weighed, optimize=True)
     back = _inverse_where_known((whole + linear.prior)[:, rest][:, :, rest])
     follow = whole[:, rest][:, :, fixed]
-    own = np.swapaxes(weighed[..., rest], -1, -2)
-    moved[:, :, rest] = -back[:, None] @ (follow[:, None] @ moved[:, :, fixed] + own)
+    pull_columns = weighed[..., rest].mT
+    moved[:, :, rest] = -back[:, None] @ (follow[:, None] @ moved[:, :, fixed] + pull_columns)
     return moved, follow, back, fixed
 
 
@@ -197,38 +205,35 @@ def unweighted_pulls(problem: Problem, even: Problem, state: State) -> dict[int,
     reduced, _, eliminate = linear.normal.reduced()
     p = linear.size
     rows = linear.design[..., :p] - linear.design[..., p:] @ eliminate[:, None]
-    moved = -determined.inverse(reduced)[:, None] @ np.swapaxes(rows, -1, -2)
-    found = {}
-    for index, (triad, alike, where) in enumerate(
-        zip(problem.triads, even.triads, problem.slices(), strict=True)
-    ):
-        ratio = (triad.sd / alike.sd)[..., None, :]
-        found[index] = moved[:, :, where, 3 * index : 3 * index + 3] * ratio
-    return found
+    moved = -determined.inverse(reduced)[:, None] @ rows.mT
+    ratios = [t.sd / e.sd for t, e in zip(problem.triads, even.triads, strict=True)]
+    return {
+        index: moved[:, :, where, 3 * index : 3 * index + 3] * ratios[index][..., None, :]
+        for index, where in enumerate(problem.slices())
+    }
 
 
 def _inverse_where_known(information: Array) -> Array:
     """Inverse (B, k, k) of an information matrix, zero along directions that it says nothing of."""
-    scale = np.sqrt(np.maximum(np.diagonal(information, axis1=-2, axis2=-1), 1e-300))
-    outer = scale[:, :, None] * scale[:, None, :]
-    return np.asarray(np.linalg.pinv(information / outer, rcond=1e-12, hermitian=True) / outer)
+    scales = outer(np.sqrt(np.maximum(diagonal(information), 1e-300)))
+    return np.asarray(np.linalg.pinv(information / scales, rcond=1e-12, hermitian=True) / scales)
 
 
 def whole_covariance(linear: Linear, determined: Determined) -> Array:
     """Covariance (B, p + s, p + s) of parameters and shared unknowns."""
     normal = linear.normal
     reduced, _, eliminate = normal.reduced()
-    own = determined.inverse(reduced)
-    cross = -own @ np.swapaxes(eliminate, -1, -2)
+    params = determined.inverse(reduced)
+    cross = -params @ eliminate.mT
     p = normal.size
     shared = inverse(normal.information[..., p:, p:]) - eliminate @ cross
-    top = np.concatenate([own, cross], -1)
-    return np.concatenate([top, np.concatenate([np.swapaxes(cross, -1, -2), shared], -1)], -2)
+    top = np.concatenate([params, cross], -1)
+    return np.concatenate([top, np.concatenate([cross.mT, shared], -1)], -2)
 
 
 def _variance_factors(residual: Array, spread: Array) -> tuple[Array, Array]:
     """s² and degrees of freedom (B, t) of each triad: restricted maximum likelihood."""
-    expected = np.diagonal(spread, axis1=-2, axis2=-1)
+    expected = diagonal(spread)
     shape = (*residual.shape[:-1], residual.shape[-1] // 3, 3)
     squares = np.sum((residual**2).reshape(shape), (1, 3))
     freedom = np.sum(expected.reshape(shape), (1, 3))
@@ -246,17 +251,16 @@ def effective_freedom(problem: Problem, state: State, analysis: Analysis) -> Arr
     linear = problem.linear(state)
     whole = whole_covariance(linear, analysis.determined)
     weighed, count = linear.weigh(linear.design), linear.residual.shape[-1]
-    inner = linear.weigh(np.broadcast_to(np.eye(count), (*linear.residual.shape, count)))
-    inner = inner * problem.evidence.include[..., None, None]
-    found = []
+    inner = linear.weight * problem.evidence.include[..., None, None]
+    each = []
     for first in range(0, count, 3):
-        own = slice(first, first + 3)
-        rows, block = weighed[..., own, :], inner[..., own, own]
+        axes = slice(first, first + 3)
+        rows, block = weighed[..., axes, :], inner[..., axes, axes]
         mixed = np.einsum("bnij,bnjp,bnip->bp", block, rows @ whole[:, None], rows, optimize=True)
         gram = np.einsum("bnip,bniq->bpq", rows, rows, optimize=True) @ whole
         twice = np.einsum("bpq,bqp->b", gram, gram)
-        found.append(np.sum(block**2, (1, 2, 3)) - 2 * mixed.sum(-1) + twice)
-    squares = np.stack(found, -1)
+        each.append(np.sum(block**2, (1, 2, 3)) - 2 * mixed.sum(-1) + twice)
+    squares = np.stack(each, -1)
     return np.asarray(analysis.freedom**2 / np.where(squares > 1e-9, squares, np.inf))
 
 
@@ -268,8 +272,7 @@ def station_misfit(analysis: Analysis) -> tuple[Array, Array]:
     values, vectors = eigen(analysis.spread)
     tested = values > TESTED
     along = np.einsum("bnij,bni->bnj", vectors, analysis.residual) ** 2
-    square = np.sum(np.where(tested, along / np.where(tested, values, 1.0), 0.0), -1)
-    return square, np.sum(tested, -1).astype(float)
+    return quotient(along, values, tested).sum(-1), np.sum(tested, -1).astype(float)
 
 
 def without_station(problem: Problem, state: State, analysis: Analysis) -> Array:
@@ -281,14 +284,13 @@ def without_station(problem: Problem, state: State, analysis: Analysis) -> Array
     linear = problem.linear(state)
     if analysis.influence is not None:
         p = linear.size
-        own = linear.design @ analysis.influence
-        stay = inverse(np.eye(own.shape[-1]) + own) @ linear.residual[..., None]
+        leverage = linear.design @ analysis.influence
+        stay = inverse(np.eye(leverage.shape[-1]) + leverage) @ linear.residual[..., None]
         return np.asarray(-(analysis.influence[:, :, :p] @ stay)[..., 0])
     whole = whole_covariance(linear, analysis.determined)[:, : linear.size]
     values, vectors = eigen(analysis.spread)
-    tested = values > TESTED
     along = np.einsum("bnij,bni->bnj", vectors, analysis.residual)
-    along = np.where(tested, along / np.where(tested, values, 1.0), 0.0)
+    along = quotient(along, values, values > TESTED)
     pulled = np.einsum("bnij,bnj->bni", vectors, along)
     pulled = np.einsum("bnmu,bnm->bnu", linear.weigh(linear.design), pulled)
     return np.asarray(np.einsum("bpu,bnu->bnp", whole, pulled))
@@ -296,48 +298,31 @@ def without_station(problem: Problem, state: State, analysis: Analysis) -> Array
 
 def candidates(problem: Problem, state: State, triads: list[int]) -> dict[str, Array]:
     """Directions (B, p) of parameter space that have a name: turns and scales of some triads."""
-    directions = {}
-    zero = np.zeros_like(state.params)
-    for axis, name in enumerate(ROTATIONS):
-        directions[name] = zero.copy()
-        directions[name][:, _columns(problem, triads)] = _tangent(
-            problem, state, triads, rotation(1e-5 * np.eye(3)[axis])
-        )
-    directions["scale"] = zero.copy()
-    directions["scale"][:, _columns(problem, triads)] = _tangent(
-        problem, state, triads, np.eye(3) * (1 + 1e-5)
-    )
+    directions = {name: np.zeros_like(state.params) for name in CHANGES}
+    for triad in triads:
+        where, model = problem.slices()[triad], problem.triads[triad].model
+        for name, change in CHANGES.items():
+            directions[name][:, where] = tangent(model, state.params[:, where], change)
     return directions | _courses(problem, directions, triads)
+
+
+def tangent(model: Model, params: Array, change: Array) -> Array:
+    """Change of the parameters (..., p) when all fields are turned or scaled, per `TANGENT_STEP`."""
+    return np.asarray((model.transformed(params, change) - params) / TANGENT_STEP)
 
 
 def _courses(problem: Problem, steady: dict[str, Array], triads: list[int]) -> dict[str, Array]:
     """Turns and scales in proportion to each power of temperature, named `…-temperature-k`."""
     orders = [problem.triads[t].model.basis.order for t in triads]
-    found = {}
+    courses = {}
     for name, direction in steady.items():
         for power in range(1, min(orders) + 1):
             moved = np.zeros_like(direction)
             for triad in triads:
                 where, model = problem.slices()[triad], problem.triads[triad].model
                 moved[:, where] = model.with_course(direction[:, where], power)
-            found[f"{name}-temperature-{power}"] = moved
-    return found
-
-
-def _columns(problem: Problem, triads: list[int]) -> Array:
-    slices = problem.slices()
-    return np.concatenate([np.arange(slices[t].start, slices[t].stop) for t in triads])
-
-
-def _tangent(problem: Problem, state: State, triads: list[int], change: Array) -> Array:
-    """Change of the parameters when the fields of some triads are transformed, per unit."""
-    slices = problem.slices()
-    parts = [
-        problem.triads[t].model.transformed(state.params[:, slices[t]], change)
-        - state.params[:, slices[t]]
-        for t in triads
-    ]
-    return np.asarray(np.concatenate(parts, -1) / 1e-5)
+            courses[f"{name}-temperature-{power}"] = moved
+    return courses
 
 
 def free_share(determined: Determined, direction: Array) -> Array:
@@ -345,7 +330,7 @@ def free_share(determined: Determined, direction: Array) -> Array:
     scaled = direction * determined.norms
     inside = np.einsum("bpk,bp->bk", determined.null(), scaled)
     total = np.sum(scaled**2, -1)
-    return np.asarray(np.sum(inside**2, -1) / np.where(total > 0, total, 1.0))
+    return quotient(np.sum(inside**2, -1), total, total > 0)
 
 
 def marginal_rank(determined: Determined, where: slice) -> Ints:
@@ -394,12 +379,12 @@ def _rescale(problem: Problem, state: State, triad: int, free: Bools) -> State:
     where, params = problem.slices()[triad], state.params.copy()
     matrix = factor[:, None, None] * np.eye(3)
     params[:, where] = problem.triads[triad].model.transformed(params[:, where], matrix)
-    own = state.own.copy()
+    departures = state.departures.copy()
     if name in problem.evidence.absent:
         place = problem.evidence.absent.index(name)
-        base = problem.constant(state, name) - own[..., place]
-        own[..., place] = factor[:, None] * problem.constant(state, name) - base
-    return replace(state, params=params, own=own)
+        base = problem.constant(state, name) - departures[..., place]
+        departures[..., place] = factor[:, None] * problem.constant(state, name) - base
+    return replace(state, params=params, departures=departures)
 
 
 def _polar_turn(problem: Problem, state: State, triad: int, free: Bools) -> Array:
@@ -418,7 +403,7 @@ def unrotating(gain: Array, free: Bools) -> Array:
     polar = nearest_rotation(gain)
     about_z = np.arctan2(polar[..., 0, 1] - polar[..., 1, 0], polar[..., 0, 0] + polar[..., 1, 1])
     along = np.where(free[..., 2], about_z, 0.0)[..., None] * np.array([0.0, 0.0, 1.0])
-    whole = np.swapaxes(polar, -1, -2)
+    whole = polar.mT
     return np.where(np.all(free, -1)[..., None, None], whole, rotation(along))
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from mwdcal.estimation.problem import Problem, State
 from mwdcal.estimation.uncertainty import Analysis
-from mwdcal.geometry.vectors import Array
+from mwdcal.geometry.vectors import Array, diagonal
 
 FIRST_SCATTER = 1e-3
 """Scatter at which its estimation begins, as a share or in radians."""
@@ -75,7 +75,7 @@ def log_evidence(problem: Problem, state: State) -> Array:
     include = problem.evidence.include
     noise = sum((np.log(t.sd).sum(-1) * include).sum(-1) for t in problem.triads)
     private = -np.linalg.slogdet(linear.core)[1].sum(-1)
-    known = np.diagonal(problem.prior.precision, axis1=-2, axis2=-1)
+    known = diagonal(problem.prior.precision)
     pin = np.zeros((len(known), linear.prior.shape[-1]))
     for name, where in zip(("gravity", "field"), problem.slices(), strict=False):
         size = problem.constant(state, name).mean(-1)[:, None]

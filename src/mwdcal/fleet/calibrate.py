@@ -37,11 +37,10 @@ from mwdcal.sensor.profile import Profile
 OK, FAILED = "ok", "failed"
 FACTS = ("rank", "size", "noise", "variance_factor", "degrees_of_freedom")
 """Columns of a triad besides its parameters and their standard uncertainties."""
-EARTH = ("gravity_g", "field", "dip_deg")
-
+EARTH_COLUMNS = ("gravity_g", "field", "dip_deg")
 CENTRES = tuple(f"centre_{axis}" for axis in "xyz")
 """Columns of a triad with own-axis terms, and `radius`: its terms are of (reading - centre) / radius."""
-STAND = {
+STAND_COLUMNS = {
     name: tuple(f for f in StandErrors.__struct_fields__ if f.startswith(name.replace("-", "_")))
     for name in ESTIMABLE
 }
@@ -49,7 +48,7 @@ STAND = {
 
 
 @dataclass(frozen=True)
-class Outcome:
+class BatchOutcome:
     """What became of B tools: a status and a message each, and columns (B,) of results.
 
     `columns` hold NaN where a tool has no result. `free` lists, for each tool and triad, the
@@ -98,79 +97,32 @@ def column(triad: str, parameter: str) -> str:
 
 def names(options: Options, profile: Profile, triads: Sequence[str] = TRIADS) -> list[str]:
     """The columns of results, in order."""
-    found: list[str] = []
+    columns: list[str] = []
     for index, triad in enumerate(triads):
-        own = [column(triad, name) for name in model_parameters(options, profile, index)]
-        found += [f"{triad}_{fact}" for fact in (*FACTS, "order")]
+        values = [column(triad, name) for name in model_parameters(options, profile, index)]
+        columns += [f"{triad}_{fact}" for fact in (*FACTS, "order")]
         if may_be_curved(options, profile, index):
-            found += [f"{triad}_{name}" for name in (*CENTRES, "radius")]
-        found += [name for pair in zip(own, (f"{n}_sd" for n in own), strict=True) for name in pair]
-    last = (STATED_ANGLES, EARTH) if len(triads) > 1 else (STATED_ANGLES[:2], EARTH[:1])
-    stand = [name for error in options.estimate for name in STAND[error]]
-    return [*found, *(f"{angle}_sd_deg" for angle in last[0]), *last[1], *stand]
+            columns += [f"{triad}_{name}" for name in (*CENTRES, "radius")]
+        columns += [name for value in values for name in (value, f"{value}_sd")]
+    last = (
+        (STATED_ANGLES, EARTH_COLUMNS)
+        if len(triads) > 1
+        else (STATED_ANGLES[:2], EARTH_COLUMNS[:1])
+    )
+    stand = [name for error in options.estimate for name in STAND_COLUMNS[error]]
+    return [*columns, *(f"{angle}_sd_deg" for angle in last[0]), *last[1], *stand]
 
 
 def calibrate_batch(
     readings: Readings, options: Options, profile: Profile, alone: Alone
-) -> Outcome:
+) -> BatchOutcome:
     """Calibrate tools of the same shape: readings (B, n, ...), at the profile's temperature.
 
     `alone` gives one tool's own readings where a check needs words for it.
     """
-    count, profile = len(readings.accelerometer), _with_scales(profile)
-    blank = {name: np.full(count, np.nan) for name in names(options, profile)}
-    free: list[tuple[list[str], ...]] = [([], []) for _ in range(count)]
-    status, message = np.full(count, OK, object), np.full(count, "", object)
-    none: list[list[str]] = [[] for _ in range(count)]
-    again: list[list[int]] = [[] for _ in range(count)]
-    outcome = Outcome(status, message, blank, free, none, again)
-    options, every = known_before(options, readings, profile), np.arange(count)
-    _screen(outcome, every, readings, options, alone)
-    for some, chosen in with_orders(readings, outcome.sound(every), options):
-        if isinstance(chosen, Exception):
-            _fail(outcome, some, chosen)
-            continue
-        if chosen.order != options.order:
-            _screen(outcome, some, readings, chosen, alone)
-        for part, final in with_curves(readings, outcome.sound(some), chosen, profile):
-            if isinstance(final, Exception):
-                _fail(outcome, part, final)
-            else:
-                _fit(outcome, readings, part, final, alone, profile)
-    return outcome
-
-
-def _fit(
-    outcome: Outcome,
-    readings: Readings,
-    tools: Ints,
-    options: Options,
-    alone: Alone,
-    profile: Profile,
-) -> None:
-    """Fit the given tools, and write down what came of it."""
-    for part, result in in_chunks(readings, tools, lambda r: fit(r, options)):
-        if isinstance(result, Exception):
-            _fail(outcome, part, result)
-        else:
-            _record(outcome, part, result, options, readings, profile, alone)
-
-
-def _fail(outcome: Outcome, tools: Ints, error: Exception) -> None:
-    """Give tools the status and message of an error: of what was asked, or of arithmetic."""
-    if isinstance(error, MwdcalError):
-        outcome.status[tools], outcome.message[tools] = BAD_INPUT, str(error)
-        return
-    outcome.status[tools] = FAILED
-    outcome.message[tools] = f"the fit failed: {error}. Calibrate this tool alone to see why."
-
-
-def _screen(
-    outcome: Outcome, tools: Ints, readings: Readings, options: Options, alone: Alone
-) -> None:
-    """Refuse those of some tools that no fit could mend."""
-    refusals = reading_refusals(take(readings, tools), options, lambda i: alone(int(tools[i]))[0])
-    _refuse(outcome, tools, refusals)
+    batch = _Batch(readings, _with_scales(profile), alone, names(options, profile))
+    batch.calibrate(known_before(options, readings, batch.profile))
+    return batch.outcome
 
 
 def _with_scales(profile: Profile) -> Profile:
@@ -180,54 +132,100 @@ def _with_scales(profile: Profile) -> Profile:
     return msgspec.structs.replace(profile, **stated)
 
 
-def _refuse(outcome: Outcome, tools: Ints, refusals: Iterable[Flag]) -> None:
-    """Give the first refusal of each of some tools as its status and message."""
-    for refusal in refusals:
-        for place in np.flatnonzero(refusal.members & (outcome.status[tools] == OK)).tolist():
-            outcome.status[tools[place]] = refusal.id
-            outcome.message[tools[place]] = refusal.sentence(place)
+class _Batch:
+    """Tools on their way: readings (B, n, ...), and the outcome that steps fill in for some of them."""
 
+    def __init__(
+        self, readings: Readings, profile: Profile, alone: Alone, columns: Sequence[str]
+    ) -> None:
+        self.readings, self.profile, self.alone = readings, profile, alone
+        self.every = np.arange(len(readings.accelerometer))
+        self.outcome = BatchOutcome(
+            status=np.full(len(self.every), OK, object),
+            message=np.full(len(self.every), "", object),
+            columns={name: np.full(len(self.every), np.nan) for name in columns},
+            free=[([], []) for _ in self.every],
+            findings=[[] for _ in self.every],
+            reshoot=[[] for _ in self.every],
+        )
 
-def _record(
-    outcome: Outcome,
-    members: Ints,
-    result: Fit,
-    options: Options,
-    readings: Readings,
-    profile: Profile,
-    alone: Alone,
-) -> None:
-    """Check a fit of some tools and write down the results of the sound ones."""
-    part, tools = take(readings, members), members
-    fitted = FittedRuns.of(part, profile, options, result, lambda i: alone(int(tools[i])))
-    _refuse(outcome, members, fit_refusals(fitted))
-    good = np.flatnonzero(outcome.status[members] == OK)
-    if not good.size:
-        return
-    if good.size < len(members):
-        fitted, members = fitted.take(good), members[good]
-    _note(outcome, members, fitted)
-    for name, values in _columns(fitted, profile.reference_temperature_c).items():
-        outcome.columns[name][members] = values
+    def calibrate(self, options: Options) -> None:
+        """Choose what the options leave to the data, fit, and note what came of it."""
+        readings, sound = self.readings, self.outcome.sound
+        self._screen(self.every, options)
+        for some, chosen in with_orders(readings, sound(self.every), options):
+            if isinstance(chosen, Exception):
+                self._fail(some, chosen)
+                continue
+            if chosen.order != options.order:
+                self._screen(some, chosen)
+            for part, final in with_curves(readings, sound(some), chosen, self.profile):
+                if isinstance(final, Exception):
+                    self._fail(part, final)
+                else:
+                    self._fit(part, final)
 
+    def _screen(self, tools: Ints, options: Options) -> None:
+        """Refuse those of some tools that no fit could mend."""
+        readings = take(self.readings, tools)
+        self._refuse(
+            tools, reading_refusals(readings, options, lambda i: self.alone(int(tools[i]))[0])
+        )
 
-def _note(outcome: Outcome, members: Ints, fitted: FittedRuns) -> None:
-    """Write down the findings of sound tools; what is undetermined, by triad."""
-    free = [{entry.id for entry in each} for each in fitted.free]
-    ids: list[dict[str, None]] = [{} for _ in members]
-    for flag in finding_flags(fitted):
-        for place in np.flatnonzero(flag.members).tolist():
-            if flag.id not in free[place]:
+    def _fit(self, tools: Ints, options: Options) -> None:
+        """Fit some tools, and note the results of the sound ones."""
+        for part, result in in_chunks(self.readings, tools, lambda r: fit(r, options)):
+            if isinstance(result, Exception):
+                self._fail(part, result)
+            else:
+                self._note(part, options, result)
+
+    def _fail(self, tools: Ints, error: Exception) -> None:
+        """Give tools the status and message of an error: of the input, or of arithmetic."""
+        status, message = self.outcome.status, self.outcome.message
+        if isinstance(error, MwdcalError):
+            status[tools], message[tools] = BAD_INPUT, str(error)
+            return
+        status[tools] = FAILED
+        message[tools] = f"the fit failed: {error}. Calibrate this tool alone to see why."
+
+    def _refuse(self, tools: Ints, refusals: Iterable[Flag]) -> None:
+        """Give the first refusal of each of some tools as its status and message."""
+        status, message = self.outcome.status, self.outcome.message
+        for refusal in refusals:
+            for place in np.flatnonzero(refusal.members & (status[tools] == OK)).tolist():
+                status[tools[place]] = refusal.id
+                message[tools[place]] = refusal.sentence(place)
+
+    def _note(self, tools: Ints, options: Options, result: Fit) -> None:
+        """Check a fit of some tools, and note results and findings of the sound ones."""
+        readings = take(self.readings, tools)
+        fitted = FittedRuns.of(
+            readings, self.profile, options, result, lambda place: self.alone(int(tools[place]))
+        )
+        self._refuse(tools, fit_refusals(fitted))
+        good = np.flatnonzero(self.outcome.status[tools] == OK)
+        if not good.size:
+            return
+        if good.size < len(tools):
+            fitted = fitted.take(good)
+        self._note_findings(tools[good], fitted)
+        for name, values in _columns(fitted, self.profile.reference_temperature_c).items():
+            self.outcome.columns[name][tools[good]] = values
+
+    def _note_findings(self, tools: Ints, fitted: FittedRuns) -> None:
+        """The findings of sound tools; what is undetermined, by triad."""
+        ids: list[dict[str, None]] = [{} for _ in tools]
+        for flag in finding_flags(fitted):
+            for place in np.flatnonzero(flag.members).tolist():
                 ids[place][flag.id] = None
-            if flag.station is not None:
-                outcome.reshoot[members[place]].append(flag.station)
-    for place, tool in enumerate(members):
-        outcome.findings[tool] = [*ids[place]]
-        if free[place]:
-            outcome.free[tool] = tuple(
-                [f.id for f in fitted.free[place] if triad in f.triads]
-                for triad in range(len(TRIADS))
-            )
+                if flag.station is not None:
+                    self.outcome.reshoot[tools[place]].append(flag.station)
+        for tool, flags, free in zip(tools, ids, fitted.free, strict=True):
+            undetermined = {entry.id for entry in free}
+            self.outcome.findings[tool] = [name for name in flags if name not in undetermined]
+            by_triad = ([f.id for f in free if triad in f.triads] for triad in range(len(TRIADS)))
+            self.outcome.free[tool] = tuple(by_triad)
 
 
 def _columns(fitted: FittedRuns, reference: float) -> dict[str, Array]:

@@ -11,7 +11,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from mwdcal.calibration.automatic.nonlinearity import PARTS, compare_curves, offered, scattered
+from mwdcal.calibration.automatic.nonlinearity import MOST_PARTS, compare_curves, offered, scattered
 from mwdcal.calibration.automatic.order_selection import choose_orders
 from mwdcal.calibration.diagnosis.refusals import check_curves, check_options
 from mwdcal.calibration.estimate import temperature_ranges
@@ -87,7 +87,9 @@ def with_curves(
         return
     options = scattered(readings, options)
     groups: dict[tuple[str, ...], list[Ints]] = {}
-    trials = in_chunks(readings, tools, lambda r: compare_curves(r, options, terms), CHUNK // PARTS)
+    trials = in_chunks(
+        readings, tools, lambda r: compare_curves(r, options, terms), CHUNK // MOST_PARTS
+    )
     for part, curves in trials:
         if isinstance(curves, Exception):
             yield part, curves

@@ -19,7 +19,7 @@ from mwdcal.calibration.soaks import HIGHEST
 from mwdcal.errors import InputError
 from mwdcal.files.contract import AZIMUTH_KEYS, CHANNELS
 from mwdcal.files.formats import parquet
-from mwdcal.fleet.calibrate import OK, Outcome, calibrate_batch, names
+from mwdcal.fleet.calibrate import OK, BatchOutcome, calibrate_batch, names
 from mwdcal.fleet.runs import Batch, Rows, batches, refused_tools
 from mwdcal.fleet.sources import SERIAL, Source
 from mwdcal.fleet.tables import Partition, read
@@ -135,7 +135,7 @@ def _result(rows: Rows, plan: Plan) -> Any:
     return _table(rows, plan, (status, message, unit), filled, free, reports)
 
 
-def _calibrated(rows: Rows, batch: Batch, plan: Plan) -> Outcome:
+def _calibrated(rows: Rows, batch: Batch, plan: Plan) -> BatchOutcome:
     return calibrate_batch(
         batch.readings,
         plan.options,

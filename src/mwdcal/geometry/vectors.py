@@ -96,6 +96,22 @@ def rotation(turn: Array) -> Array:
     )
 
 
+def diagonal(matrix: Array) -> Array:
+    """Diagonal (..., k) of every matrix of a stack (..., k, k), as a view."""
+    return np.diagonal(matrix, axis1=-2, axis2=-1)
+
+
+def outer(first: Array, second: Array | None = None) -> Array:
+    """Products (..., j, k) of the elements of two vectors, or of one with itself."""
+    second = first if second is None else second
+    return np.asarray(first[..., :, None] * second[..., None, :])
+
+
+def quotient(numerator: Array, denominator: Array, where: Bools) -> Array:
+    """What is divided, and zero elsewhere than `where`."""
+    return np.where(where, numerator / np.where(where, denominator, 1.0), 0.0)
+
+
 def nearest_rotation(matrix: Array) -> Array:
     """Rotation (..., 3, 3) nearest to a matrix in least squares: its polar factor.
 

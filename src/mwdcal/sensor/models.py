@@ -22,7 +22,7 @@ from math import prod
 
 import numpy as np
 
-from mwdcal.geometry.vectors import AnyArray, Array, inverse
+from mwdcal.geometry.vectors import AnyArray, Array, diagonal, inverse
 
 OFF_DIAGONAL = tuple((i, j) for i in range(3) for j in range(3) if i != j)
 """Axes of the six misalignments, in their order."""
@@ -138,9 +138,9 @@ class Polynomial:
         """Derivative of the field with respect to the reading (..., n, 3, 3)."""
         matrix, _ = self._terms(params, temperature)
         if self.curved:
-            x, diagonal = self._scaled(raw), np.arange(3)
+            x, axis = self._scaled(raw), np.arange(3)
             square, cube = params[..., None, -6:-3], params[..., None, -3:]
-            matrix[..., diagonal, diagonal] += (2 * square + 3 * cube * x) * x
+            matrix[..., axis, axis] += (2 * square + 3 * cube * x) * x
         return np.asarray(matrix / self.scale[..., None, :])
 
     def jacobian(self, params: Array, raw: Array, temperature: Array) -> Array:
@@ -299,7 +299,7 @@ class Factors:
 
     def start(self, matrix: Array, offset: Array) -> Array:
         """Parameters (..., p) of field = matrix · raw + offset."""
-        scale = 1 / np.diagonal(matrix, axis1=-2, axis2=-1)
+        scale = 1 / diagonal(matrix)
         mixing = matrix * scale[..., None, :]
         bias = -np.einsum("...ij,...j->...i", inverse(mixing), offset)
         steady = np.arange(self.basis.order + 1) == 0
@@ -309,7 +309,7 @@ class Factors:
         """Parameters of the model whose fields are a matrix `turn` (..., 3, 3) times ours."""
         scale, bias, misalignment = factor_parts(params)
         mixing = turn @ (np.eye(3) - misalignment)
-        gain = np.diagonal(mixing, axis1=-2, axis2=-1)
+        gain = diagonal(mixing)
         scale, bias = scale * (1 / gain)[..., None], bias * gain[..., None]
         return factor_params(scale, bias, -(mixing / gain[..., None, :]))
 

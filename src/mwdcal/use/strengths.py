@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mwdcal.calibration.readings import EARTH
+from mwdcal.calibration.readings import EARTH_RANGES
 from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.errors import InputError
 from mwdcal.geometry.vectors import AnyArray, Array
@@ -66,7 +66,7 @@ def judged(
         values = np.asarray(columns[COLUMNS[name]], float)
         free = any(entry.id == "scale" for entry in triad.undetermined)
         coil = name == "field" and calibration.profile.stand.coil
-        low, high = (-np.inf, np.inf) if coil else EARTH[name]
+        low, high = (-np.inf, np.inf) if coil else EARTH_RANGES[name]
         earth = (values < low) | (values > high)
         reference = np.zeros(values.shape, bool)
         if name in known and not free:
@@ -121,7 +121,7 @@ def findings(strengths: Mapping[str, Strengths]) -> list[Finding]:
 
 
 def _departure(name: str, each: Strengths) -> str:
-    unit, (low, high) = COLUMNS[name].rpartition("_")[2], EARTH[name]
+    unit, (low, high) = COLUMNS[name].rpartition("_")[2], EARTH_RANGES[name]
     unit = "nT" if unit == "nt" else unit
     reasons = []
     if each.earth:
@@ -168,7 +168,7 @@ def _likely(name: str, each: Strengths, scale: float) -> str:
     """The unit of the readings that would explain the strengths; empty where none does."""
     if not 0 < each.low <= each.high <= ALIKE[name] * each.low:
         return ""
-    low, high = EARTH[name]
+    low, high = EARTH_RANGES[name]
     raw = sqrt(each.low * each.high) * scale
     for unit, per in UNITS[name].items():
         if low <= raw / per <= high and not 0.9 < scale / per < 1.1:

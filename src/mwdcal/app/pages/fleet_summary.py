@@ -20,7 +20,7 @@ from mwdcal.calibration.readings import TRIADS
 from mwdcal.calibration.record import Choices, Finding
 from mwdcal.calibration.soaks import HIGHEST
 from mwdcal.files.formats import parquet
-from mwdcal.fleet.calibrate import OK, STAND
+from mwdcal.fleet.calibrate import OK, STAND_COLUMNS
 from mwdcal.fleet.sources import SERIAL
 from mwdcal.fleet.tables import one_chunk
 from mwdcal.geometry.vectors import Array
@@ -29,7 +29,7 @@ SHOWN = 5
 """Most serials that a line names."""
 DOUBTS = ("no-redundancy", "repeated-readings", "prior-conflict")
 """Findings of a doubtful fit, besides residuals beyond the declared noise."""
-ERRORS = [name for columns in STAND.values() for name in columns]
+ERRORS = [name for columns in STAND_COLUMNS.values() for name in columns]
 """Columns of errors of the stand."""
 SPAN = 10.0
 """A run that spans more without temperature terms is mentioned, °C."""

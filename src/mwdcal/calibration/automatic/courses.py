@@ -16,18 +16,17 @@ import numpy as np
 from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.soaks import HIGHEST, highest_order, usable_soaks
 from mwdcal.estimation.problem import Problem, State
-from mwdcal.geometry.vectors import Array, Bools, Ints, eigen, inverse
+from mwdcal.estimation.uncertainty import TANGENT_STEP, tangent
+from mwdcal.geometry.vectors import Array, Bools, Ints, diagonal, eigen, inverse, outer, quotient
 
 TRIED = 5
 """The highest power that is tried, if there are soaks enough."""
 UNLIKELY = 1e-3
 """A term is there if noise alone gives one as large with a probability below this."""
-WEAK = 1e-6
+LEFT_TO_TERM = 1e-6
 """A direction of a term counts if the fit leaves this share of its information to it."""
 RIDGE = 1e-11
 """Added to the information of the fit's own unknowns, that it has an inverse: free ones stay free."""
-STEP = 1e-5
-"""Change of a gain by which its direction among the parameters is found."""
 OFFSETS = tuple(f"{word}-{axis}" for word in ("offset", "bias") for axis in "xyz")
 """Steady offsets of the axes, in either model."""
 GRID = 64
@@ -35,7 +34,7 @@ GRID = 64
 
 
 @dataclass(frozen=True)
-class Terms:
+class OmittedTerms:
     """Powers 1…`TRIED` of temperature that a fit has not, by member and triad: arrays (B, t, k).
 
     `square` is χ² of a term, all lower ones being fitted, `freedom` its degrees of freedom: 0 where
@@ -92,7 +91,7 @@ def orders_of(result: Fit) -> list[int]:
     return [triad.model.basis.order for triad in result.problem.triads]
 
 
-def terms_beyond(result: Fit) -> Terms:
+def terms_beyond(result: Fit) -> OmittedTerms:
     """The powers of temperature that a fit has not."""
     memo = result.problem.memo.at(result.state)
     if "terms" not in memo.besides:
@@ -107,7 +106,7 @@ def terms_beyond(result: Fit) -> Terms:
     scatter = np.maximum(left / np.maximum(rest, 1.0), np.maximum(least, 1e-300))
     declared = np.isnan(result.noise) & (rest < 1)
     scatter, rest = np.where(declared, 1.0, scatter), np.where(declared, 1e9, rest)
-    return Terms(square, freedom, size, noise, scatter, rest)
+    return OmittedTerms(square, freedom, size, noise, scatter, rest)
 
 
 def _every_term(result: Fit) -> Array:
@@ -144,8 +143,8 @@ def _with_terms(result: Fit, shown: Bools, least: int) -> tuple[Array, Array]:
         * shown[:, None]
     )
     members, stations, count = powers.shape
-    weighed = np.swapaxes(linear.weigh(columns), -1, -2)
-    turned = np.swapaxes(powers, -1, -2)
+    weighed = linear.weigh(columns).mT
+    turned = powers.mT
 
     def summed(each: Array, by: Array) -> Array:
         return np.asarray(by @ each.reshape(members, stations, -1))
@@ -153,12 +152,12 @@ def _with_terms(result: Fit, shown: Bools, least: int) -> tuple[Array, Array]:
     width = columns.shape[-1]
     cross = summed(weighed @ linear.design, turned).reshape(members, count * width, -1)
     pairs = (powers[..., None] * powers[..., None, :]).reshape(members, stations, -1)
-    powered = summed(weighed @ columns, np.swapaxes(pairs, -1, -2))
+    powered = summed(weighed @ columns, pairs.mT)
     powered = np.swapaxes(powered.reshape(members, count, count, width, width), 2, 3)
     powered = powered.reshape(members, count * width, count * width)
     pulled = -summed(weighed @ linear.residual[..., None], turned).reshape(members, -1)
     normal = linear.normal
-    top = np.concatenate([normal.information, np.swapaxes(cross, -1, -2)], -1)
+    top = np.concatenate([normal.information, cross.mT], -1)
     whole = np.concatenate([top, np.concatenate([cross, powered], -1)], -2)
     return whole, np.concatenate([-normal.gradient, pulled], -1)
 
@@ -181,8 +180,8 @@ def steady_columns(problem: Problem, state: State) -> Array:
 
 def _mean(values: Array, weights: Array) -> Array:
     """Weighted means (2, B) of the gains and of the offsets among six coefficients (B, 6)."""
-    both = [(values * weights).reshape(-1, 2, 3).sum(-1), weights.reshape(-1, 2, 3).sum(-1)]
-    return np.swapaxes(both[0] / np.where(both[1] > 0, both[1], 1.0), 0, 1)
+    total, weight = (each.reshape(-1, 2, 3).sum(-1) for each in (values * weights, weights))
+    return np.asarray((total / np.where(weight > 0, weight, 1.0)).transpose())
 
 
 def temperature_powers(temperature: Array, count: int) -> Array:
@@ -197,24 +196,22 @@ def _in_turn(whole: Array, pulled: Array, tested: Ints, fitted: Ints) -> Array:
 
     Each is what it adds to the `fitted` unknowns, and to the powers before it.
     """
-    norm = np.sqrt(np.diagonal(whole, axis1=-2, axis2=-1))
+    norm = np.sqrt(diagonal(whole))
     norm = np.where(norm > 0, norm, 1.0)
-    whole = whole / (norm[:, :, None] * norm[:, None, :])
+    whole = whole / outer(norm)
     pulled = pulled / norm
     base, cross = whole[:, fitted][:, :, fitted], whole[:, fitted][:, :, tested]
-    absent = np.diagonal(base, axis1=-2, axis2=-1) == 0
+    absent = diagonal(base) == 0
     base = base + (RIDGE + absent[:, :, None]) * np.eye(len(fitted))
     right = np.concatenate([cross, pulled[:, fitted, None]], -1)
     both = np.concatenate([whole[:, tested][:, :, tested], pulled[:, tested, None]], -1)
-    both = both - np.swapaxes(cross, -1, -2) @ np.linalg.solve(base, right)
+    both = both - cross.mT @ np.linalg.solve(base, right)
     terms = []
     for first in range(0, len(tested), 6):
         at = slice(first, first + 6)
         values, vectors = eigen(both[:, at, at])
-        kept = values > WEAK
-        back = (vectors * np.where(kept, 1 / np.where(kept, values, 1.0), 0.0)[:, None]) @ (
-            np.swapaxes(vectors, -1, -2)
-        )
+        kept = values > LEFT_TO_TERM
+        back = (vectors * quotient(np.ones_like(values), values, kept)[:, None]) @ vectors.mT
         step = back @ both[:, at]
         square = np.einsum("bi,bi->b", both[:, at, -1], step[..., -1])
         worth = np.einsum("bii->bi", both[:, at, at])
@@ -233,13 +230,13 @@ def untested(result: Fit) -> Bools:
     return np.asarray((levels > 1) & (orders > 0) & (levels <= orders + 1))
 
 
-def misfit_size(result: Fit, terms: Terms) -> Array:
+def misfit_size(result: Fit, terms: OmittedTerms) -> Array:
     """Root mean square (B, t), per axis, of what the orders leave out, as a share of the field."""
     gains, offsets = np.moveaxis(course_misfit(result, terms), -1, 0)
     return np.asarray(np.sqrt(gains / 3 + offsets))
 
 
-def course_misfit(result: Fit, terms: Terms | None = None) -> Array:
+def course_misfit(result: Fit, terms: OmittedTerms | None = None) -> Array:
     """Variance (B, t, 2) of gains and offsets that the order leaves out, shares of the field squared.
 
     Mean square over the range of temperatures of all terms that are there, and of the next one
@@ -273,7 +270,7 @@ def _next_term(result: Fit, index: int) -> Array:
     model, params = problem.triads[index].model, result.state.params[:, problem.slices()[index]]
     still = np.zeros((*warmth.shape, 3))
     strength = np.linalg.norm(problem.targets(result.state)[index], axis=-1).mean(-1)
-    gain = np.diagonal(model.slope(params, still, warmth), axis1=-2, axis2=-1)
+    gain = diagonal(model.slope(params, still, warmth))
     offset = model.fields(params, still, warmth) / strength[:, None, None]
     both = np.stack([gain, offset], -1).reshape(*warmth.shape, 6)
     back = np.linalg.inv(np.polynomial.chebyshev.chebvander(nodes, order))
@@ -295,7 +292,7 @@ def _left_out(problem: Problem, order: int) -> tuple[Array, Array]:
     whole = np.concatenate([np.ones_like(powers[..., :1]), powers], -1)
     stations = temperature.shape[-1]
     measured, shown = whole[:, :stations], whole[:, stations:]
-    basis = np.swapaxes(measured[..., : order + 1] * weight[..., None], -1, -2)
+    basis = (measured[..., : order + 1] * weight[..., None]).mT
     gram = basis @ measured[..., : order + 1] + 1e-9 * np.eye(order + 1)
     taken = np.linalg.solve(gram, basis @ measured[..., 1:])
     remainder = shown[..., 1:] - shown[..., : order + 1] @ taken
@@ -306,7 +303,7 @@ def _left_out(problem: Problem, order: int) -> tuple[Array, Array]:
     return np.mean(remainder**2, -2), mean * levels / freedom * (1 + (order + 1) / levels)
 
 
-def misfit_covariance(result: Fit, terms: Terms | None = None) -> Array:
+def misfit_covariance(result: Fit, terms: OmittedTerms | None = None) -> Array:
     """Covariance (B, p, p) of the fit's parameters that stands for what its order leaves out."""
     problem, params = result.problem, result.state.params
     covariance = np.zeros((*params.shape, params.shape[-1]))
@@ -316,13 +313,12 @@ def misfit_covariance(result: Fit, terms: Terms | None = None) -> Array:
     for index, (triad, where) in enumerate(zip(problem.triads, problem.slices(), strict=True)):
         target = problem.targets(result.state)[index]
         strength = np.linalg.norm(target, axis=-1).mean(-1)
-        own = params[:, where]
-        turns = np.eye(3) + STEP * np.eye(3)[:, None] * np.eye(3)
-        gains = [(triad.model.transformed(own, turn) - own) / STEP for turn in turns]
+        stretches = np.eye(3) + TANGENT_STEP * np.eye(3)[:, None] * np.eye(3)
+        gains = [tangent(triad.model, params[:, where], stretch) for stretch in stretches]
         names = [name for name in triad.model.names if name in OFFSETS]
-        offsets = np.eye(own.shape[-1])[[triad.model.names.index(name) for name in names]]
+        offsets = np.eye(triad.model.size)[[triad.model.names.index(name) for name in names]]
         every = [np.stack(gains, 1), offsets * strength[:, None, None]]
         for place, rows in enumerate(every):
-            spread = np.swapaxes(rows, -1, -2) @ rows
+            spread = rows.mT @ rows
             covariance[:, where, where] += spread * variance[:, index, place, None, None]
     return covariance

@@ -22,11 +22,11 @@ from mwdcal.estimation.variance import log_evidence
 from mwdcal.geometry.vectors import Array, Ints
 from mwdcal.sensor.profile import Profile
 
-BETTER = 0.98
+BETTER_SHARE = 0.98
 """Left-out χ² must fall to this share before own-axis terms are taken…"""
-CLEAR = 2.0
+CLEAR_ERRORS = 2.0
 """…and by so many standard errors of its mean over the stations."""
-PARTS = 32
+MOST_PARTS = 32
 """Stations are left out one by one, or in so many parts where there are more."""
 ODDS = float(np.log(1000.0))
 """All offered terms are taken if they make the readings so many times (ln) as probable as none.
@@ -181,14 +181,16 @@ def _by_left_out(
     for index, score in enumerate(scores):
         gain = least - score
         error = gain.std(-1, ddof=1) / np.sqrt(readings.count)
-        better = (score.mean(-1) < BETTER * least.mean(-1)) & (gain.mean(-1) > CLEAR * error)
+        better = (score.mean(-1) < BETTER_SHARE * least.mean(-1)) & (
+            gain.mean(-1) > CLEAR_ERRORS * error
+        )
         best, least = np.where(better, index, best), np.where(better[:, None], score, least)
     return best, np.stack([score.mean(-1) for score in scores], -1)
 
 
 def _left_out(readings: Readings, options: Options) -> Array:
     """χ² per reading (B, n) of stations, each judged by the fit without its part."""
-    parts = min(readings.count, PARTS)
+    parts = min(readings.count, MOST_PARTS)
     part = np.arange(readings.count) % parts
     include = (np.arange(parts)[:, None] != part).astype(float)
     result = fit(mapped(lambda value: np.expand_dims(value, 1), readings), options, include)

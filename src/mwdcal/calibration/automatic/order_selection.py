@@ -15,7 +15,7 @@ from mwdcal.calibration.automatic.courses import terms_beyond
 from mwdcal.calibration.estimate import Fit, fit
 from mwdcal.calibration.options import Options, Orders
 from mwdcal.calibration.readings import TRIADS, Readings
-from mwdcal.calibration.record import OrderScore
+from mwdcal.calibration.record import OrderScore, stated
 from mwdcal.calibration.residuals import shown_in
 from mwdcal.calibration.soaks import HIGHEST, highest_order, usable_soaks
 from mwdcal.estimation.batch import batch_of_one, mapped, take
@@ -172,18 +172,14 @@ def _score(
     means = np.stack([part.mean(-1) for part in (squares, inner, squares[:, [0, -1]])], -1)
     scale, degree = shown[0], float(np.degrees(1))
     means[1:] = np.sqrt(means[1:]) * np.array([scale, scale, degree, degree])[:, None]
-    chi, noise, error, noise_deg, error_deg = ([_stated(v) for v in row] for row in means)
+    chi, noise, error, noise_deg, error_deg = ([stated(v) for v in row] for row in means)
     return OrderScore(
         triad=TRIADS[triad], order=order, chosen=bool(order == chosen),
-        chance=_stated(chance[order - 1]) if order else None,
+        chance=stated(chance[order - 1]) if order else None,
         inside=chi[1], ends=chi[2], unit=shown[1], noise=noise[0], error_inside=error[1],
         error_ends=error[2], noise_deg=noise_deg[0], error_inside_deg=error_deg[1],
         error_ends_deg=error_deg[2],
     )  # fmt: skip
-
-
-def _stated(value: float) -> float | None:
-    return None if np.isnan(value) else float(value)
 
 
 def _hopeless(readings: Readings, options: Options) -> Bools:
@@ -219,10 +215,7 @@ def _held_out(readings: Readings, options: Options, numbers: Ints) -> Array:
     problem, state = _everyone(result)
     linear = problem.linear(state)
     chi = np.sum(_chi(linear) * held[..., None], 1) / (3 * held.sum(1))[:, None]
-    left = linear.weigh(linear.residual[..., None])
-    share = linear.weigh(
-        np.broadcast_to(np.eye(left.shape[-2]), (*left.shape[:-1], left.shape[-2]))
-    )
+    left, share = linear.weigh(linear.residual[..., None]), linear.weight
     squares = []
     for index, (triad, where) in enumerate(zip(problem.triads, problem.slices(), strict=True)):
         params, axes = state.params[:, where], slice(3 * index, 3 * index + 3)
@@ -230,7 +223,7 @@ def _held_out(readings: Readings, options: Options, numbers: Ints) -> Array:
         slope = triad.model.slope(params, triad.raw, problem.temperature) * triad.sd[..., None, :]
         strength = np.linalg.norm(vector, axis=-2, keepdims=True)
         along = vector / strength
-        across = (slope - along @ (np.swapaxes(along, -1, -2) @ slope)) / strength
+        across = (slope - along @ (along.mT @ slope)) / strength
         parts = left[..., axes, :], share[..., axes, axes], held
         squares.append([chi[:, index], *_squares(slope, *parts, 3), *_squares(across, *parts, 2)])
     return np.array(squares)

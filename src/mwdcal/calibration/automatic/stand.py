@@ -13,7 +13,7 @@ from mwdcal.errors import FitError, InputError
 from mwdcal.estimation.batch import take
 from mwdcal.estimation.evidence import STAND_ERRORS, UNKNOWN
 from mwdcal.estimation.solvers import Determined
-from mwdcal.geometry.vectors import Bools
+from mwdcal.geometry.vectors import Bools, diagonal
 
 LOOSE = 0.1
 """A turn known no better than this share of no knowledge at all is not separated."""
@@ -43,7 +43,7 @@ def inseparable(result: Fit) -> Bools:
     """
     constants = result.problem.evidence.constants
     stand = np.array([c.unknown and c.name in STAND_ERRORS for c in constants])
-    sd = np.sqrt(np.diagonal(result.analysis.constants, axis1=-2, axis2=-1)[:, stand])
+    sd = np.sqrt(diagonal(result.analysis.constants)[:, stand])
     lost = np.any(sd > LOOSE * UNKNOWN, -1)
     some = np.flatnonzero(~lost & ~result.analysis.determined.keep.all(-1))
     if some.size:

@@ -64,9 +64,8 @@ def explaining(readings: Readings, profile: Profile) -> dict[str, tuple[str, ...
         return {}
     if result.status[0] != Status.OK or not _fits(result):
         return {}
-    if any(
-        map(is_bad, free_directions(result.problem, result.state, result.analysis.determined)[0])
-    ):
+    free = free_directions(result.problem, result.state, result.analysis.determined)[0]
+    if any(map(is_bad, free)):
         return {}
     axes = {}
     for index, gain in enumerate(_gains(result)):

@@ -7,14 +7,14 @@ from functools import partial
 
 import numpy as np
 
-from mwdcal.calibration.automatic.courses import Terms, misfit_size, terms_beyond, untested
+from mwdcal.calibration.automatic.courses import OmittedTerms, misfit_size, terms_beyond, untested
 from mwdcal.calibration.diagnosis import plausibility
 from mwdcal.calibration.diagnosis.flags import FittedRuns, Flag
 from mwdcal.calibration.diagnosis.structure import described as seen_as
 from mwdcal.calibration.diagnosis.structure import effects, suspected
 from mwdcal.calibration.readings import TRIADS
 from mwdcal.calibration.record import Finding
-from mwdcal.calibration.residuals import REASONS, shown_in
+from mwdcal.calibration.residuals import REASONS, shown_in, tail
 from mwdcal.calibration.results import common_source
 from mwdcal.calibration.soaks import HIGHEST
 from mwdcal.estimation.rank import free_directions
@@ -171,15 +171,12 @@ def _scatter(fitted: FittedRuns) -> Flag:
     def sentence(place: int) -> str:
         scatter = fitted.result.problem.evidence.scatter
         sizes = {name: float(values[place].max()) for name, values in scatter.items()}
+        shown = {n: f"{100 * size:.2f} %" for n, size in sizes.items()}
+        angles = {n: f"{np.degrees(sizes[n]):.2f}°" for n in ("dip", "direction") if n in sizes}
         words = [
-            f"{SCATTERED[name]} by "
-            + (
-                f"{np.degrees(size):.2f}°"
-                if name in ("dip", "direction")
-                else f"{100 * size:.2f} %"
-            )
-            for name, size in sizes.items()
-            if size > plausibility.SCATTER_SHARE
+            f"{SCATTERED[name]} by {size}"
+            for name, size in (shown | angles).items()
+            if sizes[name] > plausibility.SCATTER_SHARE
         ]
         return (
             f"beyond sensor noise, these vary from station to station: {', '.join(words)} "
@@ -205,7 +202,7 @@ def _repeated(fitted: FittedRuns) -> Flag:
     return Flag("repeated-readings", np.any(copies, -1), sentence)
 
 
-def _beyond_order(fitted: FittedRuns, index: int, terms: Terms) -> Flag:
+def _beyond_order(fitted: FittedRuns, index: int, terms: OmittedTerms) -> Flag:
     """A variation with temperature that the order of a triad does not follow."""
     problem, state = fitted.result.problem, fitted.result.state
     order, observable = problem.triads[index].model.basis.order, ("gravity", "field")[index]
@@ -304,6 +301,7 @@ def _prior_only(fitted: FittedRuns, source: str) -> Flag:
 def _prior_conflict(fitted: FittedRuns, source: str) -> Flag:
     """A departure from the prior that is unlikely."""
     square, tested = plausibility.departures(fitted.result)
+    unlikely = tail(square, np.maximum(tested, 1)) <= plausibility.MISFIT_CHANCE
 
     def sentence(place: int) -> str:
         ratio = np.sqrt(square[place] / tested[place])
@@ -312,7 +310,7 @@ def _prior_conflict(fitted: FittedRuns, source: str) -> Flag:
             "changed, or the prior is too narrow. Leave --prior out, or widen it."
         )
 
-    return Flag("prior-conflict", plausibility.conflicting(square, tested), sentence)
+    return Flag("prior-conflict", unlikely, sentence)
 
 
 def _model(fitted: FittedRuns) -> Iterator[Flag]:
@@ -373,7 +371,7 @@ def _reshoot(fitted: FittedRuns) -> Iterator[Flag]:
 
 def _distrusted(fitted: FittedRuns) -> Flag:
     """Stations that a robust fit has nearly left out."""
-    low = plausibility.distrusted(fitted.result)
+    low = fitted.result.trust < plausibility.LOW_WEIGHT
 
     def sentence(place: int) -> str:
         labels, weight = fitted.alone(place)[0].labels, fitted.result.trust[place]

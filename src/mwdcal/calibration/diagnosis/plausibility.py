@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 
 from mwdcal.calibration.estimate import Fit
-from mwdcal.calibration.readings import EARTH, Readings
+from mwdcal.calibration.readings import EARTH_RANGES, Readings
 from mwdcal.calibration.residuals import RESHOOT, Residuals, chances, chi_chance, tail, to_reshoot
 from mwdcal.estimation.batch import take
 from mwdcal.estimation.minimisers import closed_form
@@ -16,7 +16,7 @@ from mwdcal.estimation.problem import Prior
 from mwdcal.estimation.rank import Free
 from mwdcal.estimation.solvers import Determined
 from mwdcal.estimation.uncertainty import ROTATIONS, TESTED, effective_freedom, station_misfit
-from mwdcal.geometry.vectors import Array, Bools, Ints, centred, eigen
+from mwdcal.geometry.vectors import Array, Bools, Ints, centred, diagonal, eigen, outer, quotient
 
 BENIGN_DIRECTIONS = (*ROTATIONS, "scale")
 """Directions that may stay free."""
@@ -60,7 +60,7 @@ def gain_shares(result: Fit, index: int) -> tuple[Array, Array]:
     varies = bool(triad.model.basis.order) or getattr(whole, "curved", False)
     some = slice(None if varies else 1)
     slope = triad.model.slope(params, triad.raw[:, some], problem.temperature[:, some]).mean(1)
-    gain = np.diagonal(slope, axis1=-2, axis2=-1)
+    gain = diagonal(slope)
     middle = np.median(np.linalg.norm(slope, axis=-1), -1, keepdims=True)
     return gain, gain / middle
 
@@ -74,7 +74,7 @@ def off_earth(result: Fit, name: str, coil: bool) -> Bools:
     value = problem.constant(result.state, name)
     if name == "field" and (coil or len(problem.triads) == 1):
         return np.zeros(value.shape, bool)
-    low, high = EARTH[name]
+    low, high = EARTH_RANGES[name]
     relative = (problem.evidence.known["field"] == 1.0).all(-1, keepdims=True)
     outside = ~((value >= low) & (value <= high)) & (problem.evidence.include > 0)
     return np.asarray(outside & ~(relative & (name == "field")))
@@ -129,7 +129,7 @@ def excessive_errors(readings: Readings, result: Fit) -> dict[str, tuple[float, 
 def straying(result: Fit) -> Bools:
     """Members (B,) of which a reading is so far off that their errors have to be looked at."""
     analysis = result.analysis
-    variance = np.diagonal(analysis.spread, axis1=-2, axis2=-1)
+    variance = diagonal(analysis.spread)
     stray = analysis.residual**2 > STRAY_DEVIATIONS**2 * np.maximum(variance, 1e-30)
     return np.asarray(stray.any((-1, -2)))
 
@@ -189,11 +189,6 @@ def scattered(result: Fit) -> Bools:
     return np.asarray(np.max([np.zeros(len(result.status)), *sizes], 0) > SCATTER_SHARE)
 
 
-def distrusted(result: Fit) -> Bools:
-    """Stations (B, n) that a robust fit has nearly left out."""
-    return np.asarray(result.trust < LOW_WEIGHT)
-
-
 def without_prior(result: Fit) -> Fit:
     """The fit with only those directions determined that the run itself determines."""
     prior = result.problem.prior
@@ -207,18 +202,12 @@ def departures(result: Fit) -> tuple[Array, Ints]:
     prior, covariance = result.problem.prior, result.analysis.covariance
     precision, away = prior.precision, result.state.params - prior.expected
     spread = precision - precision @ covariance @ precision
-    scale = np.sqrt(np.maximum(np.diagonal(precision, axis1=-2, axis2=-1), 1e-300))
-    values, vectors = eigen(spread / (scale[:, :, None] * scale[:, None, :]))
+    scale = np.sqrt(np.maximum(diagonal(precision), 1e-300))
+    values, vectors = eigen(spread / outer(scale))
     pull = (precision @ away[..., None])[..., 0] / scale
     along = np.einsum("bij,bi->bj", vectors, pull) ** 2
     tested = values > 1e-6
-    square = np.sum(np.where(tested, along / np.where(tested, values, 1.0), 0.0), -1)
-    return square, np.sum(tested, -1)
-
-
-def conflicting(square: Array, freedom: Ints) -> Bools:
-    """Whether departures (B,) from the prior are unlikely."""
-    return np.asarray(tail(square, np.maximum(freedom, 1)) <= MISFIT_CHANCE)
+    return quotient(along, values, tested).sum(-1), np.sum(tested, -1)
 
 
 def stations_to_reshoot(result: Fit) -> Bools:

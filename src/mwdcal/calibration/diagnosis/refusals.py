@@ -27,7 +27,7 @@ from mwdcal.calibration.diagnosis.plausibility import (
 from mwdcal.calibration.diagnosis.structure import described, effects
 from mwdcal.calibration.methods import EVIDENCE
 from mwdcal.calibration.options import Options
-from mwdcal.calibration.readings import CONSTANTS, EARTH, TRIADS, Readings
+from mwdcal.calibration.readings import CONSTANTS, EARTH_RANGES, TRIADS, Readings
 from mwdcal.calibration.residuals import shown_in
 from mwdcal.calibration.soaks import soaks
 from mwdcal.errors import FitError, InputError
@@ -214,7 +214,7 @@ def _channels(readings: Readings, triad: str, prior: bool, run: Run) -> Iterator
     values = getattr(readings, triad)
     if values is None:
         return
-    spread = np.ptp(np.ascontiguousarray(np.swapaxes(values, -1, -2)), axis=-1)
+    spread = np.ptp(np.ascontiguousarray(values.mT), axis=-1)
     dead = spread <= 1e-12 * np.abs(values).max((-1, -2))[:, None]
     name, unit = ("gravity", "g") if triad == "accelerometer" else ("field", "nT")
     known = readings.reference(name)
@@ -327,7 +327,7 @@ def _by_arrays(fitted: FittedRuns) -> Iterator[Flag]:
     for triad in triads:
         yield named(_odd_gain(fitted, triad))
     yield named(_beyond_vertical(fitted))
-    for name in EARTH:
+    for name in EARTH_RANGES:
         yield _nowhere_on_earth(fitted, name)
 
 
@@ -484,7 +484,7 @@ def _nowhere_on_earth(fitted: FittedRuns, name: str) -> Flag:
         station = int(np.argmax(outside[place]))
         value = float(problem.constant(state, name)[place, station]) * factor
         given = bool(problem.evidence.is_known(name)[place, station])
-        low, high = (limit * factor for limit in EARTH[name])
+        low, high = (limit * factor for limit in EARTH_RANGES[name])
         source = f"'{column}' gives" if given else "the fit makes it"
         coil = "; of a run in a coil, say coil = true under [stand]" if name == "field" else ""
         return (

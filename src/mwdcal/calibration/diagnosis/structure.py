@@ -21,7 +21,7 @@ from mwdcal.calibration.evidence import STAND_TURNS, acts_on
 from mwdcal.calibration.readings import TRIADS
 from mwdcal.calibration.residuals import chances, to_reshoot
 from mwdcal.calibration.results import variance_scales
-from mwdcal.calibration.soaks import HIGHEST, SPAN, highest_order
+from mwdcal.calibration.soaks import HIGHEST, LEAST_TEMPERATURE_SPAN, highest_order
 from mwdcal.estimation.problem import Problem, State
 from mwdcal.estimation.uncertainty import whole_covariance
 from mwdcal.geometry.vectors import Array, Bools, eigen
@@ -162,7 +162,7 @@ def _misfit(problem: Problem, result: Fit) -> tuple[float, float]:
     linear, include = problem.linear(result.state), problem.evidence.include
     whole, normal = whole_covariance(linear, result.analysis.determined)[0], linear.normal
     gradient = normal.gradient[0]
-    private = problem.linear(result.state, geometry=True).own
+    private = problem.linear(result.state, geometry=True).private
     unknown = np.sum(
         np.linalg.svd(private, compute_uv=False) > 1.0
     )  # 0 where a station is left out
@@ -214,12 +214,9 @@ def _scores(problem: Problem, result: Fit, families: Mapping[str, Array]) -> _Sc
     """Efficient scores of columns (1, n, m, k): what the fit's own unknowns cannot take up."""
     linear = problem.linear(result.state)
     whole = whole_covariance(linear, result.analysis.determined)[0]
-    places, columns, at = {}, [], 0
-    for name, column in families.items():
-        places[name] = slice(at, at + column.shape[-1])
-        columns.append(column)
-        at += column.shape[-1]
-    every = np.concatenate(columns, -1)
+    ends = np.cumsum([0, *(column.shape[-1] for column in families.values())]).tolist()
+    places = dict(zip(families, map(slice, ends, ends[1:]), strict=False))
+    every = np.concatenate([*families.values()], -1)
     length = np.sqrt(np.einsum("bnmk,bnmk->k", every, linear.weigh(every)))
     length = np.where(length > 0, length, 1.0)
     unit = every / length
@@ -236,11 +233,7 @@ def _scores(problem: Problem, result: Fit, families: Mapping[str, Array]) -> _Sc
 
 def _families(problem: Problem, state: State) -> Iterator[tuple[str, Array]]:
     """Columns (1, n, m, k) of every effect that this run could show, whitened."""
-    predictions = problem.predictions(state)
-    weights = [problem.evidence.include[..., None] / t.sd for t in problem.triads]
-    pairs = list(zip(predictions, weights, strict=True))
-    turns = np.concatenate([p.by_turn * w[..., None] for p, w in pairs], -2)
-    by_earth = np.concatenate([p.by_earth * w[..., None] for p, w in pairs], -2)
+    turns, by_earth = problem.station_columns(state)
     known = {n: turn for n, turn in _turns(problem, state, turns).items() if turn.any()}
     for name in STAND_EFFECTS:
         each = [known[turn] for turn in STAND_TURNS.get(name, (name,)) if turn in known]
@@ -268,7 +261,7 @@ def _families(problem: Problem, state: State) -> Iterator[tuple[str, Array]]:
         yield "backlash", np.stack(back, -1)
     yield from _courses(problem, state)
     for index, name in enumerate(TRIADS[: len(problem.triads)]):
-        yield from _of_sensor(problem, index, name, weights[index], order)
+        yield from _of_sensor(problem, index, name, order)
 
 
 def _sets(problem: Problem) -> Array:
@@ -285,7 +278,7 @@ def _sets(problem: Problem) -> Array:
 
 def _courses(problem: Problem, state: State) -> Iterator[tuple[str, Array]]:
     """Powers of temperature that a triad's order leaves out: another finding names these."""
-    if np.ptp(problem.temperature) < SPAN:
+    if np.ptp(problem.temperature) < LEAST_TEMPERATURE_SPAN:
         return
     highest = int(np.clip(highest_order(problem.temperature)[0], HIGHEST, TRIED))
     columns = steady_columns(problem, state)
@@ -324,14 +317,13 @@ def _approach(problem: Problem) -> dict[str, Array]:
 
 
 def _of_sensor(
-    problem: Problem, index: int, name: str, weight: Array, order: Array
+    problem: Problem, index: int, name: str, order: Array
 ) -> Iterator[tuple[str, Array]]:
     """Drift with the order of stations, hysteresis and thermal lag of one triad's readings."""
-    triad, count = problem.triads[index], weight.shape[1]
-    size = 3 * len(problem.triads)
-    axes = np.zeros((1, count, size, 3))
-    axes[0, :, 3 * index : 3 * index + 3] = np.eye(3)
-    axes[:, :, 3 * index : 3 * index + 3] *= weight[..., None]
+    triad = problem.triads[index]
+    axes = np.zeros((*problem.temperature.shape, 3 * len(problem.triads), 3))
+    weight = problem.evidence.include[..., None] / triad.sd
+    axes[:, :, 3 * index : 3 * index + 3] = np.eye(3) * weight[..., None]
     if index == 0:
         yield f"{name}-drift", _products(axes, order)
     moved = np.diff(triad.raw[0], axis=0, prepend=triad.raw[0, :1])

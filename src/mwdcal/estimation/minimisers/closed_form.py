@@ -21,7 +21,15 @@ from mwdcal.estimation.problem import GEOMETRIC_NOISE, Problem, State, Triad
 from mwdcal.estimation.regression import regress
 from mwdcal.estimation.solvers import RANK_TOLERANCE, Determined
 from mwdcal.estimation.uncertainty import Analysis
-from mwdcal.geometry.vectors import Array, Bools, eigenvalues, inverse, tool_from_earth
+from mwdcal.geometry.vectors import (
+    Array,
+    Bools,
+    diagonal,
+    eigenvalues,
+    inverse,
+    outer,
+    tool_from_earth,
+)
 from mwdcal.sensor.models import Factors, Polynomial, affine_terms
 
 _ELEMENTS = np.arange(12).reshape(3, 4)
@@ -76,9 +84,9 @@ class AffineMinimum:
     @property
     def covariance(self) -> Array:
         """Covariance (B, 12, 12) of the parameters."""
-        inner = np.swapaxes(self.turn, -1, -2)[:, None] @ self.spread @ self.turn[:, None]
-        outer = self.back[:, :, None] * self.back[:, None]
-        whole = outer.reshape(-1, 9, 3) @ inner.reshape(-1, 3, 16)
+        inner = self.turn.mT[:, None] @ self.spread @ self.turn[:, None]
+        both = self.back[:, :, None] * self.back[:, None]
+        whole = both.reshape(-1, 9, 3) @ inner.reshape(-1, 3, 16)
         whole = np.swapaxes(whole.reshape(-1, 3, 3, 4, 4), 2, 3).reshape(-1, 12, 12)
         return np.asarray(whole[:, PLACES[:, None], PLACES])
 
@@ -89,19 +97,16 @@ class AffineMinimum:
         Normalised, the information is a Kronecker product.
         """
         gain, batch = self.forward[..., :3], len(self.forward)
-        read = self.terms[..., :3] @ np.swapaxes(gain, -1, -2)
+        read = self.terms[..., :3] @ gain.mT
         size = np.sqrt(np.einsum("bni,bni->bn", read, read))[..., None]
         rows = self.terms * (self.include / (GEOMETRIC_NOISE * size))
         undo = inverse(self.turn)
         parts = [
-            np.swapaxes(gain, -1, -2) @ gain,
-            undo @ np.swapaxes(rows, -1, -2) @ rows @ np.swapaxes(undo, -1, -2),
+            gain.mT @ gain,
+            undo @ rows.mT @ rows @ undo.mT,
         ]
-        sizes = [np.sqrt(np.diagonal(part, axis1=-2, axis2=-1)) for part in parts]
-        pair = [
-            eigenvalues(m / (s[:, :, None] * s[:, None, :]))
-            for m, s in zip(parts, sizes, strict=True)
-        ]
+        sizes = [np.sqrt(diagonal(part)) for part in parts]
+        pair = [eigenvalues(m / outer(s)) for m, s in zip(parts, sizes, strict=True)]
         squares, norms = (np.einsum("bi,bj->bij", *p).reshape(batch, 12) for p in (pair, sizes))
         return np.sqrt(np.clip(squares, 0, None)), norms[:, PLACES]
 
@@ -135,8 +140,8 @@ def start(problem: Problem) -> State:
     attitude = tool_from_earth(known["inclination"], azimuth, known["toolface"])
     nothing = np.zeros((batch, 0))
     size = sum(triad.model.size for triad in problem.triads)
-    own = np.zeros((*problem.temperature.shape, 0))
-    return State(np.zeros((batch, size)), attitude, nothing, own)
+    departures = np.zeros((*problem.temperature.shape, 0))
+    return State(np.zeros((batch, size)), attitude, nothing, departures)
 
 
 def solution(problem: Problem, at: State, triads: Minima) -> tuple[State, Analysis]:
@@ -164,8 +169,8 @@ def _affine_minimum(triad: Triad, target: Array, include: Array) -> AffineMinimu
     weight = include / triad.sd**2
     alike = bool((weight == weight[..., :1]).all())
     fit = regress(triad.raw, target, weight[..., :1] if alike else weight)
-    terms, forward, spread = fit.terms, np.swapaxes(fit.forward, -1, -2), fit.cofactor
-    left = (triad.raw - terms @ np.swapaxes(forward, -1, -2)) * np.sqrt(weight)
+    terms, forward, spread = fit.terms, fit.forward.mT, fit.cofactor
+    left = (triad.raw - terms @ forward.mT) * np.sqrt(weight)
     share = np.einsum("banj,bnj->bna", terms[:, None] @ spread, terms) * weight
     return AffineMinimum(
         include, terms, forward, spread, *_own(triad, forward), left, include - share, fit.spanned

@@ -20,7 +20,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from mwdcal.estimation.problem import GEOMETRIC_NOISE, Triad
-from mwdcal.geometry.vectors import Array, Bools, eigenvalues, inverse, solved
+from mwdcal.geometry.vectors import Array, Bools, diagonal, eigenvalues, inverse, outer, solved
 from mwdcal.sensor.models import OFF_COLUMNS, OFF_ROWS, factor_params, factor_parts
 
 OTHERS = np.array([[1, 2], [0, 2], [0, 1]])
@@ -50,7 +50,7 @@ class Axes:
     @classmethod
     def of(cls, phi: Array, target: Array, raw: Array, sd: Array, include: Array) -> Axes:
         """From φ (B, n, K), vectors, readings and their noise (B, n, 3), and what counts (B, n)."""
-        phi, along, raw, noise = (np.swapaxes(each, -1, -2) for each in (phi, target, raw, sd))
+        phi, along, raw, noise = (each.mT for each in (phi, target, raw, sd))
         root = include[:, None] / noise
         beside = np.empty((*noise.shape[:2], phi.shape[1] + 2, noise.shape[-1]))
         np.multiply(along[:, OTHERS], root[:, :, None], out=beside[:, :, :2])
@@ -95,7 +95,7 @@ def minimum(axes: Axes) -> Point:
         rows = axes.slopes(scale, unit)
         left = axes.raw - scale * unit
         gradient = rows @ left[..., None]
-        information = rows @ np.swapaxes(rows, -1, -2)
+        information = rows @ rows.mT
         step = solved(information, gradient)
         settled = np.all(np.sum(step * gradient, (-1, -2)) < LAST_STEP, -1) & (turn > 0)
         if settled.all():
@@ -103,7 +103,7 @@ def minimum(axes: Axes) -> Point:
         unknowns = unknowns + np.where(settled[:, None, None], 0.0, step[..., 0])
         if turn == 0:  # linear so far: what goes with the scale is still times it
             unknowns[..., count:] /= unknowns[..., :1]
-    left -= (np.swapaxes(step, -1, -2) @ rows)[..., 0, :]
+    left -= (step.mT @ rows)[..., 0, :]
     return Point(unknowns + step[..., 0], scale, rows, information, left, settled)
 
 
@@ -170,9 +170,9 @@ def _minimum(axes: Axes, at: Point, include: Array) -> FactorsMinimum:
     strength = np.linalg.norm(at.scale * (shares @ axes.vectors), axis=-2)[:, None]
     return FactorsMinimum(
         params,
-        moved @ np.swapaxes(back, -1, -2),
-        np.swapaxes(at.left, -1, -2),
-        np.swapaxes(include[:, None] - share, -1, -2),
+        moved @ back.mT,
+        at.left.mT,
+        (include[:, None] - share).mT,
         *_evidence(at.rows, axes.noise / (GEOMETRIC_NOISE * strength), slope),
         at.settled,
     )
@@ -181,11 +181,11 @@ def _minimum(axes: Axes, at: Point, include: Array) -> FactorsMinimum:
 def _evidence(rows: Array, louder: Array, slope: Array) -> tuple[Array, Array]:
     """Singular values and norms (see `FactorsMinimum`), at another noise: ours over it is (B, 3, n)."""
     rows *= louder[..., None, :]  # in place: they are large, and done with
-    own = rows @ np.swapaxes(rows, -1, -2)
-    information = (np.swapaxes(slope, -1, -2) @ own @ slope).sum(1)
-    norms = np.sqrt(np.diagonal(information, axis1=-2, axis2=-1))
+    by_axis = rows @ rows.mT
+    information = (slope.mT @ by_axis @ slope).sum(1)
+    norms = np.sqrt(diagonal(information))
     norms = np.where(norms > 0, norms, 1.0)
-    values = eigenvalues(information / (norms[:, :, None] * norms[:, None, :]))
+    values = eigenvalues(information / outer(norms))
     return np.sqrt(np.clip(values, 0, None)), norms
 
 
@@ -196,16 +196,18 @@ def factors(unknowns: Array) -> tuple[Array, Array, Array]:
     shares = np.broadcast_to(np.eye(3), (batch, 3, 3)).copy()
     shares[:, np.arange(3)[:, None], OTHERS] = cross
     back = inverse(shares)
-    own = np.diagonal(back, axis1=-2, axis2=-1)
-    params = factor_params(scale / own[..., None], bias * own[..., None], -back / own[:, None, :])
+    pivots = diagonal(back)
+    params = factor_params(
+        scale / pivots[..., None], bias * pivots[..., None], -back / pivots[:, None, :]
+    )
     slope = np.zeros((batch, 3, 2 * count + 2, params.shape[-1]))
     scales, biases, misalignments = factor_parts(np.arange(params.shape[-1]))
     axis, k = np.arange(3)[:, None], np.arange(count)
-    slope[:, axis, k, scales] = own[..., None]
-    slope[:, axis, count + 2 + k, biases] = 1 / own[..., None]
-    turn = shares * own[..., None]  # N; dN = N dm N
-    pulled, moved = turn[:, :, OFF_ROWS] / own[..., None], turn[:, OFF_COLUMNS]
-    grown = (pulled * np.swapaxes(moved, -1, -2))[:, :, None]
+    slope[:, axis, k, scales] = pivots[..., None]
+    slope[:, axis, count + 2 + k, biases] = 1 / pivots[..., None]
+    turn = shares * pivots[..., None]  # N; dN = N dm N
+    pulled, moved = turn[:, :, OFF_ROWS] / pivots[..., None], turn[:, OFF_COLUMNS]
+    grown = (pulled * moved.mT)[:, :, None]
     by_mixing = np.zeros((batch, 3, 2 * count + 2, 6))
     by_mixing[:, :, :count] = scale[..., None] * grown
     by_mixing[:, :, count + 2 :] = -bias[..., None] * grown

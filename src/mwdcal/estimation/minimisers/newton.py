@@ -34,9 +34,18 @@ import numpy as np
 
 from mwdcal.estimation.batch import take
 from mwdcal.estimation.solvers import Determined, Normal, Status
-from mwdcal.estimation.uncertainty import COUPLED, ROTATIONS, free_share
+from mwdcal.estimation.uncertainty import CHANGES, COUPLED, free_share, tangent
 from mwdcal.geometry.observables import OBSERVABLES, VERTICAL, is_vertical
-from mwdcal.geometry.vectors import AnyArray, Array, ArrayLike, Bools, Ints, inverse, rotation
+from mwdcal.geometry.vectors import (
+    AnyArray,
+    Array,
+    ArrayLike,
+    Bools,
+    Ints,
+    inverse,
+    outer,
+    quotient,
+)
 from mwdcal.sensor.models import Model
 
 THRESHOLD = 1.5e-6
@@ -50,7 +59,6 @@ SMALLEST_EIGENVALUE = 1e-12
 DECREASE = 1e-4
 """Share of the decrease promised by the gradient with which the line search is content."""
 MOST_HALVINGS = 40
-TANGENT_STEP = 1e-5
 EPSILON = float(np.finfo(float).eps)
 
 
@@ -166,14 +174,10 @@ def _compared(raw: Array, known: list[Array], shares: Array, lead: tuple[int, ..
     )
 
 
-def _outer(first: Array, second: Array) -> Array:
-    return np.asarray(first[..., :, None] * second[..., None, :])
-
-
 def half_square_strength(g: Array, gravity: Array) -> tuple[Array, Array, Array]:
     """Error e = |g|² - G² (...), and gradient (..., 3) and Hessian (..., 3, 3) of e² / 2."""
     error = np.sum(g * g, -1) - gravity**2
-    second = 4 * _outer(g, g) + 2 * error[..., None, None] * np.eye(3)
+    second = 4 * outer(g, g) + 2 * error[..., None, None] * np.eye(3)
     return error, 2 * error[..., None] * g, second
 
 
@@ -198,8 +202,8 @@ def half_square_inclination(g: Array, inclination: Array) -> tuple[Array, Array,
     vertical, across = is_vertical(g), np.hypot(g[..., 0], g[..., 1])
     limit = np.where(np.abs(error) < BOTH_VERTICAL, 1.0, 0.0)
     bend = np.where(vertical, limit, error * g[..., 2] / np.where(vertical, 1.0, across))
-    mixed = _outer(up, along) + _outer(along, up)
-    second = _outer(up, up) + bend[..., None, None] * _outer(turn, turn)
+    mixed = outer(up, along) + outer(along, up)
+    second = outer(up, up) + bend[..., None, None] * outer(turn, turn)
     second = (second - error[..., None, None] * mixed) / strength[..., None] ** 2
     return error, error[..., None] * up / strength, second
 
@@ -227,7 +231,7 @@ def local(model: Model, params: Array, stations: Compared) -> Local:
     gradient = np.einsum("bni,bnip->bp", first, slope)
     shape = (len(slope), 3 * slope.shape[1], model.size)
     bent = (second @ slope).reshape(shape)
-    hessian = np.swapaxes(slope.reshape(shape), -1, -2) @ bent
+    hessian = slope.reshape(shape).mT @ bent
     hessian = hessian + model.curvature(params, raw, temperature, first)
     squares = share * np.stack([strength[0], angle[0]], -1) ** 2
     return Local(0.5 * np.sum(squares, (-1, -2)), gradient, hessian)
@@ -254,7 +258,7 @@ def geometry(model: Model, params: Array, stations: Compared) -> tuple[Array, Ar
     agreeing = raw - np.einsum("bnij,bnj->bni", back, g - target)
     slope = model.jacobian(params, agreeing, temperature)
     rows = (_rows(target, stations) @ slope).reshape(len(slope), 3 * slope.shape[1], model.size)
-    gram = np.nan_to_num(np.swapaxes(rows, -1, -2) @ rows, posinf=0.0, neginf=0.0)
+    gram = np.nan_to_num(rows.mT @ rows, posinf=0.0, neginf=0.0)
     whole = slope / np.linalg.norm(target, axis=-1)[..., None, None]
     counted = np.any(stations.used, -1)[..., None, None]
     norms = np.sqrt(np.nan_to_num(np.sum((whole * counted) ** 2, (1, 2))))
@@ -286,13 +290,13 @@ def _rows(target: Array, stations: Compared) -> Array:
 def downhill(here: Local, determined: Determined) -> Array:
     """Newton's step (B, p) in the determined subspace, with absolute eigenvalues."""
     norms, kept = determined.norms, determined.basis * determined.keep[..., None, :]
-    inner = np.swapaxes(kept, -1, -2) @ (here.hessian / _outer(norms, norms)) @ kept
+    inner = kept.mT @ (here.hessian / outer(norms, norms)) @ kept
     values, vectors = np.linalg.eigh(inner)
     size = np.abs(values)
     size = np.maximum(size, SMALLEST_EIGENVALUE * np.max(size, -1, keepdims=True))
     axes = kept @ vectors
-    along = np.swapaxes(axes, -1, -2) @ (here.gradient / norms)[..., None]
-    length = np.where(size > 0, along[..., 0] / np.where(size > 0, size, 1.0), 0.0)
+    along = axes.mT @ (here.gradient / norms)[..., None]
+    length = quotient(along[..., 0], size, size > 0)
     return np.asarray(-(axes @ length[..., None])[..., 0] / norms)
 
 
@@ -384,15 +388,8 @@ class _NewtonDescent:
 
     def free(self, determined: Determined) -> dict[str, Bools]:
         """Whether a turn of all readings about an axis, or their scale, is free (B,), by name."""
-        turns = zip(ROTATIONS, np.eye(3), strict=True)
-        changes = {name: rotation(TANGENT_STEP * axis) for name, axis in turns}
-        changes["scale"] = np.eye(3) * (1 + TANGENT_STEP)
-        result = {}
-        for name, change in changes.items():
-            moved = self.model.transformed(self.params, change)
-            share = free_share(determined, (moved - self.params) / TANGENT_STEP)
-            result[name] = np.asarray(share > COUPLED)
-        return result
+        moved = {name: tangent(self.model, self.params, each) for name, each in CHANGES.items()}
+        return {name: free_share(determined, each) > COUPLED for name, each in moved.items()}
 
     def outcome(self, lead: tuple[int, ...]) -> Newton:
         """What became of every member, with the leading axes that were given."""

@@ -173,11 +173,11 @@ def vector_cost(raw: Array, reference: Array, error: Error = "field") -> Cost:
 
     def in_reading(params: Array) -> Array:
         matrix, offset = affine_parts(params)
-        return (readings - offset[..., None, :]) - known @ np.swapaxes(matrix, -1, -2)
+        return (readings - offset[..., None, :]) - known @ matrix.mT
 
     def in_field(params: Array) -> Array:
         matrix, offset = affine_parts(params)
-        back = np.swapaxes(inverse(matrix), -1, -2)
+        back = inverse(matrix).mT
         return (readings - offset[..., None, :]) @ back - known
 
     misfit = {"field": in_field, "reading": in_reading}[error]
@@ -201,7 +201,7 @@ def least_squares_forward(raw: Array, reference: Array) -> Array:
     Shapes: `raw`, `reference` (..., n, 3). Singular: as `regress`.
     """
     forward = regress(raw, reference, np.ones((*raw.shape[:-1], 1))).forward
-    return affine_terms(np.swapaxes(forward[..., :3, :], -1, -2), forward[..., 3, :])
+    return affine_terms(forward[..., :3, :].mT, forward[..., 3, :])
 
 
 def least_squares_affine(raw: Array, reference: Array) -> Array:
@@ -213,7 +213,7 @@ def least_squares_affine(raw: Array, reference: Array) -> Array:
     """
     centred, mean = _centred(raw)
     back = regress(reference, centred, np.ones((*raw.shape[:-1], 1))).forward
-    matrix = inverse(np.swapaxes(back[..., :3, :], -1, -2))
+    matrix = inverse(back[..., :3, :].mT)
     return affine_terms(
         matrix, mean[..., 0, :] - np.einsum("...ij,...j->...i", matrix, back[..., 3, :])
     )
@@ -244,7 +244,7 @@ class Coordinates:
         (y, mean_target), (x, mean_terms) = _centred(target), _centred(terms)
         spread, size = (np.sqrt(np.sum(v * v, (-1, -2)) / v.shape[-2]) for v in (y, x))
         _, r = np.linalg.qr(x / np.sqrt(x.shape[-2]))
-        whiten = np.swapaxes(inverse(r), -1, -2)
+        whiten = inverse(r).mT
         return cls(spread / size, spread, whiten, mean_target, mean_terms)
 
     def parts(self, place: Array) -> tuple[Array, Array]:
@@ -264,7 +264,7 @@ class Coordinates:
         both = np.broadcast_arrays(terms - self.mean_terms, target - self.mean_target)
         rows = np.concatenate(both, -1)
         few = np.linalg.qr(rows / np.sqrt(rows.shape[-2]))[1]
-        few = np.swapaxes(few, -1, -2)
+        few = few.mT
         few_terms, few_target = few[..., :3, :], few[..., 3:, :]
         spread, lead, size = self.spread[..., None, None], few.shape[:-2], 3 * few.shape[-1]
         turned = np.einsum("ij,...ab->...iajb", np.eye(3), spread * (self.whiten @ few_terms))

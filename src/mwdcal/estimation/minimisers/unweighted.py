@@ -107,4 +107,4 @@ class Sums:
         _, gradient, _ = self.at(target)
         noise = gradient @ model.slope(params, raw, self.temperature) * self.triad.sd[..., None, :]
         rows = gradient @ model.jacobian(params, raw, self.temperature) * self.weights[..., None]
-        return -bread[:, None] @ np.swapaxes(rows, -1, -2) @ noise
+        return -bread[:, None] @ rows.mT @ noise
