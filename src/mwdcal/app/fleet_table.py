@@ -14,7 +14,8 @@ import msgspec
 
 from mwdcal import __version__
 from mwdcal.app import pool, progress
-from mwdcal.app.commands.choices import Typed, options_of, prior_of
+from mwdcal.app.commands.choices import options_of, prior_of
+from mwdcal.app.commands.options import Typed
 from mwdcal.app.messages import lines
 from mwdcal.app.pages.fleet_summary import Summary, stated_options, summarise
 from mwdcal.app.text import plural

@@ -276,7 +276,7 @@ class _Worker:
         lacking = 0 if self.rules.missing == "refuse" else _MOST
         said = self.heard(("\0" * LONGEST, "\1" * LONGEST, "…"))
         worst = strengths.Strengths(_MOST, _MOST, _MOST, _MOST, -1.23e-100, -1.24e-100)
-        off = dict.fromkeys(strengths.COLUMNS, worst)
+        off = dict.fromkeys(strengths.JUDGED_STRENGTHS, worst)
         tally = RowCounts(
             _MOST, _MOST, judged, lacking, (), off, (TEMPERATURE.low, TEMPERATURE.high)
         )

@@ -18,16 +18,13 @@ from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array, Bools, Ints
 from mwdcal.use.roll_sets import ROLL_SET, RollSet, near_vertical, roll_sets
 from mwdcal.use.roll_test import GAP, OPEN, SLACK, Coverage, Curve, coverage, ends, extent, fitted
+from mwdcal.use.strengths import OUTPUTS
 
 TURNING = ("azimuth", "toolface")
 """Angles that do not exist at vertical."""
 LEVEL = ("inclination", "gravity")
 """Observables that stations of one inclination share at every azimuth."""
-COLUMNS = {
-    **{name: f"ref_{name}_deg" for name in ("inclination", "azimuth", "toolface", "dip")},
-    "gravity": "ref_gravity_g",
-    "field": "ref_field_nt",
-}
+COLUMNS = {name: f"ref_{column}" for name, column in OUTPUTS.items()}
 """Reference column of each observable."""
 NO_TOOLFACE = f"the toolface of exactly vertical stations is not known. Give {COLUMNS['toolface']}"
 SEEN = 0.7

@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
 from mwdcal.app.commands import options
 from mwdcal.app.messages import print_result, say
-
-if TYPE_CHECKING:
-    from mwdcal.app.commands.choices import Typed
 
 
 @options.command()
@@ -31,7 +27,7 @@ if TYPE_CHECKING:
 @options.DECIMAL
 @options.JSON
 def command(
-    run: Path, output: Path, tool: str | None, typed: Typed, exclude: tuple[str, ...],
+    run: Path, output: Path, tool: str | None, typed: options.Typed, exclude: tuple[str, ...],
     report: Path | None, decimal: str, as_json: bool,
 ) -> None:  # fmt: skip
     """Fit the sensor model to a calibration RUN (CSV, TSV, Parquet or XLSX).
@@ -55,9 +51,10 @@ def command(
     choice = choose(readings, profile, options_of(typed, prior, exclude), say)
     calibration = recorded(choice, fit(choice.readings, choice.options), **digests)
     if report:
-        from mwdcal.app.pages.report import write_report
+        from mwdcal.app.pages.report import render
+        from mwdcal.files.formats import atomic
 
-        write_report(report, calibration)
+        atomic.write(report, render(calibration))
     documents.write(output, calibration)
     shown = page.summary if as_json else page.screen
     unused = [finding for finding in calibration.findings if finding.id == UNUSED]

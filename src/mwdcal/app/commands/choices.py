@@ -3,29 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal, TypedDict, cast
+from typing import Any, Literal, cast
 
+from mwdcal.app.commands.options import Typed
 from mwdcal.calibration.options import AUTO, Options
 from mwdcal.calibration.prior import DATASHEET
 from mwdcal.calibration.record import Calibration
 from mwdcal.calibration.soaks import HIGHEST
 from mwdcal.files import documents
-
-
-class Typed(TypedDict):
-    """The options of `mwdcal calibrate` that say how to fit, as they come from the command line."""
-
-    method: str
-    model: str | None
-    order: str
-    parameters: str | None
-    nonlinearity: str
-    estimate: str
-    ignore: str
-    robust: str | None
-    paper_weights: bool
-    prior: str | None
-    seed: int
 
 
 def options_of(
@@ -34,20 +19,15 @@ def options_of(
     exclude: tuple[str, ...] = (),
 ) -> Options:
     """The options as typed, with the prior that `prior_of` has read."""
-    return Options(
-        method=typed["method"],
-        model=typed["model"],
-        order=order_of(typed["order"]),
-        parameters=int(typed["parameters"] or 12),
-        nonlinearity=_nonlinearity(typed["nonlinearity"]),
-        estimate=names(typed["estimate"]),
-        ignore=names(typed["ignore"]),
-        robust=typed["robust"],
-        paper_weights=typed["paper_weights"],
-        prior=prior,
-        exclude=exclude,
-        seed=typed["seed"],
-    )
+    read: dict[str, Any] = {
+        "order": order_of(typed["order"]),
+        "parameters": int(typed["parameters"] or 12),
+        "nonlinearity": _nonlinearity(typed["nonlinearity"]),
+        "estimate": names(typed["estimate"]),
+        "ignore": names(typed["ignore"]),
+        "prior": prior,
+    }
+    return Options(**{**typed, **read}, exclude=exclude)
 
 
 def prior_of(word: str | None) -> Calibration | Literal["datasheet"] | None:

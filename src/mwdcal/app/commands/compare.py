@@ -43,6 +43,7 @@ def command(
     from mwdcal.calibration.diagnosis.findings import unused_columns
     from mwdcal.calibration.options import Options
     from mwdcal.comparison.compare import able, compare
+    from mwdcal.files.formats import atomic
 
     options.check_outputs([], [run, tool], page=report)
     readings, profile, digests = load_run(run, tool, decimal)
@@ -51,7 +52,7 @@ def command(
         say(line)
     result = compare(readings, profile, Options(order=order_of(order), seed=seed), progress=say)
     if report:
-        page.write_report(report, result, profile.name, **digests)
+        atomic.write(report, page.render(result, profile.name, **digests))
     if as_json:
         print_result({**page.document(result), "findings": unused, "report": str(report or "")})
     else:

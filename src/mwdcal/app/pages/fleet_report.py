@@ -5,7 +5,6 @@ It reads the table of calibrations column by column, whatever its length.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,7 +27,7 @@ from mwdcal.app.pages.page import environment
 from mwdcal.app.text import number, plural, raised
 from mwdcal.calibration.diagnosis.plausibility import NOISE_RATIO
 from mwdcal.calibration.readings import TRIADS, is_simulated
-from mwdcal.files.formats import atomic, parquet
+from mwdcal.files.formats import parquet
 from mwdcal.fleet.calibrate import OK
 from mwdcal.fleet.sources import SERIAL
 from mwdcal.geometry.vectors import AnyArray, Array, Bools
@@ -104,11 +103,6 @@ class SoundTools:
     def words(self, name: str) -> AnyArray:
         """A column of text or labels."""
         return np.array(self._column(name).to_pylist(), object)[self._rows]
-
-
-def write_report(path: str | os.PathLike[str], calibrations: Path, summary: Summary) -> None:
-    """Write the page; the old file or the new one exists at any moment, never a part."""
-    atomic.write(path, render(calibrations, summary))
 
 
 def render(calibrations: Path, summary: Summary) -> str:

@@ -13,7 +13,8 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from mwdcal.app.commands.choices import Typed, names
+from mwdcal.app.commands.choices import names
+from mwdcal.app.commands.options import Typed
 from mwdcal.app.pages.calibration import choices
 from mwdcal.app.text import number, plural, table
 from mwdcal.calibration.readings import TRIADS

@@ -10,9 +10,8 @@ import msgspec
 import numpy as np
 
 from mwdcal import __version__
-from mwdcal.app.pages import pictures
 from mwdcal.app.pages.page import environment
-from mwdcal.app.text import table
+from mwdcal.app.text import plural, table
 from mwdcal.calibration.readings import SIMULATED
 from mwdcal.files.contract import CHANNELS
 from mwdcal.logs.noise import ChannelNoise, Noise, Term
@@ -70,7 +69,7 @@ def heading(noise: Noise) -> list[str]:
     rates = " and ".join(dict.fromkeys(f"{c.sampling_hz:.6g} Hz" for c in channels))
     return [
         noise.log,
-        f"{len(channels)} channel{'s' if len(channels) > 1 else ''}",
+        plural(len(channels), "channel"),
         f"{channels[0].samples} samples at {rates}",
         f"{noise.seconds:.6g} s",
         *([SIMULATED] if noise.simulated else []),
@@ -161,19 +160,16 @@ def profile_lines(noise: Noise) -> str:
 
 def render(noise: Noise) -> str:
     """The report: one HTML page that needs nothing else; the same noise, the same bytes."""
-    return (
-        environment()
-        .get_template("noise.html")
-        .render(
-            result=noise,
-            simulated=noise.simulated,
-            heading=heading(noise),
-            figure=figure(noise),
-            tables=tables(noise),
-            toml=profile_lines(noise),
-            deviations={name: _deviations(channel) for name, channel in noise.channels.items()},
-            version=__version__,
-        )
+    template = environment().get_template("noise.html")
+    return template.render(
+        result=noise,
+        simulated=noise.simulated,
+        heading=heading(noise),
+        figure=figure(noise),
+        tables=tables(noise),
+        toml=profile_lines(noise),
+        deviations={name: _deviations(channel) for name, channel in noise.channels.items()},
+        version=__version__,
     )
 
 
@@ -215,14 +211,7 @@ def figure(noise: Noise) -> Figure:
     return figure
 
 
-def picture(noise: Noise, path: Path) -> bytes:
-    """The figure as PNG or SVG, by the suffix."""
-    return pictures.picture(figure(noise), path)
-
-
 def _draw(axes: Axes, noise: Noise, names: list[str]) -> None:
-    from matplotlib.ticker import LogLocator, NullFormatter
-
     for name in names:
         channel = noise.channels[name]
         colour, marker, line = LOOKS[name[-1]]
@@ -252,9 +241,7 @@ def _draw(axes: Axes, noise: Noise, names: list[str]) -> None:
     axes.set(xscale="log", yscale="log", xlabel="averaging time τ, s")
     for axis in (axes.xaxis, axes.yaxis):
         crowded = np.log10(np.divide(*axis.get_view_interval()[::-1])) > 2
-        axis.set_major_locator(LogLocator(subs=(1.0,) if crowded else (1.0, 2.0, 5.0)))
-        axis.set_major_formatter(lambda value, _: f"{value:g}")
-        axis.set_minor_formatter(NullFormatter())
+        plots.plain_numbers(axis, *((1.0,) if crowded else (1.0, 2.0, 5.0)))
     axes.grid(which="minor", lw=0.25)
     handles, labels = axes.get_legend_handles_labels()
     axes.legend(handles, labels, ncols=len(names), loc="upper center", bbox_to_anchor=(0.5, 1.17))

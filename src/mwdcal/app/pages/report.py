@@ -1,12 +1,11 @@
 """The report of a calibration: one HTML file that needs nothing else, to be read and signed.
 
-`render` collects what the template shows; the pictures are drawn in `plots`, the wording of
-fixed text stands in `templates/`. Needs the extra `report` (jinja2, matplotlib).
+The pictures are drawn in `use.plots`, the wording of fixed text stands in `templates/`. Needs the
+extra `report` (jinja2, matplotlib).
 """
 
 from __future__ import annotations
 
-import os
 from datetime import datetime
 from typing import TYPE_CHECKING, Any
 
@@ -30,7 +29,6 @@ from mwdcal.calibration.readings import is_simulated
 from mwdcal.calibration.record import Calibration, TriadCalibration
 from mwdcal.errors import InputError
 from mwdcal.estimation.solvers import RANK_TOLERANCE
-from mwdcal.files.formats import atomic
 from mwdcal.use import plots
 from mwdcal.use.notation import Notation, convert
 from mwdcal.use.plots import reshoot_limit
@@ -43,13 +41,6 @@ LONG_TABLE = 60
 """A run of more stations has its station table at the end, as an annex."""
 ROWS = (5.0, 45.0, 90.0)
 """Inclinations of the table of predicted accuracy, degrees."""
-
-
-def write_report(
-    path: str | os.PathLike[str], calibration: Calibration, verdict: Verdict | None = None
-) -> None:
-    """Write the report; the old file or the new one exists at any moment, never a part."""
-    atomic.write(path, render(calibration, verdict))
 
 
 def render(calibration: Calibration, verdict: Verdict | None = None) -> str:

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mwdcal.app.pages import pictures
 from mwdcal.app.text import table
 from mwdcal.files.contract import CHANNELS
 from mwdcal.geometry.vectors import Array
@@ -129,11 +127,6 @@ def figure(stations: Stations) -> Figure:
         _shade(axes, stations)
     _number_stations(panels[0], stations)
     return figure
-
-
-def picture(stations: Stations, path: Path) -> bytes:
-    """The figure as PNG or SVG, by the suffix."""
-    return pictures.picture(figure(stations), path)
 
 
 def _thinned(x: Array, y: Array) -> tuple[Array, Array]:
