@@ -23,7 +23,7 @@ from mwdcal.comparison.compare import SCATTER, compare
 from mwdcal.estimation.rank import Free
 from mwdcal.estimation.uncertainty import unrotating
 from mwdcal.planning import simulate
-from mwdcal.use.roll_scatter import group_scatter
+from mwdcal.use.roll_sets import group_scatter
 from simulation import Tool, attitude, plan
 from test_calibrate import NOISE, PROFILE, make
 

@@ -126,7 +126,7 @@ def words(monkeypatch):
     for name in ("station_errors", "deviations", "accuracy", "order_errors"):
         monkeypatch.setattr(plots, name, lambda *arguments: "")
     monkeypatch.setattr(pictures, "svg", lambda figure, key: Markup(figure))
-    monkeypatch.setattr(report, "accuracy_map", lambda calibration: None)
+    monkeypatch.setattr(plots, "accuracy_map", lambda calibration: None)
     return render
 
 
@@ -225,7 +225,7 @@ def test_station_labels_may_be_anything(whole):
     odd = msgspec.structs.replace(whole, station_rows=rows)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        figures = {"a": plots.station_errors(odd, "field"), "b": plots.deviations(odd, 3.7)}
+        figures = {"a": plots.station_errors(odd, "field"), "b": plots.deviations(odd)}
         found = "".join(pictures.svg(figure, key) for key, figure in figures.items())
     assert "<script" not in found
     parsed(found)

@@ -77,7 +77,7 @@ Item = TypeVar("Item")
 Made = TypeVar("Made")
 
 
-class Corrected(NamedTuple):
+class CorrectedPart(NamedTuple):
     """A part, rendered for the sink, and what was seen in it."""
 
     rendered: Any
@@ -285,14 +285,14 @@ class _Worker:
         delimiter = "," if suffix == ".csv" else "\t"
         return TextSink(stream, self.source.schema, results, metadata, longest, delimiter)
 
-    def __call__(self, piece: Any, sink: Sink) -> Corrected:
+    def __call__(self, piece: Any, sink: Sink) -> CorrectedPart:
         """A piece, corrected and rendered; text that seems wrong is looked at line by line."""
         try:
             return self._corrected(self.source.load(piece, False), sink)
         except InputError:
             return self._corrected(self.source.load(piece, True), sink)
 
-    def _corrected(self, part: Part, sink: Sink) -> Corrected:
+    def _corrected(self, part: Part, sink: Sink) -> CorrectedPart:
         table, rows = part.table, part.table.count
         channels, corrected = self._compute(table)
         whole: Bools | None = None
@@ -319,7 +319,7 @@ class _Worker:
             strengths.judged(self.calibration, columns, known),
             warmth(channels["temperature"][0] if channels["temperature"] else None),
         )  # fmt: skip
-        return Corrected(rendered, part.size, tally)
+        return CorrectedPart(rendered, part.size, tally)
 
     def _serials(self, carried: Any) -> tuple[str, ...]:
         """The tools that a part names; names of others are cut, so that there is room for them."""

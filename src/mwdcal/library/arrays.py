@@ -153,7 +153,7 @@ def _by_name(values: Mapping[str, ArrayLike], limits: Mapping[str, Range]) -> di
     spelled = {name.replace("-", "_"): name for name in limits}
     angles = [key for key, name in spelled.items() if limits[name].unit == "°"]
     spelled |= {f"{key}{DEGREES}": spelled[key] for key in angles}
-    found: dict[str, str] = {}
+    given: dict[str, str] = {}
     for key in values:
         if key not in spelled:
             near = difflib.get_close_matches(key, spelled, 1)
@@ -162,12 +162,12 @@ def _by_name(values: Mapping[str, ArrayLike], limits: Mapping[str, Range]) -> di
             raise InputError(
                 f"unknown name '{key}'; expected one of {names}, or of an angle with _deg.{meant}"
             )
-        if spelled[key] in found:
+        if spelled[key] in given:
             raise InputError(
-                f"`{found[spelled[key]]}` and `{key}` are the same quantity. Give one of them."
+                f"`{given[spelled[key]]}` and `{key}` are the same quantity. Give one of them."
             )
-        found[spelled[key]] = key
-    return found
+        given[spelled[key]] = key
+    return given
 
 
 def _angle(name: str, values: Array, limits: Range, degrees: bool, turning: bool) -> Array:
@@ -202,21 +202,21 @@ def _uncertainties(sd: Mapping[str, ArrayLike], shape: tuple[int, ...]) -> dict[
     limits = {name: RAW_SPREAD._replace(positive=True) for name in TRIADS}
     limits |= {name: reference.uncertainty for name, reference in REFERENCES.items()}
     limits |= dict.fromkeys(COMMON, Range(0.0, 180.0, "°"))
-    found = {}
+    uncertainties = {}
     for name, key in _by_name(sd, limits).items():
         label, advice = f"sd {key}", "State one standard uncertainty."
         if name in TRIADS:
             values = _broadcast(label, sd[key], (*shape, 3))
             _refuse(np.isnan(values), label, values, "a number", advice, axis=-2)
-            found[name] = _within(label, values, limits[name], advice, axis=-2)
+            uncertainties[name] = _within(label, values, limits[name], advice, axis=-2)
             continue
         values = np.nan_to_num(_broadcast(label, sd[key], shape))
-        found[name] = (
+        uncertainties[name] = (
             _angle(label, values, limits[name], key.endswith(DEGREES), False)
             if limits[name].unit == "°"
             else _within(label, values, limits[name], advice)
         )
-    return found
+    return uncertainties
 
 
 def _labels(name: str, values: Sequence[object], shape: tuple[int, ...]) -> list[str]:

@@ -47,7 +47,7 @@ class Statistic:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class Departures:
     """All statistics of one observable in a run, or why there are none.
 
     `skipped`: why it cannot be judged. `blocked`: why no limit on it can be passed; `unrolled`:
@@ -147,7 +147,7 @@ class RollTest:
             return f"{roll_set.label}: no {COLUMNS[name]}"
         return ""
 
-    def spread(self, name: str) -> Outcome:
+    def spread(self, name: str) -> Departures:
         """The widest noise-free spread over the roll sets.
 
         A group that was not rolled cannot pass, nor can sets of equal reference directions of
@@ -159,14 +159,14 @@ class RollTest:
         unfit = [] if lacks else [why for s in self.sets if (why := self._unfit(name, s))]
         fit = [] if lacks else [s for s in self.sets if not self._unfit(name, s)]
         if not fit:
-            return Outcome(skipped=lacks or "; ".join(unfit))
+            return Departures(skipped=lacks or "; ".join(unfit))
         gaps = {s.label: self._loose(s.index) for s in fit}
         rolled = [s for s in fit if not gaps[s.label]]
         loose = [s for s in fit if gaps[s.label]]
         wrong = [s.label for s in loose if s.declared or (s.one_azimuth and not rolled)]
         apart = [f"{k}: not rolled, {why}" for k, why in gaps.items() if why and k not in wrong]
         if not rolled and not wrong:
-            return Outcome(skipped="; ".join([*unfit, *apart]))
+            return Departures(skipped="; ".join([*unfit, *apart]))
         blocked = self._unusable(name, any(self._free_spread(name, s.index) for s in fit))
         if wrong and not blocked:
             blocked = f"{wrong[0]} was not rolled: {gaps[wrong[0]]}"
@@ -174,7 +174,7 @@ class RollTest:
         statistics += [self._raw_spread(name, s) for s in fit if s.label in wrong]
         return self._outcome(name, statistics, blocked, bool(wrong), (*unfit, *apart))
 
-    def error(self, name: str) -> Outcome:
+    def error(self, name: str) -> Departures:
         """The largest noise-free departure from the reference: of rolled sets, and other stations.
 
         Cannot be passed on stations that were not, taken together, rolled all round.
@@ -185,7 +185,7 @@ class RollTest:
         judged = np.flatnonzero(given & ~near)
         if not judged.size:
             steep = "every station within 5° of vertical" if near.any() else f"no {COLUMNS[name]}"
-            return Outcome(skipped=lacks or steep)
+            return Departures(skipped=lacks or steep)
         free = bool(self.calibration.rests_on_free(name, self.readings)[judged].any())
         circle, blocked = self._coverage(judged), self._unusable(name, free)
         gap = NO_TOOLFACE if circle is None else _gap(circle, OPEN)
@@ -256,10 +256,10 @@ class RollTest:
         unrolled: bool,
         apart: tuple[str, ...],
         unseen: bool = False,
-    ) -> Outcome:
+    ) -> Departures:
         if self._relative(name):
-            return Outcome(blocked=blocked, apart=apart)
-        return Outcome(tuple(statistics), "", blocked, unrolled, apart, unseen)
+            return Departures(blocked=blocked, apart=apart)
+        return Departures(tuple(statistics), "", blocked, unrolled, apart, unseen)
 
     def _relative(self, name: str) -> bool:
         return name == "field" and self.calibration.relative

@@ -147,9 +147,9 @@ def station_errors(calibration: Calibration, name: str) -> Figure:
 
 
 @styled
-def deviations(calibration: Calibration, limit: float) -> Figure:
+def deviations(calibration: Calibration) -> Figure:
     """Each station's misfit in σ, with the limit above which it is to be taken again."""
-    rows = calibration.station_rows
+    rows, limit = calibration.station_rows, reshoot_limit(calibration)
     figure = new_figure("Misfit of each station in standard deviations", 1.7)
     axes = figure.subplots()
     _stems(axes, rows, [row.deviation for row in rows], AFTER, "s")
@@ -346,7 +346,7 @@ class Plots:
 
     def deviations(self) -> Figure:
         """Misfit of each station in standard deviations, and the limit for measuring it again."""
-        return deviations(self.calibration, reshoot_limit(self.calibration))
+        return deviations(self.calibration)
 
     def orders(self) -> Figure:
         """Error at temperatures left out of the fit, by temperature order."""

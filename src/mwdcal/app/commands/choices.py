@@ -1,4 +1,4 @@
-"""From the words of the command line to the options of a calibration."""
+"""From the words of the command line to a run, its tool profile, and the options of a calibration."""
 
 from __future__ import annotations
 
@@ -7,10 +7,28 @@ from typing import Any, Literal, cast
 
 from mwdcal.app.commands.options import Typed
 from mwdcal.calibration.options import AUTO, Options
-from mwdcal.calibration.prior import DATASHEET
+from mwdcal.calibration.prior import DATASHEET, profile_for
+from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import Calibration
 from mwdcal.calibration.soaks import HIGHEST
-from mwdcal.files import documents
+from mwdcal.files import documents, profiles, runs
+from mwdcal.files.formats import table
+from mwdcal.sensor.profile import Profile
+
+
+def load_run(
+    run: Path,
+    tool: str | None,
+    decimal: str,
+    prior: Calibration | Literal["datasheet"] | None = None,
+) -> tuple[Readings, Profile, dict[str, str]]:
+    """A run with its tool profile, and the digests of both files for the calibration file."""
+    profile, profile_sha256 = profiles.load_profile(tool)
+    profile = profile_for(prior, profile)
+    read = table.read(run, decimal=decimal)
+    runs.check_run(read)
+    readings, profile = runs.to_readings(read, profile)
+    return readings, profile, {"profile_sha256": profile_sha256, "run_sha256": read.digest}
 
 
 def options_of(

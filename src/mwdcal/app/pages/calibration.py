@@ -110,9 +110,7 @@ def remarks(calibration: Calibration) -> list[str]:
 def heading(calibration: Calibration) -> str:
     """What was calibrated, from what, and how much of it is determined."""
     serial = calibration.tool.get("serial", calibration.profile.name)
-    inclinations = [
-        r.inclination_deg for r in calibration.station_rows if r.inclination_deg is not None
-    ]
+    inclinations = known_inclinations(calibration)
     parts = [calibration.run, serial, f"{calibration.stations} stations"]
     if calibration.temperature_c:
         parts.append("{:.1f}–{:.1f} °C".format(*calibration.temperature_c))
@@ -125,6 +123,12 @@ def heading(calibration: Calibration) -> str:
     left_out = ["left out by --exclude: station " + ", ".join(calibration.excluded)]
     lines = ["   ".join(parts), "   ".join([how, *ranks])]
     return "\n".join(lines + (left_out if calibration.excluded else []))
+
+
+def known_inclinations(calibration: Calibration) -> list[float]:
+    """Inclinations of the stations that have one, degrees."""
+    rows = calibration.station_rows
+    return [row.inclination_deg for row in rows if row.inclination_deg is not None]
 
 
 def model(calibration: Calibration) -> str:

@@ -194,14 +194,10 @@ def parameter_pairs(comparison: Comparison) -> dict[str, list[Pairs]]:
     result = {}
     for triad in able(comparison.rows)[0].parameters:
         result[triad] = [
-            (place.title, place.unit, [_stated(*place.of(row)) for row in able(comparison.rows)])
+            (place.title, place.unit, [measured(*place.of(row)) for row in able(comparison.rows)])
             for place in places(comparison, triad)
         ]
     return result
-
-
-def _stated(value: float, sd: float) -> tuple[str, str]:
-    return measured(value, None if np.isnan(sd) else sd)
 
 
 def document(comparison: Comparison) -> dict[str, Any]:

@@ -56,7 +56,7 @@ class Said:
 
 
 @dataclass(frozen=True)
-class Summary:
+class FleetSummary:
     """What came of a fleet. `spread` has the 1 %, 50 % and 99 % point of columns of sound tools.
 
     `unused` are columns that are not used, of all tools.
@@ -88,14 +88,14 @@ class Summary:
         return sum(kind.tools for kind in self.statuses if kind.status == OK)
 
 
-def summarise(target: Path, typed: Typed, notes: list[str], **facts: Any) -> Summary:
+def summarise(target: Path, typed: Typed, notes: list[str], **facts: Any) -> FleetSummary:
     """What the table of calibrations `target` says, read column by column, beside other `facts`."""
     _, pq = parquet.modules(target.name)
     whole = pq.ParquetFile(target)
     head = whole.read([SERIAL, "status", "message", "findings"])
     columns, options = whole.schema_arrow.names, stated_options(typed)
     shown = [n for n in columns if n.endswith(("_sd_deg", "_variance_factor")) or n in ERRORS]
-    return Summary(
+    return FleetSummary(
         **facts,
         tools=head.num_rows,
         method=typed["method"],
@@ -105,7 +105,7 @@ def summarise(target: Path, typed: Typed, notes: list[str], **facts: Any) -> Sum
         nonlinear=_nonlinear(whole, columns),
         statuses=_kinds(head),
         findings=_findings(head),
-        spread={name: _quantiles(numbers(whole, name)) for name in shown},
+        spread={name: quantiles(numbers(whole, name)) for name in shown},
         undetermined=_undetermined(whole, columns),
         notes=notes + (_wide(whole) if typed["order"] == "0" else []),
     )
@@ -161,7 +161,8 @@ def numbers(whole: Any, name: str) -> Array:
     return np.asarray(cells.cast(arrow.float64()).to_numpy(), float)
 
 
-def _quantiles(values: Array) -> list[float]:
+def quantiles(values: Array) -> list[float]:
+    """The 1 %, 50 % and 99 % point of values, none where all are NaN."""
     if np.isnan(values).all():
         return []
     return [float(v) for v in np.nanquantile(values, (0.01, 0.5, 0.99))]
@@ -169,12 +170,13 @@ def _quantiles(values: Array) -> list[float]:
 
 def _kinds(head: Any) -> list[Kind]:
     """Statuses with their tools, sound ones first, then by number."""
-    counted = head.column("status").value_counts().to_pylist()
+    from pyarrow import compute
+
+    status = head.column("status")
+    counted = status.value_counts().to_pylist()
     kinds = []
     for each in sorted(counted, key=lambda c: (c["values"] != OK, -c["counts"])):
-        tools = (
-            head.filter(_equal(head.column("status"), each["values"])).slice(0, SHOWN).to_pydict()
-        )
+        tools = head.filter(compute.equal(status, each["values"])).slice(0, SHOWN).to_pydict()
         kinds.append(Kind(each["values"], each["counts"], tools[SERIAL], tools["message"][0]))
     return kinds
 
@@ -218,12 +220,6 @@ def _nonlinear(whole: Any, columns: list[str]) -> dict[str, int]:
     }
 
 
-def _equal(cells: Any, value: str) -> Any:
-    from pyarrow import compute
-
-    return compute.equal(cells, value)
-
-
 def _undetermined(whole: Any, columns: list[str]) -> dict[str, int]:
     """Tools by triad and direction that nothing determines."""
     counts: dict[str, int] = {}
@@ -236,7 +232,7 @@ def _undetermined(whole: Any, columns: list[str]) -> dict[str, int]:
     return counts
 
 
-def document(summary: Summary, report: Path | None) -> dict[str, Any]:
+def document(summary: FleetSummary, report: Path | None) -> dict[str, Any]:
     """The summary for machines."""
     shown: dict[str, Any] = msgspec.to_builtins(summary)
     whole = {"tools": summary.tools, "serials": []}
@@ -245,19 +241,21 @@ def document(summary: Summary, report: Path | None) -> dict[str, Any]:
     return {**shown, "calibrated": summary.sound, "report": str(report or "")}
 
 
-def text(summary: Summary, report: Path | None) -> str:
+def text(summary: FleetSummary, report: Path | None) -> str:
     """The summary for people: about one screen."""
     heading = (
         f"{summary.runs}   {plural(summary.tools, 'tool')}   {plural(summary.stations, 'station')}   "
         f"method {summary.method}   order {summary.order}"
     )
     also = unusual(summary.options)
-    rows = [[k.status, str(k.tools), _serials(k)] for k in summary.statuses]
+    rows = [[k.status, str(k.tools), "" if k.status == OK else _first(k)] for k in summary.statuses]
     lines = [heading, *(["options: " + ", ".join(also)] if also else []), ""]
     lines += [table(rows, ["status", "tools", "serials"])]
     refused = [kind for kind in summary.statuses if kind.status != OK]
     lines += [f"! {kind.status}, for example: {kind.message}" for kind in refused]
-    lines += [f"! {said.id} in {_count(said)}" for said in summary.findings]
+    lines += [
+        f"! {said.id} in {plural(said.tools, 'tool')}: {_first(said)}" for said in summary.findings
+    ]
     spread = [
         [_title(name), *(number(v) for v in values)]
         for name, values in summary.spread.items()
@@ -278,19 +276,10 @@ def text(summary: Summary, report: Path | None) -> str:
     return "\n".join([*lines, "", f"{wrote}   {summary.seconds:.1f} s, {rate:.0f} tools/s"])
 
 
-def orders_table(summary: Summary) -> tuple[list[str], list[list[str]]]:
+def orders_table(summary: FleetSummary) -> tuple[list[str], list[list[str]]]:
     """Header and rows of the tools by chosen order, a triad in each row."""
     header = ["tools of order", *map(str, range(HIGHEST + 1))]
     return header, [[triad, *map(str, counts.values())] for triad, counts in summary.orders.items()]
-
-
-def _count(said: Said) -> str:
-    """How many tools have a finding, and which."""
-    return f"{plural(said.tools, 'tool')}: {_first(said)}"
-
-
-def _serials(kind: Kind) -> str:
-    return "" if kind.status == OK else _first(kind)
 
 
 def _first(some: Kind | Said) -> str:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mwdcal.app.pages.calibration import choices
+from mwdcal.app.pages.calibration import choices, known_inclinations
 from mwdcal.app.pages.calibration import model as model_of
 from mwdcal.app.pages.page import (
     HELD,
@@ -24,7 +24,7 @@ from mwdcal.app.pages.page import (
     unit,
 )
 from mwdcal.app.text import plural, raised
-from mwdcal.calibration.prediction import accuracy_at, accuracy_map, angles, middle_temperature
+from mwdcal.calibration.prediction import accuracy_at, angles, middle_temperature
 from mwdcal.calibration.readings import is_simulated
 from mwdcal.calibration.record import Calibration, TriadCalibration
 from mwdcal.errors import InputError
@@ -159,8 +159,7 @@ def _temperatures(calibration: Calibration) -> str:
 
 
 def _attitudes(calibration: Calibration) -> str:
-    rows = calibration.station_rows
-    inclinations = [r.inclination_deg for r in rows if r.inclination_deg is not None]
+    inclinations = known_inclinations(calibration)
     if not inclinations:
         return str(calibration.stations)
     return f"{calibration.stations}, at inclinations {min(inclinations):.0f} to {max(inclinations):.0f}°"
@@ -177,13 +176,13 @@ def _figures(calibration: Calibration) -> dict[str, Any]:
     return {
         "errors": {name: plots.station_errors(calibration, name) for name in names},
         "missing": missing,
-        "deviations": plots.deviations(calibration, reshoot_limit(calibration)),
+        "deviations": calibration.plot.deviations(),
         "orders": (
             plots.order_errors(calibration.orders)
             if _compared(calibration) and _judged(calibration)
             else None
         ),
-        "accuracy": plots.accuracy(accuracy_map(calibration), angles(calibration)),
+        "accuracy": calibration.plot.accuracy(),
     }
 
 
@@ -248,10 +247,6 @@ def _unit(triad: TriadCalibration) -> str:
     return triad.unit if triad.unit in ("g", "nT") else "1"
 
 
-def _stated(uncertainty: float) -> float | None:
-    return None if np.isnan(uncertainty) else uncertainty
-
-
 def _factor_rows(triad: TriadCalibration, notation: Notation) -> list[Any]:
     raw = "raw" if _unit(triad) == "1" else f"raw/{triad.unit}"
     units, channels = {"SF": raw, "B": _unit(triad), "m": "1"}, "xyz"
@@ -260,7 +255,7 @@ def _factor_rows(triad: TriadCalibration, notation: Notation) -> list[Any]:
         for i, j in np.ndindex(values.shape):
             if name == "m" and i == j:
                 continue
-            sd = _stated(float(notation.uncertainty[name][i, j]))
+            sd = float(notation.uncertainty[name][i, j])
             index = channels[i] + channels[j] if name == "m" else channels[i]
             power = 0 if name == "m" else j
             rows.append(_row(name, index, power, float(values[i, j]), sd, units[name]))
