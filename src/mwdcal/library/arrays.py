@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, TypedDict, Unpack
 
 import numpy as np
@@ -148,6 +148,12 @@ def _temperature(values: ArrayLike, shape: tuple[int, ...]) -> Array:
     return _within(name, array, TEMPERATURE, "Give degrees Celsius.")
 
 
+def nearest(name: str, names: Iterable[str]) -> str:
+    """The question whether the nearest of the names was meant; empty where none is near."""
+    near = difflib.get_close_matches(name, list(names), 1)
+    return f" Did you mean '{near[0]}'?" if near else ""
+
+
 def _by_name(values: Mapping[str, ArrayLike], limits: Mapping[str, Range]) -> dict[str, str]:
     """For each quantity the name that it is given by: its own, or that of its twin in degrees."""
     spelled = {name.replace("-", "_"): name for name in limits}
@@ -156,11 +162,9 @@ def _by_name(values: Mapping[str, ArrayLike], limits: Mapping[str, Range]) -> di
     given: dict[str, str] = {}
     for key in values:
         if key not in spelled:
-            near = difflib.get_close_matches(key, spelled, 1)
-            meant = f" Did you mean '{near[0]}'?" if near else ""
             names = ", ".join(name for name in spelled if not name.endswith(DEGREES))
             raise InputError(
-                f"unknown name '{key}'; expected one of {names}, or of an angle with _deg.{meant}"
+                f"unknown name '{key}'; expected one of {names}, or of an angle with _deg.{nearest(key, spelled)}"
             )
         if spelled[key] in given:
             raise InputError(

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mwdcal.calibration.readings import Readings
+from mwdcal.calibration.readings import ANGLES, Readings
 from mwdcal.geometry.vectors import Array, reference_vectors
 from mwdcal.sensor.models import Basis, Factors
 
@@ -111,19 +111,13 @@ def run(
     """Readings with noise (g, nT), at a stand whose angles are off by `stand` (radians, 1 σ)."""
     inclination, azimuth, toolface = (
         angle + sd * rng.normal(size=angle.shape)
-        for angle, sd in zip((plan.inclination, plan.azimuth, plan.toolface), stand, strict=True)
+        for angle, sd in zip((getattr(plan, name) for name in ANGLES), stand, strict=True)
     )
     actual = StationPlan(inclination, azimuth, toolface, plan.temperature)
     g, b = reading(truth, actual)
     count = len(plan.inclination)
-    known = {
-        "inclination": plan.inclination,
-        "azimuth": plan.azimuth,
-        "toolface": plan.toolface,
-        "gravity": np.full(count, truth.gravity),
-        "field": np.full(count, truth.field),
-        "dip": np.full(count, truth.dip),
-    }
+    known = {name: getattr(plan, name) for name in ANGLES}
+    known |= {name: np.full(count, getattr(truth, name)) for name in ("gravity", "field", "dip")}
     return Readings(
         g + noise[0] * rng.normal(size=g.shape),
         b + noise[1] * rng.normal(size=b.shape),

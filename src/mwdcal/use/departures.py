@@ -24,9 +24,11 @@ TURNING = ("azimuth", "toolface")
 """Angles that do not exist at vertical."""
 LEVEL = ("inclination", "gravity")
 """Observables that stations of one inclination share at every azimuth."""
-COLUMNS = {name: f"ref_{column}" for name, column in OUTPUTS.items()}
+REFERENCE_COLUMNS = {name: f"ref_{column}" for name, column in OUTPUTS.items()}
 """Reference column of each observable."""
-NO_TOOLFACE = f"the toolface of exactly vertical stations is not known. Give {COLUMNS['toolface']}"
+NO_TOOLFACE = (
+    f"the toolface of exactly vertical stations is not known. Give {REFERENCE_COLUMNS['toolface']}"
+)
 SEEN = 0.7
 """Least share of the amplitude of each harmonic that stations should show."""
 TINY = 1e-15
@@ -140,11 +142,11 @@ class RollTest:
     def _unfit(self, name: str, roll_set: RollSet) -> str:
         """Why a roll set has no spread of an observable; empty where it has."""
         if not roll_set.one_azimuth and name not in LEVEL:
-            return f"{roll_set.label}: stations of one direction need group or {COLUMNS['azimuth']}"
+            return f"{roll_set.label}: stations of one direction need group or {REFERENCE_COLUMNS['azimuth']}"
         if name in TURNING and self.near[roll_set.index].any():
             return f"{roll_set.label}: within 5° of vertical"
         if name == "toolface" and np.isnan(self._error(name)[roll_set.index]).any():
-            return f"{roll_set.label}: no {COLUMNS[name]}"
+            return f"{roll_set.label}: no {REFERENCE_COLUMNS[name]}"
         return ""
 
     def spread(self, name: str) -> Departures:
@@ -184,7 +186,11 @@ class RollTest:
         near = given & self.near if name in TURNING else np.zeros(given.shape, bool)
         judged = np.flatnonzero(given & ~near)
         if not judged.size:
-            steep = "every station within 5° of vertical" if near.any() else f"no {COLUMNS[name]}"
+            steep = (
+                "every station within 5° of vertical"
+                if near.any()
+                else f"no {REFERENCE_COLUMNS[name]}"
+            )
             return Departures(skipped=lacks or steep)
         free = bool(self.calibration.rests_on_free(name, self.readings)[judged].any())
         circle, blocked = self._coverage(judged), self._unusable(name, free)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -37,24 +38,23 @@ _OF_A_TRIAD = (
 )
 
 
+_OF_ITS_ACCURACY = ("budget", "assumed_exact", "constants", "stand", "findings", "orders")
+
+
+def _attributes(record: object, names: Iterable[str]) -> dict[str, Any]:
+    return {name: getattr(record, name) for name in names}
+
+
 def summary(
     calibration: Calibration, choice: Choice, output: Path, report: Path | None
 ) -> dict[str, Any]:
     """The result for machines."""
-    triads = {t.name: {name: getattr(t, name) for name in _OF_A_TRIAD} for t in calibration.triads}
-    shown = {name: getattr(calibration, name) for name in _OF_A_CALIBRATION}
     return {
-        **shown,
-        "triads": triads,
-        "errors": calibration.errors,
-        "measures": calibration.measures,
+        **_attributes(calibration, _OF_A_CALIBRATION),
+        "triads": {triad.name: _attributes(triad, _OF_A_TRIAD) for triad in calibration.triads},
+        **_attributes(calibration, ("errors", "measures")),
         "accuracy_1sigma_deg": typical_accuracy(calibration),
-        "budget": calibration.budget,
-        "assumed_exact": calibration.assumed_exact,
-        "constants": calibration.constants,
-        "stand": calibration.stand,
-        "findings": calibration.findings,
-        "orders": calibration.orders,
+        **_attributes(calibration, _OF_ITS_ACCURACY),
         "nonlinearity": [msgspec.to_builtins(score) for score in choice.curves],
         "calibration": str(output),
         "report": str(report or ""),

@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 
 from mwdcal import __version__
-from mwdcal.app.pages.page import environment, measured, number
+from mwdcal.app.pages.page import environment, factor_places, measured, number
 from mwdcal.app.text import raised, superscript, table
 from mwdcal.calibration.methods import EVIDENCE
 from mwdcal.calibration.readings import SIMULATED
@@ -275,19 +275,14 @@ def places(comparison: Comparison, triad: str) -> list[Place]:
     strength = "g" if triad == "accelerometer" else "nT" if "field" in comparison.units else ""
     units = {"SF": f"raw/{strength}" if strength else "raw", "B": strength, "m": ""}
     result = []
-    for key, value in able(comparison.rows)[0].parameters[triad].values.items():
-        for i, j in np.ndindex(value.shape):
-            if key == "m" and i == j:
-                continue
-            power = 0 if key == "m" else j
-            title = f"{key} {'xyz'[i]}{'xyz'[j] if key == 'm' else ''}{raised('·τ', power)}"
-            unit = units[key] + raised("/°C", power)
-            result.append(Place(triad, title, unit, key, (i, j)))
+    for key, at, axes, power in factor_places(able(comparison.rows)[0].parameters[triad].values):
+        title, unit = f"{key} {axes}{raised('·τ', power)}", units[key] + raised("/°C", power)
+        result.append(Place(triad, title, unit, key, at))
     for name in comparison.gauge.get(triad, []):
-        key, at, unit = (
-            (name, 0, "") if name == SCALE else ("rotation_deg", ROTATIONS.index(name), "°")
-        )
-        result.append(Place(triad, name, unit, key, (at,)))
+        if name == SCALE:
+            result.append(Place(triad, name, "", name, (0,)))
+        else:
+            result.append(Place(triad, name, "°", "rotation_deg", (ROTATIONS.index(name),)))
     return result
 
 

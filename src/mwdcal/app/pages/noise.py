@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-ROWS = {
+TERM_ROWS = {
     "white": ("white noise N", "·√s"),
     "quantisation": ("quantisation Q", "·s"),
     "bias-instability": ("bias instability B", ""),
@@ -32,13 +32,13 @@ ROWS = {
 HOUR = 3600.0
 Line = tuple[str, list[str]]
 """A row of a table: what, and a cell for each channel."""
-LOOKS = {
+AXIS_LOOKS = {
     "x": (plots.AXES["x"], "o", "-"),
     "y": (plots.AXES["y"], "s", (0, (5, 1.5))),
     "z": (plots.AXES["z"], "^", (0, (1.5, 1.2))),
 }
 """Colour, marker and line style of each axis."""
-SHOWN = {"g": ("µg", 1e6), "nT": ("nT", 1.0)}
+DISPLAY_UNITS = {"g": ("µg", 1e6), "nT": ("nT", 1.0)}
 """How physical units are written, and their number in one of them."""
 MARK = " (!)"
 """Behind the name of a channel whose figures do not hold."""
@@ -92,7 +92,7 @@ def _terms(
     units = [scaled(c) if physical else _powers(c) for c in channels.values()]
     pairs = [(c, factor) for c, (_, factor) in zip(channels.values(), units, strict=True)]
     lines: list[Line] = []
-    for name, (what, unit) in ROWS.items():
+    for name, (what, unit) in TERM_ROWS.items():
         per = HOUR if name == "drift" else 1.0
         cells = [
             _term(c.terms[name], factor * per, bool({*c.doubts} - {"slow"})) for c, factor in pairs
@@ -188,7 +188,7 @@ def scaled(channel: ChannelNoise) -> tuple[str, float]:
     """The unit in which a channel is best read, and how many of it a raw unit is."""
     if channel.unit is None or channel.scale is None:
         return "raw", 1.0
-    unit, number = SHOWN[channel.unit]
+    unit, number = DISPLAY_UNITS[channel.unit]
     return unit, number / channel.scale
 
 
@@ -214,7 +214,7 @@ def figure(noise: Noise) -> Figure:
 def _draw(axes: Axes, noise: Noise, names: list[str]) -> None:
     for name in names:
         channel = noise.channels[name]
-        colour, marker, line = LOOKS[name[-1]]
+        colour, marker, line = AXIS_LOOKS[name[-1]]
         factor, tau = scaled(channel)[1], np.array(channel.tau_s)
         low, middle, high, fitted = (
             np.array(v) * factor

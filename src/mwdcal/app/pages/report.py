@@ -17,6 +17,7 @@ from mwdcal.app.pages.page import (
     HELD,
     environment,
     exponent,
+    factor_places,
     fixed,
     is_held,
     measured,
@@ -39,7 +40,7 @@ if TYPE_CHECKING:
 
 LONG_TABLE = 60
 """A run of more stations has its station table at the end, as an annex."""
-ROWS = (5.0, 45.0, 90.0)
+ACCURACY_INCLINATIONS = (5.0, 45.0, 90.0)
 """Inclinations of the table of predicted accuracy, degrees."""
 
 
@@ -249,23 +250,18 @@ def _unit(triad: TriadCalibration) -> str:
 
 def _factor_rows(triad: TriadCalibration, notation: Notation) -> list[Any]:
     raw = "raw" if _unit(triad) == "1" else f"raw/{triad.unit}"
-    units, channels = {"SF": raw, "B": _unit(triad), "m": "1"}, "xyz"
+    units = {"SF": raw, "B": _unit(triad), "m": "1"}
     rows = []
-    for name, values in notation.values.items():
-        for i, j in np.ndindex(values.shape):
-            if name == "m" and i == j:
-                continue
-            sd = float(notation.uncertainty[name][i, j])
-            index = channels[i] + channels[j] if name == "m" else channels[i]
-            power = 0 if name == "m" else j
-            rows.append(_row(name, index, power, float(values[i, j]), sd, units[name]))
+    for name, at, axes, power in factor_places(notation.values):
+        value, sd = (float(v[name][at]) for v in (notation.values, notation.uncertainty))
+        rows.append(_row(name, axes, power, value, sd, units[name]))
     return rows
 
 
 def _accuracy(calibration: Calibration) -> dict[str, Any]:
     """1σ in degrees by angle: of the calibration alone, and of one reading."""
     middle = middle_temperature(calibration)
-    cases = [(inclination, middle) for inclination in ROWS]
+    cases = [(inclination, middle) for inclination in ACCURACY_INCLINATIONS]
     if any(t.order for t in calibration.triads) and calibration.temperature_c:
         cases += [(45.0, t) for t in calibration.temperature_c]
     names = angles(calibration)

@@ -20,7 +20,7 @@ MOST_LINES = 40
 """Stations of a table on screen."""
 POINTS = 2000
 """Points of a line in the picture."""
-LINES = ("-", (0, (5, 1.5)), (0, (1.5, 1.2)))
+LINE_STYLES = ("-", (0, (5, 1.5)), (0, (1.5, 1.2)))
 """Line styles of x, y and z."""
 
 
@@ -147,7 +147,7 @@ def _draw_triad(axes: Axes, stations: Stations, triad: tuple[str, ...]) -> None:
         names[i]: c
         for i, c in zip(stations.activity.channels, stations.activity.cells, strict=True)
     }
-    for name, line in zip(triad, LINES, strict=True):
+    for name, line in zip(triad, LINE_STYLES, strict=True):
         if name in cells:
             x, y = cells[name].start, cells[name].level
         else:
