@@ -54,7 +54,7 @@ def command(
     check(between, **times)
     slowly = progress.slowly(say)
     profile = load_profile(tool)[0] if tool else None
-    readings = logs.read(log, options.names(columns), decimal=decimal, say=slowly)
+    readings = logs.read(log, options.column_names(columns), decimal=decimal, say=slowly)
     noise = find_noise(
         readings,
         profile=profile,

@@ -185,6 +185,6 @@ def check_outputs(
         environment()
 
 
-def names(text: str) -> list[str]:
+def column_names(text: str) -> list[str]:
     """The names of a list with commas, each as typed."""
     return [name.strip() for name in text.split(",")] if text else []

@@ -47,7 +47,7 @@ def command(
 
     options.check_outputs([output], [log], picture=plot)
     slowly = progress.slowly(say)
-    readings = logs.read(log, options.names(columns), decimal=decimal, say=slowly)
+    readings = logs.read(log, options.column_names(columns), decimal=decimal, say=slowly)
     try:
         stations = find_stations(readings, say=slowly, **search)
     except StandstillError as error:  # the picture helps most then

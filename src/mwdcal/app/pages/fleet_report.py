@@ -144,9 +144,9 @@ def _banner(summary: FleetSummary) -> dict[str, str]:
     """The result in one sentence."""
     refused = summary.tools - summary.sound
     doubts = [
-        f"{said.id.replace('-', ' ')} in {plural(said.tools, 'tool')}"
-        for said in summary.findings
-        if is_doubt(said.id)
+        f"{finding.id.replace('-', ' ')} in {plural(finding.tools, 'tool')}"
+        for finding in summary.findings
+        if is_doubt(finding.id)
     ]
     level = "bad" if not summary.sound else "attention" if refused or doubts else "good"
     word = "Some refused" if refused else "Some doubtful"

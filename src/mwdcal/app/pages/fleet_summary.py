@@ -37,7 +37,7 @@ SPAN = 10.0
 
 
 @dataclass(frozen=True)
-class Kind:
+class StatusCount:
     """Tools of one status: how many, the first serials, and one message."""
 
     status: str
@@ -47,7 +47,7 @@ class Kind:
 
 
 @dataclass(frozen=True)
-class Said:
+class FindingCount:
     """Sound tools with one finding: how many, and the first serials."""
 
     id: str
@@ -72,8 +72,8 @@ class FleetSummary:
     options: dict[str, Any]
     orders: dict[str, dict[str, int]]
     nonlinear: dict[str, int]
-    statuses: list[Kind]
-    findings: list[Said]
+    statuses: list[StatusCount]
+    findings: list[FindingCount]
     spread: dict[str, list[float]]
     undetermined: dict[str, int]
     parts: int
@@ -168,7 +168,7 @@ def quantiles(values: Array) -> list[float]:
     return [float(v) for v in np.nanquantile(values, (0.01, 0.5, 0.99))]
 
 
-def _kinds(head: Any) -> list[Kind]:
+def _kinds(head: Any) -> list[StatusCount]:
     """Statuses with their tools, sound ones first, then by number."""
     from pyarrow import compute
 
@@ -177,11 +177,13 @@ def _kinds(head: Any) -> list[Kind]:
     kinds = []
     for each in sorted(counted, key=lambda c: (c["values"] != OK, -c["counts"])):
         tools = head.filter(compute.equal(status, each["values"])).slice(0, SHOWN).to_pydict()
-        kinds.append(Kind(each["values"], each["counts"], tools[SERIAL], tools["message"][0]))
+        kinds.append(
+            StatusCount(each["values"], each["counts"], tools[SERIAL], tools["message"][0])
+        )
     return kinds
 
 
-def _findings(head: Any) -> list[Said]:
+def _findings(head: Any) -> list[FindingCount]:
     """Findings with their tools: doubts of the fit first, then by number."""
     arrow, _ = parquet.modules("findings")
     column = one_chunk(head.column("findings"))
@@ -191,8 +193,10 @@ def _findings(head: Any) -> list[Said]:
     for code, name in enumerate(ids.dictionary.to_pylist()):
         tools = tool[ids.indices.to_numpy() == code]
         serials = head.column(SERIAL).take(arrow.array(tools[:SHOWN])).to_pylist()
-        findings.append(Said(name, len(tools), serials))
-    return sorted(findings, key=lambda said: (not is_doubt(said.id), -said.tools, said.id))
+        findings.append(FindingCount(name, len(tools), serials))
+    return sorted(
+        findings, key=lambda finding: (not is_doubt(finding.id), -finding.tools, finding.id)
+    )
 
 
 def is_doubt(finding: str) -> bool:
@@ -254,7 +258,8 @@ def text(summary: FleetSummary, report: Path | None) -> str:
     refused = [kind for kind in summary.statuses if kind.status != OK]
     lines += [f"! {kind.status}, for example: {kind.message}" for kind in refused]
     lines += [
-        f"! {said.id} in {plural(said.tools, 'tool')}: {_first(said)}" for said in summary.findings
+        f"! {finding.id} in {plural(finding.tools, 'tool')}: {_first(finding)}"
+        for finding in summary.findings
     ]
     spread = [
         [_title(name), *(number(v) for v in values)]
@@ -282,7 +287,7 @@ def orders_table(summary: FleetSummary) -> tuple[list[str], list[list[str]]]:
     return header, [[triad, *map(str, counts.values())] for triad, counts in summary.orders.items()]
 
 
-def _first(some: Kind | Said) -> str:
+def _first(some: StatusCount | FindingCount) -> str:
     """The first serials of some tools."""
     return ", ".join(map(str, some.serials)) + (" …" if some.tools > len(some.serials) else "")
 

@@ -68,10 +68,12 @@ def screen(stations: Stations, files: dict[str, str]) -> str:
     whole = float(stations.time[-1] - stations.time[0])
     left = _left(stations)
     short = sum(is_short for *_, is_short in left)
+    same = " (the same stations from {:.3g} to {:.3g})"
+    stretch = same.format(*stations.stretch) if stations.stretch else " (given)"
     lines = [
         f"{stations.table.source}   {len(stations.time)} rows   {whole:.6g} s   "
         f"{stations.table.count} stations, {100 * float((end - start).sum()) / whole:.0f} % of the time",
-        f"threshold {stations.threshold:.3g} noise floors{_stretch(stations)}   at least "
+        f"threshold {stations.threshold:.3g} noise floors{stretch}   at least "
         f"{stations.min_seconds:g} s after {stations.trim_seconds:g} s trimmed off each end   "
         f"left: {short} too short, {len(left) - short} moving slowly",
         "",
@@ -81,12 +83,6 @@ def screen(stations: Stations, files: dict[str, str]) -> str:
         + f"   next: mwdcal calibrate {files['output']} -o CAL.json",
     ]
     return "\n".join(lines)
-
-
-def _stretch(stations: Stations) -> str:
-    if stations.stretch is None:
-        return " (given)"
-    return " (the same stations from {:.3g} to {:.3g})".format(*stations.stretch)
 
 
 def _stations_table(stations: Stations) -> str:
