@@ -145,7 +145,7 @@ def unlink(path, missing_ok=False):
     print("tidying", flush=True)
     time.sleep({seconds})
     real_unlink(path, missing_ok=missing_ok)
-Path.unlink, interruption.PATIENCE = unlink, {patience}
+Path.unlink, interruption.CLEANUP_SECONDS = unlink, {patience}
 """
 
 

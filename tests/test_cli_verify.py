@@ -173,7 +173,9 @@ def test_a_knocked_tool_that_was_not_rolled_never_exits_with_0(
     tmp_path, fitted, toolfaces, references
 ):
     """Knocked by 8 mg and 600 nT along x: rolled it fails, at one toolface it looks good."""
-    still = simulate.Plan(*(np.full(len(toolfaces), v) for v in (45 * DEG, 60 * DEG, 0.0, 25.0)))
+    still = simulate.StationPlan(
+        *(np.full(len(toolfaces), v) for v in (45 * DEG, 60 * DEG, 0.0, 25.0))
+    )
     run = simulated(dataclasses.replace(still, toolface=np.array(toolfaces) * DEG), 5)
     run = {**run, "ax": run["ax"] + 8e-3 * SCALE[0], "mx": run["mx"] + 600 * SCALE[1]}
     if not references:

@@ -23,7 +23,7 @@ from mwdcal.comparison.compare import SCATTER, compare
 from mwdcal.estimation.rank import Free
 from mwdcal.estimation.uncertainty import unrotating
 from mwdcal.planning import simulate
-from mwdcal.use.roll_scatter import group_scatter
+from mwdcal.use.roll_sets import group_scatter
 from simulation import Tool, attitude, plan
 from test_calibrate import NOISE, PROFILE, make
 
@@ -324,7 +324,7 @@ class Page(HTMLParser):
 
 
 def test_the_page_is_whole_and_needs_nothing_else(whole):
-    page = command.render(whole, [("run file", "<run>", "ab" * 32)])
+    page = command.render(whole, "<tool>", "ab" * 32)
     parsed = Page()
     parsed.feed(page)
     assert parsed.open == []
@@ -334,9 +334,10 @@ def test_the_page_is_whole_and_needs_nothing_else(whole):
     assert all(f"<th>{method}</th>" in page for method in EVIDENCE)
     assert page.count("<svg") == 4
     assert page.index("Use joint") < page.index("<svg")
-    assert "&lt;run&gt;" in page
+    assert "&lt;tool&gt;" in page
+    assert "ab" * 32 in page
     assert "SIMULATED" not in page
-    assert page == command.render(whole, [("run file", "<run>", "ab" * 32)])
+    assert page == command.render(whole, "<tool>", "ab" * 32)
 
 
 def test_the_page_says_what_is_simulated_and_what_is_refused():

@@ -12,7 +12,7 @@ from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.record import Calibration, OrderScore
 from mwdcal.geometry.vectors import reference_vectors
-from mwdcal.planning.simulate import Plan, grid, run, servo
+from mwdcal.planning.simulate import StationPlan, grid, run, servo
 from mwdcal.sensor.profile import Profile
 
 PROFILE = Profile(name="test tool")
@@ -47,7 +47,7 @@ def made(seed=0, orders=(2, 1), sd=NOISE, stand=(0.0, 0.0, 0.0), unknown=()):
         n: getattr(STATIONS, n) + s * rng.normal(size=120)
         for n, s in zip(angles, stand, strict=True)
     }
-    data = run(truth, Plan(**off, temperature=STATIONS.temperature), rng)
+    data = run(truth, StationPlan(**off, temperature=STATIONS.temperature), rng)
     stated = {n: getattr(STATIONS, n) for n in angles}
     known = {k: v for k, v in {**data.known, **stated}.items() if k not in unknown}
     spread = {n: np.array(s) for n, s in zip(angles, stand, strict=True)}

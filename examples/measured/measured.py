@@ -20,7 +20,8 @@ import numpy as np
 
 from mwdcal import Calibration, Options, Profile, Readings
 from mwdcal.app.commands import calibrate as command
-from mwdcal.app.commands.choices import Typed, options_of
+from mwdcal.app.commands.choices import options_of
+from mwdcal.app.commands.options import Typed
 from mwdcal.calibration.automatic.auto import Choice, choose
 from mwdcal.calibration.automatic.nonlinearity import ODDS, choices_of, declared, log_odds
 from mwdcal.calibration.calibrate import recorded
@@ -36,7 +37,7 @@ from mwdcal.files.profiles import load_profile
 from mwdcal.files.runs import read_run, to_readings
 from mwdcal.sensor.profile import TriadProfile
 from mwdcal.use.notation import Notation, convert
-from mwdcal.use.roll_scatter import directions, group_scatter
+from mwdcal.use.roll_sets import directions, group_scatter
 
 SAP = {
     "sap6/BB": (0.692, 0.389), "sap6/CF": (0.556, 0.414), "sap6/HC": (0.724, 0.181),

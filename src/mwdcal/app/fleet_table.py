@@ -14,9 +14,10 @@ import msgspec
 
 from mwdcal import __version__
 from mwdcal.app import pool, progress
-from mwdcal.app.commands.choices import Typed, options_of, prior_of
+from mwdcal.app.commands.choices import options_of, prior_of
+from mwdcal.app.commands.options import Typed
 from mwdcal.app.messages import lines
-from mwdcal.app.pages.fleet_summary import Summary, stated_options, summarise
+from mwdcal.app.pages.fleet_summary import FleetSummary, stated_options, summarise
 from mwdcal.app.text import plural
 from mwdcal.calibration.automatic.nonlinearity import with_strengths
 from mwdcal.calibration.automatic.stand import check_names
@@ -45,7 +46,7 @@ def calibrate_table(
     workers: int | None,
     scheduler: str | None,
     say: Callable[[str], None],
-) -> Summary:
+) -> FleetSummary:
     """Calibrate every tool of the table; the output is written at the end, as a whole."""
     begun = time.perf_counter()
     profile, digest = profiles.load_profile(tool)

@@ -11,7 +11,7 @@ from typing import Any
 
 SIGNAL = 128
 """Exit status of a command ended by a signal, less the number of the signal."""
-PATIENCE = 5.0
+CLEANUP_SECONDS = 5.0
 """Seconds of cleaning up after which another signal ends the command at once."""
 
 
@@ -28,7 +28,7 @@ def orderly_end() -> Iterator[None]:
         if not received:
             received.append(time.monotonic())
             raise Ended(number)
-        if time.monotonic() - received[0] > PATIENCE:
+        if time.monotonic() - received[0] > CLEANUP_SECONDS:
             os._exit(SIGNAL + number)
 
     handlers = _default_handlers()

@@ -32,7 +32,7 @@ def as_typed(text: str, command: click.Command) -> str:
     The library names an argument in backticks; the name stays as it is where no option has it.
     """
     options = {p.name: p.opts[-1] for p in command.params if isinstance(p, click.Option)}
-    return re.sub(r"`(\w+)`", lambda found: options.get(found[1], found[0]), text)
+    return re.sub(r"`(\w+)`", lambda name: options.get(name[1], name[0]), text)
 
 
 def say(text: str) -> None:

@@ -40,7 +40,7 @@ SETTINGS = {
 """Environment of a worker: there is one per core, and it keeps the memory that it will need again."""
 ATTEMPTS = 3
 """How often a part whose worker died is given to another."""
-PATIENCE = "30s"
+CLUSTER_TIMEOUT = "30s"
 """How long a cluster may take to answer and to have a worker."""
 COMMAND, WORKER = "mwdcal.app.cli", "mwdcal.app.worker_preload"
 """Modules that a worker process has loaded before it is given anything."""
@@ -179,7 +179,7 @@ def _on_cluster(steps: Steps, tasks: Sequence[Any], address: str) -> Iterator[tu
             "`scheduler` needs the extra 'cluster'. Install it, here and on every worker: "
             "pip install 'mwdcal[parquet,cluster]'"
         ) from None
-    client_of = partial(distributed.Client, address, timeout=PATIENCE)
+    client_of = partial(distributed.Client, address, timeout=CLUSTER_TIMEOUT)
     with _connected(client_of, address) as client:
         futures = client.map(steps, tasks, pure=False, retries=ATTEMPTS)
         places = {future.key: index for index, future in enumerate(futures)}
@@ -213,7 +213,7 @@ def _connected(connect: Callable[[], Any], address: str) -> Iterator[Any]:
             "one with `dask scheduler`, and workers with `dask worker ADDRESS`."
         ) from error
     try:
-        client.wait_for_workers(1, timeout=PATIENCE)
+        client.wait_for_workers(1, timeout=CLUSTER_TIMEOUT)
         yield client
     except TimeoutError as error:
         raise InputError(

@@ -77,7 +77,7 @@ Item = TypeVar("Item")
 Made = TypeVar("Made")
 
 
-class Corrected(NamedTuple):
+class CorrectedPart(NamedTuple):
     """A part, rendered for the sink, and what was seen in it."""
 
     rendered: Any
@@ -276,7 +276,7 @@ class _Worker:
         lacking = 0 if self.rules.missing == "refuse" else _MOST
         said = self.heard(("\0" * LONGEST, "\1" * LONGEST, "…"))
         worst = strengths.Strengths(_MOST, _MOST, _MOST, _MOST, -1.23e-100, -1.24e-100)
-        off = dict.fromkeys(strengths.COLUMNS, worst)
+        off = dict.fromkeys(strengths.JUDGED_STRENGTHS, worst)
         tally = RowCounts(
             _MOST, _MOST, judged, lacking, (), off, (TEMPERATURE.low, TEMPERATURE.high)
         )
@@ -285,14 +285,14 @@ class _Worker:
         delimiter = "," if suffix == ".csv" else "\t"
         return TextSink(stream, self.source.schema, results, metadata, longest, delimiter)
 
-    def __call__(self, piece: Any, sink: Sink) -> Corrected:
+    def __call__(self, piece: Any, sink: Sink) -> CorrectedPart:
         """A piece, corrected and rendered; text that seems wrong is looked at line by line."""
         try:
             return self._corrected(self.source.load(piece, False), sink)
         except InputError:
             return self._corrected(self.source.load(piece, True), sink)
 
-    def _corrected(self, part: Part, sink: Sink) -> Corrected:
+    def _corrected(self, part: Part, sink: Sink) -> CorrectedPart:
         table, rows = part.table, part.table.count
         channels, corrected = self._compute(table)
         whole: Bools | None = None
@@ -319,7 +319,7 @@ class _Worker:
             strengths.judged(self.calibration, columns, known),
             warmth(channels["temperature"][0] if channels["temperature"] else None),
         )  # fmt: skip
-        return Corrected(rendered, part.size, tally)
+        return CorrectedPart(rendered, part.size, tally)
 
     def _serials(self, carried: Any) -> tuple[str, ...]:
         """The tools that a part names; names of others are cut, so that there is room for them."""

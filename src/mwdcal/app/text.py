@@ -43,14 +43,14 @@ def table(rows: list[list[str]], header: list[str], width: int = 160) -> str:
     from rich.console import Console
     from rich.table import Table
 
-    made = Table(box=box.SIMPLE, pad_edge=False, show_edge=False)
+    aligned = Table(box=box.SIMPLE, pad_edge=False, show_edge=False)
     for index, title in enumerate(header):
-        made.add_column(title, justify="left" if index == 0 else "right", no_wrap=True)
+        aligned.add_column(title, justify="left" if index == 0 else "right", no_wrap=True)
     for row in rows:
-        made.add_row(*row)
+        aligned.add_row(*row)
     console = Console(width=width, color_system=None, legacy_windows=False)
     with console.capture() as capture:
-        console.print(made)
+        console.print(aligned)
     return "\n".join(line.rstrip() for line in capture.get().splitlines())
 
 

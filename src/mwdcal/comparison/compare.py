@@ -26,7 +26,7 @@ from mwdcal.estimation.solvers import Status
 from mwdcal.geometry.vectors import Array, Ints, reference_vectors
 from mwdcal.sensor.profile import Profile
 from mwdcal.use.notation import Notation
-from mwdcal.use.roll_scatter import directions, group_scatter
+from mwdcal.use.roll_sets import directions, group_scatter
 
 SCATTER = "scatter within groups"
 FOLDS = 8

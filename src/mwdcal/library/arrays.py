@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, TypedDict, Unpack
 
 import numpy as np
@@ -148,26 +148,30 @@ def _temperature(values: ArrayLike, shape: tuple[int, ...]) -> Array:
     return _within(name, array, TEMPERATURE, "Give degrees Celsius.")
 
 
+def nearest(name: str, names: Iterable[str]) -> str:
+    """The question whether the nearest of the names was meant; empty where none is near."""
+    near = difflib.get_close_matches(name, list(names), 1)
+    return f" Did you mean '{near[0]}'?" if near else ""
+
+
 def _by_name(values: Mapping[str, ArrayLike], limits: Mapping[str, Range]) -> dict[str, str]:
     """For each quantity the name that it is given by: its own, or that of its twin in degrees."""
     spelled = {name.replace("-", "_"): name for name in limits}
     angles = [key for key, name in spelled.items() if limits[name].unit == "°"]
     spelled |= {f"{key}{DEGREES}": spelled[key] for key in angles}
-    found: dict[str, str] = {}
+    given: dict[str, str] = {}
     for key in values:
         if key not in spelled:
-            near = difflib.get_close_matches(key, spelled, 1)
-            meant = f" Did you mean '{near[0]}'?" if near else ""
             names = ", ".join(name for name in spelled if not name.endswith(DEGREES))
             raise InputError(
-                f"unknown name '{key}'; expected one of {names}, or of an angle with _deg.{meant}"
+                f"unknown name '{key}'; expected one of {names}, or of an angle with _deg.{nearest(key, spelled)}"
             )
-        if spelled[key] in found:
+        if spelled[key] in given:
             raise InputError(
-                f"`{found[spelled[key]]}` and `{key}` are the same quantity. Give one of them."
+                f"`{given[spelled[key]]}` and `{key}` are the same quantity. Give one of them."
             )
-        found[spelled[key]] = key
-    return found
+        given[spelled[key]] = key
+    return given
 
 
 def _angle(name: str, values: Array, limits: Range, degrees: bool, turning: bool) -> Array:
@@ -202,21 +206,21 @@ def _uncertainties(sd: Mapping[str, ArrayLike], shape: tuple[int, ...]) -> dict[
     limits = {name: RAW_SPREAD._replace(positive=True) for name in TRIADS}
     limits |= {name: reference.uncertainty for name, reference in REFERENCES.items()}
     limits |= dict.fromkeys(COMMON, Range(0.0, 180.0, "°"))
-    found = {}
+    uncertainties = {}
     for name, key in _by_name(sd, limits).items():
         label, advice = f"sd {key}", "State one standard uncertainty."
         if name in TRIADS:
             values = _broadcast(label, sd[key], (*shape, 3))
             _refuse(np.isnan(values), label, values, "a number", advice, axis=-2)
-            found[name] = _within(label, values, limits[name], advice, axis=-2)
+            uncertainties[name] = _within(label, values, limits[name], advice, axis=-2)
             continue
         values = np.nan_to_num(_broadcast(label, sd[key], shape))
-        found[name] = (
+        uncertainties[name] = (
             _angle(label, values, limits[name], key.endswith(DEGREES), False)
             if limits[name].unit == "°"
             else _within(label, values, limits[name], advice)
         )
-    return found
+    return uncertainties
 
 
 def _labels(name: str, values: Sequence[object], shape: tuple[int, ...]) -> list[str]:

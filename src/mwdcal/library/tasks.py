@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
@@ -23,6 +22,7 @@ from mwdcal.files.formats.columns import LABELS, Column
 from mwdcal.files.formats.table import Table
 from mwdcal.files.limits import load_limits
 from mwdcal.geometry.vectors import AnyArray, Array
+from mwdcal.library.arrays import nearest
 from mwdcal.logs.noise import Noise, find_noise
 from mwdcal.logs.stations import Stations, find_stations
 from mwdcal.planning import simulate as simulation
@@ -39,7 +39,7 @@ NOMINAL = Profile(
 )
 """The profile of arrays: raw readings are nominal g and nT along the tool axes."""
 
-ANGLES = ("inclination", "azimuth", "toolface", "dip", "magnetic_toolface")
+CORRECTED_ANGLES = ("inclination", "azimuth", "toolface", "dip", "magnetic_toolface")
 """Angles of corrected readings."""
 Path = str | os.PathLike[str]
 Source = Path | Table | Mapping[str, Any]
@@ -171,9 +171,9 @@ def _options(options: Options | None, choices: Mapping[str, Any]) -> Options | N
     names = [field.name for field in fields(Options)]
     for name in choices:
         if name not in names:
-            near = difflib.get_close_matches(name, names, 1)
-            meant = f" Did you mean '{near[0]}'?" if near else ""
-            raise InputError(f"unknown option '{name}'; expected one of {', '.join(names)}.{meant}")
+            raise InputError(
+                f"unknown option '{name}'; expected one of {', '.join(names)}.{nearest(name, names)}"
+            )
     return replace(options or Options(), **choices) if choices else options
 
 
@@ -247,7 +247,7 @@ def apply(
     return Corrected(
         gravity=np.stack([columns[f"g{axis}_g"] for axis in "xyz"], -1),
         field=np.stack([columns[f"b{axis}_nt"] for axis in "xyz"], -1),
-        **{name: np.radians(columns[f"{name}_deg"]) for name in ANGLES},
+        **{name: np.radians(columns[f"{name}_deg"]) for name in CORRECTED_ANGLES},
         columns=columns,
         findings=findings,
     )

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mwdcal.calibration.readings import Readings
+from mwdcal.calibration.readings import ANGLES, Readings
 from mwdcal.geometry.vectors import Array, reference_vectors
 from mwdcal.sensor.models import Basis, Factors
 
 
 @dataclass(frozen=True)
-class Plan:
+class StationPlan:
     """Attitudes (n,) in radians and temperatures (n,) in °C, in the order they are measured."""
 
     inclination: Array
@@ -23,13 +23,13 @@ class Plan:
 
 def grid(
     inclinations: list[float], toolfaces: int, azimuths: list[float], temperatures: list[float]
-) -> Plan:
+) -> StationPlan:
     """Every toolface at every inclination (degrees), azimuths in turn, at every temperature."""
     inc = np.repeat(np.radians(inclinations), toolfaces)
     tool = np.tile(np.arange(toolfaces) * 2 * np.pi / toolfaces, len(inclinations))
     azi = np.repeat(np.resize(np.radians(azimuths), len(inclinations)), toolfaces)
     count, soaks = len(inc), len(temperatures)
-    return Plan(
+    return StationPlan(
         np.tile(inc, soaks),
         np.tile(azi, soaks),
         np.tile(tool, soaks),
@@ -86,7 +86,7 @@ def _triad(
     return np.concatenate([scales.ravel(), biases.ravel(), rng.uniform(-alignment, alignment, 6)])
 
 
-def reading(truth: Truth, plan: Plan) -> tuple[Array, Array]:
+def reading(truth: Truth, plan: StationPlan) -> tuple[Array, Array]:
     """What the tool's channels read (n, 3) without noise, nominal units: the model, inverted."""
     fields = reference_vectors(
         plan.inclination, plan.azimuth, plan.toolface, truth.gravity, truth.field, truth.dip
@@ -103,7 +103,7 @@ def reading(truth: Truth, plan: Plan) -> tuple[Array, Array]:
 
 def run(
     truth: Truth,
-    plan: Plan,
+    plan: StationPlan,
     rng: np.random.Generator,
     noise: tuple[float, float] = (1e-4, 15.0),
     stand: tuple[float, float, float] = (0.0, 0.0, 0.0),
@@ -111,19 +111,13 @@ def run(
     """Readings with noise (g, nT), at a stand whose angles are off by `stand` (radians, 1 σ)."""
     inclination, azimuth, toolface = (
         angle + sd * rng.normal(size=angle.shape)
-        for angle, sd in zip((plan.inclination, plan.azimuth, plan.toolface), stand, strict=True)
+        for angle, sd in zip((getattr(plan, name) for name in ANGLES), stand, strict=True)
     )
-    actual = Plan(inclination, azimuth, toolface, plan.temperature)
+    actual = StationPlan(inclination, azimuth, toolface, plan.temperature)
     g, b = reading(truth, actual)
     count = len(plan.inclination)
-    known = {
-        "inclination": plan.inclination,
-        "azimuth": plan.azimuth,
-        "toolface": plan.toolface,
-        "gravity": np.full(count, truth.gravity),
-        "field": np.full(count, truth.field),
-        "dip": np.full(count, truth.dip),
-    }
+    known = {name: getattr(plan, name) for name in ANGLES}
+    known |= {name: np.full(count, getattr(truth, name)) for name in ("gravity", "field", "dip")}
     return Readings(
         g + noise[0] * rng.normal(size=g.shape),
         b + noise[1] * rng.normal(size=b.shape),

@@ -13,22 +13,20 @@ from mwdcal.errors import InputError
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import AnyArray, Array
 from mwdcal.use import correction_numba, strengths
-from mwdcal.use.strengths import Strengths
+from mwdcal.use.strengths import OUTPUTS, Strengths
 
 OUTSIDE = ("blank", "refuse", "extrapolate")
 EXTRAPOLATED = "extrapolated"
 """The column that says of each row whether it was extrapolated, where that is allowed."""
 JUDGED = ("gravity", "inclination", "toolface", "azimuth", "field", "dip", "magnetic_toolface")
+"""Observables that a calibration may leave undetermined."""
 DIRECTIONS = {
     "gravity_g": ("inclination_deg", "azimuth_deg", "toolface_deg", "dip_deg"),
     "field_nt": ("azimuth_deg", "dip_deg", "magnetic_toolface_deg"),
 }
 """Directions that do not exist where a strength is zero."""
-NAMES = (
-    *("gx_g", "gy_g", "gz_g", "bx_nt", "by_nt", "bz_nt"),
-    *("inclination_deg", "azimuth_deg", "toolface_deg", "gravity_g", "field_nt", "dip_deg"),
-    "magnetic_toolface_deg",
-)
+VECTORS = ("gx_g", "gy_g", "gz_g", "bx_nt", "by_nt", "bz_nt")
+NAMES = (*VECTORS, *OUTPUTS.values())
 """The output columns, in their order."""
 COMPILED_ROWS = 300_000
 """Number of rows from which the compiled loops repay their loading."""
@@ -114,14 +112,10 @@ def check_outside(outside: str) -> None:
 def reference(calibration: Calibration, readings: Readings) -> dict[str, Array]:
     """The output columns (..., n) by plain NumPy, nothing blanked for its temperature."""
     g, b = calibration.fields(readings)
-    columns = {f"g{axis}_g": g[..., i] for i, axis in enumerate("xyz")}
-    columns |= {f"b{axis}_nt": b[..., i] for i, axis in enumerate("xyz")}
-    for name in ("inclination", "azimuth", "toolface"):
-        columns[f"{name}_deg"] = np.degrees(OBSERVABLES[name].value(g, b))
-    columns["gravity_g"] = OBSERVABLES["gravity"].value(g, b)
-    columns["field_nt"] = OBSERVABLES["field"].value(g, b)
-    columns["dip_deg"] = np.degrees(OBSERVABLES["dip"].value(g, b))
-    columns["magnetic_toolface_deg"] = np.degrees(OBSERVABLES["magnetic_toolface"].value(g, b))
+    columns = dict(zip(VECTORS, [*np.moveaxis(g, -1, 0), *np.moveaxis(b, -1, 0)], strict=True))
+    for name, column in OUTPUTS.items():
+        value = OBSERVABLES[name].value(g, b)
+        columns[column] = np.degrees(value) if OBSERVABLES[name].unit == "rad" else value
     for strength, names in DIRECTIONS.items():
         nothing = columns[strength] == 0.0
         for name in names:

@@ -225,9 +225,8 @@ def rows(
             tau[i] = s[_T, i] - reference
         field(tau, s[_G], s[_G + 1], s[_G + 2], count, first[0], first[1], curved[0])
         field(tau, s[_B], s[_B + 1], s[_B + 2], count, second[0], second[1], curved[1])
-        if last >= _INC:
-            parts(s, count)
-            angles(s, count)
+        parts(s, count)
+        angles(s, count)
         beyond += mask(s, count, low, high, blank > 0.0, last)
         for k in range(last):
             for i in range(count):

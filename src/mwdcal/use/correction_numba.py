@@ -23,8 +23,8 @@ __all__ = ["available", "cores", "numbers", "run"]
 
 HIGHEST_POWER = 3
 """Highest order in temperature that the loops know."""
-VECTORS, OUTPUTS = 6, 13
-"""Rows of a result: the two vectors; these, the angles and the strengths."""
+RESULTS = 13
+"""Rows of a result: the two vectors, the angles and the strengths."""
 _PIECE_ROWS = 1 << 15
 
 
@@ -129,19 +129,17 @@ def run(
     reference: float,
     units: Sequence[float] = (1.0,) * 6,
     limits: RowLimits = ANYTHING,
-    out: Array | None = None,
     workers: int | None = None,
 ) -> CorrectedRows:
     """All results of `columns`: three of gravity, three of the field, in tool order; temperature.
 
     Columns are (n,), in `units` (with their sign) per nominal g or nT; the last is °C, and
-    `reference` the temperature τ = 0. `out` (6 or 13, n) is filled where given; by default
-    all results are computed, on all cores.
+    `reference` the temperature τ = 0. By default on all cores.
     """
     from mwdcal.use import correction_kernels
 
     count = len(columns[-1])
-    out = np.empty((OUTPUTS, count)) if out is None else out
+    out = np.empty((RESULTS, count))
     settings = (
         *(tuple(columns[:3]), tuple(columns[3:6]), columns[6], tuple(map(float, units))),
         (*limits.raw, reference, *limits.temperature, *limits.calibrated, float(limits.blank)),

@@ -18,18 +18,17 @@ from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array, Bools, Ints
 from mwdcal.use.roll_sets import ROLL_SET, RollSet, near_vertical, roll_sets
 from mwdcal.use.roll_test import GAP, OPEN, SLACK, Coverage, Curve, coverage, ends, extent, fitted
+from mwdcal.use.strengths import OUTPUTS
 
 TURNING = ("azimuth", "toolface")
 """Angles that do not exist at vertical."""
 LEVEL = ("inclination", "gravity")
 """Observables that stations of one inclination share at every azimuth."""
-COLUMNS = {
-    **{name: f"ref_{name}_deg" for name in ("inclination", "azimuth", "toolface", "dip")},
-    "gravity": "ref_gravity_g",
-    "field": "ref_field_nt",
-}
+REFERENCE_COLUMNS = {name: f"ref_{column}" for name, column in OUTPUTS.items()}
 """Reference column of each observable."""
-NO_TOOLFACE = f"the toolface of exactly vertical stations is not known. Give {COLUMNS['toolface']}"
+NO_TOOLFACE = (
+    f"the toolface of exactly vertical stations is not known. Give {REFERENCE_COLUMNS['toolface']}"
+)
 SEEN = 0.7
 """Least share of the amplitude of each harmonic that stations should show."""
 TINY = 1e-15
@@ -50,7 +49,7 @@ class Statistic:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class Departures:
     """All statistics of one observable in a run, or why there are none.
 
     `skipped`: why it cannot be judged. `blocked`: why no limit on it can be passed; `unrolled`:
@@ -143,14 +142,14 @@ class RollTest:
     def _unfit(self, name: str, roll_set: RollSet) -> str:
         """Why a roll set has no spread of an observable; empty where it has."""
         if not roll_set.one_azimuth and name not in LEVEL:
-            return f"{roll_set.label}: stations of one direction need group or {COLUMNS['azimuth']}"
+            return f"{roll_set.label}: stations of one direction need group or {REFERENCE_COLUMNS['azimuth']}"
         if name in TURNING and self.near[roll_set.index].any():
             return f"{roll_set.label}: within 5° of vertical"
         if name == "toolface" and np.isnan(self._error(name)[roll_set.index]).any():
-            return f"{roll_set.label}: no {COLUMNS[name]}"
+            return f"{roll_set.label}: no {REFERENCE_COLUMNS[name]}"
         return ""
 
-    def spread(self, name: str) -> Outcome:
+    def spread(self, name: str) -> Departures:
         """The widest noise-free spread over the roll sets.
 
         A group that was not rolled cannot pass, nor can sets of equal reference directions of
@@ -162,14 +161,14 @@ class RollTest:
         unfit = [] if lacks else [why for s in self.sets if (why := self._unfit(name, s))]
         fit = [] if lacks else [s for s in self.sets if not self._unfit(name, s)]
         if not fit:
-            return Outcome(skipped=lacks or "; ".join(unfit))
+            return Departures(skipped=lacks or "; ".join(unfit))
         gaps = {s.label: self._loose(s.index) for s in fit}
         rolled = [s for s in fit if not gaps[s.label]]
         loose = [s for s in fit if gaps[s.label]]
         wrong = [s.label for s in loose if s.declared or (s.one_azimuth and not rolled)]
         apart = [f"{k}: not rolled, {why}" for k, why in gaps.items() if why and k not in wrong]
         if not rolled and not wrong:
-            return Outcome(skipped="; ".join([*unfit, *apart]))
+            return Departures(skipped="; ".join([*unfit, *apart]))
         blocked = self._unusable(name, any(self._free_spread(name, s.index) for s in fit))
         if wrong and not blocked:
             blocked = f"{wrong[0]} was not rolled: {gaps[wrong[0]]}"
@@ -177,7 +176,7 @@ class RollTest:
         statistics += [self._raw_spread(name, s) for s in fit if s.label in wrong]
         return self._outcome(name, statistics, blocked, bool(wrong), (*unfit, *apart))
 
-    def error(self, name: str) -> Outcome:
+    def error(self, name: str) -> Departures:
         """The largest noise-free departure from the reference: of rolled sets, and other stations.
 
         Cannot be passed on stations that were not, taken together, rolled all round.
@@ -187,8 +186,12 @@ class RollTest:
         near = given & self.near if name in TURNING else np.zeros(given.shape, bool)
         judged = np.flatnonzero(given & ~near)
         if not judged.size:
-            steep = "every station within 5° of vertical" if near.any() else f"no {COLUMNS[name]}"
-            return Outcome(skipped=lacks or steep)
+            steep = (
+                "every station within 5° of vertical"
+                if near.any()
+                else f"no {REFERENCE_COLUMNS[name]}"
+            )
+            return Departures(skipped=lacks or steep)
         free = bool(self.calibration.rests_on_free(name, self.readings)[judged].any())
         circle, blocked = self._coverage(judged), self._unusable(name, free)
         gap = NO_TOOLFACE if circle is None else _gap(circle, OPEN)
@@ -259,10 +262,10 @@ class RollTest:
         unrolled: bool,
         apart: tuple[str, ...],
         unseen: bool = False,
-    ) -> Outcome:
+    ) -> Departures:
         if self._relative(name):
-            return Outcome(blocked=blocked, apart=apart)
-        return Outcome(tuple(statistics), "", blocked, unrolled, apart, unseen)
+            return Departures(blocked=blocked, apart=apart)
+        return Departures(tuple(statistics), "", blocked, unrolled, apart, unseen)
 
     def _relative(self, name: str) -> bool:
         return name == "field" and self.calibration.relative

@@ -28,7 +28,7 @@ from mwdcal.sensor.profile import TriadProfile
 NOTATIONS = ("factors", "forward", "affine")
 COURSE = "course"
 """In place of a temperature: coefficients by power of T - reference."""
-AXES = {"S": 2, "o": 1, "M": 2, "b": 1, "SF": 1, "B": 1, "m": 2}
+VALUE_AXES = {"S": 2, "o": 1, "M": 2, "b": 1, "SF": 1, "B": 1, "m": 2}
 """Axes of each value at one temperature."""
 
 
@@ -52,8 +52,8 @@ def powers(name: str, value: AnyArray) -> Ints:
     """Power of T - reference that each element of a value belongs to, in the value's shape."""
     count = np.arange(value.shape[-1] if name in ("SF", "B") else len(value))
     if name not in ("SF", "B"):
-        course = value.ndim > AXES[name]
-        count = count.reshape(-1, *[1] * AXES[name]) if course else np.zeros(1, int)
+        course = value.ndim > VALUE_AXES[name]
+        count = count.reshape(-1, *[1] * VALUE_AXES[name]) if course else np.zeros(1, int)
     return np.broadcast_to(count, value.shape)
 
 

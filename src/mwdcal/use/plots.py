@@ -24,6 +24,7 @@ from mwdcal.geometry.vectors import Array
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
     from matplotlib.figure import Figure
     from matplotlib.patheffects import AbstractPathEffect
 
@@ -109,9 +110,18 @@ def new_figure(
     return figure
 
 
-def quantity(value: float, digits: int, unit: str) -> str:
+def plain_numbers(axis: Axis, *steps: float) -> None:
+    """Plain numbers along a logarithmic axis, at these steps of each decade."""
+    from matplotlib.ticker import LogLocator, NullFormatter
+
+    axis.set_major_locator(LogLocator(subs=steps))
+    axis.set_major_formatter(lambda value, _: f"{value:g}")
+    axis.set_minor_formatter(NullFormatter())
+
+
+def quantity(value: float, unit: str) -> str:
     """A number with its unit: 0.52°, 8.4 mg."""
-    return f"{value:.{digits}g}{'' if unit == '°' else ' '}{unit}"
+    return f"{value:.3g}{'' if unit == '°' else ' '}{unit}"
 
 
 @styled
@@ -124,12 +134,12 @@ def station_errors(calibration: Calibration, name: str) -> Figure:
     place = {"left": 0.095, "right": 0.995, "bottom": 0.27, "top": 0.87, "wspace": 0.24}
     first, second = figure.subplots(1, 2, gridspec_kw=place)
     _stems(first, stations, [s.errors_before.get(name, np.nan) for s in stations], BEFORE, "o")
-    first.set_title(f"before: rms {quantity(row.before, 3, unit)}")
+    first.set_title(f"before: rms {quantity(row.before, unit)}")
     if row.expected:
         second.axhspan(-row.expected, row.expected, color=BAND, lw=0, zorder=0.5)
     _stems(second, stations, [s.errors.get(name, np.nan) for s in stations], AFTER, "s")
     expected = "  (band: ±1σ expected)" if row.expected else ""
-    second.set_title(f"after: rms {quantity(row.after, 3, unit)}{expected}")
+    second.set_title(f"after: rms {quantity(row.after, unit)}{expected}")
     for axes in (first, second):
         axes.set_ylabel(label)
         axes.axhline(0, color="#4b5563", lw=0.6, zorder=1)
@@ -137,9 +147,9 @@ def station_errors(calibration: Calibration, name: str) -> Figure:
 
 
 @styled
-def deviations(calibration: Calibration, limit: float) -> Figure:
+def deviations(calibration: Calibration) -> Figure:
     """Each station's misfit in σ, with the limit above which it is to be taken again."""
-    rows = calibration.station_rows
+    rows, limit = calibration.station_rows, reshoot_limit(calibration)
     figure = new_figure("Misfit of each station in standard deviations", 1.7)
     axes = figure.subplots()
     _stems(axes, rows, [row.deviation for row in rows], AFTER, "s")
@@ -169,8 +179,6 @@ def order_errors(scores: Sequence[OrderScore]) -> Figure:
 
 def _by_order(axes: Axes, rows: Sequence[OrderScore]) -> None:
     """One triad's errors over the order, on a logarithmic scale, with the noise below them."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-
     where = [row.order for row in rows]
     inside, ends, noise = (
         np.array([getattr(row, name) for row in rows], float)
@@ -181,9 +189,7 @@ def _by_order(axes: Axes, rows: Sequence[OrderScore]) -> None:
     axes.plot(where, noise, ":", color=BEFORE, lw=1.2, label="noise of a reading")
     axes.set_yscale("log")
     wide = np.nanmax([inside, ends, noise]) > 30 * np.nanmin([inside, ends, noise])
-    axes.yaxis.set_major_locator(LogLocator(subs=(1.0,) if wide else (1.0, 2.0, 5.0)))
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axes.yaxis.set_minor_formatter(NullFormatter())
+    plain_numbers(axes.yaxis, *((1.0,) if wide else (1.0, 2.0, 5.0)))
     axes.set_xticks(
         where, [f"{row.order}\nchosen" if row.chosen else str(row.order) for row in rows]
     )
@@ -223,17 +229,13 @@ def _stems(
 
 def _station_axis(axes: Axes, labels: Sequence[str]) -> None:
     """Station labels below: as many as are legible."""
-    room = 96 if axes.get_subplotspec() is None or _columns(axes) == 1 else 40
+    place = axes.get_subplotspec()
+    room = 96 if place is None or place.get_gridspec().ncols == 1 else 40
     longest = max(len(label) for label in labels)
     step = max(1, -(-len(labels) * (min(longest, 12) + 1) // room))
     shown = [i for i in range(len(labels)) if i % step == 0]
     axes.set_xticks(shown, [labels[i][:12] for i in shown])
     axes.set_xlabel("station")
-
-
-def _columns(axes: Axes) -> int:
-    place = axes.get_subplotspec()
-    return 1 if place is None else int(place.get_gridspec().ncols)
 
 
 @styled
@@ -263,15 +265,18 @@ def _sphere(axes: Axes, chart: AccuracyMap, values: Array, name: str) -> None:
 
 
 def _contours(axes: Axes, x: Array, y: Array, values: Array) -> None:
+    import matplotlib as mpl
     from matplotlib.colors import BoundaryNorm, ListedColormap
     from matplotlib.patheffects import withStroke
 
     levels = contour_levels(values)
-    colours = ListedColormap(_shades(len(levels) - 1))
+    shades = mpl.colormaps["Blues"](
+        np.linspace(0.06, 0.72, len(levels) - 1)
+    )  # a grey print keeps the order
     drawn = np.ma.masked_invalid(values)
     norm = BoundaryNorm(levels, len(levels) - 1)
     axes.set_facecolor("#f3f4f6")
-    filled = axes.contourf(x, y, drawn, levels=levels, cmap=colours, norm=norm, extend="neither")
+    filled = axes.contourf(x, y, drawn, levels=levels, cmap=ListedColormap(shades), norm=norm)
     lines = axes.contour(x, y, drawn, levels=levels[1:-1], colors="#374151", linewidths=0.4)
     halo: list[AbstractPathEffect] = [withStroke(linewidth=1.6, foreground="white")]
     for text in axes.clabel(lines, fmt=_short, fontsize=6, colors="#111827"):
@@ -283,13 +288,6 @@ def _contours(axes: Axes, x: Array, y: Array, values: Array) -> None:
     bar.set_ticks(levels[::every].tolist(), labels=[_short(v) for v in levels[::every]])
     bar.ax.tick_params(labelsize=6, length=2)
     bar.set_label("1σ, °", fontsize=7)
-
-
-def _shades(count: int) -> list[Any]:
-    """Light to dark: a grey print keeps the order."""
-    import matplotlib as mpl
-
-    return list(mpl.colormaps["Blues"](np.linspace(0.06, 0.72, count)))
 
 
 def contour_levels(values: Array) -> Array:
@@ -348,7 +346,7 @@ class Plots:
 
     def deviations(self) -> Figure:
         """Misfit of each station in standard deviations, and the limit for measuring it again."""
-        return deviations(self.calibration, reshoot_limit(self.calibration))
+        return deviations(self.calibration)
 
     def orders(self) -> Figure:
         """Error at temperatures left out of the fit, by temperature order."""

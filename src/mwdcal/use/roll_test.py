@@ -178,8 +178,8 @@ def extent(curve: Curve) -> Extent:
 
 def _corrected(drawn: Array) -> tuple[Array, Array]:
     """The first of (..., d) values without the bias of the others, and its standard uncertainty."""
-    own, bias = drawn[..., 0], drawn[..., 1:] - drawn[..., :1]
-    return np.maximum(own - bias.mean(-1), 0.0), np.sqrt(np.mean(bias**2, -1))
+    curve, bias = drawn[..., 0], drawn[..., 1:] - drawn[..., :1]
+    return np.maximum(curve - bias.mean(-1), 0.0), np.sqrt(np.mean(bias**2, -1))
 
 
 def ends(curve: Curve) -> tuple[Array, Array, Array]:

@@ -7,7 +7,9 @@ calibration that does not belong to the readings, or readings in another unit.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from itertools import chain
 from math import sqrt
+from operator import add
 from typing import NamedTuple
 
 import numpy as np
@@ -23,7 +25,13 @@ MOST = 0.5
 """A table of which more than this share of the rows is off is refused."""
 ALIKE = {"gravity": 1.5, "field": 6.0}
 """Greatest over least strength up to which one unit may explain all rows."""
-COLUMNS = {"gravity": "gravity_g", "field": "field_nt"}
+OUTPUTS = {
+    **{name: f"{name}_deg" for name in ("inclination", "azimuth", "toolface")},
+    **{"gravity": "gravity_g", "field": "field_nt"},
+    **{name: f"{name}_deg" for name in ("dip", "magnetic_toolface")},
+}
+"""Output column of each observable, in their order."""
+JUDGED_STRENGTHS = ("gravity", "field")
 UNITS: dict[str, dict[str, float]] = {
     "gravity": {"g": 1.0, "m/s²": 9.80665, "mg": 1000.0},
     "field": {"nT": 1.0, "µT": 1e-3, "mT": 1e-6, "gauss": 1e-5, "mG": 1e-2},
@@ -58,12 +66,12 @@ def judged(
     A field that is relative is not judged, that of a coil not by the Earth's, and a scale that
     the calibration leaves free not by references.
     """
-    triads = dict(zip(COLUMNS, calibration.triads, strict=False))
+    triads = dict(zip(JUDGED_STRENGTHS, calibration.triads, strict=False))
     strengths = {}
     for name, triad in triads.items():
         if name == "field" and calibration.relative:
             continue
-        values = np.asarray(columns[COLUMNS[name]], float)
+        values = np.asarray(columns[OUTPUTS[name]], float)
         free = any(entry.id == "scale" for entry in triad.undetermined)
         coil = name == "field" and calibration.profile.stand.coil
         low, high = (-np.inf, np.inf) if coil else EARTH_RANGES[name]
@@ -90,22 +98,12 @@ def _counted(values: Array, earth: AnyArray, reference: AnyArray) -> Strengths:
 
 def total(parts: Iterable[Mapping[str, Strengths]]) -> dict[str, Strengths]:
     """The strengths of all parts of a table."""
-    each: dict[str, list[Strengths]] = {}
-    for part in parts:
-        for name, strengths in part.items():
-            each.setdefault(name, []).append(strengths)
-    return {name: _sum(some) for name, some in each.items()}
-
-
-def _sum(parts: list[Strengths]) -> Strengths:
-    return Strengths(
-        rows=sum(part.rows for part in parts),
-        earth=sum(part.earth for part in parts),
-        reference=sum(part.reference for part in parts),
-        off=sum(part.off for part in parts),
-        low=min(part.low for part in parts),
-        high=max(part.high for part in parts),
-    )
+    whole: dict[str, Strengths] = {}
+    for name, (*counts, low, high) in chain.from_iterable(part.items() for part in parts):
+        *before, lowest, highest = whole.get(name, Strengths())
+        ends = (min(low, lowest), max(high, highest))
+        whole[name] = Strengths._make((*map(add, before, counts), *ends))
+    return whole
 
 
 def findings(strengths: Mapping[str, Strengths]) -> list[Finding]:
@@ -121,13 +119,13 @@ def findings(strengths: Mapping[str, Strengths]) -> list[Finding]:
 
 
 def _departure(name: str, each: Strengths) -> str:
-    unit, (low, high) = COLUMNS[name].rpartition("_")[2], EARTH_RANGES[name]
+    unit, (low, high) = OUTPUTS[name].rpartition("_")[2], EARTH_RANGES[name]
     unit = "nT" if unit == "nt" else unit
     reasons = []
     if each.earth:
         reasons.append(f"no place on Earth has it ({low:g}…{high:g} {unit})")
     if each.reference:
-        reasons.append(f"it is more than {SHARE:.0%} off the table's own ref_{COLUMNS[name]}")
+        reasons.append(f"it is more than {SHARE:.0%} off the table's own ref_{OUTPUTS[name]}")
     ends = dict.fromkeys(f"{end:.3g}" for end in (each.low, each.high))
     extent = "…".join(ends)
     return f"corrected {name} is {extent} {unit}, and {' and '.join(reasons)}"

@@ -12,7 +12,7 @@ from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import MARGIN, Calibration, Finding, html_table
 from mwdcal.errors import InputError
 from mwdcal.geometry.observables import OBSERVABLES
-from mwdcal.use.departures import Outcome, RollTest, Statistic
+from mwdcal.use.departures import Departures, RollTest, Statistic
 
 COVERAGE = 2.0
 """Coverage factor of the guard band and of the remark that a value is close to its limit."""
@@ -247,7 +247,7 @@ def _check_temperature(calibration: Calibration, readings: Readings) -> None:
 
 
 def _judged(
-    title: str, name: str, limit: float, outcome: Outcome, guarded: bool
+    title: str, name: str, limit: float, outcome: Departures, guarded: bool
 ) -> tuple[VerdictRow, list[Finding]]:
     """The decision on one limit, by the worst set or station, and the findings about it."""
     guard = COVERAGE if guarded else 0.0

@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
 from mwdcal.app.commands import options
 from mwdcal.app.messages import print_result, say
-
-if TYPE_CHECKING:
-    from mwdcal.app.commands.choices import Typed
 
 
 @options.command()
@@ -31,7 +27,7 @@ if TYPE_CHECKING:
 @options.DECIMAL
 @options.JSON
 def command(
-    run: Path, output: Path, tool: str | None, typed: Typed, exclude: tuple[str, ...],
+    run: Path, output: Path, tool: str | None, typed: options.Typed, exclude: tuple[str, ...],
     report: Path | None, decimal: str, as_json: bool,
 ) -> None:  # fmt: skip
     """Fit the sensor model to a calibration RUN (CSV, TSV, Parquet or XLSX).
@@ -40,8 +36,7 @@ def command(
     Example: mwdcal calibrate run.csv --tool servo -o tool.json --report tool.html
     Exit: 0 calibrated, 2 input cannot be read, 3 fit failed or refused.
     """
-    from mwdcal.app.commands.choices import options_of, prior_of
-    from mwdcal.app.inputs import load_run
+    from mwdcal.app.commands.choices import load_run, options_of, prior_of
     from mwdcal.app.pages import calibration as page
     from mwdcal.calibration.automatic.auto import choose
     from mwdcal.calibration.calibrate import recorded
@@ -55,9 +50,10 @@ def command(
     choice = choose(readings, profile, options_of(typed, prior, exclude), say)
     calibration = recorded(choice, fit(choice.readings, choice.options), **digests)
     if report:
-        from mwdcal.app.pages.report import write_report
+        from mwdcal.app.pages.report import render
+        from mwdcal.files.formats import atomic
 
-        write_report(report, calibration)
+        atomic.write(report, render(calibration))
     documents.write(output, calibration)
     shown = page.summary if as_json else page.screen
     unused = [finding for finding in calibration.findings if finding.id == UNUSED]

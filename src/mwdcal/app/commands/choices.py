@@ -1,31 +1,34 @@
-"""From the words of the command line to the options of a calibration."""
+"""From the words of the command line to a run, its tool profile, and the options of a calibration."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal, TypedDict, cast
+from typing import Any, Literal, cast
 
+from mwdcal.app.commands.options import Typed
 from mwdcal.calibration.options import AUTO, Options
-from mwdcal.calibration.prior import DATASHEET
+from mwdcal.calibration.prior import DATASHEET, profile_for
+from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import Calibration
 from mwdcal.calibration.soaks import HIGHEST
-from mwdcal.files import documents
+from mwdcal.files import documents, profiles, runs
+from mwdcal.files.formats import table
+from mwdcal.sensor.profile import Profile
 
 
-class Typed(TypedDict):
-    """The options of `mwdcal calibrate` that say how to fit, as they come from the command line."""
-
-    method: str
-    model: str | None
-    order: str
-    parameters: str | None
-    nonlinearity: str
-    estimate: str
-    ignore: str
-    robust: str | None
-    paper_weights: bool
-    prior: str | None
-    seed: int
+def load_run(
+    run: Path,
+    tool: str | None,
+    decimal: str,
+    prior: Calibration | Literal["datasheet"] | None = None,
+) -> tuple[Readings, Profile, dict[str, str]]:
+    """A run with its tool profile, and the digests of both files for the calibration file."""
+    profile, profile_sha256 = profiles.load_profile(tool)
+    profile = profile_for(prior, profile)
+    read = table.read(run, decimal=decimal)
+    runs.check_run(read)
+    readings, profile = runs.to_readings(read, profile)
+    return readings, profile, {"profile_sha256": profile_sha256, "run_sha256": read.digest}
 
 
 def options_of(
@@ -34,20 +37,15 @@ def options_of(
     exclude: tuple[str, ...] = (),
 ) -> Options:
     """The options as typed, with the prior that `prior_of` has read."""
-    return Options(
-        method=typed["method"],
-        model=typed["model"],
-        order=order_of(typed["order"]),
-        parameters=int(typed["parameters"] or 12),
-        nonlinearity=_nonlinearity(typed["nonlinearity"]),
-        estimate=names(typed["estimate"]),
-        ignore=names(typed["ignore"]),
-        robust=typed["robust"],
-        paper_weights=typed["paper_weights"],
-        prior=prior,
-        exclude=exclude,
-        seed=typed["seed"],
-    )
+    read: dict[str, Any] = {
+        "order": order_of(typed["order"]),
+        "parameters": int(typed["parameters"] or 12),
+        "nonlinearity": _nonlinearity(typed["nonlinearity"]),
+        "estimate": names(typed["estimate"]),
+        "ignore": names(typed["ignore"]),
+        "prior": prior,
+    }
+    return Options(**{**typed, **read}, exclude=exclude)
 
 
 def prior_of(word: str | None) -> Calibration | Literal["datasheet"] | None:

@@ -37,12 +37,12 @@ def command(
     Example: mwdcal compare run.csv --tool servo --report methods.html
     Exit: 0 compared, 2 input cannot be read, 3 every method refused.
     """
-    from mwdcal.app.commands.choices import order_of
-    from mwdcal.app.inputs import load_run
+    from mwdcal.app.commands.choices import load_run, order_of
     from mwdcal.app.pages import comparison as page
     from mwdcal.calibration.diagnosis.findings import unused_columns
     from mwdcal.calibration.options import Options
     from mwdcal.comparison.compare import able, compare
+    from mwdcal.files.formats import atomic
 
     options.check_outputs([], [run, tool], page=report)
     readings, profile, digests = load_run(run, tool, decimal)
@@ -51,7 +51,7 @@ def command(
         say(line)
     result = compare(readings, profile, Options(order=order_of(order), seed=seed), progress=say)
     if report:
-        page.write_report(report, result, profile.name, **digests)
+        atomic.write(report, page.render(result, profile.name, **digests))
     if as_json:
         print_result({**page.document(result), "findings": unused, "report": str(report or "")})
     else:

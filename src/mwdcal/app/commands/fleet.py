@@ -4,16 +4,12 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
 from mwdcal.app.commands import options
 from mwdcal.app.messages import print_result, say
 from mwdcal.errors import FitError
-
-if TYPE_CHECKING:
-    from mwdcal.app.commands.choices import Typed
 
 
 @options.command()
@@ -35,7 +31,7 @@ if TYPE_CHECKING:
 @options.report("Also write a summary page of the fleet.", "FLEET.html")
 @options.JSON
 def command(
-    runs: Path, output: Path, tool: str | None, typed: Typed, workers: int | None,
+    runs: Path, output: Path, tool: str | None, typed: options.Typed, workers: int | None,
     scheduler: str | None, report: Path | None, as_json: bool,
 ) -> None:  # fmt: skip
     """Calibrate many tools: RUNS is a Parquet table, or a folder of them, with a column `serial`.
@@ -51,12 +47,13 @@ def command(
     with pool.preparing(1 if scheduler else workers):  # these imports, in the workers too
         from mwdcal.app import fleet_table
         from mwdcal.app.pages import fleet_report, fleet_summary
+        from mwdcal.files.formats import atomic
 
     options.check_outputs([output], [runs, tool], page=report)
     try:
         summary = fleet_table.calibrate_table(runs, output, tool, typed, workers, scheduler, say)
         if report:
-            fleet_report.write_report(report, output, summary)
+            atomic.write(report, fleet_report.render(output, summary))
     except KeyboardInterrupt as stop:
         stop.add_note("Finished parts are kept: the same command goes on from there.")
         raise

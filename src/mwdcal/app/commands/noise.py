@@ -41,6 +41,7 @@ def command(
 
     from mwdcal.app import progress
     from mwdcal.app.pages import noise as page
+    from mwdcal.app.pages.pictures import picture
     from mwdcal.calibration.diagnosis.findings import unused_columns
     from mwdcal.files import logs, synonyms
     from mwdcal.files.contract import COLUMNS
@@ -53,7 +54,7 @@ def command(
     check(between, **times)
     slowly = progress.slowly(say)
     profile = load_profile(tool)[0] if tool else None
-    readings = logs.read(log, options.names(columns), decimal=decimal, say=slowly)
+    readings = logs.read(log, options.column_names(columns), decimal=decimal, say=slowly)
     noise = find_noise(
         readings,
         profile=profile,
@@ -64,7 +65,7 @@ def command(
     )
     unused = unused_columns(synonyms.unused(list(readings.columns), COLUMNS))
     noise = replace(noise, findings=[*noise.findings, *unused])
-    drawn = page.picture(noise, plot) if plot else b""
+    drawn = picture(page.figure(noise), plot) if plot else b""
     rendered = page.render(noise) if report else ""
     if plot:
         atomic.write(plot, drawn)

@@ -5,15 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from functools import partial, wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, TypedDict
 
 import click
 
 from mwdcal.app.messages import Command
 from mwdcal.errors import InputError
-
-if TYPE_CHECKING:
-    from mwdcal.app.commands.choices import Typed
 
 Function = Callable[..., Any]
 Decorator = Callable[[Function], Function]
@@ -105,11 +102,22 @@ _FIT = (
         "6: scale and bias alone.",
     ),
 )  # fmt: skip
-FITTING = (
-    *("method", "model", "order", "parameters", "nonlinearity", "estimate", "ignore", "robust"),
-    *("paper_weights", "prior", "seed"),
-)
-"""Names of the options that say how to fit."""
+
+
+class Typed(TypedDict):
+    """The options of `mwdcal calibrate` that say how to fit, as they come from the command line."""
+
+    method: str
+    model: str | None
+    order: str
+    parameters: str | None
+    nonlinearity: str
+    estimate: str
+    ignore: str
+    robust: str | None
+    paper_weights: bool
+    prior: str | None
+    seed: int
 
 
 def fit_options(order: str, nonlinearity: str, prior: str, known: str) -> Decorator:
@@ -135,7 +143,7 @@ def fit_options(order: str, nonlinearity: str, prior: str, known: str) -> Decora
     def decorate(function: Function) -> Function:
         @wraps(function)
         def gathered(**given: Any) -> Any:
-            typed: Typed = {name: given.pop(name) for name in FITTING}  # type: ignore[assignment]
+            typed: Typed = {name: given.pop(name) for name in Typed.__annotations__}  # type: ignore[assignment]
             return function(typed=typed, **given)
 
         command: Function = gathered
@@ -177,6 +185,6 @@ def check_outputs(
         environment()
 
 
-def names(text: str) -> list[str]:
+def column_names(text: str) -> list[str]:
     """The names of a list with commas, each as typed."""
     return [name.strip() for name in text.split(",")] if text else []

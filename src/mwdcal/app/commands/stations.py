@@ -40,22 +40,23 @@ def command(
     """
     from mwdcal.app import progress
     from mwdcal.app.pages import stations as page
+    from mwdcal.app.pages.pictures import picture
     from mwdcal.files import logs
     from mwdcal.files.formats import atomic, table
     from mwdcal.logs.stations import StandstillError, find_stations
 
     options.check_outputs([output], [log], picture=plot)
     slowly = progress.slowly(say)
-    readings = logs.read(log, options.names(columns), decimal=decimal, say=slowly)
+    readings = logs.read(log, options.column_names(columns), decimal=decimal, say=slowly)
     try:
         stations = find_stations(readings, say=slowly, **search)
     except StandstillError as error:  # the picture helps most then
         message = [str(error), *lines(error.made.findings)]
         if plot:
-            atomic.write(plot, page.picture(error.made, plot))
+            atomic.write(plot, picture(page.figure(error.made), plot))
             message.append(f"wrote {plot} (picture)")
         raise InputError("\n".join(message)) from None
-    drawn = page.picture(stations, plot) if plot else b""
+    drawn = picture(page.figure(stations), plot) if plot else b""
     table.write(output, stations.table)
     if plot:
         atomic.write(plot, drawn)

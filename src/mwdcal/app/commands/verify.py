@@ -43,9 +43,10 @@ def command(
     result = verify(fitted, readings, load_limits(limits))
     result = replace(result, findings=result.findings + unused_columns(readings.unused))
     if report:
-        from mwdcal.app.pages.report import write_report
+        from mwdcal.app.pages.report import render
+        from mwdcal.files.formats import atomic
 
-        write_report(report, fitted, result)
+        atomic.write(report, render(fitted, result))
     shown = result if as_json else screen(result, fitted.tool, readings.metadata)
     print_result(shown, result.findings)
     sys.exit(0 if result.passed else 1)

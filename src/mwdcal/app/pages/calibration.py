@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -37,24 +38,23 @@ _OF_A_TRIAD = (
 )
 
 
+_OF_ITS_ACCURACY = ("budget", "assumed_exact", "constants", "stand", "findings", "orders")
+
+
+def _attributes(record: object, names: Iterable[str]) -> dict[str, Any]:
+    return {name: getattr(record, name) for name in names}
+
+
 def summary(
     calibration: Calibration, choice: Choice, output: Path, report: Path | None
 ) -> dict[str, Any]:
     """The result for machines."""
-    triads = {t.name: {name: getattr(t, name) for name in _OF_A_TRIAD} for t in calibration.triads}
-    shown = {name: getattr(calibration, name) for name in _OF_A_CALIBRATION}
     return {
-        **shown,
-        "triads": triads,
-        "errors": calibration.errors,
-        "measures": calibration.measures,
+        **_attributes(calibration, _OF_A_CALIBRATION),
+        "triads": {triad.name: _attributes(triad, _OF_A_TRIAD) for triad in calibration.triads},
+        **_attributes(calibration, ("errors", "measures")),
         "accuracy_1sigma_deg": typical_accuracy(calibration),
-        "budget": calibration.budget,
-        "assumed_exact": calibration.assumed_exact,
-        "constants": calibration.constants,
-        "stand": calibration.stand,
-        "findings": calibration.findings,
-        "orders": calibration.orders,
+        **_attributes(calibration, _OF_ITS_ACCURACY),
         "nonlinearity": [msgspec.to_builtins(score) for score in choice.curves],
         "calibration": str(output),
         "report": str(report or ""),
@@ -110,9 +110,7 @@ def remarks(calibration: Calibration) -> list[str]:
 def heading(calibration: Calibration) -> str:
     """What was calibrated, from what, and how much of it is determined."""
     serial = calibration.tool.get("serial", calibration.profile.name)
-    inclinations = [
-        r.inclination_deg for r in calibration.station_rows if r.inclination_deg is not None
-    ]
+    inclinations = known_inclinations(calibration)
     parts = [calibration.run, serial, f"{calibration.stations} stations"]
     if calibration.temperature_c:
         parts.append("{:.1f}–{:.1f} °C".format(*calibration.temperature_c))
@@ -125,6 +123,12 @@ def heading(calibration: Calibration) -> str:
     left_out = ["left out by --exclude: station " + ", ".join(calibration.excluded)]
     lines = ["   ".join(parts), "   ".join([how, *ranks])]
     return "\n".join(lines + (left_out if calibration.excluded else []))
+
+
+def known_inclinations(calibration: Calibration) -> list[float]:
+    """Inclinations of the stations that have one, degrees."""
+    rows = calibration.station_rows
+    return [row.inclination_deg for row in rows if row.inclination_deg is not None]
 
 
 def model(calibration: Calibration) -> str:

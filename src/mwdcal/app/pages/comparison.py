@@ -5,7 +5,6 @@ Every method has a colour and a marker of its own, the same in all figures.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -14,14 +13,13 @@ import msgspec
 import numpy as np
 
 from mwdcal import __version__
-from mwdcal.app.pages.page import environment, measured, number
+from mwdcal.app.pages.page import environment, factor_places, measured, number
 from mwdcal.app.text import raised, superscript, table
 from mwdcal.calibration.methods import EVIDENCE
 from mwdcal.calibration.readings import SIMULATED
 from mwdcal.comparison.common_gauge import SCALE
 from mwdcal.comparison.compare import Comparison, Row, able
 from mwdcal.estimation.uncertainty import ROTATIONS
-from mwdcal.files.formats import atomic
 from mwdcal.geometry.vectors import Array
 from mwdcal.use import plots
 
@@ -196,14 +194,10 @@ def parameter_pairs(comparison: Comparison) -> dict[str, list[Pairs]]:
     result = {}
     for triad in able(comparison.rows)[0].parameters:
         result[triad] = [
-            (place.title, place.unit, [_stated(*place.of(row)) for row in able(comparison.rows)])
+            (place.title, place.unit, [measured(*place.of(row)) for row in able(comparison.rows)])
             for place in places(comparison, triad)
         ]
     return result
-
-
-def _stated(value: float, sd: float) -> tuple[str, str]:
-    return measured(value, None if np.isnan(sd) else sd)
 
 
 def document(comparison: Comparison) -> dict[str, Any]:
@@ -215,26 +209,16 @@ def document(comparison: Comparison) -> dict[str, Any]:
     return shown
 
 
-def write_report(
-    path: str | os.PathLike[str],
-    comparison: Comparison,
-    profile: str = "",
-    *,
-    run_sha256: str = "",
-    profile_sha256: str = "",
-) -> None:
-    """Write the report; the old file or the new one exists at any moment, never a part."""
+def render(
+    comparison: Comparison, profile: str = "", run_sha256: str = "", profile_sha256: str = ""
+) -> str:
+    """The comparison as HTML, with the name of its tool profile and the SHA-256 of its sources."""
+    template = environment().get_template("comparison.html")
     trace = [
         ("run file", comparison.run, run_sha256),
         ("tool profile", profile, profile_sha256),
         ("software", f"mwdcal {__version__}, seed of the swarm {comparison.seed}", ""),
     ]
-    atomic.write(path, render(comparison, trace))
-
-
-def render(comparison: Comparison, trace: Sequence[tuple[str, str, str]] = ()) -> str:
-    """The comparison as HTML; `trace`: what it says of its sources, with their SHA-256."""
-    template = environment().get_template("comparison.html")
     rows = able(comparison.rows)
     headline, _, why = comparison.advice.partition(": ")
     return template.render(
@@ -291,19 +275,14 @@ def places(comparison: Comparison, triad: str) -> list[Place]:
     strength = "g" if triad == "accelerometer" else "nT" if "field" in comparison.units else ""
     units = {"SF": f"raw/{strength}" if strength else "raw", "B": strength, "m": ""}
     result = []
-    for key, value in able(comparison.rows)[0].parameters[triad].values.items():
-        for i, j in np.ndindex(value.shape):
-            if key == "m" and i == j:
-                continue
-            power = 0 if key == "m" else j
-            title = f"{key} {'xyz'[i]}{'xyz'[j] if key == 'm' else ''}{raised('·τ', power)}"
-            unit = units[key] + raised("/°C", power)
-            result.append(Place(triad, title, unit, key, (i, j)))
+    for key, at, axes, power in factor_places(able(comparison.rows)[0].parameters[triad].values):
+        title, unit = f"{key} {axes}{raised('·τ', power)}", units[key] + raised("/°C", power)
+        result.append(Place(triad, title, unit, key, at))
     for name in comparison.gauge.get(triad, []):
-        key, at, unit = (
-            (name, 0, "") if name == SCALE else ("rotation_deg", ROTATIONS.index(name), "°")
-        )
-        result.append(Place(triad, name, unit, key, (at,)))
+        if name == SCALE:
+            result.append(Place(triad, name, "", name, (0,)))
+        else:
+            result.append(Place(triad, name, "°", "rotation_deg", (ROTATIONS.index(name),)))
     return result
 
 
@@ -349,14 +328,10 @@ def _legend(figure: Any) -> None:
 
 def _ratio_axis(axes: Axes) -> None:
     """A logarithmic axis of ratios, with plain numbers."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-
     axes.set_xscale("log")
     low, high = axes.get_xlim()
     steps = (1.0, 2.0, 5.0) if high / low > 8 else (1.0, 1.2, 1.5, 2.0, 3.0, 5.0, 7.0, 8.0, 9.0)
-    axes.xaxis.set_major_locator(LogLocator(subs=steps if high / low < 1e3 else (1.0,)))
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axes.xaxis.set_minor_formatter(NullFormatter())
+    plots.plain_numbers(axes.xaxis, *(steps if high / low < 1e3 else (1.0,)))
 
 
 @plots.styled
@@ -449,7 +424,7 @@ def _differences(axes: Axes, rows: Sequence[Row], shown: Sequence[Place]) -> Non
 @plots.styled
 def draw_course(comparison: Comparison) -> Figure:
     """The swarm's cost over its iterations: its excess over the least, as a share of it."""
-    from matplotlib.ticker import FuncFormatter, NullFormatter
+    from matplotlib.ticker import NullFormatter
 
     row = next(row for row in comparison.rows if row.course)
     figure = plots.new_figure("Excess of the swarm's cost over its iterations", 1.7)
@@ -458,15 +433,10 @@ def draw_course(comparison: Comparison) -> Figure:
         shown = np.where(excess > 1e-13, excess, np.nan)
         axes.plot(np.arange(1, len(excess) + 1), shown, line, color=LOOKS["swarm"][0], label=name)
     axes.set_yscale("log")
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: _power(value)))
+    axes.yaxis.set_major_formatter(lambda value, _: f"10{superscript(round(np.log10(value)))}")
     axes.yaxis.set_minor_formatter(NullFormatter())
     axes.set_xlim(0, len(excess))
     axes.set_xlabel("iteration")
     axes.set_ylabel("cost ÷ least cost − 1")
     axes.legend(loc="upper right")
     return figure
-
-
-def _power(value: float) -> str:
-    """A power of ten, to be read on an axis."""
-    return f"10{superscript(round(np.log10(value)))}"

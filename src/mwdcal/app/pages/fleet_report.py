@@ -5,7 +5,6 @@ It reads the table of calibrations column by column, whatever its length.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,18 +16,18 @@ from mwdcal.app.pages import fleet_plots
 from mwdcal.app.pages.fleet_plots import FAR, FEWEST
 from mwdcal.app.pages.fleet_summary import (
     ERRORS,
-    Said,
-    Summary,
+    FleetSummary,
     is_doubt,
     numbers,
     orders_table,
+    quantiles,
     unusual,
 )
 from mwdcal.app.pages.page import environment
 from mwdcal.app.text import number, plural, raised
 from mwdcal.calibration.diagnosis.plausibility import NOISE_RATIO
 from mwdcal.calibration.readings import TRIADS, is_simulated
-from mwdcal.files.formats import atomic, parquet
+from mwdcal.files.formats import parquet
 from mwdcal.fleet.calibrate import OK
 from mwdcal.fleet.sources import SERIAL
 from mwdcal.geometry.vectors import AnyArray, Array, Bools
@@ -65,10 +64,9 @@ class Parameter:
         return int(np.sum(~np.isnan(self.values)))
 
     @property
-    def quantiles(self) -> tuple[float, float, float]:
+    def quantiles(self) -> list[float]:
         """1 %, median and 99 %."""
-        low, middle, high = np.nanquantile(self.values, (0.01, 0.5, 0.99))
-        return float(low), float(middle), float(high)
+        return quantiles(self.values)
 
 
 @dataclass(frozen=True)
@@ -106,12 +104,7 @@ class SoundTools:
         return np.array(self._column(name).to_pylist(), object)[self._rows]
 
 
-def write_report(path: str | os.PathLike[str], calibrations: Path, summary: Summary) -> None:
-    """Write the page; the old file or the new one exists at any moment, never a part."""
-    atomic.write(path, render(calibrations, summary))
-
-
-def render(calibrations: Path, summary: Summary) -> str:
+def render(calibrations: Path, summary: FleetSummary) -> str:
     """The page as HTML: the same table gives the same text but for the time it took."""
     template = environment().get_template("fleet.html")
     tools = SoundTools(calibrations)
@@ -137,7 +130,7 @@ def render(calibrations: Path, summary: Summary) -> str:
     )
 
 
-def _stand(summary: Summary) -> list[list[str]]:
+def _stand(summary: FleetSummary) -> list[list[str]]:
     """Rows of the table of errors of the stand: name, and three points of the sound tools."""
     known = {name: summary.spread.get(name) for name in ERRORS}
     return [
@@ -147,27 +140,26 @@ def _stand(summary: Summary) -> list[list[str]]:
     ]
 
 
-def _banner(summary: Summary) -> dict[str, str]:
+def _banner(summary: FleetSummary) -> dict[str, str]:
     """The result in one sentence."""
     refused = summary.tools - summary.sound
-    doubts = [said for said in summary.findings if is_doubt(said.id)]
+    doubts = [
+        f"{finding.id.replace('-', ' ')} in {plural(finding.tools, 'tool')}"
+        for finding in summary.findings
+        if is_doubt(finding.id)
+    ]
     level = "bad" if not summary.sound else "attention" if refused or doubts else "good"
     word = "Some refused" if refused else "Some doubtful"
     word = {"good": "All calibrated", "attention": word, "bad": "None calibrated"}[level]
     after = "Every tool has parameters with their uncertainty."
     if refused:
         after = f"{plural(refused, 'tool')} without a result: see the reasons below."
-    after = "; ".join([after.rstrip("."), *map(_doubt, doubts)]) + "." if doubts else after
+    after = "; ".join([after.rstrip("."), *doubts]) + "." if doubts else after
     headline = f"{summary.sound} of {plural(summary.tools, 'tool')} calibrated"
     return {"level": level, "word": word, "headline": headline, "after": after}
 
 
-def _doubt(said: Said) -> str:
-    """A finding of a doubtful fit, with the number of its tools."""
-    return f"{said.id.replace('-', ' ')} in {plural(said.tools, 'tool')}"
-
-
-def _facts(summary: Summary, metadata: Mapping[str, object]) -> list[tuple[str, str]]:
+def _facts(summary: FleetSummary, metadata: Mapping[str, object]) -> list[tuple[str, str]]:
     profile = str(metadata.get("profile", ""))
     facts = [
         ("method", summary.method),

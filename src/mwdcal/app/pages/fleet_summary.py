@@ -13,7 +13,8 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from mwdcal.app.commands.choices import Typed, names
+from mwdcal.app.commands.choices import names
+from mwdcal.app.commands.options import Typed
 from mwdcal.app.pages.calibration import choices
 from mwdcal.app.text import number, plural, table
 from mwdcal.calibration.readings import TRIADS
@@ -36,7 +37,7 @@ SPAN = 10.0
 
 
 @dataclass(frozen=True)
-class Kind:
+class StatusCount:
     """Tools of one status: how many, the first serials, and one message."""
 
     status: str
@@ -46,7 +47,7 @@ class Kind:
 
 
 @dataclass(frozen=True)
-class Said:
+class FindingCount:
     """Sound tools with one finding: how many, and the first serials."""
 
     id: str
@@ -55,7 +56,7 @@ class Said:
 
 
 @dataclass(frozen=True)
-class Summary:
+class FleetSummary:
     """What came of a fleet. `spread` has the 1 %, 50 % and 99 % point of columns of sound tools.
 
     `unused` are columns that are not used, of all tools.
@@ -71,8 +72,8 @@ class Summary:
     options: dict[str, Any]
     orders: dict[str, dict[str, int]]
     nonlinear: dict[str, int]
-    statuses: list[Kind]
-    findings: list[Said]
+    statuses: list[StatusCount]
+    findings: list[FindingCount]
     spread: dict[str, list[float]]
     undetermined: dict[str, int]
     parts: int
@@ -87,14 +88,14 @@ class Summary:
         return sum(kind.tools for kind in self.statuses if kind.status == OK)
 
 
-def summarise(target: Path, typed: Typed, notes: list[str], **facts: Any) -> Summary:
+def summarise(target: Path, typed: Typed, notes: list[str], **facts: Any) -> FleetSummary:
     """What the table of calibrations `target` says, read column by column, beside other `facts`."""
     _, pq = parquet.modules(target.name)
     whole = pq.ParquetFile(target)
     head = whole.read([SERIAL, "status", "message", "findings"])
     columns, options = whole.schema_arrow.names, stated_options(typed)
     shown = [n for n in columns if n.endswith(("_sd_deg", "_variance_factor")) or n in ERRORS]
-    return Summary(
+    return FleetSummary(
         **facts,
         tools=head.num_rows,
         method=typed["method"],
@@ -104,7 +105,7 @@ def summarise(target: Path, typed: Typed, notes: list[str], **facts: Any) -> Sum
         nonlinear=_nonlinear(whole, columns),
         statuses=_kinds(head),
         findings=_findings(head),
-        spread={name: _quantiles(numbers(whole, name)) for name in shown},
+        spread={name: quantiles(numbers(whole, name)) for name in shown},
         undetermined=_undetermined(whole, columns),
         notes=notes + (_wide(whole) if typed["order"] == "0" else []),
     )
@@ -160,25 +161,29 @@ def numbers(whole: Any, name: str) -> Array:
     return np.asarray(cells.cast(arrow.float64()).to_numpy(), float)
 
 
-def _quantiles(values: Array) -> list[float]:
+def quantiles(values: Array) -> list[float]:
+    """The 1 %, 50 % and 99 % point of values, none where all are NaN."""
     if np.isnan(values).all():
         return []
     return [float(v) for v in np.nanquantile(values, (0.01, 0.5, 0.99))]
 
 
-def _kinds(head: Any) -> list[Kind]:
+def _kinds(head: Any) -> list[StatusCount]:
     """Statuses with their tools, sound ones first, then by number."""
-    counted = head.column("status").value_counts().to_pylist()
+    from pyarrow import compute
+
+    status = head.column("status")
+    counted = status.value_counts().to_pylist()
     kinds = []
     for each in sorted(counted, key=lambda c: (c["values"] != OK, -c["counts"])):
-        tools = (
-            head.filter(_equal(head.column("status"), each["values"])).slice(0, SHOWN).to_pydict()
+        tools = head.filter(compute.equal(status, each["values"])).slice(0, SHOWN).to_pydict()
+        kinds.append(
+            StatusCount(each["values"], each["counts"], tools[SERIAL], tools["message"][0])
         )
-        kinds.append(Kind(each["values"], each["counts"], tools[SERIAL], tools["message"][0]))
     return kinds
 
 
-def _findings(head: Any) -> list[Said]:
+def _findings(head: Any) -> list[FindingCount]:
     """Findings with their tools: doubts of the fit first, then by number."""
     arrow, _ = parquet.modules("findings")
     column = one_chunk(head.column("findings"))
@@ -188,8 +193,10 @@ def _findings(head: Any) -> list[Said]:
     for code, name in enumerate(ids.dictionary.to_pylist()):
         tools = tool[ids.indices.to_numpy() == code]
         serials = head.column(SERIAL).take(arrow.array(tools[:SHOWN])).to_pylist()
-        findings.append(Said(name, len(tools), serials))
-    return sorted(findings, key=lambda said: (not is_doubt(said.id), -said.tools, said.id))
+        findings.append(FindingCount(name, len(tools), serials))
+    return sorted(
+        findings, key=lambda finding: (not is_doubt(finding.id), -finding.tools, finding.id)
+    )
 
 
 def is_doubt(finding: str) -> bool:
@@ -217,12 +224,6 @@ def _nonlinear(whole: Any, columns: list[str]) -> dict[str, int]:
     }
 
 
-def _equal(cells: Any, value: str) -> Any:
-    from pyarrow import compute
-
-    return compute.equal(cells, value)
-
-
 def _undetermined(whole: Any, columns: list[str]) -> dict[str, int]:
     """Tools by triad and direction that nothing determines."""
     counts: dict[str, int] = {}
@@ -235,7 +236,7 @@ def _undetermined(whole: Any, columns: list[str]) -> dict[str, int]:
     return counts
 
 
-def document(summary: Summary, report: Path | None) -> dict[str, Any]:
+def document(summary: FleetSummary, report: Path | None) -> dict[str, Any]:
     """The summary for machines."""
     shown: dict[str, Any] = msgspec.to_builtins(summary)
     whole = {"tools": summary.tools, "serials": []}
@@ -244,19 +245,22 @@ def document(summary: Summary, report: Path | None) -> dict[str, Any]:
     return {**shown, "calibrated": summary.sound, "report": str(report or "")}
 
 
-def text(summary: Summary, report: Path | None) -> str:
+def text(summary: FleetSummary, report: Path | None) -> str:
     """The summary for people: about one screen."""
     heading = (
         f"{summary.runs}   {plural(summary.tools, 'tool')}   {plural(summary.stations, 'station')}   "
         f"method {summary.method}   order {summary.order}"
     )
     also = unusual(summary.options)
-    rows = [[k.status, str(k.tools), _serials(k)] for k in summary.statuses]
+    rows = [[k.status, str(k.tools), "" if k.status == OK else _first(k)] for k in summary.statuses]
     lines = [heading, *(["options: " + ", ".join(also)] if also else []), ""]
     lines += [table(rows, ["status", "tools", "serials"])]
     refused = [kind for kind in summary.statuses if kind.status != OK]
     lines += [f"! {kind.status}, for example: {kind.message}" for kind in refused]
-    lines += [f"! {said.id} in {_count(said)}" for said in summary.findings]
+    lines += [
+        f"! {finding.id} in {plural(finding.tools, 'tool')}: {_first(finding)}"
+        for finding in summary.findings
+    ]
     spread = [
         [_title(name), *(number(v) for v in values)]
         for name, values in summary.spread.items()
@@ -277,22 +281,13 @@ def text(summary: Summary, report: Path | None) -> str:
     return "\n".join([*lines, "", f"{wrote}   {summary.seconds:.1f} s, {rate:.0f} tools/s"])
 
 
-def orders_table(summary: Summary) -> tuple[list[str], list[list[str]]]:
+def orders_table(summary: FleetSummary) -> tuple[list[str], list[list[str]]]:
     """Header and rows of the tools by chosen order, a triad in each row."""
     header = ["tools of order", *map(str, range(HIGHEST + 1))]
     return header, [[triad, *map(str, counts.values())] for triad, counts in summary.orders.items()]
 
 
-def _count(said: Said) -> str:
-    """How many tools have a finding, and which."""
-    return f"{plural(said.tools, 'tool')}: {_first(said)}"
-
-
-def _serials(kind: Kind) -> str:
-    return "" if kind.status == OK else _first(kind)
-
-
-def _first(some: Kind | Said) -> str:
+def _first(some: StatusCount | FindingCount) -> str:
     """The first serials of some tools."""
     return ", ".join(map(str, some.serials)) + (" …" if some.tools > len(some.serials) else "")
 

@@ -10,9 +10,8 @@ import msgspec
 import numpy as np
 
 from mwdcal import __version__
-from mwdcal.app.pages import pictures
 from mwdcal.app.pages.page import environment
-from mwdcal.app.text import table
+from mwdcal.app.text import plural, table
 from mwdcal.calibration.readings import SIMULATED
 from mwdcal.files.contract import CHANNELS
 from mwdcal.logs.noise import ChannelNoise, Noise, Term
@@ -22,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-ROWS = {
+TERM_ROWS = {
     "white": ("white noise N", "·√s"),
     "quantisation": ("quantisation Q", "·s"),
     "bias-instability": ("bias instability B", ""),
@@ -33,13 +32,13 @@ ROWS = {
 HOUR = 3600.0
 Line = tuple[str, list[str]]
 """A row of a table: what, and a cell for each channel."""
-LOOKS = {
+AXIS_LOOKS = {
     "x": (plots.AXES["x"], "o", "-"),
     "y": (plots.AXES["y"], "s", (0, (5, 1.5))),
     "z": (plots.AXES["z"], "^", (0, (1.5, 1.2))),
 }
 """Colour, marker and line style of each axis."""
-SHOWN = {"g": ("µg", 1e6), "nT": ("nT", 1.0)}
+DISPLAY_UNITS = {"g": ("µg", 1e6), "nT": ("nT", 1.0)}
 """How physical units are written, and their number in one of them."""
 MARK = " (!)"
 """Behind the name of a channel whose figures do not hold."""
@@ -70,7 +69,7 @@ def heading(noise: Noise) -> list[str]:
     rates = " and ".join(dict.fromkeys(f"{c.sampling_hz:.6g} Hz" for c in channels))
     return [
         noise.log,
-        f"{len(channels)} channel{'s' if len(channels) > 1 else ''}",
+        plural(len(channels), "channel"),
         f"{channels[0].samples} samples at {rates}",
         f"{noise.seconds:.6g} s",
         *([SIMULATED] if noise.simulated else []),
@@ -93,7 +92,7 @@ def _terms(
     units = [scaled(c) if physical else _powers(c) for c in channels.values()]
     pairs = [(c, factor) for c, (_, factor) in zip(channels.values(), units, strict=True)]
     lines: list[Line] = []
-    for name, (what, unit) in ROWS.items():
+    for name, (what, unit) in TERM_ROWS.items():
         per = HOUR if name == "drift" else 1.0
         cells = [
             _term(c.terms[name], factor * per, bool({*c.doubts} - {"slow"})) for c, factor in pairs
@@ -161,19 +160,16 @@ def profile_lines(noise: Noise) -> str:
 
 def render(noise: Noise) -> str:
     """The report: one HTML page that needs nothing else; the same noise, the same bytes."""
-    return (
-        environment()
-        .get_template("noise.html")
-        .render(
-            result=noise,
-            simulated=noise.simulated,
-            heading=heading(noise),
-            figure=figure(noise),
-            tables=tables(noise),
-            toml=profile_lines(noise),
-            deviations={name: _deviations(channel) for name, channel in noise.channels.items()},
-            version=__version__,
-        )
+    template = environment().get_template("noise.html")
+    return template.render(
+        result=noise,
+        simulated=noise.simulated,
+        heading=heading(noise),
+        figure=figure(noise),
+        tables=tables(noise),
+        toml=profile_lines(noise),
+        deviations={name: _deviations(channel) for name, channel in noise.channels.items()},
+        version=__version__,
     )
 
 
@@ -192,7 +188,7 @@ def scaled(channel: ChannelNoise) -> tuple[str, float]:
     """The unit in which a channel is best read, and how many of it a raw unit is."""
     if channel.unit is None or channel.scale is None:
         return "raw", 1.0
-    unit, number = SHOWN[channel.unit]
+    unit, number = DISPLAY_UNITS[channel.unit]
     return unit, number / channel.scale
 
 
@@ -215,17 +211,10 @@ def figure(noise: Noise) -> Figure:
     return figure
 
 
-def picture(noise: Noise, path: Path) -> bytes:
-    """The figure as PNG or SVG, by the suffix."""
-    return pictures.picture(figure(noise), path)
-
-
 def _draw(axes: Axes, noise: Noise, names: list[str]) -> None:
-    from matplotlib.ticker import LogLocator, NullFormatter
-
     for name in names:
         channel = noise.channels[name]
-        colour, marker, line = LOOKS[name[-1]]
+        colour, marker, line = AXIS_LOOKS[name[-1]]
         factor, tau = scaled(channel)[1], np.array(channel.tau_s)
         low, middle, high, fitted = (
             np.array(v) * factor
@@ -252,9 +241,7 @@ def _draw(axes: Axes, noise: Noise, names: list[str]) -> None:
     axes.set(xscale="log", yscale="log", xlabel="averaging time τ, s")
     for axis in (axes.xaxis, axes.yaxis):
         crowded = np.log10(np.divide(*axis.get_view_interval()[::-1])) > 2
-        axis.set_major_locator(LogLocator(subs=(1.0,) if crowded else (1.0, 2.0, 5.0)))
-        axis.set_major_formatter(lambda value, _: f"{value:g}")
-        axis.set_minor_formatter(NullFormatter())
+        plots.plain_numbers(axis, *((1.0,) if crowded else (1.0, 2.0, 5.0)))
     axes.grid(which="minor", lw=0.25)
     handles, labels = axes.get_legend_handles_labels()
     axes.legend(handles, labels, ncols=len(names), loc="upper center", bbox_to_anchor=(0.5, 1.17))

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from mwdcal.app.pages import pictures
 from mwdcal.app.text import chance, plural, superscript
+from mwdcal.geometry.vectors import Array
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -91,6 +93,18 @@ def measured(value: float, uncertainty: float | None) -> tuple[str, str]:
 def exponent(value: float) -> int:
     """The power of ten of a number rounded to two digits."""
     return int(f"{value:.1e}".split("e")[1])
+
+
+def factor_places(
+    values: Mapping[str, Array],
+) -> Iterator[tuple[str, tuple[int, int], str, int]]:
+    """Name, index, axes and power of τ of each factor; the diagonal of m is not one."""
+    for name, value in values.items():
+        for i, j in np.ndindex(value.shape):
+            if name != "m":
+                yield name, (i, j), "xyz"[i], j
+            elif i != j:
+                yield name, (i, j), "xyz"[i] + "xyz"[j], 0
 
 
 def unit(symbol: str) -> str:

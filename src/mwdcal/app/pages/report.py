@@ -1,23 +1,23 @@
 """The report of a calibration: one HTML file that needs nothing else, to be read and signed.
 
-`render` collects what the template shows; the pictures are drawn in `plots`, the wording of
-fixed text stands in `templates/`. Needs the extra `report` (jinja2, matplotlib).
+The pictures are drawn in `use.plots`, the wording of fixed text stands in `templates/`. Needs the
+extra `report` (jinja2, matplotlib).
 """
 
 from __future__ import annotations
 
-import os
 from datetime import datetime
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mwdcal.app.pages.calibration import choices
+from mwdcal.app.pages.calibration import choices, known_inclinations
 from mwdcal.app.pages.calibration import model as model_of
 from mwdcal.app.pages.page import (
     HELD,
     environment,
     exponent,
+    factor_places,
     fixed,
     is_held,
     measured,
@@ -25,12 +25,11 @@ from mwdcal.app.pages.page import (
     unit,
 )
 from mwdcal.app.text import plural, raised
-from mwdcal.calibration.prediction import accuracy_at, accuracy_map, angles, middle_temperature
+from mwdcal.calibration.prediction import accuracy_at, angles, middle_temperature
 from mwdcal.calibration.readings import is_simulated
 from mwdcal.calibration.record import Calibration, TriadCalibration
 from mwdcal.errors import InputError
 from mwdcal.estimation.solvers import RANK_TOLERANCE
-from mwdcal.files.formats import atomic
 from mwdcal.use import plots
 from mwdcal.use.notation import Notation, convert
 from mwdcal.use.plots import reshoot_limit
@@ -41,15 +40,8 @@ if TYPE_CHECKING:
 
 LONG_TABLE = 60
 """A run of more stations has its station table at the end, as an annex."""
-ROWS = (5.0, 45.0, 90.0)
+ACCURACY_INCLINATIONS = (5.0, 45.0, 90.0)
 """Inclinations of the table of predicted accuracy, degrees."""
-
-
-def write_report(
-    path: str | os.PathLike[str], calibration: Calibration, verdict: Verdict | None = None
-) -> None:
-    """Write the report; the old file or the new one exists at any moment, never a part."""
-    atomic.write(path, render(calibration, verdict))
 
 
 def render(calibration: Calibration, verdict: Verdict | None = None) -> str:
@@ -168,8 +160,7 @@ def _temperatures(calibration: Calibration) -> str:
 
 
 def _attitudes(calibration: Calibration) -> str:
-    rows = calibration.station_rows
-    inclinations = [r.inclination_deg for r in rows if r.inclination_deg is not None]
+    inclinations = known_inclinations(calibration)
     if not inclinations:
         return str(calibration.stations)
     return f"{calibration.stations}, at inclinations {min(inclinations):.0f} to {max(inclinations):.0f}°"
@@ -186,13 +177,13 @@ def _figures(calibration: Calibration) -> dict[str, Any]:
     return {
         "errors": {name: plots.station_errors(calibration, name) for name in names},
         "missing": missing,
-        "deviations": plots.deviations(calibration, reshoot_limit(calibration)),
+        "deviations": calibration.plot.deviations(),
         "orders": (
             plots.order_errors(calibration.orders)
             if _compared(calibration) and _judged(calibration)
             else None
         ),
-        "accuracy": plots.accuracy(accuracy_map(calibration), angles(calibration)),
+        "accuracy": calibration.plot.accuracy(),
     }
 
 
@@ -257,29 +248,20 @@ def _unit(triad: TriadCalibration) -> str:
     return triad.unit if triad.unit in ("g", "nT") else "1"
 
 
-def _stated(uncertainty: float) -> float | None:
-    return None if np.isnan(uncertainty) else uncertainty
-
-
 def _factor_rows(triad: TriadCalibration, notation: Notation) -> list[Any]:
     raw = "raw" if _unit(triad) == "1" else f"raw/{triad.unit}"
-    units, channels = {"SF": raw, "B": _unit(triad), "m": "1"}, "xyz"
+    units = {"SF": raw, "B": _unit(triad), "m": "1"}
     rows = []
-    for name, values in notation.values.items():
-        for i, j in np.ndindex(values.shape):
-            if name == "m" and i == j:
-                continue
-            sd = _stated(float(notation.uncertainty[name][i, j]))
-            index = channels[i] + channels[j] if name == "m" else channels[i]
-            power = 0 if name == "m" else j
-            rows.append(_row(name, index, power, float(values[i, j]), sd, units[name]))
+    for name, at, axes, power in factor_places(notation.values):
+        value, sd = (float(v[name][at]) for v in (notation.values, notation.uncertainty))
+        rows.append(_row(name, axes, power, value, sd, units[name]))
     return rows
 
 
 def _accuracy(calibration: Calibration) -> dict[str, Any]:
     """1σ in degrees by angle: of the calibration alone, and of one reading."""
     middle = middle_temperature(calibration)
-    cases = [(inclination, middle) for inclination in ROWS]
+    cases = [(inclination, middle) for inclination in ACCURACY_INCLINATIONS]
     if any(t.order for t in calibration.triads) and calibration.temperature_c:
         cases += [(45.0, t) for t in calibration.temperature_c]
     names = angles(calibration)

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mwdcal.app.pages import pictures
 from mwdcal.app.text import table
 from mwdcal.files.contract import CHANNELS
 from mwdcal.geometry.vectors import Array
@@ -22,7 +20,7 @@ MOST_LINES = 40
 """Stations of a table on screen."""
 POINTS = 2000
 """Points of a line in the picture."""
-LINES = ("-", (0, (5, 1.5)), (0, (1.5, 1.2)))
+LINE_STYLES = ("-", (0, (5, 1.5)), (0, (1.5, 1.2)))
 """Line styles of x, y and z."""
 
 
@@ -70,10 +68,12 @@ def screen(stations: Stations, files: dict[str, str]) -> str:
     whole = float(stations.time[-1] - stations.time[0])
     left = _left(stations)
     short = sum(is_short for *_, is_short in left)
+    same = " (the same stations from {:.3g} to {:.3g})"
+    stretch = same.format(*stations.stretch) if stations.stretch else " (given)"
     lines = [
         f"{stations.table.source}   {len(stations.time)} rows   {whole:.6g} s   "
         f"{stations.table.count} stations, {100 * float((end - start).sum()) / whole:.0f} % of the time",
-        f"threshold {stations.threshold:.3g} noise floors{_stretch(stations)}   at least "
+        f"threshold {stations.threshold:.3g} noise floors{stretch}   at least "
         f"{stations.min_seconds:g} s after {stations.trim_seconds:g} s trimmed off each end   "
         f"left: {short} too short, {len(left) - short} moving slowly",
         "",
@@ -83,12 +83,6 @@ def screen(stations: Stations, files: dict[str, str]) -> str:
         + f"   next: mwdcal calibrate {files['output']} -o CAL.json",
     ]
     return "\n".join(lines)
-
-
-def _stretch(stations: Stations) -> str:
-    if stations.stretch is None:
-        return " (given)"
-    return " (the same stations from {:.3g} to {:.3g})".format(*stations.stretch)
 
 
 def _stations_table(stations: Stations) -> str:
@@ -131,11 +125,6 @@ def figure(stations: Stations) -> Figure:
     return figure
 
 
-def picture(stations: Stations, path: Path) -> bytes:
-    """The figure as PNG or SVG, by the suffix."""
-    return pictures.picture(figure(stations), path)
-
-
 def _thinned(x: Array, y: Array) -> tuple[Array, Array]:
     """At most `POINTS` points: the lowest and the highest of each of equal runs."""
     step = -(-2 * len(x) // POINTS)
@@ -154,7 +143,7 @@ def _draw_triad(axes: Axes, stations: Stations, triad: tuple[str, ...]) -> None:
         names[i]: c
         for i, c in zip(stations.activity.channels, stations.activity.cells, strict=True)
     }
-    for name, line in zip(triad, LINES, strict=True):
+    for name, line in zip(triad, LINE_STYLES, strict=True):
         if name in cells:
             x, y = cells[name].start, cells[name].level
         else:
