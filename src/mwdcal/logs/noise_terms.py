@@ -57,7 +57,7 @@ SUBSETS = [s for size in range(1, 5) for s in combinations(range(4), size)]
 """Which terms are present."""
 
 
-class Terms(NamedTuple):
+class NoiseTerms(NamedTuple):
     """Squares of the noise terms (..., 4) in the order of `allan.TERMS`, and the drift.
 
     Attributes:
@@ -93,7 +93,7 @@ class Terms(NamedTuple):
         return np.asarray(gammaincc(self.freedom / 2, self.misfit / 2))
 
 
-def fit(variance: Array, slope: Array, moments: Moments) -> Terms:
+def fit(variance: Array, slope: Array, moments: Moments) -> NoiseTerms:
     """The terms of B records with centred variances (B, m) and slopes (B,).
 
     Errors: fewer than `FEWEST` factors, or a record without any noise, raise ValueError.
@@ -114,7 +114,7 @@ def fit(variance: Array, slope: Array, moments: Moments) -> Terms:
 
 
 def single(
-    values: Array, length: float, moments: Moments, terms: Terms
+    values: Array, length: float, moments: Moments, terms: NoiseTerms
 ) -> tuple[Array, Array, Bools]:
     """Deviation (B,) of one mean over `length` samples of records (B, n), drift included.
 
@@ -137,7 +137,7 @@ def single(
     return size, np.where(measured, measurable, known), measured
 
 
-def _fit(variance: Array, slope: Array, moments: Moments, start: int) -> Terms:
+def _fit(variance: Array, slope: Array, moments: Moments, start: int) -> NoiseTerms:
     """The same on the averaging factors from `start` on; if not all, without quantisation."""
     used = _Used(
         variance[:, start:], moments.mean[start:], moments.covariance[start:, start:],
@@ -152,7 +152,7 @@ def _fit(variance: Array, slope: Array, moments: Moments, start: int) -> Terms:
     lower, upper = _interval(square, spread, determined)
     weight = drift_variance(moments.samples)
     doubt = np.sqrt(np.einsum("a,bac,c->b", weight, covariance, weight))
-    return Terms(
+    return NoiseTerms(
         square, bounded, covariance, lower, upper, determined,
         slope.copy(), np.sqrt(bounded @ weight + doubt),
         np.sqrt(np.maximum(slope**2 - bounded @ weight, 0.0)),

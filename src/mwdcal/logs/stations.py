@@ -30,7 +30,7 @@ from mwdcal.logs.station_findings import (
     noisy_rests,
     time_unit,
 )
-from mwdcal.logs.station_means import Summary, correlated, summarise, summarise_all, widened
+from mwdcal.logs.station_means import ChannelMean, correlated, summarise, summarise_all, widened
 
 MIN_SECONDS, TRIM_SECONDS = 1.0, 1.0
 """Defaults for a fast log; one sampled slowly needs a window, and a cell, respectively."""
@@ -59,7 +59,7 @@ class Stations:
 
     Attributes:
         table: the run, one row per station.
-        found: all intervals that look still, with what became of each.
+        intervals: all that look still, with what became of each.
         activity: how much each moment moves, in noise floors.
         threshold: activity up to which it stands still.
         stretch: thresholds from which to which the standstills are the same ones; None
@@ -71,7 +71,7 @@ class Stations:
     """
 
     table: Table
-    found: Standstills
+    intervals: Standstills
     activity: Activity
     threshold: float
     stretch: tuple[float, float] | None
@@ -83,11 +83,11 @@ class Stations:
 
 
 class StandstillError(InputError):
-    """A log without a standstill; `made` holds the analysis, with an empty table."""
+    """A log without a standstill; `analysis` is that of the log, with an empty table."""
 
-    def __init__(self, text: str, made: Stations) -> None:
+    def __init__(self, text: str, analysis: Stations) -> None:
         super().__init__(text)
-        self.made = made
+        self.analysis = analysis
 
 
 def find_stations(
@@ -178,8 +178,8 @@ def _short(log: Table, time: Array, traces: dict[str, Trace]) -> InputError:
 
 def _none(stations: Stations) -> str:
     """The message of a log without a station."""
-    longest = float((stations.found.end - stations.found.start).max(initial=0.0))
-    moving = int(np.count_nonzero(~stations.found.short))
+    longest = float((stations.intervals.end - stations.intervals.start).max(initial=0.0))
+    moving = int(np.count_nonzero(~stations.intervals.short))
     trimmed = f"after {stations.trim_seconds:g} s trimmed off each end"
     if moving:
         word = "interval moves" if moving == 1 else "intervals move"
@@ -401,9 +401,9 @@ def _with_samples(
 def _summaries(
     traces: dict[str, Trace], start: Array, end: Array, findings: list[Finding],
     say: Say,
-) -> dict[str, list[Summary]]:  # fmt: skip
+) -> dict[str, list[ChannelMean]]:  # fmt: skip
     """What each channel read at each station."""
-    summaries: dict[str, list[Summary]] = {}
+    summaries: dict[str, list[ChannelMean]] = {}
     for name, (time, value) in traces.items():
         resolution = standstill.resolution(value) or SMALLEST * abs(value[0]) or SMALLEST
         places = zip(*_within(time, start, end), strict=True)
@@ -432,7 +432,7 @@ def _summaries(
 
 
 def _columns(
-    log: Table, time: Array, rows: dict[str, list[Summary]], start: Array, end: Array
+    log: Table, time: Array, rows: dict[str, list[ChannelMean]], start: Array, end: Array
 ) -> dict[str, Column]:
     """The run: labels and times, means, and what is known of each mean."""
     first, last = _within(time, start, end)

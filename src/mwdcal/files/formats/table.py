@@ -241,14 +241,12 @@ def _pointed(table: Table) -> dict[str, Column]:
 
 def _typed(table: Table) -> dict[str, Column]:
     """The columns for typed formats: text columns that hold nothing but numbers as numbers."""
-    return {name: _typed_column(name, c, table.decimal) for name, c in table.columns.items()}
-
-
-def _typed_column(name: str, column: Column, decimal: str) -> Column:
-    if not isinstance(column, list) or name in LABELS or any(_is_code(c) for c in column):
-        return column
-    values = _floats(column, decimal)
-    return column if values is None else values
+    columns = dict(table.columns)
+    for name, column in table.columns.items():
+        if isinstance(column, list) and name not in LABELS and not any(map(_is_code, column)):
+            values = _floats(column, table.decimal)
+            columns[name] = column if values is None else values
+    return columns
 
 
 def _is_code(cell: str) -> bool:
