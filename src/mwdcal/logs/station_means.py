@@ -281,9 +281,9 @@ def _chi_square_limit(freedom: Array) -> Array:
     return np.asarray(UNUSUAL**2 * chdtri(np.maximum(freedom, 1), SIGNIFICANT), float)
 
 
-def _blocks(value: Array) -> Array:
-    """Means of `PARTS` blocks."""
-    bounds = np.linspace(0, len(value), PARTS + 1).astype(int)
+def _blocks(value: Array, count: int = PARTS) -> Array:
+    """Means of that many blocks."""
+    bounds = np.linspace(0, len(value), count + 1).astype(int)
     return np.asarray(np.add.reduceat(value, bounds[:-1]) / np.diff(bounds))
 
 
@@ -464,8 +464,7 @@ def long_run(value: Array) -> tuple[float, float, float]:
     """
     mean = float(value.mean())
     blocks = min(len(value), BLOCKS)
-    bounds = np.linspace(0, len(value), blocks + 1).astype(int)
-    means = np.add.reduceat(value - mean, bounds[:-1]) / np.diff(bounds)
+    means = _blocks(value - mean, blocks)
     means = means - means.mean()
     products = np.correlate(means, means, "full")[blocks - 1 :] / blocks
     pairs = products[: blocks // 4 * 2].reshape(-1, 2).sum(-1)

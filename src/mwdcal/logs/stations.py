@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, replace
+from itertools import chain
 
 import numpy as np
 
@@ -23,6 +24,7 @@ from mwdcal.geometry.vectors import Array, Ints
 from mwdcal.logs import standstill
 from mwdcal.logs.standstill import Activity, Slow, Standstills
 from mwdcal.logs.station_findings import (
+    Rows,
     about,
     correlated_noise,
     count,
@@ -30,7 +32,7 @@ from mwdcal.logs.station_findings import (
     noisy_rests,
     time_unit,
 )
-from mwdcal.logs.station_means import ChannelMean, correlated, summarise, summarise_all, widened
+from mwdcal.logs.station_means import correlated, summarise, summarise_all, widened
 
 MIN_SECONDS, TRIM_SECONDS = 1.0, 1.0
 """Defaults for a fast log; one sampled slowly needs a window, and a cell, respectively."""
@@ -399,11 +401,10 @@ def _with_samples(
 
 
 def _summaries(
-    traces: dict[str, Trace], start: Array, end: Array, findings: list[Finding],
-    say: Say,
-) -> dict[str, list[ChannelMean]]:  # fmt: skip
+    traces: dict[str, Trace], start: Array, end: Array, findings: list[Finding], say: Say
+) -> Rows:
     """What each channel read at each station."""
-    summaries: dict[str, list[ChannelMean]] = {}
+    summaries: Rows = {}
     for name, (time, value) in traces.items():
         resolution = standstill.resolution(value) or SMALLEST * abs(value[0]) or SMALLEST
         places = zip(*_within(time, start, end), strict=True)
@@ -414,26 +415,25 @@ def _summaries(
 
         summaries[name] = summarise_all(rests, float(resolution), progress)
     for triad in CHANNELS.values():
-        names = [name for name in triad if name in summaries]
-        correlation = correlated([summaries[name] for name in names])
-        wider = {
-            n: widened(summaries[n], float(v))
-            for n, v in zip(names, correlation.variance, strict=True)
-        }
-        grown = [
-            a.sd > REPORTED * b.sd
-            for n in names
-            for a, b in zip(wider[n], summaries[n], strict=True)
-        ]
-        if correlation.plain and 2 * sum(grown) > len(grown):
-            findings.append(correlated_noise(names))
-        summaries |= wider
+        summaries |= _widened({n: summaries[n] for n in triad if n in summaries}, findings)
     return summaries
 
 
-def _columns(
-    log: Table, time: Array, rows: dict[str, list[ChannelMean]], start: Array, end: Array
-) -> dict[str, Column]:
+def _widened(triad: Rows, findings: list[Finding]) -> Rows:
+    """What the channels of a triad read, known less well where their noise is correlated."""
+    correlation = correlated([*triad.values()])
+    wider = {
+        name: widened(means, float(variance))
+        for (name, means), variance in zip(triad.items(), correlation.variance, strict=True)
+    }
+    pairs = zip(chain(*wider.values()), chain(*triad.values()), strict=True)
+    grown = [after.sd > REPORTED * before.sd for after, before in pairs]
+    if correlation.plain and 2 * sum(grown) > len(grown):
+        findings.append(correlated_noise([*triad]))
+    return wider
+
+
+def _columns(log: Table, time: Array, rows: Rows, start: Array, end: Array) -> dict[str, Column]:
     """The run: labels and times, means, and what is known of each mean."""
     first, last = _within(time, start, end)
     columns: dict[str, Column] = {
