@@ -265,14 +265,7 @@ def _traces(
         if name in RAW and np.ptp(traces[name][1]) == 0:
             text = f"{name} reads {traces[name][1][0] + 0.0:g} from end to end: a dead channel?"
             findings.append(Finding(id="dead-channel", text=text))
-    temperature = traces.pop("temperature_c", None)
-    if temperature is not None:
-        temperature = _possible(temperature, findings)
-    if temperature is not None and not len(temperature[0]):
-        text = "temperature_c is blank from end to end: the stations have no temperature."
-        findings.append(Finding(id="no-temperature", text=text))
-        temperature = None
-    return traces, temperature
+    return traces, _possible(traces.pop("temperature_c", None), findings)
 
 
 def _trace(log: Table, time: Array, name: str) -> Trace:
@@ -284,8 +277,10 @@ def _trace(log: Table, time: Array, name: str) -> Trace:
     return standstill.distinct(time), value
 
 
-def _possible(temperature: Trace, findings: list[Finding]) -> Trace:
+def _possible(temperature: Trace | None, findings: list[Finding]) -> Trace | None:
     """The temperatures that are possible; others, such as -999, are left out and reported."""
+    if temperature is None:
+        return None
     time, value = temperature
     fine = (value >= TEMPERATURE.low) & (value <= TEMPERATURE.high)
     if not fine.all():
@@ -295,6 +290,10 @@ def _possible(temperature: Trace, findings: list[Finding]) -> Trace:
             f"and {TEMPERATURE.high:g} °C, such as {value[wrong[0]]:g}: left out."
         )
         findings.append(Finding(id="impossible-temperature", text=text))
+    if not fine.any():
+        text = "temperature_c is blank from end to end: the stations have no temperature."
+        findings.append(Finding(id="no-temperature", text=text))
+        return None
     return time[fine], value[fine]
 
 
