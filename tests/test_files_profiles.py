@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mwdcal.errors import InputError
-from mwdcal.files.profiles import list_profiles, load_profile
+from mwdcal.files.profiles import built_in, load_profile
 from mwdcal.sensor.profile import Profile, TriadProfile
 
 
@@ -27,7 +27,7 @@ def refusal(folder, text):
 
 def test_the_built_in_profiles():
     names = ["distox", "generic", "moosavi-servo", "sap5", "sap6", "servo"]
-    assert list_profiles() == names
+    assert built_in("profiles") == names
     for name in names:
         profile, digest = load_profile(name)
         assert len(digest) == 64

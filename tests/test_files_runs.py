@@ -15,9 +15,9 @@ from mwdcal.calibration.readings import Readings
 from mwdcal.errors import InputError
 from mwdcal.files.contract import RAW
 from mwdcal.files.faults import faults
-from mwdcal.files.formats.table import SUFFIXES, Table
-from mwdcal.files.profiles import list_profiles, load_profile
-from mwdcal.files.runs import check_run, from_readings, read_run, to_readings, write_run
+from mwdcal.files.formats.table import SUFFIXES, Table, write
+from mwdcal.files.profiles import built_in, load_profile
+from mwdcal.files.runs import check_run, from_readings, read_run, to_readings
 from mwdcal.sensor.profile import Profile, StandProfile, TriadProfile
 
 DATA = os.environ.get("MWDCAL_DATA", "")
@@ -220,7 +220,9 @@ def test_a_dead_channel_is_read():
 def runs(draw):
     """Readings with every optional part present or absent, and a profile."""
     count = draw(st.integers(1, 4))
-    profile = draw(st.sampled_from([TURNED, BARE, *(load_profile(n)[0] for n in list_profiles())]))
+    profile = draw(
+        st.sampled_from([TURNED, BARE, *(load_profile(n)[0] for n in built_in("profiles"))])
+    )
 
     def numbers(low, high, shape=(count,), blank=False):
         element = st.floats(low, high, allow_subnormal=False)
@@ -279,7 +281,7 @@ SCALES = [1.0, 3.0, 5e-5, 1234.5]
 def test_a_written_run_is_read_as_it_was(tmp_path, suffix, case):
     readings, profile = case
     path = tmp_path / f"run{suffix}"
-    write_run(path, readings, profile, {"serial": "7"})
+    write(path, from_readings(readings, profile, {"serial": "7"}))
     again, same = read_run(path, profile)
     assert same == profile
     assert again.station == readings.station
@@ -306,7 +308,7 @@ def test_digests_survive_writing(tmp_path, profile):
     raw = np.random.default_rng(1).normal(size=(50, 3))
     table = Table(dict(zip(("ax", "ay", "az"), raw.T, strict=True)))
     readings = to_readings(table, profile)[0]
-    write_run(tmp_path / "run.csv", readings, profile)
+    write(tmp_path / "run.csv", from_readings(readings, profile))
     assert read_run(tmp_path / "run.csv", profile)[0].digest == readings.digest
 
 

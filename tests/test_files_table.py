@@ -93,7 +93,6 @@ def test_metadata_values(tmp_path, line, value):
 def test_the_header_tells_the_delimiter(tmp_path, delimiter):
     path = put(tmp_path, delimiter.join(["ax", "ay"]) + "\n" + delimiter.join("12"))
     assert list(read(path).columns) == ["ax", "ay"]
-    assert list(read(path, delimiter=delimiter).columns) == ["ax", "ay"]
 
 
 def test_blank_cells_at_the_end_of_a_tab_separated_line(tmp_path):
@@ -246,7 +245,7 @@ def test_a_table_that_cannot_be_written(tmp_path, columns, name, message):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("options", [{"decimal": "x"}, {"delimiter": ""}, {"delimiter": "ab"}])
+@pytest.mark.parametrize("options", [{"decimal": "x"}, {"decimal": ""}])
 def test_options_are_checked(tmp_path, options):
     with pytest.raises(InputError, match=r"`de(cimal|limiter)` must be"):
         read(put(tmp_path, CSV), **options)

@@ -139,7 +139,7 @@ def test_options_say_what_counts():
     lasting = ends - starts - 2 * long.trim_seconds
     assert np.sum(lasting > 8.4) <= long.table.count <= np.sum(lasting > 7.6)
     assert (long.table.columns["end_s"] - long.table.columns["start_s"]).min() > 7.9
-    assert long.found.short.sum() == len(starts) - long.table.count
+    assert long.intervals.short.sum() == len(starts) - long.table.count
     given = find_stations(log, threshold=12.0)
     assert given.threshold == 12.0
     assert given.stretch is None

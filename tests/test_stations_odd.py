@@ -304,7 +304,7 @@ def test_slow_turns_are_no_noisy_rests(period):
     log = Table(dict(zip(ACC, read.T, strict=True)), {}, "log.csv", range(2, len(time) + 2))
     with pytest.raises(InputError) as told:
         find_stations(log, sampling_hz=100.0)
-    assert "noisy-rest" not in ids(told.value.made)
+    assert "noisy-rest" not in ids(told.value.analysis)
 
 
 def test_a_refusal_says_how_long_it_stood_still(tmp_path):

@@ -42,8 +42,8 @@ class Gauge:
 
     def names(self, triad: int) -> list[str]:
         """The directions that are put by convention for one triad, in their usual order."""
-        own = {name for name, triads in self.free if triad in triads}
-        return [name for name in (*ROTATIONS, SCALE) if name in own]
+        free = {name for name, triads in self.free if triad in triads}
+        return [name for name in (*ROTATIONS, SCALE) if name in free]
 
     def turns(self, triads: tuple[int, ...]) -> list[str]:
         """Axes about which these triads turn together."""
@@ -51,7 +51,7 @@ class Gauge:
 
 
 def in_gauge(
-    made: Calibration, readings: Readings, gauge: Gauge
+    calibration: Calibration, readings: Readings, gauge: Gauge
 ) -> tuple[dict[str, Notation], dict[str, Notation]]:
     """Factors of each triad in a gauge, and what was taken out to put them there.
 
@@ -59,40 +59,44 @@ def in_gauge(
     `scale` (1,), each with uncertainty: NaN where this calibration does not determine it.
     Own-axis terms do not count: factors are those of the tangent at the centre of the readings.
     """
-    made = _straight(made)
-    settle = _Settle.of(made, readings, gauge)
-    params = made.parameters
-    found, slope = settle(params), settle.slope(made, readings, params)
-    covariance = slope @ made.parameter_covariance @ slope.transpose()
-    free = made.free_directions @ slope.transpose()
+    calibration = _straight(calibration)
+    settle = _Settle.of(calibration, readings, gauge)
+    params = calibration.parameters
+    settled, slope = settle(params), settle.slope(calibration, readings, params)
+    covariance = slope @ calibration.parameter_covariance @ slope.transpose()
+    free = calibration.free_directions @ slope.transpose()
     size = len(params)
     triads = [
-        msgspec.structs.replace(t, parameters=found[w].tolist())
-        for t, w in zip(made.triads, settle.slices, strict=True)
+        msgspec.structs.replace(triad, parameters=settled[where].tolist())
+        for triad, where in zip(calibration.triads, settle.slices, strict=True)
     ]
-    put = msgspec.structs.replace(
-        made,
-        accelerometer=triads[0],
-        magnetometer=triads[1] if len(triads) > 1 else None,
-        covariance_rows=covariance[:size, :size].tolist(),
-        free=free[:, :size].tolist(),
+    factors = convert(
+        _replaced(calibration, triads, covariance[:size, :size], free[:, :size]), "factors"
     )
-    moved = np.abs(free[:, size:]).max(0, initial=0.0)
-    sd = np.sqrt(np.maximum(np.diag(covariance)[size:], 0))
-    sd = np.where(moved > FREE_SHARE, np.nan, sd)
+    return factors, _taken_out(
+        [t.name for t in triads], settled[size:], covariance[size:, size:], free[:, size:]
+    )
+
+
+def _taken_out(
+    triads: list[str], taken: Array, covariance: Array, free: Array
+) -> dict[str, Notation]:
+    """Rotation and scale of each triad, from those (4 t,) of all in radians."""
     unit = np.array([*np.full(3, np.degrees(1)), 1.0])
-    taken = {}
-    for index, triad in enumerate(triads):
-        own = slice(4 * index, 4 * index + 4)
-        far = slice(size + own.start, size + own.stop)
-        value, spread = found[far] * unit, covariance[far, far] * np.outer(unit, unit)
-        parts = {"rotation_deg": slice(0, 3), "scale": slice(3, 4)}
-        taken[triad.name] = Notation(
-            {name: value[part] for name, part in parts.items()},
-            {name: (sd[own] * unit)[part] for name, part in parts.items()},
-            spread,
+    moved = np.abs(free).max(0, initial=0.0)
+    sd = np.sqrt(np.maximum(np.diag(covariance), 0))
+    sd = np.where(moved > FREE_SHARE, np.nan, sd)
+    parts = {"rotation_deg": slice(0, 3), "scale": slice(3, 4)}
+    notations = {}
+    for index, name in enumerate(triads):
+        block = slice(4 * index, 4 * index + 4)
+        value, spread = taken[block] * unit, sd[block] * unit
+        notations[name] = Notation(
+            {part: value[where] for part, where in parts.items()},
+            {part: spread[where] for part, where in parts.items()},
+            covariance[block, block] * np.outer(unit, unit),
         )
-    return convert(put, "factors"), taken
+    return notations
 
 
 @dataclass(frozen=True)
@@ -107,8 +111,8 @@ class _Settle:
     nominal: list[float]
 
     @classmethod
-    def of(cls, made: Calibration, readings: Readings, gauge: Gauge) -> _Settle:
-        reference, triads = made.reference_temperature, made.triads
+    def of(cls, calibration: Calibration, readings: Readings, gauge: Gauge) -> _Settle:
+        reference, triads = calibration.reference_temperature, calibration.triads
         ends = np.cumsum([0, *(len(t.parameters) for t in triads)])
         temperature = readings.temperature
         if temperature is None:
@@ -140,9 +144,9 @@ class _Settle:
             taken += [*_rotation_vector(turned[t].transpose()), 1 / factor]
         return np.concatenate([*parts, taken])
 
-    def slope(self, made: Calibration, readings: Readings, params: Array) -> Array:
+    def slope(self, calibration: Calibration, readings: Readings, params: Array) -> Array:
         """Derivative (p + 4 t, p) of the map, by central differences."""
-        effect, fields = made.jacobian(readings), made.fields(readings)
+        effect, fields = calibration.jacobian(readings), calibration.fields(readings)
         columns = []
         for t, where in enumerate(self.slices):
             strength = np.linalg.norm(fields[t], axis=-1).mean()
@@ -177,32 +181,38 @@ def _rotation_vector(turn: Array) -> Array:
     return odd * (angle / sine if sine > 0 else 1.0)
 
 
-def _straight(made: Calibration) -> Calibration:
+def _straight(calibration: Calibration) -> Calibration:
     """The calibration with own-axis terms replaced by the tangent at the centre of the readings."""
-    if not any(t.curved for t in made.triads):
-        return made
-    blocks = [_tangent(t, made.reference_temperature) for t in made.triads]
-    whole = np.zeros(np.sum([b.shape for b in blocks], 0))
-    row = column = 0
-    for block in blocks:
-        whole[row : row + block.shape[0], column : column + block.shape[1]] = block
-        row, column = row + block.shape[0], column + block.shape[1]
+    from scipy.linalg import block_diag
+
+    if not any(t.curved for t in calibration.triads):
+        return calibration
+    blocks = [_tangent(t, calibration.reference_temperature) for t in calibration.triads]
+    whole = block_diag(*blocks)
     triads = [
         msgspec.structs.replace(
-            t,
+            triad,
             curved=False,
-            parameter_names=t.parameter_names[: len(block)],
-            parameters=(block @ t.parameters).tolist(),
+            parameter_names=triad.parameter_names[: len(block)],
+            parameters=(block @ triad.parameters).tolist(),
         )
-        for t, block in zip(made.triads, blocks, strict=True)
+        for triad, block in zip(calibration.triads, blocks, strict=True)
     ]
-    free = made.free_directions
+    covariance = whole @ calibration.parameter_covariance @ whole.transpose()
+    free = calibration.free_directions @ whole.transpose()
+    return _replaced(calibration, triads, covariance, free)
+
+
+def _replaced(
+    calibration: Calibration, triads: list[TriadCalibration], covariance: Array, free: Array
+) -> Calibration:
+    """The calibration with other parameters, their covariance and their free directions."""
     return msgspec.structs.replace(
-        made,
+        calibration,
         accelerometer=triads[0],
         magnetometer=triads[1] if len(triads) > 1 else None,
-        covariance_rows=(whole @ made.parameter_covariance @ whole.transpose()).tolist(),
-        free=(free @ whole.transpose()).tolist(),
+        covariance_rows=covariance.tolist(),
+        free=free.tolist(),
     )
 
 

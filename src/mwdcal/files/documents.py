@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import inspect
 import json
 import os
 from importlib import resources
@@ -15,12 +14,11 @@ import numpy as np
 
 from mwdcal.calibration.readings import TRIADS
 from mwdcal.calibration.record import SCHEMA_VERSION, Calibration
+from mwdcal.calibration.soaks import HIGHEST
 from mwdcal.errors import InputError, reason
 from mwdcal.files.formats import atomic
 from mwdcal.files.profiles import check_profile
 
-HIGHEST = 3
-"""The highest order of temperature terms."""
 LARGEST = 1e30
 """Magnitude that no number of a calibration reaches."""
 WORST = 1e4
@@ -127,30 +125,8 @@ def _unusable(calibration: Calibration) -> str:
     return ""
 
 
-def schema() -> dict[str, Any]:
-    """JSON Schema of a calibration file, from its definition in code."""
-    described = _cleaned(json.loads(msgspec.json.encode(msgspec.json.schema(Calibration))))
-    return {
-        "$schema": "https://json-schema.org/draft/2020-12/schema",
-        "title": f"mwdcal calibration file, schema version {SCHEMA_VERSION}",
-        **described,
-    }
-
-
-def _cleaned(value: Any) -> Any:
-    """Descriptions without the indent that docstrings have before Python 3.13."""
-    if isinstance(value, dict):
-        return {
-            key: inspect.cleandoc(item)
-            if key == "description" and isinstance(item, str)
-            else _cleaned(item)
-            for key, item in value.items()
-        }
-    return [_cleaned(item) for item in value] if isinstance(value, list) else value
-
-
 def published_schema() -> dict[str, Any]:
-    """The schema as shipped with the package; equal to `schema()`, which a test checks."""
+    """The schema of a calibration file, as shipped with the package."""
     text = resources.files("mwdcal").joinpath("calibration.schema.json").read_text("utf-8")
     loaded: dict[str, Any] = json.loads(text)
     return loaded

@@ -11,11 +11,6 @@ from mwdcal.files.profiles import built_in, read_toml
 from mwdcal.use.verification import Limits
 
 
-def list_limits() -> list[str]:
-    """Names of the built-in limits profiles."""
-    return built_in("limits")
-
-
 def load_limits(name_or_path: str | os.PathLike[str] = "roll-test") -> Limits:
     """A limits profile: built in by name, or a TOML file by path."""
     name = os.fspath(name_or_path)
@@ -25,7 +20,7 @@ def load_limits(name_or_path: str | os.PathLike[str] = "roll-test") -> Limits:
     except (msgspec.DecodeError, ValueError) as error:
         raise InputError(
             f"{name} is not a limits profile: {error}. Compare it with the built-in ones: "
-            f"{', '.join(list_limits())} (docs, 'Files')."
+            f"{', '.join(built_in('limits'))} (docs, 'Files')."
         ) from None
     bounds = [*limits.spread.items(), *limits.error.items()]
     if not bounds:

@@ -64,15 +64,6 @@ _STAND_LIMITS: dict[str, _Limits] = {
 } | {"gravity_g": (0.0, 2.0, "1 sigma, in g."), "field_nt": (0.0, 200_000.0, "1 sigma, in nT.")}
 
 
-def list_profiles() -> list[str]:
-    """Names of the built-in tool profiles.
-
-    >>> "generic" in list_profiles()
-    True
-    """
-    return built_in("profiles")
-
-
 def load_profile(name_or_path: str | None = None) -> tuple[Profile, str]:
     """A tool profile and the SHA-256 of its bytes: built in by name, or a TOML file by path.
 
@@ -84,7 +75,11 @@ def load_profile(name_or_path: str | None = None) -> tuple[Profile, str]:
 
 
 def built_in(folder: str) -> list[str]:
-    """Names of the TOML files in a folder of the package."""
+    """Names of the TOML files in a folder of the package.
+
+    >>> "generic" in built_in("profiles")
+    True
+    """
     files = (file.name for file in resources.files("mwdcal").joinpath(folder).iterdir())
     return sorted(name.removesuffix(_SUFFIX) for name in files if name.endswith(_SUFFIX))
 

@@ -82,16 +82,6 @@ def _serial_cells(table: Table) -> list[str]:
     return labels(table, "serial") if "serial" in table.columns else []
 
 
-def write_run(
-    path: str | os.PathLike[str],
-    readings: Readings,
-    profile: Profile,
-    metadata: Mapping[str, object] | None = None,
-) -> None:
-    """Write readings of one tool as the run file that `read_run` turns back into them."""
-    tables.write(path, from_readings(readings, profile, metadata))
-
-
 def to_readings(table: Table, profile: Profile) -> tuple[Readings, Profile]:
     """The readings of a table, and the profile with its nominal scales filled in.
 

@@ -113,42 +113,37 @@ def packed(table: Any) -> bytes:
 def _result(rows: Rows, plan: Plan) -> Any:
     """The result table of some tools."""
     count = len(rows.counts)
-    every = names(plan.options, plan.profile, plan.triads)
-    filled = {name: np.full(count, np.nan) for name in every}
     status, message = np.full(count, OK, object), np.full(count, "", object)
     unit = np.full(count, None, object)
-    free: list[tuple[list[str], ...]] = [([], [])] * count
-    reports: list[tuple[list[str], list[str]]] = [([], [])] * count
+    filled = {
+        name: np.full(count, np.nan) for name in names(plan.options, plan.profile, plan.triads)
+    }
+    ids = (*LISTS, *(f"{triad}_undetermined" for triad in plan.triads))
+    lists = {name: np.full(count, None, object) for name in ids}
     for tool, text in refused_tools(rows).items():
         status[tool], message[tool] = BAD_INPUT, text
     for batch in batches(rows, np.flatnonzero(status == OK)):
         outcome = _calibrated(rows, batch, plan)
         status[batch.tools], message[batch.tools] = outcome.status, outcome.message
-        unit[batch.tools] = _field_unit(batch)
+        if batch.readings.magnetometer is not None:
+            unit[batch.tools] = batch.readings.field_unit
         for name, values in filled.items():
             values[batch.tools] = outcome.columns[name]
-        for tool, each in zip(batch.tools, outcome.free, strict=True):
-            free[tool] = each
-        for tool, ids, again in zip(batch.tools, outcome.findings, outcome.reshoot, strict=True):
-            reports[tool] = ids, [rows.label(int(tool), station) for station in again]
+        for i in np.flatnonzero(outcome.status == OK):
+            tool = int(batch.tools[i])
+            labels = [rows.label(tool, station) for station in outcome.reshoot[i]]
+            for name, entry in zip(
+                ids, (outcome.findings[i], labels, *outcome.free[i]), strict=False
+            ):
+                lists[name][tool] = entry
     unit[status != OK] = None
-    return _table(rows, plan, (status, message, unit), filled, free, reports)
+    return _table(rows, plan, (status, message, unit), filled, lists)
 
 
 def _calibrated(rows: Rows, batch: Batch, plan: Plan) -> BatchOutcome:
     return calibrate_batch(
-        batch.readings,
-        plan.options,
-        plan.profile,
-        lambda i: rows.alone(int(batch.tools[i])),
+        batch.readings, plan.options, plan.profile, lambda i: rows.alone(int(batch.tools[i]))
     )
-
-
-def _field_unit(batch: Batch) -> AnyArray:
-    """Unit of the calibrated field (B,), one for a batch of one kind; None without magnetometer."""
-    readings = batch.readings
-    unit = None if readings.magnetometer is None else readings.field_unit
-    return np.full(len(batch.tools), unit, object)
 
 
 def _table(
@@ -156,39 +151,34 @@ def _table(
     plan: Plan,
     texts: tuple[AnyArray, AnyArray, AnyArray],
     filled: dict[str, Array],
-    free: list[tuple[list[str], ...]],
-    reports: list[tuple[list[str], list[str]]],
+    lists: dict[str, AnyArray],
 ) -> Any:
     """The Arrow table of results, in the order of the columns."""
     arrow, _ = parquet.modules(plan.source)
-    status, message, unit = texts
-    count, good = len(status), status == OK
-    options, columns = plan.options, {}
+    text, of_text = arrow.string(), arrow.list_(arrow.string())
+    status, message, unit = (arrow.array(each, text) for each in texts)
     low, high = _temperatures(rows)
-    columns[SERIAL] = rows.serials
-    columns["status"] = arrow.array(status, arrow.string())
-    columns["message"] = arrow.array(message, arrow.string())
-    columns["stations"] = arrow.array(rows.counts, arrow.int32())
-    columns["temperature_min_c"] = arrow.array(low, mask=np.isnan(low))
-    columns["temperature_max_c"] = arrow.array(high, mask=np.isnan(high))
-    for index, name in enumerate(LISTS):
-        lists = [each[index] if ok else None for each, ok in zip(reports, good, strict=True)]
-        columns[name] = arrow.array(lists, arrow.list_(arrow.string()))
+    columns = {
+        SERIAL: rows.serials,
+        "status": status,
+        "message": message,
+        "stations": arrow.array(rows.counts, arrow.int32()),
+        "temperature_min_c": arrow.array(low, mask=np.isnan(low)),
+        "temperature_max_c": arrow.array(high, mask=np.isnan(high)),
+    }
+    columns |= {name: arrow.array(lists[name], of_text) for name in LISTS}
     for name, values in filled.items():
         whole = name.rpartition("_")[2] in WHOLE
         numbers = np.nan_to_num(values).astype(np.int32) if whole else values
         columns[name] = arrow.array(numbers, mask=np.isnan(values))
-    for index, triad in enumerate(plan.triads):
-        ids = [each[index] if ok else None for each, ok in zip(free, good, strict=True)]
-        columns[f"{triad}_undetermined"] = arrow.array(ids, arrow.list_(arrow.string()))
-    columns["field_unit"] = arrow.array(unit, arrow.string())
-    columns["method"] = arrow.array([options.method] * count, arrow.string())
+    columns |= {name: arrow.array(lists[name], of_text) for name in lists if name not in LISTS}
+    columns["field_unit"] = unit
+    columns["method"] = arrow.array([plan.options.method] * len(rows.counts), text)
     order = np.fmax.reduce([filled[f"{triad}_order"] for triad in plan.triads])
     if plan.options.order != AUTO:
-        order = np.full(count, float(max(options.orders)))
-    kinds = np.array([None, *(options.kind(k) for k in range(HIGHEST + 1))], object)
-    model = kinds[np.nan_to_num(order + 1).astype(int)]
-    columns["model"] = arrow.array(model, arrow.string())
+        order = np.full(len(order), float(max(plan.options.orders)))
+    kinds = np.array([None, *(plan.options.kind(k) for k in range(HIGHEST + 1))], object)
+    columns["model"] = arrow.array(kinds[np.nan_to_num(order + 1).astype(int)], text)
     columns["order"] = arrow.array(np.nan_to_num(order).astype(np.int32), mask=np.isnan(order))
     return arrow.table(columns)
 

@@ -10,6 +10,7 @@ import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import pairwise
 from pathlib import Path
 from threading import Lock
 from typing import Any
@@ -89,9 +90,7 @@ def find_tools(source: Source) -> Tools:
     serials = one_chunk(arrow.chunked_array(heads))
     codes = serials.indices.to_numpy(zero_copy_only=False)
     used, first, number = np.unique(codes, return_index=True, return_inverse=True)
-    order = np.argsort(first)
-    rank = np.empty(len(order), int)
-    rank[order] = np.arange(len(order))
+    rank = np.argsort(np.argsort(first))
     return Tools(len(used), np.concatenate(starts), rank[number])
 
 
@@ -200,19 +199,11 @@ def partitions(source: Source, tools: Tools, folder: Path) -> list[Partition]:
     if not tools.together:
         return _dealt(source, tools, folder, size)
     ends = np.append(tools.runs[1:], source.rows)
-    cuts = _cuts(ends, size)
-    parts, before = [], 0
-    for cut in cuts:
-        first = int(tools.runs[before])
-        parts.append(_part(source, first, int(ends[cut]), cut + 1 - before))
-        before = cut + 1
-    return parts
-
-
-def _cuts(ends: Ints, size: int) -> list[int]:
-    """Last tool of each partition: as soon as `size` rows are full."""
-    last = np.searchsorted(ends, np.arange(size, int(ends[-1]) + size, size))
-    return sorted({min(int(i), len(ends) - 1) for i in last} | {len(ends) - 1})
+    full = np.searchsorted(ends, np.arange(size, source.rows, size))
+    last = np.unique(np.append(full, tools.count - 1))
+    counts = np.diff(last, prepend=-1).tolist()
+    bounds = pairwise([0, *ends[last].tolist()])
+    return [_part(source, *each, count) for each, count in zip(bounds, counts, strict=True)]
 
 
 def _part(source: Source, first: int, stop: int, tools: int) -> Partition:

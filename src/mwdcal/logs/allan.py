@@ -24,7 +24,8 @@ of freedom from generalised covariances); IEEE Std 952, annex C (terms).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from itertools import product
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -115,11 +116,7 @@ def _variance(phase: Array, m: int, kind: Kind, centred: bool) -> Array:
     count = phase.shape[-1] - 1
     if m < 1 or count < (3 * m - 1 if kind == "modified" else 2 * m):
         raise ValueError(f"`averaging` must be from 1 to half of {count} readings; got {m}")
-    if kind == "standard":
-        phase = phase[..., ::m]
-        step = phase[..., 2:] - 2 * phase[..., 1:-1] + phase[..., :-2]
-    else:
-        step = phase[..., 2 * m :] - 2 * phase[..., m:-m] + phase[..., : -2 * m]
+    step = _differences(phase[..., ::m], 1) if kind == "standard" else _differences(phase, m)
     if kind == "modified":
         sums = np.cumsum(np.concatenate([np.zeros((*step.shape[:-1], 1)), step], -1), -1)
         step = (sums[..., m:] - sums[..., :-m]) / m
@@ -130,8 +127,12 @@ def _variance(phase: Array, m: int, kind: Kind, centred: bool) -> Array:
 
 def differences(values: Array, m: int) -> Array:
     """Differences (..., n - 2m + 1) of averages over m samples that follow each other."""
-    phase = _phase(values)
-    return np.asarray((phase[..., 2 * m :] - 2 * phase[..., m:-m] + phase[..., : -2 * m]) / m)
+    return _differences(_phase(values), m) / m
+
+
+def _differences(phase: Array, m: int) -> Array:
+    """Second differences (..., n - 2m) over m samples."""
+    return np.asarray(phase[..., 2 * m :] - 2 * phase[..., m:-m] + phase[..., : -2 * m])
 
 
 def drift(values: Array) -> Array:
@@ -173,16 +174,8 @@ def moments(count: int, averaging: Sequence[int], kind: Kind = "overlapping") ->
             covariance[j, i] = covariance[i, j]
             if i == j:
                 mean[i] = expected(np.array(m)) - total / 2
-    plain = [_plain(count, m, kind) for m in averaging]
-    return Moments(
-        count,
-        np.array(averaging, float),
-        mean,
-        covariance,
-        np.array([p[0] for p in plain]),
-        np.array([p[1] for p in plain]),
-        np.array([p[2] for p in plain]),
-    )
+    plain = zip(*(_plain(count, m, kind) for m in averaging), strict=True)
+    return Moments(count, np.array(averaging, float), mean, covariance, *map(np.array, plain))
 
 
 def freedom(moments: Moments, squares: Array, slope: Array, covariance: ArrayLike = 0.0) -> Array:
@@ -221,12 +214,13 @@ def _covariance(lags: Array) -> Array:
 
 def _between(m: int, k: int, lags: Array) -> Array:
     """Covariance (4, l) of differences of averages over m and over k samples, `lags` (l,) apart."""
-    total = sum(
-        one * other * _covariance(lags + p * m - q * k)
-        for p, one in enumerate(SECOND)
-        for q, other in enumerate(SECOND)
-    )
-    return np.asarray(total / (m * k))
+    return _twice_differenced(lambda lag: _covariance(lags + lag), m, k) / (m * k)
+
+
+def _twice_differenced(value: Callable[[int], Array], m: int, k: int) -> Array:
+    """Second difference over m, and once more over k, of a function of a lag."""
+    terms = product(enumerate(SECOND), repeat=2)
+    return np.asarray(sum(a * b * value(p * m - q * k) for (p, a), (q, b) in terms))
 
 
 def _pairs(first: int, second: int, lags: Array) -> Array:
@@ -317,9 +311,5 @@ def _smoothed(covariance: Array, lags: Array, m: int, step: int) -> Array:
     kernel = (m - np.abs(offsets)) / m**2
     smooth = [np.convolve(row, step * kernel, "valid") for row in covariance[1:]]
     inner = lags[m // step : len(lags) - m // step]
-    sharp = sum(
-        one * other * np.clip(m - np.abs(inner + (p - q) * m), 0, None)
-        for p, one in enumerate(SECOND)
-        for q, other in enumerate(SECOND)
-    )
+    sharp = _twice_differenced(lambda lag: np.clip(m - np.abs(inner + lag), 0, None), m, m)
     return np.stack([sharp / m**4, *smooth])

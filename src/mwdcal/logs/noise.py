@@ -11,13 +11,12 @@ at T itself.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import msgspec
 import numpy as np
 
 from mwdcal.calibration.readings import is_simulated
 from mwdcal.calibration.record import Finding
+from mwdcal.calibration.residuals import rms
 from mwdcal.errors import InputError
 from mwdcal.files.contract import CHANNELS, RAW
 from mwdcal.files.formats.table import Table, cell_error, numbers, shown
@@ -25,7 +24,7 @@ from mwdcal.files.logs import TIME, Say, silent
 from mwdcal.geometry.vectors import Array, Ints
 from mwdcal.logs import allan, noise_terms
 from mwdcal.logs.allan import Kind, Moments
-from mwdcal.logs.noise_terms import Terms
+from mwdcal.logs.noise_terms import NoiseTerms
 from mwdcal.logs.stations import row_times
 from mwdcal.sensor.profile import Profile
 
@@ -360,15 +359,7 @@ def _channel(
     )
 
 
-def _drifts(terms: Terms) -> Array:
-    """Whether the drift (B,) cannot be absent."""
-    from scipy.special import ndtr
-
-    chance = 2 * ndtr(-np.abs(terms.slope) / terms.slope_sd)
-    return np.asarray(chance < noise_terms.DETECTED)
-
-
-def _terms(terms: Terms, rate: float) -> dict[str, Term]:
+def _terms(terms: NoiseTerms, rate: float) -> dict[str, Term]:
     """The terms of the one record, in units of the channel and seconds."""
     factors = dict(zip(UNITS, (1 / rate, rate**-0.5, 1.0, rate**0.5, rate), strict=True))
     by_name = {}
@@ -386,13 +377,13 @@ def _terms(terms: Terms, rate: float) -> dict[str, Term]:
     return {**by_name, "drift": _drift(terms, rate)}
 
 
-def _drift(terms: Terms, rate: float) -> Term:
+def _drift(terms: NoiseTerms, rate: float) -> Term:
     """The drift, with its sign; where it may be absent, a bound of its size."""
-    from scipy.special import ndtri
+    from scipy.special import ndtr, ndtri
 
     slope, sd = float(terms.slope[0]) * rate, float(terms.slope_sd[0]) * rate
     tail = 1 - noise_terms.LEVEL
-    shown = bool(_drifts(terms)[0])
+    shown = bool(2 * ndtr(-abs(terms.slope[0]) / terms.slope_sd[0]) < noise_terms.DETECTED)
     reach = float(ndtri(1 - tail / 2)) * sd
     return Term(
         value=slope if shown else None,
@@ -403,7 +394,7 @@ def _drift(terms: Terms, rate: float) -> Term:
     )
 
 
-def _station(value: Array, length: float, moments: Moments, terms: Terms) -> StationNoise:
+def _station(value: Array, length: float, moments: Moments, terms: NoiseTerms) -> StationNoise:
     """The noise of a mean over `length` samples, or of one."""
     noise, freedom, measured = noise_terms.single(value[None], length, moments, terms)
     lower, upper = allan.band(noise, freedom)
@@ -416,7 +407,7 @@ def _station(value: Array, length: float, moments: Moments, terms: Terms) -> Sta
 
 
 def _findings(
-    name: str, value: Array, rate: float, station: float, moments: Moments, terms: Terms
+    name: str, value: Array, rate: float, station: float, moments: Moments, terms: NoiseTerms
 ) -> list[Finding]:
     """What the reader should know about a channel."""
     step = float(np.diff(np.unique(value)).min())
@@ -496,11 +487,8 @@ def _recommended(
         stations = {name: channels[name].station.noise for name in names if name in channels}
         if not stations or kind in withheld:
             continue
-        profile[kind] = root_mean_square(list(stations.values()))
-        noisy, quiet = (
-            max(stations, key=lambda n: stations[n]),
-            min(stations, key=lambda n: stations[n]),
-        )
+        profile[kind] = rms(np.array([*stations.values()]))
+        noisy, quiet = (pick(stations, key=stations.__getitem__) for pick in (max, min))
         if stations[noisy] > UNEVEN * stations[quiet]:
             text = (
                 f"{noisy} has {stations[noisy] / stations[quiet]:.1f} times the noise of {quiet}; the profile has one "
@@ -508,12 +496,3 @@ def _recommended(
             )
             findings.append(Finding(id="uneven", text=text))
     return profile
-
-
-def root_mean_square(values: Sequence[float]) -> float:
-    """Root of the mean square.
-
-    >>> root_mean_square([3.0, 4.0, 5.0])
-    4.08...
-    """
-    return float(np.sqrt(np.mean(np.square(values))))

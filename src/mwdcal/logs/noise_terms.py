@@ -57,7 +57,7 @@ SUBSETS = [s for size in range(1, 5) for s in combinations(range(4), size)]
 """Which terms are present."""
 
 
-class Terms(NamedTuple):
+class NoiseTerms(NamedTuple):
     """Squares of the noise terms (..., 4) in the order of `allan.TERMS`, and the drift.
 
     Attributes:
@@ -93,7 +93,7 @@ class Terms(NamedTuple):
         return np.asarray(gammaincc(self.freedom / 2, self.misfit / 2))
 
 
-def fit(variance: Array, slope: Array, moments: Moments) -> Terms:
+def fit(variance: Array, slope: Array, moments: Moments) -> NoiseTerms:
     """The terms of B records with centred variances (B, m) and slopes (B,).
 
     Errors: fewer than `FEWEST` factors, or a record without any noise, raise ValueError.
@@ -114,7 +114,7 @@ def fit(variance: Array, slope: Array, moments: Moments) -> Terms:
 
 
 def single(
-    values: Array, length: float, moments: Moments, terms: Terms
+    values: Array, length: float, moments: Moments, terms: NoiseTerms
 ) -> tuple[Array, Array, Bools]:
     """Deviation (B,) of one mean over `length` samples of records (B, n), drift included.
 
@@ -137,7 +137,7 @@ def single(
     return size, np.where(measured, measurable, known), measured
 
 
-def _fit(variance: Array, slope: Array, moments: Moments, start: int) -> Terms:
+def _fit(variance: Array, slope: Array, moments: Moments, start: int) -> NoiseTerms:
     """The same on the averaging factors from `start` on; if not all, without quantisation."""
     used = _Used(
         variance[:, start:], moments.mean[start:], moments.covariance[start:, start:],
@@ -152,7 +152,7 @@ def _fit(variance: Array, slope: Array, moments: Moments, start: int) -> Terms:
     lower, upper = _interval(square, spread, determined)
     weight = drift_variance(moments.samples)
     doubt = np.sqrt(np.einsum("a,bac,c->b", weight, covariance, weight))
-    return Terms(
+    return NoiseTerms(
         square, bounded, covariance, lower, upper, determined,
         slope.copy(), np.sqrt(bounded @ weight + doubt),
         np.sqrt(np.maximum(slope**2 - bounded @ weight, 0.0)),
@@ -211,9 +211,8 @@ def _estimate(used: _Used, bounded: Array) -> tuple[Array, Array, Array]:
     whiten = _whitening(used.unit, bounded)
     gain = _inverse(whiten @ used.mean) @ whiten
     each = np.einsum("bjm,bjn,mnac->bjac", gain, gain, used.unit, optimize=True)
-    joint = np.einsum("mnac,ba,bc->bmn", used.unit, bounded, bounded, optimize=True)
     square = np.einsum("bjm,bm->bj", gain, used.variance)
-    return square, each, gain @ joint @ np.swapaxes(gain, -1, -2)
+    return square, each, gain @ _joint(used.unit, bounded) @ np.swapaxes(gain, -1, -2)
 
 
 def _misfit(used: _Used, bounded: Array) -> tuple[Array, Ints]:
@@ -221,18 +220,22 @@ def _misfit(used: _Used, bounded: Array) -> tuple[Array, Ints]:
 
     A variance of few degrees of freedom is skew; its cube root is normal (Wilson, Hilferty).
     """
-    joint = np.einsum("mnac,ba,bc->bmn", used.unit, bounded, bounded, optimize=True)
     fitted = bounded @ np.swapaxes(used.mean, -1, -2)
-    spread = np.sqrt(np.einsum("bmm->bm", joint))
+    spread = np.sqrt(np.einsum("bmm->bm", _joint(used.unit, bounded)))
     skew = (spread / fitted) ** 2 / 9
     normal = (np.cbrt(used.variance / fitted) - 1 + skew) / np.sqrt(skew)
     rest = np.einsum("bij,bj->bi", _whitening(used.unit, bounded), normal * spread)
     return np.sum(rest**2, -1), len(used.mean) - np.sum(bounded > 0, -1)
 
 
+def _joint(unit: Array, squares: Array) -> Array:
+    """Covariance (B, m, m) of the variances under noise of these squares (B, 4)."""
+    return np.asarray(np.einsum("mnac,ba,bc->bmn", unit, squares, squares, optimize=True))
+
+
 def _whitening(unit: Array, squares: Array) -> Array:
     """Matrix (B, m, m) that makes the variances of noise (B, 4) independent, each of variance 1."""
-    joint = np.einsum("mnac,ba,bc->bmn", unit, squares, squares, optimize=True)
+    joint = _joint(unit, squares)
     scale = 1 / np.sqrt(np.einsum("bmm->bm", joint))
     size, axes = np.linalg.eigh(joint * scale[:, :, None] * scale[:, None, :])
     whiten = np.swapaxes(axes, -1, -2) / np.sqrt(np.maximum(size, SMALLEST))[..., None]

@@ -11,7 +11,7 @@ from mwdcal.calibration.record import Finding
 from mwdcal.geometry.vectors import Array
 from mwdcal.logs import standstill
 from mwdcal.logs.standstill import Activity, Standstills
-from mwdcal.logs.station_means import Summary
+from mwdcal.logs.station_means import ChannelMean
 
 MANY_SPIKES = 0.01
 """Share of spikes that is reported."""
@@ -23,7 +23,7 @@ SPARSE, RARE = 0.5, 2.0
 STEADY = 3.0
 """Standard deviations of a cell's level by which a noisy but steady stretch may drift."""
 
-Rows = dict[str, list[Summary]]
+Rows = dict[str, list[ChannelMean]]
 """What each channel read at each station."""
 
 
@@ -99,7 +99,7 @@ def _spikes(rows: Rows) -> list[Finding]:
     return [Finding(id="spikes", text=text)]
 
 
-def _stuck(name: str, summaries: list[Summary]) -> list[Finding]:
+def _stuck(name: str, summaries: list[ChannelMean]) -> list[Finding]:
     """A channel at its limit, or frozen."""
     stations = [i + 1 for i, row in enumerate(summaries) if row.stuck]
     if not stations:
@@ -113,7 +113,7 @@ def _stuck(name: str, summaries: list[Summary]) -> list[Finding]:
     return [Finding(id="stuck-channel", text=text, station=str(stations[0]))]
 
 
-def _unsteady(name: str, summaries: list[Summary]) -> list[Finding]:
+def _unsteady(name: str, summaries: list[ChannelMean]) -> list[Finding]:
     """A channel that is less steady than usual, or steps within a standstill."""
     stations = [i + 1 for i, row in enumerate(summaries) if row.unsteady and not row.stuck]
     if not stations:
@@ -127,7 +127,7 @@ def _unsteady(name: str, summaries: list[Summary]) -> list[Finding]:
     return [Finding(id="unsteady", text=text, station=str(stations[0]))]
 
 
-def _drifting(name: str, summaries: list[Summary], seconds: Array) -> list[Finding]:
+def _drifting(name: str, summaries: list[ChannelMean], seconds: Array) -> list[Finding]:
     drifting = [i for i, row in enumerate(summaries) if row.drifts]
     if not drifting:
         return []

@@ -12,7 +12,7 @@ noise that is correlated over a second or more shows there, and not in one stand
 Reference: P. J. Huber, Robust Statistics, chapter 6 (medians, MAD); C. J. Geyer, Statistical
 Science 7, 473 (1992), section 3.3 (initial monotone sequence); G. K. Smyth, Statistical
 Applications in Genetics and Molecular Biology 3, 3 (2004) (moderated variances); B. Widrow and
-I. Kollár, Quantization Noise (2008) (dither).
+I. Kollár, Quantization SharedNoise (2008) (dither).
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ Rest = tuple[Array, Array]
 """Times (n,) and values (n,) of the samples of one standstill, n >= 2."""
 
 
-class Noise(NamedTuple):
+class SharedNoise(NamedTuple):
     """What all standstills of a channel say together of one sample.
 
     Attributes:
@@ -78,11 +78,11 @@ class Noise(NamedTuple):
     course: float
 
 
-ALONE = Noise(np.nan, np.nan, np.nan, 0.0, np.nan, np.inf, 0.0)
+ALONE = SharedNoise(np.nan, np.nan, np.nan, 0.0, np.nan, np.inf, 0.0)
 """The shared noise where a channel has one standstill only."""
 
 
-class Summary(NamedTuple):
+class ChannelMean(NamedTuple):
     """What one channel read during one standstill.
 
     Attributes:
@@ -114,7 +114,7 @@ class Summary(NamedTuple):
 
 def summarise_all(
     rests: Sequence[Rest], resolution: float, say: Callable[[int], None] = lambda done: None
-) -> list[Summary]:
+) -> list[ChannelMean]:
     """What a channel read at each standstill; `say` receives how many are done."""
     noise = pooled(rests, resolution)
     summaries = []
@@ -136,7 +136,7 @@ class Correlated(NamedTuple):
     plain: bool
 
 
-def correlated(channels: Sequence[Sequence[Summary]]) -> Correlated:
+def correlated(channels: Sequence[Sequence[ChannelMean]]) -> Correlated:
     """Whether the means of a triad's channels scatter by more than the samples claim.
 
     Definition: what the halves of a channel's standstills tell, times what noise that reaches
@@ -192,7 +192,7 @@ def beyond(growth: float) -> float:
     return float(np.interp(growth, halves / quarters, variance(time) / halves))
 
 
-def widened(summaries: Sequence[Summary], variance: float) -> list[Summary]:
+def widened(summaries: Sequence[ChannelMean], variance: float) -> list[ChannelMean]:
     """The same with at least this variance of a sample's worth of mean."""
     return [
         m if m.stuck else m._replace(sd=max(m.sd, (float(variance) / m.used) ** 0.5))
@@ -200,7 +200,7 @@ def widened(summaries: Sequence[Summary], variance: float) -> list[Summary]:
     ]
 
 
-def pooled(rests: Sequence[Rest], resolution: float) -> Noise:
+def pooled(rests: Sequence[Rest], resolution: float) -> SharedNoise:
     """The noise that the standstills of a channel share.
 
     Each standstill counts with 64 samples at most. Singular: one alone has none to share.
@@ -230,7 +230,7 @@ def pooled(rests: Sequence[Rest], resolution: float) -> Noise:
     by_chance = variance**2 * float(np.mean(2 / freedom[some]))
     scatter = max(differ - by_chance, differ / max(some.sum() - 1, 1)) ** 0.5
     rough = [_rough(value) for _, value in rests if len(value) >= 3 * PARTS]
-    return Noise(
+    return SharedNoise(
         spread=spread,
         sd=variance**0.5,
         least=max(variance - scatter, 0.0) ** 0.5,
@@ -281,9 +281,9 @@ def _chi_square_limit(freedom: Array) -> Array:
     return np.asarray(UNUSUAL**2 * chdtri(np.maximum(freedom, 1), SIGNIFICANT), float)
 
 
-def _blocks(value: Array) -> Array:
-    """Means of `PARTS` blocks."""
-    bounds = np.linspace(0, len(value), PARTS + 1).astype(int)
+def _blocks(value: Array, count: int = PARTS) -> Array:
+    """Means of that many blocks."""
+    bounds = np.linspace(0, len(value), count + 1).astype(int)
     return np.asarray(np.add.reduceat(value, bounds[:-1]) / np.diff(bounds))
 
 
@@ -293,7 +293,9 @@ def _rough(value: Array) -> float:
     return float(np.median(steps) / 0.6745 / 2**0.5 * (len(value) / PARTS) ** 0.5)
 
 
-def summarise(time: Array, value: Array, resolution: float, noise: Noise = ALONE) -> Summary:
+def summarise(
+    time: Array, value: Array, resolution: float, noise: SharedNoise = ALONE
+) -> ChannelMean:
     """What a channel read: `time` and `value` (n,) of the samples of one standstill, n >= 2.
 
     `resolution` is the step of the channel, in which noise far below it hides the mean (`hidden`).
@@ -319,7 +321,7 @@ def summarise(time: Array, value: Array, resolution: float, noise: Noise = ALONE
     if stuck:
         sd = noise.reach / 12**0.5
     half = len(flat) // 2
-    return Summary(
+    return ChannelMean(
         mean=mean,
         sd=sd,
         spread=spread,
@@ -337,7 +339,7 @@ def summarise(time: Array, value: Array, resolution: float, noise: Noise = ALONE
 def hidden(spread: float, step: float) -> float:
     """What readings in steps hide of the mean of many: its standard deviation.
 
-    `spread` is the standard deviation of the readings. Noise of σ steps leaves of the mean, which
+    `spread` is the standard deviation of the readings. SharedNoise of σ steps leaves of the mean, which
     lies anywhere between two steps, the variance step²/(2π²) Σ exp(-4π²k²σ²)/k² over k = 1, 2, …:
     step²/12 without noise.
     """
@@ -364,7 +366,7 @@ def _dither() -> tuple[Array, Array, Array]:
     return sigma**2 + 1 / 12 - lost, lost, least
 
 
-def _shared_spread(value: Array, step: float, noise: Noise) -> float:
+def _shared_spread(value: Array, step: float, noise: SharedNoise) -> float:
     """Standard deviation of a reading: that of all standstills, unless its own is plainly less.
 
     Where a standstill lies on a step its own is less anyway (`_dither`).
@@ -382,14 +384,14 @@ def _shared_spread(value: Array, step: float, noise: Noise) -> float:
     return spread if len(value) * spread**2 < quiet else noise.least
 
 
-def _spike_scale(count: int, spread: float, noise: Noise) -> float:
+def _spike_scale(count: int, spread: float, noise: SharedNoise) -> float:
     """The noise by which spikes are judged: its own where many samples tell it, else that of all."""
     if count < BLOCKS and noise.freedom >= LONG:
         return max(spread, noise.spread)
     return spread if count >= LONG else np.inf
 
 
-def _is_stuck(value: Array, distance: Array, resolution: float, noise: Noise) -> bool:
+def _is_stuck(value: Array, distance: Array, resolution: float, noise: SharedNoise) -> bool:
     """Whether more readings are equal than a channel of this noise and resolution can show."""
     from scipy.special import erf
 
@@ -402,7 +404,7 @@ def _is_stuck(value: Array, distance: Array, resolution: float, noise: Noise) ->
     return bool(count >= 5 and count > max(STUCK, chance) * len(value))
 
 
-def _is_unsteady(value: Array, resolution: float, noise: Noise) -> bool:
+def _is_unsteady(value: Array, resolution: float, noise: SharedNoise) -> bool:
     """Whether a standstill spreads more than they usually do, or has a step within."""
     if noise.freedom < LONG:
         return False
@@ -416,7 +418,7 @@ def _is_unsteady(value: Array, resolution: float, noise: Noise) -> bool:
     return bool(spreads or np.ptp(_blocks(value)) > WANDERS * scatter)
 
 
-def _mean_variance(value: Array, noise: Noise, lost: int = 1) -> tuple[float, float, float]:
+def _mean_variance(value: Array, noise: SharedNoise, lost: int = 1) -> tuple[float, float, float]:
     """Mean, variance of the mean, and degrees of freedom; `lost` are those of what was fitted.
 
     Fewer than `LONG` samples are taken as independent, and share the noise of all standstills
@@ -462,8 +464,7 @@ def long_run(value: Array) -> tuple[float, float, float]:
     """
     mean = float(value.mean())
     blocks = min(len(value), BLOCKS)
-    bounds = np.linspace(0, len(value), blocks + 1).astype(int)
-    means = np.add.reduceat(value - mean, bounds[:-1]) / np.diff(bounds)
+    means = _blocks(value - mean, blocks)
     means = means - means.mean()
     products = np.correlate(means, means, "full")[blocks - 1 :] / blocks
     pairs = products[: blocks // 4 * 2].reshape(-1, 2).sum(-1)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, replace
+from itertools import chain
 
 import numpy as np
 
@@ -23,6 +24,7 @@ from mwdcal.geometry.vectors import Array, Ints
 from mwdcal.logs import standstill
 from mwdcal.logs.standstill import Activity, Slow, Standstills
 from mwdcal.logs.station_findings import (
+    Rows,
     about,
     correlated_noise,
     count,
@@ -30,7 +32,7 @@ from mwdcal.logs.station_findings import (
     noisy_rests,
     time_unit,
 )
-from mwdcal.logs.station_means import Summary, correlated, summarise, summarise_all, widened
+from mwdcal.logs.station_means import correlated, summarise, summarise_all, widened
 
 MIN_SECONDS, TRIM_SECONDS = 1.0, 1.0
 """Defaults for a fast log; one sampled slowly needs a window, and a cell, respectively."""
@@ -59,7 +61,7 @@ class Stations:
 
     Attributes:
         table: the run, one row per station.
-        found: all intervals that look still, with what became of each.
+        intervals: all that look still, with what became of each.
         activity: how much each moment moves, in noise floors.
         threshold: activity up to which it stands still.
         stretch: thresholds from which to which the standstills are the same ones; None
@@ -71,7 +73,7 @@ class Stations:
     """
 
     table: Table
-    found: Standstills
+    intervals: Standstills
     activity: Activity
     threshold: float
     stretch: tuple[float, float] | None
@@ -83,11 +85,11 @@ class Stations:
 
 
 class StandstillError(InputError):
-    """A log without a standstill; `made` holds the analysis, with an empty table."""
+    """A log without a standstill; `analysis` is that of the log, with an empty table."""
 
-    def __init__(self, text: str, made: Stations) -> None:
+    def __init__(self, text: str, analysis: Stations) -> None:
         super().__init__(text)
-        self.made = made
+        self.analysis = analysis
 
 
 def find_stations(
@@ -178,8 +180,8 @@ def _short(log: Table, time: Array, traces: dict[str, Trace]) -> InputError:
 
 def _none(stations: Stations) -> str:
     """The message of a log without a station."""
-    longest = float((stations.found.end - stations.found.start).max(initial=0.0))
-    moving = int(np.count_nonzero(~stations.found.short))
+    longest = float((stations.intervals.end - stations.intervals.start).max(initial=0.0))
+    moving = int(np.count_nonzero(~stations.intervals.short))
     trimmed = f"after {stations.trim_seconds:g} s trimmed off each end"
     if moving:
         word = "interval moves" if moving == 1 else "intervals move"
@@ -263,14 +265,7 @@ def _traces(
         if name in RAW and np.ptp(traces[name][1]) == 0:
             text = f"{name} reads {traces[name][1][0] + 0.0:g} from end to end: a dead channel?"
             findings.append(Finding(id="dead-channel", text=text))
-    temperature = traces.pop("temperature_c", None)
-    if temperature is not None:
-        temperature = _possible(temperature, findings)
-    if temperature is not None and not len(temperature[0]):
-        text = "temperature_c is blank from end to end: the stations have no temperature."
-        findings.append(Finding(id="no-temperature", text=text))
-        temperature = None
-    return traces, temperature
+    return traces, _possible(traces.pop("temperature_c", None), findings)
 
 
 def _trace(log: Table, time: Array, name: str) -> Trace:
@@ -282,8 +277,10 @@ def _trace(log: Table, time: Array, name: str) -> Trace:
     return standstill.distinct(time), value
 
 
-def _possible(temperature: Trace, findings: list[Finding]) -> Trace:
+def _possible(temperature: Trace | None, findings: list[Finding]) -> Trace | None:
     """The temperatures that are possible; others, such as -999, are left out and reported."""
+    if temperature is None:
+        return None
     time, value = temperature
     fine = (value >= TEMPERATURE.low) & (value <= TEMPERATURE.high)
     if not fine.all():
@@ -293,6 +290,10 @@ def _possible(temperature: Trace, findings: list[Finding]) -> Trace:
             f"and {TEMPERATURE.high:g} °C, such as {value[wrong[0]]:g}: left out."
         )
         findings.append(Finding(id="impossible-temperature", text=text))
+    if not fine.any():
+        text = "temperature_c is blank from end to end: the stations have no temperature."
+        findings.append(Finding(id="no-temperature", text=text))
+        return None
     return time[fine], value[fine]
 
 
@@ -399,11 +400,10 @@ def _with_samples(
 
 
 def _summaries(
-    traces: dict[str, Trace], start: Array, end: Array, findings: list[Finding],
-    say: Say,
-) -> dict[str, list[Summary]]:  # fmt: skip
+    traces: dict[str, Trace], start: Array, end: Array, findings: list[Finding], say: Say
+) -> Rows:
     """What each channel read at each station."""
-    summaries: dict[str, list[Summary]] = {}
+    summaries: Rows = {}
     for name, (time, value) in traces.items():
         resolution = standstill.resolution(value) or SMALLEST * abs(value[0]) or SMALLEST
         places = zip(*_within(time, start, end), strict=True)
@@ -414,26 +414,25 @@ def _summaries(
 
         summaries[name] = summarise_all(rests, float(resolution), progress)
     for triad in CHANNELS.values():
-        names = [name for name in triad if name in summaries]
-        correlation = correlated([summaries[name] for name in names])
-        wider = {
-            n: widened(summaries[n], float(v))
-            for n, v in zip(names, correlation.variance, strict=True)
-        }
-        grown = [
-            a.sd > REPORTED * b.sd
-            for n in names
-            for a, b in zip(wider[n], summaries[n], strict=True)
-        ]
-        if correlation.plain and 2 * sum(grown) > len(grown):
-            findings.append(correlated_noise(names))
-        summaries |= wider
+        summaries |= _widened({n: summaries[n] for n in triad if n in summaries}, findings)
     return summaries
 
 
-def _columns(
-    log: Table, time: Array, rows: dict[str, list[Summary]], start: Array, end: Array
-) -> dict[str, Column]:
+def _widened(triad: Rows, findings: list[Finding]) -> Rows:
+    """What the channels of a triad read, known less well where their noise is correlated."""
+    correlation = correlated([*triad.values()])
+    wider = {
+        name: widened(means, float(variance))
+        for (name, means), variance in zip(triad.items(), correlation.variance, strict=True)
+    }
+    pairs = zip(chain(*wider.values()), chain(*triad.values()), strict=True)
+    grown = [after.sd > REPORTED * before.sd for after, before in pairs]
+    if correlation.plain and 2 * sum(grown) > len(grown):
+        findings.append(correlated_noise([*triad]))
+    return wider
+
+
+def _columns(log: Table, time: Array, rows: Rows, start: Array, end: Array) -> dict[str, Column]:
     """The run: labels and times, means, and what is known of each mean."""
     first, last = _within(time, start, end)
     columns: dict[str, Column] = {

@@ -51,9 +51,9 @@ def command(
     try:
         stations = find_stations(readings, say=slowly, **search)
     except StandstillError as error:  # the picture helps most then
-        message = [str(error), *lines(error.made.findings)]
+        message = [str(error), *lines(error.analysis.findings)]
         if plot:
-            atomic.write(plot, picture(page.figure(error.made), plot))
+            atomic.write(plot, picture(page.figure(error.analysis), plot))
             message.append(f"wrote {plot} (picture)")
         raise InputError("\n".join(message)) from None
     drawn = picture(page.figure(stations), plot) if plot else b""

@@ -54,7 +54,7 @@ def _finite(value: float) -> float | None:
 
 def _left(stations: Stations) -> list[tuple[float, float, bool]]:
     """Intervals that look still and were not taken: start, end, whether they are short."""
-    intervals = stations.found
+    intervals = stations.intervals
     return [
         (float(intervals.start[i]), float(intervals.end[i]), bool(intervals.short[i]))
         for i in np.flatnonzero(~intervals.taken)
@@ -175,7 +175,7 @@ def _draw_activity(axes: Axes, stations: Stations) -> None:
 
 def _shade(axes: Axes, stations: Stations) -> None:
     """Taken intervals filled, left ones hatched."""
-    intervals = stations.found
+    intervals = stations.intervals
     bars = np.stack([intervals.start, intervals.end - intervals.start], -1)
     place: dict[str, Any] = {
         "yrange": (0, 1),
@@ -189,7 +189,7 @@ def _shade(axes: Axes, stations: Stations) -> None:
 
 
 def _number_stations(axes: Axes, stations: Stations) -> None:
-    intervals = stations.found
+    intervals = stations.intervals
     middle = (intervals.start + intervals.end)[intervals.taken] / 2
     every = max(1, -(-len(middle) // 30))
     for i in range(0, len(middle), every):

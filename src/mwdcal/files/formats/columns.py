@@ -75,24 +75,16 @@ def check_names(names: Sequence[str], where: str) -> None:
             f"{where}: expected the column names; got numbers. Put a line with the column "
             "names, such as ax,ay,az, above them."
         )
-    for position, name in enumerate(names, 1):
-        if not name:
-            raise InputError(
-                f"{where}: every column must have a name; column {position} has none. "
-                "Name it, or remove it with its delimiter."
-            )
-    _check_unique(names, where)
-
-
-def _check_unique(names: Sequence[str], where: str) -> None:
-    seen: set[str] = set()
-    for name in names:
-        if name in seen:
-            raise InputError(
-                f"{where}: column names must be unique; got '{name}' more than once. "
-                "Rename or remove one of the columns."
-            )
-        seen.add(name)
+    if "" in names:
+        raise InputError(
+            f"{where}: every column must have a name; column {[*names].index('') + 1} has none. "
+            "Name it, or remove it with its delimiter."
+        )
+    for name in (name for i, name in enumerate(names) if name in names[:i]):
+        raise InputError(
+            f"{where}: column names must be unique; got '{name}' more than once. "
+            "Rename or remove one of the columns."
+        )
 
 
 def assemble(

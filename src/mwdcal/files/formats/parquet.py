@@ -26,8 +26,8 @@ _MAX_CELLS = 100_000_000
 _PANDAS_INDEX = re.compile(r"__index_level_\d+__")
 
 
-def parse(data: bytes, source: str, delimiter: str | None = None) -> Parts:
-    """The table in the bytes of a Parquet file; `delimiter` has no meaning here."""
+def parse(data: bytes, source: str) -> Parts:
+    """The table in the bytes of a Parquet file."""
     arrow, parquet = modules(source)
     with reading(source):
         file = parquet.ParquetFile(arrow.BufferReader(data))

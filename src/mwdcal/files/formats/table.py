@@ -56,18 +56,16 @@ class Table:
         return len(next(iter(self.columns.values()), ()))
 
 
-def read(
-    path: str | os.PathLike[str], *, decimal: str = ".", delimiter: str | None = None
-) -> Table:
+def read(path: str | os.PathLike[str], *, decimal: str = ".") -> Table:
     """The table in a .csv, .tsv, .parquet or .xlsx file.
 
-    `decimal` is the decimal sign of text cells, '.' or ','; without `delimiter` it is
-    read from the header line of a text file.
+    `decimal` is the decimal sign of text cells, '.' or ','.
     """
-    _check_options(decimal, delimiter)
+    if decimal not in _MARKS:
+        raise InputError(f"`decimal` must be '.' or ','; got {shown(decimal)}.")
     file = Path(path)
     data = _content(file)
-    parts = _PARSERS[_suffix(file)](data, file.name, delimiter)
+    parts = _PARSERS[_suffix(file)](data, file.name)
     digest = hashlib.sha256(data).hexdigest()
     return Table(parts.columns, parts.metadata, file.name, parts.lines, digest, decimal)
 
@@ -125,17 +123,6 @@ def shown(value: object) -> str:
         cut = value if len(value) <= _LONGEST_SHOWN else value[:_LONGEST_SHOWN] + "…"
         return f"'{cut}'" if cut.isprintable() else repr(cut)
     return f"{value:.12g}" if isinstance(value, float) else str(value)
-
-
-def _check_options(decimal: str, delimiter: str | None) -> None:
-    if decimal not in _MARKS:
-        raise InputError(f"`decimal` must be '.' or ','; got {shown(decimal)}.")
-    bad = "\"'#\r\n\0"
-    if delimiter is not None and (len(delimiter) != 1 or delimiter in bad or delimiter == decimal):
-        raise InputError(
-            "`delimiter` must be one character, such as ',', ';' or a tab, and not the decimal "
-            f"sign; got {shown(delimiter)}."
-        )
 
 
 def _suffix(path: Path) -> str:
@@ -241,14 +228,12 @@ def _pointed(table: Table) -> dict[str, Column]:
 
 def _typed(table: Table) -> dict[str, Column]:
     """The columns for typed formats: text columns that hold nothing but numbers as numbers."""
-    return {name: _typed_column(name, c, table.decimal) for name, c in table.columns.items()}
-
-
-def _typed_column(name: str, column: Column, decimal: str) -> Column:
-    if not isinstance(column, list) or name in LABELS or any(_is_code(c) for c in column):
-        return column
-    values = _floats(column, decimal)
-    return column if values is None else values
+    columns = dict(table.columns)
+    for name, column in table.columns.items():
+        if isinstance(column, list) and name not in LABELS and not any(map(_is_code, column)):
+            values = _floats(column, table.decimal)
+            columns[name] = column if values is None else values
+    return columns
 
 
 def _is_code(cell: str) -> bool:

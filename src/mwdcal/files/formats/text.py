@@ -37,27 +37,27 @@ class Head(NamedTuple):
     body: bytes
 
 
-def parse(data: bytes, source: str, delimiter: str | None = None) -> Parts:
-    """The table in the bytes of a text file; without `delimiter` it is read from the header line."""
+def parse(data: bytes, source: str) -> Parts:
+    """The table in the bytes of a text file."""
     lines = _lines(data, source)
-    top = _head(lines, source, delimiter)
+    top = _head(lines, source)
     return _parts(lines[top.lines :], top, top.lines, source)._replace(metadata=top.metadata)
 
 
-def head(data: bytes, source: str, delimiter: str | None = None) -> Head:
+def head(data: bytes, source: str) -> Head:
     """The head of a text table of which `data` is the beginning, whole lines."""
     lines = _lines(data, source)
-    top = _head(lines, source, delimiter)
+    top = _head(lines, source)
     return top._replace(body="\n".join(lines[top.lines :]).encode())
 
 
-def _head(lines: Sequence[str], source: str, delimiter: str | None) -> Head:
+def _head(lines: Sequence[str], source: str) -> Head:
     """The head of a table of these lines, without a body."""
     comments = list(takewhile(is_preamble, lines))
     metadata = meta.parse([(i, comment(line)) for i, line in enumerate(comments, 1)], source)
     start = len(comments)
     header = lines[start : start + 1]
-    delimiter = delimiter or (_delimiter(header[0], source) if header else ",")
+    delimiter = _delimiter(header[0], source) if header else ","
     cells = next(split(header, start, delimiter, source), (start + 1, ()))[1]
     names = [str(cell).strip() for cell in cells]
     check_names(names, f"{source}, line {start + 1}")

@@ -26,8 +26,8 @@ _UNWRITABLE = re.compile(r"[\x00-\x08\x0b-\x1f\ufffe\uffff]")
 Row = tuple[int, Sequence[object]]
 
 
-def parse(data: bytes, source: str, delimiter: str | None = None) -> Parts:
-    """The table on the first sheet of a workbook; `delimiter` has no meaning here."""
+def parse(data: bytes, source: str) -> Parts:
+    """The table on the first sheet of a workbook."""
     rows = iter(_rows(data, source))
     comments: list[tuple[int, str]] = []
     header: list[Row] = []
