@@ -265,6 +265,55 @@ def test_options_by_name_are_those_of_options(run):
     assert by_name.options.robust == "huber"
 
 
+def test_one_name_is_a_tuple_of_one(run, cal):
+    by_name = mwdcal.Options(nonlinearity="accelerometer", estimate="azimuth-zero", ignore="dip")
+    assert by_name.nonlinearity == ("accelerometer",)
+    assert (by_name.estimate, by_name.ignore) == (("azimuth-zero",), ("dip",))
+    assert mwdcal.Options(nonlinearity="none").nonlinearity == ()
+    one, alone = cal.covariance("azimuth", run), cal.uncertainty("azimuth", run)
+    np.testing.assert_allclose(np.sqrt(one[..., 0, 0]), alone, rtol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"model": "factor"}, "`model` must be polynomial or factors; got 'factor'"),
+        ({"nonlinearity": "gyroscope"}, "got 'gyroscope'"),
+        ({"prior": "tool.json"}, "Read a file with mwdcal.load"),
+        ({"method": "joit"}, "`method` must be one of"),
+        ({"robust": "hubr"}, "`robust` must be one of"),
+        ({"parameters": 7}, "`parameters` must be 6, 9 or 12"),
+    ],
+)
+def test_refused_options(change, words, run):
+    with pytest.raises(mwdcal.InputError, match=words):
+        mwdcal.calibrate(run, **change)
+
+
+def test_refused_arguments(run, cal, simulated):
+    a, m = columns(simulated)
+    batch = mwdcal.readings(np.stack([a, a]), np.stack([m, m]))
+    labels = mwdcal.readings(a, m, station=np.arange(48) - 1.0).station[:3]
+    assert labels == ("-1", "0", "1")
+    for call, words in (
+        (lambda: mwdcal.calibrate(run, mwdcal.Options()), "`profile` must be a tool profile"),
+        (lambda: mwdcal.verify(cal, batch), "`rolltest` must have readings of one run"),
+        (lambda: mwdcal.apply(cal, a), "`survey` must be readings; got ndarray"),
+        (lambda: cal.covariance((), run), "one observable or more"),
+        (lambda: mwdcal.readings(a + 0j, m), "`accelerometer` must be numbers; got complex128"),
+        (lambda: mwdcal.readings(a > 0, m), "must be numbers; got bool"),
+        (lambda: mwdcal.readings(a, m, sd=1e-4), "`sd` must be a mapping"),
+        (lambda: mwdcal.readings(a, m, group=1), "one value for each of 48 stations; got 1"),
+        (lambda: mwdcal.read_run({"ax": [1, 2], "ay": [1], "az": [1, 2]}), "column 'ay' has 1"),
+        (lambda: mwdcal.read_run({"ax": 1, "ay": 1, "az": 1}), "column 'ax' must be numbers"),
+        (lambda: mwdcal.simulate([200]), "between 0 and 180"),
+        (lambda: mwdcal.simulate([45], 0), "`toolfaces` 1 or more"),
+        (lambda: mwdcal.calibrate(run, prior=cal), "the calibration of unnamed readings was made"),
+    ):
+        with pytest.raises(mwdcal.InputError, match=words):
+            call()
+
+
 def test_a_calibration_knows_the_stations_of_its_fit(cal, run):
     with pytest.raises(
         mwdcal.InputError, match=r"^the readings: 48 of 48 stations were in the fit"

@@ -6,12 +6,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-from mwdcal.calibration.prior import Knowledge
+from mwdcal.calibration.prior import DATASHEET, Knowledge
 from mwdcal.calibration.readings import TRIADS
 from mwdcal.calibration.record import Calibration
 from mwdcal.calibration.soaks import HIGHEST
 from mwdcal.errors import InputError
 
+MODELS = ("polynomial", "factors")
 AUTO: Literal["auto"] = "auto"
 """What an option is whose value the software chooses (`mwdcal.calibration.automatic.auto`)."""
 USUAL = 0.005
@@ -67,10 +68,21 @@ class Options:
     rounds: int = 8
 
     def __post_init__(self) -> None:
-        """Refuse an order or a triad that does not exist.
+        """Take one name for a tuple of one; refuse an order, a model, a triad or a prior that cannot be.
 
         Raises `InputError`.
         """
+        for name in ("nonlinearity", "estimate", "ignore", "exclude"):
+            value = getattr(self, name)
+            if isinstance(value, str) and value != AUTO:
+                object.__setattr__(self, name, () if value == "none" else (value,))
+        if self.model not in (None, *MODELS):
+            raise InputError(f"`model` must be {' or '.join(MODELS)}; got {self.model!r}.")
+        if isinstance(self.prior, str) and self.prior != DATASHEET:
+            raise InputError(
+                f"`prior` must be '{DATASHEET}' or a calibration; got {self.prior!r}. Read a file with "
+                "mwdcal.load."
+            )
         if self.order != AUTO and not {*self.orders} <= {*range(HIGHEST + 1)}:
             raise InputError(f"`order` must be 0, 1, 2, 3 or auto; got {self.order!r}.")
         if self.nonlinearity != AUTO and not {*self.nonlinearity} <= {*TRIADS}:

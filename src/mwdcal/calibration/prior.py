@@ -128,7 +128,7 @@ def profile_for(
         known[name] = replace_struct(present, scale=scale)
         if previous.scale is not None and (present.axes, scale) != (previous.axes, previous.scale):
             raise InputError(
-                f"`prior`: the calibration of {prior.run} was made with {name} axes "
+                f"`prior`: the calibration of {prior.run_name} was made with {name} axes "
                 f"{list(previous.axes)} and scale {previous.scale:g}; the tool profile "
                 f"'{profile.name}' has {list(present.axes)} and {scale:g}. Use the tool profile that "
                 "the previous calibration had."
@@ -158,7 +158,7 @@ def for_run(previous: Calibration, readings: Readings) -> Knowledge:
     A run without a magnetometer has no unit of the field that could differ.
     Raises `InputError` for a run of another tool, or of stations that the calibration has used.
     """
-    where = f"`prior`: the calibration of {previous.run}"
+    where = f"`prior`: the calibration of {previous.run_name}"
     other = previous.other_tool(readings)
     if other:
         raise InputError(
@@ -190,7 +190,7 @@ def from_calibration(previous: Calibration, relative: bool = False) -> Knowledge
     Raises `InputError` for one with own-axis terms (they are centred on their own run), or in
     another unit of the field than this run's.
     """
-    where = f"`prior`: the calibration of {previous.run}"
+    where = f"`prior`: the calibration of {previous.run_name}"
     if any(triad.curved for triad in previous.triads):
         raise InputError(
             f"{where} has own-axis quadratic and cubic terms, which belong to the readings of its own "

@@ -117,8 +117,8 @@ class Readings:
 
     def __repr__(self) -> str:
         known = ", ".join(self.known) or "none"
-        triads = TRIADS[: 1 if self.magnetometer is None else 2]
-        return f"<{self.name}: {self.count} stations; {' and '.join(triads)}; references: {known}>"
+        triads = " and ".join(TRIADS[: 1 if self.magnetometer is None else 2])
+        return f"<Readings: {self.count} stations; {triads}; references: {known}>"
 
     @property
     def name(self) -> str:

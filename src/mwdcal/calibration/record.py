@@ -320,6 +320,11 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
         return [t for t in (self.accelerometer, self.magnetometer) if t is not None]
 
     @property
+    def run_name(self) -> str:
+        """What messages call the run: its file, if it had one."""
+        return self.run or "unnamed readings"
+
+    @property
     def has_field(self) -> bool:
         """Whether the magnetometer was calibrated."""
         return self.magnetometer is not None
@@ -395,15 +400,20 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
         """
         return np.sqrt(self.covariance((name,), readings, noise)[..., 0, 0])
 
-    def covariance(self, names: Sequence[str], readings: Readings, noise: bool = False) -> Array:
+    def covariance(
+        self, names: str | Sequence[str], readings: Readings, noise: bool = False
+    ) -> Array:
         """Covariance (…, n, k, k) of k observables at one reading, as `uncertainty` states each.
 
         Units: products of radians, g and nT. Singular: NaN in the rows and columns of an observable
         without a stated uncertainty.
 
         Raises:
-            InputError: an observable is unknown.
+            InputError: an observable is unknown, or none is named.
         """
+        names = (names,) if isinstance(names, str) else tuple(names)
+        if not names:
+            raise InputError("`names` must name one observable or more; got none.")
         for name in names:
             if name not in OBSERVABLES:
                 raise InputError(

@@ -96,6 +96,8 @@ def readings(
 def _numbers(name: str, values: ArrayLike) -> Array:
     """Values as an array of its own; NaN where a table has a null."""
     try:
+        if np.asarray(values).dtype.kind in "bcmM":
+            raise TypeError(f"got {np.asarray(values).dtype}")
         return np.array(values, float)
     except (TypeError, ValueError) as error:
         raise InputError(f"`{name}` must be numbers; {error}. Use NaN where unknown.") from None
@@ -159,6 +161,9 @@ def _by_name(values: Mapping[str, ArrayLike], limits: Mapping[str, Range]) -> di
     spelled = {name.replace("-", "_"): name for name in limits}
     angles = [key for key, name in spelled.items() if limits[name].unit == "°"]
     spelled |= {f"{key}{DEGREES}": spelled[key] for key in angles}
+    if not hasattr(values, "keys"):
+        names = " or ".join(f"'{name}'" for name in TRIADS)
+        raise InputError(f"`sd` must be a mapping, with names such as {names}; got {values!r}.")
     given: dict[str, str] = {}
     for key in values:
         if key not in spelled:
@@ -224,15 +229,21 @@ def _uncertainties(sd: Mapping[str, ArrayLike], shape: tuple[int, ...]) -> dict[
 
 
 def _labels(name: str, values: Sequence[object], shape: tuple[int, ...]) -> list[str]:
-    """One label for each station; blank for None, NaN and a negative number."""
-    cells = list(values)
+    """One label for each station; blank for None and NaN, and for a negative number of a group."""
+    cells = [] if isinstance(values, str) or not isinstance(values, Iterable) else list(values)
     if len(cells) != shape[-1]:
+        got = len(cells) or repr(values)
         raise InputError(
-            f"`{name}` must have one value for each of {shape[-1]} stations; got {len(cells)}."
+            f"`{name}` must have one value for each of {shape[-1]} stations; got {got}."
         )
-    return ["" if _blank(cell) else str(cell) for cell in cells]
+    least = 0 if name == "group" else -np.inf
+    return [_label(cell, least) for cell in cells]
 
 
-def _blank(cell: Any) -> bool:
-    number = isinstance(cell, int | float | np.number)
-    return cell is None or (number and not cell >= 0)
+def _label(cell: Any, least: float) -> str:
+    """A label as text; blank for None, NaN and numbers below `least`; whole numbers without a point."""
+    if cell is None:
+        return ""
+    if not isinstance(cell, int | float | np.number):
+        return str(cell)
+    return f"{cell:.15g}" if cell >= least else ""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 
@@ -87,12 +87,23 @@ def _table(source: Source, name: str, read: Callable[[Path], Table]) -> Table:
     names = getattr(source, "columns", source)
     columns = {str(key): _column(str(key), source[key]) for key in names}
     count = max(map(len, columns.values()), default=0)
+    for key, column in columns.items():
+        if len(column) != count:
+            raise InputError(
+                f"{name}: column '{key}' has {len(column)} values; the longest has {count}. Give one "
+                "value for each row, blank or NaN where unknown."
+            )
     return Table(columns, source=name, lines=range(1, count + 1))
 
 
 def _column(name: str, values: Any) -> Column:
     """Numbers, or the text of a column of labels; other text stays text."""
     array = np.asarray(values)
+    if array.ndim != 1 or array.dtype.kind in "bcmM":
+        raise InputError(
+            f"column '{name}' must be numbers or text, one for each row; got {array.dtype} of shape "
+            f"{array.shape}."
+        )
     if name in LABELS or array.dtype.kind in "OUS":
         return ["" if cell is None or cell != cell else str(cell) for cell in array.tolist()]
     return np.asarray(array, float)
@@ -114,6 +125,11 @@ def simulate(
     tool, or a tool of `mwdcal.planning.simulate`; `noise` is of one reading, g and nT; `seed` is that
     of the noise.
     """
+    if not all(0 <= angle <= 180 for angle in inclination_deg) or toolfaces < 1:
+        raise InputError(
+            "`inclination_deg` must be between 0 and 180, and `toolfaces` 1 or more; got "
+            f"{list(inclination_deg)} and {toolfaces}."
+        )
     truth = simulation.servo(np.random.default_rng(tool)) if isinstance(tool, int) else tool
     plan = simulation.grid([*inclination_deg], toolfaces, [*azimuth_deg], [*temperature])
     return simulation.run(truth, plan, np.random.default_rng([seed, 1]), noise)
@@ -145,24 +161,34 @@ def calibrate(
     )
 
 
-def _profile(run: Readings, profile: Path | Profile | None) -> Profile:
+def _profile(run: Readings, profile: object) -> Profile:
     """A profile as it is given, else that of the run, else `NOMINAL`."""
     if profile is None:
         return run.profile or NOMINAL
-    return profile if isinstance(profile, Profile) else load_profile(profile)
-
-
-def _check_run(run: object) -> None:
-    """Refuse what is not the run of one tool."""
-    if not isinstance(run, Readings):
+    if isinstance(profile, Options):
         raise InputError(
-            f"`run` must be readings; got {type(run).__name__}. Make them by mwdcal.readings(…), or "
-            "mwdcal.read_run(…) of a file."
+            "`profile` must be a tool profile; got options. Give them as options=…, or by name."
         )
-    if run.accelerometer.ndim != 2:
+    return profile if isinstance(profile, Profile) else load_profile(cast(Path, profile))
+
+
+def _check_run(run: object, name: str = "run") -> None:
+    """Refuse what is not the run of one tool."""
+    _check_readings(run, name)
+    shape = cast(Readings, run).accelerometer.shape
+    if len(shape) != 2:
         raise InputError(
-            f"`run` must have readings of one run, (n, 3); got {run.accelerometer.shape}. Many runs at "
-            "once are fitted by mwdcal.calibration.estimate.fit."
+            f"`{name}` must have readings of one run, (n, 3); got {shape}. Many runs at once are "
+            "fitted by mwdcal.calibration.estimate.fit."
+        )
+
+
+def _check_readings(readings: object, name: str) -> None:
+    """Refuse what is not `Readings`."""
+    if not isinstance(readings, Readings):
+        raise InputError(
+            f"`{name}` must be readings; got {type(readings).__name__}. Make them by "
+            "mwdcal.readings(…), or mwdcal.read_run(…) of a file."
         )
 
 
@@ -206,6 +232,7 @@ def verify(
         InputError: stations of the fit, temperatures outside the calibrated range, or readings to
             which no limit applies.
     """
+    _check_run(rolltest, "rolltest")
     return judge(
         calibration, rolltest, limits if isinstance(limits, Limits) else load_limits(limits)
     )
@@ -243,6 +270,7 @@ def apply(
     Raises:
         InputError: readings that do not belong to the calibration.
     """
+    _check_readings(survey, "survey")
     columns, findings = correct(calibration, survey, outside)
     return Corrected(
         gravity=np.stack([columns[f"g{axis}_g"] for axis in "xyz"], -1),

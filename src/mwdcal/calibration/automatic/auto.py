@@ -88,7 +88,7 @@ def known_before(options: Options, readings: Readings, profile: Profile) -> Opti
     parameters = previous.options.parameters
     if options.parameters not in (12, parameters):
         raise InputError(
-            f"`prior`: the calibration of {previous.run} has {parameters} parameters per triad, not "
+            f"`prior`: the calibration of {previous.run_name} has {parameters} parameters per triad, not "
             f"{options.parameters}. Leave `parameters` out, or calibrate without `prior`."
         )
     kinds = {triad.model for triad in previous.triads}

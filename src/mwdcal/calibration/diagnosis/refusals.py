@@ -84,11 +84,11 @@ def check_options(options: Options) -> None:
     """Refuse choices that do not go together."""
     method = options.method
     if method not in EVIDENCE:
-        raise InputError(f"--method must be one of {', '.join(EVIDENCE)}; got {method!r}.")
+        raise InputError(f"`method` must be one of {', '.join(EVIDENCE)}; got {method!r}.")
     if options.parameters not in (6, 9, 12):
-        raise InputError(f"--parameters must be 6, 9 or 12; got {options.parameters}.")
+        raise InputError(f"`parameters` must be 6, 9 or 12; got {options.parameters}.")
     if options.robust not in (None, *LOSSES):
-        raise InputError(f"--robust must be one of {', '.join(LOSSES)}; got {options.robust!r}.")
+        raise InputError(f"`robust` must be one of {', '.join(LOSSES)}; got {options.robust!r}.")
     _check_ignored(options)
     _check_curved_models(options)
     minimiser = "the paper's weights" if options.paper_weights else f"method {method}"
