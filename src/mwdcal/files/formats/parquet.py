@@ -109,10 +109,23 @@ def _is_code(cells: Any) -> bool:
 def texts(cells: Any, arrow: Any) -> list[str]:
     """Cells of any type as text tables have them."""
     try:
-        values = cells.to_pylist()
+        values = _in_microseconds(cells, arrow).to_pylist()
     except ValueError:  # nanoseconds, which times of Python do not have
         return [as_text(v).replace(" ", "T", 1) for v in cells.cast(arrow.string()).to_pylist()]
     return [as_text(value) for value in values]
+
+
+def _in_microseconds(cells: Any, arrow: Any) -> Any:
+    """Times in nanoseconds as times in microseconds: else PyArrow makes them pandas' own, if it can.
+
+    Raises `ValueError` where that would lose digits.
+    """
+    kind = cells.type
+    if getattr(kind, "unit", "") != "ns":
+        return cells
+    if arrow.types.is_timestamp(kind):
+        return cells.cast(arrow.timestamp("us", kind.tz))
+    return cells.cast(arrow.duration("us") if arrow.types.is_duration(kind) else arrow.time64("us"))
 
 
 def _array(column: Column, arrow: Any) -> Any:
