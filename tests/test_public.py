@@ -448,3 +448,8 @@ def test_polars_columns(simulated):
     np.testing.assert_array_equal(made.accelerometer, a)
     assert np.flatnonzero(np.isnan(made.known["inclination"])).tolist() == [0]
     assert mwdcal.stations(polars.DataFrame(log())).table.count == 2
+
+
+def test_noise_by_an_unknown_deviation_is_refused():
+    with pytest.raises(mwdcal.InputError, match="`kind` must be overlapping or modified"):
+        mwdcal.noise(log(), kind="standard")

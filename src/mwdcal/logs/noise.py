@@ -28,6 +28,8 @@ from mwdcal.logs.noise_terms import NoiseTerms
 from mwdcal.logs.stations import row_times
 from mwdcal.sensor.profile import Profile
 
+KINDS = ("overlapping", "modified")
+"""Allan deviations whose degrees of freedom, and so bands, are known here."""
 FEWEST = 128
 """Samples of a channel below which the terms cannot be separated."""
 STATION_SECONDS = 30.0
@@ -159,6 +161,8 @@ def find_noise(
     Errors: a log without time, with gaps, too short, or without a channel that can be used.
     """
     check(between, station_seconds, sampling_hz)
+    if kind not in KINDS:
+        raise InputError(f"`kind` must be {' or '.join(KINDS)}; got {kind!r}.")
     findings: list[Finding] = []
     first, last, rate = _section(log, sampling_hz, between, findings)
     seconds = (last - first) / rate

@@ -23,7 +23,7 @@ from mwdcal.app.messages import print_result
 def command(
     calibration: Path, run: Path, limits: str, report: Path | None, decimal: str, as_json: bool
 ) -> None:
-    """Prove a CALIBRATION by a roll test: a RUN whose stations were not in the fit.
+    """Verify a CALIBRATION by a roll test: a RUN whose stations were not in the fit.
 
     \b
     Example: mwdcal verify tool.json rolltest.csv --limits roll-test

@@ -266,7 +266,7 @@ def _figures(
         for triad in triads
         if triad not in estimated
     }
-    panels = [("residuals ÷ what the noise lets one expect, s", "s", residuals)]
+    panels = [("residuals ÷ what noise alone would give, s", "s", residuals)]
     panels = panels if residuals else []
     panels += [_noise(tools, triad) for triad in triads if triad in estimated]
     accuracy = {
