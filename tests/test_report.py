@@ -61,12 +61,13 @@ def run(drop=(), magnetometer=True, moved=True, **metadata):
         station=tuple(f"P{i + 1}" for i in range(48)),
         metadata={"serial": "MWD-123", **metadata},
         source="run.csv",
+        run_sha256="ab" * 32,
     )
 
 
 @cache
 def calibrated(drop=(), magnetometer=True, moved=True, profile=SERVO, **metadata):
-    made = calibrate(run(drop, magnetometer, moved, **metadata), profile, run_sha256="ab" * 32)
+    made = calibrate(run(drop, magnetometer, moved, **metadata), profile)
     return msgspec.structs.replace(made, time="2025-01-02T03:04:05+00:00")
 
 

@@ -1,5 +1,6 @@
 """The library makes the same choices as the command: the same calibration file, byte for byte."""
 
+import dataclasses
 import hashlib
 import os
 import re
@@ -75,8 +76,9 @@ def by_library(run, tool, **options):
     """The calibration file that the library makes of a run file."""
     profile, digest = load_profile(str(tool))
     readings, profile = read_run(run, profile)
-    digests = {"profile_sha256": digest, "run_sha256": sha256(run)}
-    return documents.encode(calibrate(readings, profile, Options(**options), **digests))
+    assert readings.run_sha256 == sha256(run)
+    readings = dataclasses.replace(readings, profile_sha256=digest)
+    return documents.encode(calibrate(readings, profile, Options(**options)))
 
 
 def check(folder, run, tool, typed, options):

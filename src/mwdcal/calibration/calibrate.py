@@ -45,8 +45,6 @@ def calibrate(
     profile: Profile,
     options: Options | None = None,
     *,
-    profile_sha256: str = "",
-    run_sha256: str = "",
     progress: Callable[[str], None] = lambda text: None,
 ) -> Calibration:
     """Fit the sensor model to a run and state what it is worth.
@@ -57,25 +55,17 @@ def calibrate(
     calibration to be trusted.
     """
     choice = choose(readings, profile, options or Options(), progress)
-    return recorded(
-        choice,
-        fit(choice.readings, choice.options),
-        profile_sha256=profile_sha256,
-        run_sha256=run_sha256,
-    )
+    return recorded(choice, fit(choice.readings, choice.options))
 
 
-def recorded(
-    choice: Choice, result: Fit, *, profile_sha256: str = "", run_sha256: str = ""
-) -> Calibration:
+def recorded(choice: Choice, result: Fit) -> Calibration:
     """The record of a fit with the options chosen for a run.
 
     Raises `FitError` where the fit is not to be trusted.
     """
     fitted = FittedRuns.single(choice.readings, choice.profile, choice.options, result)
     check(fit_refusals(fitted))
-    record = _Record(choice, fitted)
-    return rounded(record.calibration(profile_sha256, run_sha256))
+    return rounded(_Record(choice, fitted).calibration())
 
 
 @dataclass(frozen=True)
@@ -100,16 +90,16 @@ class _Record:
         """Directions of the parameters that nothing determines."""
         return self.fitted.free[0]
 
-    def calibration(self, profile_sha256: str, run_sha256: str) -> Calibration:
+    def calibration(self) -> Calibration:
         """The whole record."""
         readings, result, options = self.choice.readings, self.result, self.choice.options
         residuals = self.fitted.residuals(0)
         return Calibration(
             tool={k: str(v) for k, v in readings.metadata.items() if k in IDENTITY},
             profile=self.choice.profile,
-            profile_sha256=profile_sha256,
+            profile_sha256=readings.profile_sha256,
             run=readings.source,
-            run_sha256=run_sha256,
+            run_sha256=readings.run_sha256,
             software=f"mwdcal {__version__}",
             method=options.method,
             options=Choices(

@@ -38,10 +38,10 @@ _TURN = 360.0
 
 
 def read_run(
-    path: str | os.PathLike[str], profile: Profile, *, decimal: str = "."
+    source: str | os.PathLike[str] | Table, profile: Profile, *, decimal: str = "."
 ) -> tuple[Readings, Profile]:
-    """The readings of a run file, and the profile with its nominal scales filled in."""
-    table = tables.read(path, decimal=decimal)
+    """The readings of a run, a file or a table, and the profile with its nominal scales filled in."""
+    table = source if isinstance(source, Table) else tables.read(source, decimal=decimal)
     check_run(table)
     return to_readings(table, profile)
 
@@ -101,6 +101,7 @@ def to_readings(table: Table, profile: Profile) -> tuple[Readings, Profile]:
         digest=fingerprints([channels for channels in raw if channels is not None]),
         metadata=identified(table.metadata, _serial_cells(table)),
         source=table.source,
+        run_sha256=table.digest,
         unused=synonyms.unused(list(table.columns), COLUMNS),
     )
     triads = {

@@ -71,11 +71,8 @@ def read_run(
     if not isinstance(profile, Profile):
         profile, profile_sha256 = profiles.load_profile(os.fspath(profile))
     table = _table(source, "the run", lambda path: tables.read(path, decimal=decimal))
-    runs.check_run(table)
-    readings, profile = runs.to_readings(table, profile)
-    return replace(
-        readings, profile=profile, run_sha256=table.digest, profile_sha256=profile_sha256
-    )
+    readings, profile = runs.read_run(table, profile)
+    return replace(readings, profile=profile, profile_sha256=profile_sha256)
 
 
 def _table(source: Source, name: str, read: Callable[[Path], Table]) -> Table:
@@ -152,13 +149,8 @@ def calibrate(
         InputError: an option is unknown.
     """
     _check_run(run)
-    return fit_and_judge(
-        run,
-        _profile(run, profile),
-        _options(options, choices),
-        run_sha256=run.run_sha256,
-        profile_sha256=run.profile_sha256 if profile is None else "",
-    )
+    whole = run if profile is None else replace(run, profile_sha256="")
+    return fit_and_judge(whole, _profile(run, profile), _options(options, choices))
 
 
 def _profile(run: Readings, profile: object) -> Profile:

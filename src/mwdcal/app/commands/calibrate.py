@@ -46,9 +46,9 @@ def command(
 
     options.check_outputs([output], [run, tool, typed["prior"]], page=report)
     prior = prior_of(typed["prior"])
-    readings, profile, digests = load_run(run, tool, decimal, prior)
+    readings, profile = load_run(run, tool, decimal, prior)
     choice = choose(readings, profile, options_of(typed, prior, exclude), say)
-    calibration = recorded(choice, fit(choice.readings, choice.options), **digests)
+    calibration = recorded(choice, fit(choice.readings, choice.options))
     if report:
         from mwdcal.app.pages.report import render
         from mwdcal.files.formats import atomic

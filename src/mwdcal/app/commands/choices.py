@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -12,7 +13,6 @@ from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import Calibration
 from mwdcal.calibration.soaks import HIGHEST
 from mwdcal.files import documents, profiles, runs
-from mwdcal.files.formats import table
 from mwdcal.sensor.profile import Profile
 
 
@@ -21,14 +21,11 @@ def load_run(
     tool: str | None,
     decimal: str,
     prior: Calibration | Literal["datasheet"] | None = None,
-) -> tuple[Readings, Profile, dict[str, str]]:
-    """A run with its tool profile, and the digests of both files for the calibration file."""
-    profile, profile_sha256 = profiles.load_profile(tool)
-    profile = profile_for(prior, profile)
-    read = table.read(run, decimal=decimal)
-    runs.check_run(read)
-    readings, profile = runs.to_readings(read, profile)
-    return readings, profile, {"profile_sha256": profile_sha256, "run_sha256": read.digest}
+) -> tuple[Readings, Profile]:
+    """A run, with the digests of its files, and its tool profile."""
+    profile, digest = profiles.load_profile(tool)
+    readings, profile = runs.read_run(run, profile_for(prior, profile), decimal=decimal)
+    return replace(readings, profile_sha256=digest), profile
 
 
 def options_of(

@@ -45,13 +45,15 @@ def command(
     from mwdcal.files.formats import atomic
 
     options.check_outputs([], [run, tool], page=report)
-    readings, profile, digests = load_run(run, tool, decimal)
+    readings, profile = load_run(run, tool, decimal)
     unused = unused_columns(readings.unused)
     for line in lines(unused):
         say(line)
     result = compare(readings, profile, Options(order=order_of(order), seed=seed), progress=say)
     if report:
-        atomic.write(report, page.render(result, profile.name, **digests))
+        atomic.write(
+            report, page.render(result, profile.name, readings.run_sha256, readings.profile_sha256)
+        )
     if as_json:
         print_result({**page.document(result), "findings": unused, "report": str(report or "")})
     else:
