@@ -3,9 +3,11 @@
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: papers measured verification mutations help demo test test-quick check bench docs clean
+.PHONY: papers measured verification mutations help demo test test-quick test-oldest test-versions \
+	fuzz check bench docs clean
 
 PYTHON ?= python3
+PYTHONS ?= python3.12 python3.13
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
@@ -32,7 +34,7 @@ CLOCK = set -e; start=$$(date +%s); \
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /  make \1\t/' | expand -t 20
-	@echo "Another interpreter: make PYTHON=python3.12 test"
+	@echo "Another interpreter: make PYTHON=python3.12 test, after make clean"
 
 demo: $(INSTALLED) ## calibrate the example tool, verify it, write its report
 	@$(CLOCK); mkdir -p build/demo; \
@@ -45,7 +47,30 @@ test: $(INSTALLED) ## run the tests on all cores
 	@$(CLOCK); $(ONE_THREAD) $(BIN)/python -m pytest -q -rs -n auto
 
 test-quick: $(INSTALLED) ## run the most telling tests (under a minute)
-	@$(CLOCK); $(ONE_THREAD) $(BIN)/python -m pytest -q -n auto -m "not slow" $(QUICK_TESTS:%=tests/test_%.py)
+	@$(CLOCK); $(ONE_THREAD) $(BIN)/python $(QUICK)
+
+# What the quick tests need besides the package and its extras.
+TESTED_WITH := pytest pytest-xdist hypothesis jsonschema allantools pandas polars
+INSTALL := -m pip install --quiet --disable-pip-version-check
+QUICK := -m pytest -q -n auto -m "not slow" $(QUICK_TESTS:%=tests/test_%.py)
+
+test-oldest: $(INSTALLED) ## run the quick tests with the lowest versions that pyproject.toml allows
+	@$(CLOCK); mkdir -p build; $(BIN)/python tests/oldest_versions.py > build/oldest.txt; \
+	$(PYTHON) -m venv build/oldest; \
+	build/oldest/bin/python $(INSTALL) -c build/oldest.txt -e '.[all]' $(TESTED_WITH); \
+	$(ONE_THREAD) build/oldest/bin/python $(QUICK) -W ignore::DeprecationWarning
+
+test-versions: ## run the quick tests with other interpreters (PYTHONS="python3.12 python3.13")
+	@$(CLOCK); for python in $(PYTHONS); do \
+		$$python --version >/dev/null 2>&1 || { echo "skipped: $$python is not installed"; continue; }; \
+		place=build/$$(basename $$python); $$python -m venv $$place; \
+		$$place/bin/python $(INSTALL) -c constraints.txt -e '.[all]' $(TESTED_WITH); \
+		$$place/bin/python --version; $(ONE_THREAD) $$place/bin/python $(QUICK); \
+	done
+
+fuzz: $(INSTALLED) ## run random commands on damaged files (SEEDS=0:100000 MINUTES=10), findings into build/fuzz
+	@$(CLOCK); $(ONE_THREAD) $(BIN)/python tests/fuzz.py --seeds $(or $(SEEDS),0:100000) \
+		--minutes $(or $(MINUTES),10) --jobs $$(nproc 2>/dev/null || echo 2)
 
 mutations: $(INSTALLED) ## change one operator or constant in so many (EVERY=40) and list what no test notices
 	@$(CLOCK); $(ONE_THREAD) $(BIN)/python tests/mutation_run.py --every $(or $(EVERY),40)

@@ -1,0 +1,656 @@
+"""Random commands on damaged files, and what is promised of every command. `make fuzz` runs it.
+
+The commands, their arguments and their options are read from the command line itself, so that a
+command added later is covered as soon as `SAMPLES` says which files its new arguments take. A seed
+is one case, and the same one on every machine: `python tests/fuzz.py --seeds 17:18 --keep`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import csv
+import itertools
+import json
+import math
+import multiprocessing
+import random
+import re
+import shutil
+import signal
+import sys
+import tempfile
+import time
+import traceback
+import warnings
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+import openpyxl
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+import cli_support
+import mwdcal
+from cli_support import EXAMPLE, cell, servo_run, write_csv
+from mwdcal.app.cli import cli
+from mwdcal.files.formats import table
+from test_fleet import roll_run
+
+LONGEST_SECONDS = 10
+"""Of processor time; twelve times as long by the clock, on a machine that may be busy."""
+MOST_MEMORY = 1_500_000_000
+QUIET = (DeprecationWarning, PendingDeprecationWarning, ImportWarning, ResourceWarning)
+
+# ------------------------------------------------------------------ samples: sound files by kind
+
+SAMPLES = {
+    "run": "run",
+    "calibration": "calibration",
+    "readings": "run",
+    "log": "log",
+    "runs": "fleet",
+    "tool": "profile",
+    "limits": "limits",
+    "prior": "calibration",
+}
+"""The kind of file that each argument or option takes, by its name."""
+OUTPUTS = ("output", "report", "plot")
+"""Options that name a file to write."""
+LIMITS = 'name = "lab"\n[spread]\ninclination_deg = 0.2\nazimuth_deg = 1.5\n'
+CALIBRATIONS = (
+    ("servo.csv",),
+    ("servo.csv", "--parameters", "9"),
+    ("servo.csv", "--robust", "huber"),
+    ("warm.csv", "--order", "1"),
+    ("rolls.csv",),
+    ("gravity.csv",),
+    ("bent.csv", "--nonlinearity", "accelerometer"),
+)
+
+
+def log(seed: int, still: float) -> dict[str, Any]:
+    """Columns of a log at 20 Hz: tool positions held for so many seconds, turns between them."""
+    rng = np.random.default_rng(seed)
+    run = servo_run(seed, (20, 80, 120), 3)
+    held = int(still * 20)
+    raw = np.stack([run[name] for name in cli_support.RAW], -1)
+    levels = np.concatenate(
+        [
+            np.concatenate([np.repeat(a[None], held, 0), np.linspace(a, b, 30)])
+            for a, b in itertools.pairwise(raw)
+        ]
+    )
+    levels += rng.normal(0, 3e-4, levels.shape)
+    return {
+        "time_s": np.arange(len(levels)) / 20,
+        **dict(zip(cli_support.RAW, levels.T, strict=True)),
+    }
+
+
+def runs() -> dict[str, dict[str, Any]]:
+    """Runs by file name."""
+    servo = servo_run(1, (10, 60, 110), 8)
+    return {
+        "servo.csv": servo,
+        "rolls.csv": roll_run(2),
+        "warm.csv": servo_run(3, (10, 60, 110), 6, (25.0, 80.0, 130.0)),
+        "gravity.csv": {k: v for k, v in servo.items() if not k.startswith("m")},
+        "bent.csv": {**servo, **{a: servo[a] + 1e-4 * servo[a] ** 3 for a in ("ax", "ay", "az")}},
+    }
+
+
+def samples(folder: Path) -> dict[str, list[Any]]:
+    """Sound files by kind: tables as columns, documents as text."""
+    tables = runs()
+    calibrations = []
+    for k, (name, *options) in enumerate(CALIBRATIONS):
+        run = write_csv(folder / name, tables[name], "simulated = true")
+        target = folder / f"cal{k}.json"
+        ran = cli_support.mwdcal("calibrate", run, "--tool", "servo", "-o", target, *options)
+        assert ran.code == 0, ran
+        calibrations.append(target.read_text("utf-8"))
+    fleet = {
+        name: np.concatenate([servo_run(seed, (10, 60, 110), 6)[name] for seed in range(4)])
+        for name in servo_run(0, (10, 60, 110), 6)
+    }
+    fleet = {"serial": [f"T{i // 18}" for i in range(72)], **fleet}
+    return {
+        "run": list(tables.values()),
+        "log": [log(4, 4.0), log(5, 20.0)],
+        "fleet": [fleet],
+        "calibration": calibrations,
+        "profile": [(EXAMPLE / "tool.toml").read_text("utf-8")],
+        "limits": [LIMITS],
+    }
+
+
+# ------------------------------------------------------------------------------------- damage
+
+NUMBERS = (
+    *("0", "-0.0", "1", "-1", "360", "-360", "90", "-90", "180.0000001", "89.9999999", "1e-9"),
+    *("1e-300", "1e300", "-1e300", "1e15", "-1e-15", "9" * 400, "0." + "0" * 400 + "1", "1e309"),
+    *("nan", "-inf", "Infinity", "", " ", "1,5", "1_000", "0x1F", "1e", "--1", "5.", "½", "25 °C"),
+    *("#DIV/0!", "=1+1", "TRUE", "None", "2024-02-30", "12:61", "-273.16", "1000000"),
+)
+TEXTS = (
+    *("", " ", "a", "x" * 5000, "<script>alert(1)</script>", "[/b]", "[red]x", "S[a1]", "\\[x]"),
+    *("\x1b[31mPASS\x1b[0m", "\x07", "\x9b2J", "\u202eabc", "\u2028", "\ufeff", "\x85", "\x00"),
+    *("=1+2", "@sum", "+x", "-x", "'", '"', '""', "a,b", "a;b", "a\tb", "a\nb", "a\r\nb", "#x"),
+    *("# y = 1", "%s%n", "{0}", "{{7*7}}", "$x$", "../x", "/dev/null", "CON", "é", "\U0001f600"),
+    *("nan", "007", "1e5", "true", "None", "\ud800", "\\u0000", "*", "_x_", ":warning:"),
+)
+NAMES = (
+    *("station", "group", "serial", "temperature_c", "time_s", "ax", "mz", "ref_dip_deg"),
+    *("ref_azimuth_deg", "ref_gravity_g", "sd_ax", "sd_ref_field_nt", "gx_g", "azimuth_deg"),
+    *("AX", "ax ", "Ax (mg)", "temp", "#", " #x", "", " ", "a\nb", "message", "status"),
+)
+
+
+class Columns:
+    """Columns of text with metadata lines: what a table file holds."""
+
+    def __init__(self, columns: dict[str, Any]):
+        self.columns = {name: [cell(v) for v in values] for name, values in columns.items()}
+        self.metadata = ["simulated = true"]
+
+    @property
+    def count(self) -> int:
+        """Number of rows."""
+        return len(next(iter(self.columns.values()), []))
+
+    def change(self, r: random.Random, changes: tuple[Any, ...]) -> None:
+        """One random damage."""
+        if self.columns and self.count:
+            r.choice(changes)(self, r, r.choice(list(self.columns)))
+
+    def one_cell(self, r: random.Random, name: str) -> None:
+        self.columns[name][r.randrange(self.count)] = r.choice(NUMBERS + TEXTS)
+
+    def whole_column(self, r: random.Random, name: str) -> None:
+        self.columns[name] = [r.choice(NUMBERS + TEXTS)] * self.count
+
+    def every_cell(self, r: random.Random, name: str) -> None:
+        self.columns[name] = [r.choice(NUMBERS + TEXTS) for _ in range(self.count)]
+
+    def numbers(self, r: random.Random, name: str) -> None:
+        """Scaled, shifted, noisy, rounded or constant numbers."""
+        size = 10.0 ** r.uniform(-12, 12 if r.random() < 0.3 else 0.5)
+        change = r.choice(
+            (
+                lambda x: x * size,
+                lambda x: x + size,
+                lambda x: x + r.gauss(0, size),
+                lambda x: -x,
+                lambda x: round(x / size) * size,
+                lambda x: size,
+            )
+        )
+        for other in self.columns if r.random() < 0.2 else (name,):
+            with contextlib.suppress(ValueError, OverflowError):
+                self.columns[other] = [
+                    repr(change(float(x))) if x else x for x in self.columns[other]
+                ]
+
+    def drop(self, r: random.Random, name: str) -> None:
+        del self.columns[name]
+
+    def rename(self, r: random.Random, name: str) -> None:
+        new = r.choice(NAMES + TEXTS)
+        self.columns = {new if k == name else k: v for k, v in self.columns.items()}
+
+    def add(self, r: random.Random, name: str) -> None:
+        source = r.choice(
+            [self.columns[name], [r.choice(NUMBERS + TEXTS) for _ in range(self.count)]]
+        )
+        self.columns[r.choice(NAMES)] = list(source)
+
+    def swap(self, r: random.Random, name: str) -> None:
+        other = r.choice(list(self.columns))
+        self.columns[name], self.columns[other] = self.columns[other], self.columns[name]
+
+    def rows(self, r: random.Random, name: str) -> None:
+        """Some rows, in another order, or several times."""
+        rows = list(range(self.count))
+        picked = r.choice(
+            (
+                rows[: r.randrange(self.count + 1)],
+                r.sample(rows, len(rows)),
+                r.choices(rows, k=len(rows)),
+                [*rows, rows[0]],
+                [r.choice(rows)] * len(rows),
+            )
+        )
+        self.columns = {k: [v[i] for i in picked] for k, v in self.columns.items()}
+
+    def uncertainty(self, r: random.Random, name: str) -> None:
+        self.columns[f"sd_{name}"] = [repr(10.0 ** r.uniform(-13, 4))] * self.count
+
+    def blank(self, r: random.Random, name: str) -> None:
+        share = r.choice((0.1, 0.5, 1.0))
+        self.columns[name] = ["" if r.random() < share else v for v in self.columns[name]]
+
+    def describe(self, r: random.Random, name: str) -> None:
+        key = r.choice(("serial", "sampling_hz", "simulated", "azimuth_reference", "x", "findings"))
+        value = r.choice(
+            (*NUMBERS, *(json.dumps(t) for t in TEXTS), "[" * 500, "{a={b=1}}", "1979-05-27")
+        )
+        self.metadata.append(f"{r.choice((key, key, r.choice(TEXTS)))} = {value}")
+
+
+UNLUCKY = (Columns.numbers, Columns.numbers, Columns.rows, Columns.uncertainty, Columns.blank)
+"""Damage that keeps a table readable."""
+HOSTILE = (
+    *(Columns.one_cell, Columns.whole_column, Columns.every_cell, Columns.drop, Columns.rename),
+    *(Columns.add, Columns.swap, Columns.describe, *UNLUCKY),
+)
+
+
+def text_table(r: random.Random, t: Columns, path: Path) -> None:
+    """As delimited text."""
+    delimiter = "\t" if path.suffix == ".tsv" else r.choice(",,,,,,,,,,,,;\t ")
+    with path.open("w", encoding="utf-8", errors="surrogatepass", newline="") as stream:
+        stream.writelines(f"# {line}\n" for line in t.metadata)
+        writer = csv.writer(stream, delimiter=delimiter, lineterminator="\n")
+        writer.writerow(t.columns)
+        writer.writerows(zip(*t.columns.values(), strict=True))
+
+
+def parquet_table(r: random.Random, t: Columns, path: Path) -> None:
+    """As Parquet, each column as numbers where it can be, or as text."""
+
+    def typed(values: list[str]) -> Any:
+        kind = r.random()
+        try:
+            numbers = [float(x) if x else None for x in values]
+        except ValueError:
+            return pa.array([x.encode("utf-8", "replace").decode() for x in values])
+        if kind < 0.03:
+            return pa.array([[x] for x in numbers])
+        if kind < 0.06:
+            return pa.array(numbers, pa.float64()).dictionary_encode()
+        return pa.array(numbers, pa.float32() if kind < 0.1 else pa.float64())
+
+    columns = {k.encode("utf-8", "replace").decode(): typed(v) for k, v in t.columns.items()}
+    pairs = dict(line.split(" = ", 1) for line in t.metadata if " = " in line)
+    metadata = {"mwdcal": json.dumps(pairs)[: None if r.random() < 0.95 else -1]}
+    rows = r.choice((5, 1000, None))
+    pq.write_table(pa.table(columns).replace_schema_metadata(metadata), path, row_group_size=rows)
+
+
+def workbook_table(r: random.Random, t: Columns, path: Path) -> None:
+    """As a workbook, numbers as numbers."""
+
+    def value(x: str) -> Any:
+        x = re.sub("[\x00-\x08\x0b\x0c\x0e-\x1f\ud800-\udfff]", "?", x)[:32_000]
+        with contextlib.suppress(ValueError):
+            number = float(x)
+            return number if math.isfinite(number) else x
+        return x
+
+    book = openpyxl.Workbook()
+    for row in (tuple(t.columns), *zip(*t.columns.values(), strict=True)):
+        book.active.append([value(x) for x in row])
+    book.save(path)
+
+
+WRITERS = {
+    ".csv": text_table,
+    ".tsv": text_table,
+    ".txt": text_table,
+    ".parquet": parquet_table,
+    ".xlsx": workbook_table,
+}
+
+
+def table_file(
+    r: random.Random, sample: dict[str, Any], stem: Path, suffixes: tuple[str, ...]
+) -> Path:
+    """A table, damaged or not, in a file."""
+    t = Columns(sample)
+    changes = r.choice((UNLUCKY, UNLUCKY, HOSTILE))
+    for _ in range(r.choice((0, 1, 1, 2, 3))):
+        t.change(r, changes)
+    path = stem.with_suffix(r.choice(suffixes))
+    WRITERS[path.suffix](r, t, path)
+    return path
+
+
+def leaves(node: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+    """Paths to all members of a document."""
+    pairs = (
+        node.items()
+        if isinstance(node, dict)
+        else enumerate(node)
+        if isinstance(node, list)
+        else ()
+    )
+    return [p for key, value in pairs for p in ((*path, key), *leaves(value, (*path, key)))]
+
+
+def document_file(r: random.Random, sample: str, stem: Path) -> Path:
+    """A calibration with some members changed."""
+    document = json.loads(sample)
+    for _ in range(r.choice((0, 0, 0, 1, 1, 2))):
+        *parents, last = r.choice(leaves(document))
+        node = document
+        for key in parents:
+            node = node[key]
+        old = node[last]
+        if isinstance(old, int | float) and r.random() < 0.6:
+            node[last] = old * r.choice((-1, 0, 2, 1 + 1e-9, 1e6, 1e200))
+        elif isinstance(node, dict) and r.random() < 0.3:
+            del node[last]
+        else:
+            node[last] = r.choice((None, True, 0, -1, 1e308, 10**400, [], {}, [old], *TEXTS[:-8]))
+    path = stem.with_suffix(".json")
+    text = json.dumps(document)
+    if r.random() < 0.05:
+        text = text.replace("{", '{"method": "x", ' if r.random() < 0.5 else '{"a":' * 2000, 1)
+    path.write_text(text, "utf-8", "surrogatepass")
+    return path
+
+
+def toml_file(r: random.Random, sample: str, stem: Path) -> Path:
+    """A profile or limits with some lines changed."""
+    lines = sample.splitlines()
+    for _ in range(r.choice((0, 0, 1, 2))):
+        i = r.randrange(len(lines))
+        key = lines[i].split("=")[0]
+        value = r.choice(
+            (*NUMBERS, *(json.dumps(t) for t in TEXTS[:-8]), "[" * 3000, '["+x", "-y", "+z"]')
+        )
+        lines[i] = r.choice((f"{key} = {value}", "", f"{key} = {value}", f"{lines[i]}\n{lines[i]}"))
+    path = stem.with_suffix(".toml")
+    path.write_text("\n".join(lines), "utf-8", "surrogatepass")
+    return path
+
+
+def damaged(r: random.Random, path: Path) -> None:
+    """Change bytes of a file, at times."""
+    data = bytearray(path.read_bytes())
+    if not data or r.random() > 0.05:
+        return
+    i = r.randrange(len(data))
+    kind = r.randrange(4)
+    if kind == 0:
+        data[i] ^= 1 << r.randrange(8)
+    elif kind == 1:
+        del data[i:]
+    elif kind == 2:
+        data[i : i + 64] = bytes(min(64, len(data) - i))
+    else:
+        data[i:i] = r.randbytes(r.randrange(1, 9))
+    path.write_bytes(data)
+
+
+# ------------------------------------------------------------------------------------ commands
+
+WORDS = {
+    "method": ("joint", "least-squares", "newton", "toolface-inclination", "scalar", "swarm"),
+    "ignore": ("gravity", "field", "dip", "gravity,field,dip", ","),
+    "estimate": ("azimuth-zero", "tilt", "inclination-zero,tilt"),
+    "order": ("0", "1", "2", "3", "auto", "1,0", "4"),
+    "nonlinearity": ("auto", "none", "accelerometer", "magnetometer,accelerometer"),
+    "temperature": ("course", "20", "-300", "nan", "80"),
+    "exclude": ("1", "7", "x"),
+    "decimal": (".", ".", ".", ",", ";"),
+    "columns": ("time_s,ax,ay,az,mx,my,mz", "ax,ay,az", "ax,ax,ax", ","),
+    "limits": ("moosavi", "moradi", "x"),
+    "tool": (*("servo",) * 12, "generic", "sap6", "x"),
+    "prior": ("datasheet",),
+    "workers": ("1",),
+}
+"""Values of options that are not read off the command line itself."""
+REFUSED = {2, 3}
+NETWORK = ("scheduler",)
+"""Options that are left out: what they name is not a file."""
+WITH_FILES = [
+    n for n, c in sorted(cli.commands.items()) if any(p.name in SAMPLES for p in c.params)
+]
+"""Commands that read a file."""
+
+
+def files(r: random.Random, kind: str, sound: dict[str, list[Any]], stem: Path) -> Path:
+    """A file of a kind, damaged or not."""
+    sample = r.choice(sound[kind])
+    if kind in ("run", "log"):
+        plain = (".txt",) if kind == "log" else ()
+        path = table_file(r, sample, stem, (*(".csv",) * 4, ".tsv", ".parquet", ".xlsx", *plain))
+    elif kind == "fleet":
+        path = table_file(r, sample, stem, (".parquet",))
+    else:
+        path = (document_file if kind == "calibration" else toml_file)(r, sample, stem)
+    damaged(r, path)
+    return path
+
+
+def value(r: random.Random, p: click.Parameter, sound: dict[str, list[Any]], folder: Path) -> str:
+    """A value of an argument or option."""
+    name = str(p.name)
+    metavar = str(getattr(p, "metavar", "") or "")
+    if name in OUTPUTS:
+        suffixes = re.findall(r"\.\w+", metavar) or [".csv", ".tsv", ".parquet", ".xlsx"]
+        return str(folder / f"out-{name}{r.choice(suffixes)}")
+    if name in SAMPLES and (name not in WORDS or r.random() < 0.3):
+        return str(files(r, SAMPLES[name], sound, folder / f"in-{name}"))
+    if isinstance(p.type, click.Choice):
+        return str(r.choice(p.type.choices))
+    if (
+        isinstance(p.type, click.types.FloatParamType | click.types.IntParamType)
+        and name not in WORDS
+    ):
+        return r.choice((*("1", "0.5", "3", "10", "50") * 15, *NUMBERS))
+    words = WORDS.get(name) or tuple(w for w in metavar.split("|") if w.islower())
+    return r.choice(words) if words and r.random() < 0.98 else r.choice(TEXTS).replace("\x00", "")
+
+
+def command(r: random.Random, name: str, sound: dict[str, list[Any]], folder: Path) -> list[str]:
+    """A command line."""
+    line = [name]
+    for p in cli.get_command(None, name).params:  # type: ignore[arg-type, union-attr]
+        usual = {"tool": 0.9, "seed": 0.03, "decimal": 0.05}.get(str(p.name), 0.15)
+        if isinstance(p, click.Argument):
+            line.append(value(r, p, sound, folder))
+        elif p.name not in NETWORK and (p.required or p.name == "workers" or r.random() < usual):
+            line.append(p.opts[-1] if p.opts[-1].startswith("--") else p.opts[0])
+            if not getattr(p, "is_flag", False):
+                line.append(value(r, p, sound, folder))
+    return line
+
+
+# ------------------------------------------------------------------------------------ promises
+
+
+class Hang(BaseException):
+    """A command took too long."""
+
+
+def _hang(*_: object) -> None:
+    raise Hang
+
+
+@contextlib.contextmanager
+def limited():
+    """Interrupt a command that hangs."""
+    if hasattr(signal, "SIGALRM"):
+        signal.signal(signal.SIGALRM, _hang)
+        signal.alarm(12 * LONGEST_SECONDS)
+    try:
+        yield
+    finally:
+        if hasattr(signal, "SIGALRM"):
+            signal.alarm(0)
+
+
+def memory() -> int:
+    """The most memory that this process has held, in bytes; 0 where the system does not say."""
+    try:
+        import resource
+    except ImportError:
+        return 0
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+
+
+def not_a_number(name: str) -> None:
+    raise ValueError(f"{name} in JSON")
+
+
+def strict(text: str) -> Any:
+    """JSON without NaN and infinity."""
+    return json.loads(text, parse_constant=not_a_number)
+
+
+def finite_columns(path: Path) -> list[str]:
+    """Columns of a Parquet table with numbers that are not finite."""
+    columns = pq.read_table(path)
+    floats = [n for n in columns.column_names if pa.types.is_floating(columns[n].type)]
+    return [
+        n for n in floats if not all(math.isfinite(x) for x in columns[n].drop_null().to_pylist())
+    ]
+
+
+def readable(line: list[str], path: Path) -> list[str]:
+    """What is wrong with a file that a command has written."""
+    if path.suffix == ".json" and line[0] == "calibrate":
+        mwdcal.load(path)
+    if path.suffix == ".json":
+        strict(path.read_text("utf-8"))
+    elif path.suffix == ".html":
+        return ["unescaped text"] if "<script>alert" in path.read_text("utf-8") else []
+    elif path.suffix == ".parquet" and line[0] == "fleet":
+        return [f"not finite: {name}" for name in finite_columns(path)]
+    elif path.suffix in WRITERS:
+        table.read(path)
+    return []
+
+
+def promises(line: list[str], ran: cli_support.Ran, folder: Path, before: set[Path]) -> list[str]:
+    """What of the promises to every command is not kept."""
+    broken = []
+    written = {p for p in folder.rglob("*") if p not in before}
+    named = {p for p in written if p.name.startswith("out-")}
+    if ran.code not in ({0, 1, 2, 3} if line[0] == "verify" else {0, 2, 3}):
+        broken.append(f"exit {ran.code}")
+    if written - named:
+        broken.append(f"left behind: {sorted(p.name for p in written - named)}")
+    if ran.code in REFUSED and line[0] not in ("fleet", "compare"):
+        if len(ran.messages) != 1 or len(ran.err) > 5000:
+            broken.append(f"{len(ran.messages)} messages, {len(ran.err)} characters")
+        if ran.out.strip():
+            broken.append("refused, and a result on stdout")
+        if named:
+            broken.append(f"refused, and written: {sorted(p.name for p in named)}")
+    if re.search(r"Traceback|Warning:|<class |array\(", ran.err):
+        broken.append("a message of Python's")
+    if ran.code in (0, 1):
+        if "--json" in line:
+            strict(ran.out)
+        broken += [
+            fault for path in sorted(named) if path.is_file() for fault in readable(line, path)
+        ]
+    return broken
+
+
+def case(seed: int, sound: dict[str, list[Any]], folder: Path) -> tuple[str, int, list[str]]:
+    """Run a case: its command, exit code, and the promises it breaks."""
+    r = random.Random(seed)
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    line = command(r, r.choice(WITH_FILES), sound, folder)
+    (folder / "command").write_text(json.dumps(line))
+    before = set(folder.rglob("*"))
+    held, start, code, broken = memory(), time.process_time(), -1, []
+    with warnings.catch_warnings(record=True) as warned, limited():
+        warnings.simplefilter("always")
+        try:
+            ran = cli_support.mwdcal(*line)
+            code = ran.code
+            broken = promises(line, ran, folder, before)
+            if code == 0 and not broken and r.random() < 0.03:
+                broken = repeated(line, folder)
+        except Hang:
+            broken = ["interrupted as too slow"]
+        except Exception:
+            broken = [traceback.format_exc()]
+    seconds = time.process_time() - start
+    if seconds > LONGEST_SECONDS:
+        broken.append(f"{seconds:.0f} s")
+    if memory() - held > MOST_MEMORY:
+        broken.append(f"{memory() / 1e9:.1f} GB")
+    broken += [
+        f"{w.category.__name__}: {w.message}" for w in warned if not issubclass(w.category, QUIET)
+    ]
+    return line[0], code, broken
+
+
+def repeated(line: list[str], folder: Path) -> list[str]:
+    """Outputs that a second run writes otherwise; times apart."""
+
+    def contents() -> dict[str, bytes]:
+        paths = (p for p in folder.glob("out-*") if p.is_file())
+        return {
+            p.name: re.sub(
+                rb'"(time|sha256)": *"[^"]*"|\d{4}-\d\d-\d\d[T ][\d:.+]*', b"", p.read_bytes()
+            )
+            for p in paths
+        }
+
+    first = contents()
+    cli_support.mwdcal(*line)
+    again = contents()
+    return [f"differs when repeated: {name}" for name in first if first[name] != again.get(name)]
+
+
+# ------------------------------------------------------------------------------------- running
+
+
+def work(seeds: range, until: float, keep: bool) -> tuple[Counter[str], list[str]]:
+    """Run cases until a time: how they ended, and what was found."""
+    counts: Counter[str] = Counter()
+    findings = []
+    with tempfile.TemporaryDirectory() as place:
+        sound = samples(Path(place))
+        for seed in seeds:
+            if time.time() > until:
+                break
+            name, code, broken = case(seed, sound, Path(place) / "case")
+            counts[f"{name} {code}"] += 1
+            if broken:
+                findings.append(f"seed {seed} {name}: " + "; ".join(broken))
+            if broken or keep:
+                kept = Path("build/fuzz") / str(seed)
+                shutil.rmtree(kept, ignore_errors=True)
+                shutil.copytree(Path(place) / "case", kept)
+    return counts, findings
+
+
+def main() -> int:
+    """Print what was found; exit 1 if there was anything."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--seeds", default="0:1000", help="first:last, the last apart")
+    parser.add_argument("--minutes", type=float, default=10.0, help="stop after so long")
+    parser.add_argument("--jobs", type=int, default=1, help="processes")
+    parser.add_argument("--keep", action="store_true", help="keep the files of sound cases as well")
+    given = parser.parse_args()
+    first, last = map(int, given.seeds.split(":"))
+    until = time.time() + 60 * given.minutes
+    shares = [(range(first + k, last, given.jobs), until, given.keep) for k in range(given.jobs)]
+    if given.jobs == 1:
+        results = [work(*shares[0])]
+    else:
+        with multiprocessing.get_context("spawn").Pool(given.jobs) as pool:
+            results = pool.starmap(work, shares)
+    counts = sum((c for c, _ in results), Counter())
+    findings = [f for _, found in results for f in found]
+    print("\n".join(findings))
+    print(", ".join(f"{name}: {n}" for name, n in sorted(counts.items())))
+    print(f"{counts.total()} cases, {len(findings)} findings; their files are in build/fuzz")
+    return bool(findings)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

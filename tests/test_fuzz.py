@@ -1,0 +1,25 @@
+"""A short part of `make fuzz`: what is promised of every command holds on damaged files."""
+
+import math
+
+import click
+import pytest
+
+import fuzz
+from mwdcal.app.cli import cli
+
+
+@pytest.mark.slow
+def test_no_promise_is_broken(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    counts, findings = fuzz.work(range(100), math.inf, keep=False)
+    assert counts.total() == 100
+    assert not findings
+
+
+@pytest.mark.parametrize("name", sorted(cli.commands))
+def test_the_fuzzer_has_files_for_every_argument(name):
+    """Of this command: a new one says in `fuzz.SAMPLES` what its arguments take."""
+    for p in cli.commands[name].params:
+        takes_file = isinstance(p.type, click.Path) or "FILE" in str(getattr(p, "metavar", ""))
+        assert not takes_file or p.name in {*fuzz.SAMPLES, *fuzz.OUTPUTS}
