@@ -38,6 +38,8 @@ KINDS = {
     "cube": ("own-axis cube", ""),
 }
 """Titles of panels: of one axis, and of two."""
+Panel = tuple[str, str, Mapping[str, Array]]
+"""Title, name of the axis, and values by name."""
 
 
 def distance(values: Array) -> Array:
@@ -52,44 +54,44 @@ def distance(values: Array) -> Array:
 @plots.styled
 def parameters(parameters: Sequence[Any]) -> Figure:
     """Number of tools by value of each steady parameter: a row of panels for each triad."""
-    panels: dict[str, dict[str, list[Any]]] = {}
-    for each in parameters:
-        kind, _, axes = each.title.partition(" ")
-        title = KINDS[kind][len(set(axes)) > 1]
-        panels.setdefault(each.kind or each.triad, {}).setdefault(title, []).append(each)
-    lines = [
-        (triad, list(titles.items())[first : first + ABREAST])
-        for triad, titles in panels.items()
-        for first in range(0, len(titles), ABREAST)
-    ]
+    lines = _lines(parameters)
     figure = plots.new_figure("Distributions of the fleet's parameters", 2.1 * len(lines))
-    columns = max(len(line) for _, line in lines)
+    columns = max(len(line) for line in lines)
     grid = figure.subplots(len(lines), columns, squeeze=False)
-    for row, (triad, line) in zip(grid, lines, strict=True):
+    for row, line in zip(grid, lines, strict=True):
         row[0].set_ylabel("tools")
         for axes in row[len(line) :]:
             axes.set_axis_off()
         for axes, (title, members) in zip(row, line, strict=False):
-            axes.set_title(f"{triad}: {title}")
+            axes.set(title=title, xlabel=members[0].unit or "share of nominal")
             _steps(axes, {m.title.partition(" ")[2]: m.values for m in members})
-            unit = members[0].unit
-            axes.set_xlabel(unit or "share of nominal")
             axes.locator_params(axis="x", nbins=TICKS // columns)
     return figure
 
 
-@plots.styled
-def quality(panels: Sequence[tuple[str, str, Mapping[str, Array]]]) -> Figure:
-    """Number of tools by residuals over noise or by noise, and by 1σ of each angle.
+def _lines(parameters: Sequence[Any]) -> list[list[tuple[str, list[Any]]]]:
+    """Panels in rows, each row of one triad: title and parameters of a panel."""
+    triads: dict[str, dict[str, list[Any]]] = {}
+    for each in parameters:
+        kind, _, axes = each.title.partition(" ")
+        triad = each.kind or each.triad
+        title = f"{triad}: {KINDS[kind][len(set(axes)) > 1]}"
+        triads.setdefault(triad, {}).setdefault(title, []).append(each)
+    return [
+        list(panels.items())[first : first + ABREAST]
+        for panels in triads.values()
+        for first in range(0, len(panels), ABREAST)
+    ]
 
-    A panel has a title, the name of its axis, and values by name.
-    """
+
+@plots.styled
+def quality(panels: Sequence[Panel]) -> Figure:
+    """Number of tools by residuals over noise or by noise, and by 1σ of each angle."""
     figure = plots.new_figure("Distributions of residuals and accuracy", 2.2)
     row = figure.subplots(1, len(panels), squeeze=False)[0]
     row[0].set_ylabel("tools")
     for axes, (title, label, series) in zip(row, panels, strict=True):
-        axes.set_title(title)
-        axes.set_xlabel(label)
+        axes.set(title=title, xlabel=label)
         axes.locator_params(axis="x", nbins=TICKS // len(panels))
         _steps(axes, series, abreast=3 if len(panels) < 3 else 1)
     return figure

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mwdcal.app.pages import fleet_plots
-from mwdcal.app.pages.fleet_plots import FAR, FEWEST
+from mwdcal.app.pages.fleet_plots import FAR, FEWEST, Panel
 from mwdcal.app.pages.fleet_summary import (
     ERRORS,
     FleetSummary,
@@ -23,9 +23,10 @@ from mwdcal.app.pages.fleet_summary import (
     quantiles,
     unusual,
 )
-from mwdcal.app.pages.page import environment
+from mwdcal.app.pages.page import banner, environment
 from mwdcal.app.text import number, plural, raised
 from mwdcal.calibration.diagnosis.plausibility import NOISE_RATIO
+from mwdcal.calibration.prediction import STATED_ANGLES
 from mwdcal.calibration.readings import TRIADS, is_simulated
 from mwdcal.files.formats import parquet
 from mwdcal.fleet.calibrate import OK
@@ -51,12 +52,17 @@ class Parameter:
     title: str
     unit: str
     values: Array
-    sd: float
+    sd: Array
 
     @property
     def sensors(self) -> str:
         """What may be compared."""
         return f"{self.triad}, {self.kind}" if self.kind else self.triad
+
+    @property
+    def name(self) -> str:
+        """Whose parameter it is, and which."""
+        return f"{self.sensors} {self.title}"
 
     @property
     def tools(self) -> int:
@@ -68,17 +74,10 @@ class Parameter:
         """1 %, median and 99 %."""
         return quantiles(self.values)
 
-
-@dataclass(frozen=True)
-class Outlier:
-    """A tool far from the fleet: its farthest column."""
-
-    serial: Any
-    title: str
-    value: float
-    median: float
-    unit: str
-    distance: float
+    @property
+    def typical_sd(self) -> float | None:
+        """Median of the standard uncertainties."""
+        return None if np.isnan(self.sd).all() else float(np.nanmedian(self.sd))
 
 
 class SoundTools:
@@ -116,7 +115,7 @@ def render(calibrations: Path, summary: FleetSummary) -> str:
         metadata=tools.metadata,
         simulated=is_simulated(tools.metadata),
         banner=_banner(summary),
-        facts=_facts(summary, tools.metadata),
+        options="; ".join(unusual(summary.options)) or "defaults",
         orders=orders_table(summary) if summary.orders else None,
         stand=_stand(summary),
         estimated=estimated,
@@ -148,33 +147,17 @@ def _banner(summary: FleetSummary) -> dict[str, str]:
         for finding in summary.findings
         if is_doubt(finding.id)
     ]
-    level = "bad" if not summary.sound else "attention" if refused or doubts else "good"
-    word = "Some refused" if refused else "Some doubtful"
-    word = {"good": "All calibrated", "attention": word, "bad": "None calibrated"}[level]
+    headline = f"{summary.sound} of {plural(summary.tools, 'tool')} calibrated"
     after = "Every tool has parameters with their uncertainty."
     if refused:
         after = f"{plural(refused, 'tool')} without a result: see the reasons below."
     after = "; ".join([after.rstrip("."), *doubts]) + "." if doubts else after
-    headline = f"{summary.sound} of {plural(summary.tools, 'tool')} calibrated"
-    return {"level": level, "word": word, "headline": headline, "after": after}
-
-
-def _facts(summary: FleetSummary, metadata: Mapping[str, object]) -> list[tuple[str, str]]:
-    profile = str(metadata.get("profile", ""))
-    facts = [
-        ("method", summary.method),
-        ("stations", str(summary.stations)),
-        ("order", str(summary.order)),
-        ("options", "; ".join(unusual(summary.options)) or "defaults"),
-        ("profile", profile),
-    ]
-    if summary.nonlinear:
-        pairs = summary.nonlinear.items()
-        terms = ", ".join(f"{triad} of {plural(count, 'tool')}" for triad, count in pairs)
-        facts.append(("own-axis terms", terms))
-    if summary.order:
-        facts.append(("τ", f"temperature − {metadata.get('reference_temperature_c')} °C"))
-    return facts
+    if not summary.sound:
+        return banner("bad", "None calibrated", headline, after)
+    if refused or doubts:
+        word = "Some refused" if refused else "Some doubtful"
+        return banner("attention", word, headline, after)
+    return banner("good", "All calibrated", headline, after)
 
 
 def _parameters(tools: SoundTools) -> list[Parameter]:
@@ -183,19 +166,16 @@ def _parameters(tools: SoundTools) -> list[Parameter]:
     kinds = _kinds(tools)
     nominal = _nominal(tools, kinds)
     for name in tools.names:
-        triad = next((t for t in TRIADS if name.startswith(f"{t}_")), "")
-        rest = name.removeprefix(f"{triad}_")
-        if not triad or f"{name}_sd" not in tools.names:
+        triad, _, rest = name.partition("_")
+        if triad not in TRIADS or f"{name}_sd" not in tools.names:
             continue
         every, spread = _comparable(tools, triad, rest), tools.numbers(f"{name}_sd")
-        for kind, which in kinds.items() if triad != TRIADS[0] else [("", slice(None))]:
-            values, sd = (np.full(tools.count, np.nan) for _ in range(2))
-            values[which], sd[which] = every[which], spread[which]
-            if np.isnan(values).all():
-                continue
-            unit, factor = _unit(rest, triad, bool(kind), nominal)
-            middle = float(np.nanmedian(sd)) * factor if not np.isnan(sd).all() else float("nan")
-            parameters.append(Parameter(triad, kind, _title(rest), unit, values * factor, middle))
+        for kind, which in kinds.items() if triad == TRIADS[1] else [("", True)]:
+            values, sd = (np.where(which, v, np.nan) for v in (every, spread))
+            if not np.isnan(values).all():
+                unit, factor = _unit(rest, triad, bool(kind), nominal)
+                each = Parameter(triad, kind, _title(rest), unit, values * factor, sd * factor)
+                parameters.append(each)
     return sorted(parameters, key=lambda each: each.sensors)
 
 
@@ -261,29 +241,26 @@ def _figures(
 ) -> dict[str, Figure]:
     """Distributions of the parameters, and of residuals, noise and accuracy."""
     triads = dict.fromkeys(p.triad for p in parameters)
-    residuals = {
-        f"{triad} s": np.sqrt(tools.numbers(f"{triad}_variance_factor"))
-        for triad in triads
-        if triad not in estimated
-    }
-    panels = [("residuals ÷ what noise alone would give, s", "s", residuals)]
-    panels = panels if residuals else []
+    declared = [triad for triad in triads if triad not in estimated]
+    panels: list[Panel] = []
+    if declared:
+        s = {f"{triad} s": _residuals(tools, triad) for triad in declared}
+        panels.append(("residuals ÷ what noise alone would give, s", "s", s))
     panels += [_noise(tools, triad) for triad in triads if triad in estimated]
-    accuracy = {
-        angle: tools.numbers(f"{angle}_sd_deg")
-        for angle in ("inclination", "toolface", "azimuth")
-        if angle != "azimuth" or len(triads) > 1
-    }
+    angles = STATED_ANGLES[: 1 + len(triads)]
+    accuracy = {angle: tools.numbers(f"{angle}_sd_deg") for angle in angles}
     panels.append(("1σ of the calibration at 45°", "1σ, °", accuracy))
     steady = [p for p in parameters if "τ" not in p.title]
-    return {
-        "parameters": fleet_plots.parameters(steady),
-        "quality": fleet_plots.quality(panels),
-    }
+    return {"parameters": fleet_plots.parameters(steady), "quality": fleet_plots.quality(panels)}
 
 
-def _noise(tools: SoundTools, triad: str) -> tuple[str, str, dict[str, Array]]:
-    """The panel of a noise that each tool's residuals tell; of one kind of magnetometers."""
+def _residuals(tools: SoundTools, triad: str) -> Array:
+    """Residuals of a triad divided by what noise alone would give."""
+    return np.sqrt(tools.numbers(f"{triad}_variance_factor"))
+
+
+def _noise(tools: SoundTools, triad: str) -> Panel:
+    """The panel of the noise estimated from each tool's residuals; of one kind of magnetometers."""
     values = tools.numbers(f"{triad}_noise")
     title = f"{triad}: estimated noise"
     if triad == TRIADS[0]:
@@ -294,8 +271,10 @@ def _noise(tools: SoundTools, triad: str) -> tuple[str, str, dict[str, Array]]:
     return title, "1σ of the field" if relative else "1σ, nT", {triad: values[which]}
 
 
-def _outliers(tools: SoundTools, parameters: list[Parameter]) -> list[Outlier]:
-    """Tools of which some parameter is far from the fleet's, the farthest first."""
+def _outliers(
+    tools: SoundTools, parameters: list[Parameter]
+) -> list[tuple[Any, Parameter, float, float]]:
+    """Tools far from the fleet: serial, farthest parameter, value, distance; the farthest first."""
     if tools.count < FEWEST:
         return []
     distance, which = np.zeros(tools.count), np.zeros(tools.count, int)
@@ -303,19 +282,10 @@ def _outliers(tools: SoundTools, parameters: list[Parameter]) -> list[Outlier]:
         away = fleet_plots.distance(each.values)
         which = np.where(away > distance, index, which)
         distance = np.fmax(away, distance)
-    far = np.argsort(-distance, kind="stable")[: int(np.sum(distance > FAR))]
-    serials = tools.words(SERIAL)
+    serials, farthest = tools.words(SERIAL), [parameters[index] for index in which]
+    order = np.argsort(-distance, kind="stable")[: int(np.sum(distance > FAR))]
     return [
-        Outlier(
-            serial=serials[place],
-            title=f"{each.sensors} {each.title}",
-            value=float(each.values[place]),
-            median=float(np.nanmedian(each.values)),
-            unit=each.unit,
-            distance=float(distance[place]),
-        )
-        for place in far
-        for each in [parameters[which[place]]]
+        (serials[i], farthest[i], float(farthest[i].values[i]), float(distance[i])) for i in order
     ]
 
 
@@ -324,6 +294,6 @@ def _suspects(tools: SoundTools) -> list[tuple[Any, str, float]]:
     serials, suspects = tools.words(SERIAL), []
     for triad in TRIADS:
         if f"{triad}_variance_factor" in tools.names:
-            s = np.sqrt(tools.numbers(f"{triad}_variance_factor"))
+            s = _residuals(tools, triad)
             suspects += [(serials[i], triad, float(s[i])) for i in np.flatnonzero(s > NOISE_RATIO)]
     return sorted(suspects, key=lambda row: -row[2])
