@@ -31,18 +31,15 @@ if TYPE_CHECKING:
 MOST_RESHOOTS = 12
 """Most stations to re-shoot that the screen names."""
 PROFILE = " (see [stand] of the tool profile)"
-OF_THE_RUN = ("run", "stations", "excluded", "temperature_c", "method", "options", "seed")
-OF_A_TRIAD = (
-    "model",
-    "order",
-    "rank",
-    "size",
-    "undetermined",
-    "variance_factor",
-    "misfit_probability",
-)
-OF_ITS_ACCURACY = ("budget", "assumed_exact", "constants", "stand", "findings", "orders")
+RUN = ("run", "stations", "excluded", "temperature_c", "method", "options", "seed")
+TRIAD = ("model", "order", "rank", "size", "undetermined", "variance_factor", "misfit_probability")
+ACCURACY = ("budget", "assumed_exact", "constants", "stand", "findings", "orders")
 """Parts of the record that the summary for machines repeats."""
+ORDERS = "error: rms per axis, with the noise; inside: interpolation, at the ends: extrapolation"
+COMPARED = """
+by chance: probability that noise alone gives such a term; chosen: the lowest order above which \
+none is below 0.001"""
+"""What the table of orders means, and where orders were compared."""
 
 
 def _attributes(record: object, names: Iterable[str]) -> dict[str, Any]:
@@ -54,11 +51,11 @@ def summary(
 ) -> dict[str, Any]:
     """The result for machines."""
     return {
-        **_attributes(calibration, OF_THE_RUN),
-        "triads": {triad.name: _attributes(triad, OF_A_TRIAD) for triad in calibration.triads},
+        **_attributes(calibration, RUN),
+        "triads": {triad.name: _attributes(triad, TRIAD) for triad in calibration.triads},
         **_attributes(calibration, ("errors", "measures")),
         "accuracy_1sigma_deg": typical_accuracy(calibration),
-        **_attributes(calibration, OF_ITS_ACCURACY),
+        **_attributes(calibration, ACCURACY),
         "nonlinearity": [msgspec.to_builtins(score) for score in choice.curves],
         "calibration": str(output),
         "report": str(report or ""),
@@ -187,28 +184,16 @@ def stand(errors: StandErrors) -> list[str]:
 
 def orders(scores: list[OrderScore]) -> str:
     """Error at temperatures left out of the fit, by triad and order, and what chose the order."""
-    word = "" if all(s.chosen for s in scores) else "chosen"
+    compared = not all(s.chosen for s in scores)
     rows = []
     for s in scores:
-        values = (s.error_inside, s.error_ends, s.noise)
-        shown = [quantity(value, s.unit.partition(" ")[0]) for value in values]
-        row = [s.triad, str(s.order), number(s.inside), number(s.ends), *shown, chance(s.chance)]
-        rows.append([*row, word if s.chosen else ""])
-    header = [
-        "temperatures left out",
-        "order",
-        "χ² inside",
-        "χ² ends",
-        "error inside",
-        "at the ends",
-    ]
-    note = "error: rms per axis, with the noise; inside: interpolation, at the ends: extrapolation"
-    if word:
-        note += (
-            "\nby chance: probability that noise alone gives such a term; chosen: the lowest order "
-            "above which none is below 0.001"
-        )
-    return table(rows, [*header, "noise", "by chance", ""]) + "\n" + note
+        unit, chosen = s.unit.partition(" ")[0], "chosen" if compared and s.chosen else ""
+        errors = [quantity(value, unit) for value in (s.error_inside, s.error_ends, s.noise)]
+        each = [s.triad, str(s.order), number(s.inside), number(s.ends), *errors, chance(s.chance)]
+        rows.append([*each, chosen])
+    header = ["temperatures left out", "order", "χ² inside", "χ² ends", "error inside"]
+    header += ["at the ends", "noise", "by chance", ""]
+    return f"{table(rows, header)}\n{ORDERS}{COMPARED if compared else ''}"
 
 
 def curves(scores: list[CurveScore]) -> str:

@@ -38,18 +38,9 @@ def environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {
-        "number": number,
-        "signed": signed,
-        "fixed": fixed,
-        "css": css_string,
-        "svg": pictures.svg,
-        "plural": plural,
-        "unit": unit,
-        "chance": chance,
-        "capital": capital,
-        "uncertainty": uncertainty,
-    }
+    filters = (number, signed, fixed, uncertainty, unit, chance, plural, capital)
+    environment.filters |= {function.__name__: function for function in filters}
+    environment.filters |= {"css": css_string, "svg": pictures.svg}
     return environment
 
 

@@ -55,9 +55,7 @@ def render(calibration: Calibration, verdict: Verdict | None = None) -> str:
         simulated=is_simulated(calibration.tool),
         inclinations=known_inclinations(calibration),
         method="; ".join(how(calibration)),
-        figures=_figures(calibration),
-        compared=_compared(calibration),
-        judged=_judged(calibration),
+        magnetic=MAGNETIC,
         limit=plots.reshoot_limit(calibration),
         decimals=_decimals(calibration),
         long_table=LONG_TABLE,
@@ -121,30 +119,6 @@ def _when(time: str) -> str:
         return datetime.fromisoformat(time).strftime("%Y-%m-%d %H:%M UTC")
     except ValueError:
         return time
-
-
-def _figures(calibration: Calibration) -> dict[str, Any]:
-    """Figures by name, and the observables that have none."""
-    names = [row.observable for row in calibration.errors]
-    possible = [name for name in plots.TITLES if calibration.has_field or name not in MAGNETIC]
-    compared = _compared(calibration) and _judged(calibration)
-    return {
-        "errors": {name: plots.station_errors(calibration, name) for name in names},
-        "missing": [name for name in possible if name not in names],
-        "deviations": calibration.plot.deviations(),
-        "orders": plots.order_errors(calibration.orders) if compared else None,
-        "accuracy": calibration.plot.accuracy(),
-    }
-
-
-def _compared(calibration: Calibration) -> bool:
-    """Whether orders were compared, rather than one given."""
-    return not all(row.chosen for row in calibration.orders)
-
-
-def _judged(calibration: Calibration) -> bool:
-    """Whether some order was judged at temperatures left out."""
-    return any(row.ends is not None for row in calibration.orders)
 
 
 def _decimals(calibration: Calibration) -> dict[str, int]:
