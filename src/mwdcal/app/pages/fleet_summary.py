@@ -123,21 +123,17 @@ def _wide(whole: Any) -> list[str]:
 
 def stated_options(typed: Typed) -> dict[str, Any]:
     """The options of a fleet, under the names that a calibration file and the command have."""
-    also = Choices(
-        parameters=int(typed["parameters"] or 12),
-        ignore=list(names(typed["ignore"])),
-        robust=typed["robust"],
-        paper_weights=typed["paper_weights"],
-        prior=typed["prior"],
-    )
+    method, order = typed["method"], typed["order"]
     return {
-        "method": typed["method"],
-        "seed": typed["seed"] if typed["method"] == "swarm" else None,
+        "method": method,
+        "seed": typed["seed"] if method == "swarm" else None,
         "model": typed["model"],
-        "order": typed["order"] if typed["order"] == "auto" else int(typed["order"]),
+        "order": order if order == "auto" else int(order),
         "nonlinearity": typed["nonlinearity"],
         "estimate": list(names(typed["estimate"])),
-        **msgspec.to_builtins(also),
+        "parameters": int(typed["parameters"] or 12),
+        "ignore": list(names(typed["ignore"])),
+        **{name: typed[name] for name in ("robust", "paper_weights", "prior")},
     }
 
 

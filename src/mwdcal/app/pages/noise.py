@@ -11,10 +11,9 @@ import msgspec
 import numpy as np
 
 from mwdcal import __version__
-from mwdcal.app.pages.page import environment, written
+from mwdcal.app.pages.page import channels_of, environment, written
 from mwdcal.app.text import plural, table
 from mwdcal.calibration.readings import SIMULATED
-from mwdcal.files.contract import CHANNELS
 from mwdcal.logs.noise import ChannelNoise, Noise, Term
 from mwdcal.use import plots
 
@@ -33,12 +32,8 @@ TERMS = {
 HOUR = 3600.0
 Table = tuple[list[str], list[list[str]]]
 """Titles of the channels, and rows: what each is, then a cell for each channel."""
-AXIS_LOOKS = {
-    "x": (plots.AXES["x"], "o", "-"),
-    "y": (plots.AXES["y"], "s", (0, (5, 1.5))),
-    "z": (plots.AXES["z"], "^", (0, (1.5, 1.2))),
-}
-"""Colour, marker and line style of each axis."""
+MARKERS = {"x": "o", "y": "s", "z": "^"}
+"""Markers of the channels of a triad."""
 DISPLAY_UNITS = {"g": ("µg", 1e6), "nT": ("nT", 1.0)}
 """How physical units are written, and their number in one of them."""
 MARK = " (!)"
@@ -97,10 +92,9 @@ def _table(
     white, *others = TERMS.values()
     station = f"one station of {noise.station_seconds:.3g} s, 1σ"
     titles = [white, "its one-sided density, /√Hz", *others, station, "its 95 % interval"]
-    if any(channel.doubts for channel in channels.values()):
-        titles.append("does not hold" + MARK)
-    rows = zip(titles, *columns, strict=False)  # the last cells are shown where some do not hold
-    return header, [list(row) for row in rows]
+    rows = [list(row) for row in zip(titles, *columns, strict=True)]
+    doubts = [", ".join(channel.doubts) for channel in channels.values()]
+    return header, [*rows, ["does not hold" + MARK, *doubts]] if any(doubts) else rows
 
 
 def _cells(channel: ChannelNoise, factor: float) -> list[str]:
@@ -110,17 +104,10 @@ def _cells(channel: ChannelNoise, factor: float) -> list[str]:
         _term(channel.terms[name], factor * (HOUR if name == "drift" else 1.0), doubtful)
         for name in TERMS
     )
-    density, station = channel.white_density, channel.station
-    return [
-        white,
-        "–" if density is None else _number(density * factor),
-        *others,
-        _number(station.noise * factor),
-        "?"
-        if channel.doubts
-        else f"{_number(station.lower * factor)}…{_number(station.upper * factor)}",
-        ", ".join(channel.doubts),
-    ]
+    density = "–" if channel.white_density is None else _number(channel.white_density * factor)
+    limits = (_number(end * factor) for end in (channel.station.lower, channel.station.upper))
+    interval = "?" if channel.doubts else "…".join(limits)
+    return [white, density, *others, _number(channel.station.noise * factor), interval]
 
 
 def _powers(channel: ChannelNoise) -> tuple[str, float]:
@@ -145,19 +132,14 @@ def _number(value: float, digits: int = 3) -> str:
 def profile_lines(noise: Noise) -> str:
     """The lines of a tool profile (TOML) that this log recommends, or in a comment why not."""
     lines = []
-    for kind, names in CHANNELS.items():
+    seconds = f"{noise.station_seconds:.3g} s"
+    for kind, names in channels_of(noise.channels).items():
         if kind in noise.withheld:
             lines.append(f"# [{kind}] no noise from {noise.log}: {noise.withheld[kind]}")
-        if kind not in noise.profile:
-            continue
-        each = [
-            f"{n} {_number(noise.channels[n].station.noise)}" for n in names if n in noise.channels
-        ]
-        lines += [
-            f"[{kind}]",
-            f"noise = {noise.profile[kind]:.3g}   # raw, 1 sigma of one station of "
-            f"{noise.station_seconds:.3g} s; {', '.join(each)}; from {noise.log}",
-        ]
+        if kind in noise.profile:
+            each = ", ".join(f"{n} {_number(noise.channels[n].station.noise)}" for n in names)
+            remark = f"raw, 1 sigma of one station of {seconds}; {each}; from {noise.log}"
+            lines += [f"[{kind}]", f"noise = {noise.profile[kind]:.3g}   # {remark}"]
     return "\n".join(lines)
 
 
@@ -192,10 +174,7 @@ def scaled(channel: ChannelNoise) -> tuple[str, float]:
 @plots.styled
 def figure(noise: Noise) -> Figure:
     """One panel for each triad of the log."""
-    present = {
-        kind: [name for name in names if name in noise.channels] for kind, names in CHANNELS.items()
-    }
-    triads = {kind: names for kind, names in present.items() if names}
+    triads = channels_of(noise.channels)
     figure = plots.new_figure("Allan deviation of every channel over averaging time", 3.5)
     simulated = f"   {SIMULATED}" if noise.simulated else ""
     figure.suptitle(f"{noise.log}, {noise.seconds:.4g} s{simulated}", fontsize=8)
@@ -228,7 +207,8 @@ def _draw(axes: Axes, noise: Noise, names: list[str]) -> None:
 
 def _draw_channel(axes: Axes, name: str, channel: ChannelNoise) -> None:
     """Deviations with their band, and the terms as fitted."""
-    colour, marker, line = AXIS_LOOKS[name[-1]]
+    axis = name[-1]
+    colour, marker, line = plots.AXES[axis], MARKERS[axis], plots.LINES[axis]
     factor, tau = scaled(channel)[1], np.array(channel.tau_s)
     columns = (channel.lower, channel.deviation, channel.upper, channel.fitted)
     low, middle, high, fitted = (np.array(column) * factor for column in columns)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from mwdcal.app.pages import pictures
 from mwdcal.app.text import chance, plural, raised, superscript
+from mwdcal.files.contract import CHANNELS
 from mwdcal.geometry.vectors import Array
 
 if TYPE_CHECKING:
@@ -110,6 +111,12 @@ def factor_places(
 def uncertainty(value: float | None) -> str:
     """A standard uncertainty to two digits, or that it is undetermined."""
     return UNDETERMINED if value is None or np.isnan(value) else number(value, 2)
+
+
+def channels_of(names: Collection[str]) -> dict[str, list[str]]:
+    """The channels among some names, by triad."""
+    triads = {kind: [n for n in channels if n in names] for kind, channels in CHANNELS.items()}
+    return {kind: channels for kind, channels in triads.items() if channels}
 
 
 def label(*parts: str) -> str:

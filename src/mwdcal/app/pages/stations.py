@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mwdcal.app.pages.page import channels_of
 from mwdcal.app.text import table
-from mwdcal.files.contract import CHANNELS
+from mwdcal.files.contract import RAW
 from mwdcal.geometry.vectors import Array
 from mwdcal.logs.stations import Stations
 from mwdcal.use import plots
@@ -22,8 +23,6 @@ SEARCH = ("threshold", "stretch", "min_seconds", "trim_seconds")
 """What the stations were searched with."""
 POINTS = 2000
 """Points of a line in the picture."""
-LINE_STYLES = ("-", (0, (5, 1.5)), (0, (1.5, 1.2)))
-"""Line styles of x, y and z."""
 
 
 def summary(stations: Stations) -> dict[str, Any]:
@@ -32,26 +31,27 @@ def summary(stations: Stations) -> dict[str, Any]:
         name: column if isinstance(column, list) else column.tolist()
         for name, column in stations.table.columns.items()
     }
-    intervals = stations.intervals
-    left = [
-        {
-            "start_s": float(intervals.start[i]),
-            "end_s": float(intervals.end[i]),
-            "reason": "short" if intervals.short[i] else "moves slowly",
-        }
-        for i in np.flatnonzero(~intervals.taken)
-    ]
+    rows = zip(*columns.values(), strict=True)
     return {
         "log": stations.table.source,
         "rows": len(stations.time),
         "seconds": _seconds(stations),
         **{name: getattr(stations, name) for name in SEARCH},
-        "stations": [
-            dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)
-        ],
-        "left": left,
+        "stations": [dict(zip(columns, row, strict=True)) for row in rows],
+        "left": _left(stations),
         "findings": stations.findings,
     }
+
+
+def _left(stations: Stations) -> list[dict[str, Any]]:
+    """Intervals that look still and were not taken."""
+    each = stations.intervals
+    columns = (each.start.tolist(), each.end.tolist(), each.short, each.taken)
+    return [
+        {"start_s": start, "end_s": end, "reason": "short" if short else "moves slowly"}
+        for start, end, short, taken in zip(*columns, strict=True)
+        if not taken
+    ]
 
 
 def _seconds(stations: Stations) -> float:
@@ -61,31 +61,45 @@ def _seconds(stations: Stations) -> float:
 
 def screen(stations: Stations, files: dict[str, str]) -> str:
     """What was found, for people."""
-    whole, intervals = _seconds(stations), stations.intervals
-    start, end = (np.asarray(stations.table.columns[name]) for name in ("start_s", "end_s"))
-    share = 100 * float((end - start).sum()) / whole
-    short = int(np.sum(intervals.short & ~intervals.taken))
-    slow = int(np.sum(~intervals.short & ~intervals.taken))
-    same = " (the same stations from {:.3g} to {:.3g})"
-    stretch = same.format(*stations.stretch) if stations.stretch else " (given)"
+    picture = f"   {files['plot']} (picture)" if files["plot"] else ""
     lines = [
-        f"{stations.table.source}   {len(stations.time)} rows   {whole:.6g} s   "
-        f"{stations.table.count} stations, {share:.0f} % of the time",
-        f"threshold {stations.threshold:.3g} noise floors{stretch}   at least "
-        f"{stations.min_seconds:g} s after {stations.trim_seconds:g} s trimmed off each end   "
-        f"left: {short} too short, {slow} moving slowly",
+        "   ".join(_heading(stations)),
+        "   ".join(_search(stations)),
         "",
         _stations_table(stations),
-        f"wrote {files['output']}"
-        + (f"   {files['plot']} (picture)" if files["plot"] else "")
-        + f"   next: mwdcal calibrate {files['output']} -o CAL.json",
+        f"wrote {files['output']}{picture}   next: mwdcal calibrate {files['output']} -o CAL.json",
     ]
     return "\n".join(lines)
 
 
+def _heading(stations: Stations) -> list[str]:
+    """The log, and how much of it the stations are."""
+    whole = _seconds(stations)
+    start, end = (np.asarray(stations.table.columns[name]) for name in ("start_s", "end_s"))
+    share = 100 * float((end - start).sum()) / whole
+    return [
+        stations.table.source,
+        f"{len(stations.time)} rows",
+        f"{whole:.6g} s",
+        f"{stations.table.count} stations, {share:.0f} % of the time",
+    ]
+
+
+def _search(stations: Stations) -> list[str]:
+    """How stations were searched for, and what was left."""
+    short = sum(left["reason"] == "short" for left in _left(stations))
+    same = " (the same stations from {:.3g} to {:.3g})"
+    stretch = same.format(*stations.stretch) if stations.stretch else " (given)"
+    return [
+        f"threshold {stations.threshold:.3g} noise floors{stretch}",
+        f"at least {stations.min_seconds:g} s after {stations.trim_seconds:g} s trimmed off each end",
+        f"left: {short} too short, {len(_left(stations)) - short} moving slowly",
+    ]
+
+
 def _stations_table(stations: Stations) -> str:
     columns = stations.table.columns
-    names = [name for kind in CHANNELS.values() for name in kind if name in columns]
+    names = [name for name in RAW if name in columns]
     titles = {"start_s": "start s", "end_s": "end s", "samples": "samples", "temperature_c": "°C"}
     plain = {name: title for name, title in titles.items() if name in columns}
     rows = []
@@ -109,11 +123,12 @@ def _to_sd(value: float, sd: float) -> str:
 @plots.styled
 def figure(stations: Stations) -> Figure:
     """The log with what was taken and what was left: a panel for each triad and for the activity."""
-    triads = [t for t in CHANNELS.values() if any(name in stations.traces for name in t)]
+    triads = channels_of(stations.traces)
     figure = plots.new_figure("Stations taken and left in a log", 1.5 + 1.5 * len(triads))
     panels = figure.subplots(len(triads) + 1, 1, sharex=True, squeeze=False)[:, 0]
-    for axes, triad in zip(panels, triads, strict=False):
-        _draw_triad(axes, stations, triad)
+    for axes, (triad, names) in zip(panels, triads.items(), strict=False):
+        _draw_triad(axes, stations, names)
+        axes.set_ylabel(f"{triad},\nraw")
     _draw_activity(panels[-1], stations)
     for axes in panels:
         _shade(axes, stations)
@@ -132,18 +147,15 @@ def _thinned(x: Array, y: Array) -> tuple[Array, Array]:
     return np.repeat(x[: count * step : step], 2), ends
 
 
-def _draw_triad(axes: Axes, stations: Stations, triad: tuple[str, ...]) -> None:
+def _draw_triad(axes: Axes, stations: Stations, names: list[str]) -> None:
     """Medians of short cells of the channels that have them, else the samples."""
-    names = list(stations.traces)
-    cells = {
-        names[i]: c
-        for i, c in zip(stations.activity.channels, stations.activity.cells, strict=True)
-    }
-    for name, line in zip(triad, LINE_STYLES, strict=True):
-        cell = cells.get(name)
-        x, y = (cell.start, cell.level) if cell else stations.traces[name]
-        axes.plot(*_thinned(x, y), color=plots.AXES[name[-1]], ls=line, lw=0.9, label=name)
-    axes.set_ylabel("accelerometer,\nraw" if triad[0] == "ax" else "magnetometer,\nraw")
+    traces, activity = stations.traces, stations.activity
+    measured = [list(traces)[i] for i in activity.channels]
+    cells = dict(zip(measured, activity.cells, strict=True))
+    for name in names:
+        x, y = (cells[name].start, cells[name].level) if name in cells else traces[name]
+        look = {"color": plots.AXES[name[-1]], "ls": plots.LINES[name[-1]]}
+        axes.plot(*_thinned(x, y), lw=0.9, label=name, **look)
     axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), handlelength=2.6)
 
 
