@@ -37,7 +37,14 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-STATISTICS = (("mean", "mean"), ("STD", "std"), ("MSE", "mse"), ("RMSE", "rmse"))
+STATISTICS = (
+    ("mean", "after", "mean"),
+    ("STD", "after", "std"),
+    ("MSE", "after", "mse"),
+    ("RMSE", "after", "rmse"),
+    ("RMSE left out", "left out", "rmse"),
+)
+"""Measures of the vector error: title, of which fit, and name."""
 MARK = "*"
 """Behind a figure that rests on a convention."""
 COLOURS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#d55e00", "#4b5563")
@@ -132,22 +139,18 @@ def measures(comparison: Comparison) -> Rows:
     """Moradi's four measures of the vector error by triad, and the last of them left out."""
     rows = []
     for before in comparison.measures_before:
-        for what, key in STATISTICS:
-            cells = _measures(comparison, before.triad, "after", key)
-            rows.append([f"{before.triad} |e|, {what}", number(getattr(before, key)), *cells])
-        cells = _measures(comparison, before.triad, "left out", "rmse")
-        rows.append([f"{before.triad} |e|, RMSE left out", "", *cells])
+        for what, when, key in STATISTICS:
+            cells = [_measure(row, before.triad, when, key) for row in able(comparison.rows)]
+            first = number(getattr(before, key)) if when == "after" else ""
+            rows.append([f"{before.triad} |e|, {what}", first, *cells])
     return rows
 
 
-def _measures(comparison: Comparison, triad: str, when: str, key: str) -> list[str]:
-    """One measure of the vector error of a triad by every method."""
-    cells = []
-    for row in able(comparison.rows):
-        values = [getattr(m, key) for m in row.measures if (m.triad, m.when) == (triad, when)]
-        rank, size = row.ranks[triad]
-        cells.append(number(values[0] if values else None) + MARK * (rank < size))
-    return cells
+def _measure(row: Row, triad: str, when: str, key: str) -> str:
+    """One measure of the vector error of a triad by one method."""
+    values = [getattr(m, key) for m in row.measures if (m.triad, m.when) == (triad, when)]
+    rank, size = row.ranks[triad]
+    return number(values[0] if values else None) + MARK * (rank < size)
 
 
 def effort(comparison: Comparison) -> Rows:

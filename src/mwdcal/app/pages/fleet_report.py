@@ -17,7 +17,6 @@ from mwdcal.app.pages.fleet_summary import (
     FleetSummary,
     is_doubt,
     numbers,
-    orders_table,
     quantiles,
     unusual,
 )
@@ -129,8 +128,8 @@ def render(calibrations: Path, summary: FleetSummary) -> str:
         simulated=is_simulated(tools.metadata),
         banner=_banner(summary),
         options="; ".join(unusual(summary.options)) or "defaults",
-        orders=orders_table(summary) if summary.orders else None,
-        stand=_stand(summary),
+        stand={name: summary.spread[name] for name in ERRORS if summary.spread.get(name)},
+        short=number,
         estimated=estimated,
         figures=_figures(tools, parameters, estimated) if tools.count else {},
         parameters=parameters,
@@ -140,16 +139,6 @@ def render(calibrations: Path, summary: FleetSummary) -> str:
         fewest=FEWEST,
         suspect=NOISE_RATIO,
     )
-
-
-def _stand(summary: FleetSummary) -> list[list[str]]:
-    """Rows of the table of errors of the stand: name, and three points of the sound tools."""
-    known = {name: summary.spread.get(name) for name in ERRORS}
-    return [
-        [name.removesuffix("_deg").replace("_", " "), *map(number, values)]
-        for name, values in known.items()
-        if values
-    ]
 
 
 def _banner(summary: FleetSummary) -> dict[str, str]:

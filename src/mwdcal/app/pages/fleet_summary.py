@@ -246,8 +246,8 @@ def text(summary: FleetSummary, report: Path | None) -> str:
     if spread:
         blocks.append(table(spread, ["of sound tools", "1 %", "median", "99 %"]))
     if summary.orders:
-        header, body = orders_table(summary)
-        blocks.append(table(body, header))
+        orders = [[triad, *map(str, counts.values())] for triad, counts in summary.orders.items()]
+        blocks.append(table(orders, ["tools of order", *map(str, range(HIGHEST + 1))]))
     rate = f"{summary.seconds:.1f} s, {summary.tools / summary.seconds:.0f} tools/s"
     files = written(calibrations=summary.output, report=report)
     return "\n".join(["\n\n".join(blocks), *_remarks(summary), "", f"{files}   {rate}"])
@@ -279,12 +279,6 @@ def _remarks(summary: FleetSummary) -> list[str]:
         *(f"undetermined in {plural(count, 'tool')}: {name}" for name, count in undetermined),
         *(f"! {note}" for note in summary.notes),
     ]
-
-
-def orders_table(summary: FleetSummary) -> tuple[list[str], list[list[str]]]:
-    """Header and rows of the tools by chosen order, a triad in each row."""
-    header = ["tools of order", *map(str, range(HIGHEST + 1))]
-    return header, [[triad, *map(str, counts.values())] for triad, counts in summary.orders.items()]
 
 
 def _first(some: StatusCount | FindingCount) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -153,7 +152,7 @@ def render(noise: Noise) -> str:
         figure=figure(noise),
         tables=tables(noise),
         toml=profile_lines(noise),
-        rounded=partial(_number, digits=4),
+        rounded=_number,
         version=__version__,
     )
 

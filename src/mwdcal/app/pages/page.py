@@ -39,7 +39,7 @@ def environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    filters = (number, signed, fixed, uncertainty, unit, chance, plural, capital)
+    filters = (number, signed, fixed, measured, uncertainty, unit, chance, plural, capital)
     environment.filters |= {function.__name__: function for function in filters}
     environment.filters |= {"css": css_string, "svg": pictures.svg}
     return environment

@@ -21,7 +21,6 @@ from mwdcal.app.pages.page import (
     factor_places,
     is_held,
     measured,
-    unit,
 )
 from mwdcal.app.text import plural, raised
 from mwdcal.calibration.prediction import accuracy_at, angles, middle_temperature
@@ -64,7 +63,6 @@ def render(calibration: Calibration, verdict: Verdict | None = None) -> str:
         accuracy=_accuracy(calibration),
         titles=plots.TITLES,
         tolerance=RANK_TOLERANCE,
-        earth=_earth(calibration),
         when=_when(calibration.time),
     )
 
@@ -183,36 +181,3 @@ def _accuracy(calibration: Calibration) -> dict[str, Any]:
         sd = [float(np.degrees(each[name][0])) for name in names for each in both]
         rows.append((inclination, temperature, sd))
     return {"names": names, "rows": rows, "temperature": middle}
-
-
-def _earth(calibration: Calibration) -> list[tuple[str, str, str]]:
-    """Gravity, field and dip of the run, then errors of their references: name, value, source."""
-    field = "" if calibration.relative else "nT"
-    keys = (("gravity", "gravity_g", "g"), ("field", "field", field), ("dip", "dip_deg", "°"))
-    means = [
-        (f"mean {name}", *_mean(calibration, name, calibration.earth[key], unit(symbol)))
-        for name, key, symbol in keys
-        if key in calibration.earth
-    ]
-    errors = [
-        (c.name, *_estimated(c.value, c.standard_uncertainty, unit(c.unit), "with the fit"))
-        for c in calibration.constants
-        if c.name.endswith("reference error")
-    ]
-    return means + errors
-
-
-def _mean(calibration: Calibration, name: str, value: float, symbol: str) -> tuple[str, str]:
-    """A mean of the run with its unit, and where it comes from."""
-    for constant in calibration.constants:
-        if constant.name == name:
-            return _estimated(value, constant.standard_uncertainty, symbol, "from the run")
-    if name == "field" and calibration.relative:
-        return "1", "by convention: the strength is known at no station"
-    return f"{value:.7g}{symbol}".replace("-", "−"), "given"
-
-
-def _estimated(value: float, sd: float, symbol: str, how: str) -> tuple[str, str]:
-    """An estimated value with its unit, and how it was estimated, with its uncertainty."""
-    shown, spread = measured(value, sd)
-    return f"{shown}{symbol}", f"estimated {how}, 1σ {spread}{symbol}"
