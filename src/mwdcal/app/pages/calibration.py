@@ -15,14 +15,7 @@ from mwdcal.calibration.automatic.nonlinearity import CurveScore
 from mwdcal.calibration.diagnosis.findings import UNUSED
 from mwdcal.calibration.prediction import typical_accuracy
 from mwdcal.calibration.readings import simulated
-from mwdcal.calibration.record import (
-    Calibration,
-    Choices,
-    ErrorRow,
-    Finding,
-    OrderScore,
-    StandErrors,
-)
+from mwdcal.calibration.record import Calibration, Choices, ErrorRow, Finding, OrderScore
 from mwdcal.use.plots import TITLES
 
 if TYPE_CHECKING:
@@ -98,7 +91,7 @@ def remarks(calibration: Calibration) -> list[str]:
             f"estimated constant of the run: {c.name} {c.value:.6g} ± {c.standard_uncertainty:.2g} {c.unit}"
             for c in calibration.constants
         ),
-        *stand(calibration.stand),
+        *stand(calibration),
     ]
 
 
@@ -167,9 +160,9 @@ def residuals(calibration: Calibration) -> list[str]:
     return [f"residuals over declared noise, s: {'   '.join(each)}"] if each else []
 
 
-def stand(errors: StandErrors) -> list[str]:
+def stand(calibration: Calibration) -> list[str]:
     """Estimated errors of the stand."""
-    lines = []
+    errors, lines = calibration.stand, []
     for name in ("azimuth", "inclination"):
         zero = getattr(errors, f"{name}_zero_deg")
         if zero is not None:

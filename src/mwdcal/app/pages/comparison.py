@@ -19,7 +19,6 @@ from mwdcal.app.pages.page import (
     capital,
     environment,
     factor_places,
-    label,
     measured,
     number,
 )
@@ -70,7 +69,7 @@ def text(comparison: Comparison, parameters: bool = False) -> str:
         lines += ["", gauge(comparison) + " In parentheses: 1σ of the last digits."]
         for triad in rows[0].parameters:
             stated = [
-                [label(each.title, each.unit), *(_joined(*pair) for pair in each.pairs)]
+                [_label(each.title, each.unit), *(_joined(*pair) for pair in each.pairs)]
                 for each in parameters_of(comparison, triad)
             ]
             lines += ["", table(stated, [triad, *methods])]
@@ -119,6 +118,11 @@ def figures(comparison: Comparison) -> Rows:
     ]
 
 
+def _label(*parts: str) -> str:
+    """The title of a row: its parts, the unit last, without the empty ones."""
+    return ", ".join(part for part in parts if part)
+
+
 def errors(comparison: Comparison, kind: str, how: str = "") -> Rows:
     """Root mean square errors by observable, before and of every method.
 
@@ -130,7 +134,7 @@ def errors(comparison: Comparison, kind: str, how: str = "") -> Rows:
             number(getattr(row, kind)[name]) + MARK * (name in row.resting)
             for row in able(comparison.rows)
         ]
-        what = label(plots.TITLES.get(name, name), how, unit)
+        what = _label(plots.TITLES.get(name, name), how, unit)
         rows.append([what, number(comparison.before[name]), *cells])
     return rows
 
@@ -259,24 +263,26 @@ def render(
     comparison: Comparison, profile: str = "", run_sha256: str = "", profile_sha256: str = ""
 ) -> str:
     """The comparison as HTML, with the name of its tool profile and the SHA-256 of its sources."""
-    rows = able(comparison.rows)
-    headline, _, why = comparison.advice.partition(": ")
-    return (
-        environment()
-        .get_template("comparison.html")
-        .render(
-            {function.__name__: function for function in TABLES + FIGURES},
-            result=comparison,
-            simulated=comparison.simulated,
-            banner=banner("good" if rows else "bad", "Advice", capital(headline), capital(why)),
-            rows=rows,
-            limit=MOST_STATIONS,
-            profile=profile,
-            run_sha256=run_sha256,
-            profile_sha256=profile_sha256,
-            version=__version__,
-        )
+    template = environment().get_template("comparison.html")
+    return template.render(
+        {function.__name__: function for function in TABLES + FIGURES},
+        result=comparison,
+        simulated=comparison.simulated,
+        banner=_banner(comparison),
+        rows=able(comparison.rows),
+        limit=MOST_STATIONS,
+        profile=profile,
+        run_sha256=run_sha256,
+        profile_sha256=profile_sha256,
+        version=__version__,
     )
+
+
+def _banner(comparison: Comparison) -> dict[str, str]:
+    """The advice, and why."""
+    headline, _, why = comparison.advice.partition(": ")
+    level = "good" if able(comparison.rows) else "bad"
+    return banner(level, "Advice", capital(headline), capital(why))
 
 
 @plots.styled

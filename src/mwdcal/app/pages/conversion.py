@@ -16,6 +16,14 @@ from mwdcal.use.notation import COURSE, Notation, convert, powers
 
 SCHEMA_VERSION = 1
 """Version of the JSON document."""
+UNRECORDED = (
+    "the calibration was made at unrecorded temperatures, without temperature terms: the values are "
+    "the same at any temperature, and nothing says how good they are at {:g} °C."
+)
+OUTSIDE = (
+    "{:g} °C lies outside the calibrated range {}: the values are extrapolated, and their "
+    "uncertainties do not hold. Choose a temperature inside, or calibrate over a wider range."
+)
 
 
 class Converted(NamedTuple):
@@ -54,17 +62,9 @@ def temperature_findings(
     at = calibration.reference_temperature if temperature is None else temperature
     there = Readings(np.zeros((1, 3)), temperature=np.array([at]))
     if calibration.unrecorded(there):
-        text = (
-            "the calibration was made at unrecorded temperatures, without temperature terms: the values are "
-            f"the same at any temperature, and nothing says how good they are at {at:g} °C."
-        )
-        return [Finding(id="no-temperature", text=text)]
+        return [Finding(id="no-temperature", text=UNRECORDED.format(at))]
     if calibration.outside(there).any():
-        text = (
-            f"{at:g} °C lies outside the calibrated range {_range(calibration)}: the values are extrapolated, and "
-            "their uncertainties do not hold. Choose a temperature inside, or calibrate over a wider range."
-        )
-        return [Finding(id="outside-temperature", text=text)]
+        return [Finding(id="outside-temperature", text=OUTSIDE.format(at, _range(calibration)))]
     return []
 
 
@@ -82,6 +82,21 @@ def document(converted: Converted) -> dict[str, Any]:
         at = calibration.reference_temperature
     return {
         "schema_version": SCHEMA_VERSION,
+        **_source(converted),
+        "calibrated_temperature_c": calibration.temperature_c,
+        "field_unit": calibration.field_unit,
+        "notation": converted.notation,
+        "temperature_c": at,
+        "findings": converted.findings,
+        **({"powers_of": "T - reference_temperature_c"} if course else {}),
+        **{name: _triad(converted, name) for name in converted.triads},
+    }
+
+
+def _source(converted: Converted) -> dict[str, Any]:
+    """Where the values come from: tool, run and calibration file."""
+    calibration = converted.calibration
+    return {
         "tool": calibration.tool,
         "serial": calibration.tool.get("serial"),
         "profile": calibration.profile.name,
@@ -92,13 +107,6 @@ def document(converted: Converted) -> dict[str, Any]:
         "calibrated": calibration.time,
         "software": calibration.software,
         "simulated": is_simulated(calibration.tool),
-        "calibrated_temperature_c": calibration.temperature_c,
-        "field_unit": calibration.field_unit,
-        "notation": converted.notation,
-        "temperature_c": at,
-        "findings": converted.findings,
-        **({"powers_of": "T - reference_temperature_c"} if course else {}),
-        **{name: _triad(converted, name) for name in converted.triads},
     }
 
 

@@ -39,7 +39,7 @@ def environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    filters = (number, signed, fixed, measured, uncertainty, unit, chance, plural, capital)
+    filters = (number, signed, fixed, measured, uncertainty, unit, raised, chance, plural, capital)
     environment.filters |= {function.__name__: function for function in filters}
     environment.filters |= {"css": css_string, "svg": pictures.svg}
     return environment
@@ -117,11 +117,6 @@ def channels_of(names: Collection[str]) -> dict[str, list[str]]:
     """The channels among some names, by triad."""
     triads = {kind: [n for n in channels if n in names] for kind, channels in CHANNELS.items()}
     return {kind: channels for kind, channels in triads.items() if channels}
-
-
-def label(*parts: str) -> str:
-    """The title of a row or column: its parts, the unit last, without the empty ones."""
-    return ", ".join(part for part in parts if part)
 
 
 def capital(text: str) -> str:

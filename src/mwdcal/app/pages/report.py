@@ -12,16 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mwdcal.app.pages.calibration import how, known_inclinations
-from mwdcal.app.pages.page import (
-    HELD,
-    banner,
-    capital,
-    environment,
-    exponent,
-    factor_places,
-    is_held,
-    measured,
-)
+from mwdcal.app.pages.page import HELD, banner, capital, environment, exponent, factor_places
 from mwdcal.app.text import plural, raised
 from mwdcal.calibration.prediction import accuracy_at, angles, middle_temperature
 from mwdcal.calibration.readings import is_simulated
@@ -29,7 +20,7 @@ from mwdcal.calibration.record import Calibration, Finding, TriadCalibration
 from mwdcal.errors import InputError
 from mwdcal.estimation.solvers import RANK_TOLERANCE
 from mwdcal.use import plots
-from mwdcal.use.notation import convert
+from mwdcal.use.notation import Notation, convert
 
 if TYPE_CHECKING:
     from mwdcal.use.verification import Verdict
@@ -127,43 +118,44 @@ def _decimals(calibration: Calibration) -> dict[str, int]:
     }
 
 
+Row = tuple[str, str, int, float, float | None, str]
+"""A parameter: name, axes, power of τ, value, 1σ and unit."""
+
+
 def _parameters(calibration: Calibration) -> dict[str, Any]:
-    """Parameters of each triad as rows: as factors of the raw channels where there are any."""
+    """Parameters of each triad: as factors of the raw channels where there are any."""
     try:
         notations = convert(calibration, "factors")
     except InputError:
-        tables = {triad.name: _own_rows(triad) for triad in calibration.triads}
-        return {"notation": "record", "tables": tables}
-    rows = {}
-    for triad in calibration.triads:
-        values, sd = notations[triad.name].values, notations[triad.name].uncertainty
-        rows[triad.name] = [
-            _row(name, axes, power, float(values[name][at]), float(sd[name][at]), symbol)
-            for name, at, axes, power, symbol in factor_places(values, _unit(triad), "1")
-        ]
-    return {"notation": "factors", "tables": rows}
+        rows = {triad.name: _own_rows(triad) for triad in calibration.triads}
+        return {"notation": "record", "rows": rows}
+    rows = {triad.name: _factor_rows(triad, notations[triad.name]) for triad in calibration.triads}
+    return {"notation": "factors", "rows": rows}
 
 
-def _own_rows(triad: TriadCalibration) -> list[tuple[str, ...]]:
+def _own_rows(triad: TriadCalibration) -> list[Row]:
     """The parameters of the record: tool axes, nominal units."""
     columns = (triad.parameter_names, triad.parameters, triad.standard_uncertainties)
     rows = []
     for full, value, sd in zip(*columns, strict=True):
-        base, _, text = full.partition("·")
-        name, _, index = base.rpartition("-")
-        symbol = "" if name in ("gain", "scale", "misalignment") else _unit(triad)
-        power = int(text or 0)
-        rows.append(_row(name, index, power, value, sd, (symbol or "1") + raised("/°C", power)))
+        base, _, power = full.partition("·")
+        name, _, axes = base.rpartition("-")
+        symbol = "1" if name in ("gain", "scale", "misalignment") else _unit(triad) or "1"
+        per = raised("/°C", int(power or 0))
+        rows.append((name, axes, int(power or 0), value, sd, symbol + per))
     return rows
 
 
-def _row(name: str, axes: str, power: int, value: float, sd: float | None, symbol: str) -> Any:
-    """Name, axes, power of τ, value, 1σ and unit as text."""
-    pair = ("0", HELD) if is_held(value, sd) else measured(value, sd)
-    return name, axes, raised("τ", power), *pair, symbol
+def _factor_rows(triad: TriadCalibration, factors: Notation) -> list[Row]:
+    values, sd = factors.values, factors.uncertainty
+    return [
+        (name, axes, power, float(values[name][at]), float(sd[name][at]), symbol)
+        for name, at, axes, power, symbol in factor_places(values, _unit(triad), "1")
+    ]
 
 
 def _unit(triad: TriadCalibration) -> str:
+    """The unit of a triad's field, empty if it has none."""
     return triad.unit if triad.unit in ("g", "nT") else ""
 
 
