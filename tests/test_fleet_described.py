@@ -12,7 +12,7 @@ from test_fleet_options import bent, drifting
 
 pq = pytest.importorskip("pyarrow.parquet")
 
-from mwdcal.app.pages import fleet_plots  # noqa: E402
+from mwdcal.app.pages import fleet_report  # noqa: E402
 from mwdcal.files.formats import table as tables  # noqa: E402
 from mwdcal.use import plots  # noqa: E402
 
@@ -78,7 +78,7 @@ def test_estimated_noise_is_shown_where_residuals_cannot_be_judged(
         drawn.extend(panels)
         return plots.new_figure("", 1.0)
 
-    monkeypatch.setattr(fleet_plots, "quality", quality)
+    monkeypatch.setattr(fleet_report, "draw_quality", quality)
     _, page = said(tmp_path, {f"T{i}": short_run(i) for i in range(4)}, "--tool", tool)
     triads = [] if declared else ["accelerometer", "magnetometer"]
     assert tables.read(tmp_path / "o.parquet").metadata["noise_estimated"] == triads

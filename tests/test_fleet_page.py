@@ -12,7 +12,7 @@ from test_fleet_findings import said
 pa = pytest.importorskip("pyarrow")
 pq = pytest.importorskip("pyarrow.parquet")
 
-from mwdcal.app.pages import fleet_plots, fleet_report, pictures  # noqa: E402
+from mwdcal.app.pages import fleet_report, pictures  # noqa: E402
 
 
 def unknown(seed):
@@ -67,8 +67,8 @@ def drawn(values, monkeypatch):
         edges.append(counts[0].sum())
         return counts
 
-    monkeypatch.setattr(fleet_plots.np, "histogram", histogram)
-    fleet_plots.quality([("", "", {"x": values})])
+    monkeypatch.setattr(fleet_report.np, "histogram", histogram)
+    fleet_report.draw_quality([("", "", {"x": values})])
     return edges[0][0], edges[0][-1], edges[1]
 
 
@@ -80,14 +80,14 @@ def test_axes_leave_out_the_outliers_and_nothing_else(monkeypatch):
     assert low == pytest.approx(others.min(), abs=0.3)
     assert high == pytest.approx(others.max(), abs=0.3)
     assert counted == 38
-    assert list(np.flatnonzero(fleet_plots.distance(values) > fleet_plots.FAR)) == [5]
-    few = values[: fleet_plots.FEWEST - 1]
+    assert list(np.flatnonzero(fleet_report.distance(values) > fleet_report.FAR)) == [5]
+    few = values[: fleet_report.FEWEST - 1]
     assert drawn(few, monkeypatch)[0] < -9800.0  # too few to call one of them an outlier
 
 
 def test_the_axes_of_the_page_leave_out_what_its_table_of_outliers_lists(tmp_path, monkeypatch):
     seen = {}
-    original = fleet_plots._steps
+    original = fleet_report._steps
 
     def steps(axes, series, abreast=3):
         original(axes, series, abreast)
@@ -95,7 +95,7 @@ def test_the_axes_of_the_page_leave_out_what_its_table_of_outliers_lists(tmp_pat
 
     runs = {f"T{i:02}": short_run(i) for i in range(24)}
     runs["T07"]["ax"] = runs["T07"]["ax"] + 3 * 0.4
-    monkeypatch.setattr(fleet_plots, "_steps", steps)
+    monkeypatch.setattr(fleet_report, "_steps", steps)
     _, page = said(tmp_path, runs, "--tool", "servo")
     assert re.search(r"<tr><td>T07</td><td class=\"text\">accelerometer offset x</td>", page)
     low, high = seen["accelerometer: offset"]
@@ -118,7 +118,7 @@ def test_numbers_along_an_axis_do_not_run_into_each_other(monkeypatch):
 
     monkeypatch.setattr(Figure, "savefig", savefig)
     values = np.linspace(-0.0051, 0.0057, 40)
-    figure = fleet_plots.parameters(
+    figure = fleet_report.draw_parameters(
         [
             fleet_report.Parameter("magnetometer", "field = 1", name, "of the field", values, 0.0)
             for name in ("gain xx", "gain xy", "offset x")

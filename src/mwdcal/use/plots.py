@@ -40,6 +40,8 @@ TITLES = {
 BEFORE, AFTER, MARKED, BAND = "#6b7280", "#0072b2", "#d55e00", "#dbe7f0"
 AXES = {"x": AFTER, "y": MARKED, "z": "#111827"}
 """Colours of the channels of a triad."""
+LINES: dict[str, Any] = {"x": "-", "y": (0, (5, 1.5)), "z": (0, (1.5, 1.2))}
+"""Line styles of the channels of a triad."""
 WIDTH = 7.1
 """Of a figure, inches."""
 STYLE: dict[Any, Any] = {

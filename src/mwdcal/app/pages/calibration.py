@@ -9,19 +9,13 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from mwdcal.app.messages import lines
+from mwdcal.app.pages.page import written
 from mwdcal.app.text import chance, number, quantity, table
 from mwdcal.calibration.automatic.nonlinearity import CurveScore
 from mwdcal.calibration.diagnosis.findings import UNUSED
 from mwdcal.calibration.prediction import typical_accuracy
 from mwdcal.calibration.readings import simulated
-from mwdcal.calibration.record import (
-    Calibration,
-    Choices,
-    ErrorRow,
-    Finding,
-    OrderScore,
-    StandErrors,
-)
+from mwdcal.calibration.record import Calibration, Choices, ErrorRow, Finding, OrderScore
 from mwdcal.use.plots import TITLES
 
 if TYPE_CHECKING:
@@ -30,15 +24,15 @@ if TYPE_CHECKING:
 MOST_RESHOOTS = 12
 """Most stations to re-shoot that the screen names."""
 PROFILE = " (see [stand] of the tool profile)"
-_OF_A_CALIBRATION = (
-    *("run", "stations", "excluded", "temperature_c", "method", "options", "seed"),
-)
-_OF_A_TRIAD = (
-    *("model", "order", "rank", "size", "undetermined", "variance_factor", "misfit_probability"),
-)
-
-
-_OF_ITS_ACCURACY = ("budget", "assumed_exact", "constants", "stand", "findings", "orders")
+RUN = ("run", "stations", "excluded", "temperature_c", "method", "options", "seed")
+TRIAD = ("model", "order", "rank", "size", "undetermined", "variance_factor", "misfit_probability")
+ACCURACY = ("budget", "assumed_exact", "constants", "stand", "findings", "orders")
+"""Parts of the record that the summary for machines repeats."""
+ORDERS = "error: rms per axis, with the noise; inside: interpolation, at the ends: extrapolation"
+COMPARED = """
+by chance: probability that noise alone gives such a term; chosen: the lowest order above which \
+none is below 0.001"""
+"""What the table of orders means, and where orders were compared."""
 
 
 def _attributes(record: object, names: Iterable[str]) -> dict[str, Any]:
@@ -50,11 +44,11 @@ def summary(
 ) -> dict[str, Any]:
     """The result for machines."""
     return {
-        **_attributes(calibration, _OF_A_CALIBRATION),
-        "triads": {triad.name: _attributes(triad, _OF_A_TRIAD) for triad in calibration.triads},
+        **_attributes(calibration, RUN),
+        "triads": {triad.name: _attributes(triad, TRIAD) for triad in calibration.triads},
         **_attributes(calibration, ("errors", "measures")),
         "accuracy_1sigma_deg": typical_accuracy(calibration),
-        **_attributes(calibration, _OF_ITS_ACCURACY),
+        **_attributes(calibration, ACCURACY),
         "nonlinearity": [msgspec.to_builtins(score) for score in choice.curves],
         "calibration": str(output),
         "report": str(report or ""),
@@ -68,16 +62,10 @@ def screen(calibration: Calibration, choice: Choice, output: Path, report: Path 
         *([orders(calibration.orders)] if calibration.orders else []),
         *([curves(choice.curves)] if choice.curves else []),
         errors(calibration.errors),
-        "\n".join(
-            [*remarks(calibration), *_findings(calibration.findings), _written(output, report)]
-        ),
+        "\n".join([*remarks(calibration), *_findings(calibration.findings)]),
     ]
-    return "\n\n".join(blocks)
-
-
-def _written(output: Path, report: Path | None) -> str:
-    written = f"wrote {output} (calibration)" + (f"   {report} (report)" if report else "")
-    return f"{written}   next: mwdcal verify {output} ROLLTEST.csv"
+    files = written(calibration=output, report=report)
+    return "\n\n".join(blocks) + f"\n{files}   next: mwdcal verify {output} ROLLTEST.csv"
 
 
 def _findings(findings: list[Finding]) -> list[str]:
@@ -103,7 +91,7 @@ def remarks(calibration: Calibration) -> list[str]:
             f"estimated constant of the run: {c.name} {c.value:.6g} ± {c.standard_uncertainty:.2g} {c.unit}"
             for c in calibration.constants
         ),
-        *stand(calibration.stand),
+        *stand(calibration),
     ]
 
 
@@ -117,18 +105,21 @@ def heading(calibration: Calibration) -> str:
     parts.append(f"I {min(inclinations):.0f}–{max(inclinations):.0f}°")
     parts += simulated(calibration.tool)
     ranks = [f"{t.name} {t.rank} of {t.size} determined" for t in calibration.triads]
-    how = ", ".join(
-        [f"method {calibration.method}", model(calibration), *choices(calibration.options)]
-    )
-    left_out = ["left out by --exclude: station " + ", ".join(calibration.excluded)]
-    lines = ["   ".join(parts), "   ".join([how, *ranks])]
-    return "\n".join(lines + (left_out if calibration.excluded else []))
+    lines = ["   ".join(parts), "   ".join([f"method {', '.join(how(calibration))}", *ranks])]
+    if calibration.excluded:
+        lines.append("left out by --exclude: station " + ", ".join(calibration.excluded))
+    return "\n".join(lines)
 
 
 def known_inclinations(calibration: Calibration) -> list[float]:
     """Inclinations of the stations that have one, degrees."""
     rows = calibration.station_rows
     return [row.inclination_deg for row in rows if row.inclination_deg is not None]
+
+
+def how(calibration: Calibration) -> list[str]:
+    """Method, model, and what was asked for beyond them."""
+    return [calibration.method, model(calibration), *choices(calibration.options)]
 
 
 def model(calibration: Calibration) -> str:
@@ -152,13 +143,10 @@ def choices(options: Choices) -> list[str]:
 
 def errors(rows: list[ErrorRow]) -> str:
     """Errors before and after, with what was to be expected."""
-    cells = [
-        [
-            f"{TITLES.get(row.observable, row.observable)} error, rms",
-            *(quantity(value, row.unit) for value in (row.before, row.after, row.expected)),
-        ]
-        for row in rows
-    ]
+    cells = []
+    for row in rows:
+        values = [quantity(value, row.unit) for value in (row.before, row.after, row.expected)]
+        cells.append([f"{TITLES.get(row.observable, row.observable)} error, rms", *values])
     return table(cells, ["", "before", "after", "1σ expected"])
 
 
@@ -172,9 +160,9 @@ def residuals(calibration: Calibration) -> list[str]:
     return [f"residuals over declared noise, s: {'   '.join(each)}"] if each else []
 
 
-def stand(errors: StandErrors) -> list[str]:
+def stand(calibration: Calibration) -> list[str]:
     """Estimated errors of the stand."""
-    lines = []
+    errors, lines = calibration.stand, []
     for name in ("azimuth", "inclination"):
         zero = getattr(errors, f"{name}_zero_deg")
         if zero is not None:
@@ -189,40 +177,24 @@ def stand(errors: StandErrors) -> list[str]:
 
 def orders(scores: list[OrderScore]) -> str:
     """Error at temperatures left out of the fit, by triad and order, and what chose the order."""
-    word = "" if all(s.chosen for s in scores) else "chosen"
+    compared = not all(s.chosen for s in scores)
     rows = []
     for s in scores:
-        values = (s.error_inside, s.error_ends, s.noise)
-        shown = [quantity(value, s.unit.partition(" ")[0]) for value in values]
-        row = [s.triad, str(s.order), number(s.inside), number(s.ends), *shown, chance(s.chance)]
-        rows.append([*row, word if s.chosen else ""])
-    header = [
-        "temperatures left out",
-        "order",
-        "χ² inside",
-        "χ² ends",
-        "error inside",
-        "at the ends",
-    ]
-    note = "error: rms per axis, with the noise; inside: interpolation, at the ends: extrapolation"
-    if word:
-        note += (
-            "\nby chance: probability that noise alone gives such a term; chosen: the lowest order "
-            "above which none is below 0.001"
-        )
-    return table(rows, [*header, "noise", "by chance", ""]) + "\n" + note
+        unit, chosen = s.unit.partition(" ")[0], "chosen" if compared and s.chosen else ""
+        errors = [quantity(value, unit) for value in (s.error_inside, s.error_ends, s.noise)]
+        each = [s.triad, str(s.order), number(s.inside), number(s.ends), *errors, chance(s.chance)]
+        rows.append([*each, chosen])
+    header = ["temperatures left out", "order", "χ² inside", "χ² ends", "error inside"]
+    header += ["at the ends", "noise", "by chance", ""]
+    return f"{table(rows, header)}\n{ORDERS}{COMPARED if compared else ''}"
 
 
 def curves(scores: list[CurveScore]) -> str:
     """The table that took or left the own-axis terms."""
+    rows = []
+    for s in scores:
+        shown = number(s.left_out) if s.odds is None else f"{s.odds:+.1f}"
+        rows.append([" and ".join(s.triads) or "none", shown, "chosen" if s.chosen else ""])
     judged = any(s.odds is not None for s in scores)
-    rows = [
-        [
-            " and ".join(s.triads) or "none",
-            f"{s.odds:+.1f}" if s.odds is not None else number(s.left_out),
-            "chosen" if s.chosen else "",
-        ]
-        for s in scores
-    ]
     measure = "odds, powers of ten" if judged else "χ² left out"
     return table(rows, ["own-axis nonlinearity of", measure, ""])

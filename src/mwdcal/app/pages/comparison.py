@@ -5,7 +5,7 @@ Every method has a colour and a marker of its own, the same in all figures.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +13,15 @@ import msgspec
 import numpy as np
 
 from mwdcal import __version__
-from mwdcal.app.pages.page import environment, factor_places, measured, number
+from mwdcal.app.pages.page import (
+    UNDETERMINED,
+    banner,
+    capital,
+    environment,
+    factor_places,
+    measured,
+    number,
+)
 from mwdcal.app.text import raised, superscript, table
 from mwdcal.calibration.methods import EVIDENCE
 from mwdcal.calibration.readings import SIMULATED
@@ -22,12 +30,20 @@ from mwdcal.comparison.compare import Comparison, Row, able
 from mwdcal.estimation.uncertainty import ROTATIONS
 from mwdcal.geometry.vectors import Array
 from mwdcal.use import plots
+from mwdcal.use.notation import Notation
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-STATISTICS = (("mean", "mean"), ("STD", "std"), ("MSE", "mse"), ("RMSE", "rmse"))
+STATISTICS = (
+    ("mean", "after", "mean"),
+    ("STD", "after", "std"),
+    ("MSE", "after", "mse"),
+    ("RMSE", "after", "rmse"),
+    ("RMSE left out", "left out", "rmse"),
+)
+"""Measures of the vector error: title, of which fit, and name."""
 MARK = "*"
 """Behind a figure that rests on a convention."""
 COLOURS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#d55e00", "#4b5563")
@@ -35,8 +51,8 @@ MARKERS = ("o", "s", "^", "x", "D", "v")
 LOOKS = dict(zip(EVIDENCE, zip(COLOURS, MARKERS, strict=True), strict=True))
 MOST_STATIONS = 240
 """A longer run shows the largest error of each of so many equal parts of it."""
-Line = tuple[str, str, list[str]]
-"""A row of a table: what, its unit, and a cell for each column."""
+Rows = list[list[str]]
+"""Rows of a table: what each is, then its cells."""
 
 
 def text(comparison: Comparison, parameters: bool = False) -> str:
@@ -46,16 +62,17 @@ def text(comparison: Comparison, parameters: bool = False) -> str:
     simulated = [SIMULATED] if comparison.simulated else []
     lines = ["   ".join([*heading(comparison), *simulated]), comparison.advice]
     if rows:
-        lines += ["", _table(figures(comparison), ["", "before", *methods]), ""]
+        lines += ["", table(figures(comparison), ["", "before", *methods]), ""]
     lines += notes(comparison)
     lines += [f"{who} refused: {why}" for who, why in refusals(comparison)]
     if parameters and rows:
         lines += ["", gauge(comparison) + " In parentheses: 1σ of the last digits."]
-        for name, stated in parameter_pairs(comparison).items():
-            joined = [
-                (what, unit, [_joined(*pair) for pair in pairs]) for what, unit, pairs in stated
+        for triad in rows[0].parameters:
+            stated = [
+                [_label(each.title, each.unit), *(_joined(*pair) for pair in each.pairs)]
+                for each in parameters_of(comparison, triad)
             ]
-            lines += ["", _table(joined, [name, *methods])]
+            lines += ["", table(stated, [triad, *methods])]
     return "\n".join(lines)
 
 
@@ -68,17 +85,13 @@ def refusals(comparison: Comparison) -> list[tuple[str, str]]:
     return refused
 
 
-def _table(lines: list[Line], header: list[str]) -> str:
-    return table([[f"{what}, {unit}" if unit else what, *c] for what, unit, c in lines], header)
-
-
 def _joined(value: str, sd: str) -> str:
     """1σ in parentheses, in units of the last digit of the value: 2.93051(10)."""
-    if sd == "undetermined":
+    if sd == UNDETERMINED:
         return sd
-    digits, power = (text.partition("×") for text in (sd, value))
-    short = digits[0].replace(".", "").lstrip("0") or "0"
-    return f"{power[0]}({short}){''.join(power[1:])}"
+    digits, times, power = value.partition("×")
+    short = sd.partition("×")[0].replace(".", "").lstrip("0") or "0"
+    return f"{digits}({short}){times}{power}"
 
 
 def heading(comparison: Comparison) -> list[str]:
@@ -95,72 +108,84 @@ def heading(comparison: Comparison) -> list[str]:
     return [part for part in parts if part]
 
 
-def figures(comparison: Comparison) -> list[Line]:
+def figures(comparison: Comparison) -> Rows:
     """All figures of the nominal tool ("before"), then of every method."""
-    if not able(comparison.rows):
-        return []
-    lines: list[Line] = []
-    for kind, how in (("held_out", "left out"), ("in_sample", "in sample")):
-        lines += [(f"{what}, rms {how}", unit, c) for what, unit, c in errors(comparison, kind)]
-    return [*lines, *measures(comparison), *effort(comparison)]
+    return [
+        *errors(comparison, "held_out", "rms left out"),
+        *errors(comparison, "in_sample", "rms in sample"),
+        *measures(comparison),
+        *([what, "", *cells] for what, *cells in effort(comparison)),
+    ]
 
 
-def errors(comparison: Comparison, kind: str) -> list[Line]:
-    """Root mean square errors by observable: `kind` "held_out" or "in_sample"."""
-    lines = []
+def _label(*parts: str) -> str:
+    """The title of a row: its parts, the unit last, without the empty ones."""
+    return ", ".join(part for part in parts if part)
+
+
+def errors(comparison: Comparison, kind: str, how: str = "") -> Rows:
+    """Root mean square errors by observable, before and of every method.
+
+    `kind` is "held_out" or "in_sample", and `how` what the rows say of it.
+    """
+    rows = []
     for name, unit in comparison.units.items():
         cells = [
             number(getattr(row, kind)[name]) + MARK * (name in row.resting)
             for row in able(comparison.rows)
         ]
-        before = number(comparison.before[name])
-        lines.append((plots.TITLES.get(name, name), unit, [before, *cells]))
-    return lines
+        what = _label(plots.TITLES.get(name, name), how, unit)
+        rows.append([what, number(comparison.before[name]), *cells])
+    return rows
 
 
-def measures(comparison: Comparison) -> list[Line]:
+def measures(comparison: Comparison) -> Rows:
     """Moradi's four measures of the vector error by triad, and the last of them left out."""
-    lines: list[Line] = []
+    rows = []
     for before in comparison.measures_before:
-        name = f"{before.triad} |e|"
-        for what, key in STATISTICS:
-            cells = [_measure(row, before.triad, "after", key) for row in able(comparison.rows)]
-            lines.append((f"{name}, {what}", "", [number(getattr(before, key)), *cells]))
-        cells = [_measure(row, before.triad, "left out", "rmse") for row in able(comparison.rows)]
-        lines.append((f"{name}, RMSE left out", "", ["", *cells]))
-    return lines
+        for what, when, key in STATISTICS:
+            cells = [_measure(row, before.triad, when, key) for row in able(comparison.rows)]
+            first = number(getattr(before, key)) if when == "after" else ""
+            rows.append([f"{before.triad} |e|, {what}", first, *cells])
+    return rows
 
 
 def _measure(row: Row, triad: str, when: str, key: str) -> str:
+    """One measure of the vector error of a triad by one method."""
     values = [getattr(m, key) for m in row.measures if (m.triad, m.when) == (triad, when)]
     rank, size = row.ranks[triad]
     return number(values[0] if values else None) + MARK * (rank < size)
 
 
-def effort(comparison: Comparison) -> list[Line]:
-    """Rank, iterations and time."""
+def effort(comparison: Comparison) -> Rows:
+    """Rank, iterations and time of every method."""
     rows = able(comparison.rows)
-    lines = [
-        (f"rank, {triad}", "", ["", *("{} of {}".format(*row.ranks[triad]) for row in rows)])
+    ranks = [
+        [f"rank, {triad}", *("{} of {}".format(*row.ranks[triad]) for row in rows)]
         for triad in rows[0].ranks
     ]
-    if any(row.lost for row in rows):
-        lines.append(("stations no fit could judge", "", ["", *(str(row.lost) for row in rows)]))
-    lines.append(("iterations", "", ["", *(str(row.iterations) for row in rows)]))
-    return [*lines, ("time of one fit", "s", ["", *(f"{row.seconds:.2f}" for row in rows)])]
+    lost = ["stations no fit could judge", *(str(row.lost) for row in rows)]
+    return [
+        *ranks,
+        *([lost] if any(row.lost for row in rows) else []),
+        ["iterations", *(str(row.iterations) for row in rows)],
+        ["time of one fit, s", *(f"{row.seconds:.2f}" for row in rows)],
+    ]
 
 
 def notes(comparison: Comparison) -> list[str]:
     """What each method leaves free, and what the tables mean."""
     rows = able(comparison.rows)
+    if not rows:
+        return []
     lines = [
         f"{row.method} leaves undetermined: {', '.join(row.undetermined)}"
         for row in rows
         if row.undetermined
     ]
-    if comparison.measures_before and rows:
+    if comparison.measures_before:
         lines.append("|e|: length of the vector error, as a share of the reference vector (Moradi)")
-    if any(MARK in cell for *_, cells in figures(comparison) for cell in cells):
+    if any(MARK in cell for row in figures(comparison) for cell in row):
         lines.append(f"{MARK} rests on a direction that the method leaves free: kept at nominal")
     return lines
 
@@ -185,19 +210,44 @@ def gauge(comparison: Comparison) -> str:
     )
 
 
-Pairs = tuple[str, str, list[tuple[str, str]]]
-"""A parameter, its unit, and each method's value and 1σ as text."""
+@dataclass(frozen=True)
+class Parameter:
+    """A parameter of a triad: values and standard uncertainties by method, NaN: undetermined."""
+
+    title: str
+    unit: str
+    values: list[float]
+    sd: list[float]
+
+    @property
+    def pairs(self) -> list[tuple[str, str]]:
+        """Each method's value and standard uncertainty as text."""
+        return [measured(*pair) for pair in zip(self.values, self.sd, strict=True)]
 
 
-def parameter_pairs(comparison: Comparison) -> dict[str, list[Pairs]]:
-    """Parameters of every method by triad; last what was taken out of them."""
-    result = {}
-    for triad in able(comparison.rows)[0].parameters:
-        result[triad] = [
-            (place.title, place.unit, [measured(*place.of(row)) for row in able(comparison.rows)])
-            for place in places(comparison, triad)
-        ]
+def parameters_of(comparison: Comparison, triad: str) -> list[Parameter]:
+    """The parameters of a triad: its factors, then what was taken out of them."""
+    rows = able(comparison.rows)
+    factors, taken_out = [r.parameters[triad] for r in rows], [r.taken_out[triad] for r in rows]
+    strength = "g" if triad == "accelerometer" else "nT" if "field" in comparison.units else ""
+    result = [
+        _parameter(f"{key} {axes}{raised('·τ', power)}", unit, factors, key, at)
+        for key, at, axes, power, unit in factor_places(factors[0].values, strength)
+    ]
+    for name in comparison.gauge.get(triad, []):
+        if name == SCALE:
+            result.append(_parameter(name, "", taken_out, name, (0,)))
+        else:
+            at = (ROTATIONS.index(name),)
+            result.append(_parameter(name, "°", taken_out, "rotation_deg", at))
     return result
+
+
+def _parameter(
+    title: str, unit: str, notations: Sequence[Notation], key: str, at: tuple[int, ...]
+) -> Parameter:
+    values = [float(n.values[key][at]) for n in notations]
+    return Parameter(title, unit, values, [float(n.uncertainty[key][at]) for n in notations])
 
 
 def document(comparison: Comparison) -> dict[str, Any]:
@@ -214,111 +264,67 @@ def render(
 ) -> str:
     """The comparison as HTML, with the name of its tool profile and the SHA-256 of its sources."""
     template = environment().get_template("comparison.html")
-    trace = [
-        ("run file", comparison.run, run_sha256),
-        ("tool profile", profile, profile_sha256),
-        ("software", f"mwdcal {__version__}, seed of the swarm {comparison.seed}", ""),
-    ]
-    rows = able(comparison.rows)
-    headline, _, why = comparison.advice.partition(": ")
     return template.render(
+        {function.__name__: function for function in TABLES + FIGURES},
         result=comparison,
         simulated=comparison.simulated,
-        headline=headline,
-        why=why,
-        rows=rows,
-        refused=refusals(comparison),
-        heading=heading(comparison)[1:],
-        errors=[errors(comparison, kind) for kind in ("held_out", "in_sample")] if rows else [],
-        measures=measures(comparison) if rows else [],
-        effort=effort(comparison) if rows else [],
-        notes=notes(comparison),
-        gauge=gauge(comparison),
-        parameters=parameter_pairs(comparison) if rows else {},
-        figures=figures_of(comparison) if rows else {},
+        banner=_banner(comparison),
+        rows=able(comparison.rows),
         limit=MOST_STATIONS,
-        trace=trace,
+        profile=profile,
+        run_sha256=run_sha256,
+        profile_sha256=profile_sha256,
+        version=__version__,
     )
 
 
-def figures_of(comparison: Comparison) -> dict[str, Figure]:
-    """All figures that the run gives anything for."""
-    drawn = {
-        "errors": draw_errors(comparison),
-        "stations": draw_stations(comparison),
-        "parameters": draw_parameters(comparison),
-    }
-    if any(row.course for row in comparison.rows):
-        drawn["course"] = draw_course(comparison)
-    return drawn
-
-
-@dataclass(frozen=True)
-class Place:
-    """One parameter of one triad: where a row has it, and how it is called."""
-
-    triad: str
-    title: str
-    unit: str
-    key: str
-    at: tuple[int, ...]
-
-    def of(self, row: Row) -> tuple[float, float]:
-        """A method's value and standard uncertainty, NaN where it is undetermined."""
-        source = row.parameters if self.key in ("SF", "B", "m") else row.taken_out
-        item = source[self.triad]
-        return float(item.values[self.key][self.at]), float(item.uncertainty[self.key][self.at])
-
-
-def places(comparison: Comparison, triad: str) -> list[Place]:
-    """The parameters of a triad: its factors, then what was taken out of them."""
-    strength = "g" if triad == "accelerometer" else "nT" if "field" in comparison.units else ""
-    units = {"SF": f"raw/{strength}" if strength else "raw", "B": strength, "m": ""}
-    result = []
-    for key, at, axes, power in factor_places(able(comparison.rows)[0].parameters[triad].values):
-        title, unit = f"{key} {axes}{raised('·τ', power)}", units[key] + raised("/°C", power)
-        result.append(Place(triad, title, unit, key, at))
-    for name in comparison.gauge.get(triad, []):
-        if name == SCALE:
-            result.append(Place(triad, name, "", name, (0,)))
-        else:
-            result.append(Place(triad, name, "°", "rotation_deg", (ROTATIONS.index(name),)))
-    return result
+def _banner(comparison: Comparison) -> dict[str, str]:
+    """The advice, and why."""
+    headline, _, why = comparison.advice.partition(": ")
+    level = "good" if able(comparison.rows) else "bad"
+    return banner(level, "Advice", capital(headline), capital(why))
 
 
 @plots.styled
 def draw_errors(comparison: Comparison) -> Figure:
     """Left-out error of every observable and method over the best of any; hollow: in sample."""
     rows, names = able(comparison.rows), list(comparison.units)
-    figure = plots.new_figure(
-        "Left-out error of every method and observable", 0.75 + 0.36 * len(names)
-    )
+    height = 0.75 + 0.36 * len(names)
+    figure = plots.new_figure("Left-out error of every method and observable", height)
     axes = figure.subplots()
-    for index, row in enumerate(rows):
+    for row, shift in zip(rows, _abreast(rows, 0.11), strict=True):
+        inside = [_over_best(rows, name, row.in_sample) for name in names]
+        left_out = [_over_best(rows, name, row.held_out) for name in names]
         colour, marker = LOOKS[row.method]
-        height = np.arange(len(names)) + 0.11 * (index - (len(rows) - 1) / 2)
-        inside, left_out = (
-            [kind[n] / _best(rows, n) for n in names] for kind in (row.in_sample, row.held_out)
-        )
-        edge: dict[str, Any] = {"color": colour, "ls": "none", "marker": marker}
-        axes.plot(inside, height, mfc="white", mew=0.7, ms=3.2, alpha=0.8, **edge)
-        axes.plot(left_out, height, ms=4.6, label=row.method, **edge)
+        look: dict[str, Any] = {"color": colour, "ls": "none", "marker": marker}
+        where = np.arange(len(names)) + shift
+        axes.plot(inside, where, mfc="white", mew=0.7, ms=3.2, alpha=0.8, **look)
+        axes.plot(left_out, where, ms=4.6, label=row.method, **look)
     _ratio_axis(axes)
-    axes.set_xlabel("rms error ÷ least left-out error of any method")
-    axes.set_yticks(range(len(names)), [plots.TITLES.get(n, n) for n in names])
-    axes.set_ylim(len(names) - 0.5, -0.5)
-    axes.grid(axis="y", visible=False)
-    for edge_at in np.arange(len(names) - 1) + 0.5:
-        axes.axhline(edge_at, color="#e5e7eb", lw=0.6)
+    _observable_axis(axes, names)
     axes.axvline(1, color="#4b5563", lw=0.8)
     _legend(figure)
     return figure
 
 
-def _best(rows: Sequence[Row], name: str) -> float:
-    """The least left-out error of any method."""
+def _abreast(rows: Sequence[Row], step: float) -> Array:
+    """Shifts that put the markers of every method side by side."""
+    return step * (np.arange(len(rows), dtype=float) - (len(rows) - 1) / 2)
+
+
+def _observable_axis(axes: Axes, names: Sequence[str]) -> None:
+    """An observable in each row, the first at the top, with lines between them."""
+    axes.set_yticks(range(len(names)), [plots.TITLES.get(n, n) for n in names])
+    axes.set_ylim(len(names) - 0.5, -0.5)
+    axes.grid(axis="y", visible=False)
+    for edge in np.arange(len(names) - 1) + 0.5:
+        axes.axhline(edge, color="#e5e7eb", lw=0.6)
+
+
+def _over_best(rows: Sequence[Row], name: str, errors: Mapping[str, float]) -> float:
+    """An error over the least left-out error of any method."""
     best = float(np.fmin.reduce([row.held_out[name] for row in rows]))
-    return best if best > 0 else float("nan")
+    return errors[name] / best if best > 0 else float("nan")
 
 
 def _legend(figure: Any) -> None:
@@ -328,7 +334,7 @@ def _legend(figure: Any) -> None:
 
 def _ratio_axis(axes: Axes) -> None:
     """A logarithmic axis of ratios, with plain numbers."""
-    axes.set_xscale("log")
+    axes.set(xscale="log", xlabel="rms error ÷ least left-out error of any method")
     low, high = axes.get_xlim()
     steps = (1.0, 2.0, 5.0) if high / low > 8 else (1.0, 1.2, 1.5, 2.0, 3.0, 5.0, 7.0, 8.0, 9.0)
     plots.plain_numbers(axes.xaxis, *(steps if high / low < 1e3 else (1.0,)))
@@ -386,38 +392,41 @@ def draw_parameters(comparison: Comparison) -> Figure:
     figure = plots.new_figure("Parameters of every method with 1σ", 0.4 + 2.0 * len(triads))
     panels = figure.subplots(len(triads), 1, squeeze=False)[:, 0]
     for axes, triad in zip(panels, triads, strict=True):
-        _differences(axes, rows, places(comparison, triad))
-        axes.set_title(triad)
-        axes.set_ylabel(f"less {rows[0].method}, in its 1σ")
+        shown = parameters_of(comparison, triad)
+        _differences(axes, rows, shown)
+        _parameter_axis(axes, [parameter.title for parameter in shown])
+        axes.set(title=triad, ylabel=f"less {rows[0].method}, in its 1σ")
     _legend(figure)
     return figure
 
 
-def _differences(axes: Axes, rows: Sequence[Row], shown: Sequence[Place]) -> None:
-    first = np.array([place.of(rows[0]) for place in shown])
-    unit = np.where(first[:, 1] > 0, first[:, 1], np.nan)
-    for index, row in enumerate(rows):
+def _differences(axes: Axes, rows: Sequence[Row], shown: Sequence[Parameter]) -> None:
+    """Parameters of every method less those of the first, with error bars, in its 1σ."""
+    values = np.array([parameter.values for parameter in shown])
+    sd = np.array([parameter.sd for parameter in shown])
+    unit = np.where(sd[:, 0] > 0, sd[:, 0], np.nan)
+    difference = np.where(np.isnan(sd), np.nan, (values - values[:, :1]) / unit[:, None])
+    for index, (row, shift) in enumerate(zip(rows, _abreast(rows, 0.12), strict=True)):
         colour, marker = LOOKS[row.method]
-        value, sd = np.array([place.of(row) for place in shown]).transpose()
-        where = np.arange(len(shown)) + 0.12 * (index - (len(rows) - 1) / 2)
-        value = np.where(np.isnan(sd), np.nan, (value - first[:, 0]) / unit)
         axes.errorbar(
-            where, value, sd / unit, color=colour, marker=marker, ms=3.4, ls="none",
-            elinewidth=0.8, label=row.method,
+            np.arange(len(shown)) + shift, difference[:, index], sd[:, index] / unit, color=colour,
+            marker=marker, ms=3.4, ls="none", elinewidth=0.8, label=row.method,
         )  # fmt: skip
     low, high = axes.get_ylim()
     if max(-low, high) > 20:
         axes.set_yscale("symlog", linthresh=5)
     axes.axhline(0, color="#4b5563", lw=0.6, zorder=1)
-    steep = len(shown) > 18
-    axes.set_xticks(
-        range(len(shown)), [place.title for place in shown],
-        rotation=90 if steep else 40, ha="center" if steep else "right",
-        rotation_mode="default" if steep else "anchor", fontsize=6.5,
-    )  # fmt: skip
-    axes.set_xlim(-0.6, len(shown) - 0.4)
+
+
+def _parameter_axis(axes: Axes, titles: Sequence[str]) -> None:
+    """A parameter in each column, with lines between them; many have upright titles."""
+    turned: dict[str, Any] = {"rotation": 40, "ha": "right", "rotation_mode": "anchor"}
+    upright: dict[str, Any] = {"rotation": 90, "ha": "center", "rotation_mode": "default"}
+    place = upright if len(titles) > 18 else turned
+    axes.set_xticks(range(len(titles)), titles, fontsize=6.5, **place)
+    axes.set_xlim(-0.6, len(titles) - 0.4)
     axes.grid(axis="x", visible=False)
-    for edge in np.arange(len(shown) - 1) + 0.5:
+    for edge in np.arange(len(titles) - 1) + 0.5:
         axes.axvline(edge, color="#e5e7eb", lw=0.5)
 
 
@@ -432,11 +441,15 @@ def draw_course(comparison: Comparison) -> Figure:
     for (name, excess), line in zip(row.course.items(), ("-", "--"), strict=False):
         shown = np.where(excess > 1e-13, excess, np.nan)
         axes.plot(np.arange(1, len(excess) + 1), shown, line, color=LOOKS["swarm"][0], label=name)
-    axes.set_yscale("log")
+    axes.set(
+        yscale="log", xlim=(0, len(excess)), xlabel="iteration", ylabel="cost ÷ least cost − 1"
+    )
     axes.yaxis.set_major_formatter(lambda value, _: f"10{superscript(round(np.log10(value)))}")
     axes.yaxis.set_minor_formatter(NullFormatter())
-    axes.set_xlim(0, len(excess))
-    axes.set_xlabel("iteration")
-    axes.set_ylabel("cost ÷ least cost − 1")
     axes.legend(loc="upper right")
     return figure
+
+
+TABLES = (refusals, heading, errors, measures, effort, notes, gauge, parameters_of)
+FIGURES = (draw_errors, draw_stations, draw_parameters, draw_course)
+"""What the template calls."""

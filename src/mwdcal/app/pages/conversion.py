@@ -7,15 +7,23 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mwdcal.app.pages.page import HELD, is_held
+from mwdcal.app.pages.page import HELD, UNDETERMINED, is_held
 from mwdcal.app.text import raised, table
-from mwdcal.calibration.readings import TRIADS, Readings, is_simulated, simulated
+from mwdcal.calibration.readings import Readings, is_simulated, simulated
 from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.files import documents
 from mwdcal.use.notation import COURSE, Notation, convert, powers
 
 SCHEMA_VERSION = 1
 """Version of the JSON document."""
+UNRECORDED = (
+    "the calibration was made at unrecorded temperatures, without temperature terms: the values are "
+    "the same at any temperature, and nothing says how good they are at {:g} °C."
+)
+OUTSIDE = (
+    "{:g} °C lies outside the calibrated range {}: the values are extrapolated, and their "
+    "uncertainties do not hold. Choose a temperature inside, or calibrate over a wider range."
+)
 
 
 class Converted(NamedTuple):
@@ -48,38 +56,47 @@ def temperature_findings(
 
     The reference temperature counts as asked for where the values depend on it.
     """
-    if isinstance(temperature, str):
-        return []
     varies = notation != "factors" and any(t.order for t in calibration.triads)
-    if temperature is None and not varies:
+    if isinstance(temperature, str) or (temperature is None and not varies):
         return []
     at = calibration.reference_temperature if temperature is None else temperature
     there = Readings(np.zeros((1, 3)), temperature=np.array([at]))
     if calibration.unrecorded(there):
-        text = (
-            "the calibration was made at unrecorded temperatures, without temperature terms: the values are "
-            f"the same at any temperature, and nothing says how good they are at {at:g} °C."
-        )
-        return [Finding(id="no-temperature", text=text)]
-    if not calibration.outside(there).any():
-        return []
+        return [Finding(id="no-temperature", text=UNRECORDED.format(at))]
+    if calibration.outside(there).any():
+        return [Finding(id="outside-temperature", text=OUTSIDE.format(at, _range(calibration)))]
+    return []
+
+
+def _range(calibration: Calibration) -> str:
+    """The calibrated temperatures."""
     low, high = calibration.temperature_c or (np.nan, np.nan)
-    text = (
-        f"{at:g} °C lies outside the calibrated range {low:.1f}…{high:.1f} °C: the values are extrapolated, and "
-        "their uncertainties do not hold. Choose a temperature inside, or calibrate over a wider range."
-    )
-    return [Finding(id="outside-temperature", text=text)]
+    return f"{low:.1f}…{high:.1f} °C"
 
 
 def document(converted: Converted) -> dict[str, Any]:
     """The result for machines: identity, units and conditions, then the values of each triad."""
-    return {**_identity(converted), **{name: _triad(converted, name) for name in converted.triads}}
-
-
-def _identity(converted: Converted) -> dict[str, Any]:
     calibration, at = converted.calibration, converted.temperature
-    identity: dict[str, Any] = {
+    course = isinstance(at, str)
+    if at is None or (converted.notation == "factors" and not course):
+        at = calibration.reference_temperature
+    return {
         "schema_version": SCHEMA_VERSION,
+        **_source(converted),
+        "calibrated_temperature_c": calibration.temperature_c,
+        "field_unit": calibration.field_unit,
+        "notation": converted.notation,
+        "temperature_c": at,
+        "findings": converted.findings,
+        **({"powers_of": "T - reference_temperature_c"} if course else {}),
+        **{name: _triad(converted, name) for name in converted.triads},
+    }
+
+
+def _source(converted: Converted) -> dict[str, Any]:
+    """Where the values come from: tool, run and calibration file."""
+    calibration = converted.calibration
+    return {
         "tool": calibration.tool,
         "serial": calibration.tool.get("serial"),
         "profile": calibration.profile.name,
@@ -90,17 +107,7 @@ def _identity(converted: Converted) -> dict[str, Any]:
         "calibrated": calibration.time,
         "software": calibration.software,
         "simulated": is_simulated(calibration.tool),
-        "calibrated_temperature_c": calibration.temperature_c,
-        "field_unit": calibration.field_unit,
-        "notation": converted.notation,
-        "temperature_c": at,
-        "findings": converted.findings,
     }
-    if isinstance(at, str):
-        identity["powers_of"] = "T - reference_temperature_c"
-    elif converted.notation == "factors" or at is None:
-        identity["temperature_c"] = calibration.reference_temperature
-    return identity
 
 
 def _triad(converted: Converted, name: str) -> dict[str, Any]:
@@ -122,30 +129,29 @@ def screen(converted: Converted) -> str:
     calibration, at = converted.calibration, converted.temperature
     reference = calibration.reference_temperature
     serial = calibration.tool.get("serial", calibration.profile.name)
-    first = [f"{converted.path.name}", serial, f"run {calibration.run}", calibration.software]
-    lines = ["   ".join([*first, *simulated(calibration.tool)]), f"SHA-256 {converted.sha256}"]
-    units = [
-        f"{name} raw per {triad.unit}{_nominal(calibration, name)}"
-        for name, triad in zip(TRIADS, calibration.triads, strict=False)
-    ]
+    first = [converted.path.name, serial, f"run {calibration.run}", calibration.software]
     stated = reference if at is None or converted.notation == "factors" else at
     shown = "course" if isinstance(stated, str) else f"{stated:g} °C"
-    conditions = [f"notation {converted.notation}", f"temperature {shown}", _calibrated(converted)]
-    lines += ["   ".join(conditions), "   ".join(units)]
+    lines = [
+        [*first, *simulated(calibration.tool)],
+        [f"SHA-256 {converted.sha256}"],
+        [f"notation {converted.notation}", f"temperature {shown}", _calibrated(converted)],
+        [f"{t.name} raw per {t.unit}{_nominal(calibration, t.name)}" for t in calibration.triads],
+    ]
     values = notation(converted.triads, reference if at == COURSE else None)
-    return "\n".join(lines) + "\n\n" + values
+    return "\n".join("   ".join(line) for line in lines) + "\n\n" + values
 
 
 def _calibrated(converted: Converted) -> str:
     """The calibrated temperatures, and whether the values lie outside them."""
     if converted.calibration.temperature_c is None:
         return "calibrated at unrecorded temperatures"
-    low, high = converted.calibration.temperature_c
     outside = "extrapolated: " if converted.findings else ""
-    return f"{outside}calibrated at {low:.1f}…{high:.1f} °C"
+    return f"{outside}calibrated at {_range(converted.calibration)}"
 
 
 def _nominal(calibration: Calibration, name: str) -> str:
+    """The nominal scale of a triad, if the profile states one."""
     scale = getattr(calibration.profile, name).scale
     return "" if scale is None else f" (nominal {scale:.6g})"
 
@@ -155,21 +161,24 @@ def notation(triads: dict[str, Notation], reference: float | None = None) -> str
 
     A course is stated by its `reference` temperature: each coefficient then names its power of τ.
     """
-    blocks = [] if reference is None else [f"τ = T - {reference:g} °C"]
+    course = reference is not None
+    blocks = [f"τ = T - {reference:g} °C"] if course else []
     for triad, notation in triads.items():
-        rows = []
-        for name, value in notation.values.items():
-            power = powers(name, value)
-            for index in np.ndindex(value.shape):
-                label = _label(name, index, None if reference is None else int(power[index]))
-                sd = float(notation.uncertainty[name][index])
-                diagonal = name == "m" and index[0] == index[1]  # zero in every model
-                stated = "undetermined" if np.isnan(sd) else f"{sd:.2g}"
-                if is_held(float(value[index]), sd) and not diagonal:
-                    stated = HELD
-                rows.append([label, f"{value[index] + 0.0:.12g}", stated])
+        rows = [
+            [_label(name, index, int(power) if course else None), *_stated(notation, name, index)]
+            for name, value in notation.values.items()
+            for index, power in np.ndenumerate(powers(name, value))
+        ]
         blocks.append(f"{triad}\n" + table(rows, ["", "value", "1σ"]))
     return "\n\n".join(blocks)
+
+
+def _stated(notation: Notation, name: str, index: tuple[int, ...]) -> tuple[str, str]:
+    """A value and its standard uncertainty; the diagonal of m is zero in every model."""
+    value, sd = (float(v[name][index]) for v in (notation.values, notation.uncertainty))
+    if is_held(value, sd) and not (name == "m" and index[0] == index[1]):
+        return "0", HELD
+    return f"{value + 0.0:.12g}", UNDETERMINED if np.isnan(sd) else f"{sd:.2g}"
 
 
 def _label(name: str, index: tuple[int, ...], power: int | None) -> str:

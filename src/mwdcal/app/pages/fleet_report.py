@@ -5,38 +5,56 @@ It reads the table of calibrations column by column, whatever its length.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mwdcal.app.pages import fleet_plots
-from mwdcal.app.pages.fleet_plots import FAR, FEWEST
 from mwdcal.app.pages.fleet_summary import (
     ERRORS,
     FleetSummary,
     is_doubt,
     numbers,
-    orders_table,
     quantiles,
     unusual,
 )
-from mwdcal.app.pages.page import environment
+from mwdcal.app.pages.page import banner, environment
 from mwdcal.app.text import number, plural, raised
 from mwdcal.calibration.diagnosis.plausibility import NOISE_RATIO
+from mwdcal.calibration.prediction import STATED_ANGLES
 from mwdcal.calibration.readings import TRIADS, is_simulated
 from mwdcal.files.formats import parquet
 from mwdcal.fleet.calibrate import OK
 from mwdcal.fleet.sources import SERIAL
 from mwdcal.geometry.vectors import AnyArray, Array, Bools
+from mwdcal.use import plots
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 RELATIVE = "field = 1"
 """The kind of magnetometers of which the strength of the field is not known."""
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#4b5563")
+DASHES: tuple[Any, ...] = ("-", "--", ":", "-.", (0, (5, 1)), (0, (1, 1)))
+BINS = (12, 40)
+"""Fewest and most bins: as many as half the root of the number of tools."""
+ABREAST = 3
+"""Most panels in a row."""
+TICKS = 12
+"""Numbers along the axes of a row of panels: more would run into each other."""
+FAR = 6.0
+"""Robust standard deviations from the fleet's median beyond which a tool is an outlier."""
+FEWEST = 20
+"""Sound tools without which there is no fleet to be an outlier of."""
+SPREAD = 1.4826
+"""Standard deviation of a normal variable by its median absolute deviation."""
+OWN_OR_CROSS = ("gain", "square", "cube")
+"""Parameters of one axis or of two: a panel for each."""
+Panel = tuple[str, str, Mapping[str, Array]]
+"""Title, name of the axis, and values by name."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +69,7 @@ class Parameter:
     title: str
     unit: str
     values: Array
-    sd: float
+    sd: Array
 
     @property
     def sensors(self) -> str:
@@ -68,17 +86,10 @@ class Parameter:
         """1 %, median and 99 %."""
         return quantiles(self.values)
 
-
-@dataclass(frozen=True)
-class Outlier:
-    """A tool far from the fleet: its farthest column."""
-
-    serial: Any
-    title: str
-    value: float
-    median: float
-    unit: str
-    distance: float
+    @property
+    def typical_sd(self) -> float | None:
+        """Median of the standard uncertainties."""
+        return None if np.isnan(self.sd).all() else float(np.nanmedian(self.sd))
 
 
 class SoundTools:
@@ -116,9 +127,9 @@ def render(calibrations: Path, summary: FleetSummary) -> str:
         metadata=tools.metadata,
         simulated=is_simulated(tools.metadata),
         banner=_banner(summary),
-        facts=_facts(summary, tools.metadata),
-        orders=orders_table(summary) if summary.orders else None,
-        stand=_stand(summary),
+        options="; ".join(unusual(summary.options)) or "defaults",
+        stand={name: summary.spread[name] for name in ERRORS if summary.spread.get(name)},
+        short=number,
         estimated=estimated,
         figures=_figures(tools, parameters, estimated) if tools.count else {},
         parameters=parameters,
@@ -130,16 +141,6 @@ def render(calibrations: Path, summary: FleetSummary) -> str:
     )
 
 
-def _stand(summary: FleetSummary) -> list[list[str]]:
-    """Rows of the table of errors of the stand: name, and three points of the sound tools."""
-    known = {name: summary.spread.get(name) for name in ERRORS}
-    return [
-        [name.removesuffix("_deg").replace("_", " "), *map(number, values)]
-        for name, values in known.items()
-        if values
-    ]
-
-
 def _banner(summary: FleetSummary) -> dict[str, str]:
     """The result in one sentence."""
     refused = summary.tools - summary.sound
@@ -148,33 +149,17 @@ def _banner(summary: FleetSummary) -> dict[str, str]:
         for finding in summary.findings
         if is_doubt(finding.id)
     ]
-    level = "bad" if not summary.sound else "attention" if refused or doubts else "good"
-    word = "Some refused" if refused else "Some doubtful"
-    word = {"good": "All calibrated", "attention": word, "bad": "None calibrated"}[level]
+    headline = f"{summary.sound} of {plural(summary.tools, 'tool')} calibrated"
     after = "Every tool has parameters with their uncertainty."
     if refused:
         after = f"{plural(refused, 'tool')} without a result: see the reasons below."
     after = "; ".join([after.rstrip("."), *doubts]) + "." if doubts else after
-    headline = f"{summary.sound} of {plural(summary.tools, 'tool')} calibrated"
-    return {"level": level, "word": word, "headline": headline, "after": after}
-
-
-def _facts(summary: FleetSummary, metadata: Mapping[str, object]) -> list[tuple[str, str]]:
-    profile = str(metadata.get("profile", ""))
-    facts = [
-        ("method", summary.method),
-        ("stations", str(summary.stations)),
-        ("order", str(summary.order)),
-        ("options", "; ".join(unusual(summary.options)) or "defaults"),
-        ("profile", profile),
-    ]
-    if summary.nonlinear:
-        pairs = summary.nonlinear.items()
-        terms = ", ".join(f"{triad} of {plural(count, 'tool')}" for triad, count in pairs)
-        facts.append(("own-axis terms", terms))
-    if summary.order:
-        facts.append(("τ", f"temperature − {metadata.get('reference_temperature_c')} °C"))
-    return facts
+    if not summary.sound:
+        return banner("bad", "None calibrated", headline, after)
+    if refused or doubts:
+        word = "Some refused" if refused else "Some doubtful"
+        return banner("attention", word, headline, after)
+    return banner("good", "All calibrated", headline, after)
 
 
 def _parameters(tools: SoundTools) -> list[Parameter]:
@@ -183,19 +168,16 @@ def _parameters(tools: SoundTools) -> list[Parameter]:
     kinds = _kinds(tools)
     nominal = _nominal(tools, kinds)
     for name in tools.names:
-        triad = next((t for t in TRIADS if name.startswith(f"{t}_")), "")
-        rest = name.removeprefix(f"{triad}_")
-        if not triad or f"{name}_sd" not in tools.names:
+        triad, _, rest = name.partition("_")
+        if triad not in TRIADS or f"{name}_sd" not in tools.names:
             continue
         every, spread = _comparable(tools, triad, rest), tools.numbers(f"{name}_sd")
-        for kind, which in kinds.items() if triad != TRIADS[0] else [("", slice(None))]:
-            values, sd = (np.full(tools.count, np.nan) for _ in range(2))
-            values[which], sd[which] = every[which], spread[which]
-            if np.isnan(values).all():
-                continue
-            unit, factor = _unit(rest, triad, bool(kind), nominal)
-            middle = float(np.nanmedian(sd)) * factor if not np.isnan(sd).all() else float("nan")
-            parameters.append(Parameter(triad, kind, _title(rest), unit, values * factor, middle))
+        for kind, which in kinds.items() if triad == TRIADS[1] else [("", True)]:
+            values, sd = (np.where(which, v, np.nan) for v in (every, spread))
+            if not np.isnan(values).all():
+                unit, factor = _unit(rest, triad, bool(kind), nominal)
+                each = Parameter(triad, kind, _title(rest), unit, values * factor, sd * factor)
+                parameters.append(each)
     return sorted(parameters, key=lambda each: each.sensors)
 
 
@@ -261,29 +243,26 @@ def _figures(
 ) -> dict[str, Figure]:
     """Distributions of the parameters, and of residuals, noise and accuracy."""
     triads = dict.fromkeys(p.triad for p in parameters)
-    residuals = {
-        f"{triad} s": np.sqrt(tools.numbers(f"{triad}_variance_factor"))
-        for triad in triads
-        if triad not in estimated
-    }
-    panels = [("residuals ÷ what noise alone would give, s", "s", residuals)]
-    panels = panels if residuals else []
+    declared = [triad for triad in triads if triad not in estimated]
+    panels: list[Panel] = []
+    if declared:
+        s = {f"{triad} s": _residuals(tools, triad) for triad in declared}
+        panels.append(("residuals ÷ what noise alone would give, s", "s", s))
     panels += [_noise(tools, triad) for triad in triads if triad in estimated]
-    accuracy = {
-        angle: tools.numbers(f"{angle}_sd_deg")
-        for angle in ("inclination", "toolface", "azimuth")
-        if angle != "azimuth" or len(triads) > 1
-    }
+    angles = STATED_ANGLES[: 1 + len(triads)]
+    accuracy = {angle: tools.numbers(f"{angle}_sd_deg") for angle in angles}
     panels.append(("1σ of the calibration at 45°", "1σ, °", accuracy))
     steady = [p for p in parameters if "τ" not in p.title]
-    return {
-        "parameters": fleet_plots.parameters(steady),
-        "quality": fleet_plots.quality(panels),
-    }
+    return {"parameters": draw_parameters(steady), "quality": draw_quality(panels)}
 
 
-def _noise(tools: SoundTools, triad: str) -> tuple[str, str, dict[str, Array]]:
-    """The panel of a noise that each tool's residuals tell; of one kind of magnetometers."""
+def _residuals(tools: SoundTools, triad: str) -> Array:
+    """Residuals of a triad divided by what noise alone would give."""
+    return np.sqrt(tools.numbers(f"{triad}_variance_factor"))
+
+
+def _noise(tools: SoundTools, triad: str) -> Panel:
+    """The panel of the noise estimated from each tool's residuals; of one kind of magnetometers."""
     values = tools.numbers(f"{triad}_noise")
     title = f"{triad}: estimated noise"
     if triad == TRIADS[0]:
@@ -294,29 +273,22 @@ def _noise(tools: SoundTools, triad: str) -> tuple[str, str, dict[str, Array]]:
     return title, "1σ of the field" if relative else "1σ, nT", {triad: values[which]}
 
 
-def _outliers(tools: SoundTools, parameters: list[Parameter]) -> list[Outlier]:
-    """Tools of which some parameter is far from the fleet's, the farthest first."""
+def _outliers(
+    tools: SoundTools, parameters: list[Parameter]
+) -> list[tuple[Any, Parameter, float, float]]:
+    """Tools far from the fleet: serial, farthest parameter, value, distance; the farthest first."""
     if tools.count < FEWEST:
         return []
-    distance, which = np.zeros(tools.count), np.zeros(tools.count, int)
+    farthest, which = np.zeros(tools.count), np.zeros(tools.count, int)
     for index, each in enumerate(parameters):
-        away = fleet_plots.distance(each.values)
-        which = np.where(away > distance, index, which)
-        distance = np.fmax(away, distance)
-    far = np.argsort(-distance, kind="stable")[: int(np.sum(distance > FAR))]
-    serials = tools.words(SERIAL)
-    return [
-        Outlier(
-            serial=serials[place],
-            title=f"{each.sensors} {each.title}",
-            value=float(each.values[place]),
-            median=float(np.nanmedian(each.values)),
-            unit=each.unit,
-            distance=float(distance[place]),
-        )
-        for place in far
-        for each in [parameters[which[place]]]
-    ]
+        away = distance(each.values)
+        which = np.where(away > farthest, index, which)
+        farthest = np.fmax(away, farthest)
+    serials, outliers = tools.words(SERIAL), []
+    for i in np.argsort(-farthest, kind="stable")[: int(np.sum(farthest > FAR))]:
+        each = parameters[which[i]]
+        outliers.append((serials[i], each, float(each.values[i]), float(farthest[i])))
+    return outliers
 
 
 def _suspects(tools: SoundTools) -> list[tuple[Any, str, float]]:
@@ -324,6 +296,83 @@ def _suspects(tools: SoundTools) -> list[tuple[Any, str, float]]:
     serials, suspects = tools.words(SERIAL), []
     for triad in TRIADS:
         if f"{triad}_variance_factor" in tools.names:
-            s = np.sqrt(tools.numbers(f"{triad}_variance_factor"))
+            s = _residuals(tools, triad)
             suspects += [(serials[i], triad, float(s[i])) for i in np.flatnonzero(s > NOISE_RATIO)]
     return sorted(suspects, key=lambda row: -row[2])
+
+
+def distance(values: Array) -> Array:
+    """Robust standard deviations (n,) from the median; 0 for few values, or where most are equal."""
+    if np.sum(~np.isnan(values)) < FEWEST:
+        return np.zeros(len(values))
+    away = np.abs(values - np.nanmedian(values))
+    spread = SPREAD * np.nanmedian(away)
+    return away / spread if spread > 0 else np.zeros(len(values))
+
+
+@plots.styled
+def draw_parameters(parameters: Sequence[Parameter]) -> Figure:
+    """Number of tools by value of each steady parameter: a row of panels for each triad."""
+    lines = _lines(parameters)
+    figure = plots.new_figure("Distributions of the fleet's parameters", 2.1 * len(lines))
+    columns = max(len(line) for line in lines)
+    grid = figure.subplots(len(lines), columns, squeeze=False)
+    for row, line in zip(grid, lines, strict=True):
+        row[0].set_ylabel("tools")
+        for axes in row[len(line) :]:
+            axes.set_axis_off()
+        for axes, (title, members) in zip(row, line, strict=False):
+            axes.set(title=title, xlabel=members[0].unit or "share of nominal")
+            _steps(axes, {m.title.partition(" ")[2]: m.values for m in members})
+            axes.locator_params(axis="x", nbins=TICKS // columns)
+    return figure
+
+
+def _lines(parameters: Sequence[Parameter]) -> list[list[tuple[str, list[Parameter]]]]:
+    """Panels in rows, each row of one triad: title and parameters of a panel."""
+    triads: dict[str, dict[str, list[Parameter]]] = {}
+    for each in parameters:
+        kind, _, axes = each.title.partition(" ")
+        if kind in OWN_OR_CROSS:
+            kind = f"{'own' if len(set(axes)) == 1 else 'cross'}-axis {kind}"
+        triad = each.kind or each.triad
+        title = f"{triad}: {kind}"
+        triads.setdefault(triad, {}).setdefault(title, []).append(each)
+    return [
+        list(panels.items())[first : first + ABREAST]
+        for panels in triads.values()
+        for first in range(0, len(panels), ABREAST)
+    ]
+
+
+@plots.styled
+def draw_quality(panels: Sequence[Panel]) -> Figure:
+    """Number of tools by residuals over noise or by noise, and by 1σ of each angle."""
+    figure = plots.new_figure("Distributions of residuals and accuracy", 2.2)
+    row = figure.subplots(1, len(panels), squeeze=False)[0]
+    row[0].set_ylabel("tools")
+    for axes, (title, label, series) in zip(row, panels, strict=True):
+        axes.set(title=title, xlabel=label)
+        axes.locator_params(axis="x", nbins=TICKS // len(panels))
+        _steps(axes, series, abreast=3 if len(panels) < 3 else 1)
+    return figure
+
+
+def _steps(axes: Axes, series: Mapping[str, Array], abreast: int = 3) -> None:
+    """Step histograms over common bins, each with its own colour and dash; so many names in a line."""
+    usable = {name: values[np.isfinite(values)] for name, values in series.items()}
+    usable = {name: values for name, values in usable.items() if values.size}
+    if not usable:
+        axes.text(0.5, 0.5, "undetermined", ha="center", va="center", transform=axes.transAxes)
+        return
+    every = np.concatenate([values[distance(values) <= FAR] for values in usable.values()])
+    low, high = every.min(), every.max()
+    margin = 0.05 * (high - low) or max(abs(high), 1e-9) * 1e-3
+    most = max(values.size for values in usable.values())
+    edges = np.linspace(low - margin, high + margin, int(np.clip(most**0.5 / 2, *BINS)) + 1)
+    for (name, values), colour, dash in zip(usable.items(), COLOURS, DASHES, strict=False):
+        counts, _ = np.histogram(values, edges)
+        axes.stairs(counts, edges, label=name, color=colour, ls=dash, lw=1.0)
+    rows = -(-len(usable) // abreast)
+    axes.legend(ncols=abreast, loc="upper left", handlelength=2.2, columnspacing=1.0)
+    axes.set_ylim(bottom=0, top=axes.get_ylim()[1] * (1.1 + 0.15 * rows))

@@ -5,7 +5,6 @@ The table of calibrations is read column by column, whatever its length.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ import numpy as np
 from mwdcal.app.commands.choices import names
 from mwdcal.app.commands.options import Typed
 from mwdcal.app.pages.calibration import choices
+from mwdcal.app.pages.page import written
 from mwdcal.app.text import number, plural, table
 from mwdcal.calibration.readings import TRIADS
 from mwdcal.calibration.record import Choices, Finding
@@ -123,27 +123,23 @@ def _wide(whole: Any) -> list[str]:
 
 def stated_options(typed: Typed) -> dict[str, Any]:
     """The options of a fleet, under the names that a calibration file and the command have."""
-    also = Choices(
-        parameters=int(typed["parameters"] or 12),
-        ignore=list(names(typed["ignore"])),
-        robust=typed["robust"],
-        paper_weights=typed["paper_weights"],
-        prior=typed["prior"],
-    )
+    method, order = typed["method"], typed["order"]
     return {
-        "method": typed["method"],
-        "seed": typed["seed"] if typed["method"] == "swarm" else None,
+        "method": method,
+        "seed": typed["seed"] if method == "swarm" else None,
         "model": typed["model"],
-        "order": typed["order"] if typed["order"] == "auto" else int(typed["order"]),
+        "order": order if order == "auto" else int(order),
         "nonlinearity": typed["nonlinearity"],
         "estimate": list(names(typed["estimate"])),
-        **msgspec.to_builtins(also),
+        "parameters": int(typed["parameters"] or 12),
+        "ignore": list(names(typed["ignore"])),
+        **{name: typed[name] for name in ("robust", "paper_weights", "prior")},
     }
 
 
-def unusual(options: Mapping[str, Any]) -> list[str]:
+def unusual(options: dict[str, Any]) -> list[str]:
     """What was asked for beyond method and order, in words."""
-    also = Choices(**{name: options[name] for name in Choices.__struct_fields__})
+    also = msgspec.convert(options, Choices)
     terms, stand = options["nonlinearity"], " and ".join(options["estimate"])
     return [
         *([f"model {options['model']}"] if options["model"] else []),
@@ -176,10 +172,9 @@ def _kinds(head: Any) -> list[StatusCount]:
     counted = status.value_counts().to_pylist()
     kinds = []
     for each in sorted(counted, key=lambda c: (c["values"] != OK, -c["counts"])):
-        tools = head.filter(compute.equal(status, each["values"])).slice(0, SHOWN).to_pydict()
-        kinds.append(
-            StatusCount(each["values"], each["counts"], tools[SERIAL], tools["message"][0])
-        )
+        name, count = each["values"], each["counts"]
+        tools = head.filter(compute.equal(status, name)).slice(0, SHOWN).to_pydict()
+        kinds.append(StatusCount(name, count, tools[SERIAL], tools["message"][0]))
     return kinds
 
 
@@ -194,9 +189,7 @@ def _findings(head: Any) -> list[FindingCount]:
         tools = tool[ids.indices.to_numpy() == code]
         serials = head.column(SERIAL).take(arrow.array(tools[:SHOWN])).to_pylist()
         findings.append(FindingCount(name, len(tools), serials))
-    return sorted(
-        findings, key=lambda finding: (not is_doubt(finding.id), -finding.tools, finding.id)
-    )
+    return sorted(findings, key=lambda f: (not is_doubt(f.id), -f.tools, f.id))
 
 
 def is_doubt(finding: str) -> bool:
@@ -216,11 +209,10 @@ def _orders(whole: Any, columns: list[str]) -> dict[str, dict[str, int]]:
 
 def _nonlinear(whole: Any, columns: list[str]) -> dict[str, int]:
     """Tools by triad that have own-axis terms, where they may."""
-    radii = {triad: f"{triad}_radius" for triad in TRIADS}
     return {
-        triad: int(np.sum(~np.isnan(numbers(whole, radius))))
-        for triad, radius in radii.items()
-        if radius in columns
+        triad: int(np.sum(~np.isnan(numbers(whole, f"{triad}_radius"))))
+        for triad in TRIADS
+        if f"{triad}_radius" in columns
     }
 
 
@@ -229,10 +221,10 @@ def _undetermined(whole: Any, columns: list[str]) -> dict[str, int]:
     counts: dict[str, int] = {}
     for name in columns:
         if name.endswith("_undetermined"):
-            cells = whole.read([name]).column(0)
-            for each in cells.combine_chunks().flatten().value_counts().to_pylist():
-                value, count = each["values"], each["counts"]
-                counts[f"{name.removesuffix('_undetermined')}: {value}"] = count
+            cells = whole.read([name]).column(0).combine_chunks().flatten()
+            for each in cells.value_counts().to_pylist():
+                direction = f"{name.removesuffix('_undetermined')}: {each['values']}"
+                counts[direction] = each["counts"]
     return counts
 
 
@@ -247,44 +239,46 @@ def document(summary: FleetSummary, report: Path | None) -> dict[str, Any]:
 
 def text(summary: FleetSummary, report: Path | None) -> str:
     """The summary for people: about one screen."""
-    heading = (
-        f"{summary.runs}   {plural(summary.tools, 'tool')}   {plural(summary.stations, 'station')}   "
-        f"method {summary.method}   order {summary.order}"
-    )
-    also = unusual(summary.options)
     rows = [[k.status, str(k.tools), "" if k.status == OK else _first(k)] for k in summary.statuses]
-    lines = [heading, *(["options: " + ", ".join(also)] if also else []), ""]
-    lines += [table(rows, ["status", "tools", "serials"])]
-    refused = [kind for kind in summary.statuses if kind.status != OK]
-    lines += [f"! {kind.status}, for example: {kind.message}" for kind in refused]
-    lines += [
-        f"! {finding.id} in {plural(finding.tools, 'tool')}: {_first(finding)}"
-        for finding in summary.findings
-    ]
-    spread = [
-        [_title(name), *(number(v) for v in values)]
-        for name, values in summary.spread.items()
-        if values
-    ]
+    statuses = [table(rows, ["status", "tools", "serials"]), *_doubts(summary)]
+    spread = [[_title(n), *map(number, values)] for n, values in summary.spread.items() if values]
+    blocks = [_heading(summary), "\n".join(statuses)]
     if spread:
-        lines += ["", table(spread, ["of sound tools", "1 %", "median", "99 %"])]
+        blocks.append(table(spread, ["of sound tools", "1 %", "median", "99 %"]))
     if summary.orders:
-        header, body = orders_table(summary)
-        lines += ["", table(body, header)]
-    for name, count in summary.nonlinear.items():
-        lines.append(f"own-axis terms in {plural(count, 'tool')}: {name}")
-    for name, count in summary.undetermined.items():
-        lines.append(f"undetermined in {plural(count, 'tool')}: {name}")
-    lines += [f"! {note}" for note in summary.notes]
-    rate = summary.tools / summary.seconds
-    wrote = f"wrote {summary.output} (calibrations)" + (f"   {report} (report)" if report else "")
-    return "\n".join([*lines, "", f"{wrote}   {summary.seconds:.1f} s, {rate:.0f} tools/s"])
+        orders = [[triad, *map(str, counts.values())] for triad, counts in summary.orders.items()]
+        blocks.append(table(orders, ["tools of order", *map(str, range(HIGHEST + 1))]))
+    rate = f"{summary.seconds:.1f} s, {summary.tools / summary.seconds:.0f} tools/s"
+    files = written(calibrations=summary.output, report=report)
+    return "\n".join(["\n\n".join(blocks), *_remarks(summary), "", f"{files}   {rate}"])
 
 
-def orders_table(summary: FleetSummary) -> tuple[list[str], list[list[str]]]:
-    """Header and rows of the tools by chosen order, a triad in each row."""
-    header = ["tools of order", *map(str, range(HIGHEST + 1))]
-    return header, [[triad, *map(str, counts.values())] for triad, counts in summary.orders.items()]
+def _heading(summary: FleetSummary) -> str:
+    """What was calibrated, and how."""
+    counts = [plural(summary.tools, "tool"), plural(summary.stations, "station")]
+    how = [f"method {summary.method}", f"order {summary.order}"]
+    also = unusual(summary.options)
+    options = f"\noptions: {', '.join(also)}" if also else ""
+    return "   ".join([summary.runs, *counts, *how]) + options
+
+
+def _doubts(summary: FleetSummary) -> list[str]:
+    """Why tools were refused, and findings of the others."""
+    refused = [kind for kind in summary.statuses if kind.status != OK]
+    return [
+        *(f"! {kind.status}, for example: {kind.message}" for kind in refused),
+        *(f"! {f.id} in {plural(f.tools, 'tool')}: {_first(f)}" for f in summary.findings),
+    ]
+
+
+def _remarks(summary: FleetSummary) -> list[str]:
+    """Own-axis terms, what is undetermined, and notes."""
+    nonlinear, undetermined = summary.nonlinear.items(), summary.undetermined.items()
+    return [
+        *(f"own-axis terms in {plural(count, 'tool')}: {name}" for name, count in nonlinear),
+        *(f"undetermined in {plural(count, 'tool')}: {name}" for name, count in undetermined),
+        *(f"! {note}" for note in summary.notes),
+    ]
 
 
 def _first(some: StatusCount | FindingCount) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,10 +10,9 @@ import msgspec
 import numpy as np
 
 from mwdcal import __version__
-from mwdcal.app.pages.page import environment
+from mwdcal.app.pages.page import channels_of, environment, written
 from mwdcal.app.text import plural, table
 from mwdcal.calibration.readings import SIMULATED
-from mwdcal.files.contract import CHANNELS
 from mwdcal.logs.noise import ChannelNoise, Noise, Term
 from mwdcal.use import plots
 
@@ -21,23 +20,19 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-TERM_ROWS = {
-    "white": ("white noise N", "·√s"),
-    "quantisation": ("quantisation Q", "·s"),
-    "bias-instability": ("bias instability B", ""),
-    "random-walk": ("random walk K", "/√s"),
-    "drift": ("drift R", "/h"),
+TERMS = {
+    "white": "white noise N, ·√s",
+    "quantisation": "quantisation Q, ·s",
+    "bias-instability": "bias instability B",
+    "random-walk": "random walk K, /√s",
+    "drift": "drift R, /h",
 }
 """Terms as the tables call them, with what follows the unit of the channel."""
 HOUR = 3600.0
-Line = tuple[str, list[str]]
-"""A row of a table: what, and a cell for each channel."""
-AXIS_LOOKS = {
-    "x": (plots.AXES["x"], "o", "-"),
-    "y": (plots.AXES["y"], "s", (0, (5, 1.5))),
-    "z": (plots.AXES["z"], "^", (0, (1.5, 1.2))),
-}
-"""Colour, marker and line style of each axis."""
+Table = tuple[list[str], list[list[str]]]
+"""Titles of the channels, and rows: what each is, then a cell for each channel."""
+MARKERS = {"x": "o", "y": "s", "z": "^"}
+"""Markers of the channels of a triad."""
 DISPLAY_UNITS = {"g": ("µg", 1e6), "nT": ("nT", 1.0)}
 """How physical units are written, and their number in one of them."""
 MARK = " (!)"
@@ -51,16 +46,15 @@ def document(noise: Noise, plot: Path | None, report: Path | None) -> dict[str, 
 
 def screen(noise: Noise, plot: Path | None, report: Path | None) -> str:
     """The result for people."""
-    parts = ["   ".join(heading(noise)), ""]
-    for header, lines in tables(noise):
-        parts += [table([[what, *cells] for what, cells in lines], ["", *header]), ""]
-    parts += [
+    blocks = [
+        "   ".join(heading(noise)),
+        *(table(rows, ["", *header]) for header, rows in tables(noise)),
         "± 1σ; < bound of 95 %, where the log does not show the term. For the tool profile:",
-        "",
         profile_lines(noise),
     ]
-    files = [f"{path} ({what})" for path, what in ((plot, "picture"), (report, "report")) if path]
-    return "\n".join(parts) + (f"\n\nwrote {'   '.join(files)}" if files else "")
+    if plot or report:
+        blocks.append(written(picture=plot, report=report))
+    return "\n\n".join(blocks)
 
 
 def heading(noise: Noise) -> list[str]:
@@ -76,54 +70,49 @@ def heading(noise: Noise) -> list[str]:
     ]
 
 
-def tables(noise: Noise) -> list[tuple[list[str], list[Line]]]:
-    """Header and rows of the noise terms: of all channels, raw, and of those with a scale in g and nT."""
-    scaled_channels = {n: c for n, c in noise.channels.items() if c.scale is not None}
-    return [
-        _terms(noise, channels, physical)
-        for channels, physical in ((noise.channels, False), (scaled_channels, True))
-        if channels
-    ]
+def tables(noise: Noise) -> list[Table]:
+    """The noise terms of all channels, raw, and of those with a scale in g and nT."""
+    physical = {name: c for name, c in noise.channels.items() if c.scale is not None}
+    whole = [_table(noise, noise.channels, _powers)]
+    return [*whole, _table(noise, physical, scaled)] if physical else whole
 
 
-def _terms(
-    noise: Noise, channels: Mapping[str, ChannelNoise], physical: bool
-) -> tuple[list[str], list[Line]]:
-    units = [scaled(c) if physical else _powers(c) for c in channels.values()]
-    pairs = [(c, factor) for c, (_, factor) in zip(channels.values(), units, strict=True)]
-    lines: list[Line] = []
-    for name, (what, unit) in TERM_ROWS.items():
-        per = HOUR if name == "drift" else 1.0
-        cells = [
-            _term(c.terms[name], factor * per, bool({*c.doubts} - {"slow"})) for c, factor in pairs
-        ]
-        lines.append((_label(what, unit), cells))
-    density = [
-        "–" if c.white_density is None else _number(c.white_density * factor) for c, factor in pairs
-    ]
-    lines.insert(1, (_label("its one-sided density", "/√Hz"), density))
-    station = [_number(c.station.noise * factor) for c, factor in pairs]
-    limits = ["?" if c.doubts else _limits(c, factor) for c, factor in pairs]
-    lines.append((f"one station of {noise.station_seconds:.3g} s, 1σ", station))
-    lines.append(("its 95 % interval", limits))
-    if any(c.doubts for c, _ in pairs):
-        lines.append(("does not hold" + MARK, [", ".join(c.doubts) for c, _ in pairs]))
-    named = zip(channels.items(), units, strict=True)
-    return [f"{marked(name, c)}, {unit}" for (name, c), (unit, _) in named], lines
+def _table(
+    noise: Noise,
+    channels: Mapping[str, ChannelNoise],
+    unit_of: Callable[[ChannelNoise], tuple[str, float]],
+) -> Table:
+    """Terms of some channels, each in its own unit."""
+    header, columns = [], []
+    for name, channel in channels.items():
+        unit, factor = unit_of(channel)
+        header.append(f"{marked(name, channel)}, {unit}")
+        columns.append(_cells(channel, factor))
+    white, *others = TERMS.values()
+    station = f"one station of {noise.station_seconds:.3g} s, 1σ"
+    titles = [white, "its one-sided density, /√Hz", *others, station, "its 95 % interval"]
+    rows = [list(row) for row in zip(titles, *columns, strict=True)]
+    doubts = [", ".join(channel.doubts) for channel in channels.values()]
+    return header, [*rows, ["does not hold" + MARK, *doubts]] if any(doubts) else rows
 
 
-def _limits(channel: ChannelNoise, factor: float) -> str:
-    return f"{_number(channel.station.lower * factor)}…{_number(channel.station.upper * factor)}"
+def _cells(channel: ChannelNoise, factor: float) -> list[str]:
+    """What the table says of a channel of which a raw unit is `factor` shown ones."""
+    doubtful = bool({*channel.doubts} - {"slow"})
+    white, *others = (
+        _term(channel.terms[name], factor * (HOUR if name == "drift" else 1.0), doubtful)
+        for name in TERMS
+    )
+    density = "–" if channel.white_density is None else _number(channel.white_density * factor)
+    limits = (_number(end * factor) for end in (channel.station.lower, channel.station.upper))
+    interval = "?" if channel.doubts else "…".join(limits)
+    return [white, density, *others, _number(channel.station.noise * factor), interval]
 
 
 def _powers(channel: ChannelNoise) -> tuple[str, float]:
     """The raw unit in the power of a thousand that suits a station, and its number in one."""
     power = 3 * int(np.floor(np.log10(channel.station.noise) / 3))
     return f"1e{power} raw" if power else "raw", 10.0**-power
-
-
-def _label(what: str, unit: str) -> str:
-    return f"{what}, {unit}" if unit else what
 
 
 def _term(term: Term, factor: float, doubtful: bool) -> str:
@@ -142,19 +131,14 @@ def _number(value: float, digits: int = 3) -> str:
 def profile_lines(noise: Noise) -> str:
     """The lines of a tool profile (TOML) that this log recommends, or in a comment why not."""
     lines = []
-    for kind, names in CHANNELS.items():
+    seconds = f"{noise.station_seconds:.3g} s"
+    for kind, names in channels_of(noise.channels).items():
         if kind in noise.withheld:
             lines.append(f"# [{kind}] no noise from {noise.log}: {noise.withheld[kind]}")
-        if kind not in noise.profile:
-            continue
-        each = [
-            f"{n} {_number(noise.channels[n].station.noise)}" for n in names if n in noise.channels
-        ]
-        lines += [
-            f"[{kind}]",
-            f"noise = {noise.profile[kind]:.3g}   # raw, 1 sigma of one station of "
-            f"{noise.station_seconds:.3g} s; {', '.join(each)}; from {noise.log}",
-        ]
+        if kind in noise.profile:
+            each = ", ".join(f"{n} {_number(noise.channels[n].station.noise)}" for n in names)
+            remark = f"raw, 1 sigma of one station of {seconds}; {each}; from {noise.log}"
+            lines += [f"[{kind}]", f"noise = {noise.profile[kind]:.3g}   # {remark}"]
     return "\n".join(lines)
 
 
@@ -168,15 +152,9 @@ def render(noise: Noise) -> str:
         figure=figure(noise),
         tables=tables(noise),
         toml=profile_lines(noise),
-        deviations={name: _deviations(channel) for name, channel in noise.channels.items()},
+        rounded=_number,
         version=__version__,
     )
-
-
-def _deviations(channel: ChannelNoise) -> list[list[str]]:
-    columns = (channel.tau_s, channel.deviation, channel.lower, channel.upper)
-    rows = zip(*columns, channel.fitted, channel.freedom, strict=True)
-    return [[_number(value, 4) for value in row] for row in rows]
 
 
 def marked(name: str, channel: ChannelNoise) -> str:
@@ -195,43 +173,22 @@ def scaled(channel: ChannelNoise) -> tuple[str, float]:
 @plots.styled
 def figure(noise: Noise) -> Figure:
     """One panel for each triad of the log."""
-    triads = [
-        (kind, [name for name in names if name in noise.channels])
-        for kind, names in CHANNELS.items()
-        if any(name in noise.channels for name in names)
-    ]
+    triads = channels_of(noise.channels)
     figure = plots.new_figure("Allan deviation of every channel over averaging time", 3.5)
     simulated = f"   {SIMULATED}" if noise.simulated else ""
     figure.suptitle(f"{noise.log}, {noise.seconds:.4g} s{simulated}", fontsize=8)
-    panels = figure.subplots(1, max(len(triads), 1), squeeze=False)[0]
-    for axes, (kind, names) in zip(panels, triads, strict=True):
+    panels = figure.subplots(1, len(triads), squeeze=False)[0]
+    modified = "" if noise.kind == "overlapping" else "modified "
+    for axes, (kind, names) in zip(panels, triads.items(), strict=True):
         _draw(axes, noise, names)
-        unit = scaled(noise.channels[names[0]])[0]
-        axes.set_ylabel(f"{kind}, {'' if noise.kind == 'overlapping' else 'modified '}σ(τ), {unit}")
+        axes.set_ylabel(f"{kind}, {modified}σ(τ), {scaled(noise.channels[names[0]])[0]}")
     return figure
 
 
 def _draw(axes: Axes, noise: Noise, names: list[str]) -> None:
+    """The channels of a triad over the averaging time, and the duration of a station."""
     for name in names:
-        channel = noise.channels[name]
-        colour, marker, line = AXIS_LOOKS[name[-1]]
-        factor, tau = scaled(channel)[1], np.array(channel.tau_s)
-        low, middle, high, fitted = (
-            np.array(v) * factor
-            for v in (channel.lower, channel.deviation, channel.upper, channel.fitted)
-        )
-        axes.fill_between(tau, low, high, color=colour, alpha=0.13, lw=0)
-        axes.plot(
-            tau,
-            middle,
-            marker,
-            color=colour,
-            ms=3.6,
-            mfc="white",
-            mew=0.9,
-            label=marked(name, channel),
-        )
-        axes.plot(tau, fitted, color=colour, ls=line, lw=1.0, label=f"{name}, terms")
+        _draw_channel(axes, name, noise.channels[name])
     axes.axvline(noise.station_seconds, color=plots.BEFORE, lw=0.7, ls=(0, (4, 3)))
     axes.annotate(
         f"station, {noise.station_seconds:.3g} s", (noise.station_seconds, 1.0), (-2, -2), rotation=90,
@@ -245,3 +202,16 @@ def _draw(axes: Axes, noise: Noise, names: list[str]) -> None:
     axes.grid(which="minor", lw=0.25)
     handles, labels = axes.get_legend_handles_labels()
     axes.legend(handles, labels, ncols=len(names), loc="upper center", bbox_to_anchor=(0.5, 1.17))
+
+
+def _draw_channel(axes: Axes, name: str, channel: ChannelNoise) -> None:
+    """Deviations with their band, and the terms as fitted."""
+    axis = name[-1]
+    colour, marker, line = plots.AXES[axis], MARKERS[axis], plots.LINES[axis]
+    factor, tau = scaled(channel)[1], np.array(channel.tau_s)
+    columns = (channel.lower, channel.deviation, channel.upper, channel.fitted)
+    low, middle, high, fitted = (np.array(column) * factor for column in columns)
+    look: dict[str, Any] = {"ms": 3.6, "mfc": "white", "mew": 0.9, "label": marked(name, channel)}
+    axes.fill_between(tau, low, high, color=colour, alpha=0.13, lw=0)
+    axes.plot(tau, middle, marker, color=colour, **look)
+    axes.plot(tau, fitted, color=colour, ls=line, lw=1.0, label=f"{name}, terms")

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from mwdcal.app.pages import pictures
-from mwdcal.app.text import chance, plural, superscript
+from mwdcal.app.text import chance, plural, raised, superscript
+from mwdcal.files.contract import CHANNELS
 from mwdcal.geometry.vectors import Array
 
 if TYPE_CHECKING:
@@ -16,6 +18,8 @@ if TYPE_CHECKING:
 
 HELD = "held"
 """In place of the uncertainty of a parameter that a model of 9 or 6 keeps at zero."""
+UNDETERMINED = "undetermined"
+"""In place of an uncertainty that no reading determines."""
 
 
 def is_held(value: float, uncertainty: float | None) -> bool:
@@ -35,16 +39,9 @@ def environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {
-        "number": number,
-        "signed": signed,
-        "fixed": fixed,
-        "css": css_string,
-        "svg": pictures.svg,
-        "plural": plural,
-        "unit": unit,
-        "chance": chance,
-    }
+    filters = (number, signed, fixed, measured, uncertainty, unit, raised, chance, plural, capital)
+    environment.filters |= {function.__name__: function for function in filters}
+    environment.filters |= {"css": css_string, "svg": pictures.svg}
     return environment
 
 
@@ -77,7 +74,7 @@ def signed(value: float | None, decimals: int) -> str:
 def measured(value: float, uncertainty: float | None) -> tuple[str, str]:
     """Value and standard uncertainty as text, both to two significant digits of the latter."""
     if uncertainty is None or not np.isfinite(uncertainty):
-        return number(value, 6), "undetermined"
+        return number(value, 6), UNDETERMINED
     if uncertainty == 0:
         return number(value, 9), "0"
     decimals = 1 - exponent(uncertainty)
@@ -96,15 +93,45 @@ def exponent(value: float) -> int:
 
 
 def factor_places(
-    values: Mapping[str, Array],
-) -> Iterator[tuple[str, tuple[int, int], str, int]]:
-    """Name, index, axes and power of τ of each factor; the diagonal of m is not one."""
+    values: Mapping[str, Array], strength: str, one: str = ""
+) -> Iterator[tuple[str, tuple[int, int], str, int, str]]:
+    """Name, index, axes, power of τ and unit of each factor; the diagonal of m is not one.
+
+    `strength` is the unit of the field, empty if it has none, and `one` stands for no unit.
+    """
+    units = {"SF": f"raw/{strength}" if strength else "raw", "B": strength or one, "m": one}
     for name, value in values.items():
         for i, j in np.ndindex(value.shape):
             if name != "m":
-                yield name, (i, j), "xyz"[i], j
+                yield name, (i, j), "xyz"[i], j, units[name] + raised("/°C", j)
             elif i != j:
-                yield name, (i, j), "xyz"[i] + "xyz"[j], 0
+                yield name, (i, j), "xyz"[i] + "xyz"[j], 0, units[name]
+
+
+def uncertainty(value: float | None) -> str:
+    """A standard uncertainty to two digits, or that it is undetermined."""
+    return UNDETERMINED if value is None or np.isnan(value) else number(value, 2)
+
+
+def channels_of(names: Collection[str]) -> dict[str, list[str]]:
+    """The channels among some names, by triad."""
+    triads = {kind: [n for n in channels if n in names] for kind, channels in CHANNELS.items()}
+    return {kind: channels for kind, channels in triads.items() if channels}
+
+
+def capital(text: str) -> str:
+    """Text as the start of a sentence."""
+    return text[:1].upper() + text[1:]
+
+
+def written(**files: Path | str | None) -> str:
+    """The files that were written, each with what it is."""
+    return "wrote " + "   ".join(f"{path} ({what})" for what, path in files.items() if path)
+
+
+def banner(level: str, word: str, headline: str, after: str) -> dict[str, str]:
+    """The outcome on top of a page: level (good, attention, bad), word, headline, second line."""
+    return {"level": level, "word": word, "headline": headline, "after": after}
 
 
 def unit(symbol: str) -> str:

@@ -30,7 +30,12 @@ def require(what: str, *libraries: str) -> None:
 
 def picture(figure: Figure, path: Path) -> bytes:
     """The figure as PNG or SVG, by the suffix; the same figure, the same bytes."""
-    kind, stream = path.suffix.lower()[1:], io.BytesIO()
+    return _drawn(figure, path.suffix.lower()[1:])
+
+
+def _drawn(figure: Figure, kind: str) -> bytes:
+    """The figure without the time and the program that drew it."""
+    stream = io.BytesIO()
     nothing = {"Software": None} if kind == "png" else {"Date": None, "Creator": None}
     with style():
         figure.savefig(stream, format=kind, dpi=160, metadata=nothing)
@@ -41,12 +46,7 @@ def svg(figure: Figure, key: str) -> Markup:
     """An element to put into HTML: no prologue, no names of schemas, ids that start with `key`."""
     from markupsafe import Markup
 
-    stream = io.StringIO()
-    with style():
-        nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
-        figure.savefig(stream, format="svg", metadata=nothing)
-    text = stream.getvalue()
-    text = text[text.index("<svg") :]
+    text = "<svg" + _drawn(figure, "svg").decode().partition("<svg")[2]
     text = re.sub(
         r"<!--.*?-->\s*|<metadata>.*?</metadata>\s*|<style.*?</style>\s*", "", text, flags=re.DOTALL
     )

@@ -11,35 +11,24 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mwdcal.app.pages.calibration import choices, known_inclinations
-from mwdcal.app.pages.calibration import model as model_of
-from mwdcal.app.pages.page import (
-    HELD,
-    environment,
-    exponent,
-    factor_places,
-    fixed,
-    is_held,
-    measured,
-    number,
-    unit,
-)
+from mwdcal.app.pages.calibration import how, known_inclinations
+from mwdcal.app.pages.page import HELD, banner, capital, environment, exponent, factor_places
 from mwdcal.app.text import plural, raised
 from mwdcal.calibration.prediction import accuracy_at, angles, middle_temperature
 from mwdcal.calibration.readings import is_simulated
-from mwdcal.calibration.record import Calibration, TriadCalibration
+from mwdcal.calibration.record import Calibration, Finding, TriadCalibration
 from mwdcal.errors import InputError
 from mwdcal.estimation.solvers import RANK_TOLERANCE
 from mwdcal.use import plots
 from mwdcal.use.notation import Notation, convert
-from mwdcal.use.plots import reshoot_limit
 
 if TYPE_CHECKING:
-    from mwdcal.calibration.record import Finding
     from mwdcal.use.verification import Verdict
 
 LONG_TABLE = 60
 """A run of more stations has its station table at the end, as an annex."""
+MAGNETIC = ("azimuth", "field", "dip")
+"""Observables that need a magnetometer."""
 ACCURACY_INCLINATIONS = (5.0, 45.0, 90.0)
 """Inclinations of the table of predicted accuracy, degrees."""
 
@@ -51,45 +40,36 @@ def render(calibration: Calibration, verdict: Verdict | None = None) -> str:
         cal=calibration,
         name=calibration.tool.get("serial") or calibration.profile.name,
         verdict=verdict,
-        banner=banner(calibration, verdict),
+        banner=outcome(calibration, verdict),
         findings=_findings(calibration, verdict),
         simulated=is_simulated(calibration.tool),
-        facts=_facts(calibration),
-        relative=calibration.relative,
-        figures=_figures(calibration),
-        compared=_compared(calibration),
-        judged=_judged(calibration),
-        limit=reshoot_limit(calibration),
+        inclinations=known_inclinations(calibration),
+        method="; ".join(how(calibration)),
+        magnetic=MAGNETIC,
+        limit=plots.reshoot_limit(calibration),
         decimals=_decimals(calibration),
-        left_out=any(row.errors_left_out for row in calibration.station_rows),
-        annex=len(calibration.station_rows) > LONG_TABLE,
+        long_table=LONG_TABLE,
         parameters=_parameters(calibration),
         held=HELD,
         accuracy=_accuracy(calibration),
-        budget=_budget(calibration),
         titles=plots.TITLES,
         tolerance=RANK_TOLERANCE,
-        earth=_earth(calibration),
         when=_when(calibration.time),
     )
 
 
-def banner(calibration: Calibration, verdict: Verdict | None) -> dict[str, str]:
-    """The outcome in plain words: level (good, attention, bad), word, headline, second line."""
+def outcome(calibration: Calibration, verdict: Verdict | None) -> dict[str, str]:
+    """The banner: the verdict, if there is one, and what came of the fit."""
     fit, level = _fit_outcome(calibration)
+    word = "OK" if level == "good" else "Attention"
     if verdict is None:
         after = "Not verified: run mwdcal verify on a roll test that was not used in the fit."
-        return _banner(level, fit, after)
+        return banner(level, word, fit, after)
     missed = sum(not row.passed for row in verdict.rows)
     count = plural(len(verdict.rows), "limit")
     if not verdict.passed:
-        return _banner("bad", f"Verification failed – {missed} of {count} not met", fit)
-    return _banner(level, f"Verification passed – {count} met", fit)
-
-
-def _banner(level: str, headline: str, after: str) -> dict[str, str]:
-    word = {"good": "OK", "attention": "Attention", "bad": "Failed"}[level]
-    return {"level": level, "word": word, "headline": headline, "after": after}
+        return banner("bad", "Failed", f"Verification failed – {missed} of {count} not met", fit)
+    return banner(level, word, f"Verification passed – {count} met", fit)
 
 
 def _fit_outcome(calibration: Calibration) -> tuple[str, str]:
@@ -106,7 +86,7 @@ def _fit_outcome(calibration: Calibration) -> tuple[str, str]:
     again = sum(row.reshoot for row in calibration.station_rows)
     if again:
         parts.append(f"{plural(again, 'station')} to re-shoot")
-    accepted = undetermined[0].upper() + undetermined[1:] if free else "Fit accepted"
+    accepted = capital(undetermined) if free else "Fit accepted"
     headline = "Fit doubtful" if doubts else accepted
     text = f"{headline} – {'; '.join(parts)}" if parts else headline
     return text, "attention" if parts or free else "good"
@@ -130,73 +110,6 @@ def _when(time: str) -> str:
         return time
 
 
-def _facts(calibration: Calibration) -> list[tuple[str, str]]:
-    """What was calibrated, with what."""
-    tool, profile = calibration.tool, calibration.profile
-    method = [calibration.method, model_of(calibration), *choices(calibration.options)]
-    facts = [
-        ("Tool", tool.get("serial") or "no serial given"),
-        ("Type", tool.get("tool", profile.name)),
-        ("Sensors", " and ".join(t.name for t in calibration.triads)),
-        ("Calibrated", _when(calibration.time)),
-        ("Measured", tool.get("date", "")),
-        ("Run file", calibration.run or "not named"),
-        ("Stations", _attitudes(calibration)),
-        ("Excluded", ", ".join(calibration.excluded)),
-        ("Temperature", _temperatures(calibration)),
-        ("Method", "; ".join(method)),
-        ("Stand", tool.get("stand", "")),
-        ("Laboratory", tool.get("lab", "")),
-        ("Operator", tool.get("operator", "")),
-    ]
-    return [(name, value) for name, value in facts if value]
-
-
-def _temperatures(calibration: Calibration) -> str:
-    if calibration.temperature_c is None:
-        return "not recorded"
-    low, high = (fixed(t, 1) for t in calibration.temperature_c)
-    return f"{low} °C" if low == high else f"{low} to {high} °C"
-
-
-def _attitudes(calibration: Calibration) -> str:
-    inclinations = known_inclinations(calibration)
-    if not inclinations:
-        return str(calibration.stations)
-    return f"{calibration.stations}, at inclinations {min(inclinations):.0f} to {max(inclinations):.0f}°"
-
-
-def _figures(calibration: Calibration) -> dict[str, Any]:
-    """Figures by name, and the observables that have none."""
-    names = [row.observable for row in calibration.errors]
-    missing = [
-        name
-        for name in plots.TITLES
-        if name not in names and (calibration.has_field or name not in ("azimuth", "field", "dip"))
-    ]
-    return {
-        "errors": {name: plots.station_errors(calibration, name) for name in names},
-        "missing": missing,
-        "deviations": calibration.plot.deviations(),
-        "orders": (
-            plots.order_errors(calibration.orders)
-            if _compared(calibration) and _judged(calibration)
-            else None
-        ),
-        "accuracy": calibration.plot.accuracy(),
-    }
-
-
-def _compared(calibration: Calibration) -> bool:
-    """Whether orders were compared, rather than one given."""
-    return not all(row.chosen for row in calibration.orders)
-
-
-def _judged(calibration: Calibration) -> bool:
-    """Whether some order was judged at temperatures left out."""
-    return any(row.ends is not None for row in calibration.orders)
-
-
 def _decimals(calibration: Calibration) -> dict[str, int]:
     """Decimals of the station table: two significant digits of what is left after the fit."""
     return {
@@ -205,57 +118,45 @@ def _decimals(calibration: Calibration) -> dict[str, int]:
     }
 
 
+Row = tuple[str, str, int, float, float | None, str]
+"""A parameter: name, axes, power of τ, value, 1σ and unit."""
+
+
 def _parameters(calibration: Calibration) -> dict[str, Any]:
-    """Parameters of each triad as rows: as factors of the raw channels where there are any."""
+    """Parameters of each triad: as factors of the raw channels where there are any."""
     try:
         notations = convert(calibration, "factors")
     except InputError:
-        tables = {triad.name: _own_rows(triad) for triad in calibration.triads}
-        return {"notation": "record", "tables": tables}
-    tables = {
-        triad.name: _factor_rows(triad, notations[triad.name]) for triad in calibration.triads
-    }
-    return {"notation": "factors", "tables": tables}
+        rows = {triad.name: _own_rows(triad) for triad in calibration.triads}
+        return {"notation": "record", "rows": rows}
+    rows = {triad.name: _factor_rows(triad, notations[triad.name]) for triad in calibration.triads}
+    return {"notation": "factors", "rows": rows}
 
 
-def _row(name: str, index: str, power: int, value: float, sd: float | None, symbol: str) -> Any:
-    shown, uncertainty = ("0", HELD) if is_held(value, sd) else measured(value, sd)
-    return {
-        "name": name,
-        "index": index,
-        "course": raised("τ", power),
-        "value": shown,
-        "sd": uncertainty,
-        "unit": symbol + raised("/°C", power),
-    }
-
-
-def _own_rows(triad: TriadCalibration) -> list[Any]:
+def _own_rows(triad: TriadCalibration) -> list[Row]:
     """The parameters of the record: tool axes, nominal units."""
-    columns = zip(
-        triad.parameter_names, triad.parameters, triad.standard_uncertainties, strict=True
-    )
+    columns = (triad.parameter_names, triad.parameters, triad.standard_uncertainties)
     rows = []
-    for full, value, sd in columns:
+    for full, value, sd in zip(*columns, strict=True):
         base, _, power = full.partition("·")
-        name, _, index = base.rpartition("-")
-        symbol = "1" if name in ("gain", "scale", "misalignment") else _unit(triad)
-        rows.append(_row(name, index, int(power or 0), value, sd, symbol))
+        name, _, axes = base.rpartition("-")
+        symbol = "1" if name in ("gain", "scale", "misalignment") else _unit(triad) or "1"
+        per = raised("/°C", int(power or 0))
+        rows.append((name, axes, int(power or 0), value, sd, symbol + per))
     return rows
+
+
+def _factor_rows(triad: TriadCalibration, factors: Notation) -> list[Row]:
+    values, sd = factors.values, factors.uncertainty
+    return [
+        (name, axes, power, float(values[name][at]), float(sd[name][at]), symbol)
+        for name, at, axes, power, symbol in factor_places(values, _unit(triad), "1")
+    ]
 
 
 def _unit(triad: TriadCalibration) -> str:
-    return triad.unit if triad.unit in ("g", "nT") else "1"
-
-
-def _factor_rows(triad: TriadCalibration, notation: Notation) -> list[Any]:
-    raw = "raw" if _unit(triad) == "1" else f"raw/{triad.unit}"
-    units = {"SF": raw, "B": _unit(triad), "m": "1"}
-    rows = []
-    for name, at, axes, power in factor_places(notation.values):
-        value, sd = (float(v[name][at]) for v in (notation.values, notation.uncertainty))
-        rows.append(_row(name, axes, power, value, sd, units[name]))
-    return rows
+    """The unit of a triad's field, empty if it has none."""
+    return triad.unit if triad.unit in ("g", "nT") else ""
 
 
 def _accuracy(calibration: Calibration) -> dict[str, Any]:
@@ -269,50 +170,6 @@ def _accuracy(calibration: Calibration) -> dict[str, Any]:
     for inclination, temperature in cases:
         at = [float(np.radians(inclination))]
         both = [accuracy_at(calibration, at, noise, temperature) for noise in (False, True)]
-        pairs = [[_degrees(sd[name][0]) for sd in both] for name in names]
-        rows.append({"inclination": inclination, "temperature": temperature, "pairs": pairs})
+        sd = [float(np.degrees(each[name][0])) for name in names for each in both]
+        rows.append((inclination, temperature, sd))
     return {"names": names, "rows": rows, "temperature": middle}
-
-
-def _budget(calibration: Calibration) -> list[dict[str, str]]:
-    """What the calibration's uncertainty consists of: a row for each source, degrees by angle."""
-    names = angles(calibration)
-    return [
-        {"source": row.source}
-        | {
-            name: "undetermined" if sd is None else number(sd, 2)
-            for name in names
-            for sd in [getattr(row, f"{name}_deg")]
-        }
-        for row in calibration.budget
-    ]
-
-
-def _degrees(angle: float) -> str:
-    return "undetermined" if np.isnan(angle) else number(float(np.degrees(angle)), 2)
-
-
-def _earth(calibration: Calibration) -> list[tuple[str, str, str]]:
-    """Gravity, field and dip of the run: name, value with unit, and where it comes from."""
-    estimated = {c.name: c for c in calibration.constants}
-    nanotesla = "" if calibration.relative else "nT"
-    keys = (("gravity", "gravity_g", "g"), ("field", "field", nanotesla), ("dip", "dip_deg", "°"))
-    rows = []
-    for name, key, symbol in keys:
-        if key not in calibration.earth:
-            continue
-        value, source = calibration.earth[key], "given"
-        text = f"{value:.7g}".replace("-", "−")
-        if name in estimated:
-            text, sd = measured(value, estimated[name].standard_uncertainty)
-            source = f"estimated from the run, 1σ {sd}{unit(symbol)}"
-        elif name == "field" and calibration.relative:
-            text, source = "1", "by convention: the strength is known at no station"
-        rows.append((f"mean {name}", f"{text}{unit(symbol)}", source))
-    for c in calibration.constants:
-        if c.name.endswith("reference error"):
-            text, sd = measured(c.value, c.standard_uncertainty)
-            rows.append(
-                (c.name, f"{text}{unit(c.unit)}", f"estimated with the fit, 1σ {sd}{unit(c.unit)}")
-            )
-    return rows

@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mwdcal.app.pages.page import channels_of
 from mwdcal.app.text import table
-from mwdcal.files.contract import CHANNELS
+from mwdcal.files.contract import RAW
 from mwdcal.geometry.vectors import Array
 from mwdcal.logs.stations import Stations
 from mwdcal.use import plots
@@ -18,87 +19,96 @@ if TYPE_CHECKING:
 
 MOST_LINES = 40
 """Stations of a table on screen."""
+SEARCH = ("threshold", "stretch", "min_seconds", "trim_seconds")
+"""What the stations were searched with."""
 POINTS = 2000
 """Points of a line in the picture."""
-LINE_STYLES = ("-", (0, (5, 1.5)), (0, (1.5, 1.2)))
-"""Line styles of x, y and z."""
 
 
 def summary(stations: Stations) -> dict[str, Any]:
     """The result for machines: one entry per station, and what was left."""
     columns = {
-        name: column if isinstance(column, list) else [_finite(v) for v in column.tolist()]
+        name: column if isinstance(column, list) else column.tolist()
         for name, column in stations.table.columns.items()
     }
     rows = zip(*columns.values(), strict=True)
     return {
         "log": stations.table.source,
         "rows": len(stations.time),
-        "seconds": float(stations.time[-1] - stations.time[0]),
-        "threshold": stations.threshold,
-        "stretch": stations.stretch,
-        "min_seconds": stations.min_seconds,
-        "trim_seconds": stations.trim_seconds,
+        "seconds": _seconds(stations),
+        **{name: getattr(stations, name) for name in SEARCH},
         "stations": [dict(zip(columns, row, strict=True)) for row in rows],
-        "left": [
-            {"start_s": start, "end_s": end, "reason": "short" if short else "moves slowly"}
-            for start, end, short in _left(stations)
-        ],
+        "left": _left(stations),
         "findings": stations.findings,
     }
 
 
-def _finite(value: float) -> float | None:
-    return None if np.isnan(value) else value
-
-
-def _left(stations: Stations) -> list[tuple[float, float, bool]]:
-    """Intervals that look still and were not taken: start, end, whether they are short."""
-    intervals = stations.intervals
+def _left(stations: Stations) -> list[dict[str, Any]]:
+    """Intervals that look still and were not taken."""
+    each = stations.intervals
+    columns = (each.start.tolist(), each.end.tolist(), each.short, each.taken)
     return [
-        (float(intervals.start[i]), float(intervals.end[i]), bool(intervals.short[i]))
-        for i in np.flatnonzero(~intervals.taken)
+        {"start_s": start, "end_s": end, "reason": "short" if short else "moves slowly"}
+        for start, end, short, taken in zip(*columns, strict=True)
+        if not taken
     ]
+
+
+def _seconds(stations: Stations) -> float:
+    """Duration of the log."""
+    return float(stations.time[-1] - stations.time[0])
 
 
 def screen(stations: Stations, files: dict[str, str]) -> str:
     """What was found, for people."""
-    columns = stations.table.columns
-    start, end = (np.asarray(columns[name]) for name in ("start_s", "end_s"))
-    whole = float(stations.time[-1] - stations.time[0])
-    left = _left(stations)
-    short = sum(is_short for *_, is_short in left)
-    same = " (the same stations from {:.3g} to {:.3g})"
-    stretch = same.format(*stations.stretch) if stations.stretch else " (given)"
+    picture = f"   {files['plot']} (picture)" if files["plot"] else ""
     lines = [
-        f"{stations.table.source}   {len(stations.time)} rows   {whole:.6g} s   "
-        f"{stations.table.count} stations, {100 * float((end - start).sum()) / whole:.0f} % of the time",
-        f"threshold {stations.threshold:.3g} noise floors{stretch}   at least "
-        f"{stations.min_seconds:g} s after {stations.trim_seconds:g} s trimmed off each end   "
-        f"left: {short} too short, {len(left) - short} moving slowly",
+        "   ".join(_heading(stations)),
+        "   ".join(_search(stations)),
         "",
         _stations_table(stations),
-        f"wrote {files['output']}"
-        + (f"   {files['plot']} (picture)" if files["plot"] else "")
-        + f"   next: mwdcal calibrate {files['output']} -o CAL.json",
+        f"wrote {files['output']}{picture}   next: mwdcal calibrate {files['output']} -o CAL.json",
     ]
     return "\n".join(lines)
 
 
+def _heading(stations: Stations) -> list[str]:
+    """The log, and how much of it the stations are."""
+    whole = _seconds(stations)
+    start, end = (np.asarray(stations.table.columns[name]) for name in ("start_s", "end_s"))
+    share = 100 * float((end - start).sum()) / whole
+    return [
+        stations.table.source,
+        f"{len(stations.time)} rows",
+        f"{whole:.6g} s",
+        f"{stations.table.count} stations, {share:.0f} % of the time",
+    ]
+
+
+def _search(stations: Stations) -> list[str]:
+    """How stations were searched for, and what was left."""
+    short = sum(left["reason"] == "short" for left in _left(stations))
+    same = " (the same stations from {:.3g} to {:.3g})"
+    stretch = same.format(*stations.stretch) if stations.stretch else " (given)"
+    return [
+        f"threshold {stations.threshold:.3g} noise floors{stretch}",
+        f"at least {stations.min_seconds:g} s after {stations.trim_seconds:g} s trimmed off each end",
+        f"left: {short} too short, {len(_left(stations)) - short} moving slowly",
+    ]
+
+
 def _stations_table(stations: Stations) -> str:
     columns = stations.table.columns
-    names = [name for kind in CHANNELS.values() for name in kind if name in columns]
-    warm = ["temperature_c"] if "temperature_c" in columns else []
+    names = [name for name in RAW if name in columns]
+    titles = {"start_s": "start s", "end_s": "end s", "samples": "samples", "temperature_c": "°C"}
+    plain = {name: title for name, title in titles.items() if name in columns}
     rows = []
     for i in range(min(stations.table.count, MOST_LINES)):
-        ends = [f"{float(columns[name][i]):.2f}" for name in ("start_s", "end_s")]
-        samples = f"{float(columns['samples'][i]):.0f}"
-        warmth = [f"{float(columns[name][i]):.2f}" for name in warm]
+        numbers = [f"{float(columns[n][i]):.{0 if n == 'samples' else 2}f}" for n in plain]
         values = [_to_sd(float(columns[n][i]), float(columns[f"sd_{n}"][i])) for n in names]
-        drifting = str(columns["drifting"][i])
-        rows.append([str(i + 1), *ends, samples, *warmth, *values, drifting])
-    header = ["station", "start s", "end s", "samples", *(["°C"] if warm else []), *names, "drifts"]
+        rows.append([str(i + 1), *numbers, *values, str(columns["drifting"][i])])
     more = stations.table.count - len(rows)
+    header = ["station", *plain.values(), *names, "drifts"]
     return table(rows, header) + (f"\n… and {more} more" if more > 0 else "")
 
 
@@ -113,11 +123,12 @@ def _to_sd(value: float, sd: float) -> str:
 @plots.styled
 def figure(stations: Stations) -> Figure:
     """The log with what was taken and what was left: a panel for each triad and for the activity."""
-    triads = [t for t in CHANNELS.values() if any(name in stations.traces for name in t)]
+    triads = channels_of(stations.traces)
     figure = plots.new_figure("Stations taken and left in a log", 1.5 + 1.5 * len(triads))
     panels = figure.subplots(len(triads) + 1, 1, sharex=True, squeeze=False)[:, 0]
-    for axes, triad in zip(panels, triads, strict=False):
-        _draw_triad(axes, stations, triad)
+    for axes, (triad, names) in zip(panels, triads.items(), strict=False):
+        _draw_triad(axes, stations, names)
+        axes.set_ylabel(f"{triad},\nraw")
     _draw_activity(panels[-1], stations)
     for axes in panels:
         _shade(axes, stations)
@@ -136,21 +147,15 @@ def _thinned(x: Array, y: Array) -> tuple[Array, Array]:
     return np.repeat(x[: count * step : step], 2), ends
 
 
-def _draw_triad(axes: Axes, stations: Stations, triad: tuple[str, ...]) -> None:
+def _draw_triad(axes: Axes, stations: Stations, names: list[str]) -> None:
     """Medians of short cells of the channels that have them, else the samples."""
-    names = list(stations.traces)
-    cells = {
-        names[i]: c
-        for i, c in zip(stations.activity.channels, stations.activity.cells, strict=True)
-    }
-    for name, line in zip(triad, LINE_STYLES, strict=True):
-        if name in cells:
-            x, y = cells[name].start, cells[name].level
-        else:
-            x, y = stations.traces[name]
-        colour = plots.AXES[name[-1]]
-        axes.plot(*_thinned(x, y), color=colour, ls=line, lw=0.9, label=name)
-    axes.set_ylabel("accelerometer,\nraw" if triad[0] == "ax" else "magnetometer,\nraw")
+    traces, activity = stations.traces, stations.activity
+    measured = [list(traces)[i] for i in activity.channels]
+    cells = dict(zip(measured, activity.cells, strict=True))
+    for name in names:
+        x, y = (cells[name].start, cells[name].level) if name in cells else traces[name]
+        look = {"color": plots.AXES[name[-1]], "ls": plots.LINES[name[-1]]}
+        axes.plot(*_thinned(x, y), lw=0.9, label=name, **look)
     axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), handlelength=2.6)
 
 
@@ -159,9 +164,7 @@ def _draw_activity(axes: Axes, stations: Stations) -> None:
     fine = np.isfinite(value) & (value > 0)
     x, y = _thinned(edge[:-1], np.where(fine, value, value[fine].min(initial=np.inf)))
     axes.plot(x, np.where(np.isinf(y), np.nan, y), color=plots.BEFORE, lw=0.7)
-    axes.set_yscale("log")
-    axes.set_ylabel("activity,\nnoise floors")
-    axes.set_xlabel("time, s")
+    axes.set(yscale="log", ylabel="activity,\nnoise floors", xlabel="time, s")
     axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
     axes.yaxis.set_minor_formatter(lambda value, _: "")
     axes.axhline(stations.threshold, color=plots.MARKED, lw=1, ls=(0, (5, 3)))
@@ -177,11 +180,8 @@ def _shade(axes: Axes, stations: Stations) -> None:
     """Taken intervals filled, left ones hatched."""
     intervals = stations.intervals
     bars = np.stack([intervals.start, intervals.end - intervals.start], -1)
-    place: dict[str, Any] = {
-        "yrange": (0, 1),
-        "transform": axes.get_xaxis_transform(),
-        "zorder": 0.5,
-    }
+    across = axes.get_xaxis_transform()
+    place: dict[str, Any] = {"yrange": (0, 1), "transform": across, "zorder": 0.5}
     axes.broken_barh(bars[intervals.taken].tolist(), fc=plots.BAND, lw=0, **place)
     left = bars[~intervals.taken].tolist()
     axes.broken_barh(left, fc="none", ec=plots.BEFORE, hatch="////", lw=0.4, **place)
