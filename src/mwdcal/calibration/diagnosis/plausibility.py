@@ -112,8 +112,8 @@ def excessive_errors(readings: Readings, result: Fit) -> dict[str, tuple[float, 
     misfit = np.sqrt(max(squares.sum() / max(analysis.freedom[0].sum(), 1.0), 1.0))
     residuals, weight = Residuals(readings, result), result.trust[0]
     excessive = {}
-    for name in residuals.names():
-        after, expected = residuals.errors(name, residuals.after), residuals.expected(name)
+    for name, after in residuals.errors(residuals.after).items():
+        expected = residuals.expected[name]
         known = ~np.isnan(after + expected) & (weight > 0)
         if not known.any():
             continue
