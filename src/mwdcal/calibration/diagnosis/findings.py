@@ -348,7 +348,7 @@ def _reshoot(fitted: FittedRuns) -> Iterator[Flag]:
     again = plausibility.stations_to_reshoot(fitted.result)
 
     def sentence(place: int, station: int) -> str:
-        row = fitted.rows(place)[station]
+        row = fitted.residuals(place).stations[station]
         worst = row.worst or "gravity"
         _, unit = shown_in(worst, fitted.readings.relative)
         gap = "" if unit == "°" else " "
