@@ -37,11 +37,6 @@ PAPER_WEIGHT = 1e10
 """Weight of every square of an unweighted sum: only its digits matter, not the minimum."""
 
 
-def joint(evidence: Evidence) -> Evidence:
-    """All evidence, weighted by its uncertainty."""
-    return evidence
-
-
 def whole_vectors(evidence: Evidence) -> Evidence:
     """Reference vectors only, taken as exact: least squares as in the six-state test."""
     exact = {name: np.zeros_like(sd) for name, sd in evidence.sd.items()}
@@ -50,22 +45,31 @@ def whole_vectors(evidence: Evidence) -> Evidence:
 
 def angles_alone(evidence: Evidence) -> Evidence:
     """Inclination and toolface of the accelerometer, without |g| (Ivanov); scale stays nominal."""
-    return _reset(evidence, absent=("gravity",))
+    return without(evidence, "gravity")
 
 
 def strengths_alone(evidence: Evidence) -> Evidence:
     """|g| and |b| at every station, and nothing else: the scalar (total field) method."""
-    known = dict(evidence.known)
-    for name in (*ANGLES, "dip"):
-        known[name] = np.full_like(known[name], np.nan)
+    blank = {name: np.full_like(evidence.known[name], np.nan) for name in (*ANGLES, "dip")}
     alone = np.full_like(evidence.group, -1)
-    return _reset(replace(evidence, known=known, group=alone), absent=("dip",))
+    return without(replace(evidence, known=evidence.known | blank, group=alone), "dip")
+
+
+def inclination_and_strength(evidence: Evidence) -> Evidence:
+    """|g| and inclination of the accelerometer (Moosavi); azimuth, |b| and dip of the magnetometer."""
+    known = {**evidence.known, "toolface": np.full_like(evidence.known["toolface"], np.nan)}
+    alone = np.full_like(evidence.group, -1)
+    return without(replace(evidence, known=known, group=alone))
+
+
+def without(evidence: Evidence, *names: str) -> Evidence:
+    """The evidence without some strengths or the dip: every station has its own."""
+    changed = replace(evidence, absent=tuple(dict.fromkeys((*evidence.absent, *names))))
+    return replace(changed, constants=constants(changed))
 
 
 def with_stand_errors(evidence: Evidence, names: tuple[str, ...]) -> Evidence:
     """The evidence with errors of the stand (see `ESTIMABLE`) as unknown constants of the run."""
-    if not names:
-        return evidence
     turns = [turn for error in names for turn in ESTIMABLE[error]]
     shared = [constant for constant in evidence.constants if constant.name not in turns]
     zero = np.zeros(len(evidence.include))
@@ -75,34 +79,15 @@ def with_stand_errors(evidence: Evidence, names: tuple[str, ...]) -> Evidence:
     return replace(evidence, constants=tuple(shared))
 
 
-def without(evidence: Evidence, names: tuple[str, ...]) -> Evidence:
-    """The evidence without some strengths or the dip: every station has its own."""
-    if not names:
-        return evidence
-    return _reset(evidence, tuple(dict.fromkeys((*evidence.absent, *names))))
-
-
-def inclination_and_strength(evidence: Evidence) -> Evidence:
-    """|g| and inclination of the accelerometer (Moosavi); azimuth, |b| and dip of the magnetometer."""
-    known = {**evidence.known, "toolface": np.full_like(evidence.known["toolface"], np.nan)}
-    alone = np.full_like(evidence.group, -1)
-    return _reset(replace(evidence, known=known, group=alone), evidence.absent)
-
-
-def _reset(evidence: Evidence, absent: tuple[str, ...]) -> Evidence:
-    """The evidence with its constants worked out again after a change."""
-    changed = replace(evidence, absent=absent, constants=())
-    return replace(changed, constants=constants(changed))
-
-
 EVIDENCE: dict[str, Callable[[Evidence], Evidence]] = {
-    "joint": joint,
+    "joint": lambda evidence: evidence,
     "least-squares": whole_vectors,
     "newton": inclination_and_strength,
     "swarm": whole_vectors,
     "toolface-inclination": angles_alone,
     "scalar": strengths_alone,
 }
+"""What each method uses of the evidence: "joint" all of it, weighted by its uncertainty."""
 
 
 @dataclass(frozen=True)

@@ -47,7 +47,6 @@ class Options:
             calibration of the same tool, or knowledge of its parameters.
         exclude: labels of stations to leave out.
         seed: of the swarm.
-        rounds: most repetitions of fit and estimate of the noise.
 
     A fit takes `auto` as order 0 without own-axis terms; a calibration chooses first.
     """
@@ -65,7 +64,6 @@ class Options:
     prior: Knowledge | Calibration | Literal["datasheet"] | None = None
     exclude: tuple[str, ...] = ()
     seed: int = 0
-    rounds: int = 8
 
     def __post_init__(self) -> None:
         """Take one name for a tuple of one; refuse an order, a model, a triad or a prior that cannot be.

@@ -210,7 +210,7 @@ def _beyond_order(fitted: FittedRuns, index: int, terms: OmittedTerms) -> Flag:
 
     def sentence(place: int) -> str:
         highest = np.flatnonzero(terms.present[place, index]) + 1
-        share = float(misfit_size(fitted.result, terms)[place, index])
+        share = float(misfit_size(fitted.result)[place, index])
         strength = float(np.mean(problem.constant(state, observable)[place]))
         if order < HIGHEST and highest.min() <= HIGHEST:
             cause = f"powers of temperature above order {order} are there"
