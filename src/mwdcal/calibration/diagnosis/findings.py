@@ -12,7 +12,7 @@ from mwdcal.calibration.diagnosis import plausibility
 from mwdcal.calibration.diagnosis.flags import FittedRuns, Flag
 from mwdcal.calibration.diagnosis.structure import described as seen_as
 from mwdcal.calibration.diagnosis.structure import effects, suspected
-from mwdcal.calibration.readings import TRIADS
+from mwdcal.calibration.readings import EARTH_RANGES, TRIADS
 from mwdcal.calibration.record import Finding
 from mwdcal.calibration.residuals import REASONS, shown_in, tail
 from mwdcal.calibration.results import common_source
@@ -57,9 +57,7 @@ def unused_columns(columns: Sequence[str]) -> list[Finding]:
     """Columns of a file that are not used, each with what it resembles."""
     if not columns:
         return []
-    more = f" and {len(columns) - COLUMNS_NAMED} more" if len(columns) > COLUMNS_NAMED else ""
-    text = f"columns not used: {', '.join(columns[:COLUMNS_NAMED])}{more}."
-    return [Finding(id=UNUSED, text=text)]
+    return [Finding(id=UNUSED, text=f"columns not used: {_listed(columns, COLUMNS_NAMED)}.")]
 
 
 def findings(fitted: FittedRuns) -> list[Finding]:
@@ -113,10 +111,10 @@ def _joined(triads: Bools) -> str:
     return " and ".join(TRIADS[index] for index in np.flatnonzero(triads))
 
 
-def _listed(stations: Sequence[str]) -> str:
-    """The first few stations, and how many more."""
-    more = len(stations) - STATIONS_NAMED
-    return ", ".join(stations[:STATIONS_NAMED]) + (f" and {more} more" if more > 0 else "")
+def _listed(names: Sequence[str], most: int = STATIONS_NAMED) -> str:
+    """The first few names, and how many more."""
+    more = len(names) - most
+    return ", ".join(names[:most]) + (f" and {more} more" if more > 0 else "")
 
 
 def _calm(fitted: FittedRuns, index: int) -> Flag:
@@ -171,12 +169,11 @@ def _scatter(fitted: FittedRuns) -> Flag:
     def sentence(place: int) -> str:
         scatter = fitted.result.problem.evidence.scatter
         sizes = {name: float(values[place].max()) for name, values in scatter.items()}
-        shown = {n: f"{100 * size:.2f} %" for n, size in sizes.items()}
-        angles = {n: f"{np.degrees(sizes[n]):.2f}°" for n in ("dip", "direction") if n in sizes}
         words = [
-            f"{SCATTERED[name]} by {size}"
-            for name, size in (shown | angles).items()
-            if sizes[name] > plausibility.SCATTER_SHARE
+            f"{SCATTERED[name]} by "
+            + (f"{100 * size:.2f} %" if name in EARTH_RANGES else f"{np.degrees(size):.2f}°")
+            for name, size in sizes.items()
+            if size > plausibility.SCATTER_SHARE
         ]
         return (
             f"beyond sensor noise, these vary from station to station: {', '.join(words)} "
