@@ -24,7 +24,7 @@ from mwdcal.calibration.record import FREE_SHARE
 from mwdcal.estimation.batch import take
 from mwdcal.estimation.rank import Free
 from mwdcal.estimation.uncertainty import marginal_rank
-from mwdcal.geometry.vectors import Array, Bools, diagonal, outer
+from mwdcal.geometry.vectors import Array, Bools, outer
 from mwdcal.sensor.models import Whole
 
 NOISE, SETTINGS, PRIOR = "noise of the readings", "settings of the stand", "prior"
@@ -44,17 +44,22 @@ class StatedCovariance:
     result: Fit
 
     @cached_property
-    def _parts(self) -> tuple[Array, Array, Array]:
-        """From errors that are independent from station to station; shared, and a prior; the order."""
-        effects = self.result.analysis.effects
-        shared = effects @ effects.mT + _of_prior(self.result)
-        independent = _scaled(self.result, self.result.analysis.covariance - shared)
-        return independent, shared, misfit_covariance(self.result)
+    def _parts(self) -> tuple[Array, Array, Array, Array]:
+        """From independent errors, from shared ones and a prior, from the prior alone, from the order.
+
+        Errors of a prior of precision Λ do V Λ V to a fit of covariance V.
+        """
+        analysis, precision = self.result.analysis, self.result.problem.prior.precision
+        effects, covariance = analysis.effects, analysis.covariance
+        prior = covariance @ precision @ covariance if precision.any() else 0 * precision
+        shared = effects @ effects.mT + prior
+        independent = _scaled(self.result, covariance - shared)
+        return independent, shared, prior, misfit_covariance(self.result)
 
     @cached_property
     def total(self) -> Array:
         """Covariance (B, p, p): independent errors times s², others as they are."""
-        independent, shared, order = self._parts
+        independent, shared, _, order = self._parts
         return np.asarray(independent + shared + order)
 
     def by_source(self) -> dict[str, Array]:
@@ -62,13 +67,13 @@ class StatedCovariance:
 
         A common error comes under the name of its constant of the run.
         """
-        result, (independent, _, order) = self.result, self._parts
+        result, (independent, _, prior, order) = self.result, self._parts
         settings = _scaled(result, _of_settings(result))
         shares = {NOISE: independent - settings, SETTINGS: settings}
         for index, constant in enumerate(result.problem.evidence.constants):
             effect = result.analysis.effects[..., index]
             shares[constant.name] = shares.get(constant.name, 0.0) + outer(effect)
-        shares |= {ORDER: order, PRIOR: _of_prior(result)}
+        shares |= {ORDER: order, PRIOR: prior}
         return {name: share for name, share in shares.items() if name == NOISE or share.any()}
 
 
@@ -79,11 +84,11 @@ def constants_covariance(result: Fit) -> Array:
     """
     analysis, constants = result.analysis, result.problem.evidence.constants
     scaled = analysis.constants * variance_scales(result).max(-1)[:, None, None]
-    most = [np.full(len(scaled), np.inf) if c.unknown else c.sd for c in constants]
-    if not most:
-        return np.asarray(scaled)
-    sd = np.sqrt(np.maximum(diagonal(scaled), 1e-300))
-    less = np.minimum(np.stack(most, -1) / sd, 1.0)
+    less = np.ones(scaled.shape[:2])
+    for place, constant in enumerate(constants):
+        if not constant.unknown:
+            sd = np.sqrt(np.maximum(scaled[:, place, place], 1e-300))
+            less[:, place] = np.minimum(constant.sd / sd, 1.0)
     return np.asarray(scaled * outer(less))
 
 
@@ -133,12 +138,6 @@ def _scaled(result: Fit, covariance: Array) -> Array:
     sizes = [t.model.size for t in result.problem.triads]
     grown = np.repeat(np.sqrt(variance_scales(result)), sizes, axis=-1)
     return np.asarray(covariance * outer(grown))
-
-
-def _of_prior(result: Fit) -> Array:
-    """V Λ V: what errors of a prior of precision Λ do to a fit of covariance V."""
-    precision, covariance = result.problem.prior.precision, result.analysis.covariance
-    return covariance @ precision @ covariance if precision.any() else np.zeros_like(covariance)
 
 
 def _of_settings(result: Fit) -> Array:
@@ -213,8 +212,8 @@ def triad_results(
 
 def reading_noise(result: Fit) -> Array:
     """Standard deviation (B, t) of one reading of each triad, estimated or the mean of what is declared."""
-    declared = [triad.sd.mean((-1, -2)) for triad in result.problem.triads]
-    return np.where(np.isnan(result.noise), np.stack(declared, -1), result.noise)
+    declared = np.stack([triad.sd.mean((-1, -2)) for triad in result.problem.triads], -1)
+    return np.where(np.isnan(result.noise), declared, result.noise)
 
 
 def _effect(model: Whole, params: Array, raw: Array, temperature: Array) -> Array:

@@ -61,11 +61,6 @@ class OmittedTerms:
         return np.asarray(np.nan_to_num(self.chance, nan=1.0) < UNLIKELY)
 
     @property
-    def misfit(self) -> Bools:
-        """Triads (B, t) of which noise does not explain all terms."""
-        return np.asarray(self.present.any(-1))
-
-    @property
     def variance(self) -> Array:
         """Mean square (B, t, k, 2) of a term's gains and offsets, shares of the field, noise taken off."""
         excess = self.size - self.noise * self.scatter[..., None, None]

@@ -12,9 +12,7 @@ from mwdcal.calibration.readings import EARTH_RANGES, Readings
 from mwdcal.calibration.residuals import RESHOOT, Residuals, chances, chi_chance, tail, to_reshoot
 from mwdcal.estimation.batch import take
 from mwdcal.estimation.minimisers import closed_form
-from mwdcal.estimation.problem import Prior
 from mwdcal.estimation.rank import Free
-from mwdcal.estimation.solvers import Determined
 from mwdcal.estimation.uncertainty import ROTATIONS, TESTED, effective_freedom, station_misfit
 from mwdcal.geometry.vectors import Array, Bools, Ints, centred, diagonal, eigen, outer, quotient
 
@@ -30,14 +28,6 @@ SMALLEST_EXPECTATION = 1e-12
 """Expectations below this, in the observable's own unit, are rounding."""
 NOISE_RATIO = 3.0
 """Residuals of a robust fit that exceed the declared noise this many times are reported."""
-CALM_FREEDOM = 12.0
-"""Degrees of freedom from which residuals far below the declared noise are not a coincidence."""
-MISFIT_CHANCE = 1e-3
-"""Chance of so large residuals, or of so large a departure from the prior, below which it is reported."""
-LOW_WEIGHT = 0.1
-"""A station of less weight than this in a robust fit is reported."""
-SCATTER_SHARE = 3e-4
-"""A scatter from station to station beyond this share, or radians, is a finding."""
 VARIANCE_RIDGE = 1e-9
 """What is added to variances (of whitened readings: 0…1), so that they have an inverse."""
 LEEWAY = 1.01
@@ -153,19 +143,6 @@ def robust(result: Fit) -> Bools:
     return np.asarray((result.trust != 1).any(-1))
 
 
-def excessive(result: Fit, chance: Array) -> Bools:
-    """Triads (B, t) whose residuals noise and stand do not explain, by `misfit_chances`."""
-    weighed = robust(result)[:, None] & np.isnan(result.noise) & ~unchecked(result)
-    large = weighed & (result.analysis.variance_factor > NOISE_RATIO**2)
-    return np.asarray(large | (np.nan_to_num(chance, nan=1.0) < MISFIT_CHANCE))
-
-
-def calm(result: Fit) -> Bools:
-    """Triads (B, t) whose residuals are less than the declared noise over `NOISE_RATIO`."""
-    tested = np.isnan(result.noise) & (result.analysis.freedom >= CALM_FREEDOM)
-    return np.asarray(tested & (result.analysis.variance_factor < NOISE_RATIO**-2))
-
-
 def unchecked(result: Fit) -> Bools:
     """Triads (B, t) without redundancy."""
     return np.asarray(result.analysis.freedom < 1)
@@ -181,20 +158,6 @@ def copies(result: Fit) -> Bools:
         _, first, place = np.unique(rows[member], axis=0, return_index=True, return_inverse=True)
         repeated[member] = first[place.ravel()] != np.arange(len(repeated[member]))
     return repeated
-
-
-def scattered(result: Fit) -> Bools:
-    """Whether (B,) strengths, dip or the directions of groups vary from station to station."""
-    sizes = [value.max(-1) for value in result.problem.evidence.scatter.values()]
-    return np.asarray(np.max([np.zeros(len(result.status)), *sizes], 0) > SCATTER_SHARE)
-
-
-def without_prior(result: Fit) -> Fit:
-    """The fit with only those directions determined that the run itself determines."""
-    prior = result.problem.prior
-    bare = replace(result.problem, prior=Prior(0 * prior.precision, prior.expected))
-    determined = Determined.of(bare, result.state)
-    return replace(result, problem=bare, analysis=replace(result.analysis, determined=determined))
 
 
 def departures(result: Fit) -> tuple[Array, Ints]:
