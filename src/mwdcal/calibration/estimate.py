@@ -166,7 +166,7 @@ def fit(readings: Readings, options: Options | None = None, include: Array | Non
 
 
 def scatters(readings: Readings, options: Options) -> bool:
-    """Whether a scatter from station to station is estimated: with a joint fit's own noise of both."""
+    """Whether a scatter from station to station is estimated: in a joint fit that estimates the noise of both."""
     noisy = not any(name in readings.sd for name in TRIADS) and readings.magnetometer is not None
     grouped = bool((readings.groups >= 0).any())
     return options.scatter and noisy and options.method == "joint" and grouped
@@ -389,7 +389,7 @@ def _trusting(problem: Problem, trust: Array) -> Problem:
 
 
 def _louder(problem: Problem, factor: Array) -> Problem:
-    """The problem with all that is a station's own, readings and angles, noisier by a factor (B, n)."""
+    """The problem with the readings and angles of each station noisier by a factor (B, n)."""
     triads = tuple(replace(t, sd=t.sd * factor[..., None]) for t in problem.triads)
     evidence = problem.evidence
     sd = {n: s * factor if n in ANGLES else s for n, s in evidence.sd.items()}

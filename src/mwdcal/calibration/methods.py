@@ -1,12 +1,12 @@
 """The methods: which evidence each uses, and how each minimises.
 
 A method is a selection of evidence (`EVIDENCE`); most share one estimator. Newton-Raphson and the
-swarm have one of their own, as have the papers' unweighted sums (`Options.paper_weights`).
+swarm have another, as have the papers' unweighted sums (`Options.paper_weights`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -15,6 +15,7 @@ import numpy as np
 from mwdcal.calibration.evidence import STAND_TURNS, acts_on, constants
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import ANGLES
+from mwdcal.errors import FitError, InputError
 from mwdcal.estimation.evidence import UNKNOWN, Evidence, SharedConstant
 from mwdcal.estimation.minimisers.newton import newton, propagated
 from mwdcal.estimation.minimisers.swarm import swarm_forward
@@ -35,6 +36,23 @@ SWARM_ITERATIONS = 600
 """Iterations of the swarm, as Moradi's."""
 PAPER_WEIGHT = 1e10
 """Weight of every square of an unweighted sum: only its digits matter, not the minimum."""
+
+
+def check_stand_errors(names: Sequence[str], method: str) -> None:
+    """Refuse errors of the stand that cannot be estimated, whatever the stations."""
+    for name in names:
+        if name == "toolface-zero":
+            raise FitError(
+                "`estimate` toolface-zero: a zero of the stand's toolface can never be told from a "
+                "rotation of the sensors in the tool, whatever the stations. Set it by an index mark."
+            )
+        if name not in ESTIMABLE:
+            raise InputError(
+                f"`estimate` must be of {', '.join(ESTIMABLE)}; got {name!r}. Unknown field and dip "
+                "are estimated without being asked for."
+            )
+    if names and method != "joint":
+        raise InputError(f"`estimate` needs `method` joint; got {method!r}.")
 
 
 def whole_vectors(evidence: Evidence) -> Evidence:
@@ -63,7 +81,7 @@ def inclination_and_strength(evidence: Evidence) -> Evidence:
 
 
 def without(evidence: Evidence, *names: str) -> Evidence:
-    """The evidence without some strengths or the dip: every station has its own."""
+    """The evidence without some strengths or the dip: they differ from station to station."""
     changed = replace(evidence, absent=tuple(dict.fromkeys((*evidence.absent, *names))))
     return replace(changed, constants=constants(changed))
 
@@ -107,7 +125,7 @@ class Solved:
     unweighted: bool = False
 
     def pulls(self, problem: Problem, state: State) -> dict[int, Array]:
-        """How an error of a station's whitened reading moves the triads that have sums of their own.
+        """How an error of a station's whitened reading moves the triads that minimise `sums`.
 
         (B, n, p_t, 3) by triad; none where the likelihood is at its largest.
         """

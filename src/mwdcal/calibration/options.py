@@ -39,8 +39,8 @@ class Options:
         scatter: estimate how far strengths, dip and the direction of a group depart from station to
             station, beside the noise; only where the noise of both triads is estimated.
         estimate: errors of the stand to estimate as well: "azimuth-zero", "inclination-zero", "tilt".
-        ignore: what may not be used at any station, of "gravity", "field", "dip": each station then
-            has its own.
+        ignore: what may not be used at any station, of "gravity", "field", "dip": they may then
+            differ from station to station.
         robust: None, "huber" or "student-t": weights that bound what a bad station can do.
         paper_weights: sum the squares as the method's paper does, unweighted.
         prior: what is known beforehand: "datasheet" (the tolerances in the profile), a previous

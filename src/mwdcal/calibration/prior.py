@@ -50,7 +50,7 @@ class Knowledge:
 
 
 def prior_of(knowledge: Knowledge | None, models: Sequence[Model], batch: int) -> Prior:
-    """Knowledge as precision and expectation (B, p) of a fit's own parameters; none: all free.
+    """Knowledge as precision and expectation (B, p) of a fit's parameters; none: all free.
 
     Raises `FitError` where the knowledge is of another model.
     """
@@ -73,10 +73,10 @@ def prior_of(knowledge: Knowledge | None, models: Sequence[Model], batch: int) -
             f"{strange[0]}. Use the same `model`, `order` and `parameters` as it had."
         )
     rows = [i for i, name in enumerate(names) if name in knowledge.names]
-    theirs = [knowledge.names.index(names[i]) for i in rows]
+    places = [knowledge.names.index(names[i]) for i in rows]
     values, known = np.zeros(size), np.zeros((size, size))
-    values[rows] = knowledge.expected[theirs]
-    known[np.ix_(rows, rows)] = knowledge.precision[np.ix_(theirs, theirs)]
+    values[rows] = knowledge.expected[places]
+    known[np.ix_(rows, rows)] = knowledge.precision[np.ix_(places, places)]
     centre = np.linalg.solve(whole, np.broadcast_to(values, (batch, size))[..., None])[..., 0]
     return Prior(whole.mT @ known @ whole, np.asarray(centre))
 

@@ -43,8 +43,8 @@ def simulated(*metadata: Mapping[str, object]) -> list[str]:
 def group_numbers(labels: Sequence[str], starts: Sequence[int] = ()) -> Ints | None:
     """Group numbers (n,) in order of appearance, -1 for a blank label; None if all are blank.
 
-    `starts`: where each tool's labels begin, and the end, if they are of several tools: each then
-    has numbers of its own.
+    `starts`: where each tool's labels begin, and the end, if they are of several tools: numbers
+    then start again at each.
 
     >>> group_numbers(["B", "", "A", "B"]).tolist()
     [0, -1, 1, 0]

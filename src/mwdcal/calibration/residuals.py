@@ -291,7 +291,7 @@ def measure_rows(residuals: Residuals) -> list[Measures]:
 
 
 def _judged(fit: Fit) -> Analysis:
-    """The analysis by which stations are judged: in a robust fit their own errors are whole.
+    """The analysis by which stations are judged: in a robust fit with their errors whole.
 
     A weight w takes a station's pull on the fit, not its noise: with V = C⁻¹ the residual V ρ has
     the covariance V + (1 - 2 w) V X Cov XᵀV, from V - … at w = 1 to V + … where it is left out.

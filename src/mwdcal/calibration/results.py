@@ -144,7 +144,7 @@ def _of_settings(result: Fit) -> Array:
     """Covariance (B, p, p) from independent errors of the stand's angles, before scaling.
 
     A station's reading has the covariance C = I + GGᵀ in units of its noise, the columns of G being
-    what its own unknowns do; those of known angles are meant here.
+    what its unknowns do; those of known angles are meant here.
     """
     analysis, problem = result.analysis, result.problem
     if not any(problem.evidence.sd[n].any() for n in ("inclination", "azimuth", "toolface")):

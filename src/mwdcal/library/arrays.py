@@ -94,7 +94,7 @@ def readings(
 
 
 def _numbers(name: str, values: ArrayLike) -> Array:
-    """Values as an array of its own; NaN where a table has a null."""
+    """Values as a new array; NaN where a table has a null."""
     try:
         if np.asarray(values).dtype.kind in "bcmM":
             raise TypeError(f"got {np.asarray(values).dtype}")
@@ -157,7 +157,7 @@ def nearest(name: str, names: Iterable[str]) -> str:
 
 
 def _by_name(values: Mapping[str, ArrayLike], limits: Mapping[str, Range]) -> dict[str, str]:
-    """For each quantity the name that it is given by: its own, or that of its twin in degrees."""
+    """For each quantity the name that it is given by: that of the quantity, or of its twin in degrees."""
     spelled = {name.replace("-", "_"): name for name in limits}
     angles = [key for key, name in spelled.items() if limits[name].unit == "°"]
     spelled |= {f"{key}{DEGREES}": spelled[key] for key in angles}

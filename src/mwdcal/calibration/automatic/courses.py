@@ -26,7 +26,7 @@ UNLIKELY = 1e-3
 LEFT_TO_TERM = 1e-6
 """A direction of a term counts if the fit leaves this share of its information to it."""
 RIDGE = 1e-11
-"""Added to the information of the fit's own unknowns, that it has an inverse: free ones stay free."""
+"""Added to the information of the fit's unknowns, so that it has an inverse: free ones stay free."""
 OFFSETS = tuple(f"{word}-{axis}" for word in ("offset", "bias") for axis in "xyz")
 """Steady offsets of the axes, in either model."""
 GRID = 64
@@ -152,8 +152,7 @@ def _with_terms(result: Fit, shown: Bools, least: int) -> tuple[Array, Array]:
     powered = powered.reshape(members, count * width, count * width)
     pulled = -summed(weighed @ linear.residual[..., None], turned).reshape(members, -1)
     normal = linear.normal
-    top = np.concatenate([normal.information, cross.mT], -1)
-    whole = np.concatenate([top, np.concatenate([cross, powered], -1)], -2)
+    whole = np.block([[normal.information, cross.mT], [cross, powered]])
     return whole, np.concatenate([-normal.gradient, pulled], -1)
 
 

@@ -229,7 +229,7 @@ def _squares(
 
     `effect` (B, n, 3, 3) turns a reading, in units of its noise, into what is judged, in so many
     `axes`. References that are unknown or uncertain test only the `share` of the noise that
-    the station's own unknowns leave; the error is what is `left` for each such share of noise.
+    the unknowns of the station leave; the error is what is `left` for each such share of noise.
     """
     whole = np.sum(effect**2, (-2, -1)) * held
     tested = np.einsum("bnij,bnjk,bnik->bn", effect, share, effect) * held

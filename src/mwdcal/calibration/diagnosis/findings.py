@@ -39,7 +39,7 @@ LOW_WEIGHT = 0.1
 SCATTER_SHARE = 3e-4
 """A scatter from station to station beyond this share, or radians, is a finding."""
 LARGEST_DEVIATION = 37.0
-"""Deviations are not told apart beyond this: a normal variable's chance is then below 1e-300."""
+"""Larger deviations have no figure: a normal variable's chance is then below 1e-300."""
 UNUSED = "unused-columns"
 COLUMNS_NAMED = 20
 """Most columns that the finding names."""
@@ -251,7 +251,9 @@ def _beyond_order(fitted: FittedRuns, index: int, terms: OmittedTerms) -> Flag:
             f"uncertainties here include it. {remedy}."
         )
 
-    return Flag(f"{TRIADS[index]}-temperature-misfit", np.any(terms.present[:, index], -1), sentence)
+    return Flag(
+        f"{TRIADS[index]}-temperature-misfit", np.any(terms.present[:, index], -1), sentence
+    )
 
 
 def _untested(fitted: FittedRuns) -> Flag:

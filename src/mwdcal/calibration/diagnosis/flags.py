@@ -1,7 +1,7 @@
 """Flags: what holds of some members of a batch, and the sentence that says it of one of them.
 
 Refusals and findings are both flags, raised by operations on arrays with a leading tool axis. A single
-run is a batch of one, and its sentences are made of the same numbers.
+run is a batch of one, and its sentences state the same numbers.
 """
 
 from __future__ import annotations

@@ -11,8 +11,10 @@ from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.readings import EARTH_RANGES, Readings
 from mwdcal.calibration.residuals import RESHOOT, Residuals, chances, chi_chance, tail, to_reshoot
 from mwdcal.estimation.batch import take
+from mwdcal.estimation.evidence import STAND_ERRORS, UNKNOWN
 from mwdcal.estimation.minimisers import closed_form
 from mwdcal.estimation.rank import Free
+from mwdcal.estimation.solvers import Determined
 from mwdcal.estimation.uncertainty import ROTATIONS, TESTED, effective_freedom, station_misfit
 from mwdcal.geometry.vectors import Array, Bools, Ints, centred, diagonal, eigen, outer, quotient
 
@@ -20,12 +22,14 @@ BENIGN_DIRECTIONS = (*ROTATIONS, "scale")
 """Directions that may stay free."""
 EXCESS_RATIO = 10.0
 """An error after calibration of more than this many times its expectation is not a sensor's."""
+LOOSE = 0.1
+"""A turn known no better than this share of no knowledge at all is not separated."""
 DIP_CERTAINTY = 4.0
 """Standard uncertainties by which a dip must lie beyond vertical, not to be noise at a pole."""
 STRAY_DEVIATIONS = 5.0
 """Standard deviations of one reading's residual from which the errors of a run are looked at."""
 SMALLEST_EXPECTATION = 1e-12
-"""Expectations below this, in the observable's own unit, are rounding."""
+"""Expectations below this, in the unit of the observable, are rounding."""
 NOISE_RATIO = 3.0
 """Residuals of a robust fit that exceed the declared noise this many times are reported."""
 VARIANCE_RIDGE = 1e-9
@@ -90,10 +94,30 @@ def overturned(result: Fit) -> Array:
     return np.asarray(dips)
 
 
+def inseparable(result: Fit) -> Bools:
+    """Fits (B,) whose stand errors the stations cannot separate from errors of the sensors.
+
+    One of these is as good as unknown, or the rank is higher without them.
+    """
+    constants = result.problem.evidence.constants
+    stand = np.array([c.unknown and c.name in STAND_ERRORS for c in constants])
+    sd = np.sqrt(diagonal(result.analysis.constants)[:, stand])
+    lost = np.any(sd > LOOSE * UNKNOWN, -1)
+    some = np.flatnonzero(~lost & ~result.analysis.determined.keep.all(-1))
+    if some.size:
+        problem, state = take((result.problem, result.state), some)
+        kept = np.flatnonzero(~stand)
+        fewer = tuple(problem.evidence.constants[index] for index in kept)
+        bare = replace(problem, evidence=replace(problem.evidence, constants=fewer))
+        still = replace(state, constants=state.constants[:, kept])
+        lost[some] = Determined.of(problem, state).rank < Determined.of(bare, still).rank
+    return np.asarray(lost)
+
+
 def excessive_errors(readings: Readings, result: Fit) -> dict[str, tuple[float, float]]:
     """Observables with errors far above what the misfit of the run explains: rms of both.
 
-    Definition: the expectation is that of noise and stand, times the root of the run's own s² where
+    Definition: the expectation is that of noise and stand, times the root of the run's s² where
     that is above one: so are the uncertainties that a calibration states. In a robust fit stations
     count with the pull that they have.
     """
@@ -174,7 +198,7 @@ def departures(result: Fit) -> tuple[Array, Ints]:
 
 
 def stations_to_reshoot(result: Fit) -> Bools:
-    """Stations (B, n) to take again: `to_reshoot`, asked only where a bound allows it to be true."""
+    """Stations (B, n) to take again: `to_reshoot`, evaluated only where a bound allows it to be true."""
     again = np.zeros(result.analysis.residual.shape[:2], bool)
     some = np.flatnonzero(_suspects(result))
     if some.size:

@@ -3,7 +3,7 @@
 Each effect is a family of columns that the residuals may have in common with it. A family is named
 where it takes away more of the misfit than noise of any direction would (F test), the best one
 first; the others are then judged by what that one leaves. Nothing is corrected here: what moves
-with one of the sensor's own parameters has gone into the fit, and no residual shows it.
+with a parameter of the sensor has gone into the fit, and no residual shows it.
 
 Reference: efficient scores, C. R. Rao, Proc. Camb. Phil. Soc. 44, 50 (1948).
 """
