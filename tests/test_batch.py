@@ -137,7 +137,13 @@ def test_members_are_refused_after_the_fit_as_each_would_be_alone():
     assert [each[0] for each in found[1:]] == ["gain", "gain", "residuals"]
     for place, each in enumerate(found):
         one = take(data, place)
-        single = FittedRuns.single(one, PROFILE, options, fit(one, options))
+        single = FittedRuns.of(
+            batch_of_one(one),
+            PROFILE,
+            options,
+            fit(one, options),
+            lambda _, one=one: (one, PROFILE),
+        )
         assert refused(fit_refusals(single), 1) == [each]
         sub = fitted.take(np.array([place]))
         assert refused(fit_refusals(sub), 1) == [each]

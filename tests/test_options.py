@@ -195,11 +195,12 @@ def test_a_batch_of_runs_is_compared_as_each_run_alone(declared):
     for place, run in enumerate(runs):
         chosen, table = choose_curves(run, Options(), terms)
         assert curves.choices[curves.chosen[place]] == tuple(chosen)
-        for ours, alone in zip(curves.table(place), table, strict=True):
-            assert (ours.triads, ours.chosen) == (alone.triads, alone.chosen)
-            assert (ours.left_out is None) == (ours.odds is not None) == (not declared)
-            scores = (ours.left_out or ours.odds, alone.left_out or alone.odds)
-            assert scores[0] == pytest.approx(scores[1], rel=1e-6, abs=1e-6)
+        assert curves.odds == (not declared)
+        for triads, score, row in zip(curves.choices, curves.score[place], table, strict=True):
+            assert (row.triads, row.chosen) == (triads, triads == tuple(chosen))
+            assert (row.left_out is None) == (row.odds is not None) == (not declared)
+            alone = row.left_out if declared else row.odds * np.log(10)
+            assert score == pytest.approx(alone, rel=1e-6, abs=1e-6)
     assert [bool(place) for place in curves.chosen] == [False, True, False]
 
 

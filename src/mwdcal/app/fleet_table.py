@@ -20,9 +20,9 @@ from mwdcal.app.messages import lines
 from mwdcal.app.pages.fleet_summary import FleetSummary, stated_options, summarise
 from mwdcal.app.text import plural
 from mwdcal.calibration.automatic.nonlinearity import with_strengths
-from mwdcal.calibration.automatic.stand import check_names
 from mwdcal.calibration.diagnosis.findings import unused_columns
 from mwdcal.calibration.diagnosis.refusals import check_options, no_temperature
+from mwdcal.calibration.methods import check_stand_errors
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.prior import DATASHEET, profile_for
 from mwdcal.errors import InputError
@@ -137,7 +137,7 @@ def _options(typed: Typed, profile: Profile) -> Options:
         )
     options = with_strengths(options_of(typed, prior_of(typed["prior"])), profile)
     profile_for(options.prior, profile)
-    check_names(options.estimate, options.method)
+    check_stand_errors(options.estimate, options.method)
     check_options(options)
     return options
 

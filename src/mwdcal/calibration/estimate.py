@@ -36,6 +36,8 @@ LEAST_NOISE = 1e-9
 TEMPERATURE_STEP = 10.0
 """The range of temperatures that a model is conditioned for ends at multiples of this, °C."""
 ROBUST_ROUNDS = 40
+NOISE_ROUNDS = 8
+"""Most repetitions of fit and estimate of the noise."""
 SETTLED = 1e-3
 """Change of noise and station weights, as a share, at which weighing and fitting in turn ends."""
 SCATTER_ROUNDS = 16
@@ -88,10 +90,8 @@ def temperature_ranges(temperature: Array) -> Array:
 
     Members of equal range have the same model in a batch as alone.
     """
-    low, high = (
-        np.floor(temperature.min(-1) / TEMPERATURE_STEP),
-        np.ceil(temperature.max(-1) / TEMPERATURE_STEP),
-    )
+    low = np.floor(temperature.min(-1) / TEMPERATURE_STEP)
+    high = np.ceil(temperature.max(-1) / TEMPERATURE_STEP)
     return np.stack([low, high], -1) * TEMPERATURE_STEP
 
 
@@ -100,7 +100,8 @@ def _problem(
 ) -> tuple[Problem, list[bool], Bools]:
     """The problem, for each triad whether its noise is declared, and which members (B,) are finite.
 
-    Members with readings that are not finite get stand-ins, so that the batch goes on.
+    Estimation of noise begins at a thousandth of the readings' size. Members with readings that are
+    not finite get stand-ins, so that the batch goes on.
     """
     cold = np.zeros(readings.count)
     temperature = flat(cold if readings.temperature is None else readings.temperature, lead)
@@ -112,7 +113,9 @@ def _problem(
     for name, raw, order in zip(names, raws, options.orders, strict=False):
         kind, sound = options.kind(order), raw if finite.all() else _sound(raw, finite)
         whole = model_of(kind, order, sound, temperature, evidence.include, name in curved)
-        sd = flat(readings.sd[name], lead, 3) if name in readings.sd else _first_noise(raw)
+        sd = (
+            flat(readings.sd[name], lead, 3) if name in readings.sd else 1e-3 * _size(raw) + 0 * raw
+        )
         triads.append(Triad(restricted(whole, options.parameters), sound, sd))
     prior = prior_of(options.knowledge, [t.model for t in triads], len(evidence.include))
     problem = Problem(tuple(triads), temperature, evidence, prior)
@@ -124,11 +127,6 @@ def _sound(raw: Array, finite: Bools) -> Array:
     """Readings with stand-ins of harmless size for members that are not finite."""
     pattern = np.sin(np.arange(raw[0].size) ** 1.5).reshape(-1, 3)
     return np.where(finite[:, None, None], raw, pattern)
-
-
-def _first_noise(raw: Array) -> Array:
-    """Noise (B, n, 3) at which its estimation begins, a thousandth of the readings' size."""
-    return np.asarray(1e-3 * _size(raw) + 0 * raw)
 
 
 def _bound_curves(problem: Problem, curved: Mapping[str, float]) -> None:
@@ -155,10 +153,7 @@ def fit(readings: Readings, options: Options | None = None, include: Array | Non
     """
     options = options or Options()
     include = np.ones(readings.count) if include is None else np.asarray(include, float)
-    evidence = EVIDENCE[options.method](evidence_of(readings, include))
-    evidence = without(evidence, options.ignore)
-    evidence = with_stand_errors(evidence, options.estimate)
-    evidence = _scattered(evidence, readings, options)
+    evidence = _evidence(readings, include, options)
     lead = np.broadcast_shapes(readings.accelerometer.shape[:-1], include.shape)
     problem, declared, finite = _problem(readings, evidence, lead, options)
     closed, alone = _closed(problem, declared, options, finite)
@@ -171,19 +166,24 @@ def fit(readings: Readings, options: Options | None = None, include: Array | Non
 
 
 def scatters(readings: Readings, options: Options) -> bool:
-    """Whether a scatter from station to station is estimated: with a joint fit's own noise of both."""
+    """Whether a scatter from station to station is estimated: in a joint fit that estimates the noise of both."""
     noisy = not any(name in readings.sd for name in TRIADS) and readings.magnetometer is not None
     grouped = bool((readings.groups >= 0).any())
     return options.scatter and noisy and options.method == "joint" and grouped
 
 
-def _scattered(evidence: Evidence, readings: Readings, options: Options) -> Evidence:
-    """The evidence with the first value of each scatter that the options have estimated."""
-    if not scatters(readings, options):
-        return evidence
-    names = [name for name in ("gravity", "field", "dip") if name not in evidence.absent]
-    start = np.full(evidence.include.shape, FIRST_SCATTER)
-    return replace(evidence, scatter=dict.fromkeys((*names, "direction"), start))
+def _evidence(readings: Readings, include: Array, options: Options) -> Evidence:
+    """What the options use of a run, with the stand errors and the scatter to be estimated."""
+    evidence = EVIDENCE[options.method](evidence_of(readings, include))
+    if options.ignore:
+        evidence = without(evidence, *options.ignore)
+    if options.estimate:
+        evidence = with_stand_errors(evidence, options.estimate)
+    if scatters(readings, options):
+        names = [name for name in ("gravity", "field", "dip") if name not in evidence.absent]
+        first = np.full(evidence.include.shape, FIRST_SCATTER)
+        evidence = replace(evidence, scatter=dict.fromkeys((*names, "direction"), first))
+    return evidence
 
 
 def _general(problem: Problem, declared: list[bool], options: Options, finite: Bools) -> Fit:
@@ -243,11 +243,8 @@ def _closed(
 
 def _noise(problem: Problem, declared: list[bool]) -> Array:
     """Estimated noise (B, triads) of one reading, NaN where it was declared."""
-    noise = [
-        np.full(len(t.sd), np.nan) if k else t.sd[:, 0, 0]
-        for t, k in zip(problem.triads, declared, strict=True)
-    ]
-    return np.stack(noise, -1)
+    noise = np.stack([triad.sd[:, 0, 0] for triad in problem.triads], -1)
+    return np.where(declared, np.nan, noise)
 
 
 def _determined(problem: Problem, state: State, solved: Solved) -> Determined:
@@ -326,7 +323,7 @@ def _estimate_noise(stage: _Stage, declared: list[bool], options: Options) -> _S
             solved = solve(problem, solved.state, options)
         return replace(now, problem=problem, solved=solved), settled
 
-    rounds = SCATTER_ROUNDS if stage.problem.evidence.scatter else options.rounds
+    rounds = SCATTER_ROUNDS if stage.problem.evidence.scatter else NOISE_ROUNDS
     return _in_turn(stage, rounds, turn)
 
 
@@ -392,7 +389,7 @@ def _trusting(problem: Problem, trust: Array) -> Problem:
 
 
 def _louder(problem: Problem, factor: Array) -> Problem:
-    """The problem with all that is a station's own, readings and angles, noisier by a factor (B, n)."""
+    """The problem with the readings and angles of each station noisier by a factor (B, n)."""
     triads = tuple(replace(t, sd=t.sd * factor[..., None]) for t in problem.triads)
     evidence = problem.evidence
     sd = {n: s * factor if n in ANGLES else s for n, s in evidence.sd.items()}

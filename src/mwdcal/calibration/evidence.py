@@ -111,14 +111,15 @@ def constants(evidence: Evidence) -> tuple[SharedConstant, ...]:
             scale = np.full(len(value), size) if size else np.where(value > 0, value, 1.0)
             shared.append(SharedConstant(name, (~known).astype(float), value, scale, unknown=True))
         sd = np.max(np.where(known, evidence.sd[name], 0.0), -1)
-        if (sd > 0).any():
-            floor = np.where(sd > 0, sd, 1e-12)
-            shared.append(
-                SharedConstant(name, known.astype(float), np.zeros(len(sd)), floor, unknown=False)
-            )
+        shared += _common_error(name, known.astype(float), sd)
     for name, sd in evidence.stand.items():
-        mask = acts_on(evidence, name)
-        if (sd > 0).any() and mask.any():
-            floor = np.where(sd > 0, sd, 1e-12)
-            shared.append(SharedConstant(name, mask, np.zeros(len(sd)), floor, unknown=False))
+        shared += _common_error(name, acts_on(evidence, name), sd)
     return tuple(shared)
+
+
+def _common_error(name: str, mask: Array, sd: Array) -> list[SharedConstant]:
+    """An error of standard uncertainty `sd` (B,) that stations share; none where all of that is zero."""
+    if not ((sd > 0).any() and mask.any()):
+        return []
+    floor = np.where(sd > 0, sd, 1e-12)
+    return [SharedConstant(name, mask, np.zeros(len(sd)), floor, unknown=False)]

@@ -1,12 +1,12 @@
 """The methods: which evidence each uses, and how each minimises.
 
 A method is a selection of evidence (`EVIDENCE`); most share one estimator. Newton-Raphson and the
-swarm have one of their own, as have the papers' unweighted sums (`Options.paper_weights`).
+swarm have another, as have the papers' unweighted sums (`Options.paper_weights`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -15,6 +15,7 @@ import numpy as np
 from mwdcal.calibration.evidence import STAND_TURNS, acts_on, constants
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import ANGLES
+from mwdcal.errors import FitError, InputError
 from mwdcal.estimation.evidence import UNKNOWN, Evidence, SharedConstant
 from mwdcal.estimation.minimisers.newton import newton, propagated
 from mwdcal.estimation.minimisers.swarm import swarm_forward
@@ -37,9 +38,21 @@ PAPER_WEIGHT = 1e10
 """Weight of every square of an unweighted sum: only its digits matter, not the minimum."""
 
 
-def joint(evidence: Evidence) -> Evidence:
-    """All evidence, weighted by its uncertainty."""
-    return evidence
+def check_stand_errors(names: Sequence[str], method: str) -> None:
+    """Refuse errors of the stand that cannot be estimated, whatever the stations."""
+    for name in names:
+        if name == "toolface-zero":
+            raise FitError(
+                "`estimate` toolface-zero: a zero of the stand's toolface can never be told from a "
+                "rotation of the sensors in the tool, whatever the stations. Set it by an index mark."
+            )
+        if name not in ESTIMABLE:
+            raise InputError(
+                f"`estimate` must be of {', '.join(ESTIMABLE)}; got {name!r}. Unknown field and dip "
+                "are estimated without being asked for."
+            )
+    if names and method != "joint":
+        raise InputError(f"`estimate` needs `method` joint; got {method!r}.")
 
 
 def whole_vectors(evidence: Evidence) -> Evidence:
@@ -50,22 +63,31 @@ def whole_vectors(evidence: Evidence) -> Evidence:
 
 def angles_alone(evidence: Evidence) -> Evidence:
     """Inclination and toolface of the accelerometer, without |g| (Ivanov); scale stays nominal."""
-    return _reset(evidence, absent=("gravity",))
+    return without(evidence, "gravity")
 
 
 def strengths_alone(evidence: Evidence) -> Evidence:
     """|g| and |b| at every station, and nothing else: the scalar (total field) method."""
-    known = dict(evidence.known)
-    for name in (*ANGLES, "dip"):
-        known[name] = np.full_like(known[name], np.nan)
+    blank = {name: np.full_like(evidence.known[name], np.nan) for name in (*ANGLES, "dip")}
     alone = np.full_like(evidence.group, -1)
-    return _reset(replace(evidence, known=known, group=alone), absent=("dip",))
+    return without(replace(evidence, known=evidence.known | blank, group=alone), "dip")
+
+
+def inclination_and_strength(evidence: Evidence) -> Evidence:
+    """|g| and inclination of the accelerometer (Moosavi); azimuth, |b| and dip of the magnetometer."""
+    known = {**evidence.known, "toolface": np.full_like(evidence.known["toolface"], np.nan)}
+    alone = np.full_like(evidence.group, -1)
+    return without(replace(evidence, known=known, group=alone))
+
+
+def without(evidence: Evidence, *names: str) -> Evidence:
+    """The evidence without some strengths or the dip: they differ from station to station."""
+    changed = replace(evidence, absent=tuple(dict.fromkeys((*evidence.absent, *names))))
+    return replace(changed, constants=constants(changed))
 
 
 def with_stand_errors(evidence: Evidence, names: tuple[str, ...]) -> Evidence:
     """The evidence with errors of the stand (see `ESTIMABLE`) as unknown constants of the run."""
-    if not names:
-        return evidence
     turns = [turn for error in names for turn in ESTIMABLE[error]]
     shared = [constant for constant in evidence.constants if constant.name not in turns]
     zero = np.zeros(len(evidence.include))
@@ -75,34 +97,15 @@ def with_stand_errors(evidence: Evidence, names: tuple[str, ...]) -> Evidence:
     return replace(evidence, constants=tuple(shared))
 
 
-def without(evidence: Evidence, names: tuple[str, ...]) -> Evidence:
-    """The evidence without some strengths or the dip: every station has its own."""
-    if not names:
-        return evidence
-    return _reset(evidence, tuple(dict.fromkeys((*evidence.absent, *names))))
-
-
-def inclination_and_strength(evidence: Evidence) -> Evidence:
-    """|g| and inclination of the accelerometer (Moosavi); azimuth, |b| and dip of the magnetometer."""
-    known = {**evidence.known, "toolface": np.full_like(evidence.known["toolface"], np.nan)}
-    alone = np.full_like(evidence.group, -1)
-    return _reset(replace(evidence, known=known, group=alone), evidence.absent)
-
-
-def _reset(evidence: Evidence, absent: tuple[str, ...]) -> Evidence:
-    """The evidence with its constants worked out again after a change."""
-    changed = replace(evidence, absent=absent, constants=())
-    return replace(changed, constants=constants(changed))
-
-
 EVIDENCE: dict[str, Callable[[Evidence], Evidence]] = {
-    "joint": joint,
+    "joint": lambda evidence: evidence,
     "least-squares": whole_vectors,
     "newton": inclination_and_strength,
     "swarm": whole_vectors,
     "toolface-inclination": angles_alone,
     "scalar": strengths_alone,
 }
+"""What each method uses of the evidence: "joint" all of it, weighted by its uncertainty."""
 
 
 @dataclass(frozen=True)
@@ -122,7 +125,7 @@ class Solved:
     unweighted: bool = False
 
     def pulls(self, problem: Problem, state: State) -> dict[int, Array]:
-        """How an error of a station's whitened reading moves the triads that have sums of their own.
+        """How an error of a station's whitened reading moves the triads that minimise `sums`.
 
         (B, n, p_t, 3) by triad; none where the likelihood is at its largest.
         """

@@ -39,15 +39,14 @@ class Options:
         scatter: estimate how far strengths, dip and the direction of a group depart from station to
             station, beside the noise; only where the noise of both triads is estimated.
         estimate: errors of the stand to estimate as well: "azimuth-zero", "inclination-zero", "tilt".
-        ignore: what may not be used at any station, of "gravity", "field", "dip": each station then
-            has its own.
+        ignore: what may not be used at any station, of "gravity", "field", "dip": they may then
+            differ from station to station.
         robust: None, "huber" or "student-t": weights that bound what a bad station can do.
         paper_weights: sum the squares as the method's paper does, unweighted.
         prior: what is known beforehand: "datasheet" (the tolerances in the profile), a previous
             calibration of the same tool, or knowledge of its parameters.
         exclude: labels of stations to leave out.
         seed: of the swarm.
-        rounds: most repetitions of fit and estimate of the noise.
 
     A fit takes `auto` as order 0 without own-axis terms; a calibration chooses first.
     """
@@ -65,7 +64,6 @@ class Options:
     prior: Knowledge | Calibration | Literal["datasheet"] | None = None
     exclude: tuple[str, ...] = ()
     seed: int = 0
-    rounds: int = 8
 
     def __post_init__(self) -> None:
         """Take one name for a tuple of one; refuse an order, a model, a triad or a prior that cannot be.

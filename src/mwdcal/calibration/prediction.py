@@ -116,18 +116,17 @@ class CalibratedTools:
 
         By the parameters of all triads and, with `noise`, by that of three readings of each.
         """
-        starts = np.cumsum([0, *(params.shape[-1] for params in self.parameters)])
-        size = starts[-1] + 3 * noise * len(self.models)
+        ends = np.cumsum([params.shape[-1] for params in self.parameters])
+        size = ends[-1] + 3 * noise * len(self.models)
         result = np.zeros((len(self.earth), len(self.models), *fields[0].shape[1:], size))
         for triad, (model, params) in enumerate(zip(self.models, self.parameters, strict=True)):
             warmth = np.broadcast_to(self.temperature[:, None], fields[triad].shape[:-1])
             raw = _reading(model, params, fields[triad], warmth, _STEPS if model.curved else 1)
-            columns = slice(starts[triad], starts[triad + 1])
-            result[:, triad, ..., columns] = model.jacobian(params, raw, warmth)
+            change, end = result[:, triad], ends[triad]
+            change[..., end - params.shape[-1] : end] = model.jacobian(params, raw, warmth)
             if noise:
-                columns = slice(starts[-1] + 3 * triad, starts[-1] + 3 * triad + 3)
-                slope = model.slope(params, raw, warmth)
-                result[:, triad, ..., columns] = slope * self.noise[:, triad, None, None, None]
+                slope, first = model.slope(params, raw, warmth), ends[-1] + 3 * triad
+                change[..., first : first + 3] = slope * self.noise[:, triad, None, None, None]
         return result
 
     @classmethod
@@ -174,16 +173,15 @@ def accuracy(
         change = tools.changes(both, noise)
         rows = {n: np.einsum("bati,btaic->bac", g, change) for n, g in gradients.items()}
     else:
-        change = tools.changes(
-            [s[:, None, None] * CORNERS for s in tools.earth[:, :2].transpose()], noise
-        )
+        strengths = tools.earth[:, :2].transpose()
+        change = tools.changes([s[:, None, None] * CORNERS for s in strengths], noise)
         change = change.reshape(len(change), -1, change.shape[-1])
         covariance = change @ covariance @ change.mT
         free = np.einsum("bip,bkp->bki", change, free)
         unit = vectors / earth[:, None, : len(tools.models), None]
         share = np.concatenate([np.ones_like(unit[..., :1]), unit], -1) @ CORNER_SHARES.transpose()
-        each = {n: share[..., None] * g[..., None, :] for n, g in gradients.items()}
-        rows = {n: row.reshape(*row.shape[:2], -1) for n, row in each.items()}
+        size = (*share.shape[:2], -1)
+        rows = {n: (share[..., None] * g[..., None, :]).reshape(size) for n, g in gradients.items()}
     return {n: _root_mean_square(each, number, covariance, free) for n, each in rows.items()}
 
 
@@ -228,20 +226,12 @@ def accuracy_map(calibration: Calibration) -> AccuracyMap:
     inclination = np.radians(np.linspace(2, 178, 45))
     azimuth = np.radians(np.linspace(0, 360, 25))
     grid = np.meshgrid(inclination, azimuth, indexing="ij")
-    sd = _over_toolface(calibration, grid[0], grid[1])
-    return AccuracyMap(inclination, azimuth, sd)
-
-
-def _over_toolface(
-    calibration: Calibration, inclination: Array, azimuth: Array
-) -> dict[str, Array]:
-    """1σ (…, n) by angle, root mean square over toolface: one toolface at a time, for memory."""
-    square = {name: np.zeros(inclination.shape) for name in angles(calibration)}
-    for toolface in TWELFTHS:
-        readings = readings_at(calibration, inclination, azimuth, toolface)
+    square = {name: np.zeros(grid[0].shape) for name in angles(calibration)}
+    for toolface in TWELFTHS:  # one at a time, for memory
+        readings = readings_at(calibration, *grid, toolface)
         for name, total in square.items():
             total += calibration.uncertainty(name, readings) ** 2 / len(TWELFTHS)
-    return {name: np.sqrt(total) for name, total in square.items()}
+    return AccuracyMap(inclination, azimuth, {name: np.sqrt(s) for name, s in square.items()})
 
 
 def accuracy_at(

@@ -50,7 +50,7 @@ class Knowledge:
 
 
 def prior_of(knowledge: Knowledge | None, models: Sequence[Model], batch: int) -> Prior:
-    """Knowledge as precision and expectation (B, p) of a fit's own parameters; none: all free.
+    """Knowledge as precision and expectation (B, p) of a fit's parameters; none: all free.
 
     Raises `FitError` where the knowledge is of another model.
     """
@@ -73,10 +73,10 @@ def prior_of(knowledge: Knowledge | None, models: Sequence[Model], batch: int) -
             f"{strange[0]}. Use the same `model`, `order` and `parameters` as it had."
         )
     rows = [i for i, name in enumerate(names) if name in knowledge.names]
-    theirs = [knowledge.names.index(names[i]) for i in rows]
+    places = [knowledge.names.index(names[i]) for i in rows]
     values, known = np.zeros(size), np.zeros((size, size))
-    values[rows] = knowledge.expected[theirs]
-    known[np.ix_(rows, rows)] = knowledge.precision[np.ix_(theirs, theirs)]
+    values[rows] = knowledge.expected[places]
+    known[np.ix_(rows, rows)] = knowledge.precision[np.ix_(places, places)]
     centre = np.linalg.solve(whole, np.broadcast_to(values, (batch, size))[..., None])[..., 0]
     return Prior(whole.mT @ known @ whole, np.asarray(centre))
 
@@ -87,24 +87,19 @@ def from_datasheet(profile: Profile, relative: bool = False) -> Knowledge:
     `relative`: the field's strength is unknown, so that neither scale nor bias of the
     magnetometer is known in its units, and only misalignments are.
     """
-    names, expected, spread = [], [], []
+    rows = []
     for triad in TRIADS:
         sheet = getattr(profile, triad).datasheet
-        if sheet is None:
-            continue
         unknown = relative and triad == "magnetometer"
-        for name, value, sd in _tolerances(sheet):
+        for name, value, sd in _tolerances(sheet) if sheet else []:
             if sd is not None and (not unknown or name.startswith("misalignment")):
-                names.append(f"{triad} {name}")
-                expected.append(value)
-                spread.append(sd)
-    precision = np.diag(np.array(spread) ** -2.0)
+                rows.append((f"{triad} {name}", value, sd))
     return Knowledge(
         "datasheet",
         profile.reference_temperature_c,
-        tuple(names),
-        np.array(expected),
-        precision,
+        tuple(name for name, _, _ in rows),
+        np.array([value for _, value, _ in rows]),
+        np.diag(np.array([sd for _, _, sd in rows]) ** -2.0),
         loose=True,
     )
 
@@ -202,16 +197,14 @@ def from_calibration(previous: Calibration, relative: bool = False) -> Knowledge
             "neither."
         )
     names = [f"{t.name} {name}" for t in previous.triads for name in t.parameter_names]
-    expected = previous.parameters
     covariance = previous.parameter_covariance
-    free = previous.free_directions
     moving = np.flatnonzero(np.diag(covariance) > 0)
     return Knowledge(
         previous.run,
         previous.reference_temperature,
         tuple(names[i] for i in moving),
-        expected[moving],
-        _precision(covariance[np.ix_(moving, moving)], free[:, moving]),
+        previous.parameters[moving],
+        _precision(covariance[np.ix_(moving, moving)], previous.free_directions[:, moving]),
         stations=(*(row.digest for row in previous.station_rows), *previous.inherited),
         temperature=previous.temperature_c,
         common=tuple(row.source for row in previous.budget),
@@ -254,6 +247,7 @@ def _tolerances(sheet: Datasheet) -> list[tuple[str, float, float | None]]:
 
 
 def _at(power: int, steady: float | None, drift: float | None) -> float | None:
-    if power == 0 or drift is None:
-        return steady if power == 0 else None
-    return drift / DRIFT_REACH ** (power - 1)
+    """Standard deviation of the coefficient of a power of temperature; None: not stated."""
+    if power == 0:
+        return steady
+    return None if drift is None else drift / DRIFT_REACH ** (power - 1)

@@ -43,8 +43,8 @@ def simulated(*metadata: Mapping[str, object]) -> list[str]:
 def group_numbers(labels: Sequence[str], starts: Sequence[int] = ()) -> Ints | None:
     """Group numbers (n,) in order of appearance, -1 for a blank label; None if all are blank.
 
-    `starts`: where each tool's labels begin, and the end, if they are of several tools: each then
-    has numbers of its own.
+    `starts`: where each tool's labels begin, and the end, if they are of several tools: numbers
+    then start again at each.
 
     >>> group_numbers(["B", "", "A", "B"]).tolist()
     [0, -1, 1, 0]
@@ -62,13 +62,10 @@ def fingerprints(triads: Sequence[Array]) -> tuple[str, ...]:
     Accelerometer first, then after a dash the magnetometer: stations of a fit are recognised
     without their magnetometer too.
     """
-    parts = [[_fingerprint(row) for row in (triad + 0.0).tolist()] for triad in triads]
-    return tuple("-".join(pair) for pair in zip(*parts, strict=True))
-
-
-def _fingerprint(row: Sequence[float]) -> str:
-    text = ",".join(f"{value:.12g}" for value in row)
-    return hashlib.sha256(text.encode()).hexdigest()[:DIGEST_LENGTH]
+    rows = zip(*((triad + 0.0).tolist() for triad in triads), strict=True)
+    texts = ([",".join(f"{value:.12g}" for value in reading) for reading in row] for row in rows)
+    hashes = ([hashlib.sha256(text.encode()).hexdigest() for text in row] for row in texts)
+    return tuple("-".join(each[:DIGEST_LENGTH] for each in row) for row in hashes)
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from math import erfc, gamma
 import numpy as np
 
 from mwdcal.calibration.estimate import Fit
-from mwdcal.calibration.readings import TRIADS, Readings
+from mwdcal.calibration.readings import ANGLES, TRIADS, Readings
 from mwdcal.calibration.record import ErrorRow, Measures, StationRow, stated
 from mwdcal.estimation.evidence import STAND_ERRORS
 from mwdcal.estimation.uncertainty import Analysis, station_misfit, without_station
@@ -94,86 +94,90 @@ def vector_measures(triad: str, when: str, actual: Array, target: Array) -> list
 
 @dataclass(frozen=True)
 class Residuals:
-    """The errors of one fitted run (B = 1), before and after, with what was to be expected."""
+    """The errors of one fitted run (B = 1), before and after, with what was to be expected.
+
+    Dictionaries have an entry for each observable, arrays in them are (n,), vectors (n, 3).
+    """
 
     readings: Readings
     fit: Fit
 
     @cached_property
     def after(self) -> tuple[Array, Array]:
-        """Corrected vectors (n, 3) each; the field is NaN without magnetometer."""
+        """Corrected vectors; the field is NaN without magnetometer."""
         g, b = self.fit.problem.fields(self.fit.state)
         return g[0], b[0]
 
     @cached_property
     def targets(self) -> tuple[Array, Array]:
-        """Vectors (n, 3) each that a perfect tool would read at the fitted attitudes."""
+        """Vectors that a perfect tool would read at the fitted attitudes."""
         g, b = self.fit.problem.targets(self.fit.state)
         return g[0], b[0]
 
-    def known(self, name: str) -> Array:
-        """Reference (n,) of an observable: given, or the estimated constant; NaN where unknown.
-
-        Angles of a stand whose common errors are unknowns of the fit: as they are without them.
-        """
-        if name in self.fit.problem.evidence.absent:
-            return np.asarray(self.fit.problem.evidence.known[name][0])
-        if name in ("gravity", "field", "dip"):
-            return np.asarray(self.fit.problem.constant(self.fit.state, name)[0])
-        value = np.asarray(self.fit.problem.evidence.known[name][0])
-        if not any(c.name in STAND_ERRORS for c in self.fit.problem.evidence.constants):
-            return value
-        return np.where(np.isnan(value), np.nan, self._stood(name))
-
-    def _stood(self, name: str) -> Array:
-        """An angle (n,) of the fitted attitudes; at vertical, where two do not exist, as given."""
-        north, _, down = np.moveaxis(self.fit.state.attitude[0], -1, 0)
-        angle = OBSERVABLES[name].value(down, north)
-        return np.where(np.isnan(angle), self.fit.problem.evidence.known[name][0], angle)
-
-    def _weight(self, name: str) -> Array:
-        """The weight (n,) of errors after the fit, zero where an observable does not exist."""
-        return np.nan_to_num(error_weight(name, self.known("inclination"), self.after[0]))
-
-    def judged(self, name: str) -> Bools:
-        """Stations (n,) whose error of an observable is known."""
-        return ~np.isnan(self.known(name)) & (self._weight(name) > 0)
-
-    def errors(self, name: str, fields: tuple[Array, Array]) -> Array:
-        """The `departure` (n,) of both vectors from the references of the run."""
-        known = {each: self.known(each) for each in dict.fromkeys((name, "inclination"))}
-        return departure(name, *fields, known)
-
     @cached_property
-    def _spread(self) -> Array:
-        """Expected covariance (n, m, m) of the whitened misfit left after the fit.
+    def known(self) -> dict[str, Array]:
+        """References: given, or the estimated constant; NaN where unknown.
 
-        In units of the noise itself, whatever weight a station has.
-        """
-        private = self.fit.problem.linear(self.fit.state).private
-        total = np.eye(private.shape[-2]) + private @ private.mT
-        inner = total @ _judged(self.fit).spread @ total
-        return np.asarray(inner[0])
-
-    def expected(self, name: str) -> Array:
-        """Standard deviation (n,) of `errors` after the fit that noise and stand alone would give.
-
-        NaN if the fit did not use it. Declared noise is not scaled by what the residuals come to:
-        the two are compared.
+        Angles of a stand whose common errors are unknowns of the fit: as they are without them, that
+        is of the fitted attitudes; at vertical, where two angles do not exist, as given.
         """
         problem, state = self.fit.problem, self.fit.state
-        if name in problem.evidence.absent:
-            return np.full(self.readings.count, np.nan)
-        gradient = OBSERVABLES[name].gradient(*self.targets)
-        rows = []
-        for index, (triad, where) in enumerate(zip(problem.triads, problem.slices(), strict=True)):
-            slope = triad.model.slope(state.params[:, where], triad.raw, problem.temperature)[0]
-            part = gradient[:, 3 * index : 3 * index + 3]
-            noise = triad.sd[0] * np.sqrt(self.fit.trust[0])[:, None]
-            rows.append(np.einsum("ni,nij->nj", part, slope) * noise)
-        row = np.nan_to_num(np.concatenate(rows, -1) * self._weight(name)[:, None])
-        variance = np.einsum("ni,nij,nj->n", row, self._spread, row)
-        return np.asarray(np.sqrt(np.maximum(variance, 0)))
+        evidence = problem.evidence
+        known = {name: np.asarray(evidence.known[name][0]) for name in SHOWN}
+        for name in {"gravity", "field", "dip"}.difference(evidence.absent):
+            known[name] = np.asarray(problem.constant(state, name)[0])
+        if any(constant.name in STAND_ERRORS for constant in evidence.constants):
+            north, _, down = np.moveaxis(state.attitude[0], -1, 0)
+            for name in ANGLES:
+                fitted = OBSERVABLES[name].value(down, north)
+                known[name] = np.where(np.isnan(fitted + known[name]), known[name], fitted)
+        return known
+
+    @cached_property
+    def weights(self) -> dict[str, Array]:
+        """Weights of errors after the fit, zero where an observable does not exist."""
+        inclination, g = self.known["inclination"], self.after[0]
+        return {name: np.nan_to_num(error_weight(name, inclination, g)) for name in SHOWN}
+
+    @cached_property
+    def judged(self) -> dict[str, Bools]:
+        """Stations whose error is known, of observables for which there is such a station."""
+        usable = SHOWN if len(self.fit.problem.triads) > 1 else SHOWN[:3]
+        judged = {n: ~np.isnan(self.known[n]) & (self.weights[n] > 0) for n in usable}
+        return {name: stations for name, stations in judged.items() if stations.any()}
+
+    def errors(self, fields: tuple[Array, Array]) -> dict[str, Array]:
+        """The `departure` of both vectors from the references of the run."""
+        return {name: departure(name, *fields, self.known) for name in self.judged}
+
+    @cached_property
+    def expected(self) -> dict[str, Array]:
+        """Standard deviations of `errors` after the fit that noise and stand alone would give.
+
+        NaN if the fit did not use an observable. Declared noise is not scaled by what the residuals
+        come to: the two are compared.
+        """
+        fit, problem, expected = self.fit, self.fit.problem, {}
+        private = problem.linear(fit.state).private
+        total = np.eye(private.shape[-2]) + private @ private.mT
+        # Covariance (n, m, m) of the whitened misfit, in units of the noise whatever the weights.
+        misfit = np.asarray(total @ _judged(fit).spread @ total)[0]
+        noise = [triad.sd[0] * np.sqrt(fit.trust[0])[:, None] for triad in problem.triads]
+        slopes = [
+            triad.model.slope(fit.state.params[:, where], triad.raw, problem.temperature)[0]
+            for triad, where in zip(problem.triads, problem.slices(), strict=True)
+        ]
+        for name in self.judged:
+            parts = np.split(OBSERVABLES[name].gradient(*self.targets), [3], axis=-1)
+            rows = [
+                np.einsum("ni,nij->nj", part, slope) * sd
+                for part, slope, sd in zip(parts, slopes, noise, strict=False)
+            ]
+            row = np.nan_to_num(np.concatenate(rows, -1) * self.weights[name][:, None])
+            variance = np.einsum("ni,nij,nj->n", row, misfit, row)
+            unused = name in problem.evidence.absent
+            expected[name] = np.where(unused, np.nan, np.sqrt(np.maximum(variance, 0)))
+        return expected
 
     @cached_property
     def _moves(self) -> list[Array]:
@@ -184,7 +188,7 @@ class Residuals:
 
     @cached_property
     def left_out(self) -> tuple[Array, Array]:
-        """Corrected vectors (n, 3) of each station, by the fit without it."""
+        """Corrected vectors of each station, by the fit without it."""
         problem, state = self.fit.problem, self.fit.state
         fields = []
         for triad, where, moved in zip(problem.triads, problem.slices(), self._moves, strict=True):
@@ -193,41 +197,43 @@ class Residuals:
             fields.append(triad.model.fields(params, raw, temperature)[:, 0])
         return fields[0], fields[1] if len(fields) > 1 else np.full_like(fields[0], np.nan)
 
-    def influence(self, name: str) -> Array:
-        """Largest change (n,) that each station makes to an observable, at stations of the run."""
+    @cached_property
+    def influence(self) -> dict[str, Array]:
+        """Largest change that each station makes to an observable, at stations of the run."""
         some = np.unique(np.linspace(0, self.readings.count - 1, PROBES).astype(int))
-        problem, state = self.fit.problem, self.fit.state
-        gradient = OBSERVABLES[name].gradient(*self.after)[some]
-        change = np.zeros((len(some), self.readings.count))
-        for index, (triad, where) in enumerate(zip(problem.triads, problem.slices(), strict=True)):
-            raw, temperature = triad.raw[:, some], problem.temperature[:, some]
-            rows = triad.model.jacobian(state.params[:, where], raw, temperature)[0]
-            part = np.nan_to_num(gradient[:, 3 * index : 3 * index + 3])
-            change += np.einsum("ni,nip->np", part, rows) @ self._moves[index].transpose()
-        weight = np.nan_to_num(self._weight(name)[some])
-        return np.asarray(np.abs(change * weight[:, None]).max(0))
+        problem, params, influence = self.fit.problem, self.fit.state.params, {}
+        rows = [
+            t.model.jacobian(params[:, where], t.raw[:, some], problem.temperature[:, some])[0]
+            for t, where in zip(problem.triads, problem.slices(), strict=True)
+        ]
+        for name in self.judged:
+            gradient = np.nan_to_num(OBSERVABLES[name].gradient(*self.after)[some])
+            triples = zip(np.split(gradient, [3], axis=-1), rows, self._moves, strict=False)
+            changes = [
+                np.einsum("ni,nip->np", part, row) @ m.transpose() for part, row, m in triples
+            ]
+            change = np.sum(changes, 0) * self.weights[name][some][:, None]
+            influence[name] = np.abs(change).max(0)
+        return influence
 
     @cached_property
     def stations(self) -> list[StationRow]:
         """Errors of every station, with the ones to take again."""
         from scipy.special import ndtri
 
-        readings, fit = self.readings, self.fit
-        names = self.names()
-        chance = chances(fit)[0]
+        readings, after = self.readings, self.errors(self.after)
+        chance = chances(self.fit)[0]
         again, deviation = to_reshoot(chance), -ndtri(np.maximum(chance, 1e-300) / 2)
-        after = {n: self.errors(n, self.after) for n in names}
-        before = {n: self.errors(n, nominal(readings)) for n in names}
-        left_out = {n: self.errors(n, self.left_out) for n in names}
-        influence = {n: self.influence(n) for n in names}
-        expected = {n: np.nan_to_num(self.expected(n), nan=np.inf) for n in names}
-        ratio = {n: np.abs(after[n]) / np.maximum(expected[n], 1e-30) for n in names}
-        factors = {n: shown_in(n, readings.relative)[0] for n in names}
-        attitude = {n: np.degrees(OBSERVABLES[n].value(*self.after)) for n in SHOWN[1:4]}
+        ratio = {
+            name: np.abs(after[name]) / np.maximum(np.nan_to_num(sd, nan=np.inf), 1e-30)
+            for name, sd in self.expected.items()
+        }
+        shown = after, self.errors(nominal(readings)), self.errors(self.left_out), self.influence
+        factors = {name: shown_in(name, readings.relative)[0] for name in after}
+        angles = {n: np.degrees(OBSERVABLES[n].value(*self.after)) for n in ANGLES}
         rows = []
         for i in range(readings.count):
-            bad = bool(again[i])
-            scores = {n: float(ratio[n][i]) for n in names if not np.isnan(after[n][i])}
+            errors, before, left_out, influence = (_scaled(each, factors, i) for each in shown)
             rows.append(
                 StationRow(
                     station=readings.labels[i],
@@ -235,41 +241,38 @@ class Residuals:
                     temperature_c=None
                     if readings.temperature is None
                     else float(readings.temperature[i]),
-                    inclination_deg=stated(attitude["inclination"][i]),
-                    toolface_deg=stated(attitude["toolface"][i]),
-                    azimuth_deg=stated(attitude["azimuth"][i]),
-                    errors=_scaled(after, factors, i),
-                    errors_before=_scaled(before, factors, i),
-                    errors_left_out=_scaled(left_out, factors, i),
-                    influence=_scaled(influence, factors, i),
-                    weight=float(fit.trust[0, i]),
+                    inclination_deg=stated(angles["inclination"][i]),
+                    toolface_deg=stated(angles["toolface"][i]),
+                    azimuth_deg=stated(angles["azimuth"][i]),
+                    errors=errors,
+                    errors_before=before,
+                    errors_left_out=left_out,
+                    influence=influence,
+                    weight=float(self.fit.trust[0, i]),
                     deviation=float(deviation[i]),
-                    reshoot=bad,
-                    worst=max(scores, key=lambda n: scores[n]) if bad and scores else None,
+                    reshoot=bool(again[i]),
+                    worst=max(errors, key=lambda name: ratio[name][i], default=None)
+                    if again[i]
+                    else None,
                 )
             )
         return rows
 
-    def names(self) -> list[str]:
-        """Observables with an error that is known somewhere in this run."""
-        usable = SHOWN if len(self.fit.problem.triads) > 1 else SHOWN[:3]
-        return [n for n in usable if self.judged(n).any()]
-
 
 def error_rows(residuals: Residuals) -> list[ErrorRow]:
     """Root mean square errors before and after, and what was to be expected after."""
-    rows, before = [], nominal(residuals.readings)
-    for name in residuals.names():
+    rows, after = [], residuals.errors(residuals.after)
+    before = residuals.errors(nominal(residuals.readings))
+    for name, judged in residuals.judged.items():
         factor, unit = shown_in(name, residuals.readings.relative)
-        judged = residuals.judged(name)
         rows.append(
             ErrorRow(
                 observable=name,
                 unit=unit,
                 stations=int(judged.sum()),
-                before=rms(residuals.errors(name, before)[judged]) * factor,
-                after=rms(residuals.errors(name, residuals.after)[judged]) * factor,
-                expected=stated(rms(residuals.expected(name)[judged]) * factor),
+                before=rms(before[name][judged]) * factor,
+                after=rms(after[name][judged]) * factor,
+                expected=stated(rms(residuals.expected[name][judged]) * factor),
             )
         )
     return rows
@@ -280,7 +283,7 @@ def measure_rows(residuals: Residuals) -> list[Measures]:
     rows = []
     for index, name in enumerate(TRIADS[: len(residuals.fit.problem.triads)]):
         needed = ("inclination", "toolface", "azimuth")[: 2 + index]
-        whole = np.all([~np.isnan(residuals.known(n)) for n in needed], axis=0)
+        whole = np.all([~np.isnan(residuals.known[n]) for n in needed], axis=0)
         target = np.where(whole[:, None], residuals.targets[index], np.nan)
         for when, fields in (("before", nominal(residuals.readings)), ("after", residuals.after)):
             rows += vector_measures(name, when, fields[index], target)
@@ -288,7 +291,7 @@ def measure_rows(residuals: Residuals) -> list[Measures]:
 
 
 def _judged(fit: Fit) -> Analysis:
-    """The analysis by which stations are judged: in a robust fit their own errors are whole.
+    """The analysis by which stations are judged: in a robust fit with their errors whole.
 
     A weight w takes a station's pull on the fit, not its noise: with V = C⁻¹ the residual V ρ has
     the covariance V + (1 - 2 w) V X Cov XᵀV, from V - … at w = 1 to V + … where it is left out.
@@ -353,5 +356,6 @@ def chi_chance(square: Array, freedom: Array) -> Array:
 
 
 def _scaled(errors: dict[str, Array], factors: dict[str, float], index: int) -> dict[str, float]:
+    """Errors of one station that are not NaN, in the units they are shown in."""
     pairs = {n: float(e[index] * factors[n]) for n, e in errors.items()}
     return {n: v for n, v in pairs.items() if not np.isnan(v)}

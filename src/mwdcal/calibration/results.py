@@ -24,7 +24,7 @@ from mwdcal.calibration.record import FREE_SHARE
 from mwdcal.estimation.batch import take
 from mwdcal.estimation.rank import Free
 from mwdcal.estimation.uncertainty import marginal_rank
-from mwdcal.geometry.vectors import Array, Bools, diagonal, outer
+from mwdcal.geometry.vectors import Array, Bools, outer
 from mwdcal.sensor.models import Whole
 
 NOISE, SETTINGS, PRIOR = "noise of the readings", "settings of the stand", "prior"
@@ -44,39 +44,37 @@ class StatedCovariance:
     result: Fit
 
     @cached_property
+    def _parts(self) -> tuple[Array, Array, Array, Array]:
+        """From independent errors, from shared ones and a prior, from the prior alone, from the order.
+
+        Errors of a prior of precision Λ do V Λ V to a fit of covariance V.
+        """
+        analysis, precision = self.result.analysis, self.result.problem.prior.precision
+        effects, covariance = analysis.effects, analysis.covariance
+        prior = covariance @ precision @ covariance if precision.any() else 0 * precision
+        shared = effects @ effects.mT + prior
+        independent = _scaled(self.result, covariance - shared)
+        return independent, shared, prior, misfit_covariance(self.result)
+
+    @cached_property
     def total(self) -> Array:
         """Covariance (B, p, p): independent errors times s², others as they are."""
-        return np.asarray(self._independent + self._common + self._order)
+        independent, shared, _, order = self._parts
+        return np.asarray(independent + shared + order)
 
     def by_source(self) -> dict[str, Array]:
         """Covariance (B, p, p) by source; all together they are `total`.
 
         A common error comes under the name of its constant of the run.
         """
-        result = self.result
+        result, (independent, _, prior, order) = self.result, self._parts
         settings = _scaled(result, _of_settings(result))
-        shares = {NOISE: self._independent - settings, SETTINGS: settings}
+        shares = {NOISE: independent - settings, SETTINGS: settings}
         for index, constant in enumerate(result.problem.evidence.constants):
             effect = result.analysis.effects[..., index]
             shares[constant.name] = shares.get(constant.name, 0.0) + outer(effect)
-        shares |= {ORDER: self._order, PRIOR: _of_prior(result)}
+        shares |= {ORDER: order, PRIOR: prior}
         return {name: share for name, share in shares.items() if name == NOISE or share.any()}
-
-    @cached_property
-    def _common(self) -> Array:
-        """From errors that all stations share, and from a prior."""
-        effects = self.result.analysis.effects
-        return np.asarray(effects @ effects.mT + _of_prior(self.result))
-
-    @cached_property
-    def _independent(self) -> Array:
-        """From errors that are independent from station to station."""
-        return _scaled(self.result, self.result.analysis.covariance - self._common)
-
-    @cached_property
-    def _order(self) -> Array:
-        """From what the order of the temperature terms leaves out."""
-        return misfit_covariance(self.result)
 
 
 def constants_covariance(result: Fit) -> Array:
@@ -86,11 +84,11 @@ def constants_covariance(result: Fit) -> Array:
     """
     analysis, constants = result.analysis, result.problem.evidence.constants
     scaled = analysis.constants * variance_scales(result).max(-1)[:, None, None]
-    most = [np.full(len(scaled), np.inf) if c.unknown else c.sd for c in constants]
-    if not most:
-        return np.asarray(scaled)
-    sd = np.sqrt(np.maximum(diagonal(scaled), 1e-300))
-    less = np.minimum(np.stack(most, -1) / sd, 1.0)
+    less = np.ones(scaled.shape[:2])
+    for place, constant in enumerate(constants):
+        if not constant.unknown:
+            sd = np.sqrt(np.maximum(scaled[:, place, place], 1e-300))
+            less[:, place] = np.minimum(constant.sd / sd, 1.0)
     return np.asarray(scaled * outer(less))
 
 
@@ -142,38 +140,25 @@ def _scaled(result: Fit, covariance: Array) -> Array:
     return np.asarray(covariance * outer(grown))
 
 
-def _of_prior(result: Fit) -> Array:
-    """V Λ V: what errors of a prior of precision Λ do to a fit of covariance V."""
-    precision, covariance = result.problem.prior.precision, result.analysis.covariance
-    return covariance @ precision @ covariance if precision.any() else np.zeros_like(covariance)
-
-
 def _of_settings(result: Fit) -> Array:
     """Covariance (B, p, p) from independent errors of the stand's angles, before scaling.
 
     A station's reading has the covariance C = I + GGᵀ in units of its noise, the columns of G being
-    what its own unknowns do; those of known angles are meant here.
+    what its unknowns do; those of known angles are meant here.
     """
     analysis, problem = result.analysis, result.problem
     if not any(problem.evidence.sd[n].any() for n in ("inclination", "azimuth", "toolface")):
         return np.zeros_like(analysis.covariance)
     linear = problem.linear(result.state)
+    p = linear.size
     if analysis.influence is None:
-        rows = linear.weigh(linear.design).mT
-        p = linear.size
-        moved = analysis.covariance[:, None] @ _reduced(rows, linear.normal.information, p)
+        rows, information = linear.weigh(linear.design).mT, linear.normal.information
+        cross = np.linalg.solve(information[:, p:, p:], information[:, p:, :p])
+        moved = analysis.covariance[:, None] @ (rows[:, :, :p] - cross.mT[:, None] @ rows[:, :, p:])
     else:
-        moved = analysis.influence[:, :, : linear.size]
+        moved = analysis.influence[:, :, :p]
     effect = moved @ linear.private
     return np.asarray(np.einsum("bnia,bnja->bij", effect, effect, optimize=True))
-
-
-def _reduced(rows: Array, information: Array, p: int) -> Array:
-    """Rows (B, n, u, m) of XᵀC⁻¹ with the unknowns behind the first p eliminated: (B, n, p, m)."""
-    if rows.shape[2] == p:
-        return rows
-    cross = np.linalg.solve(information[:, p:, p:], information[:, p:, :p])
-    return np.asarray(rows[:, :, :p] - cross.mT[:, None] @ rows[:, :, p:])
 
 
 @dataclass(frozen=True)
@@ -227,8 +212,8 @@ def triad_results(
 
 def reading_noise(result: Fit) -> Array:
     """Standard deviation (B, t) of one reading of each triad, estimated or the mean of what is declared."""
-    declared = [triad.sd.mean((-1, -2)) for triad in result.problem.triads]
-    return np.where(np.isnan(result.noise), np.stack(declared, -1), result.noise)
+    declared = np.stack([triad.sd.mean((-1, -2)) for triad in result.problem.triads], -1)
+    return np.where(np.isnan(result.noise), declared, result.noise)
 
 
 def _effect(model: Whole, params: Array, raw: Array, temperature: Array) -> Array:
@@ -276,11 +261,9 @@ def triad_singular_values(result: Fit, index: int) -> Array:
 
 def temperature_range(result: Fit, prior: Knowledge | None) -> tuple[Array, Array]:
     """Coldest and hottest station (B,) each, °C; those behind the prior count too."""
-    low, high = result.problem.temperature.min(-1), result.problem.temperature.max(-1)
-    known = prior.temperature if prior else None
-    if known is None:
-        return low, high
-    return np.minimum(low, known[0]), np.maximum(high, known[1])
+    low, high = prior.temperature if prior and prior.temperature else (np.inf, -np.inf)
+    temperature = result.problem.temperature
+    return np.minimum(temperature.min(-1), low), np.maximum(temperature.max(-1), high)
 
 
 def calibrated_tools(
@@ -319,10 +302,10 @@ def stand_errors(result: Fit) -> dict[str, Array]:
             word = name.replace("-", "_")
             errors[f"{word}_deg"] = value[:, place]
             errors[f"{word}_uncertainty_deg"] = np.sqrt(covariance[:, place, place])
-    if "stand-north" not in names:
-        return errors
-    pair = [names.index("stand-north"), names.index("stand-east")]
-    return errors | _tilt(value[:, pair], covariance[:, pair][..., pair])
+    if "stand-north" in names:
+        pair = [names.index("stand-north"), names.index("stand-east")]
+        errors |= _tilt(value[:, pair], covariance[:, pair][..., pair])
+    return errors
 
 
 def _tilt(turn: Array, covariance: Array) -> dict[str, Array]:

@@ -94,7 +94,7 @@ def readings(
 
 
 def _numbers(name: str, values: ArrayLike) -> Array:
-    """Values as an array of its own; NaN where a table has a null."""
+    """Values as a new array; NaN where a table has a null."""
     try:
         if np.asarray(values).dtype.kind in "bcmM":
             raise TypeError(f"got {np.asarray(values).dtype}")
@@ -157,7 +157,7 @@ def nearest(name: str, names: Iterable[str]) -> str:
 
 
 def _by_name(values: Mapping[str, ArrayLike], limits: Mapping[str, Range]) -> dict[str, str]:
-    """For each quantity the name that it is given by: its own, or that of its twin in degrees."""
+    """For each quantity the name that it is given by: that of the quantity, or of its twin in degrees."""
     spelled = {name.replace("-", "_"): name for name in limits}
     angles = [key for key, name in spelled.items() if limits[name].unit == "°"]
     spelled |= {f"{key}{DEGREES}": spelled[key] for key in angles}
@@ -179,13 +179,17 @@ def _by_name(values: Mapping[str, ArrayLike], limits: Mapping[str, Range]) -> di
     return given
 
 
-def _angle(name: str, values: Array, limits: Range, degrees: bool, turning: bool) -> Array:
-    """Angles in radians, from degrees or radians; `turning` ones in 0…360°."""
-    factor, whole = (float(np.radians(1)), 360.0) if degrees else (1.0, 2 * np.pi)
-    if not degrees:
+def _converted(
+    name: str, values: Array, limits: Range, advice: str, turning: bool = False
+) -> Array:
+    """Values within limits; angles in radians, from degrees where the name says so, `turning` ones in 0…360°."""
+    if limits.unit != "°":
+        return _within(name, values, limits, advice)
+    advice, factor, whole = "Check the value.", float(np.radians(1)), 360.0
+    if not name.endswith(DEGREES):
         low, high = np.radians((limits.low, limits.high)).tolist()
-        limits = Range(low, high, "rad")
-    advice = "Check the value." if degrees else f"Degrees go to `{name}{DEGREES}`."
+        limits, factor, whole = Range(low, high, "rad"), 1.0, 2 * np.pi
+        advice = f"Degrees go to `{name}{DEGREES}`."
     values = _within(name, values, limits, advice)
     outside = (values < 0) | (values >= whole)
     return np.where(outside, wrap(values, whole), values) * factor if turning else values * factor
@@ -196,11 +200,8 @@ def _known(references: Mapping[str, Any], shape: tuple[int, ...]) -> dict[str, A
     given = {key: value for key, value in references.items() if value is not None}
     limits, known = {name: reference.values for name, reference in REFERENCES.items()}, {}
     for name, key in _by_name(given, limits).items():
-        values = _broadcast(key, given[key], shape)
-        if limits[name].unit == "°":
-            values = _angle(key, values, limits[name], key.endswith(DEGREES), name in TURNING)
-        else:
-            values = _within(key, values, limits[name], "Check the unit.")
+        values, turning = _broadcast(key, given[key], shape), name in TURNING
+        values = _converted(key, values, limits[name], "Check the unit.", turning)
         if not np.isnan(values).all():
             known[name] = values
     return known
@@ -220,11 +221,7 @@ def _uncertainties(sd: Mapping[str, ArrayLike], shape: tuple[int, ...]) -> dict[
             uncertainties[name] = _within(label, values, limits[name], advice, axis=-2)
             continue
         values = np.nan_to_num(_broadcast(label, sd[key], shape))
-        uncertainties[name] = (
-            _angle(label, values, limits[name], key.endswith(DEGREES), False)
-            if limits[name].unit == "°"
-            else _within(label, values, limits[name], advice)
-        )
+        uncertainties[name] = _converted(label, values, limits[name], advice)
     return uncertainties
 
 

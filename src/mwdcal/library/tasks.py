@@ -32,11 +32,8 @@ from mwdcal.use.correction import correct
 from mwdcal.use.verification import Limits, Verdict
 from mwdcal.use.verification import verify as judge
 
-NOMINAL = Profile(
-    name="nominal",
-    accelerometer=TriadProfile(scale=1.0),
-    magnetometer=TriadProfile(scale=1.0),
-)
+_UNSCALED = TriadProfile(scale=1.0)
+NOMINAL = Profile(name="nominal", accelerometer=_UNSCALED, magnetometer=_UNSCALED)
 """The profile of arrays: raw readings are nominal g and nT along the tool axes."""
 
 CORRECTED_ANGLES = ("inclination", "azimuth", "toolface", "dip", "magnetic_toolface")

@@ -1,1 +1,1 @@
-"""What the software chooses where an option says `auto`: order, nonlinearity, stand errors."""
+"""What the software chooses where an option says `auto`: order, nonlinearity."""

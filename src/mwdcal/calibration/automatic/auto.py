@@ -15,8 +15,8 @@ from mwdcal.calibration.automatic.nonlinearity import (
     with_strengths,
 )
 from mwdcal.calibration.automatic.order_selection import choose_order, order_errors
-from mwdcal.calibration.automatic.stand import check_names
 from mwdcal.calibration.diagnosis.refusals import check_curves, check_readings
+from mwdcal.calibration.methods import check_stand_errors
 from mwdcal.calibration.options import AUTO, Options
 from mwdcal.calibration.prior import DATASHEET, for_run, from_datasheet, profile_for
 from mwdcal.calibration.readings import Readings
@@ -49,7 +49,7 @@ def choose(
 
     Raises `FitError` or `InputError` for readings and options that no fit could use.
     """
-    check_names(options.estimate, options.method)
+    check_stand_errors(options.estimate, options.method)
     excluded = [label for label in readings.labels if label in options.exclude]
     readings = without(readings, options.exclude)
     options, orders, curves = resolved(options, readings, profile, progress)

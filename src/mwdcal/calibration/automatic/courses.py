@@ -26,7 +26,7 @@ UNLIKELY = 1e-3
 LEFT_TO_TERM = 1e-6
 """A direction of a term counts if the fit leaves this share of its information to it."""
 RIDGE = 1e-11
-"""Added to the information of the fit's own unknowns, that it has an inverse: free ones stay free."""
+"""Added to the information of the fit's unknowns, so that it has an inverse: free ones stay free."""
 OFFSETS = tuple(f"{word}-{axis}" for word in ("offset", "bias") for axis in "xyz")
 """Steady offsets of the axes, in either model."""
 GRID = 64
@@ -59,11 +59,6 @@ class OmittedTerms:
     def present(self) -> Bools:
         """Terms (B, t, k) that noise does not explain."""
         return np.asarray(np.nan_to_num(self.chance, nan=1.0) < UNLIKELY)
-
-    @property
-    def misfit(self) -> Bools:
-        """Triads (B, t) of which noise does not explain all terms."""
-        return np.asarray(self.present.any(-1))
 
     @property
     def variance(self) -> Array:
@@ -157,8 +152,7 @@ def _with_terms(result: Fit, shown: Bools, least: int) -> tuple[Array, Array]:
     powered = powered.reshape(members, count * width, count * width)
     pulled = -summed(weighed @ linear.residual[..., None], turned).reshape(members, -1)
     normal = linear.normal
-    top = np.concatenate([normal.information, cross.mT], -1)
-    whole = np.concatenate([top, np.concatenate([cross, powered], -1)], -2)
+    whole = np.block([[normal.information, cross.mT], [cross, powered]])
     return whole, np.concatenate([-normal.gradient, pulled], -1)
 
 
@@ -230,13 +224,13 @@ def untested(result: Fit) -> Bools:
     return np.asarray((levels > 1) & (orders > 0) & (levels <= orders + 1))
 
 
-def misfit_size(result: Fit, terms: OmittedTerms) -> Array:
+def misfit_size(result: Fit) -> Array:
     """Root mean square (B, t), per axis, of what the orders leave out, as a share of the field."""
-    gains, offsets = np.moveaxis(course_misfit(result, terms), -1, 0)
+    gains, offsets = np.moveaxis(course_misfit(result), -1, 0)
     return np.asarray(np.sqrt(gains / 3 + offsets))
 
 
-def course_misfit(result: Fit, terms: OmittedTerms | None = None) -> Array:
+def course_misfit(result: Fit) -> Array:
     """Variance (B, t, 2) of gains and offsets that the order leaves out, shares of the field squared.
 
     Mean square over the range of temperatures of all terms that are there, and of the next one
@@ -244,8 +238,7 @@ def course_misfit(result: Fit, terms: OmittedTerms | None = None) -> Array:
     highest order is scatter between soaks: it is as large at any other temperature, and each soak
     passes its share of it on to the fit.
     """
-    terms = terms or terms_beyond(result)
-    problem, variances = result.problem, []
+    problem, terms, variances = result.problem, terms_beyond(result), []
     for index, order in enumerate(orders_of(result)):
         powers = np.arange(1, TRIED + 1)
         counted = terms.present[:, index] | (powers == order + 1)
@@ -303,22 +296,19 @@ def _left_out(problem: Problem, order: int) -> tuple[Array, Array]:
     return np.mean(remainder**2, -2), mean * levels / freedom * (1 + (order + 1) / levels)
 
 
-def misfit_covariance(result: Fit, terms: OmittedTerms | None = None) -> Array:
+def misfit_covariance(result: Fit) -> Array:
     """Covariance (B, p, p) of the fit's parameters that stands for what its order leaves out."""
     problem, params = result.problem, result.state.params
     covariance = np.zeros((*params.shape, params.shape[-1]))
     if not highest_order(problem.temperature).any():
         return covariance
-    variance = course_misfit(result, terms)
+    variance = course_misfit(result)
+    stretches = np.eye(3) + TANGENT_STEP * np.eye(3)[:, None] * np.eye(3)
     for index, (triad, where) in enumerate(zip(problem.triads, problem.slices(), strict=True)):
-        target = problem.targets(result.state)[index]
-        strength = np.linalg.norm(target, axis=-1).mean(-1)
-        stretches = np.eye(3) + TANGENT_STEP * np.eye(3)[:, None] * np.eye(3)
+        strength = np.linalg.norm(problem.targets(result.state)[index], axis=-1).mean(-1)
         gains = [tangent(triad.model, params[:, where], stretch) for stretch in stretches]
         names = [name for name in triad.model.names if name in OFFSETS]
         offsets = np.eye(triad.model.size)[[triad.model.names.index(name) for name in names]]
-        every = [np.stack(gains, 1), offsets * strength[:, None, None]]
-        for place, rows in enumerate(every):
-            spread = rows.mT @ rows
-            covariance[:, where, where] += spread * variance[:, index, place, None, None]
+        for place, rows in enumerate([np.stack(gains, 1), offsets * strength[:, None, None]]):
+            covariance[:, where, where] += rows.mT @ rows * variance[:, index, place, None, None]
     return covariance

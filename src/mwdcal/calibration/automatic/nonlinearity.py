@@ -13,7 +13,7 @@ from itertools import combinations
 
 import numpy as np
 
-from mwdcal.calibration.automatic.order_selection import misfit, with_noise
+from mwdcal.calibration.automatic.order_selection import misfit, with_all_stations, with_noise
 from mwdcal.calibration.estimate import fit, scatters
 from mwdcal.calibration.options import AUTO, USUAL, Options
 from mwdcal.calibration.readings import TRIADS, Readings
@@ -64,21 +64,6 @@ class Curves:
     score: Array
     odds: bool
 
-    def table(self, member: int) -> list[CurveScore]:
-        """What spoke for each choice of one tool; nothing where there was none to make."""
-        if len(self.choices) < 2:
-            return []
-        values = self.score[member] / (np.log(10) if self.odds else 1.0)
-        return [
-            CurveScore(
-                triads,
-                None if self.odds else float(value),
-                place == self.chosen[member],
-                float(value) if self.odds else None,
-            )
-            for place, (triads, value) in enumerate(zip(self.choices, values, strict=True))
-        ]
-
 
 def declared(profile: Profile, options: Options) -> dict[str, float]:
     """Triads whose profile declares a nonlinearity and whose model can have it, with its prior.
@@ -119,10 +104,14 @@ def scattered(readings: Readings, options: Options) -> Options:
 def choose_curves(
     readings: Readings, options: Options, terms: Mapping[str, float]
 ) -> tuple[dict[str, float], list[CurveScore]]:
-    """Of the offered own-axis terms those that one run shows clearly, and the table."""
+    """Of the offered own-axis terms those that one run shows clearly, and the table, if there is a choice."""
     curves = compare_curves(batch_of_one(readings), options, terms)
-    chosen = curves.choices[curves.chosen[0]]
-    return {name: terms[name] for name in chosen}, curves.table(0)
+    chosen, table = int(curves.chosen[0]), []
+    for place, triads in enumerate(curves.choices):
+        value = float(curves.score[0, place])
+        left_out, odds = (None, value / float(np.log(10))) if curves.odds else (value, None)
+        table.append(CurveScore(triads, left_out, place == chosen, odds))
+    return {n: terms[n] for n in curves.choices[chosen]}, table if len(table) > 1 else []
 
 
 def compare_curves(readings: Readings, options: Options, terms: Mapping[str, float]) -> Curves:
@@ -135,7 +124,11 @@ def compare_curves(readings: Readings, options: Options, terms: Mapping[str, flo
         each = [{name: terms[name] for name in choice} for choice in choices]
         chosen, score = _by_left_out(readings, options, each)
         return Curves(choices, chosen, score, False)
-    odds = log_odds(readings, options, every, _trusted(readings, options, every))
+    include = np.ones(readings.accelerometer.shape[:-1])
+    if options.robust:  # those that a robust fit with all terms trusts
+        trust = fit(readings, replace(options, nonlinearity=every)).trust
+        include = np.asarray(trust > TRUSTED, float)
+    odds = log_odds(readings, options, every, include)
     score = np.stack([np.zeros(count), odds], -1)
     return Curves([(), choices[-1]], np.asarray(odds > ODDS, int), score, True)
 
@@ -158,13 +151,6 @@ def log_odds(
         result = fit(readings, replace(options, robust=None, nonlinearity=curved), include)
         evidence.append(log_evidence(result.problem, result.state))
     return np.nan_to_num(evidence[1] - evidence[0], nan=-np.inf)
-
-
-def _trusted(readings: Readings, options: Options, terms: Mapping[str, float]) -> Array:
-    """Stations (B, n) that may decide: all, or those that a robust fit with all terms trusts."""
-    if not options.robust:
-        return np.ones(readings.accelerometer.shape[:-1])
-    return np.asarray(fit(readings, replace(options, nonlinearity=terms)).trust > TRUSTED, float)
 
 
 def _by_left_out(
@@ -194,5 +180,5 @@ def _left_out(readings: Readings, options: Options) -> Array:
     part = np.arange(readings.count) % parts
     include = (np.arange(parts)[:, None] != part).astype(float)
     result = fit(mapped(lambda value: np.expand_dims(value, 1), readings), options, include)
-    square = misfit(result).mean(-1).reshape(-1, parts, readings.count) / 3
+    square = misfit(*with_all_stations(result)).mean(-1).reshape(-1, parts, readings.count) / 3
     return np.asarray(square[:, part, np.arange(readings.count)])

@@ -20,9 +20,8 @@ from mwdcal.calibration.residuals import shown_in
 from mwdcal.calibration.soaks import HIGHEST, highest_order, usable_soaks
 from mwdcal.estimation.batch import batch_of_one, mapped, take
 from mwdcal.estimation.problem import Problem, State
-from mwdcal.estimation.solvers import Linear
 from mwdcal.estimation.uncertainty import TESTED, marginal_rank, readjusted
-from mwdcal.geometry.vectors import Array, Bools, Ints
+from mwdcal.geometry.vectors import Array, Ints
 
 FEWEST = 3
 """Fewest soaks among which one can be left out."""
@@ -48,7 +47,7 @@ def choose_order(
             "two temperatures cannot be left out in turn: order 1 is taken where order 0 leaves "
             "residuals beyond the noise. A third temperature would test the course between."
         )
-    orders = [(order, order) for order in range(_highest(batch, options) + 1)]
+    orders = [(order, order) for order in range(int(_highest(batch, options)[0]) + 1)]
     batch = with_noise(batch, replace(options, order=orders[-1]))
     pair = (int(chosen[0, 0]), int(chosen[0, -1]))
     return pair, _scores(batch, options, orders, chosen[0], chance[0], progress)
@@ -65,10 +64,15 @@ def choose_orders(readings: Readings, options: Options) -> Ints:
 
 
 def _judged_soaks(readings: Readings, options: Options) -> Ints:
-    """Soaks (B,) by which the order of each member is judged; 1: it has order 0 without a trial."""
+    """Soaks (B,) by which the order of each member is judged; 1: it has order 0 without a trial.
+
+    So has one whose stations cannot even determine what all temperatures have in common.
+    """
     levels = _usable_soaks(readings).max(-1) + 1
     if (levels > 1).any():
-        levels = np.where(_hopeless(readings, options), 1, levels)
+        result = fit(readings, Options(method=options.method))
+        ranks = [marginal_rank(result.analysis.determined, w) for w in result.problem.slices()]
+        levels = np.where(np.min(ranks, 0) < LOWEST_RANK, 1, levels)
     return np.asarray(levels)
 
 
@@ -77,7 +81,7 @@ def _tested(readings: Readings, options: Options) -> tuple[Ints, Array]:
 
     The chance is that of the term in a fit of the order below, or of the order chosen.
     """
-    limit = _highest_each(readings, options)
+    limit = _highest(readings, options)
     triads = sum(getattr(readings, name) is not None for name in TRIADS)
     orders = np.full((len(limit), triads), -1)
     chance = np.full((len(limit), triads, HIGHEST), np.nan)
@@ -104,7 +108,8 @@ def order_errors(
     batch = batch_of_one(readings)
     if _judged_soaks(batch, options)[0] < _needed(options.orders):
         return []
-    yardstick = options if options.prior else replace(options, order=_highest(batch, options))
+    highest = int(_highest(batch, options)[0])
+    yardstick = options if options.prior else replace(options, order=highest)
     chosen = np.array(options.orders[: 1 + (readings.magnetometer is not None)])
     untested = np.full((len(chosen), HIGHEST), np.nan)
     batch = with_noise(batch, yardstick)
@@ -123,16 +128,11 @@ def _usable_soaks(readings: Readings) -> Ints:
     return usable_soaks(readings.temperature)
 
 
-def _highest_each(readings: Readings, options: Options) -> Ints:
+def _highest(readings: Readings, options: Options) -> Ints:
     """The highest order (B,) that the soaks can carry, with stations enough."""
     if options.method == "swarm" or readings.temperature is None:
         return np.zeros(len(readings.accelerometer), int)
     return np.minimum(highest_order(readings.temperature), HIGHEST)
-
-
-def _highest(readings: Readings, options: Options) -> int:
-    """The highest order that the soaks of any member can carry."""
-    return int(_highest_each(readings, options).max())
 
 
 def _scores(
@@ -182,13 +182,6 @@ def _score(
     )  # fmt: skip
 
 
-def _hopeless(readings: Readings, options: Options) -> Bools:
-    """Whether (B,) the stations cannot even determine what all temperatures have in common."""
-    result = fit(readings, Options(method=options.method))
-    ranks = [marginal_rank(result.analysis.determined, w) for w in result.problem.slices()]
-    return np.asarray(np.min(ranks, 0) < LOWEST_RANK)
-
-
 def with_noise(readings: Readings, options: Options) -> Readings:
     """The readings (B, n) with noise declared: where it was not, as a fit leaves it.
 
@@ -212,9 +205,9 @@ def _held_out(readings: Readings, options: Options, numbers: Ints) -> Array:
     include = (soak[:, None] != numbers[:, None, :]).astype(float)
     result = fit(mapped(lambda value: np.expand_dims(value, 1), readings), options, include)
     held = 1 - include.reshape(-1, readings.count)
-    problem, state = _everyone(result)
+    problem, state = with_all_stations(result)
     linear = problem.linear(state)
-    chi = np.sum(_chi(linear) * held[..., None], 1) / (3 * held.sum(1))[:, None]
+    chi = np.sum(misfit(problem, state) * held[..., None], 1) / (3 * held.sum(1))[:, None]
     left, share = linear.weigh(linear.residual[..., None]), linear.weight
     squares = []
     for index, (triad, where) in enumerate(zip(problem.triads, problem.slices(), strict=True)):
@@ -236,7 +229,7 @@ def _squares(
 
     `effect` (B, n, 3, 3) turns a reading, in units of its noise, into what is judged, in so many
     `axes`. References that are unknown or uncertain test only the `share` of the noise that
-    the station's own unknowns leave; the error is what is `left` for each such share of noise.
+    the unknowns of the station leave; the error is what is `left` for each such share of noise.
     """
     whole = np.sum(effect**2, (-2, -1)) * held
     tested = np.einsum("bnij,bnjk,bnik->bn", effect, share, effect) * held
@@ -247,7 +240,7 @@ def _squares(
     return noise, noise * error / tested
 
 
-def _everyone(result: Fit) -> tuple[Problem, State]:
+def with_all_stations(result: Fit) -> tuple[Problem, State]:
     """The problem with the left-out stations back, each at its best attitude for the fit."""
     evidence = result.problem.evidence
     everyone = replace(evidence, include=np.ones_like(evidence.include))
@@ -255,13 +248,8 @@ def _everyone(result: Fit) -> tuple[Problem, State]:
     return problem, readjusted(problem, result.state)
 
 
-def misfit(result: Fit) -> Array:
-    """χ² (B, n, t) of every station by triad, left out or not, attitudes at their best."""
-    problem, state = _everyone(result)
-    return _chi(problem.linear(state))
-
-
-def _chi(linear: Linear) -> Array:
-    weighed = linear.weigh(linear.residual[..., None])[..., 0]
-    rows = linear.residual * weighed
+def misfit(problem: Problem, state: State) -> Array:
+    """χ² (B, n, t) of every station by triad."""
+    linear = problem.linear(state)
+    rows = linear.residual * linear.weigh(linear.residual[..., None])[..., 0]
     return np.asarray(rows.reshape(*rows.shape[:-1], rows.shape[-1] // 3, 3).sum(-1))

@@ -67,25 +67,18 @@ def explaining(readings: Readings, profile: Profile) -> dict[str, tuple[str, ...
     free = free_directions(result.problem, result.state, result.analysis.determined)[0]
     if any(map(is_bad, free)):
         return {}
-    axes = {}
-    for index, gain in enumerate(_gains(result)):
-        name, reversed_ = TRIADS[index], index == 1 and np.isfinite(overturned(result)[0])
-        gain = -gain if reversed_ else gain
+    axes, problem = {}, result.problem
+    for name, triad, where in zip(TRIADS, problem.triads, problem.slices(), strict=False):
+        slope = triad.model.slope(result.state.params[:, where], triad.raw, problem.temperature)
+        gain = slope[0].mean(0)
+        if name == "magnetometer" and np.isfinite(overturned(result)[0]):
+            gain = -gain
         permutation = nearest(gain)
         if not _is_near(gain @ permutation.transpose()):
             return {}
         if not np.array_equal(permutation, np.eye(3)):
             axes[name] = named(permutation @ getattr(profile, name).permutation)
     return axes
-
-
-def _gains(result: Fit) -> list[Array]:
-    """Mean gain (3, 3) of each triad."""
-    problem, params = result.problem, result.state.params
-    return [
-        np.asarray(t.model.slope(params[:, where], t.raw, problem.temperature)[0].mean(0))
-        for t, where in zip(problem.triads, problem.slices(), strict=True)
-    ]
 
 
 def _is_near(gain: Array) -> bool:
@@ -97,9 +90,7 @@ def _is_near(gain: Array) -> bool:
 
 def _fits(result: Fit) -> bool:
     """Whether the readings are explained at all."""
-    for index, triad in enumerate(result.problem.triads):
-        noise = np.sqrt(result.analysis.variance_factor[0, index]) * triad.sd.mean()
-        size = np.linalg.norm(triad.raw[0] - triad.raw[0].mean(0), axis=-1).mean()
-        if not noise < FITTING_SHARE * size:
-            return False
-    return True
+    triads = result.problem.triads
+    noise = np.sqrt(result.analysis.variance_factor[0]) * [triad.sd.mean() for triad in triads]
+    moved = [np.linalg.norm(t.raw[0] - t.raw[0].mean(0), axis=-1).mean() for t in triads]
+    return bool(np.all(noise < FITTING_SHARE * np.array(moved)))

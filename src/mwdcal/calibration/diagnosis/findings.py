@@ -3,25 +3,43 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
 from mwdcal.calibration.automatic.courses import OmittedTerms, misfit_size, terms_beyond, untested
-from mwdcal.calibration.diagnosis import plausibility
 from mwdcal.calibration.diagnosis.flags import FittedRuns, Flag
+from mwdcal.calibration.diagnosis.plausibility import (
+    NOISE_RATIO,
+    copies,
+    departures,
+    robust,
+    stations_to_reshoot,
+    unchecked,
+)
 from mwdcal.calibration.diagnosis.structure import described as seen_as
 from mwdcal.calibration.diagnosis.structure import effects, suspected
-from mwdcal.calibration.readings import TRIADS
+from mwdcal.calibration.readings import EARTH_RANGES, TRIADS
 from mwdcal.calibration.record import Finding
 from mwdcal.calibration.residuals import REASONS, shown_in, tail
 from mwdcal.calibration.results import common_source
 from mwdcal.calibration.soaks import HIGHEST
+from mwdcal.estimation.problem import Prior
 from mwdcal.estimation.rank import free_directions
+from mwdcal.estimation.solvers import Determined
 from mwdcal.geometry.vectors import Bools
 
+CALM_FREEDOM = 12.0
+"""Degrees of freedom from which residuals far below the declared noise are not a coincidence."""
+MISFIT_CHANCE = 1e-3
+"""Chance of so large residuals, or of so large a departure from the prior, below which it is reported."""
+LOW_WEIGHT = 0.1
+"""A station of less weight than this in a robust fit is reported."""
+SCATTER_SHARE = 3e-4
+"""A scatter from station to station beyond this share, or radians, is a finding."""
 LARGEST_DEVIATION = 37.0
-"""Deviations are not told apart beyond this: a normal variable's chance is then below 1e-300."""
+"""Larger deviations have no figure: a normal variable's chance is then below 1e-300."""
 UNUSED = "unused-columns"
 COLUMNS_NAMED = 20
 """Most columns that the finding names."""
@@ -57,9 +75,7 @@ def unused_columns(columns: Sequence[str]) -> list[Finding]:
     """Columns of a file that are not used, each with what it resembles."""
     if not columns:
         return []
-    more = f" and {len(columns) - COLUMNS_NAMED} more" if len(columns) > COLUMNS_NAMED else ""
-    text = f"columns not used: {', '.join(columns[:COLUMNS_NAMED])}{more}."
-    return [Finding(id=UNUSED, text=text)]
+    return [Finding(id=UNUSED, text=f"columns not used: {_listed(columns, COLUMNS_NAMED)}.")]
 
 
 def findings(fitted: FittedRuns) -> list[Finding]:
@@ -113,32 +129,38 @@ def _joined(triads: Bools) -> str:
     return " and ".join(TRIADS[index] for index in np.flatnonzero(triads))
 
 
-def _listed(stations: Sequence[str]) -> str:
-    """The first few stations, and how many more."""
-    more = len(stations) - STATIONS_NAMED
-    return ", ".join(stations[:STATIONS_NAMED]) + (f" and {more} more" if more > 0 else "")
+def _listed(names: Sequence[str], most: int = STATIONS_NAMED) -> str:
+    """The first few names, and how many more."""
+    more = len(names) - most
+    return ", ".join(names[:most]) + (f" and {more} more" if more > 0 else "")
 
 
 def _calm(fitted: FittedRuns, index: int) -> Flag:
     """Residuals far below the declared noise."""
+    analysis = fitted.result.analysis
+    tested = np.isnan(fitted.result.noise) & (analysis.freedom >= CALM_FREEDOM)
+    calm = tested & (analysis.variance_factor < NOISE_RATIO**-2)
 
     def sentence(place: int) -> str:
-        share = float(fitted.result.analysis.variance_factor[place, index]) ** 0.5
+        share = float(analysis.variance_factor[place, index]) ** 0.5
         return (
             f"{TRIADS[index]}: residuals are only {share:.2f} of the declared noise: the noise of "
             "the profile, or the columns sd_, are too large, and weigh the stations wrongly if "
             "not all by as much. Uncertainties are scaled down accordingly."
         )
 
-    return Flag(f"{TRIADS[index]}-noise", plausibility.calm(fitted.result)[:, index], sentence)
+    return Flag(f"{TRIADS[index]}-noise", calm[:, index], sentence)
 
 
 def _excessive(fitted: FittedRuns, index: int) -> Flag:
     """Residuals far beyond the declared noise."""
-    large = plausibility.excessive(fitted.result, fitted.chances)[:, index]
+    result, factor = fitted.result, fitted.result.analysis.variance_factor
+    weighed = robust(result)[:, None] & np.isnan(result.noise) & ~unchecked(result)
+    large = weighed & (factor > NOISE_RATIO**2)
+    large |= np.nan_to_num(fitted.chances, nan=1.0) < MISFIT_CHANCE
 
     def sentence(place: int) -> str:
-        excess = float(fitted.result.analysis.variance_factor[place, index])
+        excess = float(factor[place, index])
         chance = fitted.chances[place, index]
         rare = "" if np.isnan(chance) else f" (chance in noise {chance:.0e})"
         return (
@@ -147,12 +169,12 @@ def _excessive(fitted: FittedRuns, index: int) -> Flag:
             "scaled up accordingly."
         )
 
-    return Flag(f"{TRIADS[index]}-residuals", large, sentence)
+    return Flag(f"{TRIADS[index]}-residuals", large[:, index], sentence)
 
 
 def _no_redundancy(fitted: FittedRuns) -> Flag:
     """Triads that nothing checks."""
-    bare = plausibility.unchecked(fitted.result)
+    bare = unchecked(fitted.result)
     text = "no redundancy, so nothing in this run checks the fit. Add stations."
     return Flag("no-redundancy", np.any(bare, -1), lambda place: f"{_joined(bare[place])}: {text}")
 
@@ -167,16 +189,16 @@ def _structure(fitted: FittedRuns) -> Iterator[Flag]:
 
 def _scatter(fitted: FittedRuns) -> Flag:
     """What varies from station to station by more than the noise of the sensors."""
+    scatter = fitted.result.problem.evidence.scatter
+    sizes = {name: values.max(-1) for name, values in scatter.items()}
+    large = np.max([np.zeros(fitted.count), *sizes.values()], 0) > SCATTER_SHARE
 
     def sentence(place: int) -> str:
-        scatter = fitted.result.problem.evidence.scatter
-        sizes = {name: float(values[place].max()) for name, values in scatter.items()}
-        shown = {n: f"{100 * size:.2f} %" for n, size in sizes.items()}
-        angles = {n: f"{np.degrees(sizes[n]):.2f}°" for n in ("dip", "direction") if n in sizes}
         words = [
-            f"{SCATTERED[name]} by {size}"
-            for name, size in (shown | angles).items()
-            if sizes[name] > plausibility.SCATTER_SHARE
+            f"{SCATTERED[name]} by "
+            + (f"{100 * size:.2f} %" if name in EARTH_RANGES else f"{np.degrees(size):.2f}°")
+            for name, size in ((n, float(sd[place])) for n, sd in sizes.items())
+            if size > SCATTER_SHARE
         ]
         return (
             f"beyond sensor noise, these vary from station to station: {', '.join(words)} "
@@ -184,22 +206,22 @@ def _scatter(fitted: FittedRuns) -> Flag:
             "play in the tool holder; or the model lacks something."
         )
 
-    return Flag("scatter", plausibility.scattered(fitted.result), sentence)
+    return Flag("scatter", np.asarray(large), sentence)
 
 
 def _repeated(fitted: FittedRuns) -> Flag:
     """Stations whose readings are identical to another's."""
-    copies = plausibility.copies(fitted.result)
+    repeated = copies(fitted.result)
 
     def sentence(place: int) -> str:
         labels = fitted.alone(place)[0].labels
-        names = [labels[index] for index in np.flatnonzero(copies[place])]
+        names = [labels[index] for index in np.flatnonzero(repeated[place])]
         return (
             f"station {_listed(names)}: readings identical to those of an earlier station. Copies count as "
             "measurements of their own, and uncertainties come out too small. Remove them."
         )
 
-    return Flag("repeated-readings", np.any(copies, -1), sentence)
+    return Flag("repeated-readings", np.any(repeated, -1), sentence)
 
 
 def _beyond_order(fitted: FittedRuns, index: int, terms: OmittedTerms) -> Flag:
@@ -210,7 +232,7 @@ def _beyond_order(fitted: FittedRuns, index: int, terms: OmittedTerms) -> Flag:
 
     def sentence(place: int) -> str:
         highest = np.flatnonzero(terms.present[place, index]) + 1
-        share = float(misfit_size(fitted.result, terms)[place, index])
+        share = float(misfit_size(fitted.result)[place, index])
         strength = float(np.mean(problem.constant(state, observable)[place]))
         if order < HIGHEST and highest.min() <= HIGHEST:
             cause = f"powers of temperature above order {order} are there"
@@ -229,7 +251,9 @@ def _beyond_order(fitted: FittedRuns, index: int, terms: OmittedTerms) -> Flag:
             f"uncertainties here include it. {remedy}."
         )
 
-    return Flag(f"{TRIADS[index]}-temperature-misfit", terms.misfit[:, index], sentence)
+    return Flag(
+        f"{TRIADS[index]}-temperature-misfit", np.any(terms.present[:, index], -1), sentence
+    )
 
 
 def _untested(fitted: FittedRuns) -> Flag:
@@ -283,8 +307,9 @@ def _prior(fitted: FittedRuns) -> Iterator[Flag]:
 
 def _prior_only(fitted: FittedRuns, source: str) -> Flag:
     """Parameters that only the prior determines."""
-    bare = plausibility.without_prior(fitted.result)
-    named = free_directions(bare.problem, bare.state, bare.analysis.determined)
+    problem, state = fitted.result.problem, fitted.result.state
+    bare = replace(problem, prior=Prior(0 * problem.prior.precision, problem.prior.expected))
+    named = free_directions(bare, state, Determined.of(bare, state))
     ids = [{entry.id for entry in free} for free in fitted.free]
     only = [[e.id for e in each if e.id not in free] for each, free in zip(named, ids, strict=True)]
 
@@ -300,8 +325,8 @@ def _prior_only(fitted: FittedRuns, source: str) -> Flag:
 
 def _prior_conflict(fitted: FittedRuns, source: str) -> Flag:
     """A departure from the prior that is unlikely."""
-    square, tested = plausibility.departures(fitted.result)
-    unlikely = tail(square, np.maximum(tested, 1)) <= plausibility.MISFIT_CHANCE
+    square, tested = departures(fitted.result)
+    unlikely = tail(square, np.maximum(tested, 1)) <= MISFIT_CHANCE
 
     def sentence(place: int) -> str:
         ratio = np.sqrt(square[place] / tested[place])
@@ -345,10 +370,10 @@ def _model(fitted: FittedRuns) -> Iterator[Flag]:
 
 def _reshoot(fitted: FittedRuns) -> Iterator[Flag]:
     """Stations to take again, with the reason."""
-    again = plausibility.stations_to_reshoot(fitted.result)
+    again = stations_to_reshoot(fitted.result)
 
     def sentence(place: int, station: int) -> str:
-        row = fitted.rows(place)[station]
+        row = fitted.residuals(place).stations[station]
         worst = row.worst or "gravity"
         _, unit = shown_in(worst, fitted.readings.relative)
         gap = "" if unit == "°" else " "
@@ -371,7 +396,7 @@ def _reshoot(fitted: FittedRuns) -> Iterator[Flag]:
 
 def _distrusted(fitted: FittedRuns) -> Flag:
     """Stations that a robust fit has nearly left out."""
-    low = fitted.result.trust < plausibility.LOW_WEIGHT
+    low = fitted.result.trust < LOW_WEIGHT
 
     def sentence(place: int) -> str:
         labels, weight = fitted.alone(place)[0].labels, fitted.result.trust[place]

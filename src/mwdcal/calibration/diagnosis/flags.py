@@ -1,7 +1,7 @@
 """Flags: what holds of some members of a batch, and the sentence that says it of one of them.
 
 Refusals and findings are both flags, raised by operations on arrays with a leading tool axis. A single
-run is a batch of one, and its sentences are made of the same numbers.
+run is a batch of one, and its sentences state the same numbers.
 """
 
 from __future__ import annotations
@@ -16,9 +16,8 @@ from mwdcal.calibration.diagnosis.plausibility import misfit_chances
 from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import Readings
-from mwdcal.calibration.record import StationRow
 from mwdcal.calibration.residuals import Residuals
-from mwdcal.estimation.batch import batch_of_one, take
+from mwdcal.estimation.batch import take
 from mwdcal.estimation.rank import Free, free_directions
 from mwdcal.geometry.vectors import Array, Bools, Ints
 from mwdcal.sensor.profile import Profile
@@ -64,14 +63,6 @@ class FittedRuns:
         free = free_directions(result.problem, result.state, result.analysis.determined)
         return cls(readings, profile, options, result, free, alone)
 
-    @classmethod
-    def single(
-        cls, readings: Readings, profile: Profile, options: Options, result: Fit
-    ) -> FittedRuns:
-        """One run, whose readings have no leading axis, and its fit."""
-        alone = readings, profile
-        return cls.of(batch_of_one(readings), profile, options, result, lambda _: alone)
-
     @property
     def count(self) -> int:
         """Number of runs."""
@@ -101,7 +92,3 @@ class FittedRuns:
         if place not in self._residuals:
             self._residuals[place] = Residuals(self.alone(place)[0], self.member(place))
         return self._residuals[place]
-
-    def rows(self, place: int) -> list[StationRow]:
-        """The stations of one run."""
-        return self.residuals(place).stations

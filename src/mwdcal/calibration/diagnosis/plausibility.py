@@ -11,8 +11,8 @@ from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.readings import EARTH_RANGES, Readings
 from mwdcal.calibration.residuals import RESHOOT, Residuals, chances, chi_chance, tail, to_reshoot
 from mwdcal.estimation.batch import take
+from mwdcal.estimation.evidence import STAND_ERRORS, UNKNOWN
 from mwdcal.estimation.minimisers import closed_form
-from mwdcal.estimation.problem import Prior
 from mwdcal.estimation.rank import Free
 from mwdcal.estimation.solvers import Determined
 from mwdcal.estimation.uncertainty import ROTATIONS, TESTED, effective_freedom, station_misfit
@@ -22,22 +22,16 @@ BENIGN_DIRECTIONS = (*ROTATIONS, "scale")
 """Directions that may stay free."""
 EXCESS_RATIO = 10.0
 """An error after calibration of more than this many times its expectation is not a sensor's."""
+LOOSE = 0.1
+"""A turn known no better than this share of no knowledge at all is not separated."""
 DIP_CERTAINTY = 4.0
 """Standard uncertainties by which a dip must lie beyond vertical, not to be noise at a pole."""
 STRAY_DEVIATIONS = 5.0
 """Standard deviations of one reading's residual from which the errors of a run are looked at."""
 SMALLEST_EXPECTATION = 1e-12
-"""Expectations below this, in the observable's own unit, are rounding."""
+"""Expectations below this, in the unit of the observable, are rounding."""
 NOISE_RATIO = 3.0
 """Residuals of a robust fit that exceed the declared noise this many times are reported."""
-CALM_FREEDOM = 12.0
-"""Degrees of freedom from which residuals far below the declared noise are not a coincidence."""
-MISFIT_CHANCE = 1e-3
-"""Chance of so large residuals, or of so large a departure from the prior, below which it is reported."""
-LOW_WEIGHT = 0.1
-"""A station of less weight than this in a robust fit is reported."""
-SCATTER_SHARE = 3e-4
-"""A scatter from station to station beyond this share, or radians, is a finding."""
 VARIANCE_RIDGE = 1e-9
 """What is added to variances (of whitened readings: 0…1), so that they have an inverse."""
 LEEWAY = 1.01
@@ -100,10 +94,30 @@ def overturned(result: Fit) -> Array:
     return np.asarray(dips)
 
 
+def inseparable(result: Fit) -> Bools:
+    """Fits (B,) whose stand errors the stations cannot separate from errors of the sensors.
+
+    One of these is as good as unknown, or the rank is higher without them.
+    """
+    constants = result.problem.evidence.constants
+    stand = np.array([c.unknown and c.name in STAND_ERRORS for c in constants])
+    sd = np.sqrt(diagonal(result.analysis.constants)[:, stand])
+    lost = np.any(sd > LOOSE * UNKNOWN, -1)
+    some = np.flatnonzero(~lost & ~result.analysis.determined.keep.all(-1))
+    if some.size:
+        problem, state = take((result.problem, result.state), some)
+        kept = np.flatnonzero(~stand)
+        fewer = tuple(problem.evidence.constants[index] for index in kept)
+        bare = replace(problem, evidence=replace(problem.evidence, constants=fewer))
+        still = replace(state, constants=state.constants[:, kept])
+        lost[some] = Determined.of(problem, state).rank < Determined.of(bare, still).rank
+    return np.asarray(lost)
+
+
 def excessive_errors(readings: Readings, result: Fit) -> dict[str, tuple[float, float]]:
     """Observables with errors far above what the misfit of the run explains: rms of both.
 
-    Definition: the expectation is that of noise and stand, times the root of the run's own s² where
+    Definition: the expectation is that of noise and stand, times the root of the run's s² where
     that is above one: so are the uncertainties that a calibration states. In a robust fit stations
     count with the pull that they have.
     """
@@ -112,8 +126,8 @@ def excessive_errors(readings: Readings, result: Fit) -> dict[str, tuple[float, 
     misfit = np.sqrt(max(squares.sum() / max(analysis.freedom[0].sum(), 1.0), 1.0))
     residuals, weight = Residuals(readings, result), result.trust[0]
     excessive = {}
-    for name in residuals.names():
-        after, expected = residuals.errors(name, residuals.after), residuals.expected(name)
+    for name, after in residuals.errors(residuals.after).items():
+        expected = residuals.expected[name]
         known = ~np.isnan(after + expected) & (weight > 0)
         if not known.any():
             continue
@@ -153,19 +167,6 @@ def robust(result: Fit) -> Bools:
     return np.asarray((result.trust != 1).any(-1))
 
 
-def excessive(result: Fit, chance: Array) -> Bools:
-    """Triads (B, t) whose residuals noise and stand do not explain, by `misfit_chances`."""
-    weighed = robust(result)[:, None] & np.isnan(result.noise) & ~unchecked(result)
-    large = weighed & (result.analysis.variance_factor > NOISE_RATIO**2)
-    return np.asarray(large | (np.nan_to_num(chance, nan=1.0) < MISFIT_CHANCE))
-
-
-def calm(result: Fit) -> Bools:
-    """Triads (B, t) whose residuals are less than the declared noise over `NOISE_RATIO`."""
-    tested = np.isnan(result.noise) & (result.analysis.freedom >= CALM_FREEDOM)
-    return np.asarray(tested & (result.analysis.variance_factor < NOISE_RATIO**-2))
-
-
 def unchecked(result: Fit) -> Bools:
     """Triads (B, t) without redundancy."""
     return np.asarray(result.analysis.freedom < 1)
@@ -183,20 +184,6 @@ def copies(result: Fit) -> Bools:
     return repeated
 
 
-def scattered(result: Fit) -> Bools:
-    """Whether (B,) strengths, dip or the directions of groups vary from station to station."""
-    sizes = [value.max(-1) for value in result.problem.evidence.scatter.values()]
-    return np.asarray(np.max([np.zeros(len(result.status)), *sizes], 0) > SCATTER_SHARE)
-
-
-def without_prior(result: Fit) -> Fit:
-    """The fit with only those directions determined that the run itself determines."""
-    prior = result.problem.prior
-    bare = replace(result.problem, prior=Prior(0 * prior.precision, prior.expected))
-    determined = Determined.of(bare, result.state)
-    return replace(result, problem=bare, analysis=replace(result.analysis, determined=determined))
-
-
 def departures(result: Fit) -> tuple[Array, Ints]:
     """The χ² (B,) of the departure from the prior, Λd with covariance Λ - ΛCΛ, and its freedom."""
     prior, covariance = result.problem.prior, result.analysis.covariance
@@ -211,7 +198,7 @@ def departures(result: Fit) -> tuple[Array, Ints]:
 
 
 def stations_to_reshoot(result: Fit) -> Bools:
-    """Stations (B, n) to take again: `to_reshoot`, asked only where a bound allows it to be true."""
+    """Stations (B, n) to take again: `to_reshoot`, evaluated only where a bound allows it to be true."""
     again = np.zeros(result.analysis.residual.shape[:2], bool)
     some = np.flatnonzero(_suspects(result))
     if some.size:

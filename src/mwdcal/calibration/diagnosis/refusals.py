@@ -13,12 +13,12 @@ from functools import partial
 
 import numpy as np
 
-from mwdcal.calibration.automatic.stand import inseparable
 from mwdcal.calibration.diagnosis.axes import explaining
 from mwdcal.calibration.diagnosis.flags import FittedRuns, Flag
 from mwdcal.calibration.diagnosis.plausibility import (
     excessive_errors,
     gain_shares,
+    inseparable,
     is_bad,
     off_earth,
     overturned,

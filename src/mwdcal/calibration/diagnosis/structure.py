@@ -3,14 +3,14 @@
 Each effect is a family of columns that the residuals may have in common with it. A family is named
 where it takes away more of the misfit than noise of any direction would (F test), the best one
 first; the others are then judged by what that one leaves. Nothing is corrected here: what moves
-with one of the sensor's own parameters has gone into the fit, and no residual shows it.
+with a parameter of the sensor has gone into the fit, and no residual shows it.
 
 Reference: efficient scores, C. R. Rao, Proc. Camb. Phil. Soc. 44, 50 (1948).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,7 +24,7 @@ from mwdcal.calibration.results import variance_scales
 from mwdcal.calibration.soaks import HIGHEST, LEAST_TEMPERATURE_SPAN, highest_order
 from mwdcal.estimation.problem import Problem, State
 from mwdcal.estimation.uncertainty import whole_covariance
-from mwdcal.geometry.vectors import Array, Bools, eigen
+from mwdcal.geometry.vectors import Array, Bools, Ints, eigen
 
 EFFECT_CHANCE = 1e-4
 """Chance of so much common structure in noise, below which an effect is named."""
@@ -89,35 +89,37 @@ class Effect:
 
 @dataclass(frozen=True)
 class _Scores:
-    """Efficient scores (k,) and their covariance (k, k) for columns of unit length, with lengths."""
+    """Efficient scores (k,) and their covariance (k, k) for columns of unit length, with lengths.
+
+    `places` of the columns of each family; the `misfit` of all readings, with its degrees of freedom.
+    """
 
     score: Array
     information: Array
     length: Array
     columns: Array
-    places: dict[str, slice]
+    places: dict[str, Ints]
+    misfit: float
+    freedom: float
 
     def gain(self, names: list[str]) -> tuple[float, int]:
         """By how much some families lower the cost, and how many directions they have."""
-        value, vector, kept = self._spanned(names)
-        along = vector.transpose() @ self.score[self._index(names)]
-        return float(np.sum(along[kept] ** 2 / value[kept])), int(kept.sum())
+        value, vector, index = self._spanned(names)
+        along = vector.transpose() @ self.score[index]
+        return float(np.sum(along**2 / value)), len(value)
 
     def solution(self, names: list[str]) -> tuple[Array, Array]:
         """Values (k',) of the columns of some families, and their covariance (k', k')."""
-        value, vector, kept = self._spanned(names)
-        inverse = (vector[:, kept] / value[kept]) @ vector[:, kept].transpose()
-        index = self._index(names)
-        length = self.length[index]
+        value, vector, index = self._spanned(names)
+        inverse, length = (vector / value) @ vector.transpose(), self.length[index]
         return -inverse @ self.score[index] / length, inverse / np.outer(length, length)
 
-    def _spanned(self, names: list[str]) -> tuple[Array, Array, Array]:
-        index = self._index(names)
+    def _spanned(self, names: list[str]) -> tuple[Array, Array, Ints]:
+        """Eigenvalues and vectors of the directions that the fit leaves to some families."""
+        index = np.concatenate([self.places[name] for name in names])
         value, vector = eigen(self.information[np.ix_(index, index)])
-        return value, vector, np.asarray(value > LEFT_BY_FIT)
-
-    def _index(self, names: list[str]) -> Array:
-        return np.concatenate([np.arange(self.places[n].start, self.places[n].stop) for n in names])
+        kept = value > LEFT_BY_FIT
+        return value[kept], vector[:, kept], index
 
 
 def effects(result: Fit) -> list[Effect]:
@@ -131,20 +133,20 @@ def effects(result: Fit) -> list[Effect]:
         for i, t in enumerate(result.problem.triads)
     ]
     problem = replace(result.problem, triads=tuple(triads))
-    scores = _scores(problem, result, dict(_families(problem, result.state)))
-    left, freedom = _misfit(problem, result)
-    total, used = left, 0
+    scores = _scores(problem, result)
+    left, used = scores.misfit, 0
     chosen: list[str] = []
     shown: list[tuple[str, float, float]] = []
     while True:
-        trials = {n: _trial(scores, chosen, n, left, freedom - used) for n in scores.places}
+        freedom = scores.freedom - used
+        trials = {n: _trial(scores, chosen, n, left, freedom) for n in scores.places}
         open_ = {n: t for n, t in trials.items() if n not in chosen and t[0] < EFFECT_CHANCE}
         if not open_:
             return [e for e in _described(result, shown) if not e.name.endswith(COURSE_SUFFIX)]
         best = min(open_, key=lambda name: (open_[name][0], -open_[name][1]))
         chance, gain, directions = open_[best]
         chosen, left, used = [*chosen, best], left - gain, used + directions
-        shown.append((best, gain / total, chance))
+        shown.append((best, gain / scores.misfit, chance))
 
 
 def _without_bad_stations(result: Fit) -> Fit:
@@ -191,16 +193,14 @@ def _described(result: Fit, shown: list[tuple[str, float, float]]) -> list[Effec
     if not shown:
         return []
     problem, names = result.problem, [name for name, _, _ in shown]
-    scores = _scores(problem, result, dict(_families(problem, result.state)))
-    left, freedom = _misfit(problem, result)
+    scores = _scores(problem, result)
     gain, directions = scores.gain(names)
-    scale = np.sqrt(max(left - gain, 0.0) / max(freedom - directions, 1.0))
+    scale = np.sqrt(max(scores.misfit - gain, 0.0) / max(scores.freedom - directions, 1.0))
     values, covariance = scores.solution(names)
-    spread, sized, at = np.sqrt(np.diag(covariance)) * scale, [], 0
+    spread, sized, end = np.sqrt(np.diag(covariance)) * scale, [], 0
     for name, share, chance in shown:
         where = scores.places[name]
-        columns = slice(at, at + where.stop - where.start)
-        at = columns.stop
+        columns = slice(end, end := end + len(where))
         change = (scores.columns[..., where] * scores.length[where]) @ values[columns]
         size = [
             np.sqrt(np.mean(np.sum((change[..., 3 * i : 3 * i + 3] * t.sd) ** 2, -1)))
@@ -210,13 +210,14 @@ def _described(result: Fit, shown: list[tuple[str, float, float]]) -> list[Effec
     return sized
 
 
-def _scores(problem: Problem, result: Fit, families: Mapping[str, Array]) -> _Scores:
-    """Efficient scores of columns (1, n, m, k): what the fit's own unknowns cannot take up."""
+def _scores(problem: Problem, result: Fit) -> _Scores:
+    """Efficient scores of the columns (1, n, m, k) of all families: what the fit's unknowns cannot take up."""
+    families = dict(_families(problem, result.state))
     linear = problem.linear(result.state)
     whole = whole_covariance(linear, result.analysis.determined)[0]
-    ends = np.cumsum([0, *(column.shape[-1] for column in families.values())]).tolist()
-    places = dict(zip(families, map(slice, ends, ends[1:]), strict=False))
     every = np.concatenate([*families.values()], -1)
+    ends = np.cumsum([column.shape[-1] for column in families.values()])
+    places = dict(zip(families, np.split(np.arange(ends[-1]), ends[:-1]), strict=True))
     length = np.sqrt(np.einsum("bnmk,bnmk->k", every, linear.weigh(every)))
     length = np.where(length > 0, length, 1.0)
     unit = every / length
@@ -228,7 +229,7 @@ def _scores(problem: Problem, result: Fit, families: Mapping[str, Array]) -> _Sc
     )
     information = np.einsum("bnmk,bnml->kl", unit, weighed)
     information = information - crossed.transpose() @ whole @ crossed
-    return _Scores(score, information, length, unit, places)
+    return _Scores(score, information, length, unit, places, *_misfit(problem, result))
 
 
 def _families(problem: Problem, state: State) -> Iterator[tuple[str, Array]]:
