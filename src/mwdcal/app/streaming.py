@@ -27,9 +27,9 @@ from mwdcal.errors import InputError
 from mwdcal.files import runs, streams, synonyms
 from mwdcal.files.contract import CHANNELS, COLUMNS, RAW, RAW_RANGE, TEMPERATURE, check_columns
 from mwdcal.files.formats import atomic, parquet
-from mwdcal.files.formats.columns import no_stations
+from mwdcal.files.formats.columns import check_names, no_stations
 from mwdcal.files.formats.sinks import ParquetSink, Sink, TextSink
-from mwdcal.files.formats.table import Table, cell_error, check_header
+from mwdcal.files.formats.table import Table, cell_error
 from mwdcal.files.formats.table import numbers as as_numbers
 from mwdcal.files.streams import Part, Source
 from mwdcal.geometry.vectors import AnyArray, Array, Bools
@@ -163,7 +163,7 @@ def _source(readings: Path, output: Path, rows: int, decimal: str) -> Source:
 
 def _check_header(source: Source, outside: str) -> None:
     """Refuse columns that are missing, doubtful, or have the name of a result."""
-    check_header(source.names, source.name)
+    check_names(source.names, source.name)
     check_columns(source.names, source.name)
     check_free(source.names, result_names(outside), source.name)
 

@@ -6,8 +6,6 @@
 from __future__ import annotations
 
 import base64
-import csv
-import io
 from collections.abc import Mapping, Sequence
 from typing import IO, Any
 
@@ -85,9 +83,7 @@ class TextSink:
         stream.write("".join(f"{line}\n" for line in meta.render(metadata)).encode())
         self._place = stream.tell()
         self._room = len(_line(longest)) if longest else 0
-        header = csv.writer(buffer := io.StringIO(), delimiter=self._delimiter, lineterminator="\n")
-        header.writerow([*schema.names, *results.names])
-        self._header = buffer.getvalue().encode()
+        self._header = text.header([*schema.names, *results.names], delimiter).encode()
         self._first: bytes | None = None
 
     def render(self, carried: Any, results: Sequence[AnyArray], blank: bool) -> bytes:
@@ -106,7 +102,7 @@ class TextSink:
             return self._quoted(rows)
 
     def _lines(self, rows: Any) -> bytes:
-        """Rows of which no cell needs quotes."""
+        """Rows of which no cell needs quotes or is refused."""
         from pyarrow import csv as arrow_csv
 
         stream = self._arrow.BufferOutputStream()
@@ -114,7 +110,10 @@ class TextSink:
             include_header=False, delimiter=self._delimiter, quoting_style="none"
         )
         arrow_csv.write_csv(rows, stream, options)
-        return bytes(stream.getvalue())
+        lines = bytes(stream.getvalue())
+        if b"\0" in lines:
+            raise self._arrow.ArrowInvalid("NUL")
+        return lines
 
     def _quoted(self, rows: Any) -> bytes:
         """Rows of which some have such cells: these by the writer of short tables, numbers alike."""
@@ -135,7 +134,7 @@ class TextSink:
         odd = np.zeros(len(rows), bool)
         for cells in rows.columns:
             if self._arrow.types.is_string(cells.type):
-                quoted = compute.match_substring_regex(cells, f'["\r\n{self._delimiter}]')
+                quoted = compute.match_substring_regex(cells, f'["\r\n\\x00{self._delimiter}]')
                 odd |= quoted.fill_null(False).to_numpy()
         return odd
 

@@ -12,7 +12,15 @@ from typing import Any
 from mwdcal.errors import InputError
 from mwdcal.files import metadata as meta
 from mwdcal.files.formats import sheet
-from mwdcal.files.formats.columns import Column, Parts, assemble, damaged_unless_read, number, typed
+from mwdcal.files.formats.columns import (
+    Column,
+    Parts,
+    assemble,
+    damaged_unless_read,
+    number,
+    plain_names,
+    typed,
+)
 from mwdcal.files.formats.sheet import LONGEST_CELL, Row
 
 # A file must not depend on the hour it was written: the first day a ZIP archive can hold.
@@ -46,7 +54,7 @@ def render(columns: Mapping[str, Column], metadata: Mapping[str, object], source
     """The bytes that `parse` turns back into the same columns and metadata."""
     book = _module(source).Workbook(write_only=True)
     rows: list[Sequence[str | float]] = [[line] for line in meta.render(metadata)]
-    rows += [list(columns), *zip(*columns.values(), strict=True)]
+    rows += [plain_names(list(columns)), *zip(*columns.values(), strict=True)]
     _check_texts(rows, source)
     page = book.create_sheet("run")
     for row in rows:
