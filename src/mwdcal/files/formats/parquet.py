@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 
 from mwdcal.errors import InputError
+from mwdcal.files import metadata as meta
 from mwdcal.files.formats.columns import (
     LABELS,
     Column,
@@ -238,9 +239,10 @@ def _array(column: Column, arrow: Any) -> Any:
 def metadata_of(schema: Mapping[bytes, bytes] | None, source: str) -> dict[str, object]:
     """What a file's schema says of it."""
     try:
-        return msgspec.json.decode((schema or {}).get(KEY, b"{}"), type=dict[str, object])
+        stated = msgspec.json.decode((schema or {}).get(KEY, b"{}"), type=dict[str, object])
     except (ValueError, RecursionError) as error:
         raise InputError(
             f"{source}: the metadata under the schema key 'mwdcal' must be a JSON object "
             f"({error}). Write the file again."
         ) from None
+    return meta.plain(stated, source)

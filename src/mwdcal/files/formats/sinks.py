@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import IO, Any
 
 import msgspec
@@ -20,7 +20,13 @@ _ARROW_SCHEMA = b"ARROW:schema"
 
 
 class ParquetSink:
-    """A Parquet file; results are neither compressed nor searched for repetitions: there are none."""
+    """A Parquet file; results are neither compressed nor searched for repetitions: there are none.
+
+    Attributes:
+        formulas: columns with cells that would be run as formulas: none in this format.
+    """
+
+    formulas: Collection[str] = ()
 
     def __init__(
         self, stream: IO[bytes], schema: Any, results: Any, metadata: Mapping[str, object]
@@ -65,6 +71,9 @@ class TextSink:
     """A text table; the findings are above its header.
 
     From the second part on room is kept for them there, as a comment line of blanks.
+
+    Attributes:
+        formulas: columns with cells that spreadsheet programs would run; `numeric` ones have none.
     """
 
     def __init__(
@@ -75,6 +84,7 @@ class TextSink:
         metadata: Mapping[str, object],
         longest: Sequence[str],
         delimiter: str,
+        numeric: Collection[str] = (),
     ) -> None:
         self._arrow, _ = parquet.modules(stream.name)
         self._stream = stream
@@ -85,12 +95,15 @@ class TextSink:
         self._room = len(_line(longest)) if longest else 0
         self._header = text.header([*schema.names, *results.names], delimiter).encode()
         self._first: bytes | None = None
+        self._texts = [name for name in schema.names if name not in numeric]
+        self.formulas = {name for name in self._texts if text.is_formula(name)}
 
     def render(self, carried: Any, results: Sequence[AnyArray], blank: bool) -> bytes:
         """The lines of the part."""
         plain = {
             n: self._spelt(c) for n, c in zip(carried.column_names, carried.columns, strict=True)
         }
+        self.formulas.update(n for n in self._texts if self._has_formula(plain[n]))
         plain |= {
             name: self._arrow.array(values, from_pandas=blank)
             for name, values in zip(self._names, results, strict=True)
@@ -100,6 +113,15 @@ class TextSink:
             return self._lines(rows)
         except self._arrow.ArrowInvalid:  # a cell needs quotes
             return self._quoted(rows)
+
+    def _has_formula(self, cells: Any) -> bool:
+        """Whether spreadsheet programs would run a cell of the column."""
+        import pyarrow.compute as compute
+
+        if not self._arrow.types.is_string(cells.type):
+            return False
+        begun = (cells.filter(compute.starts_with(cells, sign)) for sign in text.FORMULA)
+        return any(text.is_formula(cell) for some in begun for cell in some.to_pylist())
 
     def _lines(self, rows: Any) -> bytes:
         """Rows of which no cell needs quotes or is refused."""

@@ -16,11 +16,14 @@ from mwdcal.files.formats.columns import (
     Parts,
     assemble,
     check_names,
+    looks_numeric,
     number,
     of_texts,
     plain_names,
 )
 
+FORMULA = ("=", "+", "-", "@", "\t", "\r")
+"""What a cell begins with that spreadsheet programs run as a formula, unless it is a number."""
 _LONGEST_LINE = 100_000
 _MAX_LINES = 1_000_000
 _DELIMITING = re.compile(r'[",;\t]')
@@ -104,6 +107,15 @@ def header(names: Sequence[str], delimiter: str) -> str:
     plain = plain_names(names)
     cells = ('"' + n.replace('"', '""') + '"' if _DELIMITING.search(n) else n for n in plain)
     return delimiter.join(cells) + "\n"
+
+
+def is_formula(cell: str) -> bool:
+    """Whether spreadsheet programs run a cell of a text table as a formula.
+
+    >>> [is_formula(cell) for cell in ("=1+1", "-1+1", "-1.5", "A-1")]
+    [True, True, False, False]
+    """
+    return cell.startswith(FORMULA) and not looks_numeric(cell.replace(",", "."))
 
 
 def _cells(name: str, column: Column) -> list[str]:
