@@ -22,12 +22,16 @@ from mwdcal.app.streaming import (
 )
 from mwdcal.calibration.diagnosis.findings import unused_columns
 from mwdcal.calibration.record import Calibration, Finding
+from mwdcal.files import carried
 from mwdcal.files.contract import check_columns
 from mwdcal.files.formats import table
 from mwdcal.files.formats.columns import as_text
 from mwdcal.files.formats.table import Table
 from mwdcal.files.runs import to_readings
 from mwdcal.use.correction import EXTRAPOLATED, RowCounts, counted
+
+TEXT = (".csv", ".tsv")
+"""Suffixes of text tables."""
 
 
 def apply_to_any(
@@ -54,7 +58,8 @@ def apply_to_any(
         words = [as_text(bool(mark)) for mark in result.columns[EXTRAPOLATED]]
         result = replace(result, columns={**result.columns, EXTRAPOLATED: words})
     table.write(output, result)
-    return tally, findings
+    formulas = carried.with_formulas(source.columns) if output.suffix.lower() in TEXT else []
+    return tally, findings + carried.copied([*source.columns], formulas, output.suffix.lower())
 
 
 def apply_to_table(
@@ -76,7 +81,8 @@ def apply_to_table(
         results if whole.all() else {n: spread(values, whole) for n, values in results.items()}
     )
     metadata = {**source.metadata, **described(calibration)}
-    if findings:
-        metadata["findings"] = [finding.text for finding in findings]
+    stated = [*carried.stated_findings(metadata), *(finding.text for finding in findings)]
+    if stated:
+        metadata["findings"] = stated
     corrected = replace(source, columns={**source.columns, **columns}, metadata=metadata)
     return corrected, tally, findings + unused_columns(readings.unused)

@@ -24,12 +24,20 @@ from mwdcal.calibration.diagnosis.findings import unused_columns
 from mwdcal.calibration.readings import TRIADS, Readings
 from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.errors import InputError
-from mwdcal.files import runs, streams, synonyms
-from mwdcal.files.contract import CHANNELS, COLUMNS, RAW, RAW_RANGE, TEMPERATURE, check_columns
+from mwdcal.files import carried, runs, streams, synonyms
+from mwdcal.files.contract import (
+    CHANNELS,
+    COLUMNS,
+    RANGES,
+    RAW,
+    RAW_RANGE,
+    TEMPERATURE,
+    check_columns,
+)
 from mwdcal.files.formats import atomic, parquet
-from mwdcal.files.formats.columns import no_stations
+from mwdcal.files.formats.columns import check_names, no_stations
 from mwdcal.files.formats.sinks import ParquetSink, Sink, TextSink
-from mwdcal.files.formats.table import Table, cell_error, check_header
+from mwdcal.files.formats.table import Table, cell_error
 from mwdcal.files.formats.table import numbers as as_numbers
 from mwdcal.files.streams import Part, Source
 from mwdcal.geometry.vectors import AnyArray, Array, Bools
@@ -131,8 +139,9 @@ def apply_to_file(
             raise nothing(source.name)
         remarks = findings(calibration, worker.heard(total.serials), total, outside)
         strengths.check(calibration, total.strengths, source.name)
-        sink.finish([finding.text for finding in remarks])
-    return total, remarks + unused_columns(synonyms.unused(source.names, COLUMNS))
+        sink.finish([*carried.stated_findings(source.metadata), *(f.text for f in remarks)])
+    remarks += unused_columns(synonyms.unused(source.names, COLUMNS))
+    return total, remarks + carried.copied(source.names, sink.formulas, output.suffix.lower())
 
 
 def overlapped(items: Iterator[Item], work: Callable[[Item], Made]) -> Iterator[Made]:
@@ -163,7 +172,7 @@ def _source(readings: Path, output: Path, rows: int, decimal: str) -> Source:
 
 def _check_header(source: Source, outside: str) -> None:
     """Refuse columns that are missing, doubtful, or have the name of a result."""
-    check_header(source.names, source.name)
+    check_names(source.names, source.name)
     check_columns(source.names, source.name)
     check_free(source.names, result_names(outside), source.name)
 
@@ -266,6 +275,7 @@ class _Worker:
         """An empty table in the format of the output's name."""
         arrow, _ = parquet.modules(output.name)
         metadata = {**self.source.metadata, **described(self.calibration)}
+        metadata.pop("findings", None)  # with those of the results, when these are known
         suffix, outside = output.suffix.lower(), self.rules.outside
         kinds = {name: arrow.float64() for name in NAMES} | {EXTRAPOLATED: arrow.bool_()}
         results = arrow.schema([(name, kinds[name]) for name in result_names(outside)])
@@ -281,9 +291,10 @@ class _Worker:
             _MOST, _MOST, judged, lacking, (), off, (TEMPERATURE.low, TEMPERATURE.high)
         )
         most = findings(self.calibration, said, tally, how)
-        longest = [finding.text for finding in most]
+        stated = carried.stated_findings(self.source.metadata)
+        longest = [*stated, *(finding.text for finding in most)]
         delimiter = "," if suffix == ".csv" else "\t"
-        return TextSink(stream, self.source.schema, results, metadata, longest, delimiter)
+        return TextSink(stream, self.source.schema, results, metadata, longest, delimiter, RANGES)
 
     def __call__(self, piece: Any, sink: Sink) -> CorrectedPart:
         """A piece, corrected and rendered; text that seems wrong is looked at line by line."""

@@ -121,7 +121,7 @@ def check_near_misses(names: Collection[str], contract: Sequence[str], what: str
             unit = alike.unit if alike else ""
             how = CONVERSIONS.get(unit, "and convert its unit")
             raise InputError(
-                f"{what} '{name}' must be spelled exactly as documented. Did you mean "
+                f"{what} {shown(name)} must be spelled exactly as documented. Did you mean "
                 f"'{meant}'? Rename it ({how}), or choose a different name."
             )
 
@@ -142,9 +142,9 @@ def _squeezed(name: str) -> str:
 
 def _missing(missing: Sequence[str], names: Sequence[str], source: str) -> InputError:
     closest = {m: difflib.get_close_matches(m, names[:100], n=1, cutoff=0.5) for m in missing}
-    hints = [f"'{near[0]}' for '{name}'" for name, near in closest.items() if near]
+    hints = [f"{shown(near[0])} for '{name}'" for name, near in closest.items() if near]
     meant = f" Did you mean {', '.join(hints)}?" if hints else ""
-    present = ", ".join(f"'{name[:40]}'" for name in names[:20]) + (" …" if names[20:] else "")
+    present = ", ".join(shown(name) for name in names[:20]) + (" …" if names[20:] else "")
     return InputError(
         f"{source}: the columns ax, ay, az must be present; {_listed(missing)} missing; "
         f"found {present}.{meant} Rename the columns, or check the delimiter of the file."

@@ -7,7 +7,7 @@ import os
 import msgspec
 
 from mwdcal.errors import InputError
-from mwdcal.files.profiles import built_in, read_toml
+from mwdcal.files.profiles import built_in, read_toml, toml_problem
 from mwdcal.use.verification import Limits
 
 
@@ -17,9 +17,9 @@ def load_limits(name_or_path: str | os.PathLike[str] = "roll-test") -> Limits:
     data, _ = read_toml(name, "limits", "limits profile")
     try:
         limits = msgspec.toml.decode(data, type=Limits)
-    except (msgspec.DecodeError, ValueError) as error:
+    except (msgspec.DecodeError, ValueError, RecursionError) as error:
         raise InputError(
-            f"{name} is not a limits profile: {error}. Compare it with the built-in ones: "
+            f"{name} is not a limits profile: {toml_problem(error)}. Compare it with the built-in ones: "
             f"{', '.join(built_in('limits'))} (docs, 'Files')."
         ) from None
     bounds = [*limits.spread.items(), *limits.error.items()]

@@ -17,6 +17,8 @@ from mwdcal.errors import InputError
 
 _BARE = re.compile(r"([A-Za-z0-9_-]+)\s*=\s*([^\s\"'\[{].*)")
 _LONGEST_SHOWN = 60
+DEEPEST = 20
+"""Levels of lists and tables in a value."""
 
 
 def parse(lines: Iterable[tuple[int, str]], source: str, word: str = "line") -> dict[str, object]:
@@ -40,6 +42,24 @@ def parse(lines: Iterable[tuple[int, str]], source: str, word: str = "line") -> 
     return metadata
 
 
+def plain(metadata: Mapping[str, object], source: str) -> dict[str, object]:
+    """The metadata in values that a line can hold; refuses what is nested more than `DEEPEST` deep."""
+    for key, value in metadata.items():
+        if not _shallow(value, DEEPEST):
+            raise InputError(
+                f"{source}, metadata {_shown(key)}: values must be nested at most {DEEPEST} deep. "
+                "Simplify or remove it."
+            )
+    return {key: _plain(value) for key, value in metadata.items()}
+
+
+def _shallow(value: object, left: int) -> bool:
+    if not isinstance(value, list | dict):
+        return True
+    inner = value.values() if isinstance(value, dict) else value
+    return left > 0 and all(_shallow(each, left - 1) for each in inner)
+
+
 def render(metadata: Mapping[str, object]) -> list[str]:
     """The lines that `parse` turns back into `metadata`; empty values are left out."""
     return [f"# {_key(k)} = {_toml(v)}" for k, v in metadata.items() if v is not None]
@@ -59,7 +79,7 @@ def _entry(text: str, where: str) -> tuple[str, object]:
             "Correct or remove the line."
         )
     ((key, value),) = pairs.items()
-    return key, _plain(value, bare[2] if bare else "")
+    return key, _plain(value, bare[2]) if bare else plain(pairs, where)[key]
 
 
 def _plain(value: object, text: str = "") -> object:
@@ -73,7 +93,7 @@ def _plain(value: object, text: str = "") -> object:
     if isinstance(value, float) and not math.isfinite(value):
         return text or str(value)
     if isinstance(value, int) and abs(value) >= 2**63:
-        return text or "an integer beyond 64 bits"
+        return text or str(value)
     return value
 
 

@@ -131,11 +131,20 @@ def _profile(data: bytes, source: str) -> Profile:
         ) from None
     except (msgspec.DecodeError, ValueError, RecursionError) as error:
         raise InputError(
-            f"{source}: a tool profile must be TOML; {_lower_first(str(error))}. Correct the "
+            f"{source}: a tool profile must be TOML; {_lower_first(toml_problem(error))}. Correct the "
             'file; text needs quotes, axes are a list such as ["+x", "+y", "+z"].'
         ) from None
     check_profile(profile, source)
     return profile
+
+
+def toml_problem(error: Exception) -> str:
+    """What the decoder of TOML says, also of values that Python itself refuses."""
+    if isinstance(error, RecursionError):
+        return "it is nested too deeply"
+    if "integer string conversion" in str(error):
+        return "a whole number has more than 4300 digits"
+    return str(error)
 
 
 def _lower_first(text: str) -> str:

@@ -34,6 +34,8 @@ from mwdcal.sensor.profile import Profile, TriadProfile
 
 MANY = 1000
 """Rows of a table with times from which it is a log."""
+MOST = 1_000_000
+"""Rows that a run may have at most, as many as a text table."""
 _TURN = 360.0
 
 
@@ -41,7 +43,7 @@ def read_run(
     source: str | os.PathLike[str] | Table, profile: Profile, *, decimal: str = "."
 ) -> tuple[Readings, Profile]:
     """The readings of a run, a file or a table, and the profile with its nominal scales filled in."""
-    table = source if isinstance(source, Table) else tables.read(source, decimal=decimal)
+    table = source if isinstance(source, Table) else tables.read(source, decimal=decimal, rows=MOST)
     check_run(table)
     return to_readings(table, profile)
 

@@ -20,8 +20,8 @@ import numpy as np
 from mwdcal.errors import InputError
 from mwdcal.files.contract import RANGES, RAW
 from mwdcal.files.formats import parquet, text
-from mwdcal.files.formats.columns import Column, check_names, no_stations
-from mwdcal.files.formats.table import Table, numbers
+from mwdcal.files.formats.columns import Column
+from mwdcal.files.formats.table import Table, check_decimal, numbers
 from mwdcal.geometry.vectors import Ints
 from mwdcal.use.correction import NAMES
 
@@ -73,13 +73,10 @@ def open_parquet(path: Path, rows: int = 0, decimal: str = ".") -> Source:
     What is carried has the type it has in the file, whatever it is; `decimal` is the sign in
     columns of text that are read as numbers.
     """
-    arrow, parquets = parquet.modules(path.name)
-    with parquet.reading(path.name):
-        file = parquets.ParquetFile(path, buffer_size=1 << 20, pre_buffer=False)
-        stored, count = file.schema_arrow, file.metadata.num_rows
-    check_names(list(stored.names), path.name)
-    if count == 0:
-        raise no_stations(path.name)
+    check_decimal(decimal)
+    arrow, _ = parquet.modules(path.name)
+    file, stored = parquet.opened(path, path.name, buffer_size=1 << 20, pre_buffer=False)
+    count = file.metadata.num_rows
     names = [name for name in stored.names if not parquet.is_index(name)]
     metadata = parquet.metadata_of(file.metadata.metadata, path.name)
     step = rows or max(1, min(ROWS, PART // (8 * (len(names) + len(NAMES)))))
@@ -94,7 +91,9 @@ def open_parquet(path: Path, rows: int = 0, decimal: str = ".") -> Source:
 
     def load(piece: Any, exact: bool) -> Part:
         first, batch = piece
-        carried = arrow.Table.from_batches([batch]).select(names)
+        with parquet.reading(path.name):
+            carried = parquet.dense(arrow.Table.from_batches([batch]), stored, path.name, arrow)
+        carried = carried.select(names)
         wanted = [name for name in names if name in RANGES]
         columns = {n: parquet.as_column(n, carried.column(n), arrow) for n in wanted}
         lines = range(first, first + len(batch))
@@ -213,13 +212,19 @@ def _sorted(data: bytes, delimiter: bytes) -> tuple[bytes, bytes, Ints | None]:
 
 def _numbers(name: str, cells: Any, arrow: Any) -> Column:
     """Readings as numbers, other columns as text, which may have blank cells."""
+    import pyarrow.compute as compute
+
     if name not in (*RAW, "temperature_c"):
         return [str(cell) for cell in cells.to_pylist()]
     if cells[0].as_py() == "" and cells.unique().to_pylist() == [""]:
         blank = np.full(len(cells), np.nan)
         blank.flags.writeable = False  # as the others are: compiled loops take columns of one type
         return blank
-    return np.asarray(cells.cast(arrow.float64()).to_numpy(), float)
+    try:
+        values = cells.cast(arrow.float64())
+    except arrow.ArrowInvalid:  # blanks around a number
+        values = compute.utf8_trim_whitespace(cells).cast(arrow.float64())
+    return np.asarray(values.to_numpy(), float)
 
 
 def _typed(carried: Any, table: Table, numeric: list[str], arrow: Any) -> Any:

@@ -13,6 +13,7 @@ from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
 from mwdcal.errors import InputError
+from mwdcal.files.formats.columns import shown
 from mwdcal.use.correction import EXTRAPOLATED, NAMES
 
 UNITS = {
@@ -95,7 +96,6 @@ SHOWN = {
 """Columns that must not be overlooked, with their units."""
 OURS = ("time_s", "start_s", "end_s", "samples", "drifting", "serial")
 """Columns beyond the contract that mwdcal itself reads or writes in run files."""
-_LONGEST = 40
 _CASED = {"nT": " nt ", "uT": " ut ", "mT": " millit ", "mG": " milligauss ", "mg": " millig "}
 
 
@@ -175,13 +175,13 @@ def unused(names: Sequence[str], used: Collection[str]) -> tuple[str, ...]:
         if name in used or name in OURS or name.startswith("drift_"):
             continue
         resemblance = resembled(name)
-        shown = f"'{name[:_LONGEST]}'"
+        entry = shown(name)
         if name in results:
-            shown += " (a result of mwdcal apply)"
+            entry += " (a result of mwdcal apply)"
         elif resemblance is not None:
-            shown += f" (resembles '{resemblance.column}')"
-        entries.append((resemblance is None, shown))
-    return tuple(shown for _, shown in sorted(entries, key=lambda each: each[0]))
+            entry += f" (resembles '{resemblance.column}')"
+        entries.append((resemblance is None, entry))
+    return tuple(entry for _, entry in sorted(entries, key=lambda each: each[0]))
 
 
 def _results(names: Collection[str]) -> set[str]:
@@ -206,12 +206,10 @@ def _refuse(names: Sequence[str], absent: Collection[str], source: str) -> None:
     if not meant:
         return
     name, resemblance = meant[0]
-    others = [
-        f"'{n[:_LONGEST]}' ({other.column}, {SHOWN[other.column]})" for n, other in meant[1:6]
-    ]
+    others = [f"{shown(n)} ({other.column}, {SHOWN[other.column]})" for n, other in meant[1:6]]
     likewise = f" Likewise {', '.join(others)}." if others else ""
     raise InputError(
-        f"{source}: the column '{name[:_LONGEST]}' resembles '{resemblance.column}', which is absent, and would not "
+        f"{source}: the column {shown(name)} resembles '{resemblance.column}', which is absent, and would not "
         f"be used. {remedy(resemblance)}; if it is something else, give it a name that says so, or remove it."
         f"{likewise}"
     )

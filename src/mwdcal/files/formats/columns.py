@@ -20,7 +20,9 @@ Column = list[str] | Array
 LABELS = ("station", "group", "serial")
 
 MAX_COLUMNS = 1000
+_LONGEST_SHOWN = 40
 
+_CONTROLS = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ufeff]+")
 _NUMBER = re.compile(r"[+-]?(\d+[.,]?\d*|[.,]\d+)([eE][+-]?\d+)?", re.ASCII)
 
 
@@ -58,6 +60,14 @@ def looks_numeric(text: str, decimal: str = ".") -> bool:
     return other not in text and _NUMBER.fullmatch(text) is not None
 
 
+def shown(value: object) -> str:
+    """A value for a message: text in quotes, long text cut, numbers in short form."""
+    if isinstance(value, str):
+        cut = value if len(value) <= _LONGEST_SHOWN else value[:_LONGEST_SHOWN] + "…"
+        return f"'{cut}'" if cut.isprintable() else repr(cut)
+    return f"{value:.12g}" if isinstance(value, float) else str(value)
+
+
 def check_names(names: Sequence[str], where: str) -> None:
     """Refuse a header with too many, unnamed or repeated columns, or without names at all."""
     if not names:
@@ -82,9 +92,34 @@ def check_names(names: Sequence[str], where: str) -> None:
         )
     for name in (name for i, name in enumerate(names) if name in names[:i]):
         raise InputError(
-            f"{where}: column names must be unique; got '{name}' more than once. "
+            f"{where}: column names must be unique; got {shown(name)} more than once. "
             "Rename or remove one of the columns."
         )
+
+
+def plain_names(names: Sequence[str]) -> list[str]:
+    """The names as text tables and workbooks can have them; those that they can have are kept.
+
+    One line without control characters and blanks around, no '#' before the first, none blank, no
+    two alike.
+
+    >>> plain_names(["#ax", "Temp\\n(C)", " ", "note", "note "])
+    ['ax', 'Temp (C)', 'column 3', 'note', 'note (2)']
+    """
+    plain = [_CONTROLS.sub(" ", name).strip() for name in names]
+    plain[:1] = [name.lstrip("# ") for name in plain[:1]]
+    taken = {name for name, wanted in zip(names, plain, strict=True) if name == wanted}
+    for place, (name, wanted) in enumerate(zip(names, plain, strict=True)):
+        if name != wanted:
+            plain[place] = _free(wanted or f"column {place + 1}", taken)
+            taken.add(plain[place])
+    return plain
+
+
+def _free(name: str, taken: set[str]) -> str:
+    """The name, with a number behind it if it is taken."""
+    numbered = (f"{name} ({count})" for count in range(2, len(taken) + 3))
+    return name if name not in taken else next(each for each in numbered if each not in taken)
 
 
 def assemble(

@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 
 from mwdcal.errors import InputError
+from mwdcal.files import metadata as meta
 from mwdcal.files.formats.columns import (
     LABELS,
     Column,
@@ -19,33 +20,132 @@ from mwdcal.files.formats.columns import (
     check_names,
     damaged_unless_read,
     no_stations,
+    shown,
 )
 
 KEY = b"mwdcal"
 _MAX_CELLS = 100_000_000
+_MAX_TEXT = 100_000_000
+_MAX_NESTED = 1_000_000
+_LONGEST_FIXED = 1000
+_UNPACKED = 100_000_000
+_DENSEST = 100
 _PANDAS_INDEX = re.compile(r"__index_level_\d+__")
 
 
-def parse(data: bytes, source: str) -> Parts:
-    """The table in the bytes of a Parquet file."""
-    arrow, parquet = modules(source)
-    with reading(source):
-        file = parquet.ParquetFile(arrow.BufferReader(data))
-        rows, names = file.metadata.num_rows, list(file.schema_arrow.names)
-    check_names(names, source)
-    if rows == 0:
-        raise no_stations(source)
+def parse(data: bytes, source: str, most: int = 0) -> Parts:
+    """The table in the bytes of a Parquet file; of a run, which has at most so many rows."""
+    arrow, _ = modules(source)
+    file, schema = opened(arrow.BufferReader(data), source)
+    rows, names = file.metadata.num_rows, list(schema.names)
+    if most and rows > most:
+        raise InputError(
+            f"{source}: a run must have at most {most} rows, one per station; got {rows}. Take the "
+            "rows of one run, or find the standstills of a log with mwdcal stations."
+        )
     if rows * len(names) > _MAX_CELLS:
         raise InputError(
             f"{source}: a table must have at most {_MAX_CELLS} cells; got {rows} rows of "
             f"{len(names)} columns. Split the file."
         )
     with reading(source):
-        table = file.read(use_pandas_metadata=False)
+        table = dense(file.read(use_pandas_metadata=False), schema, source, arrow)
         columns = {
             name: as_column(name, table.column(name), arrow) for name in names if not is_index(name)
         }
-    return Parts(columns, metadata_of(table.schema.metadata, source), range(1, rows + 1))
+    return Parts(columns, metadata_of(schema.metadata, source), range(1, rows + 1))
+
+
+def opened(source: Any, name: str, **options: Any) -> tuple[Any, Any]:
+    """A Parquet file with rows, no part of which unpacks to more than memory bears, and its schema.
+
+    Its columns of text are read as numbers of different texts, which `dense` turns into text.
+    """
+    arrow, parquet = modules(name)
+    with reading(name):
+        file = parquet.ParquetFile(source, **options)
+        schema = file.schema_arrow
+    check_names(list(schema.names), name)
+    if file.metadata.num_rows == 0:
+        raise no_stations(name)
+    with reading(name):
+        _check_sizes(file, name)
+        texts = [field.name for field in schema if _is_text(field.type, arrow.types)]
+        options = {**options, "metadata": file.metadata, "read_dictionary": texts}
+        return parquet.ParquetFile(source, **options), schema
+
+
+def _check_sizes(file: Any, source: str) -> None:
+    """Refuse a file of which a part would unpack to far more than it takes on the disk."""
+    leaves = [file.schema.column(i) for i in range(len(file.schema))]
+    for index in range(file.metadata.num_row_groups):
+        group = file.metadata.row_group(index)
+        parts = [group.column(i) for i in range(group.num_columns)]
+        unpacked = sum(part.total_uncompressed_size for part in parts)
+        stored = sum(part.total_compressed_size for part in parts)
+        if unpacked > max(_UNPACKED, _DENSEST * stored):
+            raise InputError(
+                f"{source}: a row group must unpack to at most {_UNPACKED} bytes, or {_DENSEST} "
+                f"times its size; got {unpacked} from {stored}. Write it in smaller row groups."
+            )
+        for leaf, part in zip(leaves, parts, strict=True):
+            _check_leaf(leaf, part, source)
+
+
+def _check_leaf(leaf: Any, part: Any, source: str) -> None:
+    """Refuse lists, and cells of a fixed length, that would be large in memory."""
+    size = part.num_values if leaf.max_repetition_level else 0
+    if leaf.path != leaf.name and leaf.physical_type == "BYTE_ARRAY":
+        size = part.num_values * part.total_uncompressed_size >> 8
+    if size > _MAX_NESTED or leaf.length > _LONGEST_FIXED:
+        raise InputError(
+            f"{source}, column {shown(leaf.path.partition('.')[0])}: expected one value in each "
+            f"cell, or lists of at most {_MAX_NESTED} values in all; got more. Remove the column, "
+            "or store it in a file of its own."
+        )
+
+
+def _is_text(kind: Any, types: Any) -> bool:
+    """Whether a column holds bytes of any length."""
+    return any(
+        is_kind(kind)
+        for is_kind in (
+            types.is_string,
+            types.is_large_string,
+            types.is_binary,
+            types.is_large_binary,
+        )
+    )
+
+
+def dense(table: Any, schema: Any, source: str, arrow: Any) -> Any:
+    """A table as read, its columns of the types of the schema; refuses texts that memory does not bear."""
+    size = sum(
+        _size_of(chunk, arrow.types)
+        for column in table.columns
+        if arrow.types.is_dictionary(column.type)
+        for chunk in column.chunks
+    )
+    if size > _MAX_TEXT:
+        raise InputError(
+            f"{source}: texts of rows that are read at once must have at most {_MAX_TEXT} bytes; "
+            f"got {size}. Shorten or remove the columns with long texts."
+        )
+    return table.cast(schema.remove_metadata())
+
+
+def _size_of(cells: Any, types: Any) -> int:
+    """Bytes of texts that are stored as numbers of different ones; refuses what is not UTF-8."""
+    import pyarrow.compute as compute
+
+    if not _is_text(cells.type.value_type, types):
+        return 0
+    cells.dictionary.validate(full=True)
+    lengths = compute.binary_length(cells.dictionary)
+    longest: int = compute.max(lengths).as_py() or 0
+    if longest * len(cells) <= _MAX_TEXT:
+        return 0
+    return compute.sum(lengths.take(cells.indices)).as_py() or 0
 
 
 def render(columns: Mapping[str, Column], metadata: Mapping[str, object], source: str) -> bytes:
@@ -139,9 +239,10 @@ def _array(column: Column, arrow: Any) -> Any:
 def metadata_of(schema: Mapping[bytes, bytes] | None, source: str) -> dict[str, object]:
     """What a file's schema says of it."""
     try:
-        return msgspec.json.decode((schema or {}).get(KEY, b"{}"), type=dict[str, object])
+        stated = msgspec.json.decode((schema or {}).get(KEY, b"{}"), type=dict[str, object])
     except (ValueError, RecursionError) as error:
         raise InputError(
             f"{source}: the metadata under the schema key 'mwdcal' must be a JSON object "
             f"({error}). Write the file again."
         ) from None
+    return meta.plain(stated, source)

@@ -6,9 +6,7 @@
 from __future__ import annotations
 
 import base64
-import csv
-import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import IO, Any
 
 import msgspec
@@ -22,7 +20,13 @@ _ARROW_SCHEMA = b"ARROW:schema"
 
 
 class ParquetSink:
-    """A Parquet file; results are neither compressed nor searched for repetitions: there are none."""
+    """A Parquet file; results are neither compressed nor searched for repetitions: there are none.
+
+    Attributes:
+        formulas: columns with cells that would be run as formulas: none in this format.
+    """
+
+    formulas: Collection[str] = ()
 
     def __init__(
         self, stream: IO[bytes], schema: Any, results: Any, metadata: Mapping[str, object]
@@ -67,6 +71,9 @@ class TextSink:
     """A text table; the findings are above its header.
 
     From the second part on room is kept for them there, as a comment line of blanks.
+
+    Attributes:
+        formulas: columns with cells that spreadsheet programs would run; `numeric` ones have none.
     """
 
     def __init__(
@@ -77,6 +84,7 @@ class TextSink:
         metadata: Mapping[str, object],
         longest: Sequence[str],
         delimiter: str,
+        numeric: Collection[str] = (),
     ) -> None:
         self._arrow, _ = parquet.modules(stream.name)
         self._stream = stream
@@ -85,16 +93,17 @@ class TextSink:
         stream.write("".join(f"{line}\n" for line in meta.render(metadata)).encode())
         self._place = stream.tell()
         self._room = len(_line(longest)) if longest else 0
-        header = csv.writer(buffer := io.StringIO(), delimiter=self._delimiter, lineterminator="\n")
-        header.writerow([*schema.names, *results.names])
-        self._header = buffer.getvalue().encode()
+        self._header = text.header([*schema.names, *results.names], delimiter).encode()
         self._first: bytes | None = None
+        self._texts = [name for name in schema.names if name not in numeric]
+        self.formulas = {name for name in self._texts if text.is_formula(name)}
 
     def render(self, carried: Any, results: Sequence[AnyArray], blank: bool) -> bytes:
         """The lines of the part."""
         plain = {
             n: self._spelt(c) for n, c in zip(carried.column_names, carried.columns, strict=True)
         }
+        self.formulas.update(n for n in self._texts if self._has_formula(plain[n]))
         plain |= {
             name: self._arrow.array(values, from_pandas=blank)
             for name, values in zip(self._names, results, strict=True)
@@ -105,8 +114,17 @@ class TextSink:
         except self._arrow.ArrowInvalid:  # a cell needs quotes
             return self._quoted(rows)
 
+    def _has_formula(self, cells: Any) -> bool:
+        """Whether spreadsheet programs would run a cell of the column."""
+        import pyarrow.compute as compute
+
+        if not self._arrow.types.is_string(cells.type):
+            return False
+        begun = (cells.filter(compute.starts_with(cells, sign)) for sign in text.FORMULA)
+        return any(text.is_formula(cell) for some in begun for cell in some.to_pylist())
+
     def _lines(self, rows: Any) -> bytes:
-        """Rows of which no cell needs quotes."""
+        """Rows of which no cell needs quotes or is refused."""
         from pyarrow import csv as arrow_csv
 
         stream = self._arrow.BufferOutputStream()
@@ -114,7 +132,10 @@ class TextSink:
             include_header=False, delimiter=self._delimiter, quoting_style="none"
         )
         arrow_csv.write_csv(rows, stream, options)
-        return bytes(stream.getvalue())
+        lines = bytes(stream.getvalue())
+        if b"\0" in lines:
+            raise self._arrow.ArrowInvalid("NUL")
+        return lines
 
     def _quoted(self, rows: Any) -> bytes:
         """Rows of which some have such cells: these by the writer of short tables, numbers alike."""
@@ -135,7 +156,7 @@ class TextSink:
         odd = np.zeros(len(rows), bool)
         for cells in rows.columns:
             if self._arrow.types.is_string(cells.type):
-                quoted = compute.match_substring_regex(cells, f'["\r\n{self._delimiter}]')
+                quoted = compute.match_substring_regex(cells, f'["\r\n\\x00{self._delimiter}]')
                 odd |= quoted.fill_null(False).to_numpy()
         return odd
 

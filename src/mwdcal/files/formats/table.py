@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -13,10 +13,11 @@ import numpy as np
 
 from mwdcal.errors import InputError, reason
 from mwdcal.files.formats import atomic, parquet, text, workbook
-from mwdcal.files.formats.columns import LABELS, Column, as_text, check_names, looks_numeric
+from mwdcal.files.formats.columns import LABELS, Column, Parts, as_text, check_names, looks_numeric
+from mwdcal.files.formats.columns import shown as shown
 from mwdcal.geometry.vectors import Array
 
-_PARSERS = {
+_PARSERS: dict[str, Callable[..., Parts]] = {
     ".csv": text.parse,
     ".tsv": text.parse,
     ".parquet": parquet.parse,
@@ -27,7 +28,6 @@ SUFFIXES = tuple(_PARSERS)
 _LARGEST = {".parquet": 2_000_000_000}
 _LARGEST_TEXT = 50_000_000
 _MARKS = {sign: frozenset(f"0123456789+-eE {sign}") for sign in ".,"}
-_LONGEST_SHOWN = 40
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,38 +56,39 @@ class Table:
         return len(next(iter(self.columns.values()), ()))
 
 
-def read(path: str | os.PathLike[str], *, decimal: str = ".") -> Table:
+def read(path: str | os.PathLike[str], *, decimal: str = ".", rows: int = 0) -> Table:
     """The table in a .csv, .tsv, .parquet or .xlsx file.
 
-    `decimal` is the decimal sign of text cells, '.' or ','.
+    `decimal` is the decimal sign of text cells, '.' or ','. `rows`: the most that a Parquet table may
+    have; text and workbooks have limits of their own.
     """
-    if decimal not in _MARKS:
-        raise InputError(f"`decimal` must be '.' or ','; got {shown(decimal)}.")
+    check_decimal(decimal)
     file = Path(path)
     data = _content(file)
-    parts = _PARSERS[_suffix(file)](data, file.name)
+    parser = _PARSERS[_suffix(file)]
+    limits = {"most": rows} if parser is parquet.parse else {}
+    parts = parser(data, file.name, **limits)
     digest = hashlib.sha256(data).hexdigest()
     return Table(parts.columns, parts.metadata, file.name, parts.lines, digest, decimal)
+
+
+def check_decimal(decimal: str) -> None:
+    """Refuse a decimal sign other than the point and the comma."""
+    if decimal not in _MARKS:
+        raise InputError(f"`decimal` must be '.' or ','; got {shown(decimal)}.")
 
 
 def write(path: str | os.PathLike[str], table: Table) -> None:
     """Write the table atomically, in the format of the suffix; the same table, the same bytes."""
     file = Path(path)
     suffix = _suffix(file)
-    check_header(list(table.columns), file.name)
+    check_names(list(table.columns), file.name)
     if suffix in (".csv", ".tsv"):
         delimiter = "," if suffix == ".csv" else "\t"
         atomic.write(file, text.render(_pointed(table), table.metadata, delimiter))
     else:
         render = parquet.render if suffix == ".parquet" else workbook.render
         atomic.write(file, render(_typed(table), table.metadata, file.name))
-
-
-def check_header(names: Sequence[str], source: str) -> None:
-    """Refuse column names that a written table cannot have."""
-    check_names(names, source)
-    if names[0].startswith("#"):
-        raise InputError(f"{source}: the first column name must not start with '#'.")
 
 
 def numbers(table: Table, name: str) -> Array:
@@ -115,14 +116,6 @@ def cell_error(table: Table, name: str, row: int, problem: str) -> InputError:
     word = "row" if Path(table.source).suffix.lower() in ("", ".parquet", ".xlsx") else "line"
     number = table.lines[row] if row < len(table.lines) else row + 1
     return InputError(f"{table.source}, {word} {number}, column '{name}': {problem}")
-
-
-def shown(value: object) -> str:
-    """A value for a message: text in quotes, long text cut, numbers in short form."""
-    if isinstance(value, str):
-        cut = value if len(value) <= _LONGEST_SHOWN else value[:_LONGEST_SHOWN] + "…"
-        return f"'{cut}'" if cut.isprintable() else repr(cut)
-    return f"{value:.12g}" if isinstance(value, float) else str(value)
 
 
 def _suffix(path: Path) -> str:

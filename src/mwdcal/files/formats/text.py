@@ -4,16 +4,30 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import chain, takewhile
 from typing import NamedTuple
 
 from mwdcal.errors import InputError
 from mwdcal.files import metadata as meta
-from mwdcal.files.formats.columns import Column, Parts, assemble, check_names, number, of_texts
+from mwdcal.files.formats.columns import (
+    Column,
+    Parts,
+    assemble,
+    check_names,
+    looks_numeric,
+    number,
+    of_texts,
+    plain_names,
+)
 
+FORMULA = ("=", "+", "-", "@", "\t", "\r")
+"""What a cell begins with that spreadsheet programs run as a formula, unless it is a number."""
 _LONGEST_LINE = 100_000
 _MAX_LINES = 1_000_000
+_DELIMITING = re.compile(r'[",;\t]')
+_QUOTED = re.compile(r'"[^"]*"')
 
 _FOREIGN = {
     b"\xff\xfe": ("UTF-16 text", "Save it as UTF-8 (in Excel: 'CSV UTF-8')."),
@@ -82,10 +96,26 @@ def render(columns: Mapping[str, Column], metadata: Mapping[str, object], delimi
     """The text that `parse` turns back into the same columns and metadata."""
     stream = io.StringIO()
     stream.writelines(f"{line}\n" for line in meta.render(metadata))
+    stream.write(header(list(columns), delimiter))
     writer = csv.writer(stream, delimiter=delimiter, lineterminator="\n")
-    writer.writerow(columns)
     writer.writerows(zip(*(_cells(k, v) for k, v in columns.items()), strict=True))
     return stream.getvalue()
+
+
+def header(names: Sequence[str], delimiter: str) -> str:
+    """The line of the column names, in quotes where they hold what delimits other tables."""
+    plain = plain_names(names)
+    cells = ('"' + n.replace('"', '""') + '"' if _DELIMITING.search(n) else n for n in plain)
+    return delimiter.join(cells) + "\n"
+
+
+def is_formula(cell: str) -> bool:
+    """Whether spreadsheet programs run a cell of a text table as a formula.
+
+    >>> [is_formula(cell) for cell in ("=1+1", "-1+1", "-1.5", "A-1")]
+    [True, True, False, False]
+    """
+    return cell.startswith(FORMULA) and not looks_numeric(cell.replace(",", "."))
 
 
 def _cells(name: str, column: Column) -> list[str]:
@@ -171,14 +201,21 @@ def comment(line: str) -> str:
 def _delimiter(header: str, source: str) -> str:
     """The delimiter of the header line: the most frequent one of tab, ';' and ','."""
     order = "\t,;" if source.lower().endswith(".tsv") else ",;\t"
-    return max(order, key=header.count)
+    return max(order, key=_QUOTED.sub("", header).count)
+
+
+def _tidied(line: str, delimiter: str) -> str:
+    """The line without the blanks between a delimiter and a quote, which other programs write."""
+    cell = rf'(^|{delimiter})( *)("(?:[^"]|"")*"|[^{delimiter}]*)'
+    return re.sub(cell, lambda m: m[1] + ("" if m[3].startswith('"') else m[2]) + m[3], line)
 
 
 def split(
     lines: Sequence[str], start: int, delimiter: str, source: str
 ) -> Iterator[tuple[int, Sequence[object]]]:
     """The cells of each line with its line number; `start` lines stand above."""
-    reader = csv.reader(lines, delimiter=delimiter, strict=True, skipinitialspace=True)
+    tidied = (_tidied(line, delimiter) if ' "' in line else line for line in lines)
+    reader = csv.reader(tidied, delimiter=delimiter, strict=True)
     done = 0
     try:
         for row in reader:

@@ -5,30 +5,33 @@ from __future__ import annotations
 import datetime
 import io
 import re
-import warnings
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from itertools import islice
 from typing import Any
 
 from mwdcal.errors import InputError
 from mwdcal.files import metadata as meta
-from mwdcal.files.formats.columns import Column, Parts, assemble, damaged_unless_read, number, typed
+from mwdcal.files.formats import sheet
+from mwdcal.files.formats.columns import (
+    Column,
+    Parts,
+    assemble,
+    damaged_unless_read,
+    number,
+    plain_names,
+    typed,
+)
+from mwdcal.files.formats.sheet import LONGEST_CELL, Row
 
-_LARGEST_UNPACKED = 100_000_000
-_MAX_ROWS = 1_048_576
-_LONGEST_CELL = 32_767
 # A file must not depend on the hour it was written: the first day a ZIP archive can hold.
 _EPOCH = datetime.datetime(1980, 1, 1)
 _TIMES = re.compile(rb"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ")
 _UNWRITABLE = re.compile(r"[\x00-\x08\x0b-\x1f\ufffe\uffff]")
 
-Row = tuple[int, Sequence[object]]
-
 
 def parse(data: bytes, source: str) -> Parts:
     """The table on the first sheet of a workbook."""
-    rows = iter(_rows(data, source))
+    rows = _rows(data, source)
     comments: list[tuple[int, str]] = []
     header: list[Row] = []
     for line, row in rows:
@@ -51,11 +54,11 @@ def render(columns: Mapping[str, Column], metadata: Mapping[str, object], source
     """The bytes that `parse` turns back into the same columns and metadata."""
     book = _module(source).Workbook(write_only=True)
     rows: list[Sequence[str | float]] = [[line] for line in meta.render(metadata)]
-    rows += [list(columns), *zip(*columns.values(), strict=True)]
+    rows += [plain_names(list(columns)), *zip(*columns.values(), strict=True)]
     _check_texts(rows, source)
-    sheet = book.create_sheet("run")
+    page = book.create_sheet("run")
     for row in rows:
-        sheet.append([_cell(sheet, value) for value in row])
+        page.append([_cell(page, value) for value in row])
     stream = io.BytesIO()
     book.save(stream)
     return _timeless(stream)
@@ -72,40 +75,15 @@ def _module(source: str) -> Any:
     return openpyxl
 
 
-def _rows(data: bytes, source: str) -> list[Row]:
+def _rows(data: bytes, source: str) -> Iterator[Row]:
     """Row numbers and cells of the first sheet, without the blank cells at the end."""
-    openpyxl = _module(source)
+    _module(source)
     advice = "Save it again as .xlsx, or as CSV UTF-8."
-    with damaged_unless_read(source, "an Excel workbook (.xlsx)", advice):
-        _check_size(data, source)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            book = openpyxl.load_workbook(io.BytesIO(data), read_only=True, data_only=True)
-            sheet = book.worksheets[0]
-            sheet.reset_dimensions()
-            cells = islice(sheet.iter_rows(values_only=True), _MAX_ROWS + 1)
-            rows = [(line, _trimmed(row)) for line, row in enumerate(cells, 1)]
-    if len(rows) > _MAX_ROWS:
-        raise InputError(f"{source}: a sheet must have at most {_MAX_ROWS} rows. Split it.")
-    return rows
-
-
-def _check_size(data: bytes, source: str) -> None:
-    """Refuse an archive that would unpack to more memory than any run needs."""
-    with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        size = sum(entry.file_size for entry in archive.infolist())
-    if size > _LARGEST_UNPACKED:
-        raise InputError(
-            f"{source}: a workbook must unpack to at most {_LARGEST_UNPACKED} bytes; "
-            f"got {size}. Save the sheet with the run alone, or as CSV UTF-8."
-        )
-
-
-def _trimmed(row: Sequence[object]) -> Sequence[object]:
-    end = len(row)
-    while end and (row[end - 1] is None or row[end - 1] == ""):
-        end -= 1
-    return row[:end]
+    with (
+        damaged_unless_read(source, "an Excel workbook (.xlsx)", advice),
+        zipfile.ZipFile(io.BytesIO(data)) as archive,
+    ):
+        yield from sheet.rows(archive, source)
 
 
 def _padded(header: Sequence[Row], rows: Iterator[Row], width: int) -> Iterator[Row]:
@@ -118,21 +96,21 @@ def _padded(header: Sequence[Row], rows: Iterator[Row], width: int) -> Iterator[
 def _check_texts(rows: Iterable[Sequence[str | float]], source: str) -> None:
     """Refuse text that a workbook cannot hold, before any of it is written."""
     for value in (value for row in rows for value in row if isinstance(value, str)):
-        if len(value) > _LONGEST_CELL or _UNWRITABLE.search(value):
+        if len(value) > LONGEST_CELL or _UNWRITABLE.search(value):
             raise InputError(
-                f"{source}: a cell of a workbook must be plain text of at most {_LONGEST_CELL} "
+                f"{source}: a cell of a workbook must be plain text of at most {LONGEST_CELL} "
                 f"characters; got {value[:40]!r}. Write CSV or Parquet."
             )
 
 
-def _cell(sheet: Any, value: str | float) -> Any:
+def _cell(page: Any, value: str | float) -> Any:
     """A cell with all digits of a number, or text that stays text even if it looks like a number."""
     from openpyxl.cell import WriteOnlyCell
 
     content = value if isinstance(value, str) else number(value)
     if not content:
         return None
-    cell = WriteOnlyCell(sheet, content)
+    cell = WriteOnlyCell(page, content)
     cell.data_type = "s" if isinstance(value, str) else "n"
     return cell
 
