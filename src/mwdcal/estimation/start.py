@@ -22,9 +22,11 @@ from mwdcal.geometry.vectors import (
     earth_field,
     earth_gravity,
     eigen,
+    eigenvalues,
     inverse,
     quotient,
     rotation,
+    solved,
     tool_from_earth,
 )
 
@@ -91,7 +93,7 @@ def _ellipsoid(x: Array, strength: Array, include: Array) -> tuple[Array, Array]
     sound = values[:, 0] > 1e-3 * values[:, 2]
     values = np.where(sound[:, None], values, 1.0)
     half = np.einsum("bij,bj,bkj->bik", vectors, values, vectors)
-    centre = -np.linalg.solve(half, solution[:, 6:, None])[..., 0]
+    centre = -solved(half, solution[:, 6:, None])[..., 0]
     centre = np.where(sound[:, None], centre, (x.max(-2) + x.min(-2)) / 2)
     root = np.einsum("bij,bj,bkj->bik", vectors, np.sqrt(values), vectors)
     mapped = np.linalg.norm(np.einsum("bij,bnj->bni", root, x - centre[:, None, :]), axis=-1)
@@ -121,13 +123,13 @@ def _linear(problem: Problem, state: State, index: int, x: Array) -> tuple[Array
     attitude = tool_from_earth(*(np.nan_to_num(evidence.known[name]) for name in ANGLES))
     terms = np.concatenate([x, np.ones_like(x[..., :1])], -1)
     gram = np.einsum("bn,bni,bnj->bij", weight, terms, terms)
-    values = np.linalg.eigvalsh(gram)
+    values = eigenvalues(gram)
     usable = (values[:, 0] > LEAST_SPAN**2 * values[:, -1]) & (weight.sum(-1) >= 4)
     gram = np.where(usable[:, None, None], gram, np.eye(4))
 
     def fields_of(target: Array) -> Array:
         crossed = np.einsum("bn,bni,bnj->bij", weight, terms, target)
-        return np.asarray(np.linalg.solve(gram, crossed))
+        return solved(gram, crossed)
 
     if index == 0:
         earth = earth_gravity(problem.constant(state, "gravity"))

@@ -17,6 +17,7 @@ from mwdcal.geometry.vectors import (
     Ints,
     diagonal,
     eigen,
+    finite,
     inverse,
     nearest_rotation,
     outer,
@@ -65,6 +66,12 @@ class Analysis:
     constants: Array
     effects: Array
     influence: Array | None = None
+
+    @property
+    def finite(self) -> Bools:
+        """Members (B,) of which covariance, and residuals with theirs, are finite."""
+        each = (self.covariance[:, None], self.residual[..., None], self.spread)
+        return np.asarray(np.all([np.isfinite(x).all((1, 2, 3)) for x in each], axis=0))
 
 
 def analyse(problem: Problem, state: State, determined: Determined | None = None) -> Analysis:
@@ -122,7 +129,7 @@ def determined_apart(problem: Problem, state: State, known: dict[int, Array]) ->
         (first, second), scales = slices, outer(linear.norms)
         scaled = whole / np.where(scales > 0, scales, 1.0)
         cross, block = scaled[:, second, first], scaled[:, second, second]
-        back = np.linalg.pinv(block, rcond=RANK_TOLERANCE**2, hermitian=True)
+        back = np.linalg.pinv(finite(block), rcond=RANK_TOLERANCE**2, hermitian=True)
         information[:, first, first] += cross.mT @ back @ cross * scales[:, first, first]
         information[:, second, first] = block @ back @ cross * scales[:, second, first]
         information[:, first, second] = information[:, second, first].mT
@@ -216,7 +223,8 @@ def unweighted_pulls(problem: Problem, even: Problem, state: State) -> dict[int,
 def _inverse_where_known(information: Array) -> Array:
     """Inverse (B, k, k) of an information matrix, zero along directions that it says nothing of."""
     scales = outer(np.sqrt(np.maximum(diagonal(information), 1e-300)))
-    return np.asarray(np.linalg.pinv(information / scales, rcond=1e-12, hermitian=True) / scales)
+    inner = np.linalg.pinv(finite(information / scales), rcond=1e-12, hermitian=True)
+    return np.asarray(inner / scales)
 
 
 def whole_covariance(linear: Linear, determined: Determined) -> Array:
@@ -357,6 +365,7 @@ def settle_gauge(problem: Problem, state: State, determined: Determined) -> Stat
     return readjusted(problem, state)
 
 
+@np.errstate(invalid="ignore", divide="ignore", over="ignore")
 def readjusted(problem: Problem, state: State) -> State:
     """The state with stations' and groups' own unknowns at their best for the parameters."""
     for _ in range(4):

@@ -64,6 +64,7 @@ def with_scatter(problem: Problem, state: State, ratios: dict[str, Array]) -> Pr
     return replace(problem, evidence=replace(problem.evidence, scatter=scatter))
 
 
+@np.errstate(invalid="ignore", divide="ignore", over="ignore")
 def log_evidence(problem: Problem, state: State) -> Array:
     """Logarithm (B,) of the probability of the readings, parameters integrated out.
 
