@@ -206,7 +206,7 @@ def _general(problem: Problem, declared: list[bool], options: Options, finite: B
         analysis = sandwich(analysis, trusted, state, pulls)
     if options.robust:
         analysis = _robustly(analysis, trusted, state, options.robust, trust)
-    trusted.memo.at(None)
+    trusted.memo.clear()
     finite = finite & analysis.finite
     status = np.where(finite, solved.status, int(Status.NOT_FINITE))
     return Fit(trusted, state, status, iterations, _noise(problem, declared), trust, analysis)

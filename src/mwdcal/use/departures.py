@@ -14,11 +14,10 @@ import numpy as np
 
 from mwdcal.calibration.readings import ANGLES, Readings
 from mwdcal.calibration.record import FREE_SHARE, Calibration
-from mwdcal.geometry.observables import OBSERVABLES
+from mwdcal.geometry.observables import OBSERVABLES, OUTPUTS
 from mwdcal.geometry.vectors import Array, Bools, Ints
 from mwdcal.use.roll_sets import ROLL_SET, RollSet, near_vertical, roll_sets
 from mwdcal.use.roll_test import GAP, OPEN, SLACK, Coverage, Curve, coverage, ends, extent, fitted
-from mwdcal.use.strengths import OUTPUTS
 
 TURNING = ("azimuth", "toolface")
 """Angles that do not exist at vertical."""

@@ -22,7 +22,7 @@ from mwdcal.calibration.record import (
     OrderScore,
     StandErrors,
 )
-from mwdcal.use.plots import TITLES
+from mwdcal.geometry.observables import TITLES
 
 if TYPE_CHECKING:
     from mwdcal.calibration.automatic.auto import Choice

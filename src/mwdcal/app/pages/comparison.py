@@ -20,6 +20,7 @@ from mwdcal.calibration.readings import SIMULATED
 from mwdcal.comparison.common_gauge import SCALE
 from mwdcal.comparison.compare import Comparison, Row, able
 from mwdcal.estimation.uncertainty import ROTATIONS
+from mwdcal.geometry.observables import TITLES
 from mwdcal.geometry.vectors import Array
 from mwdcal.use import plots
 
@@ -114,7 +115,7 @@ def errors(comparison: Comparison, kind: str) -> list[Line]:
             for row in able(comparison.rows)
         ]
         before = number(comparison.before[name])
-        lines.append((plots.TITLES.get(name, name), unit, [before, *cells]))
+        lines.append((TITLES.get(name, name), unit, [before, *cells]))
     return lines
 
 
@@ -305,7 +306,7 @@ def draw_errors(comparison: Comparison) -> Figure:
         axes.plot(left_out, height, ms=4.6, label=row.method, **edge)
     _ratio_axis(axes)
     axes.set_xlabel("rms error ÷ least left-out error of any method")
-    axes.set_yticks(range(len(names)), [plots.TITLES.get(n, n) for n in names])
+    axes.set_yticks(range(len(names)), [TITLES.get(n, n) for n in names])
     axes.set_ylim(len(names) - 0.5, -0.5)
     axes.grid(axis="y", visible=False)
     for edge_at in np.arange(len(names) - 1) + 0.5:
@@ -346,7 +347,7 @@ def draw_stations(comparison: Comparison) -> Figure:
     )  # fmt: skip
     for line, name in zip(panels, names, strict=True):
         unit = comparison.units[name].partition(" ")[0]
-        line[0].set_ylabel(f"{plots.TITLES[name]}, {unit}", fontsize=6.5)
+        line[0].set_ylabel(f"{TITLES[name]}, {unit}", fontsize=6.5)
         for axes, row in zip(line, rows, strict=True):
             _station_stems(axes, row.station_errors[name], LOOKS[row.method][0])
     for axes, row in zip(panels[0], rows, strict=True):

@@ -30,6 +30,7 @@ from mwdcal.calibration.readings import is_simulated
 from mwdcal.calibration.record import Calibration, TriadCalibration
 from mwdcal.errors import InputError
 from mwdcal.estimation.solvers import RANK_TOLERANCE
+from mwdcal.geometry.observables import TITLES
 from mwdcal.use import plots
 from mwdcal.use.notation import Notation, convert
 from mwdcal.use.plots import reshoot_limit
@@ -67,7 +68,7 @@ def render(calibration: Calibration, verdict: Verdict | None = None) -> str:
         held=HELD,
         accuracy=_accuracy(calibration),
         budget=_budget(calibration),
-        titles=plots.TITLES,
+        titles=TITLES,
         tolerance=RANK_TOLERANCE,
         earth=_earth(calibration),
         when=_when(calibration.time),
@@ -171,7 +172,7 @@ def _figures(calibration: Calibration) -> dict[str, Any]:
     names = [row.observable for row in calibration.errors]
     missing = [
         name
-        for name in plots.TITLES
+        for name in TITLES
         if name not in names and (calibration.has_field or name not in ("azimuth", "field", "dip"))
     ]
     return {
