@@ -20,14 +20,17 @@ from mwdcal.estimation.robust import LOSSES, consistency, inflation, weight, wei
 from mwdcal.estimation.solvers import Determined, Status
 from mwdcal.estimation.start import start
 from mwdcal.estimation.uncertainty import (
+    FIRST_SCATTER,
+    LEAST_SCATTER,
     Analysis,
     analyse,
     determined_apart,
     sandwich,
+    scatter_ratios,
     settle_gauge,
     station_misfit,
+    with_scatter,
 )
-from mwdcal.estimation.variance import FIRST_SCATTER, LEAST_SCATTER, scatter_ratios, with_scatter
 from mwdcal.geometry.vectors import Array, Bools, Ints
 from mwdcal.sensor.models import Basis, Factors, Polynomial, Whole, restricted
 

@@ -41,7 +41,7 @@ VERTICAL = 1e-12
 """A transverse share of gravity below this is an exactly vertical attitude."""
 
 
-def is_vertical(g: Array) -> Array:
+def is_vertical(g: Array) -> Bools:
     """Where the attitude is exactly vertical (..., ) as booleans."""
     return np.asarray(np.hypot(g[..., 0], g[..., 1]) <= VERTICAL * np.linalg.norm(g, axis=-1))
 

@@ -237,7 +237,7 @@ class RollTest:
         """Standard uncertainty of the reference: per station (k,), and what the set shares."""
         sd = self.readings.uncertainty(name)[roll_set.index]
         shared = float(self._common(name)[roll_set.index].max()) if error else 0.0
-        if name == "toolface" or (name in ANGLES and roll_set.set_each):
+        if name == "toolface" or (name in ANGLES and not roll_set.declared):
             return sd, shared
         whole = float(np.sqrt(np.mean(sd**2))) if error else 0.0
         return np.zeros(sd.shape), float(np.hypot(whole, shared))

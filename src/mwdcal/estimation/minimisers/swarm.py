@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mwdcal.estimation.regression import regress
+from mwdcal.estimation.solvers import regress
 from mwdcal.geometry.vectors import Array, ArrayLike, inverse
 from mwdcal.sensor.models import affine_parts, affine_terms
 
