@@ -94,7 +94,7 @@ def reached(ours: Callable[[int], float], theirs: Callable[[int], float], least:
 def least_cost(raw: np.ndarray, reference: np.ndarray) -> np.ndarray:
     """Cost (...) of the least-squares solution."""
     solved = least_squares_forward(raw, reference)
-    return vector_cost(raw, reference, "reading")(solved[..., None, :])[..., 0]
+    return vector_cost(raw, reference)(solved[..., None, :])[..., 0]
 
 
 def rows() -> list[Row]:
@@ -110,7 +110,7 @@ def _rows() -> list[Row]:
     size = {"particles": PARTICLES, "iterations": ITERATIONS}
 
     def ours(seed: int = 0) -> float:
-        return float(swarm_forward(raw, reference, "reading", seed=seed, **size).cost)
+        return float(swarm_forward(raw, reference, seed=seed, **size).cost)
 
     def handed(seed: int = 0) -> float:
         return float(swarm(cost, MIDDLE - 1, MIDDLE + 1, seed=seed, **size).cost)
@@ -123,7 +123,7 @@ def _rows() -> list[Row]:
 
     name, word = f"{PARTICLES} x {ITERATIONS} x 12", "pyswarms"
     batch, one_by_one = (
-        partial(swarm_forward, many, reference, "reading", **size),
+        partial(swarm_forward, many, reference, **size),
         f"{word}, one by one",
     )
     all_least = least_cost(many, reference)

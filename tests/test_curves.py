@@ -14,7 +14,7 @@ from mwdcal.calibration.automatic.nonlinearity import ODDS, choices_of, choose_c
 from mwdcal.calibration.estimate import fit
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import Readings
-from mwdcal.estimation.variance import PIN, log_evidence
+from mwdcal.estimation.uncertainty import PIN, log_evidence
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import centred
 

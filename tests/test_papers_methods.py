@@ -5,10 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.estimate import fit
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import Readings
+from mwdcal.errors import FitError
 from mwdcal.geometry.observables import OBSERVABLES
+from mwdcal.sensor.profile import Profile
 from simulation import DEG, attitude, factor_readings, factors_within_limits, plan
 
 FIELD, DIP = 50_000.0, 65 * DEG
@@ -55,6 +58,29 @@ def test_newton_on_moosavis_plan_for_200_instruments(model):
     gain = gain.mean(1)
     turn = np.arctan2(gain[:, 0, 1] - gain[:, 1, 0], gain[:, 0, 0] + gain[:, 1, 1])
     assert np.abs(turn).max() < 0.1 * DEG
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("paper_weights", [False, True])
+@pytest.mark.parametrize("method", ["newton", "scalar"])
+def test_noise_that_differs_by_fifteen_decades_is_refused_or_fitted(method, paper_weights):
+    """Sums of squares overflow or cancel there: a refusal, never an error of linear algebra."""
+    readings = simulated(plan((5, 45, 90, 135), 6), instruments(1))
+    known = {name: readings.known[name] for name in ("inclination", "toolface")}
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        sd = {"accelerometer": 10.0 ** rng.uniform(-13, 2, readings.accelerometer.shape)}
+        accelerometer = readings.accelerometer[0]
+        sd = {name: values[0] for name, values in sd.items()}
+        run = Readings(accelerometer, None, known=known, sd=sd)
+        options = Options(method, order=0, paper_weights=paper_weights)
+        try:
+            calibration = calibrate(run, Profile(name="servo"), options)
+        except FitError:
+            continue
+        triad = calibration.accelerometer
+        assert np.isfinite(np.array(triad.parameters)).all()
+        assert np.isfinite([sd for sd in triad.standard_uncertainties if sd is not None]).all()
 
 
 OTHER = plan((20, 40, 70, 80, 110, 150), 7)

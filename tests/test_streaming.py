@@ -29,7 +29,7 @@ from mwdcal.app.correction import apply_to_table
 from mwdcal.errors import InputError
 from mwdcal.files import documents, streams
 from mwdcal.files.formats import sinks, table
-from mwdcal.use.correction import EXTRAPOLATED, NAMES
+from mwdcal.geometry.observables import EXTRAPOLATED, RESULTS
 from simulation import Tool
 
 arrow = pytest.importorskip("pyarrow")
@@ -94,7 +94,7 @@ def assert_same(path, wanted):
     for name in wanted.columns:
         if name == EXTRAPOLATED:
             assert found.columns[name] == [str(mark).lower() for mark in wanted.columns[name]]
-        elif name in NAMES or not isinstance(wanted.columns[name], list):
+        elif name in RESULTS or not isinstance(wanted.columns[name], list):
             theirs, ours = table.numbers(wanted, name), table.numbers(found, name)
             np.testing.assert_array_equal(np.isnan(ours), np.isnan(theirs), err_msg=name)
             size = 1e5 if name.endswith("_nt") else 360.0
@@ -164,12 +164,12 @@ def test_columns_of_every_type_are_carried_through(tmp_path, cold):
         out = tmp_path / "out.parquet"
         streaming.apply_to_file(cold[1], source, out, "blank", rows=64, least=least)
         before, after = parquet.read_table(source), parquet.read_table(out)
-        assert after.schema.names == [*columns, *NAMES]
+        assert after.schema.names == [*columns, *RESULTS]
         for name in columns:
             assert after.schema.field(name).type == before.schema.field(name).type
             assert after.column(name).to_pylist() == before.column(name).to_pylist()
         wanted, _ = whole(cold[1], source)
-        for name in NAMES:
+        for name in RESULTS:
             np.testing.assert_allclose(after[name].to_numpy(), wanted.columns[name], atol=1e-6)
     text = tmp_path / "out.csv"
     streaming.apply_to_file(cold[1], source, text, "blank", rows=64)
@@ -286,7 +286,7 @@ def test_rows_that_lack_a_reading(tmp_path, warm, small_pieces, holes, least, ou
     alone = {name: values[sound] for name, values in columns.items()}
     rest, _ = whole(warm[1], write_csv(tmp_path / "rest.csv", alone), outside)
     hot = (alone["temperature_c"] < -1) | (alone["temperature_c"] > 51)
-    for name in NAMES:
+    for name in RESULTS:
         found = table.numbers(wanted, name)
         assert np.isnan(found[~sound]).all()
         np.testing.assert_array_equal(found[sound], rest.columns[name])
@@ -580,7 +580,7 @@ def test_text_in_pieces_gives_the_whole(tmp_path, warm, small_pieces, change, su
     table.write(tmp_path / f"whole{suffix}", wanted)
     found = table.read(out)
     for name, cells in table.read(tmp_path / f"whole{suffix}").columns.items():
-        if name in ("station", "time_s") or (name in wanted.columns and name not in NAMES):
+        if name in ("station", "time_s") or (name in wanted.columns and name not in RESULTS):
             ours = found.columns[name]
             if isinstance(ours, list) == isinstance(cells, list):
                 np.testing.assert_array_equal(ours, cells)
@@ -662,7 +662,7 @@ def test_findings_of_a_long_text_table_stand_above_its_header(tmp_path, small_pi
     ]
     found = table.read(tmp_path / "out.csv")
     assert found.metadata["findings"] == [f["text"] for f in ran.json["findings"]]
-    assert list(found.columns)[-13:] == list(NAMES)
+    assert list(found.columns)[-13:] == list(RESULTS)
 
 
 def test_parquet_and_long_text_are_taken_in_parts_where_the_formats_allow_it(tmp_path, monkeypatch):

@@ -1,6 +1,7 @@
 """The particle swarm against least squares on the same cost, and Moradi's tables."""
 
 import importlib.util
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -8,8 +9,6 @@ import pytest
 
 from mwdcal.estimation.minimisers.swarm import (
     CONSTRICTION,
-    least_squares_affine,
-    least_squares_forward,
     swarm,
     swarm_forward,
     vector_cost,
@@ -22,7 +21,6 @@ SPEC = importlib.util.spec_from_file_location("moradi", EXAMPLE)
 moradi = importlib.util.module_from_spec(SPEC)
 SPEC.loader.exec_module(moradi)
 
-SOLVE = {"field": least_squares_affine, "reading": least_squares_forward}
 SIX = moradi.STATES
 NOISE = moradi.RESIDUAL / np.sqrt(3)
 
@@ -67,8 +65,11 @@ def test_swarm_and_least_squares_meet_for_every_seed(case, error):
     worst = 0.0
     for seed in range(50):
         raw = simulated(seed, reference, offset, noise)
-        found = swarm_forward(raw, reference, error, seed=seed)
-        worst = max(worst, apart(found.position, SOLVE[error](raw, reference), raw, reference))
+        found = moradi.swarmed(raw, reference, error, seed=seed)
+        worst = max(
+            worst,
+            apart(found.position, moradi.least_squares(raw, reference, error), raw, reference),
+        )
     print(case, error, worst)
     assert worst < 1e-8
 
@@ -77,11 +78,10 @@ def test_swarm_and_least_squares_meet_for_every_seed(case, error):
 def test_stations_close_together_are_no_obstacle(error):
     reference = references(0, inclinations=(0, 10, 20, 30))
     raw = simulated(np.arange(12), reference, 0.01, 1e-4, lead=(12,))
-    found = swarm_forward(raw, reference, error)
-    solved = SOLVE[error](raw, reference)
+    found = moradi.swarmed(raw, reference, error)
+    solved = moradi.least_squares(raw, reference, error)
     offsets = [
-        np.abs(vector_cost(raw, reference, error)(p[:, None])[:, 0])
-        for p in (found.position, solved)
+        moradi.mean_square(raw, reference, error, params) for params in (found.position, solved)
     ]
     assert offsets[0] == pytest.approx(offsets[1], rel=1e-12)
     assert apart(found.position, solved, raw, reference) < 1e-8
@@ -118,15 +118,15 @@ def test_least_squares_is_the_minimum_of_its_cost(error):
     """Against an independent solver of the normal equations, and against its neighbours."""
     raw, rng = simulated(3, references(0), 0.01, 0.01), np.random.default_rng(0)
     reference, one = references(0), np.ones((len(raw), 1))
-    solved = SOLVE[error](raw, reference)
+    solved = moradi.least_squares(raw, reference, error)
     known, target = (raw, reference) if error == "field" else (reference, raw)
     found = np.linalg.lstsq(np.concatenate([known, one], -1), target)[0]
     matrix, offset = found[:3].T, found[3]
     if error == "field":
         matrix, offset = np.linalg.inv(matrix), -np.linalg.solve(matrix, offset)
     assert solved == pytest.approx(np.concatenate([matrix.ravel(), offset]), abs=1e-12)
-    cost = vector_cost(raw, reference, error)
-    assert (cost(solved + 1e-4 * rng.normal(size=(200, 12))) > cost(solved[None])).all()
+    cost = partial(moradi.mean_square, raw, reference, error)
+    assert (cost(solved + 1e-4 * rng.normal(size=(200, 12))) > cost(solved)).all()
 
 
 def test_costs_are_those_of_the_paper():
@@ -136,7 +136,8 @@ def test_costs_are_those_of_the_paper():
     predicted = np.array([matrix @ a + offset for a in SIX])
     for error, misfit in (("field", estimated - SIX), ("reading", raw - predicted)):
         expected = np.mean(np.sum(misfit**2, -1))
-        assert vector_cost(raw, SIX, error)(params[None])[0] == pytest.approx(expected, rel=1e-12)
+        found = moradi.mean_square(raw, SIX, error, params)
+        assert found == pytest.approx(expected, rel=1e-12)
 
 
 def test_equations_12_and_13_are_different_estimators():
@@ -146,7 +147,10 @@ def test_equations_12_and_13_are_different_estimators():
     assert moradi.apart(reference, 1e-4 * np.sqrt(3)) == pytest.approx(6e-8, rel=0.1)
     assert moradi.apart(reference, 6.5e-3) == pytest.approx(8e-5, rel=0.1)
     assert moradi.apart(reference, 6.5e-3 * np.sqrt(3)) == pytest.approx(2.5e-4, rel=0.1)
-    gain = [np.linalg.det(affine_parts(SOLVE[e](*noisy()))[0]) for e in ("field", "reading")]
+    gain = [
+        np.linalg.det(affine_parts(moradi.least_squares(*noisy(), e))[0])
+        for e in ("field", "reading")
+    ]
     assert gain[0].mean() > gain[1].mean()  # M too small: S too large
 
 
@@ -168,12 +172,12 @@ def test_same_seed_same_result_and_other_seed_another_path():
 def test_batch_is_each_tool_alone(lead, error):
     reference = references(1)
     raw = simulated(np.arange(7), reference, 2.0, 3e-4, lead=lead)
-    batch = swarm_forward(raw, reference, error, seed=2)
+    batch = moradi.swarmed(raw, reference, error, seed=2)
     assert batch.position.shape == (*lead, 12)
     assert batch.cost.shape == lead
     assert batch.history.shape == (*lead, batch.iterations)
     for index in np.ndindex(*lead):
-        alone = swarm_forward(raw[index], reference, error, seed=2)
+        alone = moradi.swarmed(raw[index], reference, error, seed=2)
         assert batch.position[index] == pytest.approx(alone.position, abs=1e-9)
         assert batch.cost[index] == pytest.approx(alone.cost, rel=1e-12)
 

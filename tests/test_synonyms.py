@@ -12,7 +12,7 @@ from mwdcal.errors import InputError
 from mwdcal.files import documents, synonyms
 from mwdcal.files.contract import COLUMNS
 from mwdcal.files.synonyms import CONVERSIONS, Resemblance, check_evidence, resembled, unused
-from mwdcal.use.correction import NAMES
+from mwdcal.geometry.observables import RESULTS
 from simulation import Tool
 
 ALIKE = {
@@ -113,7 +113,7 @@ def test_what_may_not_be_missed_is_refused_only_where_the_column_is_absent(name,
 
 def test_results_of_apply_are_never_references():
     """All of them together are known for what they are; one alone was meant as a reference."""
-    names = ["ax", "ay", "az", *NAMES]
+    names = ["ax", "ay", "az", *RESULTS]
     check_evidence(names, "run.csv")
     assert all("a result of mwdcal apply" in shown for shown in unused(names, COLUMNS))
     with pytest.raises(InputError, match="ref_inclination_deg"):

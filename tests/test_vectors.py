@@ -6,10 +6,12 @@ import pytest
 from mwdcal.geometry import observables as ob
 from mwdcal.geometry.vectors import (
     centred,
+    inverse,
     nearest_rotation,
     reference_vectors,
     rotation,
     skew,
+    solved,
     tool_from_earth,
     wrap,
 )
@@ -111,3 +113,13 @@ def test_attitude_is_a_proper_rotation():
     np.testing.assert_allclose(
         matrix @ np.swapaxes(matrix, -1, -2), np.broadcast_to(np.eye(3), (50, 3, 3)), atol=1e-14
     )
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_matrix_without_inverse_is_nan_and_spoils_no_other():
+    good = np.array([[2.0, 1.0], [1.0, 3.0]])
+    bad = [np.zeros((2, 2)), np.full((2, 2), np.inf), np.array([[np.nan, 1.0], [1.0, 0.0]])]
+    stack, right = np.array([good, *bad]), np.ones((4, 2, 1))
+    for found in (inverse(stack) @ right, solved(stack, right)):
+        np.testing.assert_allclose(found[0, :, 0], [0.4, 0.2], rtol=1e-15)
+        assert np.isnan(found[1:]).any((1, 2)).all()

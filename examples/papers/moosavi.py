@@ -17,10 +17,10 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from mwdcal.estimation.minimisers.newton import Local, Newton, Stations, cost, local, newton
+from mwdcal.estimation.minimisers.newton import Local, Newton, compared, cost, local, newton
 from mwdcal.estimation.solvers import Status
 from mwdcal.geometry.vectors import Array, centred, reference_vectors
-from mwdcal.planning.simulate import Plan, Truth, grid, reading, servo
+from mwdcal.planning.simulate import StationPlan, Truth, grid, reading, servo
 from mwdcal.sensor.models import Basis, Factors
 
 PAGES = Path(__file__).parents[2] / "docs" / "papers"
@@ -54,7 +54,7 @@ STYLE = {
 # Calibration
 
 
-def measure(truth: Truth, plan: Plan, rng: np.random.Generator) -> Array:
+def measure(truth: Truth, plan: StationPlan, rng: np.random.Generator) -> Array:
     """Accelerometer readings (n, 3) of a plan, at a stand that is a little off."""
     count = len(plan.inclination)
     stood = plan.inclination + STAND * rng.normal(size=count)
@@ -67,14 +67,14 @@ def datasheet(model: Factors) -> Array:
     return model.start(np.eye(3), np.zeros(3))
 
 
-def errors(model: Factors, params: Array, raw: Array, plan: Plan) -> tuple[Array, Array]:
+def errors(model: Factors, params: Array, raw: Array, plan: StationPlan) -> tuple[Array, Array]:
     """Errors (..., n) of |g| in g and of tilt in degrees."""
     g = model.fields(params, raw, plan.temperature)
     tilt = np.arctan2(np.hypot(g[..., 0], g[..., 1]), g[..., 2])
     return np.linalg.norm(g, axis=-1) - 1, np.degrees(tilt - plan.inclination)
 
 
-def fit(model: Factors, raw: Array, plan: Plan) -> Newton:
+def fit(model: Factors, raw: Array, plan: StationPlan) -> Newton:
     """The paper's method from the datasheet."""
     return newton(model, datasheet(model), raw, plan.temperature, 1.0, plan.inclination)
 
@@ -84,20 +84,20 @@ class Case:
     """One of the paper's two calibrations of one instrument: errors (2, n), before and after."""
 
     name: str
-    plan: Plan
+    plan: StationPlan
     found: Newton
     strength: Array
     tilt: Array
     spread: Array
 
     @classmethod
-    def of(cls, name: str, model: Factors, plan: Plan, check: Plan) -> Case:
+    def of(cls, name: str, model: Factors, plan: StationPlan, check: StationPlan) -> Case:
         """Simulate, calibrate, and roll the tool at 45° in a test of its own."""
         rng = np.random.default_rng(SEED)
         truth = servo(rng)
         raw, rolled = measure(truth, plan, rng), measure(truth, check, rng)
-        found = fit(model, raw, plan)
-        both = np.stack([datasheet(model), found.params])[:, None, :]
+        found = fit(model, raw[None], plan)
+        both = np.stack([datasheet(model), found.params[0]])[:, None, :]
         pair = [errors(model, params[0], raw, plan) for params in both]
         rolls = [errors(model, params[0], rolled, check) for params in both]
         spread = np.array([[np.ptp(t), np.ptp(s)] for s, t in rolls])
@@ -108,7 +108,7 @@ class Case:
 # Many instruments
 
 
-def fleet(plan: Plan, seeds: int = SEEDS) -> tuple[Array, list[Truth]]:
+def fleet(plan: StationPlan, seeds: int = SEEDS) -> tuple[Array, list[Truth]]:
     """Readings (seeds, n, 3) of as many instruments, and the instruments."""
     generators = [np.random.default_rng(seed) for seed in range(seeds)]
     truths = [servo(rng) for rng in generators]
@@ -116,18 +116,18 @@ def fleet(plan: Plan, seeds: int = SEEDS) -> tuple[Array, list[Truth]]:
     return np.stack([measure(truth, plan, rng) for truth, rng in pairs]), truths
 
 
-def turn(model: Factors, params: Array, raw: Array, plan: Plan) -> Array:
+def turn(model: Factors, params: Array, raw: Array, plan: StationPlan) -> Array:
     """Turn about the tool axis (...) of the mean gain, degrees."""
     gain = model.slope(params, raw, plan.temperature).mean(-3)
     sine, cosine = gain[..., 0, 1] - gain[..., 1, 0], gain[..., 0, 0] + gain[..., 1, 1]
     return np.degrees(np.arctan2(sine, cosine))
 
 
-def pseudo_inverse(raw: Array, plan: Plan, cutoff: float, steps: int = 20) -> tuple[Array, Array]:
+def pseudo_inverse(
+    raw: Array, plan: StationPlan, cutoff: float, steps: int = 20
+) -> tuple[Array, Array]:
     """Twelve parameters by the formula as printed, pseudo-inverse for inverse; and the cost."""
-    shape = raw.shape[:-1]
-    known = [np.broadcast_to(x, shape) for x in (plan.temperature, 1.0, plan.inclination)]
-    stations = Stations(raw, *known, np.ones((*shape, 2)))
+    stations = compared(raw, plan.temperature, 1.0, plan.inclination)
     params = np.broadcast_to(datasheet(TWELVE), (len(raw), 12))
     for _ in range(steps):
         here: Local = local(TWELVE, params, stations)
@@ -136,7 +136,7 @@ def pseudo_inverse(raw: Array, plan: Plan, cutoff: float, steps: int = 20) -> tu
     return params, cost(TWELVE, params, stations)
 
 
-def ramp(kind: str) -> Plan:
+def ramp(kind: str) -> StationPlan:
     """36 stations, nine at a position, while a heater changes the temperature."""
     plan, up = grid(POSITIONS, 9, [0], [25.0]), np.linspace(25, 80, 9)
     course = {
@@ -147,7 +147,7 @@ def ramp(kind: str) -> Plan:
     return replace(plan, temperature=course[kind])
 
 
-def elsewhere(plan: Plan, seeds: int = 50) -> list[str]:
+def elsewhere(plan: StationPlan, seeds: int = 50) -> list[str]:
     """Rank, iterations, and errors on a dense noise-free grid after 30 factors from a plan."""
     check = grid([10, 30, 45, 70, 90, 120, 150], 7, [0], [30.0, 40.0, 50.0, 60.0, 70.0, 80.0])
     raw, truths = fleet(plan, seeds)
@@ -311,11 +311,11 @@ def summary(cases: list[Case]) -> list[str]:
 def history(cases: list[Case]) -> list[str]:
     """Cost and criterion 22 after each iteration."""
     rows = []
-    for k in range(max(int(case.found.iterations) for case in cases) + 1):
+    for k in range(max(int(case.found.iterations[0]) for case in cases) + 1):
         cells = [str(k)]
         for case in cases:
-            change = np.nan if k == 0 else case.found.criterion[k - 1]
-            cells += ["" if np.isnan(x) else power(x) for x in (case.found.cost[k], change)]
+            change = np.nan if k == 0 else case.found.criterion[0, k - 1]
+            cells += ["" if np.isnan(x) else power(x) for x in (case.found.cost[0, k], change)]
         rows.append(cells)
     pairs = [f"{what}, {case.name}" for case in cases for what in ("E", "criterion 22")]
     return table(["iteration", *pairs], rows)
@@ -371,7 +371,7 @@ def page(cases: list[Case]) -> str:
     """The documentation page, with every number computed here."""
     (cold, truths), (hot, _) = fleet(COLD), fleet(HOT)
     twelve, thirty = fit(TWELVE, cold, COLD), fit(THIRTY, hot, HOT)
-    values = ", ".join(f"{v:.2f}" for v in cases[0].found.determined.values)
+    values = ", ".join(f"{v:.2f}" for v in cases[0].found.determined.values[0])
     kinds = (
         "heated from 25 to 80 °C once in each position",
         "heated in one position, cooled in the next",

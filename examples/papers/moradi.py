@@ -10,19 +10,19 @@ from __future__ import annotations
 
 import io
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from mwdcal.estimation.minimisers.swarm import (
     Swarm,
-    least_squares_affine,
     least_squares_forward,
     swarm_forward,
     vector_cost,
 )
 from mwdcal.geometry.vectors import Array, Bools, inverse, reference_vectors
-from mwdcal.sensor.models import affine_parts
+from mwdcal.sensor.models import affine_parts, affine_terms
 
 STATES = np.array([[0, 0, 1], [0, 0, -1], [0, 1, 0], [0, -1, 0], [1, 0, 0], [-1, 0, 0]], float)
 """Table 1: z down, z up, y down, y up, x down, x up; g."""
@@ -108,21 +108,44 @@ def table_4(errors: Array, truth: Array = TABLE_2) -> dict[str, Array]:
 def refitted(draws: int = DRAWS) -> dict[str, float]:
     """Mean RMSE in sample of twelve parameters refitted to each test's eighteen numbers."""
     raw = readings(noise(draws))
-    errors = applied(raw, least_squares_affine(raw, STATES))
+    errors = applied(raw, least_squares(raw, STATES, "field"))
     return {name: float(measures(e)[0].mean()) for name, e in errors.items()}
 
 
-def least_squares(raw: Array, error: str) -> Array:
-    """Forward parameters by one linear solve."""
-    solve = {"reading": least_squares_forward, "field": least_squares_affine}[error]
-    return solve(raw, STATES)
+def inverted(params: Array) -> Array:
+    """M and b of field = M · reading + b from S and o, or S and o from M and b."""
+    matrix, offset = affine_parts(params)
+    back = inverse(matrix)
+    return affine_terms(back, -np.einsum("...ij,...j->...i", back, offset))
+
+
+def least_squares(raw: Array, reference: Array, error: str) -> Array:
+    """S and o by one linear solve: equation 12, or 13 as the regression of fields on readings."""
+    if error == "reading":
+        return least_squares_forward(raw, reference)
+    return inverted(least_squares_forward(reference, raw))
+
+
+def swarmed(raw: Array, reference: Array, error: str, **options: int) -> Swarm:
+    """S and o by particle swarm on the error in the reading, or in the field."""
+    if error == "reading":
+        return swarm_forward(raw, reference, **options)
+    found = swarm_forward(reference, raw, **options)
+    return replace(found, position=inverted(found.position))
+
+
+def mean_square(raw: Array, reference: Array, error: str, params: Array) -> Array:
+    """Mean squared error of S and o (..., 12), in the reading or in the field."""
+    if error == "reading":
+        return vector_cost(raw, reference)(params[..., None, :])[..., 0]
+    return vector_cost(reference, raw)(inverted(params)[..., None, :])[..., 0]
 
 
 def flights(error: str, count: int) -> tuple[Array, list[Swarm]]:
     """One test: its least-squares parameters, and swarms of several seeds on the same cost."""
     raw = readings(resized(noise(1)))[0]
-    return least_squares(raw, error), [
-        swarm_forward(raw, STATES, error, seed=seed) for seed in range(count)
+    return least_squares(raw, STATES, error), [
+        swarmed(raw, STATES, error, seed=seed) for seed in range(count)
     ]
 
 
@@ -130,7 +153,7 @@ def meeting(error: str, count: int) -> tuple[float, float]:
     """Largest difference of swarm and least squares over seeds: parameters, cost (relative)."""
     solved, found = flights(error, count)
     raw = readings(resized(noise(1)))[0]
-    least = vector_cost(raw, STATES, error)(solved[None])[0]
+    least = mean_square(raw, STATES, error, solved)
     params = max(float(np.abs(f.position - solved).max()) for f in found)
     return params, max(abs(float(f.cost / least - 1)) for f in found)
 
@@ -147,7 +170,7 @@ def apart(reference: Array, length: float, draws: int = 2000) -> float:
     noise = np.random.default_rng(1).normal(size=(draws, *reference.shape)) * length / np.sqrt(3)
     matrix, offset = affine_parts(TABLE_2)
     raw = reference @ matrix.T + offset + noise
-    both = least_squares_forward(raw, reference) - least_squares_affine(raw, reference)
+    both = least_squares(raw, reference, "reading") - least_squares(raw, reference, "field")
     return float(np.linalg.norm(both, axis=-1).mean())
 
 
@@ -215,7 +238,7 @@ def _draw_flights(axes) -> None:
     raw = readings(resized(noise(1)))[0]
     for error, colour, dash in (("field", "#0072b2", "-"), ("reading", "#d55e00", "--")):
         solved, (found,) = flights(error, 1)
-        least = vector_cost(raw, STATES, error)(solved[None])[0]
+        least = mean_square(raw, STATES, error, solved)
         excess = np.maximum(found.history / least - 1, 1e-13)
         axes.semilogy(np.arange(1, 601), excess, color=colour, ls=dash, lw=1.2)
     axes.set_ylim(1e-13, 1e5)

@@ -28,7 +28,8 @@ from mwdcal.files.formats import table
 from mwdcal.files.formats.columns import as_text
 from mwdcal.files.formats.table import Table
 from mwdcal.files.runs import to_readings
-from mwdcal.use.correction import EXTRAPOLATED, RowCounts, counted
+from mwdcal.geometry.observables import EXTRAPOLATED
+from mwdcal.use.correction import RowCounts, counted
 
 TEXT = (".csv", ".tsv")
 """Suffixes of text tables."""

@@ -40,13 +40,12 @@ from mwdcal.files.formats.sinks import ParquetSink, Sink, TextSink
 from mwdcal.files.formats.table import Table, cell_error
 from mwdcal.files.formats.table import numbers as as_numbers
 from mwdcal.files.streams import Part, Source
+from mwdcal.geometry.observables import EXTRAPOLATED, RESULTS
 from mwdcal.geometry.vectors import AnyArray, Array, Bools
 from mwdcal.sensor.profile import TriadProfile
 from mwdcal.use import correction_numba, strengths
 from mwdcal.use.correction import (
-    EXTRAPOLATED,
     JUDGED,
-    NAMES,
     RowCounts,
     check_outside,
     findings,
@@ -277,7 +276,7 @@ class _Worker:
         metadata = {**self.source.metadata, **described(self.calibration)}
         metadata.pop("findings", None)  # with those of the results, when these are known
         suffix, outside = output.suffix.lower(), self.rules.outside
-        kinds = {name: arrow.float64() for name in NAMES} | {EXTRAPOLATED: arrow.bool_()}
+        kinds = {name: arrow.float64() for name in RESULTS} | {EXTRAPOLATED: arrow.bool_()}
         results = arrow.schema([(name, kinds[name]) for name in result_names(outside)])
         if suffix == ".parquet":
             return ParquetSink(stream, self.source.schema, results, metadata)
@@ -318,7 +317,7 @@ class _Worker:
             kinds = [kind for kind in TRIADS if channels[kind] is not None]
             known = runs.check_references(table, self.calibration.profile, kinds)
         moved = self._undetermined(channels, table.count)
-        columns = dict(zip(NAMES, corrected.columns, strict=True))
+        columns = dict(zip(RESULTS, corrected.columns, strict=True))
         results: list[AnyArray] = [*columns.values()]
         if self.rules.outside == "extrapolate":
             results.append(self._beyond(channels, table.count))
@@ -399,7 +398,7 @@ class _Worker:
         self, channels: Mapping[str, list[Array] | None], count: int
     ) -> correction_numba.CorrectedRows:
         """The same by plain NumPy, a block at a time."""
-        limits, out = self._limits(), np.empty((len(NAMES), count))
+        limits, out = self._limits(), np.empty((len(RESULTS), count))
         beyond = unsound = 0
         for kind, columns in channels.items():
             low, high = limits.temperature if kind == "temperature" else limits.raw

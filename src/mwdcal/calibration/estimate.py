@@ -20,14 +20,17 @@ from mwdcal.estimation.robust import LOSSES, consistency, inflation, weight, wei
 from mwdcal.estimation.solvers import Determined, Status
 from mwdcal.estimation.start import start
 from mwdcal.estimation.uncertainty import (
+    FIRST_SCATTER,
+    LEAST_SCATTER,
     Analysis,
     analyse,
     determined_apart,
     sandwich,
+    scatter_ratios,
     settle_gauge,
     station_misfit,
+    with_scatter,
 )
-from mwdcal.estimation.variance import FIRST_SCATTER, LEAST_SCATTER, scatter_ratios, with_scatter
 from mwdcal.geometry.vectors import Array, Bools, Ints
 from mwdcal.sensor.models import Basis, Factors, Polynomial, Whole, restricted
 
@@ -206,7 +209,8 @@ def _general(problem: Problem, declared: list[bool], options: Options, finite: B
         analysis = sandwich(analysis, trusted, state, pulls)
     if options.robust:
         analysis = _robustly(analysis, trusted, state, options.robust, trust)
-    trusted.memo.at(None)
+    trusted.memo.clear()
+    finite = finite & analysis.finite
     status = np.where(finite, solved.status, int(Status.NOT_FINITE))
     return Fit(trusted, state, status, iterations, _noise(problem, declared), trust, analysis)
 

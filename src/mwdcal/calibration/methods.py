@@ -178,7 +178,7 @@ def _swarmed(problem: Problem, state: State, seed: int) -> Solved:
 
 def _swarm_forward(raw: Array, target: Array, include: Bools, seed: int) -> Array:
     """Forward parameters (B, 12); members that leave stations out fly one by one."""
-    fly = partial(swarm_forward, error="reading", iterations=SWARM_ITERATIONS, seed=seed)
+    fly = partial(swarm_forward, iterations=SWARM_ITERATIONS, seed=seed)
     if include.all():
         return fly(raw, target).position
     members = zip(raw, target, include, strict=True)

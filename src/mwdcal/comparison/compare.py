@@ -217,10 +217,10 @@ def _course(calibrated: _Calibrated) -> dict[str, Array]:
     courses = {}
     for name, triad, target in zip(TRIADS, problem.triads, problem.targets(state), strict=False):
         swarm = swarm_forward(
-            triad.raw, target, "reading", iterations=SWARM_ITERATIONS, seed=calibrated.options.seed
+            triad.raw, target, iterations=SWARM_ITERATIONS, seed=calibrated.options.seed
         )
         least = least_squares_forward(triad.raw, target)[:, None]
-        cost = vector_cost(triad.raw, target, "reading")(least)[0, 0]
+        cost = vector_cost(triad.raw, target)(least)[0, 0]
         courses[name] = swarm.history[0] / cost - 1
     return courses
 

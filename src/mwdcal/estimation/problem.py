@@ -17,12 +17,15 @@ Batch axis B first, station next, component last.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import pairwise
+from typing import Any, TypeVar
 
 import numpy as np
 
-from mwdcal.estimation.evidence import EARTH, STAND, STAND_ERRORS, UNKNOWN, Evidence
+from mwdcal.estimation.evidence import ANGLES, EARTH, STAND, STAND_ERRORS, UNKNOWN, Evidence
 from mwdcal.estimation.solvers import Linear
 from mwdcal.geometry.vectors import (
     Array,
@@ -36,6 +39,8 @@ from mwdcal.geometry.vectors import (
     skew,
 )
 from mwdcal.sensor.models import Model
+
+_Found = TypeVar("_Found")
 
 INFORMED = 1e-13
 """A prior says something of a direction if its precision exceeds this share of the largest."""
@@ -102,34 +107,18 @@ class Prior:
         return np.asarray(known @ known.mT * scales)
 
 
-@dataclass
-class Memo:
-    """What was found at the last state: rank, step and analysis ask at the same one.
-
-    `besides` keeps what others found there, by name.
-    """
-
-    state: State | None = None
-    predictions: list[Prediction] = field(default_factory=list)
-    linear: dict[bool, Linear] = field(default_factory=dict)
-    besides: dict[str, Array] = field(default_factory=dict)
-
-    def at(self, state: State | None) -> Memo:
-        """Ours, emptied if it is of another state."""
-        if self.state is not state or state is None:
-            self.state, self.predictions, self.linear, self.besides = state, [], {}, {}
-        return self
-
-
 @dataclass(frozen=True)
 class Problem:
-    """Models, readings, evidence and prior knowledge of a batch of runs."""
+    """Models, readings, evidence and prior knowledge of a batch of runs.
+
+    `memo` is what was found at the last state, by name: rank, step and analysis ask at the same one.
+    """
 
     triads: tuple[Triad, ...]
     temperature: Array
     evidence: Evidence
     prior: Prior
-    memo: Memo = field(init=False, repr=False, compare=False, default_factory=Memo)
+    memo: dict[str, Any] = field(init=False, repr=False, compare=False, default_factory=dict)
 
     def slices(self) -> list[slice]:
         """Where each triad's parameters lie."""
@@ -154,44 +143,48 @@ class Problem:
             value = value + state.departures[..., self.evidence.absent.index(name)]
         return np.asarray(value)
 
-    def _by_earth(self, state: State) -> list[Array]:
-        """Derivatives (B, n, 3, 3) of both earth vectors by gravity, field and dip."""
-        gravity, field, dip = (self.constant(state, c) for c in EARTH)
-        zero = np.zeros((*gravity.shape, 3))
-        slopes = [
-            [earth_gravity(np.ones_like(gravity)), zero, zero],
-            [zero, earth_field(np.ones_like(field), dip), earth_field(field, dip + np.pi / 2)],
-        ]
-        return [np.stack(columns, -1) for columns in slopes]
-
     def targets(self, state: State) -> list[Array]:
         """Vectors (B, n, 3) that perfect triads would read: gravity, then the field."""
         gravity, field, dip = (self.constant(state, c) for c in EARTH)
         earth = earth_gravity(gravity), earth_field(field, dip)
         return [np.einsum("bnij,bnj->bni", state.attitude, vector) for vector in earth]
 
+    def once(self, name: str, state: State, find: Callable[[State], _Found]) -> _Found:
+        """What `find` finds at a state, kept under a name until something is asked at another."""
+        if self.memo.get("state") is not state:
+            self.memo.clear()
+            self.memo["state"] = state
+        if name not in self.memo:
+            self.memo[name] = find(state)
+        found: _Found = self.memo[name]
+        return found
+
     def predictions(self, state: State) -> list[Prediction]:
-        """Compare each triad's readings with the reference vectors; the last answer is kept."""
-        memo = self.memo.at(state)
-        memo.predictions = memo.predictions or self._predictions(state)
-        return memo.predictions
+        """Each triad's readings compared with the reference vectors; the last answer is kept."""
+        return self.once("predictions", state, self._predictions)
 
     def _predictions(self, state: State) -> list[Prediction]:
+        gravity, field, dip = (self.constant(state, c) for c in EARTH)
+        one, zero = np.ones_like(gravity), np.zeros((*gravity.shape, 3))
+        changes = (
+            [earth_gravity(one), zero, zero],
+            [zero, earth_field(one, dip), earth_field(field, dip + np.pi / 2)],
+        )
         result = []
         for triad, where, target, change in zip(
-            self.triads, self.slices(), self.targets(state), self._by_earth(state), strict=False
+            self.triads, self.slices(), self.targets(state), changes, strict=False
         ):
             params = state.params[:, where]
-            field = triad.model.fields(params, triad.raw, self.temperature)
+            found = triad.model.fields(params, triad.raw, self.temperature)
             back = inverse(triad.model.slope(params, triad.raw, self.temperature))
-            misfit = np.einsum("bnij,bnj->bni", back, field - target)
+            misfit = np.einsum("bnij,bnj->bni", back, found - target)
             by_params = triad.model.jacobian(params, triad.raw - misfit, self.temperature)
             result.append(
                 Prediction(
                     misfit,
                     back @ by_params,
                     back @ skew(target),
-                    -back @ state.attitude @ change,
+                    -back @ state.attitude @ np.stack(change, -1),
                     np.linalg.norm(np.einsum("bnij,bnj->bni", back, target), axis=-1),
                 )
             )
@@ -202,31 +195,40 @@ class Problem:
 
         The last answers are kept.
         """
-        memo = self.memo.at(state)
-        if geometry not in memo.linear:
-            memo.linear[geometry] = self._linear(state, geometry)
-        return memo.linear[geometry]
+        return self.once(f"linear {geometry}", state, partial(self._linear, geometry))
 
-    def _linear(self, state: State, geometry: bool) -> Linear:
-        pairs = self._weighted(state, geometry)
-        residual = np.concatenate([p.misfit * w for p, w in pairs], -1)
-        blocks = [p.by_params * w[..., None] for p, w in pairs]
-        turns, by_earth = self.station_columns(state, geometry)
-        groups = np.concatenate(self._group_turns(state, turns), -1)
+    def _linear(self, geometry: bool, state: State) -> Linear:
+        whitened = self._whitened(state, geometry)
+        blocks = [p.by_params for p in whitened]
+        turns, by_earth = _station_columns(whitened)
         constants = self._constant_columns(state, by_earth, turns, geometry)
-        shared = np.concatenate([constants, groups], -1)
-        private = [turns @ self._own_turns(state, geometry), self._own_earth(state, by_earth)]
+        shared = np.concatenate([constants, *self._group_turns(state, turns)], -1)
+        own = by_earth[..., [EARTH.index(name) for name in self.evidence.absent]]
+        private = [
+            turns @ self._own_turns(state, geometry),
+            own * self._own_scales(state)[..., None, :],
+        ]
         if self.evidence.scatter and not geometry:
             columns, scatter = self.scatter_columns(state), self.evidence.scatter
             private += [c * scatter[name][..., None, None] for name, c in columns.items()]
         prior, pull = self._prior(state, blocks, shared.shape[-1], geometry)
+        residual = np.concatenate([p.misfit for p in whitened], -1)
         return Linear(residual, tuple(blocks), shared, np.concatenate(private, -1), prior, pull)
 
-    def station_columns(self, state: State, geometry: bool = False) -> tuple[Array, Array]:
+    def _whitened(self, state: State, geometry: bool) -> list[Prediction]:
+        """Predictions over the noise, or over a uniform one; zero for stations left out."""
+        result = []
+        for triad, p in zip(self.triads, self.predictions(state), strict=True):
+            noise = GEOMETRIC_NOISE * p.strength[..., None] + np.zeros(3) if geometry else triad.sd
+            w = self.evidence.include[..., None] / noise
+            row = w[..., None]
+            whitened = (p.misfit * w, p.by_params * row, p.by_turn * row, p.by_earth * row)
+            result.append(Prediction(*whitened, p.strength))
+        return result
+
+    def station_columns(self, state: State) -> tuple[Array, Array]:
         """Whitened rows (B, n, m, 3) by a turn of the station, and by its gravity, field and dip."""
-        pairs = self._weighted(state, geometry)
-        turns = np.concatenate([p.by_turn * w[..., None] for p, w in pairs], -2)
-        return turns, np.concatenate([p.by_earth * w[..., None] for p, w in pairs], -2)
+        return _station_columns(self._whitened(state, geometry=False))
 
     def scatter_columns(self, state: State) -> dict[str, Array]:
         """Whitened rows (B, n, m, k) by a departure of one in each of the evidence's `scatter`.
@@ -248,15 +250,15 @@ class Problem:
         self, state: State, by_earth: Array, turns: Array, geometry: bool
     ) -> Array:
         """Columns (B, n, m, q) of the constants; `geometry` takes references as exact."""
-        columns = []
-        for constant in self.evidence.constants:
-            if constant.name in STAND_ERRORS:
-                column = self.stand_column(state, constant.name, turns)
-            else:
-                column = by_earth[..., EARTH.index(constant.name)]
-            counts = constant.unknown or not geometry
-            columns.append(column * constant.mask[..., None] * counts)
-        return np.stack(columns, -1) if columns else np.zeros((*by_earth.shape[:-1], 0))
+        columns = np.zeros((*by_earth.shape[:-1], len(self.evidence.constants)))
+        for index, constant in enumerate(self.evidence.constants):
+            if constant.unknown or not geometry:
+                if constant.name in STAND_ERRORS:
+                    column = self.stand_column(state, constant.name, turns)
+                else:
+                    column = by_earth[..., EARTH.index(constant.name)]
+                columns[..., index] = column * constant.mask[..., None]
+        return columns
 
     def stand_column(self, state: State, name: str, turns: Array) -> Array:
         """Change (B, n, m) of the misfit by an error of the stand, from `turns` (B, n, m, 3)."""
@@ -273,27 +275,10 @@ class Problem:
 
     def _own_scales(self, state: State) -> Array:
         """How far (B, n, a) each absent strength or dip may be anywhere: its own size, or any angle."""
-        scales = [
-            np.full(state.attitude.shape[:2], UNKNOWN)
-            if name == "dip"
-            else np.abs(self.constant(state, name))
-            for name in self.evidence.absent
-        ]
-        return np.stack(scales, -1) if scales else np.zeros((*state.attitude.shape[:2], 0))
-
-    def _own_earth(self, state: State, by_earth: Array) -> Array:
-        """Columns (B, n, m, a) of the stations' own strengths and dip, times their scale."""
-        chosen = [EARTH.index(name) for name in self.evidence.absent]
-        return np.asarray(by_earth[..., chosen] * self._own_scales(state)[..., None, :])
-
-    def _weighted(self, state: State, geometry: bool) -> list[tuple[Prediction, Array]]:
-        """Predictions, each with one over its noise (B, n, 3), zero for stations left out."""
-        include, predictions = self.evidence.include[..., None], self.predictions(state)
-        weights = [include / t.sd for t in self.triads]
-        if geometry:
-            noise = [GEOMETRIC_NOISE * p.strength[..., None] for p in predictions]
-            weights = [include / each + np.zeros(3) for each in noise]
-        return list(zip(predictions, weights, strict=True))
+        scales = np.zeros((*state.attitude.shape[:2], len(self.evidence.absent)))
+        for index, name in enumerate(self.evidence.absent):
+            scales[..., index] = UNKNOWN if name == "dip" else np.abs(self.constant(state, name))
+        return scales
 
     def _prior(
         self, state: State, blocks: list[Array], shared: int, geometry: bool
@@ -323,31 +308,16 @@ class Problem:
         loose = ~self.evidence.is_known("inclination") & ~self.evidence.is_known("azimuth")
         return loose & ~self.evidence.is_known("toolface") & (self.evidence.group < 0)
 
-    def _own_sd(self, geometry: bool) -> list[Array]:
-        """Standard uncertainty (B, n) of each station's own inclination, azimuth, toolface."""
-        evidence = self.evidence
-        result = []
-        for name in ("inclination", "azimuth", "toolface"):
-            known, exact = evidence.is_known(name), np.zeros_like(evidence.sd[name])
-            grouped = np.zeros_like(known) if name == "toolface" else evidence.group >= 0
-            stated = exact if geometry else evidence.sd[name]
-            result.append(np.where(known, stated, np.where(grouped, 0.0, UNKNOWN)))
-        return result
-
     def _own_turns(self, state: State, geometry: bool) -> Array:
         """Axes (B, n, 3, 3), as columns, of the station's private turns times their σ."""
-        inclination, azimuth, toolface = self._own_sd(geometry)
         across = np.einsum("bnij,bnj->bni", state.attitude, self._across(state))
-        down = state.attitude[..., :, 2]
-        along = np.broadcast_to(np.array([0.0, 0.0, 1.0]), down.shape)
-        natural = np.stack(
-            [
-                across * inclination[..., None],
-                down * azimuth[..., None],
-                along * toolface[..., None],
-            ],
-            -1,
-        )
+        natural = np.stack([across, state.attitude[..., :, 2], np.zeros_like(across)], -1)
+        natural[..., 2, 2] = 1.0
+        for index, name in enumerate(ANGLES):
+            stated = 0.0 if geometry else self.evidence.sd[name]
+            tied = (self.evidence.group >= 0) & (name != "toolface")
+            sd = np.where(self.evidence.is_known(name), stated, np.where(tied, 0.0, UNKNOWN))
+            natural[..., index] *= sd[..., None]
         return np.where(self._free()[..., None, None], UNKNOWN * np.eye(3), natural)
 
     def _across(self, state: State) -> Array:
@@ -444,3 +414,9 @@ class Problem:
         """Largest parameter of each triad (B, p): steps far below it are rounding."""
         parts = [state.params[:, where] for where in self.slices()]
         return np.concatenate([0 * p + np.abs(p).max(-1, keepdims=True) for p in parts], -1)
+
+
+def _station_columns(whitened: list[Prediction]) -> tuple[Array, Array]:
+    """Rows (B, n, m, 3) of all triads by a turn of the station, and by its gravity, field and dip."""
+    turns, by_earth = [p.by_turn for p in whitened], [p.by_earth for p in whitened]
+    return np.concatenate(turns, -2), np.concatenate(by_earth, -2)

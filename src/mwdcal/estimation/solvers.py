@@ -1,4 +1,4 @@
-"""Gauss-Newton with Levenberg-Marquardt damping, on the determined subspace, for a batch.
+"""Least squares of a batch: Gauss-Newton on the determined subspace, and plain regression.
 
 A problem linearises to residual rows per station, ρ + X δ, where X holds the columns of
 all parameters and shared unknowns, and `private` the columns of the station's private unknowns
@@ -21,13 +21,15 @@ from typing import Any, Protocol
 import numpy as np
 
 from mwdcal.estimation.batch import put, take
-from mwdcal.geometry.vectors import Array, Bools, Ints, diagonal, eigen, inverse, outer
+from mwdcal.geometry.vectors import Array, Bools, Ints, diagonal, eigen, eigenvalues, inverse, outer
 
 RANK_TOLERANCE = 2e-2
 """Singular values of the column-normalised design below this share of the largest are free."""
 NEGLIGIBLE = 1e-2
 """A member that is still on its way when iterations end has settled if a full step is a smaller
 share of the standard uncertainty than this."""
+SPANNED = 1e-6
+"""Smallest eigenvalue of the normalised 4 × 4 information at which the vectors span space."""
 
 
 class Status(IntEnum):
@@ -256,14 +258,6 @@ class _Descent:
     damping: Array
     active: Ints
 
-    @classmethod
-    def at(cls, problem: Linearisable, state: Any) -> _Descent:
-        """At the start."""
-        count = len(state.params)
-        determined = Determined.of(problem, state)
-        linear = problem.linear(state)
-        return cls(problem, state, linear, determined, np.zeros(count), np.arange(count))
-
     def step(self) -> tuple[Bools, Bools]:
         """One iteration: which active members are at a minimum, and which are not finite."""
         problem, linear = self.problem, self.linear
@@ -354,7 +348,8 @@ def gauss_newton(problem: Linearisable, state: Any, limit: int = 60) -> tuple[An
     count = len(state.params)
     status = np.full(count, int(Status.NOT_CONVERGED))
     iterations = np.zeros(count, int)
-    descent = _Descent.at(problem, state)
+    determined, linear = Determined.of(problem, state), problem.linear(state)
+    descent = _Descent(problem, state, linear, determined, np.zeros(count), np.arange(count))
     for _ in range(limit):
         if not descent.active.size:
             break
@@ -371,3 +366,42 @@ def gauss_newton(problem: Linearisable, state: Any, limit: int = 60) -> tuple[An
     if descent.active.size:
         status[descent.active[descent.arrived()]] = Status.OK
     return put(state, descent.active, descent.state), status, iterations
+
+
+@dataclass(frozen=True)
+class Regression:
+    """Weighted least squares of readings on vectors, axis by axis.
+
+    `forward` (..., 4, 3): the transposed S in the first rows, o in the last; `terms` (..., n, 4): what
+    they multiply, the vector and one. `cofactor` (..., 3, 4, 4) is the inverse information of each
+    axis; `spanned` (...) says where the vectors determine it.
+    """
+
+    forward: Array
+    terms: Array
+    cofactor: Array
+    spanned: Bools
+
+
+def regress(raw: Array, vectors: Array, weight: Array) -> Regression:
+    """S and o with the least weighted squared error in the readings (Moradi 12).
+
+    Shapes: raw, vectors (..., n, 3); weight (..., n, 3), or (..., n, 1) for all axes alike.
+    Singular: vectors that do not span space about their mean (fewer than four stations, or all in
+    a plane) leave `spanned` false; numbers are then NaN or mean nothing.
+    """
+    terms = np.concatenate([vectors, np.ones_like(vectors[..., :1])], -1)
+    size = np.sqrt(np.einsum("...na,...ni->...ai", weight, terms**2))
+    size = np.where(size > 0, size, 1.0)
+    scaled = terms[..., None, :, :] / size[..., None, :]
+    weighed = scaled * weight.mT[..., None]
+    information = weighed.mT @ scaled
+    sums = scaled.mT @ (weight * raw)[..., None, :, :]
+    cofactor = inverse(information)
+    by_axis = cofactor @ sums / size[..., None]
+    by_axis = np.broadcast_to(by_axis, (*by_axis.shape[:-3], 3, 4, 3))
+    forward = np.diagonal(by_axis, axis1=-3, axis2=-1).copy()
+    cofactor = cofactor / (size[..., :, None] * size[..., None, :])
+    spanned = np.all(eigenvalues(information)[..., 0] > SPANNED, -1)
+    cofactor = np.broadcast_to(cofactor, (*cofactor.shape[:-3], 3, 4, 4))
+    return Regression(forward, terms, cofactor, spanned)

@@ -13,7 +13,7 @@ import numpy as np
 
 from mwdcal.estimation.evidence import ANGLES
 from mwdcal.estimation.problem import Problem, State
-from mwdcal.estimation.regression import regress
+from mwdcal.estimation.solvers import regress
 from mwdcal.geometry import observables
 from mwdcal.geometry.vectors import (
     Array,
@@ -22,9 +22,11 @@ from mwdcal.geometry.vectors import (
     earth_field,
     earth_gravity,
     eigen,
+    eigenvalues,
     inverse,
     quotient,
     rotation,
+    solved,
     tool_from_earth,
 )
 
@@ -91,7 +93,7 @@ def _ellipsoid(x: Array, strength: Array, include: Array) -> tuple[Array, Array]
     sound = values[:, 0] > 1e-3 * values[:, 2]
     values = np.where(sound[:, None], values, 1.0)
     half = np.einsum("bij,bj,bkj->bik", vectors, values, vectors)
-    centre = -np.linalg.solve(half, solution[:, 6:, None])[..., 0]
+    centre = -solved(half, solution[:, 6:, None])[..., 0]
     centre = np.where(sound[:, None], centre, (x.max(-2) + x.min(-2)) / 2)
     root = np.einsum("bij,bj,bkj->bik", vectors, np.sqrt(values), vectors)
     mapped = np.linalg.norm(np.einsum("bij,bnj->bni", root, x - centre[:, None, :]), axis=-1)
@@ -121,13 +123,13 @@ def _linear(problem: Problem, state: State, index: int, x: Array) -> tuple[Array
     attitude = tool_from_earth(*(np.nan_to_num(evidence.known[name]) for name in ANGLES))
     terms = np.concatenate([x, np.ones_like(x[..., :1])], -1)
     gram = np.einsum("bn,bni,bnj->bij", weight, terms, terms)
-    values = np.linalg.eigvalsh(gram)
+    values = eigenvalues(gram)
     usable = (values[:, 0] > LEAST_SPAN**2 * values[:, -1]) & (weight.sum(-1) >= 4)
     gram = np.where(usable[:, None, None], gram, np.eye(4))
 
     def fields_of(target: Array) -> Array:
         crossed = np.einsum("bn,bni,bnj->bij", weight, terms, target)
-        return np.asarray(np.linalg.solve(gram, crossed))
+        return solved(gram, crossed)
 
     if index == 0:
         earth = earth_gravity(problem.constant(state, "gravity"))
@@ -179,25 +181,21 @@ def _attitudes(problem: Problem, state: State) -> State:
     guess = {name: np.nan_to_num(observables.OBSERVABLES[name].value(g, b)) for name in ANGLES}
     angles = {n: np.where(evidence.is_known(n), evidence.known[n], guess[n]) for n in ANGLES}
     angles = _by_toolface(problem, _share(problem, angles), g, b)
-    state = _with_own(problem, _with_dip(problem, state, g, b), g, b)
+    state = _with_own(problem, state, g, b)
     attitude = tool_from_earth(*(angles[name] for name in ANGLES))
-    weights = [1 / np.maximum(np.linalg.norm(f, axis=-1), 1e-30) ** 2 for f in fields]
-    targets = problem.targets(replace(state, attitude=attitude))
-    along = np.broadcast_to(np.array([0.0, 0.0, 1.0]), g.shape)
-    turn = best_turn(fields, targets, weights, along)
+    turn = _best_turn(fields, problem.targets(replace(state, attitude=attitude)))
     turn = np.where(evidence.is_known("toolface"), 0.0, turn)
-    return replace(state, attitude=rotation(along * turn[..., None]) @ attitude)
+    return replace(state, attitude=rotation(turn[..., None] * np.array([0.0, 0.0, 1.0])) @ attitude)
 
 
-def best_turn(
-    fields: Sequence[Array], targets: Sequence[Array], weights: Sequence[Array], axis: Array
-) -> Array:
-    """Angle (B, n) about a unit axis that brings targets closest to fields, in closed form."""
-    sine, cosine = np.zeros(axis.shape[:-1]), np.zeros(axis.shape[:-1])
-    for field, target, weight in zip(fields, targets, weights, strict=False):
-        flat = target - np.sum(target * axis, -1, keepdims=True) * axis
-        cosine += weight * np.sum(field * flat, -1)
-        sine += weight * np.sum(field * np.cross(axis, flat), -1)
+def _best_turn(fields: Sequence[Array], targets: Sequence[Array]) -> Array:
+    """Angle (B, n) about the tool axis that brings targets closest to fields, in closed form."""
+    sine, cosine = np.zeros(fields[0].shape[:-1]), np.zeros(fields[0].shape[:-1])
+    for field, target in zip(fields, targets, strict=False):
+        weight = 1 / np.maximum(np.linalg.norm(field, axis=-1), 1e-30) ** 2
+        x, y, to_x, to_y = field[..., 0], field[..., 1], target[..., 0], target[..., 1]
+        cosine += weight * (x * to_x + y * to_y)
+        sine += weight * (y * to_x - x * to_y)
     return np.asarray(np.arctan2(sine, cosine))
 
 
@@ -247,21 +245,16 @@ def _by_toolface(
 
 
 def _with_own(problem: Problem, state: State, g: Array, b: Array) -> State:
-    """The state with each station's own strength and dip as its corrected fields have them."""
-    departures = state.departures.copy()
-    for index, name in enumerate(problem.evidence.absent):
-        value = observables.OBSERVABLES[name].value(g, b)
-        departures[..., index] = value - problem.constant(state, name)
-    return replace(state, departures=departures)
-
-
-def _with_dip(problem: Problem, state: State, g: Array, b: Array) -> State:
-    """Unknown dip starts from the mean angle between the two vectors."""
-    include = problem.evidence.include
-    constants = state.constants.copy()
-    for index, constant in enumerate(problem.evidence.constants):
+    """The state with an unknown dip, and stations' own strengths and dip, as its fields have them."""
+    evidence, constants = problem.evidence, state.constants.copy()
+    for index, constant in enumerate(evidence.constants):
         if constant.name == "dip" and constant.unknown:
-            weight = constant.mask * include
-            total = np.sum(observables.dip(g, b) * weight, -1) / np.maximum(weight.sum(-1), 1)
-            constants[:, index] = total
-    return replace(state, constants=constants)
+            weight = constant.mask * evidence.include
+            total = np.sum(observables.dip(g, b) * weight, -1)
+            constants[:, index] = total / np.maximum(weight.sum(-1), 1)
+    state = replace(state, constants=constants)
+    own = [
+        observables.OBSERVABLES[name].value(g, b) - problem.constant(state, name)
+        for name in evidence.absent
+    ]
+    return replace(state, departures=np.stack(own, -1)) if own else state

@@ -1,6 +1,12 @@
 """What a fit is worth: covariance, rank, free directions by name, residuals per station.
 
 Nothing is quoted for a direction that the evidence does not determine.
+
+Strengths, dip and the direction of a group are constants of the model. Real instruments are held by
+hand, near iron: each such constant may have a scatter of its own beside the noise of the sensors.
+Its variance is estimated like the noise, by restricted maximum likelihood (REML).
+
+Reference: D. A. Harville, J. Am. Stat. Assoc. 72, 320 (1977).
 """
 
 from __future__ import annotations
@@ -17,6 +23,7 @@ from mwdcal.geometry.vectors import (
     Ints,
     diagonal,
     eigen,
+    finite,
     inverse,
     nearest_rotation,
     outer,
@@ -40,6 +47,14 @@ CHANGES = {
 """Turns of all fields about the tool's axes, and a stretch: what evidence may leave free, by name."""
 COUPLED = 0.9
 """Share of a candidate direction that must lie in the null space to be called free."""
+FIRST_SCATTER = 1e-3
+"""Scatter at which its estimation begins, as a share or in radians."""
+LEAST_SCATTER = 1e-5
+"""Scatter below which there is none."""
+LARGEST_CHANGE = 20.0
+"""A variance changes by this factor at most in one round."""
+PIN = 0.05
+"""Parameters are known to this share of the field when runs are compared by their probability."""
 
 
 @dataclass(frozen=True)
@@ -48,8 +63,8 @@ class Analysis:
 
     `covariance` (B, p, p) with declared noise; `determined` says which directions;
     `variance_factor` (B, t) is s² and `freedom` (B, t) its degrees of freedom;
-    `residual` (B, n, m) are whitened residuals left on the readings, and `spread`
-    (B, n, m, m) their expected covariance, so that residual · spread⁺ · residual is χ²;
+    `residual` (B, n, m) are whitened residuals C⁻¹ρ left on the readings, and `spread`
+    (B, n, m, m) their expected covariance C⁻¹ - C⁻¹X V XᵀC⁻¹, so that residual · spread⁺ · residual is χ²;
     `constants` (B, q, q) is the covariance of the constants of the run; `effects` (B, p, q) is
     what one standard uncertainty of each does to the parameters, zero for unknown constants.
     `influence` (B, n, u, m) is how an error of a station's whitened reading moves X's unknowns,
@@ -66,13 +81,21 @@ class Analysis:
     effects: Array
     influence: Array | None = None
 
+    @property
+    def finite(self) -> Bools:
+        """Members (B,) of which covariance, and residuals with theirs, are finite."""
+        each = (self.covariance[:, None], self.residual[..., None], self.spread)
+        return np.asarray(np.all([np.isfinite(x).all((1, 2, 3)) for x in each], axis=0))
+
 
 def analyse(problem: Problem, state: State, determined: Determined | None = None) -> Analysis:
     """Covariance, rank and residuals at a state; `determined` if it is known there already."""
     linear = problem.linear(state)
     determined = determined or Determined.of(problem, state)
     whole = whole_covariance(linear, determined)
-    residual, spread = _remaining(linear, whole)
+    weighed = linear.weigh(linear.design)
+    residual = linear.weigh(linear.residual[..., None])[..., 0]
+    spread = linear.weight - weighed @ whole[:, None] @ weighed.mT
     spread = spread * problem.evidence.include[..., None, None]
     factor, freedom = _variance_factors(residual, spread)
     p, q = linear.size, len(problem.evidence.constants)
@@ -98,13 +121,6 @@ def _effects(problem: Problem, cross: Array) -> Array:
     return np.stack(each, -1) if each else cross
 
 
-def _remaining(linear: Linear, covariance: Array) -> tuple[Array, Array]:
-    """Whitened residuals C⁻¹ρ (B, n, m), and their covariance C⁻¹ - C⁻¹X V XᵀC⁻¹ (B, n, m, m)."""
-    weighed = linear.weigh(linear.design)
-    left = linear.weigh(linear.residual[..., None])[..., 0]
-    return left, linear.weight - weighed @ covariance[:, None] @ weighed.mT
-
-
 def determined_apart(problem: Problem, state: State, known: dict[int, Array]) -> Determined:
     """Which directions are determined when some triads are fitted to less than all evidence.
 
@@ -122,7 +138,7 @@ def determined_apart(problem: Problem, state: State, known: dict[int, Array]) ->
         (first, second), scales = slices, outer(linear.norms)
         scaled = whole / np.where(scales > 0, scales, 1.0)
         cross, block = scaled[:, second, first], scaled[:, second, second]
-        back = np.linalg.pinv(block, rcond=RANK_TOLERANCE**2, hermitian=True)
+        back = np.linalg.pinv(finite(block), rcond=RANK_TOLERANCE**2, hermitian=True)
         information[:, first, first] += cross.mT @ back @ cross * scales[:, first, first]
         information[:, second, first] = block @ back @ cross * scales[:, second, first]
         information[:, first, second] = information[:, second, first].mT
@@ -216,7 +232,8 @@ def unweighted_pulls(problem: Problem, even: Problem, state: State) -> dict[int,
 def _inverse_where_known(information: Array) -> Array:
     """Inverse (B, k, k) of an information matrix, zero along directions that it says nothing of."""
     scales = outer(np.sqrt(np.maximum(diagonal(information), 1e-300)))
-    return np.asarray(np.linalg.pinv(information / scales, rcond=1e-12, hermitian=True) / scales)
+    inner = np.linalg.pinv(finite(information / scales), rcond=1e-12, hermitian=True)
+    return np.asarray(inner / scales)
 
 
 def whole_covariance(linear: Linear, determined: Determined) -> Array:
@@ -357,6 +374,7 @@ def settle_gauge(problem: Problem, state: State, determined: Determined) -> Stat
     return readjusted(problem, state)
 
 
+@np.errstate(invalid="ignore", divide="ignore", over="ignore")
 def readjusted(problem: Problem, state: State) -> State:
     """The state with stations' and groups' own unknowns at their best for the parameters."""
     for _ in range(4):
@@ -414,3 +432,64 @@ def _turn(problem: Problem, state: State, triads: list[int], turn: Array, statio
         params[:, where] = problem.triads[triad].model.transformed(params[:, where], turn)
     attitude = turn[:, None] @ state.attitude if stations else state.attitude
     return replace(state, params=params, attitude=attitude)
+
+
+def scatter_ratios(problem: Problem, state: State, analysis: Analysis) -> dict[str, Array]:
+    """New variance (B,) of each scatter over its present one; REML has the fixed point at one.
+
+    Definition: with q = P y and P the covariance of the weighed residuals, qᵀVq / tr(PV) for the
+    component V = GGᵀ of unit variance. One where nothing tests a component.
+    """
+    ratios = {}
+    for name, columns in problem.scatter_columns(state).items():
+        share = problem.evidence.scatter[name][..., None]
+        share = share / np.maximum(share.max(1, keepdims=True), LEAST_SCATTER)
+        along = np.einsum("bnmk,bnm->bnk", columns, analysis.residual) * share
+        tested = columns * share[..., None]
+        whole = np.einsum("bnmk,bnml,bnlk->b", tested, analysis.spread, tested, optimize=True)
+        square = np.sum(along**2, (-1, -2))
+        ratio = np.where(whole > 0, square / np.where(whole > 0, whole, 1.0), 1.0)
+        ratios[name] = np.clip(np.nan_to_num(ratio, nan=1.0), 1 / LARGEST_CHANGE, LARGEST_CHANGE)
+    return ratios
+
+
+def with_scatter(problem: Problem, state: State, ratios: dict[str, Array]) -> Problem:
+    """The problem with each scatter's variance times a ratio (B,).
+
+    A strength scatters no more than the noise of its triad: else nothing would be left to tell
+    that noise by.
+    """
+    scatter = {
+        name: np.maximum(value * np.sqrt(ratios[name])[:, None], LEAST_SCATTER)
+        for name, value in problem.evidence.scatter.items()
+    }
+    sizes = [p.strength.mean(-1) for p in problem.predictions(state)]
+    for name, triad, size in zip(("gravity", "field"), problem.triads, sizes, strict=False):
+        if name in scatter:
+            noise = np.sqrt(np.mean(triad.sd**2, (1, 2))) / size
+            scatter[name] = np.minimum(scatter[name], np.maximum(noise, LEAST_SCATTER)[:, None])
+    return replace(problem, evidence=replace(problem.evidence, scatter=scatter))
+
+
+@np.errstate(invalid="ignore", divide="ignore", over="ignore")
+def log_evidence(problem: Problem, state: State) -> Array:
+    """Logarithm (B,) of the probability of the readings, parameters integrated out.
+
+    Definition: Laplace's approximation at the fit, exact for a linear problem. Parameters without
+    a prior get one of `PIN` times the field, the same in all models that are compared; a free
+    direction then counts the same in all.
+    """
+    linear = problem.linear(state)
+    include = problem.evidence.include
+    noise = sum((np.log(t.sd).sum(-1) * include).sum(-1) for t in problem.triads)
+    private = -np.linalg.slogdet(linear.core)[1].sum(-1)
+    known = diagonal(problem.prior.precision)
+    pin = np.zeros((len(known), linear.prior.shape[-1]))
+    for name, where in zip(("gravity", "field"), problem.slices(), strict=False):
+        size = problem.constant(state, name).mean(-1)[:, None]
+        pin[:, where] = (PIN * size) ** -2
+    information = linear.normal.information + pin[:, :, None] * np.eye(pin.shape[-1])
+    prior = np.log(np.where(known > 0, known, pin[:, : linear.size])).sum(-1)
+    determinant = np.linalg.slogdet(information)[1]
+    whole = 2 * noise + private + determinant - prior + linear.normal.cost
+    return np.asarray(-0.5 * whole)

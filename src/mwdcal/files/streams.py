@@ -22,8 +22,8 @@ from mwdcal.files.contract import RANGES, RAW
 from mwdcal.files.formats import parquet, text
 from mwdcal.files.formats.columns import Column
 from mwdcal.files.formats.table import Table, check_decimal, numbers
+from mwdcal.geometry.observables import RESULTS
 from mwdcal.geometry.vectors import Ints
-from mwdcal.use.correction import NAMES
 
 ROWS = 1 << 16
 """Most rows of a part of a Parquet table."""
@@ -79,7 +79,7 @@ def open_parquet(path: Path, rows: int = 0, decimal: str = ".") -> Source:
     count = file.metadata.num_rows
     names = [name for name in stored.names if not parquet.is_index(name)]
     metadata = parquet.metadata_of(file.metadata.metadata, path.name)
-    step = rows or max(1, min(ROWS, PART // (8 * (len(names) + len(NAMES)))))
+    step = rows or max(1, min(ROWS, PART // (8 * (len(names) + len(RESULTS)))))
 
     def pieces() -> Iterator[Any]:
         first = 1

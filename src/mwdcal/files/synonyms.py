@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from mwdcal.errors import InputError
 from mwdcal.files.formats.columns import shown
-from mwdcal.use.correction import EXTRAPOLATED, NAMES
+from mwdcal.geometry.observables import EXTRAPOLATED, RESULTS
 
 UNITS = {
     "deg": "°",
@@ -186,7 +186,7 @@ def unused(names: Sequence[str], used: Collection[str]) -> tuple[str, ...]:
 
 def _results(names: Collection[str]) -> set[str]:
     """The columns that are results of `mwdcal apply`: where all of them are there."""
-    return {*NAMES, EXTRAPOLATED} if set(NAMES) <= set(names) else set()
+    return {*RESULTS, EXTRAPOLATED} if set(RESULTS) <= set(names) else set()
 
 
 def check_evidence(names: Sequence[str], source: str) -> None:

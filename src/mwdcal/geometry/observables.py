@@ -15,24 +15,40 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mwdcal.geometry.vectors import Array, ArrayLike, centred, wrap
+from mwdcal.geometry.vectors import Array, ArrayLike, Bools, centred, wrap
 
+TITLES = {
+    "gravity": "|g|",
+    "inclination": "inclination",
+    "toolface": "toolface·sin I",
+    "azimuth": "azimuth·sin I",
+    "field": "|b|",
+    "dip": "dip",
+}
+"""How an observable's error is called: toolface and azimuth are weighted by sin I."""
+OUTPUTS = {
+    **{name: f"{name}_deg" for name in ("inclination", "azimuth", "toolface")},
+    **{"gravity": "gravity_g", "field": "field_nt"},
+    **{name: f"{name}_deg" for name in ("dip", "magnetic_toolface")},
+}
+"""Output column of each observable, in their order."""
+VECTORS = ("gx_g", "gy_g", "gz_g", "bx_nt", "by_nt", "bz_nt")
+RESULTS = (*VECTORS, *OUTPUTS.values())
+"""Columns of a corrected reading, in their order."""
+EXTRAPOLATED = "extrapolated"
+"""The column that says of each row whether it was extrapolated, where that is allowed."""
 VERTICAL = 1e-12
 """A transverse share of gravity below this is an exactly vertical attitude."""
 
 
-def _transverse(g: Array) -> Array:
-    return np.hypot(g[..., 0], g[..., 1])
-
-
-def is_vertical(g: Array) -> Array:
+def is_vertical(g: Array) -> Bools:
     """Where the attitude is exactly vertical (..., ) as booleans."""
-    return np.asarray(_transverse(g) <= VERTICAL * np.linalg.norm(g, axis=-1))
+    return np.asarray(np.hypot(g[..., 0], g[..., 1]) <= VERTICAL * np.linalg.norm(g, axis=-1))
 
 
 def inclination(g: Array, b: Array) -> Array:
     """Angle between the tool axis and the vertical, 0…π."""
-    return np.asarray(np.arctan2(_transverse(g), g[..., 2]))
+    return np.asarray(np.arctan2(np.hypot(g[..., 0], g[..., 1]), g[..., 2]))
 
 
 def toolface(g: Array, b: Array) -> Array:
@@ -77,16 +93,12 @@ def _six(first: Array, second: Array) -> Array:
     return np.concatenate(np.broadcast_arrays(first, second), -1)
 
 
-def _gravity_gradient(g: Array, b: Array) -> Array:
-    return _six(g / np.linalg.norm(g, axis=-1, keepdims=True), np.zeros_like(b))
-
-
-def _field_gradient(g: Array, b: Array) -> Array:
-    return _six(np.zeros_like(g), b / np.linalg.norm(b, axis=-1, keepdims=True))
+def _unit(vector: Array) -> Array:
+    return np.asarray(vector / np.linalg.norm(vector, axis=-1, keepdims=True))
 
 
 def _inclination_gradient(g: Array, b: Array) -> Array:
-    vertical, across = is_vertical(g), _transverse(g)
+    vertical, across = is_vertical(g), np.hypot(g[..., 0], g[..., 1])
     safe = np.where(vertical, 1.0, across)
     x = np.where(vertical, 0.0, g[..., 0] / safe)
     y = np.where(vertical, -1.0, g[..., 1] / safe)
@@ -96,15 +108,14 @@ def _inclination_gradient(g: Array, b: Array) -> Array:
 
 
 def _toolface_gradient(g: Array, b: Array) -> Array:
-    square = np.where(is_vertical(g), np.nan, g[..., 0] ** 2 + g[..., 1] ** 2)
-    rows = np.stack([g[..., 1], -g[..., 0], np.zeros_like(square)], -1) / square[..., None]
-    return _six(rows, np.zeros_like(b))
+    return _six(_turning(g, ~is_vertical(g)), np.zeros_like(b))
 
 
-def _magnetic_toolface_gradient(g: Array, b: Array) -> Array:
-    square = b[..., 0] ** 2 + b[..., 1] ** 2
-    rows = np.stack([b[..., 1], -b[..., 0], np.zeros_like(square)], -1) / square[..., None]
-    return _six(np.zeros_like(g), rows)
+def _turning(vector: Array, exists: Bools | bool = True) -> Array:
+    """Gradient (..., 3) of the angle of a vector's part across the tool axis; NaN if it has none."""
+    x, y = vector[..., 0], vector[..., 1]
+    square = np.where(exists, x**2 + y**2, np.nan)
+    return np.stack([y, -x, np.zeros_like(x)], -1) / square[..., None]
 
 
 def _azimuth_gradient(g: Array, b: Array) -> Array:
@@ -133,16 +144,13 @@ def _dip_gradient(g: Array, b: Array) -> Array:
     )
 
 
-def _component(
-    index: int,
-) -> tuple[Callable[[Array, Array], Array], Callable[[Array, Array], Array]]:
-    def value(g: Array, b: Array) -> Array:
-        return _six(g, b)[..., index]
-
-    def gradient(g: Array, b: Array) -> Array:
-        return np.broadcast_to(np.eye(6)[index], _six(g, b).shape)
-
-    return value, gradient
+def _component(index: int, unit: str) -> Observable:
+    return Observable(
+        lambda g, b: _six(g, b)[..., index],
+        lambda g, b: np.broadcast_to(np.eye(6)[index], _six(g, b).shape),
+        0.0,
+        unit,
+    )
 
 
 @dataclass(frozen=True)
@@ -165,13 +173,13 @@ OBSERVABLES: dict[str, Observable] = {
     "toolface": Observable(toolface, _toolface_gradient, 2 * np.pi, "rad"),
     "azimuth": Observable(azimuth, _azimuth_gradient, 2 * np.pi, "rad"),
     "magnetic_toolface": Observable(
-        magnetic_toolface, _magnetic_toolface_gradient, 2 * np.pi, "rad"
+        magnetic_toolface, lambda g, b: _six(np.zeros_like(g), _turning(b)), 2 * np.pi, "rad"
     ),
-    "gravity": Observable(gravity, _gravity_gradient, 0.0, "g"),
-    "field": Observable(field, _field_gradient, 0.0, "nT"),
+    "gravity": Observable(gravity, lambda g, b: _six(_unit(g), np.zeros_like(b)), 0.0, "g"),
+    "field": Observable(field, lambda g, b: _six(np.zeros_like(g), _unit(b)), 0.0, "nT"),
     "dip": Observable(dip, _dip_gradient, 0.0, "rad"),
     **{
-        name: Observable(*_component(index), 0.0, "g" if index < 3 else "nT")
+        name: _component(index, "g" if index < 3 else "nT")
         for index, name in enumerate(("gx", "gy", "gz", "bx", "by", "bz"))
     },
 }

@@ -142,21 +142,23 @@ def solved(matrix: Array, right: Array) -> Array:
 
 
 def _regular(matrix: Array) -> tuple[Bools, Array]:
-    """Which matrices (..., 1, 1) are not singular, and all of them with 1 for the others."""
-    sound = np.linalg.slogdet(matrix)[0][..., None, None] != 0
+    """Which matrices (..., 1, 1) are finite and not singular, and all of them with 1 for the others."""
+    with np.errstate(all="ignore"):
+        sound = np.isfinite(np.linalg.slogdet(matrix)[1])[..., None, None]
     return sound, np.where(sound, matrix, np.eye(matrix.shape[-1]))
 
 
 def eigen(matrix: Array) -> tuple[Array, Array]:
     """Eigenvalues (..., k), smallest first, and vectors of symmetric matrices; zero for not finite."""
-    values, vectors = np.linalg.eigh(_finite(matrix))
+    values, vectors = np.linalg.eigh(finite(matrix))
     return np.asarray(values), np.asarray(vectors)
 
 
 def eigenvalues(matrix: Array) -> Array:
     """Eigenvalues (..., k) alone, smallest first: half the work."""
-    return np.asarray(np.linalg.eigvalsh(_finite(matrix)))
+    return np.asarray(np.linalg.eigvalsh(finite(matrix)))
 
 
-def _finite(matrix: Array) -> Array:
+def finite(matrix: Array) -> Array:
+    """The matrix with zero for what is not finite."""
     return matrix if np.isfinite(matrix).all() else np.nan_to_num(matrix, posinf=0.0, neginf=0.0)

@@ -16,9 +16,8 @@ The order of the parameters is defined by `affine_parts` and `factor_parts`, and
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
-from math import prod
 
 import numpy as np
 
@@ -194,17 +193,6 @@ class Polynomial:
         flat = blocks.reshape(*direction.shape[:-1], self.affine)
         return np.concatenate([flat, np.zeros_like(direction[..., self.affine :])], -1)
 
-    @property
-    def lead(self) -> tuple[int, ...]:
-        """Leading axes of the model's own numbers."""
-        return self.centre.shape[:-2]
-
-    def flat(self, lead: tuple[int, ...]) -> Polynomial:
-        """The model with one batch axis for these leading axes."""
-        count = prod(lead)
-        centre, scale = (np.broadcast_to(x, (*lead, 1, 3)) for x in (self.centre, self.scale))
-        return replace(self, centre=centre.reshape(count, 1, 3), scale=scale.reshape(count, 1, 3))
-
     def finished(self, reference: float) -> tuple[Polynomial, Array]:
         """The same model on plain readings and powers of T - reference, and the linear map to it.
 
@@ -323,15 +311,6 @@ class Factors:
         scale, bias = scale[..., :1] * moved, bias[..., :1] * moved
         return factor_params(scale, bias, np.zeros_like(misalignment))
 
-    @property
-    def lead(self) -> tuple[int, ...]:
-        """Leading axes of the model's own numbers: it has none."""
-        return ()
-
-    def flat(self, lead: tuple[int, ...]) -> Factors:
-        """The model with one batch axis: the same for all."""
-        return self
-
     def finished(self, reference: float) -> tuple[Factors, Array]:
         """The same model in powers of T - reference, and the linear map to it."""
         whole, powers = np.eye(self.size), self.basis.powers(reference)
@@ -413,15 +392,6 @@ class Restricted:
     def with_course(self, direction: Array, power: int) -> Array:
         """A change (..., p) of the steady parameters, moved to a power of temperature."""
         return self.whole.with_course(self.full(direction), power)[..., self.kept]
-
-    @property
-    def lead(self) -> tuple[int, ...]:
-        """Leading axes of the whole model's own numbers."""
-        return self.whole.lead
-
-    def flat(self, lead: tuple[int, ...]) -> Restricted:
-        """The model with one batch axis for these leading axes."""
-        return replace(self, whole=self.whole.flat(lead))
 
     def finished(self, reference: float) -> tuple[Whole, Array]:
         """The whole model on plain readings, and the linear map (..., all, p) to it."""

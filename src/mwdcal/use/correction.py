@@ -10,14 +10,12 @@ import numpy as np
 from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.errors import InputError
-from mwdcal.geometry.observables import OBSERVABLES
+from mwdcal.geometry.observables import EXTRAPOLATED, OBSERVABLES, OUTPUTS, RESULTS, VECTORS
 from mwdcal.geometry.vectors import AnyArray, Array
 from mwdcal.use import correction_numba, strengths
-from mwdcal.use.strengths import OUTPUTS, Strengths
+from mwdcal.use.strengths import Strengths
 
 OUTSIDE = ("blank", "refuse", "extrapolate")
-EXTRAPOLATED = "extrapolated"
-"""The column that says of each row whether it was extrapolated, where that is allowed."""
 JUDGED = ("gravity", "inclination", "toolface", "azimuth", "field", "dip", "magnetic_toolface")
 """Observables that a calibration may leave undetermined."""
 DIRECTIONS = {
@@ -25,9 +23,6 @@ DIRECTIONS = {
     "field_nt": ("azimuth_deg", "dip_deg", "magnetic_toolface_deg"),
 }
 """Directions that do not exist where a strength is zero."""
-VECTORS = ("gx_g", "gy_g", "gz_g", "bx_nt", "by_nt", "bz_nt")
-NAMES = (*VECTORS, *OUTPUTS.values())
-"""The output columns, in their order."""
 COMPILED_ROWS = 300_000
 """Number of rows from which the compiled loops repay their loading."""
 
@@ -100,7 +95,7 @@ def warmth(temperature: Array | None) -> tuple[float, float]:
 
 def result_names(outside: str) -> tuple[str, ...]:
     """The columns of results, in their order."""
-    return (*NAMES, EXTRAPOLATED) if outside == "extrapolate" else NAMES
+    return (*RESULTS, EXTRAPOLATED) if outside == "extrapolate" else RESULTS
 
 
 def check_outside(outside: str) -> None:
@@ -139,7 +134,7 @@ def compiled(
     g, b = readings.accelerometer, readings.magnetometer
     vectors = [*_axes(g), *(_axes(b) if b is not None else [np.full(flat.shape, np.nan)] * 3)]
     results = correction_numba.run([*vectors, flat], triads, zero)
-    return {n: c.reshape(shape) for n, c in zip(NAMES, results.columns, strict=True)}
+    return {n: c.reshape(shape) for n, c in zip(RESULTS, results.columns, strict=True)}
 
 
 def _axes(vectors: Array) -> list[Array]:

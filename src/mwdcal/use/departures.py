@@ -14,11 +14,10 @@ import numpy as np
 
 from mwdcal.calibration.readings import ANGLES, Readings
 from mwdcal.calibration.record import FREE_SHARE, Calibration
-from mwdcal.geometry.observables import OBSERVABLES
+from mwdcal.geometry.observables import OBSERVABLES, OUTPUTS
 from mwdcal.geometry.vectors import Array, Bools, Ints
 from mwdcal.use.roll_sets import ROLL_SET, RollSet, near_vertical, roll_sets
 from mwdcal.use.roll_test import GAP, OPEN, SLACK, Coverage, Curve, coverage, ends, extent, fitted
-from mwdcal.use.strengths import OUTPUTS
 
 TURNING = ("azimuth", "toolface")
 """Angles that do not exist at vertical."""
@@ -238,7 +237,7 @@ class RollTest:
         """Standard uncertainty of the reference: per station (k,), and what the set shares."""
         sd = self.readings.uncertainty(name)[roll_set.index]
         shared = float(self._common(name)[roll_set.index].max()) if error else 0.0
-        if name == "toolface" or (name in ANGLES and roll_set.set_each):
+        if name == "toolface" or (name in ANGLES and not roll_set.declared):
             return sd, shared
         whole = float(np.sqrt(np.mean(sd**2))) if error else 0.0
         return np.zeros(sd.shape), float(np.hypot(whole, shared))

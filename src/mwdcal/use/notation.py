@@ -135,9 +135,10 @@ def _one(part: _Part, notation: str, temperature: float | str) -> Notation:
         if notation == triad.model:
             return _own_factors(params, permutation, scale)
         if course and triad.order:
-            return _COURSES[notation](params, permutation, scale)
+            form = _forward_course if notation == "forward" else _affine_course
+            return form(params, permutation, scale)
         matrix, offset = _affine(params, triad, tau)
-        forms = _FORMS[notation](matrix @ permutation / scale, offset, permutation)
+        forms = _steady(notation, matrix @ permutation / scale, offset, permutation)
         lead = course and notation != "factors"
         return {name: value[None] for name, value in forms.items()} if lead else forms
 
@@ -181,16 +182,15 @@ def _affine(params: AnyArray, triad: TriadCalibration, tau: float) -> tuple[AnyA
     return mixing / (scale @ course), -mixing @ (bias @ course)
 
 
-def _as_affine(matrix: AnyArray, offset: AnyArray, permutation: Array) -> dict[str, AnyArray]:
-    return {"M": matrix, "b": offset}
-
-
-def _as_forward(matrix: AnyArray, offset: AnyArray, permutation: Array) -> dict[str, AnyArray]:
-    inverse = np.linalg.inv(matrix)
-    return {"S": inverse, "o": -inverse @ offset}
-
-
-def _as_factors(matrix: AnyArray, offset: AnyArray, permutation: Array) -> dict[str, AnyArray]:
+def _steady(
+    notation: str, matrix: AnyArray, offset: AnyArray, permutation: Array
+) -> dict[str, AnyArray]:
+    """The notation of field = matrix · raw + offset, raw in channels."""
+    if notation == "affine":
+        return {"M": matrix, "b": offset}
+    if notation == "forward":
+        inverse = np.linalg.inv(matrix)
+        return {"S": inverse, "o": -inverse @ offset}
     channel = permutation.transpose() @ matrix
     scale = 1 / np.diagonal(channel)
     mixing = channel * scale
@@ -222,15 +222,6 @@ def _affine_course(params: AnyArray, permutation: Array, scale: Array) -> dict[s
     """M and b by power: the parameters of the polynomial model themselves, for raw channels."""
     matrix, offset = affine_parts(params.reshape(-1, 12))
     return {"M": matrix @ permutation / scale, "b": offset}
-
-
-_Form = Callable[[AnyArray, AnyArray, Array], dict[str, AnyArray]]
-_FORMS: dict[str, _Form] = {
-    "affine": _as_affine,
-    "forward": _as_forward,
-    "factors": _as_factors,
-}
-_COURSES: dict[str, _Form] = {"affine": _affine_course, "forward": _forward_course}
 
 
 def _propagate(values: Callable[[AnyArray], dict[str, AnyArray]], part: _Part) -> Notation:

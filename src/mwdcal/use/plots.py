@@ -20,6 +20,7 @@ from mwdcal.calibration.prediction import AccuracyMap, accuracy_map, angles
 from mwdcal.calibration.record import Calibration, OrderScore, StationRow
 from mwdcal.calibration.residuals import RESHOOT
 from mwdcal.errors import InputError
+from mwdcal.geometry.observables import TITLES
 from mwdcal.geometry.vectors import Array
 
 if TYPE_CHECKING:
@@ -28,15 +29,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.patheffects import AbstractPathEffect
 
-TITLES = {
-    "gravity": "|g|",
-    "inclination": "inclination",
-    "toolface": "toolface·sin I",
-    "azimuth": "azimuth·sin I",
-    "field": "|b|",
-    "dip": "dip",
-}
-"""How an observable's error is called: toolface and azimuth are weighted by sin I."""
 BEFORE, AFTER, MARKED, BAND = "#6b7280", "#0072b2", "#d55e00", "#dbe7f0"
 AXES = {"x": AFTER, "y": MARKED, "z": "#111827"}
 """Colours of the channels of a triad."""

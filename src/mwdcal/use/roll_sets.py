@@ -25,15 +25,14 @@ class RollSet:
     """Stations of one direction and one temperature.
 
     `index` (k,) are their numbers. `declared`: the run says that they are a roll set, by `group`
-    or by naming no direction at all. `one_azimuth`: they are known to share an azimuth too.
-    `set_each`: the stand was set to the direction at each station.
+    or by naming no direction at all; else the stand was set to the direction at each station.
+    `one_azimuth`: they are known to share an azimuth too.
     """
 
     label: str
     index: Ints
     declared: bool
     one_azimuth: bool
-    set_each: bool
 
 
 def roll_sets(readings: Readings) -> list[RollSet]:
@@ -51,8 +50,7 @@ def roll_sets(readings: Readings) -> list[RollSet]:
             if len(index) < ROLL_SET:
                 continue
             at = f", {warmth[index].mean():.1f} °C" if warmth is not None and soak.any() else ""
-            set_each = not declared
-            sets.append(RollSet(label + at, index, declared, one_azimuth, set_each))
+            sets.append(RollSet(label + at, index, declared, one_azimuth))
     return sets
 
 

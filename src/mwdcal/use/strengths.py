@@ -17,6 +17,7 @@ import numpy as np
 from mwdcal.calibration.readings import EARTH_RANGES
 from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.errors import InputError
+from mwdcal.geometry.observables import OUTPUTS
 from mwdcal.geometry.vectors import AnyArray, Array
 
 SHARE = 0.05
@@ -25,12 +26,6 @@ MOST = 0.5
 """A table of which more than this share of the rows is off is refused."""
 ALIKE = {"gravity": 1.5, "field": 6.0}
 """Greatest over least strength up to which one unit may explain all rows."""
-OUTPUTS = {
-    **{name: f"{name}_deg" for name in ("inclination", "azimuth", "toolface")},
-    **{"gravity": "gravity_g", "field": "field_nt"},
-    **{name: f"{name}_deg" for name in ("dip", "magnetic_toolface")},
-}
-"""Output column of each observable, in their order."""
 JUDGED_STRENGTHS = ("gravity", "field")
 UNITS: dict[str, dict[str, float]] = {
     "gravity": {"g": 1.0, "m/s²": 9.80665, "mg": 1000.0},

@@ -16,7 +16,7 @@ from mwdcal.calibration.diagnosis.findings import UNUSED
 from mwdcal.calibration.prediction import typical_accuracy
 from mwdcal.calibration.readings import simulated
 from mwdcal.calibration.record import Calibration, Choices, ErrorRow, Finding, OrderScore
-from mwdcal.use.plots import TITLES
+from mwdcal.geometry.observables import TITLES
 
 if TYPE_CHECKING:
     from mwdcal.calibration.automatic.auto import Choice

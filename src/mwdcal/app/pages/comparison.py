@@ -28,6 +28,7 @@ from mwdcal.calibration.readings import SIMULATED
 from mwdcal.comparison.common_gauge import SCALE
 from mwdcal.comparison.compare import Comparison, Row, able
 from mwdcal.estimation.uncertainty import ROTATIONS
+from mwdcal.geometry.observables import TITLES
 from mwdcal.geometry.vectors import Array
 from mwdcal.use import plots
 from mwdcal.use.notation import Notation
@@ -134,7 +135,7 @@ def errors(comparison: Comparison, kind: str, how: str = "") -> Rows:
             number(getattr(row, kind)[name]) + MARK * (name in row.resting)
             for row in able(comparison.rows)
         ]
-        what = _label(plots.TITLES.get(name, name), how, unit)
+        what = _label(TITLES.get(name, name), how, unit)
         rows.append([what, number(comparison.before[name]), *cells])
     return rows
 
@@ -314,7 +315,7 @@ def _abreast(rows: Sequence[Row], step: float) -> Array:
 
 def _observable_axis(axes: Axes, names: Sequence[str]) -> None:
     """An observable in each row, the first at the top, with lines between them."""
-    axes.set_yticks(range(len(names)), [plots.TITLES.get(n, n) for n in names])
+    axes.set_yticks(range(len(names)), [TITLES.get(n, n) for n in names])
     axes.set_ylim(len(names) - 0.5, -0.5)
     axes.grid(axis="y", visible=False)
     for edge in np.arange(len(names) - 1) + 0.5:
@@ -352,7 +353,7 @@ def draw_stations(comparison: Comparison) -> Figure:
     )  # fmt: skip
     for line, name in zip(panels, names, strict=True):
         unit = comparison.units[name].partition(" ")[0]
-        line[0].set_ylabel(f"{plots.TITLES[name]}, {unit}", fontsize=6.5)
+        line[0].set_ylabel(f"{TITLES[name]}, {unit}", fontsize=6.5)
         for axes, row in zip(line, rows, strict=True):
             _station_stems(axes, row.station_errors[name], LOOKS[row.method][0])
     for axes, row in zip(panels[0], rows, strict=True):

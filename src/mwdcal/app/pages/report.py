@@ -19,6 +19,7 @@ from mwdcal.calibration.readings import is_simulated
 from mwdcal.calibration.record import Calibration, Finding, TriadCalibration
 from mwdcal.errors import InputError
 from mwdcal.estimation.solvers import RANK_TOLERANCE
+from mwdcal.geometry.observables import TITLES
 from mwdcal.use import plots
 from mwdcal.use.notation import Notation, convert
 
@@ -52,7 +53,7 @@ def render(calibration: Calibration, verdict: Verdict | None = None) -> str:
         parameters=_parameters(calibration),
         held=HELD,
         accuracy=_accuracy(calibration),
-        titles=plots.TITLES,
+        titles=TITLES,
         tolerance=RANK_TOLERANCE,
         when=_when(calibration.time),
     )

@@ -42,6 +42,7 @@ class Choice:
     excluded: list[str] = field(default_factory=list)
 
 
+@np.errstate(invalid="ignore", divide="ignore", over="ignore")
 def choose(
     readings: Readings, profile: Profile, options: Options, progress: Callable[[str], None]
 ) -> Choice:

@@ -88,10 +88,7 @@ def orders_of(result: Fit) -> list[int]:
 
 def terms_beyond(result: Fit) -> OmittedTerms:
     """The powers of temperature that a fit has not."""
-    memo = result.problem.memo.at(result.state)
-    if "terms" not in memo.besides:
-        memo.besides["terms"] = _every_term(result)
-    each = memo.besides["terms"]
+    each = result.problem.once("terms", result.state, lambda _: _every_term(result))
     square, freedom = each[:2]
     size, noise = (np.moveaxis(each[at : at + 2], 0, -1) for at in (2, 4))
     factor, known = result.analysis.variance_factor, result.analysis.freedom

@@ -18,7 +18,7 @@ from mwdcal.calibration.estimate import fit, scatters
 from mwdcal.calibration.options import AUTO, USUAL, Options
 from mwdcal.calibration.readings import TRIADS, Readings
 from mwdcal.estimation.batch import batch_of_one, mapped
-from mwdcal.estimation.variance import log_evidence
+from mwdcal.estimation.uncertainty import log_evidence
 from mwdcal.geometry.vectors import Array, Ints
 from mwdcal.sensor.profile import Profile
 

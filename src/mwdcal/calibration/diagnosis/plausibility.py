@@ -16,7 +16,17 @@ from mwdcal.estimation.minimisers import closed_form
 from mwdcal.estimation.rank import Free
 from mwdcal.estimation.solvers import Determined
 from mwdcal.estimation.uncertainty import ROTATIONS, TESTED, effective_freedom, station_misfit
-from mwdcal.geometry.vectors import Array, Bools, Ints, centred, diagonal, eigen, outer, quotient
+from mwdcal.geometry.vectors import (
+    Array,
+    Bools,
+    Ints,
+    centred,
+    diagonal,
+    eigen,
+    outer,
+    quotient,
+    solved,
+)
 
 BENIGN_DIRECTIONS = (*ROTATIONS, "scale")
 """Directions that may stay free."""
@@ -222,8 +232,8 @@ def _suspects(result: Fit) -> Bools:
     tool, station = np.nonzero(~good & ~suspect[:, None])
     left = residual[tool, station]
     whole = spread[tool, station] + VARIANCE_RIDGE * np.eye(size)
-    bound = np.sum(left * np.linalg.solve(whole, left[..., None])[..., 0], -1)
-    large = bound > likely(1, chance)
+    bound = np.sum(left * solved(whole, left[..., None])[..., 0], -1)
+    large = ~(bound <= likely(1, chance))
     tool, station, left = tool[large], station[large], left[large]
     some = replace(analysis, residual=left[None], spread=spread[None, tool, station])
     suspect[tool[tail(*station_misfit(some))[0] < LEEWAY * chance]] = True

@@ -18,8 +18,7 @@ import numpy as np
 
 from mwdcal.estimation.minimisers import closed_form_factors
 from mwdcal.estimation.problem import GEOMETRIC_NOISE, Problem, State, Triad
-from mwdcal.estimation.regression import regress
-from mwdcal.estimation.solvers import RANK_TOLERANCE, Determined
+from mwdcal.estimation.solvers import RANK_TOLERANCE, Determined, regress
 from mwdcal.estimation.uncertainty import Analysis
 from mwdcal.geometry.vectors import (
     Array,

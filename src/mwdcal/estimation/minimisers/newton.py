@@ -11,10 +11,10 @@ the observables' Jacobian, and take the absolute eigenvalues of the Hessian, so 
 goes downhill. And criterion 22 has no meaning for a parameter near zero: its denominator has
 a floor.
 
-Shapes: parameters (..., p), readings (..., n, 3), temperature, gravity and inclination
-(..., n); leading axes broadcast, and no member of a batch stops another. NaN is a reference
-that is not known. Units: g, radians. Rank is counted in normalised columns: with temperature
-terms the model wants a Chebyshev basis, as powers of 50 °C to the cube look alike.
+Shapes: parameters (B, p), readings (B, n, 3); temperature, gravity and inclination broadcast to
+(B, n); no member of a batch stops another. NaN is a reference that is not known. Units: g, radians.
+Rank is counted in normalised columns: with temperature terms the model wants a Chebyshev basis, as
+powers of 50 °C to the cube look alike.
 
 Singular: exactly vertical stations. There I has no gradient, but the square of I is smooth,
 and so is that of I - π: with a reference of exactly 0 or π nothing special happens. With
@@ -28,24 +28,13 @@ it is in `docs/errata.md`.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import prod
 
 import numpy as np
 
 from mwdcal.estimation.batch import take
 from mwdcal.estimation.solvers import Determined, Normal, Status
-from mwdcal.estimation.uncertainty import CHANGES, COUPLED, free_share, tangent
 from mwdcal.geometry.observables import OBSERVABLES, VERTICAL, is_vertical
-from mwdcal.geometry.vectors import (
-    AnyArray,
-    Array,
-    ArrayLike,
-    Bools,
-    Ints,
-    inverse,
-    outer,
-    quotient,
-)
+from mwdcal.geometry.vectors import Array, ArrayLike, Bools, Ints, eigen, inverse, outer, quotient
 from mwdcal.sensor.models import Model
 
 THRESHOLD = 1.5e-6
@@ -92,13 +81,12 @@ class Local:
 
 @dataclass(frozen=True)
 class Newton:
-    """Outcome of a batch: parameters (..., p), `Status` codes and iteration counts (...).
+    """Outcome of a batch: parameters (B, p), `Status` codes and iteration counts (B,).
 
-    `information` (..., p, p) is that of the observables, in units of gravity and radians.
-    `cost` (..., limit + 1) begins with that of the start values, `criterion` (..., limit) is
+    `information` (B, p, p) is that of the observables, in units of gravity and radians.
+    `cost` (B, limit + 1) begins with that of the start values, `criterion` (B, limit) is
     number 22 of each undamped step; both are NaN after the last one. `determined` says which
-    directions of parameter space the stations determine; `free` (...) by name whether a turn
-    about an axis, or the scale, is none of them.
+    directions of parameter space the stations determine.
     """
 
     params: Array
@@ -108,7 +96,6 @@ class Newton:
     criterion: Array
     determined: Determined
     information: Array
-    free: dict[str, Bools]
 
 
 def newton(
@@ -119,29 +106,49 @@ def newton(
     gravity: ArrayLike,
     inclination: ArrayLike,
     *,
-    weights: ArrayLike | None = None,
+    weights: ArrayLike = 1.0,
     limit: int = 30,
 ) -> Newton:
     """Minimise E from start values, for a batch; nothing is raised for a member that fails.
 
     Definition: Moosavi 16 to 22. Units: g, radians; readings in tool axes and nominal units, so
-    that the datasheet is `model.start(np.eye(3), np.zeros(3))`. `weights` (..., n, 2) of the
+    that the datasheet is `model.start(np.eye(3), np.zeros(3))`. `weights` (B, n, 2) of the
     two squares are one unless given, which is the paper's sum; see `propagated`.
     """
-    shares = np.ones(2) if weights is None else np.asarray(weights, float)
-    known = [np.asarray(values, float) for values in (temperature, gravity, inclination)]
-    shapes = [values.shape[:-1] for values in known]
-    lead = np.broadcast_shapes(
-        params.shape[:-1], raw.shape[:-2], shares.shape[:-2], model.lead, *shapes
-    )
-    stations = _compared(raw, known, shares, lead)
-    start = np.broadcast_to(params, (*lead, model.size)).reshape(prod(lead), model.size)
+    stations = compared(raw, temperature, gravity, inclination, weights)
+    start = np.broadcast_to(params, (len(raw), model.size)).copy()
     with np.errstate(all="ignore"):
-        descent = _NewtonDescent.at(model.flat(lead), stations, start, limit)
-        for _ in range(limit):
-            if descent.active.size:
-                descent.step()
-        return descent.outcome(lead)
+        reached = _descend(model, start, stations, limit)
+        information, norms = geometry(model, reached[0], stations)
+        return Newton(*reached, _determined(information, norms), information)
+
+
+def _descend(
+    model: Model, params: Array, stations: Compared, limit: int
+) -> tuple[Array, Ints, Ints, Array, Array]:
+    """Newton's steps of every member until it stops: the first five fields of `Newton`."""
+    count = len(params)
+    status, iterations = np.full(count, int(Status.NOT_CONVERGED)), np.zeros(count, int)
+    costs, changes = np.full((count, limit + 1), np.nan), np.full((count, limit), np.nan)
+    costs[:, 0], active = cost(model, params, stations), np.arange(count)
+    for turn in range(limit):
+        at = take((model, params, stations), active)
+        here, determined = local(*at), _determined(*geometry(*at))
+        step = downhill(here, determined)
+        finite = np.isfinite(here.cost) & np.isfinite(step).all(-1)
+        status[active[~finite]] = Status.NOT_FINITE
+        some, active = np.flatnonzero(finite), active[finite]
+        if not active.size:
+            break
+        (at, here, determined), step = take((at, here, determined), some), step[some]
+        share, costs[active, turn + 1] = search(*at, here, step)
+        change = criterion(params[active], step, determined, at[2])
+        params[active] += share[:, None] * step
+        changes[active, turn], iterations[active] = change, turn + 1
+        converged = change < THRESHOLD
+        status[active[converged]] = Status.OK
+        active = active[~converged & (share > 0)]
+    return params, status, iterations, costs, changes
 
 
 def propagated(gravity: ArrayLike, noise: ArrayLike, stand: ArrayLike = 0.0) -> Array:
@@ -153,24 +160,26 @@ def propagated(gravity: ArrayLike, noise: ArrayLike, stand: ArrayLike = 0.0) -> 
     return np.stack([1 / (2 * strength * sd) ** 2, 1 / ((sd / strength) ** 2 + angle**2)], -1)
 
 
-def _compared(raw: Array, known: list[Array], shares: Array, lead: tuple[int, ...]) -> Compared:
-    """Everything with one batch axis; what is not known has weight zero."""
-    count = raw.shape[-2]
-
-    def flat(values: Array, *tail: int) -> Array:
-        return np.broadcast_to(values, (*lead, count, *tail)).reshape(prod(lead), count, *tail)
-
-    temperature, gravity, inclination = (flat(values) for values in known)
-    absent = np.isnan(np.stack([gravity, inclination], -1))
-    weights = np.where(absent, 0.0, flat(shares, 2))
-    strong, inclined = weights[..., 0] > 0, weights[..., 1] > 0
+def compared(
+    raw: Array,
+    temperature: ArrayLike,
+    gravity: ArrayLike,
+    inclination: ArrayLike,
+    weights: ArrayLike = 1.0,
+) -> Compared:
+    """Readings (B, n, 3) and what broadcasts to (B, n); what is not known has weight zero."""
+    known = [
+        np.broadcast_to(np.asarray(each, float), raw.shape[:-1]) for each in (gravity, inclination)
+    ]
+    shares = np.where(np.isnan(np.stack(known, -1)), 0.0, weights)
+    strong, inclined = shares[..., 0] > 0, shares[..., 1] > 0
     counts = strong | inclined
     return Compared(
-        np.where(counts[..., None], flat(raw, 3), np.array([0.0, 0.0, 1.0])),
+        np.where(counts[..., None], raw, np.array([0.0, 0.0, 1.0])),
         np.where(counts, temperature, 0.0),
-        np.where(strong, gravity, 1.0),
-        np.where(inclined, inclination, 0.0),
-        weights,
+        np.where(strong, known[0], 1.0),
+        np.where(inclined, known[1], 0.0),
+        shares,
     )
 
 
@@ -237,11 +246,10 @@ def local(model: Model, params: Array, stations: Compared) -> Local:
     return Local(0.5 * np.sum(squares, (-1, -2)), gradient, hessian)
 
 
-def determines(model: Model, params: Array, stations: Compared) -> Determined:
+def _determined(information: Array, norms: Array) -> Determined:
     """Which directions of parameter space the stations determine, however noisy they are."""
-    gram, norms = geometry(model, params, stations)
-    nothing = np.zeros_like(params)
-    return Determined.by(Normal(gram, nothing, nothing[:, 0], model.size), norms)
+    nothing = np.zeros_like(norms)
+    return Determined.by(Normal(information, nothing, nothing[:, 0], norms.shape[-1]), norms)
 
 
 def geometry(model: Model, params: Array, stations: Compared) -> tuple[Array, Array]:
@@ -288,16 +296,20 @@ def _rows(target: Array, stations: Compared) -> Array:
 
 
 def downhill(here: Local, determined: Determined) -> Array:
-    """Newton's step (B, p) in the determined subspace, with absolute eigenvalues."""
+    """Newton's step (B, p) in the determined subspace, with absolute eigenvalues.
+
+    Singular: NaN where the Hessian is not finite in the scale of its columns.
+    """
     norms, kept = determined.norms, determined.basis * determined.keep[..., None, :]
     inner = kept.mT @ (here.hessian / outer(norms, norms)) @ kept
-    values, vectors = np.linalg.eigh(inner)
+    values, vectors = eigen(inner)
     size = np.abs(values)
     size = np.maximum(size, SMALLEST_EIGENVALUE * np.max(size, -1, keepdims=True))
     axes = kept @ vectors
     along = axes.mT @ (here.gradient / norms)[..., None]
     length = quotient(along[..., 0], size, size > 0)
-    return np.asarray(-(axes @ length[..., None])[..., 0] / norms)
+    step = -(axes @ length[..., None])[..., 0] / norms
+    return np.where(np.all(np.isfinite(inner), (-1, -2), keepdims=True)[..., 0], step, np.nan)
 
 
 def search(
@@ -328,83 +340,3 @@ def criterion(params: Array, step: Array, determined: Determined, stations: Comp
     scale = np.sqrt(comparisons) / determined.norms
     mean = np.abs(params + step / 2)
     return np.asarray(np.max(np.abs(step) / np.maximum(mean, CRITERION_FLOOR * scale), -1))
-
-
-@dataclass
-class _NewtonDescent:
-    """Steps of one batch, each member until it has stopped."""
-
-    model: Model
-    stations: Compared
-    params: Array
-    status: Ints
-    iterations: Ints
-    cost: Array
-    criterion: Array
-    active: Ints
-
-    @classmethod
-    def at(cls, model: Model, stations: Compared, params: Array, limit: int) -> _NewtonDescent:
-        """At the start values."""
-        count = len(params)
-        costs = np.full((count, limit + 1), np.nan)
-        costs[:, 0] = cost(model, params, stations)
-        return cls(
-            model,
-            stations,
-            params.copy(),
-            np.full(count, int(Status.NOT_CONVERGED)),
-            np.zeros(count, int),
-            costs,
-            np.full((count, limit), np.nan),
-            np.arange(count),
-        )
-
-    def step(self) -> None:
-        """One iteration of the members that have not stopped."""
-        here = self._local()
-        active, params = self.active, self.params[self.active]
-        model, stations = take((self.model, self.stations), active)
-        determined = determines(model, params, stations)
-        step = downhill(here, determined)
-        share, after = search(model, params, stations, here, step)
-        change = criterion(params, step, determined, stations)
-        self.params[active] = params + share[:, None] * step
-        self.criterion[active, self.iterations[active]] = change
-        self.iterations[active] += 1
-        self.cost[active, self.iterations[active]] = after
-        converged = change < THRESHOLD
-        self.status[active[converged]] = Status.OK
-        self.active = active[~converged & (share > 0)]
-
-    def _local(self) -> Local:
-        """Derivatives of the active members; those that are not finite stop."""
-        active = self.active
-        here = local(*take((self.model, self.params, self.stations), active))
-        finite = np.isfinite(here.cost) & np.isfinite(here.hessian).all((-1, -2))
-        self.status[active[~finite]] = Status.NOT_FINITE
-        self.active = active[finite]
-        return take(here, np.flatnonzero(finite))
-
-    def free(self, determined: Determined) -> dict[str, Bools]:
-        """Whether a turn of all readings about an axis, or their scale, is free (B,), by name."""
-        moved = {name: tangent(self.model, self.params, each) for name, each in CHANGES.items()}
-        return {name: free_share(determined, each) > COUPLED for name, each in moved.items()}
-
-    def outcome(self, lead: tuple[int, ...]) -> Newton:
-        """What became of every member, with the leading axes that were given."""
-
-        def led(values: AnyArray) -> AnyArray:
-            return values.reshape((*lead, *values.shape[1:]))
-
-        known = determines(self.model, self.params, self.stations)
-        return Newton(
-            led(self.params),
-            led(self.status),
-            led(self.iterations),
-            led(self.cost),
-            led(self.criterion),
-            Determined(led(known.basis), led(known.values), led(known.norms), led(known.keep)),
-            led(geometry(self.model, self.params, self.stations)[0]),
-            {name: led(values) for name, values in self.free(known).items()},
-        )

@@ -1,27 +1,23 @@
-"""Particle swarm, and the two least-squares costs of a triad against known vectors.
+"""Particle swarm, and least squares, of a triad's readings against known vectors.
 
 swarm                  the minimiser, for any cost
-vector_cost            mean squared error in the field (Moradi 13) or in the reading (Moradi 12)
-least_squares_forward  where the error in the reading is least: one linear solve
-least_squares_affine   where the error in the field is least: another one
-swarm_forward          the swarm on either cost, in coordinates that suit it
+vector_cost            mean squared error in the reading (Moradi 12)
+least_squares_forward  where it is least: one linear solve
+swarm_forward          the swarm on it, in coordinates that suit it
 
 Forward parameters (..., 12) of a triad: S and o of reading = S · field + o, as `affine_parts` has them.
-
-Moradi's equations 12 and 13 are two estimators. Each is a convex quadratic (13 in the matrix
-that takes readings to fields), so swarm and least squares meet on either, and neither
-estimator depends on the method that finds it.
+The error in the field (Moradi 13) is the same with readings and fields changed round: its parameters
+are M and b of field = M · reading + b.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 
-from mwdcal.estimation.regression import regress
+from mwdcal.estimation.solvers import regress
 from mwdcal.geometry.vectors import Array, ArrayLike, inverse
 from mwdcal.sensor.models import affine_parts, affine_terms
 
@@ -36,7 +32,6 @@ DRAWN = 50
 
 Cost = Callable[[Array], Array]
 """Takes places (..., particles, p) to their costs (..., particles)."""
-Error = Literal["field", "reading"]
 
 
 @dataclass(frozen=True)
@@ -159,44 +154,24 @@ def swarm(
     )
 
 
-def vector_cost(raw: Array, reference: Array, error: Error = "field") -> Cost:
-    """Mean squared length of the error over the stations, as a function of forward parameters.
+def vector_cost(raw: Array, reference: Array) -> Cost:
+    """Mean squared length of reading - S · reference - o over the stations (Moradi 12).
 
-    Definition: error in the field (Moradi 13): S⁻¹ (reading - o) - reference;
-    error in the reading (Moradi 12): reading - S · reference - o.
-    Units: those of the reference, or of the readings, squared.
-    Shapes: `raw`, `reference` (..., n, 3); the cost takes (..., particles, 12) to
-    (..., particles).
-    Singular: NaN in the field where S has no inverse.
+    Units: those of the readings, squared. Shapes: `raw`, `reference` (..., n, 3); the cost takes
+    forward parameters (..., particles, 12) to (..., particles).
     """
     readings, known = raw[..., None, :, :], reference[..., None, :, :]
 
-    def in_reading(params: Array) -> Array:
-        matrix, offset = affine_parts(params)
-        return (readings - offset[..., None, :]) - known @ matrix.mT
-
-    def in_field(params: Array) -> Array:
-        matrix, offset = affine_parts(params)
-        back = inverse(matrix).mT
-        return (readings - offset[..., None, :]) @ back - known
-
-    misfit = {"field": in_field, "reading": in_reading}[error]
-
     def cost(params: Array) -> Array:
-        error = misfit(params)
+        matrix, offset = affine_parts(params)
+        error = (readings - offset[..., None, :]) - known @ matrix.mT
         return np.asarray(np.einsum("...ni,...ni->...", error, error) / raw.shape[-2])
 
     return cost
 
 
-def _centred(vectors: Array) -> tuple[Array, Array]:
-    """Vectors (..., n, 3) about their mean, and the mean (..., 1, 3)."""
-    mean = vectors.mean(-2, keepdims=True)
-    return vectors - mean, mean
-
-
 def least_squares_forward(raw: Array, reference: Array) -> Array:
-    """Forward parameters (..., 12) with the least error in the readings (Moradi 12).
+    """Forward parameters (..., 12) of least `vector_cost`.
 
     Shapes: `raw`, `reference` (..., n, 3). Singular: as `regress`.
     """
@@ -204,144 +179,82 @@ def least_squares_forward(raw: Array, reference: Array) -> Array:
     return affine_terms(forward[..., :3, :].mT, forward[..., 3, :])
 
 
-def least_squares_affine(raw: Array, reference: Array) -> Array:
-    """Forward parameters (..., 12) with the least error in the field (Moradi 13).
+def _centred(vectors: Array) -> tuple[Array, Array, Array]:
+    """Vectors (..., n, 3) about their mean, the mean (..., 1, 3), and their spread (..., 1, 1)."""
+    mean = vectors.mean(-2, keepdims=True)
+    left = vectors - mean
+    spread = np.sqrt(np.sum(left * left, (-1, -2)) / left.shape[-2])
+    return left, mean, spread[..., None, None]
 
-    Definition: field = M · reading + b by linear least squares, then S = M⁻¹, o = -M⁻¹ b. With
-    noise in the readings M is a little too small, by (noise / signal)².
-    Shapes and singular cases: as `least_squares_forward`.
+
+def _coordinates(raw: Array, reference: Array) -> tuple[Cost, Callable[[Array], Array]]:
+    """Cost and forward parameters of places u (..., particles, 12), centred and whitened.
+
+    Definition: reading = S (reference - mean) + middle, with S = gain I + spread · U whiten and U
+    the first nine of u row by row; middle is the mean of the readings plus `spread`, theirs, times
+    the last three; gain is the ratio of both spreads. In u the cost is a sphere about its minimum,
+    and a unit of u is an error as large as the spread. Zero is a triad without misalignment.
     """
-    centred, mean = _centred(raw)
-    back = regress(reference, centred, np.ones((*raw.shape[:-1], 1))).forward
-    matrix = inverse(back[..., :3, :].mT)
-    return affine_terms(
-        matrix, mean[..., 0, :] - np.einsum("...ij,...j->...i", matrix, back[..., 3, :])
-    )
+    (y, mean, spread), (x, middle, size) = _centred(raw), _centred(reference)
+    gain, whiten = spread / size, inverse(np.linalg.qr(x / np.sqrt(x.shape[-2]))[1]).mT
 
-
-@dataclass(frozen=True)
-class Coordinates:
-    """Centred and whitened coordinates u (..., 12) of target = K (terms - mean) + middle.
-
-    K = gain I + spread · U whiten, with U the first nine of u row by row; middle is the mean
-    of the targets plus spread times the last three of u. In u the mean squared error of the
-    targets is a sphere about its minimum, and a unit of u is an error as large as their
-    spread. Zero is a triad without misalignment.
-
-    `spread`, `gain` (...): spread of the targets, and its ratio to that of the terms;
-    `whiten` (..., 3, 3); the means (..., 1, 3).
-    """
-
-    gain: Array
-    spread: Array
-    whiten: Array
-    mean_target: Array
-    mean_terms: Array
-
-    @classmethod
-    def of(cls, target: Array, terms: Array) -> Coordinates:
-        """Coordinates for targets and terms (..., n, 3), both in tool axes."""
-        (y, mean_target), (x, mean_terms) = _centred(target), _centred(terms)
-        spread, size = (np.sqrt(np.sum(v * v, (-1, -2)) / v.shape[-2]) for v in (y, x))
-        _, r = np.linalg.qr(x / np.sqrt(x.shape[-2]))
-        whiten = inverse(r).mT
-        return cls(spread / size, spread, whiten, mean_target, mean_terms)
-
-    def parts(self, place: Array) -> tuple[Array, Array]:
-        """K (..., particles, 3, 3) and middle (..., particles, 3) at u (..., particles, 12)."""
+    def params(place: Array) -> Array:
         turn, shift = affine_parts(place)
-        spread = self.spread[..., None, None]
-        matrix = (turn @ self.whiten[..., None, :, :]) * spread[..., None]
-        matrix = matrix + self.gain[..., None, None, None] * np.eye(3)
-        return matrix, self.mean_target + spread * shift
+        matrix = (turn @ whiten[..., None, :, :]) * spread[..., None]
+        matrix = matrix + gain[..., None] * np.eye(3)
+        moved = np.einsum("...ij,...j->...i", matrix, middle)
+        return affine_terms(matrix, mean + spread * shift - moved)
 
-    def cost(self, target: Array, terms: Array) -> Cost:
-        """Mean squared error of the targets as a function of u (..., particles, 12).
-
-        Stations count by their second moments alone: up to six that have the same, rows of the
-        triangular factor of all, take their place, however many there are.
-        """
-        both = np.broadcast_arrays(terms - self.mean_terms, target - self.mean_target)
-        rows = np.concatenate(both, -1)
-        few = np.linalg.qr(rows / np.sqrt(rows.shape[-2]))[1]
-        few = few.mT
-        few_terms, few_target = few[..., :3, :], few[..., 3:, :]
-        spread, lead, size = self.spread[..., None, None], few.shape[:-2], 3 * few.shape[-1]
-        turned = np.einsum("ij,...ab->...iajb", np.eye(3), spread * (self.whiten @ few_terms))
-        slope, zero = np.zeros((*lead, 12, size + 3)), np.zeros((*lead, 1, size + 3))
-        slope[..., :9, :size] = turned.reshape(*lead, 9, size)
-        slope[..., 9:, size:] = spread * np.eye(3)
-        rest = self.gain[..., None, None] * few_terms - few_target
-        zero[..., 0, :size] = rest.reshape(*lead, size)
-
-        def mean_square(place: Array) -> Array:
-            error = place @ slope
-            error += zero
-            return np.asarray(np.vecdot(error, error))
-
-        return mean_square
+    return _whitened_cost(y, x, spread, gain, whiten), params
 
 
-def _field_search(raw: Array, reference: Array) -> tuple[Cost, Callable[[Array], Array]]:
-    """Cost and forward parameters by u of field = M (reading - mean) + middle, S = M⁻¹."""
-    coordinates = Coordinates.of(reference, raw)
+def _whitened_cost(y: Array, x: Array, spread: Array, gain: Array, whiten: Array) -> Cost:
+    """Mean squared error of centred readings y at places u; see `_coordinates`.
 
-    def params(place: Array) -> Array:
-        matrix, middle = coordinates.parts(place)
-        back = inverse(matrix)
-        return affine_terms(
-            back, coordinates.mean_terms - np.einsum("...ij,...j->...i", back, middle)
-        )
+    Stations count by their second moments alone: up to six that have the same, rows of the
+    triangular factor of all, take their place, however many there are.
+    """
+    rows = np.concatenate(np.broadcast_arrays(x, y), -1)
+    few = np.linalg.qr(rows / np.sqrt(rows.shape[-2]))[1].mT
+    few_x, few_y = few[..., :3, :], few[..., 3:, :]
+    lead, size = few.shape[:-2], 3 * few.shape[-1]
+    turned = np.einsum("ij,...ab->...iajb", np.eye(3), spread * (whiten @ few_x))
+    slope, zero = np.zeros((*lead, 12, size + 3)), np.zeros((*lead, 1, size + 3))
+    slope[..., :9, :size] = turned.reshape(*lead, 9, size)
+    slope[..., 9:, size:] = spread * np.eye(3)
+    zero[..., 0, :size] = (gain * few_x - few_y).reshape(*lead, size)
 
-    return coordinates.cost(reference, raw), params
+    def mean_square(place: Array) -> Array:
+        error = place @ slope
+        error += zero
+        return np.asarray(np.vecdot(error, error))
 
-
-def _reading_search(raw: Array, reference: Array) -> tuple[Cost, Callable[[Array], Array]]:
-    """Cost and forward parameters by u of reading = S (reference - mean) + middle."""
-    coordinates = Coordinates.of(raw, reference)
-
-    def params(place: Array) -> Array:
-        matrix, middle = coordinates.parts(place)
-        mean = np.einsum("...ij,...j->...i", matrix, coordinates.mean_terms)
-        return affine_terms(matrix, middle - mean)
-
-    return coordinates.cost(raw, reference), params
-
-
-_SEARCHES = {"field": _field_search, "reading": _reading_search}
+    return mean_square
 
 
 def swarm_forward(
     raw: Array,
     reference: Array,
-    error: Error = "field",
     *,
     reach: float = 1.0,
     particles: int = 60,
     iterations: int = 600,
     seed: int = 0,
 ) -> Swarm:
-    """Forward parameters of least error in the field or in the readings, by a particle swarm.
+    """Forward parameters of least error in the readings, by a particle swarm.
 
-    The swarm minimises `vector_cost`, but flies in `Coordinates`: centred, so that an offset of
-    many times the field is nothing to search for, and whitened, so that all axes of the search
-    are alike however the stations are spread. The box is ± `reach` about a triad without
-    misalignment, which takes in gains from none to twice the mean one. The least-squares
-    solutions are not used. In M and b of uncentred readings a swarm misses: with hard iron of
-    five times the field, always.
+    The swarm minimises `vector_cost`, but flies in centred and whitened coordinates: an offset of
+    many times the field is then nothing to search for, and all axes of the search are alike however
+    the stations are spread. The box is ± `reach` about a triad without misalignment, which takes
+    in gains from none to twice the mean one. The least-squares solution is not used. In S and o of
+    uncentred readings a swarm misses: with hard iron of five times the field, always.
 
     Shapes: `raw`, `reference` (..., n, 3). Result: as `swarm`, the position as forward
     parameters (..., 12).
     Accuracy: a cost is seen to 16 digits, hence the position to 8 digits of the residual.
     Singular: as `least_squares_forward`.
     """
-    cost, params = _SEARCHES[error](raw, reference)
-    flight = swarm(
-        cost,
-        np.full(12, -reach),
-        np.full(12, reach),
-        particles=particles,
-        iterations=iterations,
-        seed=seed,
-    )
+    cost, params = _coordinates(raw, reference)
+    box = np.full(12, reach)
+    flight = swarm(cost, -box, box, particles=particles, iterations=iterations, seed=seed)
     return replace(flight, position=params(flight.position[..., None, :])[..., 0, :])

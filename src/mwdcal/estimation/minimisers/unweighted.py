@@ -40,12 +40,8 @@ class Sums:
     reference: Array
     weights: Array
 
-    def compared(self, params: Array) -> tuple[Array, Array, Bools]:
-        """Differences (B, n, m), gradients (B, n, m, 3) by the field, and whether each counts."""
-        return self.at(self.triad.model.fields(params, self.triad.raw, self.temperature))
-
-    def at(self, field: Array) -> tuple[Array, Array, Bools]:
-        """The same for given vectors (B, n, 3)."""
+    def compared(self, field: Array) -> tuple[Array, Array, Bools]:
+        """Differences (B, n, m), gradients (B, n, m, 3) by the field (B, n, 3), and what counts."""
         errors, gradients, counts = [], [], []
         for index, name in enumerate(self.names):
             if name == STRENGTH:
@@ -64,8 +60,9 @@ class Sums:
 
     def linear(self, state: Params, geometry: bool = False) -> Linear:
         """Linearise at a state; with `geometry` each observable is in units of its own size."""
-        error, gradient, _ = self.compared(state.params)
-        jacobian = self.triad.model.jacobian(state.params, self.triad.raw, self.temperature)
+        model, readings = self.triad.model, (self.triad.raw, self.temperature)
+        error, gradient, _ = self.compared(model.fields(state.params, *readings))
+        jacobian = model.jacobian(state.params, *readings)
         root = np.sqrt(self.weights)
         if geometry:
             sizes = [np.abs(self.reference[..., k]) if n == STRENGTH else np.ones(root.shape[:-1])
@@ -104,7 +101,7 @@ class Sums:
         determined = Determined.of(self, state)
         bread = determined.inverse(Normal.of(self.linear(state)).information)
         model, raw = self.triad.model, self.triad.raw
-        _, gradient, _ = self.at(target)
+        _, gradient, _ = self.compared(target)
         noise = gradient @ model.slope(params, raw, self.temperature) * self.triad.sd[..., None, :]
         rows = gradient @ model.jacobian(params, raw, self.temperature) * self.weights[..., None]
         return -bread[:, None] @ rows.mT @ noise
