@@ -51,6 +51,8 @@ STEP = 0.01
 """Share of a triad's size by which no slow channel of a tool at rest steps."""
 MANY = 100_000
 """Differences of readings that are looked at."""
+LEAST = 1e-200
+"""Least noise floor: ratios to a smaller one are no numbers any more."""
 INTO = 0.15
 """How far into the stretch the threshold lies, in logarithm."""
 
@@ -243,7 +245,7 @@ def activity(channels: Sequence[tuple[Array, Array]]) -> Activity:
     for channel in cells:
         ranges = quietest_range(channel.level)
         # One step of the readings up or down is not movement.
-        floor = max(noise_floor(ranges), (1 + AGREE) * channel.resolution)
+        floor = max(noise_floor(ranges), (1 + AGREE) * channel.resolution, LEAST)
         ranges = np.where(channel.torn, np.inf, ranges)
         value = np.maximum(value, on_grid(edge, channel, ranges) / floor)
         floors.append(floor)

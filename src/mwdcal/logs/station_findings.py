@@ -17,9 +17,6 @@ MANY_SPIKES = 0.01
 """Share of spikes that is reported."""
 MOST_LISTED = 12
 """Stations, or stretches of time, that a finding names."""
-DAY = 86_400.0
-SPARSE, RARE = 0.5, 2.0
-"""Seconds between samples that are odd in a log of more than a day, and in any."""
 STEADY = 3.0
 """Standard deviations of a cell's level by which a noisy but steady stretch may drift."""
 
@@ -62,19 +59,6 @@ def about(rows: Rows, standstills: Standstills, seconds: float) -> list[Finding]
             + _drifting(name, summaries, end - start)
         )
     return findings
-
-
-def time_unit(time: Array) -> list[Finding]:
-    """Times of rows (n,) that can hardly be seconds."""
-    step, lasts = standstill.time_step(time), float(time[-1] - time[0])
-    if step < (SPARSE if lasts > DAY else RARE):
-        return []
-    whole = f"{lasts / DAY:.5g} days" if lasts > DAY else f"{lasts:.4g} s"
-    text = (
-        f"samples are {step:.5g} s apart and the log lasts {whole} by time_s: is it in milliseconds or "
-        "microseconds? time_s is in seconds."
-    )
-    return [Finding(id="time-unit", text=text)]
 
 
 def correlated_noise(names: list[str]) -> Finding:
@@ -168,7 +152,7 @@ def noisy_rests(
     text = (
         f"{len(kept)} stretch{'es' if len(kept) > 1 else ''} steady on average, but too noisy for rest, "
         f"left out: {_between(start[kept], end[kept])}. Vibration? "
-        f"--threshold {ceil(enough / digit) * digit:g} takes them."
+        f"`threshold` {ceil(enough / digit) * digit:g} takes them."
     )
     return [Finding(id="noisy-rest", text=text)]
 

@@ -6,7 +6,6 @@ slower still: it never decides what stands still. See `standstill` for the metho
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass, replace
 from itertools import chain
 
@@ -15,13 +14,14 @@ import numpy as np
 from mwdcal.calibration.diagnosis.findings import unused_columns
 from mwdcal.calibration.record import Finding
 from mwdcal.errors import InputError
-from mwdcal.files.contract import CHANNELS, RAW, TEMPERATURE
+from mwdcal.files.contract import CHANNELS, RAW, TEMPERATURE, Range
 from mwdcal.files.formats.columns import Column
-from mwdcal.files.formats.table import Table, cell_error, numbers, shown
+from mwdcal.files.formats.table import Table, numbers
 from mwdcal.files.logs import READ, TIME, Say, silent
 from mwdcal.files.synonyms import unused
 from mwdcal.geometry.vectors import Array, Ints
 from mwdcal.logs import standstill
+from mwdcal.logs.clock import SECONDS, check_argument, row_times, unlikely_seconds
 from mwdcal.logs.standstill import Activity, Slow, Standstills
 from mwdcal.logs.station_findings import (
     Rows,
@@ -30,7 +30,6 @@ from mwdcal.logs.station_findings import (
     count,
     listed,
     noisy_rests,
-    time_unit,
 )
 from mwdcal.logs.station_means import correlated, summarise, summarise_all, widened
 
@@ -40,12 +39,10 @@ LEAST_SAMPLES = 3
 """Fewest samples of each channel at a station."""
 GAP = 5.0
 """Times the usual step between samples that are a gap."""
-MOST_CELLS = 50_000_000
-"""Cells of the longest log: four months at 15 samples a second or more."""
+THRESHOLD = Range(0.0, 1e15, "noise floors")
+"""Accepted thresholds."""
 REPORTED = 1.2
 """Factor by which correlated noise widens most means of a triad before it is reported."""
-CLOCK = re.compile(r"^t(?![A-Za-z0-9])|(?i:time|stamp|clock|epoch|seconds|millis|micros)")
-"""Names of columns that may hold the time."""
 SMALLEST = 1e-12
 """Resolution of a channel that never changes, as a share of its reading."""
 PARTS = {"": "mean", "sd_": "sd", "spread_": "spread", "drift_": "drift", "samples_": "used"}
@@ -107,9 +104,9 @@ def find_stations(
     found from the log where None. Errors: a log without time, without samples of a channel,
     or without standstills.
     """
-    _check("min-seconds", min_seconds)
-    _check("trim-seconds", trim_seconds)
-    _check("threshold", threshold)
+    check_argument("min_seconds", min_seconds, SECONDS)
+    check_argument("trim_seconds", trim_seconds, SECONDS)
+    check_argument("threshold", threshold, THRESHOLD)
     findings: list[Finding] = []
     time = row_times(log, sampling_hz)
     traces, temperature = _traces(log, time, findings)
@@ -159,11 +156,6 @@ def _threshold(
     return (highest, None) if np.isnan(value) else (value, stretch)
 
 
-def _check(name: str, value: float | None) -> None:
-    if value is not None and not 0 <= value < float("inf"):
-        raise InputError(f"--{name} must be a number of at least 0; got {shown(value)}.")
-
-
 def _short(log: Table, time: Array, traces: dict[str, Trace]) -> InputError:
     if len(time) > 1 and not any(np.ptp(value) for _, value in traces.values()):
         return InputError(
@@ -192,56 +184,8 @@ def _none(stations: Stations) -> str:
         seen = f"nothing is left {trimmed}"
     return (
         f"{stations.table.source}: no standstill of at least {stations.min_seconds:g} s; {seen}. Stand still "
-        "for longer, lower --min-seconds or --trim-seconds, or set --threshold; --plot shows the log."
+        "for longer, lower `min_seconds` or `trim_seconds`, or set `threshold`."
     )
-
-
-def row_times(log: Table, sampling_hz: float | None) -> Array:
-    """Seconds of each row: from the rate of sampling if given, else the column `time_s`."""
-    stated = log.metadata.get("sampling_hz") if sampling_hz is None else sampling_hz
-    if TIME in log.columns and sampling_hz is None:
-        time = numbers(log, TIME)
-        for row in np.flatnonzero(np.isnan(time))[:1]:
-            advice = "Fill it in, or remove the row."
-            raise cell_error(log, TIME, int(row), f"must be filled in; got a blank cell. {advice}")
-        for row in np.flatnonzero(np.diff(time) < 0)[:1]:
-            got = f"{shown(float(time[row + 1]))} s after {shown(float(time[row]))} s"
-            advice = "Sort the log by time, or split it where the clock was set back."
-            raise cell_error(log, TIME, int(row) + 1, f"must not go back; got {got}. {advice}")
-        _check_span(log, time)
-        return time
-    if stated is None:
-        raise _timeless(log)
-    if isinstance(stated, bool) or not isinstance(stated, int | float) or not 0 < stated <= 1e9:
-        here, advice = f"{log.source}: sampling_hz", "Correct it, or add --sampling-hz."
-        if sampling_hz is not None:
-            here, advice = "--sampling-hz", "State the samples per second."
-        raise InputError(
-            f"{here} must be a number above 0 and at most 1e9 Hz; got {shown(stated)}. {advice}"
-        )
-    return np.arange(len(numbers(log, RAW[0]))) / float(stated)
-
-
-def _timeless(log: Table) -> InputError:
-    """The refusal of a log without a time, or with one of another name."""
-    clock = next((name for name in log.columns if CLOCK.search(name)), None)
-    got = "neither. Add"
-    if clock is not None:
-        got = f"'{clock}'. Rename it to '{TIME}', in seconds (convert it if it is not); or add"
-    return InputError(
-        f"{log.source}: a log needs a column '{TIME}', or its rate of sampling; got {got} "
-        "--sampling-hz 100, or a line '# sampling_hz = 100' above the column names."
-    )
-
-
-def _check_span(log: Table, time: Array) -> None:
-    """Refuse a clock that jumps so far that most of the log would be nothing."""
-    cell = max(standstill.CELL, standstill.FEWEST * standstill.time_step(time))
-    if time[-1] - time[0] > MOST_CELLS * cell:
-        row = int(np.argmax(np.diff(time))) + 1
-        got = f"{shown(float(time[row]))} s after {shown(float(time[row - 1]))} s"
-        advice = "Correct the clock, split the log there, or write the time in seconds."
-        raise cell_error(log, TIME, row, f"must not jump so far; got {got}. {advice}")
 
 
 def _traces(
@@ -303,10 +247,10 @@ def _time_findings(
     """Gaps, times that occur twice in a channel or are not used, their unit, and spare columns."""
     findings = []
     if TIME in log.columns and sampling_hz is not None:
-        text = f"--sampling-hz {sampling_hz:g} was given: the column '{TIME}' is not used."
+        text = f"`sampling_hz` {sampling_hz:g} was given: the column '{TIME}' is not used."
         findings.append(Finding(id="time-not-used", text=text))
     elif TIME in log.columns:
-        findings += time_unit(time)
+        findings += unlikely_seconds(time)
     steps = np.diff(time)
     gaps = np.flatnonzero(steps > max(GAP * standstill.time_step(time), standstill.CELL))
     if gaps.size:

@@ -164,6 +164,8 @@ def _draw_activity(axes: Axes, stations: Stations) -> None:
     axes.set_xlabel("time, s")
     axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
     axes.yaxis.set_minor_formatter(lambda value, _: "")
+    if not stations.threshold:
+        return  # a logarithmic axis has no zero
     axes.axhline(stations.threshold, color=plots.MARKED, lw=1, ls=(0, (5, 3)))
     axes.annotate(
         f"threshold {stations.threshold:.3g}", (1.0, stations.threshold), (6, 0), va="center",
