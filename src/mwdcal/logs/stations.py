@@ -112,14 +112,14 @@ def find_stations(
     traces, temperature = _traces(log, time, findings)
     findings += _time_findings(log, time, traces, sampling_hz)
     say(f"looking for standstills in {len(time)} rows")
-    activity = standstill.activity(list(traces.values()))
+    activity = standstill.activity(traces)
     if not activity.cells:
         raise _short(log, time, traces)
     shortest = min_seconds
     if shortest is None:
         shortest = max(MIN_SECONDS, standstill.WINDOW * activity.cell)
     trim = max(TRIM_SECONDS, activity.cell) if trim_seconds is None else trim_seconds
-    findings += _torn(activity, list(traces), findings)
+    findings += _torn(activity, findings)
     limits, slow = _limits(activity, traces)
     value, stretch = _threshold(activity, limits, threshold, shortest + 2 * trim)
     standstills = standstill.standstills(activity, limits, value, shortest, trim, slow)
@@ -132,12 +132,12 @@ def find_stations(
     if not standstills.taken.any():
         raise StandstillError(_none(stations), stations)
     rows = _summaries(traces, *standstills.stations, findings, say)
-    columns = _columns(log, time, rows, *standstills.stations)
-    columns |= _temperatures(temperature, *standstills.stations, findings)
+    warmth = _temperatures(temperature, *standstills.stations, findings)
+    columns = _columns(log, time, warmth, rows, *standstills.stations)
     findings += about(rows, standstills, float(time[-1] - time[0]) - 2 * trim)
     metadata = {**log.metadata, "log": log.source, "log_sha256": log.digest}
     lines = range(1, len(columns["station"]) + 1)
-    return replace(stations, table=Table(_ordered(columns), metadata, log.source, lines))
+    return replace(stations, table=Table(columns, metadata, log.source, lines))
 
 
 def _threshold(
@@ -265,30 +265,27 @@ def _time_findings(
     return findings + unused_columns(unused(list(log.columns), READ))
 
 
-def _torn(activity: Activity, names: list[str], findings: list[Finding]) -> list[Finding]:
+def _torn(activity: Activity, findings: list[Finding]) -> list[Finding]:
     """Stretches without samples that the times of the rows do not show, as gaps."""
     if any(finding.id == "gaps" for finding in findings):
         return []
-    torn = []
-    for channel in activity.cells:
+    torn = {}
+    for name, channel in activity.cells.items():
         between = np.append(channel.start[1:] - channel.end[:-1], 0.0)
-        torn.append(channel.torn | (between > max(activity.cell, standstill.FEWEST * channel.step)))
-    worst = max(range(len(torn)), key=lambda i: np.count_nonzero(torn[i]))
-    if not torn[worst].any():
+        limit = max(activity.cell, standstill.FEWEST * channel.step)
+        torn[name] = np.flatnonzero(channel.torn | (between > limit))
+    name = max(torn, key=lambda n: torn[n].size)
+    if not torn[name].size:
         return []
-    name, first = names[activity.channels[worst]], int(np.argmax(torn[worst]))
-    gaps = count(int(np.count_nonzero(torn[worst])), "gap")
-    at = f"{activity.cells[worst].start[first]:.10g} s"
-    text = f"{name} has {gaps} of several samples, the first after {at}: no standstill goes across one."
-    return [Finding(id="gaps", text=text)]
+    at = f"{activity.cells[name].start[torn[name][0]]:.10g} s"
+    gaps = f"{name} has {count(torn[name].size, 'gap')} of several samples, the first after {at}"
+    return [Finding(id="gaps", text=f"{gaps}: no standstill goes across one.")]
 
 
 def _equal_times(log: Table, time: Array, names: list[str]) -> list[Finding]:
     """Samples of a channel at one time; rows of different channels may share theirs."""
-    present = {name: ~np.isnan(numbers(log, name)) for name in names}
-    twice = {
-        name: int(np.count_nonzero(np.diff(time[filled]) == 0)) for name, filled in present.items()
-    }
+    filled = {name: time[~np.isnan(numbers(log, name))] for name in names}
+    twice = {name: int(np.count_nonzero(np.diff(own) == 0)) for name, own in filled.items()}
     name = max(twice, key=lambda n: twice[n])
     if not twice[name]:
         return []
@@ -301,18 +298,18 @@ def _equal_times(log: Table, time: Array, names: list[str]) -> list[Finding]:
 
 def _limits(activity: Activity, traces: dict[str, Trace]) -> tuple[Array, list[Slow]]:
     """The largest range that can be rest of each channel looked at, and the others that can step."""
-    names = list(traces)
-    cells = dict(zip((names[i] for i in activity.channels), activity.cells, strict=True))
-    cut = {
-        name: cells[name] if name in cells else standstill.cells_of(*trace, standstill.CELL)
+    slow_cells = {
+        name: standstill.cells_of(*trace, standstill.CELL)
         for name, trace in traces.items()
+        if name not in activity.cells
     }
+    cut = {**activity.cells, **slow_cells}
     limits, slow = [], []
     for name, channel in cut.items():
         triad = next(kind for kind in CHANNELS.values() if name in kind)
         levels = [cut[n].level for n in triad if n in cut and len(cut[n].level)]
         size = standstill.triad_size(levels) if levels else 0.0
-        if name in cells:
+        if name in activity.cells:
             limits.append(standstill.rest_limit(channel, size))
         else:
             noise = max(channel.rough, channel.resolution)
@@ -349,14 +346,11 @@ def _summaries(
     """What each channel read at each station."""
     summaries: Rows = {}
     for name, (time, value) in traces.items():
+        say(f"means of {name} at {count(len(start), 'station')}")
         resolution = standstill.resolution(value) or SMALLEST * abs(value[0]) or SMALLEST
         places = zip(*_within(time, start, end), strict=True)
         rests = [(time[a:b], value[a:b]) for a, b in places]
-
-        def progress(done: int, name: str = name) -> None:
-            say(f"station {done} of {len(start)}, {name}")
-
-        summaries[name] = summarise_all(rests, float(resolution), progress)
+        summaries[name] = summarise_all(rests, float(resolution))
     for triad in CHANNELS.values():
         summaries |= _widened({n: summaries[n] for n in triad if n in summaries}, findings)
     return summaries
@@ -364,26 +358,29 @@ def _summaries(
 
 def _widened(triad: Rows, findings: list[Finding]) -> Rows:
     """What the channels of a triad read, known less well where their noise is correlated."""
-    correlation = correlated([*triad.values()])
+    variances, plain = correlated([*triad.values()])
     wider = {
-        name: widened(means, float(variance))
-        for (name, means), variance in zip(triad.items(), correlation.variance, strict=True)
+        name: widened(triad[name], float(variance))
+        for name, variance in zip(triad, variances, strict=True)
     }
     pairs = zip(chain(*wider.values()), chain(*triad.values()), strict=True)
     grown = [after.sd > REPORTED * before.sd for after, before in pairs]
-    if correlation.plain and 2 * sum(grown) > len(grown):
+    if plain and 2 * sum(grown) > len(grown):
         findings.append(correlated_noise([*triad]))
     return wider
 
 
-def _columns(log: Table, time: Array, rows: Rows, start: Array, end: Array) -> dict[str, Column]:
-    """The run: labels and times, means, and what is known of each mean."""
+def _columns(
+    log: Table, time: Array, warmth: dict[str, Column], rows: Rows, start: Array, end: Array
+) -> dict[str, Column]:
+    """The run: labels and times, temperatures, means, and what is known of each mean."""
     first, last = _within(time, start, end)
     columns: dict[str, Column] = {
         "station": [str(i) for i in range(1, len(start) + 1)],
         "start_s": time[first],
         "end_s": time[last - 1],
         "samples": np.asarray(last - first, float),
+        **warmth,
     }
     for prefix, part in PARTS.items():
         for name, summaries in rows.items():
@@ -434,12 +431,6 @@ def _temperature(
     grid = np.linspace(start, end, 9)
     course = np.interp(grid, time, value)
     return float(course.mean()), float(np.polyfit(grid - start, course, 1)[0] * (end - start))
-
-
-def _ordered(columns: dict[str, Column]) -> dict[str, Column]:
-    """The columns with the temperature before the means."""
-    first = ("station", "start_s", "end_s", "samples", "temperature_c", "drift_temperature_c")
-    return {n: columns[n] for n in first if n in columns} | columns
 
 
 def _middle(value: Array) -> float:

@@ -138,11 +138,7 @@ def _thinned(x: Array, y: Array) -> tuple[Array, Array]:
 
 def _draw_triad(axes: Axes, stations: Stations, triad: tuple[str, ...]) -> None:
     """Medians of short cells of the channels that have them, else the samples."""
-    names = list(stations.traces)
-    cells = {
-        names[i]: c
-        for i, c in zip(stations.activity.channels, stations.activity.cells, strict=True)
-    }
+    cells = stations.activity.cells
     for name, line in zip(triad, LINE_STYLES, strict=True):
         if name in cells:
             x, y = cells[name].start, cells[name].level
