@@ -163,9 +163,12 @@ def find_noise(
     channels: dict[str, ChannelNoise] = {}
     for name in (name for name in RAW if name in log.columns):
         say(f"Allan variances of {name}, {samples} samples")
-        taken = regular.samples(log, name, rows, rate, station, findings)
-        if taken is not None:
-            channels[name] = _channel(name, *taken, station, kind, findings)
+        try:
+            taken = regular.samples(log, name, rows, rate, station, findings)
+        except regular.UnusableChannelError as error:
+            findings.append(Finding(id="channel-left-out", text=f"{error} It was left out."))
+            continue
+        channels[name] = _channel(name, *taken, station, kind, findings)
     if not channels:
         raise InputError(
             f"{log.source}: no channel that could be used. {' '.join(f.text for f in findings)}"

@@ -8,7 +8,7 @@ from mwdcal.calibration.record import Finding
 from mwdcal.errors import InputError
 from mwdcal.files.formats.table import Table, cell_error, numbers, shown
 from mwdcal.files.logs import TIME
-from mwdcal.geometry.vectors import Array, Ints
+from mwdcal.geometry.vectors import Array
 from mwdcal.logs import allan
 from mwdcal.logs.clock import rate_findings, row_times, unlikely_seconds
 from mwdcal.logs.station_findings import count
@@ -64,72 +64,57 @@ def _regular_rate(log: Table, time: Array, row: int) -> float:
     return len(steps) / float(time[-1] - time[0])
 
 
+class UnusableChannelError(InputError):
+    """A channel that is left out; the others go on."""
+
+
 def samples(
-    log: Table,
-    name: str,
-    rows: slice,
-    rate: float,
-    station: float,
-    findings: list[Finding],
-) -> tuple[Array, float] | None:
-    """Values of a channel and samples a second; None with a finding where it cannot be used."""
+    log: Table, name: str, rows: slice, rate: float, station: float, findings: list[Finding]
+) -> tuple[Array, float]:
+    """Values of a channel and samples a second; `station` seconds are averaged later.
+
+    Errors: `UnusableChannelError` where these samples do not show the noise of the channel.
+    """
     value = numbers(log, name)[rows]
     there = np.flatnonzero(~np.isnan(value))
-    problem = _unusable(name, value[there])
-    if not problem:
-        steps = np.diff(there)
-        step = int(np.median(steps))
-        if (odd := np.flatnonzero(steps != step)).size:
-            row = rows.start + int(there[odd[0]]) + min(step, int(steps[odd[0]]))
-            line = log.lines[row] if row < len(log.lines) else row + 1
-        filled = _filled(value, there, step)
-        if filled is None:
-            problem = f"{name} is blank at irregular places, first in line {line}: fill in or cut."
-        else:
-            problem = _noiseless(name, filled, max(round(station * rate / step), 1))
-    if problem or filled is None:
-        findings.append(Finding(id="channel-left-out", text=f"{problem} It was left out."))
-        return None
-    if odd.size:
+    _check_changes(name, value[there])
+    steps = np.diff(there)
+    step = int(np.median(steps))
+    places = np.arange(there[0], there[-1] + 1, step)
+    blank = np.flatnonzero(steps != step)
+    if blank.size:
+        row = rows.start + int(there[blank[0]]) + min(step, int(steps[blank[0]]))
+        line = f"line {log.lines[row] if row < len(log.lines) else row + 1}"
+        if np.any(steps[blank] != 2 * step) or blank.size > max(SPARSE * len(there), 1):
+            problem = f"{name} is blank at irregular places, first in {line}: fill in or cut."
+            raise UnusableChannelError(problem)
         text = (
-            f"{name} is blank in {len(odd)} of {len(filled)} samples, first in line {line}: taken as "
+            f"{name} is blank in {blank.size} of {len(places)} samples, first in {line}: taken as "
             "the mean of the two neighbours."
         )
         findings.append(Finding(id="filled", text=text))
+    filled = np.interp(places, there, value[there])
+    _check_noise(name, filled, max(round(station * rate / step), 1))
     return filled, rate / step
 
 
-def _filled(value: Array, there: Ints, step: int) -> Array | None:
-    """Samples of a channel, present `there` at every `step`, single blanks the mean of their neighbours.
-
-    None where others are blank, or more than `SPARSE`.
-    """
-    steps = np.diff(there)
-    single = steps == 2 * step
-    if np.any(~single & (steps != step)) or single.sum() > max(SPARSE * len(there), 1):
-        return None
-    return np.asarray(np.interp(np.arange(there[0], there[-1] + 1, step), there, value[there]))
-
-
-def _unusable(name: str, value: Array) -> str:
-    """Why a channel with these samples (n,) has no noise to be found, if so."""
+def _check_changes(name: str, value: Array) -> None:
+    """Refuse a channel with too few samples (n,), or that never changes."""
     if not value.size:
-        return f"{name} is blank from end to end."
+        raise UnusableChannelError(f"{name} is blank from end to end.")
     if len(value) < FEWEST:
-        return f"{name} has {len(value)} samples; {FEWEST} are needed."
+        raise UnusableChannelError(f"{name} has {len(value)} samples; {FEWEST} are needed.")
     if np.ptp(value) == 0:
-        return f"{name} reads {value[0] + 0.0:g} from end to end: a dead channel?"
-    return ""
+        reads = f"{name} reads {value[0] + 0.0:g} from end to end: a dead channel?"
+        raise UnusableChannelError(reads)
 
 
-def _noiseless(name: str, value: Array, station: int) -> str:
-    """Why the samples (n,), or their means over a `station`, have no noise, if so."""
+def _check_noise(name: str, value: Array, station: int) -> None:
+    """Refuse samples (n,) without noise, or without any in means over so many of a `station`."""
     factors = [*allan.octaves(len(value)), station]
     size = np.sqrt(allan.variance(value, factors, centred=True))
-    none = np.flatnonzero(size <= np.maximum(allan.rounding(value, factors), LEAST))
-    if not none.size:
-        return ""
-    return (
-        f"{name} has no noise above the rounding of numbers in averages over "
-        f"{count(factors[none[0]], 'sample')}: a ramp, a pattern, or simulated without noise?"
-    )
+    for i in np.flatnonzero(size <= np.maximum(allan.rounding(value, factors), LEAST))[:1]:
+        raise UnusableChannelError(
+            f"{name} has no noise above the rounding of numbers in averages over "
+            f"{count(factors[i], 'sample')}: a ramp, a pattern, or simulated without noise?"
+        )
