@@ -10,7 +10,7 @@ from cli_support import mwdcal, refused, write_csv
 from mwdcal.errors import InputError
 from mwdcal.files.formats.table import Table
 from mwdcal.logs import standstill
-from mwdcal.logs.station_findings import time_unit
+from mwdcal.logs.clock import unlikely_seconds
 from mwdcal.logs.stations import find_stations
 from test_stations import ACC, MAG, means, multi_rate, tumble, without
 
@@ -227,7 +227,7 @@ def test_blanks_of_one_channel_end_a_standstill_and_are_told(shift):
     ],
 )  # fmt: skip
 def test_times_that_can_hardly_be_seconds(hz, hours, told):
-    found = time_unit(np.arange(round(hours * 3600 * hz) + 1) / hz)
+    found = unlikely_seconds(np.arange(round(hours * 3600 * hz) + 1) / hz)
     assert [f.id for f in found] == ["time-unit"] * bool(told)
     assert not told or found[0].text.startswith(f"{told}: is it in milliseconds")
 
@@ -291,7 +291,7 @@ def test_noisy_rests_are_told_with_the_threshold_that_takes_them():
     found = find_stations(shaken)
     told = finding(found, "noisy-rest").text
     assert found.table.count + int(told.split()[0]) == 20
-    threshold = float(told.split("--threshold ")[1].split()[0])
+    threshold = float(told.split("`threshold` ")[1].split()[0])
     assert find_stations(shaken, threshold=threshold).table.count == 20
 
 

@@ -35,6 +35,14 @@ def as_typed(text: str, command: click.Command) -> str:
     return re.sub(r"`(\w+)`", lambda name: options.get(name[1], name[0]), text)
 
 
+def findings_as_typed(findings: Iterable[Finding]) -> list[Finding]:
+    """The findings in the words of the command that runs."""
+    from msgspec.structs import replace
+
+    command = click.get_current_context().command
+    return [replace(finding, text=as_typed(finding.text, command)) for finding in findings]
+
+
 def say(text: str) -> None:
     """A message for people, on stderr."""
     click.echo(text, err=True)

@@ -40,11 +40,12 @@ READ = (TIME, *RANGES)
 """Columns of a log that mean something, all of them numbers."""
 
 _PIECE = 16_000_000
+_LONGEST_LINE = 1_000_000
 _TYPED = (".parquet", ".xlsx")
 _ODD = re.compile(r"nan|inf|[\"\r]", re.IGNORECASE)
 _CLOCK = re.compile(r"\d{4}-\d{1,2}-\d{1,2}|\d{1,2}:\d{2}|\d{1,2}[./]\d{1,2}[./]\d{4}")
 _BINARY = re.compile(rb"[\x00-\x08\x0e-\x1f]")
-_EXAMPLE = "--columns time_s,ax,ay,az"
+_EXAMPLE = "`columns` time_s,ax,ay,az"
 
 
 Say = Callable[[str], None]
@@ -66,19 +67,19 @@ class _Layout(NamedTuple):
 
 def read(
     path: str | os.PathLike[str],
-    names: Sequence[str] = (),
+    columns: Sequence[str] = (),
     *,
     decimal: str = ".",
     say: Say = silent,
 ) -> Table:
     """The columns of a log that mean something, as numbers (NaN: blank), and its metadata.
 
-    `names` are the columns of a text log without a line of column names. `say` receives
+    `columns` are the names of a text log without a line of column names. `say` receives
     the progress. Errors name file, line and column.
     """
     file = Path(path)
     typed = file.suffix.lower() in _TYPED
-    table = _typed(file, names, decimal) if typed else _text(file, [*names], decimal, say)
+    table = _typed(file, columns, decimal) if typed else _text(file, [*columns], decimal, say)
     cells = columns_of(table)
     refuse(table, chain.from_iterable(range_faults(cells, name) for name in RAW))
     return table
@@ -88,8 +89,8 @@ def _typed(file: Path, names: Sequence[str], decimal: str) -> Table:
     """The table of a log of typed columns, its numbers as numbers."""
     if names:
         raise InputError(
-            f"--columns names the columns of a text log without column names; '{file}' has "
-            "names of its own. Leave --columns out."
+            f"`columns` names the columns of a text log without column names; '{file}' has "
+            "names of its own. Leave `columns` out."
         )
     try:
         table = tables.read(file, decimal=decimal)
@@ -105,7 +106,7 @@ def _typed(file: Path, names: Sequence[str], decimal: str) -> Table:
 def _text(file: Path, names: list[str], decimal: str, say: Say) -> Table:
     """The table of a text log."""
     if decimal not in (".", ","):
-        raise InputError(f"--decimal must be '.' or ','; got {shown(decimal)}.")
+        raise InputError(f"`decimal` must be '.' or ','; got {shown(decimal)}.")
     try:
         tables.check_file(file)
         with file.open("rb") as stream:
@@ -130,7 +131,7 @@ def _numbers(table: Table, name: str) -> Array:
                 raise tables.cell_error(
                     table, name, row,
                     f"expected seconds as a number; got the date or time of day {shown(cell)}. Write the "
-                    "seconds since the start, or leave the column out and add --sampling-hz.",
+                    "seconds since the start, or leave the column out and give `sampling_hz`.",
                 )  # fmt: skip
     return tables.numbers(table, name)
 
@@ -165,6 +166,11 @@ def _top(stream: BinaryIO, source: str) -> tuple[list[tuple[int, str]], str, int
     """Numbered comments above the table, and its first line with its number."""
     comments: list[tuple[int, str]] = []
     for number, data in enumerate(stream, 1):
+        if len(data) > _LONGEST_LINE:
+            raise InputError(
+                f"{source}, line {number}: the line must have at most {_LONGEST_LINE} bytes; got "
+                f"{len(data)}. Is this a log?"
+            )
         line = _decoded(data, number, source).lstrip("\ufeff").strip("\r\n")
         if not is_preamble(line):
             return comments, line, number
@@ -200,11 +206,11 @@ def _layout(first: str, number: int, names: list[str], decimal: str, source: str
     cells = [str(cell).strip() for cell in header]
     numeric = all(looks_numeric(cell, decimal) or not cell for cell in cells)
     if names:
-        _check(names, "--columns")
+        _check(names, "`columns`")
         if not numeric and any(re.match(r"[A-Za-z]", cell) for cell in cells):
             raise InputError(
-                f"{source}, line {number}: expected numbers, as --columns names the columns; got "
-                f"{shown(first.strip())}. Leave --columns out, or remove this line."
+                f"{source}, line {number}: expected numbers, as `columns` names the columns; got "
+                f"{shown(first.strip())}. Leave `columns` out, or remove this line."
             )
         return _Layout(names, delimiter, decimal, source)
     if numeric:

@@ -125,6 +125,12 @@ def _variance(phase: Array, m: int, kind: Kind, centred: bool) -> Array:
     return np.asarray(np.mean(step**2, -1) / (2.0 * m * m))
 
 
+def rounding(values: Array, averaging: Sequence[int]) -> Array:
+    """Allan deviation (..., m) that the rounding of numbers alone can make of a record (..., n)."""
+    sums, largest = (np.abs(v).max(-1, keepdims=True) for v in (_phase(values), values))
+    return np.asarray(np.finfo(float).eps * (sums / np.asarray(averaging, float) + largest))
+
+
 def differences(values: Array, m: int) -> Array:
     """Differences (..., n - 2m + 1) of averages over m samples that follow each other."""
     return _differences(_phase(values), m) / m

@@ -19,29 +19,23 @@ from mwdcal.calibration.record import Finding
 from mwdcal.calibration.residuals import rms
 from mwdcal.errors import InputError
 from mwdcal.files.contract import CHANNELS, RAW
-from mwdcal.files.formats.table import Table, cell_error, numbers, shown
-from mwdcal.files.logs import TIME, Say, silent
-from mwdcal.geometry.vectors import Array, Ints
-from mwdcal.logs import allan, noise_terms
+from mwdcal.files.formats.table import Table
+from mwdcal.files.logs import Say, silent
+from mwdcal.geometry.vectors import Array
+from mwdcal.logs import allan, noise_terms, regular
 from mwdcal.logs.allan import Kind, Moments
+from mwdcal.logs.clock import DURATION, RATE, SAME, check_argument
 from mwdcal.logs.noise_terms import NoiseTerms
-from mwdcal.logs.stations import row_times
 from mwdcal.sensor.profile import Profile
 
 KINDS = ("overlapping", "modified")
 """Allan deviations whose degrees of freedom, and so bands, are known here."""
-FEWEST = 128
-"""Samples of a channel below which the terms cannot be separated."""
 STATION_SECONDS = 30.0
 """Duration of a station, unless the log is too short for it."""
 AVERAGES = 4
 """Stations that a log has to hold at least."""
 SOUND = 10
 """Stations that a log holds where their duration is chosen for it."""
-SPARSE = 1e-3
-"""Largest share of single blanks that are filled in: the change is below the uncertainty of the noise."""
-JITTER = 0.5
-"""Share of the sampling interval by which one may differ: more is a gap."""
 EVENT = 8.0
 """Size of a difference, in robust standard deviations, that no noise reaches."""
 ROUNDING = 1e-6
@@ -58,8 +52,6 @@ DOUBTS = {
     "slow": "less than a sample in a station",
 }
 """Findings after which the figures of a channel do not hold, in words; `slow`: that of a station."""
-RATE = 0.01
-"""Share by which rates, or a sampling interval and a station, may differ and still be the same."""
 UNITS = {
     "quantisation": "·s",
     "white": "·√s",
@@ -164,15 +156,19 @@ def find_noise(
     if kind not in KINDS:
         raise InputError(f"`kind` must be {' or '.join(KINDS)}; got {kind!r}.")
     findings: list[Finding] = []
-    first, last, rate = _section(log, sampling_hz, between, findings)
-    seconds = (last - first) / rate
+    rows, rate = regular.section(log, sampling_hz, between, findings)
+    samples = rows.stop - rows.start
+    seconds = samples / rate
     station = _station_seconds(station_seconds, seconds, rate, log.source)
     channels: dict[str, ChannelNoise] = {}
     for name in (name for name in RAW if name in log.columns):
-        say(f"Allan variances of {name}, {last - first} samples")
-        taken = _samples(log, name, first, last, rate, findings)
-        if taken is not None:
-            channels[name] = _channel(name, *taken, station, kind, findings)
+        say(f"Allan variances of {name}, {samples} samples")
+        try:
+            taken = regular.samples(log, name, rows, rate, station, findings)
+        except regular.UnusableChannelError as error:
+            findings.append(Finding(id="channel-left-out", text=f"{error} It was left out."))
+            continue
+        channels[name] = _channel(name, *taken, station, kind, findings)
     if not channels:
         raise InputError(
             f"{log.source}: no channel that could be used. {' '.join(f.text for f in findings)}"
@@ -204,63 +200,8 @@ def check(
     if not start < end:
         got = f"`start` {start:g} and `end` {end:g}"
         raise InputError(f"`start` must be less than `end`; got {got}. Swap them?")
-    if station_seconds is not None and not 0 < station_seconds < np.inf:
-        rule = "`station_seconds` must be above 0 and finite"
-        raise InputError(f"{rule}; got {station_seconds:g}. Correct it.")
-    if sampling_hz is not None and not 0 < sampling_hz <= 1e9:
-        rule = "`sampling_hz` must be above 0 and at most 1e9 Hz"
-        raise InputError(f"{rule}; got {sampling_hz:g}. Correct it.")
-
-
-def _section(
-    log: Table, given: float | None, between: tuple[float, float], findings: list[Finding]
-) -> tuple[int, int, float]:
-    """First row, row after the last, and rows a second, of what is to be used of a log."""
-    time = row_times(log, given)
-    inside = np.flatnonzero((time - time[0] >= between[0]) & (time - time[0] <= between[1]))
-    if len(inside) < FEWEST:
-        problem, advice = f"got {len(time)}", "Record for longer."
-        if len(time) >= FEWEST:
-            problem = f"`start` and `end` leave {len(inside)} of {len(time)} rows"
-            advice = f"The log lasts {time[-1] - time[0]:.4g} s: widen them."
-        raise InputError(
-            f"{log.source}: at least {FEWEST} samples are needed for an Allan deviation; {problem}. "
-            f"{advice}"
-        )
-    first, last = int(inside[0]), int(inside[-1]) + 1
-    steps = np.diff(time[first:last])
-    step = float(np.median(steps))
-    if step <= 0:
-        raise InputError(
-            f"{log.source}, column '{TIME}': most samples have the time of the one before; written "
-            "with too few digits? Give the rate: `sampling_hz` 100."
-        )
-    for row in np.flatnonzero(np.abs(steps - step) > JITTER * step)[:1]:
-        got = f"{steps[row]:.4g} s after {shown(float(time[first + row]))} s, not {step:.4g} s"
-        advice = (
-            "An Allan deviation needs regular samples: choose a part without gaps by `start` and "
-            "`end` (seconds from the start), or give the rate if only the clock is coarse."
-        )
-        raise cell_error(log, TIME, first + int(row) + 1, f"the next sample came {got}. {advice}")
-    rate = (last - first - 1) / float(time[last - 1] - time[first])
-    if given and TIME in log.columns:
-        _compare_rates(log, first, last, given, findings)
-    return first, last, given or rate
-
-
-def _compare_rates(
-    log: Table, first: int, last: int, given: float, findings: list[Finding]
-) -> None:
-    """A finding where the column of times contradicts the rate that was given."""
-    time = numbers(log, TIME)[first:last]
-    whole = float(time[-1] - time[0])
-    measured = (len(time) - 1) / whole if whole > 0 else np.inf
-    if not abs(measured / given - 1) < RATE:
-        text = (
-            f"--sampling-hz {given:g} was used, but {TIME} goes from {time[0]:g} to {time[-1]:g} s in "
-            f"{len(time)} rows ({measured:.6g} Hz): all times and densities rest on the rate given."
-        )
-        findings.append(Finding(id="rate", text=text))
+    check_argument("station_seconds", station_seconds, DURATION)
+    check_argument("sampling_hz", sampling_hz, RATE)
 
 
 def _station_seconds(given: float | None, seconds: float, rate: float, source: str) -> float:
@@ -279,50 +220,6 @@ def _station_seconds(given: float | None, seconds: float, rate: float, source: s
             "shorter station."
         )
     return given
-
-
-def _samples(
-    log: Table, name: str, first: int, last: int, rate: float, findings: list[Finding]
-) -> tuple[Array, float] | None:
-    """Values of a channel and samples a second; None with a finding where it cannot be used."""
-    value = numbers(log, name)[first:last]
-    there = np.flatnonzero(~np.isnan(value))
-    steps = np.diff(there)
-    if not there.size:
-        problem = f"{name} is blank from end to end."
-    elif len(there) < FEWEST:
-        problem = f"{name} has {len(there)} samples; {FEWEST} are needed."
-    elif np.ptp(value[there]) == 0:
-        problem = f"{name} reads {value[there[0]] + 0.0:g} from end to end: a dead channel?"
-    elif not (odd := np.flatnonzero(steps != np.median(steps))).size:
-        return value[there], rate / float(steps[0])
-    else:
-        row = first + min(there[odd[0]] + int(np.median(steps)), there[odd[0] + 1])
-        line = log.lines[row] if row < len(log.lines) else row + 1
-        filled = _filled(value, there)
-        if filled is not None:
-            text = (
-                f"{name} is blank in {len(odd)} of {len(filled)} samples, first in line {line}: taken as "
-                "the mean of the two neighbours."
-            )
-            findings.append(Finding(id="filled", text=text))
-            return filled, rate / float(np.median(steps))
-        problem = f"{name} is blank at irregular places, first in line {line}: fill in or cut."
-    findings.append(Finding(id="channel-left-out", text=f"{problem} It was left out."))
-    return None
-
-
-def _filled(value: Array, there: Ints) -> Array | None:
-    """Samples of a channel, present `there`, each single blank the mean of its neighbours.
-
-    None where others are blank, or more than `SPARSE`.
-    """
-    steps = np.diff(there)
-    step = int(np.median(steps))
-    single = steps == 2 * step
-    if np.any(~single & (steps != step)) or single.sum() > max(SPARSE * len(there), 1):
-        return None
-    return np.asarray(np.interp(np.arange(there[0], there[-1] + 1, step), there, value[there]))
 
 
 def _channel(
@@ -435,7 +332,7 @@ def _findings(
             f"{name}: below {start:.3g} s its noise is not that of the five terms (a filter, a vibration, "
             "or repeated samples); from there on they hold, without a quantisation."
         )
-    if station * rate < 1 - RATE:
+    if station * rate < 1 - SAME:
         seen = f"{name} is sampled every {1 / rate:.4g} s, and a station lasts {station:.4g} s"
         texts["slow"] = f"{seen}: its figure is the noise of one sample. Ask for a longer station."
     return [Finding(id=key, text=text) for key, text in texts.items() if text]
@@ -455,7 +352,7 @@ def _event(name: str, value: Array, rate: float, least: float, coarse: bool) -> 
             return (
                 f"{name} changes by {size[worst]:.3g} about {(worst + m) / rate:.4g} s after the start, "
                 f"{size[worst] / usual:.0f} times what is usual within {m / rate:.2g} s: a spike or a move. "
-                "Choose a quiet part by --from and --to."
+                "Choose a quiet part by `start` and `end`."
             )
     return ""
 

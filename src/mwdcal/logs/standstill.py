@@ -19,7 +19,7 @@ Reference: P. J. Huber, Robust Statistics, chapter 6 (medians, MAD).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import chain, pairwise
 from typing import NamedTuple
 
@@ -51,6 +51,8 @@ STEP = 0.01
 """Share of a triad's size by which no slow channel of a tool at rest steps."""
 MANY = 100_000
 """Differences of readings that are looked at."""
+LEAST = 1e-200
+"""Least noise floor: ratios to a smaller one are no numbers any more."""
 INTO = 0.15
 """How far into the stretch the threshold lies, in logarithm."""
 
@@ -86,28 +88,19 @@ class Activity(NamedTuple):
     Attributes:
         edge: start of each cell, and the end of the last (m + 1,), s.
         value: activity (m,), in noise floors; infinite where a channel has no samples.
-        channels: which of the channels were looked at.
-        cells: these channels, cut up.
+        cells: the channels that were looked at, cut up.
         floor: noise floor of each, in its own unit.
     """
 
     edge: Array
     value: Array
-    channels: tuple[int, ...]
-    cells: tuple[Cells, ...]
+    cells: dict[str, Cells]
     floor: Array
 
     @property
     def cell(self) -> float:
         """Length of a cell, s."""
         return float(self.edge[1] - self.edge[0])
-
-
-class Threshold(NamedTuple):
-    """The threshold in noise floors, and the stretch (first, last) over which it hardly matters."""
-
-    value: float
-    stretch: tuple[float, float]
 
 
 class Standstills(NamedTuple):
@@ -222,20 +215,23 @@ def distinct(time: Array) -> Array:
     return np.asarray(np.repeat(ticks, many) + rank * np.repeat(room / many, many))
 
 
-def activity(channels: Sequence[tuple[Array, Array]]) -> Activity:
+def activity(traces: Mapping[str, tuple[Array, Array]]) -> Activity:
     """How much each moment moves, of channels (time (n,), value (n,)) with rates of their own.
 
     A channel too slow to have a cell within a window of the fastest is not looked at, nor one
     that never changes. Singular: fewer samples than a window needs give no cells at all.
     """
-    steps = [time_step(time) for time, _ in channels]
-    length = max(CELL, FEWEST * min((s for s in steps if s > 0), default=0.0))
-    fast = [i for i, s in enumerate(steps) if 0 < FEWEST * s <= WINDOW * length]
-    cut = {i: cells_of(*channels[i], length) for i in fast if np.ptp(channels[i][1]) > 0}
-    cut = {i: channel for i, channel in cut.items() if len(channel.level) >= WINDOW}
-    cells = tuple(cut.values())
+    steps = {name: time_step(time) for name, (time, _) in traces.items()}
+    length = max(CELL, FEWEST * min((s for s in steps.values() if s > 0), default=0.0))
+    cut = {
+        name: cells_of(*traces[name], length)
+        for name, step in steps.items()
+        if 0 < FEWEST * step <= WINDOW * length and np.ptp(traces[name][1]) > 0
+    }
+    named = {name: channel for name, channel in cut.items() if len(channel.level) >= WINDOW}
+    cells = named.values()
     if not cells:
-        return Activity(np.zeros(1), np.zeros(0), (), (), np.zeros(0))
+        return Activity(np.zeros(1), np.zeros(0), {}, np.zeros(0))
     start = min(c.start[0] for c in cells)
     count = round(float(max(c.end[-1] for c in cells) - start) / length)
     edge = start + length * np.arange(max(count, 1) + 1)
@@ -243,11 +239,11 @@ def activity(channels: Sequence[tuple[Array, Array]]) -> Activity:
     for channel in cells:
         ranges = quietest_range(channel.level)
         # One step of the readings up or down is not movement.
-        floor = max(noise_floor(ranges), (1 + AGREE) * channel.resolution)
+        floor = max(noise_floor(ranges), (1 + AGREE) * channel.resolution, LEAST)
         ranges = np.where(channel.torn, np.inf, ranges)
         value = np.maximum(value, on_grid(edge, channel, ranges) / floor)
         floors.append(floor)
-    return Activity(edge, value, tuple(cut), cells, np.array(floors))
+    return Activity(edge, value, named, np.array(floors))
 
 
 def quietest_range(level: Array) -> Array:
@@ -298,8 +294,8 @@ def stretches(still: Bools, least: int = 1) -> tuple[Ints, Ints]:
     return first[long], last[long]
 
 
-def choose_threshold(value: Array, least: int, highest: float) -> Threshold:
-    """The threshold of the activity (m,) on which the standstills depend least.
+def choose_threshold(value: Array, least: int, highest: float) -> tuple[float, tuple[float, float]]:
+    """The threshold of the activity (m,) on which the standstills depend least, and its stretch.
 
     Definition: of all stretches of thresholds over which no more than `SAME` of the standstills of
     at least `least` cells come, go or merge, the longest in logarithm; the first with the
@@ -320,11 +316,11 @@ def choose_threshold(value: Array, least: int, highest: float) -> Threshold:
         if count and length > longest:
             best, longest = slice(first, first + length), length
     if not longest:
-        return Threshold(np.nan, (np.nan, np.nan))
+        return np.nan, (np.nan, np.nan)
     counts, tried = counts[best], tried[best]
     usual = (counts == np.median(counts)) & (np.arange(longest) >= INTO * (longest - 1))
     chosen = int(np.argmax(usual)) if usual.any() else longest // 2
-    return Threshold(float(tried[chosen]), (float(tried[0]), float(tried[-1])))
+    return float(tried[chosen]), (float(tried[0]), float(tried[-1]))
 
 
 def _changes(before: Ints, after: Ints) -> int:
@@ -354,7 +350,7 @@ def standstills(
     start, end = calm(activity, threshold, trim)
     start, end = cut_at_steps(start, end, slow, trim)
     creeps = np.zeros(len(start), bool)
-    for channel, limit in zip(activity.cells, limits, strict=True):
+    for channel, limit in zip(activity.cells.values(), limits, strict=True):
         creeps |= _travels(channel.start, channel.level, start, end) > 2 * limit
     for time, value, limit in slow:
         step = time_step(time)

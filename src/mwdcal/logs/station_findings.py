@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from math import ceil, floor, log10
 
 import numpy as np
@@ -17,9 +17,6 @@ MANY_SPIKES = 0.01
 """Share of spikes that is reported."""
 MOST_LISTED = 12
 """Stations, or stretches of time, that a finding names."""
-DAY = 86_400.0
-SPARSE, RARE = 0.5, 2.0
-"""Seconds between samples that are odd in a log of more than a day, and in any."""
 STEADY = 3.0
 """Standard deviations of a cell's level by which a noisy but steady stretch may drift."""
 
@@ -42,39 +39,21 @@ def _between(start: Array, end: Array) -> str:
     return listed(f"{a:.1f}–{b:.1f} s" for a, b in zip(start, end, strict=True))
 
 
-def about(rows: Rows, standstills: Standstills, seconds: float) -> list[Finding]:
+def about(rows: Rows, standstills: Standstills, seconds: float) -> Iterator[Finding]:
     """Findings about the stations, and about what was left; `seconds` lasts the log once trimmed."""
     start, end = standstills.stations
-    findings = []
     creeping = ~standstills.taken & ~standstills.short
     if creeping.any():
         where = _between(standstills.start[creeping], standstills.end[creeping])
         text = f"left out, as the tool moves slowly there: {where}."
-        findings.append(Finding(id="slow-movement", text=text))
+        yield Finding(id="slow-movement", text=text)
     if len(start) == 1 and end[0] - start[0] > 0.9 * seconds:
         text = "the log stands still from end to end: one station. A calibration needs several attitudes."
-        findings.append(Finding(id="all-still", text=text))
-    findings += _spikes(rows)
+        yield Finding(id="all-still", text=text)
+    yield from _spikes(rows)
     for name, summaries in rows.items():
-        findings += (
-            _stuck(name, summaries)
-            + _unsteady(name, summaries)
-            + _drifting(name, summaries, end - start)
-        )
-    return findings
-
-
-def time_unit(time: Array) -> list[Finding]:
-    """Times of rows (n,) that can hardly be seconds."""
-    step, lasts = standstill.time_step(time), float(time[-1] - time[0])
-    if step < (SPARSE if lasts > DAY else RARE):
-        return []
-    whole = f"{lasts / DAY:.5g} days" if lasts > DAY else f"{lasts:.4g} s"
-    text = (
-        f"samples are {step:.5g} s apart and the log lasts {whole} by time_s: is it in milliseconds or "
-        "microseconds? time_s is in seconds."
-    )
-    return [Finding(id="time-unit", text=text)]
+        yield from _unreliable(name, summaries)
+        yield from _drifting(name, summaries, end - start)
 
 
 def correlated_noise(names: list[str]) -> Finding:
@@ -87,69 +66,68 @@ def correlated_noise(names: list[str]) -> Finding:
     return Finding(id="correlated-noise", text=text)
 
 
-def _spikes(rows: Rows) -> list[Finding]:
+def _spikes(rows: Rows) -> Iterator[Finding]:
+    """The channel with the largest share of spikes, where that is large."""
     share = {
         n: sum(r.spikes for r in summaries) / sum(r.spikes + r.used for r in summaries)
         for n, summaries in rows.items()
     }
     name = max(share, key=lambda n: share[n])
-    if share[name] <= MANY_SPIKES:
-        return []
-    text = f"{100 * share[name]:.1f} % of the samples of {name} were left out as spikes: check the wiring."
-    return [Finding(id="spikes", text=text)]
+    if share[name] > MANY_SPIKES:
+        lost = f"{100 * share[name]:.1f} % of the samples of {name}"
+        yield Finding(id="spikes", text=f"{lost} were left out as spikes: check the wiring.")
 
 
-def _stuck(name: str, summaries: list[ChannelMean]) -> list[Finding]:
-    """A channel at its limit, or frozen."""
-    stations = [i + 1 for i, row in enumerate(summaries) if row.stuck]
-    if not stations:
-        return []
-    first = summaries[stations[0] - 1]
-    text = (
-        f"{name} stands at its limit, or is frozen, at {count(len(stations), 'station')} of {len(summaries)} "
-        f"({listed(stations)}): too many equal readings for its noise, such as {first.mean + 0.0:.6g}. Its sd_ "
-        "there is that of a reading known to the channel's range only."
-    )
-    return [Finding(id="stuck-channel", text=text, station=str(stations[0]))]
+def _unreliable(name: str, summaries: list[ChannelMean]) -> Iterator[Finding]:
+    """A channel at its limit or frozen, and one that is less steady than usual or steps."""
+    stuck = [row.stuck for row in summaries]
+    if any(stuck):
+        text = (
+            f"{name} stands at its limit, or is frozen, at {_places(stuck)}: too many equal readings for its "
+            f"noise, such as {summaries[stuck.index(True)].mean + 0.0:.6g}. Its sd_ there is that of a reading "
+            "known to the channel's range only."
+        )
+        yield Finding(id="stuck-channel", text=text, station=str(stuck.index(True) + 1))
+    unsteady = [row.unsteady and not row.stuck for row in summaries]
+    if any(unsteady):
+        usual = float(np.median([row.spread for row in summaries]))
+        text = (
+            f"{name} is less steady than usual at {_places(unsteady)}: it spreads more than at the others, or "
+            f"moves within the standstill (usual spread of one sample {usual:.2g}). Was the tool knocked, turned "
+            "or shaken?"
+        )
+        yield Finding(id="unsteady", text=text, station=str(unsteady.index(True) + 1))
 
 
-def _unsteady(name: str, summaries: list[ChannelMean]) -> list[Finding]:
-    """A channel that is less steady than usual, or steps within a standstill."""
-    stations = [i + 1 for i, row in enumerate(summaries) if row.unsteady and not row.stuck]
-    if not stations:
-        return []
-    usual = float(np.median([row.spread for row in summaries]))
-    text = (
-        f"{name} is less steady than usual at {count(len(stations), 'station')} of {len(summaries)} "
-        f"({listed(stations)}): it spreads more than at the others, or moves within the standstill "
-        f"(usual spread of one sample {usual:.2g}). Was the tool knocked, turned or shaken?"
-    )
-    return [Finding(id="unsteady", text=text, station=str(stations[0]))]
+def _places(where: list[bool]) -> str:
+    """How many of the stations, and which."""
+    numbers = [i for i, there in enumerate(where, 1) if there]
+    return f"{count(len(numbers), 'station')} of {len(where)} ({listed(numbers)})"
 
 
-def _drifting(name: str, summaries: list[ChannelMean], seconds: Array) -> list[Finding]:
+def _drifting(name: str, summaries: list[ChannelMean], seconds: Array) -> Iterator[Finding]:
+    """A channel that drifts at some stations."""
     drifting = [i for i, row in enumerate(summaries) if row.drifts]
-    if not drifting:
-        return []
-    worst = max(drifting, key=lambda i: abs(summaries[i].drift))
-    text = (
-        f"{name} drifts at {len(drifting)} of {len(summaries)} stations, most at station {worst + 1}: by "
-        f"{summaries[worst].drift:.3g} over {seconds[worst]:.1f} s (noise of one sample "
-        f"{summaries[worst].spread:.2g}). See the columns drift_."
-    )
-    return [Finding(id="drift", text=text, station=str(worst + 1))]
+    if drifting:
+        worst = max(drifting, key=lambda i: abs(summaries[i].drift))
+        text = (
+            f"{name} drifts at {len(drifting)} of {len(summaries)} stations, most at station {worst + 1}: by "
+            f"{summaries[worst].drift:.3g} over {seconds[worst]:.1f} s (noise of one sample "
+            f"{summaries[worst].spread:.2g}). See the columns drift_."
+        )
+        yield Finding(id="drift", text=text, station=str(worst + 1))
 
 
 def noisy_rests(
     activity: Activity, limits: Array, standstills: Standstills, threshold: float, least: float
-) -> list[Finding]:
+) -> Iterator[Finding]:
     """Stretches of at least `least` seconds that are steady on average, but above the threshold.
 
     Definition: no channel moves by more than can be rest within a window, and by the straight line
     none changes by more than `STEADY` times what its cells scatter about that line.
     """
     can_rest = activity.value > threshold
-    for channel, limit in zip(activity.cells, limits, strict=True):
+    for channel, limit in zip(activity.cells.values(), limits, strict=True):
         ranges = np.where(channel.torn, np.inf, standstill.quietest_range(channel.level))
         can_rest &= standstill.on_grid(activity.edge, channel, ranges) <= limit
     shortest = max(ceil(least / activity.cell), standstill.WINDOW)
@@ -159,18 +137,19 @@ def noisy_rests(
         i
         for i, (a, b) in enumerate(zip(start, end, strict=True))
         if not np.any((standstills.start < b) & (standstills.end > a))
-        and all(_is_steady(channel.start, channel.level, a, b) for channel in activity.cells)
+        and all(
+            _is_steady(channel.start, channel.level, a, b) for channel in activity.cells.values()
+        )
     ]
-    if not kept:
-        return []
-    enough = max(float(activity.value[first[i] : last[i]].max()) for i in kept)
-    digit = 10.0 ** (floor(log10(enough)) - 1)
-    text = (
-        f"{len(kept)} stretch{'es' if len(kept) > 1 else ''} steady on average, but too noisy for rest, "
-        f"left out: {_between(start[kept], end[kept])}. Vibration? "
-        f"--threshold {ceil(enough / digit) * digit:g} takes them."
-    )
-    return [Finding(id="noisy-rest", text=text)]
+    if kept:
+        enough = max(float(activity.value[first[i] : last[i]].max()) for i in kept)
+        digit = 10.0 ** (floor(log10(enough)) - 1)
+        text = (
+            f"{len(kept)} stretch{'es' if len(kept) > 1 else ''} steady on average, but too noisy for rest, "
+            f"left out: {_between(start[kept], end[kept])}. Vibration? "
+            f"`threshold` {ceil(enough / digit) * digit:g} takes them."
+        )
+        yield Finding(id="noisy-rest", text=text)
 
 
 def _is_steady(time: Array, level: Array, start: float, end: float) -> bool:

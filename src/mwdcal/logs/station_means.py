@@ -17,7 +17,7 @@ I. Kollár, Quantization SharedNoise (2008) (dither).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import cache
 from typing import NamedTuple
 
@@ -112,16 +112,10 @@ class ChannelMean(NamedTuple):
     stuck: bool
 
 
-def summarise_all(
-    rests: Sequence[Rest], resolution: float, say: Callable[[int], None] = lambda done: None
-) -> list[ChannelMean]:
-    """What a channel read at each standstill; `say` receives how many are done."""
+def summarise_all(rests: Sequence[Rest], resolution: float) -> list[ChannelMean]:
+    """What a channel read at each standstill."""
     noise = pooled(rests, resolution)
-    summaries = []
-    for rest in rests:
-        summaries.append(summarise(*rest, resolution, noise))
-        say(len(summaries))
-    return summaries
+    return [summarise(*rest, resolution, noise) for rest in rests]
 
 
 class Correlated(NamedTuple):

@@ -6,7 +6,6 @@ slower still: it never decides what stands still. See `standstill` for the metho
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass, replace
 from itertools import chain
 
@@ -15,13 +14,14 @@ import numpy as np
 from mwdcal.calibration.diagnosis.findings import unused_columns
 from mwdcal.calibration.record import Finding
 from mwdcal.errors import InputError
-from mwdcal.files.contract import CHANNELS, RAW, TEMPERATURE
+from mwdcal.files.contract import CHANNELS, RAW, TEMPERATURE, Range
 from mwdcal.files.formats.columns import Column
-from mwdcal.files.formats.table import Table, cell_error, numbers, shown
+from mwdcal.files.formats.table import Table, numbers
 from mwdcal.files.logs import READ, TIME, Say, silent
 from mwdcal.files.synonyms import unused
 from mwdcal.geometry.vectors import Array, Ints
 from mwdcal.logs import standstill
+from mwdcal.logs.clock import SECONDS, check_argument, row_times, unlikely_seconds
 from mwdcal.logs.standstill import Activity, Slow, Standstills
 from mwdcal.logs.station_findings import (
     Rows,
@@ -30,7 +30,6 @@ from mwdcal.logs.station_findings import (
     count,
     listed,
     noisy_rests,
-    time_unit,
 )
 from mwdcal.logs.station_means import correlated, summarise, summarise_all, widened
 
@@ -40,12 +39,10 @@ LEAST_SAMPLES = 3
 """Fewest samples of each channel at a station."""
 GAP = 5.0
 """Times the usual step between samples that are a gap."""
-MOST_CELLS = 50_000_000
-"""Cells of the longest log: four months at 15 samples a second or more."""
+THRESHOLD = Range(0.0, 1e15, "noise floors")
+"""Accepted thresholds."""
 REPORTED = 1.2
 """Factor by which correlated noise widens most means of a triad before it is reported."""
-CLOCK = re.compile(r"^t(?![A-Za-z0-9])|(?i:time|stamp|clock|epoch|seconds|millis|micros)")
-"""Names of columns that may hold the time."""
 SMALLEST = 1e-12
 """Resolution of a channel that never changes, as a share of its reading."""
 PARTS = {"": "mean", "sd_": "sd", "spread_": "spread", "drift_": "drift", "samples_": "used"}
@@ -107,22 +104,22 @@ def find_stations(
     found from the log where None. Errors: a log without time, without samples of a channel,
     or without standstills.
     """
-    _check("min-seconds", min_seconds)
-    _check("trim-seconds", trim_seconds)
-    _check("threshold", threshold)
+    check_argument("min_seconds", min_seconds, SECONDS)
+    check_argument("trim_seconds", trim_seconds, SECONDS)
+    check_argument("threshold", threshold, THRESHOLD)
     findings: list[Finding] = []
     time = row_times(log, sampling_hz)
     traces, temperature = _traces(log, time, findings)
     findings += _time_findings(log, time, traces, sampling_hz)
     say(f"looking for standstills in {len(time)} rows")
-    activity = standstill.activity(list(traces.values()))
+    activity = standstill.activity(traces)
     if not activity.cells:
         raise _short(log, time, traces)
     shortest = min_seconds
     if shortest is None:
         shortest = max(MIN_SECONDS, standstill.WINDOW * activity.cell)
     trim = max(TRIM_SECONDS, activity.cell) if trim_seconds is None else trim_seconds
-    findings += _torn(activity, list(traces), findings)
+    findings += _torn(activity, findings)
     limits, slow = _limits(activity, traces)
     value, stretch = _threshold(activity, limits, threshold, shortest + 2 * trim)
     standstills = standstill.standstills(activity, limits, value, shortest, trim, slow)
@@ -135,12 +132,12 @@ def find_stations(
     if not standstills.taken.any():
         raise StandstillError(_none(stations), stations)
     rows = _summaries(traces, *standstills.stations, findings, say)
-    columns = _columns(log, time, rows, *standstills.stations)
-    columns |= _temperatures(temperature, *standstills.stations, findings)
+    warmth = _temperatures(temperature, *standstills.stations, findings)
+    columns = _columns(log, time, warmth, rows, *standstills.stations)
     findings += about(rows, standstills, float(time[-1] - time[0]) - 2 * trim)
     metadata = {**log.metadata, "log": log.source, "log_sha256": log.digest}
     lines = range(1, len(columns["station"]) + 1)
-    return replace(stations, table=Table(_ordered(columns), metadata, log.source, lines))
+    return replace(stations, table=Table(columns, metadata, log.source, lines))
 
 
 def _threshold(
@@ -157,11 +154,6 @@ def _threshold(
     cells = int(np.ceil(least / activity.cell))
     value, stretch = standstill.choose_threshold(activity.value, cells, highest)
     return (highest, None) if np.isnan(value) else (value, stretch)
-
-
-def _check(name: str, value: float | None) -> None:
-    if value is not None and not 0 <= value < float("inf"):
-        raise InputError(f"--{name} must be a number of at least 0; got {shown(value)}.")
 
 
 def _short(log: Table, time: Array, traces: dict[str, Trace]) -> InputError:
@@ -192,56 +184,8 @@ def _none(stations: Stations) -> str:
         seen = f"nothing is left {trimmed}"
     return (
         f"{stations.table.source}: no standstill of at least {stations.min_seconds:g} s; {seen}. Stand still "
-        "for longer, lower --min-seconds or --trim-seconds, or set --threshold; --plot shows the log."
+        "for longer, lower `min_seconds` or `trim_seconds`, or set `threshold`."
     )
-
-
-def row_times(log: Table, sampling_hz: float | None) -> Array:
-    """Seconds of each row: from the rate of sampling if given, else the column `time_s`."""
-    stated = log.metadata.get("sampling_hz") if sampling_hz is None else sampling_hz
-    if TIME in log.columns and sampling_hz is None:
-        time = numbers(log, TIME)
-        for row in np.flatnonzero(np.isnan(time))[:1]:
-            advice = "Fill it in, or remove the row."
-            raise cell_error(log, TIME, int(row), f"must be filled in; got a blank cell. {advice}")
-        for row in np.flatnonzero(np.diff(time) < 0)[:1]:
-            got = f"{shown(float(time[row + 1]))} s after {shown(float(time[row]))} s"
-            advice = "Sort the log by time, or split it where the clock was set back."
-            raise cell_error(log, TIME, int(row) + 1, f"must not go back; got {got}. {advice}")
-        _check_span(log, time)
-        return time
-    if stated is None:
-        raise _timeless(log)
-    if isinstance(stated, bool) or not isinstance(stated, int | float) or not 0 < stated <= 1e9:
-        here, advice = f"{log.source}: sampling_hz", "Correct it, or add --sampling-hz."
-        if sampling_hz is not None:
-            here, advice = "--sampling-hz", "State the samples per second."
-        raise InputError(
-            f"{here} must be a number above 0 and at most 1e9 Hz; got {shown(stated)}. {advice}"
-        )
-    return np.arange(len(numbers(log, RAW[0]))) / float(stated)
-
-
-def _timeless(log: Table) -> InputError:
-    """The refusal of a log without a time, or with one of another name."""
-    clock = next((name for name in log.columns if CLOCK.search(name)), None)
-    got = "neither. Add"
-    if clock is not None:
-        got = f"'{clock}'. Rename it to '{TIME}', in seconds (convert it if it is not); or add"
-    return InputError(
-        f"{log.source}: a log needs a column '{TIME}', or its rate of sampling; got {got} "
-        "--sampling-hz 100, or a line '# sampling_hz = 100' above the column names."
-    )
-
-
-def _check_span(log: Table, time: Array) -> None:
-    """Refuse a clock that jumps so far that most of the log would be nothing."""
-    cell = max(standstill.CELL, standstill.FEWEST * standstill.time_step(time))
-    if time[-1] - time[0] > MOST_CELLS * cell:
-        row = int(np.argmax(np.diff(time))) + 1
-        got = f"{shown(float(time[row]))} s after {shown(float(time[row - 1]))} s"
-        advice = "Correct the clock, split the log there, or write the time in seconds."
-        raise cell_error(log, TIME, row, f"must not jump so far; got {got}. {advice}")
 
 
 def _traces(
@@ -303,10 +247,10 @@ def _time_findings(
     """Gaps, times that occur twice in a channel or are not used, their unit, and spare columns."""
     findings = []
     if TIME in log.columns and sampling_hz is not None:
-        text = f"--sampling-hz {sampling_hz:g} was given: the column '{TIME}' is not used."
+        text = f"`sampling_hz` {sampling_hz:g} was given: the column '{TIME}' is not used."
         findings.append(Finding(id="time-not-used", text=text))
     elif TIME in log.columns:
-        findings += time_unit(time)
+        findings += unlikely_seconds(time)
     steps = np.diff(time)
     gaps = np.flatnonzero(steps > max(GAP * standstill.time_step(time), standstill.CELL))
     if gaps.size:
@@ -321,30 +265,27 @@ def _time_findings(
     return findings + unused_columns(unused(list(log.columns), READ))
 
 
-def _torn(activity: Activity, names: list[str], findings: list[Finding]) -> list[Finding]:
+def _torn(activity: Activity, findings: list[Finding]) -> list[Finding]:
     """Stretches without samples that the times of the rows do not show, as gaps."""
     if any(finding.id == "gaps" for finding in findings):
         return []
-    torn = []
-    for channel in activity.cells:
+    torn = {}
+    for name, channel in activity.cells.items():
         between = np.append(channel.start[1:] - channel.end[:-1], 0.0)
-        torn.append(channel.torn | (between > max(activity.cell, standstill.FEWEST * channel.step)))
-    worst = max(range(len(torn)), key=lambda i: np.count_nonzero(torn[i]))
-    if not torn[worst].any():
+        limit = max(activity.cell, standstill.FEWEST * channel.step)
+        torn[name] = np.flatnonzero(channel.torn | (between > limit))
+    name = max(torn, key=lambda n: torn[n].size)
+    if not torn[name].size:
         return []
-    name, first = names[activity.channels[worst]], int(np.argmax(torn[worst]))
-    gaps = count(int(np.count_nonzero(torn[worst])), "gap")
-    at = f"{activity.cells[worst].start[first]:.10g} s"
-    text = f"{name} has {gaps} of several samples, the first after {at}: no standstill goes across one."
-    return [Finding(id="gaps", text=text)]
+    at = f"{activity.cells[name].start[torn[name][0]]:.10g} s"
+    gaps = f"{name} has {count(torn[name].size, 'gap')} of several samples, the first after {at}"
+    return [Finding(id="gaps", text=f"{gaps}: no standstill goes across one.")]
 
 
 def _equal_times(log: Table, time: Array, names: list[str]) -> list[Finding]:
     """Samples of a channel at one time; rows of different channels may share theirs."""
-    present = {name: ~np.isnan(numbers(log, name)) for name in names}
-    twice = {
-        name: int(np.count_nonzero(np.diff(time[filled]) == 0)) for name, filled in present.items()
-    }
+    filled = {name: time[~np.isnan(numbers(log, name))] for name in names}
+    twice = {name: int(np.count_nonzero(np.diff(own) == 0)) for name, own in filled.items()}
     name = max(twice, key=lambda n: twice[n])
     if not twice[name]:
         return []
@@ -357,18 +298,18 @@ def _equal_times(log: Table, time: Array, names: list[str]) -> list[Finding]:
 
 def _limits(activity: Activity, traces: dict[str, Trace]) -> tuple[Array, list[Slow]]:
     """The largest range that can be rest of each channel looked at, and the others that can step."""
-    names = list(traces)
-    cells = dict(zip((names[i] for i in activity.channels), activity.cells, strict=True))
-    cut = {
-        name: cells[name] if name in cells else standstill.cells_of(*trace, standstill.CELL)
+    slow_cells = {
+        name: standstill.cells_of(*trace, standstill.CELL)
         for name, trace in traces.items()
+        if name not in activity.cells
     }
+    cut = {**activity.cells, **slow_cells}
     limits, slow = [], []
     for name, channel in cut.items():
         triad = next(kind for kind in CHANNELS.values() if name in kind)
         levels = [cut[n].level for n in triad if n in cut and len(cut[n].level)]
         size = standstill.triad_size(levels) if levels else 0.0
-        if name in cells:
+        if name in activity.cells:
             limits.append(standstill.rest_limit(channel, size))
         else:
             noise = max(channel.rough, channel.resolution)
@@ -405,14 +346,11 @@ def _summaries(
     """What each channel read at each station."""
     summaries: Rows = {}
     for name, (time, value) in traces.items():
+        say(f"means of {name} at {count(len(start), 'station')}")
         resolution = standstill.resolution(value) or SMALLEST * abs(value[0]) or SMALLEST
         places = zip(*_within(time, start, end), strict=True)
         rests = [(time[a:b], value[a:b]) for a, b in places]
-
-        def progress(done: int, name: str = name) -> None:
-            say(f"station {done} of {len(start)}, {name}")
-
-        summaries[name] = summarise_all(rests, float(resolution), progress)
+        summaries[name] = summarise_all(rests, float(resolution))
     for triad in CHANNELS.values():
         summaries |= _widened({n: summaries[n] for n in triad if n in summaries}, findings)
     return summaries
@@ -420,26 +358,29 @@ def _summaries(
 
 def _widened(triad: Rows, findings: list[Finding]) -> Rows:
     """What the channels of a triad read, known less well where their noise is correlated."""
-    correlation = correlated([*triad.values()])
+    variances, plain = correlated([*triad.values()])
     wider = {
-        name: widened(means, float(variance))
-        for (name, means), variance in zip(triad.items(), correlation.variance, strict=True)
+        name: widened(triad[name], float(variance))
+        for name, variance in zip(triad, variances, strict=True)
     }
     pairs = zip(chain(*wider.values()), chain(*triad.values()), strict=True)
     grown = [after.sd > REPORTED * before.sd for after, before in pairs]
-    if correlation.plain and 2 * sum(grown) > len(grown):
+    if plain and 2 * sum(grown) > len(grown):
         findings.append(correlated_noise([*triad]))
     return wider
 
 
-def _columns(log: Table, time: Array, rows: Rows, start: Array, end: Array) -> dict[str, Column]:
-    """The run: labels and times, means, and what is known of each mean."""
+def _columns(
+    log: Table, time: Array, warmth: dict[str, Column], rows: Rows, start: Array, end: Array
+) -> dict[str, Column]:
+    """The run: labels and times, temperatures, means, and what is known of each mean."""
     first, last = _within(time, start, end)
     columns: dict[str, Column] = {
         "station": [str(i) for i in range(1, len(start) + 1)],
         "start_s": time[first],
         "end_s": time[last - 1],
         "samples": np.asarray(last - first, float),
+        **warmth,
     }
     for prefix, part in PARTS.items():
         for name, summaries in rows.items():
@@ -490,12 +431,6 @@ def _temperature(
     grid = np.linspace(start, end, 9)
     course = np.interp(grid, time, value)
     return float(course.mean()), float(np.polyfit(grid - start, course, 1)[0] * (end - start))
-
-
-def _ordered(columns: dict[str, Column]) -> dict[str, Column]:
-    """The columns with the temperature before the means."""
-    first = ("station", "start_s", "end_s", "samples", "temperature_c", "drift_temperature_c")
-    return {n: columns[n] for n in first if n in columns} | columns
 
 
 def _middle(value: Array) -> float:

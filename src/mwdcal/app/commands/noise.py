@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from mwdcal.app.commands import options
-from mwdcal.app.messages import print_result, say
+from mwdcal.app.messages import findings_as_typed, print_result, say
 
 
 @options.command()
@@ -64,7 +64,7 @@ def command(
         **times,
     )
     unused = unused_columns(synonyms.unused(list(readings.columns), COLUMNS))
-    noise = replace(noise, findings=[*noise.findings, *unused])
+    noise = replace(noise, findings=findings_as_typed([*noise.findings, *unused]))
     drawn = picture(page.figure(noise), plot) if plot else b""
     rendered = page.render(noise) if report else ""
     if plot:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from mwdcal.app.commands import options
-from mwdcal.app.messages import lines, print_result, say
+from mwdcal.app.messages import findings_as_typed, lines, print_result, say
 from mwdcal.errors import InputError
 
 
@@ -38,6 +38,8 @@ def command(
     Example: mwdcal stations log.csv -o run.csv --plot log.png
     Exit: 0 written, 2 input cannot be read or never stands still.
     """
+    from dataclasses import replace
+
     from mwdcal.app import progress
     from mwdcal.app.pages import stations as page
     from mwdcal.app.pages.pictures import picture
@@ -51,11 +53,13 @@ def command(
     try:
         stations = find_stations(readings, say=slowly, **search)
     except StandstillError as error:  # the picture helps most then
-        message = [str(error), *lines(error.analysis.findings)]
+        advice = "" if plot else " `plot` shows the log."
+        message = [f"{error}{advice}", *lines(error.analysis.findings)]
         if plot:
             atomic.write(plot, picture(page.figure(error.analysis), plot))
             message.append(f"wrote {plot} (picture)")
         raise InputError("\n".join(message)) from None
+    stations = replace(stations, findings=findings_as_typed(stations.findings))
     drawn = picture(page.figure(stations), plot) if plot else b""
     table.write(output, stations.table)
     if plot:

@@ -149,11 +149,9 @@ def _thinned(x: Array, y: Array) -> tuple[Array, Array]:
 
 def _draw_triad(axes: Axes, stations: Stations, names: list[str]) -> None:
     """Medians of short cells of the channels that have them, else the samples."""
-    traces, activity = stations.traces, stations.activity
-    measured = [list(traces)[i] for i in activity.channels]
-    cells = dict(zip(measured, activity.cells, strict=True))
+    cells = stations.activity.cells
     for name in names:
-        x, y = (cells[name].start, cells[name].level) if name in cells else traces[name]
+        x, y = (cells[name].start, cells[name].level) if name in cells else stations.traces[name]
         look = {"color": plots.AXES[name[-1]], "ls": plots.LINES[name[-1]]}
         axes.plot(*_thinned(x, y), lw=0.9, label=name, **look)
     axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), handlelength=2.6)
@@ -167,6 +165,8 @@ def _draw_activity(axes: Axes, stations: Stations) -> None:
     axes.set(yscale="log", ylabel="activity,\nnoise floors", xlabel="time, s")
     axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
     axes.yaxis.set_minor_formatter(lambda value, _: "")
+    if not stations.threshold:
+        return  # a logarithmic axis has no zero
     axes.axhline(stations.threshold, color=plots.MARKED, lw=1, ls=(0, (5, 3)))
     axes.annotate(
         f"threshold {stations.threshold:.3g}", (1.0, stations.threshold), (6, 0), va="center",
