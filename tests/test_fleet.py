@@ -732,7 +732,7 @@ def test_workers_end_with_the_command_that_was_killed(tmp_path):
 def test_other_options_or_input_are_other_parts(fleet):
     path, _ = fleet
     source = sources.open_source(path)
-    part = fleet_tables.partitions(source, fleet_tables.find_tools(source), path.parent)[0]
+    part = fleet_tables.partitions(source, fleet_tables.find_tools(source), path.parent, print)[0]
     profile = load_profile("servo")[0]
     plan = Plan.of(source, profile, Options())
     others = [
@@ -742,7 +742,7 @@ def test_other_options_or_input_are_other_parts(fleet):
         replace(plan, metadata={"declination_deg": 1.0}),
     ]
     keys = [each.key(part) for each in (plan, *others)]
-    piece = replace(part.pieces[0], stamp=(1, 1))
+    piece = replace(part.pieces[0], stamp=(1, 1, 1))
     keys.append(plan.key(replace(part, pieces=(piece,))))
     assert len(set(keys)) == len(keys)
     with pytest.raises(InputError, match="same version"):
@@ -800,7 +800,7 @@ def test_partitions_are_of_whole_tools_and_bounded(tmp_path, monkeypatch, batch)
     tools = fleet_tables.find_tools(source)
     assert tools.count == 9
     assert tools.together
-    parts = fleet_tables.partitions(source, tools, tmp_path)
+    parts = fleet_tables.partitions(source, tools, tmp_path, print)
     assert [part.rows for part in parts] == [56, 56, 56, 56, 28]
     whole = pq.read_table(path)
     starts = [sum(part.rows for part in parts[:i]) for i in range(len(parts))]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -20,6 +19,7 @@ from mwdcal.errors import InputError
 from mwdcal.files.contract import AZIMUTH_KEYS, CHANNELS
 from mwdcal.files.formats import parquet
 from mwdcal.fleet.calibrate import OK, BatchOutcome, calibrate_batch, names
+from mwdcal.fleet.kept import sealed
 from mwdcal.fleet.runs import Batch, Rows, batches, refused_tools
 from mwdcal.fleet.sources import SERIAL, Source
 from mwdcal.fleet.tables import Partition, read
@@ -30,9 +30,6 @@ LISTS = ("findings", "reshoot")
 """Columns of lists: ids of findings, and labels of stations to take again."""
 WHOLE = ("rank", "size", "order", "stations")
 """Ends of the names of columns of whole numbers."""
-
-END = b"\xff\xff\xff\xff\x00\x00\x00\x00"
-"""End of a stream in Arrow's format."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +73,7 @@ def load(plan: Plan, partition: Partition) -> bytes:
 
 
 def solve(plan: Plan, loaded: bytes) -> bytes:
-    """Calibrate the tools of loaded rows: a table in Arrow's stream format, one row per tool."""
+    """Calibrate the tools of loaded rows: a sealed part, one row per tool in Arrow's stream format."""
     if plan.version != __version__:
         raise InputError(
             f"the worker runs mwdcal {__version__}, the command {plan.version}. Install the "
@@ -85,16 +82,7 @@ def solve(plan: Plan, loaded: bytes) -> bytes:
     arrow, _ = parquet.modules(plan.source)
     table = arrow.ipc.open_stream(loaded).read_all()
     rows = Rows.of(table, plan.source, plan.metadata, plan.profile)
-    return packed(_result(rows, plan))
-
-
-def is_whole(path: Path) -> bool:
-    """Whether a finished part is there: Arrow's stream ends with its own mark."""
-    if not path.is_file():
-        return False
-    with path.open("rb") as stream:
-        stream.seek(max(path.stat().st_size - len(END), 0))
-        return stream.read() == END
+    return sealed(packed(_result(rows, plan)))
 
 
 def packed(table: Any) -> bytes:
@@ -189,5 +177,6 @@ def _temperatures(rows: Rows) -> tuple[Array, Array]:
     if values is None:
         none = np.full(len(rows.counts), np.nan)
         return none, none
+    values = np.where(np.isfinite(values), values, np.nan)  # of a tool that is refused
     first = rows.starts[:-1]
     return np.minimum.reduceat(values, first), np.maximum.reduceat(values, first)
