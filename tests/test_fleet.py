@@ -872,10 +872,9 @@ def test_a_cluster_without_its_extra(fleet, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_no_cluster_there(fleet, tmp_path, monkeypatch):
+def test_no_cluster_there(fleet, tmp_path):
     pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
     path, _ = fleet
-    monkeypatch.setattr(pool, "CLUSTER_TIMEOUT", "1s")
     ran = process(
         "fleet", path, "-o", tmp_path / "o.parquet", "--scheduler", "nonsense", timeout=90
     )
