@@ -178,7 +178,7 @@ def _computed(
         results = pool.results(steps, tasks, workers or cores(), scheduler)
         for count, (index, content) in enumerate(results, 1):
             check_unchanged(tasks[index].pieces)
-            atomic.write(paths[index], content, durable=False)
+            atomic.write(paths[index], kept.sealed(content, paths[index].name), durable=False)
             disk.submit(kept.to_disk, paths[index])
             tools += tasks[index].tools
             rate = tools / (time.perf_counter() - begun)

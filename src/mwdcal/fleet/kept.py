@@ -31,26 +31,27 @@ _STREAM = b"\xff\xff\xff\xff"
 """How Arrow's streams begin: parts of mwdcal before they were sealed."""
 
 
-def sealed(content: bytes) -> bytes:
-    """A part with its seal."""
-    return _head(content) + content
+def sealed(content: bytes, name: str) -> bytes:
+    """A part with its seal, which also holds its name."""
+    return _head(content, name) + content
 
 
-def _head(content: bytes | memoryview) -> bytes:
+def _head(content: bytes | memoryview, name: str) -> bytes:
     """The seal of a part."""
-    return (MARK + b"%016x %08x" % (len(content), crc32(content))).ljust(HEAD - 1) + b"\n"
+    check = crc32(content, crc32(name.encode()))
+    return (MARK + b"%016x %08x" % (len(content), check)).ljust(HEAD - 1) + b"\n"
 
 
-def unsealed(data: bytes) -> memoryview | None:
+def unsealed(data: bytes, name: str) -> memoryview | None:
     """The content of a sealed part; None where it is damaged."""
     content = memoryview(data)[HEAD:]
-    return content if data[:HEAD] == _head(content) else None
+    return content if data[:HEAD] == _head(content, name) else None
 
 
 def read_part(path: Path) -> memoryview | None:
     """The content of a finished part; None where it is missing or damaged."""
     with contextlib.suppress(OSError):
-        return unsealed(path.read_bytes())
+        return unsealed(path.read_bytes(), path.name)
     return None
 
 
@@ -105,10 +106,10 @@ def remove(folder: Path) -> None:
 
 
 def _is_ours(path: Path, marks: tuple[bytes, ...]) -> bool:
-    """Whether a file begins with one of our marks, or a loss of power has left nothing in it."""
+    """Whether a file begins with one of our marks, or with what a loss of power leaves of one."""
     with path.open("rb") as stream:
         head = stream.read(HEAD)
-        return head.startswith(marks) or not (head + stream.read()).strip(b"\0")
+    return head.startswith(marks) or not head.strip(b"\0")
 
 
 def is_dealt(folder: Path) -> bool:

@@ -19,7 +19,6 @@ from mwdcal.errors import InputError
 from mwdcal.files.contract import AZIMUTH_KEYS, CHANNELS
 from mwdcal.files.formats import parquet
 from mwdcal.fleet.calibrate import OK, BatchOutcome, calibrate_batch, names
-from mwdcal.fleet.kept import sealed
 from mwdcal.fleet.runs import Batch, Rows, batches, refused_tools
 from mwdcal.fleet.sources import SERIAL, Source
 from mwdcal.fleet.tables import Partition, read
@@ -73,7 +72,7 @@ def load(plan: Plan, partition: Partition) -> bytes:
 
 
 def solve(plan: Plan, loaded: bytes) -> bytes:
-    """Calibrate the tools of loaded rows: a sealed part, one row per tool in Arrow's stream format."""
+    """Calibrate the tools of loaded rows: a table in Arrow's stream format, one row per tool."""
     if plan.version != __version__:
         raise InputError(
             f"the worker runs mwdcal {__version__}, the command {plan.version}. Install the "
@@ -82,7 +81,7 @@ def solve(plan: Plan, loaded: bytes) -> bytes:
     arrow, _ = parquet.modules(plan.source)
     table = arrow.ipc.open_stream(loaded).read_all()
     rows = Rows.of(table, plan.source, plan.metadata, plan.profile)
-    return sealed(packed(_result(rows, plan)))
+    return packed(_result(rows, plan))
 
 
 def packed(table: Any) -> bytes:
