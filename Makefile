@@ -3,7 +3,7 @@
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: papers measured verification mutations help demo test test-quick check bench docs clean
+.PHONY: papers measured verification mutations kills help demo test test-quick check bench docs clean
 
 PYTHON ?= python3
 VENV := .venv
@@ -49,6 +49,9 @@ test-quick: $(INSTALLED) ## run the most telling tests (under a minute)
 
 mutations: $(INSTALLED) ## change one operator or constant in so many (EVERY=40) and list what no test notices
 	@$(CLOCK); $(ONE_THREAD) $(BIN)/python tests/mutation_run.py --every $(or $(EVERY),40)
+
+kills: $(INSTALLED) ## end commands at random moments (COUNT=1000) and check what they leave
+	@$(CLOCK); $(ONE_THREAD) $(BIN)/python tests/kills.py --count $(or $(COUNT),1000) --seed $(or $(SEED),1)
 
 check: $(INSTALLED) ## lint, format, types, architecture, doctests, docs
 	@$(CLOCK); \

@@ -789,6 +789,39 @@ def test_workers_are_prepared_with_settings_of_their_own(monkeypatch):
     assert dict(pool.results(tripled, [1, 2, 3], 2, None)) == {0: b"\3", 1: b"\6", 2: b"\t"}
 
 
+@pytest.mark.slow
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="counts threads in /proc")
+def test_the_process_that_is_copied_has_no_thread_of_a_memory_pool(fleet, tmp_path):
+    """Else Python warns from 3.12 on that the copies may hang."""
+    script = (
+        "import os\nfrom multiprocessing import forkserver\nfrom mwdcal.app import cli, fleet_table\n"
+        "tidy = fleet_table._tidy\ndef count(folder):\n    tidy(folder)\n"
+        "    pid = forkserver._forkserver._forkserver_pid\n"
+        "    for each in os.listdir(f'/proc/{pid}/task'):\n"
+        "        with open(f'/proc/{pid}/task/{each}/comm') as name:\n"
+        "            print('thread', name.read().strip(), flush=True)\n"
+        "fleet_table._tidy = count\nif __name__ == '__main__':\n    cli.main()\n"
+    )
+    (tmp_path / "count.py").write_text(script, "utf-8")
+    command = [
+        "fleet",
+        fleet[0],
+        "-o",
+        tmp_path / "cals.parquet",
+        "--tool",
+        "servo",
+        "--workers",
+        2,
+    ]
+    done = subprocess.run(
+        [sys.executable, "-W", "always", tmp_path / "count.py", *map(str, command)],
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    assert "thread python" in done.stdout
+    assert "jemalloc" not in done.stdout
+    assert "DeprecationWarning" not in done.stderr
+
+
 @pytest.mark.parametrize("batch", [5, 32_768])
 def test_partitions_are_of_whole_tools_and_bounded(tmp_path, monkeypatch, batch):
     monkeypatch.setattr(fleet_tables, "ROWS", (50, 100))

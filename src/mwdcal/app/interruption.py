@@ -49,7 +49,7 @@ def orderly_end() -> Iterator[None]:
     except Exception as error:  # of a module that was interrupted while it was loaded
         if not received:
             raise
-        raise _cause(error) or Ended(received[0][0]) from error
+        raise _cause(error) or Ended(received[0][0]) from None
     finally:
         for each, handler in handlers.items():
             signal.signal(each, signal.SIG_IGN if received else handler)  # only the exit is left

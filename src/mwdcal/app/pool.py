@@ -38,8 +38,12 @@ SETTINGS = {
     **dict.fromkeys(ONE_THREAD, "1"),
     "MALLOC_MMAP_THRESHOLD_": str(2**25),
     "MALLOC_TRIM_THRESHOLD_": str(2**26),
+    "JE_ARROW_MALLOC_CONF": "background_thread:false",
 }
-"""Environment of a worker: there is one per core, and it keeps the memory that it will need again."""
+"""Environment of a worker: there is one per core, and it keeps the memory that it will need again.
+
+The process that workers are copies of has one thread: Python warns of copies of several.
+"""
 ATTEMPTS = 3
 """How often a part whose worker died is given to another."""
 CLUSTER_TIMEOUT = 30.0
