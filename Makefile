@@ -4,7 +4,7 @@ SHELL := /bin/bash
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .PHONY: papers measured verification mutations help demo test test-quick test-oldest test-versions \
-	fuzz check bench docs clean
+	fuzz kills check bench docs clean
 
 PYTHON ?= python3
 PYTHONS ?= python3.12 python3.13
@@ -74,6 +74,9 @@ fuzz: $(INSTALLED) ## run random commands on damaged files (SEEDS=0:100000 MINUT
 
 mutations: $(INSTALLED) ## change one operator or constant in so many (EVERY=40) and list what no test notices
 	@$(CLOCK); $(ONE_THREAD) $(BIN)/python tests/mutation_run.py --every $(or $(EVERY),40)
+
+kills: $(INSTALLED) ## end commands at random moments (COUNT=1000) and check what they leave
+	@$(CLOCK); $(ONE_THREAD) $(BIN)/python tests/kills.py --count $(or $(COUNT),1000) --seed $(or $(SEED),1)
 
 check: $(INSTALLED) ## lint, format, types, architecture, doctests, docs
 	@$(CLOCK); \

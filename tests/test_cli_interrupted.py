@@ -13,7 +13,7 @@ import pytest
 
 from cli_support import EXAMPLE, mwdcal, process
 from mwdcal.app import fleet_table
-from mwdcal.app.interruption import Ended
+from mwdcal.app.interruption import Ended, orderly_end, report
 
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="POSIX signals")
 
@@ -197,12 +197,73 @@ def test_an_interrupted_fleet_says_that_finished_parts_are_kept(tmp_path, monkey
         raise stop
 
     monkeypatch.setattr(fleet_table, "calibrate_table", interrupt)
+    (tmp_path / "runs.parquet").touch()
     before = [signal.getsignal(getattr(signal, name)) for name in ENDINGS]
     ran = mwdcal("fleet", tmp_path / "runs.parquet", "-o", tmp_path / "cals.parquet")
     assert ran.code == 128 + (signal.SIGTERM if isinstance(stop, Ended) else signal.SIGINT)
     word = ran.err.strip().removeprefix("mwdcal: ")
     assert word.endswith("ed. Finished parts are kept: the same command goes on from there.")
     assert [signal.getsignal(getattr(signal, name)) for name in ENDINGS] == before
+
+
+@pytest.fixture
+def handlers():
+    """Handlers of signals that are put back."""
+    numbers = [getattr(signal, name) for name in ENDINGS]
+    before = {number: signal.getsignal(number) for number in numbers}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.parametrize("name", ENDINGS)
+def test_a_module_that_makes_another_error_of_a_signal_does_not_hide_it(handlers, name):
+    """As extension modules do that are interrupted while they are loaded."""
+    number = getattr(signal, name)
+
+    def load():
+        try:
+            signal.raise_signal(number)
+        except KeyboardInterrupt as cause:
+            raise ImportError("initialization failed") from cause
+
+    with pytest.raises(Ended) as stop, orderly_end():
+        load()
+    assert report(stop.value.__cause__ or stop.value)[1] == 128 + number
+
+
+def test_a_signal_in_a_place_that_cannot_fail_ends_the_command_all_the_same(handlers, capfd):
+    class Fragile:
+        def __del__(self):
+            signal.raise_signal(signal.SIGTERM)
+
+    def work():
+        each = Fragile()
+        del each
+        time.sleep(10)
+
+    with pytest.raises(Ended), orderly_end():
+        work()
+    assert capfd.readouterr().err == ""
+
+
+def test_other_errors_stay_what_they_are():
+    with pytest.raises(ImportError), orderly_end():
+        raise ImportError("no such module")
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes on this system")
+def test_a_command_that_waits_for_a_pipe_can_be_terminated(tmp_path):
+    pipe = tmp_path / "tool.toml"
+    os.mkfifo(pipe)
+    arguments = ("calibrate", EXAMPLE / "run.csv", "--tool", pipe, "-o", tmp_path / "cal.json")
+    child = started("import sys\nfrom mwdcal.app.cli import main\nmain(sys.argv[1:])", *arguments)
+    time.sleep(2)
+    child.send_signal(signal.SIGTERM)
+    _, err = child.communicate(timeout=30)
+    assert child.returncode in (2, 128 + signal.SIGTERM)
+    assert err.startswith("mwdcal: ")
+    assert "Traceback" not in err
 
 
 def without_time(path):

@@ -732,7 +732,7 @@ def test_workers_end_with_the_command_that_was_killed(tmp_path):
 def test_other_options_or_input_are_other_parts(fleet):
     path, _ = fleet
     source = sources.open_source(path)
-    part = fleet_tables.partitions(source, fleet_tables.find_tools(source), path.parent)[0]
+    part = fleet_tables.partitions(source, fleet_tables.find_tools(source), path.parent, print)[0]
     profile = load_profile("servo")[0]
     plan = Plan.of(source, profile, Options())
     others = [
@@ -742,7 +742,7 @@ def test_other_options_or_input_are_other_parts(fleet):
         replace(plan, metadata={"declination_deg": 1.0}),
     ]
     keys = [each.key(part) for each in (plan, *others)]
-    piece = replace(part.pieces[0], stamp=(1, 1))
+    piece = replace(part.pieces[0], stamp=(1, 1, 1))
     keys.append(plan.key(replace(part, pieces=(piece,))))
     assert len(set(keys)) == len(keys)
     with pytest.raises(InputError, match="same version"):
@@ -789,6 +789,39 @@ def test_workers_are_prepared_with_settings_of_their_own(monkeypatch):
     assert dict(pool.results(tripled, [1, 2, 3], 2, None)) == {0: b"\3", 1: b"\6", 2: b"\t"}
 
 
+@pytest.mark.slow
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="counts threads in /proc")
+def test_the_process_that_is_copied_has_no_thread_of_a_memory_pool(fleet, tmp_path):
+    """Else Python warns from 3.12 on that the copies may hang."""
+    script = (
+        "import os\nfrom multiprocessing import forkserver\nfrom mwdcal.app import cli, fleet_table\n"
+        "tidy = fleet_table._tidy\ndef count(folder):\n    tidy(folder)\n"
+        "    pid = forkserver._forkserver._forkserver_pid\n"
+        "    for each in os.listdir(f'/proc/{pid}/task'):\n"
+        "        with open(f'/proc/{pid}/task/{each}/comm') as name:\n"
+        "            print('thread', name.read().strip(), flush=True)\n"
+        "fleet_table._tidy = count\nif __name__ == '__main__':\n    cli.main()\n"
+    )
+    (tmp_path / "count.py").write_text(script, "utf-8")
+    command = [
+        "fleet",
+        fleet[0],
+        "-o",
+        tmp_path / "cals.parquet",
+        "--tool",
+        "servo",
+        "--workers",
+        2,
+    ]
+    done = subprocess.run(
+        [sys.executable, "-W", "always", tmp_path / "count.py", *map(str, command)],
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    assert "thread python" in done.stdout
+    assert "jemalloc" not in done.stdout
+    assert "DeprecationWarning" not in done.stderr
+
+
 @pytest.mark.parametrize("batch", [5, 32_768])
 def test_partitions_are_of_whole_tools_and_bounded(tmp_path, monkeypatch, batch):
     monkeypatch.setattr(fleet_tables, "ROWS", (50, 100))
@@ -800,7 +833,7 @@ def test_partitions_are_of_whole_tools_and_bounded(tmp_path, monkeypatch, batch)
     tools = fleet_tables.find_tools(source)
     assert tools.count == 9
     assert tools.together
-    parts = fleet_tables.partitions(source, tools, tmp_path)
+    parts = fleet_tables.partitions(source, tools, tmp_path, print)
     assert [part.rows for part in parts] == [56, 56, 56, 56, 28]
     whole = pq.read_table(path)
     starts = [sum(part.rows for part in parts[:i]) for i in range(len(parts))]
@@ -872,10 +905,9 @@ def test_a_cluster_without_its_extra(fleet, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_no_cluster_there(fleet, tmp_path, monkeypatch):
+def test_no_cluster_there(fleet, tmp_path):
     pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
     path, _ = fleet
-    monkeypatch.setattr(pool, "CLUSTER_TIMEOUT", "1s")
     ran = process(
         "fleet", path, "-o", tmp_path / "o.parquet", "--scheduler", "nonsense", timeout=90
     )

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-import shutil
 import time
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
@@ -25,11 +26,12 @@ from mwdcal.calibration.diagnosis.refusals import check_options, no_temperature
 from mwdcal.calibration.methods import check_stand_errors
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.prior import DATASHEET, profile_for
-from mwdcal.errors import InputError
+from mwdcal.errors import InputError, reason
 from mwdcal.files import profiles
 from mwdcal.files.formats import atomic, parquet
-from mwdcal.fleet.parts import Plan, is_whole, load, solve
-from mwdcal.fleet.sources import SERIAL, Source, open_source
+from mwdcal.fleet import kept
+from mwdcal.fleet.parts import Plan, load, solve
+from mwdcal.fleet.sources import SERIAL, Source, check_unchanged, open_source
 from mwdcal.fleet.tables import Partition, Tools, find_tools, in_several_folders, partitions
 from mwdcal.sensor.profile import Profile
 from mwdcal.use.correction_numba import cores
@@ -61,21 +63,23 @@ def calibrate_table(
     _check_target(target, runs)
     folder = target.with_name(target.name + ".parts")
     plan = Plan.of(source, profile, options)
+    kept.check_folder(folder)
     with _alone(folder, output):
         tools = find_tools(source)
-        if not tools.together:
-            say("the rows of a tool are not together: dealing them into files of whole tools first")
-        parts = {f"{plan.key(part)}.arrow": part for part in partitions(source, tools, folder)}
-        before = sum(is_whole(folder / name) for name in parts)
+        parts = {f"{plan.key(part)}.arrow": part for part in partitions(source, tools, folder, say)}
+        paths = [folder / name for name in parts]
+        done, damaged = kept.finished(paths)
         counts = {"tool": tools.count, "station": source.rows, "part": len(parts)}
         counted = ", ".join(plural(count, noun) for noun, count in counts.items())
-        say(f"{counted}, {before} done before")
-        paths = [folder / name for name in parts]
+        say(f"{counted}, {len(done)} done before")
+        if damaged:
+            say(f"! {plural(damaged, 'part')} done before, but damaged: computed again")
         steps = pool.Steps(partial(load, plan), partial(solve, plan))
-        with contextlib.closing(
-            _missing_parts(steps, list(parts.values()), paths, workers, scheduler, say)
-        ) as finished:
-            _merge(paths, finished, target, _metadata(source, plan, typed, digest))
+        missing = {
+            path: part for path, part in zip(paths, parts.values(), strict=True) if path not in done
+        }
+        with contextlib.closing(_computed(steps, missing, workers, scheduler, say)) as computed:
+            _merge(paths, done, computed, target, _metadata(source, plan, typed, digest), source)
         _tidy(folder)
     return summarise(
         target,
@@ -85,7 +89,7 @@ def calibrate_table(
         output=str(output),
         stations=source.rows,
         parts=len(parts),
-        parts_done_before=before,
+        parts_done_before=len(done),
         seconds=round(time.perf_counter() - begun, 3),
         unused=unused,
     )
@@ -94,7 +98,7 @@ def calibrate_table(
 @contextlib.contextmanager
 def _alone(folder: Path, output: Path) -> Iterator[None]:
     """Refuse a second command with the same output, as long as the first one lives."""
-    with atomic.holding(folder / "lock") as ours:
+    with atomic.holding(folder / kept.LOCK) as ours:
         if not ours:
             raise InputError(
                 f"cannot write '{output}': another fleet is writing this output. Wait for it, or choose "
@@ -156,28 +160,35 @@ def _check_target(target: Path, runs: Path) -> None:
         )
 
 
-def _missing_parts(
+def _computed(
     steps: pool.Steps,
-    parts: list[Partition],
-    paths: list[Path],
+    missing: Mapping[Path, Partition],
     workers: int | None,
     scheduler: str | None,
     say: Callable[[str], None],
 ) -> Generator[Path, None, None]:
-    """Do the parts that are not there yet, one by one; each is written when it is whole."""
-    missing = [index for index, path in enumerate(paths) if not is_whole(path)]
+    """Compute the parts that are missing, one by one; each is kept when it is whole."""
     if not missing:
         return
     begun, tools, slowly = time.perf_counter(), 0, progress.slowly(say, EVERY)
-    tasks = [parts[index] for index in missing]
+    paths, tasks = list(missing), list(missing.values())
     _load_what_the_end_needs()
-    results = pool.results(steps, tasks, workers or cores(), scheduler)
-    for count, (index, content) in enumerate(results, 1):
-        atomic.write(paths[missing[index]], content, durable=False)
-        tools += tasks[index].tools
-        rate = tools / (time.perf_counter() - begun)
-        slowly(f"part {count} of {len(missing)}   {rate:.0f} tools/s")
-        yield paths[missing[index]]
+    disk = ThreadPoolExecutor(1)  # the next part is computed while one goes to the disk
+    try:
+        results = pool.results(steps, tasks, workers or cores(), scheduler)
+        for count, (index, content) in enumerate(results, 1):
+            check_unchanged(tasks[index].pieces)
+            atomic.write(paths[index], kept.sealed(content, paths[index].name), durable=False)
+            disk.submit(kept.to_disk, paths[index])
+            tools += tasks[index].tools
+            rate = tools / (time.perf_counter() - begun)
+            slowly(f"part {count} of {len(missing)}   {rate:.0f} tools/s")
+            yield paths[index]
+    except InputError:
+        check_unchanged(piece for task in tasks for piece in task.pieces)  # then that is the reason
+        raise
+    finally:
+        disk.shutdown(cancel_futures=True)
 
 
 def _load_what_the_end_needs() -> None:
@@ -187,42 +198,73 @@ def _load_what_the_end_needs() -> None:
 
 
 def _merge(
-    paths: list[Path], finished: Iterator[Path], target: Path, metadata: dict[str, object]
+    paths: list[Path],
+    done: set[Path],
+    computed: Iterator[Path],
+    target: Path,
+    metadata: dict[str, object],
+    source: Source,
 ) -> None:
     """One Parquet table of all parts, in their order; one part in memory at a time.
 
-    A part is added when it and all before it are `finished`, while workers go on with others.
+    A part is added when it and all before it are `done`, while workers go on with others.
     """
     arrow, pq = parquet.modules(target.name)
     described = {parquet.KEY: msgspec.json.encode(metadata, enc_hook=str)}
-    writer = None
+    ready, writer = set(done), None
     with atomic.replacing(target) as stream:
         try:
             for path in paths:
-                while not is_whole(path) and next(finished, None):
-                    continue
-                with arrow.memory_map(str(path)) as file:
-                    part = arrow.ipc.open_stream(file).read_all()
+                while path not in ready:
+                    ready.add(next(computed))
+                part = arrow.ipc.open_stream(_content(path)).read_all()
+                with _writing(target):
                     if writer is None:
                         schema = part.schema.with_metadata(described)
                         texts = [f.name for f in schema if not arrow.types.is_floating(f.type)]
                         writer = pq.ParquetWriter(stream.name, schema, use_dictionary=texts)
                     writer.write_table(part.cast(writer.schema))
-            for _ in finished:
+            for _ in computed:
                 pass
-            if writer is not None:
-                writer.close()
-        except OSError as error:
-            raise InputError(
-                f"cannot write '{target}': {error.strerror or error}. Finished parts are kept: make "
-                "room, or choose another place, and run the same command again."
-            ) from error
+            with _writing(target):
+                _close(writer)
+        finally:
+            with contextlib.suppress(OSError):
+                _close(writer)
+        check_unchanged(source.pieces)
+
+
+def _close(writer: Any) -> None:
+    """Close a Parquet file, once: where the disk is full a second attempt fails as the first did."""
+    if writer is not None and writer.is_open:
+        writer.is_open = False
+        writer.writer.close()
+
+
+def _content(path: Path) -> memoryview:
+    """The content of a part that was whole."""
+    content = kept.read_part(path)
+    if content is None:
+        raise InputError(
+            f"'{path}': the finished part was changed or removed. Run the same command again: it is "
+            "computed anew."
+        )
+    return content
+
+
+@contextlib.contextmanager
+def _writing(target: Path) -> Iterator[None]:
+    """What the system refuses in the block is the writing of the output."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(
+            f"cannot write '{target}': {reason(error)}. Finished parts are kept: make "
+            "room, or choose another place, and run the same command again."
+        ) from error
 
 
 def _tidy(folder: Path) -> None:
     """Remove what was kept for a restart, and nothing that is not ours."""
     atomic.sweep(folder)
-    for path in folder.glob("*.arrow"):
-        path.unlink()
-    for path in folder.glob("sorted-*"):
-        shutil.rmtree(path)
+    kept.remove(folder)

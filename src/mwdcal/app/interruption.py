@@ -4,15 +4,21 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from threading import Timer
 from typing import Any
 
 SIGNAL = 128
 """Exit status of a command ended by a signal, less the number of the signal."""
 CLEANUP_SECONDS = 5.0
 """Seconds of cleaning up after which another signal ends the command at once."""
+
+
+AGAIN = 0.05
+"""Seconds after which an end is raised again where it was raised in a place that cannot fail."""
 
 
 class Ended(KeyboardInterrupt):
@@ -22,13 +28,13 @@ class Ended(KeyboardInterrupt):
 @contextmanager
 def orderly_end() -> Iterator[None]:
     """Raise `Ended` at the first signal to end; later ones do not interrupt the cleaning up."""
-    received: list[float] = []
+    received: list[tuple[int, float]] = []
 
     def end(number: int, frame: object) -> None:
         if not received:
-            received.append(time.monotonic())
+            received.append((number, time.monotonic()))
             raise Ended(number)
-        if time.monotonic() - received[0] > CLEANUP_SECONDS:
+        if time.monotonic() - received[0][1] > CLEANUP_SECONDS:
             os._exit(SIGNAL + number)
 
     handlers = _default_handlers()
@@ -38,10 +44,41 @@ def orderly_end() -> Iterator[None]:
     except ValueError:  # signals belong to the main thread
         handlers = {}
     try:
-        yield
+        with _raised_again(received):
+            yield
+    except Exception as error:  # of a module that was interrupted while it was loaded
+        if not received:
+            raise
+        raise _cause(error) or Ended(received[0][0]) from None
     finally:
         for each, handler in handlers.items():
             signal.signal(each, signal.SIG_IGN if received else handler)  # only the exit is left
+
+
+@contextmanager
+def _raised_again(received: list[tuple[int, float]]) -> Iterator[None]:
+    """Where Python has to swallow what it is asked to raise, such as in a destructor, raise it soon after."""
+    before = sys.unraisablehook
+
+    def hook(lost: sys.UnraisableHookArgs) -> None:
+        if not isinstance(lost.exc_value, Ended):
+            before(lost)
+            return
+        received.clear()
+        Timer(AGAIN, signal.raise_signal, lost.exc_value.args).start()
+
+    sys.unraisablehook = hook
+    try:
+        yield
+    finally:
+        sys.unraisablehook = before
+
+
+def _cause(error: BaseException | None) -> Ended | None:
+    """The end that an error was raised for."""
+    while error is not None and not isinstance(error, Ended):
+        error = error.__cause__ or error.__context__
+    return error
 
 
 def _default_handlers() -> dict[signal.Signals, Any]:

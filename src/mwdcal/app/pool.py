@@ -8,16 +8,17 @@ in hand, which is done again by others.
 
 from __future__ import annotations
 
+import asyncio
 import gc
+import logging
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from functools import partial
 from importlib import import_module
 from multiprocessing import (
     forkserver,
@@ -27,21 +28,30 @@ from multiprocessing import (
     resource_tracker,
 )
 from multiprocessing.context import BaseContext
+from queue import Empty, SimpleQueue
 from typing import Any
 
-from mwdcal.errors import InputError
+from mwdcal.errors import InputError, reason
 
 ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 SETTINGS = {
     **dict.fromkeys(ONE_THREAD, "1"),
     "MALLOC_MMAP_THRESHOLD_": str(2**25),
     "MALLOC_TRIM_THRESHOLD_": str(2**26),
+    "JE_ARROW_MALLOC_CONF": "background_thread:false",
 }
-"""Environment of a worker: there is one per core, and it keeps the memory that it will need again."""
+"""Environment of a worker: there is one per core, and it keeps the memory that it will need again.
+
+The process that workers are copies of has one thread: Python warns of copies of several.
+"""
 ATTEMPTS = 3
 """How often a part whose worker died is given to another."""
-CLUSTER_TIMEOUT = "30s"
-"""How long a cluster may take to answer and to have a worker."""
+CLUSTER_TIMEOUT = 30.0
+"""Seconds in which a scheduler must answer, and have a worker; asked again after as long a silence."""
+CLOSING = 5.0
+"""Seconds for the farewell to a scheduler."""
+LOST = (OSError, TimeoutError, CancelledError, asyncio.CancelledError)
+"""What is raised where a scheduler has gone or is mute."""
 COMMAND, WORKER = "mwdcal.app.cli", "mwdcal.app.worker_preload"
 """Modules that a worker process has loaded before it is given anything."""
 
@@ -138,6 +148,11 @@ def _on_cores(steps: Steps, tasks: Sequence[Any], workers: int) -> Iterator[tupl
                 yield index, result
         except BrokenProcessPool:
             continue
+        except OSError as error:
+            raise InputError(
+                f"worker processes cannot be started ({reason(error)}). Finished parts are kept: run the same "
+                "command again with fewer `workers`."
+            ) from error
         return
     raise InputError(
         f"a worker process died {ATTEMPTS} times, most likely for want of memory. Finished parts are "
@@ -179,17 +194,16 @@ def _on_cluster(steps: Steps, tasks: Sequence[Any], address: str) -> Iterator[tu
             "`scheduler` needs the extra 'cluster'. Install it, here and on every worker: "
             "pip install 'mwdcal[parquet,cluster]'"
         ) from None
-    client_of = partial(distributed.Client, address, timeout=CLUSTER_TIMEOUT)
-    with _connected(client_of, address) as client:
+    with _connected(distributed, address) as client:
         futures = client.map(steps, tasks, pure=False, retries=ATTEMPTS)
-        places = {future.key: index for index, future in enumerate(futures)}
-        arriving = distributed.as_completed(futures)
+        waiting = {future.key: (index, future) for index, future in enumerate(futures)}
         del futures
         try:
-            for future in arriving:
-                result = future.result()
+            for key in _finished(client, waiting):
+                index, future = waiting.pop(key)
+                result = future.result(timeout=CLUSTER_TIMEOUT)
                 future.release()
-                yield places[future.key], result
+                yield index, result
         except distributed.KilledWorker as error:
             raise InputError(
                 f"workers of {address} died again and again on the same part, most likely for want "
@@ -200,17 +214,43 @@ def _on_cluster(steps: Steps, tasks: Sequence[Any], address: str) -> Iterator[tu
                 f"a worker of {address} has no {error.name}. Install mwdcal there: pip install "
                 "'mwdcal[parquet,cluster]'"
             ) from error
+        except LOST as error:
+            raise InputError(
+                f"`scheduler` {address}: the scheduler no longer answers. Finished parts are kept: start it "
+                "and its workers again, and run the same command."
+            ) from error
+
+
+def _finished(client: Any, waiting: Mapping[str, tuple[int, Any]]) -> Iterator[str]:
+    """Keys of futures as they end; raises one of `LOST` where the scheduler has fallen silent."""
+    ended: SimpleQueue[str] = SimpleQueue()
+    for _, future in list(waiting.values()):
+        future.add_done_callback(lambda each: ended.put(each.key))
+    while waiting:
+        try:
+            yield ended.get(timeout=CLUSTER_TIMEOUT)
+        except Empty:
+            client.sync(client.scheduler.identity, callback_timeout=CLUSTER_TIMEOUT)
 
 
 @contextmanager
-def _connected(connect: Callable[[], Any], address: str) -> Iterator[Any]:
+def _connected(distributed: Any, address: str) -> Iterator[Any]:
     """A client of a cluster that has a worker."""
+    for name in [
+        each for each in logging.root.manager.loggerDict if each.startswith("distributed")
+    ]:
+        logging.getLogger(name).setLevel(logging.CRITICAL + 1)  # its tracebacks; errors are raised
     try:
-        client = connect()
-    except (OSError, ValueError, TimeoutError) as error:
+        asyncio.run(_greet(distributed, address))
+        client = distributed.Client(address, timeout=CLUSTER_TIMEOUT)
+    except Exception as error:
+        if address.startswith("tls") and not distributed.Security().require_encryption:
+            certificates = "certificates in Dask's configuration (distributed.comm.tls), and "
+        else:
+            certificates = ""
         raise InputError(
-            f"`scheduler` {address}: no Dask scheduler answers there ({str(error)[:120]}). Start "
-            "one with `dask scheduler`, and workers with `dask worker ADDRESS`."
+            f"`scheduler` {address}: no Dask scheduler answers there ({str(error)[:120] or 'it is mute'}). Start "
+            f"one with {certificates}`dask scheduler`, and workers with `dask worker ADDRESS`."
         ) from error
     try:
         client.wait_for_workers(1, timeout=CLUSTER_TIMEOUT)
@@ -220,4 +260,13 @@ def _connected(connect: Callable[[], Any], address: str) -> Iterator[Any]:
             f"`scheduler` {address}: the scheduler has no workers. Start some: dask worker {address}"
         ) from error
     finally:
-        client.close()
+        with suppress(*LOST):
+            client.close(timeout=CLOSING)
+
+
+async def _greet(distributed: Any, address: str) -> None:
+    """Exchange greetings with a scheduler: a client waits without end for one that is mute."""
+    arguments = distributed.Security().get_connection_args("client")
+    greeting = distributed.comm.connect(address, timeout=CLUSTER_TIMEOUT, **arguments)
+    comm = await asyncio.wait_for(greeting, 2 * CLUSTER_TIMEOUT)
+    await comm.close()

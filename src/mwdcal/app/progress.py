@@ -61,8 +61,9 @@ def slowly(say: Callable[[str], None], every: float = PATIENCE) -> Callable[[str
 
 def _bar(label: str) -> Any:
     from rich.console import Console
+    from rich.markup import escape
     from rich.progress import Progress
 
     shown = Progress(console=Console(stderr=True), transient=True)
-    shown.add_task(label, total=None)
+    shown.add_task(escape(label), total=None)
     return shown

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -30,9 +29,6 @@ LISTS = ("findings", "reshoot")
 """Columns of lists: ids of findings, and labels of stations to take again."""
 WHOLE = ("rank", "size", "order", "stations")
 """Ends of the names of columns of whole numbers."""
-
-END = b"\xff\xff\xff\xff\x00\x00\x00\x00"
-"""End of a stream in Arrow's format."""
 
 
 @dataclass(frozen=True)
@@ -86,15 +82,6 @@ def solve(plan: Plan, loaded: bytes) -> bytes:
     table = arrow.ipc.open_stream(loaded).read_all()
     rows = Rows.of(table, plan.source, plan.metadata, plan.profile)
     return packed(_result(rows, plan))
-
-
-def is_whole(path: Path) -> bool:
-    """Whether a finished part is there: Arrow's stream ends with its own mark."""
-    if not path.is_file():
-        return False
-    with path.open("rb") as stream:
-        stream.seek(max(path.stat().st_size - len(END), 0))
-        return stream.read() == END
 
 
 def packed(table: Any) -> bytes:
@@ -189,5 +176,6 @@ def _temperatures(rows: Rows) -> tuple[Array, Array]:
     if values is None:
         none = np.full(len(rows.counts), np.nan)
         return none, none
+    values = np.where(np.isfinite(values), values, np.nan)  # of a tool that is refused
     first = rows.starts[:-1]
     return np.minimum.reduceat(values, first), np.maximum.reduceat(values, first)

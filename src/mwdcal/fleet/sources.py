@@ -7,7 +7,7 @@ hold for its own rows: which north their azimuths count from becomes a column of
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from mwdcal.errors import InputError
 from mwdcal.files import contract, synonyms
 from mwdcal.files.contract import REFERENCES, magnetic_offset
 from mwdcal.files.formats import parquet
+from mwdcal.files.formats.columns import LABELS, check_names
 from mwdcal.files.formats.table import check_file
 
 SERIAL = "serial"
@@ -32,6 +33,10 @@ LARGEST_GROUP = 20_000_000
 """Rows of the largest row group that is read; it is dealt as a whole."""
 
 Keys = tuple[tuple[str, str | float | None], ...]
+Stamp = tuple[int, int, int]
+"""Size of a file, and when its content and its place or rights last changed, ns."""
+DEALT: Stamp = (0, 0, 0)
+"""Stamp of files that the fleet itself has written."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +48,7 @@ class Piece:
     """
 
     path: str
-    stamp: tuple[int, int]
+    stamp: Stamp
     group: int
     rows: int
     keys: Keys
@@ -96,7 +101,7 @@ class _File:
 
 def open_source(path: Path) -> Source:
     """The table at `path`, its columns checked; refuses what is not a table of many tools."""
-    paths = _paths(path)
+    paths = input_files(path)
     files = [_look(file, path) for file in paths]
     columns = files[0].columns
     for file, described in zip(paths, files, strict=True):
@@ -145,14 +150,15 @@ def _agreed(stated: Sequence[Mapping[str, object]]) -> dict[str, object]:
     return agreed | next(({"simulated": s["simulated"]} for s in stated if is_simulated(s)), {})
 
 
-def _paths(path: Path) -> list[Path]:
+def input_files(path: Path) -> list[Path]:
     """The Parquet files of a table: itself, or all in a folder, in order of their names."""
     if path.is_dir():
         hidden = ("_", ".")
         paths = sorted(
             file
             for file in path.rglob("*.parquet")
-            if not any(part.startswith(hidden) for part in file.relative_to(path).parts)
+            if file.is_file()
+            and not any(part.startswith(hidden) for part in file.relative_to(path).parts)
         )
         if not paths:
             raise InputError(f"'{path}' is a folder without .parquet files. Name a Parquet table.")
@@ -169,29 +175,50 @@ def _paths(path: Path) -> list[Path]:
 def _look(file: Path, root: Path) -> _File:
     """Pieces, columns and metadata of one file."""
     arrow, pq = parquet.modules(str(file))
+    stamp = _stamp(file)
     with parquet.reading(str(file)), pq.ParquetFile(file) as opened:
         schema, keys = opened.schema_arrow, _keys(file, root)
+        check_names(schema.names, str(file))
         columns = dict.fromkeys((*schema.names, *dict(keys)))
         names = tuple(n for n in columns if not n.startswith("__index"))
         for name in sorted({*contract.RANGES}.intersection(schema.names)):
             _check_numeric(schema.field(name).type, name, file)
+        for name in sorted({*LABELS}.intersection(schema.names)):
+            _check_label(schema.field(name).type, name, file)
         kind = schema.field(SERIAL).type if SERIAL in schema.names else arrow.string()
         kind = kind.value_type if arrow.types.is_dictionary(kind) else kind
         metadata = parquet.metadata_of(schema.metadata, str(file))
-        pieces = pieces_of(file, opened.metadata, keys)
+        pieces = pieces_of(file, stamp, opened.metadata, keys)
     offset = magnetic_offset(metadata, str(file)) if AZIMUTH in names else 0.0
     text = SERIAL in dict(keys) or not arrow.types.is_integer(kind)
     return _File(pieces, names, metadata, text, offset)
 
 
-def pieces_of(file: Path, about: Any, keys: Keys = ()) -> list[Piece]:
+def pieces_of(file: Path, stamp: Stamp, about: Any, keys: Keys = ()) -> list[Piece]:
     """The row groups of a file with the given Parquet metadata."""
-    status = file.stat()
-    stamp = (status.st_size, status.st_mtime_ns)
     return [
         Piece(str(file.resolve()), stamp, group, about.row_group(group).num_rows, keys)
         for group in range(about.num_row_groups)
     ]
+
+
+def _stamp(file: Path) -> Stamp:
+    """What tells a file from what it was, or from another in its place."""
+    try:
+        status = file.stat()
+    except OSError:
+        return (0, 0, 0)
+    return (status.st_size, status.st_mtime_ns, status.st_ctime_ns)
+
+
+def check_unchanged(pieces: Iterable[Piece]) -> None:
+    """Refuse an input that is not what it was when it was opened."""
+    for path, stamp in {piece.path: piece.stamp for piece in pieces}.items():
+        if stamp != DEALT and _stamp(Path(path)) != stamp:
+            raise InputError(
+                f"'{path}': the file has changed while its tools were calibrated, and nothing was "
+                "written. Run the same command again when the file is complete."
+            )
 
 
 def _keys(file: Path, root: Path) -> Keys:
@@ -233,6 +260,22 @@ def _check_numeric(kind: Any, name: str, file: Path) -> None:
             f"{file.name}, column '{name}': expected numbers; the column has the type {kind}. "
             "Write it as numbers, with empty cells where a value is unknown: with pandas, "
             f"table['{name}'] = pandas.to_numeric(table['{name}'])."
+        )
+
+
+def _check_label(kind: Any, name: str, file: Path) -> None:
+    """Refuse labels that are no text, numbers or times, and serials that are no text or whole numbers."""
+    types = parquet.modules(str(file))[0].types
+    kind = kind.value_type if types.is_dictionary(kind) else kind
+    texts = (types.is_string, types.is_large_string, types.is_integer)
+    if name != SERIAL:
+        fine, expected = not types.is_nested(kind), "text, numbers or times"
+    else:
+        fine, expected = any(test(kind) for test in texts), "text or whole numbers"
+    if not fine:
+        raise InputError(
+            f"{file.name}, column '{name}': must be {expected}; the column has the type {kind}. "
+            "Write it as text."
         )
 
 

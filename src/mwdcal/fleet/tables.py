@@ -7,7 +7,8 @@ Where the rows of a tool are not together, the rows are dealt once into files of
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import pairwise
@@ -17,10 +18,19 @@ from typing import Any
 
 import numpy as np
 
-from mwdcal.errors import InputError
+from mwdcal.errors import InputError, reason
 from mwdcal.files.formats import parquet
-from mwdcal.files.formats.columns import LABELS, as_text
-from mwdcal.fleet.sources import OFFSET, SERIAL, Piece, Source, pieces_of
+from mwdcal.files.formats.columns import LABELS
+from mwdcal.fleet import kept
+from mwdcal.fleet.sources import (
+    DEALT,
+    OFFSET,
+    SERIAL,
+    Piece,
+    Source,
+    check_unchanged,
+    pieces_of,
+)
 from mwdcal.geometry.vectors import Ints
 
 TOOL = "#tool"
@@ -166,38 +176,54 @@ def _check_filled(serials: Any, row: int, source: str) -> None:
 def _encoded(column: Any, piece: Piece) -> Any:
     """Serials, 64-bit whole numbers or text, as a dictionary and the place of each in it."""
     arrow, _ = parquet.modules(piece.path)
-    types = arrow.types
-    kind = column.type.value_type if types.is_dictionary(column.type) else column.type
-    whole = types.is_integer(kind)
-    if not (whole or types.is_string(kind) or types.is_large_string(kind)):
+    kind = column.type.value_type if arrow.types.is_dictionary(column.type) else column.type
+    if piece.text or not arrow.types.is_integer(kind):
+        return _texts(column, piece, SERIAL)
+    try:
+        return column.cast(kind).cast(arrow.int64()).dictionary_encode()
+    except arrow.ArrowInvalid as error:
         raise InputError(
-            f"{Path(piece.path).name}, column '{SERIAL}': must be text or whole numbers; the column has "
-            f"the type {kind}. Write it as text."
-        )
-    if piece.text or not whole:
-        return _texts(column)
-    return column.cast(kind).cast(arrow.int64()).dictionary_encode()
+            f"{Path(piece.path).name}, column '{SERIAL}': must be text or whole numbers of 64 bits ({error}). "
+            "Write it as text."
+        ) from error
 
 
-def _texts(column: Any) -> Any:
+def _texts(column: Any, piece: Piece, name: str) -> Any:
     """A column of labels as text, as a dictionary and the place of each in it."""
     arrow, _ = parquet.modules("fleet")
-    encoded = arrow.dictionary(arrow.int32(), arrow.string())
-    if column.type == encoded:
+    if column.type == arrow.dictionary(arrow.int32(), arrow.string()):
+        for each in getattr(column, "chunks", [column]):
+            with _readable(each.dictionary.type, piece, name):
+                each.dictionary.validate(full=True)
         return column
     if arrow.types.is_dictionary(column.type):
         column = column.cast(column.type.value_type)
     column = column.dictionary_encode()
     column = one_chunk(column) if hasattr(column, "chunks") else column
-    texts = arrow.array([as_text(v) for v in column.dictionary.to_pylist()], arrow.string())
+    with _readable(column.dictionary.type, piece, name):
+        texts = arrow.array(parquet.texts(column.dictionary, arrow), arrow.string())
     return arrow.DictionaryArray.from_arrays(column.indices, texts)
 
 
-def partitions(source: Source, tools: Tools, folder: Path) -> list[Partition]:
+@contextmanager
+def _readable(kind: Any, piece: Piece, name: str) -> Iterator[None]:
+    """Whatever the block raises, of a time zone or an encoding: the labels cannot be written as text."""
+    try:
+        yield
+    except Exception as error:
+        raise InputError(
+            f"{Path(piece.path).name}, column '{name}': expected labels that can be written as text; the "
+            f"column has the type {kind} ({str(error)[:80]}). Write it as text."
+        ) from error
+
+
+def partitions(
+    source: Source, tools: Tools, folder: Path, say: Callable[[str], None]
+) -> list[Partition]:
     """The table in partitions of whole tools; dealt into files in `folder` where it must be."""
     size = int(np.clip(source.rows // SHARES, *ROWS))
     if not tools.together:
-        return _dealt(source, tools, folder, size)
+        return _dealt(source, tools, folder, size, say)
     ends = np.append(tools.runs[1:], source.rows)
     full = np.searchsorted(ends, np.arange(size, source.rows, size))
     last = np.unique(np.append(full, tools.count - 1))
@@ -214,7 +240,9 @@ def _part(source: Source, first: int, stop: int, tools: int) -> Partition:
     return Partition(source.pieces[low:high], first - int(bounds[low]), stop - first, first, tools)
 
 
-def _dealt(source: Source, tools: Tools, folder: Path, size: int) -> list[Partition]:
+def _dealt(
+    source: Source, tools: Tools, folder: Path, size: int, say: Callable[[str], None]
+) -> list[Partition]:
     """Rows dealt into files by tool; what an interrupted command has finished is not done again."""
     _, pq = parquet.modules(source.name)
     rows = np.bincount(tools.tool, np.diff(tools.runs, append=source.rows), tools.count)
@@ -222,23 +250,43 @@ def _dealt(source: Source, tools: Tools, folder: Path, size: int) -> list[Partit
     number = np.cumsum(rows).astype(int) // share
     number = np.minimum(number, MOST_FILES - 1)
     done = folder / f"sorted-{source.fingerprint[:16]}"
-    if not done.is_dir():
-        unfinished = done.with_suffix(".tmp")
-        shutil.rmtree(unfinished, ignore_errors=True)
-        unfinished.mkdir(parents=True)
-        _deal(source, tools, number, unfinished)
-        unfinished.rename(done)
+    if not kept.is_whole(done):
+        again = ", again: those there are damaged" if done.exists() else ""
+        say(f"the rows of a tool are not together: dealing them into files of whole tools{again}")
+        kept.make_room(done)
+        with _whole_folder(done) as unfinished:
+            _deal(source, tools, number, unfinished)
+            check_unchanged(source.pieces)
     parts = []
     for each in np.unique(number):
         file = done / f"{each:04d}.parquet"
         pieces = tuple(
-            replace(piece, stamp=(0, 0), keys=(("", source.fingerprint),))
-            for piece in pieces_of(file, pq.read_metadata(file))
+            replace(piece, keys=(("", source.fingerprint),))
+            for piece in pieces_of(file, DEALT, pq.read_metadata(file))
         )
         total = sum(piece.rows for piece in pieces)
         count = int(np.sum(number == each))
         parts.append(Partition(pieces, 0, total, 0, count, dealt=True))
     return parts
+
+
+@contextmanager
+def _whole_folder(folder: Path) -> Iterator[Path]:
+    """A folder to fill, which has its name and a manifest when the block ends without an error."""
+    unfinished = folder.with_suffix(".tmp")
+    kept.make_room(unfinished)
+    try:
+        unfinished.mkdir(parents=True)
+        yield unfinished
+        kept.write_manifest(unfinished)
+        unfinished.rename(folder)
+    except OSError as error:
+        raise InputError(
+            f"cannot write to '{folder.parent}': {reason(error)}. Make room there, or choose another "
+            "`output`."
+        ) from error
+    finally:
+        shutil.rmtree(unfinished, ignore_errors=True)
 
 
 def _deal(source: Source, tools: Tools, number: Ints, folder: Path) -> None:
@@ -342,7 +390,7 @@ def _batches(piece: Piece, columns: tuple[str, ...]) -> Iterator[Any]:
         )
     with (
         parquet.reading(piece.path),
-        pq.ParquetFile(piece.path, memory_map=True, read_dictionary=labels) as file,
+        pq.ParquetFile(piece.path, read_dictionary=labels) as file,
     ):
         for batch in file.iter_batches(BATCH, [piece.group], wanted):
             yield _complete(arrow.Table.from_batches([batch]), piece, columns)
@@ -363,7 +411,7 @@ def _complete(table: Any, piece: Piece, columns: tuple[str, ...]) -> Any:
         if name == SERIAL:
             column = _encoded(column, piece)
         elif name in LABELS:
-            column = _texts(column)
+            column = _texts(column, piece, name)
         elif name not in (TOOL, "#row"):
             column = column.cast(arrow.float64(), safe=False)
         arrays[name] = column

@@ -1,0 +1,172 @@
+"""What a fleet keeps beside its output until it is done, and how that is told from what others put there.
+
+A part is sealed: its mark, length and checksum stand before its content. Rows that were dealt into
+files of whole tools have a manifest beside them. What is damaged is not used, and made again.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import shutil
+from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from zlib import crc32
+
+import msgspec
+
+from mwdcal.errors import InputError
+
+MARK = b"mwdcal fleet part "
+HEAD = 64
+"""Bytes before the content of a part."""
+LOCK = "lock"
+MANIFEST = "manifest.json"
+_PART = re.compile(r"[0-9a-f]{32}\.arrow")
+_DEALT = re.compile(r"sorted-[0-9a-f]{16}(\.tmp)?")
+_PARQUET = re.compile(r"\d{4}\.parquet")
+_STREAM = b"\xff\xff\xff\xff"
+"""How Arrow's streams begin: parts of mwdcal before they were sealed."""
+
+
+def sealed(content: bytes, name: str) -> bytes:
+    """A part with its seal, which also holds its name."""
+    return _head(content, name) + content
+
+
+def _head(content: bytes | memoryview, name: str) -> bytes:
+    """The seal of a part."""
+    check = crc32(content, crc32(name.encode()))
+    return (MARK + b"%016x %08x" % (len(content), check)).ljust(HEAD - 1) + b"\n"
+
+
+def unsealed(data: bytes, name: str) -> memoryview | None:
+    """The content of a sealed part; None where it is damaged."""
+    content = memoryview(data)[HEAD:]
+    return content if data[:HEAD] == _head(content, name) else None
+
+
+def read_part(path: Path) -> memoryview | None:
+    """The content of a finished part; None where it is missing or damaged."""
+    with contextlib.suppress(OSError):
+        return unsealed(path.read_bytes(), path.name)
+    return None
+
+
+def finished(paths: Iterable[Path]) -> tuple[set[Path], int]:
+    """Which parts are there, whole; and how many are there, but damaged."""
+    there = [path for path in paths if path.exists()]
+    whole = {path for path in there if read_part(path) is not None}
+    return whole, len(there) - len(whole)
+
+
+def to_disk(path: Path) -> None:
+    """Wait until a file and its name are on the disk, where the system can say so."""
+    for each, mode in ((path, os.O_RDWR), (path.parent, os.O_RDONLY)):
+        with contextlib.suppress(OSError):
+            descriptor = os.open(each, mode)
+            try:
+                os.fsync(descriptor)
+            finally:
+                os.close(descriptor)
+
+
+def check_folder(folder: Path) -> None:
+    """Refuse a folder that is none, or in which a name of ours stands for something else."""
+    if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
+        kind = "a link" if folder.is_symlink() else "not a folder"
+        raise InputError(
+            f"cannot write to '{folder}', where finished parts are kept: it is {kind}. Remove or rename "
+            "it, or choose another `output`."
+        )
+    for path in folder.iterdir() if folder.exists() else ():
+        foreign = path.is_symlink() and (_PART.fullmatch(path.name) or _DEALT.fullmatch(path.name))
+        if foreign or (path.name == LOCK and not _is_empty_file(path)):
+            raise InputError(
+                f"cannot write to '{folder}', where finished parts are kept: '{path.name}' there is not "
+                "a file of mwdcal. Remove it, or choose another `output`."
+            )
+
+
+def _is_empty_file(path: Path) -> bool:
+    return path.is_file() and not path.is_symlink() and path.stat().st_size == 0
+
+
+def remove(folder: Path) -> None:
+    """Remove parts and dealt rows from a folder, and nothing that is not ours."""
+    for path in list(folder.iterdir()):
+        if path.is_symlink():
+            continue
+        if _PART.fullmatch(path.name) and path.is_file() and _is_ours(path, (MARK, _STREAM)):
+            path.unlink()
+        elif is_dealt(path):
+            shutil.rmtree(path)
+
+
+def _is_ours(path: Path, marks: tuple[bytes, ...]) -> bool:
+    """Whether a file begins with one of our marks, or with what a loss of power leaves of one."""
+    with path.open("rb") as stream:
+        head = stream.read(HEAD)
+    return head.startswith(marks) or not head.strip(b"\0")
+
+
+def is_dealt(folder: Path) -> bool:
+    """Whether a folder has nothing but dealt rows, finished or not."""
+    return (
+        _DEALT.fullmatch(folder.name) is not None
+        and folder.is_dir()
+        and not folder.is_symlink()
+        and all(_is_dealt_file(path) for path in folder.iterdir())
+    )
+
+
+def _is_dealt_file(path: Path) -> bool:
+    if path.is_symlink() or not path.is_file():
+        return False
+    if path.name == MANIFEST:
+        return True
+    return _PARQUET.fullmatch(path.name) is not None and _is_ours(path, (b"PAR1",))
+
+
+def make_room(folder: Path) -> None:
+    """Remove a folder of dealt rows that is damaged or was not finished; refuse one of others."""
+    if not folder.exists():
+        return
+    if not is_dealt(folder):
+        raise InputError(
+            f"cannot write to '{folder}': there is something in it that is not mwdcal's. Move it away, or "
+            "choose another `output`."
+        )
+    shutil.rmtree(folder)
+
+
+def write_manifest(folder: Path) -> None:
+    """State the files of a folder of dealt rows, each with its checksum."""
+    (folder / MANIFEST).write_bytes(msgspec.json.encode(_checksums(folder)))
+
+
+def is_whole(folder: Path) -> bool:
+    """Whether dealt rows are there, as their manifest states."""
+    try:
+        return is_dealt(folder) and msgspec.json.decode(
+            (folder / MANIFEST).read_bytes()
+        ) == _checksums(folder)
+    except (OSError, ValueError, RecursionError):
+        return False
+
+
+def _checksums(folder: Path) -> dict[str, str]:
+    """Length and checksum of each file of dealt rows, by its name."""
+    paths = sorted(path for path in folder.iterdir() if path.name != MANIFEST)
+    with ThreadPoolExecutor() as pool:
+        return dict(zip((path.name for path in paths), pool.map(_checksum, paths), strict=True))
+
+
+def _checksum(path: Path) -> str:
+    length, check = 0, 0
+    with path.open("rb") as stream:
+        while piece := stream.read(1 << 20):
+            length, check = length + len(piece), crc32(piece, check)
+    return f"{length} {check:08x}"
