@@ -246,3 +246,50 @@ def test_numba_is_not_loaded_before_it_is_needed():
     assert (
         subprocess.run([sys.executable, "-c", code], env=environment, check=False).returncode == 0
     )
+
+
+@pytest.fixture()
+def kept(tmp_path, monkeypatch):
+    """Two files of machine code with their checksums, in a folder of their own."""
+    from mwdcal.use import correction_kernels as kernels
+
+    monkeypatch.setattr(kernels, "_folder", lambda: tmp_path)
+    version = f"py{sys.version_info.major}{sys.version_info.minor}"
+    names = (
+        f"correction_kernels.rows-1.{version}.nbi",
+        f"correction_kernels.rows-1.{version}.1.nbc",
+    )
+    for name in names:
+        (tmp_path / name).write_bytes(b"machine code")
+    kernels.write_checksums.cache_clear()
+    kernels.write_checksums(1)
+    yield [tmp_path / name for name in names]
+    kernels.write_checksums.cache_clear()
+
+
+@pytest.mark.parametrize("damage", [b"machine cod", b"machine codf", bytes(12), b""])
+def test_damaged_machine_code_is_removed_and_reported(kept, damage):
+    from mwdcal.use.correction_kernels import check_kept
+
+    assert check_kept()
+    kept[1].write_bytes(damage)
+    assert not check_kept()
+    assert not any(path.exists() for path in kept)
+
+
+def test_machine_code_without_checksums_is_removed_silently(kept):
+    """Of a process that was interrupted, or still compiles."""
+    from mwdcal.use.correction_kernels import check_kept
+
+    (checksums,) = kept[0].parent.glob("*.json")
+    checksums.unlink()
+    assert check_kept()
+    assert not any(path.exists() for path in kept)
+
+
+def test_checksums_that_cannot_be_read_count_as_damage(kept):
+    from mwdcal.use.correction_kernels import check_kept
+
+    (checksums,) = kept[0].parent.glob("*.json")
+    checksums.write_text("{")
+    assert not check_kept()

@@ -20,6 +20,7 @@ from typing import IO, Any, NamedTuple, TypeVar
 
 import numpy as np
 
+from mwdcal.app.messages import say
 from mwdcal.calibration.diagnosis.findings import unused_columns
 from mwdcal.calibration.readings import TRIADS, Readings
 from mwdcal.calibration.record import Calibration, Finding
@@ -267,6 +268,8 @@ class _Worker:
         )
         reference(calibration, said)  # refuses a calibration with temperature terms without any
         triads = numbers(calibration) if many and correction_numba.available() else None
+        if triads and not correction_numba.kept_code_is_sound():
+            say("machine code kept from an earlier run was damaged: it is compiled again.")
         tool = tuple(_tool(calibration, triad) for triad in TRIADS)
         return cls(calibration, source, rules, first, absent, said, triads, tool)
 

@@ -8,8 +8,15 @@ digits wherever it stands. Importing this module needs Numba.
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
+import json
+import os
+import sys
 from collections.abc import Callable
-from typing import TypeVar, cast
+from functools import cache
+from pathlib import Path
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from numba import njit
@@ -20,6 +27,7 @@ from mwdcal.geometry.vectors import AnyArray, Array
 Floats = tuple[float, ...]
 Courses = tuple[Floats, ...]
 
+_VERSION = f"py{sys.version_info.major}{sys.version_info.minor}"
 TILE = 128
 DEGREES = 180.0 / np.pi
 FULL_TURN = 2.0 * np.pi
@@ -234,3 +242,52 @@ def rows(
                 empty += value != value
                 out[k, at + i] = value
     return 7 * (stop - start) - sound, beyond, empty
+
+
+def check_kept() -> bool:
+    """Whether the machine code kept on disk is as it was written; what is not is removed.
+
+    Damaged machine code would end the process. Code without checksums, of a process that still
+    compiles or was interrupted, is removed as well, and counts as sound.
+    """
+    kept = _kept()
+    try:
+        written = json.loads(_checksums().read_text("utf-8"))
+    except OSError:
+        written = {}
+    except ValueError:
+        written = None
+    if written != kept:
+        for name in kept:
+            with contextlib.suppress(OSError):
+                (_folder() / name).unlink()
+    return written in (kept, {})
+
+
+@cache
+def write_checksums(compiled: int) -> None:
+    """Write the checksums of the machine code on disk: once after so many compilations."""
+    if compiled and _folder().is_dir():
+        with contextlib.suppress(OSError):  # then it is compiled again next time
+            temporary = _checksums().with_suffix(f".{os.getpid()}")
+            temporary.write_text(json.dumps(_kept()), "utf-8")
+            temporary.replace(_checksums())
+
+
+def compilations() -> int:
+    """How often loops had to be compiled in this process, for want of machine code on disk."""
+    return sum(cast(Any, rows).stats.cache_misses.values())
+
+
+def _folder() -> Path:
+    return Path(cast(Any, rows).stats.cache_path or os.devnull)
+
+
+def _checksums() -> Path:
+    return _folder() / f"correction_kernels.{_VERSION}.json"
+
+
+def _kept() -> dict[str, str]:
+    """SHA-256 of the files that Numba keeps for this module and this Python."""
+    files = _folder().glob(f"correction_kernels.*.{_VERSION}.*nb[ic]")
+    return {p.name: hashlib.sha256(p.read_bytes()).hexdigest() for p in sorted(files)}

@@ -78,6 +78,14 @@ def _installed() -> bool:
     return find_spec("numba") is not None
 
 
+@cache
+def kept_code_is_sound() -> bool:
+    """Whether the machine code kept on disk is as it was written; if not, it is compiled again."""
+    from mwdcal.use import correction_kernels
+
+    return correction_kernels.check_kept()
+
+
 def cores() -> int:
     """Cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
@@ -138,6 +146,7 @@ def run(
     """
     from mwdcal.use import correction_kernels
 
+    kept_code_is_sound()
     count = len(columns[-1])
     out = np.empty((RESULTS, count))
     settings = (
@@ -153,7 +162,9 @@ def run(
     step = max(_PIECE_ROWS, -(-count // workers))
     starts = range(0, count, step)
     if len(starts) < 2:
-        return CorrectedRows(out, *piece(0, count))
-    with ThreadPoolExecutor(len(starts)) as pool:
-        counts = pool.map(piece, starts, [min(s + step, count) for s in starts])
-        return CorrectedRows(out, *np.sum(list(counts), axis=0).tolist())
+        counts = [piece(0, count)]
+    else:
+        with ThreadPoolExecutor(len(starts)) as pool:
+            counts = list(pool.map(piece, starts, [min(s + step, count) for s in starts]))
+    correction_kernels.write_checksums(correction_kernels.compilations())
+    return CorrectedRows(out, *np.sum(counts, axis=0).tolist())
