@@ -10,6 +10,7 @@ import os
 import numpy as np
 import pytest
 
+import mwdcal as mwdcal_library
 from cli_support import mwdcal, refused, write_csv
 from mwdcal.errors import InputError
 from mwdcal.files.formats.table import Table
@@ -60,7 +61,7 @@ def no_number_is_missing(shown):
 )
 @pytest.mark.parametrize("option", ["--trim-seconds", "--min-seconds"])
 def test_times_of_no_station_are_refused_with_what_they_may_be(tmp_path, option, value):
-    path = write_csv(tmp_path / "log.csv", tumble(1, stations=2)[0].columns)
+    path = write_csv(tmp_path / "log.csv", tumble(1, stations=2, still=(3.0, 4.0))[0].columns)
     told = refused(mwdcal("stations", path, "-o", tmp_path / "run.csv", option, value), 2)
     assert f"{option} must be a number between 0 and 1e+09 s" in told
     assert not (tmp_path / "run.csv").exists()
@@ -93,7 +94,7 @@ def test_a_station_longer_than_any_log_is_refused_in_finite_numbers(tmp_path):
 @pytest.mark.parametrize("threshold", ["0", "5e-324", "1e15"])
 def test_any_threshold_can_be_drawn(tmp_path, threshold):
     path, plot = (
-        write_csv(tmp_path / "log.csv", tumble(1, stations=2)[0].columns),
+        write_csv(tmp_path / "log.csv", tumble(1, stations=2, still=(3.0, 4.0))[0].columns),
         tmp_path / "p.svg",
     )
     ran = mwdcal(
@@ -116,6 +117,32 @@ def test_options_are_named_as_where_they_are_given(tmp_path):
     assert "lower --min-seconds or --trim-seconds, or set --threshold. --plot shows" in message
     with pytest.raises(InputError, match="lower `min_seconds` or `trim_seconds`"):
         find_stations(log, min_seconds=500.0)
+
+
+@pytest.mark.parametrize("task", [mwdcal_library.stations, mwdcal_library.noise])
+def test_columns_in_memory_are_checked_like_a_file(task):
+    columns = rest(time_s=ROWS / RATE)
+    late = np.where(ROWS == 5, np.inf, columns["ay"])
+    for wrong, words in (
+        ({k: v for k, v in columns.items() if k != "ay"}, "'ay' is missing"),
+        ({k: v[:0] for k, v in columns.items()}, "no samples"),
+        ({**columns, "ay": late}, "row 6, column 'ay': expected a finite number"),
+        ({**columns, "ay": np.minimum(late, 1e200)}, "row 6, column 'ay': must be between -1e"),
+        ({**columns, "time_s": ["12:00:00"] * 1200}, "row 1, column 'time_s': expected seconds"),
+    ):
+        with pytest.raises(InputError, match=words):
+            task(wrong)
+    for rate in ("fast", True, np.ones(2)):
+        with pytest.raises(InputError, match=r"`sampling_hz` must be a number between"):
+            task(columns, sampling_hz=rate)
+
+
+@pytest.mark.parametrize("between", [("a", 5), (0, None), (0, np.nan)])
+def test_a_part_of_a_log_is_two_numbers(between):
+    with pytest.raises(
+        InputError, match=r"`(start|end)` must be seconds from the start of the log"
+    ):
+        noise_of(rest(), between=between)
 
 
 # Channels

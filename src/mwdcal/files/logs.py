@@ -80,9 +80,30 @@ def read(
     file = Path(path)
     typed = file.suffix.lower() in _TYPED
     table = _typed(file, columns, decimal) if typed else _text(file, [*columns], decimal, say)
+    _check_ranges(table)
+    return table
+
+
+def check(table: Table) -> Table:
+    """The log with columns that are in memory, refused like a file where they are no log."""
+    _check(list(table.columns), table.source)
+    if not table.count:
+        raise _empty(table.source)
+    checked = _numeric(table)
+    _check_ranges(checked)
+    return checked
+
+
+def _check_ranges(table: Table) -> None:
+    """Refuse readings that no channel has."""
     cells = columns_of(table)
     refuse(table, chain.from_iterable(range_faults(cells, name) for name in RAW))
-    return table
+
+
+def _numeric(table: Table) -> Table:
+    """The log with numbers in every column that means something."""
+    numbers = {name: _numbers(table, name) for name in table.columns if name in READ}
+    return replace(table, columns={**table.columns, **numbers})
 
 
 def _typed(file: Path, names: Sequence[str], decimal: str) -> Table:
@@ -99,8 +120,7 @@ def _typed(file: Path, names: Sequence[str], decimal: str) -> Table:
             raise
         raise _empty(file.name) from None
     _check(list(table.columns), table.source)
-    numbers = {name: _numbers(table, name) for name in table.columns if name in READ}
-    return replace(table, columns={**table.columns, **numbers})
+    return _numeric(table)
 
 
 def _text(file: Path, names: list[str], decimal: str, say: Say) -> Table:

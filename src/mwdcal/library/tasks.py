@@ -290,7 +290,7 @@ def stations(log: Source, **options: Any) -> Stations:
     `log` is a file, or columns by the names of log files: `time_s`, `ax`, …, `temperature_c`. `options`
     are those of `mwdcal.logs.stations.find_stations`.
     """
-    return find_stations(_table(log, "the log", logs.read), **options)
+    return find_stations(_log(log), **options)
 
 
 def noise(log: Source, **options: Any) -> Noise:
@@ -299,4 +299,10 @@ def noise(log: Source, **options: Any) -> Noise:
     `log` is a file, or columns by the names of log files. `options` are those of
     `mwdcal.logs.noise.find_noise`.
     """
-    return find_noise(_table(log, "the log", logs.read), **options)
+    return find_noise(_log(log), **options)
+
+
+def _log(source: Source) -> Table:
+    """A log: a file, or columns that are checked like one."""
+    table = _table(source, "the log", logs.read)
+    return table if isinstance(source, str | os.PathLike) else logs.check(table)

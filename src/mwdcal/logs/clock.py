@@ -16,6 +16,7 @@ from mwdcal.files.logs import TIME
 from mwdcal.geometry.vectors import Array
 from mwdcal.logs import standstill
 
+ANY = Range(-np.inf, np.inf, "s")
 SECONDS = Range(0.0, 1e9, "s")
 DURATION = Range(0.0, 1e9, "s", positive=True)
 RATE = Range(1e-12, 1e9, "Hz")

@@ -19,12 +19,12 @@ from mwdcal.calibration.record import Finding
 from mwdcal.calibration.residuals import rms
 from mwdcal.errors import InputError
 from mwdcal.files.contract import CHANNELS, RAW
-from mwdcal.files.formats.table import Table
+from mwdcal.files.formats.table import Table, shown
 from mwdcal.files.logs import Say, silent
 from mwdcal.geometry.vectors import Array
 from mwdcal.logs import allan, noise_terms, regular
 from mwdcal.logs.allan import Kind, Moments
-from mwdcal.logs.clock import DURATION, RATE, SAME, check_argument
+from mwdcal.logs.clock import ANY, DURATION, RATE, SAME, check_argument, is_number
 from mwdcal.logs.noise_terms import NoiseTerms
 from mwdcal.sensor.profile import Profile
 
@@ -194,9 +194,10 @@ def check(
 ) -> None:
     """Refuse times and a rate that are not possible in any log."""
     start, end = between
-    if np.isnan(between).any():
-        name = "`start`" if np.isnan(start) else "`end`"
-        raise InputError(f"{name} must be seconds from the start of the log; got nan. Correct it.")
+    for name, value in (("start", start), ("end", end)):
+        if not is_number(value, ANY):
+            rule = f"`{name}` must be seconds from the start of the log"
+            raise InputError(f"{rule}; got {shown(value)}. Correct it.")
     if not start < end:
         got = f"`start` {start:g} and `end` {end:g}"
         raise InputError(f"`start` must be less than `end`; got {got}. Swap them?")

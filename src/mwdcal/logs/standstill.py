@@ -329,14 +329,6 @@ def _changes(before: Ints, after: Ints) -> int:
     return len(before) + len(after) - 2 * shared
 
 
-def calm(activity: Activity, threshold: float, trim: float) -> tuple[Array, Array]:
-    """Start and end of the intervals whose activity stays at or below the threshold, trimmed."""
-    first, last = stretches(activity.value <= threshold)
-    start, end = activity.edge[first] + trim, activity.edge[last] - trim
-    some = end > start
-    return start[some], end[some]
-
-
 def standstills(
     activity: Activity, limits: Array, threshold: float, shortest: float, trim: float,
     slow: Sequence[Slow] = (),
@@ -347,8 +339,9 @@ def standstills(
     (`rest_limit`); twice that over a whole interval is slow movement. `trim` seconds are cut
     off each end; `shortest` seconds must remain. Slow channels cut intervals where they step.
     """
-    start, end = calm(activity, threshold, trim)
-    start, end = cut_at_steps(start, end, slow, trim)
+    first, last = stretches(activity.value <= threshold)
+    edge = activity.edge
+    start, end = cut_at_steps(edge[first] + trim, edge[last] - trim, slow, trim)
     creeps = np.zeros(len(start), bool)
     for channel, limit in zip(activity.cells.values(), limits, strict=True):
         creeps |= _travels(channel.start, channel.level, start, end) > 2 * limit
@@ -373,7 +366,7 @@ def _travels(time: Array, level: Array, start: Array, end: Array) -> Array:
 def cut_at_steps(
     start: Array, end: Array, slow: Sequence[Slow], trim: float
 ) -> tuple[Array, Array]:
-    """The intervals (k,), without the times at which slow channels step from one level to another."""
+    """The intervals (k,) that last, without the times at which slow channels step to another level."""
     rooms = [max(trim - 2 * time_step(channel.time), 0.0) for channel in slow]
     pieces = []
     for a, b in zip(start, end, strict=True):

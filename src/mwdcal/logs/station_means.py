@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mwdcal.geometry.vectors import Array
+from mwdcal.geometry.vectors import Array, ArrayLike
 
 CLEAR = 4.0
 """Distance from the median, in robust standard deviations, above which a sample is a spike."""
@@ -265,7 +265,7 @@ def _distances(value: Array) -> Array:
     return distance / (1 - 1.1 / len(value))
 
 
-def _chi_square_limit(freedom: Array) -> Array:
+def _chi_square_limit(freedom: ArrayLike) -> Array:
     """Sums of squares that are exceeded with the chance `SIGNIFICANT`, and four times them.
 
     The factor leaves room for standstills of different noise.
@@ -403,9 +403,7 @@ def _is_unsteady(value: Array, resolution: float, noise: SharedNoise) -> bool:
     if noise.freedom < LONG:
         return False
     usual = max(noise.sd, resolution)
-    freedom = max(len(value) - 1, 1)
-    limit = float(_chi_square_limit(np.array([freedom], float))[0])
-    spreads = len(value) * value.var() > usual**2 * limit
+    spreads = len(value) * value.var() > usual**2 * _chi_square_limit(len(value) - 1)
     if len(value) < 3 * PARTS:
         return bool(spreads)
     scatter = max(noise.rough, resolution) / (len(value) / PARTS) ** 0.5
