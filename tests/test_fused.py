@@ -248,7 +248,7 @@ def test_numba_is_not_loaded_before_it_is_needed():
     )
 
 
-@pytest.fixture()
+@pytest.fixture
 def kept(tmp_path, monkeypatch):
     """Two files of machine code with their checksums, in a folder of their own."""
     from mwdcal.use import correction_kernels as kernels
