@@ -116,9 +116,8 @@ def _problem(
     for name, raw, order in zip(names, raws, options.orders, strict=False):
         kind, sound = options.kind(order), raw if finite.all() else _sound(raw, finite)
         whole = model_of(kind, order, sound, temperature, evidence.include, name in curved)
-        sd = (
-            flat(readings.sd[name], lead, 3) if name in readings.sd else 1e-3 * _size(raw) + 0 * raw
-        )
+        first = 1e-3 * _size(raw) + 0 * raw
+        sd = flat(readings.sd[name], lead, 3) if name in readings.sd else first
         triads.append(Triad(restricted(whole, options.parameters), sound, sd))
     prior = prior_of(options.knowledge, [t.model for t in triads], len(evidence.include))
     problem = Problem(tuple(triads), temperature, evidence, prior)

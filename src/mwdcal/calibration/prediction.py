@@ -101,16 +101,6 @@ class CalibratedTools:
     free: Array
     noise: Array
 
-    @property
-    def angles(self) -> tuple[str, ...]:
-        """Names of the angles that the triads can give."""
-        return STATED_ANGLES[: 1 + len(self.models)]
-
-    @property
-    def curved(self) -> bool:
-        """Whether an axis of a triad is curved."""
-        return any(model.curved for model in self.models)
-
     def changes(self, fields: Sequence[Array], noise: bool) -> Array:
         """Changes (B, t, n, 3, c) of each triad's field, where these are `fields` (B, n, 3).
 
@@ -156,7 +146,8 @@ def accuracy(
     is its change by the parameters in the field: four fields tell it everywhere.
     """
     earth, number = tools.earth, np.arange(len(tools.earth))
-    if not tools.curved:
+    curved = any(model.curved for model in tools.models)
+    if not curved:
         earth, number = np.unique(earth, axis=0, return_inverse=True)
     grid = np.meshgrid([inclination], TWELFTHS, TWELFTHS, indexing="ij")
     attitudes = [angle.reshape(1, -1) for angle in grid]
@@ -164,12 +155,12 @@ def accuracy(
     vectors = np.stack(both[: len(tools.models)], -2)
     gradients = {
         name: OBSERVABLES[name].gradient(*both)[..., : 3 * len(tools.models)].reshape(vectors.shape)
-        for name in tools.angles
+        for name in STATED_ANGLES[: 1 + len(tools.models)]
     }
     free = tools.free
     if noise:
         covariance, free = _with_noise(covariance, free, 3 * len(tools.models))
-    if tools.curved:
+    if curved:
         change = tools.changes(both, noise)
         rows = {n: np.einsum("bati,btaic->bac", g, change) for n, g in gradients.items()}
     else:
@@ -247,7 +238,7 @@ def accuracy_at(
     tools = CalibratedTools.of(calibration, temperature)
     covariance = calibration.parameter_covariance[None]
     each = [accuracy(tools, covariance, angle, noise) for angle in inclinations]
-    return {name: np.concatenate([sd[name] for sd in each]) for name in tools.angles}
+    return {name: np.concatenate([sd[name] for sd in each]) for name in each[0]}
 
 
 def typical_accuracy(calibration: Calibration) -> dict[str, float | None]:

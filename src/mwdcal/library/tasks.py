@@ -145,7 +145,7 @@ def calibrate(
         FitError: the run cannot give a calibration to be trusted; the message says what to add.
         InputError: an option is unknown.
     """
-    _check_run(run)
+    _check_readings(run)
     whole = run if profile is None else replace(run, profile_sha256="")
     return fit_and_judge(whole, _profile(run, profile), _options(options, choices))
 
@@ -161,23 +161,18 @@ def _profile(run: Readings, profile: object) -> Profile:
     return profile if isinstance(profile, Profile) else load_profile(cast(Path, profile))
 
 
-def _check_run(run: object, name: str = "run") -> None:
-    """Refuse what is not the run of one tool."""
-    _check_readings(run, name)
-    shape = cast(Readings, run).accelerometer.shape
-    if len(shape) != 2:
-        raise InputError(
-            f"`{name}` must have readings of one run, (n, 3); got {shape}. Many runs at once are "
-            "fitted by mwdcal.calibration.estimate.fit."
-        )
-
-
-def _check_readings(readings: object, name: str) -> None:
-    """Refuse what is not `Readings`."""
+def _check_readings(readings: object, name: str = "run", single: bool = True) -> None:
+    """Refuse what is not `Readings`, or not those of one run where `single` ones are needed."""
     if not isinstance(readings, Readings):
         raise InputError(
             f"`{name}` must be readings; got {type(readings).__name__}. Make them by "
             "mwdcal.readings(…), or mwdcal.read_run(…) of a file."
+        )
+    shape = readings.accelerometer.shape
+    if single and len(shape) != 2:
+        raise InputError(
+            f"`{name}` must have readings of one run, (n, 3); got {shape}. Many runs at once are "
+            "fitted by mwdcal.calibration.estimate.fit."
         )
 
 
@@ -205,7 +200,7 @@ def compare(
     `options` and `choices` as of `calibrate`, the same for all methods; their method does not
     count. `progress` is called with a sentence at each step.
     """
-    _check_run(run)
+    _check_readings(run)
     given = _options(options, choices)
     return compare_methods(run, _profile(run, profile), given, progress=progress)
 
@@ -221,7 +216,7 @@ def verify(
         InputError: stations of the fit, temperatures outside the calibrated range, or readings to
             which no limit applies.
     """
-    _check_run(rolltest, "rolltest")
+    _check_readings(rolltest, "rolltest")
     return judge(
         calibration, rolltest, limits if isinstance(limits, Limits) else load_limits(limits)
     )
@@ -259,7 +254,7 @@ def apply(
     Raises:
         InputError: readings that do not belong to the calibration.
     """
-    _check_readings(survey, "survey")
+    _check_readings(survey, "survey", single=False)
     columns, findings = correct(calibration, survey, outside)
     return Corrected(
         gravity=np.stack([columns[f"g{axis}_g"] for axis in "xyz"], -1),

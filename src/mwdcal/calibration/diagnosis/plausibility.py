@@ -141,12 +141,10 @@ def excessive_errors(readings: Readings, result: Fit) -> dict[str, tuple[float, 
         known = ~np.isnan(after + expected) & (weight > 0)
         if not known.any():
             continue
-        both = [
-            float(np.sqrt(np.average(e[known] ** 2, weights=weight[known] ** 2)))
-            for e in (after, expected)
-        ]
-        if both[0] > EXCESS_RATIO * max(both[1] * misfit, SMALLEST_EXPECTATION):
-            excessive[name] = (both[0], float(both[1] * misfit))
+        square = np.stack([after, expected], -1)[known] ** 2
+        rms = np.sqrt(np.average(square, axis=0, weights=weight[known] ** 2)) * [1.0, misfit]
+        if rms[0] > EXCESS_RATIO * max(rms[1], SMALLEST_EXPECTATION):
+            excessive[name] = (float(rms[0]), float(rms[1]))
     return excessive
 
 

@@ -22,6 +22,7 @@ from mwdcal.calibration.readings import TRIADS
 from mwdcal.calibration.residuals import chances, to_reshoot
 from mwdcal.calibration.results import variance_scales
 from mwdcal.calibration.soaks import HIGHEST, LEAST_TEMPERATURE_SPAN, highest_order
+from mwdcal.estimation.evidence import STAND_ERRORS
 from mwdcal.estimation.problem import Problem, State
 from mwdcal.estimation.uncertainty import whole_covariance
 from mwdcal.geometry.vectors import Array, Bools, Ints, eigen
@@ -235,7 +236,7 @@ def _scores(problem: Problem, result: Fit) -> _Scores:
 def _families(problem: Problem, state: State) -> Iterator[tuple[str, Array]]:
     """Columns (1, n, m, k) of every effect that this run could show, whitened."""
     turns, by_earth = problem.station_columns(state)
-    known = {n: turn for n, turn in _turns(problem, state, turns).items() if turn.any()}
+    known = _turns(problem, state, turns)
     for name in STAND_EFFECTS:
         each = [known[turn] for turn in STAND_TURNS.get(name, (name,)) if turn in known]
         if each:
@@ -292,12 +293,12 @@ def _courses(problem: Problem, state: State) -> Iterator[tuple[str, Array]]:
 
 
 def _turns(problem: Problem, state: State, turns: Array) -> dict[str, Array]:
-    """Columns (1, n, m) of the stand's errors, at stations whose references have them."""
-    names = ("azimuth-zero", "inclination-zero", "toolface-zero", "stand-north", "stand-east")
-    return {
-        name: problem.stand_column(state, name, turns) * acts_on(problem.evidence, name)[..., None]
-        for name in names
-    }
+    """Columns (1, n, m) of errors of the stand that act on references, at stations that have them."""
+    columns = {}
+    for name in STAND_ERRORS:
+        acts = acts_on(problem.evidence, name)[..., None]
+        columns[name] = problem.stand_column(state, name, turns) * acts
+    return {name: column for name, column in columns.items() if column.any()}
 
 
 def _products(columns: Array, factors: Array) -> Array:
