@@ -113,7 +113,7 @@ def assert_equal(found, wanted):
         assert np.nanmax(np.abs(error), initial=0.0) < 1e-12, name
 
 
-VECTOR_G, VECTOR_B = correction.NAMES[:3], correction.NAMES[3:6]
+VECTOR_G, VECTOR_B = correction.RESULTS[:3], correction.RESULTS[3:6]
 
 
 @pytest.mark.parametrize(("first", "second"), PAIRS, ids=lambda m: f"{m[0]}{m[1]}{'c' * m[2]}")
@@ -174,7 +174,7 @@ def test_units_signs_and_order_of_channels(sound):
     columns = [*(nominal * units).T, readings.temperature]
     zero = calibration.reference_temperature
     found = correction_numba.run(columns, correction.numbers(calibration), zero, units)
-    named = dict(zip(correction.NAMES, found.columns, strict=True))
+    named = dict(zip(correction.RESULTS, found.columns, strict=True))
     assert_equal(named, correction.reference(calibration, readings))
 
 

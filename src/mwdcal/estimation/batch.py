@@ -18,7 +18,7 @@ from mwdcal.geometry.vectors import AnyArray, Ints
 _T = TypeVar("_T")
 
 
-def take(batch: _T, index: Ints) -> _T:
+def take(batch: _T, index: Ints | slice) -> _T:
     """The members at `index`, as a batch of their own."""
     members: _T = mapped(lambda array: array[index], batch)
     return members

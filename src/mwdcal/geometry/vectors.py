@@ -9,6 +9,7 @@ All functions broadcast over leading axes; the component axis is last.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -125,27 +126,23 @@ def nearest_rotation(matrix: Array) -> Array:
 
 def inverse(matrix: Array) -> Array:
     """Inverse (..., k, k) of every matrix of a stack; NaN for a singular one, never an exception."""
-    try:
-        return np.asarray(np.linalg.inv(matrix))
-    except np.linalg.LinAlgError:
-        sound, whole = _regular(matrix)
-        return np.where(sound, np.linalg.inv(whole), np.nan)
+    return _each(np.linalg.inv, matrix)
 
 
 def solved(matrix: Array, right: Array) -> Array:
     """Solutions (..., k, m) of matrix x = right; NaN for a singular matrix, never an exception."""
+    return _each(np.linalg.solve, matrix, right)
+
+
+def _each(operation: Callable[..., Array], matrix: Array, *right: Array) -> Array:
+    """An operation on a stack of matrices, NaN where one is singular or not finite."""
     try:
-        return np.asarray(np.linalg.solve(matrix, right))
+        return np.asarray(operation(matrix, *right))
     except np.linalg.LinAlgError:
-        sound, whole = _regular(matrix)
-        return np.where(sound, np.linalg.solve(whole, right), np.nan)
-
-
-def _regular(matrix: Array) -> tuple[Bools, Array]:
-    """Which matrices (..., 1, 1) are finite and not singular, and all of them with 1 for the others."""
-    with np.errstate(all="ignore"):
-        sound = np.isfinite(np.linalg.slogdet(matrix)[1])[..., None, None]
-    return sound, np.where(sound, matrix, np.eye(matrix.shape[-1]))
+        with np.errstate(all="ignore"):
+            sound = np.isfinite(np.linalg.slogdet(matrix)[1])[..., None, None]
+        whole = np.where(sound, matrix, np.eye(matrix.shape[-1]))
+        return np.where(sound, operation(whole, *right), np.nan)
 
 
 def eigen(matrix: Array) -> tuple[Array, Array]:

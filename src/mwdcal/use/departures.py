@@ -154,13 +154,16 @@ class RollTest:
         A group that was not rolled cannot pass, nor can sets of equal reference directions of
         which none was; other sets that were not rolled are left out. Toolface: of its error.
         """
-        lacks = self._lacks(name) or (
-            "" if self.sets else f"no {ROLL_SET} stations of one direction"
+        lacks = self._lacks(name)
+        if lacks or not self.sets:
+            return Departures(skipped=lacks or f"no {ROLL_SET} stations of one direction")
+        reasons = {s.label: self._unfit(name, s) for s in self.sets}
+        unfit, fit = (
+            [*filter(None, reasons.values())],
+            [s for s in self.sets if not reasons[s.label]],
         )
-        unfit = [] if lacks else [why for s in self.sets if (why := self._unfit(name, s))]
-        fit = [] if lacks else [s for s in self.sets if not self._unfit(name, s)]
         if not fit:
-            return Departures(skipped=lacks or "; ".join(unfit))
+            return Departures(skipped="; ".join(unfit))
         gaps = {s.label: self._loose(s.index) for s in fit}
         rolled = [s for s in fit if not gaps[s.label]]
         loose = [s for s in fit if gaps[s.label]]
@@ -172,7 +175,9 @@ class RollTest:
         if wrong and not blocked:
             blocked = f"{wrong[0]} was not rolled: {gaps[wrong[0]]}"
         statistics = [self._curve_of(name, s, False) for s in rolled]
-        statistics += [self._raw_spread(name, s) for s in fit if s.label in wrong]
+        for roll_set in (s for s in fit if s.label in wrong):
+            raw = float(np.ptp(self._centred(name, roll_set.index)))
+            statistics.append(Statistic(raw, 0.0, raw, roll_set.label))
         return self._outcome(name, statistics, blocked, bool(wrong), (*unfit, *apart))
 
     def error(self, name: str) -> Departures:
@@ -248,10 +253,6 @@ class RollTest:
         periodic = OBSERVABLES[name].period
         middle = np.angle(np.mean(np.exp(1j * part))) if periodic else part.mean()
         return OBSERVABLES[name].difference(part, middle)
-
-    def _raw_spread(self, name: str, roll_set: RollSet) -> Statistic:
-        raw = float(np.ptp(self._centred(name, roll_set.index)))
-        return Statistic(raw, 0.0, raw, roll_set.label)
 
     def _outcome(
         self,

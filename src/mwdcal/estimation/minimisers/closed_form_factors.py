@@ -15,10 +15,11 @@ of 30 or 60. The factors follow, and their covariance by the slope ∂(s, u, b)/
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 
+from mwdcal.estimation.batch import take
 from mwdcal.estimation.problem import GEOMETRIC_NOISE, Triad
 from mwdcal.geometry.vectors import Array, Bools, diagonal, eigenvalues, inverse, outer, solved
 from mwdcal.sensor.models import OFF_COLUMNS, OFF_ROWS, factor_params, factor_parts
@@ -111,29 +112,17 @@ def minimum(axes: Axes) -> Point:
 class FactorsMinimum:
     """One triad at its minimum: factors (B, 6K + 6), their covariance, and what stations show.
 
-    `left` (B, n, 3) are whitened residuals, `open` (B, n, 3) their expected variances; `values`
-    (B, p) are singular values of the evidence, `norms` (B, p) those of its columns. `settled` (B,)
-    says which runs came to their minimum.
+    `left` (B, n, 3) are whitened residuals, `open` (B, n, 3) their expected variances; `known`
+    are singular values (B, p) of the evidence, and norms (B, p) of its columns. `settled` (B,) says
+    which runs came to their minimum.
     """
 
     params: Array
     covariance: Array
     left: Array
     open: Array
-    values: Array
-    norms: Array
+    known: tuple[Array, Array]
     settled: Bools
-
-    @property
-    def known(self) -> tuple[Array, Array]:
-        """Singular values of the evidence, and the norms of its columns."""
-        return self.values, self.norms
-
-    def parted(self, count: int) -> list[FactorsMinimum]:
-        """As many triads as were put together along the batch axis."""
-        arrays, batch = [getattr(self, f.name) for f in fields(self)], len(self.params) // count
-        places = [slice(k * batch, (k + 1) * batch) for k in range(count)]
-        return [FactorsMinimum(*(array[place] for array in arrays)) for place in places]
 
 
 def minima(
@@ -155,7 +144,8 @@ def minima(
         np.concatenate([triad.sd for triad, _ in triads]),
         include := np.concatenate([include] * count),
     )
-    return _minimum(axes, minimum(axes), include).parted(count)
+    whole, batch = _minimum(axes, minimum(axes), include), len(temperature)
+    return [take(whole, slice(k * batch, (k + 1) * batch)) for k in range(count)]
 
 
 def _minimum(axes: Axes, at: Point, include: Array) -> FactorsMinimum:
@@ -173,7 +163,7 @@ def _minimum(axes: Axes, at: Point, include: Array) -> FactorsMinimum:
         moved @ back.mT,
         at.left.mT,
         (include[:, None] - share).mT,
-        *_evidence(at.rows, axes.noise / (GEOMETRIC_NOISE * strength), slope),
+        _evidence(at.rows, axes.noise / (GEOMETRIC_NOISE * strength), slope),
         at.settled,
     )
 
