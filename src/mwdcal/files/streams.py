@@ -79,7 +79,8 @@ def open_parquet(path: Path, rows: int = 0, decimal: str = ".") -> Source:
     count = file.metadata.num_rows
     names = [name for name in stored.names if not parquet.is_index(name)]
     metadata = parquet.metadata_of(file.metadata.metadata, path.name)
-    step = rows or max(1, min(ROWS, PART // (8 * (len(names) + len(NAMES)))))
+    width = 8 * (len(names) + len(NAMES)) + parquet.text_size(file.metadata) // count
+    step = max(1, min(rows or ROWS, PART // width))
 
     def pieces() -> Iterator[Any]:
         first = 1
@@ -92,10 +93,10 @@ def open_parquet(path: Path, rows: int = 0, decimal: str = ".") -> Source:
     def load(piece: Any, exact: bool) -> Part:
         first, batch = piece
         with parquet.reading(path.name):
-            carried = parquet.dense(arrow.Table.from_batches([batch]), stored, path.name, arrow)
-        carried = carried.select(names)
-        wanted = [name for name in names if name in RANGES]
-        columns = {n: parquet.as_column(n, carried.column(n), arrow) for n in wanted}
+            carried = parquet.dense(arrow.Table.from_batches([batch]), stored, path.name, arrow, 2 * PART)
+            carried = carried.select(names)
+            wanted = [name for name in names if name in RANGES]
+            columns = {n: parquet.as_column(n, carried.column(n), arrow) for n in wanted}
         lines = range(first, first + len(batch))
         table = Table(columns, metadata, path.name, lines, decimal=decimal)
         return Part(carried, table, len(batch))
