@@ -36,14 +36,14 @@ _PANDAS_INDEX = re.compile(r"__index_level_\d+__")
 
 
 def parse(data: bytes, source: str, most: int = 0) -> Parts:
-    """The table in the bytes of a Parquet file; of a run, which has at most so many rows."""
+    """The table in the bytes of a Parquet file; with `most`, of at most so many rows."""
     arrow, _ = modules(source)
     file, schema = opened(arrow.BufferReader(data), source)
     rows, names = file.metadata.num_rows, list(schema.names)
     if most and rows > most:
         raise InputError(
-            f"{source}: a run must have at most {most} rows, one per station; got {rows}. Take the "
-            "rows of one run, or find the standstills of a log with mwdcal stations."
+            f"{source}: a table that is read as a whole must have at most {most} rows; got {rows}. "
+            "Split it. The rows of a run are stations; mwdcal stations finds those of a log."
         )
     if rows * len(names) > _MAX_CELLS:
         raise InputError(
