@@ -321,6 +321,11 @@ def test_a_run_has_at_most_as_many_rows_as_a_text_table(tmp_path):
     assert (ran.code, "at most 1000000 rows; got 1000001" in ran.err) == (2, True)
 
 
+def test_a_log_has_a_limit_of_cells(tmp_path):
+    pq.write_table(pa.table({"ax": pa.nulls(150_000_000, pa.bool_())}), tmp_path / "log.parquet")
+    assert "at most 100000000 cells" in refusal(tmp_path / "log.parquet")
+
+
 @pytest.mark.parametrize(
     ("value", "kind", "text"),
     [
