@@ -668,17 +668,16 @@ def test_findings_of_a_long_text_table_stand_above_its_header(tmp_path, small_pi
 def test_parquet_and_long_text_are_taken_in_parts_where_the_formats_allow_it(tmp_path, monkeypatch):
     short = write_csv(tmp_path / "a.csv", log(50))
     packed = write_parquet(tmp_path / "a.parquet", log(1))
-    assert not streaming.in_parts(short, tmp_path / "o.csv", ".")
-    assert streaming.in_parts(packed, tmp_path / "o.csv", ",")
+    assert not streaming.in_parts(short, tmp_path / "o.csv")
+    assert streaming.in_parts(packed, tmp_path / "o.csv")
     monkeypatch.setattr(streaming, "LONG", dict.fromkeys(streaming.LONG, 100))
-    assert not streaming.in_parts(short, tmp_path / "o.csv", ",")
     for source in (short, packed):
-        assert streaming.in_parts(source, tmp_path / "o.csv", ".")
-        assert not streaming.in_parts(source, tmp_path / "o.xlsx", ".")
-    assert not streaming.in_parts(tmp_path / "none.parquet", tmp_path / "o.csv", ".")
-    assert not streaming.in_parts(tmp_path, tmp_path / "o.csv", ".")
+        assert streaming.in_parts(source, tmp_path / "o.csv")
+        assert not streaming.in_parts(source, tmp_path / "o.xlsx")
+    assert not streaming.in_parts(tmp_path / "none.parquet", tmp_path / "o.csv")
+    assert not streaming.in_parts(tmp_path, tmp_path / "o.csv")
     monkeypatch.setattr(streams, "find_spec", lambda name: None)  # without PyArrow
-    assert not streaming.in_parts(short, tmp_path / "o.csv", ".")
+    assert not streaming.in_parts(short, tmp_path / "o.csv")
 
 
 def test_work_overlaps_keeps_its_order_and_stops_at_an_error():

@@ -22,6 +22,7 @@ from mwdcal.app.streaming import (
 )
 from mwdcal.calibration.diagnosis.findings import unused_columns
 from mwdcal.calibration.record import Calibration, Finding
+from mwdcal.errors import InputError
 from mwdcal.files import carried
 from mwdcal.files.contract import check_columns
 from mwdcal.files.formats import table
@@ -31,6 +32,10 @@ from mwdcal.files.runs import to_readings
 from mwdcal.geometry.observables import EXTRAPOLATED
 from mwdcal.use.correction import RowCounts, counted
 
+WHOLE = 8_000_000
+"""Bytes of text that becomes a workbook: memory is some fifty times as much."""
+WHOLE_ROWS = 100_000
+"""Rows of a Parquet table that becomes a workbook."""
 TEXT = (".csv", ".tsv")
 """Suffixes of text tables."""
 
@@ -49,11 +54,13 @@ def apply_to_any(
     What was seen in the rows, and what the reader should know. `advance` gets how much of a long
     table is done, and the whole.
     """
-    if in_parts(readings, output, decimal):
+    if in_parts(readings, output):
         return apply_to_file(
             calibration, readings, output, outside, advance, missing=missing, decimal=decimal
         )
-    source = table.read(readings, decimal=decimal)
+    if readings.suffix.lower() in TEXT and output.suffix.lower() == ".xlsx":
+        _check_size(readings)
+    source = table.read(readings, decimal=decimal, rows=WHOLE_ROWS)
     result, tally, findings = apply_to_table(calibration, source, outside, missing)
     if EXTRAPOLATED in result.columns and output.suffix.lower() != ".parquet":
         words = [as_text(bool(mark)) for mark in result.columns[EXTRAPOLATED]]
@@ -61,6 +68,16 @@ def apply_to_any(
     table.write(output, result)
     formulas = carried.with_formulas(source.columns) if output.suffix.lower() in TEXT else []
     return tally, findings + carried.copied([*source.columns], formulas, output.suffix.lower())
+
+
+def _check_size(readings: Path) -> None:
+    """Refuse text that is too long to be taken whole."""
+    size = readings.stat().st_size if readings.is_file() else 0
+    if size > WHOLE:
+        raise InputError(
+            f"{readings.name}: a text table that becomes a workbook must have at most {WHOLE} "
+            f"bytes; got {size}. Split it, or write CSV."
+        )
 
 
 def apply_to_table(

@@ -57,7 +57,7 @@ from mwdcal.use.correction import (
     warmth,
 )
 
-LONG = {".csv": 1_000_000, ".tsv": 1_000_000, ".parquet": 16_000_000}
+LONG = {".csv": 1_000_000, ".tsv": 1_000_000, ".parquet": 8_000_000}
 """Bytes of a text table from which it is taken in parts, by what it becomes.
 
 Text that becomes Parquet has numbers in fewer columns when it is.
@@ -93,11 +93,10 @@ class CorrectedPart(NamedTuple):
     tally: RowCounts
 
 
-def in_parts(readings: Path, output: Path, decimal: str) -> bool:
-    """Whether a table is taken in parts: Parquet or long text, where format and sign allow it."""
+def in_parts(readings: Path, output: Path) -> bool:
+    """Whether a table is taken in parts: Parquet or long text that does not become a workbook."""
     least = LONG.get(output.suffix.lower())
-    plain = decimal == "." or readings.suffix.lower() == ".parquet"
-    return plain and least is not None and streams.in_parts(readings, least)
+    return least is not None and streams.in_parts(readings, least)
 
 
 def apply_to_file(
@@ -167,7 +166,7 @@ def _source(readings: Path, output: Path, rows: int, decimal: str) -> Source:
     typed = output.suffix.lower() == ".parquet"
     if readings.suffix.lower() == ".parquet":
         return streams.open_parquet(readings, rows or (0 if typed else LINES), decimal)
-    return streams.open_text(readings, typed=typed)
+    return streams.open_text(readings, typed=typed, decimal=decimal)
 
 
 def _check_header(source: Source, outside: str) -> None:

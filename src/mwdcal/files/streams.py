@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,7 +21,7 @@ from mwdcal.errors import InputError
 from mwdcal.files.contract import RANGES, RAW
 from mwdcal.files.formats import parquet, text
 from mwdcal.files.formats.columns import Column
-from mwdcal.files.formats.table import Table, check_decimal, numbers
+from mwdcal.files.formats.table import Table, check_decimal, numbers, pointed
 from mwdcal.geometry.observables import RESULTS
 from mwdcal.geometry.vectors import Ints
 
@@ -79,7 +79,8 @@ def open_parquet(path: Path, rows: int = 0, decimal: str = ".") -> Source:
     count = file.metadata.num_rows
     names = [name for name in stored.names if not parquet.is_index(name)]
     metadata = parquet.metadata_of(file.metadata.metadata, path.name)
-    step = rows or max(1, min(ROWS, PART // (8 * (len(names) + len(RESULTS)))))
+    width = 8 * (len(names) + len(RESULTS)) + parquet.text_size(file.metadata) // count
+    step = max(1, min(rows or ROWS, PART // width))
 
     def pieces() -> Iterator[Any]:
         first = 1
@@ -92,10 +93,12 @@ def open_parquet(path: Path, rows: int = 0, decimal: str = ".") -> Source:
     def load(piece: Any, exact: bool) -> Part:
         first, batch = piece
         with parquet.reading(path.name):
-            carried = parquet.dense(arrow.Table.from_batches([batch]), stored, path.name, arrow)
-        carried = carried.select(names)
-        wanted = [name for name in names if name in RANGES]
-        columns = {n: parquet.as_column(n, carried.column(n), arrow) for n in wanted}
+            carried = parquet.dense(
+                arrow.Table.from_batches([batch]), stored, path.name, arrow, 2 * PART
+            )
+            carried = carried.select(names)
+            wanted = [name for name in names if name in RANGES]
+            columns = {n: parquet.as_column(n, carried.column(n), arrow) for n in wanted}
         lines = range(first, first + len(batch))
         table = Table(columns, metadata, path.name, lines, decimal=decimal)
         return Part(carried, table, len(batch))
@@ -104,8 +107,13 @@ def open_parquet(path: Path, rows: int = 0, decimal: str = ".") -> Source:
     return Source(path.name, names, metadata, schema, count, count, pieces, load)
 
 
-def open_text(path: Path, typed: bool = False) -> Source:
-    """A text table in pieces; `typed`: the contract's columns of numbers are carried as numbers."""
+def open_text(path: Path, typed: bool = False, decimal: str = ".") -> Source:
+    """A text table in pieces; `typed`: the contract's columns of numbers are carried as numbers.
+
+    Where `decimal` is the comma every line goes through the exact parser, and numbers are carried
+    with the point.
+    """
+    check_decimal(decimal)
     arrow, _ = parquet.modules(path.name)
     try:
         with path.open("rb") as stream:
@@ -129,17 +137,18 @@ def open_text(path: Path, typed: bool = False) -> Source:
 
     def load(piece: Any, exact: bool) -> Part:
         data, above, size = piece
-        both = None if exact else _plain(data, top, arrow)
+        both = None if exact or decimal != "." else _plain(data, top, arrow)
         if both is None:
             parts = text.rows(data, top, above, path.name)
-            table = Table(parts.columns, top.metadata, path.name, parts.lines)
-            strings = {n: arrow.array(c, arrow.string()) for n, c in parts.columns.items()}
+            table = Table(parts.columns, {}, path.name, parts.lines, decimal=decimal)
+            strings = {n: arrow.array(c, arrow.string()) for n, c in pointed(table).items()}
             both = arrow.table(strings), table
         carried, table = both
         if typed:
             carried = _typed(carried, table, numeric, arrow)
         kept = {n: c for n, c in table.columns.items() if n in RANGES}
-        return Part(carried, Table(kept, top.metadata, path.name, table.lines), size)
+        stated = replace(table, columns=kept, metadata=top.metadata, source=path.name)
+        return Part(carried, stated, size)
 
     schema, total = arrow.schema(list(types.items())), path.stat().st_size
     guess = total * top.body.count(b"\n") // len(first)

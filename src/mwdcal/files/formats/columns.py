@@ -22,7 +22,7 @@ LABELS = ("station", "group", "serial")
 MAX_COLUMNS = 1000
 _LONGEST_SHOWN = 40
 
-_CONTROLS = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ufeff]+")
+_CONTROLS = re.compile(r"[\x00-\x1f\x7f\x85\u2028\u2029\ufeff]+")
 _NUMBER = re.compile(r"[+-]?(\d+[.,]?\d*|[.,]\d+)([eE][+-]?\d+)?", re.ASCII)
 
 

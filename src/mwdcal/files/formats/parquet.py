@@ -25,23 +25,25 @@ from mwdcal.files.formats.columns import (
 
 KEY = b"mwdcal"
 _MAX_CELLS = 100_000_000
-_MAX_TEXT = 100_000_000
+MAX_TEXT = 100_000_000
+"""Bytes of texts that are in memory at once."""
 _MAX_NESTED = 1_000_000
 _LONGEST_FIXED = 1000
 _UNPACKED = 100_000_000
 _DENSEST = 100
+_UNSPELT = re.compile(r"<value out of range: (-?\d+)>")
 _PANDAS_INDEX = re.compile(r"__index_level_\d+__")
 
 
 def parse(data: bytes, source: str, most: int = 0) -> Parts:
-    """The table in the bytes of a Parquet file; of a run, which has at most so many rows."""
+    """The table in the bytes of a Parquet file; with `most`, of at most so many rows."""
     arrow, _ = modules(source)
     file, schema = opened(arrow.BufferReader(data), source)
     rows, names = file.metadata.num_rows, list(schema.names)
     if most and rows > most:
         raise InputError(
-            f"{source}: a run must have at most {most} rows, one per station; got {rows}. Take the "
-            "rows of one run, or find the standstills of a log with mwdcal stations."
+            f"{source}: a table that is read as a whole must have at most {most} rows; got {rows}. "
+            "Split it. The rows of a run are stations; mwdcal stations finds those of a log."
         )
     if rows * len(names) > _MAX_CELLS:
         raise InputError(
@@ -118,17 +120,24 @@ def _is_text(kind: Any, types: Any) -> bool:
     )
 
 
-def dense(table: Any, schema: Any, source: str, arrow: Any) -> Any:
-    """A table as read, its columns of the types of the schema; refuses texts that memory does not bear."""
+def text_size(metadata: Any) -> int:
+    """Bytes of the columns of text as they are stored, before compression."""
+    groups = [metadata.row_group(i) for i in range(metadata.num_row_groups)]
+    parts = (group.column(i) for group in groups for i in range(group.num_columns))
+    return sum(p.total_uncompressed_size for p in parts if p.physical_type == "BYTE_ARRAY")
+
+
+def dense(table: Any, schema: Any, source: str, arrow: Any, most: int = MAX_TEXT) -> Any:
+    """A table as read, its columns of the types of the schema; refuses more than `most` bytes of text."""
     size = sum(
         _size_of(chunk, arrow.types)
         for column in table.columns
         if arrow.types.is_dictionary(column.type)
         for chunk in column.chunks
     )
-    if size > _MAX_TEXT:
+    if size > most:
         raise InputError(
-            f"{source}: texts of rows that are read at once must have at most {_MAX_TEXT} bytes; "
+            f"{source}: texts of rows that are read at once must have at most {most} bytes; "
             f"got {size}. Shorten or remove the columns with long texts."
         )
     return table.cast(schema.remove_metadata())
@@ -142,9 +151,6 @@ def _size_of(cells: Any, types: Any) -> int:
         return 0
     cells.dictionary.validate(full=True)
     lengths = compute.binary_length(cells.dictionary)
-    longest: int = compute.max(lengths).as_py() or 0
-    if longest * len(cells) <= _MAX_TEXT:
-        return 0
     return compute.sum(lengths.take(cells.indices)).as_py() or 0
 
 
@@ -210,9 +216,18 @@ def texts(cells: Any, arrow: Any) -> list[str]:
     """Cells of any type as text tables have them."""
     try:
         values = _in_microseconds(cells, arrow).to_pylist()
-    except ValueError:  # nanoseconds, which times of Python do not have
-        return [as_text(v).replace(" ", "T", 1) for v in cells.cast(arrow.string()).to_pylist()]
+    except (ValueError, OverflowError):  # nanoseconds, or years that times of Python do not have
+        spelt = (_UNSPELT.sub(r"\1", as_text(v)) for v in _spelt(cells, arrow).to_pylist())
+        return [value.replace(" ", "T", 1) for value in spelt]
     return [as_text(value) for value in values]
+
+
+def _spelt(cells: Any, arrow: Any) -> Any:
+    """Times as PyArrow spells them; in UTC where their time zone is not known."""
+    try:
+        return cells.cast(arrow.string())
+    except arrow.ArrowInvalid:
+        return cells.cast(arrow.timestamp(cells.type.unit)).cast(arrow.string())
 
 
 def _in_microseconds(cells: Any, arrow: Any) -> Any:

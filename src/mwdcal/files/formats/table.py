@@ -85,7 +85,7 @@ def write(path: str | os.PathLike[str], table: Table) -> None:
     check_names(list(table.columns), file.name)
     if suffix in (".csv", ".tsv"):
         delimiter = "," if suffix == ".csv" else "\t"
-        atomic.write(file, text.render(_pointed(table), table.metadata, delimiter))
+        atomic.write(file, text.render(pointed(table), table.metadata, delimiter))
     else:
         render = parquet.render if suffix == ".parquet" else workbook.render
         atomic.write(file, render(_typed(table), table.metadata, file.name))
@@ -207,7 +207,7 @@ def _advice(cell: str, decimal: str) -> str:
     return "Write a plain number, such as 0.998 or 9.98e-1."
 
 
-def _pointed(table: Table) -> dict[str, Column]:
+def pointed(table: Table) -> dict[str, Column]:
     """The columns with the decimal point in every number, for text files."""
     if table.decimal == ".":
         return dict(table.columns)
