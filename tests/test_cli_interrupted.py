@@ -13,7 +13,7 @@ import pytest
 
 from cli_support import EXAMPLE, mwdcal, process
 from mwdcal.app import fleet_table
-from mwdcal.app.interruption import Ended, orderly_end, report
+from mwdcal.app.interruption import Ended, held, orderly_end, report
 
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="POSIX signals")
 
@@ -245,6 +245,21 @@ def test_a_signal_in_a_place_that_cannot_fail_ends_the_command_all_the_same(hand
     with pytest.raises(Ended), orderly_end():
         work()
     assert capfd.readouterr().err == ""
+
+
+def test_a_signal_waits_for_what_must_not_be_left_half_begun(handlers):
+    done = []
+
+    def work():
+        with held():
+            signal.raise_signal(signal.SIGTERM)
+            done.append("begun")
+        done.append("more")
+
+    with pytest.raises(Ended) as stop, orderly_end():
+        work()
+    assert stop.value.args == (signal.SIGTERM,)
+    assert done == ["begun"]
 
 
 def test_other_errors_stay_what_they_are():

@@ -862,7 +862,7 @@ def cluster(folder, workers=2):
     one = ["worker", address, "--nthreads", "1", "--no-nanny", "--no-dashboard"]
     try:
         running += [subprocess.Popen([*dask, *one], **quiet) for _ in range(workers)]
-        yield address, running[1:]
+        yield address, running
     finally:
         for each in reversed(running):
             each.kill()
@@ -873,7 +873,7 @@ def cluster(folder, workers=2):
 def test_a_cluster_of_two_of_which_one_dies_half_way(tmp_path):
     path = many(tmp_path / "runs.parquet", tools=4800)
     output, folder = tmp_path / "cals.parquet", tmp_path / "cals.parquet.parts"
-    with cluster(tmp_path) as (address, workers):
+    with cluster(tmp_path) as (address, (_, *workers)):
         command = ["fleet", path, "-o", output, "--tool", "servo", "--scheduler", address]
         client = subprocess.Popen(
             [*MWDCAL, *map(str, command)],
@@ -914,3 +914,43 @@ def test_no_cluster_there(fleet, tmp_path):
     assert ran.returncode == 2
     assert "Traceback" not in ran.stderr
     assert "no Dask scheduler answers" in ran.stderr
+
+
+@pytest.mark.slow
+def test_a_scheduler_that_does_not_speak_or_wants_certificates(fleet, tmp_path, monkeypatch):
+    pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
+    monkeypatch.setattr(pool, "CLUSTER_TIMEOUT", 0.5)
+    command = ["fleet", fleet[0], "-o", tmp_path / "o.parquet", "--scheduler"]
+    with socket.socket() as mute:
+        mute.bind(("127.0.0.1", 0))
+        mute.listen()
+        place = f"127.0.0.1:{mute.getsockname()[1]}"
+        assert "it is mute" in refused(mwdcal(*command, f"tcp://{place}"), 2)
+        assert "distributed.comm.tls" in refused(mwdcal(*command, f"tls://{place}"), 2)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.name == "nt", reason="POSIX signals")
+@pytest.mark.parametrize("by", ["SIGKILL", "SIGSTOP"])
+def test_a_scheduler_that_falls_silent_ends_the_fleet_and_leaves_its_parts(
+    tmp_path, monkeypatch, by
+):
+    monkeypatch.setattr(pool, "CLUSTER_TIMEOUT", 20.0)
+    path = many(tmp_path / "runs.parquet", tools=4800)
+    real = pool._finished
+
+    def silenced(client, waiting):
+        for count, key in enumerate(real(client, waiting), 1):
+            yield key
+            if count == 2:
+                scheduler.send_signal(getattr(signal, by))
+                monkeypatch.setattr(pool, "CLUSTER_TIMEOUT", 2.0)
+
+    monkeypatch.setattr(pool, "_finished", silenced)
+    with cluster(tmp_path, 1) as (address, (scheduler, _)):
+        ran = mwdcal(
+            "fleet", path, "-o", tmp_path / "o.parquet", "--tool", "servo", "--scheduler", address
+        )
+    assert "the scheduler no longer answers. Finished parts are kept" in refused(ran, 2)
+    assert len(list((tmp_path / "o.parquet.parts").glob("*.arrow"))) >= 2

@@ -24,4 +24,5 @@ class FitError(MwdcalError):
 
 def reason(error: Exception) -> str:
     """What the operating system says went wrong, without its error number and the path."""
-    return getattr(error, "strerror", None) or str(error)
+    text: str = getattr(error, "strerror", None) or str(error)
+    return text.partition("[errno ")[2].partition("] ")[2] or text

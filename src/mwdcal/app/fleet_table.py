@@ -68,12 +68,7 @@ def calibrate_table(
         tools = find_tools(source)
         parts = {f"{plan.key(part)}.arrow": part for part in partitions(source, tools, folder, say)}
         paths = [folder / name for name in parts]
-        done, damaged = kept.finished(paths)
-        counts = {"tool": tools.count, "station": source.rows, "part": len(parts)}
-        counted = ", ".join(plural(count, noun) for noun, count in counts.items())
-        say(f"{counted}, {len(done)} done before")
-        if damaged:
-            say(f"! {plural(damaged, 'part')} done before, but damaged: computed again")
+        done = _finished(paths, tools, source, say)
         steps = pool.Steps(partial(load, plan), partial(solve, plan))
         missing = {
             path: part for path, part in zip(paths, parts.values(), strict=True) if path not in done
@@ -93,6 +88,19 @@ def calibrate_table(
         seconds=round(time.perf_counter() - begun, 3),
         unused=unused,
     )
+
+
+def _finished(
+    paths: list[Path], tools: Tools, source: Source, say: Callable[[str], None]
+) -> set[Path]:
+    """The parts that were done before; says how many there are, and are to do again."""
+    done, damaged = kept.finished(paths)
+    counts = {"tool": tools.count, "station": source.rows, "part": len(paths)}
+    counted = ", ".join(plural(count, noun) for noun, count in counts.items())
+    say(f"{counted}, {len(done)} done before")
+    if damaged:
+        say(f"! {plural(damaged, 'part')} done before, but damaged: computed again")
+    return done
 
 
 @contextlib.contextmanager

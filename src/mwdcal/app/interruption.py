@@ -74,6 +74,26 @@ def _raised_again(received: list[tuple[int, float]]) -> Iterator[None]:
         sys.unraisablehook = before
 
 
+@contextmanager
+def held() -> Iterator[None]:
+    """Signals to end wait until the block is over, as what it begins must not be left half begun."""
+    waiting: list[int] = []
+    handlers = {each: signal.getsignal(each) for each in _signals()}
+    ours = {each: handler for each, handler in handlers.items() if callable(handler)}
+    try:
+        for each in ours:
+            signal.signal(each, lambda number, frame: waiting.append(number))
+    except ValueError:  # signals belong to the main thread
+        ours = {}
+    try:
+        yield
+    finally:
+        for each, handler in ours.items():
+            signal.signal(each, handler)
+        if waiting:
+            signal.raise_signal(waiting[0])
+
+
 def _cause(error: BaseException | None) -> Ended | None:
     """The end that an error was raised for."""
     while error is not None and not isinstance(error, Ended):
@@ -83,11 +103,15 @@ def _cause(error: BaseException | None) -> Ended | None:
 
 def _default_handlers() -> dict[signal.Signals, Any]:
     """The signals that ask a process to end and are neither ignored nor handled by others."""
-    names = ("SIGINT", "SIGTERM", "SIGHUP")
-    signals = [getattr(signal, name) for name in names if hasattr(signal, name)]
-    handlers = {each: signal.getsignal(each) for each in signals}
+    handlers = {each: signal.getsignal(each) for each in _signals()}
     defaults = (signal.SIG_DFL, signal.default_int_handler)
     return {each: handler for each, handler in handlers.items() if handler in defaults}
+
+
+def _signals() -> list[signal.Signals]:
+    """The signals that ask a process to end, as far as the system has them."""
+    names = ("SIGINT", "SIGTERM", "SIGHUP")
+    return [getattr(signal, name) for name in names if hasattr(signal, name)]
 
 
 def report(stop: BaseException) -> tuple[str, int]:

@@ -31,6 +31,7 @@ from multiprocessing.context import BaseContext
 from queue import Empty, SimpleQueue
 from typing import Any
 
+from mwdcal.app.interruption import held
 from mwdcal.errors import InputError, reason
 
 ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
@@ -173,7 +174,11 @@ def _by_pool(
         try:
             while True:
                 for index in waiting:
-                    running[pool.submit(steps.solve, steps.load(tasks[index]))] = index
+                    loaded = steps.load(tasks[index])
+                    with (
+                        held()
+                    ):  # a worker that nobody waits for would not find what it begins with
+                        running[pool.submit(steps.solve, loaded)] = index
                     if len(running) >= 2 * workers:
                         break
                 if not running:
