@@ -30,7 +30,8 @@ TWINS = {chr(0xA0): " ", chr(0x2009): " ", chr(0x202F): " ", "‰": "per mille"}
 _BIDI = "\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069"
 _CONTROL = rf"\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff{_BIDI}"
 _UNSAFE = re.compile(f"[{_CONTROL}]")
-_UNSAFE_BUT_LINES = re.compile(f"(?!\n)[{_CONTROL}]")
+UNSAFE_BUT_LINES = re.compile(f"(?!\n)[{_CONTROL}]")
+"""Characters that control a terminal or the direction of writing, but for line breaks."""
 
 
 def one_line(text: object) -> str:
@@ -47,7 +48,7 @@ def one_line(text: object) -> str:
 
 def harmless(text: str) -> str:
     """As `one_line`, but line breaks stay."""
-    return _UNSAFE_BUT_LINES.sub(_escape, text)
+    return UNSAFE_BUT_LINES.sub(_escape, text)
 
 
 def _escape(unsafe: re.Match[str]) -> str:

@@ -6,7 +6,6 @@ from pathlib import Path
 
 from mwdcal.app.commands import options
 from mwdcal.app.messages import lines, print_result, say
-from mwdcal.errors import InputError
 
 
 @options.command()
@@ -51,11 +50,12 @@ def command(
     try:
         stations = find_stations(readings, say=slowly, **search)
     except StandstillError as error:  # the picture helps most then
-        message = [str(error), *lines(error.analysis.findings)]
+        for line in lines(error.analysis.findings):
+            error.add_note(line)
         if plot:
             atomic.write(plot, picture(page.figure(error.analysis), plot))
-            message.append(f"wrote {plot} (picture)")
-        raise InputError("\n".join(message)) from None
+            error.add_note(f"wrote {plot} (picture)")
+        raise
     drawn = picture(page.figure(stations), plot) if plot else b""
     table.write(output, stations.table)
     if plot:
