@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from mwdcal.app.messages import lines
-from mwdcal.app.text import chance, number, quantity, table
+from mwdcal.app.text import chance, number, one_line, quantity, table
 from mwdcal.calibration.automatic.nonlinearity import CurveScore
 from mwdcal.calibration.diagnosis.findings import UNUSED
 from mwdcal.calibration.prediction import typical_accuracy
@@ -77,7 +77,7 @@ def screen(calibration: Calibration, choice: Choice, output: Path, report: Path 
 
 def _written(output: Path, report: Path | None) -> str:
     written = f"wrote {output} (calibration)" + (f"   {report} (report)" if report else "")
-    return f"{written}   next: mwdcal verify {output} ROLLTEST.csv"
+    return one_line(f"{written}   next: mwdcal verify {output} ROLLTEST.csv")
 
 
 def _findings(findings: list[Finding]) -> list[str]:
@@ -120,9 +120,10 @@ def heading(calibration: Calibration) -> str:
     how = ", ".join(
         [f"method {calibration.method}", model(calibration), *choices(calibration.options)]
     )
-    left_out = ["left out by --exclude: station " + ", ".join(calibration.excluded)]
     lines = ["   ".join(parts), "   ".join([how, *ranks])]
-    return "\n".join(lines + (left_out if calibration.excluded else []))
+    if calibration.excluded:
+        lines.append("left out by --exclude: station " + ", ".join(calibration.excluded))
+    return "\n".join(map(one_line, lines))
 
 
 def known_inclinations(calibration: Calibration) -> list[float]:

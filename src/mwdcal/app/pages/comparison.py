@@ -14,7 +14,7 @@ import numpy as np
 
 from mwdcal import __version__
 from mwdcal.app.pages.page import environment, factor_places, measured, number
-from mwdcal.app.text import raised, superscript, table
+from mwdcal.app.text import one_line, raised, superscript, table
 from mwdcal.calibration.methods import EVIDENCE
 from mwdcal.calibration.readings import SIMULATED
 from mwdcal.comparison.common_gauge import SCALE
@@ -44,11 +44,11 @@ def text(comparison: Comparison, parameters: bool = False) -> str:
     rows = able(comparison.rows)
     methods = [row.method for row in rows]
     simulated = [SIMULATED] if comparison.simulated else []
-    lines = ["   ".join([*heading(comparison), *simulated]), comparison.advice]
+    lines = [one_line("   ".join([*heading(comparison), *simulated])), one_line(comparison.advice)]
     if rows:
         lines += ["", _table(figures(comparison), ["", "before", *methods]), ""]
-    lines += notes(comparison)
-    lines += [f"{who} refused: {why}" for who, why in refusals(comparison)]
+    lines += map(one_line, notes(comparison))
+    lines += [f"{who} refused: {one_line(why)}" for who, why in refusals(comparison)]
     if parameters and rows:
         lines += ["", gauge(comparison) + " In parentheses: 1σ of the last digits."]
         for name, stated in parameter_pairs(comparison).items():

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mwdcal.app.pages.page import HELD, is_held
-from mwdcal.app.text import raised, table
+from mwdcal.app.text import one_line, raised, table
 from mwdcal.calibration.readings import TRIADS, Readings, is_simulated, simulated
 from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.files import documents
@@ -133,7 +133,7 @@ def screen(converted: Converted) -> str:
     conditions = [f"notation {converted.notation}", f"temperature {shown}", _calibrated(converted)]
     lines += ["   ".join(conditions), "   ".join(units)]
     values = notation(converted.triads, reference if at == COURSE else None)
-    return "\n".join(lines) + "\n\n" + values
+    return "\n".join(map(one_line, lines)) + "\n\n" + values
 
 
 def _calibrated(converted: Converted) -> str:

@@ -16,7 +16,7 @@ import numpy as np
 from mwdcal.app.commands.choices import names
 from mwdcal.app.commands.options import Typed
 from mwdcal.app.pages.calibration import choices
-from mwdcal.app.text import number, plural, table
+from mwdcal.app.text import number, one_line, plural, table
 from mwdcal.calibration.readings import TRIADS
 from mwdcal.calibration.record import Choices, Finding
 from mwdcal.calibration.soaks import HIGHEST
@@ -253,10 +253,10 @@ def text(summary: FleetSummary, report: Path | None) -> str:
     )
     also = unusual(summary.options)
     rows = [[k.status, str(k.tools), "" if k.status == OK else _first(k)] for k in summary.statuses]
-    lines = [heading, *(["options: " + ", ".join(also)] if also else []), ""]
+    lines = [one_line(heading), *(["options: " + ", ".join(also)] if also else []), ""]
     lines += [table(rows, ["status", "tools", "serials"])]
     refused = [kind for kind in summary.statuses if kind.status != OK]
-    lines += [f"! {kind.status}, for example: {kind.message}" for kind in refused]
+    lines += [f"! {kind.status}, for example: {one_line(kind.message)}" for kind in refused]
     lines += [
         f"! {finding.id} in {plural(finding.tools, 'tool')}: {_first(finding)}"
         for finding in summary.findings
@@ -275,10 +275,12 @@ def text(summary: FleetSummary, report: Path | None) -> str:
         lines.append(f"own-axis terms in {plural(count, 'tool')}: {name}")
     for name, count in summary.undetermined.items():
         lines.append(f"undetermined in {plural(count, 'tool')}: {name}")
-    lines += [f"! {note}" for note in summary.notes]
+    lines += [f"! {one_line(note)}" for note in summary.notes]
     rate = summary.tools / summary.seconds
     wrote = f"wrote {summary.output} (calibrations)" + (f"   {report} (report)" if report else "")
-    return "\n".join([*lines, "", f"{wrote}   {summary.seconds:.1f} s, {rate:.0f} tools/s"])
+    return "\n".join(
+        [*lines, "", f"{one_line(wrote)}   {summary.seconds:.1f} s, {rate:.0f} tools/s"]
+    )
 
 
 def orders_table(summary: FleetSummary) -> tuple[list[str], list[list[str]]]:
@@ -289,7 +291,7 @@ def orders_table(summary: FleetSummary) -> tuple[list[str], list[list[str]]]:
 
 def _first(some: StatusCount | FindingCount) -> str:
     """The first serials of some tools."""
-    return ", ".join(map(str, some.serials)) + (" …" if some.tools > len(some.serials) else "")
+    return ", ".join(map(one_line, some.serials)) + (" …" if some.tools > len(some.serials) else "")
 
 
 def _title(name: str) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 
 from mwdcal import __version__
 from mwdcal.app.pages.page import environment
-from mwdcal.app.text import plural, table
+from mwdcal.app.text import one_line, plural, table
 from mwdcal.calibration.readings import SIMULATED
 from mwdcal.files.contract import CHANNELS
 from mwdcal.logs.noise import ChannelNoise, Noise, Term
@@ -51,7 +51,7 @@ def document(noise: Noise, plot: Path | None, report: Path | None) -> dict[str, 
 
 def screen(noise: Noise, plot: Path | None, report: Path | None) -> str:
     """The result for people."""
-    parts = ["   ".join(heading(noise)), ""]
+    parts = [one_line("   ".join(heading(noise))), ""]
     for header, lines in tables(noise):
         parts += [table([[what, *cells] for what, cells in lines], ["", *header]), ""]
     parts += [
@@ -60,7 +60,7 @@ def screen(noise: Noise, plot: Path | None, report: Path | None) -> str:
         profile_lines(noise),
     ]
     files = [f"{path} ({what})" for path, what in ((plot, "picture"), (report, "report")) if path]
-    return "\n".join(parts) + (f"\n\nwrote {'   '.join(files)}" if files else "")
+    return "\n".join(parts) + (f"\n\nwrote {one_line('   '.join(files))}" if files else "")
 
 
 def heading(noise: Noise) -> list[str]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mwdcal.app.pages import pictures
-from mwdcal.app.text import chance, plural, superscript
+from mwdcal.app.text import chance, harmless, plural, superscript
 from mwdcal.geometry.vectors import Array
 
 if TYPE_CHECKING:
@@ -32,6 +32,7 @@ def environment() -> Environment:
         loader=PackageLoader("mwdcal.app.pages"),
         autoescape=True,
         undefined=StrictUndefined,
+        finalize=lambda shown: harmless(shown) if type(shown) is str else shown,
         trim_blocks=True,
         lstrip_blocks=True,
     )
@@ -114,4 +115,4 @@ def unit(symbol: str) -> str:
 
 def css_string(text: str) -> str:
     """Text as the inside of a CSS string: nothing but letters and digits is left bare."""
-    return "".join(c if c.isascii() and c.isalnum() else f"\\{ord(c):x} " for c in text)
+    return "".join(c if c.isascii() and c.isalnum() else f"\\{ord(c):x} " for c in harmless(text))

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mwdcal.app.text import table
+from mwdcal.app.text import one_line, table
 from mwdcal.files.contract import CHANNELS
 from mwdcal.geometry.vectors import Array
 from mwdcal.logs.stations import Stations
@@ -71,16 +71,18 @@ def screen(stations: Stations, files: dict[str, str]) -> str:
     same = " (the same stations from {:.3g} to {:.3g})"
     stretch = same.format(*stations.stretch) if stations.stretch else " (given)"
     lines = [
-        f"{stations.table.source}   {len(stations.time)} rows   {whole:.6g} s   "
+        f"{one_line(stations.table.source)}   {len(stations.time)} rows   {whole:.6g} s   "
         f"{stations.table.count} stations, {100 * float((end - start).sum()) / whole:.0f} % of the time",
         f"threshold {stations.threshold:.3g} noise floors{stretch}   at least "
         f"{stations.min_seconds:g} s after {stations.trim_seconds:g} s trimmed off each end   "
         f"left: {short} too short, {len(left) - short} moving slowly",
         "",
         _stations_table(stations),
-        f"wrote {files['output']}"
-        + (f"   {files['plot']} (picture)" if files["plot"] else "")
-        + f"   next: mwdcal calibrate {files['output']} -o CAL.json",
+        one_line(
+            f"wrote {files['output']}"
+            + (f"   {files['plot']} (picture)" if files["plot"] else "")
+            + f"   next: mwdcal calibrate {files['output']} -o CAL.json"
+        ),
     ]
     return "\n".join(lines)
 
