@@ -15,7 +15,7 @@ from mwdcal import __version__
 from mwdcal.app import interruption
 from mwdcal.app.block_pandas import without_pandas
 from mwdcal.app.messages import say, screens
-from mwdcal.app.text import one_line
+from mwdcal.app.text import harmless
 from mwdcal.errors import MwdcalError, reason
 
 INTERNAL = 70
@@ -82,7 +82,7 @@ def _status(arguments: list[str] | None) -> int:
             status = cli.main(arguments, prog_name="mwdcal", standalone_mode=False)
     except click.ClickException as error:
         error.show(usage := io.StringIO())
-        say(usage.getvalue().rstrip("\n"))
+        click.echo(harmless(usage.getvalue()), err=True, nl=False)
         return error.exit_code
     except (click.Abort, KeyboardInterrupt) as stop:
         return _ended(*interruption.report(stop.__cause__ or stop))
@@ -114,5 +114,5 @@ def _refused(error: OSError) -> str:
 def _ended(message: str, status: int, *notes: str) -> int:
     """Say why the command ends, and what goes with it, a line each; the exit status."""
     for line in (f"mwdcal: {message}", *notes):
-        say(one_line(line))
+        say(line)
     return status

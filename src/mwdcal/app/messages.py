@@ -112,13 +112,13 @@ def _occupy_closed_descriptors() -> None:
 
 
 def say(text: str) -> None:
-    """A message for people, on stderr."""
-    click.echo(harmless(text), err=True)
+    """A message for people, on stderr and on one line."""
+    click.echo(one_line(text), err=True)
 
 
 def lines(findings: Iterable[Finding]) -> list[str]:
     """Findings, one line each."""
-    return [f"! {one_line(finding.text)}" for finding in findings]
+    return [one_line(f"! {finding.text}") for finding in findings]
 
 
 def to_json(result: Any) -> str:

@@ -19,6 +19,8 @@ from mwdcal.files.formats import parquet, text
 from mwdcal.geometry.vectors import AnyArray, Bools
 
 _ARROW_SCHEMA = b"ARROW:schema"
+FINDINGS = "findings"
+"""The key of metadata with what the reader of a table should know of it."""
 
 
 class ParquetSink:
@@ -59,7 +61,7 @@ class ParquetSink:
         self._writer.close()
 
     def _described(self, findings: Sequence[str]) -> bytes:
-        metadata = {**self._metadata, "findings": list(findings)} if findings else self._metadata
+        metadata = {**self._metadata, FINDINGS: list(findings)} if findings else self._metadata
         return msgspec.json.encode(metadata, enc_hook=str)
 
 
@@ -82,9 +84,11 @@ class TextSink:
         self._stream = stream
         self._delimiter = delimiter
         self._names = results.names
-        stream.write("".join(f"{line}\n" for line in meta.render(metadata)).encode())
+        above = {name: value for name, value in metadata.items() if name != FINDINGS}
+        stream.write("".join(f"{line}\n" for line in meta.render(above)).encode())
         self._place = stream.tell()
-        self._room = len(_line(longest)) if longest else 0
+        self._earlier = "".join(meta.render({FINDINGS: metadata.get(FINDINGS)})).encode()
+        self._room = max(len(_line(longest)), len(self._earlier))
         header = csv.writer(buffer := io.StringIO(), delimiter=self._delimiter, lineterminator="\n")
         header.writerow([*schema.names, *results.names])
         self._header = buffer.getvalue().encode()
@@ -153,12 +157,13 @@ class TextSink:
         self._header = self._first = b""
 
     def finish(self, findings: Sequence[str]) -> None:
-        """Put the findings where they belong."""
+        """Put the findings where they belong; without any those of the input stay."""
+        comment = _line(findings) or self._earlier
         if self._header:
-            self._begin(_line(findings) + b"\n" if findings else b"")
-        elif findings:
+            self._begin(comment + b"\n" if comment else b"")
+        elif comment:
             self._stream.seek(self._place)
-            self._stream.write(_line(findings).ljust(self._room))
+            self._stream.write(comment.ljust(self._room))
 
     def _spelt(self, cells: Any) -> Any:
         """A column of numbers (blank: null) or of text, as text tables have them."""
@@ -178,4 +183,5 @@ Sink = ParquetSink | TextSink
 
 
 def _line(findings: Sequence[str]) -> bytes:
-    return meta.render({"findings": list(findings)})[0].encode()
+    """The line of metadata with the findings, if there are any."""
+    return "".join(meta.render({FINDINGS: list(findings) or None})).encode()
