@@ -36,7 +36,10 @@ def write_all(files: Iterable[tuple[Path | None, bytes | str]]) -> None:
     with contextlib.ExitStack() as stack:
         for path, data in files:
             if path:
-                stack.enter_context(replacing(path)).write(_encoded(data))
+                stream = stack.enter_context(replacing(path))
+                stream.write(_encoded(data))
+                stream.flush()
+                os.fsync(stream.fileno())
 
 
 def write(path: str | os.PathLike[str], data: bytes | str, durable: bool = True) -> None:
