@@ -36,10 +36,10 @@ def write_all(files: Iterable[tuple[Path | None, bytes | str]]) -> None:
     with contextlib.ExitStack() as stack:
         for path, data in files:
             if path:
-                stream = stack.enter_context(replacing(path))
+                stream = stack.enter_context(replacing(path, durable=False))
                 stream.write(_encoded(data))
                 stream.flush()
-                os.fsync(stream.fileno())
+                os.fsync(stream.fileno())  # all are on the disk before the first is replaced
 
 
 def write(path: str | os.PathLike[str], data: bytes | str, durable: bool = True) -> None:
