@@ -76,6 +76,49 @@ def test_a_device_is_never_replaced():
         atomic.write(os.devnull, "new")
 
 
+@pytest.mark.skipif(os.name == "nt", reason="POSIX files")
+def test_a_pipe_and_a_link_to_itself_are_never_replaced(tmp_path):
+    pipe, link = tmp_path / "pipe", tmp_path / "link"
+    os.mkfifo(pipe)
+    link.symlink_to(link)
+    for path in (pipe, link):
+        with pytest.raises(InputError, match="not a regular file"):
+            atomic.write(path, "new")
+    assert pipe.is_fifo()
+    assert link.is_symlink()
+
+
+def test_a_write_protected_file_stays_even_for_the_superuser(tmp_path):
+    file = tmp_path / "cal.json"
+    file.write_text("old")
+    file.chmod(0o444)
+    with pytest.raises(InputError, match=r"it is write-protected. Name another file"):
+        atomic.write(file, "new")
+    assert file.read_text() == "old"
+    file.chmod(0o644)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="POSIX permissions")
+@pytest.mark.parametrize("mode", [0o600, 0o664, 0o755])
+def test_a_replaced_file_keeps_its_permissions(tmp_path, mode):
+    file = tmp_path / "cal.json"
+    file.write_text("old")
+    file.chmod(mode)
+    atomic.write(file, "new")
+    assert file.stat().st_mode & 0o7777 == mode
+    assert file.read_text() == "new"
+
+
+def test_several_files_are_written_together_or_not_at_all(tmp_path):
+    first, second = tmp_path / "cal.json", tmp_path / "report.html"
+    atomic.write_all([(first, "1"), (None, ""), (second, b"2")])
+    assert (first.read_text(), second.read_text()) == ("1", "2")
+    with pytest.raises(InputError, match="nowhere"):
+        atomic.write_all([(first, "3"), (tmp_path / "nowhere" / "x", "4")])
+    assert first.read_text() == "1"
+    assert {file.name for file in tmp_path.iterdir()} == {"cal.json", "report.html"}
+
+
 def test_a_name_that_no_file_can_have(tmp_path):
     for name in ("a\0b", "x" * 5000):
         with pytest.raises(InputError, match="cannot write"):

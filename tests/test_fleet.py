@@ -452,7 +452,7 @@ def test_wrong_paths(tmp_path):
     output = tmp_path / "out.parquet"
     assert "no such file" in refused(mwdcal("fleet", tmp_path / "no.parquet", "-o", output), 2)
     assert "Parquet" in refused(mwdcal("fleet", good, "-o", tmp_path / "out.csv"), 2)
-    assert "named twice" in refused(mwdcal("fleet", good, "-o", good), 2)
+    assert "would be lost" in refused(mwdcal("fleet", good, "-o", good), 2)
     assert "folder without" in refused(mwdcal("fleet", _empty(tmp_path), "-o", output), 2)
     inside = mwdcal("fleet", tmp_path, "-o", tmp_path / "out.parquet")
     assert "part of the input" in refused(inside, 2)

@@ -665,6 +665,21 @@ def test_findings_of_a_long_text_table_stand_above_its_header(tmp_path, small_pi
     assert list(found.columns)[-13:] == list(RESULTS)
 
 
+@pytest.mark.parametrize("count", [5, 5000])
+@pytest.mark.parametrize("low", [10.0, -30.0])
+def test_a_corrected_table_has_one_line_of_findings(tmp_path, warm, small_pieces, count, low):
+    columns = log(count, low=low, high=low + 20)
+    source = write_parquet(tmp_path / "log.parquet", columns, {"findings": ["old"], "lab": "B"})
+    ran = mwdcal("apply", warm[0], source, "-o", tmp_path / "out.csv", "--json")
+    written = (tmp_path / "out.csv").read_text().splitlines()
+    assert sum(line.startswith("# findings = ") for line in written) == 1
+    said = [finding["text"] for finding in ran.json["findings"]]
+    assert (said == []) == (low == 10.0)
+    found = table.read(tmp_path / "out.csv").metadata
+    assert (found["findings"], found["lab"]) == (["old", *said], "B")
+    assert_same(tmp_path / "out.csv", whole(warm[1], source)[0])
+
+
 def test_parquet_and_long_text_are_taken_in_parts_where_the_formats_allow_it(tmp_path, monkeypatch):
     short = write_csv(tmp_path / "a.csv", log(50))
     packed = write_parquet(tmp_path / "a.parquet", log(1))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import os
 import sys
 from collections.abc import Iterator, Mapping
@@ -12,11 +14,14 @@ import click
 from mwdcal import __version__
 from mwdcal.app import interruption
 from mwdcal.app.block_pandas import without_pandas
-from mwdcal.app.messages import say
-from mwdcal.errors import MwdcalError
+from mwdcal.app.messages import say, screens
+from mwdcal.app.text import harmless
+from mwdcal.errors import MwdcalError, reason
 
 INTERNAL = 70
 """Exit status of a defect of the program."""
+COMPLETION = "_MWDCAL_COMPLETE"
+"""Variable with which a shell asks for completions, which are bytes."""
 COMMANDS = (
     *("apply", "calibrate", "compare", "completion", "convert"),
     *("fleet", "noise", "stations", "verify"),
@@ -65,43 +70,49 @@ def main(arguments: list[str] | None = None) -> None:
     """
     if arguments is None:
         without_pandas()
+    with contextlib.nullcontext() if COMPLETION in os.environ else screens():
+        code = _status(arguments)
+    sys.exit(code)
+
+
+def _status(arguments: list[str] | None) -> int:
+    """Run the command line; its exit status."""
     try:
         with interruption.orderly_end():
-            code = cli.main(arguments, prog_name="mwdcal", standalone_mode=False)
+            status = cli.main(arguments, prog_name="mwdcal", standalone_mode=False)
     except click.ClickException as error:
-        error.show()
-        sys.exit(error.exit_code)
+        error.show(usage := io.StringIO())
+        click.echo(harmless(usage.getvalue()), err=True, nl=False)
+        return error.exit_code
     except (click.Abort, KeyboardInterrupt) as stop:
-        message, code = interruption.report(stop.__cause__ or stop)
-        _end(message, code)
+        return _ended(*interruption.report(stop.__cause__ or stop))
     except MwdcalError as error:
-        _end(str(error), error.exit_code)
+        return _ended(str(error), error.exit_code, *getattr(error, "__notes__", ()))
     except MemoryError:
-        _end("not enough memory for this input. Split the file, or use a larger machine.", 2)
+        return _ended(
+            "not enough memory for this input. Split the file, or use a larger machine.", 2
+        )
     except OSError as error:
-        _end(_unwritable(error), 2)
+        return _ended(_refused(error), 2)
     except Exception as error:
         if os.environ.get("MWDCAL_DEBUG"):
             raise
-        _end(
+        return _ended(
             f"internal error ({type(error).__name__}: {error}). This is a defect of "
             "mwdcal: please report it with the command and the file. MWDCAL_DEBUG=1 shows where.",
             INTERNAL,
         )
-    if isinstance(code, int):
-        sys.exit(code)
+    return status if isinstance(status, int) else 0
 
 
-def _unwritable(error: OSError) -> str:
-    """Give up stdout; why, but for a reader that has left."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    if isinstance(error, BrokenPipeError):
-        return ""
-    return f"cannot write the result: {error.strerror or error}. Send it elsewhere."
+def _refused(error: OSError) -> str:
+    """What the operating system did not do."""
+    place = f"'{error.filename}': " if error.filename else ""
+    return f"{place}{reason(error)}. Make room or choose another place, and run the command again."
 
 
-def _end(message: str, code: int) -> None:
-    """Print why the command ends, if there is anything to say, and exit."""
-    if message:
-        say(f"mwdcal: {message}")
-    sys.exit(code)
+def _ended(message: str, status: int, *notes: str) -> int:
+    """Say why the command ends, and what goes with it, a line each; the exit status."""
+    for line in (f"mwdcal: {message}", *notes):
+        say(line)
+    return status

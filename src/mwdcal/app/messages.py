@@ -1,14 +1,23 @@
-"""What commands say beside their result: messages, findings, JSON, and errors in their words."""
+"""What commands say: results on stdout, messages and findings on stderr, errors in their words.
+
+Both streams take any text in any encoding; one that is closed, or that nobody reads, is not an error.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import json
+import os
 import re
-from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any
+import sys
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any
 
 import click
 
-from mwdcal.errors import MwdcalError
+from mwdcal.app.text import UNSAFE_BUT_LINES, fitting, harmless, one_line
+from mwdcal.errors import InputError, MwdcalError, reason
 
 if TYPE_CHECKING:
     from mwdcal.calibration.record import Finding
@@ -16,6 +25,13 @@ if TYPE_CHECKING:
 
 class Command(click.Command):
     """A command whose errors name its options as they are typed."""
+
+    def parse_args(self, context: click.Context, args: list[str]) -> list[str]:
+        """Read the arguments, which are all text: outputs name the files that they are made of."""
+        for word in args:
+            if word != word.encode("utf-8", "ignore").decode():
+                raise InputError(f"'{word}': a name must be valid UTF-8. Rename the file.")
+        return super().parse_args(context, args)
 
     def invoke(self, context: click.Context) -> Any:
         """Run the command."""
@@ -43,14 +59,74 @@ def findings_as_typed(findings: Iterable[Finding]) -> list[Finding]:
     return [replace(finding, text=as_typed(finding.text, command)) for finding in findings]
 
 
+class Screen:
+    """A standard stream that shows any text in the characters that its encoding has.
+
+    Without a `stream`, or once its reader has left, what is written goes nowhere. A stream that fails
+    otherwise is a refusal; not one of messages, which could not be read either.
+    """
+
+    def __init__(self, stream: IO[str] | None, messages: bool = False) -> None:
+        self._stream = stream or Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115
+        self._messages = messages
+
+    def __getattr__(self, name: str) -> Any:
+        """What a terminal is asked for: its encoding, its descriptor; not its bytes."""
+        if name not in ("encoding", "fileno", "isatty"):
+            raise AttributeError(name)
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> int:
+        """Write text; control characters in it are up to the writer."""
+        shown = fitting(text, self.encoding)
+        with self._given_up_when_it_fails():
+            if shown:  # click tries with nothing, and takes no notice of a failure
+                self._stream.write(shown)
+        return len(text)
+
+    def flush(self) -> None:
+        """Write what is still kept back."""
+        with self._given_up_when_it_fails():
+            self._stream.flush()
+
+    @contextlib.contextmanager
+    def _given_up_when_it_fails(self) -> Iterator[None]:
+        """So that what is left in it does not fail once more when the process ends."""
+        try:
+            yield
+        except OSError as error:
+            with contextlib.suppress(OSError), Path(os.devnull).open("wb") as nothing:
+                os.dup2(nothing.fileno(), self._stream.fileno())
+            if not self._messages and not isinstance(error, BrokenPipeError):
+                message = f"cannot write the result: {reason(error)}. Send it elsewhere."
+                raise InputError(message) from error
+
+
+@contextlib.contextmanager
+def screens() -> Iterator[None]:
+    """Stdout and stderr as `Screen`s."""
+    _occupy_closed_descriptors()
+    out: Any = Screen(sys.stdout)
+    messages: Any = Screen(sys.stderr, messages=True)
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(messages):
+        yield
+
+
+def _occupy_closed_descriptors() -> None:
+    """No file that is opened later becomes stdin, stdout or stderr of this process or its workers."""
+    while (descriptor := os.open(os.devnull, os.O_RDWR)) < 3:
+        os.set_inheritable(descriptor, True)
+    os.close(descriptor)
+
+
 def say(text: str) -> None:
-    """A message for people, on stderr."""
-    click.echo(text, err=True)
+    """A message for people, on stderr and on one line."""
+    click.echo(one_line(text), err=True)
 
 
 def lines(findings: Iterable[Finding]) -> list[str]:
     """Findings, one line each."""
-    return [f"! {finding.text}" for finding in findings]
+    return [one_line(f"! {finding.text}") for finding in findings]
 
 
 def to_json(result: Any) -> str:
@@ -64,4 +140,15 @@ def print_result(result: Any, findings: Iterable[Finding] = ()) -> None:
     """Findings on stderr, and the result on stdout: text as it is, anything else as JSON."""
     for line in lines(findings):
         say(line)
-    click.echo(result if isinstance(result, str) else to_json(result))
+    click.echo(harmless(result) if isinstance(result, str) else _shown(to_json(result)))
+
+
+def _shown(document: str) -> str:
+    """JSON in characters that stdout has and that do not control a terminal; escapes for others."""
+    if fitting(document, sys.stdout.encoding) != document:
+        return re.sub(r"[^\x00-\x7e]", _json_escape, document)
+    return UNSAFE_BUT_LINES.sub(_json_escape, document)
+
+
+def _json_escape(character: re.Match[str]) -> str:
+    return json.dumps(character[0])[1:-1]

@@ -8,6 +8,7 @@ import click
 
 from mwdcal.app.commands import options
 from mwdcal.app.messages import print_result
+from mwdcal.app.text import one_line
 from mwdcal.errors import InputError
 
 
@@ -64,5 +65,5 @@ def command(
     blank = tally.blank(outside)
     document = {"rows": tally.rows, "blank": blank, "output": str(output), "findings": findings}
     corrected = f"{tally.rows} rows corrected" + (f", {blank} of them blank" if blank else "")
-    screen = "   ".join([corrected, f"wrote {output}", *simulated(fitted.tool)])
+    screen = "   ".join([corrected, f"wrote {one_line(output)}", *simulated(fitted.tool)])
     print_result(document if as_json else screen, findings)

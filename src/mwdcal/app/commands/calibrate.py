@@ -43,18 +43,19 @@ def command(
     from mwdcal.calibration.diagnosis.findings import UNUSED
     from mwdcal.calibration.estimate import fit
     from mwdcal.files import documents
+    from mwdcal.files.formats import atomic
 
     options.check_outputs([output], [run, tool, typed["prior"]], page=report)
     prior = prior_of(typed["prior"])
     readings, profile = load_run(run, tool, decimal, prior)
     choice = choose(readings, profile, options_of(typed, prior, exclude), say)
     calibration = recorded(choice, fit(choice.readings, choice.options))
+    rendered = ""
     if report:
         from mwdcal.app.pages.report import render
-        from mwdcal.files.formats import atomic
 
-        atomic.write(report, render(calibration))
-    documents.write(output, calibration)
-    shown = page.summary if as_json else page.screen
+        rendered = render(calibration)
+    shown = (page.summary if as_json else page.screen)(calibration, choice, output, report)
     unused = [finding for finding in calibration.findings if finding.id == UNUSED]
-    print_result(shown(calibration, choice, output, report), unused)
+    atomic.write_all([(output, documents.encode(calibration)), (report, rendered)])
+    print_result(shown, unused)

@@ -9,6 +9,7 @@ import click
 
 from mwdcal.app.commands import options
 from mwdcal.app.messages import lines, print_result, say
+from mwdcal.app.text import one_line
 from mwdcal.errors import FitError
 
 
@@ -57,6 +58,6 @@ def command(
     if as_json:
         print_result({**page.document(result), "findings": unused, "report": str(report or "")})
     else:
-        written = f"\nwrote {report} (report)" if report else ""
+        written = f"\nwrote {one_line(report)} (report)" if report else ""
         print_result(page.text(result, parameters) + written)
     sys.exit(0 if able(result.rows) else FitError.exit_code)

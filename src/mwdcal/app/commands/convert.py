@@ -8,6 +8,7 @@ import click
 
 from mwdcal.app.commands import options
 from mwdcal.app.messages import print_result, to_json
+from mwdcal.app.text import one_line
 from mwdcal.errors import InputError
 
 
@@ -42,11 +43,11 @@ def command(
 
     options.check_outputs([output], [calibration])
     converted = conversion.convert_file(calibration, notation, _temperature(temperature))
-    result = conversion.document(converted) if as_json or output else conversion.screen(converted)
+    document = conversion.document(converted)
+    shown = f"wrote {one_line(output)}" if output else conversion.screen(converted)
     if output:
-        atomic.write(output, to_json(result) + "\n")
-        result = f"wrote {output}"
-    print_result(result, converted.findings)
+        atomic.write(output, to_json(document) + "\n")
+    print_result(document if as_json else shown, converted.findings)
 
 
 def _temperature(typed: str | None) -> float | str | None:

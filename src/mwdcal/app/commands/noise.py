@@ -67,8 +67,6 @@ def command(
     noise = replace(noise, findings=findings_as_typed([*noise.findings, *unused]))
     drawn = picture(page.figure(noise), plot) if plot else b""
     rendered = page.render(noise) if report else ""
-    if plot:
-        atomic.write(plot, drawn)
-    if report:
-        atomic.write(report, rendered)
-    print_result((page.document if as_json else page.screen)(noise, plot, report), noise.findings)
+    shown = (page.document if as_json else page.screen)(noise, plot, report)
+    atomic.write_all([(plot, drawn), (report, rendered)])
+    print_result(shown, noise.findings)

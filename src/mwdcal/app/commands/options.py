@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable
 from functools import partial, wraps
 from pathlib import Path
 from typing import Any, TypedDict
+from unicodedata import normalize
 
 import click
 
@@ -160,18 +162,26 @@ def check_outputs(
     picture: Path | None = None,
     page: Path | None = None,
 ) -> None:
-    """Refuse, before any work, an output that cannot be made or written, or would replace an input."""
+    """Refuse, before any work, an output that cannot be made or written, or would replace an input.
+
+    Every file in an input folder is an input.
+    """
     from mwdcal.files.formats import atomic
 
-    taken = [Path(name).resolve() for name in inputs if name and Path(name).is_file()]
-    for path in filter(None, [*outputs, picture, page]):
-        target = atomic.target(path)
-        if target in taken:
-            raise InputError(
-                f"cannot write '{path}': it is named twice, or is an input that would be lost. "
-                "Name another file."
-            )
-        taken.append(target)
+    named = list(filter(None, [*outputs, picture, page]))
+    targets = [atomic.target(path) for path in named]
+    lost = _files(inputs) if any(target.exists() for target in targets) else set()
+    taken: set[object] = set()
+    for path, target in zip(named, targets, strict=True):
+        file = atomic.identity(target)
+        if file in lost:
+            raise _refused(path, "it is an input, which would be lost")
+        if file and file in (atomic.identity(1), atomic.identity(2)):
+            raise _refused(path, "what the command prints goes there")
+        names = {normalize("NFC", str(target)).casefold(), file} - {None}
+        if names & taken:
+            raise _refused(path, "it is named twice")
+        taken |= names
     if picture:
         from mwdcal.app.pages.pictures import require
 
@@ -183,6 +193,21 @@ def check_outputs(
         from mwdcal.app.pages.page import environment
 
         environment()
+
+
+def _refused(path: Path, why: str) -> InputError:
+    return InputError(f"cannot write '{path}': {why}. Name another file.")
+
+
+def _files(inputs: Iterable[str | Path | None]) -> set[tuple[int, int] | None]:
+    """The files behind the names, whatever their spelling; of a folder all that are in it."""
+    from mwdcal.files.formats import atomic
+
+    paths = [Path(name) for name in inputs if name]
+    inside = [
+        Path(folder, name) for path in paths for folder, _, names in os.walk(path) for name in names
+    ]
+    return {atomic.identity(path) for path in paths + inside} - {None}
 
 
 def column_names(text: str) -> list[str]:

@@ -6,7 +6,6 @@ from pathlib import Path
 
 from mwdcal.app.commands import options
 from mwdcal.app.messages import findings_as_typed, lines, print_result, say
-from mwdcal.errors import InputError
 
 
 @options.command()
@@ -53,12 +52,14 @@ def command(
     try:
         stations = find_stations(readings, say=slowly, **search)
     except StandstillError as error:  # the picture helps most then
-        advice = "" if plot else " `plot` shows the log."
-        message = [f"{error}{advice}", *lines(error.analysis.findings)]
+        if not plot:
+            error.add_note("--plot shows the log.")
+        for line in lines(error.analysis.findings):
+            error.add_note(line)
         if plot:
             atomic.write(plot, picture(page.figure(error.analysis), plot))
-            message.append(f"wrote {plot} (picture)")
-        raise InputError("\n".join(message)) from None
+            error.add_note(f"wrote {plot} (picture)")
+        raise
     stations = replace(stations, findings=findings_as_typed(stations.findings))
     drawn = picture(page.figure(stations), plot) if plot else b""
     table.write(output, stations.table)

@@ -37,16 +37,16 @@ def command(
     from mwdcal.files.limits import load_limits
     from mwdcal.use.verification import verify
 
-    options.check_outputs([], [calibration, run], page=report)
+    options.check_outputs([], [calibration, run, limits], page=report)
     fitted = documents.read(calibration)
     readings, _ = runs.read_run(run, fitted.profile, decimal=decimal)
     result = verify(fitted, readings, load_limits(limits))
     result = replace(result, findings=result.findings + unused_columns(readings.unused))
+    shown = result if as_json else screen(result, fitted.tool, readings.metadata)
     if report:
         from mwdcal.app.pages.report import render
         from mwdcal.files.formats import atomic
 
         atomic.write(report, render(fitted, result))
-    shown = result if as_json else screen(result, fitted.tool, readings.metadata)
     print_result(shown, result.findings)
     sys.exit(0 if result.passed else 1)

@@ -10,7 +10,7 @@ import msgspec
 
 from mwdcal.app.messages import lines
 from mwdcal.app.pages.page import written
-from mwdcal.app.text import chance, number, quantity, table
+from mwdcal.app.text import chance, number, one_line, quantity, table
 from mwdcal.calibration.automatic.nonlinearity import CurveScore
 from mwdcal.calibration.diagnosis.findings import UNUSED
 from mwdcal.calibration.prediction import typical_accuracy
@@ -65,7 +65,10 @@ def screen(calibration: Calibration, choice: Choice, output: Path, report: Path 
         "\n".join([*remarks(calibration), *_findings(calibration.findings)]),
     ]
     files = written(calibration=output, report=report)
-    return "\n\n".join(blocks) + f"\n{files}   next: mwdcal verify {output} ROLLTEST.csv"
+    return (
+        "\n\n".join(blocks)
+        + f"\n{files}   next: mwdcal verify {one_line(str(output))} ROLLTEST.csv"
+    )
 
 
 def _findings(findings: list[Finding]) -> list[str]:
@@ -108,7 +111,7 @@ def heading(calibration: Calibration) -> str:
     lines = ["   ".join(parts), "   ".join([f"method {', '.join(how(calibration))}", *ranks])]
     if calibration.excluded:
         lines.append("left out by --exclude: station " + ", ".join(calibration.excluded))
-    return "\n".join(lines)
+    return "\n".join(map(one_line, lines))
 
 
 def known_inclinations(calibration: Calibration) -> list[float]:

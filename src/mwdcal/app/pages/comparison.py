@@ -22,7 +22,7 @@ from mwdcal.app.pages.page import (
     measured,
     number,
 )
-from mwdcal.app.text import raised, superscript, table
+from mwdcal.app.text import one_line, raised, superscript, table
 from mwdcal.calibration.methods import EVIDENCE
 from mwdcal.calibration.readings import SIMULATED
 from mwdcal.comparison.common_gauge import SCALE
@@ -61,11 +61,11 @@ def text(comparison: Comparison, parameters: bool = False) -> str:
     rows = able(comparison.rows)
     methods = [row.method for row in rows]
     simulated = [SIMULATED] if comparison.simulated else []
-    lines = ["   ".join([*heading(comparison), *simulated]), comparison.advice]
+    lines = [one_line("   ".join([*heading(comparison), *simulated])), one_line(comparison.advice)]
     if rows:
         lines += ["", table(figures(comparison), ["", "before", *methods]), ""]
-    lines += notes(comparison)
-    lines += [f"{who} refused: {why}" for who, why in refusals(comparison)]
+    lines += map(one_line, notes(comparison))
+    lines += [f"{who} refused: {one_line(why)}" for who, why in refusals(comparison)]
     if parameters and rows:
         lines += ["", gauge(comparison) + " In parentheses: 1σ of the last digits."]
         for triad in rows[0].parameters:

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mwdcal.app.pages.page import HELD, UNDETERMINED, is_held
-from mwdcal.app.text import raised, table
+from mwdcal.app.text import one_line, raised, table
 from mwdcal.calibration.readings import Readings, is_simulated, simulated
 from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.files import documents
@@ -139,7 +139,7 @@ def screen(converted: Converted) -> str:
         [f"{t.name} raw per {t.unit}{_nominal(calibration, t.name)}" for t in calibration.triads],
     ]
     values = notation(converted.triads, reference if at == COURSE else None)
-    return "\n".join("   ".join(line) for line in lines) + "\n\n" + values
+    return "\n".join(one_line("   ".join(line)) for line in lines) + "\n\n" + values
 
 
 def _calibrated(converted: Converted) -> str:

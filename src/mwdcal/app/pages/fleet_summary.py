@@ -16,7 +16,7 @@ from mwdcal.app.commands.choices import names
 from mwdcal.app.commands.options import Typed
 from mwdcal.app.pages.calibration import choices
 from mwdcal.app.pages.page import written
-from mwdcal.app.text import number, plural, table
+from mwdcal.app.text import number, one_line, plural, table
 from mwdcal.calibration.readings import TRIADS
 from mwdcal.calibration.record import Choices, Finding
 from mwdcal.calibration.soaks import HIGHEST
@@ -259,14 +259,14 @@ def _heading(summary: FleetSummary) -> str:
     how = [f"method {summary.method}", f"order {summary.order}"]
     also = unusual(summary.options)
     options = f"\noptions: {', '.join(also)}" if also else ""
-    return "   ".join([summary.runs, *counts, *how]) + options
+    return one_line("   ".join([summary.runs, *counts, *how])) + options
 
 
 def _doubts(summary: FleetSummary) -> list[str]:
     """Why tools were refused, and findings of the others."""
     refused = [kind for kind in summary.statuses if kind.status != OK]
     return [
-        *(f"! {kind.status}, for example: {kind.message}" for kind in refused),
+        *(f"! {kind.status}, for example: {one_line(kind.message)}" for kind in refused),
         *(f"! {f.id} in {plural(f.tools, 'tool')}: {_first(f)}" for f in summary.findings),
     ]
 
@@ -277,13 +277,13 @@ def _remarks(summary: FleetSummary) -> list[str]:
     return [
         *(f"own-axis terms in {plural(count, 'tool')}: {name}" for name, count in nonlinear),
         *(f"undetermined in {plural(count, 'tool')}: {name}" for name, count in undetermined),
-        *(f"! {note}" for note in summary.notes),
+        *(f"! {one_line(note)}" for note in summary.notes),
     ]
 
 
 def _first(some: StatusCount | FindingCount) -> str:
     """The first serials of some tools."""
-    return ", ".join(map(str, some.serials)) + (" …" if some.tools > len(some.serials) else "")
+    return ", ".join(map(one_line, some.serials)) + (" …" if some.tools > len(some.serials) else "")
 
 
 def _title(name: str) -> str:

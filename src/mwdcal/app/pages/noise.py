@@ -11,7 +11,7 @@ import numpy as np
 
 from mwdcal import __version__
 from mwdcal.app.pages.page import channels_of, environment, written
-from mwdcal.app.text import plural, table
+from mwdcal.app.text import one_line, plural, table
 from mwdcal.calibration.readings import SIMULATED
 from mwdcal.logs.noise import ChannelNoise, Noise, Term
 from mwdcal.use import plots
@@ -47,7 +47,7 @@ def document(noise: Noise, plot: Path | None, report: Path | None) -> dict[str, 
 def screen(noise: Noise, plot: Path | None, report: Path | None) -> str:
     """The result for people."""
     blocks = [
-        "   ".join(heading(noise)),
+        one_line("   ".join(heading(noise))),
         *(table(rows, ["", *header]) for header, rows in tables(noise)),
         "± 1σ; < bound of 95 %, where the log does not show the term. For the tool profile:",
         profile_lines(noise),

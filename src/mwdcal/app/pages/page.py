@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mwdcal.app.pages import pictures
-from mwdcal.app.text import chance, plural, raised, superscript
+from mwdcal.app.text import chance, harmless, one_line, plural, raised, superscript
 from mwdcal.files.contract import CHANNELS
 from mwdcal.geometry.vectors import Array
 
@@ -36,6 +36,7 @@ def environment() -> Environment:
         loader=PackageLoader("mwdcal.app.pages"),
         autoescape=True,
         undefined=StrictUndefined,
+        finalize=lambda shown: harmless(shown) if type(shown) is str else shown,
         trim_blocks=True,
         lstrip_blocks=True,
     )
@@ -126,7 +127,7 @@ def capital(text: str) -> str:
 
 def written(**files: Path | str | None) -> str:
     """The files that were written, each with what it is."""
-    return "wrote " + "   ".join(f"{path} ({what})" for what, path in files.items() if path)
+    return one_line("wrote " + "   ".join(f"{p} ({what})" for what, p in files.items() if p))
 
 
 def banner(level: str, word: str, headline: str, after: str) -> dict[str, str]:
@@ -141,4 +142,4 @@ def unit(symbol: str) -> str:
 
 def css_string(text: str) -> str:
     """Text as the inside of a CSS string: nothing but letters and digits is left bare."""
-    return "".join(c if c.isascii() and c.isalnum() else f"\\{ord(c):x} " for c in text)
+    return "".join(c if c.isascii() and c.isalnum() else f"\\{ord(c):x} " for c in harmless(text))

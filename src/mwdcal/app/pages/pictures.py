@@ -8,6 +8,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from mwdcal.app.text import harmless
 from mwdcal.errors import InputError
 from mwdcal.use.plots import style
 
@@ -54,7 +55,7 @@ def svg(figure: Figure, key: str) -> Markup:
     text = re.sub(r'(\bid="|href="#|url\(#)', rf"\g<1>{key}-", text)
     text = re.sub(r'\b(d|x|y)="[^"]*"', _shortened, text)
     text = re.sub(r'<g([^<>]*)>\s*((?:<use [^<>]* style="([^"]*)"/>\s*)+)</g>', _gathered, text)
-    head, rest = text.split(">", 1)
+    head, rest = harmless(text).split(">", 1)
     text = re.sub(r' (width|height|version)="[^"]*"', "", head) + ">" + rest
     return Markup(text.replace("<svg", f'<svg role="img" aria-label="{figure.get_label()}"', 1))
 

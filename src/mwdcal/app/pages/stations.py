@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mwdcal.app.pages.page import channels_of
-from mwdcal.app.text import table
+from mwdcal.app.text import one_line, table
 from mwdcal.files.contract import RAW
 from mwdcal.geometry.vectors import Array
 from mwdcal.logs.stations import Stations
@@ -63,11 +63,14 @@ def screen(stations: Stations, files: dict[str, str]) -> str:
     """What was found, for people."""
     picture = f"   {files['plot']} (picture)" if files["plot"] else ""
     lines = [
-        "   ".join(_heading(stations)),
+        one_line("   ".join(_heading(stations))),
         "   ".join(_search(stations)),
         "",
         _stations_table(stations),
-        f"wrote {files['output']}{picture}   next: mwdcal calibrate {files['output']} -o CAL.json",
+        one_line(
+            f"wrote {files['output']}{picture}   "
+            f"next: mwdcal calibrate {files['output']} -o CAL.json"
+        ),
     ]
     return "\n".join(lines)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from mwdcal.app.text import WIDE, quantity, table
+from mwdcal.app.text import WIDE, one_line, quantity, table
 from mwdcal.calibration.readings import simulated
 from mwdcal.use.verification import Verdict
 
@@ -22,4 +22,4 @@ def screen(result: Verdict, *metadata: Mapping[str, object]) -> str:
     source = f" ({result.source})" if result.source else ""
     lines = ["   ".join(first), f"limits {result.limits}{source}", f"rule: {result.rule}"]
     header = ["", "raw", "noise-free", "1σ", "limit", "", "where"]
-    return "\n".join(lines) + "\n\n" + table(rows, header, WIDE)
+    return "\n".join(map(one_line, lines)) + "\n\n" + table(rows, header, WIDE)

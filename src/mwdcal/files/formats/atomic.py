@@ -1,7 +1,8 @@
 """Atomic writing: an interrupted command leaves the old file or none, never half of one.
 
 A file grows under a temporary name beside its target, locked as long as its writer lives. What a
-killed command left under such a name is removed by the next one that writes into the folder.
+killed command left under such a name is removed by the next one that writes into the folder. A link
+stays, and the file behind it is replaced; a replaced file keeps its group and its permissions.
 """
 
 from __future__ import annotations
@@ -9,9 +10,10 @@ from __future__ import annotations
 import contextlib
 import os
 import secrets
+import stat
 import time
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -29,14 +31,28 @@ _DAY = 86_400.0
 """Seconds after which a file of another machine counts as left behind: its locks may not reach here."""
 
 
+def write_all(files: Iterable[tuple[Path | None, bytes | str]]) -> None:
+    """Write several files, or none of them where one cannot be written; no path, no file."""
+    with contextlib.ExitStack() as stack:
+        for path, data in files:
+            if path:
+                stream = stack.enter_context(replacing(path, durable=False))
+                stream.write(_encoded(data))
+                stream.flush()
+                os.fsync(stream.fileno())  # all are on the disk before the first is replaced
+
+
 def write(path: str | os.PathLike[str], data: bytes | str, durable: bool = True) -> None:
     """Write `data` (text as UTF-8) to `path`, which is replaced as a whole or not at all.
 
     Not `durable`: a loss of power may leave a part of the new file; a killed program does not.
     """
-    content = data.encode("utf-8", "backslashreplace") if isinstance(data, str) else data
     with replacing(path, durable) as stream:
-        stream.write(content)
+        stream.write(_encoded(data))
+
+
+def _encoded(data: bytes | str) -> bytes:
+    return data.encode("utf-8", "backslashreplace") if isinstance(data, str) else data
 
 
 @contextlib.contextmanager
@@ -49,6 +65,7 @@ def replacing(path: str | os.PathLike[str], durable: bool = True) -> Iterator[IO
         with _begun(temporary) as stream:
             yield stream
             stream.flush()
+            _keep_permissions(file, temporary)
             if durable:
                 os.fsync(stream.fileno())  # wait until it is on the disk
             if fcntl:
@@ -63,21 +80,50 @@ def replacing(path: str | os.PathLike[str], durable: bool = True) -> Iterator[IO
 
 
 def target(path: str | os.PathLike[str]) -> Path:
-    """The file behind `path`, links followed; refuses folders and devices."""
+    """The file behind `path`, links followed; refuses folders, devices and what is write-protected."""
     try:
         file = Path(os.path.realpath(path))
-        special = file.exists() and not file.is_file()
+        why = _hindrance(file)
     except (OSError, ValueError) as error:
         raise _refusal(path, error) from error
-    if special:
-        kind = "a folder" if file.is_dir() else "not a regular file"
-        raise InputError(f"cannot write '{path}': it is {kind}. Name a file to write.")
-    if not file.parent.is_dir():
-        raise InputError(
-            f"cannot write '{path}': the folder '{file.parent}' does not exist. "
-            "Create it, or name another folder."
-        )
+    if why:
+        raise InputError(f"cannot write '{path}': {why}")
     return file
+
+
+def _hindrance(file: Path) -> str:
+    """Why a file may not be written, and what to do; empty where nothing hinders."""
+    if file.is_dir():
+        return "it is a folder. Name a file to write."
+    if file.is_symlink() or (file.exists() and not file.is_file()):
+        return "it is not a regular file. Name a file to write."
+    if not file.parent.is_dir():
+        return f"the folder '{file.parent}' does not exist. Create it, or name another folder."
+    writable = stat.S_IWUSR | stat.S_IWGRP | stat.S_IWOTH  # for the superuser anything else is
+    if file.exists() and not (file.stat().st_mode & writable and os.access(file, os.W_OK)):
+        return "it is write-protected. Name another file, or remove the protection."
+    return ""
+
+
+def identity(file: Path | int) -> tuple[int, int] | None:
+    """What a file has in common under all its names: links, hard links, spellings; None for others.
+
+    An integer is an open file.
+    """
+    try:
+        found = os.fstat(file) if isinstance(file, int) else file.stat()
+    except (OSError, ValueError):
+        return None
+    return (found.st_dev, found.st_ino) if stat.S_ISREG(found.st_mode) else None
+
+
+def _keep_permissions(old: Path, new: Path) -> None:
+    """Give the new file the group and the permissions of the one that it replaces, if there is one."""
+    with contextlib.suppress(FileNotFoundError):
+        kept = old.stat()
+        with contextlib.suppress(OSError, AttributeError):  # Windows, or a group of others
+            os.chown(new, -1, kept.st_gid)
+        new.chmod(stat.S_IMODE(kept.st_mode) & 0o777)
 
 
 @contextlib.contextmanager
