@@ -14,7 +14,8 @@ from mwdcal.calibration import results
 from mwdcal.calibration.automatic.auto import Choice, choose
 from mwdcal.calibration.diagnosis.findings import described, findings
 from mwdcal.calibration.diagnosis.flags import FittedRuns
-from mwdcal.calibration.diagnosis.refusals import check, fit_refusals
+from mwdcal.calibration.diagnosis.refusals import UNSOUND_ADVICE, check, fit_refusals
+from mwdcal.calibration.diagnosis.soundness import inconsistency
 from mwdcal.calibration.estimate import Fit, fit
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.prediction import accuracy
@@ -28,9 +29,11 @@ from mwdcal.calibration.record import (
     TriadCalibration,
     Undetermined,
     rounded,
+    sealed,
     stated,
 )
 from mwdcal.calibration.residuals import error_rows, measure_rows
+from mwdcal.errors import FitError
 from mwdcal.estimation.evidence import STAND_ERRORS
 from mwdcal.estimation.rank import Free
 from mwdcal.geometry.vectors import Array
@@ -65,7 +68,11 @@ def recorded(choice: Choice, result: Fit) -> Calibration:
     """
     fitted = FittedRuns.single(choice.readings, choice.profile, choice.options, result)
     check(fit_refusals(fitted))
-    return rounded(_Record(choice, fitted).calibration())
+    calibration = sealed(rounded(_Record(choice, fitted).calibration()))
+    problem = inconsistency(calibration)
+    if problem:
+        raise FitError(f"the fit gives no usable calibration: {problem}. {UNSOUND_ADVICE}")
+    return calibration
 
 
 @dataclass(frozen=True)
@@ -117,9 +124,7 @@ class _Record:
             temperature_c=self.temperatures,
             accelerometer=self.triad(0),
             magnetometer=self.triad(1) if readings.magnetometer is not None else None,
-            covariance_rows=(
-                self.to_file @ self.covariance.total[0] @ self.to_file.transpose()
-            ).tolist(),
+            covariance_rows=self.fitted.covariance.in_file(self.reference)[0].tolist(),
             free=[(self.to_file @ entry.direction).tolist() for entry in self.free],
             singular_values=result.analysis.determined.values[0].tolist(),
             constants=self.constants(),
@@ -134,11 +139,6 @@ class _Record:
             inherited=list(options.knowledge.stations) if options.knowledge else [],
             findings=findings(self.fitted),
         )
-
-    @cached_property
-    def covariance(self) -> results.StatedCovariance:
-        """The covariance of the fit's parameters."""
-        return results.StatedCovariance(self.result)
 
     @cached_property
     def to_file(self) -> Array:
@@ -156,7 +156,7 @@ class _Record:
     def budget(self) -> list[BudgetRow]:
         """What each source of error adds to the accuracy to expect; tilt is one source."""
         shares: dict[str, Array] = {}
-        for name, share in self.covariance.by_source().items():
+        for name, share in self.fitted.covariance.by_source().items():
             source = results.common_source(name)
             shares[source] = shares.get(source, 0.0) + share
         free, prior = self.fitted.free, self.choice.options.knowledge
@@ -190,7 +190,7 @@ class _Record:
 
     def triad(self, index: int) -> TriadCalibration:
         """The record of one triad."""
-        name, total = TRIADS[index], self.covariance.total
+        name, total = TRIADS[index], self.fitted.covariance.total
         triad = results.triad_results(self.result, index, total, self.fitted.free, self.reference)
         model = triad.model
         powers = model if isinstance(model, Polynomial) else Polynomial(model.basis)

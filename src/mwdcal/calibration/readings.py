@@ -71,7 +71,7 @@ def _fingerprint(row: Sequence[float]) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:DIGEST_LENGTH]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Readings:
     """Static stations of one tool (or of many: leading axes).
 

@@ -29,6 +29,8 @@ from mwdcal.sensor.models import Whole
 
 NOISE, SETTINGS, PRIOR = "noise of the readings", "settings of the stand", "prior"
 ORDER = "order of the temperature terms"
+EVEN = 1e-6
+"""Departure of a correlation matrix from symmetry that is left as it is."""
 
 
 def variance_scales(result: Fit) -> Array:
@@ -47,6 +49,18 @@ class StatedCovariance:
     def total(self) -> Array:
         """Covariance (B, p, p): independent errors times s², others as they are."""
         return np.asarray(self._independent + self._common + self._order)
+
+    def in_file(self, reference: float) -> Array:
+        """The total (B, k, k) of the file's parameters, of all triads and held ones.
+
+        Rounding leaves it uneven where the noise of the triads is far apart: only its even part says
+        anything then.
+        """
+        maps = to_file(self.result, reference)
+        whole = maps @ self.total @ maps.mT
+        sd = np.sqrt(np.maximum(diagonal(whole), 1e-300))
+        uneven = np.any(np.abs(whole - whole.mT) > EVEN * outer(sd), (-1, -2))
+        return np.asarray(np.where(uneven[:, None, None], (whole + whole.mT) / 2, whole))
 
     def by_source(self) -> dict[str, Array]:
         """Covariance (B, p, p) by source; all together they are `total`.
