@@ -20,7 +20,7 @@ from mwdcal.calibration.readings import NANOTESLA, Readings, simulated
 from mwdcal.calibration.soaks import SOAK_GAP
 from mwdcal.errors import InputError
 from mwdcal.geometry.observables import OBSERVABLES
-from mwdcal.geometry.vectors import Array, Bools
+from mwdcal.geometry.vectors import Array, Bools, diagonal
 from mwdcal.sensor.models import Basis, Factors, Model, Polynomial
 from mwdcal.sensor.profile import Profile
 
@@ -31,6 +31,8 @@ MARGIN = 1.0
 """Degrees Celsius by which a temperature may lie outside the calibrated range, as it is read."""
 MAGNETIC = ("azimuth", "field", "dip", "magnetic_toolface", "bx", "by", "bz")
 """Observables that need a magnetometer."""
+UNKNOWN_ANGLE = float(np.pi / np.sqrt(3))
+"""Standard deviation of an angle of which nothing is known, evenly spread over a whole turn."""
 FREE_SHARE = 5e-2
 """An output rests on a free direction if it moves by more than this share of it (rad per rad,
 or of its own strength), the direction being scaled to turn or stretch the fields by one."""
@@ -418,7 +420,8 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
         """Standard uncertainty (…, n) of an observable: of the calibration, or of a reading too.
 
         Units: radians, g or nT. `noise` adds that of one reading.
-        NaN where the observable rests on a free direction: no uncertainty can be stated.
+        NaN where no uncertainty can be stated: where the observable rests on a free direction, and where
+        azimuth or a toolface is as uncertain as an unknown angle, `UNKNOWN_ANGLE`, as at vertical.
         """
         return np.sqrt(self.covariance((name,), readings, noise)[..., 0, 0])
 
@@ -450,6 +453,8 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
             total = total + np.einsum("...ai,...ij,...bj->...ab", rows, reading, rows)
         lacking = () if self.has_field else MAGNETIC
         blank = np.stack([self.rests_on_free(n, readings) | (n in lacking) for n in names], -1)
+        turns = np.array([OBSERVABLES[n].period > 0 for n in names])
+        blank |= turns & (diagonal(total) > UNKNOWN_ANGLE**2)
         return np.where(blank[..., :, None] | blank[..., None, :], np.nan, total)
 
     def expanded_uncertainty(

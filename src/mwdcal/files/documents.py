@@ -19,6 +19,8 @@ from mwdcal.errors import InputError, reason
 from mwdcal.files.formats import atomic
 from mwdcal.files.profiles import check_profile
 
+_DIGITS = 30
+"""Digits of the longest whole number that a calibration file may have."""
 _AS_WRITTEN = "The file was changed by hand or damaged: use it as mwdcal calibrate wrote it, or calibrate again."
 _UNREADABLE = "No command would read such a file: calibrate again, or correct the record."
 
@@ -68,8 +70,14 @@ def _decoded(data: bytes, name: str) -> Calibration:
             f"{name}: 'schema_version' must be {SCHEMA_VERSION}; got {version!r}. It is not "
             "a calibration file, or another version of mwdcal wrote it: calibrate again."
         )
-    json.loads(data, object_pairs_hook=partial(_unique, name), parse_int=float)
+    json.loads(data, object_pairs_hook=partial(_unique, name), parse_int=partial(_whole, name))
     return msgspec.json.decode(data, type=Calibration)
+
+
+def _whole(name: str, digits: str) -> None:
+    """Refuse a whole number of a file that is too long for any of its fields."""
+    if len(digits) > _DIGITS:
+        raise InputError(f"{name}: a number has {len(digits)} digits. {_AS_WRITTEN}")
 
 
 def _unique(name: str, pairs: list[tuple[str, Any]]) -> None:

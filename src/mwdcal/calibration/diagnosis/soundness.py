@@ -175,8 +175,9 @@ def _gains(calibration: Calibration) -> Iterator[str]:
             yield f"the gains of the {triad.name} cannot be inverted"
         if mirrored(slope):
             yield (
-                f"the gains of the {triad.name} mirror its axes, which no sensor does: a row has the wrong sign, or "
-                "two are exchanged. If an axis is wrong, correct 'axes' in the tool profile and calibrate again"
+                f"the gains of the {triad.name} turn right-handed axes into left-handed ones, which no sensor "
+                "does: one row has the wrong sign, or two are exchanged (correct a wrong axis by 'axes' in the "
+                "tool profile)"
             )
 
 
@@ -218,4 +219,5 @@ def invertible(slope: Array) -> Bools:
 
 def mirrored(slope: Array) -> Bools:
     """Which gains (..., k, 3, 3) turn a right-handed triad into a left-handed one (...)."""
-    return np.asarray(np.any(np.linalg.det(slope) < 0, -1))
+    finite = np.isfinite(slope).all((-1, -2))[..., None, None]
+    return np.asarray(np.any(np.linalg.det(np.where(finite, slope, np.eye(3))) < 0, -1))
