@@ -16,6 +16,7 @@ import numpy as np
 from mwdcal.calibration.automatic.stand import inseparable
 from mwdcal.calibration.diagnosis.axes import explaining
 from mwdcal.calibration.diagnosis.flags import FittedRuns, Flag
+from mwdcal.calibration.diagnosis.noise_refusals import coarse_noise, unsound
 from mwdcal.calibration.diagnosis.plausibility import (
     excessive_errors,
     gain_shares,
@@ -24,13 +25,11 @@ from mwdcal.calibration.diagnosis.plausibility import (
     overturned,
     straying,
 )
-from mwdcal.calibration.diagnosis.soundness import invertible, is_covariance, mirrored
 from mwdcal.calibration.diagnosis.structure import described, effects
 from mwdcal.calibration.methods import EVIDENCE
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import CONSTANTS, EARTH_RANGES, TRIADS, Readings
 from mwdcal.calibration.residuals import shown_in
-from mwdcal.calibration.results import temperature_range
 from mwdcal.calibration.soaks import soaks
 from mwdcal.errors import FitError, InputError
 from mwdcal.estimation.batch import batch_of_one
@@ -52,13 +51,6 @@ CULPRIT_SHARE = 0.3
 """Share of all misfit at which a single station is named as the cause."""
 COARSE_NOISE = 0.05
 """Estimated noise of more than this share of the field likewise."""
-DECLARED_NOISE = 0.3
-"""Declared noise of more than this share of the field at every station is a wrong unit."""
-UNSOUND_ADVICE = (
-    "Check 'noise' and 'repeatability' in the tool profile and the columns sd_: all are in the raw units of their "
-    "channel; without them the noise is estimated."
-)
-"""What to do where a fit has no valid covariance."""
 BAD_INPUT = "bad-input"
 """The status of what is wrong with the input itself: an `InputError` of a single run."""
 NEEDS = {
@@ -169,7 +161,7 @@ def reading_refusals(readings: Readings, options: Options, run: Run) -> Iterator
     yield _common_errors(readings, options)
     for triad in TRIADS:
         yield from _channels(readings, triad, options.knowledge is not None, run)
-        yield _coarse_noise(readings, triad)
+        yield coarse_noise(readings, triad)
     if options.knowledge is None or options.knowledge.temperature is None:
         yield from _temperatures(readings, max(options.orders))
     needed = _references(options.method, readings.magnetometer is not None)
@@ -261,23 +253,6 @@ def _channels(readings: Readings, triad: str, prior: bool, run: Run) -> Iterator
     yield Flag("channel", np.any(odd, -1), moving)
 
 
-def _coarse_noise(readings: Readings, triad: str) -> Flag:
-    """Declared noise that leaves nothing of the field, on some channel at every station."""
-    values, declared = getattr(readings, triad), readings.sd.get(triad)
-    if values is None or declared is None:
-        return Flag("noise", _all(readings, False), lambda _: "")
-    share = np.broadcast_to(declared, values.shape).min(-2) / _signal(values)[:, None]
-
-    def sentence(place: int) -> str:
-        return (
-            f"the declared noise of the {triad} is {share[place].max():.2g} times the field that it measures, or more. "
-            f"'noise' and 'repeatability' of [{triad}] in the tool profile and the columns sd_ are in the raw units of "
-            "the channels, such as V: correct them, or leave them out and the noise is estimated."
-        )
-
-    return Flag("noise", np.any(share > DECLARED_NOISE, -1), sentence)
-
-
 def no_temperature(order: int) -> InputError:
     """The error of an order that needs temperatures in a run without them."""
     return InputError(f"--order {order} needs the column 'temperature_c'; use --order 0.")
@@ -356,7 +331,7 @@ def _by_arrays(fitted: FittedRuns) -> Iterator[Flag]:
     yield named(_beyond_vertical(fitted))
     for name in EARTH_RANGES:
         yield _nowhere_on_earth(fitted, name)
-    yield named(_unsound(fitted))
+    yield named(unsound(fitted))
 
 
 def _naming_axes(fitted: FittedRuns, flag: Flag) -> Flag:
@@ -521,31 +496,6 @@ def _nowhere_on_earth(fitted: FittedRuns, name: str) -> Flag:
         )
 
     return Flag("earth", np.any(outside, -1), sentence)
-
-
-def _unsound(fitted: FittedRuns) -> Flag:
-    """Fits whose covariance is none, or whose gains are none that a sensor has."""
-    result, zero = fitted.result, fitted.profile.reference_temperature_c
-    sound = is_covariance(fitted.covariance.in_file(zero))
-    low, high = temperature_range(result, fitted.options.knowledge)
-    at = np.stack([low, high, np.clip(zero, low, high)], -1)
-    for triad, where in zip(result.problem.triads, result.problem.slices(), strict=True):
-        middle = np.broadcast_to(triad.raw.mean(1, keepdims=True), (*at.shape, 3))
-        slope = triad.model.slope(result.state.params[:, where], middle, at)
-        sound &= invertible(slope) & ~mirrored(slope)
-
-    def sentence(place: int) -> str:
-        each = zip(TRIADS, result.problem.triads, strict=False)
-        parts = [_noise_range(name, triad.sd[place], triad.raw[place]) for name, triad in each]
-        return f"the fit gives no valid covariance, or gains that no sensor has: {', '.join(parts)}. {UNSOUND_ADVICE}"
-
-    return Flag("unsound", ~sound, sentence)
-
-
-def _noise_range(name: str, sd: Array, raw: Array) -> str:
-    """The smallest and the largest noise of a triad's readings (n, 3), in words."""
-    share = sd / _signal(raw[None])
-    return f"the {name}'s noise is {share.min():.1g} to {share.max():.1g} of the field"
 
 
 def _unexplained_errors(fitted: FittedRuns, sound: Bools) -> Flag:

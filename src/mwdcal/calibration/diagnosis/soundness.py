@@ -219,5 +219,4 @@ def invertible(slope: Array) -> Bools:
 
 def mirrored(slope: Array) -> Bools:
     """Which gains (..., k, 3, 3) turn a right-handed triad into a left-handed one (...)."""
-    finite = np.isfinite(slope).all((-1, -2))[..., None, None]
-    return np.asarray(np.any(np.linalg.det(np.where(finite, slope, np.eye(3))) < 0, -1))
+    return np.asarray(np.any(np.linalg.det(np.nan_to_num(slope)) < 0, -1))
