@@ -8,7 +8,7 @@ import shutil
 import pytest
 
 from cli_support import mwdcal, refused
-from mwdcal.app import fleet_table, pool, text
+from mwdcal.app import fleet_table, pool
 from mwdcal.files.formats import atomic
 from mwdcal.fleet import kept
 from mwdcal.fleet import tables as fleet_tables
@@ -434,7 +434,6 @@ def test_infinite_temperatures_of_a_refused_tool_are_blank(tmp_path):
     assert bad["temperature_max_c"] is None
 
 
-@pytest.mark.skipif(not hasattr(text, "one_line"), reason="tables of the screen read markup")
 @pytest.mark.parametrize("serial", ["[/x]", "[bold]", "[/]", "\\[red]"])
 def test_serials_with_marks_of_a_markup_language_are_shown_as_they_are(tmp_path, serial):
     good = short_run(1)

@@ -12,7 +12,9 @@ from mwdcal.calibration import results
 from mwdcal.calibration.automatic.auto import Choice, choose
 from mwdcal.calibration.diagnosis.findings import described, findings
 from mwdcal.calibration.diagnosis.flags import FittedRuns
+from mwdcal.calibration.diagnosis.noise_refusals import UNSOUND_ADVICE
 from mwdcal.calibration.diagnosis.refusals import check, fit_refusals
+from mwdcal.calibration.diagnosis.soundness import inconsistency
 from mwdcal.calibration.estimate import Fit, fit
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.prediction import accuracy
@@ -26,9 +28,11 @@ from mwdcal.calibration.record import (
     TriadCalibration,
     Undetermined,
     rounded,
+    sealed,
     stated,
 )
 from mwdcal.calibration.residuals import error_rows, measure_rows
+from mwdcal.errors import FitError
 from mwdcal.estimation.batch import batch_of_one
 from mwdcal.estimation.evidence import STAND_ERRORS
 from mwdcal.geometry.vectors import Array
@@ -66,17 +70,20 @@ def recorded(choice: Choice, result: Fit) -> Calibration:
         batch_of_one(readings), profile, choice.options, result, lambda _: (readings, profile)
     )
     check(fit_refusals(fitted))
-    return rounded(_record(choice, fitted))
+    calibration = sealed(rounded(_record(choice, fitted)))
+    problem = inconsistency(calibration)
+    if problem:
+        raise FitError(f"the fit gives no usable calibration: {problem}. {UNSOUND_ADVICE}")
+    return calibration
 
 
 def _record(choice: Choice, fitted: FittedRuns) -> Calibration:
     """The calibration file of a fit, in full digits."""
     readings, options, result = choice.readings, choice.options, fitted.result
     reference, prior = choice.profile.reference_temperature_c, options.knowledge
-    covariance = results.StatedCovariance(result)
     to_file = results.to_file(result, reference)[0]
     low, high = results.temperature_range(result, prior)
-    triads = [_triad(fitted, i, covariance.total) for i in range(len(result.problem.triads))]
+    triads = [_triad(fitted, i, fitted.covariance.total) for i in range(len(result.problem.triads))]
     return Calibration(
         tool={k: str(v) for k, v in readings.metadata.items() if k in IDENTITY},
         profile=choice.profile,
@@ -100,13 +107,13 @@ def _record(choice: Choice, fitted: FittedRuns) -> Calibration:
         temperature_c=None if readings.temperature is None else (float(low[0]), float(high[0])),
         accelerometer=triads[0],
         magnetometer=triads[1] if len(triads) > 1 else None,
-        covariance_rows=(to_file @ covariance.total[0] @ to_file.transpose()).tolist(),
+        covariance_rows=fitted.covariance.in_file(reference)[0].tolist(),
         free=[(to_file @ entry.direction).tolist() for entry in fitted.free[0]],
         singular_values=result.analysis.determined.values[0].tolist(),
         constants=_constants(result),
         stand=StandErrors(**_first(results.stand_errors(result))),
         earth=_first(results.earth(result)),
-        budget=_budget(fitted, covariance.by_source()),
+        budget=_budget(fitted, fitted.covariance.by_source()),
         assumed_exact=results.assumed_exact(result, readings.relative),
         errors=error_rows(fitted.residuals(0)),
         measures=measure_rows(fitted.residuals(0)),

@@ -68,7 +68,7 @@ def fingerprints(triads: Sequence[Array]) -> tuple[str, ...]:
     return tuple("-".join(each[:DIGEST_LENGTH] for each in row) for row in hashes)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Readings:
     """Static stations of one tool (or of many: leading axes).
 

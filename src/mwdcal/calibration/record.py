@@ -6,6 +6,8 @@ a calibration in memory and one read back give the same results.
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Iterable, Iterator, Sequence
 from html import escape
 from itertools import pairwise
@@ -18,7 +20,7 @@ from mwdcal.calibration.readings import NANOTESLA, Readings, simulated
 from mwdcal.calibration.soaks import SOAK_GAP
 from mwdcal.errors import InputError
 from mwdcal.geometry.observables import OBSERVABLES
-from mwdcal.geometry.vectors import Array, Bools
+from mwdcal.geometry.vectors import Array, Bools, diagonal
 from mwdcal.sensor.models import Basis, Factors, Model, Polynomial
 from mwdcal.sensor.profile import Profile
 
@@ -29,6 +31,8 @@ MARGIN = 1.0
 """Degrees Celsius by which a temperature may lie outside the calibrated range, as it is read."""
 MAGNETIC = ("azimuth", "field", "dip", "magnetic_toolface", "bx", "by", "bz")
 """Observables that need a magnetometer."""
+UNKNOWN_ANGLE = float(np.pi / np.sqrt(3))
+"""Standard deviation of an angle of which nothing is known, evenly spread over a whole turn."""
 FREE_SHARE = 5e-2
 """An output rests on a free direction if it moves by more than this share of it (rad per rad,
 or of its own strength), the direction being scaled to turn or stretch the fields by one."""
@@ -218,6 +222,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
     references without a declared uncertainty whose error no residual would show.
     `inherited` are the fingerprints of the stations behind the prior, if there was one;
     `excluded` the labels of stations of the run that were left out of the fit on request.
+    `sha256` is `content_sha256` of the record as it was made; earlier versions have none.
     """
 
     schema_version: int = SCHEMA_VERSION
@@ -251,9 +256,13 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
     station_rows: list[StationRow]
     inherited: list[str] = []
     findings: list[Finding]
+    sha256: str | msgspec.UnsetType = msgspec.UNSET
 
     plot: ClassVar[Any]
     """Figures of the calibration: `use.plots` puts them here, so that a record needs no drawing."""
+
+    def __hash__(self) -> int:
+        return hash((self.run_sha256, self.software, self.time))
 
     def __repr__(self) -> str:
         return f"<Calibration: {'; '.join(f'{k} {v}' for k, v in self.summary().items())}>"
@@ -298,6 +307,21 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
             d in fitted or (("-" not in d or not whole) and d.partition("-")[0] in first)
             for d in digests
         ]
+
+    @property
+    def changed(self) -> bool:
+        """Whether anything but `time` has changed since the record was made; unknown without `sha256`."""
+        return self.sha256 is not msgspec.UNSET and self.sha256 != content_sha256(self)
+
+    def change_findings(self) -> list[Finding]:
+        """A finding if the record was changed after it was made."""
+        if not self.changed:
+            return []
+        text = (
+            "the calibration was changed after mwdcal calibrate made it: its 'sha256' is of other contents. "
+            "If that was not meant, use the file as it was written, or calibrate again."
+        )
+        return [Finding(id="changed", text=text)]
 
     @property
     def parameters(self) -> Array:
@@ -396,7 +420,8 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
         """Standard uncertainty (…, n) of an observable: of the calibration, or of a reading too.
 
         Units: radians, g or nT. `noise` adds that of one reading.
-        NaN where the observable rests on a free direction: no uncertainty can be stated.
+        NaN where no uncertainty can be stated: where the observable rests on a free direction, and where
+        azimuth or a toolface is as uncertain as an unknown angle, `UNKNOWN_ANGLE`, as at vertical.
         """
         return np.sqrt(self.covariance((name,), readings, noise)[..., 0, 0])
 
@@ -428,6 +453,8 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
             total = total + np.einsum("...ai,...ij,...bj->...ab", rows, reading, rows)
         lacking = () if self.has_field else MAGNETIC
         blank = np.stack([self.rests_on_free(n, readings) | (n in lacking) for n in names], -1)
+        turns = np.array([OBSERVABLES[n].period > 0 for n in names])
+        blank |= turns & (diagonal(total) > UNKNOWN_ANGLE**2)
         return np.where(blank[..., :, None] | blank[..., None, :], np.nan, total)
 
     def expanded_uncertainty(
@@ -545,6 +572,19 @@ def _rounded(value: Any) -> Any:
     if isinstance(value, dict):
         return {key: _rounded(item) for key, item in value.items()}
     return [_rounded(item) for item in value] if isinstance(value, list | tuple) else value
+
+
+def content_sha256(calibration: Calibration) -> str:
+    """SHA-256 of all fields but `time` and `sha256`, as compact JSON with sorted keys."""
+    fields = msgspec.to_builtins(calibration)
+    kept = {name: value for name, value in fields.items() if name not in ("time", "sha256")}
+    text = json.dumps(kept, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def sealed(calibration: Calibration) -> Calibration:
+    """The record with the `sha256` of its contents, by which a later change shows."""
+    return msgspec.structs.replace(calibration, sha256=content_sha256(calibration))
 
 
 def stated(value: float) -> float | None:

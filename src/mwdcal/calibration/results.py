@@ -24,11 +24,13 @@ from mwdcal.calibration.record import FREE_SHARE
 from mwdcal.estimation.batch import take
 from mwdcal.estimation.rank import Free
 from mwdcal.estimation.uncertainty import marginal_rank
-from mwdcal.geometry.vectors import Array, Bools, outer
+from mwdcal.geometry.vectors import Array, Bools, diagonal, outer
 from mwdcal.sensor.models import Whole
 
 NOISE, SETTINGS, PRIOR = "noise of the readings", "settings of the stand", "prior"
 ORDER = "order of the temperature terms"
+EVEN = 1e-6
+"""Departure of a correlation matrix from symmetry that is left as it is."""
 
 
 def variance_scales(result: Fit) -> Array:
@@ -61,6 +63,18 @@ class StatedCovariance:
         """Covariance (B, p, p): independent errors times s², others as they are."""
         independent, shared, _, order = self._parts
         return np.asarray(independent + shared + order)
+
+    def in_file(self, reference: float) -> Array:
+        """The total (B, k, k) of the file's parameters, of all triads and held ones.
+
+        Rounding leaves it uneven where the noise of the triads is far apart: only its even part says
+        anything then.
+        """
+        maps = to_file(self.result, reference)
+        whole = maps @ self.total @ maps.mT
+        sd = np.sqrt(np.maximum(diagonal(whole), 1e-300))
+        uneven = np.any(np.abs(whole - whole.mT) > EVEN * outer(sd), (-1, -2))
+        return np.asarray(np.where(uneven[:, None, None], (whole + whole.mT) / 2, whole))
 
     def by_source(self) -> dict[str, Array]:
         """Covariance (B, p, p) by source; all together they are `total`.

@@ -231,7 +231,7 @@ class _Batch:
 def _columns(fitted: FittedRuns, reference: float) -> dict[str, Array]:
     """Columns of the results of sound fits."""
     result, free = fitted.result, fitted.free
-    covariance = results.StatedCovariance(result).total
+    covariance = fitted.covariance.total
     columns: dict[str, Array] = {}
     for index, name in enumerate(TRIADS[: len(result.problem.triads)]):
         triad = results.triad_results(result, index, covariance, free, reference)

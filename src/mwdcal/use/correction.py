@@ -163,7 +163,7 @@ def findings(
 
     Of the readings only the metadata are used, and whether there is a magnetometer.
     """
-    about = []
+    about = calibration.change_findings()
     if calibration.has_field and readings.magnetometer is None:
         text = "no columns mx, my, mz: magnetic results are blank."
         about.append(Finding(id="no-magnetometer", text=text))

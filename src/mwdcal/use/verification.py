@@ -176,7 +176,7 @@ def _findings(
     calibration: Calibration, readings: Readings, test: RollTest, skipped: Sequence[str]
 ) -> list[Finding]:
     """Findings about the verdict as a whole, and about limits that were not judged."""
-    findings = [*_temperature_findings(calibration, readings)]
+    findings = [*calibration.change_findings(), *_temperature_findings(calibration, readings)]
     findings += [Finding(id=u.id, text=f"{u.text}.") for u in calibration.undetermined()]
     if skipped:
         findings.append(Finding(id="not-judged", text=f"not judged: {'; '.join(skipped)}."))

@@ -46,6 +46,7 @@ def convert_file(path: Path, notation: str, temperature: float | str | None) -> 
     calibration, sha256 = documents.load(path)
     triads = convert(calibration, notation, temperature)
     findings = temperature_findings(calibration, notation, temperature)
+    findings += calibration.change_findings()
     return Converted(path, sha256, calibration, notation, temperature, triads, findings)
 
 
@@ -146,7 +147,8 @@ def _calibrated(converted: Converted) -> str:
     """The calibrated temperatures, and whether the values lie outside them."""
     if converted.calibration.temperature_c is None:
         return "calibrated at unrecorded temperatures"
-    outside = "extrapolated: " if converted.findings else ""
+    beyond = any(finding.id == "outside-temperature" for finding in converted.findings)
+    outside = "extrapolated: " if beyond else ""
     return f"{outside}calibrated at {_range(converted.calibration)}"
 
 

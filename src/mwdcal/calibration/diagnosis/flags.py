@@ -17,6 +17,7 @@ from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.residuals import Residuals
+from mwdcal.calibration.results import StatedCovariance
 from mwdcal.estimation.batch import take
 from mwdcal.estimation.rank import Free, free_directions
 from mwdcal.geometry.vectors import Array, Bools, Ints
@@ -72,6 +73,11 @@ class FittedRuns:
     def chances(self) -> Array:
         """`misfit_chances` (B, t) of the fit."""
         return misfit_chances(self.result)
+
+    @cached_property
+    def covariance(self) -> StatedCovariance:
+        """The covariance of the fits' parameters."""
+        return StatedCovariance(self.result)
 
     def take(self, index: Ints) -> FittedRuns:
         """Some of the runs."""

@@ -15,6 +15,7 @@ import numpy as np
 
 from mwdcal.calibration.diagnosis.axes import explaining
 from mwdcal.calibration.diagnosis.flags import FittedRuns, Flag
+from mwdcal.calibration.diagnosis.noise_refusals import coarse_noise, unsound
 from mwdcal.calibration.diagnosis.plausibility import (
     excessive_errors,
     gain_shares,
@@ -160,6 +161,7 @@ def reading_refusals(readings: Readings, options: Options, run: Run) -> Iterator
     yield _common_errors(readings, options)
     for triad in TRIADS:
         yield from _channels(readings, triad, options.knowledge is not None, run)
+        yield coarse_noise(readings, triad)
     if options.knowledge is None or options.knowledge.temperature is None:
         yield from _temperatures(readings, max(options.orders))
     needed = _references(options.method, readings.magnetometer is not None)
@@ -329,6 +331,7 @@ def _by_arrays(fitted: FittedRuns) -> Iterator[Flag]:
     yield named(_beyond_vertical(fitted))
     for name in EARTH_RANGES:
         yield _nowhere_on_earth(fitted, name)
+    yield named(unsound(fitted))
 
 
 def _naming_axes(fitted: FittedRuns, flag: Flag) -> Flag:
