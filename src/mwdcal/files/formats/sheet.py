@@ -20,7 +20,7 @@ from mwdcal.errors import InputError
 from mwdcal.files.formats.columns import MAX_COLUMNS
 
 MAX_ROWS = 1_048_576
-MAX_CELLS = 2_000_000
+MAX_CELLS = 1_500_000
 LONGEST_CELL = 32_767
 _LARGEST_UNPACKED = 200_000_000
 _MOST_STYLES = 100_000
