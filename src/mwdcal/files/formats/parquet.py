@@ -127,7 +127,8 @@ def _is_text(kind: Any, types: Any) -> bool:
 def row_size(metadata: Any) -> int:
     """Mean bytes of a row as it is stored, before compression."""
     groups = range(metadata.num_row_groups)
-    return sum(metadata.row_group(i).total_byte_size for i in groups) // int(metadata.num_rows)
+    size = sum(int(metadata.row_group(i).total_byte_size) for i in groups)
+    return size // int(metadata.num_rows)
 
 
 def dense(table: Any, schema: Any, source: str, arrow: Any, most: int = MAX_TEXT) -> Any:
