@@ -79,7 +79,7 @@ def open_parquet(path: Path, rows: int = 0, decimal: str = ".") -> Source:
     count = file.metadata.num_rows
     names = [name for name in stored.names if not parquet.is_index(name)]
     metadata = parquet.metadata_of(file.metadata.metadata, path.name)
-    width = 8 * (len(names) + len(RESULTS)) + parquet.text_size(file.metadata) // count
+    width = max(8 * len(names), parquet.row_size(file.metadata)) + 8 * len(RESULTS)
     step = max(1, min(rows or ROWS, PART // width))
 
     def pieces() -> Iterator[Any]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -71,40 +72,43 @@ def opened(source: Any, name: str, **options: Any) -> tuple[Any, Any]:
     if file.metadata.num_rows == 0:
         raise no_stations(name)
     with reading(name):
-        _check_sizes(file, name)
+        stored = source.stat().st_size if isinstance(source, Path) else source.size()
+        _check_sizes(file, stored, name)
         texts = [field.name for field in schema if _is_text(field.type, arrow.types)]
         options = {**options, "metadata": file.metadata, "read_dictionary": texts}
         return parquet.ParquetFile(source, **options), schema
 
 
-def _check_sizes(file: Any, source: str) -> None:
-    """Refuse a file of which a part would unpack to far more than it takes on the disk."""
-    leaves = [file.schema.column(i) for i in range(len(file.schema))]
-    for index in range(file.metadata.num_row_groups):
-        group = file.metadata.row_group(index)
-        parts = [group.column(i) for i in range(group.num_columns)]
-        unpacked = sum(part.total_uncompressed_size for part in parts)
-        stored = sum(part.total_compressed_size for part in parts)
-        if unpacked > max(_UNPACKED, _DENSEST * stored):
-            raise InputError(
-                f"{source}: a row group must unpack to at most {_UNPACKED} bytes, or {_DENSEST} "
-                f"times its size; got {unpacked} from {stored}. Write it in smaller row groups."
-            )
-        for leaf, part in zip(leaves, parts, strict=True):
-            _check_leaf(leaf, part, source)
+def _check_sizes(file: Any, stored: int, source: str) -> None:
+    """Refuse a file of `stored` bytes of which a part would unpack to far more than that.
 
-
-def _check_leaf(leaf: Any, part: Any, source: str) -> None:
-    """Refuse lists, and cells of a fixed length, that would be large in memory."""
-    size = part.num_values if leaf.max_repetition_level else 0
-    if leaf.path != leaf.name and leaf.physical_type == "BYTE_ARRAY":
-        size = part.num_values * part.total_uncompressed_size >> 8
-    if size > _MAX_NESTED or leaf.length > _LONGEST_FIXED:
+    PyArrow ends the process where the description of a column chunk is damaged: only those of lists
+    and structures are asked for, whose size nothing else tells.
+    """
+    groups = [file.metadata.row_group(i) for i in range(file.metadata.num_row_groups)]
+    unpacked = max(group.total_byte_size for group in groups)
+    if unpacked > max(_UNPACKED, _DENSEST * stored):
         raise InputError(
-            f"{source}, column {shown(leaf.path.partition('.')[0])}: expected one value in each "
-            f"cell, or lists of at most {_MAX_NESTED} values in all; got more. Remove the column, "
-            "or store it in a file of its own."
+            f"{source}: a row group must unpack to at most {_UNPACKED} bytes, or {_DENSEST} times "
+            f"the size of the file; got {unpacked} from {stored}. Write it in smaller row groups."
         )
+    for index in range(len(file.schema)):
+        leaf = file.schema.column(index)
+        nested = leaf.path != leaf.name or leaf.max_repetition_level
+        held = max(_held(leaf, group.column(index)) for group in groups) if nested else 0
+        if held > _MAX_NESTED or leaf.length > _LONGEST_FIXED:
+            raise InputError(
+                f"{source}, column {shown(leaf.path.partition('.')[0])}: expected one value in "
+                f"each cell, or lists of at most {_MAX_NESTED} values in all; got more. Remove the "
+                "column, or store it in a file of its own."
+            )
+
+
+def _held(leaf: Any, chunk: Any) -> int:
+    """Values that a nested column holds, of text as many as memory must be ready for."""
+    if leaf.physical_type == "BYTE_ARRAY":
+        return int(chunk.num_values * chunk.total_uncompressed_size) >> 8
+    return int(chunk.num_values) if leaf.max_repetition_level else 0
 
 
 def _is_text(kind: Any, types: Any) -> bool:
@@ -120,11 +124,11 @@ def _is_text(kind: Any, types: Any) -> bool:
     )
 
 
-def text_size(metadata: Any) -> int:
-    """Bytes of the columns of text as they are stored, before compression."""
-    groups = [metadata.row_group(i) for i in range(metadata.num_row_groups)]
-    parts = (group.column(i) for group in groups for i in range(group.num_columns))
-    return sum(p.total_uncompressed_size for p in parts if p.physical_type == "BYTE_ARRAY")
+def row_size(metadata: Any) -> int:
+    """Mean bytes of a row as it is stored, before compression."""
+    groups = range(metadata.num_row_groups)
+    size = sum(int(metadata.row_group(i).total_byte_size) for i in groups)
+    return size // int(metadata.num_rows)
 
 
 def dense(table: Any, schema: Any, source: str, arrow: Any, most: int = MAX_TEXT) -> Any:

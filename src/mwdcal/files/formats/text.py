@@ -115,7 +115,7 @@ def is_formula(cell: str) -> bool:
     >>> [is_formula(cell) for cell in ("=1+1", "-1+1", "-1.5", "A-1")]
     [True, True, False, False]
     """
-    return cell.startswith(FORMULA) and not looks_numeric(cell.replace(",", "."))
+    return cell.startswith(FORMULA) and not looks_numeric(cell.strip().replace(",", "."))
 
 
 def _cells(name: str, column: Column) -> list[str]:
