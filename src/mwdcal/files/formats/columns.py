@@ -49,6 +49,7 @@ def damaged_unless_read(source: str, expected: str, advice: str) -> Iterator[Non
         raise
     except Exception as error:
         reason = (str(error).strip() or type(error).__name__).splitlines()[0][:120]
+        reason = re.sub(r"<class '([\w.]+)'>", r"\1", reason)
         raise InputError(
             f"{source}: expected {expected}; reading it failed ({reason}). {advice}"
         ) from error

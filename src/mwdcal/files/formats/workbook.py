@@ -5,13 +5,14 @@ from __future__ import annotations
 import datetime
 import io
 import re
+import warnings
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from mwdcal.errors import InputError
 from mwdcal.files import metadata as meta
-from mwdcal.files.formats import sheet
+from mwdcal.files.formats import workbook_limits
 from mwdcal.files.formats.columns import (
     Column,
     Parts,
@@ -21,12 +22,15 @@ from mwdcal.files.formats.columns import (
     plain_names,
     typed,
 )
-from mwdcal.files.formats.sheet import LONGEST_CELL, Row
 
 # A file must not depend on the hour it was written: the first day a ZIP archive can hold.
 _EPOCH = datetime.datetime(1980, 1, 1)
 _TIMES = re.compile(rb"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ")
+LONGEST_CELL = 32_767
+_MOST_DIGITS = 15
 _UNWRITABLE = re.compile(r"[\x00-\x08\x0b-\x1f\ufffe\uffff]")
+
+Row = tuple[int, Sequence[object]]
 
 
 def parse(data: bytes, source: str) -> Parts:
@@ -77,13 +81,33 @@ def _module(source: str) -> Any:
 
 def _rows(data: bytes, source: str) -> Iterator[Row]:
     """Row numbers and cells of the first sheet, without the blank cells at the end."""
-    _module(source)
+    openpyxl = _module(source)
     advice = "Save it again as .xlsx, or as CSV UTF-8."
     with (
         damaged_unless_read(source, "an Excel workbook (.xlsx)", advice),
-        zipfile.ZipFile(io.BytesIO(data)) as archive,
+        warnings.catch_warnings(),
     ):
-        yield from sheet.rows(archive, source)
+        warnings.simplefilter("ignore")
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            workbook_limits.check(archive, source)
+        book = openpyxl.load_workbook(io.BytesIO(data), read_only=True, data_only=True)
+        page = book.worksheets[0]
+        page.reset_dimensions()
+        for line, row in enumerate(page.iter_rows(values_only=True), 1):
+            yield line, _trimmed([_read(value) for value in row])
+
+
+def _read(value: object) -> object:
+    """The value of a cell; a whole number of many digits as text, which loses none."""
+    whole = isinstance(value, int) and not isinstance(value, bool)
+    return str(value) if whole and abs(value) >= 10**_MOST_DIGITS else value  # type: ignore[arg-type]
+
+
+def _trimmed(row: Sequence[object]) -> Sequence[object]:
+    end = len(row)
+    while end and (row[end - 1] is None or row[end - 1] == ""):
+        end -= 1
+    return row[:end]
 
 
 def _padded(header: Sequence[Row], rows: Iterator[Row], width: int) -> Iterator[Row]:
