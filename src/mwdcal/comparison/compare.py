@@ -19,7 +19,7 @@ from mwdcal.calibration.readings import ANGLES, TRIADS, Readings, is_simulated
 from mwdcal.calibration.record import Calibration, Measures
 from mwdcal.calibration.residuals import SHOWN, departure, nominal, rms, shown_in, vector_measures
 from mwdcal.comparison.common_gauge import Gauge, in_gauge
-from mwdcal.errors import FitError
+from mwdcal.errors import FitError, MwdcalError
 from mwdcal.estimation.minimisers.swarm import least_squares_forward, swarm_forward, vector_cost
 from mwdcal.estimation.rank import Free, free_directions
 from mwdcal.estimation.solvers import Status
@@ -166,15 +166,13 @@ def _options(readings: Readings, profile: Profile, options: Options, progress: P
 
 def _calibrated(readings: Readings, profile: Profile, options: Options) -> _Calibrated | str:
     """A method's calibration, or the reason why there is none."""
-    if options.method == "swarm":
-        options = replace(options, nonlinearity={})
     try:
         check_readings(readings, options)
         started = time.perf_counter()
         result = fit(readings, options)
         seconds = time.perf_counter() - started
         record = recorded(Choice(readings, profile, options), result)
-    except FitError as error:
+    except MwdcalError as error:  # what is wrong for all methods was refused before
         return str(error)
     except np.linalg.LinAlgError as error:
         return f"the stations are too weak to fit the model ({error}). Add stations."
