@@ -7,6 +7,7 @@ import io
 import re
 import subprocess
 import tokenize
+from collections.abc import Callable
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -198,6 +199,28 @@ def test_functions_are_short(name: str) -> None:
 def test_modules_are_short(name: str) -> None:
     size = code_lines(name)
     assert size <= MAX_MODULE_LINES, f"mwdcal.{name} has {size} lines of code; split it"
+
+
+def constants(tree: ast.Module) -> list[str]:
+    """Upper-case names that a module assigns at its top level."""
+    targets = [t for n in tree.body if isinstance(n, ast.Assign) for t in n.targets]
+    targets += [n.target for n in tree.body if isinstance(n, ast.AnnAssign)]
+    names = [n.id for t in targets for n in ast.walk(t) if isinstance(n, ast.Name)]
+    return [name for name in names if name.isupper() and name.lstrip("_") != "T"]
+
+
+def classes(tree: ast.Module) -> list[str]:
+    """Names of all classes of a module."""
+    return [node.name for node in ast.walk(tree) if isinstance(node, ast.ClassDef)]
+
+
+@pytest.mark.parametrize("names", [classes, constants], ids=["classes", "constants"])
+def test_a_name_means_one_thing(names: Callable[[ast.Module], list[str]]) -> None:
+    places: dict[str, list[str]] = {}
+    for module, tree in TREES.items():
+        for name in names(tree):
+            places.setdefault(name, []).append(module)
+    assert {name: where for name, where in places.items() if len(where) > 1} == {}
 
 
 def tracked_files() -> list[Path]:

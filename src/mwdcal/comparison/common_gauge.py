@@ -25,7 +25,7 @@ from mwdcal.sensor.models import Basis, Model, Polynomial
 from mwdcal.use.notation import Notation, convert
 
 SCALE = "scale"
-STEP = 1e-6
+DERIVATIVE_STEP = 1e-6
 """Step of a derivative, as the share of the field by which it changes the field."""
 
 
@@ -154,7 +154,7 @@ class _Settle:
             sizes = np.sqrt(np.mean(np.sum(rows**2, 1), 0)) / strength
             for index, size in zip(range(where.start, where.stop), sizes, strict=True):
                 step = np.zeros(len(params))
-                step[index] = STEP / size
+                step[index] = DERIVATIVE_STEP / size
                 change = self(params + step) - self(params - step)
                 columns.append(change / (2 * step[index]))
         return np.stack(columns, -1)

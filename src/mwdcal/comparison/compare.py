@@ -15,11 +15,12 @@ from mwdcal.calibration.estimate import Fit, fit
 from mwdcal.calibration.evidence import evidence_of
 from mwdcal.calibration.methods import EVIDENCE, SWARM_ITERATIONS
 from mwdcal.calibration.options import Options
-from mwdcal.calibration.readings import ANGLES, TRIADS, Readings, is_simulated
+from mwdcal.calibration.readings import TRIADS, Readings, is_simulated
 from mwdcal.calibration.record import Calibration, Measures
 from mwdcal.calibration.residuals import SHOWN, departure, nominal, rms, shown_in, vector_measures
 from mwdcal.comparison.common_gauge import Gauge, in_gauge
 from mwdcal.errors import FitError, MwdcalError
+from mwdcal.estimation.evidence import ANGLES
 from mwdcal.estimation.minimisers.swarm import least_squares_forward, swarm_forward, vector_cost
 from mwdcal.estimation.rank import Free, free_directions
 from mwdcal.estimation.solvers import Status

@@ -39,7 +39,7 @@ NOMINAL = Profile(name="nominal", accelerometer=_UNSCALED, magnetometer=_UNSCALE
 CORRECTED_ANGLES = ("inclination", "azimuth", "toolface", "dip", "magnetic_toolface")
 """Angles of corrected readings."""
 Path = str | os.PathLike[str]
-Source = Path | Table | Mapping[str, Any]
+Tabular = Path | Table | Mapping[str, Any]
 """A file, a table, or columns by name: a dictionary of arrays, a pandas or a polars table."""
 
 
@@ -53,7 +53,7 @@ def load_profile(name: Path = "generic") -> Profile:
 
 
 def read_run(
-    source: Source, profile: Path | Profile = "generic", *, decimal: str = "."
+    source: Tabular, profile: Path | Profile = "generic", *, decimal: str = "."
 ) -> Readings:
     """The readings of a run: of a CSV, TSV, Parquet or XLSX file, or of columns with the same names.
 
@@ -72,7 +72,7 @@ def read_run(
     return replace(readings, profile=profile, profile_sha256=profile_sha256)
 
 
-def _table(source: Source, name: str, read: Callable[[Path], Table]) -> Table:
+def _table(source: Tabular, name: str, read: Callable[[Path], Table]) -> Table:
     """The table of a file, or of columns that are in memory."""
     if isinstance(source, Table):
         return source
@@ -279,7 +279,7 @@ def load(path: Path) -> Calibration:
     return documents.read(path)
 
 
-def stations(log: Source, **options: Any) -> Stations:
+def stations(log: Tabular, **options: Any) -> Stations:
     """The standstills of a continuous log, each as a station: `.table` is a run for `read_run`.
 
     `log` is a file, or columns by the names of log files: `time_s`, `ax`, …, `temperature_c`. `options`
@@ -288,7 +288,7 @@ def stations(log: Source, **options: Any) -> Stations:
     return find_stations(_log(log), **options)
 
 
-def noise(log: Source, **options: Any) -> Noise:
+def noise(log: Tabular, **options: Any) -> Noise:
     """The noise of each raw channel of a log of a tool at rest, by Allan deviation.
 
     `log` is a file, or columns by the names of log files. `options` are those of
@@ -297,7 +297,7 @@ def noise(log: Source, **options: Any) -> Noise:
     return find_noise(_log(log), **options)
 
 
-def _log(source: Source) -> Table:
+def _log(source: Tabular) -> Table:
     """A log: a file, or columns that are checked like one."""
     table = _table(source, "the log", logs.read)
     return table if isinstance(source, str | os.PathLike) else logs.check(table)

@@ -12,14 +12,25 @@ from functools import cached_property
 
 import numpy as np
 
-from mwdcal.calibration.readings import ANGLES, Readings
+from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import FREE_SHARE, Calibration
+from mwdcal.estimation.evidence import ANGLES
 from mwdcal.geometry.observables import OBSERVABLES, OUTPUTS
 from mwdcal.geometry.vectors import Array, Bools, Ints
 from mwdcal.use.roll_sets import ROLL_SET, RollSet, near_vertical, roll_sets
-from mwdcal.use.roll_test import GAP, OPEN, SLACK, Coverage, Curve, coverage, ends, extent, fitted
+from mwdcal.use.roll_test import (
+    OPEN,
+    SLACK,
+    WIDEST_GAP,
+    Coverage,
+    Curve,
+    coverage,
+    ends,
+    extent,
+    fitted,
+)
 
-TURNING = ("azimuth", "toolface")
+UNDEFINED_AT_VERTICAL = ("azimuth", "toolface")
 """Angles that do not exist at vertical."""
 LEVEL = ("inclination", "gravity")
 """Observables that stations of one inclination share at every azimuth."""
@@ -133,7 +144,7 @@ class RollTest:
         circle = None if np.isnan(self.toolface[index]).any() else self._coverage(index)
         if circle is None or circle.rolled:
             return "" if circle else NO_TOOLFACE
-        return _gap(circle, GAP) or (
+        return _gap(circle, WIDEST_GAP) or (
             "the toolfaces do not determine a mean and two harmonics. Add toolfaces between them: "
             "five or more, well apart"
         )
@@ -142,7 +153,7 @@ class RollTest:
         """Why a roll set has no spread of an observable; empty where it has."""
         if not roll_set.one_azimuth and name not in LEVEL:
             return f"{roll_set.label}: stations of one direction need group or {REFERENCE_COLUMNS['azimuth']}"
-        if name in TURNING and self.near[roll_set.index].any():
+        if name in UNDEFINED_AT_VERTICAL and self.near[roll_set.index].any():
             return f"{roll_set.label}: within 5° of vertical"
         if name == "toolface" and np.isnan(self._error(name)[roll_set.index]).any():
             return f"{roll_set.label}: no {REFERENCE_COLUMNS[name]}"
@@ -187,7 +198,7 @@ class RollTest:
         """
         lacks = self._lacks(name)
         given = ~np.isnan(self._error(name)) if not lacks else np.zeros(self.readings.count, bool)
-        near = given & self.near if name in TURNING else np.zeros(given.shape, bool)
+        near = given & self.near if name in UNDEFINED_AT_VERTICAL else np.zeros(given.shape, bool)
         judged = np.flatnonzero(given & ~near)
         if not judged.size:
             steep = (

@@ -18,7 +18,7 @@ COVERAGE = 2.0
 """Coverage factor of the guard band and of the remark that a value is close to its limit."""
 WEAK = 0.5
 """A test whose 1σ is a larger share of the limit hardly distinguishes a good tool from a bad one."""
-CLEAR = 3.0
+NAMED_HARMONIC = 3.0
 """Standard uncertainties above which a harmonic is named as a cause."""
 CAUSES = {
     "inclination": (
@@ -313,7 +313,7 @@ def _causes(row: VerdictRow, name: str, worst: Statistic) -> Iterable[Finding]:
     parts = [
         f"{ordinal} harmonic {amplitude:.2g}{unit} ({cause})"
         for ordinal, amplitude, cause, clear in zip(
-            ("first", "second"), row.harmonics, causes, size > CLEAR, strict=True
+            ("first", "second"), row.harmonics, causes, size > NAMED_HARMONIC, strict=True
         )
         if clear
     ]

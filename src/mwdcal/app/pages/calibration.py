@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 MOST_RESHOOTS = 12
 """Most stations to re-shoot that the screen names."""
 PROFILE = " (see [stand] of the tool profile)"
-RUN = ("run", "stations", "excluded", "temperature_c", "method", "options", "seed")
+RUN_FIELDS = ("run", "stations", "excluded", "temperature_c", "method", "options", "seed")
 TRIAD = ("model", "order", "rank", "size", "undetermined", "variance_factor", "misfit_probability")
 ACCURACY = ("budget", "assumed_exact", "constants", "stand", "findings", "orders")
 """Parts of the record that the summary for machines repeats."""
@@ -44,7 +44,7 @@ def summary(
 ) -> dict[str, Any]:
     """The result for machines."""
     return {
-        **_attributes(calibration, RUN),
+        **_attributes(calibration, RUN_FIELDS),
         "triads": {triad.name: _attributes(triad, TRIAD) for triad in calibration.triads},
         **_attributes(calibration, ("errors", "measures")),
         "accuracy_1sigma_deg": typical_accuracy(calibration),

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 LONG_TABLE = 60
 """A run of more stations has its station table at the end, as an annex."""
-MAGNETIC = ("azimuth", "field", "dip")
+NEEDS_MAGNETOMETER = ("azimuth", "field", "dip")
 """Observables that need a magnetometer."""
 ACCURACY_INCLINATIONS = (5.0, 45.0, 90.0)
 """Inclinations of the table of predicted accuracy, degrees."""
@@ -46,7 +46,7 @@ def render(calibration: Calibration, verdict: Verdict | None = None) -> str:
         simulated=is_simulated(calibration.tool),
         inclinations=known_inclinations(calibration),
         method="; ".join(how(calibration)),
-        magnetic=MAGNETIC,
+        magnetic=NEEDS_MAGNETOMETER,
         limit=plots.reshoot_limit(calibration),
         decimals=_decimals(calibration),
         long_table=LONG_TABLE,
@@ -119,7 +119,7 @@ def _decimals(calibration: Calibration) -> dict[str, int]:
     }
 
 
-Row = tuple[str, str, int, float, float | None, str]
+ParameterRow = tuple[str, str, int, float, float | None, str]
 """A parameter: name, axes, power of τ, value, 1σ and unit."""
 
 
@@ -134,7 +134,7 @@ def _parameters(calibration: Calibration) -> dict[str, Any]:
     return {"notation": "factors", "rows": rows}
 
 
-def _own_rows(triad: TriadCalibration) -> list[Row]:
+def _own_rows(triad: TriadCalibration) -> list[ParameterRow]:
     """The parameters of the record: tool axes, nominal units."""
     columns = (triad.parameter_names, triad.parameters, triad.standard_uncertainties)
     rows = []
@@ -147,7 +147,7 @@ def _own_rows(triad: TriadCalibration) -> list[Row]:
     return rows
 
 
-def _factor_rows(triad: TriadCalibration, factors: Notation) -> list[Row]:
+def _factor_rows(triad: TriadCalibration, factors: Notation) -> list[ParameterRow]:
     values, sd = factors.values, factors.uncertainty
     return [
         (name, axes, power, float(values[name][at]), float(sd[name][at]), symbol)

@@ -25,7 +25,7 @@ _PARSERS: dict[str, Callable[..., Parts]] = {
 }
 SUFFIXES = tuple(_PARSERS)
 
-_LARGEST = {".parquet": 2_000_000_000}
+_LARGEST_FILES = {".parquet": 2_000_000_000}
 _LARGEST_TEXT = 50_000_000
 _MARKS = {sign: frozenset(f"0123456789+-eE {sign}") for sign in ".,"}
 
@@ -152,7 +152,7 @@ def check_file(path: Path) -> None:
 
 
 def _check_size(size: int, path: Path) -> None:
-    largest = _LARGEST.get(_suffix(path), _LARGEST_TEXT)
+    largest = _LARGEST_FILES.get(_suffix(path), _LARGEST_TEXT)
     if size > largest:
         raise InputError(
             f"'{path}': the file must have at most {largest} bytes; got {size}. Split it, or "
