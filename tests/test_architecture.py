@@ -223,6 +223,13 @@ def test_a_name_means_one_thing(names: Callable[[ast.Module], list[str]]) -> Non
     assert {name: where for name, where in places.items() if len(where) > 1} == {}
 
 
+@pytest.mark.parametrize("name", [n for n in PATHS if n.split(".")[0] not in ("app", "__main__")])
+def test_messages_of_the_library_name_arguments_not_options(name: str) -> None:
+    strings = (n for n in ast.walk(TREES[name]) if isinstance(n, ast.Constant))
+    typed = [(n.lineno, n.value) for n in strings if re.search(r"(?<![\w-])--[a-z]", str(n.value))]
+    assert not typed, f"mwdcal.{name}: write `order`, of which the command makes --order: {typed}"
+
+
 def tracked_files() -> list[Path]:
     """Files under version control, and new ones that git does not ignore."""
     command = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]

@@ -161,14 +161,14 @@ def _refuse(triad: TriadCalibration, notation: str, temperature: float | str) ->
         raise InputError(
             f"{what}: its factors are no polynomials of temperature. Use `notation` affine, "
             "for one temperature or with `temperature` course, or `notation` forward for one "
-            "temperature, or calibrate with --model factors."
+            "temperature, or calibrate with `model` factors."
         )
     if temperature == COURSE:
         able = "affine" if model == "factors" else "forward or factors"
         raise InputError(
             f"{what}: its {notation} notation is a quotient of polynomials of temperature and has "
             f"no coefficients by power. Use `notation` {able}, or a number in °C for "
-            f"`temperature`, or calibrate with --model {model}."
+            f"`temperature`, or calibrate with `model` {model}."
         )
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from mwdcal.app.messages import lines
+from mwdcal.app.messages import findings_as_typed, lines
 from mwdcal.app.pages.page import written
 from mwdcal.app.text import chance, number, one_line, quantity, table
 from mwdcal.calibration.automatic.nonlinearity import CurveScore
@@ -49,6 +49,7 @@ def summary(
         **_attributes(calibration, ("errors", "measures")),
         "accuracy_1sigma_deg": typical_accuracy(calibration),
         **_attributes(calibration, ACCURACY),
+        "findings": findings_as_typed(calibration.findings),
         "nonlinearity": [msgspec.to_builtins(score) for score in choice.curves],
         "calibration": str(output),
         "report": str(report or ""),

@@ -14,6 +14,7 @@ import numpy as np
 
 from mwdcal.app.commands.choices import names
 from mwdcal.app.commands.options import Typed
+from mwdcal.app.messages import as_typed
 from mwdcal.app.pages.calibration import choices
 from mwdcal.app.pages.page import written
 from mwdcal.app.text import number, one_line, plural, table
@@ -174,7 +175,8 @@ def _kinds(head: Any) -> list[StatusCount]:
     for each in sorted(counted, key=lambda c: (c["values"] != OK, -c["counts"])):
         name, count = each["values"], each["counts"]
         tools = head.filter(compute.equal(status, name)).slice(0, SERIALS_SHOWN).to_pydict()
-        kinds.append(StatusCount(name, count, tools[SERIAL], tools["message"][0]))
+        message = as_typed(tools["message"][0])
+        kinds.append(StatusCount(name, count, tools[SERIAL], message))
     return kinds
 
 

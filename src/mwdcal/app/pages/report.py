@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mwdcal.app.messages import findings_as_typed
 from mwdcal.app.pages.calibration import how, known_inclinations
 from mwdcal.app.pages.page import HELD, banner, capital, environment, exponent, factor_places
 from mwdcal.app.text import plural, raised
@@ -100,7 +101,7 @@ def _findings(calibration: Calibration, verdict: Verdict | None) -> list[Finding
     for extra in verdict.findings if verdict else ():
         if extra.id not in ids:
             findings.setdefault(extra.text, extra)
-    return sorted(findings.values(), key=lambda f: f.id != "reshoot")
+    return sorted(findings_as_typed(findings.values()), key=lambda f: f.id != "reshoot")
 
 
 def _when(time: str) -> str:

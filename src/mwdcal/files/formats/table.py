@@ -193,9 +193,9 @@ def _one_by_one(table: Table, name: str, cells: Sequence[str]) -> Array:
 def _advice(cell: str, decimal: str) -> str:
     """What to do about a cell that is not a number."""
     if decimal == "." and looks_numeric(cell, ","):
-        return "Is the decimal comma intended? Use --decimal=,"
+        return "Is the decimal comma intended? Use `decimal` ','."
     if decimal == "," and looks_numeric(cell, "."):
-        return "The decimal sign was given as a comma. Is the point intended? Use --decimal=."
+        return "The decimal sign was given as a comma. Is the point intended? Use `decimal` '.'."
     if re.fullmatch(r"[+-]?(nan|inf|infinity|∞|n/?a|null|none)", cell, re.IGNORECASE):
         return "Every number must be finite. Leave the cell blank where a value is unknown."
     if re.fullmatch(r"[+-]?\d{1,3}([ ,.'’_\u00a0\u202f]\d{3})+([.,]\d*)?", cell):
