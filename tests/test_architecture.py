@@ -230,6 +230,22 @@ def test_messages_of_the_library_name_arguments_not_options(name: str) -> None:
     assert not typed, f"mwdcal.{name}: write `order`, of which the command makes --order: {typed}"
 
 
+def identifiers(tree: ast.Module) -> set[str]:
+    """Names that a module gives to variables, arguments, attributes, functions and classes."""
+    names = {n.id for n in ast.walk(tree) if isinstance(n, ast.Name)}
+    names |= {n.attr for n in ast.walk(tree) if isinstance(n, ast.Attribute)}
+    names |= {n.arg for n in ast.walk(tree) if isinstance(n, ast.arg)}
+    defined = ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef
+    return names | {n.name for n in ast.walk(tree) if isinstance(n, defined)}
+
+
+@pytest.mark.parametrize("name", PATHS)
+def test_names_are_nouns_not_participles(name: str) -> None:
+    vague = re.compile(r"(^|_)(own(?!_ax)|told|found|made|asked)(_|$)", re.IGNORECASE)
+    odd = {word for word in identifiers(TREES[name]) if vague.search(word)}
+    assert not odd, f"mwdcal.{name}: name what it is, not what was done: {odd}"
+
+
 def tracked_files() -> list[Path]:
     """Files under version control, and new ones that git does not ignore."""
     command = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]

@@ -82,7 +82,7 @@ LONGEST_SERIAL = 60
 _MOST = 10**15
 
 Item = TypeVar("Item")
-Made = TypeVar("Made")
+Result = TypeVar("Result")
 
 
 class CorrectedPart(NamedTuple):
@@ -143,13 +143,13 @@ def apply_to_file(
     return total, remarks + carried.copied(source.names, sink.formulas, output.suffix.lower())
 
 
-def overlapped(items: Iterator[Item], work: Callable[[Item], Made]) -> Iterator[Made]:
+def overlapped(items: Iterator[Item], work: Callable[[Item], Result]) -> Iterator[Result]:
     """`work` of every item, in order; the next ones are taken and worked on meanwhile."""
     workers = min(WORKERS, correction_numba.cores())
     end: Any = object()
     with ThreadPoolExecutor(workers + 1) as pool:
         upcoming = pool.submit(next, items, end)
-        running: deque[Future[Made]] = deque()
+        running: deque[Future[Result]] = deque()
         try:
             while (item := upcoming.result()) is not end:
                 upcoming = pool.submit(next, items, end)

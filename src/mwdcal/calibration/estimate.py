@@ -222,7 +222,7 @@ def _closed(
     None where it holds for no member, as with references that are not exact.
     """
     none = np.zeros(len(finite), bool)
-    apart = options.robust or options.own_solver or problem.evidence.scatter
+    apart = options.robust or options.separate_solver or problem.evidence.scatter
     if apart or not closed_form.applies(problem):
         return None, none
     at = closed_form.start(problem)

@@ -303,11 +303,11 @@ def _deal(source: FleetTable, tools: Tools, number: Ints, folder: Path) -> None:
             table = table.append_column("#row", arrow.array(rows))
             target = number[tool]
             order = np.argsort(target, kind="stable")
-            sorted_own = target[order]
+            sorted_target = target[order]
             table = table.take(arrow.array(order))
-            bounds = np.flatnonzero(np.diff(sorted_own, prepend=-1))
+            bounds = np.flatnonzero(np.diff(sorted_target, prepend=-1))
             for start, stop in zip(bounds, [*bounds[1:], len(target)], strict=True):
-                key = int(sorted_own[start])
+                key = int(sorted_target[start])
                 if key not in writers:
                     path = folder / f"{key:04d}.parquet"
                     writers[key] = pq.ParquetWriter(path, table.schema, compression="lz4")

@@ -285,7 +285,7 @@ def _torn(activity: Activity, findings: list[Finding]) -> list[Finding]:
 def _equal_times(log: Table, time: Array, names: list[str]) -> list[Finding]:
     """Samples of a channel at one time; rows of different channels may share theirs."""
     filled = {name: time[~np.isnan(numbers(log, name))] for name in names}
-    twice = {name: int(np.count_nonzero(np.diff(own) == 0)) for name, own in filled.items()}
+    twice = {name: int(np.count_nonzero(np.diff(times) == 0)) for name, times in filled.items()}
     name = max(twice, key=lambda n: twice[n])
     if not twice[name]:
         return []

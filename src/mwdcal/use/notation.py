@@ -133,7 +133,7 @@ def _one(part: _Part, notation: str, temperature: float | str) -> Notation:
 
     def values(params: AnyArray) -> dict[str, AnyArray]:
         if notation == triad.model:
-            return _own_factors(params, permutation, scale)
+            return _stored_factors(params, permutation, scale)
         if course and triad.order:
             form = _forward_course if notation == "forward" else _affine_course
             return form(params, permutation, scale)
@@ -198,7 +198,7 @@ def _steady(
     return {"SF": scale[:, None], "B": bias[:, None], "m": -mixing * (1 - np.eye(3))}
 
 
-def _own_factors(params: AnyArray, permutation: Array, scale: Array) -> dict[str, AnyArray]:
+def _stored_factors(params: AnyArray, permutation: Array, scale: Array) -> dict[str, AnyArray]:
     """Stored factors, tool axes and nominal units, to channels and raw units: exact."""
     gain, bias, mixing = factor_parts(params)
     back = permutation.transpose()

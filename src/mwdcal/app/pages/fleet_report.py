@@ -51,7 +51,7 @@ FEWEST_TOOLS = 20
 """Sound tools without which there is no fleet to be an outlier of."""
 SPREAD = 1.4826
 """Standard deviation of a normal variable by its median absolute deviation."""
-OWN_OR_CROSS = ("gain", "square", "cube")
+ONE_AXIS_OR_TWO = ("gain", "square", "cube")
 """Parameters of one axis or of two: a panel for each."""
 Panel = tuple[str, str, Mapping[str, Array]]
 """Title, name of the axis, and values by name."""
@@ -333,7 +333,7 @@ def _lines(parameters: Sequence[FleetParameter]) -> list[list[tuple[str, list[Fl
     triads: dict[str, dict[str, list[FleetParameter]]] = {}
     for each in parameters:
         kind, _, axes = each.title.partition(" ")
-        if kind in OWN_OR_CROSS:
+        if kind in ONE_AXIS_OR_TWO:
             kind = f"{'own' if len(set(axes)) == 1 else 'cross'}-axis {kind}"
         triad = each.kind or each.triad
         title = f"{triad}: {kind}"

@@ -129,13 +129,13 @@ def _parameters(calibration: Calibration) -> dict[str, Any]:
     try:
         notations = convert(calibration, "factors")
     except InputError:
-        rows = {triad.name: _own_rows(triad) for triad in calibration.triads}
+        rows = {triad.name: _record_rows(triad) for triad in calibration.triads}
         return {"notation": "record", "rows": rows}
     rows = {triad.name: _factor_rows(triad, notations[triad.name]) for triad in calibration.triads}
     return {"notation": "factors", "rows": rows}
 
 
-def _own_rows(triad: TriadCalibration) -> list[ParameterRow]:
+def _record_rows(triad: TriadCalibration) -> list[ParameterRow]:
     """The parameters of the record: tool axes, nominal units."""
     columns = (triad.parameter_names, triad.parameters, triad.standard_uncertainties)
     rows = []

@@ -93,11 +93,11 @@ def check_options(options: Options) -> None:
     _check_ignored(options)
     _check_curved_models(options)
     minimiser = "the paper's weights" if options.paper_weights else f"method {method}"
-    if options.own_solver and options.robust:
+    if options.separate_solver and options.robust:
         raise InputError(
             f"`robust` cannot weigh the stations of {minimiser}. Use `method` joint with it."
         )
-    if options.own_solver and options.curved:
+    if options.separate_solver and options.curved:
         raise InputError(
             f"`nonlinearity` cannot be combined with {minimiser}: own-axis terms need their prior. Use "
             "`method` joint, or `nonlinearity` none."
@@ -117,7 +117,7 @@ def check_options(options: Options) -> None:
             "`paper_weights`: method joint does not come from a paper. Name the paper's method: least-squares, "
             "swarm, newton, toolface-inclination or scalar."
         )
-    if options.prior and (options.own_solver or options.curved):
+    if options.prior and (options.separate_solver or options.curved):
         what = "own-axis nonlinearity" if options.curved else minimiser
         raise InputError(
             f"`prior` cannot be combined with {what}. Use `method` joint, without "
