@@ -124,10 +124,9 @@ class _Part:
 
 
 def _one(part: _Part, notation: str, temperature: float | str) -> Notation:
-    triad, profile = part.triad, part.profile
+    triad, permutation = part.triad, part.profile.permutation
     _refuse(triad, notation, temperature)
-    permutation = profile.permutation
-    scale = np.full(3, 1.0 if profile.scale is None else profile.scale)
+    scale = np.full(3, 1.0 if part.profile.scale is None else part.profile.scale)
     course = isinstance(temperature, str)
     tau = 0.0 if isinstance(temperature, str) else temperature - part.reference
 
@@ -139,8 +138,9 @@ def _one(part: _Part, notation: str, temperature: float | str) -> Notation:
             return form(params, permutation, scale)
         matrix, offset = _affine(params, triad, tau)
         forms = _steady(notation, matrix @ permutation / scale, offset, permutation)
-        lead = course and notation != "factors"
-        return {name: value[None] for name, value in forms.items()} if lead else forms
+        if course and notation != "factors":
+            return {name: value[None] for name, value in forms.items()}
+        return forms
 
     return _propagate(values, part)
 
@@ -228,15 +228,10 @@ def _propagate(values: Callable[[AnyArray], dict[str, AnyArray]], part: _Part) -
     """Values and covariance; derivatives by complex step, exact to rounding."""
     params = np.array(part.triad.parameters)
     notation = {name: np.asarray(value.real) + 0.0 for name, value in values(params).items()}
-    columns = []
-    for index in range(len(params)):
-        step = np.zeros(len(params), complex)
-        size = max(abs(params[index]), 1.0) * 1e-30
-        step[index] = 1j * size
-        columns.append(
-            np.concatenate([v.imag.ravel() / size for v in values(params + step).values()])
-        )
-    jacobian = np.stack(columns, -1)
+    sizes = np.maximum(np.abs(params), 1.0) * 1e-30
+    changed = (values(params + 1j * step) for step in np.diag(sizes))
+    columns = [np.concatenate([v.imag.ravel() for v in each.values()]) for each in changed]
+    jacobian = np.stack(columns, -1) / sizes
     spread = jacobian @ part.covariance @ jacobian.transpose()
     moved = np.abs(jacobian @ part.free.transpose()).max(-1, initial=0.0)
     loose = moved > FREE_SHARE * part.sizes(notation)

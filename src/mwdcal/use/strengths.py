@@ -114,8 +114,7 @@ def findings(strengths: Mapping[str, Strengths]) -> list[Finding]:
 
 
 def _departure(name: str, each: Strengths) -> str:
-    unit, (low, high) = OUTPUTS[name].rpartition("_")[2], EARTH_RANGES[name]
-    unit = "nT" if unit == "nt" else unit
+    unit, (low, high) = "g" if name == "gravity" else "nT", EARTH_RANGES[name]
     reasons = []
     if each.earth:
         reasons.append(f"no place on Earth has it ({low:g}…{high:g} {unit})")
@@ -123,8 +122,7 @@ def _departure(name: str, each: Strengths) -> str:
         reasons.append(
             f"it is more than {OFF_REFERENCE:.0%} off the table's own ref_{OUTPUTS[name]}"
         )
-    ends = dict.fromkeys(f"{end:.3g}" for end in (each.low, each.high))
-    extent = "…".join(ends)
+    extent = "…".join(dict.fromkeys(f"{end:.3g}" for end in (each.low, each.high)))
     return f"corrected {name} is {extent} {unit}, and {' and '.join(reasons)}"
 
 
@@ -140,23 +138,17 @@ def check(calibration: Calibration, strengths: Mapping[str, Strengths], source: 
 
 def _advice(calibration: Calibration, name: str, each: Strengths) -> str:
     """The likely cause, and what to do."""
-    triad = "accelerometer" if name == "gravity" else "magnetometer"
-    scale = getattr(calibration.profile, triad).scale
-    unit = "g" if name == "gravity" else "nT"
-    if scale is None:
-        nominal, likely = "", ""
-    else:
-        nominal = f" of about {scale:.4g} raw units per {unit}"
-        likely = _likely(name, each, scale)
-    else_ = (
-        " The field of a coil is declared in the tool profile before the calibration: [stand] coil = true."
-        if name == "field" and each.earth
-        else ""
+    triad, unit = ("accelerometer", "g") if name == "gravity" else ("magnetometer", "nT")
+    scale, nominal = getattr(calibration.profile, triad).scale, ""
+    if scale is not None:
+        nominal = f" of about {scale:.4g} raw units per {unit}{_likely(name, each, scale)}"
+    text = (
+        f"The calibration ({calibration.run}) is for {triad} readings{nominal}. Give the readings in the "
+        "units of its run, or the calibration that belongs to them."
     )
-    return (
-        f"The calibration ({calibration.run}) is for {triad} readings{nominal}{likely}. Give the readings in the "
-        f"units of its run, or the calibration that belongs to them.{else_}"
-    )
+    if name == "field" and each.earth:
+        text += " The field of a coil is declared in the tool profile before the calibration: [stand] coil = true."
+    return text
 
 
 def _likely(name: str, each: Strengths, scale: float) -> str:
