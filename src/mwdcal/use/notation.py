@@ -124,6 +124,7 @@ class _Part:
 
 
 def _one(part: _Part, notation: str, temperature: float | str) -> Notation:
+    """One triad in a notation, at a temperature or as a course."""
     triad, permutation = part.triad, part.profile.permutation
     _refuse(triad, notation, temperature)
     scale = np.full(3, 1.0 if part.profile.scale is None else part.profile.scale)
@@ -154,22 +155,25 @@ def _refuse(triad: TriadCalibration, notation: str, temperature: float | str) ->
             "mwdcal apply."
         )
     model = "polynomial" if notation == "affine" else "factors"
-    if not triad.order or triad.model == model:
-        return
+    if triad.order and triad.model != model and (notation == "factors" or temperature == COURSE):
+        raise _quotient(triad, notation, model)
+
+
+def _quotient(triad: TriadCalibration, notation: str, model: str) -> InputError:
+    """The error of a notation that only another model has as polynomials of temperature."""
     what = f"the {triad.name} has the model '{triad.model}' of order {triad.order} in temperature"
     if notation == "factors":
-        raise InputError(
+        return InputError(
             f"{what}: its factors are no polynomials of temperature. Use `notation` affine, "
             "for one temperature or with `temperature` course, or `notation` forward for one "
             "temperature, or calibrate with `model` factors."
         )
-    if temperature == COURSE:
-        able = "affine" if model == "factors" else "forward or factors"
-        raise InputError(
-            f"{what}: its {notation} notation is a quotient of polynomials of temperature and has "
-            f"no coefficients by power. Use `notation` {able}, or a number in °C for "
-            f"`temperature`, or calibrate with `model` {model}."
-        )
+    able = "affine" if model == "factors" else "forward or factors"
+    return InputError(
+        f"{what}: its {notation} notation is a quotient of polynomials of temperature and has "
+        f"no coefficients by power. Use `notation` {able}, or a number in °C for "
+        f"`temperature`, or calibrate with `model` {model}."
+    )
 
 
 def _affine(params: AnyArray, triad: TriadCalibration, tau: float) -> tuple[AnyArray, AnyArray]:

@@ -196,15 +196,11 @@ def _stems(
     """Stems over the stations; the ones to re-shoot have a triangle and their label."""
     where, heights = np.arange(len(rows)), np.asarray(values, float)
     marked = np.array([row.reshoot for row in rows])
-    plain: dict[str, Any] = {
-        "color": colour,
-        "ms": 3.6 if len(rows) <= 80 else 2.2,
-        "mfc": "white",
-        "mew": 0.9,
-    }
+    small = 3.6 if len(rows) <= 80 else 2.2
     stems = np.stack([np.zeros_like(heights), heights, np.full(len(rows), np.nan)], -1).ravel()
     axes.plot(np.repeat(where, 3), stems, color=colour, lw=0.7, alpha=0.6)
-    axes.plot(where[~marked], heights[~marked], marker, **plain)
+    plain = where[~marked], heights[~marked]
+    axes.plot(*plain, marker, color=colour, ms=small, mfc="white", mew=0.9)
     axes.plot(where[marked], heights[marked], "^", color=MARKED, ms=6)
     for index in np.flatnonzero(marked & ~np.isnan(heights)).tolist():
         _name_station(axes, index, float(heights[index]), rows[index].station)

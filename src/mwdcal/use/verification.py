@@ -248,10 +248,10 @@ def _judged(
     worst = max(outcome.statistics, key=lambda each: each.value + guard * each.uncertainty)
     value, sd = worst.value * factor, worst.uncertainty * factor
     passed = value + guard * sd <= limit
+    note, harmonics = _remark(value, sd, limit, passed), _harmonics(worst, factor)
     row = VerdictRow(
         name=title, unit=unit, value=value, uncertainty=sd, limit=limit, passed=passed,
-        note=f"{worst.where}{_remark(value, sd, limit, passed)}", raw=most,
-        harmonics=_harmonics(worst, factor),
+        note=f"{worst.where}{note}", raw=most, harmonics=harmonics,
     )  # fmt: skip
     return row, [*findings, *_weak(row), *_causes(row, name, worst)]
 
@@ -279,8 +279,8 @@ def _remark(value: float, sd: float, limit: float, passed: bool) -> str:
 def _harmonics(worst: Statistic, factor: float) -> tuple[float, float] | None:
     if worst.curve is None:
         return None
-    first, second = (float(a) * factor for a in worst.curve.amplitudes)
-    return first, second
+    first, second = worst.curve.amplitudes.tolist()
+    return first * factor, second * factor
 
 
 def _weak(row: VerdictRow) -> Iterable[Finding]:
@@ -300,12 +300,9 @@ def _causes(row: VerdictRow, name: str, worst: Statistic) -> Iterable[Finding]:
     unit = row.unit if row.unit == "°" else f" {row.unit}"
     causes = CAUSES.get(name, CAUSES["azimuth"])
     size = worst.curve.amplitudes / np.maximum(worst.curve.amplitude_sd, 1e-30)
+    each = zip(("first", "second"), row.harmonics, causes, size > NAMED_HARMONIC, strict=True)
     parts = [
-        f"{ordinal} harmonic {amplitude:.2g}{unit} ({cause})"
-        for ordinal, amplitude, cause, clear in zip(
-            ("first", "second"), row.harmonics, causes, size > NAMED_HARMONIC, strict=True
-        )
-        if clear
+        f"{which} harmonic {a:.2g}{unit} ({cause})" for which, a, cause, clear in each if clear
     ]
     if parts:
         text = f"{row.name} over a turn of toolface: {'; '.join(parts)}."
