@@ -7,6 +7,7 @@ import io
 import re
 import subprocess
 import tokenize
+from collections.abc import Callable
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -198,6 +199,51 @@ def test_functions_are_short(name: str) -> None:
 def test_modules_are_short(name: str) -> None:
     size = code_lines(name)
     assert size <= MAX_MODULE_LINES, f"mwdcal.{name} has {size} lines of code; split it"
+
+
+def constants(tree: ast.Module) -> list[str]:
+    """Upper-case names that a module assigns at its top level."""
+    targets = [t for n in tree.body if isinstance(n, ast.Assign) for t in n.targets]
+    targets += [n.target for n in tree.body if isinstance(n, ast.AnnAssign)]
+    names = [n.id for t in targets for n in ast.walk(t) if isinstance(n, ast.Name)]
+    return [name for name in names if name.isupper() and name.lstrip("_") != "T"]
+
+
+def classes(tree: ast.Module) -> list[str]:
+    """Names of all classes of a module."""
+    return [node.name for node in ast.walk(tree) if isinstance(node, ast.ClassDef)]
+
+
+@pytest.mark.parametrize("names", [classes, constants], ids=["classes", "constants"])
+def test_a_name_means_one_thing(names: Callable[[ast.Module], list[str]]) -> None:
+    places: dict[str, list[str]] = {}
+    for module, tree in TREES.items():
+        for name in names(tree):
+            places.setdefault(name, []).append(module)
+    assert {name: where for name, where in places.items() if len(where) > 1} == {}
+
+
+@pytest.mark.parametrize("name", [n for n in PATHS if n.split(".")[0] not in ("app", "__main__")])
+def test_messages_of_the_library_name_arguments_not_options(name: str) -> None:
+    strings = (n for n in ast.walk(TREES[name]) if isinstance(n, ast.Constant))
+    typed = [(n.lineno, n.value) for n in strings if re.search(r"(?<![\w-])--[a-z]", str(n.value))]
+    assert not typed, f"mwdcal.{name}: write `order`, of which the command makes --order: {typed}"
+
+
+def identifiers(tree: ast.Module) -> set[str]:
+    """Names that a module gives to variables, arguments, attributes, functions and classes."""
+    names = {n.id for n in ast.walk(tree) if isinstance(n, ast.Name)}
+    names |= {n.attr for n in ast.walk(tree) if isinstance(n, ast.Attribute)}
+    names |= {n.arg for n in ast.walk(tree) if isinstance(n, ast.arg)}
+    defined = ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef
+    return names | {n.name for n in ast.walk(tree) if isinstance(n, defined)}
+
+
+@pytest.mark.parametrize("name", PATHS)
+def test_names_are_nouns_not_participles(name: str) -> None:
+    vague = re.compile(r"(^|_)(own(?!_ax)|told|found|made|asked)(_|$)", re.IGNORECASE)
+    odd = {word for word in identifiers(TREES[name]) if vague.search(word)}
+    assert not odd, f"mwdcal.{name}: name what it is, not what was done: {odd}"
 
 
 def tracked_files() -> list[Path]:

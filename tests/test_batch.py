@@ -113,7 +113,7 @@ def test_members_are_refused_before_the_fit_as_each_would_be_alone():
 
 def test_a_single_run_is_refused_with_the_error_of_its_status():
     one = take(runs(), 0)
-    with pytest.raises(InputError, match="--order 2 needs the column"):
+    with pytest.raises(InputError, match="`order` 2 needs the column"):
         check(reading_refusals(batch_of_one(one), Options(order=2), lambda _: one))
     few = one.select(np.arange(24) < 3)
     with pytest.raises(FitError, match="3 stations; the model has 12 .* needs 4 or more"):

@@ -238,7 +238,7 @@ def test_a_course_that_is_no_polynomial_is_refused(warm):
     ran = mwdcal("convert", warm[0], "--notation", other, "--temperature", "course")
     message = refused(ran, 2)
     remedy = {"factors": "polynomial", "polynomial": "factors"}[warm[3]]
-    assert f"--model {remedy}" in message
+    assert f"`model` {remedy}" in message
     assert "accelerometer" in message
     assert "°C" in message
 
@@ -268,7 +268,7 @@ def test_a_polynomial_of_temperature_has_no_factors(warm):
     if warm[3] == "factors":
         pytest.skip("has factors")
     message = refused(mwdcal("convert", warm[0], "--notation", "factors"), 2)
-    assert "--model factors" in message
+    assert "`model` factors" in message
 
 
 @pytest.mark.parametrize("notation", NOTATIONS)

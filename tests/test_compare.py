@@ -20,9 +20,11 @@ from mwdcal.calibration.readings import Readings
 from mwdcal.comparison import compare as module
 from mwdcal.comparison.common_gauge import Gauge, in_gauge
 from mwdcal.comparison.compare import SCATTER, compare
+from mwdcal.errors import InputError
 from mwdcal.estimation.rank import Free
 from mwdcal.estimation.uncertainty import unrotating
 from mwdcal.planning import simulate
+from mwdcal.sensor.profile import Profile, TriadProfile
 from mwdcal.use.roll_sets import group_scatter
 from simulation import Tool, attitude, plan
 from test_calibrate import NOISE, PROFILE, make
@@ -263,6 +265,31 @@ def test_methods_that_do_not_apply_say_why():
     refusals = {row.method: row.refused for row in found.rows if row.refused}
     assert set(refusals) == {"least-squares", "swarm", "toolface-inclination"}
     assert all("ref_toolface_deg" in reason for reason in refusals.values())
+
+
+def test_methods_that_cannot_carry_what_the_run_shows_say_so_and_leave_the_others_alone():
+    readings = make(1)
+    raw = readings.accelerometer
+    bent = replace(readings, accelerometer=raw - 2e-2 * raw**2 - 1e-2 * raw**3)
+    profile = Profile(name="bent tool", accelerometer=TriadProfile(nonlinearity=0.01))
+    comparison = compare(bent, profile)
+    assert comparison.curved == ("accelerometer",)
+    refusals = {row.method: row.refused for row in comparison.rows if row.refused}
+    assert set(refusals) == {"newton", "swarm"}
+    assert all("own-axis terms need their prior" in reason for reason in refusals.values())
+    assert comparison.advice.startswith("use joint")
+
+
+def test_what_no_method_can_do_is_an_error_of_the_call():
+    """Temperatures that are missing are missing for all."""
+    with pytest.raises(InputError, match="temperature_c"):
+        compare(make(1), PROFILE, Options(order=1))
+
+
+def test_options_that_one_method_cannot_have_are_its_own_refusal():
+    comparison = compare(make(1), PROFILE, Options(order=0, robust="huber"))
+    refusals = {row.method for row in comparison.rows if row.refused}
+    assert refusals == {"newton", "swarm"}
 
 
 def test_a_run_that_nothing_can_calibrate():

@@ -212,7 +212,7 @@ def test_an_order_too_low_is_a_finding_simulated():
     found = {f.id: f.text for f in calibrate(data, PROFILE, Options(order=1)).findings}
     text = found["accelerometer-temperature-misfit"]
     assert " mg rms" in text
-    assert "--order 2" in text
+    assert "`order` 2" in text
     assert "temperature-untested" not in found
     order, _ = choose_order(data, Options(), lambda said: None)
     ids = {f.id for f in calibrate(data, PROFILE, Options(order=order)).findings}

@@ -132,7 +132,7 @@ CELLS = [
     ("ax", "12 545", "Write numbers without thousands separators"),
     ("ax", "12'545.5", "Write numbers without thousands separators"),
     ("ax", '"1,234.5"', "Write numbers without thousands separators"),
-    ("ax", '"0,998"', "got '0,998'. Is the decimal comma intended? Use --decimal=,"),
+    ("ax", '"0,998"', "got '0,998'. Is the decimal comma intended? Use `decimal` ','"),
     ("ax", "1.2.3", "Write a plain number"),
     ("ax", "0.98 g", "Write the number without its unit"),
     ("ax", "0.98g", "Write the number without its unit"),
@@ -173,7 +173,7 @@ def test_ugly_cells_are_named_by_file_line_and_column(tmp_path, column, text, pa
 
 def test_a_point_where_the_decimal_sign_is_the_comma(tmp_path):
     path = put(tmp_path, "ax;ay;az\n1,5;0.5;1\n")
-    assert "Is the point intended? Use --decimal=." in refusal(path, ",")
+    assert "Is the point intended? Use `decimal` '.'" in refusal(path, ",")
 
 
 @pytest.mark.parametrize(

@@ -28,7 +28,7 @@ def interleaved(path):
 
 @pytest.fixture
 def small_parts(monkeypatch):
-    monkeypatch.setattr(fleet_tables, "ROWS", (50, 100))
+    monkeypatch.setattr(fleet_tables, "PARTITION_ROWS", (50, 100))
 
 
 def small_fleet(folder, mixed=False):

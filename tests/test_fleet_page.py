@@ -81,7 +81,7 @@ def test_axes_leave_out_the_outliers_and_nothing_else(monkeypatch):
     assert high == pytest.approx(others.max(), abs=0.3)
     assert counted == 38
     assert list(np.flatnonzero(fleet_report.distance(values) > fleet_report.FAR)) == [5]
-    few = values[: fleet_report.FEWEST - 1]
+    few = values[: fleet_report.FEWEST_TOOLS - 1]
     assert drawn(few, monkeypatch)[0] < -9800.0  # too few to call one of them an outlier
 
 
@@ -120,7 +120,9 @@ def test_numbers_along_an_axis_do_not_run_into_each_other(monkeypatch):
     values = np.linspace(-0.0051, 0.0057, 40)
     figure = fleet_report.draw_parameters(
         [
-            fleet_report.Parameter("magnetometer", "field = 1", name, "of the field", values, 0.0)
+            fleet_report.FleetParameter(
+                "magnetometer", "field = 1", name, "of the field", values, 0.0
+            )
             for name in ("gain xx", "gain xy", "offset x")
         ]
     )

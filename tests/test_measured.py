@@ -113,7 +113,7 @@ def test_methods_of_the_papers_are_refused_for_want_of_references(name, method):
             assert "cannot be combined with method swarm" in reason
             continue
         assert "'ref_inclination_deg' is blank at" in reason
-        assert "--method joint" in reason
+        assert "`method` joint" in reason
 
 
 def test_every_way_gives_a_calibration_or_a_reason():

@@ -319,10 +319,10 @@ def test_a_free_scale_blanks_the_gains_of_the_power_it_moves(power):
 @pytest.mark.parametrize(
     ("model", "notation", "temperature", "remedies"),
     [
-        ("polynomial", "forward", COURSE, ("affine", "--model factors", "°C")),
-        ("factors", "affine", COURSE, ("forward", "--model polynomial", "°C")),
-        ("polynomial", "factors", COURSE, ("affine", "--model factors")),
-        ("polynomial", "factors", None, ("affine", "--model factors")),
+        ("polynomial", "forward", COURSE, ("affine", "`model` factors", "°C")),
+        ("factors", "affine", COURSE, ("forward", "`model` polynomial", "°C")),
+        ("polynomial", "factors", COURSE, ("affine", "`model` factors")),
+        ("polynomial", "factors", None, ("affine", "`model` factors")),
     ],
 )
 def test_what_no_polynomial_can_carry_is_refused_with_a_remedy(

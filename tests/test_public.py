@@ -1,7 +1,10 @@
 """`import mwdcal`: the public names, conversion and refusal of arrays, and the ten lines of a first script."""
 
+import os
+import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +14,7 @@ from cli_support import EXAMPLE, numbers, read_csv
 from cli_support import mwdcal as command
 from mwdcal.calibration.record import Calibration
 from mwdcal.files import documents
+from mwdcal.sensor.profile import TriadProfile
 
 TOOL = 3
 
@@ -308,6 +312,9 @@ def test_refused_arguments(run, cal, simulated):
         (lambda: mwdcal.read_run({"ax": 1, "ay": 1, "az": 1}), "column 'ax' must be numbers"),
         (lambda: mwdcal.simulate([200]), "between 0 and 180"),
         (lambda: mwdcal.simulate([45], 0), "`toolfaces` 1 or more"),
+        (lambda: mwdcal.simulate(tool=([1.0], [1.0])), r"30 factors of each triad; got \(1,\)"),
+        (lambda: mwdcal.save(a, "run.csv"), "`result` must be"),
+        (lambda: mwdcal.save(run, "run.dat"), "run.dat"),
         (lambda: mwdcal.calibrate(run, prior=cal), "the calibration of unnamed readings was made"),
     ):
         with pytest.raises(mwdcal.InputError, match=words):
@@ -453,3 +460,71 @@ def test_polars_columns(simulated):
 def test_noise_by_an_unknown_deviation_is_refused():
     with pytest.raises(mwdcal.InputError, match="`kind` must be overlapping or modified"):
         mwdcal.noise(log(), kind="standard")
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
+def test_a_saved_run_is_read_as_it_was(tmp_path, suffix):
+    """Channels in other units and axes: what is read back with the profile are the same vectors."""
+    profile = mwdcal.Profile(
+        name="turned",
+        accelerometer=TriadProfile(axes=("+y", "-x", "+z"), scale=3.0),
+        magnetometer=TriadProfile(axes=("+x", "+y", "+z"), scale=5e-5),
+    )
+    run = mwdcal.simulate([20, 70], 6, [0, 130], tool=TOOL, seed=5)
+    path = tmp_path / f"run{suffix}"
+    mwdcal.save(run, path, profile)
+    again = mwdcal.read_run(path, profile)
+    for name in ("accelerometer", "magnetometer", "temperature"):
+        np.testing.assert_allclose(getattr(again, name), getattr(run, name), rtol=1e-12)
+    for name, known in run.known.items():
+        np.testing.assert_allclose(again.known[name], known, rtol=1e-12)
+    assert again.metadata["simulated"]
+    mwdcal.save(again, tmp_path / "again.csv")  # with the profile that it was read with
+    twice = mwdcal.read_run(tmp_path / "again.csv", profile)
+    np.testing.assert_allclose(twice.accelerometer, run.accelerometer, rtol=1e-12)
+
+
+def test_a_run_is_saved_with_so_many_places(tmp_path):
+    run = mwdcal.simulate([45], 3, [60], tool=TOOL)
+    mwdcal.save(run, tmp_path / "run.csv", decimals=3)
+    lines = [s for s in (tmp_path / "run.csv").read_text("utf-8").splitlines() if s[0] != "#"]
+    first = dict(zip(lines[0].split(","), lines[1].split(","), strict=True))
+    assert float(first["ax"]) == round(run.accelerometer[0, 0], 3)
+    assert float(first["mx"]) == round(run.magnetometer[0, 0], 3)
+    assert float(first["ref_inclination_deg"]) == 45.0
+
+
+def test_a_simulated_tool_is_the_one_of_its_factors():
+    """SF = 1 + 1e-4 (T - 30) on x alone, B = 0.01 on y: raw = SF (field + B), Moosavi's equation."""
+    accelerometer, magnetometer = np.zeros((2, 30))
+    for factors in (accelerometer, magnetometer):
+        factors[[0, 4, 8]] = 1.0
+    accelerometer[1], accelerometer[16] = 1e-4, 0.01
+    run = mwdcal.simulate(
+        [60], 4, [0], [50.0], tool=(accelerometer, magnetometer), noise=(0.0, 0.0), drift=10.0
+    )
+    np.testing.assert_allclose(run.temperature, [45.0, 50 - 5 / 3, 50 + 5 / 3, 55.0])
+    toolface, inclination = run.known["toolface"], np.radians(60)
+    x, y = -np.sin(inclination) * np.sin(toolface), -np.sin(inclination) * np.cos(toolface)
+    expected = [(1 + 1e-4 * (run.temperature - 30)) * x, y + 0.01, np.full(4, 0.5)]
+    np.testing.assert_allclose(run.accelerometer.T, expected, atol=1e-12)
+
+
+def test_a_simulated_stand_is_off_by_its_uncertainty():
+    angles = {"noise": (0.0, 0.0), "tool": TOOL, "seed": 8}
+    true, off = (
+        mwdcal.simulate([60], 2000, [0], stand_deg=stand, **angles)
+        for stand in ((0.0, 0.0, 0.0), (0.1, 0.0, 0.0))
+    )
+    change = off.accelerometer[:, 2] - true.accelerometer[:, 2]
+    assert np.std(change) == pytest.approx(np.sin(np.radians(60)) * np.radians(0.1), rel=0.1)
+    assert (off.known["inclination"] == true.known["inclination"]).all()
+
+
+def test_the_bundled_example_is_what_its_script_writes(tmp_path):
+    folder = Path("examples/servo").resolve()
+    for name in ("make.py", "tool.toml"):
+        shutil.copy(folder / name, tmp_path / name)
+    subprocess.run([sys.executable, tmp_path / "make.py"], check=True, env=os.environ)
+    for name in ("run.csv", "rolltest.csv", "truth.json"):
+        assert (tmp_path / name).read_bytes() == (folder / name).read_bytes()

@@ -152,7 +152,7 @@ def test_a_run_spoilt_by_one_station_is_refused_with_its_name_and_saved_by_weigh
     face = np.array(data.known["toolface"])
     face[20] += 10 * DEG
     data = replace(data, known={**data.known, "toolface": face})
-    with pytest.raises(FitError, match="Station 21 alone.*--exclude 21"):
+    with pytest.raises(FitError, match="Station 21 alone.*`exclude` 21"):
         calibrate(data, PROFILE)
     saved = calibrate(data, PROFILE, Options(robust="student-t"))
     good = calibrate(make(4).select(np.arange(48) != 20), PROFILE)
@@ -162,7 +162,7 @@ def test_a_run_spoilt_by_one_station_is_refused_with_its_name_and_saved_by_weigh
 
 @pytest.mark.parametrize("method", ["swarm", "newton"])
 def test_robust_needs_the_common_estimator(method):
-    with pytest.raises(InputError, match="--robust"):
+    with pytest.raises(InputError, match="`robust`"):
         calibrate(make(), PROFILE, Options(method, robust="huber"))
 
 

@@ -57,7 +57,7 @@ def cold(tmp_path_factory):
 @pytest.fixture
 def small_pieces(monkeypatch):
     """Every text table is long, and read in pieces of a few lines."""
-    monkeypatch.setattr(streaming, "LONG", dict.fromkeys(streaming.LONG, 0))
+    monkeypatch.setattr(streaming, "TABLE_SIZES", dict.fromkeys(streaming.TABLE_SIZES, 0))
     monkeypatch.setattr(streams, "PIECE", 3000)
 
 
@@ -685,7 +685,7 @@ def test_parquet_and_long_text_are_taken_in_parts_where_the_formats_allow_it(tmp
     packed = write_parquet(tmp_path / "a.parquet", log(1))
     assert not streaming.in_parts(short, tmp_path / "o.csv")
     assert streaming.in_parts(packed, tmp_path / "o.csv")
-    monkeypatch.setattr(streaming, "LONG", dict.fromkeys(streaming.LONG, 100))
+    monkeypatch.setattr(streaming, "TABLE_SIZES", dict.fromkeys(streaming.TABLE_SIZES, 100))
     for source in (short, packed):
         assert streaming.in_parts(source, tmp_path / "o.csv")
         assert not streaming.in_parts(source, tmp_path / "o.xlsx")
@@ -887,7 +887,7 @@ def test_rows_of_another_tool_are_told(tmp_path, monkeypatch, cells, told, suffi
     command = ("calibrate", run, "--tool", "servo", "-o", tmp_path / "cal.json", "--order", 0)
     assert mwdcal(*command).code == 0
     if length == "long":
-        monkeypatch.setattr(streaming, "LONG", dict.fromkeys(streaming.LONG, 0))
+        monkeypatch.setattr(streaming, "TABLE_SIZES", dict.fromkeys(streaming.TABLE_SIZES, 0))
         monkeypatch.setattr(streams, "PIECE", 3000)
     columns = {"serial": [cells[i * len(cells) // 120] for i in range(120)]}
     columns |= log(120, low=24, high=26)
@@ -906,7 +906,7 @@ def test_rows_of_another_tool_are_told(tmp_path, monkeypatch, cells, told, suffi
 @pytest.mark.parametrize("suffix", [".csv", ".long.csv", ".parquet"])
 def test_a_blank_reading_is_refused_with_the_way_out(tmp_path, warm, monkeypatch, name, suffix):
     if "long" in suffix:
-        monkeypatch.setattr(streaming, "LONG", dict.fromkeys(streaming.LONG, 0))
+        monkeypatch.setattr(streaming, "TABLE_SIZES", dict.fromkeys(streaming.TABLE_SIZES, 0))
     columns = log(100, low=10, high=40)
     columns[name] = columns[name].copy()
     columns[name][50] = np.nan
@@ -926,7 +926,7 @@ def test_a_blank_reading_is_refused_with_the_way_out(tmp_path, warm, monkeypatch
 @pytest.mark.parametrize("outside", ["blank", "extrapolate"])
 def test_rows_without_results_are_counted(tmp_path, warm, monkeypatch, suffix, outside):
     if "long" in suffix:
-        monkeypatch.setattr(streaming, "LONG", dict.fromkeys(streaming.LONG, 0))
+        monkeypatch.setattr(streaming, "TABLE_SIZES", dict.fromkeys(streaming.TABLE_SIZES, 0))
     columns, _ = gappy(400, {"ax": range(5), "mz": range(3, 9)})
     path = tmp_path / f"log{suffix}"
     if suffix == ".parquet":

@@ -27,7 +27,7 @@ def calibration(tmp_path_factory):
 def way(request, monkeypatch):
     """Suffix of the table; text in parts where the way says so."""
     if request.param == "in parts, text":
-        monkeypatch.setitem(streaming.LONG, ".csv", 1)
+        monkeypatch.setitem(streaming.TABLE_SIZES, ".csv", 1)
     return WAYS[request.param]
 
 
@@ -55,7 +55,7 @@ def apply(calibration, source, folder, *options):
     return mwdcal("apply", calibration, source, "-o", out, *options), out
 
 
-UNITS = {
+STRENGTH_UNITS = {
     "a calibration in volts on a table in g": ((1 / 3.0, 1.0), "readings in g."),
     "m/s² in the place of volts": ((9.80665 / 3.0, 1.0), "readings in m/s²."),
     "mg": ((1000 / 3.0, 1.0), "readings in mg."),
@@ -65,7 +65,7 @@ UNITS = {
 }
 
 
-@pytest.mark.parametrize(("gain", "words"), UNITS.values(), ids=UNITS)
+@pytest.mark.parametrize(("gain", "words"), STRENGTH_UNITS.values(), ids=STRENGTH_UNITS)
 def test_readings_in_other_units_are_refused_and_nothing_is_written(
     tmp_path, calibration, way, gain, words
 ):

@@ -102,7 +102,7 @@ def test_the_contract_s_own_names_are_never_refused_nor_listed(names):
 @pytest.mark.parametrize(("name", "column"), PAIRS, ids=[name for name, _ in PAIRS])
 def test_what_may_not_be_missed_is_refused_only_where_the_column_is_absent(name, column):
     names = ["ax", "ay", "az", name]
-    if column in synonyms.SHOWN:
+    if column in synonyms.NOTICED:
         with pytest.raises(InputError, match=column):
             check_evidence(names, "run.csv")
     else:
@@ -155,7 +155,7 @@ def test_a_resembling_column_is_refused_with_name_and_unit(tmp_path, calibration
         )
     message = refused(mwdcal(command, *arguments), 2)
     assert f"'{RENAMED[column]}'" in message
-    assert f"'{column}' ({synonyms.SHOWN[column]}" in message
+    assert f"'{column}' ({synonyms.NOTICED[column]}" in message
     if column == "temperature_c":
         assert "°C = (°F - 32) · 5/9" in message
     assert not [*tmp_path.glob("out.*")]

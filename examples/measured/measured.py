@@ -3,7 +3,8 @@
     make measured        (writes docs/measured.md)
 
 Every set by every way of `mwdcal calibrate` that could apply to it. Nothing here is in sample
-only where a left-out figure is possible. See docs/measured.md.
+only where a left-out figure is possible. See docs/measured.md. It is about the estimators, and imports
+the core; a script of your own needs `import mwdcal` alone.
 """
 
 from __future__ import annotations

@@ -5,6 +5,7 @@
 24 shots, two groups of eight rolls, no reference. Noise, and scatter from shot to shot, are of the
 size found in the measured sets; heavy tails are Student's t of three degrees of freedom, which
 scales a shot or a single reading as the case may be. How often are own-axis terms taken falsely?
+It is about the estimators, and imports the core.
 """
 
 from __future__ import annotations

@@ -6,6 +6,7 @@ The first part is the paper's own Gauss-Newton, written from its appendix and in
 mwdcal: an accelerometer that reads the holding force, a = M v + b, p = (M row by row, b).
 The second simulates instruments and compares methods, the third writes the page.
 doi:10.1007/978-3-319-97277-0_14; only abstract and appendix were available.
+It is about the estimators, and imports the core.
 """
 
 from __future__ import annotations

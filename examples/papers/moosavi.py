@@ -1,6 +1,7 @@
 """Reproduce Moosavi et al.: figures 5 to 8 with SIMULATED instruments, and equation 12.
 
 Writes docs/papers/moosavi.md and its figures. Same version, same bytes.
+It is about the estimators, and imports the core.
 
     python examples/papers/moosavi.py
 """

@@ -4,6 +4,7 @@
 
 The readings of the paper are not published. Table 2 is taken as the truth, six positions are
 simulated, and the residual left by the right parameters is given the size in Table 4.
+It is about the estimators, and imports the core.
 """
 
 from __future__ import annotations

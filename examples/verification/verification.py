@@ -3,7 +3,8 @@
     make verification        (writes docs/verification.md)
 
 Tools, knocks and true errors come from a forward model of this file alone; calibration and verdict
-are the package's own. All data are simulated.
+are the package's own. All data are simulated. It is about the verdict itself, and imports the core for its
+limits and figures; a script of your own needs `import mwdcal` alone.
 """
 
 from __future__ import annotations

@@ -32,7 +32,7 @@ from mwdcal.files.runs import to_readings
 from mwdcal.geometry.observables import EXTRAPOLATED
 from mwdcal.use.correction import RowCounts, counted
 
-WHOLE = 8_000_000
+LARGEST_TEXT = 8_000_000
 """Bytes of text that becomes a workbook: memory is some fifty times as much."""
 WHOLE_ROWS = 100_000
 """Rows of a Parquet table that becomes a workbook."""
@@ -73,9 +73,9 @@ def apply_to_any(
 def _check_size(readings: Path) -> None:
     """Refuse text that is too long to be taken whole."""
     size = readings.stat().st_size if readings.is_file() else 0
-    if size > WHOLE:
+    if size > LARGEST_TEXT:
         raise InputError(
-            f"{readings.name}: a text table that becomes a workbook must have at most {WHOLE} "
+            f"{readings.name}: a text table that becomes a workbook must have at most {LARGEST_TEXT} "
             f"bytes; got {size}. Split it, or write CSV."
         )
 

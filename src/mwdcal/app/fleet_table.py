@@ -31,7 +31,7 @@ from mwdcal.files import profiles
 from mwdcal.files.formats import atomic, parquet
 from mwdcal.fleet import kept
 from mwdcal.fleet.parts import Plan, load, solve
-from mwdcal.fleet.sources import SERIAL, Source, check_unchanged, open_source
+from mwdcal.fleet.sources import SERIAL, FleetTable, check_unchanged, open_source
 from mwdcal.fleet.tables import Partition, Tools, find_tools, in_several_folders, partitions
 from mwdcal.sensor.profile import Profile
 from mwdcal.use.correction_numba import cores
@@ -91,7 +91,7 @@ def calibrate_table(
 
 
 def _finished(
-    paths: list[Path], tools: Tools, source: Source, say: Callable[[str], None]
+    paths: list[Path], tools: Tools, source: FleetTable, say: Callable[[str], None]
 ) -> set[Path]:
     """The parts that were done before; says how many there are, and are to do again."""
     done, damaged = kept.finished(paths)
@@ -115,7 +115,7 @@ def _alone(folder: Path, output: Path) -> Iterator[None]:
         yield
 
 
-def _metadata(source: Source, plan: Plan, typed: Typed, digest: str) -> dict[str, object]:
+def _metadata(source: FleetTable, plan: Plan, typed: Typed, digest: str) -> dict[str, object]:
     """What the table of calibrations says of itself: the input's own, and how it was made."""
     return {
         **{k: v for k, v in source.metadata.items() if k != SERIAL},
@@ -129,7 +129,7 @@ def _metadata(source: Source, plan: Plan, typed: Typed, digest: str) -> dict[str
     }
 
 
-def _split(source: Source, tools: Tools) -> list[str]:
+def _split(source: FleetTable, tools: Tools) -> list[str]:
     """What to say of tools of which several folders have rows."""
     count = in_several_folders(source, tools)
     if not count:
@@ -211,7 +211,7 @@ def _merge(
     computed: Iterator[Path],
     target: Path,
     metadata: dict[str, object],
-    source: Source,
+    source: FleetTable,
 ) -> None:
     """One Parquet table of all parts, in their order; one part in memory at a time.
 

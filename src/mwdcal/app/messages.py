@@ -38,16 +38,19 @@ class Command(click.Command):
         try:
             return super().invoke(context)
         except MwdcalError as error:
-            error.args = (as_typed(str(error), self),)
+            error.args = (as_typed(str(error)),)
             raise
 
 
-def as_typed(text: str, command: click.Command) -> str:
-    """A message of the library with the command's options instead of its arguments.
+def as_typed(text: str) -> str:
+    """A message of the library with the options of the command that runs instead of its arguments.
 
-    The library names an argument in backticks; the name stays as it is where no option has it.
+    The library names an argument in backticks, also in the files that it writes; the name stays as
+    it is where no option has it.
     """
-    options = {p.name: p.opts[-1] for p in command.params if isinstance(p, click.Option)}
+    context = click.get_current_context(silent=True)
+    parameters = context.command.params if context else []
+    options = {p.name: p.opts[-1] for p in parameters if isinstance(p, click.Option)}
     return re.sub(r"`(\w+)`", lambda name: options.get(name[1], name[0]), text)
 
 
@@ -55,8 +58,7 @@ def findings_as_typed(findings: Iterable[Finding]) -> list[Finding]:
     """The findings in the words of the command that runs."""
     from msgspec.structs import replace
 
-    command = click.get_current_context().command
-    return [replace(finding, text=as_typed(finding.text, command)) for finding in findings]
+    return [replace(finding, text=as_typed(finding.text)) for finding in findings]
 
 
 class Screen:
@@ -126,7 +128,7 @@ def say(text: str) -> None:
 
 def lines(findings: Iterable[Finding]) -> list[str]:
     """Findings, one line each."""
-    return [one_line(f"! {finding.text}") for finding in findings]
+    return [one_line(f"! {as_typed(finding.text)}") for finding in findings]
 
 
 def to_json(result: Any) -> str:

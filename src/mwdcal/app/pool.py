@@ -35,7 +35,7 @@ from mwdcal.app.interruption import held
 from mwdcal.errors import InputError, reason
 
 ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
-SETTINGS = {
+WORKER_SETTINGS = {
     **dict.fromkeys(ONE_THREAD, "1"),
     "MALLOC_MMAP_THRESHOLD_": str(2**25),
     "MALLOC_TRIM_THRESHOLD_": str(2**26),
@@ -102,8 +102,8 @@ def results(
 @contextmanager
 def _settings_of_workers() -> Iterator[None]:
     """The environment of processes that are started here."""
-    before = {name: os.environ.get(name) for name in SETTINGS}
-    os.environ.update(SETTINGS)
+    before = {name: os.environ.get(name) for name in WORKER_SETTINGS}
+    os.environ.update(WORKER_SETTINGS)
     try:
         yield
     finally:

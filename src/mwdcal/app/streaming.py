@@ -40,7 +40,7 @@ from mwdcal.files.formats.columns import check_names, no_stations
 from mwdcal.files.formats.sinks import ParquetSink, Sink, TextSink
 from mwdcal.files.formats.table import Table, cell_error
 from mwdcal.files.formats.table import numbers as as_numbers
-from mwdcal.files.streams import Part, Source
+from mwdcal.files.streams import Part, StreamedTable
 from mwdcal.geometry.observables import EXTRAPOLATED, RESULTS
 from mwdcal.geometry.vectors import AnyArray, Array, Bools
 from mwdcal.sensor.profile import TriadProfile
@@ -57,14 +57,14 @@ from mwdcal.use.correction import (
     warmth,
 )
 
-LONG = {".csv": 1_000_000, ".tsv": 1_000_000, ".parquet": 8_000_000}
+TABLE_SIZES = {".csv": 1_000_000, ".tsv": 1_000_000, ".parquet": 8_000_000}
 """Bytes of a text table from which it is taken in parts, by what it becomes.
 
 Text that becomes Parquet has numbers in fewer columns when it is.
 """
-MANY = 3_000_000
+ROWS_FOR_LOOPS = 3_000_000
 """Rows from which the compiled loops are worth their start: until then the writer is the slowest."""
-LINES = 1 << 14
+TEXT_ROWS = 1 << 14
 """Rows of a part that becomes text."""
 WORKERS = 4
 """Most parts that are computed at once: more would wait for the writer."""
@@ -77,12 +77,12 @@ OPTIONAL = {
     ("temperature_c",): "Fill it in, or leave the whole column blank.",
 }
 """Columns that are blank on all rows or on none, and what to do where they are neither."""
-LONGEST = 60
+LONGEST_SERIAL = 60
 """Most characters of another tool's serial that a finding names."""
 _MOST = 10**15
 
 Item = TypeVar("Item")
-Made = TypeVar("Made")
+Result = TypeVar("Result")
 
 
 class CorrectedPart(NamedTuple):
@@ -95,7 +95,7 @@ class CorrectedPart(NamedTuple):
 
 def in_parts(readings: Path, output: Path) -> bool:
     """Whether a table is taken in parts: Parquet or long text that does not become a workbook."""
-    least = LONG.get(output.suffix.lower())
+    least = TABLE_SIZES.get(output.suffix.lower())
     return least is not None and streams.in_parts(readings, least)
 
 
@@ -106,7 +106,7 @@ def apply_to_file(
     outside: str,
     advance: Callable[[int, int], None] = lambda done, total: None,
     rows: int = 0,
-    least: int = MANY,
+    least: int = ROWS_FOR_LOOPS,
     missing: str = "refuse",
     decimal: str = ".",
 ) -> tuple[RowCounts, list[Finding]]:
@@ -143,13 +143,13 @@ def apply_to_file(
     return total, remarks + carried.copied(source.names, sink.formulas, output.suffix.lower())
 
 
-def overlapped(items: Iterator[Item], work: Callable[[Item], Made]) -> Iterator[Made]:
+def overlapped(items: Iterator[Item], work: Callable[[Item], Result]) -> Iterator[Result]:
     """`work` of every item, in order; the next ones are taken and worked on meanwhile."""
     workers = min(WORKERS, correction_numba.cores())
     end: Any = object()
     with ThreadPoolExecutor(workers + 1) as pool:
         upcoming = pool.submit(next, items, end)
-        running: deque[Future[Made]] = deque()
+        running: deque[Future[Result]] = deque()
         try:
             while (item := upcoming.result()) is not end:
                 upcoming = pool.submit(next, items, end)
@@ -162,14 +162,14 @@ def overlapped(items: Iterator[Item], work: Callable[[Item], Made]) -> Iterator[
             pool.shutdown(cancel_futures=True)
 
 
-def _source(readings: Path, output: Path, rows: int, decimal: str) -> Source:
+def _source(readings: Path, output: Path, rows: int, decimal: str) -> StreamedTable:
     typed = output.suffix.lower() == ".parquet"
     if readings.suffix.lower() == ".parquet":
-        return streams.open_parquet(readings, rows or (0 if typed else LINES), decimal)
+        return streams.open_parquet(readings, rows or (0 if typed else TEXT_ROWS), decimal)
     return streams.open_text(readings, typed=typed, decimal=decimal)
 
 
-def _check_header(source: Source, outside: str) -> None:
+def _check_header(source: StreamedTable, outside: str) -> None:
     """Refuse columns that are missing, doubtful, or have the name of a result."""
     check_names(source.names, source.name)
     check_columns(source.names, source.name)
@@ -200,7 +200,7 @@ def nothing(source: str) -> InputError:
     )
 
 
-def _loaded(source: Source, piece: Any) -> Part:
+def _loaded(source: StreamedTable, piece: Any) -> Part:
     try:
         return source.load(piece, False)
     except InputError:
@@ -240,7 +240,7 @@ class _Worker:
     """
 
     calibration: Calibration
-    source: Source
+    source: StreamedTable
     rules: Rules
     first: Any
     absent: tuple[tuple[str, ...], ...]
@@ -251,7 +251,7 @@ class _Worker:
 
     @classmethod
     def of(
-        cls, calibration: Calibration, source: Source, first: Any, rules: Rules, many: bool
+        cls, calibration: Calibration, source: StreamedTable, first: Any, rules: Rules, many: bool
     ) -> _Worker:
         """What the first piece says about all."""
         judged = [first] if rules.missing == "refuse" else source.pieces()
@@ -285,7 +285,7 @@ class _Worker:
         how = "extrapolate" if outside == "refuse" else outside
         judged = JUDGED if self.calibration.free else ()
         lacking = 0 if self.rules.missing == "refuse" else _MOST
-        said = self.heard(("\0" * LONGEST, "\1" * LONGEST, "…"))
+        said = self.heard(("\0" * LONGEST_SERIAL, "\1" * LONGEST_SERIAL, "…"))
         worst = strengths.Strengths(_MOST, _MOST, _MOST, _MOST, -1.23e-100, -1.24e-100)
         off = dict.fromkeys(strengths.JUDGED_STRENGTHS, worst)
         tally = RowCounts(
@@ -340,7 +340,7 @@ class _Worker:
         arrow, _ = parquet.modules(self.source.name)
         ours = self.calibration.tool.get("serial")
         cells = [c.strip() for c in parquet.texts(carried.column("serial").unique(), arrow)]
-        return tuple(runs.serials({}, [c if c == ours else c[:LONGEST] for c in cells]))
+        return tuple(runs.serials({}, [c if c == ours else c[:LONGEST_SERIAL] for c in cells]))
 
     def heard(self, serials: Sequence[str]) -> Readings:
         """What the findings need to know of the source, with the tools that its parts named."""

@@ -11,9 +11,9 @@ from mwdcal.calibration.evidence import evidence_of, flat
 from mwdcal.calibration.methods import EVIDENCE, Solved, solve, with_stand_errors, without
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.prior import prior_of
-from mwdcal.calibration.readings import ANGLES, TRIADS, Readings
+from mwdcal.calibration.readings import TRIADS, Readings
 from mwdcal.estimation.batch import put, take
-from mwdcal.estimation.evidence import Evidence
+from mwdcal.estimation.evidence import ANGLES, Evidence
 from mwdcal.estimation.minimisers import closed_form
 from mwdcal.estimation.problem import Problem, State, Triad
 from mwdcal.estimation.robust import LOSSES, consistency, inflation, weight, weighted
@@ -222,7 +222,7 @@ def _closed(
     None where it holds for no member, as with references that are not exact.
     """
     none = np.zeros(len(finite), bool)
-    apart = options.robust or options.own_solver or problem.evidence.scatter
+    apart = options.robust or options.separate_solver or problem.evidence.scatter
     if apart or not closed_form.applies(problem):
         return None, none
     at = closed_form.start(problem)

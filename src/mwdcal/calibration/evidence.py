@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from mwdcal.calibration.readings import ANGLES, CONSTANTS, Readings
-from mwdcal.estimation.evidence import UNKNOWN, Evidence, SharedConstant
+from mwdcal.calibration.readings import CONSTANTS, Readings
+from mwdcal.estimation.evidence import ANGLES, UNKNOWN, Evidence, SharedConstant
 from mwdcal.geometry.vectors import AnyArray, Array, Ints
 from mwdcal.sensor.profile import COMMON
 

@@ -14,9 +14,8 @@ import numpy as np
 
 from mwdcal.calibration.evidence import STAND_TURNS, acts_on, constants
 from mwdcal.calibration.options import Options
-from mwdcal.calibration.readings import ANGLES
 from mwdcal.errors import FitError, InputError
-from mwdcal.estimation.evidence import UNKNOWN, Evidence, SharedConstant
+from mwdcal.estimation.evidence import ANGLES, UNKNOWN, Evidence, SharedConstant
 from mwdcal.estimation.minimisers.newton import newton, propagated
 from mwdcal.estimation.minimisers.swarm import swarm_forward
 from mwdcal.estimation.minimisers.unweighted import STRENGTH, Params, Sums

@@ -114,7 +114,7 @@ class Options:
         raise TypeError("this prior needs the readings: use calibrate, not fit")
 
     @property
-    def own_solver(self) -> bool:
+    def separate_solver(self) -> bool:
         """Whether the method minimises by its own means: no weights, priors or own-axis terms."""
         return self.paper_weights or self.method in ("newton", "swarm")
 

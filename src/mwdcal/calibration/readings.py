@@ -18,7 +18,6 @@ import numpy as np
 from mwdcal.geometry.vectors import AnyArray, Array, ArrayLike, Bools, Ints
 from mwdcal.sensor.profile import Profile
 
-ANGLES = ("inclination", "azimuth", "toolface")
 TRIADS = ("accelerometer", "magnetometer")
 SIMULATED = "SIMULATED DATA"
 CONSTANTS = ("gravity", "field", "dip")

@@ -362,7 +362,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
         if readings.temperature is None and any(t.order for t in self.triads):
             raise InputError(
                 f"{readings.name}: the calibration has temperature terms, and the "
-                "column 'temperature_c' is missing or blank. Add it, or calibrate with --order 0."
+                "column 'temperature_c' is missing or blank. Add it, or calibrate with `order` 0."
             )
         if readings.temperature is None:
             return np.full(readings.accelerometer.shape[:-1], self.reference_temperature)

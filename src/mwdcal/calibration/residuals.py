@@ -10,9 +10,9 @@ from math import erfc, gamma
 import numpy as np
 
 from mwdcal.calibration.estimate import Fit
-from mwdcal.calibration.readings import ANGLES, TRIADS, Readings
+from mwdcal.calibration.readings import TRIADS, Readings
 from mwdcal.calibration.record import ErrorRow, Measures, StationRow, stated
-from mwdcal.estimation.evidence import STAND_ERRORS
+from mwdcal.estimation.evidence import ANGLES, STAND_ERRORS
 from mwdcal.estimation.uncertainty import Analysis, station_misfit, without_station
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array, Bools

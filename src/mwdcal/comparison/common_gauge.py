@@ -25,7 +25,7 @@ from mwdcal.sensor.models import Basis, Model, Polynomial
 from mwdcal.use.notation import Notation, convert
 
 SCALE = "scale"
-STEP = 1e-6
+DERIVATIVE_STEP = 1e-6
 """Step of a derivative, as the share of the field by which it changes the field."""
 
 
@@ -61,21 +61,22 @@ def in_gauge(
     """
     calibration = _straight(calibration)
     settle = _Settle.of(calibration, readings, gauge)
-    params = calibration.parameters
+    params, size = calibration.parameters, len(calibration.parameters)
     settled, slope = settle(params), settle.slope(calibration, readings, params)
-    covariance = slope @ calibration.parameter_covariance @ slope.transpose()
-    free = calibration.free_directions @ slope.transpose()
-    size = len(params)
+    covariance, free = _carried(calibration, slope)
     triads = [
         msgspec.structs.replace(triad, parameters=settled[where].tolist())
         for triad, where in zip(calibration.triads, settle.slices, strict=True)
     ]
-    factors = convert(
-        _replaced(calibration, triads, covariance[:size, :size], free[:, :size]), "factors"
-    )
-    return factors, _taken_out(
-        [t.name for t in triads], settled[size:], covariance[size:, size:], free[:, size:]
-    )
+    record = _replaced(calibration, triads, covariance[:size, :size], free[:, :size])
+    names, rest = [t.name for t in triads], (covariance[size:, size:], free[:, size:])
+    return convert(record, "factors"), _taken_out(names, settled[size:], *rest)
+
+
+def _carried(calibration: Calibration, slope: Array) -> tuple[Array, Array]:
+    """Covariance and free directions of the parameters, through a linear map."""
+    covariance = slope @ calibration.parameter_covariance @ slope.transpose()
+    return covariance, calibration.free_directions @ slope.transpose()
 
 
 def _taken_out(
@@ -84,8 +85,7 @@ def _taken_out(
     """Rotation and scale of each triad, from those (4 t,) of all in radians."""
     unit = np.array([*np.full(3, np.degrees(1)), 1.0])
     moved = np.abs(free).max(0, initial=0.0)
-    sd = np.sqrt(np.maximum(np.diag(covariance), 0))
-    sd = np.where(moved > FREE_SHARE, np.nan, sd)
+    sd = np.where(moved > FREE_SHARE, np.nan, np.sqrt(np.maximum(np.diag(covariance), 0)))
     parts = {"rotation_deg": slice(0, 3), "scale": slice(3, 4)}
     notations = {}
     for index, name in enumerate(triads):
@@ -154,7 +154,7 @@ class _Settle:
             sizes = np.sqrt(np.mean(np.sum(rows**2, 1), 0)) / strength
             for index, size in zip(range(where.start, where.stop), sizes, strict=True):
                 step = np.zeros(len(params))
-                step[index] = STEP / size
+                step[index] = DERIVATIVE_STEP / size
                 change = self(params + step) - self(params - step)
                 columns.append(change / (2 * step[index]))
         return np.stack(columns, -1)
@@ -188,7 +188,6 @@ def _straight(calibration: Calibration) -> Calibration:
     if not any(t.curved for t in calibration.triads):
         return calibration
     blocks = [_tangent(t, calibration.reference_temperature) for t in calibration.triads]
-    whole = block_diag(*blocks)
     triads = [
         msgspec.structs.replace(
             triad,
@@ -198,9 +197,7 @@ def _straight(calibration: Calibration) -> Calibration:
         )
         for triad, block in zip(calibration.triads, blocks, strict=True)
     ]
-    covariance = whole @ calibration.parameter_covariance @ whole.transpose()
-    free = calibration.free_directions @ whole.transpose()
-    return _replaced(calibration, triads, covariance, free)
+    return _replaced(calibration, triads, *_carried(calibration, block_diag(*blocks)))
 
 
 def _replaced(

@@ -15,11 +15,12 @@ from mwdcal.calibration.estimate import Fit, fit
 from mwdcal.calibration.evidence import evidence_of
 from mwdcal.calibration.methods import EVIDENCE, SWARM_ITERATIONS
 from mwdcal.calibration.options import Options
-from mwdcal.calibration.readings import ANGLES, TRIADS, Readings, is_simulated
+from mwdcal.calibration.readings import CONSTANTS, TRIADS, Readings, is_simulated
 from mwdcal.calibration.record import Calibration, Measures
 from mwdcal.calibration.residuals import SHOWN, departure, nominal, rms, shown_in, vector_measures
 from mwdcal.comparison.common_gauge import Gauge, in_gauge
-from mwdcal.errors import FitError
+from mwdcal.errors import FitError, MwdcalError
+from mwdcal.estimation.evidence import ANGLES
 from mwdcal.estimation.minimisers.swarm import least_squares_forward, swarm_forward, vector_cost
 from mwdcal.estimation.rank import Free, free_directions
 from mwdcal.estimation.solvers import Status
@@ -122,36 +123,35 @@ def compare(
     options = options or Options()
     readings = without(readings, options.exclude)
     options = _options(readings, profile, options, progress)
-    results: dict[str, _Calibrated | str] = {}
+    results: list[_Calibrated | Row] = []
     for method in EVIDENCE:
         progress(f"{method}: fit")
-        results[method] = _calibrated(readings, profile, replace(options, method=method))
-    usable = [one for one in results.values() if isinstance(one, _Calibrated)]
+        results.append(_calibrated(readings, profile, replace(options, method=method)))
+    usable = [one for one in results if isinstance(one, _Calibrated)]
     gauge = Gauge.of(entry for one in usable for entry in one.free)
     judge = _Judge.of(readings, usable[0].record.earth if usable else {})
-    rows = []
-    for method, one in results.items():
-        if isinstance(one, str):
-            rows.append(Row(method, refused=one))
-        else:
-            progress(f"{method}: {judge.parts} fits without a part of the stations each")
-            rows.append(_row(one, judge, gauge))
-    bare = nominal(readings)
+    rows = [one if isinstance(one, Row) else _row(one, judge, gauge, progress) for one in results]
+    return _compared(judge, options, gauge, tuple(rows))
+
+
+def _compared(judge: _Judge, options: Options, gauge: Gauge, rows: tuple[Row, ...]) -> Comparison:
+    """The rows with what they have in common."""
+    readings, bare = judge.readings, nominal(judge.readings)
     return Comparison(
-        readings.source,
-        readings.count,
-        readings.labels,
-        is_simulated(readings.metadata),
-        options.orders,
-        tuple(options.curved),
-        judge.parts,
-        options.seed,
-        judge.units,
-        judge.summary(*bare),
-        tuple(judge.measures("before", *bare)),
-        {name: gauge.names(i) for i, name in enumerate(TRIADS) if gauge.names(i)},
-        tuple(rows),
-        advice(tuple(rows)),
+        run=readings.source,
+        stations=readings.count,
+        labels=readings.labels,
+        simulated=is_simulated(readings.metadata),
+        orders=options.orders,
+        curved=tuple(options.curved),
+        parts=judge.parts,
+        seed=options.seed,
+        units=judge.units,
+        before=judge.summary(*bare),
+        measures_before=judge.measures("before", *bare),
+        gauge={name: gauge.names(i) for i, name in enumerate(TRIADS) if gauge.names(i)},
+        rows=rows,
+        advice=advice(rows),
     )
 
 
@@ -164,31 +164,32 @@ def _options(readings: Readings, profile: Profile, options: Options, progress: P
         return replace(options, order=options.orders, nonlinearity=options.curved)
 
 
-def _calibrated(readings: Readings, profile: Profile, options: Options) -> _Calibrated | str:
-    """A method's calibration, or the reason why there is none."""
-    if options.method == "swarm":
-        options = replace(options, nonlinearity={})
+def _calibrated(readings: Readings, profile: Profile, options: Options) -> _Calibrated | Row:
+    """A method's calibration, or the row that says why there is none."""
     try:
         check_readings(readings, options)
         started = time.perf_counter()
         result = fit(readings, options)
         seconds = time.perf_counter() - started
         record = recorded(Choice(readings, profile, options), result)
-    except FitError as error:
-        return str(error)
+    except MwdcalError as error:  # what is wrong for all methods was refused before
+        return Row(options.method, refused=str(error))
     except np.linalg.LinAlgError as error:
-        return f"the stations are too weak to fit the model ({error}). Add stations."
+        weak = f"the stations are too weak to fit the model ({error}). Add stations."
+        return Row(options.method, refused=weak)
     free = free_directions(result.problem, result.state, result.analysis.determined)[0]
     return _Calibrated(options, record, result, seconds, free)
 
 
-def _row(calibrated: _Calibrated, judge: _Judge, gauge: Gauge) -> Row:
-    record, readings = calibrated.record, judge.readings
+def _row(calibrated: _Calibrated, judge: _Judge, gauge: Gauge, progress: Progress) -> Row:
+    """What a method reached, in the fit and left out."""
+    record, readings, method = calibrated.record, judge.readings, calibrated.options.method
+    progress(f"{method}: {judge.parts} fits without a part of the stations each")
     left_out = judge.left_out(calibrated.options)
     inside = record.fields(readings)
     parameters, taken_out = in_gauge(record, readings, gauge)
     return Row(
-        calibrated.options.method,
+        method,
         ranks={t.name: (t.rank, t.size) for t in record.triads},
         undetermined=tuple(dict.fromkeys(u.id for u in record.undetermined())),
         iterations=int(calibrated.fit.iterations[0]),
@@ -197,11 +198,11 @@ def _row(calibrated: _Calibrated, judge: _Judge, gauge: Gauge) -> Row:
         held_out=judge.summary(*left_out),
         resting=tuple(n for n in judge.units if _rests(n, record, readings)),
         lost=int(np.isnan(left_out[0]).any(-1).sum()),
-        measures=(*judge.measures("after", *inside), *judge.measures("left out", *left_out)),
+        measures=judge.measures("after", *inside) + judge.measures("left out", *left_out),
         parameters=parameters,
         taken_out=taken_out,
         station_errors=judge.errors(*left_out),
-        course=_course(calibrated) if calibrated.options.method == "swarm" else {},
+        course=_course(calibrated) if method == "swarm" else {},
     )
 
 
@@ -291,10 +292,10 @@ class _Judge:
         result = fit(self.readings, options, include)
         failed = result.status != Status.OK
         g, b = (
-            np.where(failed[:, None, None], np.nan, v) for v in result.problem.fields(result.state)
+            v[self.part, range(self.readings.count)] for v in result.problem.fields(result.state)
         )
-        every = np.arange(self.readings.count)
-        return g[self.part, every], b[self.part, every]
+        lost = failed[self.part][:, None]
+        return np.where(lost, np.nan, g), np.where(lost, np.nan, b)
 
     def summary(self, g: Array, b: Array) -> dict[str, float]:
         """Root mean square errors by observable, and the scatter within groups, in shown units."""
@@ -304,27 +305,26 @@ class _Judge:
             result[SCATTER] = float(np.degrees(scatter))
         return result
 
-    def measures(self, when: str, *fields: Array) -> list[Measures]:
+    def measures(self, when: str, *fields: Array) -> tuple[Measures, ...]:
         """Moradi's measures of the vector error, as a share of the reference vector."""
-        known = {n: self.readings.reference(n) for n in ("inclination", "azimuth", "toolface")}
-        field, dip = self.readings.reference("field"), self.readings.reference("dip")
-        field = np.where(np.isnan(field), self.earth.get("field", np.nan), field)
-        dip = np.where(np.isnan(dip), np.radians(self.earth.get("dip_deg", np.nan)), dip)
+        known = {name: self.readings.reference(name) for name in (*ANGLES, *CONSTANTS)}
+        stand_in = {
+            "field": self.earth.get("field", np.nan),
+            "dip": np.radians(self.earth.get("dip_deg", np.nan)),
+        }
+        for name, value in stand_in.items():
+            known[name] = np.where(np.isnan(known[name]), value, known[name])
         blind = {**known, "azimuth": np.zeros(self.readings.count)}
-        gravity = self.readings.reference("gravity")
-        ideal = [
-            reference_vectors(**blind, gravity=gravity)[0],
-            reference_vectors(**known, field=field, dip=dip)[1],
-        ]
+        ideal = reference_vectors(**blind)[0], reference_vectors(**known)[1]
         each = zip(TRIADS, fields, ideal, strict=True)
-        return [row for triad in each for row in vector_measures(triad[0], when, *triad[1:])]
+        return tuple(row for triad in each for row in vector_measures(triad[0], when, *triad[1:]))
 
 
 def score(row: Row, best: Mapping[str, float]) -> float:
     """Mean ratio of a method's held-out errors to the best of any method."""
-    ratios = [row.held_out[n] / value for n, value in best.items() if value > 0]
-    ratios = [ratio for ratio in ratios if not np.isnan(ratio)]
-    return float(np.mean(ratios)) if ratios else float("inf")
+    ratios = np.array([row.held_out[n] / value for n, value in best.items() if value > 0])
+    known = ratios[~np.isnan(ratios)]
+    return float(known.mean()) if known.size else float("inf")
 
 
 def able(rows: Iterable[Row]) -> list[Row]:
@@ -346,13 +346,9 @@ def advice(rows: tuple[Row, ...]) -> str:
     best = {n: float(np.fmin.reduce([row.held_out[n] for row in usable])) for n in names}
     scores = {row.method: score(row, best) for row in usable}
     winner = min(usable, key=lambda row: (*_gaps(row), scores[row.method]))
-    joint = next((row for row in usable if row.method == "joint"), None)
-    if joint is not None and _gaps(joint) <= _gaps(winner):
-        within = scores["joint"] <= NEAR_BEST * scores[winner.method]
-        winner = joint if within else winner
-    why = f"{winner.method}: held-out errors {scores[winner.method]:.2f} times the best of each"
+    for joint in (row for row in usable if row.method == "joint" and _gaps(row) <= _gaps(winner)):
+        winner = joint if scores["joint"] <= NEAR_BEST * scores[winner.method] else winner
+    why = f"{winner.method}: held-out errors {scores.pop(winner.method):.2f} times the best of each"
     free = f"; leaves {', '.join(winner.undetermined)} undetermined" if winner.undetermined else ""
-    others = [
-        f"{m} {s:.2f}" for m, s in sorted(scores.items(), key=lambda x: x[1]) if m != winner.method
-    ]
-    return f"use {why}{free} (others: {', '.join(others)})." if others else f"use {why}{free}."
+    others = ", ".join(f"{m} {s:.2f}" for m, s in sorted(scores.items(), key=lambda pair: pair[1]))
+    return f"use {why}{free}" + (f" (others: {others})." if others else ".")

@@ -40,7 +40,7 @@ from mwdcal.geometry.vectors import (
 )
 from mwdcal.sensor.models import Model
 
-_Found = TypeVar("_Found")
+_Result = TypeVar("_Result")
 
 INFORMED = 1e-13
 """A prior says something of a direction if its precision exceeds this share of the largest."""
@@ -149,15 +149,15 @@ class Problem:
         earth = earth_gravity(gravity), earth_field(field, dip)
         return [np.einsum("bnij,bnj->bni", state.attitude, vector) for vector in earth]
 
-    def once(self, name: str, state: State, find: Callable[[State], _Found]) -> _Found:
+    def once(self, name: str, state: State, find: Callable[[State], _Result]) -> _Result:
         """What `find` finds at a state, kept under a name until something is asked at another."""
         if self.memo.get("state") is not state:
             self.memo.clear()
             self.memo["state"] = state
         if name not in self.memo:
             self.memo[name] = find(state)
-        found: _Found = self.memo[name]
-        return found
+        result: _Result = self.memo[name]
+        return result
 
     def predictions(self, state: State) -> list[Prediction]:
         """Each triad's readings compared with the reference vectors; the last answer is kept."""
@@ -175,9 +175,9 @@ class Problem:
             self.triads, self.slices(), self.targets(state), changes, strict=False
         ):
             params = state.params[:, where]
-            found = triad.model.fields(params, triad.raw, self.temperature)
+            fields = triad.model.fields(params, triad.raw, self.temperature)
             back = inverse(triad.model.slope(params, triad.raw, self.temperature))
-            misfit = np.einsum("bnij,bnj->bni", back, found - target)
+            misfit = np.einsum("bnij,bnj->bni", back, fields - target)
             by_params = triad.model.jacobian(params, triad.raw - misfit, self.temperature)
             result.append(
                 Prediction(
@@ -203,10 +203,10 @@ class Problem:
         turns, by_earth = _station_columns(whitened)
         constants = self._constant_columns(state, by_earth, turns, geometry)
         shared = np.concatenate([constants, *self._group_turns(state, turns)], -1)
-        own = by_earth[..., [EARTH.index(name) for name in self.evidence.absent]]
+        departures = by_earth[..., [EARTH.index(name) for name in self.evidence.absent]]
         private = [
-            turns @ self._own_turns(state, geometry),
-            own * self._own_scales(state)[..., None, :],
+            turns @ self._private_turns(state, geometry),
+            departures * self._absent_scales(state)[..., None, :],
         ]
         if self.evidence.scatter and not geometry:
             columns, scatter = self.scatter_columns(state), self.evidence.scatter
@@ -273,7 +273,7 @@ class Problem:
             return np.asarray(state.attitude[..., 2, :])
         return np.broadcast_to(STAND[name], state.attitude.shape[:-1])
 
-    def _own_scales(self, state: State) -> Array:
+    def _absent_scales(self, state: State) -> Array:
         """How far (B, n, a) each absent strength or dip may be anywhere: its own size, or any angle."""
         scales = np.zeros((*state.attitude.shape[:2], len(self.evidence.absent)))
         for index, name in enumerate(self.evidence.absent):
@@ -308,7 +308,7 @@ class Problem:
         loose = ~self.evidence.is_known("inclination") & ~self.evidence.is_known("azimuth")
         return loose & ~self.evidence.is_known("toolface") & (self.evidence.group < 0)
 
-    def _own_turns(self, state: State, geometry: bool) -> Array:
+    def _private_turns(self, state: State, geometry: bool) -> Array:
         """Axes (B, n, 3, 3), as columns, of the station's private turns times their σ."""
         across = np.einsum("bnij,bnj->bni", state.attitude, self._across(state))
         natural = np.stack([across, state.attitude[..., :, 2], np.zeros_like(across)], -1)
@@ -375,7 +375,7 @@ class Problem:
         attitude = self._turn_groups(replace(state, attitude=attitude), step[:, p + q :])
         attitude = self._turn_stations(state, attitude, private[..., :3])
         absent = private[..., 3 : 3 + state.departures.shape[-1]]
-        departures = state.departures + absent * self._own_scales(state)
+        departures = state.departures + absent * self._absent_scales(state)
         constants = state.constants + step[:, p : p + q]
         return State(state.params + step[:, :p], attitude, constants, departures)
 
@@ -400,7 +400,7 @@ class Problem:
         return attitude
 
     def _turn_stations(self, state: State, attitude: Array, private: Array) -> Array:
-        axes = self._own_turns(state, geometry=True)
+        axes = self._private_turns(state, geometry=True)
         if not axes.any():
             return attitude
         turn = axes * private[..., None, :]

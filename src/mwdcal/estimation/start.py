@@ -181,7 +181,7 @@ def _attitudes(problem: Problem, state: State) -> State:
     guess = {name: np.nan_to_num(observables.OBSERVABLES[name].value(g, b)) for name in ANGLES}
     angles = {n: np.where(evidence.is_known(n), evidence.known[n], guess[n]) for n in ANGLES}
     angles = _by_toolface(problem, _share(problem, angles), g, b)
-    state = _with_own(problem, state, g, b)
+    state = _with_absent(problem, state, g, b)
     attitude = tool_from_earth(*(angles[name] for name in ANGLES))
     turn = _best_turn(fields, problem.targets(replace(state, attitude=attitude)))
     turn = np.where(evidence.is_known("toolface"), 0.0, turn)
@@ -244,7 +244,7 @@ def _by_toolface(
     return {**angles, "inclination": inclination, "azimuth": azimuth}
 
 
-def _with_own(problem: Problem, state: State, g: Array, b: Array) -> State:
+def _with_absent(problem: Problem, state: State, g: Array, b: Array) -> State:
     """The state with an unknown dip, and stations' own strengths and dip, as its fields have them."""
     evidence, constants = problem.evidence, state.constants.copy()
     for index, constant in enumerate(evidence.constants):
@@ -253,8 +253,8 @@ def _with_own(problem: Problem, state: State, g: Array, b: Array) -> State:
             total = np.sum(observables.dip(g, b) * weight, -1)
             constants[:, index] = total / np.maximum(weight.sum(-1), 1)
     state = replace(state, constants=constants)
-    own = [
+    departures = [
         observables.OBSERVABLES[name].value(g, b) - problem.constant(state, name)
         for name in evidence.absent
     ]
-    return replace(state, departures=np.stack(own, -1)) if own else state
+    return replace(state, departures=np.stack(departures, -1)) if departures else state

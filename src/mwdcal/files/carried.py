@@ -19,17 +19,17 @@ def copied(names: Sequence[str], formulas: Collection[str], suffix: str) -> list
     renamed = [
         f"{shown(old)} is {shown(new)}" for old, new in zip(names, plain, strict=True) if old != new
     ]
-    found = []
+    findings = []
     if renamed:
         text = f"columns renamed, as the format does not have such names: {_listed(renamed)}."
-        found.append(Finding(id="renamed-columns", text=text))
+        findings.append(Finding(id="renamed-columns", text=text))
     if formulas:
         text = (
             "spreadsheet programs may run cells as formulas, which begin with =, +, -, @ or a tab "
             f"and are written as they are: {_listed([shown(n) for n in names if n in formulas])}."
         )
-        found.append(Finding(id="formula-cells", text=text))
-    return found
+        findings.append(Finding(id="formula-cells", text=text))
+    return findings
 
 
 def _listed(entries: Sequence[str]) -> str:

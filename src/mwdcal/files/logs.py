@@ -40,7 +40,7 @@ READ = (TIME, *RANGES)
 """Columns of a log that mean something, all of them numbers."""
 
 _PIECE = 16_000_000
-_LONGEST_LINE = 1_000_000
+_LONGEST_ROW = 1_000_000
 _TYPED = (".parquet", ".xlsx")
 _ODD = re.compile(r"nan|inf|[\"\r]", re.IGNORECASE)
 _CLOCK = re.compile(r"\d{4}-\d{1,2}-\d{1,2}|\d{1,2}:\d{2}|\d{1,2}[./]\d{1,2}[./]\d{4}")
@@ -186,9 +186,9 @@ def _top(stream: BinaryIO, source: str) -> tuple[list[tuple[int, str]], str, int
     """Numbered comments above the table, and its first line with its number."""
     comments: list[tuple[int, str]] = []
     for number, data in enumerate(stream, 1):
-        if len(data) > _LONGEST_LINE:
+        if len(data) > _LONGEST_ROW:
             raise InputError(
-                f"{source}, line {number}: the line must have at most {_LONGEST_LINE} bytes; got "
+                f"{source}, line {number}: the line must have at most {_LONGEST_ROW} bytes; got "
                 f"{len(data)}. Is this a log?"
             )
         line = _decoded(data, number, source).lstrip("\ufeff").strip("\r\n")

@@ -16,7 +16,7 @@ from datetime import date, time
 from mwdcal.errors import InputError
 
 _BARE = re.compile(r"([A-Za-z0-9_-]+)\s*=\s*([^\s\"'\[{].*)")
-_LONGEST_SHOWN = 60
+_LONGEST_VALUE = 60
 DEEPEST = 20
 """Levels of lists and tables in a value."""
 
@@ -120,4 +120,4 @@ def _quoted(text: str) -> str:
 
 
 def _shown(text: str) -> str:
-    return repr(text if len(text) <= _LONGEST_SHOWN else text[:_LONGEST_SHOWN] + "…")
+    return repr(text if len(text) <= _LONGEST_VALUE else text[:_LONGEST_VALUE] + "…")

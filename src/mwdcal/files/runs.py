@@ -32,9 +32,9 @@ from mwdcal.files.formats.table import Table, labels
 from mwdcal.geometry.vectors import Array, Ints
 from mwdcal.sensor.profile import Profile, TriadProfile
 
-MANY = 1000
+ROWS_OF_LOG = 1000
 """Rows of a table with times from which it is a log."""
-MOST = 1_000_000
+MOST_ROWS = 1_000_000
 """Rows that a run may have at most, as many as a text table."""
 _TURN = 360.0
 
@@ -43,7 +43,11 @@ def read_run(
     source: str | os.PathLike[str] | Table, profile: Profile, *, decimal: str = "."
 ) -> tuple[Readings, Profile]:
     """The readings of a run, a file or a table, and the profile with its nominal scales filled in."""
-    table = source if isinstance(source, Table) else tables.read(source, decimal=decimal, rows=MOST)
+    table = (
+        source
+        if isinstance(source, Table)
+        else tables.read(source, decimal=decimal, rows=MOST_ROWS)
+    )
     check_run(table)
     return to_readings(table, profile)
 
@@ -59,7 +63,7 @@ def check_run(table: Table) -> None:
             f"{table.source} has rows of more than one tool (serial {', '.join(tools)}). Take the "
             "rows of one, or use mwdcal fleet."
         )
-    if table.count > MANY and ("time_s" in table.columns or "sampling_hz" in table.metadata):
+    if table.count > ROWS_OF_LOG and ("time_s" in table.columns or "sampling_hz" in table.metadata):
         raise InputError(
             f"{table.source} is a continuous log ({table.count} rows): its rows are not stations. Find "
             f"the standstills first: mwdcal stations {table.source} -o run.csv. If each row is a "

@@ -25,7 +25,7 @@ from mwdcal.files.formats.table import Table, check_decimal, numbers, pointed
 from mwdcal.geometry.observables import RESULTS
 from mwdcal.geometry.vectors import Ints
 
-ROWS = 1 << 16
+PART_ROWS = 1 << 16
 """Most rows of a part of a Parquet table."""
 PART = 16 << 20
 """Bytes that the numbers of such a part may take, results included."""
@@ -43,7 +43,7 @@ class Part(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Source:
+class StreamedTable:
     """A table, not yet read.
 
     Attributes:
@@ -67,7 +67,7 @@ class Source:
     load: Callable[[Any, bool], Part]
 
 
-def open_parquet(path: Path, rows: int = 0, decimal: str = ".") -> Source:
+def open_parquet(path: Path, rows: int = 0, decimal: str = ".") -> StreamedTable:
     """A Parquet file in parts of `rows` rows; by default as many as memory bears.
 
     What is carried has the type it has in the file, whatever it is; `decimal` is the sign in
@@ -80,7 +80,7 @@ def open_parquet(path: Path, rows: int = 0, decimal: str = ".") -> Source:
     names = [name for name in stored.names if not parquet.is_index(name)]
     metadata = parquet.metadata_of(file.metadata.metadata, path.name)
     width = max(8 * len(names), parquet.row_size(file.metadata)) + 8 * len(RESULTS)
-    step = max(1, min(rows or ROWS, PART // width))
+    step = max(1, min(rows or PART_ROWS, PART // width))
 
     def pieces() -> Iterator[Any]:
         first = 1
@@ -104,10 +104,10 @@ def open_parquet(path: Path, rows: int = 0, decimal: str = ".") -> Source:
         return Part(carried, table, len(batch))
 
     schema = arrow.schema([stored.field(name) for name in names])
-    return Source(path.name, names, metadata, schema, count, count, pieces, load)
+    return StreamedTable(path.name, names, metadata, schema, count, count, pieces, load)
 
 
-def open_text(path: Path, typed: bool = False, decimal: str = ".") -> Source:
+def open_text(path: Path, typed: bool = False, decimal: str = ".") -> StreamedTable:
     """A text table in pieces; `typed`: the contract's columns of numbers are carried as numbers.
 
     Where `decimal` is the comma every line goes through the exact parser, and numbers are carried
@@ -152,7 +152,7 @@ def open_text(path: Path, typed: bool = False, decimal: str = ".") -> Source:
 
     schema, total = arrow.schema(list(types.items())), path.stat().st_size
     guess = total * top.body.count(b"\n") // len(first)
-    return Source(path.name, top.names, top.metadata, schema, total, guess, pieces, load)
+    return StreamedTable(path.name, top.names, top.metadata, schema, total, guess, pieces, load)
 
 
 def _pieces(stream: Any) -> Iterator[bytes]:

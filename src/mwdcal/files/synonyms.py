@@ -56,7 +56,7 @@ CONVERSIONS = {
 }
 """How another unit is converted into that of the contract."""
 _WARM = ("°C", "°F", "K")
-_MAGNETIC = ("nT", "µT", "mT", "gauss")
+_MAGNETIC_UNITS = ("nT", "µT", "mT", "gauss")
 _STATED = {"ref", "reference", "local"}
 """Words of columns that are known, not measured."""
 _BYWORDS = _STATED | {
@@ -84,7 +84,7 @@ _INSTEAD = {
 _SYNONYMS = {word: column for column, words in _INSTEAD.items() for word in words.split()}
 _NEVER = {"mtf", "magnetictoolface", "magtoolface"}
 """A magnetic toolface is not a reference of the contract."""
-SHOWN = {
+NOTICED = {
     "ref_inclination_deg": "°",
     "ref_azimuth_deg": "° from magnetic north, or from what the metadata azimuth_reference says",
     "ref_toolface_deg": "°",
@@ -132,7 +132,7 @@ def _column(whole: str, bare: str, words: set[str], unit: str) -> str | None:
     stated = bool(words & _STATED)
     if {whole, bare} & _NEVER:
         return None
-    if bare == "field" and (stated or unit in _MAGNETIC or words & {"mag", "magnetic"}):
+    if bare == "field" and (stated or unit in _MAGNETIC_UNITS or words & {"mag", "magnetic"}):
         return "ref_field_nt"
     if bare == "az" and (stated or unit in ("°", "rad")):
         return "ref_azimuth_deg"
@@ -192,7 +192,7 @@ def _results(names: Collection[str]) -> set[str]:
 def check_evidence(names: Sequence[str], source: str) -> None:
     """Refuse a column that resembles a reference or the temperature, where that itself is absent."""
     results = _results(names)
-    _refuse([n for n in names if n not in results], [n for n in SHOWN if n not in names], source)
+    _refuse([n for n in names if n not in results], [n for n in NOTICED if n not in names], source)
 
 
 def check_temperature(names: Sequence[str], source: str) -> None:
@@ -206,7 +206,7 @@ def _refuse(names: Sequence[str], absent: Collection[str], source: str) -> None:
     if not meant:
         return
     name, resemblance = meant[0]
-    others = [f"{shown(n)} ({other.column}, {SHOWN[other.column]})" for n, other in meant[1:6]]
+    others = [f"{shown(n)} ({other.column}, {NOTICED[other.column]})" for n, other in meant[1:6]]
     likewise = f" Likewise {', '.join(others)}." if others else ""
     raise InputError(
         f"{source}: the column {shown(name)} resembles '{resemblance.column}', which is absent, and would not "
@@ -221,7 +221,7 @@ def remedy(resemblance: Resemblance) -> str:
     >>> remedy(Resemblance("temperature_c", "°F"))
     "Convert it (°C = (°F - 32) · 5/9) and name it 'temperature_c' (°C)"
     """
-    unit = f" ({SHOWN[resemblance.column]})" if resemblance.column in SHOWN else ""
+    unit = f" ({NOTICED[resemblance.column]})" if resemblance.column in NOTICED else ""
     if resemblance.unit in CONVERSIONS:
         return (
             f"Convert it ({CONVERSIONS[resemblance.unit]}) and name it '{resemblance.column}'{unit}"

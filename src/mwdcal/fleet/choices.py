@@ -22,7 +22,7 @@ from mwdcal.estimation.batch import take
 from mwdcal.geometry.vectors import Ints
 from mwdcal.sensor.profile import Profile
 
-CHUNK = 320
+TOOLS_PER_FIT = 320
 """Tools fitted in one call: few enough for the cache, many enough for NumPy."""
 _T = TypeVar("_T")
 
@@ -88,7 +88,7 @@ def with_curves(
     options = scattered(readings, options)
     groups: dict[tuple[str, ...], list[Ints]] = {}
     trials = in_chunks(
-        readings, tools, lambda r: compare_curves(r, options, terms), CHUNK // MOST_PARTS
+        readings, tools, lambda r: compare_curves(r, options, terms), TOOLS_PER_FIT // MOST_PARTS
     )
     for part, curves in trials:
         if isinstance(curves, Exception):
@@ -102,7 +102,7 @@ def with_curves(
 
 
 def in_chunks(
-    readings: Readings, tools: Ints, work: Callable[[Readings], _T], size: int = CHUNK
+    readings: Readings, tools: Ints, work: Callable[[Readings], _T], size: int = TOOLS_PER_FIT
 ) -> Iterator[tuple[Ints, _T | Exception]]:
     """The work on given members of a batch, `size` at a time; in halves where one stops the whole."""
     for start in range(0, len(tools), size):

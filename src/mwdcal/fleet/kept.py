@@ -19,7 +19,7 @@ import msgspec
 
 from mwdcal.errors import InputError
 
-MARK = b"mwdcal fleet part "
+SEAL = b"mwdcal fleet part "
 HEAD = 64
 """Bytes before the content of a part."""
 LOCK = "lock"
@@ -39,7 +39,7 @@ def sealed(content: bytes, name: str) -> bytes:
 def _head(content: bytes | memoryview, name: str) -> bytes:
     """The seal of a part."""
     check = crc32(content, crc32(name.encode()))
-    return (MARK + b"%016x %08x" % (len(content), check)).ljust(HEAD - 1) + b"\n"
+    return (SEAL + b"%016x %08x" % (len(content), check)).ljust(HEAD - 1) + b"\n"
 
 
 def unsealed(data: bytes, name: str) -> memoryview | None:
@@ -99,7 +99,7 @@ def remove(folder: Path) -> None:
     for path in list(folder.iterdir()):
         if path.is_symlink():
             continue
-        if _PART.fullmatch(path.name) and path.is_file() and _is_ours(path, (MARK, _STREAM)):
+        if _PART.fullmatch(path.name) and path.is_file() and _is_ours(path, (SEAL, _STREAM)):
             path.unlink()
         elif is_dealt(path):
             shutil.rmtree(path)

@@ -20,14 +20,14 @@ from mwdcal.files.contract import AZIMUTH_KEYS, CHANNELS
 from mwdcal.files.formats import parquet
 from mwdcal.fleet.calibrate import OK, BatchOutcome, calibrate_batch, names
 from mwdcal.fleet.runs import Batch, Rows, batches, refused_tools
-from mwdcal.fleet.sources import SERIAL, Source
+from mwdcal.fleet.sources import SERIAL, FleetTable
 from mwdcal.fleet.tables import Partition, read
 from mwdcal.geometry.vectors import AnyArray, Array
 from mwdcal.sensor.profile import Profile
 
 LISTS = ("findings", "reshoot")
 """Columns of lists: ids of findings, and labels of stations to take again."""
-WHOLE = ("rank", "size", "order", "stations")
+WHOLE_NUMBERS = ("rank", "size", "order", "stations")
 """Ends of the names of columns of whole numbers."""
 
 
@@ -43,7 +43,7 @@ class Plan:
     version: str = __version__
 
     @classmethod
-    def of(cls, source: Source, profile: Profile, options: Options) -> Plan:
+    def of(cls, source: FleetTable, profile: Profile, options: Options) -> Plan:
         """For a table: of its columns those that a run file has; which north is one of them."""
         metadata = {k: v for k, v in source.metadata.items() if k not in AZIMUTH_KEYS}
         return cls(source.name, metadata, source.used, profile, options)
@@ -155,7 +155,7 @@ def _table(
     }
     columns |= {name: arrow.array(lists[name], of_text) for name in LISTS}
     for name, values in filled.items():
-        whole = name.rpartition("_")[2] in WHOLE
+        whole = name.rpartition("_")[2] in WHOLE_NUMBERS
         numbers = np.nan_to_num(values).astype(np.int32) if whole else values
         columns[name] = arrow.array(numbers, mask=np.isnan(values))
     columns |= {name: arrow.array(lists[name], of_text) for name in lists if name not in LISTS}

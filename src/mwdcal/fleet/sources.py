@@ -56,7 +56,7 @@ class Piece:
 
 
 @dataclass(frozen=True)
-class Source:
+class FleetTable:
     """A fleet's table: its pieces, columns, the metadata of all its files, and what to mention."""
 
     name: str
@@ -99,7 +99,7 @@ class _File:
     offset: float
 
 
-def open_source(path: Path) -> Source:
+def open_source(path: Path) -> FleetTable:
     """The table at `path`, its columns checked; refuses what is not a table of many tools."""
     paths = input_files(path)
     files = [_look(file, path) for file in paths]
@@ -124,7 +124,7 @@ def open_source(path: Path) -> Source:
     return source
 
 
-def _joined(name: str, files: Sequence[_File]) -> Source:
+def _joined(name: str, files: Sequence[_File]) -> FleetTable:
     """The table of all files: each with its own azimuths, and serials of one kind."""
     columns, notes = files[0].columns, []
     offsets = sorted({file.offset for file in files})
@@ -141,7 +141,7 @@ def _joined(name: str, files: Sequence[_File]) -> Source:
             "magnetic: each file's metadata hold for its own rows."
         )
     metadata = _agreed([file.metadata for file in files])
-    return Source(name, tuple(pieces), columns, metadata, tuple(notes))
+    return FleetTable(name, tuple(pieces), columns, metadata, tuple(notes))
 
 
 def _agreed(stated: Sequence[Mapping[str, object]]) -> dict[str, object]:

@@ -26,8 +26,8 @@ from mwdcal.fleet.sources import (
     DEALT,
     OFFSET,
     SERIAL,
+    FleetTable,
     Piece,
-    Source,
     check_unchanged,
     pieces_of,
 )
@@ -35,7 +35,7 @@ from mwdcal.geometry.vectors import Ints
 
 TOOL = "#tool"
 """Column of dealt rows: number of the tool, in order of first appearance."""
-ROWS = (6_000, 100_000)
+PARTITION_ROWS = (6_000, 100_000)
 """Fewest and most rows of a partition that is not a single tool…"""
 SHARES = 32
 """…and into how many a fleet between these is divided."""
@@ -80,7 +80,7 @@ class Tools:
         return len(self.runs) == self.count
 
 
-def find_tools(source: Source) -> Tools:
+def find_tools(source: FleetTable) -> Tools:
     """One pass over the serials."""
     arrow, _ = parquet.modules(source.name)
     starts: list[Ints] = []
@@ -119,7 +119,7 @@ def _check_stretches(count: int, source: str) -> None:
         )
 
 
-def in_several_folders(source: Source, tools: Tools) -> int:
+def in_several_folders(source: FleetTable, tools: Tools) -> int:
     """Number of tools with rows in folders that state different values of a column."""
     numbers: dict[Any, int] = {}
     keys_of_pieces = [
@@ -137,7 +137,7 @@ def in_several_folders(source: Source, tools: Tools) -> int:
     return int(np.sum(low < high))
 
 
-def _serials(source: Source) -> Iterator[Any]:
+def _serials(source: FleetTable) -> Iterator[Any]:
     """The serial column, in dictionary-encoded stretches; whole numbers stay numbers."""
     arrow, pq = parquet.modules(source.name)
     row = 0
@@ -218,10 +218,10 @@ def _readable(kind: Any, piece: Piece, name: str) -> Iterator[None]:
 
 
 def partitions(
-    source: Source, tools: Tools, folder: Path, say: Callable[[str], None]
+    source: FleetTable, tools: Tools, folder: Path, say: Callable[[str], None]
 ) -> list[Partition]:
     """The table in partitions of whole tools; dealt into files in `folder` where it must be."""
-    size = int(np.clip(source.rows // SHARES, *ROWS))
+    size = int(np.clip(source.rows // SHARES, *PARTITION_ROWS))
     if not tools.together:
         return _dealt(source, tools, folder, size, say)
     ends = np.append(tools.runs[1:], source.rows)
@@ -232,7 +232,7 @@ def partitions(
     return [_part(source, *each, count) for each, count in zip(bounds, counts, strict=True)]
 
 
-def _part(source: Source, first: int, stop: int, tools: int) -> Partition:
+def _part(source: FleetTable, first: int, stop: int, tools: int) -> Partition:
     """The partition of rows `first` to `stop`."""
     bounds = np.cumsum([0, *(piece.rows for piece in source.pieces)])
     low = int(np.searchsorted(bounds, first, "right")) - 1
@@ -241,7 +241,7 @@ def _part(source: Source, first: int, stop: int, tools: int) -> Partition:
 
 
 def _dealt(
-    source: Source, tools: Tools, folder: Path, size: int, say: Callable[[str], None]
+    source: FleetTable, tools: Tools, folder: Path, size: int, say: Callable[[str], None]
 ) -> list[Partition]:
     """Rows dealt into files by tool; what an interrupted command has finished is not done again."""
     _, pq = parquet.modules(source.name)
@@ -289,7 +289,7 @@ def _whole_folder(folder: Path) -> Iterator[Path]:
         shutil.rmtree(unfinished, ignore_errors=True)
 
 
-def _deal(source: Source, tools: Tools, number: Ints, folder: Path) -> None:
+def _deal(source: FleetTable, tools: Tools, number: Ints, folder: Path) -> None:
     """Write the rows of every piece into the file of their tool."""
     arrow, pq = parquet.modules(source.name)
     writers: dict[int, Any] = {}
@@ -303,11 +303,11 @@ def _deal(source: Source, tools: Tools, number: Ints, folder: Path) -> None:
             table = table.append_column("#row", arrow.array(rows))
             target = number[tool]
             order = np.argsort(target, kind="stable")
-            sorted_own = target[order]
+            sorted_target = target[order]
             table = table.take(arrow.array(order))
-            bounds = np.flatnonzero(np.diff(sorted_own, prepend=-1))
+            bounds = np.flatnonzero(np.diff(sorted_target, prepend=-1))
             for start, stop in zip(bounds, [*bounds[1:], len(target)], strict=True):
-                key = int(sorted_own[start])
+                key = int(sorted_target[start])
                 if key not in writers:
                     path = folder / f"{key:04d}.parquet"
                     writers[key] = pq.ParquetWriter(path, table.schema, compression="lz4")

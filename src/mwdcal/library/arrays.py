@@ -14,7 +14,7 @@ from mwdcal.files.contract import RAW_SPREAD, REFERENCES, TEMPERATURE, Range
 from mwdcal.geometry.vectors import Array, ArrayLike, Bools, wrap
 from mwdcal.sensor.profile import COMMON
 
-DEGREES = "_deg"
+DEGREES_SUFFIX = "_deg"
 """Ending of the keyword twins that take degrees."""
 TURNING = ("azimuth", "toolface")
 """Angles that come as -360…360° and are kept as 0…360°."""
@@ -160,14 +160,14 @@ def _by_name(values: Mapping[str, ArrayLike], limits: Mapping[str, Range]) -> di
     """For each quantity the name that it is given by: that of the quantity, or of its twin in degrees."""
     spelled = {name.replace("-", "_"): name for name in limits}
     angles = [key for key, name in spelled.items() if limits[name].unit == "°"]
-    spelled |= {f"{key}{DEGREES}": spelled[key] for key in angles}
+    spelled |= {f"{key}{DEGREES_SUFFIX}": spelled[key] for key in angles}
     if not hasattr(values, "keys"):
         names = " or ".join(f"'{name}'" for name in TRIADS)
         raise InputError(f"`sd` must be a mapping, with names such as {names}; got {values!r}.")
     given: dict[str, str] = {}
     for key in values:
         if key not in spelled:
-            names = ", ".join(name for name in spelled if not name.endswith(DEGREES))
+            names = ", ".join(name for name in spelled if not name.endswith(DEGREES_SUFFIX))
             raise InputError(
                 f"unknown name '{key}'; expected one of {names}, or of an angle with _deg.{nearest(key, spelled)}"
             )
@@ -186,10 +186,10 @@ def _converted(
     if limits.unit != "°":
         return _within(name, values, limits, advice)
     advice, factor, whole = "Check the value.", float(np.radians(1)), 360.0
-    if not name.endswith(DEGREES):
+    if not name.endswith(DEGREES_SUFFIX):
         low, high = np.radians((limits.low, limits.high)).tolist()
         limits, factor, whole = Range(low, high, "rad"), 1.0, 2 * np.pi
-        advice = f"Degrees go to `{name}{DEGREES}`."
+        advice = f"Degrees go to `{name}{DEGREES_SUFFIX}`."
     values = _within(name, values, limits, advice)
     outside = (values < 0) | (values >= whole)
     return np.where(outside, wrap(values, whole), values) * factor if turning else values * factor

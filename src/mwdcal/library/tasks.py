@@ -21,7 +21,7 @@ from mwdcal.files.formats import table as tables
 from mwdcal.files.formats.columns import LABELS, Column
 from mwdcal.files.formats.table import Table
 from mwdcal.files.limits import load_limits
-from mwdcal.geometry.vectors import AnyArray, Array
+from mwdcal.geometry.vectors import AnyArray, Array, ArrayLike
 from mwdcal.library.arrays import nearest
 from mwdcal.logs.noise import Noise, find_noise
 from mwdcal.logs.stations import Stations, find_stations
@@ -39,7 +39,7 @@ NOMINAL = Profile(name="nominal", accelerometer=_UNSCALED, magnetometer=_UNSCALE
 CORRECTED_ANGLES = ("inclination", "azimuth", "toolface", "dip", "magnetic_toolface")
 """Angles of corrected readings."""
 Path = str | os.PathLike[str]
-Source = Path | Table | Mapping[str, Any]
+Tabular = Path | Table | Mapping[str, Any]
 """A file, a table, or columns by name: a dictionary of arrays, a pandas or a polars table."""
 
 
@@ -53,7 +53,7 @@ def load_profile(name: Path = "generic") -> Profile:
 
 
 def read_run(
-    source: Source, profile: Path | Profile = "generic", *, decimal: str = "."
+    source: Tabular, profile: Path | Profile = "generic", *, decimal: str = "."
 ) -> Readings:
     """The readings of a run: of a CSV, TSV, Parquet or XLSX file, or of columns with the same names.
 
@@ -72,7 +72,7 @@ def read_run(
     return replace(readings, profile=profile, profile_sha256=profile_sha256)
 
 
-def _table(source: Source, name: str, read: Callable[[Path], Table]) -> Table:
+def _table(source: Tabular, name: str, read: Callable[[Path], Table]) -> Table:
     """The table of a file, or of columns that are in memory."""
     if isinstance(source, Table):
         return source
@@ -109,24 +109,47 @@ def simulate(
     azimuth_deg: Sequence[float] = (0, 90, 180, 270),
     temperature: Sequence[float] = (25.0,),
     *,
-    tool: int | Truth = 0,
+    tool: int | tuple[ArrayLike, ArrayLike] | Truth = 0,
     noise: tuple[float, float] = (1e-4, 15.0),
-    seed: int = 0,
+    stand_deg: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    drift: float = 0.0,
+    seed: int | np.random.Generator = 0,
 ) -> Readings:
     """A simulated run, marked as such: every toolface at every inclination and temperature.
 
     Azimuths come in turn, one to each inclination. `tool` is a number, the same one for the same
-    tool, or a tool of `mwdcal.planning.simulate`; `noise` is of one reading, g and nT; `seed` is that
-    of the noise.
+    tool; or the true factors (30,) of accelerometer and magnetometer, SF (3 × 4) and B (3 × 4) by
+    power of T - 30 °C, then m (6). `noise` is of one reading, g and nT; `stand_deg` how far inclination,
+    azimuth and toolface are off their references; `drift` the temperature by which the tool warms
+    during the run; `seed` that of noise and stand, or a generator.
     """
     if not all(0 <= angle <= 180 for angle in inclination_deg) or toolfaces < 1:
         raise InputError(
             "`inclination_deg` must be between 0 and 180, and `toolfaces` 1 or more; got "
             f"{list(inclination_deg)} and {toolfaces}."
         )
-    truth = simulation.servo(np.random.default_rng(tool)) if isinstance(tool, int) else tool
     plan = simulation.grid([*inclination_deg], toolfaces, [*azimuth_deg], [*temperature])
-    return simulation.run(truth, plan, np.random.default_rng([seed, 1]), noise)
+    warmed = plan.temperature + drift * np.linspace(-0.5, 0.5, len(plan.temperature))
+    plan = replace(plan, temperature=warmed)
+    rng = seed if isinstance(seed, np.random.Generator) else np.random.default_rng([seed, 1])
+    inclination, azimuth, toolface = np.radians(stand_deg)
+    return simulation.run(_truth(tool), plan, rng, noise, (inclination, azimuth, toolface))
+
+
+def _truth(tool: int | tuple[ArrayLike, ArrayLike] | Truth) -> Truth:
+    """A tool to simulate: by its number, or by its factors."""
+    if isinstance(tool, Truth):
+        return tool
+    if isinstance(tool, int):
+        return simulation.servo(np.random.default_rng(tool))
+    accelerometer, magnetometer = (np.asarray(factors, float) for factors in tool)
+    for factors in (accelerometer, magnetometer):
+        if factors.shape != (30,):
+            raise InputError(
+                f"`tool` must be a number, or 30 factors of each triad; got {factors.shape}. Give SF "
+                "(3 × 4), B (3 × 4) and m (6) in one row."
+            )
+    return Truth(accelerometer, magnetometer)
 
 
 def calibrate(
@@ -265,9 +288,32 @@ def apply(
     )
 
 
-def save(calibration: Calibration, path: Path) -> None:
-    """Write a calibration file (JSON), whole or not at all."""
-    documents.write(path, calibration)
+def save(
+    result: Calibration | Readings,
+    path: Path,
+    profile: Path | Profile | None = None,
+    *,
+    decimals: int | None = None,
+) -> None:
+    """Write a calibration file (JSON), or the readings of a run as `read_run` reads them.
+
+    A run is a CSV, TSV, Parquet or XLSX file, by the suffix. Its channels are raw: in the axes and
+    units of the `profile`, by default the one that the run was read with, else g and nT along the
+    tool axes. `decimals` are places after the point, by default as many as there are. A file is
+    written whole or not at all.
+    """
+    if isinstance(result, Calibration):
+        documents.write(path, result)
+        return
+    _check_readings(result, "result")
+    table = runs.from_readings(result, _profile(result, profile))
+    if decimals is not None:
+        columns = {
+            name: cells if isinstance(cells, list) else np.round(cells, decimals)
+            for name, cells in table.columns.items()
+        }
+        table = replace(table, columns=columns)
+    tables.write(path, table)
 
 
 def load(path: Path) -> Calibration:
@@ -279,7 +325,7 @@ def load(path: Path) -> Calibration:
     return documents.read(path)
 
 
-def stations(log: Source, **options: Any) -> Stations:
+def stations(log: Tabular, **options: Any) -> Stations:
     """The standstills of a continuous log, each as a station: `.table` is a run for `read_run`.
 
     `log` is a file, or columns by the names of log files: `time_s`, `ax`, …, `temperature_c`. `options`
@@ -288,7 +334,7 @@ def stations(log: Source, **options: Any) -> Stations:
     return find_stations(_log(log), **options)
 
 
-def noise(log: Source, **options: Any) -> Noise:
+def noise(log: Tabular, **options: Any) -> Noise:
     """The noise of each raw channel of a log of a tool at rest, by Allan deviation.
 
     `log` is a file, or columns by the names of log files. `options` are those of
@@ -297,7 +343,7 @@ def noise(log: Source, **options: Any) -> Noise:
     return find_noise(_log(log), **options)
 
 
-def _log(source: Source) -> Table:
+def _log(source: Tabular) -> Table:
     """A log: a file, or columns that are checked like one."""
     table = _table(source, "the log", logs.read)
     return table if isinstance(source, str | os.PathLike) else logs.check(table)

@@ -40,13 +40,13 @@ FLOOR = 2 * np.log(2) / np.pi
 """Allan variance of a bias instability B = 1."""
 SECOND = (1.0, -2.0, 1.0)
 """Weights of a second difference."""
-STEPS = 16
+LAG_STEPS = 16
 """Steps of a lag sum per averaging factor."""
 REACH = 8
 """Lag in averaging factors beyond which covariances of second differences are left out."""
 APART = 128
 """Ratio of averaging factors above which only quantisation and random walk correlate variances."""
-LONG = 64
+LONG_RECORD = 64
 """Averages in a record above which their centring no longer counts in covariances."""
 
 
@@ -246,12 +246,12 @@ def _pair(count: int, m: int, k: int) -> tuple[Array, Array]:
     square, total = _summed(_between(m, k, spikes), _pairs(first, second, spikes))
     square[1:, 1:], total[1:] = 0.0, 0.0
     smooth = slice(1, 4) if k <= APART * m else slice(3, 4)
-    step = max(1, (m if k <= APART * m else k) // STEPS)
+    step = max(1, (m if k <= APART * m else k) // LAG_STEPS)
     low, high = -min(second - 1, REACH * k) // step, min(first - 1, REACH * k) // step
     lags = step * np.arange(low, high + 1, dtype=float)
     between = _between(m, k, lags)[smooth]
     more, mean = _summed(between, step * _pairs(first, second, lags))
-    if first < LONG * k:
+    if first < LONG_RECORD * k:
         more = more - _rows(between, lags, step, first, second)
         more = more + np.outer(mean, mean) / (first * second)
     square[smooth, smooth], total[smooth] = more, mean
@@ -290,7 +290,7 @@ def _plain(count: int, m: int, kind: Kind) -> tuple[Array, Array, Array]:
     """Mean (4,), variance (4, 4), and variance per unit drift² (4,) of a variance."""
     modified = kind == "modified"
     terms = count - (3 * m - 2 if modified else 2 * m - 1)
-    step = max(1, m // STEPS)
+    step = max(1, m // LAG_STEPS)
     reach = min(terms - 1, REACH * m) // step * step
     pad = m if modified else 0
     lags = np.arange(-reach - pad, reach + pad + 1, step, dtype=float)

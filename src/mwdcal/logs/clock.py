@@ -25,7 +25,7 @@ INSTANT = Range(-1e19, 1e19, "s")
 """Accepted cells of a clock: also those of one that counts nanoseconds from 1970, which is reported."""
 MOST_CELLS = 50_000_000
 """Cells of the longest log: four months at 15 samples a second or more."""
-SAME = 0.01
+SAME_DURATION = 0.01
 """Share by which a duration may differ from that by a rate of sampling."""
 DAY = 86_400.0
 SPARSE, RARE = 0.5, 2.0
@@ -115,7 +115,7 @@ def rate_findings(log: Table, rows: slice, sampling_hz: float) -> list[Finding]:
         return []
     first, last = time[filled[[0, -1]]]
     seconds = float(filled[-1] - filled[0]) / sampling_hz
-    if abs(last - first - seconds) <= SAME * seconds:
+    if abs(last - first - seconds) <= SAME_DURATION * seconds:
         return []
     text = (
         f"`sampling_hz` {sampling_hz:g} was used, by which {len(time)} rows last {seconds:.6g} s, but {TIME} "

@@ -24,7 +24,7 @@ from mwdcal.files.logs import Say, silent
 from mwdcal.geometry.vectors import Array
 from mwdcal.logs import allan, noise_terms, regular
 from mwdcal.logs.allan import Kind, Moments
-from mwdcal.logs.clock import ANY, DURATION, RATE, SAME, check_argument, is_number
+from mwdcal.logs.clock import ANY, DURATION, RATE, SAME_DURATION, check_argument, is_number
 from mwdcal.logs.noise_terms import NoiseTerms
 from mwdcal.sensor.profile import Profile
 
@@ -38,9 +38,9 @@ SOUND = 10
 """Stations that a log holds where their duration is chosen for it."""
 EVENT = 8.0
 """Size of a difference, in robust standard deviations, that no noise reaches."""
-ROUNDING = 1e-6
+STEP_ROUNDING = 1e-6
 """Rounding error of a ratio of whole numbers of steps of the converter."""
-PARTS = 256
+EVENT_PARTS = 256
 """Averages in a log between which events are looked for."""
 UNEVEN = 2.0
 """Ratio of the noise of two channels of a triad that is reported."""
@@ -52,7 +52,7 @@ DOUBTS = {
     "slow": "less than a sample in a station",
 }
 """Findings after which the figures of a channel do not hold, in words; `slow`: that of a station."""
-UNITS = {
+TERM_UNITS = {
     "quantisation": "·s",
     "white": "·√s",
     "bias-instability": "",
@@ -92,7 +92,7 @@ class ChannelNoise(msgspec.Struct, frozen=True, kw_only=True):
         deviation, lower, upper: Allan deviation with its 95 % band.
         freedom: its equivalent degrees of freedom.
         fitted: Allan deviation of the fitted terms.
-        terms: by name, see `UNITS`.
+        terms: by name, see `TERM_UNITS`.
         white_density: one-sided density per √Hz, √2 times the white term.
         fit_from_s: shortest averaging time that the terms describe.
         chance: probability of a misfit as large, if the terms describe the noise.
@@ -263,7 +263,7 @@ def _channel(
 
 def _terms(terms: NoiseTerms, rate: float) -> dict[str, Term]:
     """The terms of the one record, in units of the channel and seconds."""
-    factors = dict(zip(UNITS, (1 / rate, rate**-0.5, 1.0, rate**0.5, rate), strict=True))
+    factors = dict(zip(TERM_UNITS, (1 / rate, rate**-0.5, 1.0, rate**0.5, rate), strict=True))
     by_name = {}
     for i, name in enumerate(allan.TERMS):
         shown = bool(terms.determined[0, i])
@@ -274,7 +274,7 @@ def _terms(terms: NoiseTerms, rate: float) -> dict[str, Term]:
             standard_uncertainty=spread / (2 * size) if shown else None,
             lower=float(np.sqrt(terms.lower[0, i])) * factors[name],
             upper=float(np.sqrt(terms.upper[0, i])) * factors[name],
-            unit=UNITS[name],
+            unit=TERM_UNITS[name],
         )
     return {**by_name, "drift": _drift(terms, rate)}
 
@@ -284,7 +284,7 @@ def _drift(terms: NoiseTerms, rate: float) -> Term:
     from scipy.special import ndtr, ndtri
 
     slope, sd = float(terms.slope[0]) * rate, float(terms.slope_sd[0]) * rate
-    tail = 1 - noise_terms.LEVEL
+    tail = 1 - noise_terms.CONFIDENCE
     shown = bool(2 * ndtr(-abs(terms.slope[0]) / terms.slope_sd[0]) < noise_terms.DETECTED)
     reach = float(ndtri(1 - tail / 2)) * sd
     return Term(
@@ -292,7 +292,7 @@ def _drift(terms: NoiseTerms, rate: float) -> Term:
         standard_uncertainty=sd if shown else None,
         lower=slope - reach if shown else 0.0,
         upper=slope + reach if shown else abs(slope) + float(ndtri(1 - tail)) * sd,
-        unit=UNITS["drift"],
+        unit=TERM_UNITS["drift"],
     )
 
 
@@ -333,7 +333,7 @@ def _findings(
             f"{name}: below {start:.3g} s its noise is not that of the five terms (a filter, a vibration, "
             "or repeated samples); from there on they hold, without a quantisation."
         )
-    if station * rate < 1 - SAME:
+    if station * rate < 1 - SAME_DURATION:
         seen = f"{name} is sampled every {1 / rate:.4g} s, and a station lasts {station:.4g} s"
         texts["slow"] = f"{seen}: its figure is the noise of one sample. Ask for a longer station."
     return [Finding(id=key, text=text) for key, text in texts.items() if text]
@@ -345,11 +345,11 @@ def _event(name: str, value: Array, rate: float, least: float, coarse: bool) -> 
     `least` is the noise that the steps of the converter can hide: in single samples, and if they
     are `coarse` in averages.
     """
-    for m in sorted({1, max(len(value) // PARTS, 1)}):
+    for m in sorted({1, max(len(value) // EVENT_PARTS, 1)}):
         size = np.abs(allan.differences(value, m))
         usual = max(1.4826 * float(np.median(size)), least if coarse or m == 1 else 0.0)
         worst = int(np.argmax(size))
-        if usual > 0 and size[worst] / usual > EVENT + ROUNDING:
+        if usual > 0 and size[worst] / usual > EVENT + STEP_ROUNDING:
             return (
                 f"{name} changes by {size[worst]:.3g} about {(worst + m) / rate:.4g} s after the start, "
                 f"{size[worst] / usual:.0f} times what is usual within {m / rate:.2g} s: a spike or a move. "

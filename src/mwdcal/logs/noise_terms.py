@@ -32,13 +32,13 @@ import numpy as np
 from mwdcal.geometry.vectors import Array, Bools, Ints
 from mwdcal.logs.allan import Moments, deviation, drift_variance, expected, freedom
 
-FEWEST = 6
+FEWEST_FACTORS = 6
 """Averaging factors that a fit needs."""
 ITERATIONS = 8
 """Of the weights; three would do."""
 DETECTED = 0.005
 """Chance below which a term counts as present."""
-LEVEL = 0.95
+CONFIDENCE = 0.95
 """Probability of the intervals."""
 CONTRADICTED = 1e-3
 """Chance of a misfit below which the shortest averages are left out, or the fit is in doubt."""
@@ -49,9 +49,9 @@ Near 1, where both come from the same readings, to take the larger is to take th
 """
 HALVINGS = 60
 """Of an interval's limit: to the last digits of a number."""
-ALONE = 1e-9
+KEPT_VARIANCE = 1e-9
 """Share of its variance that a term keeps where all terms are absent."""
-SMALLEST = 1e-4
+ROUNDED_EIGENVALUE = 1e-4
 """Eigenvalue of the correlation between averaging factors below which rounding decides."""
 SUBSETS = [s for size in range(1, 5) for s in combinations(range(4), size)]
 """Which terms are present."""
@@ -96,13 +96,15 @@ class NoiseTerms(NamedTuple):
 def fit(variance: Array, slope: Array, moments: Moments) -> NoiseTerms:
     """The terms of B records with centred variances (B, m) and slopes (B,).
 
-    Errors: fewer than `FEWEST` factors, or a record without any noise, raise ValueError.
+    Errors: fewer than `FEWEST_FACTORS` factors, or a record without any noise, raise ValueError.
     """
     size = variance.shape[-1]
-    if size < FEWEST or not np.all(variance > 0):
-        raise ValueError(f"`variance` must hold {FEWEST} or more positive values; got {variance}")
+    if size < FEWEST_FACTORS or not np.all(variance > 0):
+        raise ValueError(
+            f"`variance` must hold {FEWEST_FACTORS} or more positive values; got {variance}"
+        )
     best = _fit(variance, slope, moments, 0)
-    for start in range(1, size - FEWEST + 1):
+    for start in range(1, size - FEWEST_FACTORS + 1):
         doubtful = np.flatnonzero(best.chance < CONTRADICTED)
         if not doubtful.size:
             break
@@ -238,7 +240,7 @@ def _whitening(unit: Array, squares: Array) -> Array:
     joint = _joint(unit, squares)
     scale = 1 / np.sqrt(np.einsum("bmm->bm", joint))
     size, axes = np.linalg.eigh(joint * scale[:, :, None] * scale[:, None, :])
-    whiten = np.swapaxes(axes, -1, -2) / np.sqrt(np.maximum(size, SMALLEST))[..., None]
+    whiten = np.swapaxes(axes, -1, -2) / np.sqrt(np.maximum(size, ROUNDED_EIGENVALUE))[..., None]
     return np.asarray(whiten * scale[:, None, :])
 
 
@@ -276,7 +278,9 @@ def _spread(each: Array, bounded: Array) -> Array:
     quadratic = np.einsum("bjjj->bj", each)
     constant = np.einsum("bja,bjac,bjc->bj", others, each, others)
     linear = 2 * np.einsum("bjjc,bjc->bj", each, others)
-    return np.stack([np.maximum(constant, ALONE * quadratic * bounded**2), linear, quadratic])
+    return np.stack(
+        [np.maximum(constant, KEPT_VARIANCE * quadratic * bounded**2), linear, quadratic]
+    )
 
 
 def _chance(observed: Array, value: Array, spread: Array) -> Array:
@@ -295,8 +299,8 @@ def _chance(observed: Array, value: Array, spread: Array) -> Array:
 
 
 def _interval(observed: Array, spread: Array, determined: Bools) -> tuple[Array, Array]:
-    """Limits (B, 4) at `LEVEL`: both sides of determined terms, a bound of the others."""
-    tail = (1 - LEVEL) / 2
+    """Limits (B, 4) at `CONFIDENCE`: both sides of determined terms, a bound of the others."""
+    tail = (1 - CONFIDENCE) / 2
     below = np.where(determined, _limit(observed, spread, np.asarray(1 - tail)), 0.0)
     seen = np.where(determined, observed, np.maximum(observed, 0.0))
     return below, _limit(seen, spread, np.where(determined, tail, 2 * tail))

@@ -13,13 +13,13 @@ from mwdcal.logs import allan
 from mwdcal.logs.clock import rate_findings, row_times, unlikely_seconds
 from mwdcal.logs.station_findings import count
 
-FEWEST = 128
+FEWEST_SAMPLES = 128
 """Samples of a channel below which the terms cannot be separated."""
-SPARSE = 1e-3
+MISSING_SHARE = 1e-3
 """Largest share of single blanks that are filled in: the change is below the uncertainty of the noise."""
 JITTER = 0.5
 """Share of the sampling interval by which one may differ: more is a gap."""
-LEAST = 1e-40
+SMALLEST_NOISE = 1e-40
 """Noise below which its powers are no numbers any more."""
 
 
@@ -29,13 +29,13 @@ def section(
     """Rows of a log that are to be used, and rows a second."""
     time = row_times(log, given)
     inside = np.flatnonzero((time - time[0] >= between[0]) & (time - time[0] <= between[1]))
-    if len(inside) < FEWEST:
+    if len(inside) < FEWEST_SAMPLES:
         problem, advice = f"got {len(time)}", "Record for longer."
-        if len(time) >= FEWEST:
+        if len(time) >= FEWEST_SAMPLES:
             problem = f"`start` and `end` leave {len(inside)} of {len(time)} rows"
             advice = f"The log lasts {time[-1] - time[0]:.4g} s: widen them."
         raise InputError(
-            f"{log.source}: at least {FEWEST} samples are needed for an Allan deviation; {problem}. "
+            f"{log.source}: at least {FEWEST_SAMPLES} samples are needed for an Allan deviation; {problem}. "
             f"{advice}"
         )
     rows = slice(int(inside[0]), int(inside[-1]) + 1)
@@ -85,7 +85,7 @@ def samples(
     if blank.size:
         row = rows.start + int(there[blank[0]]) + min(step, int(steps[blank[0]]))
         line = f"line {log.lines[row] if row < len(log.lines) else row + 1}"
-        if np.any(steps[blank] != 2 * step) or blank.size > max(SPARSE * len(there), 1):
+        if np.any(steps[blank] != 2 * step) or blank.size > max(MISSING_SHARE * len(there), 1):
             problem = f"{name} is blank at irregular places, first in {line}: fill in or cut."
             raise UnusableChannelError(problem)
         text = (
@@ -102,8 +102,8 @@ def _check_changes(name: str, value: Array) -> None:
     """Refuse a channel with too few samples (n,), or that never changes."""
     if not value.size:
         raise UnusableChannelError(f"{name} is blank from end to end.")
-    if len(value) < FEWEST:
-        raise UnusableChannelError(f"{name} has {len(value)} samples; {FEWEST} are needed.")
+    if len(value) < FEWEST_SAMPLES:
+        raise UnusableChannelError(f"{name} has {len(value)} samples; {FEWEST_SAMPLES} are needed.")
     if np.ptp(value) == 0:
         reads = f"{name} reads {value[0] + 0.0:g} from end to end: a dead channel?"
         raise UnusableChannelError(reads)
@@ -113,7 +113,7 @@ def _check_noise(name: str, value: Array, station: int) -> None:
     """Refuse samples (n,) without noise, or without any in means over so many of a `station`."""
     factors = [*allan.octaves(len(value)), station]
     size = np.sqrt(allan.variance(value, factors, centred=True))
-    for i in np.flatnonzero(size <= np.maximum(allan.rounding(value, factors), LEAST))[:1]:
+    for i in np.flatnonzero(size <= np.maximum(allan.rounding(value, factors), SMALLEST_NOISE))[:1]:
         raise UnusableChannelError(
             f"{name} has no noise above the rounding of numbers in averages over "
             f"{count(factors[i], 'sample')}: a ramp, a pattern, or simulated without noise?"

@@ -35,23 +35,23 @@ WINDOW = 5
 """Cells of a window."""
 QUIET = 0.05
 """Quantile of the windows' ranges that is the noise floor."""
-STEPS = 120
+THRESHOLDS_TRIED = 120
 """Thresholds tried."""
-CHUNK = 32
+CLOCK_SAMPLES = 32
 """Samples whose median step in time is the rate there."""
 SAME = 0.02
 """Share of the standstills that may come, go or merge while they still count as the same."""
-AGREE, SHARE = 0.03, 0.1
+AGREE, EQUAL_SHARE = 0.03, 0.1
 """Steps of a channel that differ by less are equal; share of equal ones that is its resolution."""
 TURN = 0.05
 """Share of a triad's size by which no channel of a tool at rest moves within a window."""
-NOISE = 8.0
+MOTION_RATIO = 8.0
 """The same in standard deviations of the difference of successive samples."""
-STEP = 0.01
+SLOW_STEP = 0.01
 """Share of a triad's size by which no slow channel of a tool at rest steps."""
-MANY = 100_000
+DIFFERENCES = 100_000
 """Differences of readings that are looked at."""
-LEAST = 1e-200
+LEAST_FLOOR = 1e-200
 """Least noise floor: ratios to a smaller one are no numbers any more."""
 INTO = 0.15
 """How far into the stretch the threshold lies, in logarithm."""
@@ -153,24 +153,24 @@ def _even(time: Array, value: Array, length: float) -> tuple[Array, Array, Array
 
 def _rate_changes(time: Array) -> Ints:
     """First samples of the stretches at one rate: the rate of a chunk is that of its median step."""
-    count = (len(time) - 1) // CHUNK
+    count = (len(time) - 1) // CLOCK_SAMPLES
     if count < 2:
         return np.zeros(1, int)
-    steps = np.median(np.diff(time)[: count * CHUNK].reshape(count, CHUNK), axis=-1)
+    steps = np.median(np.diff(time)[: count * CLOCK_SAMPLES].reshape(count, CLOCK_SAMPLES), axis=-1)
     usual = time_step(time)
     level = np.round(np.log2(np.maximum(steps, 1e-3 * usual) / usual)) if usual else steps
-    return np.concatenate([[0], (np.flatnonzero(np.diff(level)) + 1) * CHUNK])
+    return np.concatenate([[0], (np.flatnonzero(np.diff(level)) + 1) * CLOCK_SAMPLES])
 
 
 def resolution(value: Array) -> float:
     """The step in which the readings (n,) of a channel come; hardly anything where they show none.
 
-    Definition: the smallest difference of successive readings on which `SHARE` of those that
+    Definition: the smallest difference of successive readings on which `EQUAL_SHARE` of those that
     differ agree, but none that is far below another such one or below movements, as arises where
     a coarse reading was rescaled by something smooth. Without one, the difference that 1 % stay
     below: single odd readings do not make a channel fine.
     """
-    every = max(1, len(value) // MANY)
+    every = max(1, len(value) // DIFFERENCES)
     steps = np.sort(np.abs(value[1::every] - value[:-1:every]))
     steps = steps[steps > 0]
     if not steps.size:
@@ -185,14 +185,14 @@ def resolution(value: Array) -> float:
 def _agreed(steps: Array) -> float:
     """The smallest of the ascending steps (n,) on which many agree and few are below; else 0."""
     count = np.searchsorted(steps, steps * (1 + AGREE), "right") - np.arange(len(steps))
-    common = np.flatnonzero(count >= max(SHARE * len(steps), 10))
+    common = np.flatnonzero(count >= max(EQUAL_SHARE * len(steps), 10))
     if not common.size:
         return 0.0
     first = common[np.searchsorted(steps[common], steps[common[-1]] / 20)]
     first = first + int(np.argmax(count[first : first + count[first]]))
     step = float(steps[first + count[first] // 2])
     between = np.searchsorted(steps, [0.05 * step, 0.9 * step])
-    return step if between[1] - between[0] <= SHARE * count[first] else 0.0
+    return step if between[1] - between[0] <= EQUAL_SHARE * count[first] else 0.0
 
 
 def time_step(time: Array) -> float:
@@ -239,7 +239,7 @@ def activity(traces: Mapping[str, tuple[Array, Array]]) -> Activity:
     for channel in cells:
         ranges = quietest_range(channel.level)
         # One step of the readings up or down is not movement.
-        floor = max(noise_floor(ranges), (1 + AGREE) * channel.resolution, LEAST)
+        floor = max(noise_floor(ranges), (1 + AGREE) * channel.resolution, LEAST_FLOOR)
         ranges = np.where(channel.torn, np.inf, ranges)
         value = np.maximum(value, on_grid(edge, channel, ranges) / floor)
         floors.append(floor)
@@ -283,7 +283,7 @@ def triad_size(levels: Sequence[Array]) -> float:
 
 def rest_limit(cells: Cells, size: float) -> float:
     """Largest range within a window that can be rest: a share of the triad's `size`, or noise."""
-    return max(TURN * size, NOISE * cells.rough, 2 * cells.resolution)
+    return max(TURN * size, MOTION_RATIO * cells.rough, 2 * cells.resolution)
 
 
 def stretches(still: Bools, least: int = 1) -> tuple[Ints, Ints]:
@@ -305,7 +305,7 @@ def choose_threshold(value: Array, least: int, highest: float) -> tuple[float, t
     """
     alive = value[np.isfinite(value) & (value > 0)]
     low = max(float(alive.min()), 1.0) if alive.size else 1.0
-    tried = np.geomspace(low, highest, STEPS) if highest >= low else np.zeros(0)
+    tried = np.geomspace(low, highest, THRESHOLDS_TRIED) if highest >= low else np.zeros(0)
     runs = [stretches(value <= t, least)[0] for t in tried]
     counts = np.array([len(run) for run in runs], int)
     changes = np.cumsum([0, *(_changes(a, b) for a, b in pairwise(runs))])

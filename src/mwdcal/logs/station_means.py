@@ -25,7 +25,7 @@ import numpy as np
 
 from mwdcal.geometry.vectors import Array, ArrayLike
 
-CLEAR = 4.0
+SPIKE_DISTANCE = 4.0
 """Distance from the median, in robust standard deviations, above which a sample is a spike."""
 BLOCKS = 64
 """Blocks whose means give the long-run variance."""
@@ -37,7 +37,7 @@ UNUSUAL = 2.0
 """Ratio to the usual spread that is reported."""
 LENT = 0.01
 """Chance that a standstill of the usual noise is taken for noisier, and lent none."""
-COURSE = 0.01
+DRIFT_CHANCE = 0.01
 """Chance that steady standstills are said to share a drift, which is then taken out of their noise."""
 PARTS, WANDERS = 16, 12.0
 """Blocks that tell a knock within a standstill, and their range, in their own noise, that does."""
@@ -207,7 +207,7 @@ def pooled(rests: Sequence[Rest], resolution: float) -> SharedNoise:
     distances = [_distances(value) for value in values]
     lively = [d for d in distances if d.any()] or distances
     spread = 1.4826 * float(np.median(np.concatenate(lively)))
-    limit = CLEAR * max(spread, resolution)
+    limit = SPIKE_DISTANCE * max(spread, resolution)
     kept = [value[np.abs(value) <= limit] for value in values]
     kept = [value for value in kept if len(value)]  # none where they are at two levels far apart
     square = np.array([len(value) * value.var() for value in kept])
@@ -254,7 +254,7 @@ def _course(rests: Sequence[Rest], middles: Sequence[float], limit: float) -> fl
     weights, slopes = weights[some], sums[some] / weights[some]
     mean = float(weights @ slopes / weights.sum())
     error = float(weights @ (slopes - mean) ** 2 / freedom / weights.sum()) ** 0.5
-    return mean if abs(mean) > student(freedom, COURSE) * error else 0.0
+    return mean if abs(mean) > student(freedom, DRIFT_CHANCE) * error else 0.0
 
 
 def _distances(value: Array) -> Array:
@@ -298,7 +298,7 @@ def summarise(
     """
     distance = np.abs(value - np.median(value))
     spread = float(1.4826 * np.median(distance))
-    kept = distance <= CLEAR * max(_spike_scale(len(value), spread, noise), resolution)
+    kept = distance <= SPIKE_DISTANCE * max(_spike_scale(len(value), spread, noise), resolution)
     stuck = _is_stuck(value, distance, resolution, noise)
     unsteady = _is_unsteady(value[kept], resolution, noise)
     time, value = time[kept], value[kept]

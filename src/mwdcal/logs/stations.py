@@ -39,13 +39,13 @@ LEAST_SAMPLES = 3
 """Fewest samples of each channel at a station."""
 GAP = 5.0
 """Times the usual step between samples that are a gap."""
-THRESHOLD = Range(0.0, 1e15, "noise floors")
+THRESHOLDS = Range(0.0, 1e15, "noise floors")
 """Accepted thresholds."""
 REPORTED = 1.2
 """Factor by which correlated noise widens most means of a triad before it is reported."""
-SMALLEST = 1e-12
+SMALLEST_RESOLUTION = 1e-12
 """Resolution of a channel that never changes, as a share of its reading."""
-PARTS = {"": "mean", "sd_": "sd", "spread_": "spread", "drift_": "drift", "samples_": "used"}
+SUMMARIES = {"": "mean", "sd_": "sd", "spread_": "spread", "drift_": "drift", "samples_": "used"}
 """Columns per channel: prefix, and what of its summary stands there."""
 
 Trace = tuple[Array, Array]
@@ -106,7 +106,7 @@ def find_stations(
     """
     check_argument("min_seconds", min_seconds, SECONDS)
     check_argument("trim_seconds", trim_seconds, SECONDS)
-    check_argument("threshold", threshold, THRESHOLD)
+    check_argument("threshold", threshold, THRESHOLDS)
     findings: list[Finding] = []
     time = row_times(log, sampling_hz)
     traces, temperature = _traces(log, time, findings)
@@ -285,7 +285,7 @@ def _torn(activity: Activity, findings: list[Finding]) -> list[Finding]:
 def _equal_times(log: Table, time: Array, names: list[str]) -> list[Finding]:
     """Samples of a channel at one time; rows of different channels may share theirs."""
     filled = {name: time[~np.isnan(numbers(log, name))] for name in names}
-    twice = {name: int(np.count_nonzero(np.diff(own) == 0)) for name, own in filled.items()}
+    twice = {name: int(np.count_nonzero(np.diff(times) == 0)) for name, times in filled.items()}
     name = max(twice, key=lambda n: twice[n])
     if not twice[name]:
         return []
@@ -313,7 +313,11 @@ def _limits(activity: Activity, traces: dict[str, Trace]) -> tuple[Array, list[S
             limits.append(standstill.rest_limit(channel, size))
         else:
             noise = max(channel.rough, channel.resolution)
-            slow.append(Slow(*traces[name], max(standstill.STEP * size, standstill.NOISE * noise)))
+            slow.append(
+                Slow(
+                    *traces[name], max(standstill.SLOW_STEP * size, standstill.MOTION_RATIO * noise)
+                )
+            )
     return np.array(limits), slow
 
 
@@ -347,7 +351,11 @@ def _summaries(
     summaries: Rows = {}
     for name, (time, value) in traces.items():
         say(f"means of {name} at {count(len(start), 'station')}")
-        resolution = standstill.resolution(value) or SMALLEST * abs(value[0]) or SMALLEST
+        resolution = (
+            standstill.resolution(value)
+            or SMALLEST_RESOLUTION * abs(value[0])
+            or SMALLEST_RESOLUTION
+        )
         places = zip(*_within(time, start, end), strict=True)
         rests = [(time[a:b], value[a:b]) for a, b in places]
         summaries[name] = summarise_all(rests, float(resolution))
@@ -382,7 +390,7 @@ def _columns(
         "samples": np.asarray(last - first, float),
         **warmth,
     }
-    for prefix, part in PARTS.items():
+    for prefix, part in SUMMARIES.items():
         for name, summaries in rows.items():
             columns[prefix + name] = np.array([float(getattr(row, part)) for row in summaries])
     columns["drifting"] = [

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mwdcal.calibration.readings import ANGLES, Readings
+from mwdcal.calibration.readings import Readings
+from mwdcal.estimation.evidence import ANGLES
 from mwdcal.geometry.vectors import Array, reference_vectors
 from mwdcal.sensor.models import Basis, Factors
 

@@ -29,7 +29,7 @@ Courses = tuple[Floats, ...]
 
 _VERSION = f"py{sys.version_info.major}{sys.version_info.minor}"
 TILE = 128
-DEGREES = 180.0 / np.pi
+DEGREES_PER_RADIAN = 180.0 / np.pi
 FULL_TURN = 2.0 * np.pi
 
 # Scratch rows: temperature, then the outputs in their order, then what angles are made of.
@@ -142,18 +142,18 @@ def parts(s: Array, count: int) -> None:
 def angles(s: Array, count: int) -> None:
     """The five angles in degrees; NaN where a direction does not exist."""
     for i in range(count):
-        s[_INC, i] = DEGREES * angle(s[_ACROSS, i], s[_G + 2, i])
+        s[_INC, i] = DEGREES_PER_RADIAN * angle(s[_ACROSS, i], s[_G + 2, i])
     for i in range(count):
         turn = angle(s[_EAST, i], s[_NORTH, i])
-        s[_AZI, i] = DEGREES * (turn + FULL_TURN if turn < 0.0 else turn)
+        s[_AZI, i] = DEGREES_PER_RADIAN * (turn + FULL_TURN if turn < 0.0 else turn)
     for i in range(count):
         turn = angle(-s[_G, i], -s[_G + 1, i])
-        s[_FACE, i] = DEGREES * (turn + FULL_TURN if turn < 0.0 else turn)
+        s[_FACE, i] = DEGREES_PER_RADIAN * (turn + FULL_TURN if turn < 0.0 else turn)
     for i in range(count):
-        s[_DIP, i] = DEGREES * angle(s[_DOWN, i], s[_CROSS, i])
+        s[_DIP, i] = DEGREES_PER_RADIAN * angle(s[_DOWN, i], s[_CROSS, i])
     for i in range(count):
         turn = angle(s[_B, i], s[_B + 1, i])
-        s[_MAGNETIC, i] = DEGREES * (turn + FULL_TURN if turn < 0.0 else turn)
+        s[_MAGNETIC, i] = DEGREES_PER_RADIAN * (turn + FULL_TURN if turn < 0.0 else turn)
     for i in range(count):
         still = s[_GRAVITY, i] == 0.0
         quiet = s[_FIELD, i] == 0.0

@@ -23,7 +23,7 @@ __all__ = ["available", "cores", "numbers", "run"]
 
 HIGHEST_POWER = 3
 """Highest order in temperature that the loops know."""
-RESULTS = 13
+RESULT_ROWS = 13
 """Rows of a result: the two vectors, the angles and the strengths."""
 _PIECE_ROWS = 1 << 15
 
@@ -148,7 +148,7 @@ def run(
 
     kept_code_is_sound()
     count = len(columns[-1])
-    out = np.empty((RESULTS, count))
+    out = np.empty((RESULT_ROWS, count))
     settings = (
         *(tuple(columns[:3]), tuple(columns[3:6]), columns[6], tuple(map(float, units))),
         (*limits.raw, reference, *limits.temperature, *limits.calibrated, float(limits.blank)),

@@ -12,14 +12,25 @@ from functools import cached_property
 
 import numpy as np
 
-from mwdcal.calibration.readings import ANGLES, Readings
+from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import FREE_SHARE, Calibration
+from mwdcal.estimation.evidence import ANGLES
 from mwdcal.geometry.observables import OBSERVABLES, OUTPUTS
 from mwdcal.geometry.vectors import Array, Bools, Ints
 from mwdcal.use.roll_sets import ROLL_SET, RollSet, near_vertical, roll_sets
-from mwdcal.use.roll_test import GAP, OPEN, SLACK, Coverage, Curve, coverage, ends, extent, fitted
+from mwdcal.use.roll_test import (
+    OPEN,
+    SLACK,
+    WIDEST_GAP,
+    Coverage,
+    Curve,
+    coverage,
+    ends,
+    extent,
+    fitted,
+)
 
-TURNING = ("azimuth", "toolface")
+UNDEFINED_AT_VERTICAL = ("azimuth", "toolface")
 """Angles that do not exist at vertical."""
 LEVEL = ("inclination", "gravity")
 """Observables that stations of one inclination share at every azimuth."""
@@ -28,6 +39,7 @@ REFERENCE_COLUMNS = {name: f"ref_{column}" for name, column in OUTPUTS.items()}
 NO_TOOLFACE = (
     f"the toolface of exactly vertical stations is not known. Give {REFERENCE_COLUMNS['toolface']}"
 )
+RELATIVE_FIELD = "the calibration is relative: field = 1, not nT"
 SEEN = 0.7
 """Least share of the amplitude of each harmonic that stations should show."""
 TINY = 1e-15
@@ -133,7 +145,7 @@ class RollTest:
         circle = None if np.isnan(self.toolface[index]).any() else self._coverage(index)
         if circle is None or circle.rolled:
             return "" if circle else NO_TOOLFACE
-        return _gap(circle, GAP) or (
+        return _gap(circle, WIDEST_GAP) or (
             "the toolfaces do not determine a mean and two harmonics. Add toolfaces between them: "
             "five or more, well apart"
         )
@@ -142,7 +154,7 @@ class RollTest:
         """Why a roll set has no spread of an observable; empty where it has."""
         if not roll_set.one_azimuth and name not in LEVEL:
             return f"{roll_set.label}: stations of one direction need group or {REFERENCE_COLUMNS['azimuth']}"
-        if name in TURNING and self.near[roll_set.index].any():
+        if name in UNDEFINED_AT_VERTICAL and self.near[roll_set.index].any():
             return f"{roll_set.label}: within 5° of vertical"
         if name == "toolface" and np.isnan(self._error(name)[roll_set.index]).any():
             return f"{roll_set.label}: no {REFERENCE_COLUMNS[name]}"
@@ -157,45 +169,39 @@ class RollTest:
         lacks = self._lacks(name)
         if lacks or not self.sets:
             return Departures(skipped=lacks or f"no {ROLL_SET} stations of one direction")
-        reasons = {s.label: self._unfit(name, s) for s in self.sets}
-        unfit, fit = (
-            [*filter(None, reasons.values())],
-            [s for s in self.sets if not reasons[s.label]],
-        )
-        if not fit:
-            return Departures(skipped="; ".join(unfit))
+        unfit = {s.label: why for s in self.sets if (why := self._unfit(name, s))}
+        fit = [s for s in self.sets if s.label not in unfit]
         gaps = {s.label: self._loose(s.index) for s in fit}
         rolled = [s for s in fit if not gaps[s.label]]
-        loose = [s for s in fit if gaps[s.label]]
-        wrong = [s.label for s in loose if s.declared or (s.one_azimuth and not rolled)]
-        apart = [f"{k}: not rolled, {why}" for k, why in gaps.items() if why and k not in wrong]
+        wrong = [s for s in fit if gaps[s.label] and (s.declared or (s.one_azimuth and not rolled))]
+        kept = {s.label for s in (*rolled, *wrong)}
+        apart = (
+            *unfit.values(),
+            *(f"{label}: not rolled, {gap}" for label, gap in gaps.items() if label not in kept),
+        )
         if not rolled and not wrong:
-            return Departures(skipped="; ".join([*unfit, *apart]))
+            return Departures(skipped="; ".join(apart))
         blocked = self._unusable(name, any(self._free_spread(name, s.index) for s in fit))
         if wrong and not blocked:
-            blocked = f"{wrong[0]} was not rolled: {gaps[wrong[0]]}"
+            blocked = f"{wrong[0].label} was not rolled: {gaps[wrong[0].label]}"
         statistics = [self._curve_of(name, s, False) for s in rolled]
-        for roll_set in (s for s in fit if s.label in wrong):
-            raw = float(np.ptp(self._centred(name, roll_set.index)))
-            statistics.append(Statistic(raw, 0.0, raw, roll_set.label))
-        return self._outcome(name, statistics, blocked, bool(wrong), (*unfit, *apart))
+        raws = ((s.label, float(np.ptp(self._centred(name, s.index)))) for s in wrong)
+        statistics += [Statistic(raw, 0.0, raw, label) for label, raw in raws]
+        return _outcome(statistics, blocked, bool(wrong), apart)
 
     def error(self, name: str) -> Departures:
         """The largest noise-free departure from the reference: of rolled sets, and other stations.
 
         Cannot be passed on stations that were not, taken together, rolled all round.
         """
-        lacks = self._lacks(name)
-        given = ~np.isnan(self._error(name)) if not lacks else np.zeros(self.readings.count, bool)
-        near = given & self.near if name in TURNING else np.zeros(given.shape, bool)
+        if lacks := self._lacks(name):
+            return Departures(skipped=lacks)
+        given = ~np.isnan(self._error(name))
+        near = given & self.near & (name in UNDEFINED_AT_VERTICAL)
         judged = np.flatnonzero(given & ~near)
         if not judged.size:
-            steep = (
-                "every station within 5° of vertical"
-                if near.any()
-                else f"no {REFERENCE_COLUMNS[name]}"
-            )
-            return Departures(skipped=lacks or steep)
+            steep = "every station within 5° of vertical"
+            return Departures(skipped=steep if near.any() else f"no {REFERENCE_COLUMNS[name]}")
         free = bool(self.calibration.rests_on_free(name, self.readings)[judged].any())
         circle, blocked = self._coverage(judged), self._unusable(name, free)
         gap = NO_TOOLFACE if circle is None else _gap(circle, OPEN)
@@ -203,9 +209,8 @@ class RollTest:
             blocked = f"the stations were not rolled: {gap}"
         left = f"{near.sum()} of {given.sum()} stations lie within 5° of vertical"
         unseen = circle is not None and not gap and bool(circle.seen.min() < SEEN)
-        statistics = self._errors(name, judged)
         apart = (left,) if near.any() else ()
-        return self._outcome(name, statistics, blocked, bool(gap), apart, unseen)
+        return _outcome(self._errors(name, judged), blocked, bool(gap), apart, unseen)
 
     def _errors(self, name: str, judged: Ints) -> list[Statistic]:
         """Largest errors of rolled sets, and of each station outside of them."""
@@ -254,26 +259,10 @@ class RollTest:
         middle = np.angle(np.mean(np.exp(1j * part))) if periodic else part.mean()
         return OBSERVABLES[name].difference(part, middle)
 
-    def _outcome(
-        self,
-        name: str,
-        statistics: list[Statistic],
-        blocked: str,
-        unrolled: bool,
-        apart: tuple[str, ...],
-        unseen: bool = False,
-    ) -> Departures:
-        if self._relative(name):
-            return Departures(blocked=blocked, apart=apart)
-        return Departures(tuple(statistics), "", blocked, unrolled, apart, unseen)
-
-    def _relative(self, name: str) -> bool:
-        return name == "field" and self.calibration.relative
-
     def _unusable(self, name: str, free: bool) -> str:
         """Why no limit on an observable can be passed; empty where it can."""
-        if self._relative(name):
-            return "the calibration is relative: field = 1, not nT"
+        if name == "field" and self.calibration.relative:
+            return RELATIVE_FIELD
         return "it rests on a direction that the calibration leaves undetermined" if free else ""
 
     def _free_spread(self, name: str, index: Ints) -> bool:
@@ -282,10 +271,18 @@ class RollTest:
             return False
         rows = np.nan_to_num(self.calibration.sensitivity(name, self.readings)[index])
         moved = rows @ self.calibration.free_directions.transpose()
-        size = {"g": 1.0, "nT": self.calibration.earth.get("field", 1.0)}.get(
-            OBSERVABLES[name].unit, 1.0
-        )
+        size = self.calibration.earth.get("field", 1.0) if OBSERVABLES[name].unit == "nT" else 1.0
         return bool((np.ptp(moved, axis=0) > FREE_SHARE * size).any())
+
+
+def _outcome(
+    statistics: list[Statistic], blocked: str, unrolled: bool, apart: tuple[str, ...],
+    unseen: bool = False,
+) -> Departures:  # fmt: skip
+    """The statistics, without those of a field that is not in nT."""
+    if blocked == RELATIVE_FIELD:
+        return Departures(blocked=blocked, apart=apart)
+    return Departures(tuple(statistics), "", blocked, unrolled, apart, unseen)
 
 
 def _gap(circle: Coverage, most: float) -> str:

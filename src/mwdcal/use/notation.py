@@ -124,23 +124,24 @@ class _Part:
 
 
 def _one(part: _Part, notation: str, temperature: float | str) -> Notation:
-    triad, profile = part.triad, part.profile
+    """One triad in a notation, at a temperature or as a course."""
+    triad, permutation = part.triad, part.profile.permutation
     _refuse(triad, notation, temperature)
-    permutation = profile.permutation
-    scale = np.full(3, 1.0 if profile.scale is None else profile.scale)
+    scale = np.full(3, 1.0 if part.profile.scale is None else part.profile.scale)
     course = isinstance(temperature, str)
     tau = 0.0 if isinstance(temperature, str) else temperature - part.reference
 
     def values(params: AnyArray) -> dict[str, AnyArray]:
         if notation == triad.model:
-            return _own_factors(params, permutation, scale)
+            return _stored_factors(params, permutation, scale)
         if course and triad.order:
             form = _forward_course if notation == "forward" else _affine_course
             return form(params, permutation, scale)
         matrix, offset = _affine(params, triad, tau)
         forms = _steady(notation, matrix @ permutation / scale, offset, permutation)
-        lead = course and notation != "factors"
-        return {name: value[None] for name, value in forms.items()} if lead else forms
+        if course and notation != "factors":
+            return {name: value[None] for name, value in forms.items()}
+        return forms
 
     return _propagate(values, part)
 
@@ -154,22 +155,25 @@ def _refuse(triad: TriadCalibration, notation: str, temperature: float | str) ->
             "mwdcal apply."
         )
     model = "polynomial" if notation == "affine" else "factors"
-    if not triad.order or triad.model == model:
-        return
+    if triad.order and triad.model != model and (notation == "factors" or temperature == COURSE):
+        raise _quotient(triad, notation, model)
+
+
+def _quotient(triad: TriadCalibration, notation: str, model: str) -> InputError:
+    """The error of a notation that only another model has as polynomials of temperature."""
     what = f"the {triad.name} has the model '{triad.model}' of order {triad.order} in temperature"
     if notation == "factors":
-        raise InputError(
+        return InputError(
             f"{what}: its factors are no polynomials of temperature. Use `notation` affine, "
             "for one temperature or with `temperature` course, or `notation` forward for one "
-            "temperature, or calibrate with --model factors."
+            "temperature, or calibrate with `model` factors."
         )
-    if temperature == COURSE:
-        able = "affine" if model == "factors" else "forward or factors"
-        raise InputError(
-            f"{what}: its {notation} notation is a quotient of polynomials of temperature and has "
-            f"no coefficients by power. Use `notation` {able}, or a number in °C for "
-            f"`temperature`, or calibrate with --model {model}."
-        )
+    able = "affine" if model == "factors" else "forward or factors"
+    return InputError(
+        f"{what}: its {notation} notation is a quotient of polynomials of temperature and has "
+        f"no coefficients by power. Use `notation` {able}, or a number in °C for "
+        f"`temperature`, or calibrate with `model` {model}."
+    )
 
 
 def _affine(params: AnyArray, triad: TriadCalibration, tau: float) -> tuple[AnyArray, AnyArray]:
@@ -198,7 +202,7 @@ def _steady(
     return {"SF": scale[:, None], "B": bias[:, None], "m": -mixing * (1 - np.eye(3))}
 
 
-def _own_factors(params: AnyArray, permutation: Array, scale: Array) -> dict[str, AnyArray]:
+def _stored_factors(params: AnyArray, permutation: Array, scale: Array) -> dict[str, AnyArray]:
     """Stored factors, tool axes and nominal units, to channels and raw units: exact."""
     gain, bias, mixing = factor_parts(params)
     back = permutation.transpose()
@@ -228,15 +232,10 @@ def _propagate(values: Callable[[AnyArray], dict[str, AnyArray]], part: _Part) -
     """Values and covariance; derivatives by complex step, exact to rounding."""
     params = np.array(part.triad.parameters)
     notation = {name: np.asarray(value.real) + 0.0 for name, value in values(params).items()}
-    columns = []
-    for index in range(len(params)):
-        step = np.zeros(len(params), complex)
-        size = max(abs(params[index]), 1.0) * 1e-30
-        step[index] = 1j * size
-        columns.append(
-            np.concatenate([v.imag.ravel() / size for v in values(params + step).values()])
-        )
-    jacobian = np.stack(columns, -1)
+    sizes = np.maximum(np.abs(params), 1.0) * 1e-30
+    changed = (values(params + 1j * step) for step in np.diag(sizes))
+    columns = [np.concatenate([v.imag.ravel() for v in each.values()]) for each in changed]
+    jacobian = np.stack(columns, -1) / sizes
     spread = jacobian @ part.covariance @ jacobian.transpose()
     moved = np.abs(jacobian @ part.free.transpose()).max(-1, initial=0.0)
     loose = moved > FREE_SHARE * part.sizes(notation)

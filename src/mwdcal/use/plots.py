@@ -26,8 +26,8 @@ from mwdcal.geometry.vectors import Array
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.axis import Axis
+    from matplotlib.contour import ContourSet
     from matplotlib.figure import Figure
-    from matplotlib.patheffects import AbstractPathEffect
 
 BEFORE, AFTER, MARKED, BAND = "#6b7280", "#0072b2", "#d55e00", "#dbe7f0"
 AXES = {"x": AFTER, "y": MARKED, "z": "#111827"}
@@ -184,9 +184,7 @@ def _by_order(axes: Axes, rows: Sequence[OrderScore]) -> None:
     axes.set_yscale("log")
     wide = np.nanmax([inside, ends, noise]) > 30 * np.nanmin([inside, ends, noise])
     plain_numbers(axes.yaxis, *((1.0,) if wide else (1.0, 2.0, 5.0)))
-    axes.set_xticks(
-        where, [f"{row.order}\nchosen" if row.chosen else str(row.order) for row in rows]
-    )
+    axes.set_xticks(where, [f"{row.order}" + "\nchosen" * row.chosen for row in rows])
     axes.margins(x=0.08, y=0.12)
     axes.set_xlabel("order")
     axes.set_ylabel("error, " + rows[0].unit.partition(" ")[0])
@@ -196,39 +194,39 @@ def _stems(
     axes: Axes, rows: Sequence[StationRow], values: Sequence[float], colour: str, marker: str
 ) -> None:
     """Stems over the stations; the ones to re-shoot have a triangle and their label."""
-    from matplotlib.patheffects import withStroke
-
     where, heights = np.arange(len(rows)), np.asarray(values, float)
     marked = np.array([row.reshoot for row in rows])
     small = 3.6 if len(rows) <= 80 else 2.2
-    gaps = np.full(len(rows), np.nan)
-    stems = np.stack([np.zeros(len(rows)), heights, gaps], -1).ravel()
+    stems = np.stack([np.zeros_like(heights), heights, np.full(len(rows), np.nan)], -1).ravel()
     axes.plot(np.repeat(where, 3), stems, color=colour, lw=0.7, alpha=0.6)
-    axes.plot(
-        where[~marked], heights[~marked], marker, color=colour, ms=small, mfc="white", mew=0.9
-    )
+    plain = where[~marked], heights[~marked]
+    axes.plot(*plain, marker, color=colour, ms=small, mfc="white", mew=0.9)
     axes.plot(where[marked], heights[marked], "^", color=MARKED, ms=6)
-    halo = [withStroke(linewidth=2, foreground="white")]
     for index in np.flatnonzero(marked & ~np.isnan(heights)).tolist():
-        below = heights[index] < 0
-        axes.annotate(
-            f"station {rows[index].station}", (float(where[index]), float(heights[index])),
-            (5, -3 if below else 3), textcoords="offset points", va="top" if below else "bottom",
-            color="#9a3d00", fontsize=7, path_effects=halo,
-        )  # fmt: skip
+        _name_station(axes, index, float(heights[index]), rows[index].station)
     axes.grid(axis="x", visible=False)
     axes.margins(x=0.02, y=0.16)
     _station_axis(axes, [row.station for row in rows])
+
+
+def _name_station(axes: Axes, where: float, height: float, label: str) -> None:
+    """A station's label at the end of its stem."""
+    from matplotlib.patheffects import withStroke
+
+    axes.annotate(
+        f"station {label}", (float(where), height), (5, -3 if height < 0 else 3),
+        textcoords="offset points", va="top" if height < 0 else "bottom", color="#9a3d00", fontsize=7,
+        path_effects=[withStroke(linewidth=2, foreground="white")],
+    )  # fmt: skip
 
 
 def _station_axis(axes: Axes, labels: Sequence[str]) -> None:
     """Station labels below: as many as are legible."""
     place = axes.get_subplotspec()
     room = 96 if place is None or place.get_gridspec().ncols == 1 else 40
-    longest = max(len(label) for label in labels)
-    step = max(1, -(-len(labels) * (min(longest, 12) + 1) // room))
-    shown = [i for i in range(len(labels)) if i % step == 0]
-    axes.set_xticks(shown, [labels[i][:12] for i in shown])
+    longest = min(max(map(len, labels)), 12)
+    step = max(1, -(-len(labels) * (longest + 1) // room))
+    axes.set_xticks(range(0, len(labels), step), [label[:12] for label in labels[::step]])
     axes.set_xlabel("station")
 
 
@@ -264,17 +262,20 @@ def _contours(axes: Axes, x: Array, y: Array, values: Array) -> None:
     from matplotlib.patheffects import withStroke
 
     levels = contour_levels(values)
-    shades = mpl.colormaps["Blues"](
-        np.linspace(0.06, 0.72, len(levels) - 1)
-    )  # a grey print keeps the order
+    # a grey print keeps the order
+    shades = mpl.colormaps["Blues"](np.linspace(0.06, 0.72, len(levels) - 1))
     drawn = np.ma.masked_invalid(values)
     norm = BoundaryNorm(levels, len(levels) - 1)
     axes.set_facecolor("#f3f4f6")
     filled = axes.contourf(x, y, drawn, levels=levels, cmap=ListedColormap(shades), norm=norm)
     lines = axes.contour(x, y, drawn, levels=levels[1:-1], colors="#374151", linewidths=0.4)
-    halo: list[AbstractPathEffect] = [withStroke(linewidth=1.6, foreground="white")]
     for text in axes.clabel(lines, fmt=_short, fontsize=6, colors="#111827"):
-        text.set_path_effects(halo)
+        text.set_path_effects([withStroke(linewidth=1.6, foreground="white")])
+    _colour_bar(axes, filled, levels)
+
+
+def _colour_bar(axes: Axes, filled: ContourSet, levels: Array) -> None:
+    """The bar below the contours, with up to six of their numbers."""
     bar = axes.figure.colorbar(
         filled, ax=axes, orientation="horizontal", aspect=22, pad=0.03, spacing="uniform"
     )

@@ -15,7 +15,7 @@ NEAR_VERTICAL = np.radians(5.0)
 """Nearer to vertical than this azimuth and toolface are not judged."""
 ROLL_SET = 3
 """Fewest stations that make a roll set."""
-_DIGITS = 3
+_ANGLE_DIGITS = 3
 _BLANK = -1.0
 _ROUNDING = 1e-9
 
@@ -64,7 +64,7 @@ def _directions(readings: Readings) -> Iterator[tuple[str, Bools, bool, bool]]:
     if not known.any() and (group < 0).all():
         yield "all stations", np.ones(readings.count, bool), True, True
         return
-    key = np.round(np.stack([inclination, np.nan_to_num(azimuth, nan=_BLANK)], -1), _DIGITS)
+    key = np.round(np.stack([inclination, np.nan_to_num(azimuth, nan=_BLANK)], -1), _ANGLE_DIGITS)
     for pair in np.unique(key[(group < 0) & known], axis=0):
         given = bool(pair[1] != _BLANK)
         where = f"azimuth {pair[1]:g}°" if given else "azimuth not given"

@@ -18,7 +18,7 @@ from mwdcal.geometry.vectors import Array, Bools, inverse
 
 HARMONICS = np.arange(1, 3)
 COEFFICIENTS = 1 + 2 * len(HARMONICS)
-GAP = np.radians(90.0)
+WIDEST_GAP = np.radians(90.0)
 """The widest part of the circle without a toolface that a roll test may have."""
 OPEN = np.radians(120.0)
 """The widest part of the circle without a toolface on which limits on errors can be passed."""
@@ -26,12 +26,12 @@ SLACK = np.radians(5.0)
 """Tolerance of a gap: toolfaces set by hand are off by some degrees."""
 CARRIED = 2.0
 """Largest standard uncertainty of the curve anywhere on the circle, in noises of one reading."""
-CHANCE = 1e-3
+DEPARTURE_CHANCE = 1e-3
 """Residuals from the curve that are less likely than this are not noise alone."""
-STEPS = 120
+CURVE_POINTS = 120
 """Toolfaces at which a curve is evaluated: its range is at most 0.14 % too small."""
 PAIRS = 500
-SEED = 1
+RANDOM_SEED = 1
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Coverage:
     @property
     def rolled(self) -> Bools:
         """Whether the toolfaces determine a curve of two harmonics all round."""
-        return np.asarray((self.gap <= GAP + SLACK) & (self.carried <= CARRIED))
+        return np.asarray((self.gap <= WIDEST_GAP + SLACK) & (self.carried <= CARRIED))
 
 
 @dataclass(frozen=True)
@@ -82,12 +82,12 @@ class Curve:
     @property
     def rough(self) -> Bools:
         """Where the residuals are larger than noise alone would give: the error is not smooth."""
-        return np.asarray(self._chance() < CHANCE)
+        return np.asarray(self._chance() < DEPARTURE_CHANCE)
 
     @property
     def calm(self) -> Bools:
         """Where the residuals are smaller than the stated noise would give: it is overstated."""
-        return np.asarray((self._chance() > 1 - CHANCE) & (self.freedom > 0))
+        return np.asarray((self._chance() > 1 - DEPARTURE_CHANCE) & (self.freedom > 0))
 
     @property
     def scale(self) -> Array:
@@ -114,7 +114,7 @@ def basis(toolface: Array) -> Array:
     return np.concatenate([np.ones((*toolface.shape, 1)), np.cos(angle), np.sin(angle)], -1)
 
 
-CIRCLE = np.arange(STEPS) * 2 * np.pi / STEPS
+CIRCLE = np.arange(CURVE_POINTS) * 2 * np.pi / CURVE_POINTS
 
 
 def coverage(toolface: Array) -> Coverage:
@@ -209,7 +209,7 @@ def _root(covariance: Array) -> Array:
 @cache
 def _draws() -> Array:
     """Zero, then draws (2 · PAIRS, 5) in opposite pairs, of mean zero and covariance one exactly."""
-    drawn = np.random.default_rng(SEED).normal(size=(PAIRS, COEFFICIENTS))
+    drawn = np.random.default_rng(RANDOM_SEED).normal(size=(PAIRS, COEFFICIENTS))
     square = drawn.swapaxes(-1, -2) @ drawn / PAIRS
     even = np.linalg.solve(np.linalg.cholesky(square), drawn.swapaxes(-1, -2)).swapaxes(-1, -2)
     return np.concatenate([np.zeros((1, COEFFICIENTS)), even, -even])

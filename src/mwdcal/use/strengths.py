@@ -20,19 +20,19 @@ from mwdcal.errors import InputError
 from mwdcal.geometry.observables import OUTPUTS
 from mwdcal.geometry.vectors import AnyArray, Array
 
-SHARE = 0.05
+OFF_REFERENCE = 0.05
 """Departure from the reference of the row, as a share of it, from which a strength is off."""
-MOST = 0.5
+MOST_OFF = 0.5
 """A table of which more than this share of the rows is off is refused."""
 ALIKE = {"gravity": 1.5, "field": 6.0}
 """Greatest over least strength up to which one unit may explain all rows."""
 JUDGED_STRENGTHS = ("gravity", "field")
-UNITS: dict[str, dict[str, float]] = {
+STRENGTH_UNITS: dict[str, dict[str, float]] = {
     "gravity": {"g": 1.0, "m/s²": 9.80665, "mg": 1000.0},
     "field": {"nT": 1.0, "µT": 1e-3, "mT": 1e-6, "gauss": 1e-5, "mG": 1e-2},
 }
 """Units in which readings come, per g or nT."""
-REASONS = {
+STRENGTH_REASONS = {
     "gravity": "the tool moved while it was read, or a reading is in another unit.",
     "field": "iron or a current was near, or a reading is in another unit.",
 }
@@ -73,7 +73,7 @@ def judged(
         earth = (values < low) | (values > high)
         reference = np.zeros(values.shape, bool)
         if name in known and not free:
-            reference = np.abs(values - known[name]) > SHARE * known[name]
+            reference = np.abs(values - known[name]) > OFF_REFERENCE * known[name]
         strengths[name] = _counted(values, earth, reference)
     return strengths
 
@@ -106,7 +106,7 @@ def findings(strengths: Mapping[str, Strengths]) -> list[Finding]:
     return [
         Finding(
             id=f"implausible-{name}",
-            text=f"{each.off} of {each.rows} rows: {_departure(name, each)}: {REASONS[name]}",
+            text=f"{each.off} of {each.rows} rows: {_departure(name, each)}: {STRENGTH_REASONS[name]}",
         )
         for name, each in strengths.items()
         if each.off
@@ -114,22 +114,22 @@ def findings(strengths: Mapping[str, Strengths]) -> list[Finding]:
 
 
 def _departure(name: str, each: Strengths) -> str:
-    unit, (low, high) = OUTPUTS[name].rpartition("_")[2], EARTH_RANGES[name]
-    unit = "nT" if unit == "nt" else unit
+    unit, (low, high) = "g" if name == "gravity" else "nT", EARTH_RANGES[name]
     reasons = []
     if each.earth:
         reasons.append(f"no place on Earth has it ({low:g}…{high:g} {unit})")
     if each.reference:
-        reasons.append(f"it is more than {SHARE:.0%} off the table's own ref_{OUTPUTS[name]}")
-    ends = dict.fromkeys(f"{end:.3g}" for end in (each.low, each.high))
-    extent = "…".join(ends)
+        reasons.append(
+            f"it is more than {OFF_REFERENCE:.0%} off the table's own ref_{OUTPUTS[name]}"
+        )
+    extent = "…".join(dict.fromkeys(f"{end:.3g}" for end in (each.low, each.high)))
     return f"corrected {name} is {extent} {unit}, and {' and '.join(reasons)}"
 
 
 def check(calibration: Calibration, strengths: Mapping[str, Strengths], source: str) -> None:
     """Refuse a table of which most rows have a strength that is off."""
     for name, each in strengths.items():
-        if each.off > MOST * each.rows:
+        if each.off > MOST_OFF * each.rows:
             raise InputError(
                 f"{source}: at {each.off} of {each.rows} rows "
                 f"{_departure(name, each)}. {_advice(calibration, name, each)}"
@@ -138,23 +138,17 @@ def check(calibration: Calibration, strengths: Mapping[str, Strengths], source: 
 
 def _advice(calibration: Calibration, name: str, each: Strengths) -> str:
     """The likely cause, and what to do."""
-    triad = "accelerometer" if name == "gravity" else "magnetometer"
-    scale = getattr(calibration.profile, triad).scale
-    unit = "g" if name == "gravity" else "nT"
-    if scale is None:
-        nominal, likely = "", ""
-    else:
-        nominal = f" of about {scale:.4g} raw units per {unit}"
-        likely = _likely(name, each, scale)
-    else_ = (
-        " The field of a coil is declared in the tool profile before the calibration: [stand] coil = true."
-        if name == "field" and each.earth
-        else ""
+    triad, unit = ("accelerometer", "g") if name == "gravity" else ("magnetometer", "nT")
+    scale, nominal = getattr(calibration.profile, triad).scale, ""
+    if scale is not None:
+        nominal = f" of about {scale:.4g} raw units per {unit}{_likely(name, each, scale)}"
+    text = (
+        f"The calibration ({calibration.run}) is for {triad} readings{nominal}. Give the readings in the "
+        "units of its run, or the calibration that belongs to them."
     )
-    return (
-        f"The calibration ({calibration.run}) is for {triad} readings{nominal}{likely}. Give the readings in the "
-        f"units of its run, or the calibration that belongs to them.{else_}"
-    )
+    if name == "field" and each.earth:
+        text += " The field of a coil is declared in the tool profile before the calibration: [stand] coil = true."
+    return text
 
 
 def _likely(name: str, each: Strengths, scale: float) -> str:
@@ -163,7 +157,7 @@ def _likely(name: str, each: Strengths, scale: float) -> str:
         return ""
     low, high = EARTH_RANGES[name]
     raw = sqrt(each.low * each.high) * scale
-    for unit, per in UNITS[name].items():
+    for unit, per in STRENGTH_UNITS[name].items():
         if low <= raw / per <= high and not 0.9 < scale / per < 1.1:
             return f"; these look like readings in {unit}"
     return ""

@@ -18,7 +18,7 @@ COVERAGE = 2.0
 """Coverage factor of the guard band and of the remark that a value is close to its limit."""
 WEAK = 0.5
 """A test whose 1σ is a larger share of the limit hardly distinguishes a good tool from a bad one."""
-CLEAR = 3.0
+NAMED_HARMONIC = 3.0
 """Standard uncertainties above which a harmonic is named as a cause."""
 CAUSES = {
     "inclination": (
@@ -132,18 +132,14 @@ def verify(calibration: Calibration, readings: Readings, limits: Limits) -> Verd
         InputError: stations of the fit, temperatures outside the calibrated range, or readings to
             which no limit applies.
     """
-    _check_tool(calibration, readings)
-    _check_independent(calibration, readings)
-    _check_temperature(calibration, readings)
+    for check in (_check_tool, _check_independent, _check_temperature):
+        check(calibration, readings)
     test = RollTest(calibration, readings)
-    outcomes = [("spread", n, limit, test.spread(n)) for n, limit in limits.spread.items()]
-    outcomes += [("error", n, limit, test.error(n)) for n, limit in limits.error.items()]
-    skipped = _skipped({f"{kind} of {n}": outcome.skipped for kind, n, _, outcome in outcomes})
-    judged = [
-        _judged(f"{kind} of {n}", n, limit, outcome, limits.rule == "guarded")
-        for kind, n, limit, outcome in outcomes
-        if not outcome.skipped
-    ]
+    outcomes = [(f"spread of {n}", n, most, test.spread(n)) for n, most in limits.spread.items()]
+    outcomes += [(f"error of {n}", n, most, test.error(n)) for n, most in limits.error.items()]
+    skipped = _skipped({title: outcome.skipped for title, *_, outcome in outcomes})
+    guard = COVERAGE if limits.rule == "guarded" else 0.0
+    judged = [_judged(*outcome, guard) for outcome in outcomes if not outcome[-1].skipped]
     if not judged:
         raise InputError(
             f"{readings.name}: no limit of '{limits.name}' applies: {'; '.join(skipped)}. Add what "
@@ -157,10 +153,7 @@ def verify(calibration: Calibration, readings: Readings, limits: Limits) -> Verd
         run=readings.source,
         stations=readings.count,
         rows=[row for row, _ in judged],
-        findings=[
-            *_findings(calibration, readings, test, skipped),
-            *(finding for _, findings in judged for finding in findings),
-        ],
+        findings=sum((about for _, about in judged), _findings(test, skipped)),
     )
 
 
@@ -172,11 +165,10 @@ def _skipped(reasons: dict[str, str]) -> list[str]:
     return [f"{', '.join(names[reason])} ({reason})" for reason in names if reason]
 
 
-def _findings(
-    calibration: Calibration, readings: Readings, test: RollTest, skipped: Sequence[str]
-) -> list[Finding]:
+def _findings(test: RollTest, skipped: Sequence[str]) -> list[Finding]:
     """Findings about the verdict as a whole, and about limits that were not judged."""
-    findings = [*calibration.change_findings(), *_temperature_findings(calibration, readings)]
+    calibration = test.calibration
+    findings = [*calibration.change_findings(), *_temperature_findings(calibration, test.readings)]
     findings += [Finding(id=u.id, text=f"{u.text}.") for u in calibration.undetermined()]
     if skipped:
         findings.append(Finding(id="not-judged", text=f"not judged: {'; '.join(skipped)}."))
@@ -188,18 +180,16 @@ def _findings(
 def _temperature_findings(calibration: Calibration, readings: Readings) -> Iterable[Finding]:
     if readings.temperature is None:
         return
-    coldest, hottest = float(readings.temperature.min()), float(readings.temperature.max())
+    tested = _span(float(readings.temperature.min()), float(readings.temperature.max()))
     if calibration.temperature_c is None:
         text = (
-            f"the tool was calibrated at unrecorded temperatures, and tested at {_span(coldest, hottest)} °C: "
+            f"the tool was calibrated at unrecorded temperatures, and tested at {tested} °C: "
             "the verdict holds for the temperatures of the test alone."
         )
         yield Finding(id="no-temperature", text=text)
-        return
-    beyond = int(calibration.outside(readings, MARGIN).sum())
-    if beyond:
+    elif beyond := int(calibration.outside(readings, MARGIN).sum()):
         text = (
-            f"{beyond} of {readings.count} stations ({_span(coldest, hottest)} °C) lie outside the calibrated "
+            f"{beyond} of {readings.count} stations ({tested} °C) lie outside the calibrated "
             f"range {_span(*calibration.temperature_c)} °C. The calibration has no temperature terms: drift "
             "over the difference counts as its error."
         )
@@ -211,8 +201,7 @@ def _span(low: float, high: float) -> str:
 
 
 def _check_tool(calibration: Calibration, readings: Readings) -> None:
-    other = calibration.other_tool(readings)
-    if other is not None:
+    if other := calibration.other_tool(readings):
         ours, theirs = other
         raise InputError(
             f"{readings.name} is of tool {theirs}, the calibration of tool {ours}. Verify with a "
@@ -221,11 +210,8 @@ def _check_tool(calibration: Calibration, readings: Readings) -> None:
 
 
 def _check_independent(calibration: Calibration, readings: Readings) -> None:
-    used = [
-        label
-        for label, seen in zip(readings.labels, calibration.used(readings.digest), strict=False)
-        if seen
-    ]
+    seen = calibration.used(readings.digest)
+    used = [label for label, old in zip(readings.labels, seen, strict=False) if old]
     if used:
         raise InputError(
             f"{readings.name}: {len(used)} of {readings.count} stations were in the fit (first: "
@@ -247,19 +233,11 @@ def _check_temperature(calibration: Calibration, readings: Readings) -> None:
 
 
 def _judged(
-    title: str, name: str, limit: float, outcome: Departures, guarded: bool
+    title: str, name: str, limit: float, outcome: Departures, guard: float
 ) -> tuple[VerdictRow, list[Finding]]:
     """The decision on one limit, by the worst set or station, and the findings about it."""
-    guard = COVERAGE if guarded else 0.0
-    inside = OBSERVABLES[name].unit
+    inside, findings = OBSERVABLES[name].unit, [*_partial(title, outcome)]
     factor, unit = (float(np.degrees(1)), "°") if inside == "rad" else (1.0, inside)
-    findings = [Finding(id="partly-judged", text=f"{title}: {text}.") for text in outcome.apart]
-    if outcome.unseen:
-        text = (
-            f"{title}: the toolfaces hardly show one of the two harmonics of a turn (four at right "
-            "angles do not show a misalignment of x and y): add toolfaces between them."
-        )
-        findings.append(Finding(id="harmonic-unseen", text=text))
     most = max((each.raw * factor for each in outcome.statistics), default=None)
     if outcome.blocked:
         row = VerdictRow(
@@ -270,12 +248,24 @@ def _judged(
     worst = max(outcome.statistics, key=lambda each: each.value + guard * each.uncertainty)
     value, sd = worst.value * factor, worst.uncertainty * factor
     passed = value + guard * sd <= limit
+    note, harmonics = _remark(value, sd, limit, passed), _harmonics(worst, factor)
     row = VerdictRow(
         name=title, unit=unit, value=value, uncertainty=sd, limit=limit, passed=passed,
-        note=f"{worst.where}{_remark(value, sd, limit, passed)}", raw=most,
-        harmonics=_harmonics(worst, factor),
+        note=f"{worst.where}{note}", raw=most, harmonics=harmonics,
     )  # fmt: skip
     return row, [*findings, *_weak(row), *_causes(row, name, worst)]
+
+
+def _partial(title: str, outcome: Departures) -> Iterable[Finding]:
+    """What of the run was not judged."""
+    for text in outcome.apart:
+        yield Finding(id="partly-judged", text=f"{title}: {text}.")
+    if outcome.unseen:
+        text = (
+            f"{title}: the toolfaces hardly show one of the two harmonics of a turn (four at right "
+            "angles do not show a misalignment of x and y): add toolfaces between them."
+        )
+        yield Finding(id="harmonic-unseen", text=text)
 
 
 def _remark(value: float, sd: float, limit: float, passed: bool) -> str:
@@ -289,8 +279,8 @@ def _remark(value: float, sd: float, limit: float, passed: bool) -> str:
 def _harmonics(worst: Statistic, factor: float) -> tuple[float, float] | None:
     if worst.curve is None:
         return None
-    first, second = (float(a) * factor for a in worst.curve.amplitudes)
-    return first, second
+    first, second = worst.curve.amplitudes.tolist()
+    return first * factor, second * factor
 
 
 def _weak(row: VerdictRow) -> Iterable[Finding]:
@@ -310,12 +300,9 @@ def _causes(row: VerdictRow, name: str, worst: Statistic) -> Iterable[Finding]:
     unit = row.unit if row.unit == "°" else f" {row.unit}"
     causes = CAUSES.get(name, CAUSES["azimuth"])
     size = worst.curve.amplitudes / np.maximum(worst.curve.amplitude_sd, 1e-30)
+    each = zip(("first", "second"), row.harmonics, causes, size > NAMED_HARMONIC, strict=True)
     parts = [
-        f"{ordinal} harmonic {amplitude:.2g}{unit} ({cause})"
-        for ordinal, amplitude, cause, clear in zip(
-            ("first", "second"), row.harmonics, causes, size > CLEAR, strict=True
-        )
-        if clear
+        f"{which} harmonic {a:.2g}{unit} ({cause})" for which, a, cause, clear in each if clear
     ]
     if parts:
         text = f"{row.name} over a turn of toolface: {'; '.join(parts)}."

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import click
 
 from mwdcal.app.commands import options
-from mwdcal.app.messages import lines, print_result, say
+from mwdcal.app.messages import as_typed, lines, print_result, say
 from mwdcal.app.text import one_line
 from mwdcal.errors import FitError
 
@@ -51,6 +52,8 @@ def command(
     for line in lines(unused):
         say(line)
     result = compare(readings, profile, Options(order=order_of(order), seed=seed), progress=say)
+    rows = tuple(replace(row, refused=as_typed(row.refused)) for row in result.rows)
+    result = replace(result, rows=rows)
     if report:
         atomic.write(
             report, page.render(result, profile.name, readings.run_sha256, readings.profile_sha256)

@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 
 from mwdcal.app.commands import options
-from mwdcal.app.messages import print_result
+from mwdcal.app.messages import findings_as_typed, print_result
 
 
 @options.command()
@@ -41,7 +41,8 @@ def command(
     fitted = documents.read(calibration)
     readings, _ = runs.read_run(run, fitted.profile, decimal=decimal)
     result = verify(fitted, readings, load_limits(limits))
-    result = replace(result, findings=result.findings + unused_columns(readings.unused))
+    findings = findings_as_typed(result.findings + unused_columns(readings.unused))
+    result = replace(result, findings=findings)
     shown = result if as_json else screen(result, fitted.tool, readings.metadata)
     if report:
         from mwdcal.app.pages.report import render

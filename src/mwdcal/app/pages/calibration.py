@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from mwdcal.app.messages import lines
+from mwdcal.app.messages import findings_as_typed, lines
 from mwdcal.app.pages.page import written
 from mwdcal.app.text import chance, number, one_line, quantity, table
 from mwdcal.calibration.automatic.nonlinearity import CurveScore
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 MOST_RESHOOTS = 12
 """Most stations to re-shoot that the screen names."""
 PROFILE = " (see [stand] of the tool profile)"
-RUN = ("run", "stations", "excluded", "temperature_c", "method", "options", "seed")
+RUN_FIELDS = ("run", "stations", "excluded", "temperature_c", "method", "options", "seed")
 TRIAD = ("model", "order", "rank", "size", "undetermined", "variance_factor", "misfit_probability")
 ACCURACY = ("budget", "assumed_exact", "constants", "stand", "findings", "orders")
 """Parts of the record that the summary for machines repeats."""
@@ -44,11 +44,12 @@ def summary(
 ) -> dict[str, Any]:
     """The result for machines."""
     return {
-        **_attributes(calibration, RUN),
+        **_attributes(calibration, RUN_FIELDS),
         "triads": {triad.name: _attributes(triad, TRIAD) for triad in calibration.triads},
         **_attributes(calibration, ("errors", "measures")),
         "accuracy_1sigma_deg": typical_accuracy(calibration),
         **_attributes(calibration, ACCURACY),
+        "findings": findings_as_typed(calibration.findings),
         "nonlinearity": [msgspec.to_builtins(score) for score in choice.curves],
         "calibration": str(output),
         "report": str(report or ""),

@@ -45,14 +45,14 @@ STATISTICS = (
     ("RMSE left out", "left out", "rmse"),
 )
 """Measures of the vector error: title, of which fit, and name."""
-MARK = "*"
+CONVENTION_MARK = "*"
 """Behind a figure that rests on a convention."""
-COLOURS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#d55e00", "#4b5563")
-MARKERS = ("o", "s", "^", "x", "D", "v")
-LOOKS = dict(zip(EVIDENCE, zip(COLOURS, MARKERS, strict=True), strict=True))
+METHOD_COLOURS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#d55e00", "#4b5563")
+METHOD_MARKERS = ("o", "s", "^", "x", "D", "v")
+LOOKS = dict(zip(EVIDENCE, zip(METHOD_COLOURS, METHOD_MARKERS, strict=True), strict=True))
 MOST_STATIONS = 240
 """A longer run shows the largest error of each of so many equal parts of it."""
-Rows = list[list[str]]
+TableRows = list[list[str]]
 """Rows of a table: what each is, then its cells."""
 
 
@@ -109,7 +109,7 @@ def heading(comparison: Comparison) -> list[str]:
     return [part for part in parts if part]
 
 
-def figures(comparison: Comparison) -> Rows:
+def figures(comparison: Comparison) -> TableRows:
     """All figures of the nominal tool ("before"), then of every method."""
     return [
         *errors(comparison, "held_out", "rms left out"),
@@ -124,7 +124,7 @@ def _label(*parts: str) -> str:
     return ", ".join(part for part in parts if part)
 
 
-def errors(comparison: Comparison, kind: str, how: str = "") -> Rows:
+def errors(comparison: Comparison, kind: str, how: str = "") -> TableRows:
     """Root mean square errors by observable, before and of every method.
 
     `kind` is "held_out" or "in_sample", and `how` what the rows say of it.
@@ -132,7 +132,7 @@ def errors(comparison: Comparison, kind: str, how: str = "") -> Rows:
     rows = []
     for name, unit in comparison.units.items():
         cells = [
-            number(getattr(row, kind)[name]) + MARK * (name in row.resting)
+            number(getattr(row, kind)[name]) + CONVENTION_MARK * (name in row.resting)
             for row in able(comparison.rows)
         ]
         what = _label(TITLES.get(name, name), how, unit)
@@ -140,7 +140,7 @@ def errors(comparison: Comparison, kind: str, how: str = "") -> Rows:
     return rows
 
 
-def measures(comparison: Comparison) -> Rows:
+def measures(comparison: Comparison) -> TableRows:
     """Moradi's four measures of the vector error by triad, and the last of them left out."""
     rows = []
     for before in comparison.measures_before:
@@ -155,10 +155,10 @@ def _measure(row: Row, triad: str, when: str, key: str) -> str:
     """One measure of the vector error of a triad by one method."""
     values = [getattr(m, key) for m in row.measures if (m.triad, m.when) == (triad, when)]
     rank, size = row.ranks[triad]
-    return number(values[0] if values else None) + MARK * (rank < size)
+    return number(values[0] if values else None) + CONVENTION_MARK * (rank < size)
 
 
-def effort(comparison: Comparison) -> Rows:
+def effort(comparison: Comparison) -> TableRows:
     """Rank, iterations and time of every method."""
     rows = able(comparison.rows)
     ranks = [
@@ -186,8 +186,10 @@ def notes(comparison: Comparison) -> list[str]:
     ]
     if comparison.measures_before:
         lines.append("|e|: length of the vector error, as a share of the reference vector (Moradi)")
-    if any(MARK in cell for row in figures(comparison) for cell in row):
-        lines.append(f"{MARK} rests on a direction that the method leaves free: kept at nominal")
+    if any(CONVENTION_MARK in cell for row in figures(comparison) for cell in row):
+        lines.append(
+            f"{CONVENTION_MARK} rests on a direction that the method leaves free: kept at nominal"
+        )
     return lines
 
 
@@ -212,7 +214,7 @@ def gauge(comparison: Comparison) -> str:
 
 
 @dataclass(frozen=True)
-class Parameter:
+class ComparedParameter:
     """A parameter of a triad: values and standard uncertainties by method, NaN: undetermined."""
 
     title: str
@@ -226,7 +228,7 @@ class Parameter:
         return [measured(*pair) for pair in zip(self.values, self.sd, strict=True)]
 
 
-def parameters_of(comparison: Comparison, triad: str) -> list[Parameter]:
+def parameters_of(comparison: Comparison, triad: str) -> list[ComparedParameter]:
     """The parameters of a triad: its factors, then what was taken out of them."""
     rows = able(comparison.rows)
     factors, taken_out = [r.parameters[triad] for r in rows], [r.taken_out[triad] for r in rows]
@@ -246,9 +248,11 @@ def parameters_of(comparison: Comparison, triad: str) -> list[Parameter]:
 
 def _parameter(
     title: str, unit: str, notations: Sequence[Notation], key: str, at: tuple[int, ...]
-) -> Parameter:
+) -> ComparedParameter:
     values = [float(n.values[key][at]) for n in notations]
-    return Parameter(title, unit, values, [float(n.uncertainty[key][at]) for n in notations])
+    return ComparedParameter(
+        title, unit, values, [float(n.uncertainty[key][at]) for n in notations]
+    )
 
 
 def document(comparison: Comparison) -> dict[str, Any]:
@@ -401,7 +405,7 @@ def draw_parameters(comparison: Comparison) -> Figure:
     return figure
 
 
-def _differences(axes: Axes, rows: Sequence[Row], shown: Sequence[Parameter]) -> None:
+def _differences(axes: Axes, rows: Sequence[Row], shown: Sequence[ComparedParameter]) -> None:
     """Parameters of every method less those of the first, with error bars, in its 1σ."""
     values = np.array([parameter.values for parameter in shown])
     sd = np.array([parameter.sd for parameter in shown])

@@ -14,13 +14,13 @@ from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.files import documents
 from mwdcal.use.notation import COURSE, Notation, convert, powers
 
-SCHEMA_VERSION = 1
+CONVERSION_SCHEMA_VERSION = 1
 """Version of the JSON document."""
 UNRECORDED = (
     "the calibration was made at unrecorded temperatures, without temperature terms: the values are "
     "the same at any temperature, and nothing says how good they are at {:g} °C."
 )
-OUTSIDE = (
+OUTSIDE_RANGE = (
     "{:g} °C lies outside the calibrated range {}: the values are extrapolated, and their "
     "uncertainties do not hold. Choose a temperature inside, or calibrate over a wider range."
 )
@@ -65,7 +65,9 @@ def temperature_findings(
     if calibration.unrecorded(there):
         return [Finding(id="no-temperature", text=UNRECORDED.format(at))]
     if calibration.outside(there).any():
-        return [Finding(id="outside-temperature", text=OUTSIDE.format(at, _range(calibration)))]
+        return [
+            Finding(id="outside-temperature", text=OUTSIDE_RANGE.format(at, _range(calibration)))
+        ]
     return []
 
 
@@ -82,7 +84,7 @@ def document(converted: Converted) -> dict[str, Any]:
     if at is None or (converted.notation == "factors" and not course):
         at = calibration.reference_temperature
     return {
-        "schema_version": SCHEMA_VERSION,
+        "schema_version": CONVERSION_SCHEMA_VERSION,
         **_source(converted),
         "calibrated_temperature_c": calibration.temperature_c,
         "field_unit": calibration.field_unit,

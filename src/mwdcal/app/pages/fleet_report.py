@@ -35,9 +35,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-RELATIVE = "field = 1"
+RELATIVE_KIND = "field = 1"
 """The kind of magnetometers of which the strength of the field is not known."""
-COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#4b5563")
+TRIAD_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#4b5563")
 DASHES: tuple[Any, ...] = ("-", "--", ":", "-.", (0, (5, 1)), (0, (1, 1)))
 BINS = (12, 40)
 """Fewest and most bins: as many as half the root of the number of tools."""
@@ -47,18 +47,18 @@ TICKS = 12
 """Numbers along the axes of a row of panels: more would run into each other."""
 FAR = 6.0
 """Robust standard deviations from the fleet's median beyond which a tool is an outlier."""
-FEWEST = 20
+FEWEST_TOOLS = 20
 """Sound tools without which there is no fleet to be an outlier of."""
 SPREAD = 1.4826
 """Standard deviation of a normal variable by its median absolute deviation."""
-OWN_OR_CROSS = ("gain", "square", "cube")
+ONE_AXIS_OR_TWO = ("gain", "square", "cube")
 """Parameters of one axis or of two: a panel for each."""
 Panel = tuple[str, str, Mapping[str, Array]]
 """Title, name of the axis, and values by name."""
 
 
 @dataclass(frozen=True)
-class Parameter:
+class FleetParameter:
     """A column of parameters over the sound tools, NaN where a tool does not have it.
 
     Magnetometers calibrated to nT and to a field of one are of different `kind`.
@@ -136,7 +136,7 @@ def render(calibrations: Path, summary: FleetSummary) -> str:
         outliers=_outliers(tools, parameters),
         suspects=_suspects(tools),
         far=FAR,
-        fewest=FEWEST,
+        fewest=FEWEST_TOOLS,
         suspect=NOISE_RATIO,
     )
 
@@ -162,7 +162,7 @@ def _banner(summary: FleetSummary) -> dict[str, str]:
     return banner("good", "All calibrated", headline, after)
 
 
-def _parameters(tools: SoundTools) -> list[Parameter]:
+def _parameters(tools: SoundTools) -> list[FleetParameter]:
     """All columns of parameters, with units that people use."""
     parameters = []
     kinds = _kinds(tools)
@@ -176,7 +176,7 @@ def _parameters(tools: SoundTools) -> list[Parameter]:
             values, sd = (np.where(which, v, np.nan) for v in (every, spread))
             if not np.isnan(values).all():
                 unit, factor = _unit(rest, triad, bool(kind), nominal)
-                each = Parameter(triad, kind, _title(rest), unit, values * factor, sd * factor)
+                each = FleetParameter(triad, kind, _title(rest), unit, values * factor, sd * factor)
                 parameters.append(each)
     return sorted(parameters, key=lambda each: each.sensors)
 
@@ -185,7 +185,7 @@ def _kinds(tools: SoundTools) -> dict[str, Bools]:
     """Which tools are calibrated to nT, and which to a field of one: they do not compare."""
     units = tools.words("field_unit")
     relative = np.array([unit not in (None, "nT") for unit in units])
-    kinds = {"": units == "nT", RELATIVE: relative}
+    kinds = {"": units == "nT", RELATIVE_KIND: relative}
     return {name: which for name, which in kinds.items() if which.any()}
 
 
@@ -195,7 +195,7 @@ def _nominal(tools: SoundTools, kinds: Mapping[str, Bools]) -> str:
     nT, or none where the profile states no scale: then they are relative too, and gains near 1, as
     the fit refuses others. In nT a gain is one over the strength, and a scale is the strength.
     """
-    which = kinds.get(RELATIVE, np.zeros(tools.count, bool))
+    which = kinds.get(RELATIVE_KIND, np.zeros(tools.count, bool))
     for name in ("gain_xx", "scale_x", "radius"):
         if f"{TRIADS[1]}_{name}" in tools.names:
             values = _comparable(tools, TRIADS[1], name)[which]
@@ -239,7 +239,7 @@ def _title(name: str) -> str:
 
 
 def _figures(
-    tools: SoundTools, parameters: list[Parameter], estimated: list[str]
+    tools: SoundTools, parameters: list[FleetParameter], estimated: list[str]
 ) -> dict[str, Figure]:
     """Distributions of the parameters, and of residuals, noise and accuracy."""
     triads = dict.fromkeys(p.triad for p in parameters)
@@ -269,15 +269,15 @@ def _noise(tools: SoundTools, triad: str) -> Panel:
         return title, "1σ, mg", {triad: 1e3 * values}
     kinds = _kinds(tools)
     kind, which = next(iter(kinds.items()))
-    relative = kind == RELATIVE and not _nominal(tools, kinds)
+    relative = kind == RELATIVE_KIND and not _nominal(tools, kinds)
     return title, "1σ of the field" if relative else "1σ, nT", {triad: values[which]}
 
 
 def _outliers(
-    tools: SoundTools, parameters: list[Parameter]
-) -> list[tuple[Any, Parameter, float, float]]:
+    tools: SoundTools, parameters: list[FleetParameter]
+) -> list[tuple[Any, FleetParameter, float, float]]:
     """Tools far from the fleet: serial, farthest parameter, value, distance; the farthest first."""
-    if tools.count < FEWEST:
+    if tools.count < FEWEST_TOOLS:
         return []
     farthest, which = np.zeros(tools.count), np.zeros(tools.count, int)
     for index, each in enumerate(parameters):
@@ -303,7 +303,7 @@ def _suspects(tools: SoundTools) -> list[tuple[Any, str, float]]:
 
 def distance(values: Array) -> Array:
     """Robust standard deviations (n,) from the median; 0 for few values, or where most are equal."""
-    if np.sum(~np.isnan(values)) < FEWEST:
+    if np.sum(~np.isnan(values)) < FEWEST_TOOLS:
         return np.zeros(len(values))
     away = np.abs(values - np.nanmedian(values))
     spread = SPREAD * np.nanmedian(away)
@@ -311,7 +311,7 @@ def distance(values: Array) -> Array:
 
 
 @plots.styled
-def draw_parameters(parameters: Sequence[Parameter]) -> Figure:
+def draw_parameters(parameters: Sequence[FleetParameter]) -> Figure:
     """Number of tools by value of each steady parameter: a row of panels for each triad."""
     lines = _lines(parameters)
     figure = plots.new_figure("Distributions of the fleet's parameters", 2.1 * len(lines))
@@ -328,12 +328,12 @@ def draw_parameters(parameters: Sequence[Parameter]) -> Figure:
     return figure
 
 
-def _lines(parameters: Sequence[Parameter]) -> list[list[tuple[str, list[Parameter]]]]:
+def _lines(parameters: Sequence[FleetParameter]) -> list[list[tuple[str, list[FleetParameter]]]]:
     """Panels in rows, each row of one triad: title and parameters of a panel."""
-    triads: dict[str, dict[str, list[Parameter]]] = {}
+    triads: dict[str, dict[str, list[FleetParameter]]] = {}
     for each in parameters:
         kind, _, axes = each.title.partition(" ")
-        if kind in OWN_OR_CROSS:
+        if kind in ONE_AXIS_OR_TWO:
             kind = f"{'own' if len(set(axes)) == 1 else 'cross'}-axis {kind}"
         triad = each.kind or each.triad
         title = f"{triad}: {kind}"
@@ -370,7 +370,7 @@ def _steps(axes: Axes, series: Mapping[str, Array], abreast: int = 3) -> None:
     margin = 0.05 * (high - low) or max(abs(high), 1e-9) * 1e-3
     most = max(values.size for values in usable.values())
     edges = np.linspace(low - margin, high + margin, int(np.clip(most**0.5 / 2, *BINS)) + 1)
-    for (name, values), colour, dash in zip(usable.items(), COLOURS, DASHES, strict=False):
+    for (name, values), colour, dash in zip(usable.items(), TRIAD_COLOURS, DASHES, strict=False):
         counts, _ = np.histogram(values, edges)
         axes.stairs(counts, edges, label=name, color=colour, ls=dash, lw=1.0)
     rows = -(-len(usable) // abreast)

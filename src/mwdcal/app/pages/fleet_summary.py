@@ -14,6 +14,7 @@ import numpy as np
 
 from mwdcal.app.commands.choices import names
 from mwdcal.app.commands.options import Typed
+from mwdcal.app.messages import as_typed
 from mwdcal.app.pages.calibration import choices
 from mwdcal.app.pages.page import written
 from mwdcal.app.text import number, one_line, plural, table
@@ -26,9 +27,9 @@ from mwdcal.fleet.sources import SERIAL
 from mwdcal.fleet.tables import one_chunk
 from mwdcal.geometry.vectors import Array
 
-SHOWN = 5
+SERIALS_SHOWN = 5
 """Most serials that a line names."""
-DOUBTS = ("no-redundancy", "repeated-readings", "prior-conflict")
+DOUBTFUL_FITS = ("no-redundancy", "repeated-readings", "prior-conflict")
 """Findings of a doubtful fit, besides residuals beyond the declared noise."""
 ERRORS = [name for columns in STAND_COLUMNS.values() for name in columns]
 """Columns of errors of the stand."""
@@ -173,8 +174,9 @@ def _kinds(head: Any) -> list[StatusCount]:
     kinds = []
     for each in sorted(counted, key=lambda c: (c["values"] != OK, -c["counts"])):
         name, count = each["values"], each["counts"]
-        tools = head.filter(compute.equal(status, name)).slice(0, SHOWN).to_pydict()
-        kinds.append(StatusCount(name, count, tools[SERIAL], tools["message"][0]))
+        tools = head.filter(compute.equal(status, name)).slice(0, SERIALS_SHOWN).to_pydict()
+        message = as_typed(tools["message"][0])
+        kinds.append(StatusCount(name, count, tools[SERIAL], message))
     return kinds
 
 
@@ -187,14 +189,14 @@ def _findings(head: Any) -> list[FindingCount]:
     findings = []
     for code, name in enumerate(ids.dictionary.to_pylist()):
         tools = tool[ids.indices.to_numpy() == code]
-        serials = head.column(SERIAL).take(arrow.array(tools[:SHOWN])).to_pylist()
+        serials = head.column(SERIAL).take(arrow.array(tools[:SERIALS_SHOWN])).to_pylist()
         findings.append(FindingCount(name, len(tools), serials))
     return sorted(findings, key=lambda f: (not is_doubt(f.id), -f.tools, f.id))
 
 
 def is_doubt(finding: str) -> bool:
     """Whether a finding says that a fit is doubtful, not only that something was chosen or looks odd."""
-    return finding.endswith("-residuals") or finding in DOUBTS
+    return finding.endswith("-residuals") or finding in DOUBTFUL_FITS
 
 
 def _orders(whole: Any, columns: list[str]) -> dict[str, dict[str, int]]:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-TERMS = {
+TERM_TITLES = {
     "white": "white noise N, ·√s",
     "quantisation": "quantisation Q, ·s",
     "bias-instability": "bias instability B",
@@ -31,11 +31,11 @@ TERMS = {
 HOUR = 3600.0
 Table = tuple[list[str], list[list[str]]]
 """Titles of the channels, and rows: what each is, then a cell for each channel."""
-MARKERS = {"x": "o", "y": "s", "z": "^"}
+AXIS_MARKERS = {"x": "o", "y": "s", "z": "^"}
 """Markers of the channels of a triad."""
 DISPLAY_UNITS = {"g": ("µg", 1e6), "nT": ("nT", 1.0)}
 """How physical units are written, and their number in one of them."""
-MARK = " (!)"
+UNSOUND_MARK = " (!)"
 """Behind the name of a channel whose figures do not hold."""
 
 
@@ -88,12 +88,12 @@ def _table(
         unit, factor = unit_of(channel)
         header.append(f"{marked(name, channel)}, {unit}")
         columns.append(_cells(channel, factor))
-    white, *others = TERMS.values()
+    white, *others = TERM_TITLES.values()
     station = f"one station of {noise.station_seconds:.3g} s, 1σ"
     titles = [white, "its one-sided density, /√Hz", *others, station, "its 95 % interval"]
     rows = [list(row) for row in zip(titles, *columns, strict=True)]
     doubts = [", ".join(channel.doubts) for channel in channels.values()]
-    return header, [*rows, ["does not hold" + MARK, *doubts]] if any(doubts) else rows
+    return header, [*rows, ["does not hold" + UNSOUND_MARK, *doubts]] if any(doubts) else rows
 
 
 def _cells(channel: ChannelNoise, factor: float) -> list[str]:
@@ -101,7 +101,7 @@ def _cells(channel: ChannelNoise, factor: float) -> list[str]:
     doubtful = bool({*channel.doubts} - {"slow"})
     white, *others = (
         _term(channel.terms[name], factor * (HOUR if name == "drift" else 1.0), doubtful)
-        for name in TERMS
+        for name in TERM_TITLES
     )
     density = "–" if channel.white_density is None else _number(channel.white_density * factor)
     limits = (_number(end * factor) for end in (channel.station.lower, channel.station.upper))
@@ -159,7 +159,7 @@ def render(noise: Noise) -> str:
 
 def marked(name: str, channel: ChannelNoise) -> str:
     """The name of a channel, with a mark where its figures do not hold."""
-    return name + MARK if channel.doubts else name
+    return name + UNSOUND_MARK if channel.doubts else name
 
 
 def scaled(channel: ChannelNoise) -> tuple[str, float]:
@@ -207,7 +207,7 @@ def _draw(axes: Axes, noise: Noise, names: list[str]) -> None:
 def _draw_channel(axes: Axes, name: str, channel: ChannelNoise) -> None:
     """Deviations with their band, and the terms as fitted."""
     axis = name[-1]
-    colour, marker, line = plots.AXES[axis], MARKERS[axis], plots.LINES[axis]
+    colour, marker, line = plots.AXES[axis], AXIS_MARKERS[axis], plots.LINES[axis]
     factor, tau = scaled(channel)[1], np.array(channel.tau_s)
     columns = (channel.lower, channel.deviation, channel.upper, channel.fitted)
     low, middle, high, fitted = (np.array(column) * factor for column in columns)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mwdcal.app.messages import findings_as_typed
 from mwdcal.app.pages.calibration import how, known_inclinations
 from mwdcal.app.pages.page import HELD, banner, capital, environment, exponent, factor_places
 from mwdcal.app.text import plural, raised
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
 
 LONG_TABLE = 60
 """A run of more stations has its station table at the end, as an annex."""
-MAGNETIC = ("azimuth", "field", "dip")
+NEEDS_MAGNETOMETER = ("azimuth", "field", "dip")
 """Observables that need a magnetometer."""
 ACCURACY_INCLINATIONS = (5.0, 45.0, 90.0)
 """Inclinations of the table of predicted accuracy, degrees."""
@@ -46,7 +47,7 @@ def render(calibration: Calibration, verdict: Verdict | None = None) -> str:
         simulated=is_simulated(calibration.tool),
         inclinations=known_inclinations(calibration),
         method="; ".join(how(calibration)),
-        magnetic=MAGNETIC,
+        magnetic=NEEDS_MAGNETOMETER,
         limit=plots.reshoot_limit(calibration),
         decimals=_decimals(calibration),
         long_table=LONG_TABLE,
@@ -100,7 +101,7 @@ def _findings(calibration: Calibration, verdict: Verdict | None) -> list[Finding
     for extra in verdict.findings if verdict else ():
         if extra.id not in ids:
             findings.setdefault(extra.text, extra)
-    return sorted(findings.values(), key=lambda f: f.id != "reshoot")
+    return sorted(findings_as_typed(findings.values()), key=lambda f: f.id != "reshoot")
 
 
 def _when(time: str) -> str:
@@ -119,7 +120,7 @@ def _decimals(calibration: Calibration) -> dict[str, int]:
     }
 
 
-Row = tuple[str, str, int, float, float | None, str]
+ParameterRow = tuple[str, str, int, float, float | None, str]
 """A parameter: name, axes, power of τ, value, 1σ and unit."""
 
 
@@ -128,13 +129,13 @@ def _parameters(calibration: Calibration) -> dict[str, Any]:
     try:
         notations = convert(calibration, "factors")
     except InputError:
-        rows = {triad.name: _own_rows(triad) for triad in calibration.triads}
+        rows = {triad.name: _record_rows(triad) for triad in calibration.triads}
         return {"notation": "record", "rows": rows}
     rows = {triad.name: _factor_rows(triad, notations[triad.name]) for triad in calibration.triads}
     return {"notation": "factors", "rows": rows}
 
 
-def _own_rows(triad: TriadCalibration) -> list[Row]:
+def _record_rows(triad: TriadCalibration) -> list[ParameterRow]:
     """The parameters of the record: tool axes, nominal units."""
     columns = (triad.parameter_names, triad.parameters, triad.standard_uncertainties)
     rows = []
@@ -147,7 +148,7 @@ def _own_rows(triad: TriadCalibration) -> list[Row]:
     return rows
 
 
-def _factor_rows(triad: TriadCalibration, factors: Notation) -> list[Row]:
+def _factor_rows(triad: TriadCalibration, factors: Notation) -> list[ParameterRow]:
     values, sd = factors.values, factors.uncertainty
     return [
         (name, axes, power, float(values[name][at]), float(sd[name][at]), symbol)

@@ -74,7 +74,7 @@ def declared(profile: Profile, options: Options) -> dict[str, float]:
     return {
         name: values[name]
         for name, order in zip(TRIADS, options.orders, strict=True)
-        if values[name] and options.kind(order) == "polynomial" and not options.own_solver
+        if values[name] and options.kind(order) == "polynomial" and not options.separate_solver
     }
 
 

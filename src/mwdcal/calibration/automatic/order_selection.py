@@ -23,7 +23,7 @@ from mwdcal.estimation.problem import Problem, State
 from mwdcal.estimation.uncertainty import TESTED, marginal_rank, readjusted
 from mwdcal.geometry.vectors import Array, Ints
 
-FEWEST = 3
+FEWEST_SOAKS = 3
 """Fewest soaks among which one can be left out."""
 LOWEST_RANK = 8
 """A triad of 12 parameters whose three rotations and scale are free has this rank."""
@@ -42,7 +42,7 @@ def choose_order(
         return 0, []
     progress(f"temperature order: testing its terms over {levels} temperatures")
     chosen, chance = _tested(batch, options)
-    if levels < FEWEST:
+    if levels < FEWEST_SOAKS:
         progress(
             "two temperatures cannot be left out in turn: order 1 is taken where order 0 leaves "
             "residuals beyond the noise. A third temperature would test the course between."
@@ -118,7 +118,7 @@ def order_errors(
 
 def _needed(orders: tuple[int, int]) -> int:
     """Soaks with which orders can be judged by one left out."""
-    return max(FEWEST, max(orders) + 2)
+    return max(FEWEST_SOAKS, max(orders) + 2)
 
 
 def _usable_soaks(readings: Readings) -> Ints:

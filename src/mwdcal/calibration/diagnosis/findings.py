@@ -236,9 +236,9 @@ def _beyond_order(fitted: FittedRuns, index: int, terms: OmittedTerms) -> Flag:
         strength = float(np.mean(problem.constant(state, observable)[place]))
         if order < HIGHEST and highest.min() <= HIGHEST:
             cause = f"powers of temperature above order {order} are there"
-            remedy = f"Use --order auto, or --order {min(int(highest.max()), HIGHEST)}"
+            remedy = f"Use `order` auto, or `order` {min(int(highest.max()), HIGHEST)}"
             if fitted.options.method == "swarm":
-                remedy = "Use another --method: swarm has no temperature terms"
+                remedy = "Use another `method`: swarm has no temperature terms"
         else:
             cause = "readings differ from one temperature to the next as no course of order 3 does"
             remedy = (
@@ -332,7 +332,7 @@ def _prior_conflict(fitted: FittedRuns, source: str) -> Flag:
         ratio = np.sqrt(square[place] / tested[place])
         return (
             f"the run departs from the prior ({source}) by {ratio:.1f} times what both allow: the tool has "
-            "changed, or the prior is too narrow. Leave --prior out, or widen it."
+            "changed, or the prior is too narrow. Leave `prior` out, or widen it."
         )
 
     return Flag("prior-conflict", unlikely, sentence)
@@ -351,7 +351,7 @@ def _model(fitted: FittedRuns) -> Iterator[Flag]:
     if ignored:
         text = (
             f"nonlinearity of the {' and '.join(ignored)} is not fitted: the model of factors "
-            "has no such terms. Use --model polynomial for it."
+            "has no such terms. Use `model` polynomial for it."
         )
         yield _common(fitted, "nonlinearity-ignored", text)
     if fitted.readings.relative:
@@ -363,7 +363,7 @@ def _model(fitted: FittedRuns) -> Iterator[Flag]:
         lost = "any misalignment" if options.parameters == 6 else "mounting rotation"
         text = (
             f"{options.parameters} parameters: {lost} of the sensors in the tool is taken as "
-            "none, and no uncertainty here includes it. Use --parameters 12 to fit it."
+            "none, and no uncertainty here includes it. Use `parameters` 12 to fit it."
         )
         yield _common(fitted, "restricted", text)
 
@@ -387,7 +387,7 @@ def _reshoot(fitted: FittedRuns) -> Iterator[Flag]:
         return (
             f"station {row.station}: residual {size}σ, most in {worst} "
             f"({value:+.3g}{gap}{unit}; {alone:+.3g}{gap}{unit} if left out of the fit, which it moves "
-            f"by up to {moves:.2g}{gap}{unit}): {REASONS[worst]} Re-shoot it, or --exclude {row.station}"
+            f"by up to {moves:.2g}{gap}{unit}): {REASONS[worst]} Re-shoot it, or `exclude` {row.station}"
         )
 
     for station in np.flatnonzero(again.any(0)).tolist():

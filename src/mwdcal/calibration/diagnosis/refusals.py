@@ -93,35 +93,35 @@ def check_options(options: Options) -> None:
     _check_ignored(options)
     _check_curved_models(options)
     minimiser = "the paper's weights" if options.paper_weights else f"method {method}"
-    if options.own_solver and options.robust:
+    if options.separate_solver and options.robust:
         raise InputError(
-            f"--robust cannot weigh the stations of {minimiser}. Use --method joint with it."
+            f"`robust` cannot weigh the stations of {minimiser}. Use `method` joint with it."
         )
-    if options.own_solver and options.curved:
+    if options.separate_solver and options.curved:
         raise InputError(
-            f"--nonlinearity cannot be combined with {minimiser}: own-axis terms need their prior. Use "
-            "--method joint, or --nonlinearity none."
+            f"`nonlinearity` cannot be combined with {minimiser}: own-axis terms need their prior. Use "
+            "`method` joint, or `nonlinearity` none."
         )
     if method == "swarm" and max(options.orders):
         raise FitError(
-            "method swarm finds the 12 parameters of one temperature: use --order 0 for it, or "
-            "--method joint for temperature terms."
+            "method swarm finds the 12 parameters of one temperature: use `order` 0 for it, or "
+            "`method` joint for temperature terms."
         )
     if method == "swarm" and options.parameters < 12:
         raise InputError(
-            f"--parameters {options.parameters} cannot be combined with method swarm, which finds all "
-            "twelve. Use --method least-squares: both meet on the same cost."
+            f"`parameters` {options.parameters} cannot be combined with method swarm, which finds all "
+            "twelve. Use `method` least-squares: both meet on the same cost."
         )
     if options.paper_weights and method == "joint":
         raise InputError(
-            "--paper-weights: method joint does not come from a paper. Name the paper's method: least-squares, "
+            "`paper_weights`: method joint does not come from a paper. Name the paper's method: least-squares, "
             "swarm, newton, toolface-inclination or scalar."
         )
-    if options.prior and (options.own_solver or options.curved):
+    if options.prior and (options.separate_solver or options.curved):
         what = "own-axis nonlinearity" if options.curved else minimiser
         raise InputError(
-            f"--prior cannot be combined with {what}. Use --method joint, without "
-            "--paper-weights and with --nonlinearity none."
+            f"`prior` cannot be combined with {what}. Use `method` joint, without "
+            "`paper_weights` and with `nonlinearity` none."
         )
 
 
@@ -130,8 +130,8 @@ def _check_curved_models(options: Options) -> None:
     for name, order in zip(TRIADS, options.orders, strict=True):
         if name in options.curved and options.kind(order) != "polynomial":
             raise InputError(
-                f"--nonlinearity {name}: the model of factors has no own-axis terms. Use "
-                "--model polynomial with it."
+                f"`nonlinearity` {name}: the model of factors has no own-axis terms. Use "
+                "`model` polynomial with it."
             )
 
 
@@ -140,7 +140,7 @@ def check_curves(readings: Readings, wanted: Sequence[str]) -> None:
     for name in wanted:
         if getattr(readings, name) is None:
             raise InputError(
-                f"--nonlinearity {name}: {readings.source} has no {name}. Leave it out."
+                f"`nonlinearity` {name}: {readings.source} has no {name}. Leave it out."
             )
 
 
@@ -148,10 +148,10 @@ def _check_ignored(options: Options) -> None:
     """Refuse to ignore anything but strengths and dip, or with a method that fixes what it uses."""
     unknown = [name for name in options.ignore if name not in CONSTANTS]
     if unknown:
-        raise InputError(f"--ignore must be of {', '.join(CONSTANTS)}; got {unknown[0]!r}.")
+        raise InputError(f"`ignore` must be of {', '.join(CONSTANTS)}; got {unknown[0]!r}.")
     if options.ignore and options.method != "joint":
         raise InputError(
-            f"--ignore needs --method joint; got {options.method!r}, which says itself what it uses."
+            f"`ignore` needs `method` joint; got {options.method!r}, which says itself what it uses."
         )
 
 
@@ -185,7 +185,7 @@ def _few_stations(readings: Readings, options: Options, run: Run) -> Flag:
         return (
             f"{run(place).source or 'the run'} has {readings.count} stations; the model has {size} "
             f"parameters per triad and needs {-(-size // 3)} or more. Add stations at other "
-            f"attitudes{', or lower --order' if highest else ''}."
+            f"attitudes{', or lower `order`' if highest else ''}."
         )
 
     few = 3 * readings.count < size and options.knowledge is None
@@ -204,7 +204,7 @@ def _common_errors(readings: Readings, options: Options) -> Flag:
     what = "the paper's weights take" if options.paper_weights else method
     text = (
         f"{what} the stand as exact, and [stand] of the tool profile declares {', '.join(declared)}: no "
-        "uncertainty would include it. Use --method least-squares or joint without --paper-weights, or "
+        "uncertainty would include it. Use `method` least-squares or joint without `paper_weights`, or "
         "take it out of the profile."
     )
     held = bool(declared) and holds_stand(options)
@@ -255,7 +255,7 @@ def _channels(readings: Readings, triad: str, prior: bool, run: Run) -> Iterator
 
 def no_temperature(order: int) -> InputError:
     """The error of an order that needs temperatures in a run without them."""
-    return InputError(f"--order {order} needs the column 'temperature_c'; use --order 0.")
+    return InputError(f"`order` {order} needs the column 'temperature_c'; use `order` 0.")
 
 
 def _temperatures(readings: Readings, order: int) -> Iterator[Flag]:
@@ -271,8 +271,8 @@ def _temperatures(readings: Readings, order: int) -> Iterator[Flag]:
         count = int(levels[place])
         return (
             f"the run spans {span[place]:.1f} °C with {count} temperature{'s' * (count > 1)} more than 5 °C "
-            f"apart: too little for --order {order}, which needs {order + 1} of them over {10 * order} °C or more. "
-            "Add temperatures, or lower --order."
+            f"apart: too little for `order` {order}, which needs {order + 1} of them over {10 * order} °C or more. "
+            "Add temperatures, or lower `order`."
         )
 
     yield Flag("temperature-span", (levels < order + 1) | (span < 10 * order), sentence)
@@ -295,7 +295,7 @@ def _blank(readings: Readings, method: str, needed: list[str], name: str, run: R
         return (
             f"method {method} needs {', '.join(needed)} at every station; 'ref_{name}_deg' is "
             f"blank at {int(blank[place].sum())} of {readings.count} (first: station {first}). Fill it "
-            "in, or use --method joint, which takes what is known."
+            "in, or use `method` joint, which takes what is known."
         )
 
     return Flag("missing-reference", np.any(blank, -1), sentence)
@@ -351,7 +351,7 @@ def _naming_axes(fitted: FittedRuns, flag: Flag) -> Flag:
 def _inseparable(fitted: FittedRuns) -> Flag:
     """Stand errors that the stations cannot tell from the sensors' own errors."""
     text = (
-        f"--estimate {','.join(fitted.options.estimate)}: these stations cannot tell it from the sensors' own "
+        f"`estimate` {','.join(fitted.options.estimate)}: these stations cannot tell it from the sensors' own "
         "errors. Add stations at other azimuths and inclinations with references, or leave it out."
     )
     return Flag("inseparable", inseparable(fitted.result), lambda _: text)
@@ -403,8 +403,8 @@ def _culprit(fitted: FittedRuns, place: int) -> str:
         return ""
     label = fitted.alone(place)[0].labels[worst]
     return (
-        f" Station {label} alone has {share:.0%} of the misfit: --exclude {label}, or fit with "
-        "--robust student-t."
+        f" Station {label} alone has {share:.0%} of the misfit: `exclude` {label}, or fit with "
+        "`robust` student-t."
     )
 
 

@@ -22,7 +22,7 @@ LARGEST = 1e30
 """Magnitude that no number of a calibration reaches."""
 WORST = 1e4
 """Condition number that the gains of a real sensor never reach."""
-ROUNDING = 1e-6
+ASYMMETRY = 1e-6
 """Departure of a correlation matrix from symmetry and from zero eigenvalues that is rounding."""
 AGREEMENT = 1e-3
 """Share by which a standard uncertainty may depart from the root of its variance."""
@@ -195,14 +195,14 @@ def is_covariance(covariance: Array) -> Bools:
     whole = np.where(finite, covariance, 0.0)
     variances = diagonal(whole)
     scaled = whole / outer(np.sqrt(np.where(variances > 0, variances, 1.0)))
-    even = np.all(np.abs(scaled - scaled.mT) <= ROUNDING * (1 + np.abs(scaled)), (-1, -2))
+    even = np.all(np.abs(scaled - scaled.mT) <= ASYMMETRY * (1 + np.abs(scaled)), (-1, -2))
     sound = np.all(finite, (-1, -2)) & even & np.all(variances >= 0, -1)
     return np.asarray(sound & _semidefinite(scaled))
 
 
 def _semidefinite(correlation: Array) -> Bools:
     """Which symmetric matrices (..., p, p) have no negative eigenvalue beyond rounding."""
-    lifted = correlation + ROUNDING * np.eye(correlation.shape[-1])
+    lifted = correlation + ASYMMETRY * np.eye(correlation.shape[-1])
     try:
         np.linalg.cholesky(lifted)
     except np.linalg.LinAlgError:

@@ -49,11 +49,11 @@ COURSE_SUFFIX = "-temperature"
 ZEROS = ("azimuth-zero", "inclination-zero", "dip-reference")
 """Effects that are one angle."""
 EFFECTS = {
-    "azimuth-zero": "an azimuth zero of the stand: set the index, or fit it with --estimate azimuth-zero, or declare "
+    "azimuth-zero": "an azimuth zero of the stand: set the index, or fit it with `estimate` azimuth-zero, or declare "
     "its uncertainty (azimuth_zero_deg under [stand])",
-    "inclination-zero": "an inclination zero of the stand: set the level, or fit it with --estimate inclination-zero, "
+    "inclination-zero": "an inclination zero of the stand: set the level, or fit it with `estimate` inclination-zero, "
     "or declare its uncertainty (inclination_zero_deg under [stand])",
-    "tilt": "a stand whose vertical leans: level it, or fit it with --estimate tilt, or declare its uncertainty "
+    "tilt": "a stand whose vertical leans: level it, or fit it with `estimate` tilt, or declare its uncertainty "
     "(tilt_deg under [stand])",
     "settings": "settings of the stand that stations of one direction share: set it anew for each station, or give "
     "the roll sets as group without their reference angles",

@@ -172,11 +172,18 @@ def _affine_minimum(triad: Triad, target: Array, include: Array) -> AffineMinimu
     left = (triad.raw - terms @ forward.mT) * np.sqrt(weight)
     share = np.einsum("banj,bnj->bna", terms[:, None] @ spread, terms) * weight
     return AffineMinimum(
-        include, terms, forward, spread, *_own(triad, forward), left, include - share, fit.spanned
+        include,
+        terms,
+        forward,
+        spread,
+        *_centred(triad, forward),
+        left,
+        include - share,
+        fit.spanned,
     )
 
 
-def _own(triad: Triad, forward: Array) -> tuple[Array, Array]:
+def _centred(triad: Triad, forward: Array) -> tuple[Array, Array]:
     """M (B, 3, 3) and T (B, 4, 4) of Φ in the model's own centred and scaled reading."""
     model = triad.model
     assert isinstance(model, Polynomial)

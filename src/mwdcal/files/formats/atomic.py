@@ -111,10 +111,10 @@ def identity(file: Path | int) -> tuple[int, int] | None:
     An integer is an open file.
     """
     try:
-        found = os.fstat(file) if isinstance(file, int) else file.stat()
+        status = os.fstat(file) if isinstance(file, int) else file.stat()
     except (OSError, ValueError):
         return None
-    return (found.st_dev, found.st_ino) if stat.S_ISREG(found.st_mode) else None
+    return (status.st_dev, status.st_ino) if stat.S_ISREG(status.st_mode) else None
 
 
 def _keep_permissions(old: Path, new: Path) -> None:

@@ -25,7 +25,7 @@ _PARSERS: dict[str, Callable[..., Parts]] = {
 }
 SUFFIXES = tuple(_PARSERS)
 
-_LARGEST = {".parquet": 2_000_000_000}
+_LARGEST_FILES = {".parquet": 2_000_000_000}
 _LARGEST_TEXT = 50_000_000
 _MARKS = {sign: frozenset(f"0123456789+-eE {sign}") for sign in ".,"}
 
@@ -152,7 +152,7 @@ def check_file(path: Path) -> None:
 
 
 def _check_size(size: int, path: Path) -> None:
-    largest = _LARGEST.get(_suffix(path), _LARGEST_TEXT)
+    largest = _LARGEST_FILES.get(_suffix(path), _LARGEST_TEXT)
     if size > largest:
         raise InputError(
             f"'{path}': the file must have at most {largest} bytes; got {size}. Split it, or "
@@ -193,9 +193,9 @@ def _one_by_one(table: Table, name: str, cells: Sequence[str]) -> Array:
 def _advice(cell: str, decimal: str) -> str:
     """What to do about a cell that is not a number."""
     if decimal == "." and looks_numeric(cell, ","):
-        return "Is the decimal comma intended? Use --decimal=,"
+        return "Is the decimal comma intended? Use `decimal` ','."
     if decimal == "," and looks_numeric(cell, "."):
-        return "The decimal sign was given as a comma. Is the point intended? Use --decimal=."
+        return "The decimal sign was given as a comma. Is the point intended? Use `decimal` '.'."
     if re.fullmatch(r"[+-]?(nan|inf|infinity|∞|n/?a|null|none)", cell, re.IGNORECASE):
         return "Every number must be finite. Leave the cell blank where a value is unknown."
     if re.fullmatch(r"[+-]?\d{1,3}([ ,.'’_\u00a0\u202f]\d{3})+([.,]\d*)?", cell):
