@@ -341,6 +341,24 @@ def test_a_file_of_an_earlier_version_is_read_without_complaint(tmp_path, files,
     assert json.loads((tmp_path / "again.json").read_bytes()) == document
 
 
+@pytest.mark.parametrize("later", [True, False])
+def test_a_file_with_the_fields_of_another_version_is_not_taken_for_a_changed_one(
+    tmp_path, document, later
+):
+    """A later version may add fields, an earlier one lacks some: each has the hash of its own."""
+    if later:
+        document["accelerometer"]["settling"] = document["vibration"] = 1.5
+    else:
+        del document["assumed_exact"], document["options"]["robust"]
+    document["sha256"] = other_program(document)
+    path = saved(tmp_path, document)
+    assert not mwdcal.load(path).changed
+    mwdcal.save(mwdcal.load(path), tmp_path / "again.json")
+    assert not mwdcal.load(tmp_path / "again.json").changed
+    edited_parameter(document)
+    assert mwdcal.load(saved(tmp_path, document)).changed
+
+
 def test_saving_does_not_hide_a_change(tmp_path, files, document):
     mwdcal.save(mwdcal.load(files[0]), tmp_path / "same.json")
     assert (tmp_path / "same.json").read_bytes() == files[0].read_bytes()

@@ -6,8 +6,10 @@ import pytest
 from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.diagnosis.structure import effects
 from mwdcal.calibration.estimate import fit
+from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import Readings
 from mwdcal.geometry.vectors import earth_field, earth_gravity, rotation, tool_from_earth
+from mwdcal.library.tasks import NOMINAL, simulate
 from mwdcal.sensor.profile import Profile
 from simulation import DEG, Tool, plan
 
@@ -156,3 +158,11 @@ def test_what_the_sensors_take_up_is_not_seen():
     result = fit(Readings(data.accelerometer, data.magnetometer, known=turned, sd=data.sd))
     assert not effects(result)
     assert result.analysis.variance_factor.max() < 1.5
+
+
+@pytest.mark.parametrize("seed", [2, 4])
+def test_readings_almost_without_noise_are_judged_without_a_warning_of_numpy(seed):
+    """Warnings are errors here: rounding made the squared length of an effect negative."""
+    readings = simulate(toolfaces=16, noise=(1e-8, 1e-3), seed=seed)
+    calibration = calibrate(readings, NOMINAL, Options("scalar", order=0))
+    assert calibration.accelerometer.noise == pytest.approx(1e-8, rel=0.3)

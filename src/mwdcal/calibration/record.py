@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from html import escape
 from itertools import pairwise
 from typing import Any, ClassVar
@@ -576,7 +576,11 @@ def _rounded(value: Any) -> Any:
 
 def content_sha256(calibration: Calibration) -> str:
     """SHA-256 of all fields but `time` and `sha256`, as compact JSON with sorted keys."""
-    fields = msgspec.to_builtins(calibration)
+    return document_sha256(msgspec.to_builtins(calibration))
+
+
+def document_sha256(fields: Mapping[str, Any]) -> str:
+    """The `content_sha256` of a calibration file, whose fields are these."""
     kept = {name: value for name, value in fields.items() if name not in ("time", "sha256")}
     text = json.dumps(kept, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()

@@ -14,7 +14,7 @@ from typing import Any
 import msgspec
 
 from mwdcal.calibration.diagnosis.soundness import check
-from mwdcal.calibration.record import SCHEMA_VERSION, Calibration
+from mwdcal.calibration.record import SCHEMA_VERSION, Calibration, document_sha256, sealed
 from mwdcal.errors import InputError, reason
 from mwdcal.files.formats import atomic
 from mwdcal.files.profiles import check_profile
@@ -71,7 +71,9 @@ def _decoded(data: bytes, name: str) -> Calibration:
             "a calibration file, or another version of mwdcal wrote it: calibrate again."
         )
     json.loads(data, object_pairs_hook=partial(_unique, name), parse_int=partial(_whole, name))
-    return msgspec.json.decode(data, type=Calibration)
+    calibration = msgspec.json.decode(data, type=Calibration)
+    other_fields = calibration.changed and calibration.sha256 == document_sha256(json.loads(data))
+    return sealed(calibration) if other_fields else calibration  # those of another version
 
 
 def _whole(name: str, digits: str) -> None:

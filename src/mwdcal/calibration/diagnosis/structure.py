@@ -219,7 +219,8 @@ def _scores(problem: Problem, result: Fit) -> _Scores:
     every = np.concatenate([*families.values()], -1)
     ends = np.cumsum([column.shape[-1] for column in families.values()])
     places = dict(zip(families, np.split(np.arange(ends[-1]), ends[:-1]), strict=True))
-    length = np.sqrt(np.einsum("bnmk,bnmk->k", every, linear.weigh(every)))
+    square = np.einsum("bnmk,bnmk->k", every, linear.weigh(every))
+    length = np.sqrt(np.maximum(square, 0.0))  # rounding may leave less where the noise is tiny
     length = np.where(length > 0, length, 1.0)
     unit = every / length
     weighed = linear.weigh(unit)
