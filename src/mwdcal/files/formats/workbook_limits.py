@@ -22,7 +22,7 @@ MAX_OTHERS = 500_000
 """Most elements of other kinds in a part, but for what cells and texts are made of."""
 _CONTENTS = frozenset(("v", "t", "is", "f", "r", "rPr", "rPh"))
 _LARGEST_UNPACKED = 200_000_000
-_LONGEST = 1 << 20
+_LONGEST_ELEMENT = 1 << 20
 _MOST_NAMES = 10_000
 _CHUNK = 1 << 16
 _ADVICE = "Save the sheet with the run alone with a spreadsheet program, or as CSV UTF-8."
@@ -38,10 +38,10 @@ def check(archive: zipfile.ZipFile, source: str) -> None:
         )
     for entry in archive.infolist():
         if entry.filename.lower().endswith((".xml", ".rels")):
-            _Part(source, entry.filename).check(archive)
+            _PartCheck(source, entry.filename).check(archive)
 
 
-class _Part:
+class _PartCheck:
     """Counts the elements of a part of a workbook."""
 
     def __init__(self, source: str, name: str) -> None:
@@ -64,7 +64,9 @@ class _Part:
                 except expat.ExpatError:
                     return
                 fed += len(data)
-                self._at_most(fed - parser.CurrentByteIndex, _LONGEST, "bytes in an element")
+                self._at_most(
+                    fed - parser.CurrentByteIndex, _LONGEST_ELEMENT, "bytes in an element"
+                )
                 self._at_most(len(parser.intern), _MOST_NAMES, "names")
 
     def _at_most(self, count: int, most: int, what: str) -> None:
@@ -78,7 +80,7 @@ class _Part:
 
     def _characters(self, text: str) -> None:
         self._text += len(text)
-        self._at_most(self._text, _LONGEST, "characters in a cell")
+        self._at_most(self._text, _LONGEST_ELEMENT, "characters in a cell")
 
     def _start(self, tag: str, given: dict[str, str]) -> None:
         self._text = 0
@@ -91,7 +93,7 @@ class _Part:
             self._new_row(given.get("r", ""))
         if kind != "content":
             most = MAX_COUNTS.get(kind, MAX_OTHERS)
-            self._at_most(self._counts[kind], most, _WORDS.get(kind, "other elements"))
+            self._at_most(self._counts[kind], most, _COUNTED.get(kind, "other elements"))
 
     def _cell(self, place: str) -> None:
         letters = re.match("[A-Z]*", place)[0]  # type: ignore[index]
@@ -110,4 +112,4 @@ class _Part:
         self._at_most(self._row - self._counts["row"], MAX_BLANK_ROWS, "blank rows")
 
 
-_WORDS = {"c": "cells", "si": "texts", "row": "rows"}
+_COUNTED = {"c": "cells", "si": "texts", "row": "rows"}
