@@ -3,6 +3,8 @@
 All tools and all drift here are simulated.
 """
 
+import re
+
 import numpy as np
 import pytest
 
@@ -78,7 +80,10 @@ def check_all(rows, alone, tolerance=1e-7):
         assert row["accelerometer_rank"] is None
         if row["status"] not in ("bad-input", "failed"):
             source = f"serial {serial} of runs.parquet"
-            assert row["message"].replace(source, "one.parquet") in cal.err
+            message = row["message"].replace(source, "one.parquet")
+            for name in re.findall(r"`(\w+)`", message):
+                message = message.replace(f"`{name}`", f"--{name.replace('_', '-')}")
+            assert message in cal.err
 
 
 def check(row, cal, tolerance):
