@@ -174,8 +174,9 @@ def disturbed(
         wrong.append("the output is neither the old nor the new one")
     if code == 0 and not new:
         wrong.append("status 0 without the new output")
-    early = code == -number and name != "SIGKILL"
-    if code not in (0, -number if early or name == "SIGKILL" else 128 + number):
+    unready = code == 1 and "init_import_site" in error  # Python itself was not ready
+    early = (code == -number or unready) and name != "SIGKILL"
+    if not early and code not in (0, -number if name == "SIGKILL" else 128 + number):
         wrong.append(f"status {code}: {error[-300:]!r}")
     if "Traceback" in error and not early:
         wrong.append(f"a traceback: {error[-2000:]!r}")

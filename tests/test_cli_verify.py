@@ -6,7 +6,16 @@ import json
 import numpy as np
 import pytest
 
-from cli_support import SCALE, calibrated, channels, mwdcal, refused, servo_run, stations, write_csv
+from cli_support import (
+    SCALE,
+    calibrated,
+    channels,
+    mwdcal,
+    refused,
+    servo_run,
+    stations,
+    write_csv,
+)
 from mwdcal.planning import simulate
 
 SEED = 11

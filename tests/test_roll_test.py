@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mwdcal.use.roll_test import coverage, ends, extent, fitted
+from mwdcal.use.roll_test import Curve, coverage, ends, extent, fitted
 from simulation import DEG
 
 TWELVE = np.arange(12) * 30 * DEG
@@ -136,3 +136,11 @@ def test_overstated_noise_does_not_shrink_a_spread():
     _, curve = rolls(np.random.default_rng(5), 1000, 0.12, 0.005, stated=0.05)
     assert curve.calm.mean() > 0.99
     assert (extent(curve).range > 0.1).mean() > 0.98
+
+
+def test_a_curve_without_a_covariance_has_no_range():
+    """NaN, which the verdict refuses; no error of the linear algebra."""
+    nothing = np.full((5, 5), np.nan)
+    curve = Curve(coefficients=np.zeros(5), covariance=nothing, square=np.array(0.0), freedom=7)
+    with np.errstate(invalid="ignore"):
+        assert np.isnan(extent(curve).range_sd)

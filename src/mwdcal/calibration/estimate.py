@@ -39,6 +39,8 @@ LEAST_NOISE = 1e-9
 TEMPERATURE_STEP = 10.0
 """The range of temperatures that a model is conditioned for ends at multiples of this, °C."""
 ROBUST_ROUNDS = 40
+ROBUST_STEPS = 200
+"""Steps of all fits of a run after which weights that have not settled never will."""
 NOISE_ROUNDS = 8
 """Most repetitions of fit and estimate of the noise."""
 SETTLED = 1e-3
@@ -192,7 +194,7 @@ def _general(problem: Problem, declared: list[bool], options: Options, finite: B
     """The fit by the method's minimiser, with estimated noise and station weights in turn."""
     solved = solve(problem, start(problem), options)
     iterations = solved.iterations
-    stage = _Stage(problem, solved, np.ones(problem.evidence.include.shape))
+    stage = _Stage(problem, solved, np.ones(problem.evidence.include.shape), solved.iterations)
     if not all(declared):
         stage = _estimate_noise(stage, declared, options)
     if options.robust:
@@ -284,11 +286,15 @@ def _bounded_factor(analysis: Analysis, trust: Array, loss: str, freedom: Array)
 
 @dataclass(frozen=True)
 class _Stage:
-    """Where weighing and fitting in turn have come to: problem, solution, station weights (B, n)."""
+    """Where weighing and fitting in turn have come to: problem, solution, station weights (B, n).
+
+    `steps` (B,) counts the steps of all fits so far.
+    """
 
     problem: Problem
     solved: Solved
     trust: Array
+    steps: Ints
 
 
 def _in_turn(stage: _Stage, rounds: int, turn: Callable[[_Stage], tuple[_Stage, Bools]]) -> _Stage:
@@ -363,7 +369,9 @@ def _downweigh(stage: _Stage, declared: list[bool], options: Options) -> _Stage:
                 ratios = {n: r / share for n, r in ratios.items()}
                 problem = with_scatter(problem, solved.state, ratios)
         solved = solve(_trusting(problem, trust), solved.state, options)
-        return _Stage(problem, solved, trust), ~np.any(np.abs(trust / now.trust - 1) >= SETTLED, -1)
+        steps = now.steps + solved.iterations
+        settled = ~np.any(np.abs(trust / now.trust - 1) >= SETTLED, -1)
+        return _Stage(problem, solved, trust, steps), settled | (steps > ROBUST_STEPS)
 
     return _in_turn(stage, ROBUST_ROUNDS, turn)
 

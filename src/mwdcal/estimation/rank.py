@@ -28,6 +28,7 @@ class Free:
     direction: Array
 
 
+@np.errstate(all="ignore")  # numbers that overflow belong to fits that are refused
 def free_directions(problem: Problem, state: State, determined: Determined) -> list[list[Free]]:
     """Name the free directions of every member of a batch.
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import FREE_SHARE, Calibration
+from mwdcal.errors import InputError
 from mwdcal.estimation.evidence import ANGLES
 from mwdcal.geometry.observables import OBSERVABLES, OUTPUTS
 from mwdcal.geometry.vectors import Array, Bools, Ints
@@ -241,6 +242,11 @@ class RollTest:
         if curve.rough:
             where += f"; raw figure judged: {float(curve.scale):.2g} × the noise is left about a smooth curve"
             value, noise = raw, noise * float(curve.scale)
+        if not np.isfinite([value, noise, raw, *curve.coefficients, *curve.covariance.flat]).all():
+            raise InputError(
+                f"{self.readings.source}: the uncertainties of {roll_set.label} are too far apart to judge "
+                f"its {name}. Check the columns sd_: they are in the unit of their column."
+            )
         return Statistic(value, float(np.hypot(noise, common)), raw, where, curve)
 
     def _reference_sd(self, name: str, roll_set: RollSet, error: bool) -> tuple[Array, float]:

@@ -14,7 +14,7 @@ from functools import cache
 import numpy as np
 
 from mwdcal.calibration.residuals import tail
-from mwdcal.geometry.vectors import Array, Bools, inverse
+from mwdcal.geometry.vectors import Array, Bools, eigen, inverse
 
 HARMONICS = np.arange(1, 3)
 COEFFICIENTS = 1 + 2 * len(HARMONICS)
@@ -201,9 +201,10 @@ def _measures(coefficients: Array) -> tuple[Array, Array]:
 
 
 def _root(covariance: Array) -> Array:
-    """Matrices (..., 5, 5) whose product with their transpose is the covariance."""
-    values, vectors = np.linalg.eigh(covariance)
-    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :])
+    """Matrices (..., 5, 5) whose product with their transpose is the covariance; NaN without one."""
+    values, vectors = eigen(covariance)
+    known = np.isfinite(covariance).all((-1, -2), keepdims=True)
+    return np.where(known, vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :], np.nan)
 
 
 @cache
