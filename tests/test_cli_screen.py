@@ -388,3 +388,15 @@ def test_a_report_that_cannot_be_written_leaves_no_calibration(folder, monkeypat
     arguments = ("calibrate", folder / "run.csv", "--tool", "servo", "-o", folder / "new.json")
     assert "No space left" in kept((*arguments, "--report", folder / "new.html"))
     assert sorted(folder.iterdir()) == before
+
+
+def test_a_message_with_a_serial_of_any_length_stays_short(tmp_path):
+    """Its beginning and what to do about it are shown."""
+    run = {"serial": ["S1", "A" * 30_000] * 24, **servo_run(1)}
+    path = write_csv(tmp_path / "run.csv", run)
+    ran = mwdcal("calibrate", path, "--tool", "servo", "-o", tmp_path / "c.json")
+    message = ran.err.strip()
+    assert ran.code == 2
+    assert message.startswith("mwdcal: run.csv has rows of more than one tool")
+    assert "mwdcal fleet" in message
+    assert len(message) < 2000

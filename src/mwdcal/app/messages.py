@@ -23,6 +23,10 @@ if TYPE_CHECKING:
     from mwdcal.calibration.record import Finding
 
 
+LONGEST_MESSAGE = 2000
+"""Characters of a message that are shown: what a file is named or says may be of any length."""
+
+
 class Command(click.Command):
     """A command whose errors name its options as they are typed."""
 
@@ -122,8 +126,11 @@ def _occupy_closed_descriptors() -> None:
 
 
 def say(text: str) -> None:
-    """A message for people, on stderr and on one line."""
-    click.echo(one_line(text), err=True)
+    """A message for people, on stderr and on one line; of a very long one the beginning and the end."""
+    line = one_line(text)
+    if len(line) > LONGEST_MESSAGE:
+        line = f"{line[: LONGEST_MESSAGE // 2]} … {line[-LONGEST_MESSAGE // 4 :]}"
+    click.echo(line, err=True)
 
 
 def lines(findings: Iterable[Finding]) -> list[str]:
