@@ -39,8 +39,8 @@ LEAST_NOISE = 1e-9
 TEMPERATURE_STEP = 10.0
 """The range of temperatures that a model is conditioned for ends at multiples of this, °C."""
 ROBUST_ROUNDS = 40
-ROBUST_STEPS = 200
-"""Steps of all fits of a run after which weights that have not settled never will."""
+MOST_STEPS = 200
+"""Steps of all fits of a run after which weights or noise that have not settled never will."""
 NOISE_ROUNDS = 8
 """Most repetitions of fit and estimate of the noise."""
 SETTLED = 1e-3
@@ -194,7 +194,8 @@ def _general(problem: Problem, declared: list[bool], options: Options, finite: B
     """The fit by the method's minimiser, with estimated noise and station weights in turn."""
     solved = solve(problem, start(problem), options)
     iterations = solved.iterations
-    stage = _Stage(problem, solved, np.ones(problem.evidence.include.shape), solved.iterations)
+    none = np.zeros_like(solved.iterations)
+    stage = _Stage(problem, solved, np.ones(problem.evidence.include.shape), none)
     if not all(declared):
         stage = _estimate_noise(stage, declared, options)
     if options.robust:
@@ -328,9 +329,12 @@ def _estimate_noise(stage: _Stage, declared: list[bool], options: Options) -> _S
             problem = with_scatter(problem, solved.state, ratios)
             settled = ~np.any(np.abs(scale[:, free] - 1) >= SCATTER_SETTLED, -1)
             settled &= _steady(now.problem, problem)
+        steps = now.steps
         if options.method != "swarm":
             solved = solve(problem, solved.state, options)
-        return replace(now, problem=problem, solved=solved), settled
+            steps = steps + solved.iterations
+            settled |= steps > MOST_STEPS
+        return replace(now, problem=problem, solved=solved, steps=steps), settled
 
     rounds = SCATTER_ROUNDS if stage.problem.evidence.scatter else NOISE_ROUNDS
     return _in_turn(stage, rounds, turn)
@@ -371,7 +375,7 @@ def _downweigh(stage: _Stage, declared: list[bool], options: Options) -> _Stage:
         solved = solve(_trusting(problem, trust), solved.state, options)
         steps = now.steps + solved.iterations
         settled = ~np.any(np.abs(trust / now.trust - 1) >= SETTLED, -1)
-        return _Stage(problem, solved, trust, steps), settled | (steps > ROBUST_STEPS)
+        return _Stage(problem, solved, trust, steps), settled | (steps > MOST_STEPS)
 
     return _in_turn(stage, ROBUST_ROUNDS, turn)
 
