@@ -39,7 +39,7 @@ LEAST_NOISE = 1e-9
 TEMPERATURE_STEP = 10.0
 """The range of temperatures that a model is conditioned for ends at multiples of this, °C."""
 ROBUST_ROUNDS = 40
-MOST_STEPS = 200
+MOST_STEPS_IN_TURN = 200
 """Steps of all fits of a run after which weights or noise that have not settled never will."""
 NOISE_ROUNDS = 8
 """Most repetitions of fit and estimate of the noise."""
@@ -333,7 +333,7 @@ def _estimate_noise(stage: _Stage, declared: list[bool], options: Options) -> _S
         if options.method != "swarm":
             solved = solve(problem, solved.state, options)
             steps = steps + solved.iterations
-            settled |= steps > MOST_STEPS
+            settled |= steps > MOST_STEPS_IN_TURN
         return replace(now, problem=problem, solved=solved, steps=steps), settled
 
     rounds = SCATTER_ROUNDS if stage.problem.evidence.scatter else NOISE_ROUNDS
@@ -375,7 +375,7 @@ def _downweigh(stage: _Stage, declared: list[bool], options: Options) -> _Stage:
         solved = solve(_trusting(problem, trust), solved.state, options)
         steps = now.steps + solved.iterations
         settled = ~np.any(np.abs(trust / now.trust - 1) >= SETTLED, -1)
-        return _Stage(problem, solved, trust, steps), settled | (steps > MOST_STEPS)
+        return _Stage(problem, solved, trust, steps), settled | (steps > MOST_STEPS_IN_TURN)
 
     return _in_turn(stage, ROBUST_ROUNDS, turn)
 
