@@ -178,7 +178,7 @@ def disturbed(
     early = (code == -number or unready) and name != "SIGKILL"
     if not early and code not in (0, -number if name == "SIGKILL" else 128 + number):
         wrong.append(f"status {code}: {error[-300:]!r}")
-    if "Traceback" in error and not early:
+    if "Traceback" in error and not early and name != "SIGKILL":  # of a process it left behind
         wrong.append(f"a traceback: {error[-2000:]!r}")
     if hidden(folder) and name != "SIGKILL":
         wrong.append(f"left {hidden(folder)}")
