@@ -150,7 +150,7 @@ def test_what_does_not_fit_together_is_refused():
     previous = from_calibration(calibrate(make(1), PROFILE))
     with pytest.raises(FitError, match="`parameters`"):
         calibrate(make(2), PROFILE, Options(prior=previous, parameters=9))
-    with pytest.raises(InputError, match="--prior"):
+    with pytest.raises(InputError, match="`prior`"):
         calibrate(make(2), PROFILE, Options("newton", prior=previous))
 
 
