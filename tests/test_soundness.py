@@ -13,6 +13,7 @@ import mwdcal
 from cli_support import EXAMPLE, calibrated, refused, servo_run, write_csv
 from cli_support import mwdcal as command
 from mwdcal.calibration.diagnosis.soundness import invertible, is_covariance, mirrored
+from mwdcal.calibration.record import LARGEST_ANGLE_SD
 from mwdcal.errors import InputError
 from simulation import DEG
 from test_fleet import write_fleet
@@ -417,7 +418,7 @@ def test_readings_are_equal_to_themselves_alone():
 
 @pytest.mark.parametrize("name", ["azimuth", "toolface"])
 def test_an_angle_that_a_noisy_vertical_reading_does_not_have_has_no_uncertainty(files, name):
-    """Known to 1 / tilt of it; at 104° nothing is known of an angle, and nothing is stated."""
+    """Known to 1 / tilt of it; beyond half a radian nothing is stated."""
     calibration = mwdcal.load(files[0])
     tilt = np.array([0.0, 1e-12, 1e-9, 1e-3, 45.0]) * DEG
     g = np.stack([-np.sin(tilt), np.zeros(5), np.cos(tilt)], -1)
@@ -425,6 +426,13 @@ def test_an_angle_that_a_noisy_vertical_reading_does_not_have_has_no_uncertainty
     sd = calibration.uncertainty(name, inverse_readings(calibration, g, b), noise=True)
     np.testing.assert_array_equal(np.isnan(sd), [True, True, True, True, False])
     assert sd[-1] < 0.1 * DEG
+
+
+def test_the_largest_uncertainty_of_a_direction_is_a_fifth_too_small():
+    """The direction of a vector in even noise, twice as long as that: drawn, against 1 / length."""
+    x, y = np.random.default_rng(1).normal(size=(2, 1_000_000))
+    seen = np.sqrt(np.mean(np.arctan2(y, 1 / LARGEST_ANGLE_SD + x) ** 2))
+    assert 1.2 < seen / LARGEST_ANGLE_SD < 1.25
 
 
 def inverse_readings(calibration, g, b):

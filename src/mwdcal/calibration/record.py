@@ -31,8 +31,9 @@ MARGIN = 1.0
 """Degrees Celsius by which a temperature may lie outside the calibrated range, as it is read."""
 MAGNETIC = ("azimuth", "field", "dip", "magnetic_toolface", "bx", "by", "bz")
 """Observables that need a magnetometer."""
-UNKNOWN_ANGLE = float(np.pi / np.sqrt(3))
-"""Standard deviation of an angle of which nothing is known, evenly spread over a whole turn."""
+LARGEST_ANGLE_SD = 0.5
+"""Largest standard uncertainty of a direction that is stated, rad: a fifth too small already, as the
+error of a direction no longer follows that of its vector, and soon without meaning."""
 FREE_SHARE = 5e-2
 """An output rests on a free direction if it moves by more than this share of it (rad per rad,
 or of its own strength), the direction being scaled to turn or stretch the fields by one."""
@@ -421,7 +422,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
 
         Units: radians, g or nT. `noise` adds that of one reading.
         NaN where no uncertainty can be stated: where the observable rests on a free direction, and where
-        azimuth or a toolface is as uncertain as an unknown angle, `UNKNOWN_ANGLE`, as at vertical.
+        that of azimuth or a toolface would exceed `LARGEST_ANGLE_SD`, as near vertical.
         """
         return np.sqrt(self.covariance((name,), readings, noise)[..., 0, 0])
 
@@ -454,7 +455,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
         lacking = () if self.has_field else MAGNETIC
         blank = np.stack([self.rests_on_free(n, readings) | (n in lacking) for n in names], -1)
         turns = np.array([OBSERVABLES[n].period > 0 for n in names])
-        blank |= turns & (diagonal(total) > UNKNOWN_ANGLE**2)
+        blank |= turns & (diagonal(total) > LARGEST_ANGLE_SD**2)
         return np.where(blank[..., :, None] | blank[..., None, :], np.nan, total)
 
     def expanded_uncertainty(
