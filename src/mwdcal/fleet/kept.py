@@ -153,7 +153,7 @@ def is_whole(folder: Path) -> bool:
         return is_dealt(folder) and msgspec.json.decode(
             (folder / MANIFEST).read_bytes()
         ) == _checksums(folder)
-    except (OSError, ValueError, RecursionError):
+    except (OSError, msgspec.MsgspecError, ValueError, RecursionError):
         return False
 
 

@@ -220,7 +220,7 @@ def texts(cells: Any, arrow: Any) -> list[str]:
     """Cells of any type as text tables have them."""
     try:
         values = _in_microseconds(cells, arrow).to_pylist()
-    except (ValueError, OverflowError):  # nanoseconds, or years that times of Python do not have
+    except (ValueError, OverflowError, KeyError):  # nanoseconds, years or time zones Python lacks
         spelt = (_UNSPELT.sub(r"\1", as_text(v)) for v in _spelt(cells, arrow).to_pylist())
         return [value.replace(" ", "T", 1) for value in spelt]
     return [as_text(value) for value in values]
