@@ -98,7 +98,8 @@ def overturned(result: Fit) -> Array:
         if constant.name != "dip" or not constant.unknown:
             continue
         dip = centred(result.state.constants[:, index], 2 * np.pi)
-        sd = np.sqrt(np.nan_to_num(result.analysis.constants[:, index, index]))
+        variance = np.nan_to_num(result.analysis.constants[:, index, index])
+        sd = np.sqrt(np.maximum(variance, 0.0))  # by rounding it may be below
         beyond = np.abs(dip) - np.pi / 2 > DIP_CERTAINTY * np.minimum(sd, 1.0)
         dips = np.where(referenced & beyond, dip, dips)
     return np.asarray(dips)
