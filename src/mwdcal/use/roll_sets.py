@@ -93,7 +93,8 @@ def directions(g: Array, b: Array) -> Array:
     """
     down = g / np.linalg.norm(g, axis=-1, keepdims=True)
     east = np.cross(down, b)
-    east = east / np.linalg.norm(east, axis=-1, keepdims=True)
+    with np.errstate(invalid="ignore"):  # a vertical direction has no east
+        east = east / np.linalg.norm(east, axis=-1, keepdims=True)
     north = np.cross(east, down)
     return np.stack([north[..., 2], east[..., 2], down[..., 2]], -1)
 

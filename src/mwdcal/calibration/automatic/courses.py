@@ -187,7 +187,8 @@ def _in_turn(whole: Array, pulled: Array, tested: Ints, fitted: Ints) -> Array:
 
     Each is what it adds to the `fitted` unknowns, and to the powers before it.
     """
-    norm = np.sqrt(diagonal(whole))
+    with np.errstate(invalid="ignore"):  # by rounding it may be below zero
+        norm = np.sqrt(diagonal(whole))
     norm = np.where(norm > 0, norm, 1.0)
     whole = whole / outer(norm)
     pulled = pulled / norm

@@ -112,7 +112,8 @@ def inseparable(result: Fit) -> Bools:
     """
     constants = result.problem.evidence.constants
     stand = np.array([c.unknown and c.name in STAND_ERRORS for c in constants])
-    sd = np.sqrt(diagonal(result.analysis.constants)[:, stand])
+    with np.errstate(invalid="ignore"):  # by rounding it may be below zero
+        sd = np.sqrt(diagonal(result.analysis.constants)[:, stand])
     lost = np.any(sd > LOOSE * UNKNOWN, -1)
     some = np.flatnonzero(~lost & ~result.analysis.determined.keep.all(-1))
     if some.size:
