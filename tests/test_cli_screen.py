@@ -1,6 +1,7 @@
 """What the command line shows: any encoding, any stream, and text of others that must not act on a terminal."""
 
 import ast
+import functools
 import io
 import json
 import os
@@ -8,14 +9,15 @@ import re
 import shutil
 import subprocess
 import sys
-from contextlib import redirect_stderr, redirect_stdout
+import threading
+from contextlib import redirect_stderr, redirect_stdout, suppress
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from cli_support import calibrated, mwdcal, refused, servo_run, write_csv
-from mwdcal.app import cli, text
+from mwdcal.app import cli, progress, text
 
 SOURCE = Path(cli.__file__).parents[1]
 ENCODINGS = ("cp1252", "cp850", "latin-1", "ascii")
@@ -59,8 +61,12 @@ OTHERS = {name: (name, "--help") for name in COMMANDS} | {
     "refused": ("verify", "cal.json", "run.csv"),
     "misused": ("verify", "cal.json"),
 }
+LINES = {name: (name, *arguments) for name, arguments in COMMANDS.items()} | {
+    f"{name} {arguments[-1]}": arguments for name, arguments in OTHERS.items()
+}
 
 
+@functools.cache
 def shown(encoding, *arguments):
     """Exit status, stdout and stderr of a command, in streams of an encoding."""
     out, err = (io.TextIOWrapper(io.BytesIO(), encoding, newline="\n") for _ in range(2))
@@ -69,10 +75,38 @@ def shown(encoding, *arguments):
     return stop.value.code, *(stream.buffer.getvalue().decode(encoding) for stream in (out, err))
 
 
+def shown_on_a_terminal(encoding, *arguments):
+    """The same in two terminals: one has stdout, one has stderr."""
+    pairs = [os.openpty() for _ in range(2)]
+    printed = [b"", b""]
+
+    def listen(k):
+        with suppress(OSError):  # the end of what was written, on Linux
+            while part := os.read(pairs[k][0], 1 << 16):
+                printed[k] += part
+
+    listeners = [threading.Thread(target=listen, args=(k,)) for k in range(2)]
+    for listener in listeners:
+        listener.start()
+    out, err = (open(inner, "w", encoding=encoding) for _, inner in pairs)  # noqa: SIM115
+    with redirect_stdout(out), redirect_stderr(err), pytest.raises(SystemExit) as stop:
+        cli.main(list(arguments))
+    for stream in (out, err):
+        stream.close()
+    for listener, (outer, _) in zip(listeners, pairs, strict=True):
+        listener.join()
+        os.close(outer)
+    return stop.value.code, *(part.decode(encoding).replace("\r\n", "\n") for part in printed)
+
+
+def timeless(printed):
+    """What was printed, without measured times."""
+    return re.sub(r"\b[\d.]+ (s|tools/s)\b|time of one fit.*", "", printed)
+
+
 def words(printed):
     """Words in plain characters, without rules between them and without measured times."""
-    plain = text.fitting(printed, "ascii")
-    return re.sub(r"-{5,}|\b[\d.]+ (s|tools/s)\b|time of one fit.*", "", plain).split()
+    return re.sub("-{5,}", "", timeless(text.fitting(printed, "ascii"))).split()
 
 
 def untimed(document):
@@ -83,16 +117,46 @@ def untimed(document):
     return [untimed(v) for v in document] if isinstance(document, list) else document
 
 
+@pytest.fixture
+def no_progress(monkeypatch):
+    """Nothing is said of how far a command is, however slow the machine."""
+    monkeypatch.setattr(progress, "PATIENCE", 600.0)
+    monkeypatch.setattr(progress.slowly, "__defaults__", (600.0,))
+
+
 @pytest.mark.parametrize("command", COMMANDS)
-def test_status_and_result_are_the_same_in_every_encoding(files, monkeypatch, command):
+def test_status_and_result_are_the_same_in_every_encoding(files, monkeypatch, no_progress, command):
     monkeypatch.chdir(files)
-    few = ("ascii",) if command in ("compare", "fleet") else ENCODINGS
     code, *said = shown("utf-8", command, *COMMANDS[command])
     assert code == 0, said
-    for encoding in few:
+    for encoding in ENCODINGS:
         other, *printed = shown(encoding, command, *COMMANDS[command])
         assert other == code
         assert [words(part) for part in printed] == [words(part) for part in said]
+
+
+@posix
+@pytest.mark.parametrize("encoding", ["utf-8", *ENCODINGS])
+@pytest.mark.parametrize("arguments", LINES.values(), ids=LINES)
+def test_a_terminal_sees_what_a_file_holds(files, monkeypatch, no_progress, arguments, encoding):
+    monkeypatch.chdir(files)
+    code, out, err = shown_on_a_terminal(encoding, *arguments)
+    other, *said = shown(encoding, *arguments)
+    assert code == other
+    assert "\x1b" not in out
+    assert [timeless(out), words(err)] == [timeless(said[0]), words(said[1])]
+
+
+@posix
+@pytest.mark.parametrize("encoding", ["utf-8", *ENCODINGS])
+def test_a_progress_bar_is_drawn_in_every_encoding(files, monkeypatch, encoding):
+    monkeypatch.chdir(files)
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setattr(progress, "PATIENCE", 0.0)
+    code, out, err = shown_on_a_terminal(encoding, "apply", *COMMANDS["apply"])
+    assert code == 0
+    assert "\x1b" in err
+    assert timeless(out) == timeless(shown(encoding, "apply", *COMMANDS["apply"])[1])
 
 
 @pytest.mark.parametrize("arguments", OTHERS.values(), ids=OTHERS)
@@ -161,19 +225,6 @@ def process(*arguments, **streams):
     """The command line as its own process."""
     command = [sys.executable, "-m", "mwdcal", *map(str, arguments)]
     return subprocess.run(command, check=False, encoding="utf-8", **streams)
-
-
-@pytest.mark.skipif(not shutil.which("script"), reason="needs script")
-def test_a_terminal_sees_what_a_file_holds(files):
-    line = f"'{sys.executable}' -m mwdcal verify cal.json roll.csv"
-    told = {"cwd": files, "capture_output": True, "stdin": subprocess.DEVNULL}
-    environment = {**os.environ, "PYTHONIOENCODING": "utf-8"}
-    done = subprocess.run(
-        ["script", "-qec", line, "/dev/null"], check=False, env=environment, **told
-    )
-    ran = mwdcal("verify", files / "cal.json", files / "roll.csv")
-    assert done.returncode == ran.code == 0
-    assert done.stdout.decode().replace("\r\n", "\n") == ran.err + ran.out
 
 
 @posix
