@@ -72,10 +72,10 @@ CALIBRATIONS = (
 )
 
 
-def log(seed: int, still: float) -> dict[str, Any]:
+def log(seed: int, still: float, inclinations: tuple[float, ...]) -> dict[str, Any]:
     """Columns of a log at 20 Hz: tool positions held for so many seconds, turns between them."""
     rng = np.random.default_rng(seed)
-    run = servo_run(seed, (20, 80, 120), 3)
+    run = servo_run(seed, inclinations, 3)
     held = int(still * 20)
     raw = np.stack([run[name] for name in cli_support.RAW], -1)
     levels = np.concatenate(
@@ -120,7 +120,7 @@ def samples(folder: Path) -> dict[str, list[Any]]:
     fleet = {"serial": [f"T{i // 18}" for i in range(72)], **fleet}
     return {
         "run": list(tables.values()),
-        "log": [log(4, 4.0), log(5, 20.0)],
+        "log": [log(4, 4.0, (20, 80, 120)), log(5, 20.0, (20,))],
         "fleet": [fleet],
         "calibration": calibrations,
         "profile": [(EXAMPLE / "tool.toml").read_text("utf-8")],
@@ -405,6 +405,10 @@ WORDS = {
     "workers": ("1",),
 }
 """Values of options that are not read off the command line itself."""
+USUAL = {"tool": 0.9, "seed": 0.03, "decimal": 0.05, "report": 0.04, "plot": 0.04}
+"""Share of command lines that have an option."""
+OTHERWISE = 0.08
+"""The same, of options not named there."""
 REFUSED = {2, 3}
 NETWORK = ("scheduler",)
 """Options that are left out: what they name is not a file."""
@@ -412,6 +416,8 @@ WITH_FILES = [
     n for n, c in sorted(cli.commands.items()) if any(p.name in SAMPLES for p in c.params)
 ]
 """Commands that read a file."""
+RARE = {"compare": 0.2, "noise": 0.5}
+"""How often a command that takes long is run, against the others."""
 
 
 def files(r: random.Random, kind: str, sound: dict[str, list[Any]], stem: Path) -> Path:
@@ -452,7 +458,7 @@ def command(r: random.Random, name: str, sound: dict[str, list[Any]], folder: Pa
     """A command line."""
     line = [name]
     for p in cli.get_command(None, name).params:  # type: ignore[arg-type, union-attr]
-        usual = {"tool": 0.9, "seed": 0.03, "decimal": 0.05}.get(str(p.name), 0.15)
+        usual = USUAL.get(str(p.name), OTHERWISE)
         if isinstance(p, click.Argument):
             line.append(value(r, p, sound, folder))
         elif p.name not in NETWORK and (p.required or p.name == "workers" or r.random() < usual):
@@ -561,7 +567,8 @@ def case(seed: int, sound: dict[str, list[Any]], folder: Path) -> tuple[str, int
     r = random.Random(seed)
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    line = command(r, r.choice(WITH_FILES), sound, folder)
+    (name,) = r.choices(WITH_FILES, [RARE.get(n, 1.0) for n in WITH_FILES])
+    line = command(r, name, sound, folder)
     (folder / "command").write_text(json.dumps(line))
     before = set(folder.rglob("*"))
     held, start, code, broken = memory(), time.process_time(), -1, []
