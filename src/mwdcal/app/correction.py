@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 
 from mwdcal.app.streaming import (
@@ -23,13 +24,14 @@ from mwdcal.app.streaming import (
 from mwdcal.calibration.diagnosis.findings import unused_columns
 from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.errors import InputError
-from mwdcal.files import carried
-from mwdcal.files.contract import check_columns
-from mwdcal.files.formats import table
+from mwdcal.files import carried, streams
+from mwdcal.files.contract import CHANNELS, check_columns
+from mwdcal.files.formats import table as tables
 from mwdcal.files.formats.columns import as_text
 from mwdcal.files.formats.table import Table
-from mwdcal.files.runs import to_readings
+from mwdcal.files.runs import is_export, read_export, renamed, to_readings
 from mwdcal.geometry.observables import EXTRAPOLATED
+from mwdcal.sensor.profile import Profile
 from mwdcal.use.correction import RowCounts, counted
 
 LARGEST_TEXT = 8_000_000
@@ -52,22 +54,40 @@ def apply_to_any(
     """Correct a file into another: part by part, or whole where it is short text or a workbook.
 
     What was seen in the rows, and what the reader should know. `advance` gets how much of a long
-    table is done, and the whole.
+    table is done, and the whole. An export as the calibration's profile describes it is taken whole, and
+    text that comes of it is written as it is.
     """
-    if in_parts(readings, output):
+    profile = calibration.profile
+    exported = _is_exported(readings, profile, decimal)
+    if in_parts(readings, output) and not exported:
         return apply_to_file(
             calibration, readings, output, outside, advance, missing=missing, decimal=decimal
         )
-    if readings.suffix.lower() in TEXT and output.suffix.lower() == ".xlsx":
+    if readings.suffix.lower() in TEXT and (exported or output.suffix.lower() == ".xlsx"):
         _check_size(readings)
-    source = table.read(readings, decimal=decimal, rows=WHOLE_ROWS)
+    source = read_export(readings, profile, decimal=decimal, rows=WHOLE_ROWS)
     result, tally, findings = apply_to_table(calibration, source, outside, missing)
     if EXTRAPOLATED in result.columns and output.suffix.lower() != ".parquet":
         words = [as_text(bool(mark)) for mark in result.columns[EXTRAPOLATED]]
         result = replace(result, columns={**result.columns, EXTRAPOLATED: words})
-    table.write(output, result)
+    form = profile.table if exported and readings.suffix.lower() in TEXT else msgspec.UNSET
+    tables.write(output, result, None if isinstance(form, msgspec.UnsetType) else form)
     formulas = carried.with_formulas(source.columns) if output.suffix.lower() in TEXT else []
     return tally, findings + carried.copied([*source.columns], formulas, output.suffix.lower())
+
+
+def _is_exported(readings: Path, profile: Profile, decimal: str) -> bool:
+    """Whether a table is written, or names its columns, as the profile says and not as documented."""
+    if isinstance(profile.columns, msgspec.UnsetType):
+        return False
+    if readings.suffix.lower() == ".xlsx":
+        return True
+    opened = streams.open_parquet if readings.suffix.lower() == ".parquet" else streams.open_text
+    try:
+        names = opened(readings, decimal=decimal).names
+    except InputError:
+        return True
+    return is_export(names, profile) or not set(CHANNELS["accelerometer"]) <= {*names}
 
 
 def _check_size(readings: Path) -> None:
@@ -75,8 +95,8 @@ def _check_size(readings: Path) -> None:
     size = readings.stat().st_size if readings.is_file() else 0
     if size > LARGEST_TEXT:
         raise InputError(
-            f"{readings.name}: a text table that becomes a workbook must have at most {LARGEST_TEXT} "
-            f"bytes; got {size}. Split it, or write CSV."
+            f"{readings.name}: an export, or a text table that becomes a workbook, must have at most "
+            f"{LARGEST_TEXT} bytes; got {size}. Split it, or write a run file as CSV."
         )
 
 
@@ -84,14 +104,15 @@ def apply_to_table(
     calibration: Calibration, source: Table, outside: str, missing: str = "refuse"
 ) -> tuple[Table, RowCounts, list[Finding]]:
     """The input's columns and metadata, the results, and what the calibration was."""
-    check_columns(list(source.columns), source.source)
-    check_warmth(calibration, list(source.columns), source.source)
+    table = renamed(source, calibration.profile)
+    check_columns(list(table.columns), source.source)
+    check_warmth(calibration, list(table.columns), source.source)
     whole = np.ones(source.count, bool)
     if missing == "blank":
-        whole = ~lacking(source, wholly_blank([source]))
+        whole = ~lacking(table, wholly_blank([table]))
     if not whole.any():
         raise nothing(source.source)
-    kept = source if whole.all() else chosen(source, whole)
+    kept = table if whole.all() else chosen(table, whole)
     readings, _ = to_readings(kept, calibration.profile)
     results, tally, findings = counted(calibration, readings, outside, source.count - kept.count)
     check_free(source.columns, list(results), source.source)

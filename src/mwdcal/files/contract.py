@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mwdcal.errors import InputError
+from mwdcal.files.formats.columns import LABELS
 from mwdcal.files.formats.table import shown
 from mwdcal.files.synonyms import CONVERSIONS, resembled
 from mwdcal.geometry.vectors import Array, Bools
@@ -86,10 +87,31 @@ RANGES = {
 }
 """The columns of numbers, and their accepted values."""
 COLUMNS = ("station", "group", *RANGES)
+MAPPED = (*COLUMNS, "serial")
+"""Columns that a table may have under another name."""
+_UNITS = {
+    "deg": ("°", "rad"),
+    "g": ("g", "mg", "m/s²"),
+    "nt": ("nT", "µT", "mT", "gauss"),
+    "c": ("°C", "°F", "K"),
+}
+"""The units of a quantity by the end of its column's name, that of the contract first."""
 
 _UNIT = re.compile(
     r"[\s_(\[-]+(°|°?c|deg|degc|degrees?|rad|f|k|m?g|m/?s2|[nµu]t|gauss|m?v|counts?|raw)[)\]]?$"
 )
+
+
+def units_of(column: str) -> tuple[str, ...]:
+    """The units that a column may be given in, that of the contract first; any for a raw channel.
+
+    >>> units_of("ref_field_nt")
+    ('nT', 'µT', 'mT', 'gauss')
+    >>> units_of("ax")
+    ()
+    """
+    end = column.rpartition("_")[2]
+    return _UNITS.get(end, ()) if column.removeprefix("sd_") not in (*RAW, *LABELS) else ()
 
 
 def check_columns(names: Sequence[str], source: str) -> None:
@@ -113,9 +135,9 @@ def check_near_misses(names: Collection[str], contract: Sequence[str], what: str
     Such a column would be ignored silently; any other unknown column is the user's.
     """
     present = set(names)
-    expected = {form: name for name in contract if name not in present for form in _forms(name)}
+    expected = {form: name for name in contract if name not in present for form in forms(name)}
     for name in names:
-        meant = next((expected[form] for form in _forms(name) if form in expected), None)
+        meant = next((expected[form] for form in forms(name) if form in expected), None)
         if meant is not None and name not in contract:
             alike = resembled(name)
             unit = alike.unit if alike else ""
@@ -126,10 +148,10 @@ def check_near_misses(names: Collection[str], contract: Sequence[str], what: str
             )
 
 
-def _forms(name: str) -> tuple[str, str]:
+def forms(name: str) -> tuple[str, str]:
     """The name without case and separators, and the same without its unit.
 
-    >>> _forms("Ref inclination [deg]")
+    >>> forms("Ref inclination [deg]")
     ('refinclinationdeg', 'refinclination')
     """
     bare = name.strip().lower()

@@ -62,7 +62,7 @@ def _shallow(value: object, left: int) -> bool:
 
 def render(metadata: Mapping[str, object]) -> list[str]:
     """The lines that `parse` turns back into `metadata`; empty values are left out."""
-    return [f"# {_key(k)} = {_toml(v)}" for k, v in metadata.items() if v is not None]
+    return [f"# {_key(k)} = {toml(v)}" for k, v in metadata.items() if v is not None]
 
 
 def _entry(text: str, where: str) -> tuple[str, object]:
@@ -101,16 +101,16 @@ def _key(key: str) -> str:
     return key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else _quoted(key)
 
 
-def _toml(value: object) -> str:
-    """The value as TOML on one line."""
+def toml(value: object) -> str:
+    """A value as TOML on one line."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, int) or (isinstance(value, float) and math.isfinite(value)):
         return repr(value)
     if isinstance(value, list | tuple):
-        return "[" + ", ".join(_toml(item) for item in value) + "]"
+        return "[" + ", ".join(toml(item) for item in value) + "]"
     if isinstance(value, Mapping):
-        return "{" + ", ".join(f"{_key(k)} = {_toml(v)}" for k, v in value.items()) + "}"
+        return "{" + ", ".join(f"{_key(k)} = {toml(v)}" for k, v in value.items()) + "}"
     return _quoted(str(value))
 
 

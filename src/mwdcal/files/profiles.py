@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import hashlib
 import re
+from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -13,9 +14,16 @@ import msgspec
 
 from mwdcal.calibration.readings import TRIADS
 from mwdcal.errors import InputError, reason
-from mwdcal.files.contract import TEMPERATURE
+from mwdcal.files.contract import MAPPED, TEMPERATURE, units_of
 from mwdcal.files.formats.table import shown
-from mwdcal.sensor.profile import Datasheet, Profile, StandProfile, TriadProfile
+from mwdcal.sensor.profile import (
+    ColumnSource,
+    Datasheet,
+    Profile,
+    StandProfile,
+    TableFormat,
+    TriadProfile,
+)
 
 _DEFAULT = "generic"
 _SUFFIX = ".toml"
@@ -25,6 +33,7 @@ _STRUCTS: dict[str, type[msgspec.Struct]] = {
     "accelerometer": TriadProfile,
     "magnetometer": TriadProfile,
     "stand": StandProfile,
+    "table": TableFormat,
     "accelerometer.datasheet": Datasheet,
     "magnetometer.datasheet": Datasheet,
 }
@@ -57,6 +66,9 @@ _DATASHEET_LIMITS: dict[str, _Limits] = dict.fromkeys(
     Datasheet.__struct_fields__,
     (1e-15, 1e15, "1 sigma, more than zero; leave it out where it is unknown."),
 )
+_TABLE_LIMITS: dict[str, _Limits] = {
+    "header_line": (1, 1e6, "The line of the column names, counted from 1."),
+}
 _STAND_LIMITS: dict[str, _Limits] = {
     name: (0.0, 180.0, "1 sigma, in degrees.")
     for name in StandProfile.__struct_fields__
@@ -222,6 +234,39 @@ def check_profile(profile: Profile, source: str) -> None:
         if triad.datasheet is not None:
             _check_numbers(triad.datasheet, _DATASHEET_LIMITS, source, f"{name}.datasheet.")
     _check_numbers(profile.stand, _STAND_LIMITS, source, "stand.")
+    if not isinstance(profile.table, msgspec.UnsetType):
+        _check_numbers(profile.table, _TABLE_LIMITS, source, "table.")
+        _check_numbers(
+            profile.table, {"first_line": (profile.table.header_line + 1, 1e6, "It is below the names.")},
+            source, "table.",
+        )  # fmt: skip
+    if not isinstance(profile.columns, msgspec.UnsetType):
+        _check_columns(profile.columns, source)
+
+
+def _check_columns(columns: Mapping[str, ColumnSource], source: str) -> None:
+    """Refuse names that no run file has, units that are not of their quantity, and a column named twice."""
+    taken: dict[str, str] = {}
+    for column, each in columns.items():
+        key = f"{source}, key 'columns.{column[:40]}'"
+        if column not in MAPPED:
+            near = difflib.get_close_matches(column.lower(), MAPPED, n=1)
+            meant = f" Did you mean '{near[0]}'?" if near else ""
+            raise InputError(
+                f"{key}: must be a column of a run file, such as ax or ref_inclination_deg.{meant} Rename or "
+                "remove it."
+            )
+        allowed = units_of(column)
+        if each.unit and allowed and each.unit not in allowed:
+            raise InputError(
+                f"{key}: the unit must be one of {', '.join(allowed)}; got {shown(each.unit)}. Correct it, or "
+                "convert the column in the table."
+            )
+        if each.name in taken:
+            raise InputError(
+                f"{key}: the column {shown(each.name)} is '{taken[each.name]}' already. Name each column once."
+            )
+        taken[each.name] = column
 
 
 def _check_numbers(

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 
 import msgspec
@@ -19,6 +20,7 @@ from mwdcal.files import synonyms
 from mwdcal.files.contract import (
     CHANNELS,
     COLUMNS,
+    RAW,
     REFERENCES,
     Range,
     check_columns,
@@ -27,10 +29,10 @@ from mwdcal.files.contract import (
 from mwdcal.files.faults import BlankReadingError as BlankReadingError
 from mwdcal.files.faults import Cells, columns_of, faults, faults_beside_readings, refuse
 from mwdcal.files.formats import table as tables
-from mwdcal.files.formats.columns import Column
+from mwdcal.files.formats.columns import LABELS, Column, shown
 from mwdcal.files.formats.table import Table, labels
 from mwdcal.geometry.vectors import Array, Ints
-from mwdcal.sensor.profile import Profile, TriadProfile
+from mwdcal.sensor.profile import ColumnSource, Profile, TriadProfile
 
 ROWS_OF_LOG = 1000
 """Rows of a table with times from which it is a log."""
@@ -46,10 +48,91 @@ def read_run(
     table = (
         source
         if isinstance(source, Table)
-        else tables.read(source, decimal=decimal, rows=MOST_ROWS)
+        else read_export(source, profile, decimal=decimal, rows=MOST_ROWS)
     )
+    table = renamed(table, profile)
     check_run(table)
     return to_readings(table, profile)
+
+
+def read_export(
+    path: str | os.PathLike[str], profile: Profile, *, decimal: str = ".", rows: int = 0
+) -> Table:
+    """The table in a file, written as the profile says or as documented, under its own names.
+
+    `decimal` and `rows` as for `table.read`; a profile that says how tables are written says their
+    decimal sign as well.
+    """
+    form = profile.table
+    if isinstance(form, msgspec.UnsetType):
+        return tables.read(path, decimal=decimal, rows=rows)
+    try:
+        table = tables.read(path, rows=rows, form=form)
+        if is_export(table.columns, profile):
+            return table
+        problem = _not_as_stated(table, profile)
+    except InputError as error:
+        problem = error
+    table = None
+    with suppress(InputError):
+        table = tables.read(path, decimal=decimal, rows=rows)
+    if table is None or not set(CHANNELS["accelerometer"]) <= {*table.columns}:
+        raise InputError(
+            f"{problem} If the table is laid out otherwise than the tool profile says, correct [table] there, "
+            "or propose a profile for it: mwdcal profile."
+        ) from None
+    return table
+
+
+def _sources(profile: Profile) -> dict[str, ColumnSource]:
+    """The columns that a profile names, by the name of the run file."""
+    return {} if isinstance(profile.columns, msgspec.UnsetType) else profile.columns
+
+
+def is_export(names: Iterable[str], profile: Profile) -> bool:
+    """Whether columns of these names are those of the channels that the profile states."""
+    stated = {s.name for column, s in _sources(profile).items() if column in RAW}
+    return not stated.isdisjoint(names)
+
+
+def _not_as_stated(table: Table, profile: Profile) -> InputError:
+    stated = [s.name for column, s in _sources(profile).items() if column in RAW]
+    return InputError(
+        f"{table.source}: none of the columns {', '.join(map(shown, stated))} that [columns] of the tool "
+        f"profile names; found {', '.join(shown(name) for name in [*table.columns][:12])}."
+    )
+
+
+def renamed(table: Table, profile: Profile) -> Table:
+    """An export under the names and in the units of the run file; a run file as it is.
+
+    Raises:
+        InputError: a channel of the profile that the table has not, or a name that is taken.
+    """
+    if not is_export(table.columns, profile):
+        return table
+    sources = _sources(profile)
+    theirs = {s.name: column for column, s in sources.items() if s.name in table.columns}
+    for column, source in sources.items():
+        if column in RAW and source.name not in table.columns:
+            raise InputError(
+                f"{table.source}: the column {shown(source.name)}, which is '{column}' by the tool profile, "
+                "is missing. Correct [columns] in the profile, or the table."
+            )
+        if column in table.columns and source.name != column:
+            raise InputError(
+                f"{table.source}: '{column}' is a column of the table, and {shown(source.name)} is '{column}' by "
+                "the tool profile. Rename the former, or correct [columns] in the profile."
+            )
+    columns: dict[str, Column] = {}
+    for name, cells in table.columns.items():
+        column = theirs.get(name, name)
+        columns[column] = cells
+        if name in theirs and column not in LABELS:
+            factor, offset = synonyms.FACTORS.get(sources[column].unit, (1.0, 0.0))
+            values = tables.numbers(table, name)
+            columns[column] = values * factor + offset if (factor, offset) != (1.0, 0.0) else values
+    return replace(table, columns=columns)
 
 
 def check_run(table: Table) -> None:

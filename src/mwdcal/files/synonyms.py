@@ -7,6 +7,7 @@ refused where the contract's own column is absent. A column is never used under 
 
 from __future__ import annotations
 
+import math
 import re
 import unicodedata
 from collections.abc import Collection, Sequence
@@ -55,6 +56,17 @@ CONVERSIONS = {
     "gauss": "nT = gauss · 1e5",
 }
 """How another unit is converted into that of the contract."""
+FACTORS = {
+    "°F": (5 / 9, -160 / 9),
+    "K": (1.0, -273.15),
+    "rad": (180 / math.pi, 0.0),
+    "mg": (1e-3, 0.0),
+    "m/s²": (1 / 9.80665, 0.0),
+    "µT": (1e3, 0.0),
+    "mT": (1e6, 0.0),
+    "gauss": (1e5, 0.0),
+}
+"""The same in numbers: factor, and what is added to the product."""
 _WARM = ("°C", "°F", "K")
 _MAGNETIC_UNITS = ("nT", "µT", "mT", "gauss")
 _STATED = {"ref", "reference", "local"}
@@ -156,6 +168,16 @@ def _words(name: str) -> list[str]:
         text = re.sub(rf"(?<![A-Za-z]){cased}(?![A-Za-z])", word, text)
     words = re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+", text)
     return [word.lower() for word in words]
+
+
+def unit_of(text: str) -> str:
+    """The unit that a text is, empty if it is none.
+
+    >>> [unit_of(text) for text in ("deg", "°F", "m/s²", "mg", "x")]
+    ['°', '°F', 'm/s²', 'mg', '']
+    """
+    words = _words(text)
+    return UNITS[words[-1]] if words and set(words) <= {*UNITS} else ""
 
 
 def _without_unit(words: list[str]) -> tuple[list[str], str]:

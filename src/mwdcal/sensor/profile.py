@@ -102,11 +102,41 @@ class StandProfile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
         return {name: value for name, value in values.items() if value}
 
 
+class TableFormat(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """How the tables of a logger or a spreadsheet program are written.
+
+    `header_line` holds the column names, `first_line` the first readings; what stands above and
+    between is not read. A workbook has only these two, which count its rows.
+    """
+
+    encoding: Literal["utf-8", "utf-16", "cp1252"] = "utf-8"
+    delimiter: Literal[",", ";", "\t", "|"] = ","
+    decimal: Literal[".", ","] = "."
+    header_line: int = 1
+    first_line: int = 2
+
+
+class ColumnSource(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The column of a table that holds a quantity under another name, and the unit it is in there.
+
+    Without `unit` it is in the unit of the run file.
+    """
+
+    name: str
+    unit: str = ""
+
+
 class Profile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A tool as its maker describes it: see `docs/files.md` for the TOML form."""
+    """A tool as its maker describes it: see `docs/files.md` for the TOML form.
+
+    `table` and `columns` say how its tables are written, and which of their columns is which of the
+    run file's; without them tables are run files as documented.
+    """
 
     name: str
     reference_temperature_c: float = 30.0
     accelerometer: TriadProfile = TriadProfile()
     magnetometer: TriadProfile = TriadProfile()
     stand: StandProfile = StandProfile()
+    table: TableFormat | msgspec.UnsetType = msgspec.UNSET
+    columns: dict[str, ColumnSource] | msgspec.UnsetType = msgspec.UNSET

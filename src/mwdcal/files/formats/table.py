@@ -8,14 +8,16 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from mwdcal.errors import InputError, reason
-from mwdcal.files.formats import atomic, parquet, text, workbook
+from mwdcal.files.formats import atomic, dialect, parquet, text, workbook
 from mwdcal.files.formats.columns import LABELS, Column, Parts, as_text, check_names, looks_numeric
 from mwdcal.files.formats.columns import shown as shown
 from mwdcal.geometry.vectors import Array
+from mwdcal.sensor.profile import TableFormat
 
 _PARSERS: dict[str, Callable[..., Parts]] = {
     ".csv": text.parse,
@@ -56,19 +58,30 @@ class Table:
         return len(next(iter(self.columns.values()), ()))
 
 
-def read(path: str | os.PathLike[str], *, decimal: str = ".", rows: int = 0) -> Table:
+def read(
+    path: str | os.PathLike[str],
+    *,
+    decimal: str = ".",
+    rows: int = 0,
+    form: TableFormat | None = None,
+) -> Table:
     """The table in a .csv, .tsv, .parquet or .xlsx file.
 
     `decimal` is the decimal sign of text cells, '.' or ','. `rows`: the most that a Parquet table may
-    have; text and workbooks have limits of their own.
+    have; text and workbooks have limits of their own. `form`: how another program has written it.
     """
     check_decimal(decimal)
     file = Path(path)
     data = _content(file)
-    parser = _PARSERS[_suffix(file)]
-    limits = {"most": rows} if parser is parquet.parse else {}
-    parts = parser(data, file.name, **limits)
     digest = hashlib.sha256(data).hexdigest()
+    parser = _PARSERS[_suffix(file)]
+    arguments: dict[str, Any] = {"most": rows} if parser is parquet.parse else {}
+    if form and parser is text.parse:
+        data, decimal = dialect.plain(data, form, file.name), form.decimal
+        arguments = {"delimiter": form.delimiter}
+    elif form and parser is workbook.parse:
+        decimal, arguments = form.decimal, {"form": form}
+    parts = parser(data, file.name, **arguments)
     return Table(parts.columns, parts.metadata, file.name, parts.lines, digest, decimal)
 
 
@@ -78,12 +91,19 @@ def check_decimal(decimal: str) -> None:
         raise InputError(f"`decimal` must be '.' or ','; got {shown(decimal)}.")
 
 
-def write(path: str | os.PathLike[str], table: Table) -> None:
-    """Write the table atomically, in the format of the suffix; the same table, the same bytes."""
+def write(path: str | os.PathLike[str], table: Table, form: TableFormat | None = None) -> None:
+    """Write the table atomically, in the format of the suffix; the same table, the same bytes.
+
+    `form`: text with that delimiter, decimal sign and encoding.
+    """
     file = Path(path)
     suffix = _suffix(file)
     check_names(list(table.columns), file.name)
-    if suffix in (".csv", ".tsv"):
+    if form and suffix in (".csv", ".tsv"):
+        content = text.render(table.columns, table.metadata, form.delimiter, form.decimal)
+        mark = "utf-8-sig" if form.encoding == "utf-8" else form.encoding
+        atomic.write(file, content.encode(mark, "replace"))
+    elif suffix in (".csv", ".tsv"):
         delimiter = "," if suffix == ".csv" else "\t"
         atomic.write(file, text.render(pointed(table), table.metadata, delimiter))
     else:
@@ -116,6 +136,20 @@ def cell_error(table: Table, name: str, row: int, problem: str) -> InputError:
     word = "row" if Path(table.source).suffix.lower() in ("", ".parquet", ".xlsx") else "line"
     number = table.lines[row] if row < len(table.lines) else row + 1
     return InputError(f"{table.source}, {word} {number}, column '{name}': {problem}")
+
+
+def recognised(path: str | os.PathLike[str]) -> dialect.Export:
+    """How a file that another program has written holds its table."""
+    file = Path(path)
+    data, suffix = _content(file), _suffix(file)
+    if suffix == ".xlsx":
+        rows = [[as_text(cell) for cell in row] for _, row in workbook.read_rows(data, file.name)]
+        return dialect.recognised_rows(rows, TableFormat(), file.name)
+    if suffix == ".parquet":
+        names = [*parquet.parse(data, file.name, most=0).columns]
+        return dialect.Export(TableFormat(), names, [""] * len(names))
+    text.refuse_foreign(data, file.name, allowed=text.UTF_16)
+    return dialect.recognised_text(data, file.name)
 
 
 def _suffix(path: Path) -> str:

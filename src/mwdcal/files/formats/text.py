@@ -29,6 +29,8 @@ _MAX_LINES = 1_000_000
 _DELIMITING = re.compile(r'[",;\t]')
 _QUOTED = re.compile(r'"[^"]*"')
 
+UTF_16 = (b"\xff\xfe", b"\xfe\xff")
+"""What UTF-16 text begins with."""
 _FOREIGN = {
     b"\xff\xfe": ("UTF-16 text", "Save it as UTF-8 (in Excel: 'CSV UTF-8')."),
     b"\xfe\xff": ("UTF-16 text", "Save it as UTF-8 (in Excel: 'CSV UTF-8')."),
@@ -51,10 +53,10 @@ class Head(NamedTuple):
     body: bytes
 
 
-def parse(data: bytes, source: str) -> Parts:
-    """The table in the bytes of a text file."""
+def parse(data: bytes, source: str, delimiter: str = "") -> Parts:
+    """The table in the bytes of a text file; without `delimiter` the header says what it is."""
     lines = _lines(data, source)
-    top = _head(lines, source)
+    top = _head(lines, source, delimiter)
     return _parts(lines[top.lines :], top, top.lines, source)._replace(metadata=top.metadata)
 
 
@@ -65,13 +67,13 @@ def head(data: bytes, source: str) -> Head:
     return top._replace(body="\n".join(lines[top.lines :]).encode())
 
 
-def _head(lines: Sequence[str], source: str) -> Head:
+def _head(lines: Sequence[str], source: str, delimiter: str = "") -> Head:
     """The head of a table of these lines, without a body."""
     comments = list(takewhile(is_preamble, lines))
     metadata = meta.parse([(i, comment(line)) for i, line in enumerate(comments, 1)], source)
     start = len(comments)
     header = lines[start : start + 1]
-    delimiter = _delimiter(header[0], source) if header else ","
+    delimiter = delimiter or (_delimiter(header[0], source) if header else ",")
     cells = next(split(header, start, delimiter, source), (start + 1, ()))[1]
     names = [str(cell).strip() for cell in cells]
     check_names(names, f"{source}, line {start + 1}")
@@ -92,13 +94,21 @@ def _parts(lines: Sequence[str], top: Head, above: int, source: str) -> Parts:
     return Parts(of_texts(names, cells), {}, numbers)
 
 
-def render(columns: Mapping[str, Column], metadata: Mapping[str, object], delimiter: str) -> str:
-    """The text that `parse` turns back into the same columns and metadata."""
+def render(
+    columns: Mapping[str, Column],
+    metadata: Mapping[str, object],
+    delimiter: str,
+    decimal: str = ".",
+) -> str:
+    """The text that `parse` turns back into the same columns and metadata.
+
+    `decimal` is the sign in numbers; cells of text stay as they are.
+    """
     stream = io.StringIO()
     stream.writelines(f"{line}\n" for line in meta.render(metadata))
     stream.write(header(list(columns), delimiter))
     writer = csv.writer(stream, delimiter=delimiter, lineterminator="\n")
-    writer.writerows(zip(*(_cells(k, v) for k, v in columns.items()), strict=True))
+    writer.writerows(zip(*(_cells(k, v, decimal) for k, v in columns.items()), strict=True))
     return stream.getvalue()
 
 
@@ -118,9 +128,9 @@ def is_formula(cell: str) -> bool:
     return cell.startswith(FORMULA) and not looks_numeric(cell.strip().replace(",", "."))
 
 
-def _cells(name: str, column: Column) -> list[str]:
+def _cells(name: str, column: Column, decimal: str) -> list[str]:
     if not isinstance(column, list):
-        return [number(value) for value in column]
+        return [number(value).replace(".", decimal) for value in column]
     for cell in column:
         if any(mark in cell for mark in "\n\r\0"):
             raise InputError(
@@ -133,7 +143,7 @@ def _cells(name: str, column: Column) -> list[str]:
 def _lines(data: bytes, source: str, above: int = 0) -> list[str]:
     """The lines without their ends, blank ones at the end left out; `above` lines came before."""
     if not above:
-        _refuse_foreign(data, source)
+        refuse_foreign(data, source)
     content = _decoded(data, source, above).replace("\r\n", "\n").replace("\r", "\n").rstrip("\n")
     if not content.strip():
         raise InputError(
@@ -156,9 +166,10 @@ def _lines(data: bytes, source: str, above: int = 0) -> list[str]:
     return lines
 
 
-def _refuse_foreign(data: bytes, source: str) -> None:
+def refuse_foreign(data: bytes, source: str, allowed: Sequence[bytes] = ()) -> None:
+    """Refuse bytes that are no text table, unless they begin with one of those allowed."""
     for signature, (kind, advice) in _FOREIGN.items():
-        if data.startswith(signature):
+        if data.startswith(signature) and signature not in allowed:
             raise InputError(f"{source}: expected a text table; the file is {kind}. {advice}")
 
 

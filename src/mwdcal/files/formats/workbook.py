@@ -22,6 +22,8 @@ from mwdcal.files.formats.columns import (
     plain_names,
     typed,
 )
+from mwdcal.files.formats.dialect import is_metadata
+from mwdcal.sensor.profile import TableFormat
 
 # A file must not depend on the hour it was written: the first day a ZIP archive can hold.
 _EPOCH = datetime.datetime(1980, 1, 1)
@@ -33,9 +35,11 @@ _UNWRITABLE = re.compile(r"[\x00-\x08\x0b-\x1f\ufffe\uffff]")
 Row = tuple[int, Sequence[object]]
 
 
-def parse(data: bytes, source: str) -> Parts:
-    """The table on the first sheet of a workbook."""
-    rows = _rows(data, source)
+def parse(data: bytes, source: str, form: TableFormat | None = None) -> Parts:
+    """The table on the first sheet of a workbook; `form` says in which row it begins."""
+    rows = read_rows(data, source)
+    if form:
+        rows = (row for row in rows if _belongs(*row, form))
     comments: list[tuple[int, str]] = []
     header: list[Row] = []
     for line, row in rows:
@@ -79,7 +83,13 @@ def _module(source: str) -> Any:
     return openpyxl
 
 
-def _rows(data: bytes, source: str) -> Iterator[Row]:
+def _belongs(line: int, row: Sequence[object], form: TableFormat) -> bool:
+    """Whether a row holds metadata, the column names or readings."""
+    metadata = line < form.header_line and bool(row) and is_metadata(str(row[0]).lstrip())
+    return metadata or line == form.header_line or line >= form.first_line
+
+
+def read_rows(data: bytes, source: str) -> Iterator[Row]:
     """Row numbers and cells of the first sheet, without the blank cells at the end."""
     openpyxl = _module(source)
     advice = "Save it again as .xlsx, or as CSV UTF-8."

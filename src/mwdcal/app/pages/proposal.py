@@ -1,0 +1,71 @@
+"""A proposed tool profile on the screen and for machines."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from mwdcal.app.pages.page import written
+from mwdcal.app.text import one_line, plural, table
+from mwdcal.identification.proposal import Proposal, in_order
+
+UNITS = {"accelerometer": "g", "magnetometer": "nT"}
+
+
+def summary(proposal: Proposal, run: Path, output: Path) -> dict[str, Any]:
+    """The result for machines."""
+    profile = proposal.profile
+    return {
+        "run": run.name,
+        "stations": proposal.stations,
+        **msgspec.to_builtins(profile),
+        **{
+            kind: {
+                "axes": result.axes,
+                "scale": getattr(profile, kind).scale,
+                "unexplained": result.unexplained,
+                "next_best": result.next_best,
+            }
+            for kind, result in proposal.wirings.items()
+        },
+        "profile": str(output),
+    }
+
+
+def screen(proposal: Proposal, run: Path, output: Path) -> str:
+    """The result for people."""
+    profile = proposal.profile
+    blocks = [
+        f"{one_line(run.name)}   {one_line(profile.name)}   {plural(proposal.stations, 'station')}"
+    ]
+    if not isinstance(profile.table, msgspec.UnsetType):
+        form = profile.table
+        sign = "tab" if form.delimiter == "\t" else f"'{form.delimiter}'"
+        blocks[0] += (
+            f"\n{form.encoding}, delimiter {sign}, decimal sign '{form.decimal}', names in line "
+            f"{form.header_line}, readings from line {form.first_line}"
+        )
+    if not isinstance(profile.columns, msgspec.UnsetType):
+        rows = [[c, each.name, each.unit or "–"] for c, each in in_order(profile.columns)]
+        blocks.append(table(rows, ["column of a run file", "column here", "unit here"]))
+    rows = [
+        [
+            kind,
+            " ".join(result.axes),
+            _scale(getattr(profile, kind).scale, UNITS[kind]),
+            f"{result.unexplained:.1%}",
+            f"{result.next_best:.0%}",
+        ]
+        for kind, result in proposal.wirings.items()
+    ]
+    blocks.append(
+        table(rows, ["triad", "axes", "nominal scale", "unexplained", "by the next best"])
+    )
+    command = f"mwdcal calibrate {one_line(str(run))} --tool {one_line(str(output))} -o tool.json"
+    return "\n\n".join(blocks) + f"\n\n{written(profile=output)}   next: {command}"
+
+
+def _scale(scale: float | None, unit: str) -> str:
+    return f"{scale:g} raw units per {unit}" if scale else "left open: no field strength"

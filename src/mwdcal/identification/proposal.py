@@ -1,0 +1,201 @@
+"""A tool profile proposed for a table as it was exported."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+
+from mwdcal.calibration.readings import TRIADS, Readings
+from mwdcal.errors import FitError, InputError
+from mwdcal.files.contract import CHANNELS, MAPPED, units_of
+from mwdcal.files.formats import table as tables
+from mwdcal.files.formats.dialect import Export
+from mwdcal.files.formats.table import Table
+from mwdcal.files.metadata import toml
+from mwdcal.files.runs import check_run, renamed, to_readings
+from mwdcal.geometry.vectors import Array, tool_from_earth
+from mwdcal.identification.columns import proposed
+from mwdcal.identification.wiring import LEAST_STATIONS, Wiring, is_clear, wiring
+from mwdcal.sensor.profile import ColumnSource, Profile, TriadProfile
+
+NEEDED = {
+    "accelerometer": ("inclination", "toolface"),
+    "magnetometer": ("inclination", "azimuth", "toolface"),
+}
+"""References that tell the axes of a triad."""
+UNRELATED = 0.9
+"""Readings of which even the best axes leave more than this share have nothing to do with the references."""
+MOST_NAMED = 6
+"""Alternatives that a message names."""
+
+
+class Proposal(NamedTuple):
+    """A profile, how the axes of each triad in it were told, and the number of stations that told."""
+
+    profile: Profile
+    wirings: dict[str, Wiring]
+    stations: int
+
+
+def propose(path: str | os.PathLike[str]) -> Proposal:
+    """The profile with which a table of stations at known attitudes is a calibration run.
+
+    Raises:
+        InputError: the file cannot be read, or is no table of stations.
+        FitError: columns, units or axes that names and readings leave open.
+    """
+    export = tables.recognised(path)
+    form = None if _is_documented(path, export) else export.form
+    table = tables.read(path, form=form)
+
+    def values(name: str) -> Array | None:
+        try:
+            return tables.numbers(table, name)
+        except InputError:
+            return None
+
+    columns = proposed(export.names, export.units, values, table.source)
+    profile = Profile(name=Path(path).stem, table=form or msgspec.UNSET, columns=columns)
+    run = renamed(table, profile)
+    check_run(run)
+    readings, _ = to_readings(run, profile)
+    wirings = _wirings(run, readings)
+    scales = {kind: _rounded(result.scale) for kind, result in wirings.items()}
+    if readings.relative:
+        scales["magnetometer"] = None
+    triads = {
+        kind: TriadProfile(axes=result.axes, scale=scales[kind])  # type: ignore[arg-type]
+        for kind, result in wirings.items()
+    }
+    name = str(readings.metadata.get("serial", Path(path).stem))
+    profile = msgspec.structs.replace(profile, name=name, **triads)
+    return Proposal(_without_the_usual(profile), wirings, readings.count)
+
+
+def _is_documented(path: str | os.PathLike[str], export: Export) -> bool:
+    """Whether a table, but for the names of its columns, is written as a run file is."""
+    try:
+        return [*tables.read(path).columns] == export.names and export.form.decimal == "."
+    except InputError:
+        return False
+
+
+def _rounded(scale: float) -> float | None:
+    """Four digits: a nominal scale says no more."""
+    return float(f"{scale:.4g}")
+
+
+def _without_the_usual(profile: Profile) -> Profile:
+    """The profile without what it would say of a table that is a run file already."""
+    columns = profile.columns
+    assert not isinstance(columns, msgspec.UnsetType)
+    usual = all(
+        c == each.name and each.unit in ("", *units_of(c)[:1]) for c, each in columns.items()
+    )
+    is_run_file = usual and isinstance(profile.table, msgspec.UnsetType)
+    return msgspec.structs.replace(profile, columns=msgspec.UNSET) if is_run_file else profile
+
+
+def _wirings(run: Table, readings: Readings) -> dict[str, Wiring]:
+    """The axes of the triads that the run has."""
+    known = {name: readings.reference(name) for name in NEEDED["magnetometer"]}
+    results = {}
+    for kind in TRIADS:
+        if getattr(readings, kind) is None:
+            continue
+        absent = [name for name in NEEDED[kind] if np.isnan(known[name]).all()]
+        whole = ~np.isnan([known[name] for name in NEEDED[kind]]).any(0)
+        if absent or whole.sum() < LEAST_STATIONS:
+            raise FitError(
+                f"{run.source}: the axes of the {kind} are told by readings at known "
+                f"{', '.join(NEEDED[kind])}: at least {LEAST_STATIONS} stations, got {whole.sum()}"
+                f"{f' (no {absent[0]})' if absent else ''}. Add these columns, or write a profile "
+                'with axes such as ["+x", "+y", "+z"] (all 48 orders and signs are open).'
+            )
+        raw = np.stack([tables.numbers(run, name) for name in CHANNELS[kind]], -1)[whole]
+        result = wiring(raw, *_parts(kind, readings, whole))
+        if not is_clear(result):
+            raise FitError(f"{run.source}: {_choice(kind, result)}")
+        results[kind] = result
+    return results
+
+
+def _parts(kind: str, readings: Readings, whole: Array) -> list[Array]:
+    """Components of the field along the tool axes (n, 3), in g or nT; of an unknown dip, both of them."""
+    angles = [
+        np.nan_to_num(readings.reference(name)[whole])
+        for name in ("inclination", "azimuth", "toolface")
+    ]
+    turn = tool_from_earth(*angles)
+    north, down = turn[..., 0], turn[..., 2]
+    if kind == "accelerometer":
+        return [down]
+    dip, field = (readings.reference(name)[whole] for name in ("dip", "field"))
+    strength = np.where(np.isnan(field), 1.0, field)[:, None]
+    if np.isnan(dip).any():
+        return [north * strength, down * strength]
+    return [strength * (north * np.cos(dip)[:, None] + down * np.sin(dip)[:, None])]
+
+
+def _choice(kind: str, result: Wiring) -> str:
+    """The sentence on axes that the readings leave open."""
+    if len(result.alternatives) == 1 or result.unexplained > UNRELATED:
+        return (
+            f"no axes of the {kind} explain its readings: the best, {toml(result.axes)}, leave "
+            f"{result.unexplained:.0%} of their variation. Check the reference angles, their units, and whether "
+            "the columns are the raw channels."
+        )
+    named = " or ".join(toml(axes) for axes in result.alternatives[:MOST_NAMED])
+    more = len(result.alternatives) - MOST_NAMED
+    return (
+        f"the readings leave the axes of the {kind} open: {named}{f' or {more} others' if more > 0 else ''}. "
+        "Add stations at other inclinations and toolfaces, or write the axes into a profile."
+    )
+
+
+def as_toml(proposal: Proposal, source: str) -> str:
+    """The text of the profile, with how its entries were told."""
+    profile = proposal.profile
+    lines = [
+        f"# Proposed by mwdcal profile from {source}, {proposal.stations} stations. Check and complete it.",
+        f"name = {toml(profile.name)}",
+    ]
+    for kind, unit in (("accelerometer", "g"), ("magnetometer", "nT")):
+        if kind in proposal.wirings:
+            result = proposal.wirings[kind]
+            lines += [
+                "",
+                f"[{kind}]",
+                f"# {_sureness(result)}",
+                f"axes = {toml(result.axes)}",
+            ]
+            if scale := getattr(profile, kind).scale:
+                lines.append(f"scale = {scale!r}   # raw units per {unit}")
+    if not isinstance(profile.table, msgspec.UnsetType):
+        lines += ["", "[table]"]
+        fields = msgspec.structs.asdict(profile.table)
+        lines += [f"{key} = {toml(value)}" for key, value in fields.items()]
+    if not isinstance(profile.columns, msgspec.UnsetType):
+        lines += ["", "[columns]   # column of a run file = column of this table"]
+        lines += [f"{c} = {toml(_stated(each))}" for c, each in in_order(profile.columns)]
+    return "\n".join(lines) + "\n"
+
+
+def in_order(columns: dict[str, ColumnSource]) -> list[tuple[str, ColumnSource]]:
+    """The columns in the order of a run file."""
+    return sorted(columns.items(), key=lambda each: MAPPED.index(each[0]))
+
+
+def _stated(each: ColumnSource) -> dict[str, str]:
+    return {key: value for key, value in msgspec.structs.asdict(each).items() if value}
+
+
+def _sureness(result: Wiring) -> str:
+    return (
+        f"these axes leave {result.unexplained:.1%} of the readings' variation, the next best "
+        f"{result.next_best:.0%}"
+    )

@@ -1,0 +1,290 @@
+"""`mwdcal profile`: exports as people have them, calibrated without an option typed by hand."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+import exports
+from cli_support import mwdcal, numbers, read_csv, refused, servo_run, write_csv
+from mwdcal.calibration.readings import TRIADS
+from mwdcal.files.profiles import load_profile
+from mwdcal.geometry.observables import RESULTS
+from mwdcal.identification.columns import meaning
+from mwdcal.identification.wiring import is_clear, wiring
+
+DIALECTS = list(exports.DIALECTS)
+
+
+@pytest.mark.parametrize("place", range(len(DIALECTS)), ids=DIALECTS)
+def test_an_export_gives_the_results_of_the_clean_run(tmp_path, place):
+    dialect = exports.DIALECTS[DIALECTS[place]]
+    run, roll = (
+        exports.write(tmp_path / f"x-{i}", r, dialect) for i, r in enumerate(exports.runs(place))
+    )
+    plain_run, plain_roll, plain_tool = exports.clean(tmp_path, place)
+    ran = mwdcal("profile", run, "-o", tmp_path / "tool.toml.new", "--json")
+    assert ran.code == 0, ran.err
+    for kind, axes in zip(TRIADS, exports.axes(place, dialect), strict=True):
+        assert tuple(ran.json[kind]["axes"]) == axes
+    tool = tmp_path / "tool.toml.new"
+    outputs = []
+    for name, cal_run, cal_roll, profile in (
+        ("export", run, roll, tool),
+        ("clean", plain_run, plain_roll, plain_tool),
+    ):
+        cal = tmp_path / f"{name}.json"
+        ran = mwdcal("calibrate", cal_run, "--tool", profile, "-o", cal)
+        assert ran.code == 0, ran.err
+        verdict = mwdcal("verify", cal, cal_roll, "--json")
+        assert verdict.code == 0, verdict.err
+        applied = tmp_path / f"{name}-out{cal_roll.suffix}"
+        ran = mwdcal("apply", cal, cal_roll, "-o", applied)
+        assert ran.code == 0, ran.err
+        rows = [(r["name"], r["value"], r["limit"], r["passed"]) for r in verdict.json["rows"]]
+        outputs.append((rows, applied))
+    (rows, applied), (plain_rows, plain_applied) = outputs
+    assert [(n, most, passed) for n, _, most, passed in rows] == [
+        (n, most, passed) for n, _, most, passed in plain_rows
+    ]
+    np.testing.assert_allclose([r[1] for r in rows], [r[1] for r in plain_rows], rtol=1e-6)
+    corrected, clean = results(applied, dialect), read_csv(plain_applied)
+    for name in RESULTS:
+        expected = numbers(clean[name])
+        np.testing.assert_allclose(
+            corrected[name], expected, rtol=0, atol=1e-9 * max(1.0, np.nanmax(np.abs(expected)))
+        )
+
+
+def results(path, dialect):
+    """The results in an output, by a reader of its dialect that is not the package's own."""
+    if dialect.suffix == ".parquet":
+        columns = exports.pq.read_table(path).to_pydict()
+    elif dialect.suffix == ".xlsx":
+        rows = [
+            r
+            for r in exports.openpyxl.load_workbook(path).active.values
+            if not str(r[0]).startswith("#")
+        ]
+        columns = dict(zip(rows[0], zip(*rows[1:], strict=True), strict=True))
+    else:
+        encoding = "utf-8-sig" if dialect.encoding == "utf-8" else dialect.encoding
+        lines = [s for s in path.read_text(encoding).splitlines() if not s.startswith("#")]
+        rows = list(exports.csv.reader(lines, delimiter=dialect.delimiter))
+        columns = dict(zip(rows[0], zip(*rows[1:], strict=True), strict=True))
+    assert (
+        list(dialect.names.values())[1:7]
+        == [n for n in columns if n in dialect.names.values()][1:7]
+    )
+    return {
+        name: np.array(
+            [
+                np.nan if v in (None, "") else float(str(v).replace(dialect.decimal, "."))
+                for v in columns[name]
+            ]
+        )
+        for name in RESULTS
+    }
+
+
+# ----------------------------------------------------------------------------- open choices
+
+
+def changed(**columns):
+    """Columns of a sound run with other ones; None takes one away."""
+    run = {k: v for k, v in servo_run().items() if columns.get(k, v) is not None}
+    return {**run, **{k: v for k, v in columns.items() if v is not None}}
+
+
+def renamed(run, **names):
+    """The run with columns under other names."""
+    return {names.get(k, k): v for k, v in run.items()}
+
+
+def thousands(run):
+    """Raw readings as whole numbers with a comma."""
+    return {
+        k: [f"{1 + abs(int(v * 1000)) // 1000},{abs(int(v * 1000)) % 1000:03d}" for v in run[k]]
+        for k in exports.RAW
+    }
+
+
+OPEN = {
+    "one inclination": (servo_run(inclinations=(90,)), "axes of the accelerometer open"),
+    "two azimuths": (
+        {**renamed(servo_run(), ref_azimuth_deg="Azi stand", ), "Ref Azi": servo_run()["ref_azimuth_deg"]},
+        "'Azi stand' and 'Ref Azi' may each be 'ref_azimuth_deg'",
+    ),
+    "true north": (renamed(servo_run(), ref_azimuth_deg="Azimuth true"), "counts from true or grid north"),
+    "no unit of temperature": (
+        renamed(changed(temperature_c=np.full(48, 77.0)), temperature_c="Temp"),
+        "neither its name nor its values say whether it is in °C or °F or K",
+    ),
+    "no unit of angles": (
+        renamed(changed(ref_inclination_deg=np.radians(servo_run()["ref_inclination_deg"])),
+                ref_inclination_deg="Inc"),
+        "whether it is in ° or rad",
+    ),
+    "a field that is none": (
+        renamed(changed(ref_field_nt=np.full(48, 5.0)), ref_field_nt="Btotal"),
+        "in nT or µT or mT or gauss",
+    ),
+    "no toolface": (changed(ref_toolface_deg=None), "(no toolface)"),
+    "nameless channels": (renamed(servo_run(), ax="Ch1", ay="Ch2", az="Ch3"), "no column says by its name"),
+    "two magnetometers": (changed(mz=None), "only mx, my"),
+    "no relation": (
+        changed(**{k: np.random.default_rng(1).normal(size=48) for k in exports.RAW}),
+        "no axes of the accelerometer explain",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", OPEN)
+def test_what_is_open_is_asked_and_nothing_is_written(tmp_path, case):
+    columns, expected = OPEN[case]
+    run = write_csv(tmp_path / "run.csv", columns)
+    message = refused(mwdcal("profile", run, "-o", tmp_path / "tool.toml"), 3)
+    assert expected in message
+    assert not (tmp_path / "tool.toml").exists()
+
+
+def test_a_comma_that_may_separate_thousands_is_asked(tmp_path):
+    run = {k: np.round(v) for k, v in servo_run().items()}
+    path = write_csv(tmp_path / "run.csv", {**run, **thousands(servo_run())}, delimiter=";")
+    path.write_text(path.read_text().replace(".0;", ";").replace(".0\n", "\n"))
+    message = refused(mwdcal("profile", path, "-o", tmp_path / "tool.toml"), 3)
+    assert "may be a decimal sign or separate thousands" in message
+
+
+def test_mixed_decimal_signs_are_refused(tmp_path):
+    path = write_csv(tmp_path / "run.csv", servo_run(), delimiter=";")
+    path.write_text(path.read_text().replace("\n1;25.0;", "\n1;25,5;"))
+    message = refused(mwdcal("profile", path, "-o", tmp_path / "tool.toml"), 2)
+    assert "25,5" in message
+
+
+# ------------------------------------------------------------------------------------ axes
+
+
+@pytest.mark.parametrize("unknown_dip", [False, True])
+def test_all_signed_permutations_are_told(unknown_dip):
+    rng = np.random.default_rng(3)
+    field = rng.normal(size=(20, 3))
+    other = np.cross(field, rng.normal(size=(20, 3)))
+    gain = 3.0 * (np.eye(3) + 0.02 * rng.normal(size=(3, 3)))
+    parts = [field, other] if unknown_dip else [field]
+    for order in itertools.permutations(range(3)):
+        for signs in itertools.product((1, -1), repeat=3):
+            vector = field + 2 * other if unknown_dip else field
+            raw = (vector @ gain)[:, list(order)] * signs + [5.0, -3.0, 0.2]
+            result = wiring(raw, *parts)
+            assert is_clear(result)
+            assert result.axes == tuple(
+                "+-"[s < 0] + "xyz"[o] for o, s in zip(order, signs, strict=True)
+            )
+            expected = 3.0 * np.sqrt(5) if unknown_dip else 3.0
+            assert result.scale == pytest.approx(expected, rel=0.1)
+
+
+def test_an_axis_without_variation_stays_open():
+    field = np.random.default_rng(4).normal(size=(20, 3)) * [1, 1, 0] + [0, 0, 0.3]
+    result = wiring(field * 2.0, field)
+    assert not is_clear(result)
+    assert sorted(result.alternatives) == [("+x", "+y", "+z"), ("+x", "+y", "-z")]
+
+
+# -------------------------------------------------------------------------- names and files
+
+
+@pytest.mark.parametrize(
+    ("name", "column", "unit"),
+    [
+        ("Neigung Soll (°)", "ref_inclination_deg", "°"),
+        ("Azimut", "ref_azimuth_deg", ""),
+        ("gravTran2Raw", "ay", "raw"),
+        ("magAxialRaw", "mz", "raw"),
+        ("Température (°C)", "temperature_c", "°C"),
+        ("Feldstärke [µT]", "ref_field_nt", "µT"),
+        ("Beschleunigung X (m/s²)", "ax", "m/s²"),
+    ],
+)
+def test_names_of_other_houses(name, column, unit):
+    assert tuple(meaning(name)) == (column, unit)
+
+
+def test_a_documented_run_needs_neither_columns_nor_a_table(tmp_path):
+    run = write_csv(tmp_path / "run.csv", servo_run(), 'serial = "A-1"')
+    assert mwdcal("profile", run, "-o", tmp_path / "tool.toml").code == 0
+    profile, _ = load_profile(str(tmp_path / "tool.toml"))
+    assert profile.name == "A-1"
+    assert "[columns]" not in (tmp_path / "tool.toml").read_text("utf-8")
+    assert "[table]" not in (tmp_path / "tool.toml").read_text("utf-8")
+    assert profile.accelerometer.scale == pytest.approx(3.0, rel=0.1)
+    assert profile.magnetometer.scale == pytest.approx(5e-5, rel=0.1)
+
+
+@pytest.fixture
+def german(tmp_path):
+    """A run, a roll test and a profile of a German export."""
+    d = exports.DIALECTS["german"]
+    run, roll = (
+        exports.write(tmp_path / n, r, d)
+        for n, r in zip(("run", "roll"), exports.runs(0), strict=True)
+    )
+    tool = tmp_path / "tool.toml"
+    assert mwdcal("profile", run, "-o", tool).code == 0
+    return run, roll, tool
+
+
+def test_a_profile_of_an_export_also_takes_documented_runs(german, tmp_path):
+    _, _, tool = german
+    run = write_csv(tmp_path / "plain.csv", exports.runs(0)[0])
+    assert mwdcal("calibrate", run, "--tool", tool, "-o", tmp_path / "cal.json").code == 0
+    ran = mwdcal("apply", tmp_path / "cal.json", run, "-o", tmp_path / "out.csv")
+    assert ran.code == 0
+    assert "inclination_deg" in read_csv(tmp_path / "out.csv")
+
+
+def test_a_missing_channel_and_another_layout_are_named(german, tmp_path):
+    run, _, tool = german
+    text = run.read_bytes()
+    (tmp_path / "less.csv").write_bytes(text.replace(b"Gx", b"Gq", 1))
+    output = ("--tool", tool, "-o", tmp_path / "cal.json")
+    assert "'Gx', which is 'ax'" in refused(mwdcal("calibrate", tmp_path / "less.csv", *output), 2)
+    (tmp_path / "shifted.csv").write_bytes(b"one more line\r\n" + text)
+    message = refused(mwdcal("calibrate", tmp_path / "shifted.csv", *output), 2)
+    assert "mwdcal profile" in message
+
+
+def test_a_wrong_cell_is_named_in_the_words_of_the_export(german, tmp_path):
+    run, _, tool = german
+    lines = run.read_bytes().decode("cp1252").split("\r\n")
+    cells = lines[7].split(";")
+    lines[7] = ";".join([cells[0], "o,o", *cells[2:]])
+    wrong = tmp_path / "wrong.csv"
+    wrong.write_bytes("\r\n".join(lines).encode("cp1252"))
+    message = refused(mwdcal("calibrate", wrong, "--tool", tool, "-o", tmp_path / "cal.json"), 2)
+    assert "wrong.csv, line 8, column 'Gx'" in message
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ('aq = {name = "Gx"}', "must be a column of a run file"),
+        ('temperature_c = {name = "T", unit = "nT"}', "must be one of °C, °F, K"),
+        ('ax = {name = "G"}\nay = {name = "G"}', "is 'ax' already"),
+        ("ax = 3", "columns"),
+    ],
+)
+def test_wrong_columns_of_a_profile_are_refused(tmp_path, line, expected):
+    (tmp_path / "tool.toml").write_text(f'name = "x"\n[columns]\n{line}\n', "utf-8")
+    run = write_csv(tmp_path / "run.csv", servo_run())
+    ran = mwdcal("calibrate", run, "--tool", tmp_path / "tool.toml", "-o", tmp_path / "cal.json")
+    assert expected in refused(ran, 2)
+
+
+def test_bytes_that_an_encoding_does_not_have(german, tmp_path):
+    run, _, tool = german
+    tool.write_text(tool.read_text("utf-8").replace("cp1252", "utf-8"), "utf-8")
+    message = refused(mwdcal("calibrate", run, "--tool", tool, "-o", tmp_path / "cal.json"), 2)
+    assert "expected utf-8 text" in message
