@@ -25,7 +25,7 @@ FLOORS = (
     ("calibration",),
     ("use",),
     ("files", "profiles"),
-    ("comparison", "fleet", "logs", "planning", "registry", "survey"),
+    ("comparison", "fleet", "identification", "logs", "planning", "registry", "survey"),
     ("library",),
     ("",),  # the package itself: its public names
     ("app",),

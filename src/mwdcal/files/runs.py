@@ -73,15 +73,14 @@ def read_export(
         problem = _not_as_stated(table, profile)
     except InputError as error:
         problem = error
-    table = None
     with suppress(InputError):
         table = tables.read(path, decimal=decimal, rows=rows)
-    if table is None or not set(CHANNELS["accelerometer"]) <= {*table.columns}:
-        raise InputError(
-            f"{problem} If the table is laid out otherwise than the tool profile says, correct [table] there, "
-            "or propose a profile for it: mwdcal profile."
-        ) from None
-    return table
+        if set(CHANNELS["accelerometer"]) <= {*table.columns}:
+            return table
+    raise InputError(
+        f"{problem} If the table is laid out otherwise than the tool profile says, correct [table] there, "
+        "or propose a profile for it: mwdcal profile."
+    )
 
 
 def _sources(profile: Profile) -> dict[str, ColumnSource]:

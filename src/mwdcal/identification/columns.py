@@ -37,7 +37,7 @@ _LABELS = {
     "group": "group gruppe set rollset",
 }
 """Names of columns of labels; a column is one only where no other is."""
-_STATED = re.compile(r"\b(ref|reference|nominal|target|set)\b", re.IGNORECASE)
+_CALLED_REFERENCE = re.compile(r"\b(ref|reference|nominal|target|set)\b", re.IGNORECASE)
 _OTHER_NORTH = re.compile(r"true|grid|geographi|wahr|gitter", re.IGNORECASE)
 _BY_VALUE: dict[str, tuple[tuple[str, float, float], ...]] = {
     "ref_gravity_g": (("g", 0.9, 1.1), ("m/s²", 9.0, 10.5), ("mg", 900.0, 1100.0)),
@@ -121,7 +121,7 @@ def proposed(
 
 def _one(column: str, candidates: Sequence[str], source: str) -> str:
     """The only candidate for a column, or the only one that is called a reference."""
-    stated = [name for name in candidates if _STATED.search(spelled(name))]
+    stated = [name for name in candidates if _CALLED_REFERENCE.search(spelled(name))]
     if len(candidates) == 1 or len(stated) == 1:
         return (stated or candidates)[0]
     raise FitError(
@@ -175,7 +175,7 @@ def _labels(names: Sequence[str], chosen: Mapping[str, ColumnSource]) -> dict[st
     labels = {}
     for column, words in _LABELS.items():
         forms = {name: re.sub(r"[^a-z]", "", name.lower()) for name in names if name not in taken}
-        found = [name for name, form in forms.items() if form in words.split()]
-        if len(found) == 1 and column not in chosen:
-            labels[column] = ColumnSource(name=found[0])
+        matching = [name for name, form in forms.items() if form in words.split()]
+        if len(matching) == 1 and column not in chosen:
+            labels[column] = ColumnSource(name=matching[0])
     return labels

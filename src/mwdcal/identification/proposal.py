@@ -17,7 +17,7 @@ from mwdcal.files.formats.dialect import Export
 from mwdcal.files.formats.table import Table
 from mwdcal.files.metadata import toml
 from mwdcal.files.runs import check_run, renamed, to_readings
-from mwdcal.geometry.vectors import Array, tool_from_earth
+from mwdcal.geometry.vectors import Array, Bools, tool_from_earth
 from mwdcal.identification.columns import proposed
 from mwdcal.identification.wiring import LEAST_STATIONS, Wiring, is_clear, wiring
 from mwdcal.sensor.profile import ColumnSource, Profile, TriadProfile
@@ -78,8 +78,11 @@ def propose(path: str | os.PathLike[str]) -> Proposal:
 
 def _is_documented(path: str | os.PathLike[str], export: Export) -> bool:
     """Whether a table, but for the names of its columns, is written as a run file is."""
+    suffix, form = Path(path).suffix.lower(), export.form
+    if suffix in (".csv", ".tsv") and form.delimiter != {".csv": ",", ".tsv": "\t"}[suffix]:
+        return False
     try:
-        return [*tables.read(path).columns] == export.names and export.form.decimal == "."
+        return [*tables.read(path).columns] == export.names and form.decimal == "."
     except InputError:
         return False
 
@@ -108,7 +111,7 @@ def _wirings(run: Table, readings: Readings) -> dict[str, Wiring]:
         if getattr(readings, kind) is None:
             continue
         absent = [name for name in NEEDED[kind] if np.isnan(known[name]).all()]
-        whole = ~np.isnan([known[name] for name in NEEDED[kind]]).any(0)
+        whole = np.all([~np.isnan(known[name]) for name in NEEDED[kind]], 0)
         if absent or whole.sum() < LEAST_STATIONS:
             raise FitError(
                 f"{run.source}: the axes of the {kind} are told by readings at known "
@@ -124,7 +127,7 @@ def _wirings(run: Table, readings: Readings) -> dict[str, Wiring]:
     return results
 
 
-def _parts(kind: str, readings: Readings, whole: Array) -> list[Array]:
+def _parts(kind: str, readings: Readings, whole: Bools) -> list[Array]:
     """Components of the field along the tool axes (n, 3), in g or nT; of an unknown dip, both of them."""
     angles = [
         np.nan_to_num(readings.reference(name)[whole])

@@ -16,7 +16,7 @@ from mwdcal.geometry.vectors import Array
 
 EXPLAINED = 0.3
 """Largest share of the channels' variation that the right axes leave: misalignment, noise, bias."""
-APART = 0.2
+ALTERNATIVE = 0.2
 """By how much less they leave than any others."""
 LEAST_STATIONS = 5
 
@@ -61,7 +61,7 @@ def wiring(raw: Array, *parts: Array) -> Wiring:
         for signs in product((0, 1), repeat=3)
     )
     best, order, signs = ranked[0]
-    near = [each for each in ranked if each[0] < best + APART]
+    near = [each for each in ranked if each[0] < best + ALTERNATIVE]
     scale = float(np.median(sizes[range(3), order]))
     return Wiring(
         _named(order, signs), scale, best, ranked[1][0], [_named(*each[1:]) for each in near]
@@ -72,6 +72,6 @@ def _named(order: tuple[int, ...], signs: tuple[int, ...]) -> tuple[str, ...]:
     return tuple("+-"[sign] + "xyz"[axis] for axis, sign in zip(order, signs, strict=True))
 
 
-def is_clear(found: Wiring) -> bool:
+def is_clear(result: Wiring) -> bool:
     """Whether the readings leave no choice of axes."""
-    return len(found.alternatives) == 1 and found.unexplained < EXPLAINED
+    return len(result.alternatives) == 1 and result.unexplained < EXPLAINED

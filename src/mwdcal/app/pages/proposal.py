@@ -11,7 +11,7 @@ from mwdcal.app.pages.page import written
 from mwdcal.app.text import one_line, plural, table
 from mwdcal.identification.proposal import Proposal, in_order
 
-UNITS = {"accelerometer": "g", "magnetometer": "nT"}
+SCALE_UNITS = {"accelerometer": "g", "magnetometer": "nT"}
 
 
 def summary(proposal: Proposal, run: Path, output: Path) -> dict[str, Any]:
@@ -54,7 +54,7 @@ def screen(proposal: Proposal, run: Path, output: Path) -> str:
         [
             kind,
             " ".join(result.axes),
-            _scale(getattr(profile, kind).scale, UNITS[kind]),
+            _scale(getattr(profile, kind).scale, SCALE_UNITS[kind]),
             f"{result.unexplained:.1%}",
             f"{result.next_best:.0%}",
         ]
