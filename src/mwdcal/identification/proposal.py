@@ -9,7 +9,7 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from mwdcal.calibration.readings import TRIADS, Readings
+from mwdcal.calibration.readings import TRIADS, Readings, simulated
 from mwdcal.errors import FitError, InputError
 from mwdcal.files.contract import CHANNELS, MAPPED, units_of
 from mwdcal.files.formats import table as tables
@@ -34,11 +34,16 @@ MOST_NAMED = 6
 
 
 class Proposal(NamedTuple):
-    """A profile, how the axes of each triad in it were told, and the number of stations that told."""
+    """A profile, how the axes of each triad in it were told, and the run that told.
+
+    `unused` are columns of the table that are nothing of a run file.
+    """
 
     profile: Profile
     wirings: dict[str, Wiring]
     stations: int
+    unused: tuple[str, ...]
+    simulated: list[str]
 
 
 def propose(path: str | os.PathLike[str]) -> Proposal:
@@ -73,7 +78,13 @@ def propose(path: str | os.PathLike[str]) -> Proposal:
     }
     name = str(readings.metadata.get("serial", Path(path).stem))
     profile = msgspec.structs.replace(profile, name=name, **triads)
-    return Proposal(_without_the_usual(profile), wirings, readings.count)
+    return Proposal(
+        _without_the_usual(profile),
+        wirings,
+        readings.count,
+        readings.unused,
+        simulated(readings.metadata),
+    )
 
 
 def _is_documented(path: str | os.PathLike[str], export: Export) -> bool:

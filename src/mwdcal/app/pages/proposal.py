@@ -20,6 +20,7 @@ def summary(proposal: Proposal, run: Path, output: Path) -> dict[str, Any]:
     return {
         "run": run.name,
         "stations": proposal.stations,
+        "simulated": bool(proposal.simulated),
         **msgspec.to_builtins(profile),
         **{
             kind: {
