@@ -27,7 +27,7 @@ from mwdcal.calibration.methods import check_stand_errors
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.prior import DATASHEET, profile_for
 from mwdcal.errors import InputError, reason
-from mwdcal.files import profiles
+from mwdcal.files import profiles, synonyms
 from mwdcal.files.formats import atomic, parquet
 from mwdcal.fleet import kept
 from mwdcal.fleet.parts import Plan, load, solve
@@ -56,7 +56,7 @@ def calibrate_table(
     source = open_source(runs)
     if max(options.orders) and "temperature_c" not in source.columns:
         raise no_temperature(max(options.orders))
-    unused = unused_columns(source.unused)
+    unused = unused_columns(synonyms.unused(source.columns, source.used))
     for line in lines(unused):
         say(line)
     target = atomic.target(output)
