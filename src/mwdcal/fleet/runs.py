@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from mwdcal.calibration.diagnosis.flags import Alone
 from mwdcal.calibration.readings import Readings, group_numbers
 from mwdcal.errors import InputError, MwdcalError
 from mwdcal.files.contract import COLUMNS, RANGES
@@ -21,6 +22,7 @@ from mwdcal.files.formats import parquet
 from mwdcal.files.formats.columns import as_text
 from mwdcal.files.formats.table import Table
 from mwdcal.files.runs import convert, to_readings
+from mwdcal.fleet.choices import alike
 from mwdcal.fleet.sources import AZIMUTH, OFFSET, SERIAL
 from mwdcal.fleet.tables import one_chunk
 from mwdcal.geometry.vectors import AnyArray, Array, Bools, Ints
@@ -106,6 +108,10 @@ class Rows:
         metadata = {**self.metadata, SERIAL: str(serial), **self._north(tool, source)}
         return to_readings(Table(columns, metadata, source, lines), self.profile)
 
+    def members(self, tools: Ints) -> Alone:
+        """The same for some tools, by place among these."""
+        return lambda place: self.alone(int(tools[place]))
+
     def label(self, tool: int, station: int) -> str:
         """A station's label, as a single run has it."""
         number = str(station + 1)
@@ -154,16 +160,7 @@ def refused_tools(rows: Rows) -> dict[int, str]:
 
 def batches(rows: Rows, tools: Ints) -> list[Batch]:
     """The given tools, in batches of one number of stations and the same kinds of evidence."""
-    if not tools.size:
-        return []
-    keys = _kinds(rows)[tools]
-    if (keys == keys[0]).all():
-        return [Batch(_readings(rows, tools), tools)]
-    _, number = np.unique(keys, axis=0, return_inverse=True)
-    order = np.argsort(number, kind="stable")
-    bounds = np.flatnonzero(np.diff(number[order], prepend=-1))
-    groups = np.split(order, bounds[1:])
-    return [Batch(_readings(rows, tools[np.sort(each)]), tools[np.sort(each)]) for each in groups]
+    return [Batch(_readings(rows, some), some) for _, some in alike(tools, _kinds(rows)[tools])]
 
 
 def _kinds(rows: Rows) -> Ints:
