@@ -124,20 +124,26 @@ def _check_stretches(count: int, source: str) -> None:
         )
 
 
-def in_several_folders(source: FleetTable, tools: Tools) -> int:
-    """Number of tools with rows in folders that state different values of a column."""
+def in_several_folders(source: FleetTable, tools: Tools) -> list[str]:
+    """What to say of tools with rows in folders that state different values of a column."""
     numbers: dict[Any, int] = {}
     keys_of_pieces = [
         tuple(k for k in p.keys if k[0] not in (SERIAL, OFFSET)) for p in source.pieces
     ]
     folder = np.array([numbers.setdefault(keys, len(numbers)) for keys in keys_of_pieces])
     if len(numbers) == 1:
-        return 0
+        return []
     ends = np.cumsum([piece.rows for piece in source.pieces])
     last = np.append(tools.runs[1:], source.rows) - 1
     places = folder[np.searchsorted(ends, [tools.runs, last], "right")]
     pairs = np.unique(tools.tool * len(numbers) + places)
-    return int(np.sum(np.bincount(pairs // len(numbers)) > 1))
+    count = int(np.sum(np.bincount(pairs // len(numbers)) > 1))
+    if not count:
+        return []
+    return [
+        f"tools with rows in several folders: {count}. All rows of a serial are one run; where they are "
+        "runs of their own, calibrate folder by folder."
+    ]
 
 
 def _serials(source: FleetTable) -> Iterator[Any]:
