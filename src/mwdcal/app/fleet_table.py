@@ -214,7 +214,7 @@ def _merge(
     arrow, pq = parquet.modules(target.name)
     described = {parquet.KEY: msgspec.json.encode(metadata, enc_hook=str)}
     writer = None
-    with atomic.replacing(target) as stream, _writing(target):
+    with atomic.replacing(target) as stream:
         try:
             for part in parts:
                 if writer is None:
@@ -223,6 +223,11 @@ def _merge(
                     writer = pq.ParquetWriter(stream.name, schema, use_dictionary=texts)
                 writer.write_table(part.cast(writer.schema))
             _close(writer)
+        except OSError as error:
+            raise InputError(
+                f"cannot write '{target}': {reason(error)}. Finished parts are kept: make "
+                "room, or choose another place, and run the same command again."
+            ) from error
         finally:
             with contextlib.suppress(OSError):
                 _close(writer)
@@ -234,15 +239,3 @@ def _close(writer: Any) -> None:
     if writer is not None and writer.is_open:
         writer.is_open = False
         writer.writer.close()
-
-
-@contextlib.contextmanager
-def _writing(target: Path) -> Iterator[None]:
-    """What the system refuses in the block is the writing of the output."""
-    try:
-        yield
-    except OSError as error:
-        raise InputError(
-            f"cannot write '{target}': {reason(error)}. Finished parts are kept: make "
-            "room, or choose another place, and run the same command again."
-        ) from error

@@ -38,11 +38,11 @@ def with_orders(
     if readings.temperature is not None and (options.order == AUTO or max(options.orders)):
         ranges = temperature_ranges(readings.temperature[tools])
         groups = [group for _, group in alike(tools, ranges)]
-    if options.order != AUTO:
-        yield from ((group, options) for group in groups)
-        return
     trial = replace(options, nonlinearity={})
     for group in groups:
+        if options.order != AUTO:
+            yield group, options
+            continue
         trials = in_chunks(readings, group, lambda r: choose_orders(r, trial), fail)
         for orders, some in _by_choice(trials):
             yield some, replace(options, order=(int(orders[0]), int(orders[1])))

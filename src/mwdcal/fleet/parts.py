@@ -55,9 +55,11 @@ class Plan:
     @property
     def noise_estimated(self) -> tuple[str, ...]:
         """Triads of which neither the profile nor the table states the noise."""
-        stated = {t for t in self.triads if any(f"sd_{n}" in self.columns for n in CHANNELS[t])}
         return tuple(
-            t for t in self.triads if t not in stated and getattr(self.profile, t).noise is None
+            triad
+            for triad in self.triads
+            if getattr(self.profile, triad).noise is None
+            and not {f"sd_{name}" for name in CHANNELS[triad]} & {*self.columns}
         )
 
     def key(self, partition: Partition) -> str:
@@ -79,7 +81,7 @@ def solve(plan: Plan, loaded: bytes) -> bytes:
         )
     arrow, _ = parquet.modules(plan.source)
     table = arrow.ipc.open_stream(loaded).read_all()
-    rows = Rows.of(table, plan.source, plan.metadata, plan.profile)
+    rows = Rows(table, plan.source, plan.metadata, plan.profile)
     return packed(_result(rows, plan))
 
 
@@ -101,10 +103,9 @@ def _result(rows: Rows, plan: Plan) -> Any:
     whole = Outcome.blank(len(rows.counts), names(plan.options, plan.profile, plan.triads))
     for tool, text in refused_tools(rows).items():
         whole.status[tool], whole.message[tool] = BAD_INPUT, text
-    for batch in batches(rows, np.flatnonzero(whole.status == OK)):
-        alone = rows.members(batch.tools)
-        outcome = calibrate_batch(batch.readings, plan.options, plan.profile, alone)
-        whole = put(whole, batch.tools, outcome)
+    for tools, readings in batches(rows, np.flatnonzero(whole.status == OK)):
+        outcome = calibrate_batch(readings, plan.options, plan.profile, rows.members(tools))
+        whole = put(whole, tools, outcome)
     again = whole.lists["reshoot"]
     for tool in np.flatnonzero(whole.status == OK).tolist():
         again[tool] = [rows.label(tool, station) for station in again[tool]]

@@ -120,10 +120,8 @@ def open_source(path: Path) -> FleetTable:
 
 def _joined(name: str, files: Sequence[_File]) -> FleetTable:
     """The table of all files: each with its own azimuths, and serials of one kind."""
-    columns, notes = files[0].columns, []
-    offsets = sorted({file.offset for file in files})
-    text = any(file.text for file in files)
-    pieces = []
+    columns, notes, pieces = files[0].columns, [], []
+    text, offsets = any(file.text for file in files), sorted({file.offset for file in files})
     for file in files:
         stated: Keys = ((OFFSET, file.offset),) if any(offsets) else ()
         pieces += [replace(p, keys=(*p.keys, *stated), text=text) for p in file.pieces]
@@ -232,18 +230,13 @@ def _keys(file: Path, root: Path) -> Keys:
                 "a blank cell. Say which tool these stations belong to."
             )
         if name in contract.RANGES and value not in BLANK:
-            keys[name] = _number(value, name, file)
+            try:
+                keys[name] = float(value)
+            except ValueError:
+                raise InputError(
+                    f"{file.parent}, column '{name}': expected a number; the folder says '{value}'. Rename it."
+                ) from None
     return tuple(keys.items())
-
-
-def _number(value: str, name: str, file: Path) -> float:
-    """The number that a folder's name states."""
-    try:
-        return float(value)
-    except ValueError:
-        raise InputError(
-            f"{file.parent}, column '{name}': expected a number; the folder says '{value}'. Rename it."
-        ) from None
 
 
 def _check_type(kind: Any, name: str, file: Path) -> None:

@@ -101,7 +101,11 @@ def find_tools(source: FleetTable) -> Tools:
             indices = arrow.array(codes[change], values.indices.type)
             heads.append(arrow.DictionaryArray.from_arrays(indices, values.dictionary))
             row, last = row + len(codes), values[-1].as_py()
-            _check_stretches(sum(map(len, starts)), source.name)
+            if sum(map(len, starts)) > MOST_STRETCHES:
+                raise InputError(
+                    f"{source.name}: the rows change from tool to tool more than {MOST_STRETCHES} times. "
+                    f"Sort the table by '{SERIAL}'."
+                )
     serials = one_chunk(arrow.chunked_array(heads))
     codes = serials.indices.to_numpy(zero_copy_only=False)
     used, first, number = np.unique(codes, return_index=True, return_inverse=True)
@@ -113,15 +117,6 @@ def one_chunk(column: Any) -> Any:
     """A dictionary-encoded column as one array."""
     joined = column.unify_dictionaries().combine_chunks()
     return joined.chunk(0) if hasattr(joined, "chunks") else joined
-
-
-def _check_stretches(count: int, source: str) -> None:
-    """Refuse rows so mixed that an index of the tools would fill the memory."""
-    if count > MOST_STRETCHES:
-        raise InputError(
-            f"{source}: the rows change from tool to tool more than {MOST_STRETCHES} times. Sort the "
-            f"table by '{SERIAL}'."
-        )
 
 
 def in_several_folders(source: FleetTable, tools: Tools) -> list[str]:
@@ -155,9 +150,10 @@ def _serials(source: FleetTable) -> Iterator[Any]:
         if stated is None:
             tables = _batches(piece, (SERIAL,), SERIALS)
         else:
-            tables = iter([arrow.table({SERIAL: arrow.repeat(stated, piece.rows)})])
+            label = arrow.DictionaryArray.from_arrays(np.zeros(piece.rows, np.int32), [stated])
+            tables = iter([arrow.table({SERIAL: label})])
         for table in tables:
-            column = one_chunk(table.column(SERIAL).dictionary_encode())
+            column = one_chunk(table.column(SERIAL))
             _check_filled(column, row, source.name)
             row += len(column)
             yield column
@@ -220,16 +216,13 @@ def partitions(
     full = np.searchsorted(ends, np.arange(size, source.rows, size))
     last = np.unique(np.append(full, tools.count - 1))
     counts = np.diff(last, prepend=-1).tolist()
-    bounds = pairwise([0, *ends[last].tolist()])
-    return [_part(source, *each, count) for each, count in zip(bounds, counts, strict=True)]
-
-
-def _part(source: FleetTable, first: int, stop: int, tools: int) -> Partition:
-    """The partition of rows `first` to `stop`."""
     bounds = np.cumsum([0, *(piece.rows for piece in source.pieces)])
-    low = int(np.searchsorted(bounds, first, "right")) - 1
-    high = int(np.searchsorted(bounds, stop, "left"))
-    return Partition(source.pieces[low:high], first - int(bounds[low]), stop - first, first, tools)
+    parts = []
+    for (first, stop), count in zip(pairwise([0, *ends[last].tolist()]), counts, strict=True):
+        low = int(np.searchsorted(bounds, first, "right")) - 1
+        pieces = source.pieces[low : int(np.searchsorted(bounds, stop, "left"))]
+        parts.append(Partition(pieces, first - int(bounds[low]), stop - first, first, count))
+    return parts
 
 
 def _dealt(
@@ -237,9 +230,9 @@ def _dealt(
 ) -> list[Partition]:
     """Rows dealt into files by tool; what an interrupted command has finished is not done again."""
     _, pq = parquet.modules(source.name)
-    rows = np.bincount(tools.tool, np.diff(tools.runs, append=source.rows), tools.count)
+    sizes = np.bincount(tools.tool, np.diff(tools.runs, append=source.rows), tools.count)
     share = max(size, -(-source.rows // MOST_FILES))
-    number = np.minimum(np.cumsum(rows).astype(int) // share, MOST_FILES - 1)
+    number = np.minimum(np.cumsum(sizes).astype(int) // share, MOST_FILES - 1)
     done = folder / f"sorted-{source.fingerprint[:16]}"
     if not kept.is_whole(done):
         again = ", again: those there are damaged" if done.exists() else ""
@@ -252,8 +245,8 @@ def _dealt(
     for each, count in zip(*np.unique(number, return_counts=True), strict=True):
         file = done / f"{each:04d}.parquet"
         pieces = pieces_of(file, DEALT, pq.read_metadata(file), (("", source.fingerprint),))
-        total = sum(piece.rows for piece in pieces)
-        parts.append(Partition(tuple(pieces), 0, total, 0, int(count), dealt=True))
+        rows = sum(piece.rows for piece in pieces)
+        parts.append(Partition(tuple(pieces), 0, rows, 0, int(count), dealt=True))
     return parts
 
 
@@ -288,13 +281,13 @@ def _deal(source: FleetTable, tools: Tools, number: Ints, folder: Path) -> None:
             tool = tools.tool[np.searchsorted(tools.runs, rows, "right") - 1]
             table = table.append_column(TOOL, arrow.array(tool))
             table = table.append_column(ROW, arrow.array(rows))
-            for file in np.unique(number[tool]).tolist():
+            target = number[tool]
+            for file in np.unique(target).tolist():
                 if file not in writers:
-                    writer = pq.ParquetWriter(
-                        folder / f"{file:04d}.parquet", table.schema, compression="lz4"
-                    )
+                    path = folder / f"{file:04d}.parquet"
+                    writer = pq.ParquetWriter(path, table.schema, compression="lz4")
                     writers[file] = stack.enter_context(writer)
-                writers[file].write_table(table.filter(arrow.array(number[tool] == file)))
+                writers[file].write_table(table.filter(arrow.array(target == file)))
             row += piece.rows
 
 
