@@ -115,8 +115,7 @@ def find_tools(source: FleetTable) -> Tools:
 
 def one_chunk(column: Any) -> Any:
     """A dictionary-encoded column as one array."""
-    joined = column.unify_dictionaries().combine_chunks()
-    return joined.chunk(0) if hasattr(joined, "chunks") else joined
+    return column.unify_dictionaries().combine_chunks()
 
 
 def in_several_folders(source: FleetTable, tools: Tools) -> list[str]:
