@@ -163,8 +163,7 @@ class _Batch:
             if chosen.order != options.order:
                 self._screen(some, chosen)
             for part, final in with_curves(readings, sound(some), chosen, self.profile, fail):
-                fits = in_chunks(readings, part, partial(fit, options=final), fail)
-                for few, result in fits:
+                for few, result in in_chunks(readings, part, partial(fit, options=final), fail):
                     self._note(few, final, result)
 
     def _screen(self, tools: Ints, options: Options) -> None:
@@ -176,12 +175,10 @@ class _Batch:
 
     def _fail(self, tools: Ints, error: Exception) -> None:
         """Give tools the status and message of an error: of the input, or of arithmetic."""
-        status, message = self.outcome.status, self.outcome.message
-        if isinstance(error, MwdcalError):
-            status[tools], message[tools] = BAD_INPUT, str(error)
-            return
-        status[tools] = FAILED
-        message[tools] = f"the fit failed: {error}. Calibrate this tool alone to see why."
+        known = isinstance(error, MwdcalError)
+        words = f"the fit failed: {error}. Calibrate this tool alone to see why."
+        self.outcome.status[tools] = BAD_INPUT if known else FAILED
+        self.outcome.message[tools] = str(error) if known else words
 
     def _refuse(self, tools: Ints, refusals: Iterable[Flag]) -> None:
         """Give the first refusal of each of some tools as its status and message."""

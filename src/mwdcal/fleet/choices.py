@@ -71,8 +71,7 @@ def with_curves(
 
     trials = in_chunks(readings, tools, shown, fail, TOOLS_PER_FIT // MOST_PARTS)
     for chosen, some in _by_choice(trials):
-        nonlinearity = dict(compress(terms.items(), chosen))
-        yield some, replace(options, nonlinearity=nonlinearity)
+        yield some, replace(options, nonlinearity=dict(compress(terms.items(), chosen)))
 
 
 def alike(tools: Ints, keys: AnyArray) -> list[tuple[AnyArray, Ints]]:

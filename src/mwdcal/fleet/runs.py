@@ -92,11 +92,8 @@ class Rows:
         part = self.table.slice(self.starts[tool], self.counts[tool])
         serial = part.column(SERIAL)[0].as_py()
         lines = (part.column("#row").to_numpy() + 1).tolist()
-        columns = {
-            name: parquet.as_column(name, part.column(name), arrow)
-            for name in part.column_names
-            if name in COLUMNS
-        }
+        names = [name for name in part.column_names if name in COLUMNS]
+        columns = {name: parquet.as_column(name, part.column(name), arrow) for name in names}
         place = self.source if self.source.endswith(".parquet") else f"{self.source}/*.parquet"
         source = f"serial {serial} of {place}"
         metadata = {**self.metadata, SERIAL: str(serial), **self._north(tool, source)}

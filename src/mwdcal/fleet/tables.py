@@ -121,10 +121,8 @@ def one_chunk(column: Any) -> Any:
 def in_several_folders(source: FleetTable, tools: Tools) -> list[str]:
     """What to say of tools with rows in folders that state different values of a column."""
     numbers: dict[Any, int] = {}
-    keys_of_pieces = [
-        tuple(k for k in p.keys if k[0] not in (SERIAL, OFFSET)) for p in source.pieces
-    ]
-    folder = np.array([numbers.setdefault(keys, len(numbers)) for keys in keys_of_pieces])
+    stated = [tuple(k for k in p.keys if k[0] not in (SERIAL, OFFSET)) for p in source.pieces]
+    folder = np.array([numbers.setdefault(keys, len(numbers)) for keys in stated])
     if len(numbers) == 1:
         return []
     ends = np.cumsum([piece.rows for piece in source.pieces])
