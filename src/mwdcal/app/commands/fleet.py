@@ -48,9 +48,8 @@ def command(
         from mwdcal.app import fleet_table
         from mwdcal.app.pages import fleet_report, fleet_summary
         from mwdcal.files.formats import atomic
-        from mwdcal.fleet.sources import input_files
 
-    options.check_outputs([output], [*input_files(runs), tool], page=report)
+    options.check_outputs([output], [runs, tool], page=report)
     try:
         summary = fleet_table.calibrate_table(runs, output, tool, typed, workers, scheduler, say)
         if report:
