@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 import zipfile
 from collections import Counter
+from typing import IO
 from xml.parsers import expat
 
 from mwdcal.errors import InputError
@@ -38,18 +39,19 @@ def check(archive: zipfile.ZipFile, source: str) -> None:
         )
     for entry in archive.infolist():
         if entry.filename.lower().endswith((".xml", ".rels")):
-            _PartCheck(source, entry.filename).check(archive)
+            with archive.open(entry.filename) as stream:
+                _PartCheck(f"{source}, {entry.filename}").check(stream)
 
 
 class _PartCheck:
     """Counts the elements of a part of a workbook."""
 
-    def __init__(self, source: str, name: str) -> None:
-        self._where = f"{source}, {name}"
+    def __init__(self, where: str) -> None:
+        self._where = where
         self._counts: Counter[str] = Counter()
         self._row = self._column = self._text = 0
 
-    def check(self, archive: zipfile.ZipFile) -> None:
+    def check(self, stream: IO[bytes]) -> None:
         """Refuse what is beyond the limits; XML that is none is left to its reader."""
         parser = expat.ParserCreate()
         parser.buffer_text = True
@@ -57,17 +59,14 @@ class _PartCheck:
         parser.CharacterDataHandler = self._characters
         parser.StartDoctypeDeclHandler = self._doctype
         fed = 0
-        with archive.open(self._where.rpartition(", ")[2]) as stream:
-            while data := stream.read(_CHUNK):
-                try:
-                    parser.Parse(data, False)
-                except expat.ExpatError:
-                    return
-                fed += len(data)
-                self._at_most(
-                    fed - parser.CurrentByteIndex, _LONGEST_ELEMENT, "bytes in an element"
-                )
-                self._at_most(len(parser.intern), _MOST_NAMES, "names")
+        while data := stream.read(_CHUNK):
+            try:
+                parser.Parse(data, False)
+            except expat.ExpatError:
+                return
+            fed += len(data)
+            self._at_most(fed - parser.CurrentByteIndex, _LONGEST_ELEMENT, "bytes in an element")
+            self._at_most(len(parser.intern), _MOST_NAMES, "names")
 
     def _at_most(self, count: int, most: int, what: str) -> None:
         if count > most:
