@@ -227,7 +227,7 @@ def test_a_workbook_that_defines_entities_is_refused(tmp_path):
 
 
 def test_more_cells_than_any_run_has(tmp_path, monkeypatch):
-    monkeypatch.setitem(workbook_limits.MAX_COUNTS, "c", 5)
+    monkeypatch.setitem(workbook_limits.MAX_COUNTS, "c", (5, "cells"))
     path = tmp_path / "t.xlsx"
     write(path, Table({"ax": ["1", "2"], "ay": ["1", "2"]}))
     assert "at most 5 cells" in refusal(path)

@@ -121,12 +121,13 @@ def open_text(path: Path, typed: bool = False, decimal: str = ".") -> StreamedTa
     except OSError as error:
         raise InputError(f"cannot read '{path}': {error.strerror}.") from error
     start = _newlines(first)
-    top = text.head(start, path.name)
+    top = text.head(text.lines(start, path.name), path.name)
+    body = start.split(b"\n", top.lines)[-1].rstrip(b"\n")
     numeric = [name for name in top.names if typed and name in RANGES]
     types = {n: arrow.float64() if n in numeric else arrow.string() for n in top.names}
 
     def pieces() -> Iterator[Any]:
-        yield top.body, top.lines, len(first)
+        yield body, top.lines, len(first)
         above = start.count(b"\n")
         with path.open("rb") as stream:
             stream.seek(len(first))
@@ -151,7 +152,7 @@ def open_text(path: Path, typed: bool = False, decimal: str = ".") -> StreamedTa
         return Part(carried, stated, size)
 
     schema, total = arrow.schema(list(types.items())), path.stat().st_size
-    guess = total * top.body.count(b"\n") // len(first)
+    guess = total * body.count(b"\n") // len(first)
     return StreamedTable(path.name, top.names, top.metadata, schema, total, guess, pieces, load)
 
 

@@ -13,7 +13,15 @@ import numpy as np
 
 from mwdcal.errors import InputError, reason
 from mwdcal.files.formats import atomic, parquet, text, workbook
-from mwdcal.files.formats.columns import LABELS, Column, Parts, as_text, check_names, looks_numeric
+from mwdcal.files.formats.columns import (
+    LABELS,
+    Column,
+    Parts,
+    as_text,
+    at_most,
+    check_names,
+    looks_numeric,
+)
 from mwdcal.files.formats.columns import shown as shown
 from mwdcal.geometry.vectors import Array
 
@@ -105,8 +113,8 @@ def numbers(table: Table, name: str) -> Array:
 
 
 def labels(table: Table, name: str) -> list[str]:
-    """The column as text without surrounding blanks."""
-    column = table.columns[name]
+    """The column as text without surrounding blanks; no cells where there is no such column."""
+    column = table.columns.get(name, [])
     cells = column if isinstance(column, list) else [as_text(value) for value in column.tolist()]
     return [cell.strip() for cell in cells]
 
@@ -132,7 +140,9 @@ def _content(path: Path) -> bytes:
     """The bytes of a regular file of a known suffix that is not too large."""
     try:
         check_file(path)
-        _check_size(path.stat().st_size, path)
+        most = _LARGEST_FILES.get(_suffix(path), _LARGEST_TEXT)
+        advice = "Split it, or write long tables as Parquet."
+        at_most(path.stat().st_size, most, f"'{path}'", "the file", "bytes", advice)
         return path.read_bytes()
     except (OSError, ValueError) as error:
         raise InputError(
@@ -149,15 +159,6 @@ def check_file(path: Path) -> None:
         raise InputError(f"'{path}': no such file. Check the name and the folder.")
     if not path.is_file():
         raise InputError(f"'{path}' is not a regular file. Name a file with readings.")
-
-
-def _check_size(size: int, path: Path) -> None:
-    largest = _LARGEST_FILES.get(_suffix(path), _LARGEST_TEXT)
-    if size > largest:
-        raise InputError(
-            f"'{path}': the file must have at most {largest} bytes; got {size}. Split it, or "
-            "write long tables as Parquet."
-        )
 
 
 def _floats(cells: Sequence[str], decimal: str) -> Array | None:
