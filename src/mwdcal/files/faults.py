@@ -46,17 +46,14 @@ def faults(cells: Cells, starts: Ints, profile: Profile) -> Iterator[Fault]:
 
     A column is not read before its turn.
     """
-    for kind, names in CHANNELS.items():
+    readings = [(names, "Fill it in, or remove the station.") for names in CHANNELS.values()]
+    warmth = (("temperature_c",), "Fill it in, or leave the whole column blank.")
+    for names, advice in (*readings, warmth):
         for name in names:
             yield from range_faults(cells, name)
-        blank = _blank_faults(cells, starts, names, "Fill it in, or remove the station.", True)
-        optional = kind == "magnetometer"
+        blank = _blank_faults(cells, starts, names, advice, True)
+        optional = names != CHANNELS["accelerometer"]
         yield from _where_filled(cells, starts, names, blank) if optional else blank
-    name = "temperature_c"
-    yield from range_faults(cells, name)
-    advice = "Fill it in, or leave the whole column blank."
-    blank = _blank_faults(cells, starts, (name,), advice, True)
-    yield from _where_filled(cells, starts, (name,), blank)
     yield from faults_beside_readings(cells, starts, profile, TRIADS)
 
 
@@ -103,13 +100,10 @@ def _noise_faults(cells: Cells, starts: Ints, profile: Profile, kind: str) -> It
         )
         blank = _blank_faults(cells, starts, names, advice)
         yield from _where_filled(cells, starts, names, blank)
-
-    def problem(column: int, row: int) -> str:
-        return f"must be above 0; got 0. State the noise of the {kind}, or leave it blank."
-
     zero = _stacked(cells, names, starts) == 0.0
     if triad.repeatability == 0.0 and zero.any():
-        yield Fault(names, zero, problem)
+        advice = f"State the noise of the {kind}, or leave it blank."
+        yield Fault(names, zero, lambda column, row: f"must be above 0; got 0. {advice}")
 
 
 def range_faults(cells: Cells, name: str) -> Iterator[Fault]:
