@@ -97,8 +97,7 @@ class StandProfile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
 
     def common(self) -> dict[str, float]:
         """Standard uncertainties, in degrees, of errors of the stand that all stations share."""
-        keys = {name: f"{name.replace('-', '_')}_deg" for name in COMMON}
-        values = {name: float(getattr(self, key)) for name, key in keys.items()}
+        values = {name: self.of(f"{name.replace('-', '_')}_deg") for name in COMMON}
         return {name: value for name, value in values.items() if value}
 
 
