@@ -17,7 +17,6 @@ from mwdcal.files.contract import TEMPERATURE
 from mwdcal.files.formats.table import shown
 from mwdcal.sensor.profile import Datasheet, Profile, StandProfile, TriadProfile
 
-_DEFAULT = "generic"
 _SUFFIX = ".toml"
 _LARGEST = 1_000_000
 _SECTIONS: dict[str, type[msgspec.Struct]] = {
@@ -65,7 +64,7 @@ def load_profile(name_or_path: str | None = None) -> tuple[Profile, str]:
 
     None is the built-in `generic`: channels along the tool axes, nothing else known.
     """
-    name = _DEFAULT if name_or_path is None else name_or_path
+    name = "generic" if name_or_path is None else name_or_path
     data, digest = read_toml(name, "profiles", "tool profile")
     return _profile(data, Path(name).name), digest
 
