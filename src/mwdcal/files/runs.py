@@ -43,13 +43,10 @@ def read_run(
     source: str | os.PathLike[str] | Table, profile: Profile, *, decimal: str = "."
 ) -> tuple[Readings, Profile]:
     """The readings of a run, a file or a table, and the profile with its nominal scales filled in."""
-    table = (
-        source
-        if isinstance(source, Table)
-        else tables.read(source, decimal=decimal, rows=MOST_ROWS)
-    )
-    check_run(table)
-    return to_readings(table, profile)
+    if not isinstance(source, Table):
+        source = tables.read(source, decimal=decimal, rows=MOST_ROWS)
+    check_run(source)
+    return to_readings(source, profile)
 
 
 def check_run(table: Table) -> None:
@@ -242,13 +239,9 @@ def _reference_uncertainties(
     cells: Cells, shape: tuple[int, ...], profile: Profile, known: Iterable[str]
 ) -> dict[str, Array]:
     """Standard uncertainties (..., n) of references: the table's, else the stand's; zero ones left out."""
-    uncertainties = {}
-    for name in dict.fromkeys([*known, "gravity"]):
-        stated = _or_blank(cells(f"sd_{REFERENCES[name].column}"), shape)
-        sd = _reference_uncertainty(profile, name, stated)
-        if sd.any():
-            uncertainties[name] = sd
-    return uncertainties
+    columns = {name: cells(f"sd_{REFERENCES[name].column}") for name in (*known, "gravity")}
+    sd = {n: _reference_uncertainty(profile, n, _or_blank(c, shape)) for n, c in columns.items()}
+    return {name: values for name, values in sd.items() if values.any()}
 
 
 def _reference_uncertainty(profile: Profile, name: str, stated: Array) -> Array:

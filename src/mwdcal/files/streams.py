@@ -9,7 +9,7 @@ spelling or anything that is refused: one place decides what is accepted, and wo
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -140,13 +140,12 @@ def open_text(path: Path, typed: bool = False, decimal: str = ".") -> StreamedTa
         if both is None:
             parts = text.rows(data, top, above, path.name)
             table = Table(parts.columns, {}, path.name, parts.lines, decimal=decimal)
-            strings = {n: arrow.array(c, arrow.string()) for n, c in pointed(table).items()}
-            both = arrow.table(strings), table
+            both = _strings(pointed(table), arrow), table
         carried, table = both
         if typed:
             carried = _typed(carried, table, numeric, arrow)
-        kept = {n: c for n, c in table.columns.items() if n in RANGES}
-        stated = replace(table, columns=kept, metadata=top.metadata, source=path.name)
+        columns = {n: c for n, c in table.columns.items() if n in RANGES}
+        stated = replace(table, columns=columns, metadata=top.metadata, source=path.name)
         return Part(carried, stated, size)
 
     schema, total = arrow.schema(list(types.items())), path.stat().st_size
@@ -192,8 +191,7 @@ def _plain(data: bytes, top: text.Head, arrow: Any) -> tuple[Any, Table] | None:
             csv.ConvertOptions(column_types=strings, strings_can_be_null=False),
         )
         if order is not None:
-            unusual = text.rows(odd, top, 1, "").columns
-            few = arrow.table({n: arrow.array(c, arrow.string()) for n, c in unusual.items()})
+            few = _strings(text.rows(odd, top, 1, "").columns, arrow)
             both = arrow.concat_tables([carried, few]).combine_chunks()
             if len(both) != len(order):  # lines that are blank are no rows
                 return None
@@ -202,6 +200,10 @@ def _plain(data: bytes, top: text.Head, arrow: Any) -> tuple[Any, Table] | None:
     except (arrow.ArrowInvalid, arrow.ArrowKeyError):
         return None
     return carried, Table(columns, {}, "", range(carried.num_rows))
+
+
+def _strings(columns: Mapping[str, Column], arrow: Any) -> Any:
+    return arrow.table({n: arrow.array(cells, arrow.string()) for n, cells in columns.items()})
 
 
 def _sorted(data: bytes, delimiter: bytes) -> tuple[bytes, bytes, Ints | None]:

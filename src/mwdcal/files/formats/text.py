@@ -55,7 +55,7 @@ def parse(data: bytes, source: str) -> Parts:
     """The table in the bytes of a text file."""
     whole = lines(data, source)
     top = head(whole, source)
-    return _parts(whole[top.lines :], top, top.lines, source)._replace(metadata=top.metadata)
+    return _parts(whole[top.lines :], top, top.lines, source)
 
 
 def head(lines: Sequence[str], source: str) -> Head:
@@ -82,7 +82,7 @@ def _parts(lines: Sequence[str], top: Head, above: int, source: str) -> Parts:
     """The rows in some lines, which `above` lines of the file stand before."""
     entries = split(lines, above, top.delimiter, source)
     names, cells, numbers = assemble(chain([(above, top.names)], entries), source, "line")
-    return Parts(of_texts(names, cells), {}, numbers)
+    return Parts(of_texts(names, cells), top.metadata, numbers)
 
 
 def render(columns: Mapping[str, Column], metadata: Mapping[str, object], delimiter: str) -> str:
