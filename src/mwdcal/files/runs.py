@@ -29,7 +29,7 @@ from mwdcal.files.faults import Cells, columns_of, faults, faults_beside_reading
 from mwdcal.files.formats import table as tables
 from mwdcal.files.formats.columns import Column
 from mwdcal.files.formats.table import Table, labels
-from mwdcal.geometry.vectors import Array, Ints
+from mwdcal.geometry.vectors import Array
 from mwdcal.sensor.profile import Profile, TriadProfile
 
 ROWS_OF_LOG = 1000
@@ -90,7 +90,7 @@ def to_readings(table: Table, profile: Profile) -> tuple[Readings, Profile]:
     """
     check_columns(list(table.columns), table.source)
     cells = columns_of(table)
-    refuse(table, faults(cells, _one_tool(table), profile))
+    refuse(table, faults(cells, np.array([0, table.count]), profile))
     readings, scales = convert(cells, (table.count,), profile, _azimuth_offset(table))
     raw = [_stacked(cells, kind) for kind in scales]
     readings = replace(
@@ -113,12 +113,9 @@ def to_readings(table: Table, profile: Profile) -> tuple[Readings, Profile]:
 def check_references(table: Table, profile: Profile, kinds: list[str]) -> dict[str, Array]:
     """The references of a table; refuses what `to_readings` refuses in them and in triads `kinds`."""
     cells = columns_of(table)
-    refuse(table, faults_beside_readings(cells, _one_tool(table), profile, kinds))
+    starts = np.array([0, table.count])
+    refuse(table, faults_beside_readings(cells, starts, profile, kinds))
     return references(cells, _azimuth_offset(table))
-
-
-def _one_tool(table: Table) -> Ints:
-    return np.array([0, table.count])
 
 
 def _azimuth_offset(table: Table) -> float:
@@ -228,8 +225,7 @@ def _scale(raw: Array, strength: Array) -> Array:
 
 def _noise(cells: Cells, kind: str, triad: TriadProfile, shape: tuple[int, ...]) -> Array | None:
     """Standard uncertainty (..., n, 3) of raw readings; None where nothing is stated."""
-    columns = [_or_blank(cells(f"sd_{name}"), shape) for name in CHANNELS[kind]]
-    noise = np.stack(columns, -1)
+    noise = np.stack([_or_blank(cells(f"sd_{name}"), shape) for name in CHANNELS[kind]], -1)
     if triad.noise is not None:
         noise = np.where(np.isnan(noise), triad.noise, noise)
     return None if np.isnan(noise).all() else np.hypot(noise, triad.repeatability)
