@@ -2,7 +2,7 @@
 
 A source hands out pieces in order, which are cheap to make, and loads a piece, which may be
 done by several threads at once. Needs PyArrow. Lines of text that are not plain (quotes, blanks
-before a cell) go through the parser of `files.text`, and so do whole pieces with numbers in unusual
+before a cell) go through the parser of `formats.text`, and so do whole pieces with numbers in unusual
 spelling or anything that is refused: one place decides what is accepted, and words it.
 """
 

@@ -1,6 +1,6 @@
 """The tool profile: which axis each channel measures, nominal scales, noise, stand.
 
-Instrument polarity and raw units live here and nowhere else: `files.tables` turns
+Instrument polarity and raw units live here and nowhere else: `files.runs` turns
 raw channels into nominal readings along the tool axes with it, and `notation`
 turns fitted parameters back into the instrument's own channels.
 """
