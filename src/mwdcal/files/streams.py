@@ -127,11 +127,13 @@ def open_text(path: Path, typed: bool = False, decimal: str = ".") -> StreamedTa
     types = {n: arrow.float64() if n in numeric else arrow.string() for n in top.names}
 
     def pieces() -> Iterator[Any]:
-        above = 0
+        yield body, top.lines, len(first)
+        above = start.count(b"\n")
         with path.open("rb") as stream:
+            stream.seek(len(first))
             for data in _pieces(stream):
                 plain = _newlines(data)
-                yield (plain, above, len(data)) if above else (body, top.lines, len(data))
+                yield plain, above, len(data)
                 above += plain.count(b"\n")
 
     def load(piece: Any, exact: bool) -> Part:
