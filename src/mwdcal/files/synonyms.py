@@ -139,7 +139,8 @@ def _words(name: str) -> list[str]:
     """The words of a name in lower case, its units spelled without signs."""
     text = unicodedata.normalize("NFKC", name.replace("º", "°"))
     text = re.sub(r"m\s*/\s*s\s*(\^\s*)?2|ms-2", " mss ", text)
-    text = text.translate(str.maketrans({"°": " deg ", "μ": "u", "µ": "u"}))
+    for sign, word in (("°", " deg "), ("μ", "u"), ("µ", "u")):
+        text = text.replace(sign, word)
     for cased, word in _CASED.items():
         text = re.sub(rf"(?<![A-Za-z]){cased}(?![A-Za-z])", word, text)
     return [word.lower() for word in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", text)]
