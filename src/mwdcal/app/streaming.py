@@ -179,7 +179,7 @@ def _check_header(source: StreamedTable, outside: str) -> None:
 def check_warmth(calibration: Calibration, names: Sequence[str], source: str) -> None:
     """Refuse a temperature under another name or in another unit where it is needed."""
     if any(triad.order for triad in calibration.triads):
-        synonyms.check_temperature(names, source)
+        synonyms.check_evidence(names, source, ("temperature_c",))
 
 
 def check_free(names: Iterable[str], results: Sequence[str], source: str) -> None:

@@ -5,25 +5,29 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from mwdcal.errors import InputError, reason
 from mwdcal.files.formats import atomic, parquet, text, workbook
-from mwdcal.files.formats.columns import LABELS, Column, Parts, as_text, check_names, looks_numeric
+from mwdcal.files.formats.columns import (
+    LABELS,
+    Column,
+    Parts,
+    as_text,
+    at_most,
+    check_names,
+    looks_numeric,
+)
 from mwdcal.files.formats.columns import shown as shown
 from mwdcal.geometry.vectors import Array
 
-_PARSERS: dict[str, Callable[..., Parts]] = {
-    ".csv": text.parse,
-    ".tsv": text.parse,
-    ".parquet": parquet.parse,
-    ".xlsx": workbook.parse,
-}
-SUFFIXES = tuple(_PARSERS)
+_FORMATS: dict[str, Any] = {".csv": text, ".tsv": text, ".parquet": parquet, ".xlsx": workbook}
+SUFFIXES = tuple(_FORMATS)
 
 _LARGEST_FILES = {".parquet": 2_000_000_000}
 _LARGEST_TEXT = 50_000_000
@@ -65,9 +69,9 @@ def read(path: str | os.PathLike[str], *, decimal: str = ".", rows: int = 0) -> 
     check_decimal(decimal)
     file = Path(path)
     data = _content(file)
-    parser = _PARSERS[_suffix(file)]
-    limits = {"most": rows} if parser is parquet.parse else {}
-    parts = parser(data, file.name, **limits)
+    form = _FORMATS[_suffix(file)]
+    limits = {"most": rows} if form is parquet else {}
+    parts: Parts = form.parse(data, file.name, **limits)
     digest = hashlib.sha256(data).hexdigest()
     return Table(parts.columns, parts.metadata, file.name, parts.lines, digest, decimal)
 
@@ -81,14 +85,13 @@ def check_decimal(decimal: str) -> None:
 def write(path: str | os.PathLike[str], table: Table) -> None:
     """Write the table atomically, in the format of the suffix; the same table, the same bytes."""
     file = Path(path)
-    suffix = _suffix(file)
+    form = _FORMATS[_suffix(file)]
     check_names(list(table.columns), file.name)
-    if suffix in (".csv", ".tsv"):
-        delimiter = "," if suffix == ".csv" else "\t"
+    if form is text:
+        delimiter = "\t" if file.suffix.lower() == ".tsv" else ","
         atomic.write(file, text.render(pointed(table), table.metadata, delimiter))
     else:
-        render = parquet.render if suffix == ".parquet" else workbook.render
-        atomic.write(file, render(_typed(table), table.metadata, file.name))
+        atomic.write(file, form.render(_typed(table), table.metadata, file.name))
 
 
 def numbers(table: Table, name: str) -> Array:
@@ -97,16 +100,14 @@ def numbers(table: Table, name: str) -> Array:
     if isinstance(column, list):
         fast = _floats(column, table.decimal)
         return _one_by_one(table, name, column) if fast is None else fast
-    endless = np.flatnonzero(np.isinf(column))
-    if endless.size:
-        row = int(endless[0])
+    for row in np.flatnonzero(np.isinf(column)).tolist():
         raise cell_error(table, name, row, f"expected a finite number; got {column[row]}.")
     return column
 
 
 def labels(table: Table, name: str) -> list[str]:
-    """The column as text without surrounding blanks."""
-    column = table.columns[name]
+    """The column as text without surrounding blanks; no cells where there is no such column."""
+    column = table.columns.get(name, [])
     cells = column if isinstance(column, list) else [as_text(value) for value in column.tolist()]
     return [cell.strip() for cell in cells]
 
@@ -120,7 +121,7 @@ def cell_error(table: Table, name: str, row: int, problem: str) -> InputError:
 
 def _suffix(path: Path) -> str:
     suffix = path.suffix.lower()
-    if suffix not in _PARSERS:
+    if suffix not in _FORMATS:
         raise InputError(
             f"'{path}': the suffix must be one of {', '.join(SUFFIXES)}; got "
             f"'{suffix or 'none'}'. Convert or rename the file."
@@ -132,7 +133,9 @@ def _content(path: Path) -> bytes:
     """The bytes of a regular file of a known suffix that is not too large."""
     try:
         check_file(path)
-        _check_size(path.stat().st_size, path)
+        most = _LARGEST_FILES.get(_suffix(path), _LARGEST_TEXT)
+        advice = "Split it, or write long tables as Parquet."
+        at_most(path.stat().st_size, most, f"'{path}'", "the file", "bytes", advice)
         return path.read_bytes()
     except (OSError, ValueError) as error:
         raise InputError(
@@ -149,15 +152,6 @@ def check_file(path: Path) -> None:
         raise InputError(f"'{path}': no such file. Check the name and the folder.")
     if not path.is_file():
         raise InputError(f"'{path}' is not a regular file. Name a file with readings.")
-
-
-def _check_size(size: int, path: Path) -> None:
-    largest = _LARGEST_FILES.get(_suffix(path), _LARGEST_TEXT)
-    if size > largest:
-        raise InputError(
-            f"'{path}': the file must have at most {largest} bytes; got {size}. Split it, or "
-            "write long tables as Parquet."
-        )
 
 
 def _floats(cells: Sequence[str], decimal: str) -> Array | None:
@@ -180,8 +174,7 @@ def _one_by_one(table: Table, name: str, cells: Sequence[str]) -> Array:
         if not stripped:
             continue
         if not looks_numeric(stripped, table.decimal):
-            advice = _advice(stripped, table.decimal)
-            problem = f"expected a number; got {shown(cell)}. {advice}"
+            problem = f"expected a number; got {shown(cell)}. {_advice(stripped, table.decimal)}"
             raise cell_error(table, name, row, problem)
         values[row] = float(stripped.replace(",", "."))
         if np.isinf(values[row]):
