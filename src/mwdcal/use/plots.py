@@ -277,18 +277,17 @@ class Plots:
         shown = f"Error of {label}, per station, before and after"
         place = {"left": 0.095, "right": 0.995, "bottom": 0.27, "top": 0.87, "wspace": 0.24}
         figure, [panels] = new_figure(shown, 1.5, columns=2, layout=None, gridspec_kw=place)
-        before = [s.errors_before.get(observable, np.nan) for s in stations]
-        after = [s.errors.get(observable, np.nan) for s in stations]
-        _station_stems(panels[0], stations, before, BEFORE, "o")
-        _station_stems(panels[1], stations, after, AFTER, "s")
+        series = (("errors_before", BEFORE, "o"), ("errors", AFTER, "s"))
+        for axes, (errors, *look) in zip(panels, series, strict=True):
+            values = [getattr(station, errors).get(observable, np.nan) for station in stations]
+            _station_stems(axes, stations, values, *look)
+            axes.axhline(0, color="#4b5563", lw=0.6, zorder=1)
+            axes.set_ylabel(label)
         if row.expected:
             panels[1].axhspan(-row.expected, row.expected, color=BAND, lw=0, zorder=0.5)
         band = "  (band: ±1σ expected)" if row.expected else ""
         panels[0].set_title(f"before: rms {quantity(row.before, unit)}")
         panels[1].set_title(f"after: rms {quantity(row.after, unit)}{band}")
-        for axes in panels:
-            axes.set_ylabel(label)
-            axes.axhline(0, color="#4b5563", lw=0.6, zorder=1)
         return figure
 
     def _errors(self, observable: str) -> ErrorRow:

@@ -243,10 +243,8 @@ def _figures(
     """Distributions of the parameters, and of residuals, noise and accuracy."""
     triads = dict.fromkeys(p.triad for p in parameters)
     declared = [triad for triad in triads if triad not in estimated]
-    panels: list[Panel] = []
-    if declared:
-        s = {f"{triad} s": _residuals(tools, triad) for triad in declared}
-        panels.append(("residuals ÷ what noise alone would give, s", "s", s))
+    s = {f"{triad} s": _residuals(tools, triad) for triad in declared}
+    panels: list[Panel] = [("residuals ÷ what noise alone would give, s", "s", s)] if s else []
     panels += [_noise(tools, triad) for triad in triads if triad in estimated]
     angles = STATED_ANGLES[: 1 + len(triads)]
     accuracy = {angle: tools.numbers(f"{angle}_sd_deg") for angle in angles}

@@ -190,11 +190,10 @@ def _draw(axes: Axes, noise: Noise, names: list[str]) -> None:
     for name in names:
         _draw_channel(axes, name, noise.channels[name])
     axes.axvline(noise.station_seconds, color=plots.BEFORE, lw=0.7, ls=(0, (4, 3)))
-    axes.annotate(
-        f"station, {noise.station_seconds:.3g} s", (noise.station_seconds, 1.0), (-2, -2), rotation=90,
-        xycoords=("data", "axes fraction"), textcoords="offset points", ha="right", va="top",
-        fontsize=6.5, color="#374151",
-    )  # fmt: skip
+    place = {"xycoords": ("data", "axes fraction"), "ha": "right", "va": "top", "rotation": 90}
+    look = plots.NOTE | place | {"fontsize": 6.5, "color": "#374151"}
+    title = f"station, {noise.station_seconds:.3g} s"
+    axes.annotate(title, (noise.station_seconds, 1.0), (-2, -2), **look)
     axes.set(xscale="log", yscale="log", xlabel="averaging time τ, s")
     for axis in (axes.xaxis, axes.yaxis):
         crowded = np.log10(np.divide(*axis.get_view_interval()[::-1])) > 2

@@ -59,15 +59,13 @@ def _seconds(stations: Stations) -> float:
 def screen(stations: Stations, files: dict[str, str]) -> str:
     """What was found, for people."""
     picture = f"   {files['plot']} (picture)" if files["plot"] else ""
+    after = f"next: mwdcal calibrate {files['output']} -o CAL.json"
     lines = [
         one_line("   ".join(_heading(stations))),
         "   ".join(_search(stations)),
         "",
         _stations_table(stations),
-        one_line(
-            f"wrote {files['output']}{picture}   "
-            f"next: mwdcal calibrate {files['output']} -o CAL.json"
-        ),
+        one_line(f"wrote {files['output']}{picture}   {after}"),
     ]
     return "\n".join(lines)
 
