@@ -65,7 +65,7 @@ def command(
     )
     unused = unused_columns(synonyms.unused(list(readings.columns), COLUMNS))
     noise = replace(noise, findings=findings_as_typed([*noise.findings, *unused]))
-    drawn = picture(page.figure(noise), plot) if plot else b""
+    drawn = picture(page.figure(noise), plot.suffix) if plot else b""
     rendered = page.render(noise) if report else ""
     shown = (page.document if as_json else page.screen)(noise, plot, report)
     atomic.write_all([(plot, drawn), (report, rendered)])

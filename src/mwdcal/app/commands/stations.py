@@ -57,11 +57,11 @@ def command(
         for line in lines(error.analysis.findings):
             error.add_note(line)
         if plot:
-            atomic.write(plot, picture(page.figure(error.analysis), plot))
+            atomic.write(plot, picture(page.figure(error.analysis), plot.suffix))
             error.add_note(f"wrote {plot} (picture)")
         raise
     stations = replace(stations, findings=findings_as_typed(stations.findings))
-    drawn = picture(page.figure(stations), plot) if plot else b""
+    drawn = picture(page.figure(stations), plot.suffix) if plot else b""
     table.write(output, stations.table)
     if plot:
         atomic.write(plot, drawn)
