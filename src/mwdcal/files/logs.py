@@ -30,8 +30,9 @@ from mwdcal.files.formats.columns import (
     looks_numeric,
     no_stations,
     of_texts,
+    shown,
 )
-from mwdcal.files.formats.table import Table, shown
+from mwdcal.files.formats.table import Table
 from mwdcal.files.formats.text import comment, is_preamble, split
 from mwdcal.geometry.vectors import Array
 

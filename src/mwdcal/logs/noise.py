@@ -19,7 +19,8 @@ from mwdcal.calibration.record import Finding
 from mwdcal.calibration.residuals import rms
 from mwdcal.errors import InputError
 from mwdcal.files.contract import CHANNELS, RAW
-from mwdcal.files.formats.table import Table, shown
+from mwdcal.files.formats.columns import shown
+from mwdcal.files.formats.table import Table
 from mwdcal.files.logs import Say, silent
 from mwdcal.geometry.vectors import Array
 from mwdcal.logs import allan, noise_terms, regular
