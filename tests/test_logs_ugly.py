@@ -113,8 +113,10 @@ def test_options_are_named_as_where_they_are_given(tmp_path):
     assert "--sampling-hz 100 was given" in ran.json["findings"][0]["text"]
     (told,) = texts(find_stations(log, sampling_hz=100.0), "time-not-used")
     assert told.startswith("`sampling_hz` 100 was given")
-    message = refused(mwdcal("stations", path, "-o", run, "--min-seconds", 500), 2)
+    ran = mwdcal("stations", path, "-o", run, "--min-seconds", 500)
+    message = refused(ran, 2)
     assert "lower --min-seconds or --trim-seconds, or set --threshold." in message
+    assert "--plot shows" in ran.err
     with pytest.raises(InputError, match="lower `min_seconds` or `trim_seconds`"):
         find_stations(log, min_seconds=500.0)
 
