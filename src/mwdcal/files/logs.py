@@ -122,7 +122,9 @@ def _text(file: Path, names: list[str], decimal: str, say: Say) -> Table:
     try:
         tables.check_file(file)
         with file.open("rb") as stream:
-            return _read_text(stream, names, decimal, file.name, say)
+            table = _read_text(stream, names, decimal, file.name, say)
+            stream.seek(0)
+            return replace(table, digest=hashlib.file_digest(stream, "sha256").hexdigest())
     except (OSError, ValueError) as error:
         raise InputError(
             f"cannot read '{file}': {reason(error)}. Check the name and the file."
@@ -166,9 +168,7 @@ def _read_text(stream: BinaryIO, names: list[str], decimal: str, source: str, sa
     whole = np.concatenate(pieces)
     columns: dict[str, Column] = {name: [] for name in layout.names if name not in READ}
     columns |= {name: whole[:, i].copy() for i, name in enumerate(_wanted(layout))}
-    stream.seek(0)
-    digest = hashlib.file_digest(stream, "sha256").hexdigest()
-    return Table(columns, metadata, source, _joined(lines), digest, decimal)
+    return Table(columns, metadata, source, _joined(lines), decimal=decimal)
 
 
 def _top(stream: BinaryIO, source: str) -> tuple[list[tuple[int, str]], str, int]:
