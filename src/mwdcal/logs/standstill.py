@@ -133,7 +133,8 @@ def cells_of(time: Array, value: Array, length: float) -> Cells:
     number of samples of a cell; what is left there belongs in time to the cell before.
     """
     step = time_step(time)
-    rough = float(np.median(np.abs(np.diff(value)))) / 0.6745 / np.sqrt(2)
+    steps = np.abs(np.diff(value))
+    rough = float(np.median(steps)) / 0.6745 / np.sqrt(2) if steps.size else 0.0
     bounds = [*_rate_changes(time), len(time)]
     parts = [_even(time[a:b], value[a:b], length) for a, b in pairwise(bounds)]
     start, end, level, torn = (np.concatenate(column) for column in zip(*parts, strict=True))
