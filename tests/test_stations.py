@@ -489,7 +489,7 @@ BAD = {
     "half a magnetometer": (lambda c: {**c, "mx": c["ax"]}, ("mx, my, mz",)),
     "a huge number": (lambda c: changed(c, "ax", 3, "1e999"), ("line 5", "column 'ax'", "too large")),
     "too short": (lambda c: {k: v[:20] for k, v in c.items()}, ("too short", "20 rows")),
-    "a single row": (lambda c: {k: v[:1] for k, v in c.items()}, ("too short", "1 rows")),
+    "a single row": (lambda c: {k: v[:1] for k, v in c.items()}, ("too short", "got 1 row over")),
     "no rows": (lambda c: {k: v[:0] for k, v in c.items()}, ("no samples",)),
 }  # fmt: skip
 

@@ -155,7 +155,7 @@ def _short(log: Table, time: Array, traces: Traces) -> InputError:
         )
     window = standstill.WINDOW
     return InputError(
-        f"{log.source}: too short to find standstills in; got {len(time)} rows over "
+        f"{log.source}: too short to find standstills in; got {count(len(time), 'row')} over "
         f"{time[-1] - time[0]:g} s. A channel needs at least {window * standstill.FEWEST} samples, over "
         f"{window * standstill.CELL:g} s. Is the log complete, and its time in seconds?"
     )
@@ -273,8 +273,9 @@ def _equal_times(log: Table, time: Array, names: list[str]) -> Iterator[Finding]
     twice = {name: int(np.count_nonzero(np.diff(times) == 0)) for name, times in filled.items()}
     name = max(twice, key=twice.__getitem__)
     if twice[name]:
+        have = "has" if twice[name] == 1 else "have"
         text = (
-            f"{twice[name]} samples of {name} have the time of the one before: all are used, spread "
+            f"{count(twice[name], 'sample')} of {name} {have} the time of the one before: all are used, spread "
             "over the step. Is the time written with too few digits, or are rows doubled?"
         )
         yield Finding(id="duplicate-time", text=text)
