@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mwdcal.app.pages.page import channels_of
-from mwdcal.app.text import one_line, table
+from mwdcal.app.text import one_line, plural, table
 from mwdcal.files.contract import RAW
 from mwdcal.geometry.vectors import Array
 from mwdcal.logs.stations import Stations
@@ -79,7 +79,7 @@ def _heading(stations: Stations) -> list[str]:
         stations.table.source,
         f"{len(stations.time)} rows",
         f"{whole:.6g} s",
-        f"{stations.table.count} stations, {share:.0f} % of the time",
+        f"{plural(stations.table.count, 'station')}, {share:.0f} % of the time",
     ]
 
 
