@@ -29,6 +29,7 @@ from mwdcal.estimation.uncertainty import (
     scatter_ratios,
     settle_gauge,
     station_misfit,
+    triad_sums,
     with_scatter,
 )
 from mwdcal.geometry.vectors import Array, Bools, Ints
@@ -278,9 +279,7 @@ def _robustly(
 
 def _bounded_factor(analysis: Analysis, trust: Array, loss: str, freedom: Array) -> Array:
     """s² (B, t) of a fit with station weights `trust`, from the pulls w d that they bound."""
-    pulled = analysis.residual**2 * trust[..., None]
-    shape = (*pulled.shape[:-1], pulled.shape[-1] // 3, 3)
-    squares = np.sum(pulled.reshape(shape), (1, 3))
+    squares = triad_sums(analysis.residual**2 * trust[..., None])
     share = np.array([consistency(loss, k) for k in freedom])[:, None]
     return np.asarray(squares / np.where(analysis.freedom > 1e-9, analysis.freedom, np.nan) / share)
 

@@ -18,7 +18,7 @@ from mwdcal.errors import FitError, InputError
 from mwdcal.estimation.evidence import ANGLES, UNKNOWN, Evidence, SharedConstant
 from mwdcal.estimation.minimisers.newton import newton, propagated
 from mwdcal.estimation.minimisers.swarm import swarm_forward
-from mwdcal.estimation.minimisers.unweighted import STRENGTH, Params, Sums
+from mwdcal.estimation.minimisers.unweighted import STRENGTH, Sums
 from mwdcal.estimation.problem import Prior, Problem, State
 from mwdcal.estimation.solvers import Status, gauss_newton
 from mwdcal.estimation.uncertainty import readjusted, unweighted_pulls
@@ -132,10 +132,15 @@ class Solved:
             return unweighted_pulls(problem, _alike(problem), state)
         triples = zip(problem.triads, problem.slices(), problem.targets(state), strict=False)
         return {
-            index: replace(self.sums[index], triad=triad).pulls(state.params[:, where], target)
+            index: replace(self.sums[index], triad=triad).pulls(_alone(state, where), target)
             for index, (triad, where, target) in enumerate(triples)
             if index in self.sums
         }
+
+
+def _alone(state: State, where: slice) -> State:
+    """The state with the parameters of one triad."""
+    return replace(state, params=state.params[:, where])
 
 
 def solve(problem: Problem, state: State, options: Options) -> Solved:
@@ -217,8 +222,7 @@ def _by_sums(problem: Problem, state: State, method: str) -> Solved:
             include * (PAPER_WEIGHT / strength**4 if scalar else PAPER_WEIGHT) * np.ones(len(names))
         )
         sums[index] = _sums(problem, state, index, names, weights)
-        where = problem.slices()[index]
-        minima.append(gauss_newton(sums[index], Params(state.params[:, where])))
+        minima.append(gauss_newton(sums[index], _alone(state, problem.slices()[index])))
     params = np.concatenate([each[0].params for each in minima], -1)
     status = np.max([each[1] for each in minima], 0)
     iterations = np.max([each[2] for each in minima], 0)
@@ -227,7 +231,7 @@ def _by_sums(problem: Problem, state: State, method: str) -> Solved:
     else:
         after = _magnetometer(problem, state, params)
     pairs = zip(sums.items(), minima, strict=True)
-    known = {index: one.information(each[0].params) for (index, one), each in pairs}
+    known = {index: one.information(each[0]) for (index, one), each in pairs}
     return Solved(after.state, np.maximum(status, after.status), iterations, sums, known)
 
 

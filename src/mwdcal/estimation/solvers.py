@@ -76,7 +76,7 @@ class Linear:
         """Number p of model parameters, at the head of X."""
         return sum(block.shape[-1] for block in self.blocks)
 
-    def _placed(self) -> Iterator[tuple[Array, slice, slice]]:
+    def placed(self) -> Iterator[tuple[Array, slice, slice]]:
         """Each triad's block of X, with the rows and columns where it lies."""
         row = column = 0
         for block in self.blocks:
@@ -88,7 +88,7 @@ class Linear:
     def design(self) -> Array:
         """X (B, n, m, u) as one array."""
         whole = np.zeros((*self.residual.shape, self.size + self.shared.shape[-1]))
-        for block, rows, columns in self._placed():
+        for block, rows, columns in self.placed():
             whole[..., rows, columns] = block
         whole[..., self.size :] = self.shared
         return whole
@@ -108,7 +108,7 @@ class Linear:
     @cached_property
     def determined(self) -> Determined:
         """Which directions it determines, if it is of the geometry."""
-        return Determined.by(self.normal, self.norms)
+        return Determined.by(self.normal.reduced()[0], self.norms)
 
     def cost(self, at: Linear) -> Array:
         """ρᵀC⁻¹ρ over all stations, and the prior's part (B,), of residuals `at` a state; C is ours."""
@@ -135,7 +135,7 @@ class Linear:
     def private_step(self, step: Array) -> Array:
         """Private unknowns (B, n, a), in their prior's units, after a step of X's unknowns."""
         moved = self.residual + np.einsum("bnms,bs->bnm", self.shared, step[:, self.size :])
-        for block, rows, columns in self._placed():
+        for block, rows, columns in self.placed():
             moved[..., rows] += np.einsum("bnmp,bp->bnm", block, step[:, columns])
         pulled = self.private.mT @ moved[..., None]
         return np.asarray(-(self.core @ pulled)[..., 0])
@@ -193,19 +193,17 @@ class Determined:
     keep: Bools
 
     @classmethod
-    def by(cls, geometry: Normal, norms: Array, tolerance: float = RANK_TOLERANCE) -> Determined:
-        """From the evidence's geometry: what is known, not how precisely.
+    def by(cls, information: Array, norms: Array) -> Determined:
+        """From the information (B, p, p) of the evidence's geometry: what is known, not how precisely.
 
         `norms` (B, p) are those of the whole columns. What is left of a column when private
         unknowns are taken out may be noise alone: its own norm would make much of that.
         """
         norms = np.where(norms > 0, norms, 1.0)
-        reduced, _, _ = geometry.reduced()
-        scaled = np.nan_to_num(reduced / outer(norms))
-        values, basis = eigen(scaled)
+        values, basis = eigen(np.nan_to_num(information / outer(norms)))
         values = np.sqrt(np.clip(values[..., ::-1], 0, None))
         values = values / np.maximum(values[..., :1], 1e-300)
-        return cls(basis[..., ::-1], values, norms, values > tolerance)
+        return cls(basis[..., ::-1], values, norms, values > RANK_TOLERANCE)
 
     @classmethod
     def of(cls, problem: Linearisable, state: Any) -> Determined:
@@ -232,16 +230,13 @@ class Determined:
 
 
 class Linearisable(Protocol):
-    """What the solver asks of a problem; states are opaque to it."""
+    """What the solver asks of a problem; of states it asks the parameters."""
 
     def linear(self, state: Any, geometry: bool = False) -> Linear:
         """Linearise; `geometry` asks for what is known, leaving out how precisely."""
 
     def move(self, state: Any, linear: Linear, step: Array) -> Any:
         """The state after a step of X's unknowns, private unknowns re-adjusted."""
-
-    def size_of(self, state: Any) -> Array:
-        """Magnitude (B, p) below 1e-12 of which a parameter step is rounding."""
 
 
 @dataclass
@@ -270,7 +265,7 @@ class _Descent:
         after = problem.linear(trial)
         # the gradient holds the weights fixed, and so must the cost that judges the step
         cost = linear.cost(after)
-        small = _small(normal, step, problem.size_of(self.state))
+        small = _small(linear, step, self.state.params)
         with np.errstate(invalid="ignore"):
             better = (cost <= normal.cost * (1 + 1e-9) + 1e-9) | small
         self._accept(trial, after, better)
@@ -336,11 +331,14 @@ def _length(normal: Normal, step: Array) -> Array:
     return np.asarray(np.einsum("...i,...ij,...j->...", step, normal.information, step))
 
 
-def _small(normal: Normal, step: Array, size: Array) -> Bools:
-    """Below a millionth of the standard uncertainty, or rounding."""
-    length = _length(normal, step)
-    rounding = np.all(np.abs(step[..., : normal.size]) <= 1e-12 * size, -1)
-    return np.asarray((length < 1e-12) | rounding)
+def _small(linear: Linear, step: Array, params: Array) -> Bools:
+    """Below a millionth of the standard uncertainty, or rounding of each triad's largest parameter."""
+    size, moved = (
+        np.stack([np.abs(x[:, columns]).max(-1) for _, _, columns in linear.placed()])
+        for x in (params, step)
+    )
+    near = _length(linear.normal, step) < 1e-12
+    return np.asarray(near | np.all(moved <= 1e-12 * size, 0))
 
 
 def gauss_newton(problem: Linearisable, state: Any, limit: int = 60) -> tuple[Any, Ints, Ints]:

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mwdcal.estimation.problem import GEOMETRIC_NOISE, Problem, State
-from mwdcal.estimation.solvers import RANK_TOLERANCE, Determined, Linear, Normal
+from mwdcal.estimation.solvers import RANK_TOLERANCE, Determined, Linear
 from mwdcal.geometry.vectors import (
     Array,
     Bools,
@@ -142,8 +142,7 @@ def determined_apart(problem: Problem, state: State, known: dict[int, Array]) ->
         information[:, first, first] += cross.mT @ back @ cross * scales[:, first, first]
         information[:, second, first] = block @ back @ cross * scales[:, second, first]
         information[:, first, second] = information[:, second, first].mT
-    nothing = np.zeros_like(state.params)
-    return Determined.by(Normal(information, nothing, nothing[:, 0], linear.size), linear.norms)
+    return Determined.by(information, linear.norms)
 
 
 def sandwich(
@@ -250,11 +249,14 @@ def whole_covariance(linear: Linear, determined: Determined) -> Array:
 
 def _variance_factors(residual: Array, spread: Array) -> tuple[Array, Array]:
     """s² and degrees of freedom (B, t) of each triad: restricted maximum likelihood."""
-    expected = diagonal(spread)
-    shape = (*residual.shape[:-1], residual.shape[-1] // 3, 3)
-    squares = np.sum((residual**2).reshape(shape), (1, 3))
-    freedom = np.sum(expected.reshape(shape), (1, 3))
-    return squares / np.where(freedom > 1e-9, freedom, np.nan), freedom
+    freedom = triad_sums(diagonal(spread))
+    return triad_sums(residual**2) / np.where(freedom > 1e-9, freedom, np.nan), freedom
+
+
+def triad_sums(values: Array) -> Array:
+    """Sums (B, t) over the stations and axes of each triad, of values (B, n, m)."""
+    by_triad = values.reshape(*values.shape[:-1], values.shape[-1] // 3, 3)
+    return np.asarray(np.sum(by_triad, (1, 3)))
 
 
 def effective_freedom(problem: Problem, state: State, analysis: Analysis) -> Array:

@@ -100,10 +100,7 @@ class AffineMinimum:
         size = np.sqrt(np.einsum("bni,bni->bn", read, read))[..., None]
         rows = self.terms * (self.include / (GEOMETRIC_NOISE * size))
         undo = inverse(self.turn)
-        parts = [
-            gain.mT @ gain,
-            undo @ rows.mT @ rows @ undo.mT,
-        ]
+        parts = [gain.mT @ gain, undo @ rows.mT @ rows @ undo.mT]
         sizes = [np.sqrt(diagonal(part)) for part in parts]
         pair = [eigenvalues(m / outer(s)) for m, s in zip(parts, sizes, strict=True)]
         squares, norms = (np.einsum("bi,bj->bij", *p).reshape(batch, 12) for p in (pair, sizes))

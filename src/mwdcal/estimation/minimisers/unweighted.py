@@ -11,12 +11,12 @@ toolface of a reference or a reading that is vertical has weight zero, as it has
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mwdcal.estimation.problem import Triad
-from mwdcal.estimation.solvers import Determined, Linear, Normal
+from mwdcal.estimation.problem import State, Triad
+from mwdcal.estimation.solvers import Determined, Linear
 from mwdcal.geometry.observables import OBSERVABLES, is_vertical
 from mwdcal.geometry.vectors import Array, Bools, centred
 
@@ -24,15 +24,11 @@ STRENGTH = "strength-squared"
 
 
 @dataclass(frozen=True)
-class Params:
-    """The state of such a sum: parameters (B, p) alone."""
-
-    params: Array
-
-
-@dataclass(frozen=True)
 class Sums:
-    """One triad, the observables compared with `reference` (B, n, m), and their `weights`."""
+    """One triad, the observables compared with `reference` (B, n, m), and their `weights`.
+
+    The parameters of its states are those of this triad alone.
+    """
 
     triad: Triad
     temperature: Array
@@ -58,7 +54,7 @@ class Sums:
         error = np.where(counted, np.stack(errors, -1), 0.0)
         return error, np.where(counted[..., None], np.stack(gradients, -2), 0.0), counted
 
-    def linear(self, state: Params, geometry: bool = False) -> Linear:
+    def linear(self, state: State, geometry: bool = False) -> Linear:
         """Linearise at a state; with `geometry` each observable is in units of its own size."""
         model, readings = self.triad.model, (self.triad.raw, self.temperature)
         error, gradient, _ = self.compared(model.fields(state.params, *readings))
@@ -78,29 +74,23 @@ class Sums:
             np.zeros((len(error), size)),
         )
 
-    def move(self, state: Params, linear: Linear, step: Array) -> Params:
+    def move(self, state: State, linear: Linear, step: Array) -> State:
         """The state after a step."""
-        return Params(state.params + step)
+        return replace(state, params=state.params + step)
 
-    def size_of(self, state: Params) -> Array:
-        """Largest parameter (B, p): steps far below it are rounding."""
-        largest = np.max(np.abs(state.params), -1, keepdims=True)
-        return np.broadcast_to(largest, state.params.shape)
-
-    def information(self, params: Array) -> Array:
+    def information(self, state: State) -> Array:
         """Information (B, p, p) of the observables, in relative units and radians."""
-        return Normal.of(self.linear(Params(params), geometry=True)).information
+        return self.linear(state, geometry=True).normal.information
 
-    def pulls(self, params: Array, target: Array) -> Array:
+    def pulls(self, state: State, target: Array) -> Array:
         """Change (B, n, p, 3) of the minimum by an error of each station's whitened reading.
 
         On the determined subspace. The observables' gradients are taken at `target` (B, n, 3), the
         vectors that a perfect tool reads: along an unknown turn they are then exactly zero.
         """
-        state = Params(params)
         determined = Determined.of(self, state)
-        bread = determined.inverse(Normal.of(self.linear(state)).information)
-        model, raw = self.triad.model, self.triad.raw
+        bread = determined.inverse(self.linear(state).normal.information)
+        model, raw, params = self.triad.model, self.triad.raw, state.params
         _, gradient, _ = self.compared(target)
         noise = gradient @ model.slope(params, raw, self.temperature) * self.triad.sd[..., None, :]
         rows = gradient @ model.jacobian(params, raw, self.temperature) * self.weights[..., None]
