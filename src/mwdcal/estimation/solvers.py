@@ -102,8 +102,14 @@ class Linear:
 
     @cached_property
     def normal(self) -> Normal:
-        """Its normal equations."""
-        return Normal.of(self)
+        """Its normal equations: the sum over stations, priors included."""
+        columns = np.concatenate([self.design, self.residual[..., None]], -1)
+        weighed = self.weigh(columns)
+        whole = np.einsum("...nmi,...nmj->...ij", columns, weighed, optimize=True)
+        pulled = (self.prior @ self.pull[..., None])[..., 0]
+        information = whole[..., :-1, :-1] + self.prior
+        cost = whole[..., -1, -1] + np.sum(self.pull * pulled, -1)
+        return Normal(information, whole[..., :-1, -1] + pulled, cost, self.size)
 
     @cached_property
     def determined(self) -> Determined:
@@ -149,19 +155,6 @@ class Normal:
     gradient: Array
     cost: Array
     size: int
-
-    @classmethod
-    def of(cls, linear: Linear) -> Normal:
-        """Sum over stations, priors included."""
-        columns = np.concatenate([linear.design, linear.residual[..., None]], -1)
-        weighed = linear.weigh(columns)
-        whole = np.einsum("...nmi,...nmj->...ij", columns, weighed, optimize=True)
-        information, gradient = whole[..., :-1, :-1].copy(), whole[..., :-1, -1].copy()
-        pulled = (linear.prior @ linear.pull[..., None])[..., 0]
-        information += linear.prior
-        gradient += pulled
-        cost = whole[..., -1, -1] + np.sum(linear.pull * pulled, -1)
-        return cls(information, gradient, cost, linear.size)
 
     def reduced(self) -> tuple[Array, Array, Array]:
         """Information (B, p, p) and gradient (B, p) of the parameters, and the elimination.
@@ -280,7 +273,7 @@ class _Descent:
         slowly: both are at their minimum for all purposes.
         """
         normal = self.linear.normal
-        step = _step(normal, self.determined, np.zeros(len(self.damping)))
+        step = _step(normal, self.determined)
         return self.settled(np.asarray(_length(normal, step) < NEGLIGIBLE**2))
 
     def _accept(self, trial: Any, after: Linear, better: Bools) -> None:
@@ -308,17 +301,8 @@ class _Descent:
         settled[which] = same
         return settled
 
-    def drop(self, stopped: Bools) -> None:
-        """Go on without some members."""
-        if not stopped.any():
-            return
-        rest = np.flatnonzero(~stopped)
-        self.problem, self.state = take((self.problem, self.state), rest)
-        self.linear, self.determined = take((self.linear, self.determined), rest)
-        self.damping, self.active = self.damping[rest], self.active[rest]
 
-
-def _step(normal: Normal, determined: Determined, damping: Array) -> Array:
+def _step(normal: Normal, determined: Determined, damping: Array | float = 0.0) -> Array:
     reduced, gradient, eliminate = normal.reduced()
     step = -(determined.inverse(reduced, damping) @ gradient[..., None])
     p = normal.size
@@ -359,8 +343,10 @@ def gauss_newton(problem: Linearisable, state: Any, limit: int = 60) -> tuple[An
         stopped = settled | broken
         if len(stopped) == count and stopped.all():
             return descent.state, status, iterations
-        state = put(state, descent.active[stopped], take(descent.state, np.flatnonzero(stopped)))
-        descent.drop(stopped)
+        if stopped.any():
+            done, rest = np.flatnonzero(stopped), np.flatnonzero(~stopped)
+            state = put(state, descent.active[done], take(descent.state, done))
+            descent = take(descent, rest)
     if descent.active.size:
         status[descent.active[descent.arrived()]] = Status.OK
     return put(state, descent.active, descent.state), status, iterations

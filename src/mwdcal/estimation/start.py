@@ -50,14 +50,13 @@ def start(problem: Problem) -> State:
         np.stack(constants, -1) if constants else np.zeros((batch, 0)),
         np.zeros((batch, count, len(problem.evidence.absent))),
     )
-    params = [_triad_start(problem, empty, index) for index in range(len(problem.triads))]
-    values = np.concatenate(params, -1)
-    for where in problem.slices():
+    params = []
+    for index, where in enumerate(problem.slices()):
         known = diagonal(problem.prior.precision[:, where, where]) > 0
+        free = _triad_start(problem, empty, index)
         whole = known.all(-1, keepdims=True)
-        values[:, where] = np.where(whole, problem.prior.expected[:, where], values[:, where])
-    state = replace(empty, params=values)
-    return _attitudes(problem, state)
+        params.append(np.where(whole, problem.prior.expected[:, where], free))
+    return _attitudes(problem, replace(empty, params=np.concatenate(params, -1)))
 
 
 def _triad_start(problem: Problem, state: State, index: int) -> Array:
@@ -197,12 +196,12 @@ def _share(problem: Problem, angles: dict[str, Array]) -> dict[str, Array]:
     axis = tool_from_earth(inc, azi, np.zeros_like(inc))[..., 2, :]
     members = evidence.members
     mean = members @ (members.mT @ axis)
-    shared = {n: evidence.shared(n).sum(-1) > 0 for n in ("inclination", "azimuth")}
     means = {
         "inclination": np.arctan2(np.hypot(mean[..., 0], mean[..., 1]), mean[..., 2]),
         "azimuth": np.arctan2(mean[..., 1], mean[..., 0]),
     }
-    return {n: np.where(shared[n], means[n], a) if n in shared else a for n, a in angles.items()}
+    shared = {n: np.where(evidence.shared(n).sum(-1) > 0, m, angles[n]) for n, m in means.items()}
+    return angles | shared
 
 
 def _by_toolface(

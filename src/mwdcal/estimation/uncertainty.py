@@ -12,6 +12,7 @@ Reference: D. A. Harville, J. Am. Stat. Assoc. 72, 320 (1977).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import chain
 
 import numpy as np
 
@@ -316,32 +317,27 @@ def without_station(problem: Problem, state: State, analysis: Analysis) -> Array
 
 
 def candidates(problem: Problem, state: State, triads: list[int]) -> dict[str, Array]:
-    """Directions (B, p) of parameter space that have a name: turns and scales of some triads."""
-    directions = {name: np.zeros_like(state.params) for name in CHANGES}
+    """Directions (B, p) of parameter space that have a name: turns and scales of some triads.
+
+    Those in proportion to a power of temperature follow, named `…-temperature-k`.
+    """
+    powers = range(1, 1 + min(problem.triads[t].model.basis.order for t in triads))
+    courses = {name: [f"{name}-temperature-{power}" for power in powers] for name in CHANGES}
+    names = [*CHANGES, *chain(*courses.values())]
+    directions = {name: np.zeros_like(state.params) for name in names}
     for triad in triads:
         where, model = problem.slices()[triad], problem.triads[triad].model
         for name, change in CHANGES.items():
-            directions[name][:, where] = tangent(model, state.params[:, where], change)
-    return directions | _courses(problem, directions, triads)
+            steady = tangent(model, state.params[:, where], change)
+            directions[name][:, where] = steady
+            for power, course in enumerate(courses[name], 1):
+                directions[course][:, where] = model.with_course(steady, power)
+    return directions
 
 
 def tangent(model: Model, params: Array, change: Array) -> Array:
     """Change of the parameters (..., p) when all fields are turned or scaled, per `TANGENT_STEP`."""
     return np.asarray((model.transformed(params, change) - params) / TANGENT_STEP)
-
-
-def _courses(problem: Problem, steady: dict[str, Array], triads: list[int]) -> dict[str, Array]:
-    """Turns and scales in proportion to each power of temperature, named `…-temperature-k`."""
-    orders = [problem.triads[t].model.basis.order for t in triads]
-    courses = {}
-    for name, direction in steady.items():
-        for power in range(1, min(orders) + 1):
-            moved = np.zeros_like(direction)
-            for triad in triads:
-                where, model = problem.slices()[triad], problem.triads[triad].model
-                moved[:, where] = model.with_course(direction[:, where], power)
-            courses[f"{name}-temperature-{power}"] = moved
-    return courses
 
 
 def free_share(determined: Determined, direction: Array) -> Array:
@@ -369,7 +365,7 @@ def settle_gauge(problem: Problem, state: State, determined: Determined) -> Stat
         named = candidates(problem, state, triads)
         free = np.stack([free_share(determined, named[n]) > COUPLED for n in ROTATIONS], -1)
         turn = _polar_turn(problem, state, triads[0], free)
-        state = _turn(problem, state, triads, turn, stations=len(triads) == len(every))
+        state = _turn(problem, state, triads, turn)
     for triad in every:
         share = free_share(determined, candidates(problem, state, [triad])["scale"])
         state = _rescale(problem, state, triad, share > COUPLED)
@@ -427,12 +423,14 @@ def unrotating(gain: Array, free: Bools) -> Array:
     return np.where(np.all(free, -1)[..., None, None], whole, rotation(along))
 
 
-def _turn(problem: Problem, state: State, triads: list[int], turn: Array, stations: bool) -> State:
+def _turn(problem: Problem, state: State, triads: list[int], turn: Array) -> State:
+    """The state with some triads turned; with all of them the stations turn too."""
     params = state.params.copy()
     for triad in triads:
         where = problem.slices()[triad]
         params[:, where] = problem.triads[triad].model.transformed(params[:, where], turn)
-    attitude = turn[:, None] @ state.attitude if stations else state.attitude
+    whole = len(triads) == len(problem.triads)
+    attitude = turn[:, None] @ state.attitude if whole else state.attitude
     return replace(state, params=params, attitude=attitude)
 
 

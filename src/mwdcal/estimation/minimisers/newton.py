@@ -295,7 +295,7 @@ def downhill(here: Local, determined: Determined) -> Array:
     Singular: NaN where the Hessian is not finite in the scale of its columns.
     """
     norms, kept = determined.norms, determined.basis * determined.keep[..., None, :]
-    inner = kept.mT @ (here.hessian / outer(norms, norms)) @ kept
+    inner = kept.mT @ (here.hessian / outer(norms)) @ kept
     values, vectors = eigen(inner)
     size = np.abs(values)
     size = np.maximum(size, SMALLEST_EIGENVALUE * np.max(size, -1, keepdims=True))
