@@ -18,7 +18,7 @@ import numpy as np
 from mwdcal.estimation.problem import State, Triad
 from mwdcal.estimation.solvers import Determined, Linear
 from mwdcal.geometry.observables import OBSERVABLES, is_vertical
-from mwdcal.geometry.vectors import Array, Bools, centred
+from mwdcal.geometry.vectors import Array
 
 STRENGTH = "strength-squared"
 
@@ -36,34 +36,32 @@ class Sums:
     reference: Array
     weights: Array
 
-    def compared(self, field: Array) -> tuple[Array, Array, Bools]:
-        """Differences (B, n, m), gradients (B, n, m, 3) by the field (B, n, 3), and what counts."""
+    def compared(self, field: Array) -> tuple[Array, Array]:
+        """Differences (B, n, m) and gradients (B, n, m, 3) by the field (B, n, 3), zero if they do not count."""
         errors, gradients, counts = [], [], []
         for index, name in enumerate(self.names):
             if name == STRENGTH:
-                value, gradient = np.sum(field**2, -1), 2 * field
+                errors.append(np.sum(field**2, -1) - self.reference[..., index])
+                gradients.append(2 * field)
             else:
                 observable, blank = OBSERVABLES[name], np.zeros_like(field)
                 value = observable.value(field, blank)
-                gradient = observable.gradient(field, blank)[..., :3]
-            error = value - self.reference[..., index]
-            errors.append(centred(error, OBSERVABLES[name].period) if name == "toolface" else error)
-            gradients.append(gradient)
+                errors.append(observable.difference(value, self.reference[..., index]))
+                gradients.append(observable.gradient(field, blank)[..., :3])
             counts.append(np.logical_or(name != "toolface", is_vertical(field) == 0))
         counted = np.stack(counts, -1) & (self.weights > 0)
         error = np.where(counted, np.stack(errors, -1), 0.0)
-        return error, np.where(counted[..., None], np.stack(gradients, -2), 0.0), counted
+        return error, np.where(counted[..., None], np.stack(gradients, -2), 0.0)
 
     def linear(self, state: State, geometry: bool = False) -> Linear:
         """Linearise at a state; with `geometry` each observable is in units of its own size."""
         model, readings = self.triad.model, (self.triad.raw, self.temperature)
-        error, gradient, _ = self.compared(model.fields(state.params, *readings))
+        error, gradient = self.compared(model.fields(state.params, *readings))
         jacobian = model.jacobian(state.params, *readings)
         root = np.sqrt(self.weights)
         if geometry:
-            sizes = [np.abs(self.reference[..., k]) if n == STRENGTH else np.ones(root.shape[:-1])
-                     for k, n in enumerate(self.names)]  # fmt: skip
-            root = (self.weights > 0) / np.stack(sizes, -1)
+            strong = np.array(self.names) == STRENGTH
+            root = (self.weights > 0) / np.where(strong, np.abs(self.reference), 1.0)
         size = state.params.shape[-1]
         return Linear(
             error * root,
@@ -91,7 +89,7 @@ class Sums:
         determined = Determined.of(self, state)
         bread = determined.inverse(self.linear(state).normal.information)
         model, raw, params = self.triad.model, self.triad.raw, state.params
-        _, gradient, _ = self.compared(target)
+        _, gradient = self.compared(target)
         noise = gradient @ model.slope(params, raw, self.temperature) * self.triad.sd[..., None, :]
         rows = gradient @ model.jacobian(params, raw, self.temperature) * self.weights[..., None]
         return -bread[:, None] @ rows.mT @ noise
