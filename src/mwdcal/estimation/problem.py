@@ -50,11 +50,12 @@ GEOMETRIC_NOISE = 1e-4
 
 @dataclass(frozen=True)
 class Triad:
-    """One sensor triad: model, readings (B, n, 3), their noise (B, n, 3)."""
+    """One sensor triad: model, readings (B, n, 3), their noise (B, n, 3), and whether that is declared."""
 
     model: Model
     raw: Array
     sd: Array
+    declared: bool = True
 
 
 @dataclass(frozen=True)
