@@ -8,12 +8,19 @@ import numpy as np
 
 from mwdcal.calibration.diagnosis.flags import FittedRuns, Flag
 from mwdcal.calibration.diagnosis.soundness import invertible, is_covariance, mirrored
+from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.readings import TRIADS, Readings
 from mwdcal.calibration.results import temperature_range
-from mwdcal.geometry.vectors import Array
+from mwdcal.geometry.vectors import Array, Bools
 
 DECLARED_NOISE = 0.3
 """Declared noise of more than this share of the field at every station is a wrong unit."""
+COARSE = (
+    "the declared noise of the {triad} is {share:.2g} times the field that it measures, or more. 'noise' and "
+    "'repeatability' of [{triad}] in the tool profile and the columns sd_ are in the raw units of the channels, such "
+    "as V: correct them, or leave them out and the noise is estimated."
+)
+"""What is wrong with such a noise, and what to do."""
 UNSOUND_ADVICE = (
     "Check 'noise' and 'repeatability' in the tool profile and the columns sd_: all are in the raw units of their "
     "channel; without them the noise is estimated."
@@ -21,37 +28,24 @@ UNSOUND_ADVICE = (
 """What to do where a fit has no valid covariance."""
 
 
-def coarse_noise(readings: Readings, triad: str) -> Flag:
+def coarse_noise(readings: Readings, triad: str) -> Iterator[Flag]:
     """Declared noise that leaves nothing of the field, on some channel at every station."""
-    values, declared = getattr(readings, triad), readings.sd.get(triad)
-    if values is None or declared is None:
-        return Flag("noise", np.zeros(len(readings.accelerometer), bool), lambda _: "")
-    share = np.broadcast_to(declared, values.shape).min(-2) / _strength(values)[:, None]
-
-    def sentence(place: int) -> str:
-        return (
-            f"the declared noise of the {triad} is {share[place].max():.2g} times the field that it measures, or more. "
-            f"'noise' and 'repeatability' of [{triad}] in the tool profile and the columns sd_ are in the raw units of "
-            "the channels, such as V: correct them, or leave them out and the noise is estimated."
-        )
-
-    return Flag("noise", np.any(share > DECLARED_NOISE, -1), sentence)
+    if triad not in readings.sd:
+        return
+    values = getattr(readings, triad)
+    least = np.broadcast_to(readings.sd[triad], values.shape).min(-2)
+    share = least / _strength(values)[:, None]
+    coarse = np.any(share > DECLARED_NOISE, -1)
+    yield Flag("noise", coarse, COARSE, {"triad": triad, "share": share.max(-1)})
 
 
-def unsound(fitted: FittedRuns) -> Flag:
-    """Fits whose covariance is none, or whose gains are none that a sensor has."""
-    result = fitted.result
+def is_sound(fitted: FittedRuns) -> Bools:
+    """Fits (B,) whose covariance is one, and whose gains are such as a sensor has."""
     with np.errstate(all="ignore"):  # of members that earlier refusals hold of
         sound = is_covariance(fitted.covariance.in_file(fitted.profile.reference_temperature_c))
         for slope in _slopes(fitted):
             sound &= invertible(slope) & ~mirrored(slope)
-
-    def sentence(place: int) -> str:
-        triads = zip(TRIADS, result.problem.triads, strict=False)
-        parts = [_noise_range(name, triad.sd[place], triad.raw[place]) for name, triad in triads]
-        return f"the fit gives no valid covariance, or gains that no sensor has: {', '.join(parts)}. {UNSOUND_ADVICE}"
-
-    return Flag("unsound", ~sound, sentence)
+    return sound
 
 
 def _slopes(fitted: FittedRuns) -> Iterator[Array]:
@@ -64,10 +58,13 @@ def _slopes(fitted: FittedRuns) -> Iterator[Array]:
         yield triad.model.slope(result.state.params[:, where], middle, at)
 
 
-def _noise_range(name: str, sd: Array, raw: Array) -> str:
-    """The smallest and the largest noise of a triad's readings (n, 3), in words."""
-    share = sd / _strength(raw)
-    return f"the {name}'s noise is {share.min():.1g} to {share.max():.1g} of the field"
+def noise_ranges(result: Fit, place: int) -> str:
+    """The smallest and the largest noise of each triad's readings, in words."""
+    shares = [triad.sd[place] / _strength(triad.raw[place]) for triad in result.problem.triads]
+    return ", ".join(
+        f"the {name}'s noise is {share.min():.1g} to {share.max():.1g} of the field"
+        for name, share in zip(TRIADS, shares, strict=False)
+    )
 
 
 def _strength(raw: Array) -> Array:
