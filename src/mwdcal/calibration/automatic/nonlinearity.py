@@ -13,11 +13,11 @@ from itertools import combinations
 
 import numpy as np
 
-from mwdcal.calibration.automatic.order_selection import misfit, with_all_stations, with_noise
+from mwdcal.calibration.automatic.order_selection import left_out, misfit, with_noise
 from mwdcal.calibration.estimate import fit, scatters
 from mwdcal.calibration.options import AUTO, USUAL, Options
 from mwdcal.calibration.readings import TRIADS, Readings
-from mwdcal.estimation.batch import batch_of_one, mapped
+from mwdcal.estimation.batch import batch_of_one
 from mwdcal.estimation.uncertainty import log_evidence
 from mwdcal.geometry.vectors import Array, Ints
 from mwdcal.sensor.profile import Profile
@@ -178,7 +178,6 @@ def _left_out(readings: Readings, options: Options) -> Array:
     """χ² per reading (B, n) of stations, each judged by the fit without its part."""
     parts = min(readings.count, MOST_PARTS)
     part = np.arange(readings.count) % parts
-    include = (np.arange(parts)[:, None] != part).astype(float)
-    result = fit(mapped(lambda value: np.expand_dims(value, 1), readings), options, include)
-    square = misfit(*with_all_stations(result)).mean(-1).reshape(-1, parts, readings.count) / 3
+    problem, state, _ = left_out(readings, options, part)
+    square = misfit(problem, state).mean(-1).reshape(-1, parts, readings.count) / 3
     return np.asarray(square[:, part, np.arange(readings.count)])

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from mwdcal.calibration.automatic.courses import terms_beyond
-from mwdcal.calibration.estimate import Fit, fit
+from mwdcal.calibration.estimate import fit
 from mwdcal.calibration.options import Options, Orders
 from mwdcal.calibration.readings import TRIADS, Readings
 from mwdcal.calibration.record import OrderScore, stated
@@ -68,7 +68,7 @@ def _judged_soaks(readings: Readings, options: Options) -> Ints:
 
     So has one whose stations cannot even determine what all temperatures have in common.
     """
-    levels = _usable_soaks(readings).max(-1) + 1
+    levels = usable_soaks(_temperature(readings)).max(-1) + 1
     if (levels > 1).any():
         result = fit(readings, Options(method=options.method))
         ranks = [marginal_rank(result.analysis.determined, w) for w in result.problem.slices()]
@@ -121,18 +121,16 @@ def _needed(orders: tuple[int, int]) -> int:
     return max(FEWEST_SOAKS, max(orders) + 2)
 
 
-def _usable_soaks(readings: Readings) -> Ints:
-    """Number (B, n) of each station's soak: all 0 without temperatures, or with too short a span."""
-    if readings.temperature is None:
-        return np.zeros(readings.accelerometer.shape[:-1], int)
-    return usable_soaks(readings.temperature)
+def _temperature(readings: Readings) -> Array:
+    """Temperatures (B, n), all alike where none were measured."""
+    shape = readings.accelerometer.shape[:-1]
+    return np.zeros(shape) if readings.temperature is None else readings.temperature
 
 
 def _highest(readings: Readings, options: Options) -> Ints:
     """The highest order (B,) that the soaks can carry, with stations enough."""
-    if options.method == "swarm" or readings.temperature is None:
-        return np.zeros(len(readings.accelerometer), int)
-    return np.minimum(highest_order(readings.temperature), HIGHEST)
+    carried = highest_order(_temperature(readings))
+    return np.minimum(carried, 0 if options.method == "swarm" else HIGHEST)
 
 
 def _scores(
@@ -147,7 +145,7 @@ def _scores(
 
     `chosen` (t,) orders and the `chance` (t, k) of each term by triad.
     """
-    numbers = _usable_soaks(readings)
+    numbers = usable_soaks(_temperature(readings))
     count, squares = int(numbers.max()) + 1, []
     for pair in orders:
         if count < _needed(pair):
@@ -201,11 +199,7 @@ def _held_out(readings: Readings, options: Options, numbers: Ints) -> Array:
     Of the reading, in units of its noise (χ²); then of noise and error per axis of the vector
     (g, nT), and of noise and error across the field (rad).
     """
-    soak = np.arange(int(numbers.max()) + 1)
-    include = (soak[:, None] != numbers[:, None, :]).astype(float)
-    result = fit(mapped(lambda value: np.expand_dims(value, 1), readings), options, include)
-    held = 1 - include.reshape(-1, readings.count)
-    problem, state = with_all_stations(result)
+    problem, state, held = left_out(readings, options, numbers)
     linear = problem.linear(state)
     chi = np.sum(misfit(problem, state) * held[..., None], 1) / (3 * held.sum(1))[:, None]
     left, share = linear.weigh(linear.residual[..., None]), linear.weight
@@ -240,12 +234,17 @@ def _squares(
     return noise, noise * error / tested
 
 
-def with_all_stations(result: Fit) -> tuple[Problem, State]:
-    """The problem with the left-out stations back, each at its best attitude for the fit."""
+def left_out(readings: Readings, options: Options, part: Ints) -> tuple[Problem, State, Array]:
+    """Fits without each part of the stations, these at their best attitude then; who was left out.
+
+    `part` (n,) or (B, n) has the numbers of the parts; what was left out (parts, n) is 1 in the last.
+    """
+    include = (np.arange(int(part.max()) + 1)[:, None] != part[..., None, :]).astype(float)
+    result = fit(mapped(lambda value: np.expand_dims(value, 1), readings), options, include)
     evidence = result.problem.evidence
     everyone = replace(evidence, include=np.ones_like(evidence.include))
     problem = replace(result.problem, evidence=everyone)
-    return problem, readjusted(problem, result.state)
+    return problem, readjusted(problem, result.state), 1 - include.reshape(-1, readings.count)
 
 
 def misfit(problem: Problem, state: State) -> Array:
