@@ -12,8 +12,7 @@ from mwdcal.calibration import results
 from mwdcal.calibration.automatic.auto import Choice, choose
 from mwdcal.calibration.diagnosis.findings import described, findings
 from mwdcal.calibration.diagnosis.flags import FittedRuns
-from mwdcal.calibration.diagnosis.noise_refusals import UNSOUND_ADVICE
-from mwdcal.calibration.diagnosis.refusals import check, fit_refusals
+from mwdcal.calibration.diagnosis.refusals import UNSOUND_ADVICE, check, fit_refusals
 from mwdcal.calibration.diagnosis.soundness import inconsistency
 from mwdcal.calibration.estimate import Fit, fit
 from mwdcal.calibration.options import Options

@@ -24,9 +24,8 @@ from mwdcal.calibration.estimate import Fit, fit
 from mwdcal.calibration.methods import ESTIMABLE
 from mwdcal.calibration.options import AUTO, Options
 from mwdcal.calibration.prediction import STATED_ANGLES, accuracy
-from mwdcal.calibration.readings import TRIADS, Readings
+from mwdcal.calibration.readings import HIGHEST, TRIADS, Readings
 from mwdcal.calibration.record import StandErrors
-from mwdcal.calibration.soaks import HIGHEST
 from mwdcal.errors import MwdcalError
 from mwdcal.estimation.batch import take
 from mwdcal.fleet.choices import in_chunks, with_curves, with_orders

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mwdcal.calibration.estimate import Fit
-from mwdcal.calibration.soaks import HIGHEST, highest_order, usable_soaks
+from mwdcal.calibration.readings import HIGHEST, highest_order, usable_soaks
 from mwdcal.estimation.problem import Problem, State
 from mwdcal.estimation.uncertainty import TANGENT_STEP, tangent
 from mwdcal.geometry.vectors import Array, Bools, Ints, diagonal, eigen, inverse, outer, quotient

@@ -14,10 +14,9 @@ import numpy as np
 from mwdcal.calibration.automatic.courses import terms_beyond
 from mwdcal.calibration.estimate import fit
 from mwdcal.calibration.options import Options, Orders
-from mwdcal.calibration.readings import TRIADS, Readings
+from mwdcal.calibration.readings import HIGHEST, TRIADS, Readings, highest_order, usable_soaks
 from mwdcal.calibration.record import OrderScore, stated
 from mwdcal.calibration.residuals import shown_in
-from mwdcal.calibration.soaks import HIGHEST, highest_order, usable_soaks
 from mwdcal.estimation.batch import batch_of_one, mapped, take
 from mwdcal.estimation.problem import Problem, State
 from mwdcal.estimation.uncertainty import TESTED, marginal_rank, readjusted

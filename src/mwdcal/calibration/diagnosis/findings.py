@@ -21,11 +21,10 @@ from mwdcal.calibration.diagnosis.plausibility import (
 )
 from mwdcal.calibration.diagnosis.structure import described as seen_as
 from mwdcal.calibration.diagnosis.structure import effects, suspected
-from mwdcal.calibration.readings import EARTH_RANGES, TRIADS
+from mwdcal.calibration.readings import EARTH_RANGES, HIGHEST, TRIADS
 from mwdcal.calibration.record import Finding
 from mwdcal.calibration.residuals import REASONS, shown_in, tail
 from mwdcal.calibration.results import common_source
-from mwdcal.calibration.soaks import HIGHEST
 from mwdcal.estimation.problem import Prior
 from mwdcal.estimation.rank import free_directions
 from mwdcal.estimation.solvers import Determined

@@ -7,6 +7,7 @@ from functools import cache
 
 import numpy as np
 
+from mwdcal.calibration.diagnosis.soundness import invertible, mirrored
 from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.readings import EARTH_RANGES, Readings
 from mwdcal.calibration.residuals import RESHOOT, Residuals, chances, chi_chance, tail, to_reshoot
@@ -67,6 +68,16 @@ def gain_shares(result: Fit, index: int) -> tuple[Array, Array]:
     gain = diagonal(slope)
     middle = np.median(np.linalg.norm(slope, axis=-1), -1, keepdims=True)
     return gain, gain / middle
+
+
+def has_sensor_gains(result: Fit, temperature: Array) -> Bools:
+    """Fits (B,) whose gains at temperatures (B, k) are such as a sensor has."""
+    problem, gains = result.problem, []
+    for triad, where in zip(problem.triads, problem.slices(), strict=True):
+        middle = np.broadcast_to(triad.raw.mean(1, keepdims=True), (*temperature.shape, 3))
+        slope = triad.model.slope(result.state.params[:, where], middle, temperature)
+        gains.append(invertible(slope) & ~mirrored(slope))
+    return np.asarray(np.all(gains, 0))
 
 
 def off_earth(result: Fit, name: str, coil: bool) -> Bools:

@@ -15,27 +15,23 @@ import numpy as np
 
 from mwdcal.calibration.diagnosis.axes import explaining
 from mwdcal.calibration.diagnosis.flags import FittedRuns, Flag, listed, spaced
-from mwdcal.calibration.diagnosis.noise_refusals import (
-    UNSOUND_ADVICE,
-    coarse_noise,
-    is_sound,
-    noise_ranges,
-)
 from mwdcal.calibration.diagnosis.plausibility import (
     excessive_errors,
     gain_shares,
+    has_sensor_gains,
     inseparable,
     is_bad,
     off_earth,
     overturned,
     straying,
 )
+from mwdcal.calibration.diagnosis.soundness import is_covariance
 from mwdcal.calibration.diagnosis.structure import described, effects
 from mwdcal.calibration.methods import EVIDENCE
 from mwdcal.calibration.options import Options
-from mwdcal.calibration.readings import CONSTANTS, EARTH_RANGES, TRIADS, Readings
+from mwdcal.calibration.readings import CONSTANTS, EARTH_RANGES, TRIADS, Readings, soaks
 from mwdcal.calibration.residuals import shown_in
-from mwdcal.calibration.soaks import soaks
+from mwdcal.calibration.results import temperature_range
 from mwdcal.errors import FitError, InputError
 from mwdcal.estimation.batch import batch_of_one
 from mwdcal.estimation.robust import LOSSES
@@ -49,6 +45,8 @@ GAIN_RANGE = (0.3, 3.0)
 """An own-axis gain outside this share of nominal is a wrong profile, not a sensor error."""
 MOTION_RANGE = (1e-2, 30.0)
 """A channel that moves by less or more than this share of the field has not seen the field."""
+DECLARED_NOISE = 0.3
+"""Declared noise of more than this share of the field at every station is a wrong unit."""
 PARAMETERS_NAMED = 4
 """Most undetermined parameters that a message lists."""
 ABSURD_RATIO = 30.0
@@ -61,17 +59,17 @@ BAD_INPUT = "bad-input"
 """The status of what is wrong with the input itself: an `InputError` of a single run."""
 NEEDS = {
     "newton": ("inclination",),
-    "swarm": ("inclination", "toolface"),
-    "least-squares": ("inclination", "toolface"),
+    "swarm": ("inclination", "toolface", "azimuth", "dip"),
+    "least-squares": ("inclination", "toolface", "azimuth"),
     "toolface-inclination": ("inclination", "toolface"),
 }
-"""Reference angles that a method needs at every station."""
-REFERENCES = {
+"""Reference angles that a method needs at every station, those of the field for a magnetometer."""
+STRENGTH_COLUMNS = {
     "gravity": ("ref_gravity_g", 1.0, "g", ""),
     "field": ("ref_field_nt", 1e-3, "µT", "; of a run in a coil, say coil = true under [stand]"),
 }
 """Column of each strength, factor and unit in which a message has it, and a remedy besides."""
-AXES = np.array([*"xyz"])
+TOOL_AXES = np.array([*"xyz"])
 Run = Callable[[int], Readings]
 """Readings of one member of a batch, without leading axis: their labels and source."""
 
@@ -98,6 +96,11 @@ OF_OPTIONS = {
     "and with `nonlinearity` none.",
 }
 """Why options do not go together."""
+UNSOUND_ADVICE = (
+    "Check 'noise' and 'repeatability' in the tool profile and the columns sd_: all are in the raw units of their "
+    "channel; without them the noise is estimated."
+)
+"""What to do where a fit has no valid covariance."""
 OF_READINGS = {
     "few": "{source} has {count} stations; the model has {size} parameters per triad and needs {needed} or more. Add "
     "stations at other attitudes{remedy}.",
@@ -110,6 +113,9 @@ OF_READINGS = {
     "column, or a wrong 'scale' of [{triad}] in the tool profile.",
     "much": "{source}: the {triad} channel on tool axis {axis} moves by {moved:.3g} {unit} over the run, more than any "
     "field explains. Look for a wrong column or cell, or a wrong 'scale' of [{triad}] in the tool profile.",
+    "noise": "the declared noise of the {triad} is {share:.2g} times the field that it measures, or more. 'noise' and "
+    "'repeatability' of [{triad}] in the tool profile and the columns sd_ are in the raw units of the channels, such "
+    "as V: correct them, or leave them out and the noise is estimated.",
     "no temperature": "`order` {order} needs the column 'temperature_c'; use `order` 0.",
     "span": "the run spans {span:.1f} °C with {levels} temperature{plural} more than 5 °C apart: too little for "
     "`order` {order}, which needs {needed} of them over {range} °C or more. Add temperatures, or lower `order`.",
@@ -217,10 +223,10 @@ def reading_refusals(readings: Readings, options: Options, run: Run) -> Iterator
 
     yield _few_stations(readings, options, source)
     yield _common_errors(readings, options)
-    for triad in TRIADS:
-        if getattr(readings, triad) is not None:
-            yield from _channels(readings, triad, options.knowledge is not None, source)
-            yield from coarse_noise(readings, triad)
+    for triad in (name for name in TRIADS if getattr(readings, name) is not None):
+        yield from _channels(readings, triad, options.knowledge is not None, source)
+        if triad in readings.sd:
+            yield _coarse_noise(readings, triad)
     if options.knowledge is None or options.knowledge.temperature is None:
         yield from _temperatures(readings, max(options.orders))
     yield from _blanks(readings, options.method, run)
@@ -269,14 +275,28 @@ def _channels(
     )
     odd = (share < (0.0 if prior else MOTION_RANGE[0])) | (share > MOTION_RANGE[1])
     words = {"source": source, "triad": triad, "count": readings.count, "unit": unit}
-    still = words | {"axis": AXES[np.argmax(dead, -1)]}
+    still = words | {"axis": TOOL_AXES[np.argmax(dead, -1)]}
     yield Flag("channel", np.any(dead, -1), OF_READINGS["dead"], still)
     axis = np.argmax(odd, -1)
     first = np.arange(len(axis)), axis
-    moving = words | {"axis": AXES[axis], "moved": spread[first]}
+    moving = words | {"axis": TOOL_AXES[axis], "moved": spread[first]}
     little = share[first] < MOTION_RANGE[0]
     yield Flag("channel", np.any(odd, -1) & little, OF_READINGS["little"], moving)
     yield Flag("channel", np.any(odd, -1) & ~little, OF_READINGS["much"], moving)
+
+
+def _coarse_noise(readings: Readings, triad: str) -> Flag:
+    """Declared noise that leaves nothing of the field, on some channel at every station."""
+    values = getattr(readings, triad)
+    least = np.broadcast_to(readings.sd[triad], values.shape).min(-2)
+    share = least / _strength(values)[:, None]
+    coarse = np.any(share > DECLARED_NOISE, -1)
+    return Flag("noise", coarse, OF_READINGS["noise"], {"triad": triad, "share": share.max(-1)})
+
+
+def _strength(raw: Array) -> Array:
+    """Mean strength (...) of readings (..., n, 3), at least 1e-30."""
+    return np.asarray(np.maximum(np.linalg.norm(raw, axis=-1).mean(-1), 1e-30))
 
 
 def no_temperature(order: int) -> InputError:
@@ -300,9 +320,8 @@ def _temperatures(readings: Readings, order: int) -> Iterator[Flag]:
 
 def _blanks(readings: Readings, method: str, run: Run) -> Iterator[Flag]:
     """Blanks of reference angles that a method needs at every station."""
-    needed = list(NEEDS.get(method, ()))
-    if readings.magnetometer is not None and method in ("least-squares", "swarm"):
-        needed += ["azimuth", "dip"][: 1 + (method == "swarm")]
+    magnetic = () if readings.magnetometer is not None else ("azimuth", "dip")
+    needed = [name for name in NEEDS.get(method, ()) if name not in magnetic]
     words = {"method": method, "needed": ", ".join(needed), "count": readings.count}
     for name in needed:
         blank = np.isnan(readings.reference(name))
@@ -353,7 +372,7 @@ def _by_arrays(fitted: FittedRuns) -> Iterator[Flag]:
     yield refusal("overturned", np.isfinite(dip), "earth", dip=dip)
     for name in EARTH_RANGES:
         yield _nowhere_on_earth(fitted, name)
-    yield refusal("unsound", ~is_sound(fitted), noise=partial(noise_ranges, result))
+    yield _unsound(fitted)
 
 
 def _refusal(
@@ -395,7 +414,7 @@ def _absurd(fitted: FittedRuns, index: int) -> Flag:
     result, raw = fitted.result, fitted.result.problem.triads[index].raw
     excess = np.sqrt(np.nan_to_num(result.analysis.variance_factor[:, index]))
     noise = result.noise[:, index]
-    declared, signal = np.isnan(noise), _signal(raw)
+    declared, signal = np.isnan(noise), np.minimum(_strength(raw), 2 * raw.std(axis=1).max(-1))
     absurd = np.where(declared, excess > ABSURD_RATIO, noise > COARSE_NOISE * signal)
 
     def much(place: int) -> str:
@@ -405,12 +424,6 @@ def _absurd(fitted: FittedRuns, index: int) -> Flag:
 
     absurd &= result.analysis.freedom[:, index] >= 1
     return _refusal(fitted, "residuals", absurd, triad=TRIADS[index], much=much)
-
-
-def _signal(raw: Array) -> Array:
-    """Size (B,) of what readings (B, n, 3) measure, at least 1e-300."""
-    strength = np.linalg.norm(raw, axis=-1).mean(-1)
-    return np.asarray(np.maximum(np.minimum(strength, 2 * raw.std(axis=1).max(-1)), 1e-300))
 
 
 def _too_weak(fitted: FittedRuns) -> Flag:
@@ -434,7 +447,7 @@ def _odd_gain(fitted: FittedRuns, index: int) -> Flag:
     axis = np.argmax(odd, -1)
     first = value[np.arange(len(axis)), axis]
     wrong = np.where(first < 0, "has the wrong sign", "is far from nominal")
-    values = {"triad": name, "axis": AXES[axis], "gain": first, "wrong": wrong}
+    values = {"triad": name, "axis": TOOL_AXES[axis], "gain": first, "wrong": wrong}
     return _refusal(fitted, "gain", np.any(odd, -1), range=GAIN_RANGE, **values)
 
 
@@ -442,7 +455,7 @@ def _nowhere_on_earth(fitted: FittedRuns, name: str) -> Flag:
     """A gravity or field that no place on Earth has."""
     problem, state = fitted.result.problem, fitted.result.state
     outside = off_earth(fitted.result, name, fitted.profile.stand.coil)
-    column, factor, unit, coil = REFERENCES[name]
+    column, factor, unit, coil = STRENGTH_COLUMNS[name]
     first = np.arange(fitted.count), np.argmax(outside, -1)
     given = np.where(
         problem.evidence.is_known(name)[first], f"'{column}' gives", "the fit makes it"
@@ -475,3 +488,21 @@ def _unexplained_errors(fitted: FittedRuns, sound: Bools) -> Flag:
         return "".join(f" {described(each, shown_in('field', relative)[1])}" for each in first)
 
     return _refusal(fitted, "errors", flags, of=worst, looks=looks)
+
+
+def _unsound(fitted: FittedRuns) -> Flag:
+    """Fits whose covariance is none, or whose gains are none that a sensor has."""
+    result, zero = fitted.result, fitted.profile.reference_temperature_c
+    low, high = temperature_range(result, fitted.options.knowledge)
+    with np.errstate(all="ignore"):  # of members that earlier refusals hold of
+        sound = is_covariance(fitted.covariance.in_file(zero))
+        sound &= has_sensor_gains(result, np.stack([low, high, np.clip(zero, low, high)], -1))
+
+    def noise(place: int) -> str:
+        shares = [triad.sd[place] / _strength(triad.raw[place]) for triad in result.problem.triads]
+        return ", ".join(
+            f"the {name}'s noise is {share.min():.1g} to {share.max():.1g} of the field"
+            for name, share in zip(TRIADS, shares, strict=False)
+        )
+
+    return _refusal(fitted, "unsound", ~sound, noise=noise)

@@ -19,10 +19,9 @@ from mwdcal.calibration.automatic.courses import TRIED, f_test, steady_columns, 
 from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.evidence import acts_on
 from mwdcal.calibration.methods import ESTIMABLE
-from mwdcal.calibration.readings import TRIADS
+from mwdcal.calibration.readings import HIGHEST, LEAST_TEMPERATURE_SPAN, TRIADS, highest_order
 from mwdcal.calibration.residuals import chances, to_reshoot
 from mwdcal.calibration.results import variance_scales
-from mwdcal.calibration.soaks import HIGHEST, LEAST_TEMPERATURE_SPAN, highest_order
 from mwdcal.estimation.evidence import STAND_ERRORS
 from mwdcal.estimation.problem import Problem, State
 from mwdcal.estimation.uncertainty import whole_covariance
@@ -132,7 +131,8 @@ def effects(result: Fit) -> list[Effect]:
     ]
     problem = replace(result.problem, triads=tuple(triads))
     scores = _scores(problem, result)
-    left, shown = scores.misfit, dict[str, tuple[float, float]]()
+    left = scores.misfit
+    shown: dict[str, tuple[float, float]] = {}
     while True:
         others = [name for name in scores.places if name not in shown]
         trials = [(*_trial(scores, [*shown], name, left), name) for name in others]
