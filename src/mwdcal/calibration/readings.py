@@ -119,13 +119,18 @@ class Readings:
 
     def __repr__(self) -> str:
         known = ", ".join(self.known) or "none"
-        triads = " and ".join(TRIADS[: 1 if self.magnetometer is None else 2])
+        triads = " and ".join(self.triads)
         return f"<Readings: {self.count} stations; {triads}; references: {known}>"
 
     @property
     def name(self) -> str:
         """What messages call the readings: the name of the file, if there is one."""
         return self.source or "the readings"
+
+    @property
+    def triads(self) -> tuple[str, ...]:
+        """The triads that were read, of `TRIADS`."""
+        return TRIADS[: 1 if self.magnetometer is None else 2]
 
     @property
     def count(self) -> int:

@@ -135,7 +135,7 @@ def compare_curves(readings: Readings, options: Options, terms: Mapping[str, flo
 
 def choices_of(readings: Readings, terms: Mapping[str, float]) -> list[tuple[str, ...]]:
     """Which triads may have terms: none first, then each offered one that the run has, then both."""
-    names = [name for name in TRIADS if name in terms and getattr(readings, name) is not None]
+    names = [name for name in readings.triads if name in terms]
     return [c for count in range(len(names) + 1) for c in combinations(names, count)]
 
 

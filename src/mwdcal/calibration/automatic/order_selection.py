@@ -22,6 +22,8 @@ from mwdcal.estimation.problem import Problem, State
 from mwdcal.estimation.uncertainty import TESTED, marginal_rank, readjusted
 from mwdcal.geometry.vectors import Array, Ints
 
+Progress = Callable[[str], None]
+"""What gets a line for each trial."""
 FEWEST_SOAKS = 3
 """Fewest soaks among which one can be left out."""
 LOWEST_RANK = 8
@@ -29,7 +31,7 @@ LOWEST_RANK = 8
 
 
 def choose_order(
-    readings: Readings, options: Options, progress: Callable[[str], None]
+    readings: Readings, options: Options, progress: Progress
 ) -> tuple[Orders, list[OrderScore]]:
     """Each triad's lowest order above which noise explains all terms, and the tables, of one run.
 
@@ -81,9 +83,8 @@ def _tested(readings: Readings, options: Options) -> tuple[Ints, Array]:
     The chance is that of the term in a fit of the order below, or of the order chosen.
     """
     limit = _highest(readings, options)
-    triads = sum(getattr(readings, name) is not None for name in TRIADS)
-    orders = np.full((len(limit), triads), -1)
-    chance = np.full((len(limit), triads, HIGHEST), np.nan)
+    orders = np.full((len(limit), len(readings.triads)), -1)
+    chance = np.full((*orders.shape, HIGHEST), np.nan)
     powers = np.arange(1, HIGHEST + 1)
     for order in range(int(limit.max()) + 1):
         terms = terms_beyond(fit(readings, replace(options, order=order)))
@@ -97,9 +98,7 @@ def _tested(readings: Readings, options: Options) -> tuple[Ints, Array]:
     return orders, chance
 
 
-def order_errors(
-    readings: Readings, options: Options, progress: Callable[[str], None]
-) -> list[OrderScore]:
+def order_errors(readings: Readings, options: Options, progress: Progress) -> list[OrderScore]:
     """What an order that was given is worth at temperatures left out, one row per triad.
 
     None where there are too few soaks to leave one out.
@@ -109,7 +108,7 @@ def order_errors(
         return []
     highest = int(_highest(batch, options)[0])
     yardstick = options if options.prior else replace(options, order=highest)
-    chosen = np.array(options.orders[: 1 + (readings.magnetometer is not None)])
+    chosen = np.array(options.orders[: len(readings.triads)])
     untested = np.full((len(chosen), HIGHEST), np.nan)
     batch = with_noise(batch, yardstick)
     return _scores(batch, options, [options.orders], chosen, untested, progress)
@@ -138,7 +137,7 @@ def _scores(
     orders: Sequence[tuple[int, int]],
     chosen: Ints,
     chance: Array,
-    progress: Callable[[str], None],
+    progress: Progress,
 ) -> list[OrderScore]:
     """The tables of all triads over some orders, of a batch of one; blank where soaks are too few.
 
@@ -184,10 +183,11 @@ def with_noise(readings: Readings, options: Options) -> Readings:
 
     Every choice is then judged by the same yardstick.
     """
-    names = [name for name in TRIADS if getattr(readings, name) is not None]
-    if all(name in readings.sd for name in names):
+    if all(name in readings.sd for name in readings.triads):
         return readings
-    noise = dict(zip(names, np.moveaxis(fit(readings, options).noise, -1, 0), strict=True))
+    noise = dict(
+        zip(readings.triads, np.moveaxis(fit(readings, options).noise, -1, 0), strict=True)
+    )
     estimated = {n: sd[:, None, None] for n, sd in noise.items() if n not in readings.sd}
     return replace(readings, sd={**readings.sd, **estimated})
 

@@ -114,13 +114,9 @@ def unused_columns(columns: Sequence[str]) -> list[Finding]:
 
 def findings(fitted: FittedRuns) -> list[Finding]:
     """All findings of a single run, a batch of one, in order of weight."""
-    labels = fitted.alone(0)[0].labels
+    labels: dict[int | None, str] = dict(enumerate(fitted.alone(0)[0].labels))
     return [
-        Finding(
-            id=flag.id,
-            text=flag.sentence(0),
-            station=None if flag.station is None else labels[flag.station],
-        )
+        Finding(id=flag.id, text=flag.sentence(0), station=labels.get(flag.station))
         for flag in finding_flags(fitted)
         if flag.members[0]
     ]
@@ -140,7 +136,7 @@ def finding_flags(fitted: FittedRuns) -> Iterator[Flag]:
     yield from _prior(fitted)
     yield from _model(fitted)
     for unused in unused_columns(fitted.readings.unused):
-        yield _common(fitted, unused.id, unused.text)
+        yield _common(fitted, unused.id, unused.text, range(fitted.count))
     yield from _reshoot(fitted)
     yield _distrusted(fitted)
 
@@ -150,10 +146,9 @@ def _remark(name: str, members: Bools, **values: Any) -> Flag:
     return Flag(name, members, REMARKS[name], values)
 
 
-def _common(fitted: FittedRuns, name: str, text: str, places: Sequence[int] | None = None) -> Flag:
-    """One sentence for all members, or for those at some places."""
-    index = np.arange(fitted.count)
-    members = np.ones(fitted.count, bool) if places is None else np.isin(index, places)
+def _common(fitted: FittedRuns, name: str, text: str, places: Sequence[int]) -> Flag:
+    """One sentence for the members at some places."""
+    members = np.isin(np.arange(fitted.count), places)
     return Flag(name, members, "{text}", {"text": text})
 
 
@@ -315,10 +310,8 @@ def _model(fitted: FittedRuns) -> Iterator[Flag]:
     every = np.ones(fitted.count, bool)
     yield _remark("nonlinearity-ignored", every & bool(ignored), triads=" and ".join(ignored))
     yield _remark("field-unknown", every & fitted.readings.relative)
-    few, lost = options.parameters < 12, "mounting rotation"
-    if options.parameters == 6:
-        lost = "any misalignment"
-    yield _remark("restricted", every & few, parameters=options.parameters, lost=lost)
+    lost = {6: "any misalignment", 9: "mounting rotation"}.get(options.parameters, "")
+    yield _remark("restricted", every & bool(lost), parameters=options.parameters, lost=lost)
 
 
 def _reshoot(fitted: FittedRuns) -> Iterator[Flag]:

@@ -209,7 +209,7 @@ def minimiser(options: Options) -> str:
 def check_curves(readings: Readings, wanted: Sequence[str]) -> None:
     """Refuse own-axis terms of a triad that the run does not have."""
     for name in wanted:
-        if getattr(readings, name) is None:
+        if name not in readings.triads:
             raise InputError(
                 f"`nonlinearity` {name}: {readings.source} has no {name}. Leave it out."
             )
@@ -223,7 +223,7 @@ def reading_refusals(readings: Readings, options: Options, run: Run) -> Iterator
 
     yield _few_stations(readings, options, source)
     yield _common_errors(readings, options)
-    for triad in (name for name in TRIADS if getattr(readings, name) is not None):
+    for triad in readings.triads:
         yield from _channels(readings, triad, options.knowledge is not None, source)
         if triad in readings.sd:
             yield _coarse_noise(readings, triad)
