@@ -167,9 +167,8 @@ def _by_left_out(
     for index, score in enumerate(scores):
         gain = least - score
         error = gain.std(-1, ddof=1) / np.sqrt(readings.count)
-        better = (score.mean(-1) < BETTER_SHARE * least.mean(-1)) & (
-            gain.mean(-1) > CLEAR_ERRORS * error
-        )
+        clear = gain.mean(-1) > CLEAR_ERRORS * error
+        better = clear & (score.mean(-1) < BETTER_SHARE * least.mean(-1))
         best, least = np.where(better, index, best), np.where(better[:, None], score, least)
     return best, np.stack([score.mean(-1) for score in scores], -1)
 

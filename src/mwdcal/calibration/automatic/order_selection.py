@@ -185,9 +185,7 @@ def with_noise(readings: Readings, options: Options) -> Readings:
     """
     if all(name in readings.sd for name in readings.triads):
         return readings
-    noise = dict(
-        zip(readings.triads, np.moveaxis(fit(readings, options).noise, -1, 0), strict=True)
-    )
+    noise = dict(zip(readings.triads, fit(readings, options).noise.mT, strict=True))
     estimated = {n: sd[:, None, None] for n, sd in noise.items() if n not in readings.sd}
     return replace(readings, sd={**readings.sd, **estimated})
 

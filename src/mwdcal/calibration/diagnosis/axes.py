@@ -49,11 +49,9 @@ def named(permutation: Array) -> tuple[str, ...]:
     >>> named(np.array([[0, -1.0, 0], [1, 0, 0], [0, 0, 1]]))
     ('+y', '-x', '+z')
     """
-    rows = [int(np.argmax(np.abs(column))) for column in np.transpose(permutation)]
-    return tuple(
-        ("+" if permutation[row, channel] > 0 else "-") + "xyz"[row]
-        for channel, row in enumerate(rows)
-    )
+    rows = np.argmax(np.abs(permutation), 0).tolist()
+    signs = ["+" if permutation[row, channel] > 0 else "-" for channel, row in enumerate(rows)]
+    return tuple(f"{sign}{'xyz'[row]}" for sign, row in zip(signs, rows, strict=True))
 
 
 def explaining(readings: Readings, profile: Profile) -> dict[str, tuple[str, ...]]:

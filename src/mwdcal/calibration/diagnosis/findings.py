@@ -260,13 +260,11 @@ def _untested(fitted: FittedRuns) -> Flag:
 
 def _undetermined(fitted: FittedRuns) -> Iterator[Flag]:
     """Directions that nothing determines."""
-    places: dict[tuple[str, tuple[int, ...]], list[int]] = {}
-    for place, free in enumerate(fitted.free):
-        for entry in free:
-            places.setdefault((entry.id, entry.triads), []).append(place)
-    for (name, triads), some in places.items():
+    kinds = [[(entry.id, entry.triads) for entry in free] for free in fitted.free]
+    for name, triads in dict.fromkeys(kind for each in kinds for kind in each):
+        places = [place for place, each in enumerate(kinds) if (name, triads) in each]
         text = f"{' and '.join(TRIADS[triad] for triad in triads)}: {described(name)}."
-        yield _common(fitted, name, text, some)
+        yield _common(fitted, name, text, places)
 
 
 def _prior(fitted: FittedRuns) -> Iterator[Flag]:

@@ -7,7 +7,7 @@ single run is refused by the first flag that holds, and so is each tool of a fle
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from typing import Any
 
@@ -74,10 +74,10 @@ Run = Callable[[int], Readings]
 """Readings of one member of a batch, without leading axis: their labels and source."""
 
 OF_OPTIONS = {
-    "method": "`method` must be one of {methods}; got {options.method!r}.",
+    "method": f"`method` must be one of {', '.join(EVIDENCE)}; got {{options.method!r}}.",
     "parameters": "`parameters` must be 6, 9 or 12; got {options.parameters}.",
-    "robust": "`robust` must be one of {losses}; got {options.robust!r}.",
-    "ignore": "`ignore` must be of {constants}; got {unknown[0]!r}.",
+    "robust": f"`robust` must be one of {', '.join(LOSSES)}; got {{options.robust!r}}.",
+    "ignore": f"`ignore` must be of {', '.join(CONSTANTS)}; got {{unknown[0]!r}}.",
     "ignore and method": "`ignore` needs `method` joint; got {options.method!r}, which says itself what it uses.",
     "nonlinearity and model": "`nonlinearity` {curved[0]}: the model of factors has no own-axis terms. Use `model` "
     "polynomial with it.",
@@ -146,9 +146,7 @@ OF_FITS = {
     "errors": "the errors of {of[name]} after calibration are {of[after]:.3g}{of[unit]} (root mean square), where the "
     "misfit of the run explains {of[expected]:.2g}{of[unit]}. Check the references of {of[name]} and 'axes' in the "
     "tool profile, or declare 'noise' and [stand] as they are.{looks}{culprit}{axes}",
-    "unsound": "the fit gives no valid covariance, or gains that no sensor has: {noise}. "
-    + UNSOUND_ADVICE
-    + "{axes}",
+    "unsound": "the fit gives no valid covariance, or gains that no sensor has: {noise}. {advice}{axes}",
 }
 """Why a fit cannot be trusted."""
 
@@ -194,11 +192,8 @@ def check_options(options: Options) -> None:
     first = next((name for name, holds in wrong.items() if holds), None)
     if first:
         error = FitError if first == "order and swarm" else InputError
-        words = {"methods": ", ".join(EVIDENCE), "losses": ", ".join(LOSSES)}
-        words |= {"constants": ", ".join(CONSTANTS), "minimiser": minimiser(options)}
-        raise error(
-            OF_OPTIONS[first].format(options=options, unknown=unknown, curved=curved, **words)
-        )
+        values = {"options": options, "unknown": unknown, "curved": curved}
+        raise error(OF_OPTIONS[first].format(minimiser=minimiser(options), **values))
 
 
 def minimiser(options: Options) -> str:
@@ -206,7 +201,7 @@ def minimiser(options: Options) -> str:
     return "the paper's weights" if options.paper_weights else f"method {options.method}"
 
 
-def check_curves(readings: Readings, wanted: Sequence[str]) -> None:
+def check_curves(readings: Readings, wanted: Iterable[str]) -> None:
     """Refuse own-axis terms of a triad that the run does not have."""
     for name in wanted:
         if name not in readings.triads:
@@ -270,9 +265,8 @@ def _channels(
     name, unit = ("gravity", "g") if triad == "accelerometer" else ("field", "nT")
     known = readings.reference(name)
     given = np.sum(~np.isnan(known), -1)
-    share = (
-        spread / np.where(given > 0, np.nansum(known, -1) / np.maximum(given, 1), np.nan)[:, None]
-    )
+    mean = np.where(given > 0, np.nansum(known, -1) / np.maximum(given, 1), np.nan)
+    share = spread / mean[:, None]
     odd = (share < (0.0 if prior else MOTION_RANGE[0])) | (share > MOTION_RANGE[1])
     words = {"source": source, "triad": triad, "count": readings.count, "unit": unit}
     still = words | {"axis": TOOL_AXES[np.argmax(dead, -1)]}
@@ -505,4 +499,4 @@ def _unsound(fitted: FittedRuns) -> Flag:
             for name, share in zip(TRIADS, shares, strict=False)
         )
 
-    return _refusal(fitted, "unsound", ~sound, noise=noise)
+    return _refusal(fitted, "unsound", ~sound, noise=noise, advice=UNSOUND_ADVICE)

@@ -207,10 +207,9 @@ def _scores(problem: Problem, result: Fit) -> _Scores:
     information = np.einsum("bnmk,bnml->kl", unit, weighed)
     information = information - crossed.transpose() @ whole @ crossed
     misfit = float(normal.cost[0] - gradient @ whole @ gradient)
-    fitted = float(
-        np.sum(whole * (normal.information - linear.prior)[0]) + _unknown(problem, result)
-    )
-    freedom = float(problem.evidence.include.sum()) * linear.residual.shape[-1] - fitted
+    fitted = np.sum(whole * (normal.information - linear.prior)[0])
+    count = float(problem.evidence.include.sum()) * linear.residual.shape[-1]
+    freedom = count - float(fitted + _unknown(problem, result))
     return _Scores(score, information, length, unit, places, misfit, freedom)
 
 
