@@ -60,10 +60,8 @@ def explaining(readings: Readings, profile: Profile) -> dict[str, tuple[str, ...
         result = fit(readings)
     except (MwdcalError, np.linalg.LinAlgError):
         return {}
-    if result.status[0] != Status.OK or not _fits(result):
-        return {}
     free = free_directions(result.problem, result.state, result.analysis.determined)[0]
-    if any(map(is_bad, free)):
+    if result.status[0] != Status.OK or not _fits(result) or any(map(is_bad, free)):
         return {}
     axes, problem = {}, result.problem
     for name, triad, where in zip(TRIADS, problem.triads, problem.slices(), strict=False):

@@ -105,9 +105,8 @@ def overturned(result: Fit) -> Array:
     if len(problem.triads) == 1:
         return dips
     referenced = problem.evidence.is_known("azimuth").any(-1)
-    for index, constant in enumerate(problem.evidence.constants):
-        if constant.name != "dip" or not constant.unknown:
-            continue
+    constants = enumerate(problem.evidence.constants)
+    for index in [place for place, c in constants if c.name == "dip" and c.unknown]:
         dip = centred(result.state.constants[:, index], 2 * np.pi)
         variance = np.nan_to_num(result.analysis.constants[:, index, index])
         sd = np.sqrt(np.maximum(variance, 0.0))  # by rounding it may be below

@@ -72,6 +72,8 @@ STRENGTH_COLUMNS = {
 TOOL_AXES = np.array([*"xyz"])
 Run = Callable[[int], Readings]
 """Readings of one member of a batch, without leading axis: their labels and source."""
+Words = dict[str, Any]
+"""What fills in the words of a flag, by name."""
 
 OF_OPTIONS = {
     "method": f"`method` must be one of {', '.join(EVIDENCE)}; got {{options.method!r}}.",
@@ -216,10 +218,11 @@ def reading_refusals(readings: Readings, options: Options, run: Run) -> Iterator
     def source(place: int) -> str:
         return run(place).source or "the run"
 
-    yield _few_stations(readings, options, source)
+    words = {"source": source, "count": readings.count}
+    yield _few_stations(readings, options, words)
     yield _common_errors(readings, options)
     for triad in readings.triads:
-        yield from _channels(readings, triad, options.knowledge is not None, source)
+        yield from _channels(readings, triad, options.knowledge is not None, words)
         if triad in readings.sd:
             yield _coarse_noise(readings, triad)
     if options.knowledge is None or options.knowledge.temperature is None:
@@ -232,7 +235,7 @@ def _all(readings: Readings, hold: bool) -> Bools:
     return np.full(len(readings.accelerometer), hold)
 
 
-def _few_stations(readings: Readings, options: Options, source: Callable[[int], str]) -> Flag:
+def _few_stations(readings: Readings, options: Options, words: Words) -> Flag:
     """Fewer readings than parameters; with a prior any number will do."""
     order = max(options.orders)
     basis, factors = Basis(order), options.kind(order) == "factors"
@@ -240,9 +243,8 @@ def _few_stations(readings: Readings, options: Options, source: Callable[[int], 
     size = restricted(model, options.parameters).size
     few = 3 * readings.count < size and options.knowledge is None
     remedy = ", or lower `order`" if order else ""
-    values = {"count": readings.count, "size": size, "needed": -(-size // 3), "remedy": remedy}
-    words = OF_READINGS["few"]
-    return Flag("too-few-stations", _all(readings, few), words, {"source": source, **values})
+    values = words | {"size": size, "needed": -(-size // 3), "remedy": remedy}
+    return Flag("too-few-stations", _all(readings, few), OF_READINGS["few"], values)
 
 
 def _common_errors(readings: Readings, options: Options) -> Flag:
@@ -255,9 +257,7 @@ def _common_errors(readings: Readings, options: Options) -> Flag:
     return Flag("common-errors", held, OF_READINGS["common"], values)
 
 
-def _channels(
-    readings: Readings, triad: str, prior: bool, source: Callable[[int], str]
-) -> Iterator[Flag]:
+def _channels(readings: Readings, triad: str, prior: bool, words: Words) -> Iterator[Flag]:
     """Channels that are dead or cannot have seen the field; a prior needs no motion."""
     values = getattr(readings, triad)
     spread = np.ptp(np.ascontiguousarray(values.mT), axis=-1)
@@ -268,7 +268,7 @@ def _channels(
     mean = np.where(given > 0, np.nansum(known, -1) / np.maximum(given, 1), np.nan)
     share = spread / mean[:, None]
     odd = (share < (0.0 if prior else MOTION_RANGE[0])) | (share > MOTION_RANGE[1])
-    words = {"source": source, "triad": triad, "count": readings.count, "unit": unit}
+    words = words | {"triad": triad, "unit": unit}
     still = words | {"axis": TOOL_AXES[np.argmax(dead, -1)]}
     yield Flag("channel", np.any(dead, -1), OF_READINGS["dead"], still)
     axis = np.argmax(odd, -1)
