@@ -65,7 +65,7 @@ def recorded(choice: Choice, result: Fit) -> Calibration:
     Raises `FitError` where the fit is not to be trusted.
     """
     readings, profile = choice.readings, choice.profile
-    fitted = FittedRuns.of(
+    fitted = FittedRuns(
         batch_of_one(readings), profile, choice.options, result, lambda _: (readings, profile)
     )
     check(fit_refusals(fitted))

@@ -199,7 +199,7 @@ class _Batch:
     def _note(self, tools: Ints, options: Options, result: Fit) -> None:
         """Check a fit of some tools, and note results and findings of the sound ones."""
         readings = take(self.readings, tools)
-        fitted = FittedRuns.of(
+        fitted = FittedRuns(
             readings, self.profile, options, result, lambda place: self.alone(int(tools[place]))
         )
         self._refuse(tools, fit_refusals(fitted))

@@ -119,16 +119,14 @@ def compare_curves(readings: Readings, options: Options, terms: Mapping[str, flo
     choices, count = choices_of(readings, terms), len(readings.accelerometer)
     if len(choices) == 1:
         return Curves(choices, np.zeros(count, int), np.zeros((count, 1)), False)
-    every = {name: terms[name] for name in choices[-1]}
+    each = [{name: terms[name] for name in choice} for choice in choices]
     if any(name in readings.sd for name in TRIADS):
-        each = [{name: terms[name] for name in choice} for choice in choices]
-        chosen, score = _by_left_out(readings, options, each)
-        return Curves(choices, chosen, score, False)
+        return Curves(choices, *_by_left_out(readings, options, each), False)
     include = np.ones(readings.accelerometer.shape[:-1])
     if options.robust:  # those that a robust fit with all terms trusts
-        trust = fit(readings, replace(options, nonlinearity=every)).trust
+        trust = fit(readings, replace(options, nonlinearity=each[-1])).trust
         include = np.asarray(trust > TRUSTED, float)
-    odds = log_odds(readings, options, every, include)
+    odds = log_odds(readings, options, each[-1], include)
     score = np.stack([np.zeros(count), odds], -1)
     return Curves([(), choices[-1]], np.asarray(odds > ODDS, int), score, True)
 

@@ -77,25 +77,22 @@ def spaced(unit: str) -> str:
 class FittedRuns:
     """Fitted runs of one shape, as refusals and findings look at them.
 
-    `readings` (B, n, ...), the `profile` with its scales stated, the fit, and the free directions
-    of each member. `alone` gives a member by itself, for its sentences.
+    `readings` (B, n, ...), the `profile` with its scales stated, and the fit. `alone` gives a member by
+    itself, for its sentences.
     """
 
     readings: Readings
     profile: Profile
     options: Options
     result: Fit
-    free: list[list[Free]]
     alone: Alone
     _residuals: dict[int, Residuals] = field(init=False, repr=False, default_factory=dict)
 
-    @classmethod
-    def of(
-        cls, readings: Readings, profile: Profile, options: Options, result: Fit, alone: Alone
-    ) -> FittedRuns:
-        """Runs with a leading axis and their fit."""
-        free = free_directions(result.problem, result.state, result.analysis.determined)
-        return cls(readings, profile, options, result, free, alone)
+    @cached_property
+    def free(self) -> list[list[Free]]:
+        """Free directions of each member."""
+        result = self.result
+        return free_directions(result.problem, result.state, result.analysis.determined)
 
     @property
     def count(self) -> int:
@@ -118,7 +115,6 @@ class FittedRuns:
             self,
             readings=take(self.readings, index),
             result=take(self.result, index),
-            free=[self.free[place] for place in index],
             alone=lambda place: self.alone(int(index[place])),
         )
 
