@@ -17,17 +17,7 @@ from mwdcal.estimation.minimisers import closed_form
 from mwdcal.estimation.rank import Free
 from mwdcal.estimation.solvers import Determined
 from mwdcal.estimation.uncertainty import ROTATIONS, TESTED, effective_freedom, station_misfit
-from mwdcal.geometry.vectors import (
-    Array,
-    Bools,
-    Ints,
-    centred,
-    diagonal,
-    eigen,
-    outer,
-    quotient,
-    solved,
-)
+from mwdcal.geometry.vectors import Array, Bools, Ints, centred, diagonal, eigen, outer, quotient
 
 BENIGN_DIRECTIONS = (*ROTATIONS, "scale")
 """Directions that may stay free."""
@@ -43,8 +33,6 @@ SMALLEST_EXPECTATION = 1e-12
 """Expectations below this, in the unit of the observable, are rounding."""
 NOISE_RATIO = 3.0
 """Residuals of a robust fit that exceed the declared noise this many times are reported."""
-VARIANCE_RIDGE = 1e-9
-"""What is added to variances (of whitened readings: 0…1), so that they have an inverse."""
 LEEWAY = 1.01
 """A station is suspect already if a bound is as unlikely as this many times the limit."""
 
@@ -230,7 +218,7 @@ def _suspects(result: Fit) -> Bools:
     """Members (B,) of which some station's misfit may be too large.
 
     With declared noise and no robust weights χ² itself must be. It is bounded from above by what
-    the trace of the residuals' covariance says, whose eigenvalues are 0…1, then by its inverse.
+    the trace of the residuals' covariance says, whose eigenvalues are 0…1.
     """
     analysis = result.analysis
     residual, spread = analysis.residual, analysis.spread
@@ -240,12 +228,8 @@ def _suspects(result: Fit) -> Bools:
     good = np.sum(residual**2, -1) < likely(size, chance) * smallest
     good &= (smallest > TESTED) & (analysis.influence is None)
     tool, station = np.nonzero(~good & ~suspect[:, None])
-    left = residual[tool, station]
-    whole = spread[tool, station] + VARIANCE_RIDGE * np.eye(size)
-    bound = np.sum(left * solved(whole, left[..., None])[..., 0], -1)
-    large = ~(bound <= likely(1, chance))
-    tool, station, left = tool[large], station[large], left[large]
-    some = replace(analysis, residual=left[None], spread=spread[None, tool, station])
+    left = residual[None, tool, station]
+    some = replace(analysis, residual=left, spread=spread[None, tool, station])
     suspect[tool[tail(*station_misfit(some))[0] < LEEWAY * chance]] = True
     return np.asarray(suspect)
 
