@@ -12,8 +12,7 @@ from mwdcal.calibration import results
 from mwdcal.calibration.automatic.auto import Choice, choose
 from mwdcal.calibration.diagnosis.findings import described, findings
 from mwdcal.calibration.diagnosis.flags import FittedRuns
-from mwdcal.calibration.diagnosis.noise_refusals import UNSOUND_ADVICE
-from mwdcal.calibration.diagnosis.refusals import check, fit_refusals
+from mwdcal.calibration.diagnosis.refusals import UNSOUND_ADVICE, check, fit_refusals
 from mwdcal.calibration.diagnosis.soundness import inconsistency
 from mwdcal.calibration.estimate import Fit, fit
 from mwdcal.calibration.options import Options
@@ -66,7 +65,7 @@ def recorded(choice: Choice, result: Fit) -> Calibration:
     Raises `FitError` where the fit is not to be trusted.
     """
     readings, profile = choice.readings, choice.profile
-    fitted = FittedRuns.of(
+    fitted = FittedRuns(
         batch_of_one(readings), profile, choice.options, result, lambda _: (readings, profile)
     )
     check(fit_refusals(fitted))

@@ -112,7 +112,7 @@ def _problem(
     cold = np.zeros(readings.count)
     temperature = flat(cold if readings.temperature is None else readings.temperature, lead)
     curved = options.curved
-    names = [name for name in TRIADS if getattr(readings, name) is not None]
+    names = readings.triads
     raws = [flat(getattr(readings, name), lead, 3) for name in names]
     finite = np.all([np.isfinite(raw).all((-1, -2)) for raw in raws], axis=0)
     triads: list[Triad] = []

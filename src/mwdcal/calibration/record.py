@@ -16,8 +16,7 @@ from typing import Any, ClassVar
 import msgspec
 import numpy as np
 
-from mwdcal.calibration.readings import NANOTESLA, Readings, simulated
-from mwdcal.calibration.soaks import SOAK_GAP
+from mwdcal.calibration.readings import NANOTESLA, SOAK_GAP, Readings, simulated
 from mwdcal.errors import InputError
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array, Bools, diagonal
@@ -530,7 +529,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
     def margin(self) -> float:
         """Degrees Celsius by which a reading may lie outside the calibrated range.
 
-        A calibration without temperature terms holds for the soak it was made in: `soaks.SOAK_GAP`.
+        A calibration without temperature terms holds for the soak it was made in: `SOAK_GAP`.
         """
         return MARGIN if any(t.order for t in self.triads) else SOAK_GAP
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from mwdcal.calibration.automatic.auto import Choice, resolved, without
+from mwdcal.calibration.automatic.order_selection import Progress
 from mwdcal.calibration.calibrate import recorded
 from mwdcal.calibration.diagnosis.refusals import check_readings
 from mwdcal.calibration.estimate import Fit, fit
@@ -36,8 +37,6 @@ SINGLY = 24
 """Runs of no more stations have each left out by itself."""
 NEAR_BEST = 1.02
 """A simpler preference stands if its held-out error is within this ratio of the best."""
-
-Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True)

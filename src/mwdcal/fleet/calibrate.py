@@ -25,9 +25,8 @@ from mwdcal.calibration.estimate import Fit, fit
 from mwdcal.calibration.methods import ESTIMABLE
 from mwdcal.calibration.options import AUTO, Options
 from mwdcal.calibration.prediction import STATED_ANGLES, accuracy
-from mwdcal.calibration.readings import TRIADS, Readings
+from mwdcal.calibration.readings import HIGHEST, TRIADS, Readings
 from mwdcal.calibration.record import StandErrors
-from mwdcal.calibration.soaks import HIGHEST
 from mwdcal.errors import MwdcalError
 from mwdcal.estimation.batch import take
 from mwdcal.fleet.choices import in_chunks, with_curves, with_orders
@@ -191,7 +190,7 @@ class _Batch:
     def _note(self, tools: Ints, options: Options, result: Fit) -> None:
         """Check a fit of some tools, and note results and findings of the sound ones."""
         readings = take(self.readings, tools)
-        fitted = FittedRuns.of(
+        fitted = FittedRuns(
             readings, self.profile, options, result, lambda place: self.alone(int(tools[place]))
         )
         self._refuse(tools, fit_refusals(fitted))

@@ -13,8 +13,7 @@ import numpy as np
 from mwdcal import __version__
 from mwdcal.calibration.diagnosis.refusals import BAD_INPUT
 from mwdcal.calibration.options import AUTO, Options
-from mwdcal.calibration.readings import TRIADS
-from mwdcal.calibration.soaks import HIGHEST
+from mwdcal.calibration.readings import HIGHEST, TRIADS
 from mwdcal.errors import InputError
 from mwdcal.estimation.batch import put
 from mwdcal.files.contract import AZIMUTH_KEYS, CHANNELS

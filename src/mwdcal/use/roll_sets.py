@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mwdcal.calibration.readings import Readings
-from mwdcal.calibration.soaks import soaks
+from mwdcal.calibration.readings import Readings, soaks
 from mwdcal.geometry.vectors import Array, Bools, Ints
 
 NEAR_VERTICAL = np.radians(5.0)

@@ -9,9 +9,8 @@ from typing import Any, Literal, cast
 from mwdcal.app.commands.options import Typed
 from mwdcal.calibration.options import AUTO, Options
 from mwdcal.calibration.prior import DATASHEET, profile_for
-from mwdcal.calibration.readings import Readings
+from mwdcal.calibration.readings import HIGHEST, Readings
 from mwdcal.calibration.record import Calibration
-from mwdcal.calibration.soaks import HIGHEST
 from mwdcal.files import documents, profiles, runs
 from mwdcal.sensor.profile import Profile
 

@@ -18,9 +18,8 @@ from mwdcal.app.messages import as_typed
 from mwdcal.app.pages.calibration import choices
 from mwdcal.app.pages.page import written
 from mwdcal.app.text import number, one_line, plural, table
-from mwdcal.calibration.readings import TRIADS
+from mwdcal.calibration.readings import HIGHEST, TRIADS
 from mwdcal.calibration.record import Choices, Finding
-from mwdcal.calibration.soaks import HIGHEST
 from mwdcal.files.formats import parquet
 from mwdcal.fleet.calibrate import OK, STAND_COLUMNS
 from mwdcal.fleet.sources import SERIAL
