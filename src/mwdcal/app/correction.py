@@ -18,6 +18,7 @@ from mwdcal.app.streaming import (
     lacking,
     nothing,
     spread,
+    stated,
     wholly_blank,
 )
 from mwdcal.calibration.diagnosis.findings import unused_columns
@@ -91,16 +92,13 @@ def apply_to_table(
         whole = ~lacking(source, wholly_blank([source]))
     if not whole.any():
         raise nothing(source.source)
-    kept = source if whole.all() else chosen(source, whole)
+    kept = chosen(source, whole)
     readings, _ = to_readings(kept, calibration.profile)
     results, tally, findings = counted(calibration, readings, outside, source.count - kept.count)
     check_free(source.columns, list(results), source.source)
-    columns = (
-        results if whole.all() else {n: spread(values, whole) for n, values in results.items()}
-    )
+    columns = {name: spread(values, whole) for name, values in results.items()}
     metadata = {**source.metadata, **described(calibration)}
-    stated = [*carried.stated_findings(metadata), *(finding.text for finding in findings)]
-    if stated:
-        metadata["findings"] = stated
+    if remarks := stated(metadata, findings):
+        metadata["findings"] = remarks
     corrected = replace(source, columns={**source.columns, **columns}, metadata=metadata)
     return corrected, tally, findings + unused_columns(readings.unused)
