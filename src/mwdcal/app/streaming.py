@@ -81,7 +81,7 @@ LONGEST_SERIAL = 60
 """Most characters of another tool's serial that a finding names."""
 _MOST = 10**15
 _OFF = strengths.Strengths(_MOST, _MOST, _MOST, _MOST, -1.23e-100, -1.24e-100)
-WORST = RowCounts(
+WORST_ROWS = RowCounts(
     rows=_MOST,
     beyond=_MOST,
     serials=("\0" * LONGEST_SERIAL, "\1" * LONGEST_SERIAL, "…"),
@@ -284,7 +284,7 @@ class _Worker:
         results = arrow.schema([(name, kinds[name]) for name in result_names(self.outside)])
         if output.suffix.lower() == ".parquet":
             return ParquetSink(stream, self.source.schema, results, metadata)
-        worst = WORST._replace(
+        worst = WORST_ROWS._replace(
             moved=JUDGED if self.calibration.free else (),
             lacking=0 if self.missing == "refuse" else _MOST,
         )
