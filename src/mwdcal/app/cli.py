@@ -71,15 +71,14 @@ def main(arguments: list[str] | None = None) -> None:
     if arguments is None:
         without_pandas()
     with contextlib.nullcontext() if COMPLETION in os.environ else screens():
-        code = _status(arguments)
-    sys.exit(code)
+        sys.exit(_status(arguments))
 
 
 def _status(arguments: list[str] | None) -> int:
     """Run the command line; its exit status."""
     try:
         with interruption.orderly_end():
-            status = cli.main(arguments, prog_name="mwdcal", standalone_mode=False)
+            return cli.main(arguments, prog_name="mwdcal", standalone_mode=False) or 0
     except click.ClickException as error:
         error.show(usage := io.StringIO())
         click.echo(harmless(usage.getvalue()), err=True, nl=False)
@@ -102,7 +101,6 @@ def _status(arguments: list[str] | None) -> int:
             "mwdcal: please report it with the command and the file. MWDCAL_DEBUG=1 shows where.",
             INTERNAL,
         )
-    return status if isinstance(status, int) else 0
 
 
 def _refused(error: OSError) -> str:

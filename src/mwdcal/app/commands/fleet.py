@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import Unpack
 
 import click
 
@@ -31,8 +32,8 @@ from mwdcal.errors import FitError
 @options.report("Also write a summary page of the fleet.", "FLEET.html")
 @options.JSON
 def command(
-    runs: Path, output: Path, tool: str | None, typed: options.Typed, workers: int | None,
-    scheduler: str | None, report: Path | None, as_json: bool,
+    runs: Path, output: Path, tool: str | None, workers: int | None,
+    scheduler: str | None, report: Path | None, as_json: bool, **typed: Unpack[options.Typed],
 ) -> None:  # fmt: skip
     """Calibrate many tools: RUNS is a Parquet table, or a folder of them, with a column `serial`.
 

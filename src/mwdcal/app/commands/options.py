@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable
-from functools import partial, wraps
+from functools import partial
 from pathlib import Path
 from typing import Any, TypedDict
 from unicodedata import normalize
@@ -37,9 +37,6 @@ COLUMN_NAMES = click.option(
     "--columns", default="", metavar="NAMES",
     help="Columns of a text log without column names, such as time_s,ax,ay,az.",
 )  # fmt: skip
-SAMPLING_HZ = click.option(
-    "--sampling-hz", type=float, metavar="HZ", help="Rate of the log; wins over its column time_s."
-)
 
 
 def output(metavar: str, text: str, required: bool = True) -> Decorator:
@@ -69,6 +66,7 @@ def number(name: str, metavar: str, text: str, *variable: str) -> Decorator:
     return click.option(name, *variable, type=float, metavar=metavar, help=text)
 
 
+SAMPLING_HZ = number("--sampling-hz", "HZ", "Rate of the log; wins over its column time_s.")
 _FIT = (
     click.option(
         "--method", default="joint", show_default=True, metavar="METHOD",
@@ -123,7 +121,7 @@ class Typed(TypedDict):
 
 
 def fit_options(order: str, nonlinearity: str, prior: str, known: str) -> Decorator:
-    """The options that say how to fit, which the command gets as one argument, `typed`.
+    """The options that say how to fit, which the command gets as `Typed`.
 
     With the defaults of two of them, and what a prior may be, as metavar and in words.
     """
@@ -143,15 +141,9 @@ def fit_options(order: str, nonlinearity: str, prior: str, known: str) -> Decora
     )  # fmt: skip
 
     def decorate(function: Function) -> Function:
-        @wraps(function)
-        def gathered(**given: Any) -> Any:
-            typed: Typed = {name: given.pop(name) for name in Typed.__annotations__}  # type: ignore[assignment]
-            return function(typed=typed, **given)
-
-        command: Function = gathered
         for option in reversed(declared):
-            command = option(command)
-        return command
+            function = option(function)
+        return function
 
     return decorate
 
