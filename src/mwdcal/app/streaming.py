@@ -11,7 +11,7 @@ compared with others of their part.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
@@ -134,7 +134,7 @@ def apply_to_file(
             tallies.append(tally)
             done += size
             advance(done, source.size)
-        total = _total(tallies)
+        total = _total(tallies, worker.moved)
         if total.lacking == total.rows:
             raise nothing(source.name)
         remarks = worker.findings(total, outside)
@@ -216,8 +216,7 @@ def _table(source: StreamedTable, piece: Any) -> Table:
     return _exactly_if_refused(source, piece, lambda part: part.table)
 
 
-def _total(tallies: Sequence[RowCounts]) -> RowCounts:
-    moved = {name for tally in tallies for name in tally.moved}
+def _total(tallies: Sequence[RowCounts], moved: Collection[str]) -> RowCounts:
     rows, beyond, lacking = np.sum([(t.rows, t.beyond, t.lacking) for t in tallies], 0).tolist()
     serials = runs.serials({}, chain.from_iterable(tally.serials for tally in tallies))
     lows, highs = zip(*(tally.warmth for tally in tallies), strict=True)
@@ -318,9 +317,10 @@ class _Worker:
         if whole is not None:
             results = [spread(values, whole) for values in results]
         rendered = sink.render(part.carried, results, bool(corrected.empty) or whole is not None)
+        self._judge(channels, table.count)
         tally = RowCounts(
-            rows, corrected.beyond, self._undetermined(channels, table.count), rows - table.count,
-            self._serials(part.carried), strengths.judged(self.calibration, columns, known),
+            rows, corrected.beyond, (), rows - table.count, self._serials(part.carried),
+            strengths.judged(self.calibration, columns, known),
             warmth(*channels.get("temperature", [None])),
         )  # fmt: skip
         return rendered, part.size, tally
@@ -394,14 +394,12 @@ class _Worker:
         }
         return replace(self.said, **read, temperature=some.get("temperature", [None])[0])
 
-    def _undetermined(self, channels: Channels, count: int) -> tuple[str, ...]:
-        if not self.calibration.free or not count:
-            return ()
-        readings = self._readings(channels, slice(0, count, max(1, count // SAMPLE)))
-        names = [name for name in JUDGED if name not in self.moved]
-        moved = undetermined(self.calibration, readings, names)
-        self.moved.update(moved)
-        return moved
+    def _judge(self, channels: Channels, count: int) -> None:
+        """Which outputs rest on what the calibration leaves undetermined."""
+        if self.calibration.free and count:
+            readings = self._readings(channels, slice(0, count, max(1, count // SAMPLE)))
+            names = [name for name in JUDGED if name not in self.moved]
+            self.moved.update(undetermined(self.calibration, readings, names))
 
     def _refuse(self, table: Table) -> None:
         """Say what is wrong with a part, in the words of a run file."""

@@ -15,7 +15,7 @@ from mwdcal.errors import InputError
 @options.command()
 @options.CALIBRATION
 @options.argument("readings")
-@options.output("OUT", "Table to write; format by suffix.")
+@options.output(metavar="OUT", help="Table to write; format by suffix.")
 @click.option(
     "--outside",
     default="blank",

@@ -13,7 +13,7 @@ from mwdcal.app.messages import print_result, say
 
 @options.command()
 @options.RUN
-@options.output("CAL.json", "Calibration file to write.")
+@options.output(metavar="CAL.json", help="Calibration file to write.")
 @options.tool()
 @options.fit_options(
     "auto",

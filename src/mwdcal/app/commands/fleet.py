@@ -15,7 +15,7 @@ from mwdcal.errors import FitError
 
 @options.command()
 @options.argument("runs")
-@options.output("CALS.parquet", "Table of calibrations to write, one row per tool.")
+@options.output(metavar="CALS.parquet", help="Table of calibrations to write, one row per tool.")
 @options.tool()
 @options.fit_options("0", "none", "datasheet", "the tolerances in the tool profile")
 @click.option(
@@ -29,7 +29,7 @@ from mwdcal.errors import FitError
     metavar="ADDRESS",
     help="Use the workers of this Dask scheduler instead, such as tcp://host:8786.",
 )
-@options.report("Also write a summary page of the fleet.", "FLEET.html")
+@options.report(metavar="FLEET.html", help="Also write a summary page of the fleet.")
 @options.JSON
 def command(
     runs: Path, output: Path, tool: str | None, workers: int | None,

@@ -12,7 +12,7 @@ from mwdcal.app.messages import findings_as_typed, print_result, say
 
 @options.command()
 @options.LOG
-@options.tool("Tool profile with the scales: figures also in g and nT.")
+@options.tool(help="Tool profile with the scales: figures also in g and nT.")
 @options.COLUMN_NAMES
 @options.SAMPLING_HZ
 @options.number("--from", "S", "Use the log from so many seconds on.", "start")
@@ -21,7 +21,7 @@ from mwdcal.app.messages import findings_as_typed, print_result, say
     "--station-seconds", "S", "Duration of a station. Default: 30, or a tenth of a shorter log."
 )
 @click.option("--modified", is_flag=True, help="Show modified Allan deviations.")
-@options.plot("Also draw the Allan deviations.")
+@options.plot(help="Also draw the Allan deviations.")
 @options.report()
 @options.DECIMAL
 @options.JSON

@@ -22,6 +22,18 @@ PICTURES = (".png", ".svg")
 
 command = partial(click.command, cls=Command)
 argument = partial(click.argument, type=FILE)
+output = partial(click.option, "-o", "--output", type=FILE, required=True)
+tool = partial(
+    click.option, "--tool", metavar="NAME|FILE", help="Tool profile: a shipped name or a TOML file."
+)
+report = partial(
+    click.option,
+    "--report",
+    type=FILE,
+    metavar="R.html",
+    help="Also write a self-contained HTML report.",
+)
+plot = partial(click.option, "--plot", type=FILE, metavar="FILE.png|svg")
 CALIBRATION = argument("calibration")
 RUN = argument("run")
 LOG = argument("log")
@@ -37,28 +49,6 @@ COLUMN_NAMES = click.option(
     "--columns", default="", metavar="NAMES",
     help="Columns of a text log without column names, such as time_s,ax,ay,az.",
 )  # fmt: skip
-
-
-def output(metavar: str, text: str, required: bool = True) -> Decorator:
-    """The option `-o`."""
-    return click.option("-o", "--output", type=FILE, required=required, metavar=metavar, help=text)
-
-
-def tool(text: str = "Tool profile: a shipped name or a TOML file.") -> Decorator:
-    """The option `--tool`."""
-    return click.option("--tool", metavar="NAME|FILE", help=text)
-
-
-def report(
-    text: str = "Also write a self-contained HTML report.", metavar: str = "R.html"
-) -> Decorator:
-    """The option `--report`."""
-    return click.option("--report", type=FILE, metavar=metavar, help=text)
-
-
-def plot(text: str) -> Decorator:
-    """The option `--plot`."""
-    return click.option("--plot", type=FILE, metavar="FILE.png|svg", help=text)
 
 
 def number(name: str, metavar: str, text: str, *variable: str) -> Decorator:

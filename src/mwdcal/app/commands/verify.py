@@ -17,7 +17,7 @@ from mwdcal.app.messages import findings_as_typed, print_result
 @click.option(
     "--limits", default="roll-test", show_default=True, metavar="NAME|FILE", help="Limits profile."
 )
-@options.report("Also write the report, with this verdict.")
+@options.report(help="Also write the report, with this verdict.")
 @options.DECIMAL
 @options.JSON
 def command(
