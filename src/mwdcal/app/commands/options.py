@@ -34,17 +34,15 @@ report = partial(
     help="Also write a self-contained HTML report.",
 )
 plot = partial(click.option, "--plot", type=FILE, metavar="FILE.png|svg")
+preset = partial(click.option, show_default=True)
 CALIBRATION = argument("calibration")
 RUN = argument("run")
 LOG = argument("log")
-DECIMAL = click.option(
-    "--decimal", default=".", show_default=True, metavar="SIGN",
-    help="Decimal sign of numbers in text files.",
-)  # fmt: skip
-JSON = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
-SEED = click.option(
-    "--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of the swarm."
+DECIMAL = preset(
+    "--decimal", default=".", metavar="SIGN", help="Decimal sign of numbers in text files."
 )
+JSON = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
+SEED = preset("--seed", type=click.IntRange(0), default=0, help="Seed of the swarm.")
 COLUMN_NAMES = click.option(
     "--columns", default="", metavar="NAMES",
     help="Columns of a text log without column names, such as time_s,ax,ay,az.",
@@ -58,8 +56,8 @@ def number(name: str, metavar: str, text: str, *variable: str) -> Decorator:
 
 SAMPLING_HZ = number("--sampling-hz", "HZ", "Rate of the log; wins over its column time_s.")
 _FIT = (
-    click.option(
-        "--method", default="joint", show_default=True, metavar="METHOD",
+    preset(
+        "--method", default="joint", metavar="METHOD",
         help="joint: all evidence, weighted. least-squares: reference vectors only. swarm: the same "
         "by particle swarm. newton: Newton-Raphson on |g| and inclination. toolface-inclination: the "
         "accelerometer by angles alone. scalar: |g| and |b| alone.",
@@ -118,12 +116,12 @@ def fit_options(order: str, nonlinearity: str, prior: str, known: str) -> Decora
     declared = (
         *_FIT,
         click.option("--prior", metavar=prior, help=f"What is known beforehand: {known}."),
-        click.option(
-            "--order", default=order, show_default=True, metavar="0…3|auto",
+        preset(
+            "--order", default=order, metavar="0…3|auto",
             help="Order of temperature terms. auto: of each triad, the terms that noise does not explain.",
         ),
-        click.option(
-            "--nonlinearity", default=nonlinearity, show_default=True, metavar="auto|none|NAMES",
+        preset(
+            "--nonlinearity", default=nonlinearity, metavar="auto|none|NAMES",
             help="Own-axis quadratic and cubic terms. auto: of the triads whose profile declares "
             "them, where the run speaks for them. NAMES: accelerometer, magnetometer, or both with "
             "a comma.",
