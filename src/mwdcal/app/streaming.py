@@ -44,18 +44,8 @@ from mwdcal.files.formats.table import numbers as as_numbers
 from mwdcal.files.streams import Part, StreamedTable
 from mwdcal.geometry.observables import EXTRAPOLATED, RESULTS
 from mwdcal.geometry.vectors import AnyArray, Array, Bools
-from mwdcal.use import correction_numba, strengths
-from mwdcal.use.correction import (
-    JUDGED,
-    RowCounts,
-    check_outside,
-    findings,
-    numbers,
-    reference,
-    result_names,
-    undetermined,
-    warmth,
-)
+from mwdcal.use import correction, correction_numba, strengths
+from mwdcal.use.correction import JUDGED, RowCounts
 
 TABLE_SIZES = {".csv": 1_000_000, ".tsv": 1_000_000, ".parquet": 8_000_000}
 """Bytes of a text table from which it is taken in parts, by what it becomes.
@@ -118,7 +108,7 @@ def apply_to_file(
     `advance` gets how much of the whole is done, and the whole. `rows` of a part of a Parquet table, by
     default as many as memory bears; `least` rows of the whole from which loops are compiled.
     """
-    check_outside(outside)
+    correction.check_outside(outside)
     source = _source(readings, output, rows, decimal)
     _check_header(calibration, source, outside)
     pieces = source.pieces()
@@ -129,7 +119,8 @@ def apply_to_file(
     done, tallies = 0, []
     with atomic.replacing(output) as stream:
         sink = worker.sink(stream, output)
-        for rendered, size, tally in overlapped(chain([first], pieces), partial(worker, sink)):
+        work = partial(_exactly_if_refused, source, partial(worker.corrected, sink))
+        for rendered, size, tally in overlapped(chain([first], pieces), work):
             sink.write(rendered)
             tallies.append(tally)
             done += size
@@ -174,7 +165,7 @@ def _check_header(calibration: Calibration, source: StreamedTable, outside: str)
     """Refuse columns that are missing, doubtful, or have the name of a result."""
     check_names(source.names, source.name)
     check_columns(source.names, source.name)
-    check_free(source.names, result_names(outside), source.name)
+    check_free(source.names, correction.result_names(outside), source.name)
     check_warmth(calibration, source.names, source.name)
 
 
@@ -203,7 +194,7 @@ def nothing(source: str) -> InputError:
 
 
 def _exactly_if_refused(
-    source: StreamedTable, piece: Any, work: Callable[[Part], Result]
+    source: StreamedTable, work: Callable[[Part], Result], piece: Any
 ) -> Result:
     """`work` of a piece; where something in it seems wrong, of its text looked at line by line."""
     try:
@@ -213,7 +204,7 @@ def _exactly_if_refused(
 
 
 def _table(source: StreamedTable, piece: Any) -> Table:
-    return _exactly_if_refused(source, piece, lambda part: part.table)
+    return _exactly_if_refused(source, lambda part: part.table, piece)
 
 
 def _total(tallies: Sequence[RowCounts], moved: Collection[str]) -> RowCounts:
@@ -247,32 +238,27 @@ class _Worker:
         self.moved: set[str] = set()
         judged = [first] if missing == "refuse" else source.pieces()
         self.absent = wholly_blank(_table(source, piece) for piece in judged)
-        kept = [g[0] for g in OPTIONAL if g[0] in source.names and g not in self.absent]
-        empty = np.empty((0, 3))
-        self.said = Readings(
-            accelerometer=empty,
-            magnetometer=empty if "mx" in kept else None,
-            temperature=empty[:, 0] if "temperature_c" in kept else None,
-            source=source.name,
-        )
-        reference(calibration, self.said)  # refuses one with temperature terms without any
-        self.triads = numbers(calibration) if many and correction_numba.available() else None
+        table = _table(source, first)
+        no_rows = chosen(table, np.zeros(table.count, bool))
+        self.said = self._readings(self._channels(no_rows), slice(None))
+        correction.reference(calibration, self.said)  # refuses where temperatures are needed
+        compiled = many and correction_numba.available()
+        self.triads = correction.numbers(calibration) if compiled else None
         if self.triads and not correction_numba.kept_code_is_sound():
             say("machine code kept from an earlier run was damaged: it is compiled again.")
         self.limits = self._limits()
 
     def _limits(self) -> correction_numba.RowLimits:
-        low, high = self.calibration.temperature_c or (-np.inf, np.inf)
-        if self.said.temperature is None:
-            low, high = -np.inf, np.inf
+        given = self.said.temperature is not None and self.calibration.temperature_c
+        low, high = given or (-np.inf, np.inf)
         warmth = low - self.calibration.margin, high + self.calibration.margin
         blank = self.outside == "blank"
         return correction_numba.RowLimits(RAW_RANGE[:2], TEMPERATURE[:2], warmth, blank)
 
     def findings(self, tally: RowCounts, outside: str) -> list[Finding]:
         """What the reader should know of rows with these counts."""
-        metadata = runs.identified(self.source.metadata, tally.serials)
-        return findings(self.calibration, replace(self.said, metadata=metadata), tally, outside)
+        heard = replace(self.said, metadata=runs.identified(self.source.metadata, tally.serials))
+        return correction.findings(self.calibration, heard, tally, outside)
 
     def sink(self, stream: IO[bytes], output: Path) -> Sink:
         """An empty table in the format of the output's name."""
@@ -280,7 +266,8 @@ class _Worker:
         metadata = {**self.source.metadata, **described(self.calibration)}
         metadata.pop("findings", None)  # with those of the results, when these are known
         kinds = {name: arrow.float64() for name in RESULTS} | {EXTRAPOLATED: arrow.bool_()}
-        results = arrow.schema([(name, kinds[name]) for name in result_names(self.outside)])
+        names = correction.result_names(self.outside)
+        results = arrow.schema([(name, kinds[name]) for name in names])
         if output.suffix.lower() == ".parquet":
             return ParquetSink(stream, self.source.schema, results, metadata)
         worst = WORST_ROWS._replace(
@@ -292,11 +279,8 @@ class _Worker:
         delimiter = "," if output.suffix.lower() == ".csv" else "\t"
         return TextSink(stream, self.source.schema, results, metadata, longest, delimiter, RANGES)
 
-    def __call__(self, sink: Sink, piece: Any) -> tuple[Any, int, RowCounts]:
-        """A piece, corrected and rendered, its size, and what was seen in it."""
-        return _exactly_if_refused(self.source, piece, partial(self._corrected, sink))
-
-    def _corrected(self, sink: Sink, part: Part) -> tuple[Any, int, RowCounts]:
+    def corrected(self, sink: Sink, part: Part) -> tuple[Any, int, RowCounts]:
+        """A part, corrected and rendered, its size, and what was seen in it."""
         table, rows = part.table, part.table.count
         channels, corrected = self._compute(table)
         whole: Bools | None = None
@@ -321,7 +305,7 @@ class _Worker:
         tally = RowCounts(
             rows, corrected.beyond, (), rows - table.count, self._serials(part.carried),
             strengths.judged(self.calibration, columns, known),
-            warmth(*channels.get("temperature", [None])),
+            correction.warmth(*channels.get("temperature", [None])),
         )  # fmt: skip
         return rendered, part.size, tally
 
@@ -364,8 +348,8 @@ class _Worker:
         zero = self.calibration.reference_temperature
         columns += channels.get("temperature", [np.full(count, zero)])
         corrected = correction_numba.run(columns, self.triads, zero, units, self.limits, workers=1)
-        nothing = 0 if "magnetometer" in channels else 3 * count
-        return corrected._replace(unsound=corrected.unsound - nothing)
+        absent = 0 if "magnetometer" in channels else 3 * count
+        return corrected._replace(unsound=corrected.unsound - absent)
 
     def _plain(self, channels: Channels, count: int) -> correction_numba.CorrectedRows:
         """The same by plain NumPy, a block at a time."""
@@ -377,7 +361,7 @@ class _Worker:
         for start in range(0, 0 if unsound else count, BLOCK):
             rows = slice(start, start + BLOCK)
             readings = self._readings(channels, rows)
-            out[:, rows] = [*reference(self.calibration, readings).values()]
+            out[:, rows] = [*correction.reference(self.calibration, readings).values()]
             hot = self.calibration.outside(readings)
             beyond += int(hot.sum())
             if limits.blank:
@@ -392,14 +376,15 @@ class _Worker:
             for kind in TRIADS
             if kind in some
         }
-        return replace(self.said, **read, temperature=some.get("temperature", [None])[0])
+        warmth = some.get("temperature", [None])[0]
+        return Readings(**read, temperature=warmth, source=self.source.name)
 
     def _judge(self, channels: Channels, count: int) -> None:
         """Which outputs rest on what the calibration leaves undetermined."""
         if self.calibration.free and count:
             readings = self._readings(channels, slice(0, count, max(1, count // SAMPLE)))
             names = [name for name in JUDGED if name not in self.moved]
-            self.moved.update(undetermined(self.calibration, readings, names))
+            self.moved.update(correction.undetermined(self.calibration, readings, names))
 
     def _refuse(self, table: Table) -> None:
         """Say what is wrong with a part, in the words of a run file."""
