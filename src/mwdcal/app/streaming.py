@@ -26,16 +26,8 @@ from mwdcal.calibration.diagnosis.findings import unused_columns
 from mwdcal.calibration.readings import TRIADS, Readings
 from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.errors import InputError
-from mwdcal.files import carried, runs, streams, synonyms
-from mwdcal.files.contract import (
-    CHANNELS,
-    COLUMNS,
-    RANGES,
-    RAW,
-    RAW_RANGE,
-    TEMPERATURE,
-    check_columns,
-)
+from mwdcal.files import carried, contract, runs, streams, synonyms
+from mwdcal.files.contract import CHANNELS, COLUMNS, RANGES, RAW, RAW_RANGE, TEMPERATURE
 from mwdcal.files.formats import atomic, parquet
 from mwdcal.files.formats.columns import check_names, no_stations
 from mwdcal.files.formats.sinks import ParquetSink, Sink, TextSink
@@ -164,7 +156,7 @@ def _source(readings: Path, output: Path, rows: int, decimal: str) -> StreamedTa
 def _check_header(calibration: Calibration, source: StreamedTable, outside: str) -> None:
     """Refuse columns that are missing, doubtful, or have the name of a result."""
     check_names(source.names, source.name)
-    check_columns(source.names, source.name)
+    contract.check_columns(source.names, source.name)
     check_free(source.names, correction.result_names(outside), source.name)
     check_warmth(calibration, source.names, source.name)
 
