@@ -8,18 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mwdcal.app.streaming import (
-    apply_to_file,
-    check_free,
-    check_warmth,
-    chosen,
-    described,
-    in_parts,
-    lacking,
-    nothing,
-    spread,
-    wholly_blank,
-)
+from mwdcal.app import streaming
 from mwdcal.calibration.diagnosis.findings import unused_columns
 from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.errors import InputError
@@ -54,8 +43,8 @@ def apply_to_any(
     What was seen in the rows, and what the reader should know. `advance` gets how much of a long
     table is done, and the whole.
     """
-    if in_parts(readings, output):
-        return apply_to_file(
+    if streaming.in_parts(readings, output):
+        return streaming.apply_to_file(
             calibration, readings, output, outside, advance, missing=missing, decimal=decimal
         )
     if readings.suffix.lower() in TEXT and output.suffix.lower() == ".xlsx":
@@ -85,22 +74,19 @@ def apply_to_table(
 ) -> tuple[Table, RowCounts, list[Finding]]:
     """The input's columns and metadata, the results, and what the calibration was."""
     check_columns(list(source.columns), source.source)
-    check_warmth(calibration, list(source.columns), source.source)
+    streaming.check_warmth(calibration, list(source.columns), source.source)
     whole = np.ones(source.count, bool)
     if missing == "blank":
-        whole = ~lacking(source, wholly_blank([source]))
+        whole = ~streaming.lacking(source, streaming.wholly_blank([source]))
     if not whole.any():
-        raise nothing(source.source)
-    kept = source if whole.all() else chosen(source, whole)
+        raise streaming.nothing(source.source)
+    kept = streaming.chosen(source, whole)
     readings, _ = to_readings(kept, calibration.profile)
     results, tally, findings = counted(calibration, readings, outside, source.count - kept.count)
-    check_free(source.columns, list(results), source.source)
-    columns = (
-        results if whole.all() else {n: spread(values, whole) for n, values in results.items()}
-    )
-    metadata = {**source.metadata, **described(calibration)}
-    stated = [*carried.stated_findings(metadata), *(finding.text for finding in findings)]
-    if stated:
-        metadata["findings"] = stated
+    streaming.check_free(source.columns, list(results), source.source)
+    columns = {name: streaming.spread(values, whole) for name, values in results.items()}
+    metadata = {**source.metadata, **streaming.described(calibration)}
+    if remarks := streaming.stated(metadata, findings):
+        metadata["findings"] = remarks
     corrected = replace(source, columns={**source.columns, **columns}, metadata=metadata)
     return corrected, tally, findings + unused_columns(readings.unused)
