@@ -13,9 +13,8 @@ from typing import Literal
 import numpy as np
 from msgspec.structs import replace as replace_struct
 
-from mwdcal.calibration.readings import TRIADS, Readings
+from mwdcal.calibration.readings import HIGHEST, TRIADS, Readings
 from mwdcal.calibration.record import Calibration
-from mwdcal.calibration.soaks import HIGHEST
 from mwdcal.errors import FitError, InputError
 from mwdcal.estimation.problem import Prior
 from mwdcal.geometry.vectors import Array
