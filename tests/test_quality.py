@@ -335,6 +335,15 @@ def test_setting_the_stand_each_time_adds_its_repeatability_and_a_roll_in_place_
     assert shared["error of inclination"].uncertainty == pytest.approx(0.05, rel=0.05)
 
 
+@pytest.mark.parametrize("kind", ["spread", "error"])
+def test_uncertainties_without_any_weight_are_refused(record, kind):
+    """Settings of the stand so uncertain that their weights are zero: no curve, and no verdict."""
+    sd = {**NOISE, "inclination": np.full(12, 1e200)}
+    limits = Limits(name="i", **{kind: Bounds(inclination_deg=0.1)})
+    with pytest.raises(InputError, match=r"roll.csv: .* too far apart to judge its inclination"):
+        verify(record, roll(45, sd=sd), limits)
+
+
 @pytest.mark.parametrize(
     ("order", "temperature", "outside"),
     [(0, 25.0, None), (0, 28.5, "finding"), (0, 31.0, "refused"), (1, 51.5, "refused")],
