@@ -362,8 +362,11 @@ def test_how_far_outside_its_temperatures_a_calibration_is_verified(order, tempe
     own = calibrate(run, PROFILE, Options(order=order))
     test = msgspec_replace(roll(45), temperature=np.full(12, temperature))
     if outside == "refused":
-        with pytest.raises(InputError, match="outside the calibrated range"):
+        with pytest.raises(InputError, match="12 stations lie outside the calibrated range"):
             verify(own, test, SPREADS)
+        one = np.where(np.arange(12) == 4, temperature, 25.0)
+        with pytest.raises(InputError, match=r"1 station lies outside .* \(first: station 5\)"):
+            verify(own, msgspec_replace(test, temperature=one), SPREADS)
         return
     result = verify(own, test, SPREADS)
     assert result.passed

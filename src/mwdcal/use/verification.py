@@ -224,9 +224,9 @@ def _check_temperature(calibration: Calibration, readings: Readings) -> None:
     outside = calibration.outside(readings)
     if outside.any() and calibration.temperature_c is not None:
         low, high = calibration.temperature_c
-        first = int(np.flatnonzero(outside)[0])
+        first, count = int(np.flatnonzero(outside)[0]), int(outside.sum())
         raise InputError(
-            f"{readings.name}: {int(outside.sum())} stations lie outside the calibrated range "
+            f"{readings.name}: {count} {'station lies' if count == 1 else 'stations lie'} outside the calibrated range "
             f"{low:.1f}…{high:.1f} °C (first: station {readings.labels[first]}). Verify within "
             "the range, or calibrate over a wider one."
         )
