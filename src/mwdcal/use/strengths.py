@@ -68,9 +68,10 @@ def judged(
         if name in known and not any(entry.id == "scale" for entry in triad.undetermined):
             reference = np.abs(values - known[name]) > OFF_REFERENCE * known[name]
         kinds = (~np.isnan(values), earth, reference, earth | reference)
+        counts = (int(np.count_nonzero(rows)) for rows in kinds)
         worst = values[earth | reference]
         ends = float(worst.min(initial=np.inf)), float(worst.max(initial=-np.inf))
-        strengths[name] = Strengths(*(int(np.count_nonzero(rows)) for rows in kinds), *ends)
+        strengths[name] = Strengths._make((*counts, *ends))
     return strengths
 
 
