@@ -20,7 +20,7 @@ from mwdcal.calibration.record import FREE_SHARE, Calibration, TriadCalibration
 from mwdcal.estimation.rank import Free
 from mwdcal.estimation.uncertainty import ROTATIONS, unrotating
 from mwdcal.geometry.vectors import Array
-from mwdcal.sensor.models import Basis, Model, Polynomial
+from mwdcal.sensor.models import Model
 from mwdcal.use.notation import Notation, convert
 
 SCALE = "scale"
@@ -207,6 +207,5 @@ def _tangent(triad: TriadCalibration, reference: float) -> Array:
     """Linear map from a triad's parameters to those of its tangent on plain readings."""
     if not triad.curved:
         return np.eye(len(triad.parameters))
-    centre, radius = np.array([triad.centre]), np.full((1, 3), triad.radius)
-    plain = Polynomial(Basis(triad.order, reference), centre, radius).finished(reference)[1]
+    _, plain = msgspec.structs.replace(triad, curved=False).functions(reference).finished(reference)
     return np.concatenate([plain, np.zeros((len(plain), 6))], -1)

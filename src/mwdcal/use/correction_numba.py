@@ -16,15 +16,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from mwdcal.geometry.observables import RESULTS
 from mwdcal.geometry.vectors import AnyArray, Array
 from mwdcal.sensor.models import Factors, Model, Polynomial, affine_parts, factor_parts
 
-__all__ = ["available", "cores", "numbers", "run"]
-
 HIGHEST_POWER = 3
 """Highest order in temperature that the loops know."""
-RESULT_ROWS = 13
-"""Rows of a result: the two vectors, the angles and the strengths."""
 _PIECE_ROWS = 1 << 15
 
 
@@ -70,12 +67,7 @@ class CorrectedRows(NamedTuple):
 
 def available() -> bool:
     """Whether compiled loops can be had, and are wanted: Numba, and not MWDCAL_NUMPY=1."""
-    return _installed() and not os.environ.get("MWDCAL_NUMPY")
-
-
-@cache
-def _installed() -> bool:
-    return find_spec("numba") is not None
+    return find_spec("numba") is not None and not os.environ.get("MWDCAL_NUMPY")
 
 
 @cache
@@ -148,15 +140,12 @@ def run(
 
     kept_code_is_sound()
     count = len(columns[-1])
-    out = np.empty((RESULT_ROWS, count))
-    settings = (
-        *(tuple(columns[:3]), tuple(columns[3:6]), columns[6], tuple(map(float, units))),
-        (*limits.raw, reference, *limits.temperature, *limits.calibrated, float(limits.blank)),
-        *(triads[0][:2], triads[1][:2], (triads[0].curved, triads[1].curved)),
-    )
+    out = np.empty((len(RESULTS), count))
+    channels = tuple(columns[:3]), tuple(columns[3:6]), columns[6]
+    settings = tuple(map(float, units)), limits, reference, triads
 
     def piece(start: int, stop: int) -> tuple[int, int, int]:
-        return correction_kernels.rows(*settings, out, start, stop)
+        return correction_kernels.rows(channels, *settings, out, start, stop)
 
     workers = workers or cores()
     step = max(_PIECE_ROWS, -(-count // workers))
