@@ -81,13 +81,11 @@ def _taken_out(
     unit = np.array([*np.full(3, np.degrees(1)), 1.0])
     moved = np.abs(free).max(0, initial=0.0)
     sd = np.where(moved > FREE_SHARE, np.nan, np.sqrt(np.maximum(np.diag(covariance), 0)))
+    each = np.stack([taken, sd]).reshape(2, len(triads), 4) * unit
     notations = {}
     for index, name in enumerate(triads):
         block = slice(4 * index, 4 * index + 4)
-        value, spread = (
-            {"rotation_deg": part[:3], "scale": part[3:]}
-            for part in (taken[block] * unit, sd[block] * unit)
-        )
+        value, spread = ({"rotation_deg": v[:3], "scale": v[3:]} for v in each[:, index])
         notations[name] = Notation(value, spread, covariance[block, block] * np.outer(unit, unit))
     return notations
 

@@ -104,9 +104,11 @@ def _one(
     def values(params: AnyArray) -> dict[str, AnyArray]:
         if notation == triad.model:
             return _stored_factors(params, permutation, scale)
-        if course and triad.order:
-            form = _forward_course if notation == "forward" else _affine_course
-            return form(params, permutation, scale)
+        if course and triad.order and notation == "forward":
+            return _forward_course(params, permutation, scale)
+        if course and triad.order:  # the parameters of the polynomial model themselves
+            matrix, offset = affine_parts(params.reshape(-1, 12))
+            return {"M": matrix @ permutation / scale, "b": offset}
         matrix, offset = _affine(params, triad, tau)
         forms = _steady(notation, matrix @ permutation / scale, offset, permutation)
         if course and notation != "factors":
@@ -176,12 +178,6 @@ def _forward_course(params: AnyArray, permutation: Array, scale: Array) -> dict[
     offset = np.stack([np.convolve(s, b) for s, b in zip(gain, bias, strict=True)], -1)
     back = permutation.transpose() * scale[:, None]
     return {"S": back @ matrix, "o": offset @ back.transpose()}
-
-
-def _affine_course(params: AnyArray, permutation: Array, scale: Array) -> dict[str, AnyArray]:
-    """M and b by power: the parameters of the polynomial model themselves, for raw channels."""
-    matrix, offset = affine_parts(params.reshape(-1, 12))
-    return {"M": matrix @ permutation / scale, "b": offset}
 
 
 def _propagate(

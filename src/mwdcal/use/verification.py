@@ -12,7 +12,7 @@ from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import MARGIN, Calibration, Finding, html_table
 from mwdcal.errors import InputError
 from mwdcal.geometry.observables import OBSERVABLES
-from mwdcal.use.departures import Departures, RollTest, Statistic
+from mwdcal.use.departures import LEVEL, Departures, RollTest, Statistic
 
 COVERAGE = 2.0
 """Coverage factor of the guard band and of the remark that a value is close to its limit."""
@@ -20,21 +20,14 @@ WEAK = 0.5
 """A test whose 1σ is a larger share of the limit hardly distinguishes a good tool from a bad one."""
 NAMED_HARMONIC = 3.0
 """Standard uncertainties above which a harmonic is named as a cause."""
-CAUSES = {
-    "inclination": (
-        "a bias of the accelerometer across the tool axis, or it leans",
-        "a difference in scale, or a misalignment, of the accelerometer's x and y",
-    ),
-    "azimuth": (
-        "a bias across the tool axis of either triad, or it leans",
-        "a difference in scale, or a misalignment, of x and y of either triad",
-    ),
-    "gravity": (
-        "a bias of the accelerometer across the tool axis, or its x or y is not square to z",
-        "a difference in scale, or a misalignment, of the accelerometer's x and y",
-    ),
+FIRST_HARMONIC = {
+    "inclination": "a bias of the accelerometer across the tool axis, or it leans",
+    "azimuth": "a bias across the tool axis of either triad, or it leans",
+    "gravity": "a bias of the accelerometer across the tool axis, or its x or y is not square to z",
 }
-"""What a first and a second harmonic of toolface come from; as for azimuth where not named."""
+"""What a first harmonic of toolface comes from; as for azimuth where not named."""
+SECOND_HARMONIC = "a difference in scale, or a misalignment, of "
+"""What a second harmonic comes from."""
 VERDICT_FINDINGS = {
     "no-temperature": "the tool was calibrated at unrecorded temperatures, and tested at {tested} °C: "
     "the verdict holds for the temperatures of the test alone.",
@@ -62,8 +55,7 @@ class Bounds(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 
     def items(self) -> Iterable[tuple[str, float]]:
         """Observable and limit, of those that are set; angles in degrees."""
-        for name in self.__struct_fields__:
-            value = getattr(self, name)
+        for name, value in msgspec.structs.asdict(self).items():
             if value is not None:
                 yield name.rpartition("_")[0], value
 
@@ -287,6 +279,8 @@ def _causes(row: VerdictRow, name: str, worst: Statistic) -> list[str]:
         return []
     unit = row.unit if row.unit == "°" else f" {row.unit}"
     clear = worst.curve.amplitudes / np.maximum(worst.curve.amplitude_sd, 1e-30) > NAMED_HARMONIC
-    each = zip(("first", "second"), row.harmonics, CAUSES.get(name, CAUSES["azimuth"]), strict=True)
+    axes = "the accelerometer's x and y" if name in LEVEL else "x and y of either triad"
+    causes = FIRST_HARMONIC.get(name, FIRST_HARMONIC["azimuth"]), SECOND_HARMONIC + axes
+    each = zip(("first", "second"), row.harmonics, causes, strict=True)
     parts = [f"{which} harmonic {size:.2g}{unit} ({cause})" for which, size, cause in each]
     return [part for part, named in zip(parts, clear, strict=True) if named]
