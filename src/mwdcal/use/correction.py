@@ -25,7 +25,7 @@ DIRECTIONS = {
 """Directions that do not exist where a strength is zero."""
 ROW_FINDINGS = {
     "no-magnetometer": "no columns mx, my, mz: magnetic results are blank.",
-    "other-tool": "the readings are of tool {theirs}, the calibration of tool {ours}: is it the right one?",
+    "other-tool": "the readings are of tool {tools[1]}, the calibration of tool {tools[0]}: is it the right one?",
     "missing-reading": "{tally.lacking} of {tally.rows} rows lack a reading: their results are blank.",
     "outside-temperature": "{beyond}: their results are {results}.",
     "no-temperature": "the calibration was made at unrecorded temperatures, without temperature terms: nothing says "
@@ -87,9 +87,7 @@ def counted(
 ) -> tuple[dict[str, AnyArray], RowCounts, list[Finding]]:
     """Output columns, counts of the rows and findings; `lacking` more rows were left out unread."""
     check_outside(outside)
-    columns: dict[str, AnyArray] = {
-        **(compiled(calibration, readings) or reference(calibration, readings))
-    }
+    columns = compiled(calibration, readings) or reference(calibration, readings)
     beyond = calibration.outside(readings)
     if outside == "blank" and beyond.any():
         columns = {name: np.where(beyond, np.nan, value) for name, value in columns.items()}
@@ -122,7 +120,7 @@ def check_outside(outside: str) -> None:
         raise InputError(f"`outside` must be one of {', '.join(OUTSIDE)}; got {outside!r}.")
 
 
-def reference(calibration: Calibration, readings: Readings) -> dict[str, Array]:
+def reference(calibration: Calibration, readings: Readings) -> dict[str, AnyArray]:
     """The output columns (..., n) by plain NumPy, nothing blanked for its temperature."""
     g, b = calibration.fields(readings)
     columns = dict(zip(VECTORS, [*np.moveaxis(g, -1, 0), *np.moveaxis(b, -1, 0)], strict=True))
@@ -137,7 +135,7 @@ def reference(calibration: Calibration, readings: Readings) -> dict[str, Array]:
 
 def compiled(
     calibration: Calibration, readings: Readings, least: int | None = None
-) -> dict[str, Array] | None:
+) -> dict[str, AnyArray] | None:
     """The same columns by the compiled loops; None for few rows, or a model they do not have."""
     shape = readings.accelerometer.shape[:-1]
     triads = numbers(calibration)
@@ -181,11 +179,10 @@ def findings(
     if tally.beyond and outside == "refuse":
         advice = "Use `outside` blank or extrapolate, or calibrate over a wider range."
         raise InputError(f"{readings.source}: {beyond}. {advice}")
-    off = strengths.departures(tally.strengths)
-    ours, theirs = calibration.other_tool(readings) or ("", "")
+    off, tools = strengths.departures(tally.strengths), calibration.other_tool(readings)
     applies = {
         "no-magnetometer": calibration.has_field and readings.magnetometer is None,
-        "other-tool": ours != theirs,
+        "other-tool": tools,
         "missing-reading": tally.lacking,
         "outside-temperature": tally.beyond,
         "no-temperature": calibration.unrecorded(readings),
@@ -202,7 +199,7 @@ def findings(
         "free": ", ".join(dict.fromkeys(u.id for u in calibration.undetermined())),
     }
     return calibration.change_findings() + [
-        Finding(id=name, text=text.format(tally=tally, ours=ours, theirs=theirs, off=off, **words))
+        Finding(id=name, text=text.format(tally=tally, tools=tools, off=off, **words))
         for name, text in ROW_FINDINGS.items()
         if applies[name]
     ]

@@ -108,9 +108,7 @@ def field(t: Array, x: Array, y: Array, z: Array, count: int, triad: Triad) -> N
             fx += (shape[6] + shape[9] * u) * u * u
             fy += (shape[7] + shape[10] * v) * v * v
             fz += (shape[8] + shape[11] * q) * q * q
-        x[i] = fx
-        y[i] = fy
-        z[i] = fz
+        x[i], y[i], z[i] = fx, fy, fz
 
 
 @compiled
@@ -180,8 +178,7 @@ def mask(s: Array, count: int, low: float, high: float, blank: bool, last: int) 
     if blank and beyond:
         for i in range(count):
             if (s[_T, i] < low) | (s[_T, i] > high):
-                for k in range(1, last + 1):
-                    s[k, i] = np.nan
+                s[1 : last + 1, i] = np.nan
     return beyond
 
 
