@@ -126,16 +126,13 @@ class RollTest:
         known = self.readings.known.get(name, np.nan)
         return OBSERVABLES[name].difference(self.value(name), known)
 
-    def _coverage(self, index: Ints) -> Coverage | None:
-        """How the toolfaces of stations cover the circle; None if none is known."""
-        known = self.toolface[index][~np.isnan(self.toolface[index])]
-        return roll_test.coverage(known) if known.size else None
-
     def _loose(self, index: Ints) -> str:
         """Why stations do not determine a curve of two harmonics; empty where they do."""
-        circle = None if np.isnan(self.toolface[index]).any() else self._coverage(index)
-        if circle is None or circle.rolled:
-            return "" if circle else NO_TOOLFACE
+        if not index.size or np.isnan(self.toolface[index]).any():
+            return NO_TOOLFACE
+        circle = roll_test.coverage(self.toolface[index])
+        if circle.rolled:
+            return ""
         return _gap(circle, roll_test.WIDEST_GAP) or (
             "the toolfaces do not determine a mean and two harmonics. Add toolfaces between them: "
             "five or more, well apart"
@@ -192,7 +189,8 @@ class RollTest:
             steep = "every station within 5° of vertical"
             return Departures(skipped=steep if near.any() else f"no {REFERENCE_COLUMNS[name]}")
         free = bool(self.calibration.rests_on_free(name, self.readings)[judged].any())
-        circle = self._coverage(judged)
+        known = self.toolface[judged][~np.isnan(self.toolface[judged])]
+        circle = roll_test.coverage(known) if known.size else None
         gap = NO_TOOLFACE if circle is None else _gap(circle, roll_test.OPEN)
         unrolled = f"the stations were not rolled: {gap}" if gap else ""
         unseen = circle is not None and not gap and bool(circle.seen.min() < SEEN)
@@ -206,8 +204,7 @@ class RollTest:
     ) -> Departures:  # fmt: skip
         """The statistics, and why no limit can be passed: `free` and `unrolled` are reasons."""
         if name == "field" and self.calibration.relative:
-            relative = "the calibration is relative: field = 1, not nT"
-            return Departures(blocked=relative, apart=apart)
+            return Departures(blocked="the calibration is relative: field = 1, not nT", apart=apart)
         blocked = NOT_DETERMINED if free else unrolled
         return Departures(tuple(statistics), "", blocked, bool(unrolled), apart, unseen)
 
@@ -216,13 +213,13 @@ class RollTest:
         seen = [replace(s, index=s.index[np.isin(s.index, judged)]) for s in self.sets]
         whole = [s for s in seen if not self._loose(s.index) and (s.one_azimuth or name in LEVEL)]
         inside = np.concatenate([s.index for s in whole]) if whole else ()
+        alone = judged[~np.isin(judged, inside)]
         reference = np.hypot(self.readings.uncertainty(name), self._common(name))
         error, sd = np.abs(self._error(name)), np.hypot(self._noise(name), reference)
+        each = zip(error[alone].tolist(), sd[alone].tolist(), alone, strict=True)
         return [self._curve_of(name, s, True) for s in whole] + [
-            Statistic(
-                float(error[i]), float(sd[i]), float(error[i]), f"station {self.readings.labels[i]}"
-            )
-            for i in judged[~np.isin(judged, inside)].tolist()
+            Statistic(off, off_sd, off, f"station {self.readings.labels[i]}")
+            for off, off_sd, i in each
         ]
 
     def _curve_of(self, name: str, roll_set: RollSet, error: bool) -> Statistic:
