@@ -214,12 +214,10 @@ def _rests(name: str, record: Calibration, readings: Readings) -> bool:
 
 def _course(calibrated: _Calibrated) -> dict[str, Array]:
     """Excess of the swarm's best cost over the least one, as a share of it, by triad."""
-    problem, state = calibrated.fit.problem, calibrated.fit.state
-    courses = {}
-    for name, triad, target in zip(TRIADS, problem.triads, problem.targets(state), strict=False):
-        swarm = swarm_forward(
-            triad.raw, target, iterations=SWARM_ITERATIONS, seed=calibrated.options.seed
-        )
+    problem, seed = calibrated.fit.problem, calibrated.options.seed
+    targets, courses = problem.targets(calibrated.fit.state), {}
+    for name, triad, target in zip(TRIADS, problem.triads, targets, strict=False):
+        swarm = swarm_forward(triad.raw, target, iterations=SWARM_ITERATIONS, seed=seed)
         least = least_squares_forward(triad.raw, target)[:, None]
         cost = vector_cost(triad.raw, target)(least)[0, 0]
         courses[name] = swarm.history[0] / cost - 1
@@ -228,8 +226,7 @@ def _course(calibrated: _Calibrated) -> dict[str, Array]:
 
 def _referenced(readings: Readings) -> list[str]:
     """Observables that have a reference somewhere in the run."""
-    magnetic = ("azimuth", "field", "dip")
-    usable = [n for n in SHOWN if readings.magnetometer is not None or n not in magnetic]
+    usable = SHOWN if readings.magnetometer is not None else SHOWN[:3]
     return [n for n in usable if not np.isnan(readings.reference(n)).all()]
 
 
@@ -239,10 +236,7 @@ def errors(readings: Readings, g: Array, b: Array) -> dict[str, Array]:
     Of angles that is the group's where a station of a group has none of its own.
     """
     shared = evidence_of(readings, np.ones(readings.count)).known
-    known = {
-        name: shared[name][0] if name in ANGLES else readings.reference(name)
-        for name in dict.fromkeys((*_referenced(readings), "inclination"))
-    }
+    known = {n: shared[n][0] if n in ANGLES else readings.reference(n) for n in SHOWN}
     return {name: departure(name, g, b, known) for name in _referenced(readings)}
 
 
