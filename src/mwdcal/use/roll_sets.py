@@ -46,10 +46,9 @@ def roll_sets(readings: Readings) -> list[RollSet]:
     for label, members, declared, one_azimuth in _directions(readings):
         for number in np.unique(soak[members]):
             index = np.flatnonzero(members & (soak == number))
-            if len(index) < ROLL_SET:
-                continue
             at = f", {warmth[index].mean():.1f} °C" if warmth is not None and soak.any() else ""
-            sets.append(RollSet(label + at, index, declared, one_azimuth))
+            if len(index) >= ROLL_SET:
+                sets.append(RollSet(label + at, index, declared, one_azimuth))
     return sets
 
 
