@@ -76,7 +76,7 @@ CASES = [
 def test_wrong_axes_are_refused_and_the_right_ones_named(triad, order, model, unknown, wrong):
     runs, options = miswired(triad, unknown, order, wrong), Options(order=order, model=model)
     result = fit(runs, options)
-    fitted = FittedRuns.of(runs, PROFILE, options, result, lambda i: (one(runs, i), PROFILE))
+    fitted = FittedRuns(runs, PROFILE, options, result, lambda i: (one(runs, i), PROFILE))
     refusals = [*fit_refusals(fitted)]
     for index, each in enumerate(wrong):
         first = next(refusal for refusal in refusals if refusal.members[index])

@@ -131,13 +131,13 @@ def test_members_are_refused_after_the_fit_as_each_would_be_alone():
     def alone(place):
         return take(data, place), PROFILE
 
-    fitted = FittedRuns.of(data, PROFILE, options, result, alone)
+    fitted = FittedRuns(data, PROFILE, options, result, alone)
     found = refused(fit_refusals(fitted), 4)
     assert found[0] is None
     assert [each[0] for each in found[1:]] == ["gain", "gain", "residuals"]
     for place, each in enumerate(found):
         one = take(data, place)
-        single = FittedRuns.of(
+        single = FittedRuns(
             batch_of_one(one),
             PROFILE,
             options,

@@ -10,9 +10,8 @@ from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.estimate import fit
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.prediction import readings_at
-from mwdcal.calibration.readings import Readings
+from mwdcal.calibration.readings import Readings, soaks
 from mwdcal.calibration.record import Calibration
-from mwdcal.calibration.soaks import soaks
 from mwdcal.errors import FitError, InputError
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import reference_vectors

@@ -210,6 +210,16 @@ def test_sheets_that_no_program_writes(tmp_path, sheet, part):
     assert part in refusal(workbook(tmp_path / "t.xlsx", sheet))
 
 
+def test_parts_whose_names_have_commas_are_checked_too(tmp_path):
+    part = "xl/notes, old, 2.xml"
+    path = workbook(tmp_path / "t, 1.xlsx", b"<n/>", part=part)
+    assert list(read(path).columns) == ["ax", "ay", "az"]
+    workbook(path, b"<row" + FLOOD + b"/>", part=part)
+    assert refusal(path).startswith(
+        f"t, 1.xlsx, {part}: a workbook must have at most 1048576 bytes"
+    )
+
+
 def test_a_workbook_that_defines_entities_is_refused(tmp_path):
     head = b'<!DOCTYPE x [<!ENTITY a "<row/>">]>'
     path = workbook(tmp_path / "t.xlsx", b"&a;" * 9, head=head)
@@ -217,7 +227,7 @@ def test_a_workbook_that_defines_entities_is_refused(tmp_path):
 
 
 def test_more_cells_than_any_run_has(tmp_path, monkeypatch):
-    monkeypatch.setitem(workbook_limits.MAX_COUNTS, "c", 5)
+    monkeypatch.setitem(workbook_limits.MAX_COUNTS, "c", (5, "cells"))
     path = tmp_path / "t.xlsx"
     write(path, Table({"ax": ["1", "2"], "ay": ["1", "2"]}))
     assert "at most 5 cells" in refusal(path)

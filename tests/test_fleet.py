@@ -794,13 +794,13 @@ def test_workers_are_prepared_with_settings_of_their_own(monkeypatch):
 def test_the_process_that_is_copied_has_no_thread_of_a_memory_pool(fleet, tmp_path):
     """Else Python warns from 3.12 on that the copies may hang."""
     script = (
-        "import os\nfrom multiprocessing import forkserver\nfrom mwdcal.app import cli, fleet_table\n"
-        "tidy = fleet_table._tidy\ndef count(folder):\n    tidy(folder)\n"
+        "import os\nfrom multiprocessing import forkserver\nfrom mwdcal.app import cli\n"
+        "from mwdcal.fleet import kept\ntidy = kept.remove\ndef count(folder):\n    tidy(folder)\n"
         "    pid = forkserver._forkserver._forkserver_pid\n"
         "    for each in os.listdir(f'/proc/{pid}/task'):\n"
         "        with open(f'/proc/{pid}/task/{each}/comm') as name:\n"
         "            print('thread', name.read().strip(), flush=True)\n"
-        "fleet_table._tidy = count\nif __name__ == '__main__':\n    cli.main()\n"
+        "kept.remove = count\nif __name__ == '__main__':\n    cli.main()\n"
     )
     (tmp_path / "count.py").write_text(script, "utf-8")
     command = [

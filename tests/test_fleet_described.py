@@ -76,7 +76,7 @@ def test_estimated_noise_is_shown_where_residuals_cannot_be_judged(
 
     def quality(panels):
         drawn.extend(panels)
-        return plots.new_figure("", 1.0)
+        return plots.new_figure("", 1.0)[0]
 
     monkeypatch.setattr(fleet_report, "draw_quality", quality)
     _, page = said(tmp_path, {f"T{i}": short_run(i) for i in range(4)}, "--tool", tool)

@@ -414,6 +414,23 @@ def test_stations_named_by_odd_times_are_labels(tmp_path, first, kind):
     assert fleet(path)[0].code == 0
 
 
+@pytest.mark.parametrize("name", ["serial", "station", "group"])
+@pytest.mark.parametrize("kind", [pa.string(), pa.large_string()])
+@pytest.mark.parametrize("encoded", [False, True])
+def test_labels_of_broken_utf_8_are_refused_by_name(tmp_path, name, kind, encoded):
+    path = write_fleet(tmp_path / "runs.parquet", {"T1": short_run(1)})
+    table = pq.read_table(path)
+    raw = pa.array(
+        [b"\xff"] * table.num_rows, pa.binary() if kind == "string" else pa.large_binary()
+    )
+    cells = pa.Array.from_buffers(kind, len(raw), raw.buffers())
+    if encoded:
+        cells = pa.DictionaryArray.from_arrays(pa.array([0] * len(raw)), cells.slice(0, 1))
+    pq.write_table(replaced_column(table, name, cells), path)
+    message = refused(fleet(path)[0], 2)
+    assert f"runs.parquet, column '{name}': expected labels that can be written as text" in message
+
+
 def test_a_pipe_among_the_files_of_a_folder_is_no_table(tmp_path):
     if not hasattr(os, "mkfifo"):
         pytest.skip("no named pipes on this system")

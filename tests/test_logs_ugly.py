@@ -113,10 +113,25 @@ def test_options_are_named_as_where_they_are_given(tmp_path):
     assert "--sampling-hz 100 was given" in ran.json["findings"][0]["text"]
     (told,) = texts(find_stations(log, sampling_hz=100.0), "time-not-used")
     assert told.startswith("`sampling_hz` 100 was given")
-    message = refused(mwdcal("stations", path, "-o", run, "--min-seconds", 500), 2)
+    ran = mwdcal("stations", path, "-o", run, "--min-seconds", 500)
+    message = refused(ran, 2)
     assert "lower --min-seconds or --trim-seconds, or set --threshold." in message
+    assert "--plot shows" in ran.err
     with pytest.raises(InputError, match="lower `min_seconds` or `trim_seconds`"):
         find_stations(log, min_seconds=500.0)
+
+
+def test_one_of_something_is_singular(tmp_path):
+    log, *_ = tumble(13, stations=1, still=(9, 9), move=(3, 3))
+    time = log.columns["time_s"].copy()
+    time[300] = time[299]
+    path = write_csv(tmp_path / "log.csv", {**log.columns, "time_s": time})
+    ran = mwdcal("stations", path, "-o", tmp_path / "run.csv")
+    assert "   1 station, " in ran.out
+    assert "! 1 sample of ax has the time of the one before" in ran.err
+    one = np.where(ROWS == 5, 0.1, np.nan)
+    (left,) = texts(noise_of(rest(ax=one)), "channel-left-out")
+    assert left.startswith("ax has 1 sample; 128 are needed.")
 
 
 @pytest.mark.parametrize("task", [mwdcal_library.stations, mwdcal_library.noise])

@@ -335,6 +335,15 @@ def test_setting_the_stand_each_time_adds_its_repeatability_and_a_roll_in_place_
     assert shared["error of inclination"].uncertainty == pytest.approx(0.05, rel=0.05)
 
 
+@pytest.mark.parametrize("kind", ["spread", "error"])
+def test_uncertainties_without_any_weight_are_refused(record, kind):
+    """Settings of the stand so uncertain that their weights are zero: no curve, and no verdict."""
+    sd = {**NOISE, "inclination": np.full(12, 1e200)}
+    limits = Limits(name="i", **{kind: Bounds(inclination_deg=0.1)})
+    with pytest.raises(InputError, match=r"roll.csv: .* too far apart to judge its inclination"):
+        verify(record, roll(45, sd=sd), limits)
+
+
 @pytest.mark.parametrize(
     ("order", "temperature", "outside"),
     [(0, 25.0, None), (0, 28.5, "finding"), (0, 31.0, "refused"), (1, 51.5, "refused")],
@@ -353,8 +362,11 @@ def test_how_far_outside_its_temperatures_a_calibration_is_verified(order, tempe
     own = calibrate(run, PROFILE, Options(order=order))
     test = msgspec_replace(roll(45), temperature=np.full(12, temperature))
     if outside == "refused":
-        with pytest.raises(InputError, match="outside the calibrated range"):
+        with pytest.raises(InputError, match="12 stations lie outside the calibrated range"):
             verify(own, test, SPREADS)
+        one = np.where(np.arange(12) == 4, temperature, 25.0)
+        with pytest.raises(InputError, match=r"1 station lies outside .* \(first: station 5\)"):
+            verify(own, msgspec_replace(test, temperature=one), SPREADS)
         return
     result = verify(own, test, SPREADS)
     assert result.passed

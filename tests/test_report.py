@@ -17,7 +17,7 @@ from markupsafe import Markup
 from mwdcal.app import text
 from mwdcal.app.pages import calibration as screen
 from mwdcal.app.pages import conversion, pictures, report
-from mwdcal.app.pages.page import css_string, fixed, measured, number, signed
+from mwdcal.app.pages.page import css, fixed, measured, number, signed
 from mwdcal.app.pages.report import render
 from mwdcal.calibration.automatic.auto import Choice
 from mwdcal.calibration.calibrate import calibrate
@@ -124,10 +124,9 @@ def whole():
 @pytest.fixture
 def words(monkeypatch):
     """`render` without its pictures, for tests of what it says."""
-    for name in ("station_errors", "deviations", "accuracy", "order_errors"):
-        monkeypatch.setattr(plots, name, lambda *arguments: "")
+    for name in ("errors", "deviations", "accuracy", "orders"):
+        monkeypatch.setattr(plots.Plots, name, lambda *arguments: "")
     monkeypatch.setattr(pictures, "svg", lambda figure, key: Markup(figure))
-    monkeypatch.setattr(plots, "accuracy_map", lambda calibration: None)
     return render
 
 
@@ -194,7 +193,7 @@ def test_user_settings_of_matplotlib_change_nothing(whole, page):
     import matplotlib as mpl
 
     with mpl.rc_context({"font.size": 20, "axes.facecolor": "red", "svg.fonttype": "none"}):
-        assert pictures.svg(plots.station_errors(whole, "gravity"), "error-gravity") in page
+        assert pictures.svg(whole.plot.errors("gravity"), "error-gravity") in page
         assert mpl.rcParams["font.size"] == 20
 
 
@@ -226,7 +225,7 @@ def test_station_labels_may_be_anything(whole):
     odd = msgspec.structs.replace(whole, station_rows=rows)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        figures = {"a": plots.station_errors(odd, "field"), "b": plots.deviations(odd)}
+        figures = {"a": odd.plot.errors("field"), "b": odd.plot.deviations()}
         found = "".join(pictures.svg(figure, key) for key, figure in figures.items())
     assert "<script" not in found
     parsed(found)
@@ -293,7 +292,7 @@ def test_temperature_terms_and_annex(model, words):
 
 
 def test_errors_at_left_out_temperatures(words, monkeypatch):
-    monkeypatch.setattr(plots, "order_errors", lambda scores: "<svg>by order</svg>")
+    monkeypatch.setattr(plots.Plots, "orders", lambda self: "<svg>by order</svg>")
     made = judged()
     page = words(made)
     parsed(page)
@@ -333,13 +332,17 @@ def test_a_course_that_nothing_tests_says_so(words, whole):
 
 
 def test_picture_of_the_orders_has_both_triads():
-    scores = judged().orders
-    both = plots.order_errors(scores)
+    made = judged()
+
+    def drawn(scores):
+        return msgspec.structs.replace(made, orders=scores).plot.orders()
+
+    both = drawn(made.orders)
     parsed(pictures.svg(both, "orders"))
-    alone = plots.order_errors([s for s in scores if s.triad == "accelerometer"])
+    alone = drawn([s for s in made.orders if s.triad == "accelerometer"])
     assert (len(alone.axes), len(both.axes)) == (1, 2)
-    blank = [msgspec.structs.replace(s, error_inside=None) for s in scores]
-    parsed(pictures.svg(plots.order_errors(blank), "orders"))
+    blank = [msgspec.structs.replace(s, error_inside=None) for s in made.orders]
+    parsed(pictures.svg(drawn(blank), "orders"))
 
 
 @cache
@@ -547,7 +550,7 @@ def test_numbers():
         "0", "22.4", "−0.0649", "1.50×10⁻⁷", "–", "–", "12345",
     ]  # fmt: skip
     assert [signed(v, 2) for v in (1, -1, -0.001, None)] == ["+1.00", "−1.00", "0.00", "–"]
-    assert set(css_string("a<é\n}")) <= set("0123456789abcdef\\ ")
+    assert set(css("a<é\n}")) <= set("0123456789abcdef\\ ")
 
 
 @pytest.mark.parametrize("low", [1e-7, 0.0011, 0.3, 7.0])

@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import norm
 
 from mwdcal.logs.standstill import resolution
-from mwdcal.logs.station_means import correlated, hidden, summarise_all, widened
+from mwdcal.logs.station_means import ChannelMean, correlated, hidden, summarise, widened
 from mwdcal.logs.stations import find_stations
 from test_stations import ACC, ar1, means, tumble, without
 
@@ -17,35 +17,39 @@ SEED = 20261121
 
 
 def together(samples, standstills=24, logs=100, change=lambda value, rng: value):
-    """Summaries (logs, standstills) of white noise of unit variance about zero."""
+    """What is read at all standstills of some logs of white noise of unit variance about zero."""
     rng = np.random.default_rng([SEED, samples])
     time = np.arange(samples) * 1.0
     made = []
     for _ in range(logs):
         values = rng.standard_normal((standstills, samples))
         rests = [(time, change(value, rng)) for value in values]
-        made.append(summarise_all(rests, 1e-9))
-    return made
+        made.append(summarise(rests, 1e-9))
+    return ChannelMean._make(map(np.concatenate, zip(*made, strict=True)))
+
+
+def covers(made, true=0.0):
+    """Where the truth is within 1.96 standard uncertainties of the mean."""
+    return np.abs(made.mean - true) <= 1.96 * made.sd
 
 
 @pytest.mark.parametrize("samples", [3, 4, 5, 6, 8, 10, 12, 15, 16, 20, 50, 200])
 def test_few_samples_know_what_they_do_not_know(samples):
     """2400 standstills: 95 % has a standard error of 0.4 %, 10⁻⁴ is exceeded 0.2 times."""
-    made = [row for log in together(samples) for row in log]
-    misses = np.array([abs(row.mean) > 1.96 * row.sd for row in made])
-    assert 0.93 <= 1 - misses.mean() <= 0.98
-    assert sum(row.drifts for row in made) <= 2
-    assert sum(row.unsteady or row.stuck for row in made) == 0
-    assert sum(row.spikes for row in made) < 0.002 * samples * len(made)
-    weights = np.array([row.sd**-2 for row in made])
+    made = together(samples)
+    assert 0.93 <= covers(made).mean() <= 0.98
+    assert made.drifts.sum() <= 2
+    assert not (made.unsteady | made.stuck).any()
+    assert made.spikes.sum() < 0.002 * samples * len(made.mean)
+    weights = made.sd**-2
     assert weights.max() < 15 * np.median(weights)
 
 
 @pytest.mark.parametrize("standstills", [1, 2, 3])
 @pytest.mark.parametrize("samples", [4, 6, 10])
 def test_few_standstills_know_it_too(standstills, samples):
-    made = [row for log in together(samples, standstills, 1800 // standstills) for row in log]
-    assert 0.92 <= np.mean([abs(row.mean) <= 1.96 * row.sd for row in made]) <= 0.98
+    made = together(samples, standstills, 1800 // standstills)
+    assert 0.92 <= covers(made).mean() <= 0.98
 
 
 def spike(value, rng):
@@ -54,9 +58,9 @@ def spike(value, rng):
 
 
 def test_spikes_among_few_samples_are_seen():
-    made = [row for log in together(8, change=spike) for row in log]
-    assert 0.92 <= np.mean([abs(row.mean) <= 1.96 * row.sd for row in made]) <= 0.98
-    assert sum(row.spikes for row in made) == pytest.approx(0.05 * 8 * len(made), rel=0.1)
+    made = together(8, change=spike)
+    assert 0.92 <= covers(made).mean() <= 0.98
+    assert made.spikes.sum() == pytest.approx(0.05 * 8 * len(made.mean), rel=0.1)
 
 
 @pytest.mark.parametrize("step", [0.2, 0.4, 0.8])
@@ -69,7 +73,7 @@ def test_a_quiet_standstill_is_not_stuck(step, samples):
     for _ in range(60):
         sigma = rng.choice([1 / 3, 1.0, 1.0, 1.5], 24)
         values = np.round(sigma[:, None] * rng.standard_normal((24, samples)) / step) * step
-        stuck += sum(row.stuck for row in summarise_all([(time, v) for v in values], step))
+        stuck += summarise([(time, v) for v in values], step).stuck.sum()
     assert stuck == 0
 
 
@@ -102,10 +106,10 @@ def test_coarse_steps_cover_and_weigh_alike(sigma, standstills, samples):
     for _ in range(240 // standstills):
         place = rng.uniform(-0.5, 0.5, standstills)
         values = np.round(place[:, None] + sigma * rng.standard_normal((standstills, samples)))
-        made = summarise_all([(time, value) for value in values], 1.0)
-        inside += [abs(m.mean - x) <= 1.96 * m.sd for m, x in zip(made, place, strict=True)]
+        made = summarise([(time, value) for value in values], 1.0)
+        inside += [*covers(made, place)]
         if samples == 500:
-            assert max(m.sd for m in made) < 4 * min(m.sd for m in made)
+            assert made.sd.max() < 4 * made.sd.min()
     assert np.mean(inside) > 0.91
 
 
@@ -118,8 +122,8 @@ def test_coarse_steps_cover_where_noise_differs(sigma):
         place = rng.uniform(-0.5, 0.5, 24)
         noise = sigma * np.exp(rng.uniform(np.log(0.5), np.log(2), (24, 1)))
         values = np.round(place[:, None] + noise * rng.standard_normal((24, 500)))
-        made = summarise_all([(time, value) for value in values], 1.0)
-        inside += [abs(m.mean - x) <= 1.96 * m.sd for m, x in zip(made, place, strict=True)]
+        made = summarise([(time, value) for value in values], 1.0)
+        inside += [*covers(made, place)]
     assert np.mean(inside) > 0.91
 
 
@@ -129,8 +133,8 @@ def test_samples_at_two_levels_warn_of_nothing():
     for samples in (4, 6, 7):
         values = 2e-4 * rng.standard_normal((5, samples))
         values[2] += np.arange(samples) >= samples // 2
-        made = summarise_all([(np.arange(samples) * 1.0, value) for value in values], 1e-9)
-        assert np.isfinite([m.sd for m in made]).all()
+        made = summarise([(np.arange(samples) * 1.0, value) for value in values], 1e-9)
+        assert np.isfinite(made.sd).all()
 
 
 @pytest.mark.parametrize("noisier", [2.0, 3.0, 5.0])
@@ -141,8 +145,8 @@ def test_a_noisier_standstill_borrows_no_calm(noisier):
     inside = []
     for _ in range(150):
         values = loud[:, None] * rng.standard_normal((24, 7))
-        made = summarise_all([(np.arange(7.0), value) for value in values], 1e-9)
-        inside.append([abs(m.mean) <= 1.96 * m.sd for m in made])
+        made = summarise([(np.arange(7.0), value) for value in values], 1e-9)
+        inside.append(covers(made))
     assert np.mean(np.array(inside)[:, loud > 1]) > 0.85
     assert 0.93 < np.mean(np.array(inside)[:, loud == 1]) < 0.98
 
@@ -232,7 +236,7 @@ def test_white_noise_is_seldom_said_to_be_correlated(standstills):
     time, told = np.arange(300) / 100, 0
     for _ in range(1200 // standstills // 3):
         values = rng.standard_normal((3, standstills, 300))
-        made = [summarise_all([(time, v) for v in own], 1e-9) for own in values]
+        made = [summarise([(time, v) for v in own], 1e-9) for own in values]
         told += correlated(made).plain
     assert told <= 0.03 * (1200 // standstills // 3) + 1
 
@@ -244,12 +248,12 @@ def judged(rho, samples, logs=50):
     time, told, grown, inside = np.arange(samples) / 100, [], [], []
     for _ in range(logs):
         read = ar1(rng, 30 * (samples + 300), rho).reshape(30, samples + 300, 3)[:, :samples]
-        made = [summarise_all([(time, v) for v in own], 1e-9) for own in read.transpose(2, 0, 1)]
+        made = [summarise([(time, v) for v in own], 1e-9) for own in read.transpose(2, 0, 1)]
         told.append(correlated(made))
-        for own, variance in zip(made, told[-1].variance, strict=True):
+        for own, variance in zip(made, told[-1].variance.tolist(), strict=True):
             new = widened(own, variance)
-            grown += [b.sd / a.sd for a, b in zip(own, new, strict=True)]
-            inside += [abs(m.mean) <= 1.96 * m.sd for m in new]
+            grown += [*(new.sd / own.sd)]
+            inside += [*covers(new)]
     return told, np.mean(grown), np.mean(inside)
 
 

@@ -307,6 +307,14 @@ def test_slow_turns_are_no_noisy_rests(period):
     assert "noisy-rest" not in ids(told.value.analysis)
 
 
+@pytest.mark.filterwarnings("error")
+def test_a_channel_of_one_sample_warns_of_nothing():
+    log, *_ = tumble(6, stations=3)
+    once = np.where(np.arange(len(log.columns["ax"])) == 700, 0.3, np.nan)
+    with pytest.raises(InputError, match="no standstill of at least"):
+        find_stations(without(log, **dict.fromkeys(MAG, once)))
+
+
 def test_a_refusal_says_how_long_it_stood_still(tmp_path):
     log, starts, ends, _ = tumble(3, stations=10, still=(5, 8))
     path = write_csv(tmp_path / "log.csv", {**log.columns, "gx": np.zeros(len(log.columns["ax"]))})

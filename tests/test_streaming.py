@@ -733,14 +733,14 @@ def test_progress_is_shown_on_a_terminal_and_only_to_the_patient(
 ):
     monkeypatch.setattr(progress, "PATIENCE", patience)
     monkeypatch.setattr(sys, "stderr", shown := stream())
-    limit = time.monotonic() + 20
+    limit, before = time.monotonic() + 20, {*threading.enumerate()}
     with progress.bar("correcting") as advance:  # nothing is told, as while a workbook is written
         while seen and "correcting" not in shown.getvalue() and time.monotonic() < limit:
             time.sleep(0.01)
         advance(2, 4)
     assert ("correcting" in shown.getvalue()) == seen
     assert ("50%" in shown.getvalue()) == seen
-    assert not any(isinstance(thread, threading.Timer) for thread in threading.enumerate())
+    assert all(thread.daemon for thread in {*threading.enumerate()} - before)
 
 
 def test_progress_begins_with_what_was_told_before_it_was_seen(monkeypatch):

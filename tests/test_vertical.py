@@ -85,7 +85,7 @@ def test_roll_sets_at_vertical_are_neither_refused_nor_wrong(inclinations, known
         made, matrix, offset = roll_sets(inclinations, known, seed, off=off)
         result = fit(made)
         assert (result.status == 0).all()
-        fitted = FittedRuns.of(made, PROFILE, Options(), result, alone=lambda _: None)
+        fitted = FittedRuns(made, PROFILE, Options(), result, alone=lambda _: None)
         assert not any(refusal.members.any() for refusal in fit_refusals(fitted))
         squares.append(normalised_error(result, matrix, offset))
     whole = np.concatenate(squares)

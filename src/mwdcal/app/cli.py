@@ -6,8 +6,9 @@ import contextlib
 import io
 import os
 import sys
-from collections.abc import Iterator, Mapping
+from collections import UserDict
 from importlib import import_module
+from typing import Any
 
 import click
 
@@ -29,27 +30,16 @@ COMMANDS = (
 """Modules of `mwdcal.app.commands` with a command of their name."""
 
 
-class Commands(Mapping[str, click.Command]):
-    """The commands by name; each is imported when it is asked for."""
+class Commands(UserDict[str, Any]):
+    """The commands by name; kept are the names, and each is imported when it is asked for."""
 
-    def __getitem__(self, name: str) -> click.Command:
+    def __getitem__(self, name: str) -> Any:
         """The command of the module of that name."""
-        if name not in COMMANDS:
-            raise KeyError(name)
-        command: click.Command = import_module(f"mwdcal.app.commands.{name}").command
-        return command
-
-    def __iter__(self) -> Iterator[str]:
-        """The names of the commands."""
-        return iter(COMMANDS)
-
-    def __len__(self) -> int:
-        """The number of commands."""
-        return len(COMMANDS)
+        return super().__getitem__(name) or import_module(f"mwdcal.app.commands.{name}").command
 
 
 @click.group(
-    commands=Commands(),
+    commands=Commands.fromkeys(COMMANDS),
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
 @click.version_option(__version__, prog_name="mwdcal")
@@ -71,15 +61,14 @@ def main(arguments: list[str] | None = None) -> None:
     if arguments is None:
         without_pandas()
     with contextlib.nullcontext() if COMPLETION in os.environ else screens():
-        code = _status(arguments)
-    sys.exit(code)
+        sys.exit(_status(arguments))
 
 
 def _status(arguments: list[str] | None) -> int:
     """Run the command line; its exit status."""
     try:
         with interruption.orderly_end():
-            status = cli.main(arguments, prog_name="mwdcal", standalone_mode=False)
+            return cli.main(arguments, prog_name="mwdcal", standalone_mode=False) or 0
     except click.ClickException as error:
         error.show(usage := io.StringIO())
         click.echo(harmless(usage.getvalue()), err=True, nl=False)
@@ -93,7 +82,9 @@ def _status(arguments: list[str] | None) -> int:
             "not enough memory for this input. Split the file, or use a larger machine.", 2
         )
     except OSError as error:
-        return _ended(_refused(error), 2)
+        place = f"'{error.filename}': " if error.filename else ""
+        advice = "Make room or choose another place, and run the command again."
+        return _ended(f"{place}{reason(error)}. {advice}", 2)
     except Exception as error:
         if os.environ.get("MWDCAL_DEBUG"):
             raise
@@ -102,13 +93,6 @@ def _status(arguments: list[str] | None) -> int:
             "mwdcal: please report it with the command and the file. MWDCAL_DEBUG=1 shows where.",
             INTERNAL,
         )
-    return status if isinstance(status, int) else 0
-
-
-def _refused(error: OSError) -> str:
-    """What the operating system did not do."""
-    place = f"'{error.filename}': " if error.filename else ""
-    return f"{place}{reason(error)}. Make room or choose another place, and run the command again."
 
 
 def _ended(message: str, status: int, *notes: str) -> int:

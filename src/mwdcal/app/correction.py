@@ -9,18 +9,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from mwdcal.app.streaming import (
-    apply_to_file,
-    check_free,
-    check_warmth,
-    chosen,
-    described,
-    in_parts,
-    lacking,
-    nothing,
-    spread,
-    wholly_blank,
-)
+from mwdcal.app import streaming
 from mwdcal.calibration.diagnosis.findings import unused_columns
 from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.errors import InputError
@@ -59,8 +48,8 @@ def apply_to_any(
     """
     profile = calibration.profile
     exported = _is_exported(readings, profile, decimal)
-    if in_parts(readings, output) and not exported:
-        return apply_to_file(
+    if streaming.in_parts(readings, output) and not exported:
+        return streaming.apply_to_file(
             calibration, readings, output, outside, advance, missing=missing, decimal=decimal
         )
     if readings.suffix.lower() in TEXT and (exported or output.suffix.lower() == ".xlsx"):
@@ -95,8 +84,8 @@ def _check_size(readings: Path) -> None:
     size = readings.stat().st_size if readings.is_file() else 0
     if size > LARGEST_TEXT:
         raise InputError(
-            f"{readings.name}: an export, or a text table that becomes a workbook, must have at most "
-            f"{LARGEST_TEXT} bytes; got {size}. Split it, or write a run file as CSV."
+            f"{readings.name}: an export, or a text table that becomes a workbook, must have at most {LARGEST_TEXT} "
+            f"bytes; got {size}. Split it, or write CSV."
         )
 
 
@@ -106,22 +95,19 @@ def apply_to_table(
     """The input's columns and metadata, the results, and what the calibration was."""
     table = renamed(source, calibration.profile)
     check_columns(list(table.columns), source.source)
-    check_warmth(calibration, list(table.columns), source.source)
+    streaming.check_warmth(calibration, list(table.columns), source.source)
     whole = np.ones(source.count, bool)
     if missing == "blank":
-        whole = ~lacking(table, wholly_blank([table]))
+        whole = ~streaming.lacking(table, streaming.wholly_blank([table]))
     if not whole.any():
-        raise nothing(source.source)
-    kept = table if whole.all() else chosen(table, whole)
+        raise streaming.nothing(source.source)
+    kept = streaming.chosen(table, whole)
     readings, _ = to_readings(kept, calibration.profile)
     results, tally, findings = counted(calibration, readings, outside, source.count - kept.count)
-    check_free(source.columns, list(results), source.source)
-    columns = (
-        results if whole.all() else {n: spread(values, whole) for n, values in results.items()}
-    )
-    metadata = {**source.metadata, **described(calibration)}
-    stated = [*carried.stated_findings(metadata), *(finding.text for finding in findings)]
-    if stated:
-        metadata["findings"] = stated
+    streaming.check_free(source.columns, list(results), source.source)
+    columns = {name: streaming.spread(values, whole) for name, values in results.items()}
+    metadata = {**source.metadata, **streaming.described(calibration)}
+    if remarks := streaming.stated(metadata, findings):
+        metadata["findings"] = remarks
     corrected = replace(source, columns={**source.columns, **columns}, metadata=metadata)
     return corrected, tally, findings + unused_columns(readings.unused)

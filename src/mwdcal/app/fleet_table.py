@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable, Generator, Iterator, Mapping
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from importlib import import_module
@@ -27,7 +27,7 @@ from mwdcal.calibration.methods import check_stand_errors
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.prior import DATASHEET, profile_for
 from mwdcal.errors import InputError, reason
-from mwdcal.files import profiles
+from mwdcal.files import profiles, synonyms
 from mwdcal.files.formats import atomic, parquet
 from mwdcal.fleet import kept
 from mwdcal.fleet.parts import Plan, load, solve
@@ -38,6 +38,8 @@ from mwdcal.use.correction_numba import cores
 
 EVERY = 5.0
 """Seconds between two lines of progress."""
+NEEDED_AT_THE_END = ("pyarrow.compute", "rich.console", "rich.table")
+"""Modules that are loaded before, as nothing else is left to do then."""
 
 
 def calibrate_table(
@@ -56,30 +58,29 @@ def calibrate_table(
     source = open_source(runs)
     if max(options.orders) and "temperature_c" not in source.columns:
         raise no_temperature(max(options.orders))
-    unused = unused_columns(source.unused)
+    unused = unused_columns(synonyms.unused(source.columns, source.used))
     for line in lines(unused):
         say(line)
     target = atomic.target(output)
     _check_target(target, runs)
-    folder = target.with_name(target.name + ".parts")
     plan = Plan.of(source, profile, options)
-    kept.check_folder(folder)
-    with _alone(folder, output):
+    steps = pool.Steps(partial(load, plan), partial(solve, plan))
+    with _place_of_parts(target, output) as folder:
         tools = find_tools(source)
-        parts = {f"{plan.key(part)}.arrow": part for part in partitions(source, tools, folder, say)}
-        paths = [folder / name for name in parts]
-        done = _finished(paths, tools, source, say)
-        steps = pool.Steps(partial(load, plan), partial(solve, plan))
-        missing = {
-            path: part for path, part in zip(paths, parts.values(), strict=True) if path not in done
-        }
-        with contextlib.closing(_computed(steps, missing, workers, scheduler, say)) as computed:
-            _merge(paths, done, computed, target, _metadata(source, plan, typed, digest), source)
-        _tidy(folder)
+        whole = partitions(source, tools, folder, say)
+        parts = {folder / f"{plan.key(part)}.arrow": part for part in whole}
+        done = _finished(parts, tools, source, say)
+        missing = {path: part for path, part in parts.items() if path not in done}
+        computing = _computed(
+            pool.results(steps, list(missing.values()), workers or cores(), scheduler), missing, say
+        )
+        with contextlib.closing(computing) as computed:
+            tables = _in_order(parts, done, computed)
+            _merge(tables, target, _metadata(source, plan, typed, digest), source)
     return summarise(
         target,
         typed,
-        notes=[*source.notes, *_split(source, tools)],
+        notes=[*source.notes, *in_several_folders(source, tools)],
         runs=runs.name,
         output=str(output),
         stations=source.rows,
@@ -90,29 +91,32 @@ def calibrate_table(
     )
 
 
-def _finished(
-    paths: list[Path], tools: Tools, source: FleetTable, say: Callable[[str], None]
-) -> set[Path]:
-    """The parts that were done before; says how many there are, and are to do again."""
-    done, damaged = kept.finished(paths)
-    counts = {"tool": tools.count, "station": source.rows, "part": len(paths)}
-    counted = ", ".join(plural(count, noun) for noun, count in counts.items())
-    say(f"{counted}, {len(done)} done before")
-    if damaged:
-        say(f"! {plural(damaged, 'part')} done before, but damaged: computed again")
-    return done
-
-
 @contextlib.contextmanager
-def _alone(folder: Path, output: Path) -> Iterator[None]:
-    """Refuse a second command with the same output, as long as the first one lives."""
+def _place_of_parts(target: Path, output: Path) -> Iterator[Path]:
+    """The folder of finished parts: of one command as long as it lives, and tidied where that succeeds."""
+    folder = target.with_name(target.name + ".parts")
+    kept.check_folder(folder)
     with atomic.holding(folder / kept.LOCK) as ours:
         if not ours:
             raise InputError(
                 f"cannot write '{output}': another fleet is writing this output. Wait for it, or choose "
                 "another -o."
             )
-        yield
+        yield folder
+        atomic.sweep(folder)
+        kept.remove(folder)
+
+
+def _finished(
+    paths: Collection[Path], tools: Tools, source: FleetTable, say: Callable[[str], None]
+) -> set[Path]:
+    """The parts that were done before; says how many there are, and are to do again."""
+    done, damaged = kept.finished(paths)
+    fleet = f"{plural(tools.count, 'tool')}, {plural(source.rows, 'station')}"
+    say(f"{fleet}, {plural(len(paths), 'part')}, {len(done)} done before")
+    if damaged:
+        say(f"! {plural(damaged, 'part')} done before, but damaged: computed again")
+    return done
 
 
 def _metadata(source: FleetTable, plan: Plan, typed: Typed, digest: str) -> dict[str, object]:
@@ -127,17 +131,6 @@ def _metadata(source: FleetTable, plan: Plan, typed: Typed, digest: str) -> dict
         "reference_temperature_c": plan.profile.reference_temperature_c,
         "noise_estimated": list(plan.noise_estimated),
     }
-
-
-def _split(source: FleetTable, tools: Tools) -> list[str]:
-    """What to say of tools of which several folders have rows."""
-    count = in_several_folders(source, tools)
-    if not count:
-        return []
-    return [
-        f"tools with rows in several folders: {count}. All rows of a serial are one run; where they are "
-        "runs of their own, calibrate folder by folder."
-    ]
 
 
 def _options(typed: Typed, profile: Profile) -> Options:
@@ -169,21 +162,19 @@ def _check_target(target: Path, runs: Path) -> None:
 
 
 def _computed(
-    steps: pool.Steps,
+    results: Iterator[tuple[int, bytes]],
     missing: Mapping[Path, Partition],
-    workers: int | None,
-    scheduler: str | None,
     say: Callable[[str], None],
 ) -> Generator[Path, None, None]:
-    """Compute the parts that are missing, one by one; each is kept when it is whole."""
+    """The parts that are missing, one by one as they are computed; each is kept when it is whole."""
     if not missing:
         return
     begun, tools, slowly = time.perf_counter(), 0, progress.slowly(say, EVERY)
     paths, tasks = list(missing), list(missing.values())
-    _load_what_the_end_needs()
+    for name in NEEDED_AT_THE_END:  # while the workers start: later it would be waited for
+        import_module(name)
     disk = ThreadPoolExecutor(1)  # the next part is computed while one goes to the disk
     try:
-        results = pool.results(steps, tasks, workers or cores(), scheduler)
         for count, (index, content) in enumerate(results, 1):
             check_unchanged(tasks[index].pieces)
             atomic.write(paths[index], kept.sealed(content, paths[index].name), durable=False)
@@ -199,43 +190,44 @@ def _computed(
         disk.shutdown(cancel_futures=True)
 
 
-def _load_what_the_end_needs() -> None:
-    """While the workers start: at the end nothing else is left to do, and it would be waited for."""
-    for name in ("pyarrow.compute", "rich.console", "rich.table"):
-        import_module(name)
+def _in_order(paths: Iterable[Path], done: set[Path], computed: Iterator[Path]) -> Iterator[Any]:
+    """The tables of all parts, each when it and all before it are done, while workers go on with others."""
+    arrow, _ = parquet.modules("fleet")
+    ready = set(done)
+    for path in paths:
+        while path not in ready:
+            ready.add(next(computed))
+        content = kept.read_part(path)
+        if content is None:
+            raise InputError(
+                f"'{path}': the finished part was changed or removed. Run the same command again: it is "
+                "computed anew."
+            )
+        yield arrow.ipc.open_stream(content).read_all()
+    ready.update(computed)  # to its end, with that of the workers
 
 
 def _merge(
-    paths: list[Path],
-    done: set[Path],
-    computed: Iterator[Path],
-    target: Path,
-    metadata: dict[str, object],
-    source: FleetTable,
+    parts: Iterator[Any], target: Path, metadata: dict[str, object], source: FleetTable
 ) -> None:
-    """One Parquet table of all parts, in their order; one part in memory at a time.
-
-    A part is added when it and all before it are `done`, while workers go on with others.
-    """
+    """One Parquet table of all parts; one part in memory at a time."""
     arrow, pq = parquet.modules(target.name)
     described = {parquet.KEY: msgspec.json.encode(metadata, enc_hook=str)}
-    ready, writer = set(done), None
+    writer = None
     with atomic.replacing(target) as stream:
         try:
-            for path in paths:
-                while path not in ready:
-                    ready.add(next(computed))
-                part = arrow.ipc.open_stream(_content(path)).read_all()
-                with _writing(target):
-                    if writer is None:
-                        schema = part.schema.with_metadata(described)
-                        texts = [f.name for f in schema if not arrow.types.is_floating(f.type)]
-                        writer = pq.ParquetWriter(stream.name, schema, use_dictionary=texts)
-                    writer.write_table(part.cast(writer.schema))
-            for _ in computed:
-                pass
-            with _writing(target):
-                _close(writer)
+            for part in parts:
+                if writer is None:
+                    schema = part.schema.with_metadata(described)
+                    texts = [f.name for f in schema if not arrow.types.is_floating(f.type)]
+                    writer = pq.ParquetWriter(stream.name, schema, use_dictionary=texts)
+                writer.write_table(part.cast(writer.schema))
+            _close(writer)
+        except OSError as error:
+            raise InputError(
+                f"cannot write '{target}': {reason(error)}. Finished parts are kept: make "
+                "room, or choose another place, and run the same command again."
+            ) from error
         finally:
             with contextlib.suppress(OSError):
                 _close(writer)
@@ -247,32 +239,3 @@ def _close(writer: Any) -> None:
     if writer is not None and writer.is_open:
         writer.is_open = False
         writer.writer.close()
-
-
-def _content(path: Path) -> memoryview:
-    """The content of a part that was whole."""
-    content = kept.read_part(path)
-    if content is None:
-        raise InputError(
-            f"'{path}': the finished part was changed or removed. Run the same command again: it is "
-            "computed anew."
-        )
-    return content
-
-
-@contextlib.contextmanager
-def _writing(target: Path) -> Iterator[None]:
-    """What the system refuses in the block is the writing of the output."""
-    try:
-        yield
-    except OSError as error:
-        raise InputError(
-            f"cannot write '{target}': {reason(error)}. Finished parts are kept: make "
-            "room, or choose another place, and run the same command again."
-        ) from error
-
-
-def _tidy(folder: Path) -> None:
-    """Remove what was kept for a restart, and nothing that is not ours."""
-    atomic.sweep(folder)
-    kept.remove(folder)

@@ -6,9 +6,9 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from threading import Timer
+from threading import Timer, current_thread, main_thread
 from typing import Any
 
 SIGNAL = 128
@@ -37,12 +37,8 @@ def orderly_end() -> Iterator[None]:
         if time.monotonic() - received[0][1] > CLEANUP_SECONDS:
             os._exit(SIGNAL + number)
 
-    handlers = _default_handlers()
-    try:
-        for each in handlers:
-            signal.signal(each, end)
-    except ValueError:  # signals belong to the main thread
-        handlers = {}
+    defaults = (signal.SIG_DFL, signal.default_int_handler)
+    handlers = _replaced(end, lambda handler: handler in defaults)
     try:
         with _raised_again(received):
             yield
@@ -78,17 +74,11 @@ def _raised_again(received: list[tuple[int, float]]) -> Iterator[None]:
 def held() -> Iterator[None]:
     """Signals to end wait until the block is over, as what it begins must not be left half begun."""
     waiting: list[int] = []
-    handlers = {each: signal.getsignal(each) for each in _signals()}
-    ours = {each: handler for each, handler in handlers.items() if callable(handler)}
-    try:
-        for each in ours:
-            signal.signal(each, lambda number, frame: waiting.append(number))
-    except ValueError:  # signals belong to the main thread
-        ours = {}
+    handlers = _replaced(lambda number, frame: waiting.append(number), callable)
     try:
         yield
     finally:
-        for each, handler in ours.items():
+        for each, handler in handlers.items():
             signal.signal(each, handler)
         if waiting:
             signal.raise_signal(waiting[0])
@@ -101,17 +91,18 @@ def _cause(error: BaseException | None) -> Ended | None:
     return error
 
 
-def _default_handlers() -> dict[signal.Signals, Any]:
-    """The signals that ask a process to end and are neither ignored nor handled by others."""
-    handlers = {each: signal.getsignal(each) for each in _signals()}
-    defaults = (signal.SIG_DFL, signal.default_int_handler)
-    return {each: handler for each, handler in handlers.items() if handler in defaults}
-
-
-def _signals() -> list[signal.Signals]:
-    """The signals that ask a process to end, as far as the system has them."""
+def _replaced(
+    new: Callable[[int, object], None], replaceable: Callable[[Any], bool]
+) -> Mapping[signal.Signals, Any]:
+    """What handled the signals that ask a process to end, before `new` did; none outside the main thread."""
+    if current_thread() is not main_thread():
+        return {}
     names = ("SIGINT", "SIGTERM", "SIGHUP")
-    return [getattr(signal, name) for name in names if hasattr(signal, name)]
+    handlers = {s: signal.getsignal(s) for s in signal.Signals if s.name in names}
+    before = {each: handler for each, handler in handlers.items() if replaceable(handler)}
+    for each in before:
+        signal.signal(each, new)
+    return before
 
 
 def report(stop: BaseException) -> tuple[str, int]:

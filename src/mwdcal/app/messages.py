@@ -154,10 +154,6 @@ def print_result(result: Any, findings: Iterable[Finding] = ()) -> None:
 
 def _shown(document: str) -> str:
     """JSON in characters that stdout has and that do not control a terminal; escapes for others."""
-    if fitting(document, sys.stdout.encoding) != document:
-        return re.sub(r"[^\x00-\x7e]", _json_escape, document)
-    return UNSAFE_BUT_LINES.sub(_json_escape, document)
-
-
-def _json_escape(character: re.Match[str]) -> str:
-    return json.dumps(character[0])[1:-1]
+    fits = fitting(document, sys.stdout.encoding) == document
+    others = UNSAFE_BUT_LINES if fits else re.compile(r"[^\x00-\x7e]")
+    return others.sub(lambda character: json.dumps(character[0])[1:-1], document)

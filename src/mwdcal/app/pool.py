@@ -11,6 +11,7 @@ from __future__ import annotations
 import asyncio
 import gc
 import logging
+import multiprocessing
 import os
 import signal
 import threading
@@ -20,13 +21,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib import import_module
-from multiprocessing import (
-    forkserver,
-    get_all_start_methods,
-    get_context,
-    parent_process,
-    resource_tracker,
-)
+from multiprocessing import forkserver, resource_tracker
 from multiprocessing.context import BaseContext
 from queue import Empty, SimpleQueue
 from typing import Any
@@ -102,22 +97,21 @@ def results(
 @contextmanager
 def _settings_of_workers() -> Iterator[None]:
     """The environment of processes that are started here."""
-    before = {name: os.environ.get(name) for name in WORKER_SETTINGS}
+    before = {name: os.environ[name] for name in WORKER_SETTINGS if name in os.environ}
     os.environ.update(WORKER_SETTINGS)
     try:
         yield
     finally:
-        for name, value in before.items():
-            os.environ.pop(name)
-            if value is not None:
-                os.environ[name] = value
+        for name in WORKER_SETTINGS:
+            del os.environ[name]
+        os.environ.update(before)
 
 
 def _context() -> BaseContext:
     """Clean processes; where the system can, copies of one that has loaded everything."""
-    if "forkserver" not in get_all_start_methods():
-        return get_context("spawn")
-    context = get_context("forkserver")
+    if "forkserver" not in multiprocessing.get_all_start_methods():
+        return multiprocessing.get_context("spawn")
+    context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload([COMMAND, WORKER])
     return context
 
@@ -133,7 +127,7 @@ def _follow_the_command() -> None:
 
 def _end_with_parent() -> None:
     """Wait for the end of the parent process, however that comes."""
-    parent = parent_process()
+    parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()
         os._exit(1)
@@ -175,9 +169,8 @@ def _by_pool(
             while True:
                 for index in waiting:
                     loaded = steps.load(tasks[index])
-                    with (
-                        held()
-                    ):  # a worker that nobody waits for would not find what it begins with
+                    # a worker that nobody waits for would not find what it begins with
+                    with held():
                         running[pool.submit(steps.solve, loaded)] = index
                     if len(running) >= 2 * workers:
                         break
@@ -241,21 +234,20 @@ def _finished(client: Any, waiting: Mapping[str, tuple[int, Any]]) -> Iterator[s
 @contextmanager
 def _connected(distributed: Any, address: str) -> Iterator[Any]:
     """A client of a cluster that has a worker."""
-    for name in [
-        each for each in logging.root.manager.loggerDict if each.startswith("distributed")
-    ]:
-        logging.getLogger(name).setLevel(logging.CRITICAL + 1)  # its tracebacks; errors are raised
+    for name in list(logging.root.manager.loggerDict):
+        if name.startswith("distributed"):
+            logging.getLogger(name).setLevel(
+                logging.CRITICAL + 1
+            )  # its tracebacks; errors are raised
     try:
         asyncio.run(_greet(distributed, address))
         client = distributed.Client(address, timeout=CLUSTER_TIMEOUT)
     except Exception as error:
-        if address.startswith("tls") and not distributed.Security().require_encryption:
-            certificates = "certificates in Dask's configuration (distributed.comm.tls), and "
-        else:
-            certificates = ""
+        insecure = address.startswith("tls") and not distributed.Security().require_encryption
+        missing = "certificates in Dask's configuration (distributed.comm.tls), and " * insecure
         raise InputError(
             f"`scheduler` {address}: no Dask scheduler answers there ({str(error)[:120] or 'it is mute'}). Start "
-            f"one with {certificates}`dask scheduler`, and workers with `dask worker ADDRESS`."
+            f"one with {missing}`dask scheduler`, and workers with `dask worker ADDRESS`."
         ) from error
     try:
         client.wait_for_workers(1, timeout=CLUSTER_TIMEOUT)

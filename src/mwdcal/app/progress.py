@@ -5,12 +5,14 @@ from __future__ import annotations
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
 PATIENCE = 2.0
 """Seconds before there is anything to see."""
+MOMENT = 0.1
+"""Seconds after which a bar moves."""
 
 
 @contextmanager
@@ -19,31 +21,33 @@ def bar(label: str) -> Iterator[Callable[[int, int], None]]:
 
     The bar also moves while that is not known.
     """
-    shown: list[Any] = []
-    known: dict[str, int] = {}
     if not sys.stderr.isatty():
         yield lambda done, total: None
         return
-
-    def advance(done: int, total: int) -> None:
-        known.update(completed=done, total=total)
-        for each in shown:
-            each.update(each.task_ids[0], **known)
-
-    def begin() -> None:
-        shown.append(_bar(label))  # before what is known is read: nothing told meanwhile is lost
-        shown[0].update(shown[0].task_ids[0], **known)
-        shown[0].start()
-
-    clock = threading.Timer(PATIENCE, begin)
-    clock.start()
+    known: dict[str, Any] = {"completed": 0, "total": None}
+    over = threading.Event()
+    shows = threading.Thread(target=_show, args=(label, known, over))
+    shows.start()
     try:
-        yield advance
+        yield lambda done, total: known.update(completed=done, total=total)
     finally:
-        clock.cancel()
-        clock.join()
-        for each in shown:
-            each.stop()
+        over.set()
+        shows.join()
+
+
+def _show(label: str, known: Mapping[str, Any], over: threading.Event) -> None:
+    """Show what is known until it is over, unless that is soon."""
+    if over.wait(PATIENCE):
+        return
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.progress import Progress
+
+    with Progress(console=Console(stderr=True), transient=True) as shown:
+        task = shown.add_task(escape(label), **known)
+        while not over.wait(MOMENT):
+            shown.update(task, **known)
+        shown.update(task, **known)
 
 
 def slowly(say: Callable[[str], None], every: float = PATIENCE) -> Callable[[str], None]:
@@ -57,13 +61,3 @@ def slowly(say: Callable[[str], None], every: float = PATIENCE) -> Callable[[str
             say(text)
 
     return say_slowly
-
-
-def _bar(label: str) -> Any:
-    from rich.console import Console
-    from rich.markup import escape
-    from rich.progress import Progress
-
-    shown = Progress(console=Console(stderr=True), transient=True)
-    shown.add_task(escape(label), total=None)
-    return shown

@@ -11,12 +11,13 @@ compared with others of their part.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
+from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import IO, Any, NamedTuple, TypeVar
+from typing import IO, Any, TypeVar
 
 import numpy as np
 
@@ -25,16 +26,8 @@ from mwdcal.calibration.diagnosis.findings import unused_columns
 from mwdcal.calibration.readings import TRIADS, Readings
 from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.errors import InputError
-from mwdcal.files import carried, runs, streams, synonyms
-from mwdcal.files.contract import (
-    CHANNELS,
-    COLUMNS,
-    RANGES,
-    RAW,
-    RAW_RANGE,
-    TEMPERATURE,
-    check_columns,
-)
+from mwdcal.files import carried, contract, runs, streams, synonyms
+from mwdcal.files.contract import CHANNELS, COLUMNS, RANGES, RAW, RAW_RANGE, TEMPERATURE
 from mwdcal.files.formats import atomic, parquet
 from mwdcal.files.formats.columns import check_names, no_stations
 from mwdcal.files.formats.sinks import ParquetSink, Sink, TextSink
@@ -43,19 +36,8 @@ from mwdcal.files.formats.table import numbers as as_numbers
 from mwdcal.files.streams import Part, StreamedTable
 from mwdcal.geometry.observables import EXTRAPOLATED, RESULTS
 from mwdcal.geometry.vectors import AnyArray, Array, Bools
-from mwdcal.sensor.profile import TriadProfile
-from mwdcal.use import correction_numba, strengths
-from mwdcal.use.correction import (
-    JUDGED,
-    RowCounts,
-    check_outside,
-    findings,
-    numbers,
-    reference,
-    result_names,
-    undetermined,
-    warmth,
-)
+from mwdcal.use import correction, correction_numba, strengths
+from mwdcal.use.correction import JUDGED, RowCounts
 
 TABLE_SIZES = {".csv": 1_000_000, ".tsv": 1_000_000, ".parquet": 8_000_000}
 """Bytes of a text table from which it is taken in parts, by what it becomes.
@@ -80,17 +62,20 @@ OPTIONAL = {
 LONGEST_SERIAL = 60
 """Most characters of another tool's serial that a finding names."""
 _MOST = 10**15
+_OFF = strengths.Strengths(_MOST, _MOST, _MOST, _MOST, -1.23e-100, -1.24e-100)
+WORST_ROWS = RowCounts(
+    rows=_MOST,
+    beyond=_MOST,
+    serials=("\0" * LONGEST_SERIAL, "\1" * LONGEST_SERIAL, "…"),
+    strengths=dict.fromkeys(strengths.JUDGED_STRENGTHS, _OFF),
+    warmth=TEMPERATURE[:2],
+)
+"""Rows whose findings take more room than those of any others."""
 
+Channels = Mapping[str, list[Array]]
+"""Columns of each triad, and of the temperature, that are not blank."""
 Item = TypeVar("Item")
 Result = TypeVar("Result")
-
-
-class CorrectedPart(NamedTuple):
-    """A part, rendered for the sink, and what was seen in it."""
-
-    rendered: Any
-    size: int
-    tally: RowCounts
 
 
 def in_parts(readings: Path, output: Path) -> bool:
@@ -115,30 +100,29 @@ def apply_to_file(
     `advance` gets how much of the whole is done, and the whole. `rows` of a part of a Parquet table, by
     default as many as memory bears; `least` rows of the whole from which loops are compiled.
     """
-    check_outside(outside)
+    correction.check_outside(outside)
     source = _source(readings, output, rows, decimal)
-    _check_header(source, outside)
-    check_warmth(calibration, source.names, source.name)
+    _check_header(calibration, source, outside)
     pieces = source.pieces()
-    first = next((piece for piece in pieces if _loaded(source, piece).table.count), None)
+    first = next((piece for piece in pieces if _table(source, piece).count), None)
     if first is None:
         raise no_stations(source.name)
-    rules = Rules(outside, missing)
-    worker = _Worker.of(calibration, source, first, rules, source.rows >= least)
+    worker = _Worker(calibration, source, first, outside, missing, source.rows >= least)
     done, tallies = 0, []
     with atomic.replacing(output) as stream:
         sink = worker.sink(stream, output)
-        for part in overlapped(chain([first], pieces), lambda piece: worker(piece, sink)):
-            sink.write(part.rendered)
-            tallies.append(part.tally)
-            done += part.size
+        work = partial(_exactly_if_refused, source, partial(worker.corrected, sink))
+        for rendered, size, tally in overlapped(chain([first], pieces), work):
+            sink.write(rendered)
+            tallies.append(tally)
+            done += size
             advance(done, source.size)
-        total = _total(tallies)
+        total = _total(tallies, worker.moved)
         if total.lacking == total.rows:
             raise nothing(source.name)
-        remarks = findings(calibration, worker.heard(total.serials), total, outside)
+        remarks = worker.findings(total, outside)
         strengths.check(calibration, total.strengths, source.name)
-        sink.finish([*carried.stated_findings(source.metadata), *(f.text for f in remarks)])
+        sink.finish(stated(source.metadata, remarks))
     remarks += unused_columns(synonyms.unused(source.names, COLUMNS))
     return total, remarks + carried.copied(source.names, sink.formulas, output.suffix.lower())
 
@@ -169,17 +153,18 @@ def _source(readings: Path, output: Path, rows: int, decimal: str) -> StreamedTa
     return streams.open_text(readings, typed=typed, decimal=decimal)
 
 
-def _check_header(source: StreamedTable, outside: str) -> None:
+def _check_header(calibration: Calibration, source: StreamedTable, outside: str) -> None:
     """Refuse columns that are missing, doubtful, or have the name of a result."""
     check_names(source.names, source.name)
-    check_columns(source.names, source.name)
-    check_free(source.names, result_names(outside), source.name)
+    contract.check_columns(source.names, source.name)
+    check_free(source.names, correction.result_names(outside), source.name)
+    check_warmth(calibration, source.names, source.name)
 
 
 def check_warmth(calibration: Calibration, names: Sequence[str], source: str) -> None:
     """Refuse a temperature under another name or in another unit where it is needed."""
     if any(triad.order for triad in calibration.triads):
-        synonyms.check_temperature(names, source)
+        synonyms.check_evidence(names, source, ("temperature_c",))
 
 
 def check_free(names: Iterable[str], results: Sequence[str], source: str) -> None:
@@ -200,15 +185,21 @@ def nothing(source: str) -> InputError:
     )
 
 
-def _loaded(source: StreamedTable, piece: Any) -> Part:
+def _exactly_if_refused(
+    source: StreamedTable, work: Callable[[Part], Result], piece: Any
+) -> Result:
+    """`work` of a piece; where something in it seems wrong, of its text looked at line by line."""
     try:
-        return source.load(piece, False)
+        return work(source.load(piece, False))
     except InputError:
-        return source.load(piece, True)
+        return work(source.load(piece, True))
 
 
-def _total(tallies: Sequence[RowCounts]) -> RowCounts:
-    moved = {name for tally in tallies for name in tally.moved}
+def _table(source: StreamedTable, piece: Any) -> Table:
+    return _exactly_if_refused(source, lambda part: part.table, piece)
+
+
+def _total(tallies: Sequence[RowCounts], moved: Collection[str]) -> RowCounts:
     rows, beyond, lacking = np.sum([(t.rows, t.beyond, t.lacking) for t in tallies], 0).tolist()
     serials = runs.serials({}, chain.from_iterable(tally.serials for tally in tallies))
     lows, highs = zip(*(tally.warmth for tally in tallies), strict=True)
@@ -218,97 +209,74 @@ def _total(tallies: Sequence[RowCounts]) -> RowCounts:
     )  # fmt: skip
 
 
-class Rules(NamedTuple):
-    """What is done with rows outside the calibrated temperatures, and with those lacking a reading."""
-
-    outside: str = "blank"
-    missing: str = "refuse"
-
-
-@dataclass(frozen=True)
 class _Worker:
     """Corrects parts; may be called by several threads at once.
 
     Attributes:
-        first: the first piece that has rows.
         absent: groups of columns that are wholly blank in the first part, and so everywhere.
             Where rows may lack a reading: that are wholly blank in all parts.
         said: readings without rows: what the findings need to know of the source.
         triads: numbers for the compiled loops; None where NumPy computes.
-        tool: which channel each tool axis is, and the nominal unit of it, by triad.
         moved: outputs already known to rest on what the calibration leaves undetermined.
     """
 
-    calibration: Calibration
-    source: StreamedTable
-    rules: Rules
-    first: Any
-    absent: tuple[tuple[str, ...], ...]
-    said: Readings
-    triads: tuple[correction_numba.Numbers, correction_numba.Numbers] | None
-    tool: tuple[tuple[list[int], list[float]], ...]
-    moved: set[str] = field(default_factory=set)
-
-    @classmethod
-    def of(
-        cls, calibration: Calibration, source: StreamedTable, first: Any, rules: Rules, many: bool
-    ) -> _Worker:
-        """What the first piece says about all."""
-        judged = [first] if rules.missing == "refuse" else source.pieces()
-        absent = wholly_blank(_loaded(source, piece).table for piece in judged)
-        kept = [g[0] for g in OPTIONAL if g[0] in source.names and g not in absent]
-        empty = np.empty((0, 3))
-        said = Readings(
-            accelerometer=empty,
-            magnetometer=empty if "mx" in kept else None,
-            temperature=empty[:, 0] if "temperature_c" in kept else None,
-            metadata=source.metadata,
-            source=source.name,
-        )
-        reference(calibration, said)  # refuses a calibration with temperature terms without any
-        triads = numbers(calibration) if many and correction_numba.available() else None
-        if triads and not correction_numba.kept_code_is_sound():
+    def __init__(
+        self, calibration: Calibration, source: StreamedTable, first: Any, outside: str,
+        missing: str, many: bool,
+    ) -> None:  # fmt: skip
+        """With the first piece that has rows, and whether there are `many` rows in all."""
+        self.calibration, self.source, self.first = calibration, source, first
+        self.outside, self.missing = outside, missing
+        self.moved: set[str] = set()
+        judged = [first] if missing == "refuse" else source.pieces()
+        self.absent = wholly_blank(_table(source, piece) for piece in judged)
+        table = _table(source, first)
+        no_rows = chosen(table, np.zeros(table.count, bool))
+        self.said = self._readings(self._channels(no_rows), slice(None))
+        correction.reference(calibration, self.said)  # refuses where temperatures are needed
+        compiled = many and correction_numba.available()
+        self.triads = correction.numbers(calibration) if compiled else None
+        if self.triads and not correction_numba.kept_code_is_sound():
             say("machine code kept from an earlier run was damaged: it is compiled again.")
-        tool = tuple(_tool(calibration, triad) for triad in TRIADS)
-        return cls(calibration, source, rules, first, absent, said, triads, tool)
+        self.limits = self._limits()
+
+    def _limits(self) -> correction_numba.RowLimits:
+        given = self.said.temperature is not None and self.calibration.temperature_c
+        low, high = given or (-np.inf, np.inf)
+        warmth = low - self.calibration.margin, high + self.calibration.margin
+        blank = self.outside == "blank"
+        return correction_numba.RowLimits(RAW_RANGE[:2], TEMPERATURE[:2], warmth, blank)
+
+    def findings(self, tally: RowCounts, outside: str) -> list[Finding]:
+        """What the reader should know of rows with these counts."""
+        heard = replace(self.said, metadata=runs.identified(self.source.metadata, tally.serials))
+        return correction.findings(self.calibration, heard, tally, outside)
 
     def sink(self, stream: IO[bytes], output: Path) -> Sink:
         """An empty table in the format of the output's name."""
         arrow, _ = parquet.modules(output.name)
         metadata = {**self.source.metadata, **described(self.calibration)}
         metadata.pop("findings", None)  # with those of the results, when these are known
-        suffix, outside = output.suffix.lower(), self.rules.outside
         kinds = {name: arrow.float64() for name in RESULTS} | {EXTRAPOLATED: arrow.bool_()}
-        results = arrow.schema([(name, kinds[name]) for name in result_names(outside)])
-        if suffix == ".parquet":
+        names = correction.result_names(self.outside)
+        results = arrow.schema([(name, kinds[name]) for name in names])
+        if output.suffix.lower() == ".parquet":
             return ParquetSink(stream, self.source.schema, results, metadata)
-        how = "extrapolate" if outside == "refuse" else outside
-        judged = JUDGED if self.calibration.free else ()
-        lacking = 0 if self.rules.missing == "refuse" else _MOST
-        said = self.heard(("\0" * LONGEST_SERIAL, "\1" * LONGEST_SERIAL, "…"))
-        worst = strengths.Strengths(_MOST, _MOST, _MOST, _MOST, -1.23e-100, -1.24e-100)
-        off = dict.fromkeys(strengths.JUDGED_STRENGTHS, worst)
-        tally = RowCounts(
-            _MOST, _MOST, judged, lacking, (), off, (TEMPERATURE.low, TEMPERATURE.high)
+        worst = WORST_ROWS._replace(
+            moved=JUDGED if self.calibration.free else (),
+            lacking=0 if self.missing == "refuse" else _MOST,
         )
-        most = findings(self.calibration, said, tally, how)
-        stated = carried.stated_findings(self.source.metadata)
-        longest = [*stated, *(finding.text for finding in most)]
-        delimiter = "," if suffix == ".csv" else "\t"
+        how = "extrapolate" if self.outside == "refuse" else self.outside
+        longest = stated(self.source.metadata, self.findings(worst, how))
+        delimiter = "," if output.suffix.lower() == ".csv" else "\t"
         return TextSink(stream, self.source.schema, results, metadata, longest, delimiter, RANGES)
 
-    def __call__(self, piece: Any, sink: Sink) -> CorrectedPart:
-        """A piece, corrected and rendered; text that seems wrong is looked at line by line."""
-        try:
-            return self._corrected(self.source.load(piece, False), sink)
-        except InputError:
-            return self._corrected(self.source.load(piece, True), sink)
-
-    def _corrected(self, part: Part, sink: Sink) -> CorrectedPart:
+    def corrected(self, sink: Sink, part: Part) -> tuple[Any, int, RowCounts]:
+        """A part, corrected and rendered, its size, and what was seen in it."""
         table, rows = part.table, part.table.count
         channels, corrected = self._compute(table)
         whole: Bools | None = None
-        if corrected.unsound and self.rules.missing == "blank":
+        if corrected.unsound and self.missing == "blank":
             whole = ~lacking(table, self.absent)
             table = chosen(table, whole)
             channels, corrected = self._compute(table)
@@ -316,22 +284,22 @@ class _Worker:
             self._refuse(table)
         known: Mapping[str, Array] = {}
         if any(name.startswith(("ref_", "sd_")) for name in table.columns):
-            kinds = [kind for kind in TRIADS if channels[kind] is not None]
+            kinds = [kind for kind in TRIADS if kind in channels]
             known = runs.check_references(table, self.calibration.profile, kinds)
-        moved = self._undetermined(channels, table.count)
         columns = dict(zip(RESULTS, corrected.columns, strict=True))
         results: list[AnyArray] = [*columns.values()]
-        if self.rules.outside == "extrapolate":
-            results.append(self._beyond(channels, table.count))
+        if self.outside == "extrapolate":
+            results.append(self.calibration.outside(self._readings(channels, slice(None))))
         if whole is not None:
             results = [spread(values, whole) for values in results]
         rendered = sink.render(part.carried, results, bool(corrected.empty) or whole is not None)
+        self._judge(channels, table.count)
         tally = RowCounts(
-            rows, corrected.beyond, moved, rows - table.count, self._serials(part.carried),
+            rows, corrected.beyond, (), rows - table.count, self._serials(part.carried),
             strengths.judged(self.calibration, columns, known),
-            warmth(channels["temperature"][0] if channels["temperature"] else None),
+            correction.warmth(*channels.get("temperature", [None])),
         )  # fmt: skip
-        return CorrectedPart(rendered, part.size, tally)
+        return rendered, part.size, tally
 
     def _serials(self, carried: Any) -> tuple[str, ...]:
         """The tools that a part names; names of others are cut, so that there is room for them."""
@@ -342,100 +310,73 @@ class _Worker:
         cells = [c.strip() for c in parquet.texts(carried.column("serial").unique(), arrow)]
         return tuple(runs.serials({}, [c if c == ours else c[:LONGEST_SERIAL] for c in cells]))
 
-    def heard(self, serials: Sequence[str]) -> Readings:
-        """What the findings need to know of the source, with the tools that its parts named."""
-        return replace(self.said, metadata=runs.identified(self.source.metadata, serials))
-
-    def _compute(
-        self, table: Table
-    ) -> tuple[dict[str, list[Array] | None], correction_numba.CorrectedRows]:
+    def _compute(self, table: Table) -> tuple[Channels, correction_numba.CorrectedRows]:
         """The channels of a table, and their results."""
         channels = self._channels(table)
-        compute = self._compiled if self.triads else self._plain
+        compute = self._plain if self.triads is None else self._compiled
         return channels, compute(channels, table.count)
 
-    def _beyond(self, channels: Mapping[str, list[Array] | None], count: int) -> Bools:
-        """Rows (n,) outside the calibrated temperatures."""
-        low, high = self._limits().calibrated
-        warmth = channels["temperature"]
-        return (warmth[0] < low) | (warmth[0] > high) if warmth else np.zeros(count, bool)
-
-    def _channels(self, table: Table) -> dict[str, list[Array] | None]:
-        """Columns of each triad, and of the temperature; None where there are none."""
-        groups = {**CHANNELS, "temperature": ("temperature_c",)}
-        channels: dict[str, list[Array] | None] = {}
-        for kind, names in groups.items():
-            lacking = names in self.absent or names[0] not in table.columns
-            channels[kind] = None if lacking else [_column(table, name) for name in names]
-            if names in self.absent and not all(_is_blank(table, name) for name in names):
+    def _channels(self, table: Table) -> Channels:
+        channels = {}
+        for kind, names in {**CHANNELS, "temperature": ("temperature_c",)}.items():
+            if names not in self.absent:
+                if names[0] in table.columns:
+                    channels[kind] = [_column(table, name) for name in names]
+            elif not all(_is_blank(table, name) for name in names):
                 raise _blank(self.source.load(self.first, True).table, names)
         return channels
 
-    def _limits(self) -> correction_numba.RowLimits:
-        low, high = self.calibration.temperature_c or (-np.inf, np.inf)
-        if self.said.temperature is None:
-            low, high = -np.inf, np.inf
-        accepted = (RAW_RANGE.low, RAW_RANGE.high), (TEMPERATURE.low, TEMPERATURE.high)
-        warmth = low - self.calibration.margin, high + self.calibration.margin
-        return correction_numba.RowLimits(*accepted, warmth, self.rules.outside == "blank")
-
-    def _compiled(
-        self, channels: Mapping[str, list[Array] | None], count: int
-    ) -> correction_numba.CorrectedRows:
+    def _compiled(self, channels: Channels, count: int) -> correction_numba.CorrectedRows:
         assert self.triads is not None
-        columns, units, blank = [], [], 0
-        for kind, (order, unit) in zip(TRIADS, self.tool, strict=True):
-            three = channels[kind] or [np.full(count, np.nan)] * 3
-            blank += 0 if channels[kind] else 3
-            columns += [three[i] for i in order]
-            units += unit
+        blank = [np.full(count, np.nan)] * 3
+        columns: list[Array] = []
+        units: list[float] = []
+        for kind in TRIADS:
+            triad = getattr(self.calibration.profile, kind)
+            order = np.abs(triad.permutation).argmax(axis=1)
+            sign = triad.permutation[np.arange(3), order]
+            columns += [channels.get(kind, blank)[i] for i in order]
+            units += (sign * (triad.scale or 1.0)).tolist()
         zero = self.calibration.reference_temperature
-        columns += channels["temperature"] or [np.full(count, zero)]
-        corrected = correction_numba.run(
-            columns, self.triads, zero, units, self._limits(), workers=1
-        )
-        return corrected._replace(unsound=corrected.unsound - blank * count)
+        columns += channels.get("temperature", [np.full(count, zero)])
+        corrected = correction_numba.run(columns, self.triads, zero, units, self.limits, workers=1)
+        absent = 0 if "magnetometer" in channels else 3 * count
+        return corrected._replace(unsound=corrected.unsound - absent)
 
-    def _plain(
-        self, channels: Mapping[str, list[Array] | None], count: int
-    ) -> correction_numba.CorrectedRows:
+    def _plain(self, channels: Channels, count: int) -> correction_numba.CorrectedRows:
         """The same by plain NumPy, a block at a time."""
-        limits, out = self._limits(), np.empty((len(RESULTS), count))
+        limits, out = self.limits, np.empty((len(RESULTS), count))
         beyond = unsound = 0
         for kind, columns in channels.items():
             low, high = limits.temperature if kind == "temperature" else limits.raw
-            unsound += sum(int((~((c >= low) & (c <= high))).sum()) for c in columns or [])
+            unsound += sum(int((~((c >= low) & (c <= high))).sum()) for c in columns)
         for start in range(0, 0 if unsound else count, BLOCK):
             rows = slice(start, start + BLOCK)
             readings = self._readings(channels, rows)
-            out[:, rows] = [*reference(self.calibration, readings).values()]
+            out[:, rows] = [*correction.reference(self.calibration, readings).values()]
             hot = self.calibration.outside(readings)
             beyond += int(hot.sum())
             if limits.blank:
                 out[:, rows][:, hot] = np.nan
         return correction_numba.CorrectedRows(out, unsound, beyond, int(np.isnan(out).sum()))
 
-    def _readings(self, channels: Mapping[str, list[Array] | None], rows: slice) -> Readings:
+    def _readings(self, channels: Channels, rows: slice) -> Readings:
         """Some rows as `Readings`, without labels and references."""
-        profile, magnetic = self.calibration.profile, channels["magnetometer"]
-        warmth = channels["temperature"]
-        return replace(
-            self.said,
-            accelerometer=_nominal(channels["accelerometer"] or [], rows, profile.accelerometer),
-            magnetometer=_nominal(magnetic, rows, profile.magnetometer) if magnetic else None,
-            temperature=warmth[0][rows] if warmth else None,
-        )
+        some = {kind: [column[rows] for column in columns] for kind, columns in channels.items()}
+        read: dict[str, Any] = {
+            kind: runs.to_nominal(np.stack(some[kind], -1), getattr(self.calibration.profile, kind))
+            for kind in TRIADS
+            if kind in some
+        }
+        warmth = some.get("temperature", [None])[0]
+        return Readings(**read, temperature=warmth, source=self.source.name)
 
-    def _undetermined(
-        self, channels: Mapping[str, list[Array] | None], count: int
-    ) -> tuple[str, ...]:
-        if not self.calibration.free or not count:
-            return ()
-        readings = self._readings(channels, slice(0, count, max(1, count // SAMPLE)))
-        names = [name for name in JUDGED if name not in self.moved]
-        moved = undetermined(self.calibration, readings, names)
-        self.moved.update(moved)
-        return moved
+    def _judge(self, channels: Channels, count: int) -> None:
+        """Which outputs rest on what the calibration leaves undetermined."""
+        if self.calibration.free and count:
+            readings = self._readings(channels, slice(0, count, max(1, count // SAMPLE)))
+            names = [name for name in JUDGED if name not in self.moved]
+            self.moved.update(correction.undetermined(self.calibration, readings, names))
 
     def _refuse(self, table: Table) -> None:
         """Say what is wrong with a part, in the words of a run file."""
@@ -454,6 +395,11 @@ def described(calibration: Calibration) -> dict[str, object]:
         "azimuth_out": "magnetic",
         "field_unit": calibration.field_unit,
     }
+
+
+def stated(metadata: Mapping[str, object], remarks: Iterable[Finding]) -> list[str]:
+    """The findings that a table's metadata state already, and others."""
+    return [*carried.stated_findings(metadata), *(finding.text for finding in remarks)]
 
 
 def wholly_blank(tables: Iterable[Table]) -> tuple[tuple[str, ...], ...]:
@@ -501,20 +447,8 @@ def _column(table: Table, name: str) -> Array:
     return as_numbers(table, name) if isinstance(column, list) else column
 
 
-def _nominal(channels: Sequence[Array], rows: slice, triad: TriadProfile) -> Array:
-    return runs.to_nominal(np.stack([channel[rows] for channel in channels], -1), triad)
-
-
 def _is_blank(table: Table, name: str) -> bool:
     column = table.columns[name]
     if isinstance(column, list):
         return not any(cell.strip() for cell in column)
     return bool(np.isnan(column).all())
-
-
-def _tool(calibration: Calibration, kind: str) -> tuple[list[int], list[float]]:
-    """Which channel each tool axis is, and raw units, with sign, per nominal one."""
-    triad = getattr(calibration.profile, kind)
-    channel = np.abs(triad.permutation).argmax(axis=1)
-    sign = triad.permutation[np.arange(3), channel]
-    return channel.tolist(), (sign * (triad.scale or 1.0)).tolist()

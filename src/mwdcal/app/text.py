@@ -10,11 +10,7 @@ import sys
 
 WIDE = 300
 """Width of a table whose last column holds remarks, which are never cut."""
-_SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
-_POWERS = {
-    ord(raised): plain for plain, raised in zip("-+0123456789T", "⁻⁺⁰¹²³⁴⁵⁶⁷⁸⁹ᵀ", strict=True)
-}
-_RAISED = f"[{''.join(map(chr, _POWERS))}]+"
+_PLAIN, _RAISED = "-+0123456789T", "⁻⁺⁰¹²³⁴⁵⁶⁷⁸⁹ᵀ"
 _HANDLER = "mwdcal.twins"
 TWINS = {chr(0xA0): " ", chr(0x2009): " ", chr(0x202F): " ", "‰": "per mille"} | dict(
     re.findall(
@@ -74,13 +70,10 @@ def _twins(error: UnicodeError) -> tuple[str, int]:
     if not isinstance(error, UnicodeEncodeError):
         raise error
     lacking = error.object[error.start : error.end]
-    plain = re.sub(_RAISED, lambda run: "^" + run[0].translate(_POWERS), lacking)
-    return "".join(map(_twin, plain)), error.end
-
-
-def _twin(character: str) -> str:
-    twin = TWINS.get(character, character)
-    return one_line(twin).encode("ascii", "backslashreplace").decode()
+    level = str.maketrans(_RAISED, _PLAIN)
+    plain = re.sub(f"[{_RAISED}]+", lambda run: "^" + run[0].translate(level), lacking)
+    twins = "".join(TWINS.get(character, character) for character in plain)
+    return one_line(twins).encode("ascii", "backslashreplace").decode(), error.end
 
 
 codecs.register_error(_HANDLER, _twins)
@@ -139,7 +132,7 @@ def table(rows: list[list[str]], header: list[str], width: int = 160) -> str:
 
 def superscript(power: int) -> str:
     """An exponent, raised."""
-    return str(power).translate(_SUPERSCRIPT)
+    return str(power).translate(str.maketrans(_PLAIN, _RAISED))
 
 
 def raised(symbol: str, power: int) -> str:

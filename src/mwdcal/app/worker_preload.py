@@ -43,5 +43,3 @@ def warm() -> None:
 without_pandas()
 warm()
 gc.freeze()  # copies then share this memory: collecting garbage would write to all of it
-
-__all__ = ["solve", "warm"]

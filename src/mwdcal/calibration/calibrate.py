@@ -12,8 +12,7 @@ from mwdcal.calibration import results
 from mwdcal.calibration.automatic.auto import Choice, choose
 from mwdcal.calibration.diagnosis.findings import described, findings
 from mwdcal.calibration.diagnosis.flags import FittedRuns
-from mwdcal.calibration.diagnosis.noise_refusals import UNSOUND_ADVICE
-from mwdcal.calibration.diagnosis.refusals import check, fit_refusals
+from mwdcal.calibration.diagnosis.refusals import UNSOUND_ADVICE, check, fit_refusals
 from mwdcal.calibration.diagnosis.soundness import inconsistency
 from mwdcal.calibration.estimate import Fit, fit
 from mwdcal.calibration.options import Options
@@ -66,13 +65,12 @@ def recorded(choice: Choice, result: Fit) -> Calibration:
     Raises `FitError` where the fit is not to be trusted.
     """
     readings, profile = choice.readings, choice.profile
-    fitted = FittedRuns.of(
+    fitted = FittedRuns(
         batch_of_one(readings), profile, choice.options, result, lambda _: (readings, profile)
     )
     check(fit_refusals(fitted))
     calibration = sealed(rounded(_record(choice, fitted)))
-    problem = inconsistency(calibration)
-    if problem:
+    if problem := inconsistency(calibration):
         raise FitError(f"the fit gives no usable calibration: {problem}. {UNSOUND_ADVICE}")
     return calibration
 
@@ -83,7 +81,7 @@ def _record(choice: Choice, fitted: FittedRuns) -> Calibration:
     reference, prior = choice.profile.reference_temperature_c, options.knowledge
     to_file = results.to_file(result, reference)[0]
     low, high = results.temperature_range(result, prior)
-    triads = [_triad(fitted, i, fitted.covariance.total) for i in range(len(result.problem.triads))]
+    triads = [_triad(fitted, index) for index in range(len(result.problem.triads))]
     return Calibration(
         tool={k: str(v) for k, v in readings.metadata.items() if k in IDENTITY},
         profile=choice.profile,
@@ -113,7 +111,7 @@ def _record(choice: Choice, fitted: FittedRuns) -> Calibration:
         constants=_constants(result),
         stand=StandErrors(**_first(results.stand_errors(result))),
         earth=_first(results.earth(result)),
-        budget=_budget(fitted, fitted.covariance.by_source()),
+        budget=_budget(fitted),
         assumed_exact=results.assumed_exact(result, readings.relative),
         errors=error_rows(fitted.residuals(0)),
         measures=measure_rows(fitted.residuals(0)),
@@ -124,17 +122,12 @@ def _record(choice: Choice, fitted: FittedRuns) -> Calibration:
     )
 
 
-def _budget(fitted: FittedRuns, covariances: dict[str, Array]) -> list[BudgetRow]:
-    """What each source of error adds to the accuracy to expect; tilt is one source."""
-    shares: dict[str, Array] = {}
-    for name, share in covariances.items():
-        source = results.common_source(name)
-        shares[source] = shares.get(source, 0.0) + share
+def _budget(fitted: FittedRuns) -> list[BudgetRow]:
+    """What each source of error adds to the accuracy to expect."""
     reference, prior = fitted.profile.reference_temperature_c, fitted.options.knowledge
-    sd = accuracy(
-        results.calibrated_tools(fitted.result, fitted.free, reference, prior),
-        np.stack([*shares.values()]),
-    )
+    tools = results.calibrated_tools(fitted.result, fitted.free, reference, prior)
+    shares = fitted.covariance.by_source()
+    sd = accuracy(tools, np.stack([*shares.values()]))
     degrees = {f"{angle}_deg": np.degrees(values[:, 0]) for angle, values in sd.items()}
     return [
         BudgetRow(source=source, **{name: stated(sd[place]) for name, sd in degrees.items()})
@@ -146,9 +139,8 @@ def _constants(result: Fit) -> list[Constant]:
     """Estimated constants of the run with their uncertainty."""
     constants, problem = [], result.problem
     sd = np.sqrt(np.diag(results.constants_covariance(result)[0]))
-    for value, uncertainty, constant in zip(
-        result.state.constants[0], sd, problem.evidence.constants, strict=True
-    ):
+    triples = zip(result.state.constants[0], sd, problem.evidence.constants, strict=True)
+    for value, uncertainty, constant in triples:
         lone = constant.name == "dip" and len(problem.triads) == 1
         if lone or (constant.unknown and constant.name in STAND_ERRORS):  # those are in `stand`
             continue
@@ -165,9 +157,10 @@ def _constants(result: Fit) -> list[Constant]:
     return constants
 
 
-def _triad(fitted: FittedRuns, index: int, covariance: Array) -> TriadCalibration:
+def _triad(fitted: FittedRuns, index: int) -> TriadCalibration:
     """The record of one triad."""
     name, reference = TRIADS[index], fitted.profile.reference_temperature_c
+    covariance = fitted.covariance.total
     triad = results.triad_results(fitted.result, index, covariance, fitted.free, reference)
     model = triad.model
     powers = model if isinstance(model, Polynomial) else Polynomial(model.basis)

@@ -29,6 +29,7 @@ from mwdcal.estimation.uncertainty import (
     scatter_ratios,
     settle_gauge,
     station_misfit,
+    triad_sums,
     with_scatter,
 )
 from mwdcal.geometry.vectors import Array, Bools, Ints
@@ -102,8 +103,8 @@ def temperature_ranges(temperature: Array) -> Array:
 
 def _problem(
     readings: Readings, evidence: Evidence, lead: tuple[int, ...], options: Options
-) -> tuple[Problem, list[bool], Bools]:
-    """The problem, for each triad whether its noise is declared, and which members (B,) are finite.
+) -> tuple[Problem, Bools]:
+    """The problem, and which members (B,) are finite.
 
     Estimation of noise begins at a thousandth of the readings' size. Members with readings that are
     not finite get stand-ins, so that the batch goes on.
@@ -111,20 +112,20 @@ def _problem(
     cold = np.zeros(readings.count)
     temperature = flat(cold if readings.temperature is None else readings.temperature, lead)
     curved = options.curved
-    names = [name for name in TRIADS if getattr(readings, name) is not None]
+    names = readings.triads
     raws = [flat(getattr(readings, name), lead, 3) for name in names]
     finite = np.all([np.isfinite(raw).all((-1, -2)) for raw in raws], axis=0)
     triads: list[Triad] = []
     for name, raw, order in zip(names, raws, options.orders, strict=False):
         kind, sound = options.kind(order), raw if finite.all() else _sound(raw, finite)
         whole = model_of(kind, order, sound, temperature, evidence.include, name in curved)
-        first = 1e-3 * _size(raw) + 0 * raw
-        sd = flat(readings.sd[name], lead, 3) if name in readings.sd else first
-        triads.append(Triad(restricted(whole, options.parameters), sound, sd))
+        declared = name in readings.sd
+        sd = flat(readings.sd[name], lead, 3) if declared else 1e-3 * _size(raw) + 0 * raw
+        triads.append(Triad(restricted(whole, options.parameters), sound, sd, declared))
     prior = prior_of(options.knowledge, [t.model for t in triads], len(evidence.include))
     problem = Problem(tuple(triads), temperature, evidence, prior)
     _bound_curves(problem, curved)
-    return problem, [name in readings.sd for name in names], finite
+    return problem, finite
 
 
 def _sound(raw: Array, finite: Bools) -> Array:
@@ -159,14 +160,14 @@ def fit(readings: Readings, options: Options | None = None, include: Array | Non
     include = np.ones(readings.count) if include is None else np.asarray(include, float)
     evidence = _evidence(readings, include, options)
     lead = np.broadcast_shapes(readings.accelerometer.shape[:-1], include.shape)
-    problem, declared, finite = _problem(readings, evidence, lead, options)
-    closed, alone = _closed(problem, declared, options, finite)
-    if closed is None:
-        return _general(problem, declared, options, finite)
-    if alone.all():
+    problem, finite = _problem(readings, evidence, lead, options)
+    closed, good = _closed(problem, finite) if _comes_apart(problem, options) else (None, finite)
+    if closed is None or not good.any():
+        return _general(problem, options, finite)
+    if good.all():
         return closed
-    rest = np.flatnonzero(~alone)
-    return put(closed, rest, _general(take(problem, rest), declared, options, finite[rest]))
+    rest = np.flatnonzero(~good)
+    return put(closed, rest, _general(take(problem, rest), options, finite[rest]))
 
 
 def scatters(readings: Readings, options: Options) -> bool:
@@ -190,16 +191,15 @@ def _evidence(readings: Readings, include: Array, options: Options) -> Evidence:
     return evidence
 
 
-def _general(problem: Problem, declared: list[bool], options: Options, finite: Bools) -> Fit:
+def _general(problem: Problem, options: Options, finite: Bools) -> Fit:
     """The fit by the method's minimiser, with estimated noise and station weights in turn."""
     solved = solve(problem, start(problem), options)
-    iterations = solved.iterations
-    none = np.zeros_like(solved.iterations)
-    stage = _Stage(problem, solved, np.ones(problem.evidence.include.shape), none)
-    if not all(declared):
-        stage = _estimate_noise(stage, declared, options)
+    iterations, trust = solved.iterations, np.ones(problem.evidence.include.shape)
+    stage = _Stage(problem, solved, trust, np.zeros_like(iterations))
+    if not _all_declared(problem):
+        stage = _estimate_noise(stage, options)
     if options.robust:
-        stage = _downweigh(stage, declared, options)
+        stage = _downweigh(stage, options)
     problem, solved, trust = stage.problem, stage.solved, stage.trust
     trusted, state = _trusting(problem, trust), solved.state
     determined = _determined(trusted, state, solved)
@@ -214,43 +214,38 @@ def _general(problem: Problem, declared: list[bool], options: Options, finite: B
     trusted.memo.clear()
     finite = finite & analysis.finite
     status = np.where(finite, solved.status, int(Status.NOT_FINITE))
-    return Fit(trusted, state, status, iterations, _noise(problem, declared), trust, analysis)
+    return Fit(trusted, state, status, iterations, _noise(problem), trust, analysis)
 
 
-def _closed(
-    problem: Problem, declared: list[bool], options: Options, finite: Bools
-) -> tuple[Fit | None, Bools]:
-    """The fit in closed form, and for which members (B,) it holds: all directions are determined.
+def _comes_apart(problem: Problem, options: Options) -> bool:
+    """Whether the fit has a closed form: not where references are not exact, for example."""
+    general = options.robust or options.separate_solver or problem.evidence.scatter
+    return not general and closed_form.applies(problem)
 
-    None where it holds for no member, as with references that are not exact.
-    """
-    none = np.zeros(len(finite), bool)
-    apart = options.robust or options.separate_solver or problem.evidence.scatter
-    if apart or not closed_form.applies(problem):
-        return None, none
+
+def _closed(problem: Problem, finite: Bools) -> tuple[Fit, Bools]:
+    """The fit in closed form, and for which members (B,) it holds: all directions are determined."""
     at = closed_form.start(problem)
-    triads = closed_form.minima(problem, at)
-    state, analysis = closed_form.solution(problem, at, triads)
-    good = closed_form.settled(triads) & analysis.determined.keep.all(-1)
-    if not good.any():
-        return None, none
-    if not all(declared):
-        problem = _rescaled(problem, np.sqrt(analysis.variance_factor), declared)
-        triads = closed_form.minima(problem, at)
-        state, analysis = closed_form.solution(problem, at, triads)
-        good &= closed_form.settled(triads)
+    state, analysis, good = closed_form.solution(problem, at)
+    good = good & analysis.determined.keep.all(-1)
+    if good.any() and not _all_declared(problem):
+        problem = _rescaled(problem, np.sqrt(analysis.variance_factor))
+        state, analysis, settled = closed_form.solution(problem, at)
+        good &= settled
     sound = finite & np.isfinite(state.params).all(-1)
     status = np.where(sound, int(Status.OK), int(Status.NOT_FINITE))
     trust = np.ones(problem.evidence.include.shape)
     once = np.ones(len(status), int)
-    noise = _noise(problem, declared)
-    return Fit(problem, state, status, once, noise, trust, analysis), good
+    return Fit(problem, state, status, once, _noise(problem), trust, analysis), good
 
 
-def _noise(problem: Problem, declared: list[bool]) -> Array:
+def _all_declared(problem: Problem) -> bool:
+    return all(triad.declared for triad in problem.triads)
+
+
+def _noise(problem: Problem) -> Array:
     """Estimated noise (B, triads) of one reading, NaN where it was declared."""
-    noise = np.stack([triad.sd[:, 0, 0] for triad in problem.triads], -1)
-    return np.where(declared, np.nan, noise)
+    return np.stack([np.where(t.declared, np.nan, t.sd[:, 0, 0]) for t in problem.triads], -1)
 
 
 def _determined(problem: Problem, state: State, solved: Solved) -> Determined:
@@ -278,9 +273,7 @@ def _robustly(
 
 def _bounded_factor(analysis: Analysis, trust: Array, loss: str, freedom: Array) -> Array:
     """s² (B, t) of a fit with station weights `trust`, from the pulls w d that they bound."""
-    pulled = analysis.residual**2 * trust[..., None]
-    shape = (*pulled.shape[:-1], pulled.shape[-1] // 3, 3)
-    squares = np.sum(pulled.reshape(shape), (1, 3))
+    squares = triad_sums(analysis.residual**2 * trust[..., None])
     share = np.array([consistency(loss, k) for k in freedom])[:, None]
     return np.asarray(squares / np.where(analysis.freedom > 1e-9, analysis.freedom, np.nan) / share)
 
@@ -312,22 +305,23 @@ def _in_turn(stage: _Stage, rounds: int, turn: Callable[[_Stage], tuple[_Stage, 
     return stage if len(active) == len(whole.trust) else put(whole, active, stage)
 
 
-def _estimate_noise(stage: _Stage, declared: list[bool], options: Options) -> _Stage:
+def _estimate_noise(stage: _Stage, options: Options) -> _Stage:
     """Variance per triad by restricted maximum likelihood, fit and estimate in turn.
 
     A triad without redundancy keeps its start: its residuals are rounding, and say nothing.
     """
-    free = [i for i, known in enumerate(declared) if not known]
+    free = [i for i, triad in enumerate(stage.problem.triads) if not triad.declared]
+    scatter = stage.problem.evidence.scatter
+    rounds, least = (SCATTER_ROUNDS, SCATTER_SETTLED) if scatter else (NOISE_ROUNDS, SETTLED)
 
     def turn(now: _Stage) -> tuple[_Stage, Bools]:
         analysis = analyse(now.problem, now.solved.state)
         scale = np.sqrt(np.where(analysis.freedom >= 1, analysis.variance_factor, np.nan))
-        problem, solved = _rescaled(now.problem, scale, declared), now.solved
-        settled = ~np.any(np.abs(scale[:, free] - 1) >= SETTLED, -1)
-        if problem.evidence.scatter:
+        problem, solved = _rescaled(now.problem, scale), now.solved
+        settled = ~np.any(np.abs(scale[:, free] - 1) >= least, -1)
+        if scatter:
             ratios = scatter_ratios(now.problem, solved.state, analysis)
             problem = with_scatter(problem, solved.state, ratios)
-            settled = ~np.any(np.abs(scale[:, free] - 1) >= SCATTER_SETTLED, -1)
             settled &= _steady(now.problem, problem)
         steps = now.steps
         if options.method != "swarm":
@@ -336,7 +330,6 @@ def _estimate_noise(stage: _Stage, declared: list[bool], options: Options) -> _S
             settled |= steps > MOST_STEPS_IN_TURN
         return replace(now, problem=problem, solved=solved, steps=steps), settled
 
-    rounds = SCATTER_ROUNDS if stage.problem.evidence.scatter else NOISE_ROUNDS
     return _in_turn(stage, rounds, turn)
 
 
@@ -351,9 +344,9 @@ def _steady(old: Problem, new: Problem) -> Bools:
     return np.asarray(np.all(each, 0))
 
 
-def _downweigh(stage: _Stage, declared: list[bool], options: Options) -> _Stage:
+def _downweigh(stage: _Stage, options: Options) -> _Stage:
     """Weigh the stations by their misfit and fit in turn."""
-    loss = options.robust or LOSSES[0]
+    loss, declared = options.robust or LOSSES[0], _all_declared(stage.problem)
 
     def turn(now: _Stage) -> tuple[_Stage, Bools]:
         problem, solved = now.problem, now.solved
@@ -362,11 +355,11 @@ def _downweigh(stage: _Stage, declared: list[bool], options: Options) -> _Stage:
         square, freedom = station_misfit(analysis)
         square = square / now.trust
         excess = _typical(square, freedom)
-        excess = np.maximum(excess, 1.0) if all(declared) else excess
+        excess = np.maximum(excess, 1.0) if declared else excess
         trust = weight(loss, square / excess[:, None], freedom)
-        if not all(declared):
+        if not declared:
             factor = _bounded_factor(analysis, now.trust, loss, _tested(freedom))
-            problem = _rescaled(problem, np.sqrt(factor), declared)
+            problem = _rescaled(problem, np.sqrt(factor))
             if problem.evidence.scatter:
                 share = np.array([weighted(loss, k) for k in _tested(freedom)])
                 ratios = scatter_ratios(weighed, solved.state, analysis)
@@ -412,11 +405,11 @@ def _louder(problem: Problem, factor: Array) -> Problem:
     return replace(problem, triads=triads, evidence=replace(evidence, sd=sd, scatter=scatter))
 
 
-def _rescaled(problem: Problem, scale: Array, declared: list[bool]) -> Problem:
+def _rescaled(problem: Problem, scale: Array) -> Problem:
     """The problem with the noise of triads that declare none times `scale` (B, triads)."""
     factors = np.moveaxis(np.where(np.isfinite(scale), scale, 1.0), -1, 0)[..., None, None]
     triads = tuple(
-        t if known else replace(t, sd=np.maximum(t.sd * factor, LEAST_NOISE * _size(t.raw)))
-        for t, factor, known in zip(problem.triads, factors, declared, strict=True)
+        t if t.declared else replace(t, sd=np.maximum(t.sd * factor, LEAST_NOISE * _size(t.raw)))
+        for t, factor in zip(problem.triads, factors, strict=True)
     )
     return replace(problem, triads=triads)

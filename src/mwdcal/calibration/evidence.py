@@ -18,10 +18,8 @@ STAND_TURNS = {"tilt": ("stand-north", "stand-east")}
 
 def flat(value: AnyArray, lead: tuple[int, ...], *tail: int) -> AnyArray:
     """A value with one batch axis: (B, n, *tail)."""
-    whole, shape = np.asarray(value), (*lead, *tail)
-    if whole.shape != shape:
-        whole = np.broadcast_to(whole, shape)
-    return np.asarray(whole.reshape(math.prod(lead[:-1]), lead[-1], *tail))
+    whole = np.broadcast_to(value, (*lead, *tail))
+    return whole.reshape(math.prod(lead[:-1]), lead[-1], *tail)
 
 
 def evidence_of(readings: Readings, include: Array) -> Evidence:

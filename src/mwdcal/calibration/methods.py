@@ -18,7 +18,7 @@ from mwdcal.errors import FitError, InputError
 from mwdcal.estimation.evidence import ANGLES, UNKNOWN, Evidence, SharedConstant
 from mwdcal.estimation.minimisers.newton import newton, propagated
 from mwdcal.estimation.minimisers.swarm import swarm_forward
-from mwdcal.estimation.minimisers.unweighted import STRENGTH, Params, Sums
+from mwdcal.estimation.minimisers.unweighted import STRENGTH, Sums
 from mwdcal.estimation.problem import Prior, Problem, State
 from mwdcal.estimation.solvers import Status, gauss_newton
 from mwdcal.estimation.uncertainty import readjusted, unweighted_pulls
@@ -54,10 +54,17 @@ def check_stand_errors(names: Sequence[str], method: str) -> None:
         raise InputError(f"`estimate` needs `method` joint; got {method!r}.")
 
 
+def without_groups(evidence: Evidence, *blank: str) -> Evidence:
+    """The evidence of every station by itself, without some references."""
+    nothing = {name: np.full_like(evidence.known[name], np.nan) for name in blank}
+    alone = np.full_like(evidence.group, -1)
+    return replace(evidence, known=evidence.known | nothing, group=alone)
+
+
 def whole_vectors(evidence: Evidence) -> Evidence:
     """Reference vectors only, taken as exact: least squares as in the six-state test."""
     exact = {name: np.zeros_like(sd) for name, sd in evidence.sd.items()}
-    return replace(evidence, sd=exact, group=np.full_like(evidence.group, -1))
+    return replace(without_groups(evidence), sd=exact)
 
 
 def angles_alone(evidence: Evidence) -> Evidence:
@@ -67,16 +74,12 @@ def angles_alone(evidence: Evidence) -> Evidence:
 
 def strengths_alone(evidence: Evidence) -> Evidence:
     """|g| and |b| at every station, and nothing else: the scalar (total field) method."""
-    blank = {name: np.full_like(evidence.known[name], np.nan) for name in (*ANGLES, "dip")}
-    alone = np.full_like(evidence.group, -1)
-    return without(replace(evidence, known=evidence.known | blank, group=alone), "dip")
+    return without(without_groups(evidence, *ANGLES, "dip"), "dip")
 
 
 def inclination_and_strength(evidence: Evidence) -> Evidence:
     """|g| and inclination of the accelerometer (Moosavi); azimuth, |b| and dip of the magnetometer."""
-    known = {**evidence.known, "toolface": np.full_like(evidence.known["toolface"], np.nan)}
-    alone = np.full_like(evidence.group, -1)
-    return without(replace(evidence, known=known, group=alone))
+    return without(without_groups(evidence, "toolface"))
 
 
 def without(evidence: Evidence, *names: str) -> Evidence:
@@ -132,10 +135,15 @@ class Solved:
             return unweighted_pulls(problem, _alike(problem), state)
         triples = zip(problem.triads, problem.slices(), problem.targets(state), strict=False)
         return {
-            index: replace(self.sums[index], triad=triad).pulls(state.params[:, where], target)
+            index: replace(self.sums[index], triad=triad).pulls(_alone(state, where), target)
             for index, (triad, where, target) in enumerate(triples)
             if index in self.sums
         }
+
+
+def _alone(state: State, where: slice) -> State:
+    """The state with the parameters of one triad."""
+    return replace(state, params=state.params[:, where])
 
 
 def solve(problem: Problem, state: State, options: Options) -> Solved:
@@ -153,11 +161,9 @@ def solve(problem: Problem, state: State, options: Options) -> Solved:
 
 def _alike(problem: Problem) -> Problem:
     """The problem with one noise for all readings of a triad, as an unweighted sum has it."""
-    triads = [
-        replace(t, sd=np.sqrt(np.mean(t.sd**2, (1, 2), keepdims=True)) + 0 * t.sd)
-        for t in problem.triads
-    ]
-    return replace(problem, triads=tuple(triads))
+    means = (np.sqrt(np.mean(t.sd**2, (1, 2), keepdims=True)) for t in problem.triads)
+    pairs = zip(problem.triads, means, strict=True)
+    return replace(problem, triads=tuple(replace(t, sd=mean + 0 * t.sd) for t, mean in pairs))
 
 
 def _swarmed(problem: Problem, state: State, seed: int) -> Solved:
@@ -217,8 +223,7 @@ def _by_sums(problem: Problem, state: State, method: str) -> Solved:
             include * (PAPER_WEIGHT / strength**4 if scalar else PAPER_WEIGHT) * np.ones(len(names))
         )
         sums[index] = _sums(problem, state, index, names, weights)
-        where = problem.slices()[index]
-        minima.append(gauss_newton(sums[index], Params(state.params[:, where])))
+        minima.append(gauss_newton(sums[index], _alone(state, problem.slices()[index])))
     params = np.concatenate([each[0].params for each in minima], -1)
     status = np.max([each[1] for each in minima], 0)
     iterations = np.max([each[2] for each in minima], 0)
@@ -227,7 +232,7 @@ def _by_sums(problem: Problem, state: State, method: str) -> Solved:
     else:
         after = _magnetometer(problem, state, params)
     pairs = zip(sums.items(), minima, strict=True)
-    known = {index: one.information(each[0].params) for (index, one), each in pairs}
+    known = {index: one.information(each[0]) for (index, one), each in pairs}
     return Solved(after.state, np.maximum(status, after.status), iterations, sums, known)
 
 

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 from mwdcal.calibration.prior import DATASHEET, Knowledge
-from mwdcal.calibration.readings import TRIADS
+from mwdcal.calibration.readings import HIGHEST, TRIADS
 from mwdcal.calibration.record import Calibration
-from mwdcal.calibration.soaks import HIGHEST
 from mwdcal.errors import InputError
 
 MODELS = ("polynomial", "factors")

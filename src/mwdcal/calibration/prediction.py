@@ -58,7 +58,9 @@ def readings_at(
     at = middle_temperature(calibration) if temperature is None else temperature
     warmth = np.full(vectors[0].shape[:-1], at)
     raw = [
-        _reading(t.functions(calibration.reference_temperature), np.array(t.parameters), v, warmth)
+        raw_reading(
+            t.functions(calibration.reference_temperature), np.array(t.parameters), v, warmth
+        )
         for t, v in zip(calibration.triads, vectors, strict=False)
     ]
     return Readings(raw[0], raw[1] if len(raw) > 1 else None, temperature=warmth)
@@ -70,7 +72,7 @@ def _earth(calibration: Calibration) -> tuple[float, float, float]:
     return earth["gravity_g"], earth.get("field", 1.0), np.radians(earth.get("dip_deg", 0.0))
 
 
-def _reading(
+def raw_reading(
     model: Model, params: Array, field: Array, temperature: Array, steps: int = _STEPS
 ) -> Array:
     """Readings (…, n, 3) that a triad's model turns into `field` (…, n, 3).
@@ -111,7 +113,7 @@ class CalibratedTools:
         result = np.zeros((len(self.earth), len(self.models), *fields[0].shape[1:], size))
         for triad, (model, params) in enumerate(zip(self.models, self.parameters, strict=True)):
             warmth = np.broadcast_to(self.temperature[:, None], fields[triad].shape[:-1])
-            raw = _reading(model, params, fields[triad], warmth, _STEPS if model.curved else 1)
+            raw = raw_reading(model, params, fields[triad], warmth, _STEPS if model.curved else 1)
             change, end = result[:, triad], ends[triad]
             change[..., end - params.shape[-1] : end] = model.jacobian(params, raw, warmth)
             if noise:

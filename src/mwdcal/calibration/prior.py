@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 from msgspec.structs import replace as replace_struct
 
-from mwdcal.calibration.readings import TRIADS, Readings
+from mwdcal.calibration.readings import HIGHEST, TRIADS, Readings
 from mwdcal.calibration.record import Calibration
 from mwdcal.errors import FitError, InputError
 from mwdcal.estimation.problem import Prior
@@ -92,7 +92,7 @@ def from_datasheet(profile: Profile, relative: bool = False) -> Knowledge:
         sheet = getattr(profile, triad).datasheet
         unknown = relative and triad == "magnetometer"
         for name, value, sd in _tolerances(sheet) if sheet else []:
-            if sd is not None and (not unknown or name.startswith("misalignment")):
+            if not np.isnan(sd) and (not unknown or name.startswith("misalignment")):
                 rows.append((f"{triad} {name}", value, sd))
     return Knowledge(
         "datasheet",
@@ -139,8 +139,7 @@ def _check_datasheet(profile: Profile) -> None:
             f"`prior` datasheet: the tool profile '{profile.name}' has none. Add a section "
             "[accelerometer.datasheet] with scale, bias and misalignment_deg (1 sigma)."
         )
-    bare = [t for t in sheets if getattr(profile, t).scale is None]
-    if bare:
+    if bare := [t for t in sheets if getattr(profile, t).scale is None]:
         raise InputError(
             f"`prior` datasheet: the tool profile '{profile.name}' has no 'scale' in [{bare[0]}], "
             "which the tolerances are a share of. Add it."
@@ -154,8 +153,7 @@ def for_run(previous: Calibration, readings: Readings) -> Knowledge:
     Raises `InputError` for a run of another tool, or of stations that the calibration has used.
     """
     where = f"`prior`: the calibration of {previous.run_name}"
-    other = previous.other_tool(readings)
-    if other:
+    if other := previous.other_tool(readings):
         raise InputError(
             f"{where} is of tool {other[0]}, the run is of {other[1]}. Give the previous calibration "
             "of the same tool."
@@ -227,15 +225,16 @@ def _precision(covariance: Array, free: Array) -> Array:
     return np.asarray(inner / np.outer(scale, scale))
 
 
-def _tolerances(sheet: Datasheet) -> list[tuple[str, float, float | None]]:
-    """Name, expected value and standard deviation of every parameter, for both models."""
-    turn = None if sheet.misalignment_deg is None else float(np.radians(sheet.misalignment_deg))
-    tolerances: list[tuple[str, float, float | None]] = []
-    for power in range(4):
-        scale = _at(power, sheet.scale, sheet.scale_per_c)
-        bias = _at(power, sheet.bias, sheet.bias_per_c)
+def _tolerances(sheet: Datasheet) -> list[tuple[str, float, float]]:
+    """Name, expected value and standard deviation of every parameter, for both models; NaN: not stated."""
+    steady = np.array([sheet.scale, sheet.bias], float)
+    drift = np.array([sheet.scale_per_c, sheet.bias_per_c], float)
+    turn = np.radians(np.array(sheet.misalignment_deg, float))
+    tolerances = []
+    for power in range(HIGHEST + 1):
+        scale, bias = drift / DRIFT_REACH ** (power - 1) if power else steady
         suffix = f"·{power}" if power else ""
-        across = turn if power == 0 else (turn * scale if turn and scale else None)
+        across = turn * scale if power else turn
         for i in "xyz":
             tolerances += [(f"scale-{i}{suffix}", float(power == 0), scale)]
             tolerances += [(f"gain-{i}{i}{suffix}", float(power == 0), scale)]
@@ -244,10 +243,3 @@ def _tolerances(sheet: Datasheet) -> list[tuple[str, float, float | None]]:
     return tolerances + [
         (f"misalignment-{i}{j}", 0.0, turn) for i in "xyz" for j in "xyz" if j != i
     ]
-
-
-def _at(power: int, steady: float | None, drift: float | None) -> float | None:
-    """Standard deviation of the coefficient of a power of temperature; None: not stated."""
-    if power == 0:
-        return steady
-    return None if drift is None else drift / DRIFT_REACH ** (power - 1)

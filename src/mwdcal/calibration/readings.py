@@ -27,6 +27,12 @@ DIGEST_LENGTH = 16
 NANOTESLA = "nT"
 RELATIVE = "relative (field = 1)"
 """Unit of the calibrated field where its strength is known at no station."""
+SOAK_GAP = 5.0
+"""Temperatures closer than this belong to one soak, °C."""
+LEAST_TEMPERATURE_SPAN = 10.0
+"""A run that spans less has no temperature terms, °C. An order needs as much for each power."""
+HIGHEST = 3
+"""The highest temperature order of a model."""
 
 
 def is_simulated(metadata: Mapping[str, object]) -> bool:
@@ -113,13 +119,18 @@ class Readings:
 
     def __repr__(self) -> str:
         known = ", ".join(self.known) or "none"
-        triads = " and ".join(TRIADS[: 1 if self.magnetometer is None else 2])
+        triads = " and ".join(self.triads)
         return f"<Readings: {self.count} stations; {triads}; references: {known}>"
 
     @property
     def name(self) -> str:
         """What messages call the readings: the name of the file, if there is one."""
         return self.source or "the readings"
+
+    @property
+    def triads(self) -> tuple[str, ...]:
+        """The triads that were read, of `TRIADS`."""
+        return TRIADS[: 1 if self.magnetometer is None else 2]
 
     @property
     def count(self) -> int:
@@ -211,3 +222,27 @@ class Readings:
             station=tuple(self.station[i] for i in chosen) if self.station else (),
             digest=tuple(self.digest[i] for i in chosen) if self.digest else (),
         )
+
+
+def soaks(temperature: Array) -> Ints:
+    """Number (..., n) of the soak that each station belongs to, coldest first."""
+    order = np.argsort(temperature, -1, kind="stable")
+    ascending = np.take_along_axis(temperature, order, -1)
+    steps = np.cumsum(np.diff(ascending, prepend=ascending[..., :1], axis=-1) > SOAK_GAP, -1)
+    numbers = np.empty(order.shape, int)
+    np.put_along_axis(numbers, order, steps, -1)
+    return numbers
+
+
+def usable_soaks(temperature: Array) -> Ints:
+    """Number (..., n) of each station's soak: all 0 where temperatures span less than `LEAST_TEMPERATURE_SPAN`."""
+    wide = np.ptp(temperature, axis=-1, keepdims=True) >= LEAST_TEMPERATURE_SPAN
+    return np.where(wide, soaks(temperature), 0)
+
+
+def highest_order(temperature: Array) -> Ints:
+    """The highest order (...,) that soaks (..., n) can carry: one less than they are, 10 °C for each."""
+    levels = usable_soaks(temperature).max(-1) + 1
+    return np.asarray(
+        np.minimum(levels - 1, np.ptp(temperature, axis=-1) // LEAST_TEMPERATURE_SPAN), int
+    )

@@ -16,8 +16,7 @@ from typing import Any, ClassVar
 import msgspec
 import numpy as np
 
-from mwdcal.calibration.readings import NANOTESLA, Readings, simulated
-from mwdcal.calibration.soaks import SOAK_GAP
+from mwdcal.calibration.readings import NANOTESLA, SOAK_GAP, Readings, simulated
 from mwdcal.errors import InputError
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array, Bools, diagonal
@@ -380,7 +379,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
                 at = np.array(triad.parameters), raw, temperature
                 yield triad, model, at, slice(3 * index, 3 * index + 3)
 
-    def _places(self) -> dict[str, slice]:
+    def places(self) -> dict[str, slice]:
         """Where the parameters of each triad lie."""
         ends = np.cumsum([0, *(len(triad.parameters) for triad in self.triads)]).tolist()
         return {t.name: slice(*pair) for t, pair in zip(self.triads, pairwise(ends), strict=True)}
@@ -392,7 +391,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
 
     def jacobian(self, readings: Readings) -> Array:
         """Derivative (…, n, 6, p) of both vectors with respect to the parameters of all triads."""
-        places = self._places()
+        places = self.places()
         result = np.zeros((*readings.accelerometer.shape[:-1], 6, len(self.parameters)))
         for triad, model, at, vector in self._measured(readings):
             result[..., vector, places[triad.name]] = model.jacobian(*at)
@@ -472,7 +471,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
 
         rows, covariance = self.sensitivity(name, readings), self.parameter_covariance
         spread = np.zeros(rows.shape[:-1])
-        for triad, where in zip(self.triads, self._places().values(), strict=True):
+        for triad, where in zip(self.triads, self.places().values(), strict=True):
             part = rows[..., where]
             variance = np.einsum("...i,ij,...j->...", part, covariance[where, where], part)
             spread = spread + variance**2 / max(triad.degrees_of_freedom, 1.0)
@@ -530,7 +529,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
     def margin(self) -> float:
         """Degrees Celsius by which a reading may lie outside the calibrated range.
 
-        A calibration without temperature terms holds for the soak it was made in: `soaks.SOAK_GAP`.
+        A calibration without temperature terms holds for the soak it was made in: `SOAK_GAP`.
         """
         return MARGIN if any(t.order for t in self.triads) else SOAK_GAP
 

@@ -222,6 +222,7 @@ class Residuals:
         from scipy.special import ndtri
 
         readings, after = self.readings, self.errors(self.after)
+        warmth = readings.temperature
         chance = chances(self.fit)[0]
         again, deviation = to_reshoot(chance), -ndtri(np.maximum(chance, 1e-300) / 2)
         ratio = {
@@ -234,16 +235,13 @@ class Residuals:
         rows = []
         for i in range(readings.count):
             errors, before, left_out, influence = (_scaled(each, factors, i) for each in shown)
+            worst = max(errors, key=lambda name: ratio[name][i], default=None) if again[i] else None
             rows.append(
                 StationRow(
                     station=readings.labels[i],
                     digest=readings.digest[i] if readings.digest else "",
-                    temperature_c=None
-                    if readings.temperature is None
-                    else float(readings.temperature[i]),
-                    inclination_deg=stated(angles["inclination"][i]),
-                    toolface_deg=stated(angles["toolface"][i]),
-                    azimuth_deg=stated(angles["azimuth"][i]),
+                    temperature_c=None if warmth is None else float(warmth[i]),
+                    **{f"{name}_deg": stated(angle[i]) for name, angle in angles.items()},
                     errors=errors,
                     errors_before=before,
                     errors_left_out=left_out,
@@ -251,9 +249,7 @@ class Residuals:
                     weight=float(self.fit.trust[0, i]),
                     deviation=float(deviation[i]),
                     reshoot=bool(again[i]),
-                    worst=max(errors, key=lambda name: ratio[name][i], default=None)
-                    if again[i]
-                    else None,
+                    worst=worst,
                 )
             )
         return rows

@@ -79,14 +79,14 @@ class StatedCovariance:
     def by_source(self) -> dict[str, Array]:
         """Covariance (B, p, p) by source; all together they are `total`.
 
-        A common error comes under the name of its constant of the run.
+        A common error comes under its `common_source`.
         """
         result, (independent, _, prior, order) = self.result, self._parts
         settings = _scaled(result, _of_settings(result))
         shares = {NOISE: independent - settings, SETTINGS: settings}
         for index, constant in enumerate(result.problem.evidence.constants):
-            effect = result.analysis.effects[..., index]
-            shares[constant.name] = shares.get(constant.name, 0.0) + outer(effect)
+            name, effect = common_source(constant.name), result.analysis.effects[..., index]
+            shares[name] = shares.get(name, 0.0) + outer(effect)
         shares |= {ORDER: order, PRIOR: prior}
         return {name: share for name, share in shares.items() if name == NOISE or share.any()}
 
@@ -239,11 +239,10 @@ def _effect(model: Whole, params: Array, raw: Array, temperature: Array) -> Arra
 
 def free_rows(free: Sequence[list[Free]], size: int) -> Array:
     """Free directions (B, k, p) of every tool, rows of zeros where there are fewer than k."""
-    rows = np.zeros((len(free), max((len(each) for each in free), default=0), size))
-    for index, each in enumerate(free):
-        for place, entry in enumerate(each):
-            rows[index, place] = entry.direction
-    return rows
+    count = max(map(len, free), default=0)
+    nothing = [np.zeros(size)] * count
+    rows = [([entry.direction for entry in each] + nothing)[:count] for each in free]
+    return np.reshape(rows, (len(free), count, size))
 
 
 def to_file(result: Fit, reference: float) -> Array:

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from itertools import pairwise
 
 import msgspec
 import numpy as np
@@ -21,7 +20,7 @@ from mwdcal.calibration.record import FREE_SHARE, Calibration, TriadCalibration
 from mwdcal.estimation.rank import Free
 from mwdcal.estimation.uncertainty import ROTATIONS, unrotating
 from mwdcal.geometry.vectors import Array
-from mwdcal.sensor.models import Basis, Model, Polynomial
+from mwdcal.sensor.models import Model
 from mwdcal.use.notation import Notation, convert
 
 SCALE = "scale"
@@ -44,10 +43,6 @@ class Gauge:
         """The directions that are put by convention for one triad, in their usual order."""
         free = {name for name, triads in self.free if triad in triads}
         return [name for name in (*ROTATIONS, SCALE) if name in free]
-
-    def turns(self, triads: tuple[int, ...]) -> list[str]:
-        """Axes about which these triads turn together."""
-        return [name for name in ROTATIONS if (name, triads) in self.free]
 
 
 def in_gauge(
@@ -86,16 +81,12 @@ def _taken_out(
     unit = np.array([*np.full(3, np.degrees(1)), 1.0])
     moved = np.abs(free).max(0, initial=0.0)
     sd = np.where(moved > FREE_SHARE, np.nan, np.sqrt(np.maximum(np.diag(covariance), 0)))
-    parts = {"rotation_deg": slice(0, 3), "scale": slice(3, 4)}
+    each = np.stack([taken, sd]).reshape(2, len(triads), 4) * unit
     notations = {}
     for index, name in enumerate(triads):
         block = slice(4 * index, 4 * index + 4)
-        value, spread = taken[block] * unit, sd[block] * unit
-        notations[name] = Notation(
-            {part: value[where] for part, where in parts.items()},
-            {part: spread[where] for part, where in parts.items()},
-            covariance[block, block] * np.outer(unit, unit),
-        )
+        value, spread = ({"rotation_deg": v[:3], "scale": v[3:]} for v in each[:, index])
+        notations[name] = Notation(value, spread, covariance[block, block] * np.outer(unit, unit))
     return notations
 
 
@@ -113,7 +104,6 @@ class _Settle:
     @classmethod
     def of(cls, calibration: Calibration, readings: Readings, gauge: Gauge) -> _Settle:
         reference, triads = calibration.reference_temperature, calibration.triads
-        ends = np.cumsum([0, *(len(t.parameters) for t in triads)])
         temperature = readings.temperature
         if temperature is None:
             temperature = np.full(readings.count, reference)
@@ -121,7 +111,7 @@ class _Settle:
         return cls(
             gauge,
             [t.functions(reference) for t in triads],
-            [slice(int(a), int(b)) for a, b in pairwise(ends)],
+            [*calibration.places().values()],
             [getattr(readings, t.name) for t in triads],
             temperature,
             [1.0 if np.isnan(s).all() else float(np.nanmean(s)) for s in strengths],
@@ -147,23 +137,21 @@ class _Settle:
     def slope(self, calibration: Calibration, readings: Readings, params: Array) -> Array:
         """Derivative (p + 4 t, p) of the map, by central differences."""
         effect, fields = calibration.jacobian(readings), calibration.fields(readings)
-        columns = []
+        steps: list[float] = []
         for t, where in enumerate(self.slices):
             strength = np.linalg.norm(fields[t], axis=-1).mean()
             rows = effect[:, 3 * t : 3 * t + 3, where]
             sizes = np.sqrt(np.mean(np.sum(rows**2, 1), 0)) / strength
-            for index, size in zip(range(where.start, where.stop), sizes, strict=True):
-                step = np.zeros(len(params))
-                step[index] = DERIVATIVE_STEP / size
-                change = self(params + step) - self(params - step)
-                columns.append(change / (2 * step[index]))
-        return np.stack(columns, -1)
+            steps += (DERIVATIVE_STEP / sizes).tolist()
+        moves = np.diag(steps)
+        changes = [self(params + move) - self(params - move) for move in moves]
+        return np.asarray(np.stack(changes, -1) / (2 * np.array(steps)))
 
     def _turn(self, params: Array, triads: tuple[int, ...]) -> Array:
         """The turn that leaves the first triad's gain without rotation about the free axes."""
-        axes, first = self.gauge.turns(triads), triads[0]
+        first, free = triads[0], [(axis, triads) in self.gauge.free for axis in ROTATIONS]
         gain = self.models[first].slope(params, self.raw[first], self.temperature).mean(0)
-        return unrotating(gain, np.array([axis in axes for axis in ROTATIONS]))
+        return unrotating(gain, np.array(free))
 
     def _factor(self, params: Array, triad: int) -> float:
         """What brings the triad's mean strength to that of the references, if its scale is free."""
@@ -217,6 +205,5 @@ def _tangent(triad: TriadCalibration, reference: float) -> Array:
     """Linear map from a triad's parameters to those of its tangent on plain readings."""
     if not triad.curved:
         return np.eye(len(triad.parameters))
-    centre, radius = np.array([triad.centre]), np.full((1, 3), triad.radius)
-    plain = Polynomial(Basis(triad.order, reference), centre, radius).finished(reference)[1]
+    _, plain = msgspec.structs.replace(triad, curved=False).functions(reference).finished(reference)
     return np.concatenate([plain, np.zeros((len(plain), 6))], -1)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from mwdcal.calibration.automatic.auto import Choice, resolved, without
+from mwdcal.calibration.automatic.order_selection import Progress
 from mwdcal.calibration.calibrate import recorded
 from mwdcal.calibration.diagnosis.refusals import check_readings
 from mwdcal.calibration.estimate import Fit, fit
@@ -24,7 +25,7 @@ from mwdcal.estimation.evidence import ANGLES
 from mwdcal.estimation.minimisers.swarm import least_squares_forward, swarm_forward, vector_cost
 from mwdcal.estimation.rank import Free, free_directions
 from mwdcal.estimation.solvers import Status
-from mwdcal.geometry.vectors import Array, Ints, reference_vectors
+from mwdcal.geometry.vectors import Array, reference_vectors
 from mwdcal.sensor.profile import Profile
 from mwdcal.use.notation import Notation
 from mwdcal.use.roll_sets import directions, group_scatter
@@ -36,8 +37,6 @@ SINGLY = 24
 """Runs of no more stations have each left out by itself."""
 NEAR_BEST = 1.02
 """A simpler preference stands if its held-out error is within this ratio of the best."""
-
-Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -129,7 +128,7 @@ def compare(
         results.append(_calibrated(readings, profile, replace(options, method=method)))
     usable = [one for one in results if isinstance(one, _Calibrated)]
     gauge = Gauge.of(entry for one in usable for entry in one.free)
-    judge = _Judge.of(readings, usable[0].record.earth if usable else {})
+    judge = _Judge(readings, usable[0].record.earth if usable else {})
     rows = [one if isinstance(one, Row) else _row(one, judge, gauge, progress) for one in results]
     return _compared(judge, options, gauge, tuple(rows))
 
@@ -214,12 +213,10 @@ def _rests(name: str, record: Calibration, readings: Readings) -> bool:
 
 def _course(calibrated: _Calibrated) -> dict[str, Array]:
     """Excess of the swarm's best cost over the least one, as a share of it, by triad."""
-    problem, state = calibrated.fit.problem, calibrated.fit.state
-    courses = {}
-    for name, triad, target in zip(TRIADS, problem.triads, problem.targets(state), strict=False):
-        swarm = swarm_forward(
-            triad.raw, target, iterations=SWARM_ITERATIONS, seed=calibrated.options.seed
-        )
+    problem, seed = calibrated.fit.problem, calibrated.options.seed
+    targets, courses = problem.targets(calibrated.fit.state), {}
+    for name, triad, target in zip(TRIADS, problem.triads, targets, strict=False):
+        swarm = swarm_forward(triad.raw, target, iterations=SWARM_ITERATIONS, seed=seed)
         least = least_squares_forward(triad.raw, target)[:, None]
         cost = vector_cost(triad.raw, target)(least)[0, 0]
         courses[name] = swarm.history[0] / cost - 1
@@ -228,8 +225,7 @@ def _course(calibrated: _Calibrated) -> dict[str, Array]:
 
 def _referenced(readings: Readings) -> list[str]:
     """Observables that have a reference somewhere in the run."""
-    magnetic = ("azimuth", "field", "dip")
-    usable = [n for n in SHOWN if readings.magnetometer is not None or n not in magnetic]
+    usable = SHOWN if readings.magnetometer is not None else SHOWN[:3]
     return [n for n in usable if not np.isnan(readings.reference(n)).all()]
 
 
@@ -239,10 +235,7 @@ def errors(readings: Readings, g: Array, b: Array) -> dict[str, Array]:
     Of angles that is the group's where a station of a group has none of its own.
     """
     shared = evidence_of(readings, np.ones(readings.count)).known
-    known = {
-        name: shared[name][0] if name in ANGLES else readings.reference(name)
-        for name in dict.fromkeys((*_referenced(readings), "inclination"))
-    }
+    known = {n: shared[n][0] if n in ANGLES else readings.reference(n) for n in SHOWN}
     return {name: departure(name, g, b, known) for name in _referenced(readings)}
 
 
@@ -250,23 +243,16 @@ def errors(readings: Readings, g: Array, b: Array) -> dict[str, Array]:
 class _Judge:
     """How well vectors agree with a run's references, the same for every method.
 
-    `earth` stands in where field and dip have no reference; `part` (n,) numbers the part that
-    each station is left out with.
+    `earth` stands in where field and dip have no reference.
     """
 
     readings: Readings
     earth: Mapping[str, float]
-    part: Ints
-
-    @classmethod
-    def of(cls, readings: Readings, earth: Mapping[str, float]) -> _Judge:
-        count = readings.count
-        return cls(readings, earth, np.arange(count) % (count if count <= SINGLY else FOLDS))
 
     @property
     def parts(self) -> int:
-        """Number of parts."""
-        return int(self.part.max()) + 1
+        """Number of parts into which the stations are dealt."""
+        return self.readings.count if self.readings.count <= SINGLY else FOLDS
 
     @property
     def grouped(self) -> bool:
@@ -288,14 +274,13 @@ class _Judge:
 
     def left_out(self, options: Options) -> tuple[Array, Array]:
         """Vectors (n, 3) of each station from the fit that left its part out; NaN if that failed."""
-        include = (np.arange(self.parts)[:, None] != self.part).astype(float)
+        part = np.arange(self.readings.count) % self.parts
+        include = (np.arange(self.parts)[:, None] != part).astype(float)
         result = fit(self.readings, options, include)
-        failed = result.status != Status.OK
-        g, b = (
-            v[self.part, range(self.readings.count)] for v in result.problem.fields(result.state)
-        )
-        lost = failed[self.part][:, None]
-        return np.where(lost, np.nan, g), np.where(lost, np.nan, b)
+        lost = (result.status != Status.OK)[part][:, None]
+        vectors = result.problem.fields(result.state)
+        g, b = (np.where(lost, np.nan, v[part, range(len(part))]) for v in vectors)
+        return g, b
 
     def summary(self, g: Array, b: Array) -> dict[str, float]:
         """Root mean square errors by observable, and the scatter within groups, in shown units."""
@@ -308,11 +293,8 @@ class _Judge:
     def measures(self, when: str, *fields: Array) -> tuple[Measures, ...]:
         """Moradi's measures of the vector error, as a share of the reference vector."""
         known = {name: self.readings.reference(name) for name in (*ANGLES, *CONSTANTS)}
-        stand_in = {
-            "field": self.earth.get("field", np.nan),
-            "dip": np.radians(self.earth.get("dip_deg", np.nan)),
-        }
-        for name, value in stand_in.items():
+        dip = np.radians(self.earth.get("dip_deg", np.nan))
+        for name, value in (("field", self.earth.get("field", np.nan)), ("dip", dip)):
             known[name] = np.where(np.isnan(known[name]), value, known[name])
         blind = {**known, "azimuth": np.zeros(self.readings.count)}
         ideal = reference_vectors(**blind)[0], reference_vectors(**known)[1]

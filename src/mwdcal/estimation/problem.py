@@ -50,11 +50,12 @@ GEOMETRIC_NOISE = 1e-4
 
 @dataclass(frozen=True)
 class Triad:
-    """One sensor triad: model, readings (B, n, 3), their noise (B, n, 3)."""
+    """One sensor triad: model, readings (B, n, 3), their noise (B, n, 3), and whether that is declared."""
 
     model: Model
     raw: Array
     sd: Array
+    declared: bool = True
 
 
 @dataclass(frozen=True)
@@ -198,9 +199,7 @@ class Problem:
         return self.once(f"linear {geometry}", state, partial(self._linear, geometry))
 
     def _linear(self, geometry: bool, state: State) -> Linear:
-        whitened = self._whitened(state, geometry)
-        blocks = [p.by_params for p in whitened]
-        turns, by_earth = _station_columns(whitened)
+        residual, blocks, turns, by_earth = self._whitened(state, geometry)
         constants = self._constant_columns(state, by_earth, turns, geometry)
         shared = np.concatenate([constants, *self._group_turns(state, turns)], -1)
         departures = by_earth[..., [EARTH.index(name) for name in self.evidence.absent]]
@@ -212,23 +211,28 @@ class Problem:
             columns, scatter = self.scatter_columns(state), self.evidence.scatter
             private += [c * scatter[name][..., None, None] for name, c in columns.items()]
         prior, pull = self._prior(state, blocks, shared.shape[-1], geometry)
-        residual = np.concatenate([p.misfit for p in whitened], -1)
-        return Linear(residual, tuple(blocks), shared, np.concatenate(private, -1), prior, pull)
+        return Linear(residual, blocks, shared, np.concatenate(private, -1), prior, pull)
 
-    def _whitened(self, state: State, geometry: bool) -> list[Prediction]:
-        """Predictions over the noise, or over a uniform one; zero for stations left out."""
+    def _whitened(
+        self, state: State, geometry: bool
+    ) -> tuple[Array, tuple[Array, ...], Array, Array]:
+        """Predictions over the noise, or over a uniform one; zero for stations left out.
+
+        Misfit (B, n, m), rows by the parameters of each triad, and the two of `station_columns`.
+        """
         result = []
         for triad, p in zip(self.triads, self.predictions(state), strict=True):
             noise = GEOMETRIC_NOISE * p.strength[..., None] + np.zeros(3) if geometry else triad.sd
             w = self.evidence.include[..., None] / noise
             row = w[..., None]
-            whitened = (p.misfit * w, p.by_params * row, p.by_turn * row, p.by_earth * row)
-            result.append(Prediction(*whitened, p.strength))
-        return result
+            result.append((p.misfit * w, p.by_params * row, p.by_turn * row, p.by_earth * row))
+        misfits, blocks, turns, by_earth = zip(*result, strict=True)
+        stacked = np.concatenate(turns, -2), np.concatenate(by_earth, -2)
+        return np.concatenate(misfits, -1), blocks, *stacked
 
     def station_columns(self, state: State) -> tuple[Array, Array]:
         """Whitened rows (B, n, m, 3) by a turn of the station, and by its gravity, field and dip."""
-        return _station_columns(self._whitened(state, geometry=False))
+        return self._whitened(state, geometry=False)[2:]
 
     def scatter_columns(self, state: State) -> dict[str, Array]:
         """Whitened rows (B, n, m, k) by a departure of one in each of the evidence's `scatter`.
@@ -281,7 +285,7 @@ class Problem:
         return scales
 
     def _prior(
-        self, state: State, blocks: list[Array], shared: int, geometry: bool
+        self, state: State, blocks: tuple[Array, ...], shared: int, geometry: bool
     ) -> tuple[Array, Array]:
         """Precision (B, u, u) and pull (B, u) of the parameters and the shared unknowns.
 
@@ -337,8 +341,8 @@ class Problem:
         turned = np.einsum("bnij,bni->bnj", state.attitude, fixed)
         return np.where(by_toolface[..., None], turned, across)
 
-    def _group_axes(self, state: State) -> tuple[Array, Array]:
-        """Two earth axes (B, k, 3) of each group's shared turns: inclining, and across or about down."""
+    def _group_axes(self, state: State) -> dict[str, Array]:
+        """Earth axes (B, k, 3) of each group's shared turns: inclining, and across or about down."""
         members = self.evidence.members
         tied = self.evidence.is_known("toolface") | self.evidence.is_known("azimuth")
         axis = self._mean_of(members, state.attitude[..., 2, :])
@@ -351,7 +355,7 @@ class Problem:
             first = np.where(upright[..., None], along / size, first)
         upright |= np.einsum("bnk,bn->bk", members, self.evidence.is_known("inclination")) > 0
         second = np.where(upright[..., None], np.array([0.0, 0.0, 1.0]), np.cross(axis, first))
-        return first, second
+        return {"inclination": first, "azimuth": second}
 
     @staticmethod
     def _mean_of(members: Array, vectors: Array) -> Array:
@@ -362,7 +366,7 @@ class Problem:
     def _group_turns(self, state: State, turns: Array) -> list[Array]:
         """Columns (B, n, m, k) of both shared turns of each group."""
         columns = []
-        for name, axis in zip(("inclination", "azimuth"), self._group_axes(state), strict=True):
+        for name, axis in self._group_axes(state).items():
             tool = np.einsum("bnij,bkj->bnik", state.attitude, axis)
             columns.append(turns @ tool * self.evidence.shared(name)[..., None, :])
         return columns
@@ -389,12 +393,11 @@ class Problem:
         return attitude
 
     def _turn_groups(self, state: State, turns: Array) -> Array:
-        half = turns.shape[-1] // 2
-        if not half:
-            return state.attitude
-        attitude, parts = state.attitude, (turns[:, :half], turns[:, half:])
-        names = ("inclination", "azimuth")
-        for axis, name, turn in zip(self._group_axes(state), names, parts, strict=True):
+        attitude = state.attitude
+        if not turns.size:
+            return attitude
+        axes, parts = self._group_axes(state).items(), np.split(turns, 2, -1)
+        for (name, axis), turn in zip(axes, parts, strict=True):
             vector = np.einsum("bnk,bk,bki->bni", self.evidence.shared(name), turn, axis)
             attitude = attitude @ rotation(vector)
         return attitude
@@ -409,14 +412,3 @@ class Problem:
         about_down[..., 2] = np.einsum("bni,bni->bn", turn[..., 1], state.attitude[..., :, 2])
         natural = rotation(turn[..., 2]) @ rotation(turn[..., 0]) @ attitude @ rotation(about_down)
         return np.where(self._free()[..., None, None], free, natural)
-
-    def size_of(self, state: State) -> Array:
-        """Largest parameter of each triad (B, p): steps far below it are rounding."""
-        parts = [state.params[:, where] for where in self.slices()]
-        return np.concatenate([0 * p + np.abs(p).max(-1, keepdims=True) for p in parts], -1)
-
-
-def _station_columns(whitened: list[Prediction]) -> tuple[Array, Array]:
-    """Rows (B, n, m, 3) of all triads by a turn of the station, and by its gravity, field and dip."""
-    turns, by_earth = [p.by_turn for p in whitened], [p.by_earth for p in whitened]
-    return np.concatenate(turns, -2), np.concatenate(by_earth, -2)

@@ -28,7 +28,8 @@ class Free:
     direction: Array
 
 
-@np.errstate(all="ignore")  # numbers that overflow belong to fits that are refused
+# What overflows belongs to a fit that is refused.
+@np.errstate(over="ignore", invalid="ignore")
 def free_directions(problem: Problem, state: State, determined: Determined) -> list[list[Free]]:
     """Name the free directions of every member of a batch.
 

@@ -76,7 +76,7 @@ class Linear:
         """Number p of model parameters, at the head of X."""
         return sum(block.shape[-1] for block in self.blocks)
 
-    def _placed(self) -> Iterator[tuple[Array, slice, slice]]:
+    def placed(self) -> Iterator[tuple[Array, slice, slice]]:
         """Each triad's block of X, with the rows and columns where it lies."""
         row = column = 0
         for block in self.blocks:
@@ -88,7 +88,7 @@ class Linear:
     def design(self) -> Array:
         """X (B, n, m, u) as one array."""
         whole = np.zeros((*self.residual.shape, self.size + self.shared.shape[-1]))
-        for block, rows, columns in self._placed():
+        for block, rows, columns in self.placed():
             whole[..., rows, columns] = block
         whole[..., self.size :] = self.shared
         return whole
@@ -102,13 +102,19 @@ class Linear:
 
     @cached_property
     def normal(self) -> Normal:
-        """Its normal equations."""
-        return Normal.of(self)
+        """Its normal equations: the sum over stations, priors included."""
+        columns = np.concatenate([self.design, self.residual[..., None]], -1)
+        weighed = self.weigh(columns)
+        whole = np.einsum("...nmi,...nmj->...ij", columns, weighed, optimize=True)
+        pulled = (self.prior @ self.pull[..., None])[..., 0]
+        information = whole[..., :-1, :-1] + self.prior
+        cost = whole[..., -1, -1] + np.sum(self.pull * pulled, -1)
+        return Normal(information, whole[..., :-1, -1] + pulled, cost, self.size)
 
     @cached_property
     def determined(self) -> Determined:
         """Which directions it determines, if it is of the geometry."""
-        return Determined.by(self.normal, self.norms)
+        return Determined.by(self.normal.reduced()[0], self.norms)
 
     def cost(self, at: Linear) -> Array:
         """ρᵀC⁻¹ρ over all stations, and the prior's part (B,), of residuals `at` a state; C is ours."""
@@ -135,7 +141,7 @@ class Linear:
     def private_step(self, step: Array) -> Array:
         """Private unknowns (B, n, a), in their prior's units, after a step of X's unknowns."""
         moved = self.residual + np.einsum("bnms,bs->bnm", self.shared, step[:, self.size :])
-        for block, rows, columns in self._placed():
+        for block, rows, columns in self.placed():
             moved[..., rows] += np.einsum("bnmp,bp->bnm", block, step[:, columns])
         pulled = self.private.mT @ moved[..., None]
         return np.asarray(-(self.core @ pulled)[..., 0])
@@ -149,19 +155,6 @@ class Normal:
     gradient: Array
     cost: Array
     size: int
-
-    @classmethod
-    def of(cls, linear: Linear) -> Normal:
-        """Sum over stations, priors included."""
-        columns = np.concatenate([linear.design, linear.residual[..., None]], -1)
-        weighed = linear.weigh(columns)
-        whole = np.einsum("...nmi,...nmj->...ij", columns, weighed, optimize=True)
-        information, gradient = whole[..., :-1, :-1].copy(), whole[..., :-1, -1].copy()
-        pulled = (linear.prior @ linear.pull[..., None])[..., 0]
-        information += linear.prior
-        gradient += pulled
-        cost = whole[..., -1, -1] + np.sum(linear.pull * pulled, -1)
-        return cls(information, gradient, cost, linear.size)
 
     def reduced(self) -> tuple[Array, Array, Array]:
         """Information (B, p, p) and gradient (B, p) of the parameters, and the elimination.
@@ -193,19 +186,17 @@ class Determined:
     keep: Bools
 
     @classmethod
-    def by(cls, geometry: Normal, norms: Array, tolerance: float = RANK_TOLERANCE) -> Determined:
-        """From the evidence's geometry: what is known, not how precisely.
+    def by(cls, information: Array, norms: Array) -> Determined:
+        """From the information (B, p, p) of the evidence's geometry: what is known, not how precisely.
 
         `norms` (B, p) are those of the whole columns. What is left of a column when private
         unknowns are taken out may be noise alone: its own norm would make much of that.
         """
         norms = np.where(norms > 0, norms, 1.0)
-        reduced, _, _ = geometry.reduced()
-        scaled = np.nan_to_num(reduced / outer(norms))
-        values, basis = eigen(scaled)
+        values, basis = eigen(np.nan_to_num(information / outer(norms)))
         values = np.sqrt(np.clip(values[..., ::-1], 0, None))
         values = values / np.maximum(values[..., :1], 1e-300)
-        return cls(basis[..., ::-1], values, norms, values > tolerance)
+        return cls(basis[..., ::-1], values, norms, values > RANK_TOLERANCE)
 
     @classmethod
     def of(cls, problem: Linearisable, state: Any) -> Determined:
@@ -232,16 +223,13 @@ class Determined:
 
 
 class Linearisable(Protocol):
-    """What the solver asks of a problem; states are opaque to it."""
+    """What the solver asks of a problem; of states it asks the parameters."""
 
     def linear(self, state: Any, geometry: bool = False) -> Linear:
         """Linearise; `geometry` asks for what is known, leaving out how precisely."""
 
     def move(self, state: Any, linear: Linear, step: Array) -> Any:
         """The state after a step of X's unknowns, private unknowns re-adjusted."""
-
-    def size_of(self, state: Any) -> Array:
-        """Magnitude (B, p) below 1e-12 of which a parameter step is rounding."""
 
 
 @dataclass
@@ -270,7 +258,7 @@ class _Descent:
         after = problem.linear(trial)
         # the gradient holds the weights fixed, and so must the cost that judges the step
         cost = linear.cost(after)
-        small = _small(normal, step, problem.size_of(self.state))
+        small = _small(linear, step, self.state.params)
         with np.errstate(invalid="ignore"):
             better = (cost <= normal.cost * (1 + 1e-9) + 1e-9) | small
         self._accept(trial, after, better)
@@ -285,7 +273,7 @@ class _Descent:
         slowly: both are at their minimum for all purposes.
         """
         normal = self.linear.normal
-        step = _step(normal, self.determined, np.zeros(len(self.damping)))
+        step = _step(normal, self.determined)
         return self.settled(np.asarray(_length(normal, step) < NEGLIGIBLE**2))
 
     def _accept(self, trial: Any, after: Linear, better: Bools) -> None:
@@ -313,17 +301,8 @@ class _Descent:
         settled[which] = same
         return settled
 
-    def drop(self, stopped: Bools) -> None:
-        """Go on without some members."""
-        if not stopped.any():
-            return
-        rest = np.flatnonzero(~stopped)
-        self.problem, self.state = take((self.problem, self.state), rest)
-        self.linear, self.determined = take((self.linear, self.determined), rest)
-        self.damping, self.active = self.damping[rest], self.active[rest]
 
-
-def _step(normal: Normal, determined: Determined, damping: Array) -> Array:
+def _step(normal: Normal, determined: Determined, damping: Array | float = 0.0) -> Array:
     reduced, gradient, eliminate = normal.reduced()
     step = -(determined.inverse(reduced, damping) @ gradient[..., None])
     p = normal.size
@@ -336,11 +315,14 @@ def _length(normal: Normal, step: Array) -> Array:
     return np.asarray(np.einsum("...i,...ij,...j->...", step, normal.information, step))
 
 
-def _small(normal: Normal, step: Array, size: Array) -> Bools:
-    """Below a millionth of the standard uncertainty, or rounding."""
-    length = _length(normal, step)
-    rounding = np.all(np.abs(step[..., : normal.size]) <= 1e-12 * size, -1)
-    return np.asarray((length < 1e-12) | rounding)
+def _small(linear: Linear, step: Array, params: Array) -> Bools:
+    """Below a millionth of the standard uncertainty, or rounding of each triad's largest parameter."""
+    size, moved = (
+        np.stack([np.abs(x[:, columns]).max(-1) for _, _, columns in linear.placed()])
+        for x in (params, step)
+    )
+    near = _length(linear.normal, step) < 1e-12
+    return np.asarray(near | np.all(moved <= 1e-12 * size, 0))
 
 
 def gauss_newton(problem: Linearisable, state: Any, limit: int = 60) -> tuple[Any, Ints, Ints]:
@@ -361,8 +343,10 @@ def gauss_newton(problem: Linearisable, state: Any, limit: int = 60) -> tuple[An
         stopped = settled | broken
         if len(stopped) == count and stopped.all():
             return descent.state, status, iterations
-        state = put(state, descent.active[stopped], take(descent.state, np.flatnonzero(stopped)))
-        descent.drop(stopped)
+        if stopped.any():
+            done, rest = np.flatnonzero(stopped), np.flatnonzero(~stopped)
+            state = put(state, descent.active[done], take(descent.state, done))
+            descent = take(descent, rest)
     if descent.active.size:
         status[descent.active[descent.arrived()]] = Status.OK
     return put(state, descent.active, descent.state), status, iterations

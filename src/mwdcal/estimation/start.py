@@ -6,7 +6,7 @@ nominal values but for the orientation of the axes, and where all else fails.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -50,14 +50,13 @@ def start(problem: Problem) -> State:
         np.stack(constants, -1) if constants else np.zeros((batch, 0)),
         np.zeros((batch, count, len(problem.evidence.absent))),
     )
-    params = [_triad_start(problem, empty, index) for index in range(len(problem.triads))]
-    values = np.concatenate(params, -1)
-    for where in problem.slices():
+    params = []
+    for index, where in enumerate(problem.slices()):
         known = diagonal(problem.prior.precision[:, where, where]) > 0
+        free = _triad_start(problem, empty, index)
         whole = known.all(-1, keepdims=True)
-        values[:, where] = np.where(whole, problem.prior.expected[:, where], values[:, where])
-    state = replace(empty, params=values)
-    return _attitudes(problem, state)
+        params.append(np.where(whole, problem.prior.expected[:, where], free))
+    return _attitudes(problem, replace(empty, params=np.concatenate(params, -1)))
 
 
 def _triad_start(problem: Problem, state: State, index: int) -> Array:
@@ -127,15 +126,11 @@ def _linear(problem: Problem, state: State, index: int, x: Array) -> tuple[Array
     usable = (values[:, 0] > LEAST_SPAN**2 * values[:, -1]) & (weight.sum(-1) >= 4)
     gram = np.where(usable[:, None, None], gram, np.eye(4))
 
-    def fields_of(target: Array) -> Array:
-        crossed = np.einsum("bn,bni,bnj->bij", weight, terms, target)
-        return solved(gram, crossed)
-
     if index == 0:
         earth = earth_gravity(problem.constant(state, "gravity"))
     else:
         field, dip = problem.constant(state, "field"), problem.constant(state, "dip")
-        unknown = _unknown_dip(attitude, field, terms, weight, fields_of)
+        unknown = _unknown_dip(attitude, field, terms, weight, gram)
         blank = ~evidence.is_known("dip")
         earth = earth_field(field, np.where(blank, unknown[:, None], dip))
     target = np.einsum("bnij,bnj->bni", attitude, earth)
@@ -146,13 +141,7 @@ def _linear(problem: Problem, state: State, index: int, x: Array) -> tuple[Array
     return back, -np.einsum("bij,bj->bi", back, forward[:, 3]), np.asarray(usable)
 
 
-def _unknown_dip(
-    attitude: Array,
-    field: Array,
-    terms: Array,
-    weight: Array,
-    fields_of: Callable[[Array], Array],
-) -> Array:
+def _unknown_dip(attitude: Array, field: Array, terms: Array, weight: Array, gram: Array) -> Array:
     """Dip (B,) at which the fields are nearest to a linear function of the readings.
 
     Definition: the smallest eigenvector of the residual sums of a horizontal and a vertical field.
@@ -161,13 +150,14 @@ def _unknown_dip(
         np.einsum("bnij,bnj->bni", attitude, earth_field(field, np.full_like(field, angle)))
         for angle in (0.0, np.pi / 2)
     ]
-    left = [part - terms @ fields_of(part) for part in parts]
-    gram = np.stack(
+    maps = [solved(gram, np.einsum("bn,bni,bnj->bij", weight, terms, part)) for part in parts]
+    left = [part - terms @ each for part, each in zip(parts, maps, strict=True)]
+    sums = np.stack(
         [np.stack([np.einsum("bn,bni,bni->b", weight, p, q) for q in left], -1) for p in left], -2
     )
-    _, vectors = eigen(gram)
+    _, vectors = eigen(sums)
     north, down = vectors[:, 0, 0], vectors[:, 1, 0]
-    gains = [np.trace(fields_of(part)[:, :3], axis1=-2, axis2=-1) for part in parts]
+    gains = [np.trace(each[:, :3], axis1=-2, axis2=-1) for each in maps]
     sign = np.where(north * gains[0] + down * gains[1] < 0, -1.0, 1.0)
     return np.asarray(np.arctan2(sign * down, sign * north))
 
@@ -206,12 +196,12 @@ def _share(problem: Problem, angles: dict[str, Array]) -> dict[str, Array]:
     axis = tool_from_earth(inc, azi, np.zeros_like(inc))[..., 2, :]
     members = evidence.members
     mean = members @ (members.mT @ axis)
-    shared = {n: evidence.shared(n).sum(-1) > 0 for n in ("inclination", "azimuth")}
     means = {
         "inclination": np.arctan2(np.hypot(mean[..., 0], mean[..., 1]), mean[..., 2]),
         "azimuth": np.arctan2(mean[..., 1], mean[..., 0]),
     }
-    return {n: np.where(shared[n], means[n], a) if n in shared else a for n, a in angles.items()}
+    shared = {n: np.where(evidence.shared(n).sum(-1) > 0, m, angles[n]) for n, m in means.items()}
+    return angles | shared
 
 
 def _by_toolface(

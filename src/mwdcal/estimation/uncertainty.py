@@ -12,11 +12,12 @@ Reference: D. A. Harville, J. Am. Stat. Assoc. 72, 320 (1977).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import chain
 
 import numpy as np
 
 from mwdcal.estimation.problem import GEOMETRIC_NOISE, Problem, State
-from mwdcal.estimation.solvers import RANK_TOLERANCE, Determined, Linear, Normal
+from mwdcal.estimation.solvers import RANK_TOLERANCE, Determined, Linear
 from mwdcal.geometry.vectors import (
     Array,
     Bools,
@@ -142,8 +143,7 @@ def determined_apart(problem: Problem, state: State, known: dict[int, Array]) ->
         information[:, first, first] += cross.mT @ back @ cross * scales[:, first, first]
         information[:, second, first] = block @ back @ cross * scales[:, second, first]
         information[:, first, second] = information[:, second, first].mT
-    nothing = np.zeros_like(state.params)
-    return Determined.by(Normal(information, nothing, nothing[:, 0], linear.size), linear.norms)
+    return Determined.by(information, linear.norms)
 
 
 def sandwich(
@@ -250,11 +250,14 @@ def whole_covariance(linear: Linear, determined: Determined) -> Array:
 
 def _variance_factors(residual: Array, spread: Array) -> tuple[Array, Array]:
     """s² and degrees of freedom (B, t) of each triad: restricted maximum likelihood."""
-    expected = diagonal(spread)
-    shape = (*residual.shape[:-1], residual.shape[-1] // 3, 3)
-    squares = np.sum((residual**2).reshape(shape), (1, 3))
-    freedom = np.sum(expected.reshape(shape), (1, 3))
-    return squares / np.where(freedom > 1e-9, freedom, np.nan), freedom
+    freedom = triad_sums(diagonal(spread))
+    return triad_sums(residual**2) / np.where(freedom > 1e-9, freedom, np.nan), freedom
+
+
+def triad_sums(values: Array) -> Array:
+    """Sums (B, t) over the stations and axes of each triad, of values (B, n, m)."""
+    by_triad = values.reshape(*values.shape[:-1], values.shape[-1] // 3, 3)
+    return np.asarray(np.sum(by_triad, (1, 3)))
 
 
 def effective_freedom(problem: Problem, state: State, analysis: Analysis) -> Array:
@@ -314,32 +317,27 @@ def without_station(problem: Problem, state: State, analysis: Analysis) -> Array
 
 
 def candidates(problem: Problem, state: State, triads: list[int]) -> dict[str, Array]:
-    """Directions (B, p) of parameter space that have a name: turns and scales of some triads."""
-    directions = {name: np.zeros_like(state.params) for name in CHANGES}
+    """Directions (B, p) of parameter space that have a name: turns and scales of some triads.
+
+    Those in proportion to a power of temperature follow, named `…-temperature-k`.
+    """
+    powers = range(1, 1 + min(problem.triads[t].model.basis.order for t in triads))
+    courses = {name: [f"{name}-temperature-{power}" for power in powers] for name in CHANGES}
+    names = [*CHANGES, *chain(*courses.values())]
+    directions = {name: np.zeros_like(state.params) for name in names}
     for triad in triads:
         where, model = problem.slices()[triad], problem.triads[triad].model
         for name, change in CHANGES.items():
-            directions[name][:, where] = tangent(model, state.params[:, where], change)
-    return directions | _courses(problem, directions, triads)
+            steady = tangent(model, state.params[:, where], change)
+            directions[name][:, where] = steady
+            for power, course in enumerate(courses[name], 1):
+                directions[course][:, where] = model.with_course(steady, power)
+    return directions
 
 
 def tangent(model: Model, params: Array, change: Array) -> Array:
     """Change of the parameters (..., p) when all fields are turned or scaled, per `TANGENT_STEP`."""
     return np.asarray((model.transformed(params, change) - params) / TANGENT_STEP)
-
-
-def _courses(problem: Problem, steady: dict[str, Array], triads: list[int]) -> dict[str, Array]:
-    """Turns and scales in proportion to each power of temperature, named `…-temperature-k`."""
-    orders = [problem.triads[t].model.basis.order for t in triads]
-    courses = {}
-    for name, direction in steady.items():
-        for power in range(1, min(orders) + 1):
-            moved = np.zeros_like(direction)
-            for triad in triads:
-                where, model = problem.slices()[triad], problem.triads[triad].model
-                moved[:, where] = model.with_course(direction[:, where], power)
-            courses[f"{name}-temperature-{power}"] = moved
-    return courses
 
 
 def free_share(determined: Determined, direction: Array) -> Array:
@@ -367,7 +365,7 @@ def settle_gauge(problem: Problem, state: State, determined: Determined) -> Stat
         named = candidates(problem, state, triads)
         free = np.stack([free_share(determined, named[n]) > COUPLED for n in ROTATIONS], -1)
         turn = _polar_turn(problem, state, triads[0], free)
-        state = _turn(problem, state, triads, turn, stations=len(triads) == len(every))
+        state = _turn(problem, state, triads, turn)
     for triad in every:
         share = free_share(determined, candidates(problem, state, [triad])["scale"])
         state = _rescale(problem, state, triad, share > COUPLED)
@@ -425,12 +423,14 @@ def unrotating(gain: Array, free: Bools) -> Array:
     return np.where(np.all(free, -1)[..., None, None], whole, rotation(along))
 
 
-def _turn(problem: Problem, state: State, triads: list[int], turn: Array, stations: bool) -> State:
+def _turn(problem: Problem, state: State, triads: list[int], turn: Array) -> State:
+    """The state with some triads turned; with all of them the stations turn too."""
     params = state.params.copy()
     for triad in triads:
         where = problem.slices()[triad]
         params[:, where] = problem.triads[triad].model.transformed(params[:, where], turn)
-    attitude = turn[:, None] @ state.attitude if stations else state.attitude
+    whole = len(triads) == len(problem.triads)
+    attitude = turn[:, None] @ state.attitude if whole else state.attitude
     return replace(state, params=params, attitude=attitude)
 
 

@@ -26,11 +26,12 @@ RAW = tuple(name for triad in CHANNELS.values() for name in triad)
 
 # Metadata that changes what the numbers mean.
 AZIMUTH_KEYS = ("azimuth_reference", "declination_deg", "convergence_deg")
-_NORTHS: dict[str, tuple[str, ...]] = {
-    "magnetic": (),
-    "true": ("declination_deg",),
-    "grid": ("declination_deg", "convergence_deg"),
+_NORTHS: dict[str, dict[str, float]] = {
+    "magnetic": {},
+    "true": {"declination_deg": 1.0},
+    "grid": {"declination_deg": 1.0, "convergence_deg": -1.0},
 }
+"""What is added to magnetic azimuths, with its sign."""
 
 
 class Range(NamedTuple):
@@ -47,9 +48,8 @@ class Range(NamedTuple):
         return np.asarray(low | (values > self.high))
 
     def __str__(self) -> str:
-        if self.positive:
-            return f"above {self.low:g} and at most {self.high:g} {self.unit}".rstrip()
-        return f"between {self.low:g} and {self.high:g} {self.unit}".rstrip()
+        words = "above {:g} and at most {:g} {}" if self.positive else "between {:g} and {:g} {}"
+        return words.format(self.low, self.high, self.unit).rstrip()
 
 
 class Reference(NamedTuple):
@@ -89,7 +89,7 @@ RANGES = {
 COLUMNS = ("station", "group", *RANGES)
 MAPPED = (*COLUMNS, "serial")
 """Columns that a table may have under another name."""
-_UNITS = {
+_UNITS_BY_END = {
     "deg": ("°", "rad"),
     "g": ("g", "mg", "m/s²"),
     "nt": ("nT", "µT", "mT", "gauss"),
@@ -111,7 +111,7 @@ def units_of(column: str) -> tuple[str, ...]:
     ()
     """
     end = column.rpartition("_")[2]
-    return _UNITS.get(end, ()) if column.removeprefix("sd_") not in (*RAW, *LABELS) else ()
+    return _UNITS_BY_END.get(end, ()) if column.removeprefix("sd_") not in (*RAW, *LABELS) else ()
 
 
 def check_columns(names: Sequence[str], source: str) -> None:
@@ -140,8 +140,7 @@ def check_near_misses(names: Collection[str], contract: Sequence[str], what: str
         meant = next((expected[form] for form in forms(name) if form in expected), None)
         if meant is not None and name not in contract:
             alike = resembled(name)
-            unit = alike.unit if alike else ""
-            how = CONVERSIONS.get(unit, "and convert its unit")
+            how = CONVERSIONS.get(alike.unit if alike else "", "and convert its unit")
             raise InputError(
                 f"{what} {shown(name)} must be spelled exactly as documented. Did you mean "
                 f"'{meant}'? Rename it ({how}), or choose a different name."
@@ -155,11 +154,8 @@ def forms(name: str) -> tuple[str, str]:
     ('refinclinationdeg', 'refinclination')
     """
     bare = name.strip().lower()
-    return _squeezed(bare), _squeezed(_UNIT.sub("", bare))
-
-
-def _squeezed(name: str) -> str:
-    return re.sub(r"[^a-z0-9]", "", name)
+    whole, without = (re.sub(r"[^a-z0-9]", "", form) for form in (bare, _UNIT.sub("", bare)))
+    return whole, without
 
 
 def _missing(missing: Sequence[str], names: Sequence[str], source: str) -> InputError:
@@ -202,8 +198,7 @@ def magnetic_offset(metadata: Mapping[str, object], source: str) -> float:
                 f"{source}: {kind} azimuths need the metadata '{key}'; got none. Add a line "
                 f"`# {key} = …`, or give magnetic azimuths."
             )
-    sign = {"declination_deg": 1.0, "convergence_deg": -1.0}
-    return sum((sign[key] * stated[key] for key in _NORTHS[kind]), 0.0)
+    return sum((sign * stated[key] for key, sign in _NORTHS[kind].items()), 0.0)
 
 
 def _degrees(value: object, key: str, source: str) -> float:

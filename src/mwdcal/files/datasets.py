@@ -33,7 +33,7 @@ def fetch(name: str) -> Path:
         raise InputError(
             f"{name!r} is not a file of the measured sets; see mwdcal.files.datasets.registry()."
         )
-    if FOLDER not in os.environ and ADDRESS not in os.environ:
+    if not {FOLDER, ADDRESS} & os.environ.keys():
         raise InputError(
             f"{name}: set {FOLDER} to the folder of a local copy of the measured sets, or "
             f"{ADDRESS} to the address of one."

@@ -94,5 +94,4 @@ def _unique(name: str, pairs: list[tuple[str, Any]]) -> None:
 def published_schema() -> dict[str, Any]:
     """The schema of a calibration file, as shipped with the package."""
     text = resources.files("mwdcal").joinpath("calibration.schema.json").read_text("utf-8")
-    loaded: dict[str, Any] = json.loads(text)
-    return loaded
+    return msgspec.json.decode(text, type=dict[str, Any])

@@ -31,13 +31,14 @@ class BlankReadingError(InputError):
 class Fault(NamedTuple):
     """Cells that break one rule: where `cells` (k, R) is true, of the `columns` (k).
 
-    `problem` says of a column and a row what is wrong with the cell, and what to do.
-    `missing_reading`: the rule is that readings and temperatures may not be blank.
+    `must_be` is the rule, `advice` what to do. `missing_reading`: the rule is that readings and
+    temperatures may not be blank.
     """
 
     columns: tuple[str, ...]
     cells: Bools
-    problem: Callable[[int, int], str]
+    must_be: str
+    advice: str
     missing_reading: bool = False
 
 
@@ -46,17 +47,14 @@ def faults(cells: Cells, starts: Ints, profile: Profile) -> Iterator[Fault]:
 
     A column is not read before its turn.
     """
-    for kind, names in CHANNELS.items():
+    readings = [(names, "Fill it in, or remove the station.") for names in CHANNELS.values()]
+    warmth = (("temperature_c",), "Fill it in, or leave the whole column blank.")
+    for names, advice in (*readings, warmth):
         for name in names:
             yield from range_faults(cells, name)
-        blank = _blank_faults(cells, starts, names, "Fill it in, or remove the station.", True)
-        optional = kind == "magnetometer"
+        blank = _blank_faults(cells, starts, names, advice, True)
+        optional = names != CHANNELS["accelerometer"]
         yield from _where_filled(cells, starts, names, blank) if optional else blank
-    name = "temperature_c"
-    yield from range_faults(cells, name)
-    advice = "Fill it in, or leave the whole column blank."
-    blank = _blank_faults(cells, starts, (name,), advice, True)
-    yield from _where_filled(cells, starts, (name,), blank)
     yield from faults_beside_readings(cells, starts, profile, TRIADS)
 
 
@@ -84,9 +82,18 @@ def refuse(table: Table, rules: Iterable[Fault]) -> None:
     """Refuse the first cell that breaks a rule."""
     for fault in rules:
         row = int(np.argmax(fault.cells.any(0)))
-        column = int(np.argmax(fault.cells[:, row]))
-        error = cell_error(table, fault.columns[column], row, fault.problem(column, row))
+        name = fault.columns[int(np.argmax(fault.cells[:, row]))]
+        problem = f"must be {fault.must_be}; got {_content(table, name, row)}. {fault.advice}"
+        error = cell_error(table, name, row, problem)
         raise BlankReadingError(str(error)) if fault.missing_reading else error
+
+
+def _content(table: Table, name: str, row: int) -> str:
+    """What stands in a cell, for messages."""
+    if name not in table.columns:
+        return "no such column"
+    value = float(numbers(table, name)[row])
+    return "a blank cell" if np.isnan(value) else f"{shown(value)} {RANGES[name].unit}".rstrip()
 
 
 def _noise_faults(cells: Cells, starts: Ints, profile: Profile, kind: str) -> Iterator[Fault]:
@@ -103,42 +110,27 @@ def _noise_faults(cells: Cells, starts: Ints, profile: Profile, kind: str) -> It
         )
         blank = _blank_faults(cells, starts, names, advice)
         yield from _where_filled(cells, starts, names, blank)
-
-    def problem(column: int, row: int) -> str:
-        return f"must be above 0; got 0. State the noise of the {kind}, or leave it blank."
-
     zero = _stacked(cells, names, starts) == 0.0
     if triad.repeatability == 0.0 and zero.any():
-        yield Fault(names, zero, problem)
+        advice = f"State the noise of the {kind}, or leave it blank."
+        yield Fault(names, zero, "above 0", advice)
 
 
 def range_faults(cells: Cells, name: str) -> Iterator[Fault]:
     """Values that the column may not have."""
     values, limits = cells(name), RANGES[name]
-    if values is None:
-        return
-
-    def problem(column: int, row: int, values: Array = values) -> str:
-        got = f"{shown(float(values[row]))} {limits.unit}".rstrip()
-        return f"must be {limits}; got {got}. Check the cell, and the unit of the column."
-
-    outside = limits.outside(values)
-    if outside.any():
-        yield Fault((name,), outside[None], problem)
+    if values is not None and (outside := limits.outside(values)).any():
+        advice = "Check the cell, and the unit of the column."
+        yield Fault((name,), outside[None], str(limits), advice)
 
 
 def _blank_faults(
     cells: Cells, starts: Ints, names: tuple[str, ...], advice: str, missing_reading: bool = False
 ) -> Iterator[Fault]:
     """Cells that are blank."""
-
-    def problem(column: int, row: int) -> str:
-        got = "no such column" if cells(names[column]) is None else "a blank cell"
-        return f"must be filled in; got {got}. {advice}"
-
     blank = np.isnan(_stacked(cells, names, starts))
     if blank.any():
-        yield Fault(names, blank, problem, missing_reading)
+        yield Fault(names, blank, "filled in", advice, missing_reading)
 
 
 def _where_filled(

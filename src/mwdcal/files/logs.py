@@ -30,8 +30,9 @@ from mwdcal.files.formats.columns import (
     looks_numeric,
     no_stations,
     of_texts,
+    shown,
 )
-from mwdcal.files.formats.table import Table, shown
+from mwdcal.files.formats.table import Table
 from mwdcal.files.formats.text import comment, is_preamble, split
 from mwdcal.geometry.vectors import Array
 
@@ -78,10 +79,9 @@ def read(
     the progress. Errors name file, line and column.
     """
     file = Path(path)
-    typed = file.suffix.lower() in _TYPED
-    table = _typed(file, columns, decimal) if typed else _text(file, [*columns], decimal, say)
-    _check_ranges(table)
-    return table
+    if file.suffix.lower() in _TYPED:
+        return _typed(file, columns, decimal)
+    return _accepted(_text(file, [*columns], decimal, say))
 
 
 def check(table: Table) -> Table:
@@ -89,21 +89,16 @@ def check(table: Table) -> Table:
     _check(list(table.columns), table.source)
     if not table.count:
         raise _empty(table.source)
-    checked = _numeric(table)
-    _check_ranges(checked)
-    return checked
+    return _accepted(table)
 
 
-def _check_ranges(table: Table) -> None:
-    """Refuse readings that no channel has."""
-    cells = columns_of(table)
-    refuse(table, chain.from_iterable(range_faults(cells, name) for name in RAW))
-
-
-def _numeric(table: Table) -> Table:
-    """The log with numbers in every column that means something."""
+def _accepted(table: Table) -> Table:
+    """The log with numbers in every column that means something; refused if no channel reads them."""
     numbers = {name: _numbers(table, name) for name in table.columns if name in READ}
-    return replace(table, columns={**table.columns, **numbers})
+    numeric = replace(table, columns={**table.columns, **numbers})
+    cells = columns_of(numeric)
+    refuse(numeric, chain.from_iterable(range_faults(cells, name) for name in RAW))
+    return numeric
 
 
 def _typed(file: Path, names: Sequence[str], decimal: str) -> Table:
@@ -114,23 +109,22 @@ def _typed(file: Path, names: Sequence[str], decimal: str) -> Table:
             "names of its own. Leave `columns` out."
         )
     try:
-        table = tables.read(file, decimal=decimal)
+        return check(tables.read(file, decimal=decimal))
     except InputError as error:
         if str(error) != str(no_stations(file.name)):
             raise
         raise _empty(file.name) from None
-    _check(list(table.columns), table.source)
-    return _numeric(table)
 
 
 def _text(file: Path, names: list[str], decimal: str, say: Say) -> Table:
     """The table of a text log."""
-    if decimal not in (".", ","):
-        raise InputError(f"`decimal` must be '.' or ','; got {shown(decimal)}.")
+    tables.check_decimal(decimal)
     try:
         tables.check_file(file)
         with file.open("rb") as stream:
-            return _read_text(stream, names, decimal, file.name, say)
+            table = _read_text(stream, names, decimal, file.name, say)
+            stream.seek(0)
+            return replace(table, digest=hashlib.file_digest(stream, "sha256").hexdigest())
     except (OSError, ValueError) as error:
         raise InputError(
             f"cannot read '{file}': {reason(error)}. Check the name and the file."
@@ -162,10 +156,9 @@ def _read_text(stream: BinaryIO, names: list[str], decimal: str, source: str, sa
     metadata = meta.parse(comments, source)
     layout = _layout(first, number, names, decimal, source)
     size = os.fstat(stream.fileno()).st_size
-    done = number if not names else number - 1
+    ahead, done = (first + "\n", number - 1) if names else ("", number)
     pieces, lines = [], []
-    ahead = first + "\n" if names else ""
-    for piece in _pieces(stream, ahead, done, source):
+    for piece in _pieces(stream, ahead, number, source):
         values, numbers, done = _piece(piece, done, layout)
         pieces.append(values)
         lines.append(numbers)
@@ -175,11 +168,7 @@ def _read_text(stream: BinaryIO, names: list[str], decimal: str, source: str, sa
     whole = np.concatenate(pieces)
     columns: dict[str, Column] = {name: [] for name in layout.names if name not in READ}
     columns |= {name: whole[:, i].copy() for i, name in enumerate(_wanted(layout))}
-    stream.seek(0)
-    digest = hashlib.sha256()
-    while data := stream.read(_PIECE):
-        digest.update(data)
-    return Table(columns, metadata, source, _joined(lines), digest.hexdigest(), decimal)
+    return Table(columns, metadata, source, _joined(lines), decimal=decimal)
 
 
 def _top(stream: BinaryIO, source: str) -> tuple[list[tuple[int, str]], str, int]:
@@ -225,21 +214,19 @@ def _layout(first: str, number: int, names: list[str], decimal: str, source: str
     _, header = next(_rows([first], delimiter, number - 1, source))
     cells = [str(cell).strip() for cell in header]
     numeric = all(looks_numeric(cell, decimal) or not cell for cell in cells)
-    if names:
-        _check(names, "`columns`")
-        if not numeric and any(re.match(r"[A-Za-z]", cell) for cell in cells):
-            raise InputError(
-                f"{source}, line {number}: expected numbers, as `columns` names the columns; got "
-                f"{shown(first.strip())}. Leave `columns` out, or remove this line."
-            )
-        return _Layout(names, delimiter, decimal, source)
-    if numeric:
+    where = f"{source}, line {number}"
+    if numeric and not names:
         raise InputError(
-            f"{source}, line {number}: expected the column names; got numbers. Name the columns: "
-            f"{_EXAMPLE} (in the order of the file)."
+            f"{where}: expected the column names; got numbers. Name the columns: {_EXAMPLE} (in the "
+            "order of the file)."
         )
-    _check(cells, f"{source}, line {number}")
-    return _Layout(cells, delimiter, decimal, source)
+    _check(names or cells, "`columns`" if names else where)
+    if names and not numeric and any(re.match(r"[A-Za-z]", cell) for cell in cells):
+        raise InputError(
+            f"{where}: expected numbers, as `columns` names the columns; got {shown(first.strip())}. "
+            "Leave `columns` out, or remove this line."
+        )
+    return _Layout(names or cells, delimiter, decimal, source)
 
 
 def _check(names: list[str], where: str) -> None:
@@ -254,12 +241,12 @@ def _wanted(layout: _Layout) -> list[str]:
 
 
 def _pieces(stream: BinaryIO, ahead: str, done: int, source: str) -> Iterator[str]:
-    """The rest of the file in whole lines; `done` lines stand above, `ahead` was read already."""
+    """The rest of the file in whole lines, `ahead` before it; `done` lines were read already."""
     while data := stream.read(_PIECE) + stream.readline():
-        text = ahead + _decoded(data, done + 1 + ahead.count("\n"), source)
+        text = _decoded(data, done + 1, source)
         done += text.count("\n")
+        yield ahead + text.replace("\r\n", "\n")
         ahead = ""
-        yield text.replace("\r\n", "\n")
     if ahead:
         yield ahead
 
@@ -284,40 +271,32 @@ def _piece(text: str, done: int, layout: _Layout) -> tuple[Array, Sequence[int],
 def _plain(text: str, count: int, layout: _Layout) -> Array | None:
     """The values of a piece of plain numbers and blanks, None where it is anything else."""
     mark, names = layout.delimiter, layout.names
+    wanted = [names.index(name) for name in _wanted(layout)]
     if _ODD.search(text) or (layout.decimal == "," and "." in text):
         return None
     if mark is not None:
         if text.count(mark) != (len(names) - 1) * count:
             return None
         text = _filled(text, mark)
-    pointed = text.replace(",", ".") if layout.decimal == "," else text
+    rows = text.replace(layout.decimal, ".").split("\n")
+    used = wanted if mark else None
     try:
-        values = np.loadtxt(
-            pointed.split("\n"), delimiter=mark, comments=None, ndmin=2,
-            usecols=[names.index(n) for n in _wanted(layout)] if mark else None,
-        )  # fmt: skip
+        values = np.loadtxt(rows, delimiter=mark, comments=None, ndmin=2, usecols=used)
     except ValueError:
         return None
     if not mark:
         if values.shape[-1] != len(names):
             return None
-        values = values[:, [names.index(n) for n in _wanted(layout)]]
+        values = values[:, wanted]
     return None if np.isinf(values).any() else values
 
 
 def _filled(text: str, mark: str) -> str:
     """The text with `nan` in every blank cell."""
-    if text.startswith(mark):
-        text = "nan" + text
-    for blank, filled in (
-        (mark * 2, f"{mark}nan{mark}"),
-        (mark * 2, f"{mark}nan{mark}"),
-        (f"{mark}\n", f"{mark}nan\n"),
-        (f"\n{mark}", f"\nnan{mark}"),
-    ):
-        if blank in text:
-            text = text.replace(blank, filled)
-    return text + "nan" if text.endswith(mark) else text
+    for _ in range(2):  # of blanks that share a delimiter, one at a time
+        text = text.replace(mark * 2, f"{mark}nan{mark}")
+    text = f"\n{text}\n".replace(f"{mark}\n", f"{mark}nan\n")
+    return text.replace(f"\n{mark}", f"\nnan{mark}")[1:-1]
 
 
 def _rows(

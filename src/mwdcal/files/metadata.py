@@ -44,20 +44,16 @@ def parse(lines: Iterable[tuple[int, str]], source: str, word: str = "line") -> 
 
 def plain(metadata: Mapping[str, object], source: str) -> dict[str, object]:
     """The metadata in values that a line can hold; refuses what is nested more than `DEEPEST` deep."""
+    values = {}
     for key, value in metadata.items():
-        if not _shallow(value, DEEPEST):
+        try:
+            values[key] = _plain(value)
+        except RecursionError:
             raise InputError(
                 f"{source}, metadata {_shown(key)}: values must be nested at most {DEEPEST} deep. "
                 "Simplify or remove it."
-            )
-    return {key: _plain(value) for key, value in metadata.items()}
-
-
-def _shallow(value: object, left: int) -> bool:
-    if not isinstance(value, list | dict):
-        return True
-    inner = value.values() if isinstance(value, dict) else value
-    return left > 0 and all(_shallow(each, left - 1) for each in inner)
+            ) from None
+    return values
 
 
 def render(metadata: Mapping[str, object]) -> list[str]:
@@ -82,17 +78,21 @@ def _entry(text: str, where: str) -> tuple[str, object]:
     return key, _plain(value, bare[2]) if bare else plain(pairs, where)[key]
 
 
-def _plain(value: object, text: str = "") -> object:
-    """The value in types that JSON has: dates, and numbers beyond its range, as text."""
+def _plain(value: object, text: str = "", left: int = DEEPEST) -> object:
+    """The value in types that JSON has: dates, and numbers beyond its range, as text.
+
+    Raises `RecursionError` where more than `left` lists and tables stand one within the other.
+    """
+    if isinstance(value, list | dict) and not left:
+        raise RecursionError
     if isinstance(value, list):
-        return [_plain(item) for item in value]
+        return [_plain(item, left=left - 1) for item in value]
     if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
+        return {key: _plain(item, left=left - 1) for key, item in value.items()}
     if isinstance(value, date | time):
         return value.isoformat()
-    if isinstance(value, float) and not math.isfinite(value):
-        return text or str(value)
-    if isinstance(value, int) and abs(value) >= 2**63:
+    endless = isinstance(value, float) and not math.isfinite(value)
+    if endless or (isinstance(value, int) and abs(value) >= 2**63):
         return text or str(value)
     return value
 

@@ -25,17 +25,14 @@ from mwdcal.sensor.profile import (
     TriadProfile,
 )
 
-_DEFAULT = "generic"
 _SUFFIX = ".toml"
 _LARGEST = 1_000_000
-_STRUCTS: dict[str, type[msgspec.Struct]] = {
-    "": Profile,
-    "accelerometer": TriadProfile,
-    "magnetometer": TriadProfile,
+_SECTIONS: dict[str, type[msgspec.Struct]] = {
+    **dict.fromkeys(TRIADS, TriadProfile),
+    "datasheet": Datasheet,
     "stand": StandProfile,
     "table": TableFormat,
-    "accelerometer.datasheet": Datasheet,
-    "magnetometer.datasheet": Datasheet,
+    "columns": ColumnSource,
 }
 _WORDS = {
     "float": "a number",
@@ -48,32 +45,29 @@ _WORDS = {
     "datetime": "a date with time",
     "time": "a time of day",
 }
-_Limits = tuple[float, float, str]
-"""Least and greatest value of a key, and what to do about another one."""
-_TRIAD_LIMITS: dict[str, _Limits] = {
-    "scale": (
-        1e-15, 1e15,
-        'Put the sign into `axes`, for example "-x"; leave it out where it is unknown.',
+_ALL = (1e-15, 1e15)
+_UNKNOWN = "leave it out where it is unknown."
+_SHARE = "1 sigma as a share of the field, such as 0.005; leave it out for a linear axis."
+_ANGLE = (0.0, 180.0, "1 sigma, in degrees.")
+_LIMITS: dict[type[msgspec.Struct], dict[str, tuple[float, float, str]]] = {
+    Profile: {"reference_temperature_c": (TEMPERATURE.low, TEMPERATURE.high, "In °C.")},
+    TriadProfile: {
+        "scale": (*_ALL, f'Put the sign into `axes`, for example "-x"; {_UNKNOWN}'),
+        "noise": (*_ALL, f"1 sigma in raw units; {_UNKNOWN}"),
+        "nonlinearity": (1e-9, 1.0, _SHARE),
+        "repeatability": (0.0, 1e15, f"1 sigma in raw units; {_UNKNOWN}"),
+    },
+    Datasheet: dict.fromkeys(
+        Datasheet.__struct_fields__, (*_ALL, f"1 sigma, more than zero; {_UNKNOWN}")
     ),
-    "noise": (1e-15, 1e15, "1 sigma in raw units; leave it out where it is unknown."),
-    "nonlinearity": (
-        1e-9, 1.0,
-        "1 sigma as a share of the field, such as 0.005; leave it out for a linear axis.",
-    ),
-    "repeatability": (0.0, 1e15, "1 sigma in raw units; leave it out where it is unknown."),
-}  # fmt: skip
-_DATASHEET_LIMITS: dict[str, _Limits] = dict.fromkeys(
-    Datasheet.__struct_fields__,
-    (1e-15, 1e15, "1 sigma, more than zero; leave it out where it is unknown."),
-)
-_TABLE_LIMITS: dict[str, _Limits] = {
-    "header_line": (1, 1e6, "The line of the column names, counted from 1."),
+    StandProfile: {
+        **{name: _ANGLE for name in StandProfile.__struct_fields__ if name != "coil"},
+        "gravity_g": (0.0, 2.0, "1 sigma, in g."),
+        "field_nt": (0.0, 200_000.0, "1 sigma, in nT."),
+    },
+    TableFormat: dict.fromkeys(("header_line", "first_line"), (1, 1e6, "Lines count from 1.")),
 }
-_STAND_LIMITS: dict[str, _Limits] = {
-    name: (0.0, 180.0, "1 sigma, in degrees.")
-    for name in StandProfile.__struct_fields__
-    if name != "coil"
-} | {"gravity_g": (0.0, 2.0, "1 sigma, in g."), "field_nt": (0.0, 200_000.0, "1 sigma, in nT.")}
+"""Least and greatest value of each number, and what to do about another one."""
 
 
 def load_profile(name_or_path: str | None = None) -> tuple[Profile, str]:
@@ -81,7 +75,7 @@ def load_profile(name_or_path: str | None = None) -> tuple[Profile, str]:
 
     None is the built-in `generic`: channels along the tool axes, nothing else known.
     """
-    name = _DEFAULT if name_or_path is None else name_or_path
+    name = "generic" if name_or_path is None else name_or_path
     data, digest = read_toml(name, "profiles", "tool profile")
     return _profile(data, Path(name).name), digest
 
@@ -194,7 +188,7 @@ def _plain_types(problem: str) -> str:
 
 
 def _unknown_key(key: str, section: str, source: str) -> InputError:
-    struct = _STRUCTS.get(section, Profile)
+    struct = _SECTIONS.get(section.rpartition(".")[2], Profile)
     known = [field.encode_name for field in msgspec.structs.fields(struct)]
     near = difflib.get_close_matches(key.lower(), known, n=1)
     meant = f" Did you mean '{near[0]}'?" if near else ""
@@ -224,24 +218,32 @@ def check_profile(profile: Profile, source: str) -> None:
     """Refuse values that no tool can have."""
     if not profile.name.strip():
         raise InputError(f"{source}, key 'name': must not be blank; got ''. Name the tool.")
-    limits = (TEMPERATURE.low, TEMPERATURE.high)
-    _check_numbers(profile, {"reference_temperature_c": (*limits, "In °C.")}, source)
-    for name in TRIADS:
-        triad: TriadProfile = getattr(profile, name)
-        if len({axis[1] for axis in triad.axes}) < len(triad.axes):
-            raise _axes_error(f"{name}.axes", " ".join(triad.axes), source)
-        _check_numbers(triad, _TRIAD_LIMITS, source, f"{name}.")
-        if triad.datasheet is not None:
-            _check_numbers(triad.datasheet, _DATASHEET_LIMITS, source, f"{name}.datasheet.")
-    _check_numbers(profile.stand, _STAND_LIMITS, source, "stand.")
-    if not isinstance(profile.table, msgspec.UnsetType):
-        _check_numbers(profile.table, _TABLE_LIMITS, source, "table.")
-        _check_numbers(
-            profile.table, {"first_line": (profile.table.header_line + 1, 1e6, "It is below the names.")},
-            source, "table.",
-        )  # fmt: skip
+    _check_section(profile, source)
+    form = profile.table
+    if not isinstance(form, msgspec.UnsetType) and form.first_line <= form.header_line:
+        raise InputError(
+            f"{source}, key 'table.first_line': must be below the names in line {form.header_line}; got "
+            f"{form.first_line}. Correct it."
+        )
     if not isinstance(profile.columns, msgspec.UnsetType):
         _check_columns(profile.columns, source)
+
+
+def _check_section(section: msgspec.Struct, source: str, prefix: str = "") -> None:
+    """Refuse axes of fewer than three letters, and numbers outside their limits; None is not stated."""
+    if isinstance(section, TriadProfile) and len({axis[1] for axis in section.axes}) < 3:
+        raise _axes_error(f"{prefix}axes", " ".join(section.axes), source)
+    for field, (low, high, advice) in _LIMITS[type(section)].items():
+        value = getattr(section, field)
+        if value is not None and not low <= value <= high:
+            raise InputError(
+                f"{source}, key '{prefix}{field}': must be between {low:g} and {high:g}; "
+                f"got {shown(value)}. {advice}"
+            )
+    for field in section.__struct_fields__:
+        inner = getattr(section, field)
+        if isinstance(inner, msgspec.Struct):
+            _check_section(inner, source, f"{prefix}{field}.")
 
 
 def _check_columns(columns: Mapping[str, ColumnSource], source: str) -> None:
@@ -267,16 +269,3 @@ def _check_columns(columns: Mapping[str, ColumnSource], source: str) -> None:
                 f"{key}: the column {shown(each.name)} is '{taken[each.name]}' already. Name each column once."
             )
         taken[each.name] = column
-
-
-def _check_numbers(
-    section: msgspec.Struct, limits: dict[str, _Limits], source: str, prefix: str = ""
-) -> None:
-    """Refuse the first number that is outside its limits; None is not stated."""
-    for field, (low, high, advice) in limits.items():
-        value = getattr(section, field)
-        if value is not None and not low <= value <= high:
-            raise InputError(
-                f"{source}, key '{prefix}{field}': must be between {low:g} and {high:g}; "
-                f"got {shown(value)}. {advice}"
-            )

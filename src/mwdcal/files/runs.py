@@ -31,7 +31,7 @@ from mwdcal.files.faults import Cells, columns_of, faults, faults_beside_reading
 from mwdcal.files.formats import table as tables
 from mwdcal.files.formats.columns import LABELS, Column, shown
 from mwdcal.files.formats.table import Table, labels
-from mwdcal.geometry.vectors import Array, Ints
+from mwdcal.geometry.vectors import Array
 from mwdcal.sensor.profile import ColumnSource, Profile, TriadProfile
 
 ROWS_OF_LOG = 1000
@@ -45,12 +45,9 @@ def read_run(
     source: str | os.PathLike[str] | Table, profile: Profile, *, decimal: str = "."
 ) -> tuple[Readings, Profile]:
     """The readings of a run, a file or a table, and the profile with its nominal scales filled in."""
-    table = (
-        source
-        if isinstance(source, Table)
-        else read_export(source, profile, decimal=decimal, rows=MOST_ROWS)
-    )
-    table = renamed(table, profile)
+    if not isinstance(source, Table):
+        source = read_export(source, profile, decimal=decimal, rows=MOST_ROWS)
+    table = renamed(source, profile)
     check_run(table)
     return to_readings(table, profile)
 
@@ -67,7 +64,7 @@ def read_export(
     if isinstance(form, msgspec.UnsetType):
         return tables.read(path, decimal=decimal, rows=rows)
     try:
-        table = tables.read(path, rows=rows, form=form)
+        table = tables.read(path, rows=rows, export=form)
         if is_export(table.columns, profile):
             return table
         problem = _not_as_stated(table, profile)
@@ -139,7 +136,7 @@ def check_run(table: Table) -> None:
     names = list(table.columns)
     check_columns(names, table.source)
     synonyms.check_evidence(names, table.source)
-    tools = serials(table.metadata, _serial_cells(table))
+    tools = serials(table.metadata, labels(table, "serial"))
     if len(tools) > 1:
         raise InputError(
             f"{table.source} has rows of more than one tool (serial {', '.join(tools)}). Take the "
@@ -166,10 +163,6 @@ def identified(metadata: Mapping[str, object], cells: Sequence[str]) -> Mapping[
     return {**metadata, "serial": ", ".join(tools)} if tools else metadata
 
 
-def _serial_cells(table: Table) -> list[str]:
-    return labels(table, "serial") if "serial" in table.columns else []
-
-
 def to_readings(table: Table, profile: Profile) -> tuple[Readings, Profile]:
     """The readings of a table, and the profile with its nominal scales filled in.
 
@@ -179,15 +172,15 @@ def to_readings(table: Table, profile: Profile) -> tuple[Readings, Profile]:
     """
     check_columns(list(table.columns), table.source)
     cells = columns_of(table)
-    refuse(table, faults(cells, _one_tool(table), profile))
+    refuse(table, faults(cells, np.array([0, table.count]), profile))
     readings, scales = convert(cells, (table.count,), profile, _azimuth_offset(table))
     raw = [_stacked(cells, kind) for kind in scales]
     readings = replace(
         readings,
-        group=group_numbers(labels(table, "group") if "group" in table.columns else []),
+        group=group_numbers(labels(table, "group")),
         station=_stations(table),
         digest=fingerprints([channels for channels in raw if channels is not None]),
-        metadata=identified(table.metadata, _serial_cells(table)),
+        metadata=identified(table.metadata, labels(table, "serial")),
         source=table.source,
         run_sha256=table.digest,
         unused=synonyms.unused(list(table.columns), COLUMNS),
@@ -202,12 +195,9 @@ def to_readings(table: Table, profile: Profile) -> tuple[Readings, Profile]:
 def check_references(table: Table, profile: Profile, kinds: list[str]) -> dict[str, Array]:
     """The references of a table; refuses what `to_readings` refuses in them and in triads `kinds`."""
     cells = columns_of(table)
-    refuse(table, faults_beside_readings(cells, _one_tool(table), profile, kinds))
+    starts = np.array([0, table.count])
+    refuse(table, faults_beside_readings(cells, starts, profile, kinds))
     return references(cells, _azimuth_offset(table))
-
-
-def _one_tool(table: Table) -> Ints:
-    return np.array([0, table.count])
 
 
 def _azimuth_offset(table: Table) -> float:
@@ -235,15 +225,16 @@ def convert(
         triad: TriadProfile = getattr(profile, kind)
         scales[kind] = triad.scale or _scale(raw, _strength(known, kind))
         triads[kind] = to_nominal(raw, triad, scales[kind])
-        noise = _noise(cells, kind, triad, raw.shape)
+        noise = _noise(cells, kind, triad, shape)
         if noise is not None:
             sd[kind] = (noise / scales[kind]) @ np.abs(triad.permutation.transpose())
+    common = {n: np.full(shape, np.radians(v)) for n, v in profile.stand.common().items()}
     readings = Readings(
         accelerometer=triads["accelerometer"],
         magnetometer=triads.get("magnetometer"),
         temperature=_given(cells, "temperature_c"),
         known=known,
-        sd=sd | _reference_uncertainties(cells, shape, profile, known) | _common(profile, shape),
+        sd=sd | _reference_uncertainties(cells, shape, profile, known) | common,
     )
     return readings, scales
 
@@ -252,6 +243,11 @@ def _given(cells: Cells, name: str) -> Array | None:
     """A column that is not wholly blank."""
     values = cells(name)
     return None if values is None or np.isnan(values).all() else values
+
+
+def _or_blank(values: Array | None, shape: tuple[int, ...]) -> Array:
+    """A column, of blank cells where it is not there."""
+    return np.full(shape, np.nan) if values is None else values
 
 
 def _stacked(cells: Cells, kind: str) -> Array | None:
@@ -311,12 +307,9 @@ def _scale(raw: Array, strength: Array) -> Array:
 
 def _noise(cells: Cells, kind: str, triad: TriadProfile, shape: tuple[int, ...]) -> Array | None:
     """Standard uncertainty (..., n, 3) of raw readings; None where nothing is stated."""
-    columns = [_given(cells, f"sd_{name}") for name in CHANNELS[kind]]
-    default = np.nan if triad.noise is None else triad.noise
-    noise = np.full(shape, default)
-    for channel, values in enumerate(columns):
-        if values is not None:
-            noise[..., channel] = np.where(np.isnan(values), default, values)
+    noise = np.stack([_or_blank(cells(f"sd_{name}"), shape) for name in CHANNELS[kind]], -1)
+    if triad.noise is not None:
+        noise = np.where(np.isnan(noise), triad.noise, noise)
     return None if np.isnan(noise).all() else np.hypot(noise, triad.repeatability)
 
 
@@ -324,15 +317,9 @@ def _reference_uncertainties(
     cells: Cells, shape: tuple[int, ...], profile: Profile, known: Iterable[str]
 ) -> dict[str, Array]:
     """Standard uncertainties (..., n) of references: the table's, else the stand's; zero ones left out."""
-    uncertainties = {}
-    for name in dict.fromkeys([*known, "gravity"]):
-        stated = _given(cells, f"sd_{REFERENCES[name].column}")
-        sd = _reference_uncertainty(
-            profile, name, np.full(shape, np.nan) if stated is None else stated
-        )
-        if sd.any():
-            uncertainties[name] = sd
-    return uncertainties
+    columns = {name: cells(f"sd_{REFERENCES[name].column}") for name in (*known, "gravity")}
+    sd = {n: _reference_uncertainty(profile, n, _or_blank(c, shape)) for n, c in columns.items()}
+    return {name: values for name, values in sd.items() if values.any()}
 
 
 def _reference_uncertainty(profile: Profile, name: str, stated: Array) -> Array:
@@ -343,11 +330,6 @@ def _reference_uncertainty(profile: Profile, name: str, stated: Array) -> Array:
     factor, quantity = REFERENCES[name].factor, _quantity(name)
     sd = np.where(np.isnan(stated), profile.stand.of(quantity), stated)
     return np.hypot(sd, profile.stand.repeatability(quantity)) * factor
-
-
-def _common(profile: Profile, shape: tuple[int, ...]) -> dict[str, Array]:
-    """Standard uncertainties of errors that all stations of the stand share, radians."""
-    return {name: np.full(shape, np.radians(sd)) for name, sd in profile.stand.common().items()}
 
 
 def from_readings(
@@ -380,7 +362,7 @@ def _quantity(name: str) -> str:
 
 def _stations(table: Table) -> tuple[str, ...]:
     """Labels of the stations; a blank one is the number of its row."""
-    given = labels(table, "station") if "station" in table.columns else [""] * table.count
+    given = labels(table, "station") or [""] * table.count
     return tuple(label or str(i) for i, label in enumerate(given, 1))
 
 

@@ -2,14 +2,14 @@
 
 A source hands out pieces in order, which are cheap to make, and loads a piece, which may be
 done by several threads at once. Needs PyArrow. Lines of text that are not plain (quotes, blanks
-before a cell) go through the parser of `files.text`, and so do whole pieces with numbers in unusual
+before a cell) go through the parser of `formats.text`, and so do whole pieces with numbers in unusual
 spelling or anything that is refused: one place decides what is accepted, and words it.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -121,12 +121,13 @@ def open_text(path: Path, typed: bool = False, decimal: str = ".") -> StreamedTa
     except OSError as error:
         raise InputError(f"cannot read '{path}': {error.strerror}.") from error
     start = _newlines(first)
-    top = text.head(start, path.name)
+    top = text.head(text.lines(start, path.name), path.name)
+    body = start.split(b"\n", top.lines)[-1].rstrip(b"\n")
     numeric = [name for name in top.names if typed and name in RANGES]
     types = {n: arrow.float64() if n in numeric else arrow.string() for n in top.names}
 
     def pieces() -> Iterator[Any]:
-        yield top.body, top.lines, len(first)
+        yield body, top.lines, len(first)
         above = start.count(b"\n")
         with path.open("rb") as stream:
             stream.seek(len(first))
@@ -141,17 +142,16 @@ def open_text(path: Path, typed: bool = False, decimal: str = ".") -> StreamedTa
         if both is None:
             parts = text.rows(data, top, above, path.name)
             table = Table(parts.columns, {}, path.name, parts.lines, decimal=decimal)
-            strings = {n: arrow.array(c, arrow.string()) for n, c in pointed(table).items()}
-            both = arrow.table(strings), table
+            both = _strings(pointed(table), arrow), table
         carried, table = both
         if typed:
             carried = _typed(carried, table, numeric, arrow)
-        kept = {n: c for n, c in table.columns.items() if n in RANGES}
-        stated = replace(table, columns=kept, metadata=top.metadata, source=path.name)
+        columns = {n: c for n, c in table.columns.items() if n in RANGES}
+        stated = replace(table, columns=columns, metadata=top.metadata, source=path.name)
         return Part(carried, stated, size)
 
     schema, total = arrow.schema(list(types.items())), path.stat().st_size
-    guess = total * top.body.count(b"\n") // len(first)
+    guess = total * body.count(b"\n") // len(first)
     return StreamedTable(path.name, top.names, top.metadata, schema, total, guess, pieces, load)
 
 
@@ -193,8 +193,7 @@ def _plain(data: bytes, top: text.Head, arrow: Any) -> tuple[Any, Table] | None:
             csv.ConvertOptions(column_types=strings, strings_can_be_null=False),
         )
         if order is not None:
-            unusual = text.rows(odd, top, 1, "").columns
-            few = arrow.table({n: arrow.array(c, arrow.string()) for n, c in unusual.items()})
+            few = _strings(text.rows(odd, top, 1, "").columns, arrow)
             both = arrow.concat_tables([carried, few]).combine_chunks()
             if len(both) != len(order):  # lines that are blank are no rows
                 return None
@@ -203,6 +202,10 @@ def _plain(data: bytes, top: text.Head, arrow: Any) -> tuple[Any, Table] | None:
     except (arrow.ArrowInvalid, arrow.ArrowKeyError):
         return None
     return carried, Table(columns, {}, "", range(carried.num_rows))
+
+
+def _strings(columns: Mapping[str, Column], arrow: Any) -> Any:
+    return arrow.table({n: arrow.array(cells, arrow.string()) for n, cells in columns.items()})
 
 
 def _sorted(data: bytes, delimiter: bytes) -> tuple[bytes, bytes, Ints | None]:

@@ -17,33 +17,25 @@ from mwdcal.errors import InputError
 from mwdcal.files.formats.columns import shown
 from mwdcal.geometry.observables import EXTRAPOLATED, RESULTS
 
-UNITS = {
-    "deg": "°",
-    "degree": "°",
-    "degrees": "°",
-    "rad": "rad",
-    "radian": "rad",
-    "radians": "rad",
-    "c": "°C",
-    "celsius": "°C",
-    "f": "°F",
-    "fahrenheit": "°F",
-    "k": "K",
-    "kelvin": "K",
+_SPELLINGS = {
+    "°": "deg degree degrees",
+    "rad": "rad radian radians",
+    "°C": "c celsius",
+    "°F": "f fahrenheit",
+    "K": "k kelvin",
     "g": "g",
-    "millig": "mg",
-    "mss": "m/s²",
-    "nt": "nT",
-    "gamma": "nT",
-    "ut": "µT",
-    "millit": "mT",
+    "mg": "millig",
+    "m/s²": "mss",
+    "nT": "nt gamma",
+    "µT": "ut",
+    "mT": "millit",
     "gauss": "gauss",
-    "v": "V",
-    "mv": "mV",
-    "lsb": "counts",
-    "counts": "counts",
+    "V": "v",
+    "mV": "mv",
+    "counts": "lsb counts",
     "raw": "raw",
 }
+_UNITS = {word: unit for unit, words in _SPELLINGS.items() for word in words.split()}
 """Units by the words of names, as `_words` leaves them."""
 CONVERSIONS = {
     "°F": "°C = (°F - 32) · 5/9",
@@ -124,9 +116,8 @@ def resembled(name: str) -> Resemblance | None:
     >>> [resembled(n) for n in ("Azi (°)", "Temp (°F)", "comment")]
     [Resemblance(column='ref_azimuth_deg', unit='°'), Resemblance(column='temperature_c', unit='°F'), None]
     """
-    spelled = _words(name)
-    words, unit = _without_unit([word for word in spelled if not word.isdigit()])
-    spread = any(word in _SPREADS for word in words)
+    words, unit = _without_unit(_words(name))
+    spread = not _SPREADS.isdisjoint(words)
     words = [word for word in words if word not in _SPREADS]
     whole = "".join(words)
     bare = "".join(word for word in words if word not in _BYWORDS)
@@ -141,21 +132,19 @@ def resembled(name: str) -> Resemblance | None:
 
 def _column(whole: str, bare: str, words: set[str], unit: str) -> str | None:
     """The contract's column of a name's words, all of them joined and without bywords."""
-    stated = bool(words & _STATED)
     if {whole, bare} & _NEVER:
         return None
-    if bare == "field" and (stated or unit in _MAGNETIC_UNITS or words & {"mag", "magnetic"}):
-        return "ref_field_nt"
-    if bare == "az" and (stated or unit in ("°", "rad")):
-        return "ref_azimuth_deg"
-    if bare in ("t", "deg", "") and unit in _WARM:
-        return "temperature_c"
-    if stated and bare in ("g", "b", "h"):
-        return "ref_gravity_g" if bare == "g" else "ref_field_nt"
-    for stem in (whole, bare, *(s.removeprefix("ref").removesuffix("deg") for s in (whole, bare))):
-        if stem in _SYNONYMS:
-            return _SYNONYMS[stem]
-    return None
+    stated = bool(words & _STATED)
+    magnetic = stated or unit in _MAGNETIC_UNITS or words & {"mag", "magnetic"}
+    rules = {
+        "ref_field_nt": (bare == "field" and magnetic) or (bare in ("b", "h") and stated),
+        "ref_azimuth_deg": bare == "az" and (stated or unit in ("°", "rad")),
+        "temperature_c": bare in ("t", "deg", "") and unit in _WARM,
+        "ref_gravity_g": bare == "g" and stated,
+    }
+    short = (s.removeprefix("ref").removesuffix("deg") for s in (whole, bare))
+    known = [_SYNONYMS[stem] for stem in (whole, bare, *short) if stem in _SYNONYMS]
+    return next(iter([column for column, fits in rules.items() if fits] + known), None)
 
 
 def _words(name: str) -> list[str]:
@@ -166,8 +155,7 @@ def _words(name: str) -> list[str]:
         text = text.replace(sign, word)
     for cased, word in _CASED.items():
         text = re.sub(rf"(?<![A-Za-z]){cased}(?![A-Za-z])", word, text)
-    words = re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+", text)
-    return [word.lower() for word in words]
+    return [word.lower() for word in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", text)]
 
 
 def unit_of(text: str) -> str:
@@ -177,33 +165,26 @@ def unit_of(text: str) -> str:
     ['°', '°F', 'm/s²', 'mg', '']
     """
     words = _words(text)
-    return UNITS[words[-1]] if words and set(words) <= {*UNITS} else ""
+    return _UNITS[words[-1]] if words and set(words) <= {*_UNITS} else ""
 
 
 def _without_unit(words: list[str]) -> tuple[list[str], str]:
     """The words before a unit, and the unit; a single word is not a unit."""
     left, unit = list(words), ""
-    while len(left) > 1 and left[-1] in UNITS and not set(left[:-1]) <= _STATED | {"total"}:
-        unit = unit or UNITS[left[-1]]
+    while len(left) > 1 and left[-1] in _UNITS and not set(left[:-1]) <= _STATED | {"total"}:
+        unit = unit or _UNITS[left[-1]]
         left.pop()
     return left, unit
 
 
 def unused(names: Sequence[str], used: Collection[str]) -> tuple[str, ...]:
     """Columns that are not used, each with what it resembles; those that resemble something first."""
-    results = _results(names)
-    entries = []
-    for name in names:
-        if name in used or name in OURS or name.startswith("drift_"):
-            continue
-        resemblance = resembled(name)
-        entry = shown(name)
-        if name in results:
-            entry += " (a result of mwdcal apply)"
-        elif resemblance is not None:
-            entry += f" (resembles '{resemblance.column}')"
-        entries.append((resemblance is None, entry))
-    return tuple(entry for _, entry in sorted(entries, key=lambda each: each[0]))
+    others = [n for n in names if n not in (*used, *OURS) and not n.startswith("drift_")]
+    alike = {name: resembled(name) for name in others}
+    notes = {name: f" (resembles '{each.column}')" for name, each in alike.items() if each}
+    notes |= dict.fromkeys(_results(names), " (a result of mwdcal apply)")
+    ordered = sorted(others, key=lambda name: alike[name] is None)
+    return tuple(shown(name) + notes.get(name, "") for name in ordered)
 
 
 def _results(names: Collection[str]) -> set[str]:
@@ -211,20 +192,13 @@ def _results(names: Collection[str]) -> set[str]:
     return {*RESULTS, EXTRAPOLATED} if set(RESULTS) <= set(names) else set()
 
 
-def check_evidence(names: Sequence[str], source: str) -> None:
-    """Refuse a column that resembles a reference or the temperature, where that itself is absent."""
-    results = _results(names)
-    _refuse([n for n in names if n not in results], [n for n in NOTICED if n not in names], source)
-
-
-def check_temperature(names: Sequence[str], source: str) -> None:
-    """Refuse a column that resembles the temperature, where that itself is absent."""
-    _refuse(names, [n for n in ("temperature_c",) if n not in names], source)
-
-
-def _refuse(names: Sequence[str], absent: Collection[str], source: str) -> None:
-    resembling = {name: resembled(name) for name in names}
-    meant = [(name, each) for name, each in resembling.items() if each and each.column in absent]
+def check_evidence(
+    names: Sequence[str], source: str, noticed: Collection[str] = tuple(NOTICED)
+) -> None:
+    """Refuse a column that resembles one of those to be noticed, where that itself is absent."""
+    results, absent = _results(names), {*noticed}.difference(names)
+    alike = {name: resembled(name) for name in names if name not in results}
+    meant = [(name, each) for name, each in alike.items() if each and each.column in absent]
     if not meant:
         return
     name, resemblance = meant[0]
@@ -244,8 +218,7 @@ def remedy(resemblance: Resemblance) -> str:
     "Convert it (°C = (°F - 32) · 5/9) and name it 'temperature_c' (°C)"
     """
     unit = f" ({NOTICED[resemblance.column]})" if resemblance.column in NOTICED else ""
+    how = "Rename it to"
     if resemblance.unit in CONVERSIONS:
-        return (
-            f"Convert it ({CONVERSIONS[resemblance.unit]}) and name it '{resemblance.column}'{unit}"
-        )
-    return f"Rename it to '{resemblance.column}'{unit}"
+        how = f"Convert it ({CONVERSIONS[resemblance.unit]}) and name it"
+    return f"{how} '{resemblance.column}'{unit}"

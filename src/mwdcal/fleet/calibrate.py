@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import msgspec
 import numpy as np
@@ -24,9 +25,8 @@ from mwdcal.calibration.estimate import Fit, fit
 from mwdcal.calibration.methods import ESTIMABLE
 from mwdcal.calibration.options import AUTO, Options
 from mwdcal.calibration.prediction import STATED_ANGLES, accuracy
-from mwdcal.calibration.readings import TRIADS, Readings
+from mwdcal.calibration.readings import HIGHEST, TRIADS, Readings
 from mwdcal.calibration.record import StandErrors
-from mwdcal.calibration.soaks import HIGHEST
 from mwdcal.errors import MwdcalError
 from mwdcal.estimation.batch import take
 from mwdcal.fleet.choices import in_chunks, with_curves, with_orders
@@ -47,21 +47,33 @@ STAND_COLUMNS = {
 """Columns of each error of the stand that may be asked for."""
 
 
+LISTS = ("findings", "reshoot", *(f"{triad}_undetermined" for triad in TRIADS))
+"""Columns of lists: ids of findings, stations to take again, ids of what nothing determines."""
+
+
 @dataclass(frozen=True)
-class BatchOutcome:
+class Outcome:
     """What became of B tools: a status and a message each, and columns (B,) of results.
 
-    `columns` hold NaN where a tool has no result. `free` lists, for each tool and triad, the
-    ids of directions that nothing determines; `findings` the ids of each tool's findings, and
-    `reshoot` the numbers of its stations to take again.
+    Where a tool has no result, there are NaN among `numbers`, and None among `lists` and units.
     """
 
     status: AnyArray
     message: AnyArray
-    columns: dict[str, Array]
-    free: list[tuple[list[str], ...]]
-    findings: list[list[str]]
-    reshoot: list[list[int]]
+    unit: AnyArray
+    numbers: dict[str, Array]
+    lists: dict[str, AnyArray]
+
+    @classmethod
+    def blank(cls, count: int, numbers: Iterable[str]) -> Outcome:
+        """Of tools that nothing has refused, and nothing calibrated."""
+        return cls(
+            status=np.full(count, OK, object),
+            message=np.full(count, "", object),
+            unit=np.full(count, None, object),
+            numbers={name: np.full(count, np.nan) for name in numbers},
+            lists={name: np.full(count, None, object) for name in LISTS},
+        )
 
     def sound(self, tools: Ints) -> Ints:
         """Those of the given tools that nothing has refused."""
@@ -104,25 +116,25 @@ def names(options: Options, profile: Profile, triads: Sequence[str] = TRIADS) ->
         if may_be_curved(options, profile, index):
             columns += [f"{triad}_{name}" for name in (*CENTRES, "radius")]
         columns += [name for value in values for name in (value, f"{value}_sd")]
-    last = (
-        (STATED_ANGLES, EARTH_COLUMNS)
-        if len(triads) > 1
-        else (STATED_ANGLES[:2], EARTH_COLUMNS[:1])
-    )
+    several = len(triads) > 1
+    angles = STATED_ANGLES if several else STATED_ANGLES[:2]
+    earth = EARTH_COLUMNS if several else EARTH_COLUMNS[:1]
     stand = [name for error in options.estimate for name in STAND_COLUMNS[error]]
-    return [*columns, *(f"{angle}_sd_deg" for angle in last[0]), *last[1], *stand]
+    return [*columns, *(f"{angle}_sd_deg" for angle in angles), *earth, *stand]
 
 
 def calibrate_batch(
     readings: Readings, options: Options, profile: Profile, alone: Alone
-) -> BatchOutcome:
+) -> Outcome:
     """Calibrate tools of the same shape: readings (B, n, ...), at the profile's temperature.
 
-    `alone` gives one tool's own readings where a check needs words for it.
+    `alone` gives one tool's own readings where a check needs words for it. Stations to take again
+    are counted from 0.
     """
-    batch = _Batch(readings, _with_scales(profile), alone, names(options, profile))
+    outcome = Outcome.blank(len(readings.accelerometer), names(options, profile))
+    batch = _Batch(readings, _with_scales(profile), alone, outcome)
     batch.calibrate(known_before(options, readings, batch.profile))
-    return batch.outcome
+    return outcome
 
 
 def _with_scales(profile: Profile) -> Profile:
@@ -132,38 +144,26 @@ def _with_scales(profile: Profile) -> Profile:
     return msgspec.structs.replace(profile, **stated)
 
 
+@dataclass(frozen=True)
 class _Batch:
     """Tools on their way: readings (B, n, ...), and the outcome that steps fill in for some of them."""
 
-    def __init__(
-        self, readings: Readings, profile: Profile, alone: Alone, columns: Sequence[str]
-    ) -> None:
-        self.readings, self.profile, self.alone = readings, profile, alone
-        self.every = np.arange(len(readings.accelerometer))
-        self.outcome = BatchOutcome(
-            status=np.full(len(self.every), OK, object),
-            message=np.full(len(self.every), "", object),
-            columns={name: np.full(len(self.every), np.nan) for name in columns},
-            free=[([], []) for _ in self.every],
-            findings=[[] for _ in self.every],
-            reshoot=[[] for _ in self.every],
-        )
+    readings: Readings
+    profile: Profile
+    alone: Alone
+    outcome: Outcome
 
     def calibrate(self, options: Options) -> None:
         """Choose what the options leave to the data, fit, and note what came of it."""
-        readings, sound = self.readings, self.outcome.sound
-        self._screen(self.every, options)
-        for some, chosen in with_orders(readings, sound(self.every), options):
-            if isinstance(chosen, Exception):
-                self._fail(some, chosen)
-                continue
+        readings, sound, fail = self.readings, self.outcome.sound, self._fail
+        every = np.arange(len(readings.accelerometer))
+        self._screen(every, options)
+        for some, chosen in with_orders(readings, sound(every), options, fail):
             if chosen.order != options.order:
                 self._screen(some, chosen)
-            for part, final in with_curves(readings, sound(some), chosen, self.profile):
-                if isinstance(final, Exception):
-                    self._fail(part, final)
-                else:
-                    self._fit(part, final)
+            for part, final in with_curves(readings, sound(some), chosen, self.profile, fail):
+                for few, result in in_chunks(readings, part, partial(fit, options=final), fail):
+                    self._note(few, final, result)
 
     def _screen(self, tools: Ints, options: Options) -> None:
         """Refuse those of some tools that no fit could mend."""
@@ -172,22 +172,12 @@ class _Batch:
             tools, reading_refusals(readings, options, lambda i: self.alone(int(tools[i]))[0])
         )
 
-    def _fit(self, tools: Ints, options: Options) -> None:
-        """Fit some tools, and note the results of the sound ones."""
-        for part, result in in_chunks(self.readings, tools, lambda r: fit(r, options)):
-            if isinstance(result, Exception):
-                self._fail(part, result)
-            else:
-                self._note(part, options, result)
-
     def _fail(self, tools: Ints, error: Exception) -> None:
         """Give tools the status and message of an error: of the input, or of arithmetic."""
-        status, message = self.outcome.status, self.outcome.message
-        if isinstance(error, MwdcalError):
-            status[tools], message[tools] = BAD_INPUT, str(error)
-            return
-        status[tools] = FAILED
-        message[tools] = f"the fit failed: {error}. Calibrate this tool alone to see why."
+        known = isinstance(error, MwdcalError)
+        words = f"the fit failed: {error}. Calibrate this tool alone to see why."
+        self.outcome.status[tools] = BAD_INPUT if known else FAILED
+        self.outcome.message[tools] = str(error) if known else words
 
     def _refuse(self, tools: Ints, refusals: Iterable[Flag]) -> None:
         """Give the first refusal of each of some tools as its status and message."""
@@ -200,7 +190,7 @@ class _Batch:
     def _note(self, tools: Ints, options: Options, result: Fit) -> None:
         """Check a fit of some tools, and note results and findings of the sound ones."""
         readings = take(self.readings, tools)
-        fitted = FittedRuns.of(
+        fitted = FittedRuns(
             readings, self.profile, options, result, lambda place: self.alone(int(tools[place]))
         )
         self._refuse(tools, fit_refusals(fitted))
@@ -210,22 +200,28 @@ class _Batch:
         if good.size < len(tools):
             fitted = fitted.take(good)
         self._note_findings(tools[good], fitted)
+        if readings.magnetometer is not None:
+            self.outcome.unit[tools[good]] = readings.field_unit
         for name, values in _columns(fitted, self.profile.reference_temperature_c).items():
-            self.outcome.columns[name][tools[good]] = values
+            self.outcome.numbers[name][tools[good]] = values
 
     def _note_findings(self, tools: Ints, fitted: FittedRuns) -> None:
         """The findings of sound tools; what is undetermined, by triad."""
+        lists = self.outcome.lists
         ids: list[dict[str, None]] = [{} for _ in tools]
+        stations: list[list[int]] = [[] for _ in tools]
         for flag in finding_flags(fitted):
             for place in np.flatnonzero(flag.members).tolist():
                 ids[place][flag.id] = None
                 if flag.station is not None:
-                    self.outcome.reshoot[tools[place]].append(flag.station)
-        for tool, flags, free in zip(tools, ids, fitted.free, strict=True):
+                    stations[place].append(flag.station)
+        for tool, flags, again, free in zip(tools, ids, stations, fitted.free, strict=True):
             undetermined = {entry.id for entry in free}
-            self.outcome.findings[tool] = [name for name in flags if name not in undetermined]
-            by_triad = ([f.id for f in free if triad in f.triads] for triad in range(len(TRIADS)))
-            self.outcome.free[tool] = tuple(by_triad)
+            lists["findings"][tool] = [name for name in flags if name not in undetermined]
+            lists["reshoot"][tool] = again
+            for index, triad in enumerate(TRIADS):
+                free_here = [entry.id for entry in free if index in entry.triads]
+                lists[f"{triad}_undetermined"][tool] = free_here
 
 
 def _columns(fitted: FittedRuns, reference: float) -> dict[str, Array]:

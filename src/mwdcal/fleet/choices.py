@@ -5,8 +5,9 @@ As for a single run; many tools are tried in one fit.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
+from itertools import compress
 from typing import TypeVar
 
 import numpy as np
@@ -19,60 +20,37 @@ from mwdcal.calibration.options import AUTO, Options
 from mwdcal.calibration.readings import Readings
 from mwdcal.errors import MwdcalError
 from mwdcal.estimation.batch import take
-from mwdcal.geometry.vectors import Ints
+from mwdcal.geometry.vectors import AnyArray, Bools, Ints
 from mwdcal.sensor.profile import Profile
 
 TOOLS_PER_FIT = 320
 """Tools fitted in one call: few enough for the cache, many enough for NumPy."""
 _T = TypeVar("_T")
+Fail = Callable[[Ints, Exception], None]
+"""What becomes of tools that an exception stops."""
 
 
 def with_orders(
-    readings: Readings, tools: Ints, options: Options
-) -> Iterator[tuple[Ints, Options | Exception]]:
-    """Those of the given tools that have orders, and a range of temperatures, in common.
-
-    An exception where one of a tool's trials failed.
-    """
-    if not max(options.orders) and options.order != AUTO:
-        yield tools, options
-        return
-    for alike in _alike(readings, tools):
-        if options.order == AUTO:
-            yield from _by_order(readings, alike, options)
-        else:
-            yield alike, options
-
-
-def _alike(readings: Readings, tools: Ints) -> list[Ints]:
-    """The given tools by range of temperatures: a model is conditioned for one."""
-    if readings.temperature is None:
-        return [tools]
-    ranges = temperature_ranges(readings.temperature[tools])
-    _, number = np.unique(ranges, axis=0, return_inverse=True)
-    return [tools[number == k] for k in range(number.max(initial=-1) + 1)]
-
-
-def _by_order(
-    readings: Readings, tools: Ints, options: Options
-) -> Iterator[tuple[Ints, Options | Exception]]:
-    """The given tools by the orders that are chosen for them."""
+    readings: Readings, tools: Ints, options: Options, fail: Fail
+) -> Iterator[tuple[Ints, Options]]:
+    """Those of the given tools that have orders, and a range of temperatures, in common."""
+    groups = [tools]
+    if readings.temperature is not None and (options.order == AUTO or max(options.orders)):
+        ranges = temperature_ranges(readings.temperature[tools])
+        groups = [group for _, group in alike(tools, ranges)]
     trial = replace(options, nonlinearity={})
-    orders = np.full((len(readings.accelerometer), 2), -1)
-    for part, chosen in in_chunks(readings, tools, lambda r: choose_orders(r, trial)):
-        if isinstance(chosen, Exception):
-            yield part, chosen
-        else:
-            orders[part] = chosen
-    for pair in np.unique(orders[tools], axis=0):
-        if pair.min() >= 0:
-            order = (int(pair[0]), int(pair[1]))
-            yield tools[(orders[tools] == pair).all(-1)], replace(options, order=order)
+    for group in groups:
+        if options.order != AUTO:
+            yield group, options
+            continue
+        trials = in_chunks(readings, group, lambda r: choose_orders(r, trial), fail)
+        for orders, some in _by_choice(trials):
+            yield some, replace(options, order=(int(orders[0]), int(orders[1])))
 
 
 def with_curves(
-    readings: Readings, tools: Ints, options: Options, profile: Profile
-) -> Iterator[tuple[Ints, Options | Exception]]:
+    readings: Readings, tools: Ints, options: Options, profile: Profile, fail: Fail
+) -> Iterator[tuple[Ints, Options]]:
     """The given tools by the own-axis terms that their runs show."""
     terms = offered(profile, options)
     if not terms:
@@ -81,44 +59,51 @@ def with_curves(
             check_curves(readings, tuple(options.curved))
             check_options(options)
         except MwdcalError as error:
-            yield tools, error
+            fail(tools, error)
         else:
             yield tools, options
         return
     options = scattered(readings, options)
-    groups: dict[tuple[str, ...], list[Ints]] = {}
-    trials = in_chunks(
-        readings, tools, lambda r: compare_curves(r, options, terms), TOOLS_PER_FIT // MOST_PARTS
-    )
-    for part, curves in trials:
-        if isinstance(curves, Exception):
-            yield part, curves
-            continue
-        for place in np.unique(curves.chosen):
-            groups.setdefault(curves.choices[place], []).append(part[curves.chosen == place])
-    for names, parts in groups.items():
-        chosen = {name: terms[name] for name in names}
-        yield np.concatenate(parts), replace(options, nonlinearity=chosen)
+
+    def shown(some: Readings) -> Bools:
+        curves = compare_curves(some, options, terms)
+        return np.array([[n in names for n in terms] for names in curves.choices])[curves.chosen]
+
+    trials = in_chunks(readings, tools, shown, fail, TOOLS_PER_FIT // MOST_PARTS)
+    for chosen, some in _by_choice(trials):
+        yield some, replace(options, nonlinearity=dict(compress(terms.items(), chosen)))
+
+
+def alike(tools: Ints, keys: AnyArray) -> list[tuple[AnyArray, Ints]]:
+    """The given tools by their keys (T, k), and each key once."""
+    kinds, number = np.unique(keys, axis=0, return_inverse=True)
+    return [(kind, tools[number == place]) for place, kind in enumerate(kinds)]
+
+
+def _by_choice(trials: Iterable[tuple[Ints, AnyArray]]) -> list[tuple[AnyArray, Ints]]:
+    """Tools by what is chosen for them: a row (k,) each."""
+    parts = list(zip(*trials, strict=True))
+    return alike(*map(np.concatenate, parts)) if parts else []
 
 
 def in_chunks(
-    readings: Readings, tools: Ints, work: Callable[[Readings], _T], size: int = TOOLS_PER_FIT
-) -> Iterator[tuple[Ints, _T | Exception]]:
+    readings: Readings,
+    tools: Ints,
+    work: Callable[[Readings], _T],
+    fail: Fail,
+    size: int = TOOLS_PER_FIT,
+) -> Iterator[tuple[Ints, _T]]:
     """The work on given members of a batch, `size` at a time; in halves where one stops the whole."""
     for start in range(0, len(tools), size):
-        yield from _halved(readings, tools[start : start + size], work)
-
-
-def _halved(
-    readings: Readings, tools: Ints, work: Callable[[Readings], _T]
-) -> Iterator[tuple[Ints, _T | Exception]]:
-    """The work on given members of a batch, done in halves where one member stops the whole."""
-    try:
-        yield tools, work(take(readings, tools))
-    except (ArithmeticError, ValueError, np.linalg.LinAlgError) as error:
-        if len(tools) == 1:
-            yield tools, error
-            return
-        middle = len(tools) // 2
-        for part in (tools[:middle], tools[middle:]):
-            yield from _halved(readings, part, work)
+        part = tools[start : start + size]
+        try:
+            result = work(take(readings, part))
+        except (ArithmeticError, ValueError, np.linalg.LinAlgError) as error:
+            if len(part) == 1:
+                fail(part, error)
+                continue
+            middle = len(part) // 2
+            for half in (part[:middle], part[middle:]):
+                yield from in_chunks(readings, half, work, fail)
+        else:
+            yield part, result

@@ -26,9 +26,9 @@ LOCK = "lock"
 MANIFEST = "manifest.json"
 _PART = re.compile(r"[0-9a-f]{32}\.arrow")
 _DEALT = re.compile(r"sorted-[0-9a-f]{16}(\.tmp)?")
-_PARQUET = re.compile(r"\d{4}\.parquet")
-_STREAM = b"\xff\xff\xff\xff"
-"""How Arrow's streams begin: parts of mwdcal before they were sealed."""
+_DEALT_FILE = re.compile(r"\d{4}\.parquet|manifest\.json")
+_BEGINNINGS = {".arrow": (SEAL, b"\xff\xff\xff\xff"), ".parquet": (b"PAR1",), ".json": (b"",)}
+"""How our files begin, by their suffix; parts of mwdcal before they were sealed as Arrow's streams do."""
 
 
 def sealed(content: bytes, name: str) -> bytes:
@@ -82,52 +82,37 @@ def check_folder(folder: Path) -> None:
             "it, or choose another `output`."
         )
     for path in folder.iterdir() if folder.exists() else ():
-        foreign = path.is_symlink() and (_PART.fullmatch(path.name) or _DEALT.fullmatch(path.name))
-        if foreign or (path.name == LOCK and not _is_empty_file(path)):
+        name, link = path.name, path.is_symlink()
+        ours = name == LOCK or _PART.fullmatch(name) or _DEALT.fullmatch(name)
+        if (ours and link) or (name == LOCK and not (path.is_file() and path.stat().st_size == 0)):
             raise InputError(
-                f"cannot write to '{folder}', where finished parts are kept: '{path.name}' there is not "
+                f"cannot write to '{folder}', where finished parts are kept: '{name}' there is not "
                 "a file of mwdcal. Remove it, or choose another `output`."
             )
-
-
-def _is_empty_file(path: Path) -> bool:
-    return path.is_file() and not path.is_symlink() and path.stat().st_size == 0
 
 
 def remove(folder: Path) -> None:
     """Remove parts and dealt rows from a folder, and nothing that is not ours."""
     for path in list(folder.iterdir()):
-        if path.is_symlink():
-            continue
-        if _PART.fullmatch(path.name) and path.is_file() and _is_ours(path, (SEAL, _STREAM)):
-            path.unlink()
-        elif is_dealt(path):
+        if is_dealt(path):
             shutil.rmtree(path)
-
-
-def _is_ours(path: Path, marks: tuple[bytes, ...]) -> bool:
-    """Whether a file begins with one of our marks, or with what a loss of power leaves of one."""
-    with path.open("rb") as stream:
-        head = stream.read(HEAD)
-    return head.startswith(marks) or not head.strip(b"\0")
+        elif _is_ours(path, _PART):
+            path.unlink()
 
 
 def is_dealt(folder: Path) -> bool:
     """Whether a folder has nothing but dealt rows, finished or not."""
-    return (
-        _DEALT.fullmatch(folder.name) is not None
-        and folder.is_dir()
-        and not folder.is_symlink()
-        and all(_is_dealt_file(path) for path in folder.iterdir())
-    )
+    ours = folder.is_dir() and not folder.is_symlink() and _DEALT.fullmatch(folder.name)
+    return bool(ours) and all(_is_ours(path, _DEALT_FILE) for path in folder.iterdir())
 
 
-def _is_dealt_file(path: Path) -> bool:
-    if path.is_symlink() or not path.is_file():
+def _is_ours(path: Path, names: re.Pattern[str]) -> bool:
+    """Whether a file has such a name, and begins as it says or with what a loss of power leaves of that."""
+    if path.is_symlink() or not path.is_file() or not names.fullmatch(path.name):
         return False
-    if path.name == MANIFEST:
-        return True
-    return _PARQUET.fullmatch(path.name) is not None and _is_ours(path, (b"PAR1",))
+    with path.open("rb") as stream:
+        head = stream.read(HEAD)
+    return head.startswith(_BEGINNINGS[path.suffix]) or not head.strip(b"\0")
 
 
 def make_room(folder: Path) -> None:
@@ -150,9 +135,8 @@ def write_manifest(folder: Path) -> None:
 def is_whole(folder: Path) -> bool:
     """Whether dealt rows are there, as their manifest states."""
     try:
-        return is_dealt(folder) and msgspec.json.decode(
-            (folder / MANIFEST).read_bytes()
-        ) == _checksums(folder)
+        stated = msgspec.json.decode((folder / MANIFEST).read_bytes())
+        return is_dealt(folder) and bool(stated == _checksums(folder))
     except (OSError, msgspec.MsgspecError, ValueError, RecursionError):
         return False
 

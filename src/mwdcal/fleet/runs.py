@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from mwdcal.calibration.diagnosis.flags import Alone
 from mwdcal.calibration.readings import Readings, group_numbers
 from mwdcal.errors import InputError, MwdcalError
 from mwdcal.files.contract import COLUMNS, RANGES
@@ -21,6 +22,7 @@ from mwdcal.files.formats import parquet
 from mwdcal.files.formats.columns import as_text
 from mwdcal.files.formats.table import Table
 from mwdcal.files.runs import convert, to_readings
+from mwdcal.fleet.choices import alike
 from mwdcal.fleet.sources import AZIMUTH, OFFSET, SERIAL
 from mwdcal.fleet.tables import one_chunk
 from mwdcal.geometry.vectors import AnyArray, Array, Bools, Ints
@@ -31,20 +33,18 @@ GROUP, STATION = "group", "station"
 
 @dataclass(frozen=True)
 class Rows:
-    """The stations of T tools, the rows of each together: an Arrow table and where tools start."""
+    """The stations of T tools, the rows of each together: an Arrow table."""
 
     table: Any
-    starts: Ints
     source: str
     metadata: Mapping[str, object]
     profile: Profile
 
-    @classmethod
-    def of(cls, table: Any, source: str, metadata: Mapping[str, object], profile: Profile) -> Rows:
-        """From a table whose rows are in order of tools."""
-        codes = one_chunk(table.column(SERIAL)).indices.to_numpy(zero_copy_only=False)
-        starts = np.append(np.flatnonzero(np.diff(codes, prepend=codes[0] - 1)), len(codes))
-        return cls(table, starts, source, metadata, profile)
+    @cached_property
+    def starts(self) -> Ints:
+        """The first row of each tool, and the end (T + 1,); rows are in order of tools."""
+        codes = one_chunk(self.table.column(SERIAL)).indices.to_numpy(zero_copy_only=False)
+        return np.append(np.flatnonzero(np.diff(codes, prepend=codes[0] - 1)), len(codes))
 
     @property
     def serials(self) -> Any:
@@ -60,15 +60,9 @@ class Rows:
     @cached_property
     def numbers(self) -> dict[str, Array]:
         """Columns of numbers (R,), NaN where blank; wholly blank ones are left out."""
-        arrow, _ = parquet.modules(self.source)
-        numbers = {}
-        for name in self.table.column_names:
-            if name in RANGES:
-                cells = self.table.column(name).cast(arrow.float64(), safe=False)
-                values = np.asarray(cells.to_numpy(), float)
-                if not np.isnan(values).all():
-                    numbers[name] = values
-        return numbers
+        names = [name for name in self.table.column_names if name in RANGES]
+        columns = {name: np.asarray(self.table.column(name).to_numpy(), float) for name in names}
+        return {name: cells for name, cells in columns.items() if not np.isnan(cells).all()}
 
     @cached_property
     def offsets(self) -> tuple[Array, Array]:
@@ -84,11 +78,13 @@ class Rows:
     @cached_property
     def groups(self) -> Ints:
         """Number (R,) of the group of each row within its tool, -1 for none."""
+        none = np.full(self.starts[-1], -1)
+        if GROUP not in self.table.column_names:
+            return none
         arrow, _ = parquet.modules(self.source)
         names = parquet.as_column(GROUP, self.table.column(GROUP), arrow)
-        labels = [str(name).strip() for name in names]
-        numbers = group_numbers(labels, self.starts.tolist())
-        return np.full(len(labels), -1) if numbers is None else numbers
+        numbers = group_numbers([str(name).strip() for name in names], self.starts.tolist())
+        return none if numbers is None else numbers
 
     def alone(self, tool: int) -> tuple[Readings, Profile]:
         """One tool's readings as a single run has them; raises what a single run would."""
@@ -96,15 +92,16 @@ class Rows:
         part = self.table.slice(self.starts[tool], self.counts[tool])
         serial = part.column(SERIAL)[0].as_py()
         lines = (part.column("#row").to_numpy() + 1).tolist()
-        columns = {
-            name: parquet.as_column(name, part.column(name), arrow)
-            for name in part.column_names
-            if name in COLUMNS
-        }
+        names = [name for name in part.column_names if name in COLUMNS]
+        columns = {name: parquet.as_column(name, part.column(name), arrow) for name in names}
         place = self.source if self.source.endswith(".parquet") else f"{self.source}/*.parquet"
         source = f"serial {serial} of {place}"
         metadata = {**self.metadata, SERIAL: str(serial), **self._north(tool, source)}
         return to_readings(Table(columns, metadata, source, lines), self.profile)
+
+    def members(self, tools: Ints) -> Alone:
+        """The same for some tools, by place among these."""
+        return lambda place: self.alone(int(tools[place]))
 
     def label(self, tool: int, station: int) -> str:
         """A station's label, as a single run has it."""
@@ -130,14 +127,6 @@ class Rows:
         return np.logical_or.reduceat(rows, self.starts[:-1])
 
 
-@dataclass(frozen=True)
-class Batch:
-    """Tools of one shape: readings (B, n, ...), and the number (B,) of each among its rows."""
-
-    readings: Readings
-    tools: Ints
-
-
 def refused_tools(rows: Rows) -> dict[int, str]:
     """Tools with cells that a run may not have, and the message about the first of them."""
     wrong = np.zeros(rows.starts[-1], bool)
@@ -152,18 +141,12 @@ def refused_tools(rows: Rows) -> dict[int, str]:
     return refused
 
 
-def batches(rows: Rows, tools: Ints) -> list[Batch]:
-    """The given tools, in batches of one number of stations and the same kinds of evidence."""
-    if not tools.size:
-        return []
-    keys = _kinds(rows)[tools]
-    if (keys == keys[0]).all():
-        return [Batch(_readings(rows, tools), tools)]
-    _, number = np.unique(keys, axis=0, return_inverse=True)
-    order = np.argsort(number, kind="stable")
-    bounds = np.flatnonzero(np.diff(number[order], prepend=-1))
-    groups = np.split(order, bounds[1:])
-    return [Batch(_readings(rows, tools[np.sort(each)]), tools[np.sort(each)]) for each in groups]
+def batches(rows: Rows, tools: Ints) -> list[tuple[Ints, Readings]]:
+    """The given tools, in batches of one number of stations and the same kinds of evidence.
+
+    Their numbers (B,), and their readings (B, n, ...).
+    """
+    return [(some, _readings(rows, some)) for _, some in alike(tools, _kinds(rows)[tools])]
 
 
 def _kinds(rows: Rows) -> Ints:
@@ -174,9 +157,7 @@ def _kinds(rows: Rows) -> Ints:
         kinds += [rows.any(~blank), ~rows.any(blank)]
         if name.startswith("sd_ref"):
             kinds.append(rows.any(rows.numbers[name] > 0))
-    if GROUP in rows.table.column_names:
-        kinds.append(rows.any(rows.groups >= 0))
-    return np.stack(kinds, -1).astype(int)
+    return np.stack([*kinds, rows.any(rows.groups >= 0)], -1).astype(int)
 
 
 def _readings(rows: Rows, tools: Ints) -> Readings:
@@ -189,6 +170,5 @@ def _readings(rows: Rows, tools: Ints) -> Readings:
         return None if values is None else values[where]
 
     readings, _ = convert(cells, where.shape, rows.profile, rows.offsets[0][tools][:, None])
-    group = rows.groups[where] if GROUP in rows.table.column_names else None
-    some = group is not None and (group >= 0).any()
-    return replace(readings, group=group if some else None, source=rows.source)
+    group = rows.groups[where]
+    return replace(readings, group=group if (group >= 0).any() else None, source=rows.source)

@@ -77,11 +77,6 @@ class FleetTable:
         return tuple(name for name in self.columns if name in known)
 
     @property
-    def unused(self) -> tuple[str, ...]:
-        """The columns that are not used, each with what it resembles."""
-        return synonyms.unused(self.columns, self.used)
-
-    @property
     def fingerprint(self) -> str:
         """What changes when a file of the table does."""
         parts = [(Path(p.path).name, p.stamp, p.group, p.rows, p.keys) for p in self.pieces]
@@ -105,10 +100,9 @@ def open_source(path: Path) -> FleetTable:
     files = [_look(file, path) for file in paths]
     columns = files[0].columns
     for file, described in zip(paths, files, strict=True):
-        if set(described.columns) != set(columns):
-            odd = sorted(set(described.columns) ^ set(columns))[0]
+        if odd := sorted(set(described.columns) ^ set(columns)):
             raise InputError(
-                f"{file}: all files of '{path.name}' must have the same columns; '{odd}' is in some "
+                f"{file}: all files of '{path.name}' must have the same columns; '{odd[0]}' is in some "
                 f"and not in others ({paths[0].name} …). Write the table again."
             )
     _check_columns(columns, path.name)
@@ -126,10 +120,8 @@ def open_source(path: Path) -> FleetTable:
 
 def _joined(name: str, files: Sequence[_File]) -> FleetTable:
     """The table of all files: each with its own azimuths, and serials of one kind."""
-    columns, notes = files[0].columns, []
-    offsets = sorted({file.offset for file in files})
-    text = any(file.text for file in files)
-    pieces = []
+    columns, notes, pieces = files[0].columns, [], []
+    text, offsets = any(file.text for file in files), sorted({file.offset for file in files})
     for file in files:
         stated: Keys = ((OFFSET, file.offset),) if any(offsets) else ()
         pieces += [replace(p, keys=(*p.keys, *stated), text=text) for p in file.pieces]
@@ -179,22 +171,24 @@ def _look(file: Path, root: Path) -> _File:
     with parquet.reading(str(file)), pq.ParquetFile(file) as opened:
         schema, keys = opened.schema_arrow, _keys(file, root)
         check_names(schema.names, str(file))
+        for field in sorted(schema, key=lambda each: (each.name in LABELS, each.name)):
+            _check_type(field.type, field.name, file)
         columns = dict.fromkeys((*schema.names, *dict(keys)))
         names = tuple(n for n in columns if not n.startswith("__index"))
-        for name in sorted({*contract.RANGES}.intersection(schema.names)):
-            _check_numeric(schema.field(name).type, name, file)
-        for name in sorted({*LABELS}.intersection(schema.names)):
-            _check_label(schema.field(name).type, name, file)
-        kind = schema.field(SERIAL).type if SERIAL in schema.names else arrow.string()
-        kind = kind.value_type if arrow.types.is_dictionary(kind) else kind
+        whole = {each.name for each in schema if arrow.types.is_integer(cell_type(each.type))}
         metadata = parquet.metadata_of(schema.metadata, str(file))
         pieces = pieces_of(file, stamp, opened.metadata, keys)
     offset = magnetic_offset(metadata, str(file)) if AZIMUTH in names else 0.0
-    text = SERIAL in dict(keys) or not arrow.types.is_integer(kind)
-    return _File(pieces, names, metadata, text, offset)
+    return _File(pieces, names, metadata, SERIAL in dict(keys) or SERIAL not in whole, offset)
 
 
-def pieces_of(file: Path, stamp: Stamp, about: Any, keys: Keys = ()) -> list[Piece]:
+def cell_type(kind: Any) -> Any:
+    """The type of a column's cells, whether they are encoded or not."""
+    arrow, _ = parquet.modules("fleet")
+    return kind.value_type if arrow.types.is_dictionary(kind) else kind
+
+
+def pieces_of(file: Path, stamp: Stamp, about: Any, keys: Keys) -> list[Piece]:
     """The row groups of a file with the given Parquet metadata."""
     return [
         Piece(str(file.resolve()), stamp, group, about.row_group(group).num_rows, keys)
@@ -236,46 +230,36 @@ def _keys(file: Path, root: Path) -> Keys:
                 "a blank cell. Say which tool these stations belong to."
             )
         if name in contract.RANGES and value not in BLANK:
-            keys[name] = _number(value, name, file)
+            try:
+                keys[name] = float(value)
+            except ValueError:
+                raise InputError(
+                    f"{file.parent}, column '{name}': expected a number; the folder says '{value}'. Rename it."
+                ) from None
     return tuple(keys.items())
 
 
-def _number(value: str, name: str, file: Path) -> float:
-    """The number that a folder's name states."""
-    try:
-        return float(value)
-    except ValueError:
-        raise InputError(
-            f"{file.parent}, column '{name}': expected a number; the folder says '{value}'. Rename it."
-        ) from None
-
-
-def _check_numeric(kind: Any, name: str, file: Path) -> None:
-    """Refuse a column of text where numbers belong."""
-    arrow, _ = parquet.modules(str(file))
-    types = arrow.types
-    fine = (types.is_integer, types.is_floating, types.is_decimal, types.is_null)
-    if not any(test(kind) for test in fine):
-        raise InputError(
-            f"{file.name}, column '{name}': expected numbers; the column has the type {kind}. "
+def _check_type(kind: Any, name: str, file: Path) -> None:
+    """Refuse text where numbers belong, labels that are no text, numbers or times, and odd serials."""
+    types = parquet.modules(str(file))[0].types
+    advice = "Write it as text."
+    if name in contract.RANGES:
+        numbers = (types.is_integer, types.is_floating, types.is_decimal, types.is_null)
+        fine, expected = any(test(kind) for test in numbers), "expected numbers"
+        advice = (
             "Write it as numbers, with empty cells where a value is unknown: with pandas, "
             f"table['{name}'] = pandas.to_numeric(table['{name}'])."
         )
-
-
-def _check_label(kind: Any, name: str, file: Path) -> None:
-    """Refuse labels that are no text, numbers or times, and serials that are no text or whole numbers."""
-    types = parquet.modules(str(file))[0].types
-    kind = kind.value_type if types.is_dictionary(kind) else kind
-    texts = (types.is_string, types.is_large_string, types.is_integer)
-    if name != SERIAL:
-        fine, expected = not types.is_nested(kind), "text, numbers or times"
+    elif name == SERIAL:
+        kind, texts = cell_type(kind), (types.is_string, types.is_large_string, types.is_integer)
+        fine, expected = any(test(kind) for test in texts), "must be text or whole numbers"
     else:
-        fine, expected = any(test(kind) for test in texts), "text or whole numbers"
+        kind = cell_type(kind)
+        fine = name not in LABELS or not types.is_nested(kind)
+        expected = "must be text, numbers or times"
     if not fine:
         raise InputError(
-            f"{file.name}, column '{name}': must be {expected}; the column has the type {kind}. "
-            "Write it as text."
+            f"{file.name}, column '{name}': {expected}; the column has the type {kind}. {advice}"
         )
 
 

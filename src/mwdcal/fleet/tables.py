@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
@@ -28,6 +28,7 @@ from mwdcal.fleet.sources import (
     SERIAL,
     FleetTable,
     Piece,
+    cell_type,
     check_unchanged,
     pieces_of,
 )
@@ -35,12 +36,16 @@ from mwdcal.geometry.vectors import Ints
 
 TOOL = "#tool"
 """Column of dealt rows: number of the tool, in order of first appearance."""
+ROW = "#row"
+"""Column of the number of a row in the whole table."""
 PARTITION_ROWS = (6_000, 100_000)
 """Fewest and most rows of a partition that is not a single tool…"""
 SHARES = 32
 """…and into how many a fleet between these is divided."""
 BATCH = 32_768
-"""Rows that are read at once."""
+"""Rows that are read at once…"""
+SERIALS = 500_000
+"""…and serials."""
 MOST_STRETCHES = 50_000_000
 """Most stretches of rows of one tool in a table."""
 MOST_FILES = 200
@@ -96,7 +101,11 @@ def find_tools(source: FleetTable) -> Tools:
             indices = arrow.array(codes[change], values.indices.type)
             heads.append(arrow.DictionaryArray.from_arrays(indices, values.dictionary))
             row, last = row + len(codes), values[-1].as_py()
-            _check_stretches(sum(map(len, starts)), source.name)
+            if sum(map(len, starts)) > MOST_STRETCHES:
+                raise InputError(
+                    f"{source.name}: the rows change from tool to tool more than {MOST_STRETCHES} times. "
+                    f"Sort the table by '{SERIAL}'."
+                )
     serials = one_chunk(arrow.chunked_array(heads))
     codes = serials.indices.to_numpy(zero_copy_only=False)
     used, first, number = np.unique(codes, return_index=True, return_inverse=True)
@@ -106,58 +115,45 @@ def find_tools(source: FleetTable) -> Tools:
 
 def one_chunk(column: Any) -> Any:
     """A dictionary-encoded column as one array."""
-    joined = column.unify_dictionaries().combine_chunks()
-    return joined.chunk(0) if hasattr(joined, "chunks") else joined
+    return column.unify_dictionaries().combine_chunks()
 
 
-def _check_stretches(count: int, source: str) -> None:
-    """Refuse rows so mixed that an index of the tools would fill the memory."""
-    if count > MOST_STRETCHES:
-        raise InputError(
-            f"{source}: the rows change from tool to tool more than {MOST_STRETCHES} times. Sort the "
-            f"table by '{SERIAL}'."
-        )
-
-
-def in_several_folders(source: FleetTable, tools: Tools) -> int:
-    """Number of tools with rows in folders that state different values of a column."""
+def in_several_folders(source: FleetTable, tools: Tools) -> list[str]:
+    """What to say of tools with rows in folders that state different values of a column."""
     numbers: dict[Any, int] = {}
-    keys_of_pieces = [
-        tuple(k for k in p.keys if k[0] not in (SERIAL, OFFSET)) for p in source.pieces
-    ]
-    folder = np.array([numbers.setdefault(keys, len(numbers)) for keys in keys_of_pieces])
+    stated = [tuple(k for k in p.keys if k[0] not in (SERIAL, OFFSET)) for p in source.pieces]
+    folder = np.array([numbers.setdefault(keys, len(numbers)) for keys in stated])
     if len(numbers) == 1:
-        return 0
+        return []
     ends = np.cumsum([piece.rows for piece in source.pieces])
     last = np.append(tools.runs[1:], source.rows) - 1
     places = folder[np.searchsorted(ends, [tools.runs, last], "right")]
-    low, high = np.full(tools.count, len(numbers)), np.full(tools.count, -1)
-    np.minimum.at(low, tools.tool, places.min(0))
-    np.maximum.at(high, tools.tool, places.max(0))
-    return int(np.sum(low < high))
+    pairs = np.unique(tools.tool * len(numbers) + places)
+    count = int(np.sum(np.bincount(pairs // len(numbers)) > 1))
+    if not count:
+        return []
+    return [
+        f"tools with rows in several folders: {count}. All rows of a serial are one run; where they are "
+        "runs of their own, calibrate folder by folder."
+    ]
 
 
 def _serials(source: FleetTable) -> Iterator[Any]:
     """The serial column, in dictionary-encoded stretches; whole numbers stay numbers."""
-    arrow, pq = parquet.modules(source.name)
+    arrow, _ = parquet.modules(source.name)
     row = 0
     for piece in filter(lambda p: p.rows, source.pieces):
         stated = dict(piece.keys).get(SERIAL)
-        if stated is not None:
-            label = arrow.array([stated]).dictionary_encode()
-            yield label.take(arrow.array(np.zeros(piece.rows, int)))
-            row += piece.rows
-            continue
-        with (
-            parquet.reading(piece.path),
-            pq.ParquetFile(piece.path, read_dictionary=[SERIAL]) as file,
-        ):
-            for batch in file.iter_batches(500_000, row_groups=[piece.group], columns=[SERIAL]):
-                column = _encoded(batch.column(0), piece)
-                _check_filled(column, row, source.name)
-                row += len(column)
-                if len(column):
-                    yield column
+        if stated is None:
+            tables = _batches(piece, (SERIAL,), SERIALS)
+        else:
+            label = arrow.DictionaryArray.from_arrays(np.zeros(piece.rows, np.int32), [stated])
+            tables = iter([arrow.table({SERIAL: label})])
+        for table in tables:
+            column = one_chunk(table.column(SERIAL))
+            _check_filled(column, row, source.name)
+            row += len(column)
+            yield column
 
 
 def _check_filled(serials: Any, row: int, source: str) -> None:
@@ -176,7 +172,7 @@ def _check_filled(serials: Any, row: int, source: str) -> None:
 def _encoded(column: Any, piece: Piece) -> Any:
     """Serials, 64-bit whole numbers or text, as a dictionary and the place of each in it."""
     arrow, _ = parquet.modules(piece.path)
-    kind = column.type.value_type if arrow.types.is_dictionary(column.type) else column.type
+    kind = cell_type(column.type)
     if piece.text or not arrow.types.is_integer(kind):
         return _texts(column, piece, SERIAL)
     try:
@@ -189,31 +185,20 @@ def _encoded(column: Any, piece: Piece) -> Any:
 
 
 def _texts(column: Any, piece: Piece, name: str) -> Any:
-    """A column of labels as text, as a dictionary and the place of each in it."""
+    """A column of labels as text, as a dictionary and the place of each in it; refuses broken UTF-8."""
     arrow, _ = parquet.modules("fleet")
-    if column.type == arrow.dictionary(arrow.int32(), arrow.string()):
-        for each in getattr(column, "chunks", [column]):
-            with _readable(each.dictionary.type, piece, name):
-                each.dictionary.validate(full=True)
-        return column
-    if arrow.types.is_dictionary(column.type):
-        column = column.cast(column.type.value_type)
-    column = column.dictionary_encode()
-    column = one_chunk(column) if hasattr(column, "chunks") else column
-    with _readable(column.dictionary.type, piece, name):
-        texts = arrow.array(parquet.texts(column.dictionary, arrow), arrow.string())
-    return arrow.DictionaryArray.from_arrays(column.indices, texts)
-
-
-@contextmanager
-def _readable(kind: Any, piece: Piece, name: str) -> Iterator[None]:
-    """Whatever the block raises, of a time zone or an encoding: the labels cannot be written as text."""
     try:
-        yield
+        if column.type != arrow.dictionary(arrow.int32(), arrow.string()):
+            column = one_chunk(column.cast(cell_type(column.type)).dictionary_encode())
+            texts = arrow.array(parquet.texts(column.dictionary, arrow), arrow.string())
+            return arrow.DictionaryArray.from_arrays(column.indices, texts)
+        for chunk in column.chunks:
+            chunk.dictionary.validate(full=True)
+        return column
     except Exception as error:
         raise InputError(
             f"{Path(piece.path).name}, column '{name}': expected labels that can be written as text; the "
-            f"column has the type {kind} ({str(error)[:80]}). Write it as text."
+            f"column has the type {cell_type(column.type)} ({str(error)[:80]}). Write it as text."
         ) from error
 
 
@@ -228,16 +213,13 @@ def partitions(
     full = np.searchsorted(ends, np.arange(size, source.rows, size))
     last = np.unique(np.append(full, tools.count - 1))
     counts = np.diff(last, prepend=-1).tolist()
-    bounds = pairwise([0, *ends[last].tolist()])
-    return [_part(source, *each, count) for each, count in zip(bounds, counts, strict=True)]
-
-
-def _part(source: FleetTable, first: int, stop: int, tools: int) -> Partition:
-    """The partition of rows `first` to `stop`."""
     bounds = np.cumsum([0, *(piece.rows for piece in source.pieces)])
-    low = int(np.searchsorted(bounds, first, "right")) - 1
-    high = int(np.searchsorted(bounds, stop, "left"))
-    return Partition(source.pieces[low:high], first - int(bounds[low]), stop - first, first, tools)
+    parts = []
+    for (first, stop), count in zip(pairwise([0, *ends[last].tolist()]), counts, strict=True):
+        low = int(np.searchsorted(bounds, first, "right")) - 1
+        pieces = source.pieces[low : int(np.searchsorted(bounds, stop, "left"))]
+        parts.append(Partition(pieces, first - int(bounds[low]), stop - first, first, count))
+    return parts
 
 
 def _dealt(
@@ -245,10 +227,9 @@ def _dealt(
 ) -> list[Partition]:
     """Rows dealt into files by tool; what an interrupted command has finished is not done again."""
     _, pq = parquet.modules(source.name)
-    rows = np.bincount(tools.tool, np.diff(tools.runs, append=source.rows), tools.count)
+    sizes = np.bincount(tools.tool, np.diff(tools.runs, append=source.rows), tools.count)
     share = max(size, -(-source.rows // MOST_FILES))
-    number = np.cumsum(rows).astype(int) // share
-    number = np.minimum(number, MOST_FILES - 1)
+    number = np.minimum(np.cumsum(sizes).astype(int) // share, MOST_FILES - 1)
     done = folder / f"sorted-{source.fingerprint[:16]}"
     if not kept.is_whole(done):
         again = ", again: those there are damaged" if done.exists() else ""
@@ -258,15 +239,11 @@ def _dealt(
             _deal(source, tools, number, unfinished)
             check_unchanged(source.pieces)
     parts = []
-    for each in np.unique(number):
+    for each, count in zip(*np.unique(number, return_counts=True), strict=True):
         file = done / f"{each:04d}.parquet"
-        pieces = tuple(
-            replace(piece, keys=(("", source.fingerprint),))
-            for piece in pieces_of(file, DEALT, pq.read_metadata(file))
-        )
-        total = sum(piece.rows for piece in pieces)
-        count = int(np.sum(number == each))
-        parts.append(Partition(pieces, 0, total, 0, count, dealt=True))
+        pieces = pieces_of(file, DEALT, pq.read_metadata(file), (("", source.fingerprint),))
+        rows = sum(piece.rows for piece in pieces)
+        parts.append(Partition(tuple(pieces), 0, rows, 0, int(count), dealt=True))
     return parts
 
 
@@ -294,45 +271,37 @@ def _deal(source: FleetTable, tools: Tools, number: Ints, folder: Path) -> None:
     arrow, pq = parquet.modules(source.name)
     writers: dict[int, Any] = {}
     row = 0
-    try:
+    with ExitStack() as stack:
         for piece in filter(lambda p: p.rows, source.pieces):
             table = arrow.concat_tables(_batches(piece, source.used)).unify_dictionaries()
             rows = np.arange(row, row + piece.rows)
             tool = tools.tool[np.searchsorted(tools.runs, rows, "right") - 1]
             table = table.append_column(TOOL, arrow.array(tool))
-            table = table.append_column("#row", arrow.array(rows))
+            table = table.append_column(ROW, arrow.array(rows))
             target = number[tool]
-            order = np.argsort(target, kind="stable")
-            sorted_target = target[order]
-            table = table.take(arrow.array(order))
-            bounds = np.flatnonzero(np.diff(sorted_target, prepend=-1))
-            for start, stop in zip(bounds, [*bounds[1:], len(target)], strict=True):
-                key = int(sorted_target[start])
-                if key not in writers:
-                    path = folder / f"{key:04d}.parquet"
-                    writers[key] = pq.ParquetWriter(path, table.schema, compression="lz4")
-                writers[key].write_table(table.slice(start, stop - start))
+            for file in np.unique(target).tolist():
+                if file not in writers:
+                    path = folder / f"{file:04d}.parquet"
+                    writer = pq.ParquetWriter(path, table.schema, compression="lz4")
+                    writers[file] = stack.enter_context(writer)
+                writers[file].write_table(table.filter(arrow.array(target == file)))
             row += piece.rows
-    finally:
-        for writer in writers.values():
-            writer.close()
 
 
 def read(partition: Partition, columns: Sequence[str]) -> Any:
     """The rows of a partition as an Arrow table, in order of tools, with their row numbers."""
     arrow, _ = parquet.modules("fleet")
-    names = (*columns, TOOL, "#row") if partition.dealt else tuple(columns)
+    names = (*columns, TOOL, ROW) if partition.dealt else tuple(columns)
     tables, start, rows = [], partition.skip, partition.rows
     for piece in partition.pieces:
         stop = min(piece.rows, start + rows)
         tables += _rows(piece, names, start, stop) if stop > start else []
         start, rows = 0, rows - (stop - start)
     table = arrow.concat_tables(tables, promote_options="permissive").unify_dictionaries()
-    if not partition.dealt:
-        numbers = np.arange(partition.first, partition.first + partition.rows)
-        return table.append_column("#row", arrow.array(numbers))
-    order = np.argsort(table.column(TOOL).to_numpy(), kind="stable")
-    return table.take(arrow.array(order)).drop_columns([TOOL])
+    if partition.dealt:
+        return table.sort_by(TOOL).drop_columns([TOOL])
+    numbers = np.arange(partition.first, partition.first + partition.rows)
+    return table.append_column(ROW, arrow.array(numbers))
 
 
 @dataclass
@@ -340,7 +309,7 @@ class _Reading:
     """A row group that is being read: `held` is the batch of rows that has come, `row` its first."""
 
     batches: Iterator[Any]
-    held: Any
+    held: Any = ()
     row: int = 0
 
     def rows(self, start: int, stop: int) -> list[Any]:
@@ -373,11 +342,10 @@ def _rows(piece: Piece, columns: tuple[str, ...], start: int, stop: int) -> list
 
 @lru_cache(maxsize=1)
 def _reading(piece: Piece, columns: tuple[str, ...]) -> _Reading:
-    batches = _batches(piece, columns)
-    return _Reading(batches, next(batches))
+    return _Reading(_batches(piece, columns))
 
 
-def _batches(piece: Piece, columns: tuple[str, ...]) -> Iterator[Any]:
+def _batches(piece: Piece, columns: tuple[str, ...], size: int = 0) -> Iterator[Any]:
     """The rows of a row group in tables, with the values that its folder names state."""
     arrow, pq = parquet.modules(piece.path)
     keys = dict(piece.keys)
@@ -392,7 +360,7 @@ def _batches(piece: Piece, columns: tuple[str, ...]) -> Iterator[Any]:
         parquet.reading(piece.path),
         pq.ParquetFile(piece.path, read_dictionary=labels) as file,
     ):
-        for batch in file.iter_batches(BATCH, [piece.group], wanted):
+        for batch in file.iter_batches(size or BATCH, [piece.group], wanted):
             yield _complete(arrow.Table.from_batches([batch]), piece, columns)
 
 
@@ -404,15 +372,14 @@ def _complete(table: Any, piece: Piece, columns: tuple[str, ...]) -> Any:
     for name in columns:
         if name in stated:
             kind = arrow.string() if name in LABELS else arrow.float64()
-            places = arrow.array(np.zeros(len(table), int))
-            column = arrow.array([stated[name]], kind).take(places)
-        else:
-            column = table.column(name)
+            cells = arrow.repeat(arrow.scalar(stated[name], kind), len(table))
+            table = table.append_column(name, cells)
+        column = table.column(name)
         if name == SERIAL:
             column = _encoded(column, piece)
         elif name in LABELS:
             column = _texts(column, piece, name)
-        elif name not in (TOOL, "#row"):
+        elif name not in (TOOL, ROW):
             column = column.cast(arrow.float64(), safe=False)
         arrays[name] = column
     return arrow.table(arrays)

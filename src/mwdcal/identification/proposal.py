@@ -55,7 +55,7 @@ def propose(path: str | os.PathLike[str]) -> Proposal:
     """
     export = tables.recognised(path)
     form = None if _is_documented(path, export) else export.form
-    table = tables.read(path, form=form)
+    table = tables.read(path, export=form)
 
     def values(name: str) -> Array | None:
         try:

@@ -137,8 +137,7 @@ def _broadcast(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:
 
 def _within(name: str, values: Array, limits: Range, advice: str, axis: int = -1) -> Array:
     """Values that are all within limits, or NaN."""
-    low = values <= limits.low if limits.positive else values < limits.low
-    _refuse(low | (values > limits.high), name, values, str(limits), advice, axis)
+    _refuse(limits.outside(values), name, values, str(limits), advice, axis)
     return values
 
 

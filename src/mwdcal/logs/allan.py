@@ -78,7 +78,7 @@ def octaves(count: int) -> list[int]:
     >>> octaves(100)
     [1, 2, 4, 8, 16]
     """
-    return [2**k for k in range(max(count // 4, 1).bit_length())] if count >= 4 else []
+    return [2**k for k in range((count // 4).bit_length())]
 
 
 def deviation(values: Array, averaging: Sequence[int], kind: Kind = "overlapping") -> Array:
@@ -107,9 +107,12 @@ def _phase(values: Array) -> Array:
 
     Without the mean, sums stay small: rounding is that of the noise, not that of the offset.
     """
-    values = values - np.mean(values, -1, keepdims=True)
-    zero = np.zeros((*values.shape[:-1], 1))
-    return np.concatenate([zero, np.cumsum(values, -1)], -1)
+    return _sums(values - np.mean(values, -1, keepdims=True))
+
+
+def _sums(values: Array) -> Array:
+    """Sums (..., n + 1) of the first 0, 1, … n values."""
+    return np.insert(np.cumsum(values, -1), 0, 0.0, -1)
 
 
 def _variance(phase: Array, m: int, kind: Kind, centred: bool) -> Array:
@@ -118,7 +121,7 @@ def _variance(phase: Array, m: int, kind: Kind, centred: bool) -> Array:
         raise ValueError(f"`averaging` must be from 1 to half of {count} readings; got {m}")
     step = _differences(phase[..., ::m], 1) if kind == "standard" else _differences(phase, m)
     if kind == "modified":
-        sums = np.cumsum(np.concatenate([np.zeros((*step.shape[:-1], 1)), step], -1), -1)
+        sums = _sums(step)
         step = (sums[..., m:] - sums[..., :-m]) / m
     if centred:
         step = step - step.mean(-1, keepdims=True)
@@ -200,13 +203,13 @@ def freedom(moments: Moments, squares: Array, slope: Array, covariance: ArrayLik
     return np.asarray(2 * mean**2 / (spread + steady * added))
 
 
-def band(value: Array, freedom: Array, level: float = 0.95) -> tuple[Array, Array]:
-    """Confidence limits (...) of a deviation with degrees of freedom: χ² of its square."""
+def band(value: Array, freedom: Array) -> tuple[Array, Array]:
+    """Limits (...) at 95 % confidence of a deviation with degrees of freedom: χ² of its square."""
     from scipy.special import gammaincinv
 
-    low, high = (gammaincinv(freedom / 2, (1 + sign * level) / 2) for sign in (1, -1))
     half = freedom / 2
-    return value * np.sqrt(half / low), value * np.sqrt(half / high)
+    low, high = (half / gammaincinv(half, (1 + sign * 0.95) / 2) for sign in (1, -1))
+    return value * np.sqrt(low), value * np.sqrt(high)
 
 
 def _covariance(lags: Array) -> Array:

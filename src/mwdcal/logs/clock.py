@@ -11,7 +11,8 @@ import numpy as np
 from mwdcal.calibration.record import Finding
 from mwdcal.errors import InputError
 from mwdcal.files.contract import RAW, Range
-from mwdcal.files.formats.table import Table, cell_error, numbers, shown
+from mwdcal.files.formats.columns import shown
+from mwdcal.files.formats.table import Table, cell_error, numbers
 from mwdcal.files.logs import TIME
 from mwdcal.geometry.vectors import Array
 from mwdcal.logs import standstill

@@ -19,7 +19,8 @@ from mwdcal.calibration.record import Finding
 from mwdcal.calibration.residuals import rms
 from mwdcal.errors import InputError
 from mwdcal.files.contract import CHANNELS, RAW
-from mwdcal.files.formats.table import Table, shown
+from mwdcal.files.formats.columns import shown
+from mwdcal.files.formats.table import Table
 from mwdcal.files.logs import Say, silent
 from mwdcal.geometry.vectors import Array
 from mwdcal.logs import allan, noise_terms, regular
@@ -168,13 +169,11 @@ def find_noise(
         except regular.UnusableChannelError as error:
             findings.append(Finding(id="channel-left-out", text=f"{error} It was left out."))
             continue
-        channels[name] = _channel(name, *taken, station, kind, findings)
+        channel = _channel(name, *taken, station, kind, findings)
+        channels[name] = channel if profile is None else _physical(name, channel, profile)
     if not channels:
-        raise InputError(
-            f"{log.source}: no channel that could be used. {' '.join(f.text for f in findings)}"
-        )
-    if profile is not None:
-        channels = {name: _physical(name, channel, profile) for name, channel in channels.items()}
+        remarks = " ".join(finding.text for finding in findings)
+        raise InputError(f"{log.source}: no channel that could be used. {remarks}")
     withheld = _withheld(channels)
     return Noise(
         log=log.source,
@@ -193,20 +192,18 @@ def check(
     between: tuple[float, float], station_seconds: float | None, sampling_hz: float | None
 ) -> None:
     """Refuse times and a rate that are not possible in any log."""
-    start, end = between
-    for name, value in (("start", start), ("end", end)):
+    for name, value in zip(("start", "end"), between, strict=True):
         if not is_number(value, ANY):
             rule = f"`{name}` must be seconds from the start of the log"
             raise InputError(f"{rule}; got {shown(value)}. Correct it.")
-    if not start < end:
-        got = f"`start` {start:g} and `end` {end:g}"
+    if not between[0] < between[1]:
+        got = "`start` {:g} and `end` {:g}".format(*between)
         raise InputError(f"`start` must be less than `end`; got {got}. Swap them?")
     check_argument("station_seconds", station_seconds, DURATION)
     check_argument("sampling_hz", sampling_hz, RATE)
 
 
 def _station_seconds(given: float | None, seconds: float, rate: float, source: str) -> float:
-    longest = seconds / AVERAGES
     if given is None:
         return max(min(STATION_SECONDS, seconds / SOUND), 1 / rate)
     if given < 1 / rate:
@@ -214,9 +211,9 @@ def _station_seconds(given: float | None, seconds: float, rate: float, source: s
             f"`station_seconds` must be at least one sample of {source}, {1 / rate:g} s; got {given:g}. "
             "Ask for a longer station."
         )
-    if given > longest:
+    if given > seconds / AVERAGES:
         raise InputError(
-            f"`station_seconds` must be at most a quarter of {source}, {longest:.4g} s; got {given:g}. "
+            f"`station_seconds` must be at most a quarter of {source}, {seconds / AVERAGES:.4g} s; got {given:g}. "
             f"Record for at least {AVERAGES * given:g} s, better {SOUND * given:g} s, or ask for a "
             "shorter station."
         )
@@ -299,13 +296,9 @@ def _drift(terms: NoiseTerms, rate: float) -> Term:
 def _station(value: Array, length: float, moments: Moments, terms: NoiseTerms) -> StationNoise:
     """The noise of a mean over `length` samples, or of one."""
     noise, freedom, measured = noise_terms.single(value[None], length, moments, terms)
-    lower, upper = allan.band(noise, freedom)
-    return StationNoise(
-        noise=float(noise[0]),
-        lower=float(lower[0]),
-        upper=float(upper[0]),
-        source="measured" if measured[0] else "terms",
-    )
+    lower, upper = (float(limit[0]) for limit in allan.band(noise, freedom))
+    source = "measured" if measured[0] else "terms"
+    return StationNoise(noise=float(noise[0]), lower=lower, upper=upper, source=source)
 
 
 def _findings(

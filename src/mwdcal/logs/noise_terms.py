@@ -263,9 +263,8 @@ def _nonnegative(design: Array, data: Array, present: tuple[int, ...]) -> Array:
         rest = np.sum((data - np.einsum("bmj,bj->bm", part, solution)) ** 2, -1)
         better = (solution >= 0).all(-1) & (rest < cost)
         cost = np.where(better, rest, cost)
-        whole = np.zeros_like(best)
-        whole[:, subset] = solution
-        best = np.where(better[:, None], whole, best)
+        best[better] = 0.0
+        best[np.ix_(better, subset)] = solution[better]
     return best
 
 

@@ -6,7 +6,8 @@ import numpy as np
 
 from mwdcal.calibration.record import Finding
 from mwdcal.errors import InputError
-from mwdcal.files.formats.table import Table, cell_error, numbers, shown
+from mwdcal.files.formats.columns import shown
+from mwdcal.files.formats.table import Table, cell_error, numbers
 from mwdcal.files.logs import TIME
 from mwdcal.geometry.vectors import Array
 from mwdcal.logs import allan
@@ -103,7 +104,8 @@ def _check_changes(name: str, value: Array) -> None:
     if not value.size:
         raise UnusableChannelError(f"{name} is blank from end to end.")
     if len(value) < FEWEST_SAMPLES:
-        raise UnusableChannelError(f"{name} has {len(value)} samples; {FEWEST_SAMPLES} are needed.")
+        size = count(len(value), "sample")
+        raise UnusableChannelError(f"{name} has {size}; {FEWEST_SAMPLES} are needed.")
     if np.ptp(value) == 0:
         reads = f"{name} reads {value[0] + 0.0:g} from end to end: a dead channel?"
         raise UnusableChannelError(reads)

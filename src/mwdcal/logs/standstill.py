@@ -57,6 +57,11 @@ INTO = 0.15
 """How far into the stretch the threshold lies, in logarithm."""
 
 
+Trace = tuple[Array, Array]
+Traces = Mapping[str, Trace]
+"""Times (n,) and values (n,) of a channel, where it has any; of channels by name."""
+
+
 class Cells(NamedTuple):
     """One channel in short cells (m,): start, end, median, and whether there is a gap within.
 
@@ -128,7 +133,8 @@ def cells_of(time: Array, value: Array, length: float) -> Cells:
     number of samples of a cell; what is left there belongs in time to the cell before.
     """
     step = time_step(time)
-    rough = float(np.median(np.abs(np.diff(value)))) / 0.6745 / np.sqrt(2)
+    steps = np.abs(np.diff(value))
+    rough = float(np.median(steps)) / 0.6745 / np.sqrt(2) if steps.size else 0.0
     bounds = [*_rate_changes(time), len(time)]
     parts = [_even(time[a:b], value[a:b], length) for a, b in pairwise(bounds)]
     start, end, level, torn = (np.concatenate(column) for column in zip(*parts, strict=True))
@@ -140,15 +146,12 @@ def _even(time: Array, value: Array, length: float) -> tuple[Array, Array, Array
     step = time_step(time)
     size = max(FEWEST, round(length / step)) if step > 0 else FEWEST
     count = len(time) // size
-    whole = value[: count * size].reshape(count, size)
-    last = np.arange(1, count + 1) * size - 1
-    end = time[last] + step
-    start = time[last - size + 1]
-    steps = np.diff(time[: count * size + 1], append=time[-1:])[: count * size]
-    torn = np.any(steps.reshape(count, size)[:, :-1] > (size + 0.5) * step, axis=-1)
-    if count and time[-1] - time[last[-1]] < size * step:
+    clock, whole = (x[: count * size].reshape(count, size) for x in (time, value))
+    end = clock[:, -1] + step
+    torn = np.any(np.diff(clock) > (size + 0.5) * step, axis=-1)
+    if count and time[-1] - clock[-1, -1] < size * step:
         end[-1] = time[-1] + step
-    return start, end, np.asarray(np.median(whole, axis=-1), float), torn
+    return clock[:, 0], end, np.asarray(np.median(whole, axis=-1), float), torn
 
 
 def _rate_changes(time: Array) -> Ints:
@@ -215,8 +218,8 @@ def distinct(time: Array) -> Array:
     return np.asarray(np.repeat(ticks, many) + rank * np.repeat(room / many, many))
 
 
-def activity(traces: Mapping[str, tuple[Array, Array]]) -> Activity:
-    """How much each moment moves, of channels (time (n,), value (n,)) with rates of their own.
+def activity(traces: Traces) -> Activity:
+    """How much each moment moves, of channels with rates of their own.
 
     A channel too slow to have a cell within a window of the fastest is not looked at, nor one
     that never changes. Singular: fewer samples than a window needs give no cells at all.
@@ -274,9 +277,11 @@ def triad_size(levels: Sequence[Array]) -> float:
     """Strength of what a triad measures, from the levels (m,) of its channels, in their unit.
 
     Definition: half the range that a channel covers, the largest of the triad. A triad that
-    covers less than 3 % of its norm has never been turned: then it is that norm.
+    covers less than 3 % of its norm has never been turned: then it is that norm. Channels without a
+    level count for nothing.
     """
-    half = max(float(np.ptp(level)) / 2 for level in levels)
+    levels = [level for level in levels if len(level)]
+    half = max((float(np.ptp(level)) / 2 for level in levels), default=0.0)
     norm = float(np.linalg.norm([np.median(level) for level in levels]))
     return half if half > 0.03 * norm else norm
 
@@ -284,6 +289,11 @@ def triad_size(levels: Sequence[Array]) -> float:
 def rest_limit(cells: Cells, size: float) -> float:
     """Largest range within a window that can be rest: a share of the triad's `size`, or noise."""
     return max(TURN * size, MOTION_RATIO * cells.rough, 2 * cells.resolution)
+
+
+def step_limit(cells: Cells, size: float) -> float:
+    """Step of a slow channel that is movement: a share of the triad's `size`, or noise."""
+    return max(SLOW_STEP * size, MOTION_RATIO * max(cells.rough, cells.resolution))
 
 
 def stretches(still: Bools, least: int = 1) -> tuple[Ints, Ints]:

@@ -8,7 +8,7 @@ from math import ceil, floor, log10
 import numpy as np
 
 from mwdcal.calibration.record import Finding
-from mwdcal.geometry.vectors import Array
+from mwdcal.geometry.vectors import Array, Bools
 from mwdcal.logs import standstill
 from mwdcal.logs.standstill import Activity, Standstills
 from mwdcal.logs.station_means import ChannelMean
@@ -20,8 +20,8 @@ MOST_LISTED = 12
 STEADY = 3.0
 """Standard deviations of a cell's level by which a noisy but steady stretch may drift."""
 
-Rows = dict[str, list[ChannelMean]]
-"""What each channel read at each station."""
+Rows = dict[str, ChannelMean]
+"""What each channel read at the stations."""
 
 
 def count(number: int, word: str) -> str:
@@ -51,69 +51,54 @@ def about(rows: Rows, standstills: Standstills, seconds: float) -> Iterator[Find
         text = "the log stands still from end to end: one station. A calibration needs several attitudes."
         yield Finding(id="all-still", text=text)
     yield from _spikes(rows)
-    for name, summaries in rows.items():
-        yield from _unreliable(name, summaries)
-        yield from _drifting(name, summaries, end - start)
-
-
-def correlated_noise(names: list[str]) -> Finding:
-    """Noise that is correlated over times that are not short against the standstills."""
-    text = (
-        f"noise of {', '.join(names)} is correlated over seconds: the halves of standstills differ by "
-        "more than their samples explain. sd_ is widened to what they tell; with 1/f noise it is still "
-        "too small. Stand still for longer, or state the noise in the tool profile."
-    )
-    return Finding(id="correlated-noise", text=text)
+    for name, row in rows.items():
+        yield from _unreliable(name, row)
+        yield from _drifting(name, row, end - start)
 
 
 def _spikes(rows: Rows) -> Iterator[Finding]:
     """The channel with the largest share of spikes, where that is large."""
-    share = {
-        n: sum(r.spikes for r in summaries) / sum(r.spikes + r.used for r in summaries)
-        for n, summaries in rows.items()
-    }
-    name = max(share, key=lambda n: share[n])
+    share = {n: row.spikes.sum() / (row.spikes + row.used).sum() for n, row in rows.items()}
+    name = max(share, key=share.__getitem__)
     if share[name] > MANY_SPIKES:
         lost = f"{100 * share[name]:.1f} % of the samples of {name}"
         yield Finding(id="spikes", text=f"{lost} were left out as spikes: check the wiring.")
 
 
-def _unreliable(name: str, summaries: list[ChannelMean]) -> Iterator[Finding]:
+def _unreliable(name: str, row: ChannelMean) -> Iterator[Finding]:
     """A channel at its limit or frozen, and one that is less steady than usual or steps."""
-    stuck = [row.stuck for row in summaries]
-    if any(stuck):
+    if row.stuck.any():
+        first = int(np.argmax(row.stuck))
         text = (
-            f"{name} stands at its limit, or is frozen, at {_places(stuck)}: too many equal readings for its "
-            f"noise, such as {summaries[stuck.index(True)].mean + 0.0:.6g}. Its sd_ there is that of a reading "
-            "known to the channel's range only."
+            f"{name} stands at its limit, or is frozen, at {_places(row.stuck)}: too many equal readings for its "
+            f"noise, such as {row.mean[first] + 0.0:.6g}. Its sd_ there is that of a reading known to the "
+            "channel's range only."
         )
-        yield Finding(id="stuck-channel", text=text, station=str(stuck.index(True) + 1))
-    unsteady = [row.unsteady and not row.stuck for row in summaries]
-    if any(unsteady):
-        usual = float(np.median([row.spread for row in summaries]))
+        yield Finding(id="stuck-channel", text=text, station=str(first + 1))
+    unsteady = row.unsteady & ~row.stuck
+    if unsteady.any():
         text = (
             f"{name} is less steady than usual at {_places(unsteady)}: it spreads more than at the others, or "
-            f"moves within the standstill (usual spread of one sample {usual:.2g}). Was the tool knocked, turned "
-            "or shaken?"
+            f"moves within the standstill (usual spread of one sample {np.median(row.spread):.2g}). Was the "
+            "tool knocked, turned or shaken?"
         )
-        yield Finding(id="unsteady", text=text, station=str(unsteady.index(True) + 1))
+        yield Finding(id="unsteady", text=text, station=str(int(np.argmax(unsteady)) + 1))
 
 
-def _places(where: list[bool]) -> str:
+def _places(where: Bools) -> str:
     """How many of the stations, and which."""
-    numbers = [i for i, there in enumerate(where, 1) if there]
+    numbers = np.flatnonzero(where) + 1
     return f"{count(len(numbers), 'station')} of {len(where)} ({listed(numbers)})"
 
 
-def _drifting(name: str, summaries: list[ChannelMean], seconds: Array) -> Iterator[Finding]:
+def _drifting(name: str, row: ChannelMean, seconds: Array) -> Iterator[Finding]:
     """A channel that drifts at some stations."""
-    drifting = [i for i, row in enumerate(summaries) if row.drifts]
-    if drifting:
-        worst = max(drifting, key=lambda i: abs(summaries[i].drift))
+    if row.drifts.any():
+        worst = int(np.argmax(row.drifts * np.abs(row.drift)))
         text = (
-            f"{name} drifts at {len(drifting)} of {len(summaries)} stations, most at station {worst + 1}: by "
-            f"{summaries[worst].drift:.3g} over {seconds[worst]:.1f} s (noise of one sample "
-            f"{summaries[worst].spread:.2g}). See the columns drift_."
+            f"{name} drifts at {row.drifts.sum()} of {len(seconds)} stations, most at station {worst + 1}: by "
+            f"{row.drift[worst]:.3g} over {seconds[worst]:.1f} s (noise of one sample {row.spread[worst]:.2g}). "
+            "See the columns drift_."
         )
         yield Finding(id="drift", text=text, station=str(worst + 1))
 

@@ -23,7 +23,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mwdcal.geometry.vectors import Array, ArrayLike
+from mwdcal.geometry.vectors import Array, ArrayLike, Bools, Ints
+from mwdcal.logs.standstill import Trace
 
 SPIKE_DISTANCE = 4.0
 """Distance from the median, in robust standard deviations, above which a sample is a spike."""
@@ -49,11 +50,10 @@ CHANCE, GROWN = (5e-2, 1e-3), (1e-1, 1e-2)
 """Chances that white noise is widened, and said to be correlated: by the halves, by their growth."""
 LONGEST = 1.0
 """Longest correlation time, in standstills, that their halves and quarters can tell."""
+NORMAL = 1.9599639845400545
+"""Standard deviations of a normal variate within which it is with a chance of 95 %."""
 GROWTH = 2.0
 """Growth of the variance from quarters to halves that only a drift can have."""
-
-Rest = tuple[Array, Array]
-"""Times (n,) and values (n,) of the samples of one standstill, n >= 2."""
 
 
 class SharedNoise(NamedTuple):
@@ -83,7 +83,7 @@ ALONE = SharedNoise(np.nan, np.nan, np.nan, 0.0, np.nan, np.inf, 0.0)
 
 
 class ChannelMean(NamedTuple):
-    """What one channel read during one standstill.
+    """What one channel read at its standstills (k,).
 
     Attributes:
         mean: of the samples that are not spikes.
@@ -93,29 +93,30 @@ class ChannelMean(NamedTuple):
         drifts: whether that is more than the noise explains.
         used: samples in the mean.
         spikes: samples left out.
-        halves: variance of the mean as the difference of the two halves' means tells it.
-        quarters: that of the mean of a half, by the quarters; NaN for fewer than eight samples.
+        halves: variance of a sample's worth of mean as the difference of the two halves' means tells it.
+        quarters: that of the halves, by the quarters; NaN for fewer than eight samples.
         unsteady: whether it spreads more than it usually does, or moves within the standstill.
         stuck: whether it stands at a limit, or is frozen: too many equal readings for its noise.
     """
 
-    mean: float
-    sd: float
-    spread: float
-    drift: float
-    drifts: bool
-    used: int
-    spikes: int
-    halves: float
-    quarters: float
-    unsteady: bool
-    stuck: bool
+    mean: Array
+    sd: Array
+    spread: Array
+    drift: Array
+    drifts: Bools
+    used: Ints
+    spikes: Ints
+    halves: Array
+    quarters: Array
+    unsteady: Bools
+    stuck: Bools
 
 
-def summarise_all(rests: Sequence[Rest], resolution: float) -> list[ChannelMean]:
-    """What a channel read at each standstill."""
+def summarise(rests: Sequence[Trace], resolution: float) -> ChannelMean:
+    """What a channel read at its standstills of n >= 2 samples; `resolution` is the step of its readings."""
     noise = pooled(rests, resolution)
-    return [summarise(*rest, resolution, noise) for rest in rests]
+    rows = [_summary(*rest, resolution, noise) for rest in rests]
+    return ChannelMean._make(np.array([row[name] for row in rows]) for name in ChannelMean._fields)
 
 
 class Correlated(NamedTuple):
@@ -130,7 +131,7 @@ class Correlated(NamedTuple):
     plain: bool
 
 
-def correlated(channels: Sequence[Sequence[ChannelMean]]) -> Correlated:
+def correlated(channels: Sequence[ChannelMean]) -> Correlated:
     """Whether the means of a triad's channels scatter by more than the samples claim.
 
     Definition: what the halves of a channel's standstills tell, times what noise that reaches
@@ -140,33 +141,28 @@ def correlated(channels: Sequence[Sequence[ChannelMean]]) -> Correlated:
     """
     from scipy.special import chdtri, fdtri
 
-    clear = [[m for m in summaries if not m.stuck] for summaries in channels]
-    count = sum(map(len, clear))
-    if count < HALVES or not all(clear):
+    clear = [ChannelMean._make(part[~m.stuck] for part in m) for m in channels]
+    counts = np.array([len(m.mean) for m in clear])
+    if counts.sum() < HALVES or not counts.all():
         return Correlated(np.zeros(len(channels)), False)
-    halves: Array = np.array(
-        [_typical([m.halves * m.used for m in summaries]) for summaries in clear]
-    )
-    quartered = [m for summaries in clear for m in summaries if m.quarters == m.quarters]
-    quarters = _typical([m.quarters * m.used for m in quartered]) if quartered else 0.0
-    growth = _typical([m.halves * m.used for m in quartered]) / quarters if quarters else 0.5
-    claimed = np.array(
-        [float(np.median([m.sd**2 * m.used for m in summaries])) for summaries in clear]
-    )
-    parts = claimed / [len(summaries) for summaries in clear]
-    freedom = claimed.sum() ** 2 / (claimed @ parts)  # Satterthwaite: a noisy channel counts most
+    halves = np.array([_typical(m.halves) for m in clear])
+    pairs = np.concatenate([(m.halves, m.quarters) for m in clear], -1)
+    pairs = pairs[:, ~np.isnan(pairs[1])]
+    quartered = max(len(pairs[0]), 1)
+    half, quarter = (_typical(one) if one.size else 0.0 for one in pairs)
+    growth = half / quarter if quarter else 0.5
+    claimed = np.array([np.median(m.sd**2 * m.used) for m in clear])
+    # Satterthwaite: a noisy channel counts most
+    freedom = claimed.sum() ** 2 / (claimed @ (claimed / counts))
     more = halves.sum() > chdtri(freedom, CHANCE) / freedom * claimed.sum()
-    more |= growth > 0.5 * fdtri(
-        max(len(quartered), 1), max(2 * len(quartered), 1), 1 - np.array(GROWN)
-    )
+    more |= growth > 0.5 * fdtri(quartered, 2 * quartered, 1 - np.array(GROWN))
     widens, plain = (bool(one) for one in more & (growth < GROWTH))
     return Correlated(halves * beyond(growth) if widens else 0 * halves, plain)
 
 
-def _typical(squares: Sequence[float]) -> float:
+def _typical(squares: Array) -> float:
     """Mean of squares of normal variates (n,), the largest cut at `MOST` times what is expected."""
-    values = np.asarray(squares, float)
-    return float(np.minimum(values, MOST * np.median(values) / 0.455).mean())
+    return float(np.minimum(squares, MOST * np.median(squares) / 0.455).mean())
 
 
 def beyond(growth: float) -> float:
@@ -186,15 +182,13 @@ def beyond(growth: float) -> float:
     return float(np.interp(growth, halves / quarters, variance(time) / halves))
 
 
-def widened(summaries: Sequence[ChannelMean], variance: float) -> list[ChannelMean]:
+def widened(channel: ChannelMean, variance: float) -> ChannelMean:
     """The same with at least this variance of a sample's worth of mean."""
-    return [
-        m if m.stuck else m._replace(sd=max(m.sd, (float(variance) / m.used) ** 0.5))
-        for m in summaries
-    ]
+    least = [(variance / used) ** 0.5 for used in channel.used.tolist()]
+    return channel._replace(sd=np.where(channel.stuck, channel.sd, np.maximum(channel.sd, least)))
 
 
-def pooled(rests: Sequence[Rest], resolution: float) -> SharedNoise:
+def pooled(rests: Sequence[Trace], resolution: float) -> SharedNoise:
     """The noise that the standstills of a channel share.
 
     Each standstill counts with 64 samples at most. Singular: one alone has none to share.
@@ -213,8 +207,7 @@ def pooled(rests: Sequence[Rest], resolution: float) -> SharedNoise:
     square = np.array([len(value) * value.var() for value in kept])
     freedom = np.array([len(value) - 1 for value in kept], float)
     usual = square <= max(spread, resolution) ** 2 * _chi_square_limit(freedom)
-    if freedom.sum() < 2 * LONG:
-        usual[:] = True
+    usual |= freedom.sum() < 2 * LONG
     total = float(freedom[usual].sum())
     if not total:
         return ALONE
@@ -235,7 +228,7 @@ def pooled(rests: Sequence[Rest], resolution: float) -> SharedNoise:
     )
 
 
-def _course(rests: Sequence[Rest], middles: Sequence[float], limit: float) -> float:
+def _course(rests: Sequence[Trace], middles: Sequence[float], limit: float) -> float:
     """Change per second that standstills share, 0 unless it is plain against how it scatters.
 
     Samples further than `limit` from the middle of their standstill are left out.
@@ -287,14 +280,12 @@ def _rough(value: Array) -> float:
     return float(np.median(steps) / 0.6745 / 2**0.5 * (len(value) / PARTS) ** 0.5)
 
 
-def summarise(
-    time: Array, value: Array, resolution: float, noise: SharedNoise = ALONE
-) -> ChannelMean:
-    """What a channel read: `time` and `value` (n,) of the samples of one standstill, n >= 2.
+def _summary(time: Array, value: Array, resolution: float, noise: SharedNoise) -> dict[str, float]:
+    """The entries of `ChannelMean` of one standstill: `time` and `value` (n,) of its samples, n >= 2.
 
-    `resolution` is the step of the channel, in which noise far below it hides the mean (`hidden`).
-    The mean is that of the middle of the standstill: the course that all share is not part of its
-    uncertainty. A stuck channel is known to its reach/√12.
+    Steps of the `resolution` hide the mean where noise is far below them (`hidden`). The mean is that of
+    the middle of the standstill: the course that all share is not part of its uncertainty. A stuck
+    channel is known to its reach/√12.
     """
     distance = np.abs(value - np.median(value))
     spread = float(1.4826 * np.median(distance))
@@ -310,24 +301,25 @@ def summarise(
     drift = slope * float(time[-1] - time[0])
     _, steady, left = _mean_variance(value - slope * clock, noise, 2)
     limit = student(left, SIGNIFICANT) * np.sqrt(12 * steady)
-    sd = float(np.sqrt(variance)) * student(freedom, 0.05) / student(np.inf, 0.05)
+    sd = float(np.sqrt(variance)) * student(freedom, 0.05) / NORMAL
     sd = float(np.hypot(sd, hidden(_shared_spread(flat, resolution, noise), resolution)))
     if stuck:
         sd = noise.reach / 12**0.5
-    half = len(flat) // 2
-    return ChannelMean(
-        mean=mean,
-        sd=sd,
-        spread=spread,
-        drift=drift,
-        drifts=abs(drift) > max(limit, resolution, 1e-12 * abs(mean)),
-        used=len(value),
-        spikes=len(kept) - len(value),
-        halves=_halves(flat),
-        quarters=(_halves(flat[:half]) + _halves(flat[half:])) / 2 if half >= 4 else np.nan,
-        unsteady=unsteady,
-        stuck=stuck,
-    )
+    used, half = len(value), len(value) // 2
+    quarters = (_halves(flat[:half]) + _halves(flat[half:])) / 2 if half >= 4 else np.nan
+    return {
+        "mean": mean,
+        "sd": sd,
+        "spread": spread,
+        "drift": drift,
+        "drifts": abs(drift) > max(limit, resolution, 1e-12 * abs(mean)),
+        "used": used,
+        "spikes": len(kept) - used,
+        "halves": _halves(flat) * used,
+        "quarters": quarters * used,
+        "unsteady": unsteady,
+        "stuck": stuck,
+    }
 
 
 def hidden(spread: float, step: float) -> float:
@@ -403,11 +395,10 @@ def _is_unsteady(value: Array, resolution: float, noise: SharedNoise) -> bool:
     if noise.freedom < LONG:
         return False
     usual = max(noise.sd, resolution)
-    spreads = len(value) * value.var() > usual**2 * _chi_square_limit(len(value) - 1)
-    if len(value) < 3 * PARTS:
-        return bool(spreads)
+    if len(value) * value.var() > usual**2 * _chi_square_limit(len(value) - 1):
+        return True
     scatter = max(noise.rough, resolution) / (len(value) / PARTS) ** 0.5
-    return bool(spreads or np.ptp(_blocks(value)) > WANDERS * scatter)
+    return len(value) >= 3 * PARTS and bool(np.ptp(_blocks(value)) > WANDERS * scatter)
 
 
 def _mean_variance(value: Array, noise: SharedNoise, lost: int = 1) -> tuple[float, float, float]:
@@ -433,15 +424,13 @@ def _halves(value: Array) -> float:
     """Variance of the mean of independent samples, by the difference of the halves' means."""
     half = len(value) // 2
     share = half * (len(value) - half) / len(value) ** 2
-    return share * float(value[:half].mean() - value[half:].mean()) ** 2 if half else np.nan
+    return share * float(value[:half].mean() - value[half:].mean()) ** 2
 
 
 def student(freedom: float, chance: float) -> float:
     """Two-sided Student quantile that is exceeded with this chance."""
-    from scipy.special import ndtri, stdtrit
+    from scipy.special import stdtrit
 
-    if np.isinf(freedom):
-        return float(-ndtri(chance / 2))
     return float(stdtrit(freedom, 1 - chance / 2))
 
 

@@ -6,8 +6,8 @@ slower still: it never decides what stands still. See `standstill` for the metho
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from itertools import chain
 
 import numpy as np
 
@@ -22,16 +22,9 @@ from mwdcal.files.synonyms import unused
 from mwdcal.geometry.vectors import Array, Ints
 from mwdcal.logs import standstill
 from mwdcal.logs.clock import SECONDS, check_argument, row_times, unlikely_seconds
-from mwdcal.logs.standstill import Activity, Slow, Standstills
-from mwdcal.logs.station_findings import (
-    Rows,
-    about,
-    correlated_noise,
-    count,
-    listed,
-    noisy_rests,
-)
-from mwdcal.logs.station_means import correlated, summarise, summarise_all, widened
+from mwdcal.logs.standstill import Activity, Slow, Standstills, Trace, Traces
+from mwdcal.logs.station_findings import Rows, about, count, listed, noisy_rests
+from mwdcal.logs.station_means import correlated, summarise, widened
 
 MIN_SECONDS, TRIM_SECONDS = 1.0, 1.0
 """Defaults for a fast log; one sampled slowly needs a window, and a cell, respectively."""
@@ -47,9 +40,6 @@ SMALLEST_RESOLUTION = 1e-12
 """Resolution of a channel that never changes, as a share of its reading."""
 SUMMARIES = {"": "mean", "sd_": "sd", "spread_": "spread", "drift_": "drift", "samples_": "used"}
 """Columns per channel: prefix, and what of its summary stands there."""
-
-Trace = tuple[Array, Array]
-"""Times (n,) and values (n,) of one channel, where it has any."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +67,7 @@ class Stations:
     min_seconds: float
     trim_seconds: float
     time: Array
-    traces: dict[str, Trace]
+    traces: Traces
     findings: list[Finding]
 
 
@@ -109,17 +99,18 @@ def find_stations(
     check_argument("threshold", threshold, THRESHOLDS)
     findings: list[Finding] = []
     time = row_times(log, sampling_hz)
-    traces, temperature = _traces(log, time, findings)
+    traces = _traces(log, time, findings)
+    temperature = _warmth(log, time, findings)
     findings += _time_findings(log, time, traces, sampling_hz)
     say(f"looking for standstills in {len(time)} rows")
     activity = standstill.activity(traces)
     if not activity.cells:
         raise _short(log, time, traces)
-    shortest = min_seconds
-    if shortest is None:
-        shortest = max(MIN_SECONDS, standstill.WINDOW * activity.cell)
-    trim = max(TRIM_SECONDS, activity.cell) if trim_seconds is None else trim_seconds
-    findings += _torn(activity, findings)
+    cell = activity.cell
+    shortest = max(MIN_SECONDS, standstill.WINDOW * cell) if min_seconds is None else min_seconds
+    trim = max(TRIM_SECONDS, cell) if trim_seconds is None else trim_seconds
+    if all(finding.id != "gaps" for finding in findings):  # the times of the rows show none
+        findings += _torn(activity)
     limits, slow = _limits(activity, traces)
     value, stretch = _threshold(activity, limits, threshold, shortest + 2 * trim)
     standstills = standstill.standstills(activity, limits, value, shortest, trim, slow)
@@ -156,7 +147,7 @@ def _threshold(
     return (highest, None) if np.isnan(value) else (value, stretch)
 
 
-def _short(log: Table, time: Array, traces: dict[str, Trace]) -> InputError:
+def _short(log: Table, time: Array, traces: Traces) -> InputError:
     if len(time) > 1 and not any(np.ptp(value) for _, value in traces.values()):
         return InputError(
             f"{log.source}: no channel ever changes, so rest and movement cannot be told apart. "
@@ -164,7 +155,7 @@ def _short(log: Table, time: Array, traces: dict[str, Trace]) -> InputError:
         )
     window = standstill.WINDOW
     return InputError(
-        f"{log.source}: too short to find standstills in; got {len(time)} rows over "
+        f"{log.source}: too short to find standstills in; got {count(len(time), 'row')} over "
         f"{time[-1] - time[0]:g} s. A channel needs at least {window * standstill.FEWEST} samples, over "
         f"{window * standstill.CELL:g} s. Is the log complete, and its time in seconds?"
     )
@@ -188,28 +179,24 @@ def _none(stations: Stations) -> str:
     )
 
 
-def _traces(
-    log: Table, time: Array, findings: list[Finding]
-) -> tuple[dict[str, Trace], Trace | None]:
-    """The raw channels that have samples, and the temperature."""
-    traces = {
-        name: _trace(log, time, name) for name in (*RAW, "temperature_c") if name in log.columns
-    }
+def _traces(log: Table, time: Array, findings: list[Finding]) -> Traces:
+    """The raw channels that have samples."""
+    traces = {name: _trace(log, time, name) for name in RAW if name in log.columns}
     magnetometer = [name for name in CHANNELS["magnetometer"] if name in traces]
     if magnetometer and not any(len(traces[name][0]) for name in magnetometer):
         text = "mx, my and mz are blank from end to end: the stations have no magnetometer."
         findings.append(Finding(id="no-magnetometer", text=text))
-        traces = {name: trace for name, trace in traces.items() if name not in magnetometer}
-    for name, (values, _) in traces.items():
-        if not len(values) and name in RAW:
+        traces = {name: traces[name] for name in CHANNELS["accelerometer"]}
+    for name, (_, value) in traces.items():
+        if not len(value):
             raise InputError(
                 f"{log.source}, column '{name}': must have samples; every cell is blank. Check the "
                 "logger and the order of the columns, or leave out the triad."
             )
-        if name in RAW and np.ptp(traces[name][1]) == 0:
-            text = f"{name} reads {traces[name][1][0] + 0.0:g} from end to end: a dead channel?"
+        if np.ptp(value) == 0:
+            text = f"{name} reads {value[0] + 0.0:g} from end to end: a dead channel?"
             findings.append(Finding(id="dead-channel", text=text))
-    return traces, _possible(traces.pop("temperature_c", None), findings)
+    return traces
 
 
 def _trace(log: Table, time: Array, name: str) -> Trace:
@@ -221,12 +208,12 @@ def _trace(log: Table, time: Array, name: str) -> Trace:
     return standstill.distinct(time), value
 
 
-def _possible(temperature: Trace | None, findings: list[Finding]) -> Trace | None:
+def _warmth(log: Table, time: Array, findings: list[Finding]) -> Trace | None:
     """The temperatures that are possible; others, such as -999, are left out and reported."""
-    if temperature is None:
+    if "temperature_c" not in log.columns:
         return None
-    time, value = temperature
-    fine = (value >= TEMPERATURE.low) & (value <= TEMPERATURE.high)
+    time, value = _trace(log, time, "temperature_c")
+    fine = ~TEMPERATURE.outside(value)
     if not fine.all():
         wrong = np.flatnonzero(~fine)
         text = (
@@ -242,15 +229,14 @@ def _possible(temperature: Trace | None, findings: list[Finding]) -> Trace | Non
 
 
 def _time_findings(
-    log: Table, time: Array, traces: dict[str, Trace], sampling_hz: float | None
-) -> list[Finding]:
+    log: Table, time: Array, traces: Traces, sampling_hz: float | None
+) -> Iterator[Finding]:
     """Gaps, times that occur twice in a channel or are not used, their unit, and spare columns."""
-    findings = []
     if TIME in log.columns and sampling_hz is not None:
         text = f"`sampling_hz` {sampling_hz:g} was given: the column '{TIME}' is not used."
-        findings.append(Finding(id="time-not-used", text=text))
+        yield Finding(id="time-not-used", text=text)
     elif TIME in log.columns:
-        findings += unlikely_seconds(time)
+        yield from unlikely_seconds(time)
     steps = np.diff(time)
     gaps = np.flatnonzero(steps > max(GAP * standstill.time_step(time), standstill.CELL))
     if gaps.size:
@@ -259,65 +245,57 @@ def _time_findings(
             f"{count(gaps.size, 'gap')} in time, the widest {steps[widest]:.3g} s after "
             f"{TIME} = {time[widest]:.10g} (line {log.lines[widest]}): no standstill goes across one."
         )
-        findings.append(Finding(id="gaps", text=text))
+        yield Finding(id="gaps", text=text)
     if not np.all(steps > 0):
-        findings += _equal_times(log, time, list(traces))
-    return findings + unused_columns(unused(list(log.columns), READ))
+        yield from _equal_times(log, time, list(traces))
+    yield from unused_columns(unused(list(log.columns), READ))
 
 
-def _torn(activity: Activity, findings: list[Finding]) -> list[Finding]:
-    """Stretches without samples that the times of the rows do not show, as gaps."""
-    if any(finding.id == "gaps" for finding in findings):
-        return []
+def _torn(activity: Activity) -> Iterator[Finding]:
+    """Stretches in which a channel has no samples, as gaps."""
     torn = {}
     for name, channel in activity.cells.items():
         between = np.append(channel.start[1:] - channel.end[:-1], 0.0)
         limit = max(activity.cell, standstill.FEWEST * channel.step)
         torn[name] = np.flatnonzero(channel.torn | (between > limit))
     name = max(torn, key=lambda n: torn[n].size)
-    if not torn[name].size:
-        return []
-    at = f"{activity.cells[name].start[torn[name][0]]:.10g} s"
-    gaps = f"{name} has {count(torn[name].size, 'gap')} of several samples, the first after {at}"
-    return [Finding(id="gaps", text=f"{gaps}: no standstill goes across one.")]
+    if torn[name].size:
+        at = f"{activity.cells[name].start[torn[name][0]]:.10g} s"
+        gaps = (
+            f"{name} has {count(torn[name].size, 'gap')} of several samples, the first after {at}"
+        )
+        yield Finding(id="gaps", text=f"{gaps}: no standstill goes across one.")
 
 
-def _equal_times(log: Table, time: Array, names: list[str]) -> list[Finding]:
+def _equal_times(log: Table, time: Array, names: list[str]) -> Iterator[Finding]:
     """Samples of a channel at one time; rows of different channels may share theirs."""
     filled = {name: time[~np.isnan(numbers(log, name))] for name in names}
     twice = {name: int(np.count_nonzero(np.diff(times) == 0)) for name, times in filled.items()}
-    name = max(twice, key=lambda n: twice[n])
-    if not twice[name]:
-        return []
-    text = (
-        f"{twice[name]} samples of {name} have the time of the one before: all are used, spread "
-        "over the step. Is the time written with too few digits, or are rows doubled?"
-    )
-    return [Finding(id="duplicate-time", text=text)]
+    name = max(twice, key=twice.__getitem__)
+    if twice[name]:
+        have = "has" if twice[name] == 1 else "have"
+        text = (
+            f"{count(twice[name], 'sample')} of {name} {have} the time of the one before: all are used, spread "
+            "over the step. Is the time written with too few digits, or are rows doubled?"
+        )
+        yield Finding(id="duplicate-time", text=text)
 
 
-def _limits(activity: Activity, traces: dict[str, Trace]) -> tuple[Array, list[Slow]]:
+def _limits(activity: Activity, traces: Traces) -> tuple[Array, list[Slow]]:
     """The largest range that can be rest of each channel looked at, and the others that can step."""
-    slow_cells = {
-        name: standstill.cells_of(*trace, standstill.CELL)
+    cut = {
+        name: activity.cells.get(name) or standstill.cells_of(*trace, standstill.CELL)
         for name, trace in traces.items()
-        if name not in activity.cells
     }
-    cut = {**activity.cells, **slow_cells}
     limits, slow = [], []
-    for name, channel in cut.items():
-        triad = next(kind for kind in CHANNELS.values() if name in kind)
-        levels = [cut[n].level for n in triad if n in cut and len(cut[n].level)]
-        size = standstill.triad_size(levels) if levels else 0.0
-        if name in activity.cells:
-            limits.append(standstill.rest_limit(channel, size))
-        else:
-            noise = max(channel.rough, channel.resolution)
-            slow.append(
-                Slow(
-                    *traces[name], max(standstill.SLOW_STEP * size, standstill.MOTION_RATIO * noise)
-                )
-            )
+    for triad in CHANNELS.values():
+        channels = {name: cut[name] for name in triad if name in cut}
+        size = standstill.triad_size([each.level for each in channels.values()])
+        for name, channel in channels.items():
+            if name in activity.cells:
+                limits.append(standstill.rest_limit(channel, size))
+            else:
+                slow.append(Slow(*traces[name], standstill.step_limit(channel, size)))
     return np.array(limits), slow
 
 
@@ -326,14 +304,10 @@ def _within(time: Array, start: Array, end: Array) -> tuple[Ints, Ints]:
     return np.searchsorted(time, start), np.searchsorted(time, end, side="right")
 
 
-def _with_samples(
-    standstills: Standstills, traces: dict[str, Trace], findings: list[Finding]
-) -> Standstills:
+def _with_samples(standstills: Standstills, traces: Traces, findings: list[Finding]) -> Standstills:
     """The same, without stations for which a slow channel has hardly a sample."""
-    enough = np.ones(len(standstills.start), bool)
-    for time, _ in traces.values():
-        first, last = _within(time, standstills.start, standstills.end)
-        enough &= last - first >= LEAST_SAMPLES
+    places = [_within(time, standstills.start, standstills.end) for time, _ in traces.values()]
+    enough = np.all([last - first >= LEAST_SAMPLES for first, last in places], axis=0)
     poor = int(np.count_nonzero(standstills.taken & ~enough))
     if poor:
         text = (
@@ -344,21 +318,15 @@ def _with_samples(
     return standstills._replace(taken=standstills.taken & enough, short=standstills.short | ~enough)
 
 
-def _summaries(
-    traces: dict[str, Trace], start: Array, end: Array, findings: list[Finding], say: Say
-) -> Rows:
+def _summaries(traces: Traces, start: Array, end: Array, findings: list[Finding], say: Say) -> Rows:
     """What each channel read at each station."""
     summaries: Rows = {}
     for name, (time, value) in traces.items():
         say(f"means of {name} at {count(len(start), 'station')}")
-        resolution = (
-            standstill.resolution(value)
-            or SMALLEST_RESOLUTION * abs(value[0])
-            or SMALLEST_RESOLUTION
-        )
+        resolution = standstill.resolution(value) or SMALLEST_RESOLUTION * abs(float(value[0]))
         places = zip(*_within(time, start, end), strict=True)
         rests = [(time[a:b], value[a:b]) for a, b in places]
-        summaries[name] = summarise_all(rests, float(resolution))
+        summaries[name] = summarise(rests, resolution or SMALLEST_RESOLUTION)
     for triad in CHANNELS.values():
         summaries |= _widened({n: summaries[n] for n in triad if n in summaries}, findings)
     return summaries
@@ -367,14 +335,16 @@ def _summaries(
 def _widened(triad: Rows, findings: list[Finding]) -> Rows:
     """What the channels of a triad read, known less well where their noise is correlated."""
     variances, plain = correlated([*triad.values()])
-    wider = {
-        name: widened(triad[name], float(variance))
-        for name, variance in zip(triad, variances, strict=True)
-    }
-    pairs = zip(chain(*wider.values()), chain(*triad.values()), strict=True)
-    grown = [after.sd > REPORTED * before.sd for after, before in pairs]
-    if plain and 2 * sum(grown) > len(grown):
-        findings.append(correlated_noise([*triad]))
+    each = zip(triad.items(), variances.tolist(), strict=True)
+    wider = {name: widened(channel, variance) for (name, channel), variance in each}
+    grown = [wider[name].sd > REPORTED * triad[name].sd for name in triad]
+    if plain and np.mean(grown) > 0.5:
+        text = (
+            f"noise of {', '.join(triad)} is correlated over seconds: the halves of standstills differ by more "
+            "than their samples explain. sd_ is widened to what they tell; with 1/f noise it is still too "
+            "small. Stand still for longer, or state the noise in the tool profile."
+        )
+        findings.append(Finding(id="correlated-noise", text=text))
     return wider
 
 
@@ -391,10 +361,10 @@ def _columns(
         **warmth,
     }
     for prefix, part in SUMMARIES.items():
-        for name, summaries in rows.items():
-            columns[prefix + name] = np.array([float(getattr(row, part)) for row in summaries])
+        for name, row in rows.items():
+            columns[prefix + name] = np.asarray(getattr(row, part), float)
     columns["drifting"] = [
-        " ".join(n for n in rows if rows[n][i].drifts) for i in range(len(start))
+        " ".join(n for n in rows if rows[n].drifts[i]) for i in range(len(start))
     ]
     for name in (n for n in log.columns if n.startswith(("ref_", "sd_ref_")) and n in READ):
         value = numbers(log, name)
@@ -430,8 +400,8 @@ def _temperature(
     """
     first, last = np.searchsorted(time, [start, end])
     if last - first >= standstill.WINDOW:
-        summary = summarise(time[first:last], value[first:last], 0.0)
-        return summary.mean, summary.drift
+        rest = summarise([(time[first:last], value[first:last])], 0.0)
+        return float(rest.mean[0]), float(rest.drift[0])
     before = time[first - 1] if first else -np.inf
     after = time[last] if last < len(time) else np.inf
     if last == first and min(start - before, after - end) > lag:

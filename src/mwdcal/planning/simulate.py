@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from mwdcal.calibration.prediction import raw_reading
 from mwdcal.calibration.readings import Readings
 from mwdcal.estimation.evidence import ANGLES
 from mwdcal.geometry.vectors import Array, reference_vectors
@@ -77,13 +78,11 @@ def _triad(
     bias_drift: float,
 ) -> Array:
     course = np.array([1.0, 1e-3, 1e-6])
-    scales = np.concatenate(
-        [1 + rng.uniform(-scale, scale, (3, 1)), scale_drift * rng.uniform(-1, 1, (3, 3)) * course],
-        -1,
-    )
-    biases = np.concatenate(
-        [rng.uniform(-bias, bias, (3, 1)), bias_drift * rng.uniform(-1, 1, (3, 3)) * course], -1
-    )
+    terms = []
+    for middle, spread, drift in ((1.0, scale, scale_drift), (0.0, bias, bias_drift)):
+        steady = middle + rng.uniform(-spread, spread, (3, 1))
+        terms += [steady, drift * rng.uniform(-1, 1, (3, 3)) * course]
+    scales, biases = np.hstack(terms[:2]), np.hstack(terms[2:])
     return np.concatenate([scales.ravel(), biases.ravel(), rng.uniform(-alignment, alignment, 6)])
 
 
@@ -92,14 +91,11 @@ def reading(truth: Truth, plan: StationPlan) -> tuple[Array, Array]:
     fields = reference_vectors(
         plan.inclination, plan.azimuth, plan.toolface, truth.gravity, truth.field, truth.dip
     )
-    result: list[Array] = []
-    for params, field in zip((truth.accelerometer, truth.magnetometer), fields, strict=True):
-        zero = np.zeros_like(field)
-        slope = truth.model.slope(params, zero, plan.temperature)
-        offset = truth.model.fields(params, zero, plan.temperature)
-        solved = np.linalg.solve(slope, (field - offset)[..., None])[..., 0]
-        result.append(np.asarray(solved, float))
-    return result[0], result[1]
+    g, b = (
+        raw_reading(truth.model, params, field, plan.temperature, steps=1)
+        for params, field in zip((truth.accelerometer, truth.magnetometer), fields, strict=True)
+    )
+    return g, b
 
 
 def run(
@@ -110,14 +106,13 @@ def run(
     stand: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> Readings:
     """Readings with noise (g, nT), at a stand whose angles are off by `stand` (radians, 1 σ)."""
-    inclination, azimuth, toolface = (
-        angle + sd * rng.normal(size=angle.shape)
-        for angle, sd in zip((getattr(plan, name) for name in ANGLES), stand, strict=True)
-    )
-    actual = StationPlan(inclination, azimuth, toolface, plan.temperature)
-    g, b = reading(truth, actual)
     count = len(plan.inclination)
     known = {name: getattr(plan, name) for name in ANGLES}
+    off = {
+        name: known[name] + sd * rng.normal(size=count)
+        for name, sd in zip(ANGLES, stand, strict=True)
+    }
+    g, b = reading(truth, replace(plan, **off))
     known |= {name: np.full(count, getattr(truth, name)) for name in ("gravity", "field", "dip")}
     return Readings(
         g + noise[0] * rng.normal(size=g.shape),

@@ -1,6 +1,6 @@
 """The tool profile: which axis each channel measures, nominal scales, noise, stand.
 
-Instrument polarity and raw units live here and nowhere else: `files.tables` turns
+Instrument polarity and raw units live here and nowhere else: `files.runs` turns
 raw channels into nominal readings along the tool axes with it, and `notation`
 turns fitted parameters back into the instrument's own channels.
 """
@@ -97,8 +97,7 @@ class StandProfile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
 
     def common(self) -> dict[str, float]:
         """Standard uncertainties, in degrees, of errors of the stand that all stations share."""
-        keys = {name: f"{name.replace('-', '_')}_deg" for name in COMMON}
-        values = {name: float(getattr(self, key)) for name, key in keys.items()}
+        values = {name: self.of(f"{name.replace('-', '_')}_deg") for name in COMMON}
         return {name: value for name, value in values.items() if value}
 
 

@@ -23,6 +23,25 @@ DIRECTIONS = {
     "field_nt": ("azimuth_deg", "dip_deg", "magnetic_toolface_deg"),
 }
 """Directions that do not exist where a strength is zero."""
+ROW_FINDINGS = {
+    "no-magnetometer": "no columns mx, my, mz: magnetic results are blank.",
+    "other-tool": "the readings are of tool {tools[1]}, the calibration of tool {tools[0]}: is it the right one?",
+    "missing-reading": "{tally.lacking} of {tally.rows} rows lack a reading: their results are blank.",
+    "outside-temperature": "{beyond}: their results are {results}.",
+    "no-temperature": "the calibration was made at unrecorded temperatures, without temperature terms: nothing says "
+    "how good the results are at the readings' {warmth} °C.",
+    "implausible-gravity": "{off[gravity]}: the tool moved while it was read, or a reading is in another unit.",
+    "implausible-field": "{off[field]}: iron or a current was near, or a reading is in another unit.",
+    "field-relative": "the magnetometer is calibrated to field = 1: bx_nt, by_nt, bz_nt and field_nt are relative, "
+    "not nT.",
+    "undetermined": "{moved} rest on what the calibration leaves undetermined ({free}): no uncertainty can be stated.",
+}
+"""What the findings about corrected rows say, in their order."""
+RESULTS_BEYOND = (
+    "blank",
+    f"extrapolated, with no statement of accuracy, and marked in the column '{EXTRAPOLATED}'",
+)
+"""What becomes of results outside the calibrated temperatures."""
 COMPILED_ROWS = 300_000
 """Number of rows from which the compiled loops repay their loading."""
 
@@ -68,15 +87,12 @@ def counted(
 ) -> tuple[dict[str, AnyArray], RowCounts, list[Finding]]:
     """Output columns, counts of the rows and findings; `lacking` more rows were left out unread."""
     check_outside(outside)
-    columns: dict[str, AnyArray] = {
-        **(compiled(calibration, readings) or reference(calibration, readings))
-    }
+    columns = compiled(calibration, readings) or reference(calibration, readings)
     beyond = calibration.outside(readings)
-    rows, moved = readings.count + lacking, undetermined(calibration, readings)
     if outside == "blank" and beyond.any():
         columns = {name: np.where(beyond, np.nan, value) for name, value in columns.items()}
     tally = RowCounts(
-        rows, int(beyond.sum()), moved, lacking, (),
+        readings.count + lacking, int(beyond.sum()), undetermined(calibration, readings), lacking, (),
         strengths.judged(calibration, columns, readings.known), warmth(readings.temperature),
     )  # fmt: skip
     about = findings(calibration, readings, tally, outside)
@@ -104,7 +120,7 @@ def check_outside(outside: str) -> None:
         raise InputError(f"`outside` must be one of {', '.join(OUTSIDE)}; got {outside!r}.")
 
 
-def reference(calibration: Calibration, readings: Readings) -> dict[str, Array]:
+def reference(calibration: Calibration, readings: Readings) -> dict[str, AnyArray]:
     """The output columns (..., n) by plain NumPy, nothing blanked for its temperature."""
     g, b = calibration.fields(readings)
     columns = dict(zip(VECTORS, [*np.moveaxis(g, -1, 0), *np.moveaxis(b, -1, 0)], strict=True))
@@ -112,15 +128,14 @@ def reference(calibration: Calibration, readings: Readings) -> dict[str, Array]:
         value = OBSERVABLES[name].value(g, b)
         columns[column] = np.degrees(value) if OBSERVABLES[name].unit == "rad" else value
     for strength, names in DIRECTIONS.items():
-        nothing = columns[strength] == 0.0
         for name in names:
-            columns[name] = np.where(nothing, np.nan, columns[name])
+            columns[name] = np.where(columns[strength] == 0.0, np.nan, columns[name])
     return columns
 
 
 def compiled(
     calibration: Calibration, readings: Readings, least: int | None = None
-) -> dict[str, Array] | None:
+) -> dict[str, AnyArray] | None:
     """The same columns by the compiled loops; None for few rows, or a model they do not have."""
     shape = readings.accelerometer.shape[:-1]
     triads = numbers(calibration)
@@ -132,15 +147,11 @@ def compiled(
     warmth = zero if readings.temperature is None else readings.temperature
     flat = np.ascontiguousarray(np.broadcast_to(warmth, shape), float).reshape(-1)
     g, b = readings.accelerometer, readings.magnetometer
-    vectors = [*_axes(g), *(_axes(b) if b is not None else [np.full(flat.shape, np.nan)] * 3)]
-    results = correction_numba.run([*vectors, flat], triads, zero)
+    vectors = (g, np.full(g.shape, np.nan) if b is None else b)
+    rows = (np.ascontiguousarray(vector, float).reshape(-1, 3) for vector in vectors)
+    axes = [axis for three in rows for axis in three.transpose()]
+    results = correction_numba.run([*axes, flat], triads, zero)
     return {n: c.reshape(shape) for n, c in zip(RESULTS, results.columns, strict=True)}
-
-
-def _axes(vectors: Array) -> list[Array]:
-    """The three components (n,) of vectors (..., 3), as views where the memory allows it."""
-    flat = np.ascontiguousarray(vectors, float).reshape(-1, 3)
-    return [flat[:, i] for i in range(3)]
 
 
 def numbers(
@@ -163,59 +174,35 @@ def findings(
 
     Of the readings only the metadata are used, and whether there is a magnetometer.
     """
-    about = calibration.change_findings()
-    if calibration.has_field and readings.magnetometer is None:
-        text = "no columns mx, my, mz: magnetic results are blank."
-        about.append(Finding(id="no-magnetometer", text=text))
-    about += _other_tool(calibration, readings)
-    if tally.lacking:
-        text = f"{tally.lacking} of {tally.rows} rows lack a reading: their results are blank."
-        about.append(Finding(id="missing-reading", text=text))
-    if tally.beyond:
-        about.append(_outside(calibration, readings.source, outside, tally))
-    if calibration.unrecorded(readings):
-        at = "…".join(dict.fromkeys(f"{end:.1f}" for end in tally.warmth))
-        text = (
-            "the calibration was made at unrecorded temperatures, without temperature terms: nothing says how "
-            f"good the results are at the readings' {at} °C."
-        )
-        about.append(Finding(id="no-temperature", text=text))
-    about += strengths.findings(tally.strengths)
-    if calibration.relative:
-        text = "the magnetometer is calibrated to field = 1: bx_nt, by_nt, bz_nt and field_nt are relative, not nT."
-        about.append(Finding(id="field-relative", text=text))
-    if tally.moved:
-        free = ", ".join(dict.fromkeys(u.id for u in calibration.undetermined()))
-        text = f"{', '.join(tally.moved)} rest on what the calibration leaves undetermined ({free})"
-        about.append(Finding(id="undetermined", text=f"{text}: no uncertainty can be stated."))
-    return about
-
-
-def _other_tool(calibration: Calibration, readings: Readings) -> list[Finding]:
-    other = calibration.other_tool(readings)
-    if other is None:
-        return []
-    ours, theirs = other
-    text = (
-        f"the readings are of tool {theirs}, the calibration of tool {ours}: is it the right one?"
-    )
-    return [Finding(id="other-tool", text=text)]
-
-
-def _outside(calibration: Calibration, source: str, how: str, tally: RowCounts) -> Finding:
     low, high = calibration.temperature_c or (np.nan, np.nan)
-    text = f"{tally.beyond} of {tally.rows} rows lie outside the calibrated range {low:.1f}…{high:.1f} °C"
-    if how == "refuse":
-        raise InputError(
-            f"{source}: {text}. Use `outside` blank or extrapolate, or calibrate over a wider range."
-        )
-    results = "their results are blank"
-    if how == "extrapolate":
-        results = (
-            "their results are extrapolated, with no statement of accuracy, and marked in the column "
-            f"'{EXTRAPOLATED}'"
-        )
-    return Finding(id="outside-temperature", text=f"{text}: {results}.")
+    beyond = f"{tally.beyond} of {tally.rows} rows lie outside the calibrated range {low:.1f}…{high:.1f} °C"
+    if tally.beyond and outside == "refuse":
+        advice = "Use `outside` blank or extrapolate, or calibrate over a wider range."
+        raise InputError(f"{readings.source}: {beyond}. {advice}")
+    off, tools = strengths.departures(tally.strengths), calibration.other_tool(readings)
+    applies = {
+        "no-magnetometer": calibration.has_field and readings.magnetometer is None,
+        "other-tool": tools,
+        "missing-reading": tally.lacking,
+        "outside-temperature": tally.beyond,
+        "no-temperature": calibration.unrecorded(readings),
+        "implausible-gravity": "gravity" in off,
+        "implausible-field": "field" in off,
+        "field-relative": calibration.relative,
+        "undetermined": tally.moved,
+    }
+    words = {
+        "beyond": beyond,
+        "results": RESULTS_BEYOND[outside == "extrapolate"],
+        "warmth": "…".join(dict.fromkeys(f"{end:.1f}" for end in tally.warmth)),
+        "moved": ", ".join(tally.moved),
+        "free": ", ".join(dict.fromkeys(u.id for u in calibration.undetermined())),
+    }
+    return calibration.change_findings() + [
+        Finding(id=name, text=text.format(tally=tally, tools=tools, off=off, **words))
+        for name, text in ROW_FINDINGS.items()
+        if applies[name]
+    ]
 
 
 def undetermined(

@@ -25,7 +25,9 @@ from mwdcal.geometry.observables import VERTICAL
 from mwdcal.geometry.vectors import AnyArray, Array
 
 Floats = tuple[float, ...]
-Courses = tuple[Floats, ...]
+Triad = tuple[tuple[Floats, ...], Floats, bool]
+"""The fields of `correction_numba.Numbers`."""
+Channels = tuple[AnyArray, ...]
 
 _VERSION = f"py{sys.version_info.major}{sys.version_info.minor}"
 TILE = 128
@@ -91,18 +93,9 @@ def cubic(c: Floats, t: float) -> float:
 
 
 @compiled
-def field(
-    t: Array,
-    x: Array,
-    y: Array,
-    z: Array,
-    count: int,
-    courses: Courses,
-    shape: Floats,
-    curved: bool,
-) -> None:
+def field(t: Array, x: Array, y: Array, z: Array, count: int, triad: Triad) -> None:
     """Nominal readings x, y, z become the field, in place; see `correction_numba.Numbers`."""
-    c = courses
+    c, shape, curved = triad
     for i in range(count):
         w = t[i]
         u = (x[i] - shape[0]) / (shape[3] * cubic(c[12], w))
@@ -115,9 +108,7 @@ def field(
             fx += (shape[6] + shape[9] * u) * u * u
             fy += (shape[7] + shape[10] * v) * v * v
             fz += (shape[8] + shape[11] * q) * q * q
-        x[i] = fx
-        y[i] = fy
-        z[i] = fz
+        x[i], y[i], z[i] = fx, fy, fz
 
 
 @compiled
@@ -167,20 +158,13 @@ def angles(s: Array, count: int) -> None:
 
 @compiled
 def load(
-    s: Array,
-    row: int,
-    column: AnyArray,
-    start: int,
-    count: int,
-    unit: float,
-    low: float,
-    high: float,
+    s: Array, row: int, column: AnyArray, start: int, count: int, unit: float, accepted: Floats
 ) -> int:
-    """Copy a piece of a column, in its unit, into a scratch row; the number of values in range."""
+    """Copy a piece of a column, in its unit, into a scratch row; the number of values accepted."""
     sound = 0
     for i in range(count):
         value = column[start + i]
-        sound += (value >= low) & (value <= high)
+        sound += (value >= accepted[0]) & (value <= accepted[1])
         s[row, i] = value / unit
     return sound
 
@@ -194,48 +178,45 @@ def mask(s: Array, count: int, low: float, high: float, blank: bool, last: int) 
     if blank and beyond:
         for i in range(count):
             if (s[_T, i] < low) | (s[_T, i] > high):
-                for k in range(1, last + 1):
-                    s[k, i] = np.nan
+                s[1 : last + 1, i] = np.nan
     return beyond
 
 
 @compiled
 def rows(
-    gravity: tuple[AnyArray, ...],
-    magnetic: tuple[AnyArray, ...],
-    temperature: AnyArray,
+    columns: tuple[Channels, Channels, AnyArray],
     units: Floats,
-    limits: Floats,
-    first: tuple[Courses, Floats],
-    second: tuple[Courses, Floats],
-    curved: tuple[bool, bool],
+    limits: tuple[Floats, Floats, Floats, bool],
+    reference: float,
+    triads: tuple[Triad, Triad],
     out: Array,
     start: int,
     stop: int,
 ) -> tuple[int, int, int]:
     """Fill rows start…stop of `out`; unsound cells, rows beyond the temperatures, NaN results.
 
-    See `correction_numba.run`. `limits`: accepted raw values, reference temperature, accepted and
-    calibrated temperatures, and whether results beyond these become NaN.
+    See `correction_numba.run`. `limits`: accepted raw values, accepted and calibrated temperatures,
+    and whether results beyond these become NaN.
     """
     s = np.empty((_ROWS, TILE))
     last = len(out)
-    lowest, highest, reference, coldest, hottest, low, high, blank = limits
+    gravity, magnetic, temperature = columns
+    raw, bearable, (low, high), blank = limits
     sound, beyond, empty = 0, 0, 0
     for at in range(start, stop, TILE):
         count = min(TILE, stop - at)
-        sound += load(s, _T, temperature, at, count, 1.0, coldest, hottest)
+        sound += load(s, _T, temperature, at, count, 1.0, bearable)
         for k in range(3):
-            sound += load(s, _G + k, gravity[k], at, count, units[k], lowest, highest)
-            sound += load(s, _B + k, magnetic[k], at, count, units[3 + k], lowest, highest)
+            sound += load(s, _G + k, gravity[k], at, count, units[k], raw)
+            sound += load(s, _B + k, magnetic[k], at, count, units[3 + k], raw)
         tau = s[_TAU]
         for i in range(count):
             tau[i] = s[_T, i] - reference
-        field(tau, s[_G], s[_G + 1], s[_G + 2], count, first[0], first[1], curved[0])
-        field(tau, s[_B], s[_B + 1], s[_B + 2], count, second[0], second[1], curved[1])
+        field(tau, s[_G], s[_G + 1], s[_G + 2], count, triads[0])
+        field(tau, s[_B], s[_B + 1], s[_B + 2], count, triads[1])
         parts(s, count)
         angles(s, count)
-        beyond += mask(s, count, low, high, blank > 0.0, last)
+        beyond += mask(s, count, low, high, blank, last)
         for k in range(last):
             for i in range(count):
                 value = s[k + 1, i]

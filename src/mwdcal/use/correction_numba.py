@@ -16,15 +16,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from mwdcal.geometry.observables import RESULTS
 from mwdcal.geometry.vectors import AnyArray, Array
 from mwdcal.sensor.models import Factors, Model, Polynomial, affine_parts, factor_parts
 
-__all__ = ["available", "cores", "numbers", "run"]
-
 HIGHEST_POWER = 3
 """Highest order in temperature that the loops know."""
-RESULT_ROWS = 13
-"""Rows of a result: the two vectors, the angles and the strengths."""
 _PIECE_ROWS = 1 << 15
 
 
@@ -70,12 +67,7 @@ class CorrectedRows(NamedTuple):
 
 def available() -> bool:
     """Whether compiled loops can be had, and are wanted: Numba, and not MWDCAL_NUMPY=1."""
-    return _installed() and not os.environ.get("MWDCAL_NUMPY")
-
-
-@cache
-def _installed() -> bool:
-    return find_spec("numba") is not None
+    return find_spec("numba") is not None and not os.environ.get("MWDCAL_NUMPY")
 
 
 @cache
@@ -99,7 +91,7 @@ def numbers(model: Model, params: Array) -> Numbers | None:
         return None
     if isinstance(model, Polynomial):
         return _polynomial(model, params)
-    return _factors(model, params) if isinstance(model, Factors) else None
+    return _factors(params) if isinstance(model, Factors) else None
 
 
 NOTHING = Numbers(((0.0,) * 4,) * 12 + ((1.0, 0.0, 0.0, 0.0),) * 3, (np.nan,) * 12, False)
@@ -108,26 +100,24 @@ NOTHING = Numbers(((0.0,) * 4,) * 12 + ((1.0, 0.0, 0.0, 0.0),) * 3, (np.nan,) * 
 
 def _polynomial(model: Polynomial, params: Array) -> Numbers:
     gain, offset = affine_parts(params[: model.affine].reshape(-1, 12))
-    scale = np.zeros_like(offset)
-    scale[0] = 1.0
     curves = params[model.affine :] if model.curved else np.zeros(6)
     shape = np.concatenate([model.centre.ravel(), model.scale.ravel(), curves])
-    return Numbers(_courses(gain, offset, scale), tuple(shape.tolist()), model.curved)
+    return Numbers(_courses(gain, offset, np.ones((1, 3))), tuple(shape.tolist()), model.curved)
 
 
-def _factors(model: Factors, params: Array) -> Numbers:
+def _factors(params: Array) -> Numbers:
     scale, bias, misalignment = factor_parts(params)
     mixing = np.eye(3) - misalignment
-    gain = np.zeros((model.basis.order + 1, 3, 3))
-    gain[0] = mixing
-    courses = _courses(gain, -np.swapaxes(mixing @ bias, 0, 1), np.swapaxes(scale, 0, 1))
+    courses = _courses(mixing[None], -np.swapaxes(mixing @ bias, 0, 1), np.swapaxes(scale, 0, 1))
     return Numbers(courses, (0.0,) * 3 + (1.0,) * 3 + (0.0,) * 6, False)
 
 
 def _courses(gain: Array, offset: Array, scale: Array) -> tuple[tuple[float, ...], ...]:
-    """Coefficients by power, gains (K, 3, 3), offsets and scales (K, 3), as one tuple of four each."""
+    """Gains (K, 3, 3), offsets and scales (K, 3) by power, each as far as it goes, as tuples of four."""
     padded = np.zeros((HIGHEST_POWER + 1, 15))
-    padded[: len(gain)] = np.hstack([gain.reshape(-1, 9), offset, scale])
+    padded[: len(gain), :9] = gain.reshape(-1, 9)
+    padded[: len(offset), 9:12] = offset
+    padded[: len(scale), 12:] = scale
     return tuple(map(tuple, np.swapaxes(padded, 0, 1).tolist()))
 
 
@@ -148,23 +138,16 @@ def run(
 
     kept_code_is_sound()
     count = len(columns[-1])
-    out = np.empty((RESULT_ROWS, count))
-    settings = (
-        *(tuple(columns[:3]), tuple(columns[3:6]), columns[6], tuple(map(float, units))),
-        (*limits.raw, reference, *limits.temperature, *limits.calibrated, float(limits.blank)),
-        *(triads[0][:2], triads[1][:2], (triads[0].curved, triads[1].curved)),
-    )
+    out = np.empty((len(RESULTS), count))
+    channels = tuple(columns[:3]), tuple(columns[3:6]), columns[6]
+    settings = tuple(map(float, units)), limits, reference, triads
 
     def piece(start: int, stop: int) -> tuple[int, int, int]:
-        return correction_kernels.rows(*settings, out, start, stop)
+        return correction_kernels.rows(channels, *settings, out, start, stop)
 
-    workers = workers or cores()
-    step = max(_PIECE_ROWS, -(-count // workers))
-    starts = range(0, count, step)
-    if len(starts) < 2:
-        counts = [piece(0, count)]
-    else:
-        with ThreadPoolExecutor(len(starts)) as pool:
-            counts = list(pool.map(piece, starts, [min(s + step, count) for s in starts]))
+    step = max(_PIECE_ROWS, -(-count // (workers or cores())))
+    starts = range(0, max(count, 1), step)
+    with ThreadPoolExecutor(len(starts)) as pool:
+        counts = list(pool.map(piece, starts, [min(s + step, count) for s in starts]))
     correction_kernels.write_checksums(correction_kernels.compilations())
     return CorrectedRows(out, *np.sum(counts, axis=0).tolist())

@@ -18,18 +18,9 @@ from mwdcal.errors import InputError
 from mwdcal.estimation.evidence import ANGLES
 from mwdcal.geometry.observables import OBSERVABLES, OUTPUTS
 from mwdcal.geometry.vectors import Array, Bools, Ints
+from mwdcal.use import roll_test
 from mwdcal.use.roll_sets import ROLL_SET, RollSet, near_vertical, roll_sets
-from mwdcal.use.roll_test import (
-    OPEN,
-    SLACK,
-    WIDEST_GAP,
-    Coverage,
-    Curve,
-    coverage,
-    ends,
-    extent,
-    fitted,
-)
+from mwdcal.use.roll_test import Coverage, Curve
 
 UNDEFINED_AT_VERTICAL = ("azimuth", "toolface")
 """Angles that do not exist at vertical."""
@@ -40,7 +31,7 @@ REFERENCE_COLUMNS = {name: f"ref_{column}" for name, column in OUTPUTS.items()}
 NO_TOOLFACE = (
     f"the toolface of exactly vertical stations is not known. Give {REFERENCE_COLUMNS['toolface']}"
 )
-RELATIVE_FIELD = "the calibration is relative: field = 1, not nT"
+NOT_DETERMINED = "it rests on a direction that the calibration leaves undetermined"
 SEEN = 0.7
 """Least share of the amplitude of each harmonic that stations should show."""
 TINY = 1e-15
@@ -132,21 +123,17 @@ class RollTest:
 
     def _error(self, name: str) -> Array:
         """Departure (n,) from the reference that the run itself gives; NaN where it gives none."""
-        known = self.readings.known.get(name, np.full(self.readings.count, np.nan))
+        known = self.readings.known.get(name, np.nan)
         return OBSERVABLES[name].difference(self.value(name), known)
-
-    def _coverage(self, index: Ints) -> Coverage | None:
-        """How the toolfaces of stations cover the circle; None if none is known."""
-        toolface = self.toolface[index]
-        known = ~np.isnan(toolface)
-        return coverage(toolface[known]) if known.any() else None
 
     def _loose(self, index: Ints) -> str:
         """Why stations do not determine a curve of two harmonics; empty where they do."""
-        circle = None if np.isnan(self.toolface[index]).any() else self._coverage(index)
-        if circle is None or circle.rolled:
-            return "" if circle else NO_TOOLFACE
-        return _gap(circle, WIDEST_GAP) or (
+        if not index.size or np.isnan(self.toolface[index]).any():
+            return NO_TOOLFACE
+        circle = roll_test.coverage(self.toolface[index])
+        if circle.rolled:
+            return ""
+        return _gap(circle, roll_test.WIDEST_GAP) or (
             "the toolfaces do not determine a mean and two harmonics. Add toolfaces between them: "
             "five or more, well apart"
         )
@@ -154,12 +141,11 @@ class RollTest:
     def _unfit(self, name: str, roll_set: RollSet) -> str:
         """Why a roll set has no spread of an observable; empty where it has."""
         if not roll_set.one_azimuth and name not in LEVEL:
-            return f"{roll_set.label}: stations of one direction need group or {REFERENCE_COLUMNS['azimuth']}"
+            return f"stations of one direction need group or {REFERENCE_COLUMNS['azimuth']}"
         if name in UNDEFINED_AT_VERTICAL and self.near[roll_set.index].any():
-            return f"{roll_set.label}: within 5° of vertical"
-        if name == "toolface" and np.isnan(self._error(name)[roll_set.index]).any():
-            return f"{roll_set.label}: no {REFERENCE_COLUMNS[name]}"
-        return ""
+            return "within 5° of vertical"
+        blank = name == "toolface" and np.isnan(self._error(name)[roll_set.index]).any()
+        return f"no {REFERENCE_COLUMNS[name]}" if blank else ""
 
     def spread(self, name: str) -> Departures:
         """The widest noise-free spread over the roll sets.
@@ -170,25 +156,24 @@ class RollTest:
         lacks = self._lacks(name)
         if lacks or not self.sets:
             return Departures(skipped=lacks or f"no {ROLL_SET} stations of one direction")
-        unfit = {s.label: why for s in self.sets if (why := self._unfit(name, s))}
-        fit = [s for s in self.sets if s.label not in unfit]
+        unfit = {s.label: self._unfit(name, s) for s in self.sets}
+        fit = [s for s in self.sets if not unfit[s.label]]
         gaps = {s.label: self._loose(s.index) for s in fit}
         rolled = [s for s in fit if not gaps[s.label]]
         wrong = [s for s in fit if gaps[s.label] and (s.declared or (s.one_azimuth and not rolled))]
         kept = {s.label for s in (*rolled, *wrong)}
         apart = (
-            *unfit.values(),
+            *(f"{label}: {why}" for label, why in unfit.items() if why),
             *(f"{label}: not rolled, {gap}" for label, gap in gaps.items() if label not in kept),
         )
-        if not rolled and not wrong:
+        if not kept:
             return Departures(skipped="; ".join(apart))
-        blocked = self._unusable(name, any(self._free_spread(name, s.index) for s in fit))
-        if wrong and not blocked:
-            blocked = f"{wrong[0].label} was not rolled: {gaps[wrong[0].label]}"
-        statistics = [self._curve_of(name, s, False) for s in rolled]
+        free = any(self._free_spread(name, s.index) for s in fit)
+        unrolled = f"{wrong[0].label} was not rolled: {gaps[wrong[0].label]}" if wrong else ""
         raws = ((s.label, float(np.ptp(self._centred(name, s.index)))) for s in wrong)
+        statistics = [self._curve_of(name, s, False) for s in rolled]
         statistics += [Statistic(raw, 0.0, raw, label) for label, raw in raws]
-        return _outcome(statistics, blocked, bool(wrong), apart)
+        return self._outcome(name, statistics, free, unrolled, apart)
 
     def error(self, name: str) -> Departures:
         """The largest noise-free departure from the reference: of rolled sets, and other stations.
@@ -204,26 +189,37 @@ class RollTest:
             steep = "every station within 5° of vertical"
             return Departures(skipped=steep if near.any() else f"no {REFERENCE_COLUMNS[name]}")
         free = bool(self.calibration.rests_on_free(name, self.readings)[judged].any())
-        circle, blocked = self._coverage(judged), self._unusable(name, free)
-        gap = NO_TOOLFACE if circle is None else _gap(circle, OPEN)
-        if gap and not blocked:
-            blocked = f"the stations were not rolled: {gap}"
-        left = f"{near.sum()} of {given.sum()} stations lie within 5° of vertical"
+        known = self.toolface[judged][~np.isnan(self.toolface[judged])]
+        circle = roll_test.coverage(known) if known.size else None
+        gap = NO_TOOLFACE if circle is None else _gap(circle, roll_test.OPEN)
+        unrolled = f"the stations were not rolled: {gap}" if gap else ""
         unseen = circle is not None and not gap and bool(circle.seen.min() < SEEN)
+        left = f"{near.sum()} of {given.sum()} stations lie within 5° of vertical"
         apart = (left,) if near.any() else ()
-        return _outcome(self._errors(name, judged), blocked, bool(gap), apart, unseen)
+        return self._outcome(name, self._errors(name, judged), free, unrolled, apart, unseen)
+
+    def _outcome(
+        self, name: str, statistics: list[Statistic], free: bool, unrolled: str,
+        apart: tuple[str, ...], unseen: bool = False,
+    ) -> Departures:  # fmt: skip
+        """The statistics, and why no limit can be passed: `free` and `unrolled` are reasons."""
+        if name == "field" and self.calibration.relative:
+            return Departures(blocked="the calibration is relative: field = 1, not nT", apart=apart)
+        blocked = NOT_DETERMINED if free else unrolled
+        return Departures(tuple(statistics), "", blocked, bool(unrolled), apart, unseen)
 
     def _errors(self, name: str, judged: Ints) -> list[Statistic]:
         """Largest errors of rolled sets, and of each station outside of them."""
         seen = [replace(s, index=s.index[np.isin(s.index, judged)]) for s in self.sets]
         whole = [s for s in seen if not self._loose(s.index) and (s.one_azimuth or name in LEVEL)]
-        inside = np.concatenate([s.index for s in whole]) if whole else np.zeros(0, int)
-        error, labels = np.abs(self._error(name)), self.readings.labels
+        inside = np.concatenate([s.index for s in whole]) if whole else ()
+        alone = judged[~np.isin(judged, inside)]
         reference = np.hypot(self.readings.uncertainty(name), self._common(name))
-        sd = np.hypot(self._noise(name), reference)
+        error, sd = np.abs(self._error(name)), np.hypot(self._noise(name), reference)
+        each = zip(error[alone].tolist(), sd[alone].tolist(), alone, strict=True)
         return [self._curve_of(name, s, True) for s in whole] + [
-            Statistic(float(error[i]), float(sd[i]), float(error[i]), f"station {labels[i]}")
-            for i in judged[~np.isin(judged, inside)].tolist()
+            Statistic(off, off_sd, off, f"station {self.readings.labels[i]}")
+            for off, off_sd, i in each
         ]
 
     def _curve_of(self, name: str, roll_set: RollSet, error: bool) -> Statistic:
@@ -232,8 +228,8 @@ class RollTest:
         part = self._error(name)[index] if error else self._centred(name, index)
         each, common = self._reference_sd(name, roll_set, error)
         sd = np.hypot(self._noise(name)[index], each)
-        curve = fitted(part, sd, self.toolface[index])
-        turn, (most, least, farthest) = extent(curve), np.degrees(ends(curve))
+        curve = roll_test.fitted(part, sd, self.toolface[index])
+        turn, (most, least, farthest) = roll_test.extent(curve), np.degrees(roll_test.ends(curve))
         raw = float(np.abs(part).max() if error else np.ptp(part))
         value = float(turn.largest if error else turn.range)
         noise = float(turn.largest_sd if error else turn.range_sd)
@@ -265,12 +261,6 @@ class RollTest:
         middle = np.angle(np.mean(np.exp(1j * part))) if periodic else part.mean()
         return OBSERVABLES[name].difference(part, middle)
 
-    def _unusable(self, name: str, free: bool) -> str:
-        """Why no limit on an observable can be passed; empty where it can."""
-        if name == "field" and self.calibration.relative:
-            return RELATIVE_FIELD
-        return "it rests on a direction that the calibration leaves undetermined" if free else ""
-
     def _free_spread(self, name: str, index: Ints) -> bool:
         """Whether the spread of a set moves with a direction that no evidence determines."""
         if not self.calibration.free:
@@ -281,19 +271,9 @@ class RollTest:
         return bool((np.ptp(moved, axis=0) > FREE_SHARE * size).any())
 
 
-def _outcome(
-    statistics: list[Statistic], blocked: str, unrolled: bool, apart: tuple[str, ...],
-    unseen: bool = False,
-) -> Departures:  # fmt: skip
-    """The statistics, without those of a field that is not in nT."""
-    if blocked == RELATIVE_FIELD:
-        return Departures(blocked=blocked, apart=apart)
-    return Departures(tuple(statistics), "", blocked, unrolled, apart, unseen)
-
-
 def _gap(circle: Coverage, most: float) -> str:
     """The sentence on toolfaces that leave a gap wider than `most` (radians); empty if they do not."""
-    if circle.gap <= most + SLACK:
+    if circle.gap <= most + roll_test.SLACK:
         return ""
     width, start = round(float(np.degrees(circle.gap))), round(float(np.degrees(circle.start)))
     span = f"{width}° from {start % 360}° to {(start + width) % 360}°"

@@ -19,15 +19,26 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mwdcal.calibration.readings import TRIADS
 from mwdcal.calibration.record import FREE_SHARE, Calibration, TriadCalibration
 from mwdcal.errors import InputError
 from mwdcal.geometry.vectors import AnyArray, Array, Ints
 from mwdcal.sensor.models import affine_parts, factor_parts
-from mwdcal.sensor.profile import TriadProfile
 
 NOTATIONS = ("factors", "forward", "affine")
 COURSE = "course"
 """In place of a temperature: coefficients by power of T - reference."""
+_NO_COURSE = (
+    "{} notation is a quotient of polynomials of temperature and has no coefficients by power. Use `notation` {}, "
+    "or a number in °C for `temperature`, or calibrate with `model` {}."
+)
+QUOTIENTS = {
+    "factors": "factors are no polynomials of temperature. Use `notation` affine, for one temperature or with "
+    "`temperature` course, or `notation` forward for one temperature, or calibrate with `model` factors.",
+    "forward": _NO_COURSE.format("forward", "affine", "factors"),
+    "affine": _NO_COURSE.format("affine", "forward or factors", "polynomial"),
+}
+"""Why a notation is refused that only another model has as polynomials of temperature, and what to do."""
 VALUE_AXES = {"S": 2, "o": 1, "M": 2, "b": 1, "SF": 1, "B": 1, "m": 2}
 """Axes of each value at one temperature."""
 
@@ -77,73 +88,34 @@ def convert(
             f"of temperature; got {temperature!r}."
         )
     at = calibration.reference_temperature if temperature is None else temperature
-    return {
-        triad.name: _one(_Part.of(calibration, index), notation, at)
-        for index, triad in enumerate(calibration.triads)
-    }
+    return {triad.name: _one(calibration, triad, notation, at) for triad in calibration.triads}
 
 
-@dataclass(frozen=True)
-class _Part:
-    """One triad of a calibration, with its part of the covariance and of the free directions."""
-
-    triad: TriadCalibration
-    profile: TriadProfile
-    covariance: Array
-    free: Array
-    strength: float
-    reference: float
-    half_range: float
-
-    @classmethod
-    def of(cls, calibration: Calibration, index: int) -> _Part:
-        triads = calibration.triads
-        triad, start = triads[index], sum(len(t.parameters) for t in triads[:index])
-        where = slice(start, start + len(triad.parameters))
-        low, high = calibration.temperature_c or (0.0, 0.0)
-        return cls(
-            triad,
-            getattr(calibration.profile, triad.name),
-            calibration.parameter_covariance[where, where],
-            calibration.free_directions[:, where],
-            calibration.earth.get("field", 1.0) if index else 1.0,
-            calibration.reference_temperature,
-            max((high - low) / 2, 1.0),
-        )
-
-    def sizes(self, values: dict[str, Array]) -> Array:
-        """What each value is compared with to see whether a free direction moves it."""
-        name, value = next((n, v) for n, v in values.items() if n in ("S", "SF", "M"))
-        gain = np.abs(value[powers(name, value) == 0]).max()
-        scale = {"m": 1.0, "b": self.strength, "B": self.strength, "o": gain * self.strength}
-        sizes = [
-            scale.get(name, gain) / self.half_range ** powers(name, value)
-            for name, value in values.items()
-        ]
-        return np.concatenate([size.ravel() for size in sizes])
-
-
-def _one(part: _Part, notation: str, temperature: float | str) -> Notation:
+def _one(
+    calibration: Calibration, triad: TriadCalibration, notation: str, temperature: float | str
+) -> Notation:
     """One triad in a notation, at a temperature or as a course."""
-    triad, permutation = part.triad, part.profile.permutation
     _refuse(triad, notation, temperature)
-    scale = np.full(3, 1.0 if part.profile.scale is None else part.profile.scale)
+    profile = getattr(calibration.profile, triad.name)
+    permutation, scale = profile.permutation, np.full(3, profile.scale or 1.0)
     course = isinstance(temperature, str)
-    tau = 0.0 if isinstance(temperature, str) else temperature - part.reference
+    tau = 0.0 if isinstance(temperature, str) else temperature - calibration.reference_temperature
 
     def values(params: AnyArray) -> dict[str, AnyArray]:
         if notation == triad.model:
             return _stored_factors(params, permutation, scale)
-        if course and triad.order:
-            form = _forward_course if notation == "forward" else _affine_course
-            return form(params, permutation, scale)
+        if course and triad.order and notation == "forward":
+            return _forward_course(params, permutation, scale)
+        if course and triad.order:  # the parameters of the polynomial model themselves
+            matrix, offset = affine_parts(params.reshape(-1, 12))
+            return {"M": matrix @ permutation / scale, "b": offset}
         matrix, offset = _affine(params, triad, tau)
         forms = _steady(notation, matrix @ permutation / scale, offset, permutation)
         if course and notation != "factors":
             return {name: value[None] for name, value in forms.items()}
         return forms
 
-    return _propagate(values, part)
+    return _propagate(values, calibration, triad)
 
 
 def _refuse(triad: TriadCalibration, notation: str, temperature: float | str) -> None:
@@ -156,24 +128,10 @@ def _refuse(triad: TriadCalibration, notation: str, temperature: float | str) ->
         )
     model = "polynomial" if notation == "affine" else "factors"
     if triad.order and triad.model != model and (notation == "factors" or temperature == COURSE):
-        raise _quotient(triad, notation, model)
-
-
-def _quotient(triad: TriadCalibration, notation: str, model: str) -> InputError:
-    """The error of a notation that only another model has as polynomials of temperature."""
-    what = f"the {triad.name} has the model '{triad.model}' of order {triad.order} in temperature"
-    if notation == "factors":
-        return InputError(
-            f"{what}: its factors are no polynomials of temperature. Use `notation` affine, "
-            "for one temperature or with `temperature` course, or `notation` forward for one "
-            "temperature, or calibrate with `model` factors."
+        what = (
+            f"the {triad.name} has the model '{triad.model}' of order {triad.order} in temperature"
         )
-    able = "affine" if model == "factors" else "forward or factors"
-    return InputError(
-        f"{what}: its {notation} notation is a quotient of polynomials of temperature and has "
-        f"no coefficients by power. Use `notation` {able}, or a number in °C for "
-        f"`temperature`, or calibrate with `model` {model}."
-    )
+        raise InputError(f"{what}: its {QUOTIENTS[notation]}")
 
 
 def _affine(params: AnyArray, triad: TriadCalibration, tau: float) -> tuple[AnyArray, AnyArray]:
@@ -222,25 +180,38 @@ def _forward_course(params: AnyArray, permutation: Array, scale: Array) -> dict[
     return {"S": back @ matrix, "o": offset @ back.transpose()}
 
 
-def _affine_course(params: AnyArray, permutation: Array, scale: Array) -> dict[str, AnyArray]:
-    """M and b by power: the parameters of the polynomial model themselves, for raw channels."""
-    matrix, offset = affine_parts(params.reshape(-1, 12))
-    return {"M": matrix @ permutation / scale, "b": offset}
-
-
-def _propagate(values: Callable[[AnyArray], dict[str, AnyArray]], part: _Part) -> Notation:
+def _propagate(
+    values: Callable[[AnyArray], dict[str, AnyArray]],
+    calibration: Calibration,
+    triad: TriadCalibration,
+) -> Notation:
     """Values and covariance; derivatives by complex step, exact to rounding."""
-    params = np.array(part.triad.parameters)
+    params, where = np.array(triad.parameters), calibration.places()[triad.name]
     notation = {name: np.asarray(value.real) + 0.0 for name, value in values(params).items()}
-    sizes = np.maximum(np.abs(params), 1.0) * 1e-30
-    changed = (values(params + 1j * step) for step in np.diag(sizes))
+    steps = np.maximum(np.abs(params), 1.0) * 1e-30
+    changed = (values(params + 1j * step) for step in np.diag(steps))
     columns = [np.concatenate([v.imag.ravel() for v in each.values()]) for each in changed]
-    jacobian = np.stack(columns, -1) / sizes
-    spread = jacobian @ part.covariance @ jacobian.transpose()
-    moved = np.abs(jacobian @ part.free.transpose()).max(-1, initial=0.0)
-    loose = moved > FREE_SHARE * part.sizes(notation)
+    jacobian = np.stack(columns, -1) / steps
+    spread = jacobian @ calibration.parameter_covariance[where, where] @ jacobian.transpose()
+    free = calibration.free_directions[:, where]
+    moved = np.abs(jacobian @ free.transpose()).max(-1, initial=0.0)
+    loose = moved > FREE_SHARE * _sizes(calibration, triad, notation)
     sd = np.where(loose, np.nan, np.sqrt(np.maximum(np.diag(spread), 0.0)))
     ends = np.cumsum([value.size for value in notation.values()])[:-1]
     parts = zip(notation.items(), np.split(sd, ends), strict=True)
     uncertainty = {name: part.reshape(value.shape) for (name, value), part in parts}
     return Notation(notation, uncertainty, spread)
+
+
+def _sizes(calibration: Calibration, triad: TriadCalibration, values: dict[str, Array]) -> Array:
+    """What each value is compared with to see whether a free direction moves it."""
+    low, high = calibration.temperature_c or (0.0, 0.0)
+    strength = calibration.earth.get("field", 1.0) if triad.name == TRIADS[1] else 1.0
+    name, value = next((n, v) for n, v in values.items() if n in ("S", "SF", "M"))
+    gain = np.abs(value[powers(name, value) == 0]).max()
+    scale = {"m": 1.0, "b": strength, "B": strength, "o": gain * strength}
+    sizes = [
+        scale.get(name, gain) / max((high - low) / 2, 1.0) ** powers(name, value)
+        for name, value in values.items()
+    ]
+    return np.concatenate([size.ravel() for size in sizes])

@@ -8,20 +8,19 @@ every contour its number.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import wraps
-from typing import TYPE_CHECKING, Any, Literal, ParamSpec
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from mwdcal.calibration.prediction import AccuracyMap, accuracy_map, angles
-from mwdcal.calibration.record import Calibration, OrderScore, StationRow
+from mwdcal.calibration.record import Calibration, ErrorRow, OrderScore, StationRow
 from mwdcal.calibration.residuals import RESHOOT
 from mwdcal.errors import InputError
 from mwdcal.geometry.observables import TITLES
-from mwdcal.geometry.vectors import Array
+from mwdcal.geometry.vectors import AnyArray, Array
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -36,6 +35,8 @@ LINES: dict[str, Any] = {"x": "-", "y": (0, (5, 1.5)), "z": (0, (1.5, 1.2))}
 """Line styles of the channels of a triad."""
 WIDTH = 7.1
 """Of a figure, inches."""
+NOTE: dict[str, Any] = {"textcoords": "offset points", "color": "#9a3d00", "fontsize": 7}
+"""Look of a remark at something marked."""
 STYLE: dict[Any, Any] = {
     "axes.axisbelow": True,
     "axes.edgecolor": "#4b5563",
@@ -46,7 +47,6 @@ STYLE: dict[Any, Any] = {
     "axes.spines.top": False,
     "axes.titlelocation": "left",
     "axes.titlesize": 8,
-    "axes.unicode_minus": True,
     "font.family": "DejaVu Sans",
     "font.size": 7.5,
     "grid.color": "#e5e7eb",
@@ -57,7 +57,6 @@ STYLE: dict[Any, Any] = {
     "legend.frameon": False,
     "lines.linewidth": 0.8,
     "lines.markersize": 3.6,
-    "svg.fonttype": "path",
     "svg.hashsalt": "mwdcal",
     "text.parse_math": False,
     "xtick.labelsize": 7,
@@ -67,12 +66,9 @@ STYLE: dict[Any, Any] = {
 }
 
 
-Arguments = ParamSpec("Arguments")
-
-
 @contextmanager
 def style() -> Iterator[None]:
-    """Our style on matplotlib's own defaults, whatever the user's settings are."""
+    """Our style on matplotlib's own defaults, whatever the user's settings are; for a block or a function."""
     import matplotlib as mpl
 
     with mpl.rc_context(), warnings.catch_warnings():
@@ -82,26 +78,23 @@ def style() -> Iterator[None]:
         yield
 
 
-def styled(draw: Callable[Arguments, Figure]) -> Callable[Arguments, Figure]:
-    """A function that draws a figure, in our style."""
-
-    @wraps(draw)
-    def draw_in_style(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Figure:
-        with style():
-            return draw(*args, **kwargs)
-
-    return draw_in_style
-
-
 def new_figure(
-    label: str, height: float, layout: Literal["constrained"] | None = "constrained"
-) -> Figure:
-    """An empty figure as wide as a page; `height` in inches, `label`: what it shows."""
+    label: str,
+    height: float,
+    rows: int = 1,
+    columns: int = 1,
+    layout: Literal["constrained"] | None = "constrained",
+    **grid: Any,
+) -> tuple[Figure, Any]:
+    """A figure as wide as a page, and its empty panels (rows, columns).
+
+    `label` is what the figure shows, `height` in inches, `grid` as of `Figure.subplots`.
+    """
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(WIDTH, height), layout=layout)
     figure.set_label(label)
-    return figure
+    return figure, figure.subplots(rows, columns, squeeze=False, **grid)
 
 
 def plain_numbers(axis: Axis, *steps: float) -> None:
@@ -116,59 +109,6 @@ def plain_numbers(axis: Axis, *steps: float) -> None:
 def quantity(value: float, unit: str) -> str:
     """A number with its unit: 0.52°, 8.4 mg."""
     return f"{value:.3g}{'' if unit == '°' else ' '}{unit}"
-
-
-@styled
-def station_errors(calibration: Calibration, name: str) -> Figure:
-    """Errors of one observable per station: before and after, each on its own scale."""
-    row = next(r for r in calibration.errors if r.observable == name)
-    stations, unit = calibration.station_rows, row.unit.partition(" ")[0]
-    label = f"{TITLES[name]}, {unit}"
-    figure = new_figure(f"Error of {label}, per station, before and after", 1.5, layout=None)
-    place = {"left": 0.095, "right": 0.995, "bottom": 0.27, "top": 0.87, "wspace": 0.24}
-    first, second = figure.subplots(1, 2, gridspec_kw=place)
-    _stems(first, stations, [s.errors_before.get(name, np.nan) for s in stations], BEFORE, "o")
-    first.set_title(f"before: rms {quantity(row.before, unit)}")
-    if row.expected:
-        second.axhspan(-row.expected, row.expected, color=BAND, lw=0, zorder=0.5)
-    _stems(second, stations, [s.errors.get(name, np.nan) for s in stations], AFTER, "s")
-    expected = "  (band: ±1σ expected)" if row.expected else ""
-    second.set_title(f"after: rms {quantity(row.after, unit)}{expected}")
-    for axes in (first, second):
-        axes.set_ylabel(label)
-        axes.axhline(0, color="#4b5563", lw=0.6, zorder=1)
-    return figure
-
-
-@styled
-def deviations(calibration: Calibration) -> Figure:
-    """Each station's misfit in σ, with the limit above which it is to be taken again."""
-    rows, limit = calibration.station_rows, reshoot_limit(calibration)
-    figure = new_figure("Misfit of each station in standard deviations", 1.7)
-    axes = figure.subplots()
-    _stems(axes, rows, [row.deviation for row in rows], AFTER, "s")
-    axes.axhline(limit, color=MARKED, lw=1, ls=(0, (5, 3)))
-    top = max(limit, *(row.deviation for row in rows)) * 1.2
-    axes.set_ylim(0, top)
-    axes.annotate(
-        f"re-shoot above {limit:.1f}σ", (1, limit), (-2, 3), xycoords=("axes fraction", "data"),
-        textcoords="offset points", ha="right", va="bottom", color="#9a3d00", fontsize=7,
-    )  # fmt: skip
-    axes.set_ylabel("misfit of the station, σ")
-    return figure
-
-
-@styled
-def order_errors(scores: Sequence[OrderScore]) -> Figure:
-    """Error at temperatures left out of the fit by order, inside and at the ends, per triad."""
-    triads = list(dict.fromkeys(row.triad for row in scores))
-    figure = new_figure("Error at left-out temperatures by temperature order", 2.0)
-    panels = figure.subplots(1, len(triads), squeeze=False)[0]
-    for axes, triad in zip(panels, triads, strict=True):
-        _by_order(axes, [row for row in scores if row.triad == triad])
-        axes.set_title(triad)
-    panels[0].legend(loc="upper right")
-    return figure
 
 
 def _by_order(axes: Axes, rows: Sequence[OrderScore]) -> None:
@@ -186,19 +126,24 @@ def _by_order(axes: Axes, rows: Sequence[OrderScore]) -> None:
     plain_numbers(axes.yaxis, *((1.0,) if wide else (1.0, 2.0, 5.0)))
     axes.set_xticks(where, [f"{row.order}" + "\nchosen" * row.chosen for row in rows])
     axes.margins(x=0.08, y=0.12)
-    axes.set_xlabel("order")
-    axes.set_ylabel("error, " + rows[0].unit.partition(" ")[0])
+    unit = rows[0].unit.partition(" ")[0]
+    axes.set(title=rows[0].triad, xlabel="order", ylabel=f"error, {unit}")
 
 
-def _stems(
+def stems(axes: Axes, where: AnyArray, heights: Array, **look: Any) -> None:
+    """Lines from zero to each height."""
+    ends = np.stack([np.zeros_like(heights), heights, np.full_like(heights, np.nan)], -1)
+    axes.plot(np.repeat(where, 3), ends.ravel(), **look)
+
+
+def _station_stems(
     axes: Axes, rows: Sequence[StationRow], values: Sequence[float], colour: str, marker: str
 ) -> None:
     """Stems over the stations; the ones to re-shoot have a triangle and their label."""
     where, heights = np.arange(len(rows)), np.asarray(values, float)
     marked = np.array([row.reshoot for row in rows])
     small = 3.6 if len(rows) <= 80 else 2.2
-    stems = np.stack([np.zeros_like(heights), heights, np.full(len(rows), np.nan)], -1).ravel()
-    axes.plot(np.repeat(where, 3), stems, color=colour, lw=0.7, alpha=0.6)
+    stems(axes, where, heights, color=colour, lw=0.7, alpha=0.6)
     plain = where[~marked], heights[~marked]
     axes.plot(*plain, marker, color=colour, ms=small, mfc="white", mew=0.9)
     axes.plot(where[marked], heights[marked], "^", color=MARKED, ms=6)
@@ -213,11 +158,9 @@ def _name_station(axes: Axes, where: float, height: float, label: str) -> None:
     """A station's label at the end of its stem."""
     from matplotlib.patheffects import withStroke
 
-    axes.annotate(
-        f"station {label}", (float(where), height), (5, -3 if height < 0 else 3),
-        textcoords="offset points", va="top" if height < 0 else "bottom", color="#9a3d00", fontsize=7,
-        path_effects=[withStroke(linewidth=2, foreground="white")],
-    )  # fmt: skip
+    offset, align = ((5, -3), "top") if height < 0 else ((5, 3), "bottom")
+    halo = [withStroke(linewidth=2, foreground="white")]
+    axes.annotate(f"station {label}", (where, height), offset, va=align, path_effects=halo, **NOTE)
 
 
 def _station_axis(axes: Axes, labels: Sequence[str]) -> None:
@@ -228,17 +171,6 @@ def _station_axis(axes: Axes, labels: Sequence[str]) -> None:
     step = max(1, -(-len(labels) * (longest + 1) // room))
     axes.set_xticks(range(0, len(labels), step), [label[:12] for label in labels[::step]])
     axes.set_xlabel("station")
-
-
-@styled
-def accuracy(chart: AccuracyMap, names: Sequence[str]) -> Figure:
-    """1σ of the angles over inclination and azimuth, degrees, in contours with their numbers."""
-    figure = new_figure("Predicted 1σ over inclination and azimuth", 2.75)
-    panels = figure.subplots(1, len(names), sharey=True, squeeze=False)[0]
-    for axes, name in zip(panels, names, strict=True):
-        _sphere(axes, chart, np.degrees(chart.sd[name]), name)
-    panels[0].set_ylabel("inclination, °")
-    return figure
 
 
 def _sphere(axes: Axes, chart: AccuracyMap, values: Array, name: str) -> None:
@@ -325,32 +257,78 @@ class Plots:
 
     calibration: Calibration
 
+    @style()
     def accuracy(self) -> Figure:
         """1σ of each angle over inclination and azimuth, degrees, root mean square over toolface."""
-        return accuracy(accuracy_map(self.calibration), angles(self.calibration))
+        chart, names = accuracy_map(self.calibration), angles(self.calibration)
+        label = "Predicted 1σ over inclination and azimuth"
+        figure, [panels] = new_figure(label, 2.75, columns=len(names), sharey=True)
+        for axes, name in zip(panels, names, strict=True):
+            _sphere(axes, chart, np.degrees(chart.sd[name]), name)
+        panels[0].set_ylabel("inclination, °")
+        return figure
 
+    @style()
     def errors(self, observable: str) -> Figure:
-        """Errors of an observable at each station of the run, before and after the calibration."""
-        known = [row.observable for row in self.calibration.errors]
-        if observable not in known:
+        """Errors of an observable at each station, before and after, each on its own scale."""
+        row, stations = self._errors(observable), self.calibration.station_rows
+        unit = row.unit.partition(" ")[0]
+        label = f"{TITLES[observable]}, {unit}"
+        shown = f"Error of {label}, per station, before and after"
+        place = {"left": 0.095, "right": 0.995, "bottom": 0.27, "top": 0.87, "wspace": 0.24}
+        figure, [panels] = new_figure(shown, 1.5, columns=2, layout=None, gridspec_kw=place)
+        series = (("errors_before", BEFORE, "o"), ("errors", AFTER, "s"))
+        for axes, (errors, *look) in zip(panels, series, strict=True):
+            values = [getattr(station, errors).get(observable, np.nan) for station in stations]
+            _station_stems(axes, stations, values, *look)
+            axes.axhline(0, color="#4b5563", lw=0.6, zorder=1)
+            axes.set_ylabel(label)
+        if row.expected:
+            panels[1].axhspan(-row.expected, row.expected, color=BAND, lw=0, zorder=0.5)
+        band = "  (band: ±1σ expected)" if row.expected else ""
+        panels[0].set_title(f"before: rms {quantity(row.before, unit)}")
+        panels[1].set_title(f"after: rms {quantity(row.after, unit)}{band}")
+        return figure
+
+    def _errors(self, observable: str) -> ErrorRow:
+        """The row of the table of errors; refuses an observable without one."""
+        rows = {row.observable: row for row in self.calibration.errors}
+        if observable not in rows:
             raise InputError(
-                f"`observable` must be one with references in the run ({', '.join(known)}); got "
+                f"`observable` must be one with references in the run ({', '.join(rows)}); got "
                 f"{observable!r}. Name another."
             )
-        return station_errors(self.calibration, observable)
+        return rows[observable]
 
+    @style()
     def deviations(self) -> Figure:
         """Misfit of each station in standard deviations, and the limit for measuring it again."""
-        return deviations(self.calibration)
+        rows, limit = self.calibration.station_rows, reshoot_limit(self.calibration)
+        figure, [[axes]] = new_figure("Misfit of each station in standard deviations", 1.7)
+        misfits = [row.deviation for row in rows]
+        _station_stems(axes, rows, misfits, AFTER, "s")
+        axes.axhline(limit, color=MARKED, lw=1, ls=(0, (5, 3)))
+        axes.set(ylabel="misfit of the station, σ", ylim=(0, max(limit, *misfits) * 1.2))
+        place = {"xycoords": ("axes fraction", "data"), "ha": "right", "va": "bottom"}
+        axes.annotate(f"re-shoot above {limit:.1f}σ", (1, limit), (-2, 3), **place, **NOTE)
+        return figure
 
+    @style()
     def orders(self) -> Figure:
-        """Error at temperatures left out of the fit, by temperature order."""
-        if not any(row.ends is not None for row in self.calibration.orders):
+        """Error at temperatures left out of the fit by order, inside and at the ends, per triad."""
+        scores = self.calibration.orders
+        if not any(row.ends is not None for row in scores):
             raise InputError(
                 "no temperature orders were compared in this calibration: the run needs stations at "
                 "three temperatures or more."
             )
-        return order_errors(self.calibration.orders)
+        triads = list(dict.fromkeys(row.triad for row in scores))
+        label = "Error at left-out temperatures by temperature order"
+        figure, [panels] = new_figure(label, 2.0, columns=len(triads))
+        for axes, triad in zip(panels, triads, strict=True):
+            _by_order(axes, [row for row in scores if row.triad == triad])
+        panels[0].legend(loc="upper right")
+        return figure
 
 
 Calibration.plot = property(Plots)

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mwdcal.calibration.readings import Readings
-from mwdcal.calibration.soaks import soaks
+from mwdcal.calibration.readings import Readings, soaks
 from mwdcal.geometry.vectors import Array, Bools, Ints
 
 NEAR_VERTICAL = np.radians(5.0)
@@ -47,10 +46,9 @@ def roll_sets(readings: Readings) -> list[RollSet]:
     for label, members, declared, one_azimuth in _directions(readings):
         for number in np.unique(soak[members]):
             index = np.flatnonzero(members & (soak == number))
-            if len(index) < ROLL_SET:
-                continue
             at = f", {warmth[index].mean():.1f} °C" if warmth is not None and soak.any() else ""
-            sets.append(RollSet(label + at, index, declared, one_azimuth))
+            if len(index) >= ROLL_SET:
+                sets.append(RollSet(label + at, index, declared, one_azimuth))
     return sets
 
 

@@ -152,12 +152,7 @@ def fitted(value: Array, sd: Array, toolface: Array) -> Curve:
     covariance = inverse(np.swapaxes(rows, -1, -2) @ rows)
     coefficients = np.einsum("...ij,...nj,...n->...i", covariance, rows, seen)
     left = seen - np.einsum("...ni,...i->...n", rows, coefficients)
-    return Curve(
-        coefficients=coefficients,
-        covariance=covariance,
-        square=np.sum(left**2, -1),
-        freedom=value.shape[-1] - COEFFICIENTS,
-    )
+    return Curve(coefficients, covariance, np.sum(left**2, -1), value.shape[-1] - COEFFICIENTS)
 
 
 def extent(curve: Curve) -> Extent:
@@ -185,8 +180,8 @@ def _corrected(drawn: Array) -> tuple[Array, Array]:
 def ends(curve: Curve) -> tuple[Array, Array, Array]:
     """Toolfaces (...) where the curve is greatest, least, and farthest from zero."""
     values = curve.coefficients @ basis(CIRCLE).swapaxes(-1, -2)
-    where = (values.argmax(-1), values.argmin(-1), np.abs(values).argmax(-1))
-    return CIRCLE[where[0]], CIRCLE[where[1]], CIRCLE[where[2]]
+    farthest = np.abs(values).argmax(-1)
+    return CIRCLE[values.argmax(-1)], CIRCLE[values.argmin(-1)], CIRCLE[farthest]
 
 
 def _measures(coefficients: Array) -> tuple[Array, Array]:

@@ -14,10 +14,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mwdcal.calibration.readings import EARTH_RANGES
-from mwdcal.calibration.record import Calibration, Finding
+from mwdcal.calibration.readings import EARTH_RANGES, TRIADS
+from mwdcal.calibration.record import Calibration
 from mwdcal.errors import InputError
-from mwdcal.geometry.observables import OUTPUTS
+from mwdcal.geometry.observables import OBSERVABLES, OUTPUTS
 from mwdcal.geometry.vectors import AnyArray, Array
 
 OFF_REFERENCE = 0.05
@@ -32,10 +32,6 @@ STRENGTH_UNITS: dict[str, dict[str, float]] = {
     "field": {"nT": 1.0, "µT": 1e-3, "mT": 1e-6, "gauss": 1e-5, "mG": 1e-2},
 }
 """Units in which readings come, per g or nT."""
-STRENGTH_REASONS = {
-    "gravity": "the tool moved while it was read, or a reading is in another unit.",
-    "field": "iron or a current was near, or a reading is in another unit.",
-}
 
 
 class Strengths(NamedTuple):
@@ -61,34 +57,22 @@ def judged(
     A field that is relative is not judged, that of a coil not by the Earth's, and a scale that
     the calibration leaves free not by references.
     """
-    triads = dict(zip(JUDGED_STRENGTHS, calibration.triads, strict=False))
     strengths = {}
-    for name, triad in triads.items():
+    for name, triad in zip(JUDGED_STRENGTHS, calibration.triads, strict=False):
         if name == "field" and calibration.relative:
             continue
         values = np.asarray(columns[OUTPUTS[name]], float)
-        free = any(entry.id == "scale" for entry in triad.undetermined)
         coil = name == "field" and calibration.profile.stand.coil
         low, high = (-np.inf, np.inf) if coil else EARTH_RANGES[name]
-        earth = (values < low) | (values > high)
-        reference = np.zeros(values.shape, bool)
-        if name in known and not free:
+        earth, reference = (values < low) | (values > high), np.zeros(values.shape, bool)
+        if name in known and not any(entry.id == "scale" for entry in triad.undetermined):
             reference = np.abs(values - known[name]) > OFF_REFERENCE * known[name]
-        strengths[name] = _counted(values, earth, reference)
+        kinds = (~np.isnan(values), earth, reference, earth | reference)
+        counts = (int(np.count_nonzero(rows)) for rows in kinds)
+        worst = values[earth | reference]
+        ends = float(worst.min(initial=np.inf)), float(worst.max(initial=-np.inf))
+        strengths[name] = Strengths._make((*counts, *ends))
     return strengths
-
-
-def _counted(values: Array, earth: AnyArray, reference: AnyArray) -> Strengths:
-    off = earth | reference
-    which = values[off]
-    return Strengths(
-        rows=int(np.count_nonzero(~np.isnan(values))),
-        earth=int(np.count_nonzero(earth)),
-        reference=int(np.count_nonzero(reference)),
-        off=int(np.count_nonzero(off)),
-        low=float(which.min(initial=np.inf)),
-        high=float(which.max(initial=-np.inf)),
-    )
 
 
 def total(parts: Iterable[Mapping[str, Strengths]]) -> dict[str, Strengths]:
@@ -101,29 +85,24 @@ def total(parts: Iterable[Mapping[str, Strengths]]) -> dict[str, Strengths]:
     return whole
 
 
-def findings(strengths: Mapping[str, Strengths]) -> list[Finding]:
-    """Findings about rows whose strength is off."""
-    return [
-        Finding(
-            id=f"implausible-{name}",
-            text=f"{each.off} of {each.rows} rows: {_departure(name, each)}: {STRENGTH_REASONS[name]}",
-        )
+def departures(strengths: Mapping[str, Strengths]) -> dict[str, str]:
+    """How each strength is off that is off at any row, and at how many."""
+    return {
+        name: f"{each.off} of {each.rows} rows: {_departure(name, each)}"
         for name, each in strengths.items()
         if each.off
-    ]
+    }
 
 
 def _departure(name: str, each: Strengths) -> str:
-    unit, (low, high) = "g" if name == "gravity" else "nT", EARTH_RANGES[name]
-    reasons = []
-    if each.earth:
-        reasons.append(f"no place on Earth has it ({low:g}…{high:g} {unit})")
-    if each.reference:
-        reasons.append(
-            f"it is more than {OFF_REFERENCE:.0%} off the table's own ref_{OUTPUTS[name]}"
-        )
+    unit, (low, high) = OBSERVABLES[name].unit, EARTH_RANGES[name]
     extent = "…".join(dict.fromkeys(f"{end:.3g}" for end in (each.low, each.high)))
-    return f"corrected {name} is {extent} {unit}, and {' and '.join(reasons)}"
+    reasons = {
+        f"no place on Earth has it ({low:g}…{high:g} {unit})": each.earth,
+        f"it is more than {OFF_REFERENCE:.0%} off the table's own ref_{OUTPUTS[name]}": each.reference,
+    }
+    why = " and ".join(reason for reason, rows in reasons.items() if rows)
+    return f"corrected {name} is {extent} {unit}, and {why}"
 
 
 def check(calibration: Calibration, strengths: Mapping[str, Strengths], source: str) -> None:
@@ -138,7 +117,7 @@ def check(calibration: Calibration, strengths: Mapping[str, Strengths], source: 
 
 def _advice(calibration: Calibration, name: str, each: Strengths) -> str:
     """The likely cause, and what to do."""
-    triad, unit = ("accelerometer", "g") if name == "gravity" else ("magnetometer", "nT")
+    triad, unit = TRIADS[name == "field"], OBSERVABLES[name].unit
     scale, nominal = getattr(calibration.profile, triad).scale, ""
     if scale is not None:
         nominal = f" of about {scale:.4g} raw units per {unit}{_likely(name, each, scale)}"

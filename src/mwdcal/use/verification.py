@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Literal
 
 import msgspec
@@ -12,7 +12,7 @@ from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import MARGIN, Calibration, Finding, html_table
 from mwdcal.errors import InputError
 from mwdcal.geometry.observables import OBSERVABLES
-from mwdcal.use.departures import Departures, RollTest, Statistic
+from mwdcal.use.departures import LEVEL, Departures, RollTest, Statistic
 
 COVERAGE = 2.0
 """Coverage factor of the guard band and of the remark that a value is close to its limit."""
@@ -20,21 +20,27 @@ WEAK = 0.5
 """A test whose 1σ is a larger share of the limit hardly distinguishes a good tool from a bad one."""
 NAMED_HARMONIC = 3.0
 """Standard uncertainties above which a harmonic is named as a cause."""
-CAUSES = {
-    "inclination": (
-        "a bias of the accelerometer across the tool axis, or it leans",
-        "a difference in scale, or a misalignment, of the accelerometer's x and y",
-    ),
-    "azimuth": (
-        "a bias across the tool axis of either triad, or it leans",
-        "a difference in scale, or a misalignment, of x and y of either triad",
-    ),
-    "gravity": (
-        "a bias of the accelerometer across the tool axis, or its x or y is not square to z",
-        "a difference in scale, or a misalignment, of the accelerometer's x and y",
-    ),
+FIRST_HARMONIC = {
+    "inclination": "a bias of the accelerometer across the tool axis, or it leans",
+    "azimuth": "a bias across the tool axis of either triad, or it leans",
+    "gravity": "a bias of the accelerometer across the tool axis, or its x or y is not square to z",
 }
-"""What a first and a second harmonic of toolface come from; as for azimuth where not named."""
+"""What a first harmonic of toolface comes from; as for azimuth where not named."""
+SECOND_HARMONIC = "a difference in scale, or a misalignment, of "
+"""What a second harmonic comes from."""
+VERDICT_FINDINGS = {
+    "no-temperature": "the tool was calibrated at unrecorded temperatures, and tested at {tested} °C: "
+    "the verdict holds for the temperatures of the test alone.",
+    "outside-temperature": "{where} lie outside the calibrated range {calibrated} °C. The calibration has no "
+    "temperature terms: drift over the difference counts as its error.",
+    "not-judged": "not judged: {limits}.",
+    "no-roll-set": "no roll set: spreads were not judged.",
+    "harmonic-unseen": "{title}: the toolfaces hardly show one of the two harmonics of a turn (four at right "
+    "angles do not show a misalignment of x and y): add toolfaces between them.",
+    "weak-test": "{row.name}: its 1σ of {row.uncertainty:.2g} {row.unit} is more than half of the limit: this "
+    "test can hardly tell a good tool from a bad one. Average longer at each station, or take more toolfaces.",
+    "roll-harmonics": "{row.name} over a turn of toolface: {causes}.",
+}
 
 
 class Bounds(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -49,8 +55,7 @@ class Bounds(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 
     def items(self) -> Iterable[tuple[str, float]]:
         """Observable and limit, of those that are set; angles in degrees."""
-        for name in self.__struct_fields__:
-            value = getattr(self, name)
+        for name, value in msgspec.structs.asdict(self).items():
             if value is not None:
                 yield name.rpartition("_")[0], value
 
@@ -153,7 +158,7 @@ def verify(calibration: Calibration, readings: Readings, limits: Limits) -> Verd
         run=readings.source,
         stations=readings.count,
         rows=[row for row, _ in judged],
-        findings=sum((about for _, about in judged), _findings(test, skipped)),
+        findings=sum((about for _, about in judged), [*_findings(test, skipped)]),
     )
 
 
@@ -165,35 +170,28 @@ def _skipped(reasons: dict[str, str]) -> list[str]:
     return [f"{', '.join(names[reason])} ({reason})" for reason in names if reason]
 
 
-def _findings(test: RollTest, skipped: Sequence[str]) -> list[Finding]:
+def _findings(test: RollTest, skipped: Sequence[str]) -> Iterator[Finding]:
     """Findings about the verdict as a whole, and about limits that were not judged."""
-    calibration = test.calibration
-    findings = [*calibration.change_findings(), *_temperature_findings(calibration, test.readings)]
-    findings += [Finding(id=u.id, text=f"{u.text}.") for u in calibration.undetermined()]
+    calibration, readings = test.calibration, test.readings
+    warmth = readings.temperature
+    tested = "" if warmth is None else _span(float(warmth.min()), float(warmth.max()))
+    yield from calibration.change_findings()
+    if calibration.unrecorded(readings):
+        yield _finding("no-temperature", tested=tested)
+    if beyond := int(calibration.outside(readings, MARGIN).sum()):
+        where = f"{beyond} of {readings.count} stations ({tested} °C)"
+        calibrated = _span(*calibration.temperature_c or (np.nan, np.nan))
+        yield _finding("outside-temperature", where=where, calibrated=calibrated)
+    for free in calibration.undetermined():
+        yield Finding(id=free.id, text=f"{free.text}.")
     if skipped:
-        findings.append(Finding(id="not-judged", text=f"not judged: {'; '.join(skipped)}."))
+        yield _finding("not-judged", limits="; ".join(skipped))
     if not test.sets:
-        findings.append(Finding(id="no-roll-set", text="no roll set: spreads were not judged."))
-    return findings
+        yield _finding("no-roll-set")
 
 
-def _temperature_findings(calibration: Calibration, readings: Readings) -> Iterable[Finding]:
-    if readings.temperature is None:
-        return
-    tested = _span(float(readings.temperature.min()), float(readings.temperature.max()))
-    if calibration.temperature_c is None:
-        text = (
-            f"the tool was calibrated at unrecorded temperatures, and tested at {tested} °C: "
-            "the verdict holds for the temperatures of the test alone."
-        )
-        yield Finding(id="no-temperature", text=text)
-    elif beyond := int(calibration.outside(readings, MARGIN).sum()):
-        text = (
-            f"{beyond} of {readings.count} stations ({tested} °C) lie outside the calibrated "
-            f"range {_span(*calibration.temperature_c)} °C. The calibration has no temperature terms: drift "
-            "over the difference counts as its error."
-        )
-        yield Finding(id="outside-temperature", text=text)
+def _finding(name: str, **values: object) -> Finding:
+    return Finding(id=name, text=VERDICT_FINDINGS[name].format(**values))
 
 
 def _span(low: float, high: float) -> str:
@@ -202,33 +200,30 @@ def _span(low: float, high: float) -> str:
 
 def _check_tool(calibration: Calibration, readings: Readings) -> None:
     if other := calibration.other_tool(readings):
-        ours, theirs = other
         raise InputError(
-            f"{readings.name} is of tool {theirs}, the calibration of tool {ours}. Verify with a "
+            f"{readings.name} is of tool {other[1]}, the calibration of tool {other[0]}. Verify with a "
             "run of the same tool, or correct 'serial' in the file."
         )
 
 
 def _check_independent(calibration: Calibration, readings: Readings) -> None:
-    seen = calibration.used(readings.digest)
-    used = [label for label, old in zip(readings.labels, seen, strict=False) if old]
-    if used:
+    used = np.flatnonzero(calibration.used(readings.digest))
+    if used.size:
         raise InputError(
-            f"{readings.name}: {len(used)} of {readings.count} stations were in the fit (first: "
-            f"station {used[0]}). Verification needs data that the fit has not seen: take a roll "
+            f"{readings.name}: {used.size} of {readings.count} stations were in the fit (first: "
+            f"station {readings.labels[used[0]]}). Verification needs data that the fit has not seen: take a roll "
             "test of its own."
         )
 
 
 def _check_temperature(calibration: Calibration, readings: Readings) -> None:
-    outside = calibration.outside(readings)
-    if outside.any() and calibration.temperature_c is not None:
+    outside = np.flatnonzero(calibration.outside(readings))
+    if outside.size and calibration.temperature_c is not None:
         low, high = calibration.temperature_c
-        first = int(np.flatnonzero(outside)[0])
+        lie = "station lies" if outside.size == 1 else "stations lie"
         raise InputError(
-            f"{readings.name}: {int(outside.sum())} stations lie outside the calibrated range "
-            f"{low:.1f}…{high:.1f} °C (first: station {readings.labels[first]}). Verify within "
-            "the range, or calibrate over a wider one."
+            f"{readings.name}: {outside.size} {lie} outside the calibrated range {low:.1f}…{high:.1f} °C "
+            f"(first: station {readings.labels[outside[0]]}). Verify within the range, or calibrate over a wider one."
         )
 
 
@@ -236,8 +231,11 @@ def _judged(
     title: str, name: str, limit: float, outcome: Departures, guard: float
 ) -> tuple[VerdictRow, list[Finding]]:
     """The decision on one limit, by the worst set or station, and the findings about it."""
-    inside, findings = OBSERVABLES[name].unit, [*_partial(title, outcome)]
+    inside = OBSERVABLES[name].unit
     factor, unit = (float(np.degrees(1)), "°") if inside == "rad" else (1.0, inside)
+    findings = [Finding(id="partly-judged", text=f"{title}: {text}.") for text in outcome.apart]
+    if outcome.unseen:
+        findings.append(_finding("harmonic-unseen", title=title))
     most = max((each.raw * factor for each in outcome.statistics), default=None)
     if outcome.blocked:
         row = VerdictRow(
@@ -248,24 +246,16 @@ def _judged(
     worst = max(outcome.statistics, key=lambda each: each.value + guard * each.uncertainty)
     value, sd = worst.value * factor, worst.uncertainty * factor
     passed = value + guard * sd <= limit
-    note, harmonics = _remark(value, sd, limit, passed), _harmonics(worst, factor)
     row = VerdictRow(
         name=title, unit=unit, value=value, uncertainty=sd, limit=limit, passed=passed,
-        note=f"{worst.where}{note}", raw=most, harmonics=harmonics,
+        note=worst.where + _remark(value, sd, limit, passed), raw=most,
+        harmonics=_harmonics(worst, factor),
     )  # fmt: skip
-    return row, [*findings, *_weak(row), *_causes(row, name, worst)]
-
-
-def _partial(title: str, outcome: Departures) -> Iterable[Finding]:
-    """What of the run was not judged."""
-    for text in outcome.apart:
-        yield Finding(id="partly-judged", text=f"{title}: {text}.")
-    if outcome.unseen:
-        text = (
-            f"{title}: the toolfaces hardly show one of the two harmonics of a turn (four at right "
-            "angles do not show a misalignment of x and y): add toolfaces between them."
-        )
-        yield Finding(id="harmonic-unseen", text=text)
+    if sd > WEAK * limit:
+        findings.append(_finding("weak-test", row=row))
+    if causes := _causes(row, name, worst):
+        findings.append(_finding("roll-harmonics", row=row, causes="; ".join(causes)))
+    return row, findings
 
 
 def _remark(value: float, sd: float, limit: float, passed: bool) -> str:
@@ -279,31 +269,18 @@ def _remark(value: float, sd: float, limit: float, passed: bool) -> str:
 def _harmonics(worst: Statistic, factor: float) -> tuple[float, float] | None:
     if worst.curve is None:
         return None
-    first, second = worst.curve.amplitudes.tolist()
-    return first * factor, second * factor
+    first, second = (worst.curve.amplitudes * factor).tolist()
+    return first, second
 
 
-def _weak(row: VerdictRow) -> Iterable[Finding]:
-    if row.uncertainty is not None and row.uncertainty > WEAK * row.limit:
-        text = (
-            f"{row.name}: its 1σ of {row.uncertainty:.2g} {row.unit} is more than half of the limit: this "
-            "test can hardly tell a good tool from a bad one. Average longer at each station, or "
-            "take more toolfaces."
-        )
-        yield Finding(id="weak-test", text=text)
-
-
-def _causes(row: VerdictRow, name: str, worst: Statistic) -> Iterable[Finding]:
+def _causes(row: VerdictRow, name: str, worst: Statistic) -> list[str]:
     """The likely causes of a failed limit, from the harmonics of the set that decided."""
     if row.passed or row.harmonics is None or worst.curve is None:
-        return
+        return []
     unit = row.unit if row.unit == "°" else f" {row.unit}"
-    causes = CAUSES.get(name, CAUSES["azimuth"])
-    size = worst.curve.amplitudes / np.maximum(worst.curve.amplitude_sd, 1e-30)
-    each = zip(("first", "second"), row.harmonics, causes, size > NAMED_HARMONIC, strict=True)
-    parts = [
-        f"{which} harmonic {a:.2g}{unit} ({cause})" for which, a, cause, clear in each if clear
-    ]
-    if parts:
-        text = f"{row.name} over a turn of toolface: {'; '.join(parts)}."
-        yield Finding(id="roll-harmonics", text=text)
+    clear = worst.curve.amplitudes / np.maximum(worst.curve.amplitude_sd, 1e-30) > NAMED_HARMONIC
+    axes = "the accelerometer's x and y" if name in LEVEL else "x and y of either triad"
+    causes = FIRST_HARMONIC.get(name, FIRST_HARMONIC["azimuth"]), SECOND_HARMONIC + axes
+    each = zip(("first", "second"), row.harmonics, causes, strict=True)
+    parts = [f"{which} harmonic {size:.2g}{unit} ({cause})" for which, size, cause in each]
+    return [part for part, named in zip(parts, clear, strict=True) if named]

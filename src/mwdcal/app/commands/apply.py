@@ -15,20 +15,18 @@ from mwdcal.errors import InputError
 @options.command()
 @options.CALIBRATION
 @options.argument("readings")
-@options.output("OUT", "Table to write; format by suffix.")
-@click.option(
+@options.output(metavar="OUT", help="Table to write; format by suffix.")
+@options.preset(
     "--outside",
     default="blank",
-    show_default=True,
     metavar="blank|refuse|extrapolate",
     help="Results of rows more than 1 °C (without temperature terms: 5 °C) outside the calibrated "
     "temperatures: none; refuse the file; or extrapolated, and marked in a column 'extrapolated'.",
 )
-@click.option(
+@options.preset(
     "--missing",
     type=click.Choice(["refuse", "blank"]),
     default="refuse",
-    show_default=True,
     help="Rows with a blank reading or temperature: refuse the file, or leave their results blank.",
 )
 @options.DECIMAL

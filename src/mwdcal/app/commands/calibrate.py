@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Unpack
 
 import click
 
@@ -12,7 +13,7 @@ from mwdcal.app.messages import print_result, say
 
 @options.command()
 @options.RUN
-@options.output("CAL.json", "Calibration file to write.")
+@options.output(metavar="CAL.json", help="Calibration file to write.")
 @options.tool()
 @options.fit_options(
     "auto",
@@ -27,8 +28,8 @@ from mwdcal.app.messages import print_result, say
 @options.DECIMAL
 @options.JSON
 def command(
-    run: Path, output: Path, tool: str | None, typed: options.Typed, exclude: tuple[str, ...],
-    report: Path | None, decimal: str, as_json: bool,
+    run: Path, output: Path, tool: str | None, exclude: tuple[str, ...],
+    report: Path | None, decimal: str, as_json: bool, **typed: Unpack[options.Typed],
 ) -> None:  # fmt: skip
     """Fit the sensor model to a calibration RUN (CSV, TSV, Parquet or XLSX).
 

@@ -17,11 +17,10 @@ from mwdcal.errors import FitError
 @options.command()
 @options.RUN
 @options.tool()
-@click.option(
+@options.preset(
     "--order",
     type=click.Choice(["0", "1", "2", "3", "auto"]),
     default="auto",
-    show_default=True,
     help="Order of temperature terms, the same for all methods.",
 )
 @options.SEED

@@ -26,7 +26,7 @@ from mwdcal.errors import InputError
     help="One temperature, or 'course': coefficients by power of T - reference. "
     "Default: the reference temperature.",
 )
-@options.output("OUT.json", "Write JSON here instead of printing.", required=False)
+@options.output(metavar="OUT.json", help="Write JSON here instead of printing.", required=False)
 @options.JSON
 def command(
     calibration: Path, notation: str, temperature: str | None, output: Path | None, as_json: bool
@@ -52,13 +52,12 @@ def command(
 
 def _temperature(typed: str | None) -> float | str | None:
     """A temperature in °C if it is a number; a word is left to the conversion."""
-    try:
-        value = None if typed is None else float(typed)
-    except ValueError:
-        return typed
     from mwdcal.files.contract import TEMPERATURE
 
-    low, high = TEMPERATURE.low, TEMPERATURE.high
-    if value is not None and not low <= value <= high:
-        raise InputError(f"`temperature` must be between {low:g} and {high:g} °C; got {value:g}.")
+    try:
+        value = float(typed or "")
+    except ValueError:
+        return typed
+    if not TEMPERATURE.low <= value <= TEMPERATURE.high:
+        raise InputError(f"`temperature` must be {TEMPERATURE}; got {value:g}.")
     return value

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import Unpack
 
 import click
 
@@ -14,7 +15,7 @@ from mwdcal.errors import FitError
 
 @options.command()
 @options.argument("runs")
-@options.output("CALS.parquet", "Table of calibrations to write, one row per tool.")
+@options.output(metavar="CALS.parquet", help="Table of calibrations to write, one row per tool.")
 @options.tool()
 @options.fit_options("0", "none", "datasheet", "the tolerances in the tool profile")
 @click.option(
@@ -28,11 +29,11 @@ from mwdcal.errors import FitError
     metavar="ADDRESS",
     help="Use the workers of this Dask scheduler instead, such as tcp://host:8786.",
 )
-@options.report("Also write a summary page of the fleet.", "FLEET.html")
+@options.report(metavar="FLEET.html", help="Also write a summary page of the fleet.")
 @options.JSON
 def command(
-    runs: Path, output: Path, tool: str | None, typed: options.Typed, workers: int | None,
-    scheduler: str | None, report: Path | None, as_json: bool,
+    runs: Path, output: Path, tool: str | None, workers: int | None,
+    scheduler: str | None, report: Path | None, as_json: bool, **typed: Unpack[options.Typed],
 ) -> None:  # fmt: skip
     """Calibrate many tools: RUNS is a Parquet table, or a folder of them, with a column `serial`.
 
@@ -48,9 +49,8 @@ def command(
         from mwdcal.app import fleet_table
         from mwdcal.app.pages import fleet_report, fleet_summary
         from mwdcal.files.formats import atomic
-        from mwdcal.fleet.sources import input_files
 
-    options.check_outputs([output], [*input_files(runs), tool], page=report)
+    options.check_outputs([output], [runs, tool], page=report)
     try:
         summary = fleet_table.calibrate_table(runs, output, tool, typed, workers, scheduler, say)
         if report:

@@ -12,7 +12,7 @@ from mwdcal.app.messages import findings_as_typed, print_result, say
 
 @options.command()
 @options.LOG
-@options.tool("Tool profile with the scales: figures also in g and nT.")
+@options.tool(help="Tool profile with the scales: figures also in g and nT.")
 @options.COLUMN_NAMES
 @options.SAMPLING_HZ
 @options.number("--from", "S", "Use the log from so many seconds on.", "start")
@@ -21,7 +21,7 @@ from mwdcal.app.messages import findings_as_typed, print_result, say
     "--station-seconds", "S", "Duration of a station. Default: 30, or a tenth of a shorter log."
 )
 @click.option("--modified", is_flag=True, help="Show modified Allan deviations.")
-@options.plot("Also draw the Allan deviations.")
+@options.plot(help="Also draw the Allan deviations.")
 @options.report()
 @options.DECIMAL
 @options.JSON
@@ -47,6 +47,7 @@ def command(
     from mwdcal.files.contract import COLUMNS
     from mwdcal.files.formats import atomic
     from mwdcal.files.profiles import load_profile
+    from mwdcal.logs.allan import Kind
     from mwdcal.logs.noise import check, find_noise
 
     options.check_outputs([], [log, tool], picture=plot, page=report)
@@ -55,17 +56,11 @@ def command(
     slowly = progress.slowly(say)
     profile = load_profile(tool)[0] if tool else None
     readings = logs.read(log, options.column_names(columns), decimal=decimal, say=slowly)
-    noise = find_noise(
-        readings,
-        profile=profile,
-        between=between,
-        kind="modified" if modified else "overlapping",
-        say=slowly,
-        **times,
-    )
+    kind: Kind = "modified" if modified else "overlapping"
+    noise = find_noise(readings, profile=profile, between=between, kind=kind, say=slowly, **times)
     unused = unused_columns(synonyms.unused(list(readings.columns), COLUMNS))
     noise = replace(noise, findings=findings_as_typed([*noise.findings, *unused]))
-    drawn = picture(page.figure(noise), plot) if plot else b""
+    drawn = picture(page.figure(noise), plot.suffix) if plot else b""
     rendered = page.render(noise) if report else ""
     shown = (page.document if as_json else page.screen)(noise, plot, report)
     atomic.write_all([(plot, drawn), (report, rendered)])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable
-from functools import partial, wraps
+from functools import partial
 from pathlib import Path
 from typing import Any, TypedDict
 from unicodedata import normalize
@@ -22,46 +22,31 @@ PICTURES = (".png", ".svg")
 
 command = partial(click.command, cls=Command)
 argument = partial(click.argument, type=FILE)
+output = partial(click.option, "-o", "--output", type=FILE, required=True)
+tool = partial(
+    click.option, "--tool", metavar="NAME|FILE", help="Tool profile: a shipped name or a TOML file."
+)
+report = partial(
+    click.option,
+    "--report",
+    type=FILE,
+    metavar="R.html",
+    help="Also write a self-contained HTML report.",
+)
+plot = partial(click.option, "--plot", type=FILE, metavar="FILE.png|svg")
+preset = partial(click.option, show_default=True)
 CALIBRATION = argument("calibration")
 RUN = argument("run")
 LOG = argument("log")
-DECIMAL = click.option(
-    "--decimal", default=".", show_default=True, metavar="SIGN",
-    help="Decimal sign of numbers in text files.",
-)  # fmt: skip
-JSON = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
-SEED = click.option(
-    "--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of the swarm."
+DECIMAL = preset(
+    "--decimal", default=".", metavar="SIGN", help="Decimal sign of numbers in text files."
 )
+JSON = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
+SEED = preset("--seed", type=click.IntRange(0), default=0, help="Seed of the swarm.")
 COLUMN_NAMES = click.option(
     "--columns", default="", metavar="NAMES",
     help="Columns of a text log without column names, such as time_s,ax,ay,az.",
 )  # fmt: skip
-SAMPLING_HZ = click.option(
-    "--sampling-hz", type=float, metavar="HZ", help="Rate of the log; wins over its column time_s."
-)
-
-
-def output(metavar: str, text: str, required: bool = True) -> Decorator:
-    """The option `-o`."""
-    return click.option("-o", "--output", type=FILE, required=required, metavar=metavar, help=text)
-
-
-def tool(text: str = "Tool profile: a shipped name or a TOML file.") -> Decorator:
-    """The option `--tool`."""
-    return click.option("--tool", metavar="NAME|FILE", help=text)
-
-
-def report(
-    text: str = "Also write a self-contained HTML report.", metavar: str = "R.html"
-) -> Decorator:
-    """The option `--report`."""
-    return click.option("--report", type=FILE, metavar=metavar, help=text)
-
-
-def plot(text: str) -> Decorator:
-    """The option `--plot`."""
-    return click.option("--plot", type=FILE, metavar="FILE.png|svg", help=text)
 
 
 def number(name: str, metavar: str, text: str, *variable: str) -> Decorator:
@@ -69,9 +54,10 @@ def number(name: str, metavar: str, text: str, *variable: str) -> Decorator:
     return click.option(name, *variable, type=float, metavar=metavar, help=text)
 
 
+SAMPLING_HZ = number("--sampling-hz", "HZ", "Rate of the log; wins over its column time_s.")
 _FIT = (
-    click.option(
-        "--method", default="joint", show_default=True, metavar="METHOD",
+    preset(
+        "--method", default="joint", metavar="METHOD",
         help="joint: all evidence, weighted. least-squares: reference vectors only. swarm: the same "
         "by particle swarm. newton: Newton-Raphson on |g| and inclination. toolface-inclination: the "
         "accelerometer by angles alone. scalar: |g| and |b| alone.",
@@ -123,19 +109,19 @@ class Typed(TypedDict):
 
 
 def fit_options(order: str, nonlinearity: str, prior: str, known: str) -> Decorator:
-    """The options that say how to fit, which the command gets as one argument, `typed`.
+    """The options that say how to fit, which the command gets as `Typed`.
 
     With the defaults of two of them, and what a prior may be, as metavar and in words.
     """
     declared = (
         *_FIT,
         click.option("--prior", metavar=prior, help=f"What is known beforehand: {known}."),
-        click.option(
-            "--order", default=order, show_default=True, metavar="0…3|auto",
+        preset(
+            "--order", default=order, metavar="0…3|auto",
             help="Order of temperature terms. auto: of each triad, the terms that noise does not explain.",
         ),
-        click.option(
-            "--nonlinearity", default=nonlinearity, show_default=True, metavar="auto|none|NAMES",
+        preset(
+            "--nonlinearity", default=nonlinearity, metavar="auto|none|NAMES",
             help="Own-axis quadratic and cubic terms. auto: of the triads whose profile declares "
             "them, where the run speaks for them. NAMES: accelerometer, magnetometer, or both with "
             "a comma.",
@@ -143,15 +129,9 @@ def fit_options(order: str, nonlinearity: str, prior: str, known: str) -> Decora
     )  # fmt: skip
 
     def decorate(function: Function) -> Function:
-        @wraps(function)
-        def gathered(**given: Any) -> Any:
-            typed: Typed = {name: given.pop(name) for name in Typed.__annotations__}  # type: ignore[assignment]
-            return function(typed=typed, **given)
-
-        command: Function = gathered
         for option in reversed(declared):
-            command = option(command)
-        return command
+            function = option(function)
+        return function
 
     return decorate
 

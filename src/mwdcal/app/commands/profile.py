@@ -10,7 +10,7 @@ from mwdcal.app.messages import print_result
 
 @options.command()
 @options.RUN
-@options.output("TOOL.toml", "Tool profile to write.")
+@options.output(metavar="TOOL.toml", help="Tool profile to write.")
 @options.JSON
 def command(run: Path, output: Path, as_json: bool) -> None:
     """Propose a tool profile for a RUN as a logger or spreadsheet program has written it.

@@ -10,7 +10,7 @@ from mwdcal.app.messages import findings_as_typed, lines, print_result, say
 
 @options.command()
 @options.LOG
-@options.output("STATIONS.csv", "Run file to write; format by suffix.")
+@options.output(metavar="STATIONS.csv", help="Run file to write; format by suffix.")
 @options.COLUMN_NAMES
 @options.SAMPLING_HZ
 @options.number(
@@ -24,7 +24,7 @@ from mwdcal.app.messages import findings_as_typed, lines, print_result, say
     "FLOORS",
     "Movement that is still rest, in noise floors. Default: found from the log.",
 )
-@options.plot("Also draw what was taken and left.")
+@options.plot(help="Also draw what was taken and left.")
 @options.DECIMAL
 @options.JSON
 def command(
@@ -57,14 +57,13 @@ def command(
         for line in lines(error.analysis.findings):
             error.add_note(line)
         if plot:
-            atomic.write(plot, picture(page.figure(error.analysis), plot))
+            atomic.write(plot, picture(page.figure(error.analysis), plot.suffix))
             error.add_note(f"wrote {plot} (picture)")
         raise
     stations = replace(stations, findings=findings_as_typed(stations.findings))
-    drawn = picture(page.figure(stations), plot) if plot else b""
+    drawn = picture(page.figure(stations), plot.suffix) if plot else b""
     table.write(output, stations.table)
-    if plot:
-        atomic.write(plot, drawn)
+    atomic.write_all([(plot, drawn)])
     files = {"output": str(output), "plot": str(plot or "")}
     shown = {**page.summary(stations), **files} if as_json else page.screen(stations, files)
     print_result(shown, stations.findings)

@@ -5,8 +5,6 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-import click
-
 from mwdcal.app.commands import options
 from mwdcal.app.messages import findings_as_typed, print_result
 
@@ -14,10 +12,8 @@ from mwdcal.app.messages import findings_as_typed, print_result
 @options.command()
 @options.CALIBRATION
 @options.RUN
-@click.option(
-    "--limits", default="roll-test", show_default=True, metavar="NAME|FILE", help="Limits profile."
-)
-@options.report("Also write the report, with this verdict.")
+@options.preset("--limits", default="roll-test", metavar="NAME|FILE", help="Limits profile.")
+@options.report(help="Also write the report, with this verdict.")
 @options.DECIMAL
 @options.JSON
 def command(

@@ -6,8 +6,6 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import msgspec
-
 from mwdcal.app.messages import findings_as_typed, lines
 from mwdcal.app.pages.page import written
 from mwdcal.app.text import chance, number, one_line, quantity, table
@@ -50,7 +48,7 @@ def summary(
         "accuracy_1sigma_deg": typical_accuracy(calibration),
         **_attributes(calibration, ACCURACY),
         "findings": findings_as_typed(calibration.findings),
-        "nonlinearity": [msgspec.to_builtins(score) for score in choice.curves],
+        "nonlinearity": choice.curves,
         "calibration": str(output),
         "report": str(report or ""),
     }
@@ -66,10 +64,8 @@ def screen(calibration: Calibration, choice: Choice, output: Path, report: Path 
         "\n".join([*remarks(calibration), *_findings(calibration.findings)]),
     ]
     files = written(calibration=output, report=report)
-    return (
-        "\n\n".join(blocks)
-        + f"\n{files}   next: mwdcal verify {one_line(str(output))} ROLLTEST.csv"
-    )
+    after = f"{files}   next: mwdcal verify {one_line(output)} ROLLTEST.csv"
+    return "\n\n".join(blocks) + f"\n{after}"
 
 
 def _findings(findings: list[Finding]) -> list[str]:
@@ -82,14 +78,11 @@ def _findings(findings: list[Finding]) -> list[str]:
 
 def remarks(calibration: Calibration) -> list[str]:
     """Size of the residuals, accuracy to expect, what was taken as exact, and estimated constants."""
-    accuracy = "  ".join(
-        f"{name} {number(sd)}{'°' if sd is not None else ''}"
-        for name, sd in typical_accuracy(calibration).items()
-    )
+    accuracy = [f"{name} {quantity(sd, '°')}" for name, sd in typical_accuracy(calibration).items()]
     exact = ", ".join(calibration.assumed_exact)
     return [
         *residuals(calibration),
-        f"accuracy to expect (1σ, calibration alone, typical): {accuracy}",
+        f"accuracy to expect (1σ, calibration alone, typical): {'  '.join(accuracy)}",
         *([f"taken as exact, and no residual tests it: {exact}{PROFILE}"] if exact else []),
         *(
             f"estimated constant of the run: {c.name} {c.value:.6g} ± {c.standard_uncertainty:.2g} {c.unit}"
@@ -147,10 +140,11 @@ def choices(options: Choices) -> list[str]:
 
 def errors(rows: list[ErrorRow]) -> str:
     """Errors before and after, with what was to be expected."""
-    cells = []
-    for row in rows:
-        values = [quantity(value, row.unit) for value in (row.before, row.after, row.expected)]
-        cells.append([f"{TITLES.get(row.observable, row.observable)} error, rms", *values])
+    cells = [
+        [f"{TITLES.get(row.observable, row.observable)} error, rms"]
+        + [quantity(value, row.unit) for value in (row.before, row.after, row.expected)]
+        for row in rows
+    ]
     return table(cells, ["", "before", "after", "1σ expected"])
 
 

@@ -5,7 +5,7 @@ Every method has a colour and a marker of its own, the same in all figures.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -48,12 +48,9 @@ STATISTICS = (
 CONVENTION_MARK = "*"
 """Behind a figure that rests on a convention."""
 METHOD_COLOURS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#d55e00", "#4b5563")
-METHOD_MARKERS = ("o", "s", "^", "x", "D", "v")
-LOOKS = dict(zip(EVIDENCE, zip(METHOD_COLOURS, METHOD_MARKERS, strict=True), strict=True))
+LOOKS = dict(zip(EVIDENCE, zip(METHOD_COLOURS, "os^xDv", strict=True), strict=True))
 MOST_STATIONS = 240
 """A longer run shows the largest error of each of so many equal parts of it."""
-TableRows = list[list[str]]
-"""Rows of a table: what each is, then its cells."""
 
 
 def text(comparison: Comparison, parameters: bool = False) -> str:
@@ -70,7 +67,7 @@ def text(comparison: Comparison, parameters: bool = False) -> str:
         lines += ["", gauge(comparison) + " In parentheses: 1σ of the last digits."]
         for triad in rows[0].parameters:
             stated = [
-                [_label(each.title, each.unit), *(_joined(*pair) for pair in each.pairs)]
+                [each.name, *(_joined(*pair) for pair in each.pairs)]
                 for each in parameters_of(comparison, triad)
             ]
             lines += ["", table(stated, [triad, *methods])]
@@ -109,7 +106,7 @@ def heading(comparison: Comparison) -> list[str]:
     return [part for part in parts if part]
 
 
-def figures(comparison: Comparison) -> TableRows:
+def figures(comparison: Comparison) -> list[list[str]]:
     """All figures of the nominal tool ("before"), then of every method."""
     return [
         *errors(comparison, "held_out", "rms left out"),
@@ -119,12 +116,7 @@ def figures(comparison: Comparison) -> TableRows:
     ]
 
 
-def _label(*parts: str) -> str:
-    """The title of a row: its parts, the unit last, without the empty ones."""
-    return ", ".join(part for part in parts if part)
-
-
-def errors(comparison: Comparison, kind: str, how: str = "") -> TableRows:
+def errors(comparison: Comparison, kind: str, how: str = "") -> list[list[str]]:
     """Root mean square errors by observable, before and of every method.
 
     `kind` is "held_out" or "in_sample", and `how` what the rows say of it.
@@ -135,12 +127,12 @@ def errors(comparison: Comparison, kind: str, how: str = "") -> TableRows:
             number(getattr(row, kind)[name]) + CONVENTION_MARK * (name in row.resting)
             for row in able(comparison.rows)
         ]
-        what = _label(TITLES.get(name, name), how, unit)
+        what = ", ".join(filter(None, (TITLES.get(name, name), how, unit)))
         rows.append([what, number(comparison.before[name]), *cells])
     return rows
 
 
-def measures(comparison: Comparison) -> TableRows:
+def measures(comparison: Comparison) -> list[list[str]]:
     """Moradi's four measures of the vector error by triad, and the last of them left out."""
     rows = []
     for before in comparison.measures_before:
@@ -158,7 +150,7 @@ def _measure(row: Row, triad: str, when: str, key: str) -> str:
     return number(values[0] if values else None) + CONVENTION_MARK * (rank < size)
 
 
-def effort(comparison: Comparison) -> TableRows:
+def effort(comparison: Comparison) -> list[list[str]]:
     """Rank, iterations and time of every method."""
     rows = able(comparison.rows)
     ranks = [
@@ -223,6 +215,11 @@ class ComparedParameter:
     sd: list[float]
 
     @property
+    def name(self) -> str:
+        """Title and unit."""
+        return f"{self.title}, {self.unit}" if self.unit else self.title
+
+    @property
     def pairs(self) -> list[tuple[str, str]]:
         """Each method's value and standard uncertainty as text."""
         return [measured(*pair) for pair in zip(self.values, self.sd, strict=True)]
@@ -238,21 +235,21 @@ def parameters_of(comparison: Comparison, triad: str) -> list[ComparedParameter]
         for key, at, axes, power, unit in factor_places(factors[0].values, strength)
     ]
     for name in comparison.gauge.get(triad, []):
-        if name == SCALE:
-            result.append(_parameter(name, "", taken_out, name, (0,)))
-        else:
-            at = (ROTATIONS.index(name),)
-            result.append(_parameter(name, "°", taken_out, "rotation_deg", at))
+        turn = name != SCALE
+        key, index = ("rotation_deg", ROTATIONS.index(name)) if turn else (name, 0)
+        result.append(_parameter(name, "°" if turn else "", taken_out, key, (index,)))
     return result
 
 
 def _parameter(
-    title: str, unit: str, notations: Sequence[Notation], key: str, at: tuple[int, ...]
+    title: str, unit: str, notations: list[Notation], key: str, at: tuple[int, ...]
 ) -> ComparedParameter:
-    values = [float(n.values[key][at]) for n in notations]
-    return ComparedParameter(
-        title, unit, values, [float(n.uncertainty[key][at]) for n in notations]
+    """One number of every method's notation."""
+    values, sd = (
+        [float(getattr(notation, what)[key][at]) for notation in notations]
+        for what in ("values", "uncertainty")
     )
+    return ComparedParameter(title, unit, values, sd)
 
 
 def document(comparison: Comparison) -> dict[str, Any]:
@@ -290,21 +287,21 @@ def _banner(comparison: Comparison) -> dict[str, str]:
     return banner(level, "Advice", capital(headline), capital(why))
 
 
-@plots.styled
+@plots.style()
 def draw_errors(comparison: Comparison) -> Figure:
     """Left-out error of every observable and method over the best of any; hollow: in sample."""
     rows, names = able(comparison.rows), list(comparison.units)
-    height = 0.75 + 0.36 * len(names)
-    figure = plots.new_figure("Left-out error of every method and observable", height)
-    axes = figure.subplots()
+    label = "Left-out error of every method and observable"
+    figure, [[axes]] = plots.new_figure(label, 0.75 + 0.36 * len(names))
+    best = np.fmin.reduce([[row.held_out[name] for name in names] for row in rows])
+    best = np.where(best > 0, best, np.nan)
     for row, shift in zip(rows, _abreast(rows, 0.11), strict=True):
-        inside = [_over_best(rows, name, row.in_sample) for name in names]
-        left_out = [_over_best(rows, name, row.held_out) for name in names]
-        colour, marker = LOOKS[row.method]
-        look: dict[str, Any] = {"color": colour, "ls": "none", "marker": marker}
-        where = np.arange(len(names)) + shift
-        axes.plot(inside, where, mfc="white", mew=0.7, ms=3.2, alpha=0.8, **look)
-        axes.plot(left_out, where, ms=4.6, label=row.method, **look)
+        where, (colour, marker) = np.arange(len(names)) + shift, LOOKS[row.method]
+        inside = [row.in_sample[name] for name in names] / best
+        left_out = [row.held_out[name] for name in names] / best
+        hollow: dict[str, Any] = {"mfc": "white", "mew": 0.7, "ms": 3.2, "alpha": 0.8}
+        axes.plot(inside, where, marker, color=colour, **hollow)
+        axes.plot(left_out, where, marker, color=colour, ms=4.6, label=row.method)
     _ratio_axis(axes)
     _observable_axis(axes, names)
     axes.axvline(1, color="#4b5563", lw=0.8)
@@ -326,12 +323,6 @@ def _observable_axis(axes: Axes, names: Sequence[str]) -> None:
         axes.axhline(edge, color="#e5e7eb", lw=0.6)
 
 
-def _over_best(rows: Sequence[Row], name: str, errors: Mapping[str, float]) -> float:
-    """An error over the least left-out error of any method."""
-    best = float(np.fmin.reduce([row.held_out[name] for row in rows]))
-    return errors[name] / best if best > 0 else float("nan")
-
-
 def _legend(figure: Any) -> None:
     handles, labels = figure.axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper left", ncols=len(labels))
@@ -345,35 +336,30 @@ def _ratio_axis(axes: Axes) -> None:
     plots.plain_numbers(axes.xaxis, *(steps if high / low < 1e3 else (1.0,)))
 
 
-@plots.styled
+@plots.style()
 def draw_stations(comparison: Comparison) -> Figure:
     """Left-out error of every station, an observable in each row and a method in each column."""
     rows = able(comparison.rows)
     names = [name for name in comparison.units if name in rows[0].station_errors]
-    figure = plots.new_figure("Left-out error of every station by method", 0.5 + 0.85 * len(names))
-    panels = figure.subplots(
-        len(names), len(rows), sharex=True, sharey="row", squeeze=False,
-        gridspec_kw={"hspace": 0.02, "wspace": 0.02},
-    )  # fmt: skip
-    for line, name in zip(panels, names, strict=True):
+    label, height = "Left-out error of every station by method", 0.5 + 0.85 * len(names)
+    across: dict[str, Any] = {"sharex": True, "sharey": "row"}
+    across["gridspec_kw"] = {"hspace": 0.02, "wspace": 0.02}
+    figure, panels = plots.new_figure(label, height, len(names), len(rows), **across)
+    for axes, name in zip(panels[:, 0], names, strict=True):
         unit = comparison.units[name].partition(" ")[0]
-        line[0].set_ylabel(f"{TITLES[name]}, {unit}", fontsize=6.5)
-        for axes, row in zip(line, rows, strict=True):
-            _station_stems(axes, row.station_errors[name], LOOKS[row.method][0])
-    for axes, row in zip(panels[0], rows, strict=True):
-        axes.set_title(row.method, fontsize=7, color=LOOKS[row.method][0])
-    for axes in panels[-1]:
-        axes.set_xlabel("station, in order", fontsize=6.5)
+        axes.set_ylabel(f"{TITLES[name]}, {unit}", fontsize=6.5)
+    for column, row in zip(panels.T, rows, strict=True):
+        colour = LOOKS[row.method][0]
+        for axes, name in zip(column, names, strict=True):
+            _station_stems(axes, row.station_errors[name], colour)
+        column[0].set_title(row.method, fontsize=7, color=colour)
+        column[-1].set_xlabel("station, in order", fontsize=6.5)
     return figure
 
 
 def _station_stems(axes: Axes, values: Array, colour: str) -> None:
     where, heights = _largest(values)
-    gap = np.full(len(where), np.nan)
-    axes.plot(
-        np.repeat(where, 3), np.stack([0 * heights, heights, gap], -1).ravel(),
-        color=colour, lw=0.8 if len(where) < 80 else 0.5,
-    )  # fmt: skip
+    plots.stems(axes, where, heights, color=colour, lw=0.8 if len(where) < 80 else 0.5)
     axes.axhline(0, color="#4b5563", lw=0.5)
     axes.tick_params(labelsize=6, length=2)
     axes.locator_params(nbins=4)
@@ -389,14 +375,14 @@ def _largest(values: Array) -> tuple[Array, Array]:
     return worst + 1.0, values[worst]
 
 
-@plots.styled
+@plots.style()
 def draw_parameters(comparison: Comparison) -> Figure:
     """Parameters with 1σ, less those of the first method, in units of its own 1σ."""
     rows = able(comparison.rows)
     triads = list(rows[0].parameters)
-    figure = plots.new_figure("Parameters of every method with 1σ", 0.4 + 2.0 * len(triads))
-    panels = figure.subplots(len(triads), 1, squeeze=False)[:, 0]
-    for axes, triad in zip(panels, triads, strict=True):
+    label, height = "Parameters of every method with 1σ", 0.4 + 2.0 * len(triads)
+    figure, panels = plots.new_figure(label, height, len(triads))
+    for axes, triad in zip(panels[:, 0], triads, strict=True):
         shown = parameters_of(comparison, triad)
         _differences(axes, rows, shown)
         _parameter_axis(axes, [parameter.title for parameter in shown])
@@ -413,10 +399,9 @@ def _differences(axes: Axes, rows: Sequence[Row], shown: Sequence[ComparedParame
     difference = np.where(np.isnan(sd), np.nan, (values - values[:, :1]) / unit[:, None])
     for index, (row, shift) in enumerate(zip(rows, _abreast(rows, 0.12), strict=True)):
         colour, marker = LOOKS[row.method]
-        axes.errorbar(
-            np.arange(len(shown)) + shift, difference[:, index], sd[:, index] / unit, color=colour,
-            marker=marker, ms=3.4, ls="none", elinewidth=0.8, label=row.method,
-        )  # fmt: skip
+        look: dict[str, Any] = {"color": colour, "ms": 3.4, "elinewidth": 0.8, "label": row.method}
+        where = np.arange(len(shown)) + shift
+        axes.errorbar(where, difference[:, index], sd[:, index] / unit, fmt=marker, **look)
     low, high = axes.get_ylim()
     if max(-low, high) > 20:
         axes.set_yscale("symlog", linthresh=5)
@@ -435,22 +420,19 @@ def _parameter_axis(axes: Axes, titles: Sequence[str]) -> None:
         axes.axvline(edge, color="#e5e7eb", lw=0.5)
 
 
-@plots.styled
+@plots.style()
 def draw_course(comparison: Comparison) -> Figure:
     """The swarm's cost over its iterations: its excess over the least, as a share of it."""
-    from matplotlib.ticker import NullFormatter
-
     row = next(row for row in comparison.rows if row.course)
-    figure = plots.new_figure("Excess of the swarm's cost over its iterations", 1.7)
-    axes = figure.subplots()
+    figure, [[axes]] = plots.new_figure("Excess of the swarm's cost over its iterations", 1.7)
+    colour = LOOKS["swarm"][0]
     for (name, excess), line in zip(row.course.items(), ("-", "--"), strict=False):
         shown = np.where(excess > 1e-13, excess, np.nan)
-        axes.plot(np.arange(1, len(excess) + 1), shown, line, color=LOOKS["swarm"][0], label=name)
-    axes.set(
-        yscale="log", xlim=(0, len(excess)), xlabel="iteration", ylabel="cost ÷ least cost − 1"
-    )
+        axes.plot(np.arange(1, len(excess) + 1), shown, line, color=colour, label=name)
+    axes.set(yscale="log", xlim=(0, len(excess)), xlabel="iteration")
+    axes.set_ylabel("cost ÷ least cost − 1")
     axes.yaxis.set_major_formatter(lambda value, _: f"10{superscript(round(np.log10(value)))}")
-    axes.yaxis.set_minor_formatter(NullFormatter())
+    axes.yaxis.set_minor_formatter(lambda value, _: "")
     axes.legend(loc="upper right")
     return figure
 

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mwdcal.app.pages.page import HELD, UNDETERMINED, is_held
+from mwdcal.app.pages.page import HELD, UNDETERMINED
 from mwdcal.app.text import one_line, raised, table
 from mwdcal.calibration.readings import Readings, is_simulated, simulated
 from mwdcal.calibration.record import Calibration, Finding
@@ -65,9 +65,8 @@ def temperature_findings(
     if calibration.unrecorded(there):
         return [Finding(id="no-temperature", text=UNRECORDED.format(at))]
     if calibration.outside(there).any():
-        return [
-            Finding(id="outside-temperature", text=OUTSIDE_RANGE.format(at, _range(calibration)))
-        ]
+        text = OUTSIDE_RANGE.format(at, _range(calibration))
+        return [Finding(id="outside-temperature", text=text)]
     return []
 
 
@@ -180,7 +179,8 @@ def notation(triads: dict[str, Notation], reference: float | None = None) -> str
 def _stated(notation: Notation, name: str, index: tuple[int, ...]) -> tuple[str, str]:
     """A value and its standard uncertainty; the diagonal of m is zero in every model."""
     value, sd = (float(v[name][index]) for v in (notation.values, notation.uncertainty))
-    if is_held(value, sd) and not (name == "m" and index[0] == index[1]):
+    diagonal = name == "m" and index[0] == index[1]
+    if value == sd == 0 and not diagonal:
         return "0", HELD
     return f"{value + 0.0:.12g}", UNDETERMINED if np.isnan(sd) else f"{sd:.2g}"
 

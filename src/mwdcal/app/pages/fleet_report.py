@@ -120,8 +120,7 @@ def render(calibrations: Path, summary: FleetSummary) -> str:
     template = environment().get_template("fleet.html")
     tools = SoundTools(calibrations)
     parameters = _parameters(tools) if tools.count else []
-    noisy = tools.metadata.get("noise_estimated")
-    estimated = [triad for triad in TRIADS if isinstance(noisy, list) and triad in noisy]
+    estimated: Any = tools.metadata["noise_estimated"]
     return template.render(
         result=summary,
         metadata=tools.metadata,
@@ -244,10 +243,8 @@ def _figures(
     """Distributions of the parameters, and of residuals, noise and accuracy."""
     triads = dict.fromkeys(p.triad for p in parameters)
     declared = [triad for triad in triads if triad not in estimated]
-    panels: list[Panel] = []
-    if declared:
-        s = {f"{triad} s": _residuals(tools, triad) for triad in declared}
-        panels.append(("residuals ÷ what noise alone would give, s", "s", s))
+    s = {f"{triad} s": _residuals(tools, triad) for triad in declared}
+    panels: list[Panel] = [("residuals ÷ what noise alone would give, s", "s", s)] if s else []
     panels += [_noise(tools, triad) for triad in triads if triad in estimated]
     angles = STATED_ANGLES[: 1 + len(triads)]
     accuracy = {angle: tools.numbers(f"{angle}_sd_deg") for angle in angles}
@@ -279,11 +276,8 @@ def _outliers(
     """Tools far from the fleet: serial, farthest parameter, value, distance; the farthest first."""
     if tools.count < FEWEST_TOOLS:
         return []
-    farthest, which = np.zeros(tools.count), np.zeros(tools.count, int)
-    for index, each in enumerate(parameters):
-        away = distance(each.values)
-        which = np.where(away > farthest, index, which)
-        farthest = np.fmax(away, farthest)
+    away = np.nan_to_num([distance(each.values) for each in parameters])
+    which, farthest = away.argmax(0), away.max(0)
     serials, outliers = tools.words(SERIAL), []
     for i in np.argsort(-farthest, kind="stable")[: int(np.sum(farthest > FAR))]:
         each = parameters[which[i]]
@@ -310,13 +304,12 @@ def distance(values: Array) -> Array:
     return away / spread if spread > 0 else np.zeros(len(values))
 
 
-@plots.styled
+@plots.style()
 def draw_parameters(parameters: Sequence[FleetParameter]) -> Figure:
     """Number of tools by value of each steady parameter: a row of panels for each triad."""
     lines = _lines(parameters)
-    figure = plots.new_figure("Distributions of the fleet's parameters", 2.1 * len(lines))
-    columns = max(len(line) for line in lines)
-    grid = figure.subplots(len(lines), columns, squeeze=False)
+    columns, label = max(map(len, lines)), "Distributions of the fleet's parameters"
+    figure, grid = plots.new_figure(label, 2.1 * len(lines), len(lines), columns)
     for row, line in zip(grid, lines, strict=True):
         row[0].set_ylabel("tools")
         for axes in row[len(line) :]:
@@ -345,14 +338,14 @@ def _lines(parameters: Sequence[FleetParameter]) -> list[list[tuple[str, list[Fl
     ]
 
 
-@plots.styled
+@plots.style()
 def draw_quality(panels: Sequence[Panel]) -> Figure:
     """Number of tools by residuals over noise or by noise, and by 1σ of each angle."""
-    figure = plots.new_figure("Distributions of residuals and accuracy", 2.2)
-    row = figure.subplots(1, len(panels), squeeze=False)[0]
+    label = "Distributions of residuals and accuracy"
+    figure, [row] = plots.new_figure(label, 2.2, columns=len(panels))
     row[0].set_ylabel("tools")
-    for axes, (title, label, series) in zip(row, panels, strict=True):
-        axes.set(title=title, xlabel=label)
+    for axes, (title, quantity, series) in zip(row, panels, strict=True):
+        axes.set(title=title, xlabel=quantity)
         axes.locator_params(axis="x", nbins=TICKS // len(panels))
         _steps(axes, series, abreast=3 if len(panels) < 3 else 1)
     return figure

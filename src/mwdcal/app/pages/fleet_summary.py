@@ -18,9 +18,8 @@ from mwdcal.app.messages import as_typed
 from mwdcal.app.pages.calibration import choices
 from mwdcal.app.pages.page import written
 from mwdcal.app.text import number, one_line, plural, table
-from mwdcal.calibration.readings import TRIADS
+from mwdcal.calibration.readings import HIGHEST, TRIADS
 from mwdcal.calibration.record import Choices, Finding
-from mwdcal.calibration.soaks import HIGHEST
 from mwdcal.files.formats import parquet
 from mwdcal.fleet.calibrate import OK, STAND_COLUMNS
 from mwdcal.fleet.sources import SERIAL
@@ -116,10 +115,8 @@ def _wide(whole: Any) -> list[str]:
     """What to say of tools whose temperatures differ, where there are no temperature terms."""
     span = numbers(whole, "temperature_max_c") - numbers(whole, "temperature_min_c")
     wide = int(np.sum(span > SPAN))
-    if not wide:
-        return []
-    spans = f"{plural(wide, 'tool')} {'spans' if wide == 1 else 'span'}"
-    return [f"{spans} more than {SPAN:g} °C, and --order 0 has no temperature terms."]
+    spans = f"{plural(wide, 'tool')} {'spans' if wide == 1 else 'span'} more than {SPAN:g} °C"
+    return [f"{spans}, and --order 0 has no temperature terms."] if wide else []
 
 
 def stated_options(typed: Typed) -> dict[str, Any]:
@@ -153,16 +150,13 @@ def unusual(options: dict[str, Any]) -> list[str]:
 
 def numbers(whole: Any, name: str) -> Array:
     """One column of numbers of an opened Parquet file, NaN where there is none."""
-    arrow, _ = parquet.modules(name)
     cells = whole.read([name]).column(0)
-    return np.asarray(cells.cast(arrow.float64()).to_numpy(), float)
+    return np.asarray(cells.cast("float64").to_numpy(), float)
 
 
 def quantiles(values: Array) -> list[float]:
     """The 1 %, 50 % and 99 % point of values, none where all are NaN."""
-    if np.isnan(values).all():
-        return []
-    return [float(v) for v in np.nanquantile(values, (0.01, 0.5, 0.99))]
+    return [] if np.isnan(values).all() else np.nanquantile(values, (0.01, 0.5, 0.99)).tolist()
 
 
 def _kinds(head: Any) -> list[StatusCount]:
@@ -170,26 +164,23 @@ def _kinds(head: Any) -> list[StatusCount]:
     from pyarrow import compute
 
     status = head.column("status")
-    counted = status.value_counts().to_pylist()
+    counts = dict(each.values() for each in status.value_counts().to_pylist())
     kinds = []
-    for each in sorted(counted, key=lambda c: (c["values"] != OK, -c["counts"])):
-        name, count = each["values"], each["counts"]
+    for name, count in sorted(counts.items(), key=lambda kind: (kind[0] != OK, -kind[1])):
         tools = head.filter(compute.equal(status, name)).slice(0, SERIALS_SHOWN).to_pydict()
-        message = as_typed(tools["message"][0])
-        kinds.append(StatusCount(name, count, tools[SERIAL], message))
+        kinds.append(StatusCount(name, count, tools[SERIAL], as_typed(tools["message"][0])))
     return kinds
 
 
 def _findings(head: Any) -> list[FindingCount]:
     """Findings with their tools: doubts of the fit first, then by number."""
-    arrow, _ = parquet.modules("findings")
     column = one_chunk(head.column("findings"))
     ids = column.flatten().dictionary_encode()
     tool = np.repeat(np.arange(len(column)), column.value_lengths().fill_null(0).to_numpy())
     findings = []
     for code, name in enumerate(ids.dictionary.to_pylist()):
         tools = tool[ids.indices.to_numpy() == code]
-        serials = head.column(SERIAL).take(arrow.array(tools[:SERIALS_SHOWN])).to_pylist()
+        serials = head.column(SERIAL).take(tools[:SERIALS_SHOWN]).to_pylist()
         findings.append(FindingCount(name, len(tools), serials))
     return sorted(findings, key=lambda f: (not is_doubt(f.id), -f.tools, f.id))
 

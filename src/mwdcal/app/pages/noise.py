@@ -170,14 +170,14 @@ def scaled(channel: ChannelNoise) -> tuple[str, float]:
     return unit, number / channel.scale
 
 
-@plots.styled
+@plots.style()
 def figure(noise: Noise) -> Figure:
     """One panel for each triad of the log."""
     triads = channels_of(noise.channels)
-    figure = plots.new_figure("Allan deviation of every channel over averaging time", 3.5)
+    label = "Allan deviation of every channel over averaging time"
+    figure, [panels] = plots.new_figure(label, 3.5, columns=len(triads))
     simulated = f"   {SIMULATED}" if noise.simulated else ""
     figure.suptitle(f"{noise.log}, {noise.seconds:.4g} s{simulated}", fontsize=8)
-    panels = figure.subplots(1, len(triads), squeeze=False)[0]
     modified = "" if noise.kind == "overlapping" else "modified "
     for axes, (kind, names) in zip(panels, triads.items(), strict=True):
         _draw(axes, noise, names)
@@ -190,18 +190,16 @@ def _draw(axes: Axes, noise: Noise, names: list[str]) -> None:
     for name in names:
         _draw_channel(axes, name, noise.channels[name])
     axes.axvline(noise.station_seconds, color=plots.BEFORE, lw=0.7, ls=(0, (4, 3)))
-    axes.annotate(
-        f"station, {noise.station_seconds:.3g} s", (noise.station_seconds, 1.0), (-2, -2), rotation=90,
-        xycoords=("data", "axes fraction"), textcoords="offset points", ha="right", va="top",
-        fontsize=6.5, color="#374151",
-    )  # fmt: skip
+    place = {"xycoords": ("data", "axes fraction"), "ha": "right", "va": "top", "rotation": 90}
+    look = plots.NOTE | place | {"fontsize": 6.5, "color": "#374151"}
+    title = f"station, {noise.station_seconds:.3g} s"
+    axes.annotate(title, (noise.station_seconds, 1.0), (-2, -2), **look)
     axes.set(xscale="log", yscale="log", xlabel="averaging time τ, s")
     for axis in (axes.xaxis, axes.yaxis):
         crowded = np.log10(np.divide(*axis.get_view_interval()[::-1])) > 2
         plots.plain_numbers(axis, *((1.0,) if crowded else (1.0, 2.0, 5.0)))
     axes.grid(which="minor", lw=0.25)
-    handles, labels = axes.get_legend_handles_labels()
-    axes.legend(handles, labels, ncols=len(names), loc="upper center", bbox_to_anchor=(0.5, 1.17))
+    axes.legend(ncols=len(names), loc="upper center", bbox_to_anchor=(0.5, 1.17))
 
 
 def _draw_channel(axes: Axes, name: str, channel: ChannelNoise) -> None:

@@ -22,11 +22,6 @@ UNDETERMINED = "undetermined"
 """In place of an uncertainty that no reading determines."""
 
 
-def is_held(value: float, uncertainty: float | None) -> bool:
-    """Whether a parameter was not fitted but kept at zero."""
-    return value == 0 and uncertainty == 0
-
-
 def environment() -> Environment:
     """The templates, and what they call; refuses where what draws a page is missing."""
     pictures.require("the report", "matplotlib", "jinja2")
@@ -40,9 +35,8 @@ def environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    filters = (number, signed, fixed, measured, uncertainty, unit, raised, chance, plural, capital)
-    environment.filters |= {function.__name__: function for function in filters}
-    environment.filters |= {"css": css_string, "svg": pictures.svg}
+    environment.filters |= {function.__name__: function for function in FILTERS}
+    environment.filters["svg"] = pictures.svg
     return environment
 
 
@@ -82,9 +76,8 @@ def measured(value: float, uncertainty: float | None) -> tuple[str, str]:
     power = exponent(max(abs(value), uncertainty))
     if decimals <= 7 and power < 7:
         return fixed(value, decimals), fixed(uncertainty, decimals)
-    factor, times = 10.0**-power, f"×10{superscript(power)}"
-    pair = (fixed(v * factor, decimals + power) for v in (value, uncertainty))
-    first, second = (f"{text}{times}" for text in pair)
+    scaled = (fixed(v * 10.0**-power, decimals + power) for v in (value, uncertainty))
+    first, second = (f"{text}×10{superscript(power)}" for text in scaled)
     return first, second
 
 
@@ -140,6 +133,10 @@ def unit(symbol: str) -> str:
     return symbol if symbol in ("", "°") else f" {symbol}"
 
 
-def css_string(text: str) -> str:
+def css(text: str) -> str:
     """Text as the inside of a CSS string: nothing but letters and digits is left bare."""
     return "".join(c if c.isascii() and c.isalnum() else f"\\{ord(c):x} " for c in harmless(text))
+
+
+FILTERS = (number, signed, fixed, measured, uncertainty, unit, raised, chance, plural, capital, css)
+"""What the templates call."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import re
 from importlib import import_module
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mwdcal.app.text import harmless
@@ -29,13 +28,9 @@ def require(what: str, *libraries: str) -> None:
             ) from None
 
 
-def picture(figure: Figure, path: Path) -> bytes:
-    """The figure as PNG or SVG, by the suffix; the same figure, the same bytes."""
-    return _drawn(figure, path.suffix.lower()[1:])
-
-
-def _drawn(figure: Figure, kind: str) -> bytes:
-    """The figure without the time and the program that drew it."""
+def picture(figure: Figure, suffix: str) -> bytes:
+    """The figure as .png or .svg, without time and program: the same figure, the same bytes."""
+    kind = suffix.lower()[1:]
     stream = io.BytesIO()
     nothing = {"Software": None} if kind == "png" else {"Date": None, "Creator": None}
     with style():
@@ -47,7 +42,7 @@ def svg(figure: Figure, key: str) -> Markup:
     """An element to put into HTML: no prologue, no names of schemas, ids that start with `key`."""
     from markupsafe import Markup
 
-    text = "<svg" + _drawn(figure, "svg").decode().partition("<svg")[2]
+    text = "<svg" + picture(figure, ".svg").decode().partition("<svg")[2]
     text = re.sub(
         r"<!--.*?-->\s*|<metadata>.*?</metadata>\s*|<style.*?</style>\s*", "", text, flags=re.DOTALL
     )

@@ -17,7 +17,7 @@ from mwdcal.app.pages.page import HELD, banner, capital, environment, exponent, 
 from mwdcal.app.text import plural, raised
 from mwdcal.calibration.prediction import accuracy_at, angles, middle_temperature
 from mwdcal.calibration.readings import is_simulated
-from mwdcal.calibration.record import Calibration, Finding, TriadCalibration
+from mwdcal.calibration.record import MAGNETIC, Calibration, Finding, TriadCalibration
 from mwdcal.errors import InputError
 from mwdcal.estimation.solvers import RANK_TOLERANCE
 from mwdcal.geometry.observables import TITLES
@@ -29,8 +29,6 @@ if TYPE_CHECKING:
 
 LONG_TABLE = 60
 """A run of more stations has its station table at the end, as an annex."""
-NEEDS_MAGNETOMETER = ("azimuth", "field", "dip")
-"""Observables that need a magnetometer."""
 ACCURACY_INCLINATIONS = (5.0, 45.0, 90.0)
 """Inclinations of the table of predicted accuracy, degrees."""
 
@@ -47,7 +45,7 @@ def render(calibration: Calibration, verdict: Verdict | None = None) -> str:
         simulated=is_simulated(calibration.tool),
         inclinations=known_inclinations(calibration),
         method="; ".join(how(calibration)),
-        magnetic=NEEDS_MAGNETOMETER,
+        magnetic=MAGNETIC,
         limit=plots.reshoot_limit(calibration),
         decimals=_decimals(calibration),
         long_table=LONG_TABLE,
@@ -120,12 +118,11 @@ def _decimals(calibration: Calibration) -> dict[str, int]:
     }
 
 
-ParameterRow = tuple[str, str, int, float, float | None, str]
-"""A parameter: name, axes, power of τ, value, 1σ and unit."""
-
-
 def _parameters(calibration: Calibration) -> dict[str, Any]:
-    """Parameters of each triad: as factors of the raw channels where there are any."""
+    """Parameters of each triad: as factors of the raw channels where there are any.
+
+    A row is name, axes, power of τ, value, 1σ and unit.
+    """
     try:
         notations = convert(calibration, "factors")
     except InputError:
@@ -135,7 +132,7 @@ def _parameters(calibration: Calibration) -> dict[str, Any]:
     return {"notation": "factors", "rows": rows}
 
 
-def _record_rows(triad: TriadCalibration) -> list[ParameterRow]:
+def _record_rows(triad: TriadCalibration) -> list[tuple[Any, ...]]:
     """The parameters of the record: tool axes, nominal units."""
     columns = (triad.parameter_names, triad.parameters, triad.standard_uncertainties)
     rows = []
@@ -148,7 +145,7 @@ def _record_rows(triad: TriadCalibration) -> list[ParameterRow]:
     return rows
 
 
-def _factor_rows(triad: TriadCalibration, factors: Notation) -> list[ParameterRow]:
+def _factor_rows(triad: TriadCalibration, factors: Notation) -> list[tuple[Any, ...]]:
     values, sd = factors.values, factors.uncertainty
     return [
         (name, axes, power, float(values[name][at]), float(sd[name][at]), symbol)

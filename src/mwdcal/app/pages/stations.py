@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mwdcal.app.pages.page import channels_of
-from mwdcal.app.text import one_line, table
+from mwdcal.app.text import one_line, plural, table
 from mwdcal.files.contract import RAW
 from mwdcal.geometry.vectors import Array
 from mwdcal.logs.stations import Stations
@@ -27,11 +27,8 @@ POINTS = 2000
 
 def summary(stations: Stations) -> dict[str, Any]:
     """The result for machines: one entry per station, and what was left."""
-    columns = {
-        name: column if isinstance(column, list) else column.tolist()
-        for name, column in stations.table.columns.items()
-    }
-    rows = zip(*columns.values(), strict=True)
+    columns = stations.table.columns
+    rows = zip(*(np.asarray(column).tolist() for column in columns.values()), strict=True)
     return {
         "log": stations.table.source,
         "rows": len(stations.time),
@@ -45,12 +42,12 @@ def summary(stations: Stations) -> dict[str, Any]:
 
 def _left(stations: Stations) -> list[dict[str, Any]]:
     """Intervals that look still and were not taken."""
-    each = stations.intervals
-    columns = (each.start.tolist(), each.end.tolist(), each.short, each.taken)
+    intervals = stations.intervals
+    columns = (intervals.start, intervals.end, intervals.short)
+    rows = zip(*(column[~intervals.taken].tolist() for column in columns), strict=True)
     return [
         {"start_s": start, "end_s": end, "reason": "short" if short else "moves slowly"}
-        for start, end, short, taken in zip(*columns, strict=True)
-        if not taken
+        for start, end, short in rows
     ]
 
 
@@ -62,15 +59,13 @@ def _seconds(stations: Stations) -> float:
 def screen(stations: Stations, files: dict[str, str]) -> str:
     """What was found, for people."""
     picture = f"   {files['plot']} (picture)" if files["plot"] else ""
+    after = f"next: mwdcal calibrate {files['output']} -o CAL.json"
     lines = [
         one_line("   ".join(_heading(stations))),
         "   ".join(_search(stations)),
         "",
         _stations_table(stations),
-        one_line(
-            f"wrote {files['output']}{picture}   "
-            f"next: mwdcal calibrate {files['output']} -o CAL.json"
-        ),
+        one_line(f"wrote {files['output']}{picture}   {after}"),
     ]
     return "\n".join(lines)
 
@@ -84,7 +79,7 @@ def _heading(stations: Stations) -> list[str]:
         stations.table.source,
         f"{len(stations.time)} rows",
         f"{whole:.6g} s",
-        f"{stations.table.count} stations, {share:.0f} % of the time",
+        f"{plural(stations.table.count, 'station')}, {share:.0f} % of the time",
     ]
 
 
@@ -123,12 +118,13 @@ def _to_sd(value: float, sd: float) -> str:
     return f"{value:.{digits}f}"
 
 
-@plots.styled
+@plots.style()
 def figure(stations: Stations) -> Figure:
     """The log with what was taken and what was left: a panel for each triad and for the activity."""
     triads = channels_of(stations.traces)
-    figure = plots.new_figure("Stations taken and left in a log", 1.5 + 1.5 * len(triads))
-    panels = figure.subplots(len(triads) + 1, 1, sharex=True, squeeze=False)[:, 0]
+    label, count = "Stations taken and left in a log", len(triads)
+    figure, grid = plots.new_figure(label, 1.5 + 1.5 * count, count + 1, sharex=True)
+    panels = grid[:, 0]
     for axes, (triad, names) in zip(panels, triads.items(), strict=False):
         _draw_triad(axes, stations, names)
         axes.set_ylabel(f"{triad},\nraw")
@@ -166,15 +162,13 @@ def _draw_activity(axes: Axes, stations: Stations) -> None:
     x, y = _thinned(edge[:-1], np.where(fine, value, value[fine].min(initial=np.inf)))
     axes.plot(x, np.where(np.isinf(y), np.nan, y), color=plots.BEFORE, lw=0.7)
     axes.set(yscale="log", ylabel="activity,\nnoise floors", xlabel="time, s")
-    axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
-    axes.yaxis.set_minor_formatter(lambda value, _: "")
+    plots.plain_numbers(axes.yaxis, 1.0)
     if not stations.threshold:
         return  # a logarithmic axis has no zero
     axes.axhline(stations.threshold, color=plots.MARKED, lw=1, ls=(0, (5, 3)))
-    axes.annotate(
-        f"threshold {stations.threshold:.3g}", (1.0, stations.threshold), (6, 0), va="center",
-        xycoords=("axes fraction", "data"), textcoords="offset points", color="#9a3d00", fontsize=7,
-    )  # fmt: skip
+    title, place = f"threshold {stations.threshold:.3g}", (1.0, stations.threshold)
+    across = ("axes fraction", "data")
+    axes.annotate(title, place, (6, 0), xycoords=across, va="center", **plots.NOTE)
     if stations.stretch:
         axes.axhspan(*stations.stretch, color="#fde8d4", lw=0, zorder=0.4)
 
@@ -192,18 +186,15 @@ def _shade(axes: Axes, stations: Stations) -> None:
 
 
 def _number_stations(axes: Axes, stations: Stations) -> None:
-    intervals = stations.intervals
-    middle = (intervals.start + intervals.end)[intervals.taken] / 2
+    start, end = stations.intervals.stations
+    middle = (start + end) / 2
     every = max(1, -(-len(middle) // 30))
+    across = ("data", "axes fraction")
+    look: dict[str, Any] = {"xycoords": across, "textcoords": "offset points", "fontsize": 6}
     for i in range(0, len(middle), every):
-        place = (float(middle[i]), 1.0)
-        axes.annotate(
-            str(i + 1), place, (0, 2), xycoords=("data", "axes fraction"), ha="center",
-            textcoords="offset points", fontsize=6,
-        )  # fmt: skip
-    left = int(np.count_nonzero(~intervals.taken))
+        axes.annotate(str(i + 1), (middle[i], 1.0), (0, 2), ha="center", **look)
     axes.set_title(
         f"{stations.table.source}: stations taken {stations.table.count} (filled, numbered), "
-        f"calm intervals left {left} (hatched)",
+        f"calm intervals left {len(_left(stations))} (hatched)",
         pad=12,
     )

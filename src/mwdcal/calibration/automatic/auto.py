@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -14,7 +13,7 @@ from mwdcal.calibration.automatic.nonlinearity import (
     scattered,
     with_strengths,
 )
-from mwdcal.calibration.automatic.order_selection import choose_order, order_errors
+from mwdcal.calibration.automatic.order_selection import Progress, choose_order, order_errors
 from mwdcal.calibration.diagnosis.refusals import check_curves, check_readings
 from mwdcal.calibration.methods import check_stand_errors
 from mwdcal.calibration.options import AUTO, Options
@@ -43,9 +42,7 @@ class Choice:
 
 
 @np.errstate(invalid="ignore", divide="ignore", over="ignore")
-def choose(
-    readings: Readings, profile: Profile, options: Options, progress: Callable[[str], None]
-) -> Choice:
+def choose(readings: Readings, profile: Profile, options: Options, progress: Progress) -> Choice:
     """The options of one run; what they leave to the software is decided by the run.
 
     Raises `FitError` or `InputError` for readings and options that no fit could use.
@@ -59,7 +56,7 @@ def choose(
 
 
 def resolved(
-    options: Options, readings: Readings, profile: Profile, progress: Callable[[str], None]
+    options: Options, readings: Readings, profile: Profile, progress: Progress
 ) -> tuple[Options, list[OrderScore], list[CurveScore]]:
     """The options without `auto`, and the tables of what was chosen among."""
     options = known_before(options, readings, profile)
@@ -104,7 +101,7 @@ def known_before(options: Options, readings: Readings, profile: Profile) -> Opti
 
 
 def _with_curves(
-    options: Options, readings: Readings, profile: Profile, progress: Callable[[str], None]
+    options: Options, readings: Readings, profile: Profile, progress: Progress
 ) -> tuple[Options, list[CurveScore]]:
     """The options with own-axis terms as asked for, or with those that the run shows."""
     terms = offered(profile, options)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mwdcal.calibration.estimate import Fit
-from mwdcal.calibration.soaks import HIGHEST, highest_order, usable_soaks
+from mwdcal.calibration.readings import HIGHEST, highest_order, usable_soaks
 from mwdcal.estimation.problem import Problem, State
 from mwdcal.estimation.uncertainty import TANGENT_STEP, tangent
 from mwdcal.geometry.vectors import Array, Bools, Ints, diagonal, eigen, inverse, outer, quotient
@@ -130,10 +130,8 @@ def _with_terms(result: Fit, shown: Bools, least: int) -> tuple[Array, Array]:
     problem, state = result.problem, result.state
     linear = problem.linear(state)
     columns = steady_columns(problem, state)
-    powers = (
-        temperature_powers(problem.temperature, least + shown.shape[-1])[..., least:]
-        * shown[:, None]
-    )
+    every = temperature_powers(problem.temperature, least + shown.shape[-1])
+    powers = every[..., least:] * shown[:, None]
     members, stations, count = powers.shape
     weighed = linear.weigh(columns).mT
     turned = powers.mT
@@ -305,8 +303,7 @@ def misfit_covariance(result: Fit) -> Array:
     for index, (triad, where) in enumerate(zip(problem.triads, problem.slices(), strict=True)):
         strength = np.linalg.norm(problem.targets(result.state)[index], axis=-1).mean(-1)
         gains = [tangent(triad.model, params[:, where], stretch) for stretch in stretches]
-        names = [name for name in triad.model.names if name in OFFSETS]
-        offsets = np.eye(triad.model.size)[[triad.model.names.index(name) for name in names]]
+        offsets = np.eye(triad.model.size)[[name in OFFSETS for name in triad.model.names]]
         for place, rows in enumerate([np.stack(gains, 1), offsets * strength[:, None, None]]):
             covariance[:, where, where] += rows.mT @ rows * variance[:, index, place, None, None]
     return covariance

@@ -13,11 +13,11 @@ from itertools import combinations
 
 import numpy as np
 
-from mwdcal.calibration.automatic.order_selection import misfit, with_all_stations, with_noise
+from mwdcal.calibration.automatic.order_selection import left_out, misfit, with_noise
 from mwdcal.calibration.estimate import fit, scatters
 from mwdcal.calibration.options import AUTO, USUAL, Options
 from mwdcal.calibration.readings import TRIADS, Readings
-from mwdcal.estimation.batch import batch_of_one, mapped
+from mwdcal.estimation.batch import batch_of_one
 from mwdcal.estimation.uncertainty import log_evidence
 from mwdcal.geometry.vectors import Array, Ints
 from mwdcal.sensor.profile import Profile
@@ -119,23 +119,21 @@ def compare_curves(readings: Readings, options: Options, terms: Mapping[str, flo
     choices, count = choices_of(readings, terms), len(readings.accelerometer)
     if len(choices) == 1:
         return Curves(choices, np.zeros(count, int), np.zeros((count, 1)), False)
-    every = {name: terms[name] for name in choices[-1]}
+    each = [{name: terms[name] for name in choice} for choice in choices]
     if any(name in readings.sd for name in TRIADS):
-        each = [{name: terms[name] for name in choice} for choice in choices]
-        chosen, score = _by_left_out(readings, options, each)
-        return Curves(choices, chosen, score, False)
+        return Curves(choices, *_by_left_out(readings, options, each), False)
     include = np.ones(readings.accelerometer.shape[:-1])
     if options.robust:  # those that a robust fit with all terms trusts
-        trust = fit(readings, replace(options, nonlinearity=every)).trust
+        trust = fit(readings, replace(options, nonlinearity=each[-1])).trust
         include = np.asarray(trust > TRUSTED, float)
-    odds = log_odds(readings, options, every, include)
+    odds = log_odds(readings, options, each[-1], include)
     score = np.stack([np.zeros(count), odds], -1)
     return Curves([(), choices[-1]], np.asarray(odds > ODDS, int), score, True)
 
 
 def choices_of(readings: Readings, terms: Mapping[str, float]) -> list[tuple[str, ...]]:
     """Which triads may have terms: none first, then each offered one that the run has, then both."""
-    names = [name for name in TRIADS if name in terms and getattr(readings, name) is not None]
+    names = [name for name in readings.triads if name in terms]
     return [c for count in range(len(names) + 1) for c in combinations(names, count)]
 
 
@@ -167,9 +165,8 @@ def _by_left_out(
     for index, score in enumerate(scores):
         gain = least - score
         error = gain.std(-1, ddof=1) / np.sqrt(readings.count)
-        better = (score.mean(-1) < BETTER_SHARE * least.mean(-1)) & (
-            gain.mean(-1) > CLEAR_ERRORS * error
-        )
+        clear = gain.mean(-1) > CLEAR_ERRORS * error
+        better = clear & (score.mean(-1) < BETTER_SHARE * least.mean(-1))
         best, least = np.where(better, index, best), np.where(better[:, None], score, least)
     return best, np.stack([score.mean(-1) for score in scores], -1)
 
@@ -178,7 +175,6 @@ def _left_out(readings: Readings, options: Options) -> Array:
     """χ² per reading (B, n) of stations, each judged by the fit without its part."""
     parts = min(readings.count, MOST_PARTS)
     part = np.arange(readings.count) % parts
-    include = (np.arange(parts)[:, None] != part).astype(float)
-    result = fit(mapped(lambda value: np.expand_dims(value, 1), readings), options, include)
-    square = misfit(*with_all_stations(result)).mean(-1).reshape(-1, parts, readings.count) / 3
+    problem, state, _ = left_out(readings, options, part)
+    square = misfit(problem, state).mean(-1).reshape(-1, parts, readings.count) / 3
     return np.asarray(square[:, part, np.arange(readings.count)])

@@ -12,17 +12,18 @@ from dataclasses import replace
 import numpy as np
 
 from mwdcal.calibration.automatic.courses import terms_beyond
-from mwdcal.calibration.estimate import Fit, fit
+from mwdcal.calibration.estimate import fit
 from mwdcal.calibration.options import Options, Orders
-from mwdcal.calibration.readings import TRIADS, Readings
+from mwdcal.calibration.readings import HIGHEST, TRIADS, Readings, highest_order, usable_soaks
 from mwdcal.calibration.record import OrderScore, stated
 from mwdcal.calibration.residuals import shown_in
-from mwdcal.calibration.soaks import HIGHEST, highest_order, usable_soaks
 from mwdcal.estimation.batch import batch_of_one, mapped, take
 from mwdcal.estimation.problem import Problem, State
 from mwdcal.estimation.uncertainty import TESTED, marginal_rank, readjusted
 from mwdcal.geometry.vectors import Array, Ints
 
+Progress = Callable[[str], None]
+"""What gets a line for each trial."""
 FEWEST_SOAKS = 3
 """Fewest soaks among which one can be left out."""
 LOWEST_RANK = 8
@@ -30,7 +31,7 @@ LOWEST_RANK = 8
 
 
 def choose_order(
-    readings: Readings, options: Options, progress: Callable[[str], None]
+    readings: Readings, options: Options, progress: Progress
 ) -> tuple[Orders, list[OrderScore]]:
     """Each triad's lowest order above which noise explains all terms, and the tables, of one run.
 
@@ -68,7 +69,7 @@ def _judged_soaks(readings: Readings, options: Options) -> Ints:
 
     So has one whose stations cannot even determine what all temperatures have in common.
     """
-    levels = _usable_soaks(readings).max(-1) + 1
+    levels = usable_soaks(_temperature(readings)).max(-1) + 1
     if (levels > 1).any():
         result = fit(readings, Options(method=options.method))
         ranks = [marginal_rank(result.analysis.determined, w) for w in result.problem.slices()]
@@ -82,9 +83,8 @@ def _tested(readings: Readings, options: Options) -> tuple[Ints, Array]:
     The chance is that of the term in a fit of the order below, or of the order chosen.
     """
     limit = _highest(readings, options)
-    triads = sum(getattr(readings, name) is not None for name in TRIADS)
-    orders = np.full((len(limit), triads), -1)
-    chance = np.full((len(limit), triads, HIGHEST), np.nan)
+    orders = np.full((len(limit), len(readings.triads)), -1)
+    chance = np.full((*orders.shape, HIGHEST), np.nan)
     powers = np.arange(1, HIGHEST + 1)
     for order in range(int(limit.max()) + 1):
         terms = terms_beyond(fit(readings, replace(options, order=order)))
@@ -98,9 +98,7 @@ def _tested(readings: Readings, options: Options) -> tuple[Ints, Array]:
     return orders, chance
 
 
-def order_errors(
-    readings: Readings, options: Options, progress: Callable[[str], None]
-) -> list[OrderScore]:
+def order_errors(readings: Readings, options: Options, progress: Progress) -> list[OrderScore]:
     """What an order that was given is worth at temperatures left out, one row per triad.
 
     None where there are too few soaks to leave one out.
@@ -110,7 +108,7 @@ def order_errors(
         return []
     highest = int(_highest(batch, options)[0])
     yardstick = options if options.prior else replace(options, order=highest)
-    chosen = np.array(options.orders[: 1 + (readings.magnetometer is not None)])
+    chosen = np.array(options.orders[: len(readings.triads)])
     untested = np.full((len(chosen), HIGHEST), np.nan)
     batch = with_noise(batch, yardstick)
     return _scores(batch, options, [options.orders], chosen, untested, progress)
@@ -121,18 +119,16 @@ def _needed(orders: tuple[int, int]) -> int:
     return max(FEWEST_SOAKS, max(orders) + 2)
 
 
-def _usable_soaks(readings: Readings) -> Ints:
-    """Number (B, n) of each station's soak: all 0 without temperatures, or with too short a span."""
-    if readings.temperature is None:
-        return np.zeros(readings.accelerometer.shape[:-1], int)
-    return usable_soaks(readings.temperature)
+def _temperature(readings: Readings) -> Array:
+    """Temperatures (B, n), all alike where none were measured."""
+    shape = readings.accelerometer.shape[:-1]
+    return np.zeros(shape) if readings.temperature is None else readings.temperature
 
 
 def _highest(readings: Readings, options: Options) -> Ints:
     """The highest order (B,) that the soaks can carry, with stations enough."""
-    if options.method == "swarm" or readings.temperature is None:
-        return np.zeros(len(readings.accelerometer), int)
-    return np.minimum(highest_order(readings.temperature), HIGHEST)
+    carried = highest_order(_temperature(readings))
+    return np.minimum(carried, 0 if options.method == "swarm" else HIGHEST)
 
 
 def _scores(
@@ -141,13 +137,13 @@ def _scores(
     orders: Sequence[tuple[int, int]],
     chosen: Ints,
     chance: Array,
-    progress: Callable[[str], None],
+    progress: Progress,
 ) -> list[OrderScore]:
     """The tables of all triads over some orders, of a batch of one; blank where soaks are too few.
 
     `chosen` (t,) orders and the `chance` (t, k) of each term by triad.
     """
-    numbers = _usable_soaks(readings)
+    numbers = usable_soaks(_temperature(readings))
     count, squares = int(numbers.max()) + 1, []
     for pair in orders:
         if count < _needed(pair):
@@ -187,10 +183,9 @@ def with_noise(readings: Readings, options: Options) -> Readings:
 
     Every choice is then judged by the same yardstick.
     """
-    names = [name for name in TRIADS if getattr(readings, name) is not None]
-    if all(name in readings.sd for name in names):
+    if all(name in readings.sd for name in readings.triads):
         return readings
-    noise = dict(zip(names, np.moveaxis(fit(readings, options).noise, -1, 0), strict=True))
+    noise = dict(zip(readings.triads, fit(readings, options).noise.mT, strict=True))
     estimated = {n: sd[:, None, None] for n, sd in noise.items() if n not in readings.sd}
     return replace(readings, sd={**readings.sd, **estimated})
 
@@ -201,11 +196,7 @@ def _held_out(readings: Readings, options: Options, numbers: Ints) -> Array:
     Of the reading, in units of its noise (χ²); then of noise and error per axis of the vector
     (g, nT), and of noise and error across the field (rad).
     """
-    soak = np.arange(int(numbers.max()) + 1)
-    include = (soak[:, None] != numbers[:, None, :]).astype(float)
-    result = fit(mapped(lambda value: np.expand_dims(value, 1), readings), options, include)
-    held = 1 - include.reshape(-1, readings.count)
-    problem, state = with_all_stations(result)
+    problem, state, held = left_out(readings, options, numbers)
     linear = problem.linear(state)
     chi = np.sum(misfit(problem, state) * held[..., None], 1) / (3 * held.sum(1))[:, None]
     left, share = linear.weigh(linear.residual[..., None]), linear.weight
@@ -240,12 +231,17 @@ def _squares(
     return noise, noise * error / tested
 
 
-def with_all_stations(result: Fit) -> tuple[Problem, State]:
-    """The problem with the left-out stations back, each at its best attitude for the fit."""
+def left_out(readings: Readings, options: Options, part: Ints) -> tuple[Problem, State, Array]:
+    """Fits without each part of the stations, these at their best attitude then; who was left out.
+
+    `part` (n,) or (B, n) has the numbers of the parts; what was left out (parts, n) is 1 in the last.
+    """
+    include = (np.arange(int(part.max()) + 1)[:, None] != part[..., None, :]).astype(float)
+    result = fit(mapped(lambda value: np.expand_dims(value, 1), readings), options, include)
     evidence = result.problem.evidence
     everyone = replace(evidence, include=np.ones_like(evidence.include))
     problem = replace(result.problem, evidence=everyone)
-    return problem, readjusted(problem, result.state)
+    return problem, readjusted(problem, result.state), 1 - include.reshape(-1, readings.count)
 
 
 def misfit(problem: Problem, state: State) -> Array:

@@ -49,11 +49,9 @@ def named(permutation: Array) -> tuple[str, ...]:
     >>> named(np.array([[0, -1.0, 0], [1, 0, 0], [0, 0, 1]]))
     ('+y', '-x', '+z')
     """
-    rows = [int(np.argmax(np.abs(column))) for column in np.transpose(permutation)]
-    return tuple(
-        ("+" if permutation[row, channel] > 0 else "-") + "xyz"[row]
-        for channel, row in enumerate(rows)
-    )
+    rows = np.argmax(np.abs(permutation), 0).tolist()
+    signs = ["+" if permutation[row, channel] > 0 else "-" for channel, row in enumerate(rows)]
+    return tuple(f"{sign}{'xyz'[row]}" for sign, row in zip(signs, rows, strict=True))
 
 
 def explaining(readings: Readings, profile: Profile) -> dict[str, tuple[str, ...]]:
@@ -62,10 +60,8 @@ def explaining(readings: Readings, profile: Profile) -> dict[str, tuple[str, ...
         result = fit(readings)
     except (MwdcalError, np.linalg.LinAlgError):
         return {}
-    if result.status[0] != Status.OK or not _fits(result):
-        return {}
     free = free_directions(result.problem, result.state, result.analysis.determined)[0]
-    if any(map(is_bad, free)):
+    if result.status[0] != Status.OK or not _fits(result) or any(map(is_bad, free)):
         return {}
     axes, problem = {}, result.problem
     for name, triad, where in zip(TRIADS, problem.triads, problem.slices(), strict=False):

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 
-from mwdcal.calibration.automatic.courses import OmittedTerms, misfit_size, terms_beyond, untested
-from mwdcal.calibration.diagnosis.flags import FittedRuns, Flag
+from mwdcal.calibration.automatic.courses import misfit_size, orders_of, terms_beyond, untested
+from mwdcal.calibration.diagnosis.flags import FittedRuns, Flag, listed, spaced
 from mwdcal.calibration.diagnosis.plausibility import (
     NOISE_RATIO,
     copies,
@@ -20,11 +21,10 @@ from mwdcal.calibration.diagnosis.plausibility import (
 )
 from mwdcal.calibration.diagnosis.structure import described as seen_as
 from mwdcal.calibration.diagnosis.structure import effects, suspected
-from mwdcal.calibration.readings import EARTH_RANGES, TRIADS
+from mwdcal.calibration.readings import EARTH_RANGES, HIGHEST, TRIADS
 from mwdcal.calibration.record import Finding
 from mwdcal.calibration.residuals import REASONS, shown_in, tail
 from mwdcal.calibration.results import common_source
-from mwdcal.calibration.soaks import HIGHEST
 from mwdcal.estimation.problem import Prior
 from mwdcal.estimation.rank import free_directions
 from mwdcal.estimation.solvers import Determined
@@ -56,11 +56,45 @@ FREE_DIRECTIONS = {
     "scale": "overall scale is undetermined: no evidence fixes it; kept at nominal. Give a reference strength",
 }
 
+REMARKS = {
+    "noise": "{triad}: residuals are only {times:.2f} of the declared noise: the noise of the profile, or the columns "
+    "sd_, are too large, and weigh the stations wrongly if not all by as much. Uncertainties are scaled down "
+    "accordingly.",
+    "residuals": "{triad}: residuals are {times:.2f} times the declared noise{rare}: the noise figure, a reference, or "
+    "the model is wrong. Uncertainties are scaled up accordingly.",
+    "no-redundancy": "{triads}: no redundancy, so nothing in this run checks the fit. Add stations.",
+    "scatter": "beyond sensor noise, these vary from station to station: {what} (1σ, estimated; weights and "
+    "uncertainties include it). Look for iron near the stand and play in the tool holder; or the model lacks "
+    "something.",
+    "repeated-readings": "station {stations}: readings identical to those of an earlier station. Copies count as "
+    "measurements of their own, and uncertainties come out too small. Remove them.",
+    "temperature-misfit": "{triad}: {of[cause]}, beyond what noise explains: {of[rms]:.2g} {of[unit]} rms per axis "
+    "over the range ({of[angle]:.2g}° across the field). The uncertainties here include it. {of[remedy]}.",
+    "temperature-untested": "{triads}: {levels} temperatures are as many as a course of order {order} takes, so "
+    "nothing tests it between them, and {unsaid}. Add a temperature between them.",
+    "prior-shared": "the prior ({source}) and this run both have {both} in their uncertainty, and count as independent "
+    "there. On the same stand it is one error: what rests on it is then stated up to 1.4 times too small.",
+    "prior-only": "this run does not determine {names}: there values and uncertainties rest on the prior ({source}).",
+    "prior-conflict": "the run departs from the prior ({source}) by {ratio:.1f} times what both allow: the tool has "
+    "changed, or the prior is too narrow. Leave `prior` out, or widen it.",
+    "nonlinearity-ignored": "nonlinearity of the {triads} is not fitted: the model of factors has no such terms. Use "
+    "`model` polynomial for it.",
+    "field-unknown": "field strength is known at no station: the magnetometer is calibrated to field = 1. Give "
+    "ref_field_nt to have nT.",
+    "restricted": "{parameters} parameters: {lost} of the sensors in the tool is taken as none, and no uncertainty "
+    "here includes it. Use `parameters` 12 to fit it.",
+    "reshoot": "station {of[station]}: residual {of[size]}σ, most in {of[worst]} ({of[value]:+.3g}{of[unit]}; "
+    "{of[alone]:+.3g}{of[unit]} if left out of the fit, which it moves by up to {of[moves]:.2g}{of[unit]}): "
+    "{of[reason]} Re-shoot it, or `exclude` {of[station]}",
+    "distrusted": "robust fit: low weight for station {stations}. Look at what they have in common.",
+}
+"""What a finding says, by its id or the end of it."""
+
 SCATTERED = {
-    "gravity": "the strength of g",
-    "field": "the strength of b",
-    "dip": "the dip",
-    "direction": "the direction within groups",
+    "gravity": "the strength of g by {:.2f} %",
+    "field": "the strength of b by {:.2f} %",
+    "dip": "the dip by {:.2f}°",
+    "direction": "the direction within groups by {:.2f}°",
 }
 
 
@@ -75,18 +109,14 @@ def unused_columns(columns: Sequence[str]) -> list[Finding]:
     """Columns of a file that are not used, each with what it resembles."""
     if not columns:
         return []
-    return [Finding(id=UNUSED, text=f"columns not used: {_listed(columns, COLUMNS_NAMED)}.")]
+    return [Finding(id=UNUSED, text=f"columns not used: {listed(columns, COLUMNS_NAMED)}.")]
 
 
 def findings(fitted: FittedRuns) -> list[Finding]:
     """All findings of a single run, a batch of one, in order of weight."""
-    labels = fitted.alone(0)[0].labels
+    labels: dict[int | None, str] = dict(enumerate(fitted.alone(0)[0].labels))
     return [
-        Finding(
-            id=flag.id,
-            text=flag.sentence(0),
-            station=None if flag.station is None else labels[flag.station],
-        )
+        Finding(id=flag.id, text=flag.sentence(0), station=labels.get(flag.station))
         for flag in finding_flags(fitted)
         if flag.members[0]
     ]
@@ -94,89 +124,61 @@ def findings(fitted: FittedRuns) -> list[Finding]:
 
 def finding_flags(fitted: FittedRuns) -> Iterator[Flag]:
     """All findings of a batch, in order of weight: some ids come more than once."""
-    triads = range(len(fitted.result.problem.triads))
-    yield from (_calm(fitted, triad) for triad in triads)
-    yield from (_excessive(fitted, triad) for triad in triads)
-    yield _no_redundancy(fitted)
+    yield from _noise(fitted)
+    bare = unchecked(fitted.result)
+    yield _remark("no-redundancy", np.any(bare, -1), triads=partial(_joined, bare))
     yield from _structure(fitted)
     yield _scatter(fitted)
     yield _repeated(fitted)
-    terms = terms_beyond(fitted.result)
-    yield from (_beyond_order(fitted, triad, terms) for triad in triads)
+    yield from _beyond_order(fitted)
     yield _untested(fitted)
     yield from _undetermined(fitted)
     yield from _prior(fitted)
     yield from _model(fitted)
     for unused in unused_columns(fitted.readings.unused):
-        yield _common(fitted, unused.id, unused.text)
+        yield _common(fitted, unused.id, unused.text, range(fitted.count))
     yield from _reshoot(fitted)
     yield _distrusted(fitted)
 
 
-def _common(fitted: FittedRuns, name: str, text: str, places: Sequence[int] | None = None) -> Flag:
-    """One sentence for all members, or for those at some places."""
-    index = np.arange(fitted.count)
-    members = np.ones(fitted.count, bool) if places is None else np.isin(index, places)
-    return Flag(name, members, lambda _: text)
+def _remark(name: str, members: Bools, **values: Any) -> Flag:
+    """A finding by its name, with what fills in its words."""
+    return Flag(name, members, REMARKS[name], values)
 
 
-def _joined(triads: Bools) -> str:
-    """The names of the flagged triads (t,).
+def _common(fitted: FittedRuns, name: str, text: str, places: Sequence[int]) -> Flag:
+    """One sentence for the members at some places."""
+    members = np.isin(np.arange(fitted.count), places)
+    return Flag(name, members, "{text}", {"text": text})
 
-    >>> _joined(np.array([True, True]))
+
+def _joined(triads: Bools, place: int) -> str:
+    """The names of a member's flagged triads (B, t).
+
+    >>> _joined(np.array([[True, True]]), 0)
     'accelerometer and magnetometer'
     """
-    return " and ".join(TRIADS[index] for index in np.flatnonzero(triads))
+    return " and ".join(TRIADS[index] for index in np.flatnonzero(triads[place]))
 
 
-def _listed(names: Sequence[str], most: int = STATIONS_NAMED) -> str:
-    """The first few names, and how many more."""
-    more = len(names) - most
-    return ", ".join(names[:most]) + (f" and {more} more" if more > 0 else "")
+def _noise(fitted: FittedRuns) -> Iterator[Flag]:
+    """Residuals far below the declared noise, then those far beyond it."""
+    result, analysis, chances = fitted.result, fitted.result.analysis, fitted.chances
+    declared, factor = np.isnan(result.noise), analysis.variance_factor
+    calm = declared & (analysis.freedom >= CALM_FREEDOM) & (factor < NOISE_RATIO**-2)
+    weighed = robust(result)[:, None] & declared & ~unchecked(result)
+    large = weighed & (factor > NOISE_RATIO**2) | (chances < MISFIT_CHANCE)
 
+    times = np.sqrt(factor)
 
-def _calm(fitted: FittedRuns, index: int) -> Flag:
-    """Residuals far below the declared noise."""
-    analysis = fitted.result.analysis
-    tested = np.isnan(fitted.result.noise) & (analysis.freedom >= CALM_FREEDOM)
-    calm = tested & (analysis.variance_factor < NOISE_RATIO**-2)
+    def rare(place: int, index: int) -> str:
+        chance = chances[place, index]
+        return "" if np.isnan(chance) else f" (chance in noise {chance:.0e})"
 
-    def sentence(place: int) -> str:
-        share = float(analysis.variance_factor[place, index]) ** 0.5
-        return (
-            f"{TRIADS[index]}: residuals are only {share:.2f} of the declared noise: the noise of "
-            "the profile, or the columns sd_, are too large, and weigh the stations wrongly if "
-            "not all by as much. Uncertainties are scaled down accordingly."
-        )
-
-    return Flag(f"{TRIADS[index]}-noise", calm[:, index], sentence)
-
-
-def _excessive(fitted: FittedRuns, index: int) -> Flag:
-    """Residuals far beyond the declared noise."""
-    result, factor = fitted.result, fitted.result.analysis.variance_factor
-    weighed = robust(result)[:, None] & np.isnan(result.noise) & ~unchecked(result)
-    large = weighed & (factor > NOISE_RATIO**2)
-    large |= np.nan_to_num(fitted.chances, nan=1.0) < MISFIT_CHANCE
-
-    def sentence(place: int) -> str:
-        excess = float(factor[place, index])
-        chance = fitted.chances[place, index]
-        rare = "" if np.isnan(chance) else f" (chance in noise {chance:.0e})"
-        return (
-            f"{TRIADS[index]}: residuals are {excess**0.5:.2f} times the declared noise{rare}: "
-            "the noise figure, a reference, or the model is wrong. Uncertainties are "
-            "scaled up accordingly."
-        )
-
-    return Flag(f"{TRIADS[index]}-residuals", large[:, index], sentence)
-
-
-def _no_redundancy(fitted: FittedRuns) -> Flag:
-    """Triads that nothing checks."""
-    bare = unchecked(fitted.result)
-    text = "no redundancy, so nothing in this run checks the fit. Add stations."
-    return Flag("no-redundancy", np.any(bare, -1), lambda place: f"{_joined(bare[place])}: {text}")
+    for end, holds in (("noise", calm), ("residuals", large)):
+        for index, triad in enumerate(TRIADS[: factor.shape[-1]]):
+            values = {"triad": triad, "times": times[:, index], "rare": partial(rare, index=index)}
+            yield Flag(f"{triad}-{end}", holds[:, index], REMARKS[end], values)
 
 
 def _structure(fitted: FittedRuns) -> Iterator[Flag]:
@@ -193,98 +195,76 @@ def _scatter(fitted: FittedRuns) -> Flag:
     sizes = {name: values.max(-1) for name, values in scatter.items()}
     large = np.max([np.zeros(fitted.count), *sizes.values()], 0) > SCATTER_SHARE
 
-    def sentence(place: int) -> str:
-        words = [
-            f"{SCATTERED[name]} by "
-            + (f"{100 * size:.2f} %" if name in EARTH_RANGES else f"{np.degrees(size):.2f}°")
-            for name, size in ((n, float(sd[place])) for n, sd in sizes.items())
-            if size > SCATTER_SHARE
-        ]
-        return (
-            f"beyond sensor noise, these vary from station to station: {', '.join(words)} "
-            "(1σ, estimated; weights and uncertainties include it). Look for iron near the stand and "
-            "play in the tool holder; or the model lacks something."
+    def what(place: int) -> str:
+        return ", ".join(
+            SCATTERED[name].format(sd[place] * (100 if name in EARTH_RANGES else np.degrees(1)))
+            for name, sd in sizes.items()
+            if sd[place] > SCATTER_SHARE
         )
 
-    return Flag("scatter", np.asarray(large), sentence)
+    return _remark("scatter", np.asarray(large), what=what)
 
 
 def _repeated(fitted: FittedRuns) -> Flag:
     """Stations whose readings are identical to another's."""
     repeated = copies(fitted.result)
 
-    def sentence(place: int) -> str:
+    def stations(place: int) -> str:
         labels = fitted.alone(place)[0].labels
-        names = [labels[index] for index in np.flatnonzero(repeated[place])]
-        return (
-            f"station {_listed(names)}: readings identical to those of an earlier station. Copies count as "
-            "measurements of their own, and uncertainties come out too small. Remove them."
-        )
+        return listed([labels[i] for i in np.flatnonzero(repeated[place])], STATIONS_NAMED)
 
-    return Flag("repeated-readings", np.any(repeated, -1), sentence)
+    return _remark("repeated-readings", np.any(repeated, -1), stations=stations)
 
 
-def _beyond_order(fitted: FittedRuns, index: int, terms: OmittedTerms) -> Flag:
+def _beyond_order(fitted: FittedRuns) -> Iterator[Flag]:
     """A variation with temperature that the order of a triad does not follow."""
+    present = terms_beyond(fitted.result).present
+    for index, triad in enumerate(TRIADS[: present.shape[1]]):
+        members = np.any(present[:, index], -1)
+        words = {"triad": triad, "of": partial(_course, fitted, index, present[:, index])}
+        yield Flag(f"{triad}-temperature-misfit", members, REMARKS["temperature-misfit"], words)
+
+
+def _course(fitted: FittedRuns, index: int, present: Bools, place: int) -> dict[str, Any]:
+    """What is left out of a triad's course of temperature, of powers `present` (B, k)."""
     problem, state = fitted.result.problem, fitted.result.state
     order, observable = problem.triads[index].model.basis.order, ("gravity", "field")[index]
     scale, unit = shown_in(observable, fitted.readings.relative)
-
-    def sentence(place: int) -> str:
-        highest = np.flatnonzero(terms.present[place, index]) + 1
-        share = float(misfit_size(fitted.result)[place, index])
-        strength = float(np.mean(problem.constant(state, observable)[place]))
-        if order < HIGHEST and highest.min() <= HIGHEST:
-            cause = f"powers of temperature above order {order} are there"
-            remedy = f"Use `order` auto, or `order` {min(int(highest.max()), HIGHEST)}"
-            if fitted.options.method == "swarm":
-                remedy = "Use another `method`: swarm has no temperature terms"
-        else:
-            cause = "readings differ from one temperature to the next as no course of order 3 does"
-            remedy = (
-                "Let the tool come to rest at each temperature and look for hysteresis or a reference "
-                "that moved; more temperatures make the mean better"
-            )
-        return (
-            f"{TRIADS[index]}: {cause}, beyond what noise explains: {share * strength * scale:.2g} {unit} "
-            f"rms per axis over the range ({np.degrees(share):.2g}° across the field). The "
-            f"uncertainties here include it. {remedy}."
-        )
-
-    return Flag(
-        f"{TRIADS[index]}-temperature-misfit", np.any(terms.present[:, index], -1), sentence
+    share = float(misfit_size(fitted.result)[place, index])
+    strength = float(np.mean(problem.constant(state, observable)[place]))
+    powers = np.flatnonzero(present[place]) + 1
+    cause = "readings differ from one temperature to the next as no course of order 3 does"
+    remedy = (
+        "Let the tool come to rest at each temperature and look for hysteresis or a reference "
+        "that moved; more temperatures make the mean better"
     )
+    if order < HIGHEST and powers.min() <= HIGHEST:
+        cause = f"powers of temperature above order {order} are there"
+        remedy = f"Use `order` auto, or `order` {min(int(powers.max()), HIGHEST)}"
+        if fitted.options.method == "swarm":
+            remedy = "Use another `method`: swarm has no temperature terms"
+    size = {"rms": share * strength * scale, "unit": unit, "angle": np.degrees(share)}
+    return {"cause": cause, "remedy": remedy, **size}
 
 
 def _untested(fitted: FittedRuns) -> Flag:
     """Temperature terms that nothing tests."""
     bare = untested(fitted.result)
-    orders = np.array([t.model.basis.order for t in fitted.result.problem.triads])
-
-    def sentence(place: int) -> str:
-        order = int(orders[bare[place]].max())
-        unsaid = (
-            "no uncertainty here includes a curvature"
-            if order == 1
-            else "the uncertainty takes the next power to fall off as the last one did"
-        )
-        return (
-            f"{_joined(bare[place])}: {order + 1} temperatures are as many as a course of order {order} takes, so "
-            f"nothing tests it between them, and {unsaid}. Add a temperature between them."
-        )
-
-    return Flag("temperature-untested", np.any(bare, -1), sentence)
+    order = np.where(bare, orders_of(fitted.result), 0).max(-1)
+    last = "the uncertainty takes the next power to fall off as the last one did"
+    unsaid = np.where(order == 1, "no uncertainty here includes a curvature", last)
+    values = {"order": order, "levels": order + 1, "unsaid": unsaid}
+    triads = partial(_joined, bare)
+    return _remark("temperature-untested", np.any(bare, -1), triads=triads, **values)
 
 
 def _undetermined(fitted: FittedRuns) -> Iterator[Flag]:
     """Directions that nothing determines."""
-    places: dict[tuple[str, tuple[int, ...]], list[int]] = {}
-    for place, free in enumerate(fitted.free):
-        for entry in free:
-            places.setdefault((entry.id, entry.triads), []).append(place)
-    for (name, triads), some in places.items():
+    kinds = [[(entry.id, entry.triads) for entry in free] for free in fitted.free]
+    for name, triads in dict.fromkeys(kind for each in kinds for kind in each):
+        places = [place for place, each in enumerate(kinds) if (name, triads) in each]
         text = f"{' and '.join(TRIADS[triad] for triad in triads)}: {described(name)}."
-        yield _common(fitted, name, text, some)
+        yield _common(fitted, name, text, places)
 
 
 def _prior(fitted: FittedRuns) -> Iterator[Flag]:
@@ -293,49 +273,26 @@ def _prior(fitted: FittedRuns) -> Iterator[Flag]:
     if prior is None:
         return
     declared = {common_source(c.name) for c in constants if not c.unknown}
-    both = [name for name in prior.common if name in declared]
-    if both:
-        text = (
-            f"the prior ({prior.source}) and this run both have {', '.join(both)} in their uncertainty, and "
-            "count as independent there. On the same stand it is one error: what rests on it is then "
-            "stated up to 1.4 times too small."
-        )
-        yield _common(fitted, "prior-shared", text)
-    yield _prior_only(fitted, prior.source)
-    yield _prior_conflict(fitted, prior.source)
-
-
-def _prior_only(fitted: FittedRuns, source: str) -> Flag:
-    """Parameters that only the prior determines."""
-    problem, state = fitted.result.problem, fitted.result.state
-    bare = replace(problem, prior=Prior(0 * problem.prior.precision, problem.prior.expected))
-    named = free_directions(bare, state, Determined.of(bare, state))
-    ids = [{entry.id for entry in free} for free in fitted.free]
-    only = [[e.id for e in each if e.id not in free] for each, free in zip(named, ids, strict=True)]
-
-    def sentence(place: int) -> str:
-        names = dict.fromkeys(name.removeprefix("weak-") for name in only[place])
-        return (
-            f"this run does not determine {', '.join(names)}: there values and uncertainties "
-            f"rest on the prior ({source})."
-        )
-
-    return Flag("prior-only", np.array([*map(bool, only)]), sentence)
-
-
-def _prior_conflict(fitted: FittedRuns, source: str) -> Flag:
-    """A departure from the prior that is unlikely."""
+    both = ", ".join(name for name in prior.common if name in declared)
+    every = np.ones(fitted.count, bool)
+    yield _remark("prior-shared", every & bool(both), source=prior.source, both=both)
+    only = np.array([", ".join(names) for names in _prior_only(fitted)])
+    yield _remark("prior-only", only != "", source=prior.source, names=only)
     square, tested = departures(fitted.result)
     unlikely = tail(square, np.maximum(tested, 1)) <= MISFIT_CHANCE
+    ratio = np.sqrt(square / np.maximum(tested, 1))
+    yield _remark("prior-conflict", unlikely, source=prior.source, ratio=ratio)
 
-    def sentence(place: int) -> str:
-        ratio = np.sqrt(square[place] / tested[place])
-        return (
-            f"the run departs from the prior ({source}) by {ratio:.1f} times what both allow: the tool has "
-            "changed, or the prior is too narrow. Leave `prior` out, or widen it."
-        )
 
-    return Flag("prior-conflict", unlikely, sentence)
+def _prior_only(fitted: FittedRuns) -> list[dict[str, None]]:
+    """Parameters of each member that only the prior determines."""
+    problem, state = fitted.result.problem, fitted.result.state
+    bare = replace(problem, prior=Prior(0 * problem.prior.precision, problem.prior.expected))
+    without = free_directions(bare, state, Determined.of(bare, state))
+    return [
+        dict.fromkeys(e.id.removeprefix("weak-") for e in each if e.id not in {f.id for f in free})
+        for each, free in zip(without, fitted.free, strict=True)
+    ]
 
 
 def _model(fitted: FittedRuns) -> Iterator[Flag]:
@@ -348,61 +305,45 @@ def _model(fitted: FittedRuns) -> Iterator[Flag]:
         and triad.model.kind == "factors"
         and getattr(fitted.profile, name).nonlinearity
     ]
-    if ignored:
-        text = (
-            f"nonlinearity of the {' and '.join(ignored)} is not fitted: the model of factors "
-            "has no such terms. Use `model` polynomial for it."
-        )
-        yield _common(fitted, "nonlinearity-ignored", text)
-    if fitted.readings.relative:
-        text = (
-            "field strength is known at no station: the magnetometer is calibrated to field = 1. "
-        )
-        yield _common(fitted, "field-unknown", text + "Give ref_field_nt to have nT.")
-    if options.parameters < 12:
-        lost = "any misalignment" if options.parameters == 6 else "mounting rotation"
-        text = (
-            f"{options.parameters} parameters: {lost} of the sensors in the tool is taken as "
-            "none, and no uncertainty here includes it. Use `parameters` 12 to fit it."
-        )
-        yield _common(fitted, "restricted", text)
+    every = np.ones(fitted.count, bool)
+    yield _remark("nonlinearity-ignored", every & bool(ignored), triads=" and ".join(ignored))
+    yield _remark("field-unknown", every & fitted.readings.relative)
+    lost = {6: "any misalignment", 9: "mounting rotation"}.get(options.parameters, "")
+    yield _remark("restricted", every & bool(lost), parameters=options.parameters, lost=lost)
 
 
 def _reshoot(fitted: FittedRuns) -> Iterator[Flag]:
     """Stations to take again, with the reason."""
     again = stations_to_reshoot(fitted.result)
-
-    def sentence(place: int, station: int) -> str:
-        row = fitted.residuals(place).stations[station]
-        worst = row.worst or "gravity"
-        _, unit = shown_in(worst, fitted.readings.relative)
-        gap = "" if unit == "°" else " "
-        value = row.errors.get(worst, float("nan"))
-        size = (
-            f"{row.deviation:.1f}"
-            if row.deviation < LARGEST_DEVIATION
-            else f"more than {LARGEST_DEVIATION:.0f}"
-        )
-        alone, moves = (d.get(worst, 0.0) for d in (row.errors_left_out, row.influence))
-        return (
-            f"station {row.station}: residual {size}σ, most in {worst} "
-            f"({value:+.3g}{gap}{unit}; {alone:+.3g}{gap}{unit} if left out of the fit, which it moves "
-            f"by up to {moves:.2g}{gap}{unit}): {REASONS[worst]} Re-shoot it, or `exclude` {row.station}"
-        )
-
     for station in np.flatnonzero(again.any(0)).tolist():
-        yield Flag("reshoot", again[:, station], partial(sentence, station=station), station)
+        values = {"of": partial(_misfit, fitted, station)}
+        yield Flag("reshoot", again[:, station], REMARKS["reshoot"], values, station)
+
+
+def _misfit(fitted: FittedRuns, station: int, place: int) -> dict[str, Any]:
+    """The misfit of a station, where it is worst, and why that may be."""
+    row = fitted.residuals(place).stations[station]
+    worst = row.worst or "gravity"
+    measurable = row.deviation < LARGEST_DEVIATION
+    return {
+        "station": row.station,
+        "size": f"{row.deviation:.1f}" if measurable else f"more than {LARGEST_DEVIATION:.0f}",
+        "worst": worst,
+        "value": row.errors.get(worst, float("nan")),
+        "alone": row.errors_left_out.get(worst, 0.0),
+        "moves": row.influence.get(worst, 0.0),
+        "unit": spaced(shown_in(worst, fitted.readings.relative)[1]),
+        "reason": REASONS[worst],
+    }
 
 
 def _distrusted(fitted: FittedRuns) -> Flag:
     """Stations that a robust fit has nearly left out."""
     low = fitted.result.trust < LOW_WEIGHT
 
-    def sentence(place: int) -> str:
+    def stations(place: int) -> str:
         labels, weight = fitted.alone(place)[0].labels, fitted.result.trust[place]
         each = [f"{labels[i]} ({weight[i]:.1g})" for i in np.flatnonzero(low[place])]
-        return (
-            f"robust fit: low weight for station {_listed(each)}. Look at what they have in common."
-        )
+        return listed(each, STATIONS_NAMED)
 
-    return Flag("distrusted", np.any(low, -1), sentence)
+    return _remark("distrusted", np.any(low, -1), stations=stations)

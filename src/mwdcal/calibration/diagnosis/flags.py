@@ -1,4 +1,4 @@
-"""Flags: what holds of some members of a batch, and the sentence that says it of one of them.
+"""Flags: what holds of some members of a batch, and the words that say it of one of them.
 
 Refusals and findings are both flags, raised by operations on arrays with a leading tool axis. A single
 run is a batch of one, and its sentences state the same numbers.
@@ -6,9 +6,10 @@ run is a batch of one, and its sentences state the same numbers.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -29,40 +30,69 @@ Alone = Callable[[int], tuple[Readings, Profile]]
 
 @dataclass(frozen=True)
 class Flag:
-    """A refusal or a finding: its `id`, the `members` (B,) it holds of, and a sentence for one.
+    """A refusal or a finding: its `id`, the `members` (B,) it holds of, and the words for one.
 
+    The `words` have the names of `values` in braces: of an array (B, ...) the member's value is meant, of
+    a function what it returns for the member's place, and anything else is common to all members.
     `station` is the number of the station that it is about, if it is about one.
     """
 
     id: str
     members: Bools
-    sentence: Callable[[int], str]
+    words: str
+    values: Mapping[str, Any] = field(default_factory=dict)
     station: int | None = None
+
+    def sentence(self, place: int) -> str:
+        """What the flag says of one member."""
+        return self.words.format_map(_Values(self.values, place))
+
+
+@dataclass(frozen=True)
+class _Values:
+    """What fills in the words of a flag for the member at `place`."""
+
+    values: Mapping[str, Any]
+    place: int
+
+    def __getitem__(self, name: str) -> Any:
+        value = self.values[name]
+        if callable(value):
+            return value(self.place)
+        return value[self.place] if isinstance(value, np.ndarray) else value
+
+
+def listed(names: Sequence[str], most: int) -> str:
+    """The first few names, and how many more."""
+    more = len(names) - most
+    return ", ".join(names[:most]) + (f" and {more} more" if more > 0 else "")
+
+
+def spaced(unit: str) -> str:
+    """A unit as it stands behind a number: degrees without a space."""
+    return unit if unit == "°" else f" {unit}"
 
 
 @dataclass(frozen=True)
 class FittedRuns:
     """Fitted runs of one shape, as refusals and findings look at them.
 
-    `readings` (B, n, ...), the `profile` with its scales stated, the fit, and the free directions
-    of each member. `alone` gives a member by itself, for its sentences.
+    `readings` (B, n, ...), the `profile` with its scales stated, and the fit. `alone` gives a member by
+    itself, for its sentences.
     """
 
     readings: Readings
     profile: Profile
     options: Options
     result: Fit
-    free: list[list[Free]]
     alone: Alone
     _residuals: dict[int, Residuals] = field(init=False, repr=False, default_factory=dict)
 
-    @classmethod
-    def of(
-        cls, readings: Readings, profile: Profile, options: Options, result: Fit, alone: Alone
-    ) -> FittedRuns:
-        """Runs with a leading axis and their fit."""
-        free = free_directions(result.problem, result.state, result.analysis.determined)
-        return cls(readings, profile, options, result, free, alone)
+    @cached_property
+    def free(self) -> list[list[Free]]:
+        """Free directions of each member."""
+        result = self.result
+        return free_directions(result.problem, result.state, result.analysis.determined)
 
     @property
     def count(self) -> int:
@@ -85,7 +115,6 @@ class FittedRuns:
             self,
             readings=take(self.readings, index),
             result=take(self.result, index),
-            free=[self.free[place] for place in index],
             alone=lambda place: self.alone(int(index[place])),
         )
 

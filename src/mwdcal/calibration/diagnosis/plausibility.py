@@ -7,6 +7,7 @@ from functools import cache
 
 import numpy as np
 
+from mwdcal.calibration.diagnosis.soundness import invertible, mirrored
 from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.readings import EARTH_RANGES, Readings
 from mwdcal.calibration.residuals import RESHOOT, Residuals, chances, chi_chance, tail, to_reshoot
@@ -16,17 +17,7 @@ from mwdcal.estimation.minimisers import closed_form
 from mwdcal.estimation.rank import Free
 from mwdcal.estimation.solvers import Determined
 from mwdcal.estimation.uncertainty import ROTATIONS, TESTED, effective_freedom, station_misfit
-from mwdcal.geometry.vectors import (
-    Array,
-    Bools,
-    Ints,
-    centred,
-    diagonal,
-    eigen,
-    outer,
-    quotient,
-    solved,
-)
+from mwdcal.geometry.vectors import Array, Bools, Ints, centred, diagonal, eigen, outer, quotient
 
 BENIGN_DIRECTIONS = (*ROTATIONS, "scale")
 """Directions that may stay free."""
@@ -42,8 +33,6 @@ SMALLEST_EXPECTATION = 1e-12
 """Expectations below this, in the unit of the observable, are rounding."""
 NOISE_RATIO = 3.0
 """Residuals of a robust fit that exceed the declared noise this many times are reported."""
-VARIANCE_RIDGE = 1e-9
-"""What is added to variances (of whitened readings: 0…1), so that they have an inverse."""
 LEEWAY = 1.01
 """A station is suspect already if a bound is as unlikely as this many times the limit."""
 
@@ -67,6 +56,16 @@ def gain_shares(result: Fit, index: int) -> tuple[Array, Array]:
     gain = diagonal(slope)
     middle = np.median(np.linalg.norm(slope, axis=-1), -1, keepdims=True)
     return gain, gain / middle
+
+
+def has_sensor_gains(result: Fit, temperature: Array) -> Bools:
+    """Fits (B,) whose gains at temperatures (B, k) are such as a sensor has."""
+    problem, gains = result.problem, []
+    for triad, where in zip(problem.triads, problem.slices(), strict=True):
+        middle = np.broadcast_to(triad.raw.mean(1, keepdims=True), (*temperature.shape, 3))
+        slope = triad.model.slope(result.state.params[:, where], middle, temperature)
+        gains.append(invertible(slope) & ~mirrored(slope))
+    return np.asarray(np.all(gains, 0))
 
 
 def off_earth(result: Fit, name: str, coil: bool) -> Bools:
@@ -94,9 +93,8 @@ def overturned(result: Fit) -> Array:
     if len(problem.triads) == 1:
         return dips
     referenced = problem.evidence.is_known("azimuth").any(-1)
-    for index, constant in enumerate(problem.evidence.constants):
-        if constant.name != "dip" or not constant.unknown:
-            continue
+    constants = enumerate(problem.evidence.constants)
+    for index in [place for place, c in constants if c.name == "dip" and c.unknown]:
         dip = centred(result.state.constants[:, index], 2 * np.pi)
         variance = np.nan_to_num(result.analysis.constants[:, index, index])
         sd = np.sqrt(np.maximum(variance, 0.0))  # by rounding it may be below
@@ -220,7 +218,7 @@ def _suspects(result: Fit) -> Bools:
     """Members (B,) of which some station's misfit may be too large.
 
     With declared noise and no robust weights χ² itself must be. It is bounded from above by what
-    the trace of the residuals' covariance says, whose eigenvalues are 0…1, then by its inverse.
+    the trace of the residuals' covariance says, whose eigenvalues are 0…1.
     """
     analysis = result.analysis
     residual, spread = analysis.residual, analysis.spread
@@ -230,12 +228,8 @@ def _suspects(result: Fit) -> Bools:
     good = np.sum(residual**2, -1) < likely(size, chance) * smallest
     good &= (smallest > TESTED) & (analysis.influence is None)
     tool, station = np.nonzero(~good & ~suspect[:, None])
-    left = residual[tool, station]
-    whole = spread[tool, station] + VARIANCE_RIDGE * np.eye(size)
-    bound = np.sum(left * solved(whole, left[..., None])[..., 0], -1)
-    large = ~(bound <= likely(1, chance))
-    tool, station, left = tool[large], station[large], left[large]
-    some = replace(analysis, residual=left[None], spread=spread[None, tool, station])
+    left = residual[None, tool, station]
+    some = replace(analysis, residual=left, spread=spread[None, tool, station])
     suspect[tool[tail(*station_misfit(some))[0] < LEEWAY * chance]] = True
     return np.asarray(suspect)
 

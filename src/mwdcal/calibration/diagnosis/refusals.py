@@ -7,42 +7,46 @@ single run is refused by the first flag that holds, and so is each tool of a fle
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
+from typing import Any
 
 import numpy as np
 
 from mwdcal.calibration.diagnosis.axes import explaining
-from mwdcal.calibration.diagnosis.flags import FittedRuns, Flag
-from mwdcal.calibration.diagnosis.noise_refusals import coarse_noise, unsound
+from mwdcal.calibration.diagnosis.flags import FittedRuns, Flag, listed, spaced
 from mwdcal.calibration.diagnosis.plausibility import (
     excessive_errors,
     gain_shares,
+    has_sensor_gains,
     inseparable,
     is_bad,
     off_earth,
     overturned,
     straying,
 )
+from mwdcal.calibration.diagnosis.soundness import is_covariance
 from mwdcal.calibration.diagnosis.structure import described, effects
 from mwdcal.calibration.methods import EVIDENCE
 from mwdcal.calibration.options import Options
-from mwdcal.calibration.readings import CONSTANTS, EARTH_RANGES, TRIADS, Readings
+from mwdcal.calibration.readings import CONSTANTS, EARTH_RANGES, TRIADS, Readings, soaks
 from mwdcal.calibration.residuals import shown_in
-from mwdcal.calibration.soaks import soaks
+from mwdcal.calibration.results import temperature_range
 from mwdcal.errors import FitError, InputError
 from mwdcal.estimation.batch import batch_of_one
 from mwdcal.estimation.robust import LOSSES
 from mwdcal.estimation.solvers import Status
 from mwdcal.estimation.uncertainty import station_misfit
 from mwdcal.geometry.vectors import Array, Bools
+from mwdcal.sensor.models import Basis, Factors, Polynomial, Whole, restricted
 from mwdcal.sensor.profile import COMMON
 
 GAIN_RANGE = (0.3, 3.0)
 """An own-axis gain outside this share of nominal is a wrong profile, not a sensor error."""
 MOTION_RANGE = (1e-2, 30.0)
 """A channel that moves by less or more than this share of the field has not seen the field."""
+DECLARED_NOISE = 0.3
+"""Declared noise of more than this share of the field at every station is a wrong unit."""
 PARAMETERS_NAMED = 4
 """Most undetermined parameters that a message lists."""
 ABSURD_RATIO = 30.0
@@ -55,13 +59,98 @@ BAD_INPUT = "bad-input"
 """The status of what is wrong with the input itself: an `InputError` of a single run."""
 NEEDS = {
     "newton": ("inclination",),
-    "swarm": ("inclination", "toolface"),
-    "least-squares": ("inclination", "toolface"),
+    "swarm": ("inclination", "toolface", "azimuth", "dip"),
+    "least-squares": ("inclination", "toolface", "azimuth"),
     "toolface-inclination": ("inclination", "toolface"),
 }
-"""Reference angles that a method needs at every station."""
+"""Reference angles that a method needs at every station, those of the field for a magnetometer."""
+STRENGTH_COLUMNS = {
+    "gravity": ("ref_gravity_g", 1.0, "g", ""),
+    "field": ("ref_field_nt", 1e-3, "µT", "; of a run in a coil, say coil = true under [stand]"),
+}
+"""Column of each strength, factor and unit in which a message has it, and a remedy besides."""
+TOOL_AXES = np.array([*"xyz"])
 Run = Callable[[int], Readings]
 """Readings of one member of a batch, without leading axis: their labels and source."""
+Words = dict[str, Any]
+"""What fills in the words of a flag, by name."""
+
+OF_OPTIONS = {
+    "method": f"`method` must be one of {', '.join(EVIDENCE)}; got {{options.method!r}}.",
+    "parameters": "`parameters` must be 6, 9 or 12; got {options.parameters}.",
+    "robust": f"`robust` must be one of {', '.join(LOSSES)}; got {{options.robust!r}}.",
+    "ignore": f"`ignore` must be of {', '.join(CONSTANTS)}; got {{unknown[0]!r}}.",
+    "ignore and method": "`ignore` needs `method` joint; got {options.method!r}, which says itself what it uses.",
+    "nonlinearity and model": "`nonlinearity` {curved[0]}: the model of factors has no own-axis terms. Use `model` "
+    "polynomial with it.",
+    "robust and minimiser": "`robust` cannot weigh the stations of {minimiser}. Use `method` joint with it.",
+    "nonlinearity and minimiser": "`nonlinearity` cannot be combined with {minimiser}: own-axis terms need their "
+    "prior. Use `method` joint, or `nonlinearity` none.",
+    "order and swarm": "method swarm finds the 12 parameters of one temperature: use `order` 0 for it, or `method` "
+    "joint for temperature terms.",
+    "parameters and swarm": "`parameters` {options.parameters} cannot be combined with method swarm, which finds all "
+    "twelve. Use `method` least-squares: both meet on the same cost.",
+    "weights and joint": "`paper_weights`: method joint does not come from a paper. Name the paper's method: "
+    "least-squares, swarm, newton, toolface-inclination or scalar.",
+    "prior and nonlinearity": "`prior` cannot be combined with own-axis nonlinearity. Use `method` joint, without "
+    "`paper_weights` and with `nonlinearity` none.",
+    "prior and minimiser": "`prior` cannot be combined with {minimiser}. Use `method` joint, without `paper_weights` "
+    "and with `nonlinearity` none.",
+}
+"""Why options do not go together."""
+UNSOUND_ADVICE = (
+    "Check 'noise' and 'repeatability' in the tool profile and the columns sd_: all are in the raw units of their "
+    "channel; without them the noise is estimated."
+)
+"""What to do where a fit has no valid covariance."""
+OF_READINGS = {
+    "few": "{source} has {count} stations; the model has {size} parameters per triad and needs {needed} or more. Add "
+    "stations at other attitudes{remedy}.",
+    "common": "{takes} the stand as exact, and [stand] of the tool profile declares {declared}: no uncertainty would "
+    "include it. Use `method` least-squares or joint without `paper_weights`, or take it out of the profile.",
+    "dead": "{source}: the {triad} channel on tool axis {axis} does not move: the same value at all {count} stations. "
+    "A dead sensor, a wrong column, or all stations in one attitude; check the wiring and the columns.",
+    "little": "{source}: the {triad} channel on tool axis {axis} moves by {moved:.3g} {unit} over the run, too little "
+    "to calibrate it. Add stations at other inclinations and toolfaces; if there are, look for a dead sensor, a wrong "
+    "column, or a wrong 'scale' of [{triad}] in the tool profile.",
+    "much": "{source}: the {triad} channel on tool axis {axis} moves by {moved:.3g} {unit} over the run, more than any "
+    "field explains. Look for a wrong column or cell, or a wrong 'scale' of [{triad}] in the tool profile.",
+    "noise": "the declared noise of the {triad} is {share:.2g} times the field that it measures, or more. 'noise' and "
+    "'repeatability' of [{triad}] in the tool profile and the columns sd_ are in the raw units of the channels, such "
+    "as V: correct them, or leave them out and the noise is estimated.",
+    "no temperature": "`order` {order} needs the column 'temperature_c'; use `order` 0.",
+    "span": "the run spans {span:.1f} °C with {levels} temperature{plural} more than 5 °C apart: too little for "
+    "`order` {order}, which needs {needed} of them over {range} °C or more. Add temperatures, or lower `order`.",
+    "blank": "method {method} needs {needed} at every station; 'ref_{name}_deg' is blank at {blank} of {count} "
+    "(first: station {first}). Fill it in, or use `method` joint, which takes what is known.",
+}
+"""Why no fit of a run can be good."""
+OF_FITS = {
+    "inseparable": "`estimate` {errors}: these stations cannot tell it from the sensors' own errors. Add stations at "
+    "other azimuths and inclinations with references, or leave it out.",
+    "unsettled": "the fit failed: {message}.{axes}",
+    "residuals": "the {triad}'s residuals are {much}: no sensor model explains these readings. Check that columns, "
+    "reference angles and groups belong to the stations they stand at, and 'axes' and 'noise' in the tool "
+    "profile.{culprit}{axes}",
+    "weak-geometry": "the stations are too weak to fit the model: nothing determines {names}. Add stations at other "
+    "inclinations (at least three, well apart, up and down) with six or more toolfaces each, or give more reference "
+    "angles.{axes}",
+    "no-redundancy": "the {triad} has no redundancy ({freedom:.1f} degrees of freedom): its noise cannot be estimated. "
+    "Add stations, or declare 'noise' in the tool profile.",
+    "gain": "the {triad}'s gain on tool axis {axis} comes out at {gain:.3g} times nominal and {wrong} (accepted: "
+    "{range[0]}…{range[1]}). Check 'axes' and 'scale' of [{triad}] in the tool profile, and the reference "
+    "angles.{axes}",
+    "overturned": "the dip comes out at {dip:.1f}°, beyond vertical (accepted: -90…90): the magnetometer reads the "
+    "reverse of the field, or the reference azimuths are 180° off. Check 'axes' of [magnetometer] in the tool "
+    "profile, and ref_azimuth_deg.{axes}",
+    "off earth": "no place on Earth has a {what} of {value:.4g} {unit} ({low:g}…{high:g}): {given} so. Check "
+    "{column} and its unit, and 'scale' in the tool profile{coil}.",
+    "errors": "the errors of {of[name]} after calibration are {of[after]:.3g}{of[unit]} (root mean square), where the "
+    "misfit of the run explains {of[expected]:.2g}{of[unit]}. Check the references of {of[name]} and 'axes' in the "
+    "tool profile, or declare 'noise' and [stand] as they are.{looks}{culprit}{axes}",
+    "unsound": "the fit gives no valid covariance, or gains that no sensor has: {noise}. {advice}{axes}",
+}
+"""Why a fit cannot be trusted."""
 
 
 def check(refusals: Iterable[Flag]) -> None:
@@ -83,90 +172,62 @@ def check_readings(readings: Readings, options: Options) -> None:
 
 def check_options(options: Options) -> None:
     """Refuse choices that do not go together."""
-    method = options.method
-    if method not in EVIDENCE:
-        raise InputError(f"`method` must be one of {', '.join(EVIDENCE)}; got {method!r}.")
-    if options.parameters not in (6, 9, 12):
-        raise InputError(f"`parameters` must be 6, 9 or 12; got {options.parameters}.")
-    if options.robust not in (None, *LOSSES):
-        raise InputError(f"`robust` must be one of {', '.join(LOSSES)}; got {options.robust!r}.")
-    _check_ignored(options)
-    _check_curved_models(options)
-    minimiser = "the paper's weights" if options.paper_weights else f"method {method}"
-    if options.separate_solver and options.robust:
-        raise InputError(
-            f"`robust` cannot weigh the stations of {minimiser}. Use `method` joint with it."
-        )
-    if options.separate_solver and options.curved:
-        raise InputError(
-            f"`nonlinearity` cannot be combined with {minimiser}: own-axis terms need their prior. Use "
-            "`method` joint, or `nonlinearity` none."
-        )
-    if method == "swarm" and max(options.orders):
-        raise FitError(
-            "method swarm finds the 12 parameters of one temperature: use `order` 0 for it, or "
-            "`method` joint for temperature terms."
-        )
-    if method == "swarm" and options.parameters < 12:
-        raise InputError(
-            f"`parameters` {options.parameters} cannot be combined with method swarm, which finds all "
-            "twelve. Use `method` least-squares: both meet on the same cost."
-        )
-    if options.paper_weights and method == "joint":
-        raise InputError(
-            "`paper_weights`: method joint does not come from a paper. Name the paper's method: least-squares, "
-            "swarm, newton, toolface-inclination or scalar."
-        )
-    if options.prior and (options.separate_solver or options.curved):
-        what = "own-axis nonlinearity" if options.curved else minimiser
-        raise InputError(
-            f"`prior` cannot be combined with {what}. Use `method` joint, without "
-            "`paper_weights` and with `nonlinearity` none."
-        )
+    alone, swarm = options.separate_solver, options.method == "swarm"
+    unknown = [name for name in options.ignore if name not in CONSTANTS]
+    models = dict(zip(TRIADS, map(options.kind, options.orders), strict=True))
+    curved = [name for name in TRIADS if name in options.curved and models[name] != "polynomial"]
+    wrong = {
+        "method": options.method not in EVIDENCE,
+        "parameters": options.parameters not in (6, 9, 12),
+        "robust": options.robust not in (None, *LOSSES),
+        "ignore": unknown,
+        "ignore and method": options.ignore and options.method != "joint",
+        "nonlinearity and model": curved,
+        "robust and minimiser": alone and options.robust,
+        "nonlinearity and minimiser": alone and options.curved,
+        "order and swarm": swarm and max(options.orders),
+        "parameters and swarm": swarm and options.parameters < 12,
+        "weights and joint": options.paper_weights and options.method == "joint",
+        "prior and nonlinearity": options.prior and options.curved,
+        "prior and minimiser": options.prior and alone,
+    }
+    first = next((name for name, holds in wrong.items() if holds), None)
+    if first:
+        error = FitError if first == "order and swarm" else InputError
+        values = {"options": options, "unknown": unknown, "curved": curved}
+        raise error(OF_OPTIONS[first].format(minimiser=minimiser(options), **values))
 
 
-def _check_curved_models(options: Options) -> None:
-    """Refuse own-axis terms of a model that has none."""
-    for name, order in zip(TRIADS, options.orders, strict=True):
-        if name in options.curved and options.kind(order) != "polynomial":
-            raise InputError(
-                f"`nonlinearity` {name}: the model of factors has no own-axis terms. Use "
-                "`model` polynomial with it."
-            )
+def minimiser(options: Options) -> str:
+    """What an own minimiser is called."""
+    return "the paper's weights" if options.paper_weights else f"method {options.method}"
 
 
-def check_curves(readings: Readings, wanted: Sequence[str]) -> None:
+def check_curves(readings: Readings, wanted: Iterable[str]) -> None:
     """Refuse own-axis terms of a triad that the run does not have."""
     for name in wanted:
-        if getattr(readings, name) is None:
+        if name not in readings.triads:
             raise InputError(
                 f"`nonlinearity` {name}: {readings.source} has no {name}. Leave it out."
             )
 
 
-def _check_ignored(options: Options) -> None:
-    """Refuse to ignore anything but strengths and dip, or with a method that fixes what it uses."""
-    unknown = [name for name in options.ignore if name not in CONSTANTS]
-    if unknown:
-        raise InputError(f"`ignore` must be of {', '.join(CONSTANTS)}; got {unknown[0]!r}.")
-    if options.ignore and options.method != "joint":
-        raise InputError(
-            f"`ignore` needs `method` joint; got {options.method!r}, which says itself what it uses."
-        )
-
-
 def reading_refusals(readings: Readings, options: Options, run: Run) -> Iterator[Flag]:
     """What no fit of runs (B, n, ...) can make good, in order of precedence."""
-    yield _few_stations(readings, options, run)
+
+    def source(place: int) -> str:
+        return run(place).source or "the run"
+
+    words = {"source": source, "count": readings.count}
+    yield _few_stations(readings, options, words)
     yield _common_errors(readings, options)
-    for triad in TRIADS:
-        yield from _channels(readings, triad, options.knowledge is not None, run)
-        yield coarse_noise(readings, triad)
+    for triad in readings.triads:
+        yield from _channels(readings, triad, options.knowledge is not None, words)
+        if triad in readings.sd:
+            yield _coarse_noise(readings, triad)
     if options.knowledge is None or options.knowledge.temperature is None:
         yield from _temperatures(readings, max(options.orders))
-    needed = _references(options.method, readings.magnetometer is not None)
-    for name in needed:
-        yield _blank(readings, options.method, needed, name, run)
+    yield from _blanks(readings, options.method, run)
 
 
 def _all(readings: Readings, hold: bool) -> Bools:
@@ -174,131 +235,97 @@ def _all(readings: Readings, hold: bool) -> Bools:
     return np.full(len(readings.accelerometer), hold)
 
 
-def _few_stations(readings: Readings, options: Options, run: Run) -> Flag:
+def _few_stations(readings: Readings, options: Options, words: Words) -> Flag:
     """Fewer readings than parameters; with a prior any number will do."""
-    highest = max(options.orders)
-    factors = options.kind(highest) == "factors"
-    size = 6 * (highest + 1) + 6 if factors else 12 * (highest + 1)
-    size -= (12 - options.parameters) * (1 if factors else highest + 1)
-
-    def sentence(place: int) -> str:
-        return (
-            f"{run(place).source or 'the run'} has {readings.count} stations; the model has {size} "
-            f"parameters per triad and needs {-(-size // 3)} or more. Add stations at other "
-            f"attitudes{', or lower `order`' if highest else ''}."
-        )
-
+    order = max(options.orders)
+    basis, factors = Basis(order), options.kind(order) == "factors"
+    model: Whole = Factors(basis) if factors else Polynomial(basis)
+    size = restricted(model, options.parameters).size
     few = 3 * readings.count < size and options.knowledge is None
-    return Flag("too-few-stations", _all(readings, few), sentence)
-
-
-def holds_stand(options: Options) -> bool:
-    """Whether a method takes the stand as exact: errors common to its stations have no place in it."""
-    return options.method == "swarm" or options.paper_weights
+    remedy = ", or lower `order`" if order else ""
+    values = words | {"size": size, "needed": -(-size // 3), "remedy": remedy}
+    return Flag("too-few-stations", _all(readings, few), OF_READINGS["few"], values)
 
 
 def _common_errors(readings: Readings, options: Options) -> Flag:
     """Declared errors that all stations share where the method cannot have them as unknowns."""
     declared = [name for name in COMMON if name in readings.sd]
-    method = f"method {options.method} takes"
-    what = "the paper's weights take" if options.paper_weights else method
-    text = (
-        f"{what} the stand as exact, and [stand] of the tool profile declares {', '.join(declared)}: no "
-        "uncertainty would include it. Use `method` least-squares or joint without `paper_weights`, or "
-        "take it out of the profile."
-    )
-    held = bool(declared) and holds_stand(options)
-    return Flag("common-errors", _all(readings, held), lambda _: text)
+    exact = options.method == "swarm" or options.paper_weights
+    takes = f"{minimiser(options)} take{'' if options.paper_weights else 's'}"
+    values = {"takes": takes, "declared": ", ".join(declared)}
+    held = _all(readings, bool(declared) and exact)
+    return Flag("common-errors", held, OF_READINGS["common"], values)
 
 
-def _channels(readings: Readings, triad: str, prior: bool, run: Run) -> Iterator[Flag]:
+def _channels(readings: Readings, triad: str, prior: bool, words: Words) -> Iterator[Flag]:
     """Channels that are dead or cannot have seen the field; a prior needs no motion."""
     values = getattr(readings, triad)
-    if values is None:
-        return
     spread = np.ptp(np.ascontiguousarray(values.mT), axis=-1)
     dead = spread <= 1e-12 * np.abs(values).max((-1, -2))[:, None]
     name, unit = ("gravity", "g") if triad == "accelerometer" else ("field", "nT")
     known = readings.reference(name)
     given = np.sum(~np.isnan(known), -1)
-    share = (
-        spread / np.where(given > 0, np.nansum(known, -1) / np.maximum(given, 1), np.nan)[:, None]
-    )
+    mean = np.where(given > 0, np.nansum(known, -1) / np.maximum(given, 1), np.nan)
+    share = spread / mean[:, None]
     odd = (share < (0.0 if prior else MOTION_RANGE[0])) | (share > MOTION_RANGE[1])
+    words = words | {"triad": triad, "unit": unit}
+    still = words | {"axis": TOOL_AXES[np.argmax(dead, -1)]}
+    yield Flag("channel", np.any(dead, -1), OF_READINGS["dead"], still)
+    axis = np.argmax(odd, -1)
+    first = np.arange(len(axis)), axis
+    moving = words | {"axis": TOOL_AXES[axis], "moved": spread[first]}
+    little = share[first] < MOTION_RANGE[0]
+    yield Flag("channel", np.any(odd, -1) & little, OF_READINGS["little"], moving)
+    yield Flag("channel", np.any(odd, -1) & ~little, OF_READINGS["much"], moving)
 
-    def where(place: int, flags: Bools) -> tuple[int, str]:
-        axis = int(np.argmax(flags[place]))
-        source = run(place).source or "the run"
-        return axis, f"{source}: the {triad} channel on tool axis {'xyz'[axis]}"
 
-    def still(place: int) -> str:
-        return (
-            f"{where(place, dead)[1]} does not move: the same value at all {readings.count} stations. "
-            "A dead sensor, a wrong column, or all stations in one attitude; check the wiring and "
-            "the columns."
-        )
+def _coarse_noise(readings: Readings, triad: str) -> Flag:
+    """Declared noise that leaves nothing of the field, on some channel at every station."""
+    values = getattr(readings, triad)
+    least = np.broadcast_to(readings.sd[triad], values.shape).min(-2)
+    share = least / _strength(values)[:, None]
+    coarse = np.any(share > DECLARED_NOISE, -1)
+    return Flag("noise", coarse, OF_READINGS["noise"], {"triad": triad, "share": share.max(-1)})
 
-    def moving(place: int) -> str:
-        axis, channel = where(place, odd)
-        moves = f"{channel} moves by {spread[place, axis]:.3g} {unit} over the run, "
-        scale = f"a wrong 'scale' of [{triad}] in the tool profile"
-        if share[place, axis] < MOTION_RANGE[0]:
-            return (
-                f"{moves}too little to calibrate it. Add stations at other inclinations and "
-                f"toolfaces; if there are, look for a dead sensor, a wrong column, or {scale}."
-            )
-        return f"{moves}more than any field explains. Look for a wrong column or cell, or {scale}."
 
-    yield Flag("channel", np.any(dead, -1), still)
-    yield Flag("channel", np.any(odd, -1), moving)
+def _strength(raw: Array) -> Array:
+    """Mean strength (...) of readings (..., n, 3), at least 1e-30."""
+    return np.asarray(np.maximum(np.linalg.norm(raw, axis=-1).mean(-1), 1e-30))
 
 
 def no_temperature(order: int) -> InputError:
     """The error of an order that needs temperatures in a run without them."""
-    return InputError(f"`order` {order} needs the column 'temperature_c'; use `order` 0.")
+    return InputError(OF_READINGS["no temperature"].format(order=order))
 
 
 def _temperatures(readings: Readings, order: int) -> Iterator[Flag]:
     """Temperatures that are too few or too close for an order."""
     if order == 0:
         return
+    needs = {"order": order, "needed": order + 1, "range": 10 * order}
     if readings.temperature is None:
-        yield Flag(BAD_INPUT, _all(readings, True), lambda _: str(no_temperature(order)))
+        yield Flag(BAD_INPUT, _all(readings, True), OF_READINGS["no temperature"], needs)
         return
     levels, span = soaks(readings.temperature).max(-1) + 1, np.ptp(readings.temperature, axis=-1)
-
-    def sentence(place: int) -> str:
-        count = int(levels[place])
-        return (
-            f"the run spans {span[place]:.1f} °C with {count} temperature{'s' * (count > 1)} more than 5 °C "
-            f"apart: too little for `order` {order}, which needs {order + 1} of them over {10 * order} °C or more. "
-            "Add temperatures, or lower `order`."
-        )
-
-    yield Flag("temperature-span", (levels < order + 1) | (span < 10 * order), sentence)
+    few = (levels < order + 1) | (span < 10 * order)
+    values = {"span": span, "levels": levels, "plural": np.where(levels > 1, "s", "")}
+    yield Flag("temperature-span", few, OF_READINGS["span"], needs | values)
 
 
-def _references(method: str, magnetometer: bool) -> list[str]:
-    """Reference angles that a method needs at every station of a run."""
-    needed = list(NEEDS.get(method, ()))
-    if magnetometer and method in ("least-squares", "swarm"):
-        needed += ["azimuth", "dip"][: 1 + (method == "swarm")]
-    return needed
+def _blanks(readings: Readings, method: str, run: Run) -> Iterator[Flag]:
+    """Blanks of reference angles that a method needs at every station."""
+    magnetic = () if readings.magnetometer is not None else ("azimuth", "dip")
+    needed = [name for name in NEEDS.get(method, ()) if name not in magnetic]
+    words = {"method": method, "needed": ", ".join(needed), "count": readings.count}
+    for name in needed:
+        blank = np.isnan(readings.reference(name))
+        values = {"name": name, "blank": blank.sum(-1), "first": partial(_first, run, blank)}
+        yield Flag("missing-reference", np.any(blank, -1), OF_READINGS["blank"], words | values)
 
 
-def _blank(readings: Readings, method: str, needed: list[str], name: str, run: Run) -> Flag:
-    """Blanks of a reference, of those that a method needs at every station."""
-    blank = np.isnan(readings.reference(name))
-
-    def sentence(place: int) -> str:
-        first = run(place).labels[int(np.argmax(blank[place]))]
-        return (
-            f"method {method} needs {', '.join(needed)} at every station; 'ref_{name}_deg' is "
-            f"blank at {int(blank[place].sum())} of {readings.count} (first: station {first}). Fill it "
-            "in, or use `method` joint, which takes what is known."
-        )
-
-    return Flag("missing-reference", np.any(blank, -1), sentence)
+def _first(run: Run, stations: Bools, place: int) -> str:
+    """The label of the first of some stations (B, n) of a run."""
+    return run(place).labels[int(np.argmax(stations[place]))]
 
 
 def fit_refusals(fitted: FittedRuns) -> Iterator[Flag]:
@@ -311,87 +338,55 @@ def fit_refusals(fitted: FittedRuns) -> Iterator[Flag]:
     for flag in _by_arrays(fitted):
         sound &= ~flag.members
         yield flag
-    yield _naming_axes(fitted, _unexplained_errors(fitted, sound))
+    yield _unexplained_errors(fitted, sound)
 
 
 def _by_arrays(fitted: FittedRuns) -> Iterator[Flag]:
     """Refusals that operations on arrays find."""
-    triads, named = range(len(fitted.result.problem.triads)), partial(_naming_axes, fitted)
+    result, refusal = fitted.result, partial(_refusal, fitted)
+    triads = range(len(result.problem.triads))
     if fitted.options.estimate:
-        yield _inseparable(fitted)
+        errors = ",".join(fitted.options.estimate)
+        yield refusal("inseparable", inseparable(result), errors=errors)
     for status in (Status.NOT_CONVERGED, Status.NOT_FINITE):
-        yield named(_unsettled(fitted, status))
+        unsettled = result.status == int(status)
+        name = status.name.lower().replace("_", "-")
+        yield refusal("unsettled", unsettled, name, message=status.message)
     for triad in triads:
-        yield named(_absurd(fitted, triad))
-    yield named(_too_weak(fitted))
+        yield _absurd(fitted, triad)
+    yield _too_weak(fitted)
     for triad in triads:
-        yield _without_redundancy(fitted, triad)
+        freedom = result.analysis.freedom[:, triad]
+        bare = np.isfinite(result.noise[:, triad]) & (freedom < 1)
+        least = np.maximum(freedom, 0)
+        yield refusal("no-redundancy", bare, triad=TRIADS[triad], freedom=least)
     for triad in triads:
-        yield named(_odd_gain(fitted, triad))
-    yield named(_beyond_vertical(fitted))
+        yield _odd_gain(fitted, triad)
+    dip = np.degrees(overturned(result))
+    yield refusal("overturned", np.isfinite(dip), "earth", dip=dip)
     for name in EARTH_RANGES:
         yield _nowhere_on_earth(fitted, name)
-    yield named(unsound(fitted))
+    yield _unsound(fitted)
 
 
-def _naming_axes(fitted: FittedRuns, flag: Flag) -> Flag:
-    """A refusal that also names the axes with which the run would fit, if there are any."""
+def _refusal(
+    fitted: FittedRuns, words: str, members: Bools, status: str = "", **values: Any
+) -> Flag:
+    """A refusal of fits by its words, whose name is the status if no other is given.
 
-    def sentence(place: int) -> str:
-        text = flag.sentence(place)
-        each = [
-            f"axes = {json.dumps(axes)} of [{name}]"
-            for name, axes in explaining(*fitted.alone(place)).items()
-        ]
-        return f"{text} The run fits with {' and '.join(each)}." if each else text
-
-    return replace(flag, sentence=sentence)
+    The words may end with the station to look at first, and with the axes with which the run would fit.
+    """
+    ends = {"culprit": partial(_culprit, fitted), "axes": partial(_axes, fitted)}
+    return Flag(status or words, members, OF_FITS[words], ends | values)
 
 
-def _inseparable(fitted: FittedRuns) -> Flag:
-    """Stand errors that the stations cannot tell from the sensors' own errors."""
-    text = (
-        f"`estimate` {','.join(fitted.options.estimate)}: these stations cannot tell it from the sensors' own "
-        "errors. Add stations at other azimuths and inclinations with references, or leave it out."
-    )
-    return Flag("inseparable", inseparable(fitted.result), lambda _: text)
-
-
-def _unsettled(fitted: FittedRuns, status: Status) -> Flag:
-    """Fits that did not end well."""
-    name, text = status.name.lower().replace("_", "-"), f"the fit failed: {status.message}."
-    return Flag(name, fitted.result.status == int(status), lambda _: text)
-
-
-def _absurd(fitted: FittedRuns, index: int) -> Flag:
-    """Residuals that no error of a sensor explains: columns, references or groups are mixed up."""
-    result, raw = fitted.result, fitted.result.problem.triads[index].raw
-    excess = np.sqrt(np.nan_to_num(result.analysis.variance_factor[:, index]))
-    noise = result.noise[:, index]
-    declared = np.isnan(noise)
-    absurd = declared & (excess > ABSURD_RATIO)
-    if not declared.all():
-        absurd |= noise > COARSE_NOISE * _signal(raw)
-
-    def sentence(place: int) -> str:
-        much = (
-            f"{excess[place]:.0f} times the declared noise"
-            if declared[place]
-            else f"{noise[place] / _signal(raw)[place]:.0%} of the field"
-        )
-        return (
-            f"the {TRIADS[index]}'s residuals are {much}: no sensor model explains these readings. Check "
-            "that columns, reference angles and groups belong to the stations they stand at, and "
-            f"'axes' and 'noise' in the tool profile.{_culprit(fitted, place)}"
-        )
-
-    return Flag("residuals", absurd & (result.analysis.freedom[:, index] >= 1), sentence)
-
-
-def _signal(raw: Array) -> Array:
-    """Size (B,) of what readings (B, n, 3) measure, at least 1e-300."""
-    strength = np.linalg.norm(raw, axis=-1).mean(-1)
-    return np.asarray(np.maximum(np.minimum(strength, 2 * raw.std(axis=1).max(-1)), 1e-300))
+def _axes(fitted: FittedRuns, place: int) -> str:
+    """The axes with which a run would fit, in words; nothing if there are none."""
+    each = [
+        f"axes = {json.dumps(axes)} of [{name}]"
+        for name, axes in explaining(*fitted.alone(place)).items()
+    ]
+    return f" The run fits with {' and '.join(each)}." if each else ""
 
 
 def _culprit(fitted: FittedRuns, place: int) -> str:
@@ -408,36 +403,32 @@ def _culprit(fitted: FittedRuns, place: int) -> str:
     )
 
 
+def _absurd(fitted: FittedRuns, index: int) -> Flag:
+    """Residuals that no error of a sensor explains: columns, references or groups are mixed up."""
+    result, raw = fitted.result, fitted.result.problem.triads[index].raw
+    excess = np.sqrt(np.nan_to_num(result.analysis.variance_factor[:, index]))
+    noise = result.noise[:, index]
+    declared, signal = np.isnan(noise), np.minimum(_strength(raw), 2 * raw.std(axis=1).max(-1))
+    absurd = np.where(declared, excess > ABSURD_RATIO, noise > COARSE_NOISE * signal)
+
+    def much(place: int) -> str:
+        if declared[place]:
+            return f"{excess[place]:.0f} times the declared noise"
+        return f"{noise[place] / signal[place]:.0%} of the field"
+
+    absurd &= result.analysis.freedom[:, index] >= 1
+    return _refusal(fitted, "residuals", absurd, triad=TRIADS[index], much=much)
+
+
 def _too_weak(fitted: FittedRuns) -> Flag:
     """Rotations and scales may stay free; anything else is a design too weak to fit."""
     bad = [[entry for entry in free if is_bad(entry)] for free in fitted.free]
 
-    def sentence(place: int) -> str:
+    def names(place: int) -> str:
         each = [f"{TRIADS[t]} {e.id.removeprefix('weak-')}" for e in bad[place] for t in e.triads]
-        each = list(dict.fromkeys(each))
-        more = f" and {len(each) - PARAMETERS_NAMED} more" if len(each) > PARAMETERS_NAMED else ""
-        names = ", ".join(each[:PARAMETERS_NAMED]) + more
-        return (
-            f"the stations are too weak to fit the model: nothing determines {names}. Add stations "
-            "at other inclinations (at least three, well apart, up and down) with six or more "
-            "toolfaces each, or give more reference angles."
-        )
+        return listed([*dict.fromkeys(each)], PARAMETERS_NAMED)
 
-    return Flag("weak-geometry", np.array([*map(bool, bad)]), sentence)
-
-
-def _without_redundancy(fitted: FittedRuns, index: int) -> Flag:
-    """Triads without redundancy whose noise would have to be estimated from the residuals."""
-    freedom = fitted.result.analysis.freedom[:, index]
-
-    def sentence(place: int) -> str:
-        return (
-            f"the {TRIADS[index]} has no redundancy ({max(freedom[place], 0):.1f} degrees of freedom): its noise "
-            "cannot be estimated. Add stations, or declare 'noise' in the tool profile."
-        )
-
-    bare = np.isfinite(fitted.result.noise[:, index]) & (freedom < 1)
-    return Flag("no-redundancy", bare, sentence)
+    return _refusal(fitted, "weak-geometry", np.array([*map(bool, bad)]), names=names)
 
 
 def _odd_gain(fitted: FittedRuns, index: int) -> Flag:
@@ -447,55 +438,26 @@ def _odd_gain(fitted: FittedRuns, index: int) -> Flag:
     gain, share = gain_shares(fitted.result, index)
     value = share if unscaled or (index == 1 and fitted.readings.relative) else gain
     odd = ~((value >= GAIN_RANGE[0]) & (value <= GAIN_RANGE[1]))
-
-    def sentence(place: int) -> str:
-        axis = int(np.argmax(odd[place]))
-        wrong = "has the wrong sign" if value[place, axis] < 0 else "is far from nominal"
-        return (
-            f"the {name}'s gain on tool axis {'xyz'[axis]} comes out at {value[place, axis]:.3g} times "
-            f"nominal and {wrong} (accepted: {GAIN_RANGE[0]}…{GAIN_RANGE[1]}). Check 'axes' and 'scale' "
-            f"of [{name}] in the tool profile, and the reference angles."
-        )
-
-    return Flag("gain", np.any(odd, -1), sentence)
-
-
-def _beyond_vertical(fitted: FittedRuns) -> Flag:
-    """A dip beyond vertical: north of the field opposite to that of the azimuths."""
-    dip = np.degrees(overturned(fitted.result))
-
-    def sentence(place: int) -> str:
-        return (
-            f"the dip comes out at {dip[place]:.1f}°, beyond vertical (accepted: -90…90): the magnetometer "
-            "reads the reverse of the field, or the reference azimuths are 180° off. Check 'axes' of "
-            "[magnetometer] in the tool profile, and ref_azimuth_deg."
-        )
-
-    return Flag("earth", np.isfinite(dip), sentence)
+    axis = np.argmax(odd, -1)
+    first = value[np.arange(len(axis)), axis]
+    wrong = np.where(first < 0, "has the wrong sign", "is far from nominal")
+    values = {"triad": name, "axis": TOOL_AXES[axis], "gain": first, "wrong": wrong}
+    return _refusal(fitted, "gain", np.any(odd, -1), range=GAIN_RANGE, **values)
 
 
 def _nowhere_on_earth(fitted: FittedRuns, name: str) -> Flag:
     """A gravity or field that no place on Earth has."""
     problem, state = fitted.result.problem, fitted.result.state
     outside = off_earth(fitted.result, name, fitted.profile.stand.coil)
-    column, factor, unit = {
-        "gravity": ("ref_gravity_g", 1.0, "g"),
-        "field": ("ref_field_nt", 1e-3, "µT"),
-    }[name]
-
-    def sentence(place: int) -> str:
-        station = int(np.argmax(outside[place]))
-        value = float(problem.constant(state, name)[place, station]) * factor
-        given = bool(problem.evidence.is_known(name)[place, station])
-        low, high = (limit * factor for limit in EARTH_RANGES[name])
-        source = f"'{column}' gives" if given else "the fit makes it"
-        coil = "; of a run in a coil, say coil = true under [stand]" if name == "field" else ""
-        return (
-            f"no place on Earth has a {name} of {value:.4g} {unit} ({low:g}…{high:g}): {source} so. "
-            f"Check {column} and its unit, and 'scale' in the tool profile{coil}."
-        )
-
-    return Flag("earth", np.any(outside, -1), sentence)
+    column, factor, unit, coil = STRENGTH_COLUMNS[name]
+    first = np.arange(fitted.count), np.argmax(outside, -1)
+    given = np.where(
+        problem.evidence.is_known(name)[first], f"'{column}' gives", "the fit makes it"
+    )
+    low, high = (limit * factor for limit in EARTH_RANGES[name])
+    values = {"value": problem.constant(state, name)[first] * factor, "given": given}
+    words = {"what": name, "unit": unit, "low": low, "high": high, "column": column, "coil": coil}
+    return _refusal(fitted, "off earth", np.any(outside, -1), "earth", **words, **values)
 
 
 def _unexplained_errors(fitted: FittedRuns, sound: Bools) -> Flag:
@@ -508,19 +470,33 @@ def _unexplained_errors(fitted: FittedRuns, sound: Bools) -> Flag:
     flags = np.array([bool(errors.get(place)) for place in range(fitted.count)])
     relative = fitted.readings.relative
 
-    def sentence(place: int) -> str:
+    def worst(place: int) -> dict[str, Any]:
         rms = errors[place]
         name = max(rms, key=lambda n: rms[n][0] / max(rms[n][1], 1e-300))
         factor, unit = shown_in(name, relative)
-        first = effects(fitted.member(place))[:1]
-        looks = [f" {described(each, shown_in('field', relative)[1])}" for each in first]
-        gap = "" if unit == "°" else " "
         after, expected = (value * factor for value in rms[name])
-        return (
-            f"the errors of {name} after calibration are {after:.3g}{gap}{unit} (root mean square), where the "
-            f"misfit of the run explains {expected:.2g}{gap}{unit}. Check the references of {name} and 'axes' in the "
-            f"tool profile, or declare 'noise' and [stand] as they are.{''.join(looks)}"
-            f"{_culprit(fitted, place)}"
+        return {"name": name, "after": after, "expected": expected, "unit": spaced(unit)}
+
+    def looks(place: int) -> str:
+        first = effects(fitted.member(place))[:1]
+        return "".join(f" {described(each, shown_in('field', relative)[1])}" for each in first)
+
+    return _refusal(fitted, "errors", flags, of=worst, looks=looks)
+
+
+def _unsound(fitted: FittedRuns) -> Flag:
+    """Fits whose covariance is none, or whose gains are none that a sensor has."""
+    result, zero = fitted.result, fitted.profile.reference_temperature_c
+    low, high = temperature_range(result, fitted.options.knowledge)
+    with np.errstate(all="ignore"):  # of members that earlier refusals hold of
+        sound = is_covariance(fitted.covariance.in_file(zero))
+        sound &= has_sensor_gains(result, np.stack([low, high, np.clip(zero, low, high)], -1))
+
+    def noise(place: int) -> str:
+        shares = [triad.sd[place] / _strength(triad.raw[place]) for triad in result.problem.triads]
+        return ", ".join(
+            f"the {name}'s noise is {share.min():.1g} to {share.max():.1g} of the field"
+            for name, share in zip(TRIADS, shares, strict=False)
         )
 
-    return Flag("errors", flags, sentence)
+    return _refusal(fitted, "unsound", ~sound, noise=noise, advice=UNSOUND_ADVICE)

@@ -6,15 +6,14 @@ calibration file that is read.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import msgspec
 import numpy as np
 
-from mwdcal.calibration.readings import TRIADS
-from mwdcal.calibration.record import Calibration, TriadCalibration
-from mwdcal.calibration.soaks import HIGHEST
+from mwdcal.calibration.readings import HIGHEST, TRIADS
+from mwdcal.calibration.record import Calibration
 from mwdcal.errors import InputError
 from mwdcal.geometry.vectors import Array, Bools, diagonal, outer
 
@@ -42,20 +41,12 @@ def check(calibration: Calibration, name: str, advice: str) -> None:
 
 def inconsistency(calibration: Calibration) -> str:
     """What is impossible in a calibration, or does not fit together; empty where all is well."""
-    rules: tuple[Callable[[Calibration], Iterator[str]], ...] = (
-        _parts,
-        _stations,
-        _numbers,
-        _surroundings,
-        _ranks,
-        _covariance,
-        _gains,
-    )
+    rules = (_parts, _numbers, _surroundings, _ranks, _covariance, _gains)
     return next((problem for rule in rules for problem in rule(calibration)), "")
 
 
 def _parts(calibration: Calibration) -> Iterator[str]:
-    """Models that are unknown, and lists of a wrong length."""
+    """Models that are unknown, and lists of a wrong length: `verify` knows by the stations what the fit has seen."""
     for triad, expected in zip(calibration.triads, TRIADS, strict=False):
         if triad.name != expected:
             yield f"the triad '{triad.name}' stands where the {expected} belongs"
@@ -72,10 +63,6 @@ def _parts(calibration: Calibration) -> Iterator[str]:
         yield "parameters and covariance do not fit together"
     if any(len(row) != size for row in calibration.free):
         yield "parameters and undetermined directions do not fit together"
-
-
-def _stations(calibration: Calibration) -> Iterator[str]:
-    """A list of stations other than their number: `verify` knows by it what the fit has seen."""
     said, listed = calibration.stations, len(calibration.station_rows)
     if said != listed or said < 1:
         yield f"'stations' is {said}, and 'station_rows' lists {listed}"
@@ -170,7 +157,9 @@ def _gains(calibration: Calibration) -> Iterator[str]:
     low, high = calibration.temperature_c or (zero, zero)
     temperature = np.array([low, high, min(max(zero, low), high)])
     for triad in calibration.triads:
-        slope = _slopes(triad, zero, temperature)
+        middle, params = np.broadcast_to(triad.centre, (3, 3)), np.array(triad.parameters)
+        with np.errstate(all="ignore"):
+            slope = triad.functions(zero).slope(params, middle, temperature)
         if not invertible(slope):
             yield f"the gains of the {triad.name} cannot be inverted"
         if mirrored(slope):
@@ -179,14 +168,6 @@ def _gains(calibration: Calibration) -> Iterator[str]:
                 "does: one row has the wrong sign, or two are exchanged (correct a wrong axis by 'axes' in the "
                 "tool profile)"
             )
-
-
-def _slopes(triad: TriadCalibration, reference: float, temperature: Array) -> Array:
-    """Gains (k, 3, 3) of a triad at temperatures (k,)."""
-    middle = np.broadcast_to(np.array(triad.centre), (len(temperature), 3))
-    with np.errstate(all="ignore"):
-        model = triad.functions(reference)
-        return model.slope(np.array(triad.parameters), middle, temperature)
 
 
 def is_covariance(covariance: Array) -> Bools:

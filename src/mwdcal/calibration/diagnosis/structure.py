@@ -10,22 +10,22 @@ Reference: efficient scores, C. R. Rao, Proc. Camb. Phil. Soc. 44, 50 (1948).
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from mwdcal.calibration.automatic.courses import TRIED, f_test, steady_columns, temperature_powers
 from mwdcal.calibration.estimate import Fit
-from mwdcal.calibration.evidence import STAND_TURNS, acts_on
-from mwdcal.calibration.readings import TRIADS
+from mwdcal.calibration.evidence import acts_on
+from mwdcal.calibration.methods import ESTIMABLE
+from mwdcal.calibration.readings import HIGHEST, LEAST_TEMPERATURE_SPAN, TRIADS, highest_order
 from mwdcal.calibration.residuals import chances, to_reshoot
 from mwdcal.calibration.results import variance_scales
-from mwdcal.calibration.soaks import HIGHEST, LEAST_TEMPERATURE_SPAN, highest_order
 from mwdcal.estimation.evidence import STAND_ERRORS
 from mwdcal.estimation.problem import Problem, State
 from mwdcal.estimation.uncertainty import whole_covariance
-from mwdcal.geometry.vectors import Array, Bools, Ints, eigen
+from mwdcal.geometry.vectors import Array, Bools, Ints, centred, eigen
 
 EFFECT_CHANCE = 1e-4
 """Chance of so much common structure in noise, below which an effect is named."""
@@ -35,12 +35,8 @@ BAD_SHARE = 0.1
 """Share of bad stations up to which they are left out."""
 LEFT_BY_FIT = 1e-3
 """A column counts if the fit leaves this share of its square: what is left of others is rounding."""
-STAND_EFFECTS = ("azimuth-zero", "inclination-zero", "tilt")
-"""Errors of the stand that leave residuals; a toolface zero does not."""
 DRIFTS = 2
 """Degree of the polynomial of order (or of the row) that a drift is looked for as."""
-
-
 SMALLEST_SET = 3
 """Fewest stations of one direction that may share an error of its setting."""
 SET_TURNS = ("inclination-zero", "azimuth-zero")
@@ -135,19 +131,16 @@ def effects(result: Fit) -> list[Effect]:
     ]
     problem = replace(result.problem, triads=tuple(triads))
     scores = _scores(problem, result)
-    left, used = scores.misfit, 0
-    chosen: list[str] = []
-    shown: list[tuple[str, float, float]] = []
+    left = scores.misfit
+    shown: dict[str, tuple[float, float]] = {}
     while True:
-        freedom = scores.freedom - used
-        trials = {n: _trial(scores, chosen, n, left, freedom) for n in scores.places}
-        open_ = {n: t for n, t in trials.items() if n not in chosen and t[0] < EFFECT_CHANCE}
-        if not open_:
+        others = [name for name in scores.places if name not in shown]
+        trials = [(*_trial(scores, [*shown], name, left), name) for name in others]
+        chance, change, best = min(trials, default=(1.0, 0.0, ""))
+        if chance >= EFFECT_CHANCE:
             return [e for e in _described(result, shown) if not e.name.endswith(COURSE_SUFFIX)]
-        best = min(open_, key=lambda name: (open_[name][0], -open_[name][1]))
-        chance, gain, directions = open_[best]
-        chosen, left, used = [*chosen, best], left - gain, used + directions
-        shown.append((best, gain / scores.misfit, chance))
+        shown[best] = chance, -change / scores.misfit
+        left += change
 
 
 def _without_bad_stations(result: Fit) -> Fit:
@@ -160,46 +153,30 @@ def _without_bad_stations(result: Fit) -> Fit:
     return replace(result, problem=replace(result.problem, evidence=fewer))
 
 
-def _misfit(problem: Problem, result: Fit) -> tuple[float, float]:
-    """The least ρᵀC⁻¹ρ of all readings, priors included, and its degrees of freedom."""
-    linear, include = problem.linear(result.state), problem.evidence.include
-    whole, normal = whole_covariance(linear, result.analysis.determined)[0], linear.normal
-    gradient = normal.gradient[0]
-    private = problem.linear(result.state, geometry=True).private
-    unknown = np.sum(
-        np.linalg.svd(private, compute_uv=False) > 1.0
-    )  # 0 where a station is left out
-    readings = float(include.sum()) * linear.residual.shape[-1]
-    fitted = np.sum(whole * (normal.information - linear.prior)[0])
-    return float(normal.cost[0] - gradient @ whole @ gradient), readings - float(fitted + unknown)
-
-
-def _trial(
-    scores: _Scores, chosen: list[str], name: str, left: float, freedom: float
-) -> tuple[float, float, int]:
-    """Chance in noise, gain and directions of one more family, of misfit `left`."""
+def _trial(scores: _Scores, chosen: list[str], name: str, left: float) -> tuple[float, float]:
+    """Chance in noise of one more family, and its change of the misfit `left` by those chosen."""
     before = scores.gain(chosen) if chosen else (0.0, 0)
     after = scores.gain([*chosen, name])
     gain, directions = after[0] - before[0], after[1] - before[1]
-    rest = freedom - directions
+    rest = scores.freedom - before[1] - directions
     if directions < 1 or rest < 1:
-        return 1.0, 0.0, 0
+        return 1.0, 0.0
     gain = min(gain, left * (1 - 1e-9))
     chance = f_test(*np.array([gain, directions, (left - gain) / rest, rest]))
-    return float(chance), gain, directions
+    return float(chance), -gain
 
 
-def _described(result: Fit, shown: list[tuple[str, float, float]]) -> list[Effect]:
-    """The effects with their sizes: all together, with the noise that they leave."""
+def _described(result: Fit, shown: Mapping[str, tuple[float, float]]) -> list[Effect]:
+    """The effects, of chance and share, with their sizes: all together, with the noise that they leave."""
     if not shown:
         return []
-    problem, names = result.problem, [name for name, _, _ in shown]
+    problem, names = result.problem, [*shown]
     scores = _scores(problem, result)
     gain, directions = scores.gain(names)
     scale = np.sqrt(max(scores.misfit - gain, 0.0) / max(scores.freedom - directions, 1.0))
     values, covariance = scores.solution(names)
     spread, sized, end = np.sqrt(np.diag(covariance)) * scale, [], 0
-    for name, share, chance in shown:
+    for name, (chance, share) in shown.items():
         where = scores.places[name]
         columns = slice(end, end := end + len(where))
         change = (scores.columns[..., where] * scores.length[where]) @ values[columns]
@@ -215,7 +192,7 @@ def _scores(problem: Problem, result: Fit) -> _Scores:
     """Efficient scores of the columns (1, n, m, k) of all families: what the fit's unknowns cannot take up."""
     families = dict(_families(problem, result.state))
     linear = problem.linear(result.state)
-    whole = whole_covariance(linear, result.analysis.determined)[0]
+    whole, normal = whole_covariance(linear, result.analysis.determined)[0], linear.normal
     every = np.concatenate([*families.values()], -1)
     ends = np.cumsum([column.shape[-1] for column in families.values()])
     places = dict(zip(families, np.split(np.arange(ends[-1]), ends[:-1]), strict=True))
@@ -223,23 +200,31 @@ def _scores(problem: Problem, result: Fit) -> _Scores:
     length = np.sqrt(np.maximum(square, 0.0))  # rounding may leave less where the noise is tiny
     length = np.where(length > 0, length, 1.0)
     unit = every / length
-    weighed = linear.weigh(unit)
+    weighed, gradient = linear.weigh(unit), normal.gradient[0]
     crossed = np.einsum("bnmu,bnmk->uk", linear.design, weighed)
-    gradient = linear.normal.gradient[0]
-    score = (
-        np.einsum("bnmk,bnm->k", weighed, linear.residual) - crossed.transpose() @ whole @ gradient
-    )
+    pull = np.einsum("bnmk,bnm->k", weighed, linear.residual)
+    score = pull - crossed.transpose() @ whole @ gradient
     information = np.einsum("bnmk,bnml->kl", unit, weighed)
     information = information - crossed.transpose() @ whole @ crossed
-    return _Scores(score, information, length, unit, places, *_misfit(problem, result))
+    misfit = float(normal.cost[0] - gradient @ whole @ gradient)
+    fitted = np.sum(whole * (normal.information - linear.prior)[0])
+    count = float(problem.evidence.include.sum()) * linear.residual.shape[-1]
+    freedom = count - float(fitted + _unknown(problem, result))
+    return _Scores(score, information, length, unit, places, misfit, freedom)
+
+
+def _unknown(problem: Problem, result: Fit) -> int:
+    """Number of unknowns that stations have to themselves; none where one is left out."""
+    private = problem.linear(result.state, geometry=True).private
+    return int(np.sum(np.linalg.svd(private, compute_uv=False) > 1.0))
 
 
 def _families(problem: Problem, state: State) -> Iterator[tuple[str, Array]]:
     """Columns (1, n, m, k) of every effect that this run could show, whitened."""
     turns, by_earth = problem.station_columns(state)
     known = _turns(problem, state, turns)
-    for name in STAND_EFFECTS:
-        each = [known[turn] for turn in STAND_TURNS.get(name, (name,)) if turn in known]
+    for name, parts in ESTIMABLE.items():
+        each = [known[turn] for turn in parts if turn in known]
         if each:
             yield name, np.stack(each, -1)
     sets = _sets(problem)
@@ -295,10 +280,8 @@ def _courses(problem: Problem, state: State) -> Iterator[tuple[str, Array]]:
 
 def _turns(problem: Problem, state: State, turns: Array) -> dict[str, Array]:
     """Columns (1, n, m) of errors of the stand that act on references, at stations that have them."""
-    columns = {}
-    for name in STAND_ERRORS:
-        acts = acts_on(problem.evidence, name)[..., None]
-        columns[name] = problem.stand_column(state, name, turns) * acts
+    acting = {name: acts_on(problem.evidence, name)[..., None] for name in STAND_ERRORS}
+    columns = {n: problem.stand_column(state, n, turns) * acts for n, acts in acting.items()}
     return {name: column for name, column in columns.items() if column.any()}
 
 
@@ -314,7 +297,7 @@ def _approach(problem: Problem) -> dict[str, Array]:
     for name in ("inclination", "azimuth", "toolface"):
         angle = problem.evidence.known[name][0]
         step = np.diff(angle, prepend=angle[:1])
-        step = np.nan_to_num((step + np.pi) % (2 * np.pi) - np.pi)
+        step = np.nan_to_num(centred(step))
         sides[f"{name}-zero"] = np.where(np.abs(step) > 1e-6, np.sign(step), 0.0)[:, None]
     return sides
 
@@ -336,8 +319,8 @@ def _of_sensor(
     rate = np.diff(problem.temperature[0], prepend=problem.temperature[0, :1])
     if np.ptp(rate) > 1.0:
         rate = rate / np.abs(rate).max()
-        centred = (triad.raw[0] - triad.raw[0].mean(0)) / np.std(triad.raw[0])
-        scale = axes * (rate[:, None] * centred)[:, None, :]
+        reading = (triad.raw[0] - triad.raw[0].mean(0)) / np.std(triad.raw[0])
+        scale = axes * (rate[:, None] * reading)[:, None, :]
         yield f"{name}-thermal-lag", np.concatenate([axes * rate[:, None, None], scale], -1)
 
 
@@ -357,11 +340,8 @@ def described(effect: Effect, unit: str) -> str:
     looks = EFFECTS[kind if of_triad else effect.name]
     if effect.name in ZEROS:
         size = f"{np.degrees(effect.values[0]):+.3g}° ± {np.degrees(effect.uncertainties[0]):.2g}°"
-        size += (
-            " (dip less its reference)"
-            if effect.name == "dip-reference"
-            else " (reading less true)"
-        )
+        reference = effect.name == "dip-reference"
+        size += " (dip less its reference)" if reference else " (reading less true)"
     elif effect.name == "tilt":
         size = f"{np.degrees(np.linalg.norm(effect.values)):.3g}°"
     else:

@@ -100,10 +100,7 @@ class AffineMinimum:
         size = np.sqrt(np.einsum("bni,bni->bn", read, read))[..., None]
         rows = self.terms * (self.include / (GEOMETRIC_NOISE * size))
         undo = inverse(self.turn)
-        parts = [
-            gain.mT @ gain,
-            undo @ rows.mT @ rows @ undo.mT,
-        ]
+        parts = [gain.mT @ gain, undo @ rows.mT @ rows @ undo.mT]
         sizes = [np.sqrt(diagonal(part)) for part in parts]
         pair = [eigenvalues(m / outer(s)) for m, s in zip(parts, sizes, strict=True)]
         squares, norms = (np.einsum("bi,bj->bij", *p).reshape(batch, 12) for p in (pair, sizes))
@@ -127,25 +124,18 @@ def minima(problem: Problem, at: State) -> Minima:
     ]
 
 
-def settled(triads: Minima) -> Bools:
-    """Members (B,) of which all triads are at their minimum."""
-    return np.asarray(np.all([triad.settled for triad in triads], axis=0))
-
-
 def start(problem: Problem) -> State:
     """The known attitudes, with parameters of zero."""
-    known, batch = problem.evidence.known, len(problem.temperature)
+    known, shape = problem.evidence.known, problem.temperature.shape
     azimuth = known["azimuth"] if len(problem.triads) > 1 else np.zeros_like(known["azimuth"])
     attitude = tool_from_earth(known["inclination"], azimuth, known["toolface"])
-    nothing = np.zeros((batch, 0))
-    size = sum(triad.model.size for triad in problem.triads)
-    departures = np.zeros((*problem.temperature.shape, 0))
-    return State(np.zeros((batch, size)), attitude, nothing, departures)
+    params = np.zeros((shape[0], problem.slices()[-1].stop))
+    return State(params, attitude, params[:, :0], np.zeros((*shape, 0)))
 
 
-def solution(problem: Problem, at: State, triads: Minima) -> tuple[State, Analysis]:
-    """State and analysis at the minimum."""
-    include = problem.evidence.include
+def solution(problem: Problem, at: State) -> tuple[State, Analysis, Bools]:
+    """State and analysis at the minimum for the attitudes of a state, and members (B,) that came there."""
+    include, triads = problem.evidence.include, minima(problem, at)
     state = replace(at, params=np.concatenate([h.params for h in triads], -1))
     p = state.params.shape[-1]
     covariance = np.zeros((len(include), p, p))
@@ -161,7 +151,8 @@ def solution(problem: Problem, at: State, triads: Minima) -> tuple[State, Analys
     factor = squares / np.where(freedom > 1e-9, freedom, np.nan)
     none = np.zeros((len(include), p, 0))
     known = determined(triads)
-    return state, Analysis(covariance, known, factor, freedom, left, spread, none[:, :0], none)
+    analysis = Analysis(covariance, known, factor, freedom, left, spread, none[:, :0], none)
+    return state, analysis, np.all([triad.settled for triad in triads], axis=0)
 
 
 def _affine_minimum(triad: Triad, target: Array, include: Array) -> AffineMinimum:

@@ -32,7 +32,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mwdcal.estimation.batch import take
-from mwdcal.estimation.solvers import Determined, Normal, Status
+from mwdcal.estimation.solvers import Determined, Status
 from mwdcal.geometry.observables import OBSERVABLES, VERTICAL, is_vertical
 from mwdcal.geometry.vectors import Array, ArrayLike, Bools, Ints, eigen, inverse, outer, quotient
 from mwdcal.sensor.models import Model
@@ -120,7 +120,7 @@ def newton(
     with np.errstate(all="ignore"):
         reached = _descend(model, start, stations, limit)
         information, norms = geometry(model, reached[0], stations)
-        return Newton(*reached, _determined(information, norms), information)
+        return Newton(*reached, Determined.by(information, norms), information)
 
 
 def _descend(
@@ -133,7 +133,7 @@ def _descend(
     costs[:, 0], active = cost(model, params, stations), np.arange(count)
     for turn in range(limit):
         at = take((model, params, stations), active)
-        here, determined = local(*at), _determined(*geometry(*at))
+        here, determined = local(*at), Determined.by(*geometry(*at))
         step = downhill(here, determined)
         finite = np.isfinite(here.cost) & np.isfinite(step).all(-1)
         status[active[~finite]] = Status.NOT_FINITE
@@ -246,12 +246,6 @@ def local(model: Model, params: Array, stations: Compared) -> Local:
     return Local(0.5 * np.sum(squares, (-1, -2)), gradient, hessian)
 
 
-def _determined(information: Array, norms: Array) -> Determined:
-    """Which directions of parameter space the stations determine, however noisy they are."""
-    nothing = np.zeros_like(norms)
-    return Determined.by(Normal(information, nothing, nothing[:, 0], norms.shape[-1]), norms)
-
-
 def geometry(model: Model, params: Array, stations: Compared) -> tuple[Array, Array]:
     """Information (B, p, p) of what the stations compare, and norms (B, p) of the whole columns.
 
@@ -301,7 +295,7 @@ def downhill(here: Local, determined: Determined) -> Array:
     Singular: NaN where the Hessian is not finite in the scale of its columns.
     """
     norms, kept = determined.norms, determined.basis * determined.keep[..., None, :]
-    inner = kept.mT @ (here.hessian / outer(norms, norms)) @ kept
+    inner = kept.mT @ (here.hessian / outer(norms)) @ kept
     values, vectors = eigen(inner)
     size = np.abs(values)
     size = np.maximum(size, SMALLEST_EIGENVALUE * np.max(size, -1, keepdims=True))

@@ -11,28 +11,24 @@ toolface of a reference or a reading that is vertical has weight zero, as it has
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mwdcal.estimation.problem import Triad
-from mwdcal.estimation.solvers import Determined, Linear, Normal
+from mwdcal.estimation.problem import State, Triad
+from mwdcal.estimation.solvers import Determined, Linear
 from mwdcal.geometry.observables import OBSERVABLES, is_vertical
-from mwdcal.geometry.vectors import Array, Bools, centred
+from mwdcal.geometry.vectors import Array
 
 STRENGTH = "strength-squared"
 
 
 @dataclass(frozen=True)
-class Params:
-    """The state of such a sum: parameters (B, p) alone."""
-
-    params: Array
-
-
-@dataclass(frozen=True)
 class Sums:
-    """One triad, the observables compared with `reference` (B, n, m), and their `weights`."""
+    """One triad, the observables compared with `reference` (B, n, m), and their `weights`.
+
+    The parameters of its states are those of this triad alone.
+    """
 
     triad: Triad
     temperature: Array
@@ -40,34 +36,32 @@ class Sums:
     reference: Array
     weights: Array
 
-    def compared(self, field: Array) -> tuple[Array, Array, Bools]:
-        """Differences (B, n, m), gradients (B, n, m, 3) by the field (B, n, 3), and what counts."""
+    def compared(self, field: Array) -> tuple[Array, Array]:
+        """Differences (B, n, m) and gradients (B, n, m, 3) by the field (B, n, 3), zero if they do not count."""
         errors, gradients, counts = [], [], []
         for index, name in enumerate(self.names):
             if name == STRENGTH:
-                value, gradient = np.sum(field**2, -1), 2 * field
+                errors.append(np.sum(field**2, -1) - self.reference[..., index])
+                gradients.append(2 * field)
             else:
                 observable, blank = OBSERVABLES[name], np.zeros_like(field)
                 value = observable.value(field, blank)
-                gradient = observable.gradient(field, blank)[..., :3]
-            error = value - self.reference[..., index]
-            errors.append(centred(error, OBSERVABLES[name].period) if name == "toolface" else error)
-            gradients.append(gradient)
+                errors.append(observable.difference(value, self.reference[..., index]))
+                gradients.append(observable.gradient(field, blank)[..., :3])
             counts.append(np.logical_or(name != "toolface", is_vertical(field) == 0))
         counted = np.stack(counts, -1) & (self.weights > 0)
         error = np.where(counted, np.stack(errors, -1), 0.0)
-        return error, np.where(counted[..., None], np.stack(gradients, -2), 0.0), counted
+        return error, np.where(counted[..., None], np.stack(gradients, -2), 0.0)
 
-    def linear(self, state: Params, geometry: bool = False) -> Linear:
+    def linear(self, state: State, geometry: bool = False) -> Linear:
         """Linearise at a state; with `geometry` each observable is in units of its own size."""
         model, readings = self.triad.model, (self.triad.raw, self.temperature)
-        error, gradient, _ = self.compared(model.fields(state.params, *readings))
+        error, gradient = self.compared(model.fields(state.params, *readings))
         jacobian = model.jacobian(state.params, *readings)
         root = np.sqrt(self.weights)
         if geometry:
-            sizes = [np.abs(self.reference[..., k]) if n == STRENGTH else np.ones(root.shape[:-1])
-                     for k, n in enumerate(self.names)]  # fmt: skip
-            root = (self.weights > 0) / np.stack(sizes, -1)
+            strong = np.array(self.names) == STRENGTH
+            root = (self.weights > 0) / np.where(strong, np.abs(self.reference), 1.0)
         size = state.params.shape[-1]
         return Linear(
             error * root,
@@ -78,30 +72,24 @@ class Sums:
             np.zeros((len(error), size)),
         )
 
-    def move(self, state: Params, linear: Linear, step: Array) -> Params:
+    def move(self, state: State, linear: Linear, step: Array) -> State:
         """The state after a step."""
-        return Params(state.params + step)
+        return replace(state, params=state.params + step)
 
-    def size_of(self, state: Params) -> Array:
-        """Largest parameter (B, p): steps far below it are rounding."""
-        largest = np.max(np.abs(state.params), -1, keepdims=True)
-        return np.broadcast_to(largest, state.params.shape)
-
-    def information(self, params: Array) -> Array:
+    def information(self, state: State) -> Array:
         """Information (B, p, p) of the observables, in relative units and radians."""
-        return Normal.of(self.linear(Params(params), geometry=True)).information
+        return self.linear(state, geometry=True).normal.information
 
-    def pulls(self, params: Array, target: Array) -> Array:
+    def pulls(self, state: State, target: Array) -> Array:
         """Change (B, n, p, 3) of the minimum by an error of each station's whitened reading.
 
         On the determined subspace. The observables' gradients are taken at `target` (B, n, 3), the
         vectors that a perfect tool reads: along an unknown turn they are then exactly zero.
         """
-        state = Params(params)
         determined = Determined.of(self, state)
-        bread = determined.inverse(Normal.of(self.linear(state)).information)
-        model, raw = self.triad.model, self.triad.raw
-        _, gradient, _ = self.compared(target)
+        bread = determined.inverse(self.linear(state).normal.information)
+        model, raw, params = self.triad.model, self.triad.raw, state.params
+        _, gradient = self.compared(target)
         noise = gradient @ model.slope(params, raw, self.temperature) * self.triad.sd[..., None, :]
         rows = gradient @ model.jacobian(params, raw, self.temperature) * self.weights[..., None]
         return -bread[:, None] @ rows.mT @ noise

@@ -69,6 +69,12 @@ def shown(value: object) -> str:
     return f"{value:.12g}" if isinstance(value, float) else str(value)
 
 
+def at_most(count: int, most: int, where: str, what: str, units: str, advice: str) -> None:
+    """Refuse more of something than may be there."""
+    if count > most:
+        raise InputError(f"{where}: {what} must have at most {most} {units}; got {count}. {advice}")
+
+
 def check_names(names: Sequence[str], where: str) -> None:
     """Refuse a header with too many, unnamed or repeated columns, or without names at all."""
     if not names:
@@ -76,11 +82,7 @@ def check_names(names: Sequence[str], where: str) -> None:
             f"{where}: expected the column names; got the end of the file. Add a line with the "
             "column names, such as ax,ay,az, and one row per station."
         )
-    if len(names) > MAX_COLUMNS:
-        raise InputError(
-            f"{where}: a table must have at most {MAX_COLUMNS} columns; got {len(names)}. "
-            "Is this a run file?"
-        )
+    at_most(len(names), MAX_COLUMNS, where, "a table", "columns", "Is this a run file?")
     if all(looks_numeric(name) for name in names):
         raise InputError(
             f"{where}: expected the column names; got numbers. Put a line with the column "
@@ -172,13 +174,9 @@ def _ragged(row: Sequence[object], width: int, where: str) -> InputError:
 def typed(name: str, cells: Iterable[object]) -> Column:
     """A column of typed cells: numbers if all are numbers or blank, else text."""
     values = list(cells)
-    if name in LABELS or not all(_is_number(value) for value in values):
+    if name in LABELS or not {type(value) for value in values} <= {int, float, type(None)}:
         return [as_text(value) for value in values]
     return np.array([np.nan if value is None else value for value in values], float)
-
-
-def _is_number(value: object) -> bool:
-    return value is None or (isinstance(value, int | float) and not isinstance(value, bool))
 
 
 def as_text(value: object) -> str:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from mwdcal.files.formats.columns import (
     Column,
     Parts,
     as_text,
+    at_most,
     check_names,
     damaged_unless_read,
     no_stations,
@@ -32,6 +33,8 @@ _MAX_NESTED = 1_000_000
 _LONGEST_FIXED = 1000
 _UNPACKED = 100_000_000
 _DENSEST = 100
+_TEXTS = ("string", "large_string", "binary", "large_binary")
+"""Types of columns that hold bytes of any length."""
 _UNSPELT = re.compile(r"<value out of range: (-?\d+)>")
 _PANDAS_INDEX = re.compile(r"__index_level_\d+__")
 
@@ -41,11 +44,8 @@ def parse(data: bytes, source: str, most: int = 0) -> Parts:
     arrow, _ = modules(source)
     file, schema = opened(arrow.BufferReader(data), source)
     rows, names = file.metadata.num_rows, list(schema.names)
-    if most and rows > most:
-        raise InputError(
-            f"{source}: a table that is read as a whole must have at most {most} rows; got {rows}. "
-            "Split it. The rows of a run are stations; mwdcal stations finds those of a log."
-        )
+    advice = "Split it. The rows of a run are stations; mwdcal stations finds those of a log."
+    at_most(rows, most or rows, source, "a table that is read as a whole", "rows", advice)
     if rows * len(names) > _MAX_CELLS:
         raise InputError(
             f"{source}: a table must have at most {_MAX_CELLS} cells; got {rows} rows of "
@@ -64,7 +64,7 @@ def opened(source: Any, name: str, **options: Any) -> tuple[Any, Any]:
 
     Its columns of text are read as numbers of different texts, which `dense` turns into text.
     """
-    arrow, parquet = modules(name)
+    _, parquet = modules(name)
     with reading(name):
         file = parquet.ParquetFile(source, **options)
         schema = file.schema_arrow
@@ -74,7 +74,7 @@ def opened(source: Any, name: str, **options: Any) -> tuple[Any, Any]:
     with reading(name):
         stored = source.stat().st_size if isinstance(source, Path) else source.size()
         _check_sizes(file, stored, name)
-        texts = [field.name for field in schema if _is_text(field.type, arrow.types)]
+        texts = [field.name for field in schema if str(field.type) in _TEXTS]
         options = {**options, "metadata": file.metadata, "read_dictionary": texts}
         return parquet.ParquetFile(source, **options), schema
 
@@ -111,19 +111,6 @@ def _held(leaf: Any, chunk: Any) -> int:
     return int(chunk.num_values) if leaf.max_repetition_level else 0
 
 
-def _is_text(kind: Any, types: Any) -> bool:
-    """Whether a column holds bytes of any length."""
-    return any(
-        is_kind(kind)
-        for is_kind in (
-            types.is_string,
-            types.is_large_string,
-            types.is_binary,
-            types.is_large_binary,
-        )
-    )
-
-
 def row_size(metadata: Any) -> int:
     """Mean bytes of a row as it is stored, before compression."""
     groups = range(metadata.num_row_groups)
@@ -134,7 +121,7 @@ def row_size(metadata: Any) -> int:
 def dense(table: Any, schema: Any, source: str, arrow: Any, most: int = MAX_TEXT) -> Any:
     """A table as read, its columns of the types of the schema; refuses more than `most` bytes of text."""
     size = sum(
-        _size_of(chunk, arrow.types)
+        _size_of(chunk)
         for column in table.columns
         if arrow.types.is_dictionary(column.type)
         for chunk in column.chunks
@@ -147,11 +134,11 @@ def dense(table: Any, schema: Any, source: str, arrow: Any, most: int = MAX_TEXT
     return table.cast(schema.remove_metadata())
 
 
-def _size_of(cells: Any, types: Any) -> int:
+def _size_of(cells: Any) -> int:
     """Bytes of texts that are stored as numbers of different ones; refuses what is not UTF-8."""
     import pyarrow.compute as compute
 
-    if not _is_text(cells.type.value_type, types):
+    if str(cells.type.value_type) not in _TEXTS:
         return 0
     cells.dictionary.validate(full=True)
     lengths = compute.binary_length(cells.dictionary)
@@ -182,11 +169,10 @@ def modules(source: str) -> tuple[Any, Any]:
     return pyarrow, pyarrow.parquet
 
 
-@contextmanager
-def reading(source: str) -> Iterator[None]:
-    """Whatever PyArrow raises in the block, the file is foreign or damaged."""
-    with damaged_unless_read(source, "a complete Parquet file", "Copy or export it again."):
-        yield
+reading = partial(
+    damaged_unless_read, expected="a complete Parquet file", advice="Copy or export it again."
+)
+"""Whatever PyArrow raises in the block, the file is foreign or damaged."""
 
 
 def is_index(name: str) -> bool:
@@ -198,14 +184,12 @@ def as_column(name: str, cells: Any, arrow: Any) -> Column:
     """A column as floats (blank: NaN) where it is numeric, else as text; so long whole numbers."""
     if arrow.types.is_dictionary(cells.type):
         cells = cells.cast(cells.type.value_type)
-    kinds = arrow.types
-    numeric = kinds.is_floating(cells.type) or kinds.is_integer(cells.type)
-    if kinds.is_integer(cells.type) and _is_code(cells):
+    types, kind = arrow.types, cells.type
+    numeric = types.is_floating(kind) or types.is_decimal(kind)
+    whole = types.is_integer(kind) and not _is_code(cells)
+    if name in LABELS or not (numeric or whole):
         return texts(cells, arrow)
-    if name not in LABELS and (numeric or kinds.is_decimal(cells.type)):
-        values = cells.cast(arrow.float64(), safe=False).to_numpy()
-        return np.array(values, float)
-    return texts(cells, arrow)
+    return np.array(cells.cast(arrow.float64(), safe=False).to_numpy(), float)
 
 
 def _is_code(cells: Any) -> bool:
@@ -250,9 +234,8 @@ def _in_microseconds(cells: Any, arrow: Any) -> Any:
 def _array(column: Column, arrow: Any) -> Any:
     if isinstance(column, list):
         return arrow.array([cell or None for cell in column], arrow.string())
-    if column.dtype == bool:
-        return arrow.array(column)
-    return arrow.array(column, arrow.float64(), from_pandas=True)
+    kind = None if column.dtype == bool else arrow.float64()
+    return arrow.array(column, kind, from_pandas=True)
 
 
 def metadata_of(schema: Mapping[bytes, bytes] | None, source: str) -> dict[str, object]:

@@ -34,13 +34,13 @@ class ParquetSink:
         self._arrow, parquets = parquet.modules(stream.name)
         self._metadata = dict(metadata)
         self._names = names = results.names
-        numeric = {f.name for f in schema if self._arrow.types.is_floating(f.type)}
+        words = [f.name for f in schema if not self._arrow.types.is_floating(f.type)]
         self._schema = schema = self._arrow.schema([*schema, *results])
         schema = schema.with_metadata({parquet.KEY: self._described([])})
         self._writer = parquets.ParquetWriter(
             stream.name,
             schema,
-            use_dictionary=[f.name for f in schema if f.name not in numeric.union(names)],
+            use_dictionary=words,
             compression={f.name: "none" if f.name in names else "snappy" for f in schema},
         )
 
@@ -100,9 +100,7 @@ class TextSink:
 
     def render(self, carried: Any, results: Sequence[AnyArray], blank: bool) -> bytes:
         """The lines of the part."""
-        plain = {
-            n: self._spelt(c) for n, c in zip(carried.column_names, carried.columns, strict=True)
-        }
+        plain = {name: self._spelt(carried.column(name)) for name in carried.column_names}
         self.formulas.update(n for n in self._texts if self._has_formula(plain[n]))
         plain |= {
             name: self._arrow.array(values, from_pandas=blank)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,18 +14,21 @@ import numpy as np
 
 from mwdcal.errors import InputError, reason
 from mwdcal.files.formats import atomic, dialect, parquet, text, workbook
-from mwdcal.files.formats.columns import LABELS, Column, Parts, as_text, check_names, looks_numeric
+from mwdcal.files.formats.columns import (
+    LABELS,
+    Column,
+    Parts,
+    as_text,
+    at_most,
+    check_names,
+    looks_numeric,
+)
 from mwdcal.files.formats.columns import shown as shown
 from mwdcal.geometry.vectors import Array
 from mwdcal.sensor.profile import TableFormat
 
-_PARSERS: dict[str, Callable[..., Parts]] = {
-    ".csv": text.parse,
-    ".tsv": text.parse,
-    ".parquet": parquet.parse,
-    ".xlsx": workbook.parse,
-}
-SUFFIXES = tuple(_PARSERS)
+_FORMATS: dict[str, Any] = {".csv": text, ".tsv": text, ".parquet": parquet, ".xlsx": workbook}
+SUFFIXES = tuple(_FORMATS)
 
 _LARGEST_FILES = {".parquet": 2_000_000_000}
 _LARGEST_TEXT = 50_000_000
@@ -63,25 +66,25 @@ def read(
     *,
     decimal: str = ".",
     rows: int = 0,
-    form: TableFormat | None = None,
+    export: TableFormat | None = None,
 ) -> Table:
     """The table in a .csv, .tsv, .parquet or .xlsx file.
 
     `decimal` is the decimal sign of text cells, '.' or ','. `rows`: the most that a Parquet table may
-    have; text and workbooks have limits of their own. `form`: how another program has written it.
+    have; text and workbooks have limits of their own. `export`: how another program has written it.
     """
     check_decimal(decimal)
     file = Path(path)
     data = _content(file)
     digest = hashlib.sha256(data).hexdigest()
-    parser = _PARSERS[_suffix(file)]
-    arguments: dict[str, Any] = {"most": rows} if parser is parquet.parse else {}
-    if form and parser is text.parse:
-        data, decimal = dialect.plain(data, form, file.name), form.decimal
-        arguments = {"delimiter": form.delimiter}
-    elif form and parser is workbook.parse:
-        decimal, arguments = form.decimal, {"form": form}
-    parts = parser(data, file.name, **arguments)
+    form = _FORMATS[_suffix(file)]
+    arguments: dict[str, Any] = {"most": rows} if form is parquet else {}
+    if export and form is text:
+        data, arguments = dialect.plain(data, export, file.name), {"delimiter": export.delimiter}
+    elif export and form is workbook:
+        arguments = {"form": export}
+    decimal = export.decimal if export else decimal
+    parts: Parts = form.parse(data, file.name, **arguments)
     return Table(parts.columns, parts.metadata, file.name, parts.lines, digest, decimal)
 
 
@@ -91,24 +94,23 @@ def check_decimal(decimal: str) -> None:
         raise InputError(f"`decimal` must be '.' or ','; got {shown(decimal)}.")
 
 
-def write(path: str | os.PathLike[str], table: Table, form: TableFormat | None = None) -> None:
+def write(path: str | os.PathLike[str], table: Table, export: TableFormat | None = None) -> None:
     """Write the table atomically, in the format of the suffix; the same table, the same bytes.
 
-    `form`: text with that delimiter, decimal sign and encoding.
+    `export`: text with that delimiter, decimal sign and encoding.
     """
     file = Path(path)
-    suffix = _suffix(file)
+    form = _FORMATS[_suffix(file)]
     check_names(list(table.columns), file.name)
-    if form and suffix in (".csv", ".tsv"):
-        content = text.render(table.columns, table.metadata, form.delimiter, form.decimal)
-        mark = "utf-8-sig" if form.encoding == "utf-8" else form.encoding
-        atomic.write(file, content.encode(mark, "replace"))
-    elif suffix in (".csv", ".tsv"):
-        delimiter = "," if suffix == ".csv" else "\t"
+    if export and form is text:
+        content = text.render(table.columns, table.metadata, export.delimiter, export.decimal)
+        encoding = "utf-8-sig" if export.encoding == "utf-8" else export.encoding
+        atomic.write(file, content.encode(encoding, "replace"))
+    elif form is text:
+        delimiter = "\t" if file.suffix.lower() == ".tsv" else ","
         atomic.write(file, text.render(pointed(table), table.metadata, delimiter))
     else:
-        render = parquet.render if suffix == ".parquet" else workbook.render
-        atomic.write(file, render(_typed(table), table.metadata, file.name))
+        atomic.write(file, form.render(_typed(table), table.metadata, file.name))
 
 
 def numbers(table: Table, name: str) -> Array:
@@ -117,16 +119,14 @@ def numbers(table: Table, name: str) -> Array:
     if isinstance(column, list):
         fast = _floats(column, table.decimal)
         return _one_by_one(table, name, column) if fast is None else fast
-    endless = np.flatnonzero(np.isinf(column))
-    if endless.size:
-        row = int(endless[0])
+    for row in np.flatnonzero(np.isinf(column)).tolist():
         raise cell_error(table, name, row, f"expected a finite number; got {column[row]}.")
     return column
 
 
 def labels(table: Table, name: str) -> list[str]:
-    """The column as text without surrounding blanks."""
-    column = table.columns[name]
+    """The column as text without surrounding blanks; no cells where there is no such column."""
+    column = table.columns.get(name, [])
     cells = column if isinstance(column, list) else [as_text(value) for value in column.tolist()]
     return [cell.strip() for cell in cells]
 
@@ -143,8 +143,9 @@ def recognised(path: str | os.PathLike[str]) -> dialect.Export:
     file = Path(path)
     data, suffix = _content(file), _suffix(file)
     if suffix == ".xlsx":
-        rows = [[as_text(cell) for cell in row] for _, row in workbook.read_rows(data, file.name)]
-        return dialect.recognised_rows(rows, TableFormat(), file.name)
+        rows = dict(workbook.read_rows(data, file.name))
+        cells = [[as_text(c) for c in rows.get(n, ())] for n in range(1, max(rows, default=0) + 1)]
+        return dialect.recognised_rows(cells, TableFormat(), file.name)
     if suffix == ".parquet":
         names = [*parquet.parse(data, file.name, most=0).columns]
         return dialect.Export(TableFormat(), names, [""] * len(names))
@@ -154,7 +155,7 @@ def recognised(path: str | os.PathLike[str]) -> dialect.Export:
 
 def _suffix(path: Path) -> str:
     suffix = path.suffix.lower()
-    if suffix not in _PARSERS:
+    if suffix not in _FORMATS:
         raise InputError(
             f"'{path}': the suffix must be one of {', '.join(SUFFIXES)}; got "
             f"'{suffix or 'none'}'. Convert or rename the file."
@@ -166,7 +167,9 @@ def _content(path: Path) -> bytes:
     """The bytes of a regular file of a known suffix that is not too large."""
     try:
         check_file(path)
-        _check_size(path.stat().st_size, path)
+        most = _LARGEST_FILES.get(_suffix(path), _LARGEST_TEXT)
+        advice = "Split it, or write long tables as Parquet."
+        at_most(path.stat().st_size, most, f"'{path}'", "the file", "bytes", advice)
         return path.read_bytes()
     except (OSError, ValueError) as error:
         raise InputError(
@@ -183,15 +186,6 @@ def check_file(path: Path) -> None:
         raise InputError(f"'{path}': no such file. Check the name and the folder.")
     if not path.is_file():
         raise InputError(f"'{path}' is not a regular file. Name a file with readings.")
-
-
-def _check_size(size: int, path: Path) -> None:
-    largest = _LARGEST_FILES.get(_suffix(path), _LARGEST_TEXT)
-    if size > largest:
-        raise InputError(
-            f"'{path}': the file must have at most {largest} bytes; got {size}. Split it, or "
-            "write long tables as Parquet."
-        )
 
 
 def _floats(cells: Sequence[str], decimal: str) -> Array | None:
@@ -214,8 +208,7 @@ def _one_by_one(table: Table, name: str, cells: Sequence[str]) -> Array:
         if not stripped:
             continue
         if not looks_numeric(stripped, table.decimal):
-            advice = _advice(stripped, table.decimal)
-            problem = f"expected a number; got {shown(cell)}. {advice}"
+            problem = f"expected a number; got {shown(cell)}. {_advice(stripped, table.decimal)}"
             raise cell_error(table, name, row, problem)
         values[row] = float(stripped.replace(",", "."))
         if np.isinf(values[row]):

@@ -15,6 +15,7 @@ from mwdcal.files.formats.columns import (
     Column,
     Parts,
     assemble,
+    at_most,
     check_names,
     looks_numeric,
     number,
@@ -44,31 +45,23 @@ _FOREIGN = {
 
 
 class Head(NamedTuple):
-    """What stands above the rows of a text table, and the rest of the piece it was read from."""
+    """What stands above the rows of a text table, in so many lines."""
 
     names: list[str]
     metadata: dict[str, object]
     delimiter: str
     lines: int
-    body: bytes
 
 
 def parse(data: bytes, source: str, delimiter: str = "") -> Parts:
     """The table in the bytes of a text file; without `delimiter` the header says what it is."""
-    lines = _lines(data, source)
-    top = _head(lines, source, delimiter)
-    return _parts(lines[top.lines :], top, top.lines, source)._replace(metadata=top.metadata)
+    whole = lines(data, source)
+    top = head(whole, source, delimiter)
+    return _parts(whole[top.lines :], top, top.lines, source)
 
 
-def head(data: bytes, source: str) -> Head:
-    """The head of a text table of which `data` is the beginning, whole lines."""
-    lines = _lines(data, source)
-    top = _head(lines, source)
-    return top._replace(body="\n".join(lines[top.lines :]).encode())
-
-
-def _head(lines: Sequence[str], source: str, delimiter: str = "") -> Head:
-    """The head of a table of these lines, without a body."""
+def head(lines: Sequence[str], source: str, delimiter: str = "") -> Head:
+    """The head of a table that begins with these lines."""
     comments = list(takewhile(is_preamble, lines))
     metadata = meta.parse([(i, comment(line)) for i, line in enumerate(comments, 1)], source)
     start = len(comments)
@@ -77,21 +70,21 @@ def _head(lines: Sequence[str], source: str, delimiter: str = "") -> Head:
     cells = next(split(header, start, delimiter, source), (start + 1, ()))[1]
     names = [str(cell).strip() for cell in cells]
     check_names(names, f"{source}, line {start + 1}")
-    return Head(names, metadata, delimiter, start + 1, b"")
+    return Head(names, metadata, delimiter, start + 1)
 
 
 def rows(data: bytes, top: Head, above: int, source: str) -> Parts:
     """The rows of a piece of a text table, whole lines with `above` lines of the file before."""
     if not data.strip(top.delimiter.encode() + b" \t\r\n"):
         return Parts({name: [] for name in top.names}, {}, ())
-    return _parts(_lines(data, source, above), top, above, source)
+    return _parts(lines(data, source, above), top, above, source)
 
 
 def _parts(lines: Sequence[str], top: Head, above: int, source: str) -> Parts:
     """The rows in some lines, which `above` lines of the file stand before."""
     entries = split(lines, above, top.delimiter, source)
     names, cells, numbers = assemble(chain([(above, top.names)], entries), source, "line")
-    return Parts(of_texts(names, cells), {}, numbers)
+    return Parts(of_texts(names, cells), top.metadata, numbers)
 
 
 def render(
@@ -140,7 +133,7 @@ def _cells(name: str, column: Column, decimal: str) -> list[str]:
     return column
 
 
-def _lines(data: bytes, source: str, above: int = 0) -> list[str]:
+def lines(data: bytes, source: str, above: int = 0) -> list[str]:
     """The lines without their ends, blank ones at the end left out; `above` lines came before."""
     if not above:
         refuse_foreign(data, source)
@@ -150,20 +143,16 @@ def _lines(data: bytes, source: str, above: int = 0) -> list[str]:
             f"{source}: the file is empty. A run file needs a line with the column names, "
             "such as ax,ay,az, and one row per station."
         )
-    ends = content.count("\n")
-    if ends > _MAX_LINES:
-        raise InputError(
-            f"{source}: a text table must have at most {_MAX_LINES} lines; got {ends}. "
-            "Split it, or write long tables as Parquet."
-        )
-    lines = content.split("\n")
-    for position, line in enumerate(lines, above + 1):
+    advice = "Split it, or write long tables as Parquet."
+    at_most(content.count("\n"), _MAX_LINES, source, "a text table", "lines", advice)
+    result = content.split("\n")
+    for position, line in enumerate(result, above + 1):
         if len(line) > _LONGEST_LINE:
             raise InputError(
                 f"{source}, line {position}: a line must have at most {_LONGEST_LINE} "
                 f"characters; got {len(line)}. Is this a run file, with one line per station?"
             )
-    return lines
+    return result
 
 
 def refuse_foreign(data: bytes, source: str, allowed: Sequence[bytes] = ()) -> None:

@@ -8,6 +8,7 @@ import re
 import warnings
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import takewhile
 from typing import Any
 
 from mwdcal.errors import InputError
@@ -37,25 +38,19 @@ Row = tuple[int, Sequence[object]]
 
 def parse(data: bytes, source: str, form: TableFormat | None = None) -> Parts:
     """The table on the first sheet of a workbook; `form` says in which row it begins."""
-    rows = read_rows(data, source)
-    if form:
-        rows = (row for row in rows if _belongs(*row, form))
-    comments: list[tuple[int, str]] = []
-    header: list[Row] = []
-    for line, row in rows:
-        if row and str(row[0]).lstrip().startswith("#"):
-            comments.append((line, str(row[0]).strip()))
-        elif row:
-            header.append((line, row))
-            break
-    metadata = meta.parse(comments, source, "row")
-    width = len(header[0][1]) if header else 0
-    names, cells, lines = assemble(_padded(header, rows, width), source, "row")
-    columns = {
-        name: typed(name, column)
-        for name, column in zip(names, zip(*cells, strict=True), strict=True)
-    }
-    return Parts(columns, metadata, lines)
+    rows = [row for row in read_rows(data, source) if form is None or _belongs(*row, form)]
+    comments = list(takewhile(_is_comment, rows))
+    table = rows[len(comments) :]
+    width = len(table[0][1]) if table else 0
+    padded = ((line, [*row, *[None] * (width - len(row))]) for line, row in table)
+    metadata = meta.parse([(line, str(row[0]).strip()) for line, row in comments], source, "row")
+    names, cells, lines = assemble(padded, source, "row")
+    named = zip(names, zip(*cells, strict=True), strict=True)
+    return Parts({name: typed(name, column) for name, column in named}, metadata, lines)
+
+
+def _is_comment(row: Row) -> bool:
+    return str(row[1][0]).lstrip().startswith("#")
 
 
 def render(columns: Mapping[str, Column], metadata: Mapping[str, object], source: str) -> bytes:
@@ -85,12 +80,12 @@ def _module(source: str) -> Any:
 
 def _belongs(line: int, row: Sequence[object], form: TableFormat) -> bool:
     """Whether a row holds metadata, the column names or readings."""
-    metadata = line < form.header_line and bool(row) and is_metadata(str(row[0]).lstrip())
+    metadata = line < form.header_line and is_metadata(str(row[0]).lstrip())
     return metadata or line == form.header_line or line >= form.first_line
 
 
 def read_rows(data: bytes, source: str) -> Iterator[Row]:
-    """Row numbers and cells of the first sheet, without the blank cells at the end."""
+    """Row numbers and cells of the first sheet, without blank cells at the end and blank rows."""
     openpyxl = _module(source)
     advice = "Save it again as .xlsx, or as CSV UTF-8."
     with (
@@ -104,13 +99,14 @@ def read_rows(data: bytes, source: str) -> Iterator[Row]:
         page = book.worksheets[0]
         page.reset_dimensions()
         for line, row in enumerate(page.iter_rows(values_only=True), 1):
-            yield line, _trimmed([_read(value) for value in row])
+            cells = _trimmed([_read(value) for value in row])
+            if cells:
+                yield line, cells
 
 
 def _read(value: object) -> object:
     """The value of a cell; a whole number of many digits as text, which loses none."""
-    whole = isinstance(value, int) and not isinstance(value, bool)
-    return str(value) if whole and abs(value) >= 10**_MOST_DIGITS else value  # type: ignore[arg-type]
+    return str(value) if isinstance(value, int) and abs(value) >= 10**_MOST_DIGITS else value
 
 
 def _trimmed(row: Sequence[object]) -> Sequence[object]:
@@ -118,13 +114,6 @@ def _trimmed(row: Sequence[object]) -> Sequence[object]:
     while end and (row[end - 1] is None or row[end - 1] == ""):
         end -= 1
     return row[:end]
-
-
-def _padded(header: Sequence[Row], rows: Iterator[Row], width: int) -> Iterator[Row]:
-    """Header and rows, each row filled up with blank cells to `width`."""
-    yield from header
-    for line, row in rows:
-        yield line, [*row, *[None] * (width - len(row))]
 
 
 def _check_texts(rows: Iterable[Sequence[str | float]], source: str) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 import zipfile
 from collections import Counter
+from typing import IO
 from xml.parsers import expat
 
 from mwdcal.errors import InputError
@@ -16,10 +17,13 @@ from mwdcal.files.formats.columns import MAX_COLUMNS
 
 MAX_ROWS = 1_048_576
 MAX_BLANK_ROWS = 100_000
-MAX_COUNTS = {"c": 1_500_000, "si": 750_000, "row": MAX_ROWS}
-"""Most cells, texts and rows."""
-MAX_OTHERS = 500_000
-"""Most elements of other kinds in a part, but for what cells and texts are made of."""
+MAX_COUNTS = {
+    "c": (1_500_000, "cells"),
+    "si": (750_000, "texts"),
+    "row": (MAX_ROWS, "rows"),
+    "": (500_000, "other elements"),
+}
+"""Most elements of a kind in a part; what cells and texts are made of does not count."""
 _CONTENTS = frozenset(("v", "t", "is", "f", "r", "rPr", "rPh"))
 _LARGEST_UNPACKED = 200_000_000
 _LONGEST_ELEMENT = 1 << 20
@@ -38,18 +42,19 @@ def check(archive: zipfile.ZipFile, source: str) -> None:
         )
     for entry in archive.infolist():
         if entry.filename.lower().endswith((".xml", ".rels")):
-            _PartCheck(source, entry.filename).check(archive)
+            with archive.open(entry.filename) as stream:
+                _PartCheck(f"{source}, {entry.filename}").check(stream)
 
 
 class _PartCheck:
     """Counts the elements of a part of a workbook."""
 
-    def __init__(self, source: str, name: str) -> None:
-        self._where = f"{source}, {name}"
+    def __init__(self, where: str) -> None:
+        self._where = where
         self._counts: Counter[str] = Counter()
         self._row = self._column = self._text = 0
 
-    def check(self, archive: zipfile.ZipFile) -> None:
+    def check(self, stream: IO[bytes]) -> None:
         """Refuse what is beyond the limits; XML that is none is left to its reader."""
         parser = expat.ParserCreate()
         parser.buffer_text = True
@@ -57,17 +62,14 @@ class _PartCheck:
         parser.CharacterDataHandler = self._characters
         parser.StartDoctypeDeclHandler = self._doctype
         fed = 0
-        with archive.open(self._where.rpartition(", ")[2]) as stream:
-            while data := stream.read(_CHUNK):
-                try:
-                    parser.Parse(data, False)
-                except expat.ExpatError:
-                    return
-                fed += len(data)
-                self._at_most(
-                    fed - parser.CurrentByteIndex, _LONGEST_ELEMENT, "bytes in an element"
-                )
-                self._at_most(len(parser.intern), _MOST_NAMES, "names")
+        while data := stream.read(_CHUNK):
+            try:
+                parser.Parse(data, False)
+            except expat.ExpatError:
+                return
+            fed += len(data)
+            self._at_most(fed - parser.CurrentByteIndex, _LONGEST_ELEMENT, "bytes in an element")
+            self._at_most(len(parser.intern), _MOST_NAMES, "names")
 
     def _at_most(self, count: int, most: int, what: str) -> None:
         if count > most:
@@ -85,15 +87,15 @@ class _PartCheck:
     def _start(self, tag: str, given: dict[str, str]) -> None:
         self._text = 0
         tag = tag.rpartition(":")[2]
-        kind = tag if tag in MAX_COUNTS else "" if tag not in _CONTENTS else "content"
+        if tag in _CONTENTS:
+            return
+        kind = tag if tag in MAX_COUNTS else ""
         self._counts[kind] += 1
         if kind == "c":
             self._cell(given.get("r", ""))
         elif kind == "row":
             self._new_row(given.get("r", ""))
-        if kind != "content":
-            most = MAX_COUNTS.get(kind, MAX_OTHERS)
-            self._at_most(self._counts[kind], most, _COUNTED.get(kind, "other elements"))
+        self._at_most(self._counts[kind], *MAX_COUNTS[kind])
 
     def _cell(self, place: str) -> None:
         letters = re.match("[A-Z]*", place)[0]  # type: ignore[index]
@@ -110,6 +112,3 @@ class _PartCheck:
         self._row = int(number[:12]) if number.isdecimal() else self._row + 1
         self._at_most(self._row, MAX_ROWS, "rows")
         self._at_most(self._row - self._counts["row"], MAX_BLANK_ROWS, "blank rows")
-
-
-_COUNTED = {"c": "cells", "si": "texts", "row": "rows"}
