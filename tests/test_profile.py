@@ -288,3 +288,17 @@ def test_bytes_that_an_encoding_does_not_have(german, tmp_path):
     tool.write_text(tool.read_text("utf-8").replace("cp1252", "utf-8"), "utf-8")
     message = refused(mwdcal("calibrate", run, "--tool", tool, "-o", tmp_path / "cal.json"), 2)
     assert "expected utf-8 text" in message
+
+
+def test_a_simulated_run_is_said_to_be_one(tmp_path):
+    run = write_csv(tmp_path / "run.csv", servo_run(), "simulated = true")
+    ran = mwdcal("profile", run, "-o", tmp_path / "tool.toml")
+    assert "48 stations   SIMULATED DATA" in ran.out
+    assert mwdcal("profile", run, "-o", tmp_path / "tool.toml", "--json").json["simulated"] is True
+
+
+def test_columns_that_are_not_understood_are_named(tmp_path):
+    run = write_csv(tmp_path / "run.csv", renamed(servo_run(), ref_azimuth_deg="Lage 2"))
+    message = refused(mwdcal("profile", run, "-o", tmp_path / "tool.toml"), 3)
+    assert "(no azimuth)" in message
+    assert "Columns not understood: 'Lage 2'." in message
