@@ -327,3 +327,29 @@ def test_what_is_no_table_ends_in_one_sentence(tmp_path, content, status):
     (tmp_path / "x.csv").write_bytes(content)
     refused(mwdcal("profile", tmp_path / "x.csv", "-o", tmp_path / "tool.toml"), status)
     assert not (tmp_path / "tool.toml").exists()
+
+
+def test_angles_computed_from_the_readings_are_no_reference(tmp_path):
+    """A tool that writes its inclination beside the raw channels, and nothing of the stand."""
+    run = servo_run()
+    across = np.hypot(run["ax"], run["ay"])
+    run["ref_inclination_deg"] = np.degrees(np.arctan2(across, run["az"]))
+    path = write_csv(tmp_path / "run.csv", renamed(run, ref_inclination_deg="Inc (deg)"))
+    message = refused(mwdcal("profile", path, "-o", tmp_path / "tool.toml"), 3)
+    assert "computed from them" in message
+
+
+@pytest.mark.parametrize("name", ["Inc measured", "Azi calc (deg)", "MWD Inclination", "TF corr"])
+def test_what_the_tool_has_measured_is_no_reference(name):
+    assert meaning(name) is None
+
+
+def test_units_that_only_the_values_tell_are_said(tmp_path):
+    run = {**servo_run(), "ref_field_nt": servo_run()["ref_field_nt"] / 1000}
+    path = write_csv(tmp_path / "run.csv", renamed(run, ref_field_nt="Btotal"))
+    ran = mwdcal("profile", path, "-o", tmp_path / "tool.toml")
+    assert "µT, by its values" in ran.out
+    assert "# unit by its values" in (tmp_path / "tool.toml").read_text("utf-8")
+    assert mwdcal("profile", path, "-o", tmp_path / "tool.toml", "--json").json[
+        "unit_by_values"
+    ] == ["ref_field_nt"]

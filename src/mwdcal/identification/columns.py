@@ -40,6 +40,11 @@ _LABELS = {
 }
 """Names of columns of labels; a column is one only where no other is."""
 _CALLED_REFERENCE = re.compile(r"\b(ref|reference|nominal|target|set)\b", re.IGNORECASE)
+_MEASURED = re.compile(
+    r"\b(measured|meas|calc|calculated|computed|corr|corrected|gemessen|berechnet|ist|mwd|survey)\b",
+    re.IGNORECASE,
+)
+"""Words of angles that the tool itself has measured: no references."""
 _OTHER_NORTH = re.compile(r"true|grid|geographi|wahr|gitter", re.IGNORECASE)
 _BY_VALUE: dict[str, tuple[tuple[str, float, float], ...]] = {
     "ref_gravity_g": (("g", 0.9, 1.1), ("m/s²", 9.0, 10.5), ("mg", 900.0, 1100.0)),
@@ -74,6 +79,8 @@ def meaning(name: str, unit: str = "") -> Resemblance | None:
     if name in MAPPED:
         return Resemblance(name, unit_of(unit) or "".join(units_of(name)[:1]))
     plain = spelled(f"{name} ({unit})" if unit else name)
+    if _MEASURED.search(plain):
+        return None
     near = {form: column for column in MAPPED for form in forms(column)}
     spelt = next((near[form] for form in forms(plain) if form in near), None)
     return resembled(plain) or (Resemblance(spelt) if spelt else None)
@@ -81,8 +88,8 @@ def meaning(name: str, unit: str = "") -> Resemblance | None:
 
 def proposed(
     names: Sequence[str], units: Sequence[str], values: Values, source: str
-) -> dict[str, ColumnSource]:
-    """The columns of a table by the name that they have in a run file.
+) -> tuple[dict[str, ColumnSource], set[str]]:
+    """The columns of a table by the name that they have in a run file, and those with a unit by their values.
 
     Raises:
         FitError: two columns of which each may be one of the run file's, a unit that neither name nor
@@ -118,7 +125,8 @@ def proposed(
             f"{source}: of the magnetometers only {', '.join(n for n in RAW[3:] if n in chosen)} can be told by "
             "name. Name all three such as Bx, By, Bz or mx, my, mz."
         )
-    return _labels(names, chosen) | chosen
+    by_value = {c for c, each in chosen.items() if each.unit and not meanings[each.name].unit}
+    return _labels(names, chosen) | chosen, by_value
 
 
 def _one(column: str, candidates: Sequence[str], source: str) -> str:

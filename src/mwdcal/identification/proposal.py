@@ -17,6 +17,7 @@ from mwdcal.files.formats.dialect import Export
 from mwdcal.files.formats.table import Table
 from mwdcal.files.metadata import toml
 from mwdcal.files.runs import check_run, renamed, to_readings
+from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array, Bools, tool_from_earth
 from mwdcal.identification.columns import proposed
 from mwdcal.identification.wiring import LEAST_STATIONS, Wiring, is_clear, wiring
@@ -29,6 +30,8 @@ NEEDED = {
 """References that tell the axes of a triad."""
 UNRELATED = 0.9
 """Readings of which even the best axes leave more than this share have nothing to do with the references."""
+SAME_ANGLE = np.radians(1e-4)
+"""Inclinations of a stand never agree with raw readings to this, radians."""
 MOST_NAMED = 6
 """Alternatives that a message names."""
 
@@ -36,13 +39,15 @@ MOST_NAMED = 6
 class Proposal(NamedTuple):
     """A profile, how the axes of each triad in it were told, and the run that told.
 
-    `unused` are columns of the table that are nothing of a run file.
+    `unused` are columns of the table that are nothing of a run file, `by_value` columns of a run file whose
+    unit no name states.
     """
 
     profile: Profile
     wirings: dict[str, Wiring]
     stations: int
     unused: tuple[str, ...]
+    by_value: set[str]
     simulated: list[str]
 
 
@@ -63,7 +68,7 @@ def propose(path: str | os.PathLike[str]) -> Proposal:
         except InputError:
             return None
 
-    columns = proposed(export.names, export.units, values, table.source)
+    columns, by_value = proposed(export.names, export.units, values, table.source)
     profile = Profile(name=Path(path).stem, table=form or msgspec.UNSET, columns=columns)
     run = renamed(table, profile)
     check_run(run)
@@ -83,6 +88,7 @@ def propose(path: str | os.PathLike[str]) -> Proposal:
         wirings,
         readings.count,
         readings.unused,
+        by_value,
         simulated(readings.metadata),
     )
 
@@ -130,7 +136,23 @@ def _wirings(run: Table, readings: Readings) -> dict[str, Wiring]:
         if not is_clear(result):
             raise FitError(f"{run.source}: {_choice(kind, result)}")
         results[kind] = result
+        _check_independent(readings, results)
     return results
+
+
+def _check_independent(readings: Readings, results: dict[str, Wiring]) -> None:
+    """Refuse inclinations that were computed from the readings: they are no reference."""
+    result = results["accelerometer"]
+    permutation = TriadProfile(axes=result.axes).permutation  # type: ignore[arg-type]
+    vectors = readings.accelerometer @ permutation.transpose()
+    computed = OBSERVABLES["inclination"].value(vectors, vectors)
+    apart = np.abs(computed - readings.reference("inclination"))
+    if np.nanmax(apart) < SAME_ANGLE:
+        raise FitError(
+            f"{readings.source}: the inclinations are those that the readings themselves give, to "
+            f"{np.degrees(SAME_ANGLE):.1g}°: they were computed from them. A calibration needs the angles of the "
+            "stand: name their columns as references, such as 'Ref Inc'."
+        )
 
 
 def _unknown(kind: str, absent: list[str], stations: int, readings: Readings) -> FitError:
@@ -203,8 +225,13 @@ def as_toml(proposal: Proposal, source: str) -> str:
             fields = {key: fields[key] for key in ("header_line", "first_line")}
         lines += [f"{key} = {toml(value)}" for key, value in fields.items()]
     if not isinstance(profile.columns, msgspec.UnsetType):
-        lines += ["", "[columns]   # column of a run file = column of this table"]
-        lines += [f"{c} = {toml(_stated(each))}" for c, each in in_order(profile.columns)]
+        lines += [
+            "",
+            "[columns]   # of a run file = of this table; ref_ are angles of the stand, not the tool's",
+        ]
+        for column, each in in_order(profile.columns):
+            guess = "   # unit by its values" if column in proposal.by_value else ""
+            lines.append(f"{column} = {toml(_stated(each))}{guess}")
     return "\n".join(lines) + "\n"
 
 

@@ -22,6 +22,7 @@ def summary(proposal: Proposal, run: Path, output: Path) -> dict[str, Any]:
         "run": run.name,
         "stations": proposal.stations,
         "simulated": bool(proposal.simulated),
+        "unit_by_values": sorted(proposal.by_value),
         **msgspec.to_builtins(profile),
         **{
             kind: {
@@ -44,7 +45,11 @@ def screen(proposal: Proposal, run: Path, output: Path) -> str:
     if not isinstance(profile.table, msgspec.UnsetType):
         blocks[0] += "\n" + _layout(profile.table, run.suffix.lower() == ".xlsx")
     if not isinstance(profile.columns, msgspec.UnsetType):
-        rows = [[c, each.name, each.unit or "–"] for c, each in in_order(profile.columns)]
+        guesses = dict.fromkeys(proposal.by_value, ", by its values")
+        rows = [
+            [c, each.name, (each.unit or "–") + guesses.get(c, "")]
+            for c, each in in_order(profile.columns)
+        ]
         blocks.append(table(rows, ["column of a run file", "column here", "unit here"]))
     rows = [
         [
