@@ -41,7 +41,6 @@ def command(
     from mwdcal.app.pages import calibration as page
     from mwdcal.calibration.automatic.auto import choose
     from mwdcal.calibration.calibrate import recorded
-    from mwdcal.calibration.diagnosis.findings import UNUSED
     from mwdcal.calibration.estimate import fit
     from mwdcal.files import documents
     from mwdcal.files.formats import atomic
@@ -57,6 +56,5 @@ def command(
 
         rendered = render(calibration)
     shown = (page.summary if as_json else page.screen)(calibration, choice, output, report)
-    unused = [finding for finding in calibration.findings if finding.id == UNUSED]
     atomic.write_all([(output, documents.encode(calibration)), (report, rendered)])
-    print_result(shown, unused)
+    print_result(shown, page.first_findings(calibration))
