@@ -24,7 +24,7 @@ INTERNAL = 70
 COMPLETION = "_MWDCAL_COMPLETE"
 """Variable with which a shell asks for completions, which are bytes."""
 COMMANDS = (
-    *("apply", "calibrate", "compare", "completion", "convert"),
+    *("apply", "calibrate", "compare", "completion", "convert", "example"),
     *("fleet", "noise", "profile", "stations", "verify"),
 )
 """Modules of `mwdcal.app.commands` with a command of their name."""

@@ -15,7 +15,7 @@ import msgspec
 
 from mwdcal import __version__
 from mwdcal.app import pool, progress
-from mwdcal.app.commands.choices import options_of, prior_of
+from mwdcal.app.choices import options_of, prior_of
 from mwdcal.app.commands.options import Typed
 from mwdcal.app.pages.fleet_summary import FleetSummary, stated_options, summarise
 from mwdcal.app.text import plural

@@ -52,6 +52,10 @@ class Command(click.Command):
                 raise InputError(f"'{word}': a name must be valid UTF-8. Rename the file.")
         return super().parse_args(context, args)
 
+    def get_help(self, context: click.Context) -> str:
+        """The help, as wide as the terminal."""
+        return laid_out(super().get_help(context), sys.stdout)
+
     def invoke(self, context: click.Context) -> Any:
         """Run the command."""
         try:

@@ -8,7 +8,7 @@ import math
 import os
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, TypeAlias
 
 NARROWEST, WIDEST = 80, 160
@@ -20,9 +20,9 @@ UNCUT = 1_000_000
 BETWEEN = 3
 """Blanks between two columns of a table."""
 READABLE = 24
-"""Least width to which a column of words is folded."""
+"""Least width to which a column of words is folded; its title, to half of it."""
 Column: TypeAlias = tuple[str, ...]
-"""The cells of a column of a table, below its title."""
+"""The title of a column of a table, and its cells."""
 _PLAIN, _RAISED = "-+0123456789T", "⁻⁺⁰¹²³⁴⁵⁶⁷⁸⁹ᵀ"
 _HANDLER = "mwdcal.twins"
 TWINS = {chr(0xA0): " ", chr(0x2009): " ", chr(0x202F): " ", "‰": "per mille"} | dict(
@@ -127,7 +127,7 @@ def columns(stream: Any) -> int | None:
     stated = os.environ.get("COLUMNS", "")
     try:
         size = int(stated) if stated.isdecimal() else os.get_terminal_size(stream.fileno()).columns
-    except OSError:
+    except (OSError, ValueError):
         size = 0
     return min(max(size, NARROWEST), WIDEST)
 
@@ -137,8 +137,13 @@ def laid_out(text: str, stream: Any) -> str:
     width = columns(stream)
     if width is None:
         return text
+
+    def indent(line: str) -> str:
+        deeper = len(line) - len(line.lstrip(" ")) + 2
+        return "# " if " # " in f" {line}" else " " * deeper
+
     lines = fitting(text, stream.encoding).split("\n")
-    return "\n".join(fold(line, width, "# " if " # " in f" {line}" else "  ") for line in lines)
+    return "\n".join(fold(line, width, indent(line)) for line in lines)
 
 
 def fold(line: str, width: int, indent: str = "") -> str:
@@ -193,8 +198,10 @@ def _abreast(whole: Sequence[Column], room: int, names: int) -> list[list[Column
     def folded(column: Column, width: int) -> Column:
         return tuple(fold(cell, max(width, READABLE)) for cell in column)
 
-    if left(whole) + BETWEEN >= 0:
-        return [list(whole)]
+    narrow = [(fold(title, max(_width(cells), READABLE // 2)), *cells) for title, *cells in whole]
+    for each in (whole, narrow):
+        if left(each) + BETWEEN >= 0:
+            return [list(each)]
     first = [folded(column, room // 2) for column in whole[:names]]
     tables = [first]
     for column in whole[names:]:
@@ -206,11 +213,11 @@ def _abreast(whole: Sequence[Column], room: int, names: int) -> list[list[Column
     return tables
 
 
-def _width(column: Column) -> int:
-    """Width of the longest line of a column."""
+def _width(column: Iterable[str]) -> int:
+    """Width of the longest line of some cells."""
     from rich.cells import cell_len
 
-    return max(cell_len(line) for cell in column for line in cell.split("\n"))
+    return max((cell_len(line) for cell in column for line in cell.split("\n")), default=0)
 
 
 def _drawn(whole: Sequence[Column], width: int) -> str:
@@ -221,10 +228,12 @@ def _drawn(whole: Sequence[Column], width: int) -> str:
     from rich.text import Text
 
     aligned = Table(box=box.SIMPLE, pad_edge=False, show_edge=False)
-    for index, column in enumerate(whole):
-        words = index == 0 or any("\n" in cell for cell in column)
-        aligned.add_column(Text(column[0]), justify="left" if words else "right", no_wrap=True)
-    for row in zip(*(column[1:] for column in whole), strict=True):
+    tallest = max(title.count("\n") for title, *_ in whole)
+    for index, (title, *cells) in enumerate(whole):
+        words = index == 0 or any("\n" in cell for cell in cells)
+        lowered = Text("\n" * (tallest - title.count("\n")) + title)
+        aligned.add_column(lowered, justify="left" if words else "right", no_wrap=True)
+    for row in zip(*(cells for _, *cells in whole), strict=True):
         aligned.add_row(*map(Text, row))
     shown = io.StringIO()  # not stdout, whose encoding would change the lines
     Console(file=shown, width=width, color_system=None, legacy_windows=False).print(aligned)

@@ -37,7 +37,7 @@ def command(
     Example: mwdcal calibrate run.csv --tool servo -o tool.json --report tool.html
     Exit: 0 calibrated, 2 input cannot be read, 3 fit failed or refused.
     """
-    from mwdcal.app.commands.choices import load_run, options_of, prior_of
+    from mwdcal.app.choices import load_run, options_of, prior_of
     from mwdcal.app.pages import calibration as page
     from mwdcal.calibration.automatic.auto import choose
     from mwdcal.calibration.calibrate import recorded

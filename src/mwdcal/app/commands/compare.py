@@ -38,7 +38,7 @@ def command(
     Example: mwdcal compare run.csv --tool servo --report methods.html
     Exit: 0 compared, 2 input cannot be read, 3 every method refused.
     """
-    from mwdcal.app.commands.choices import load_run, order_of
+    from mwdcal.app.choices import load_run, order_of
     from mwdcal.app.pages import comparison as page
     from mwdcal.calibration.diagnosis.findings import unused_columns
     from mwdcal.calibration.options import Options

@@ -12,7 +12,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from mwdcal.app.commands.choices import names
+from mwdcal.app.choices import names
 from mwdcal.app.commands.options import Typed
 from mwdcal.app.messages import as_typed
 from mwdcal.app.pages.calibration import choices
