@@ -61,10 +61,11 @@ def test_an_installed_package_has_the_files(tmp_path):
 def test_every_line_of_the_first_pages_runs(tmp_path, monkeypatch, page):
     pytest.importorskip("matplotlib")
     text = (ROOT / page).read_text("utf-8")
-    blocks = re.findall(r"^```\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
-    lines = re.findall(r"^(?:\$ )?mwdcal (.*)", "".join(blocks), re.MULTILINE)
+    blocks = re.findall(r"^```(\w*)\n(.*?)^```$", text, re.DOTALL | re.MULTILINE)
+    shell = "".join(block for language, block in blocks if not language)
+    lines = re.findall(r"^(?:\$ )?mwdcal (.*)", shell, re.MULTILINE)
     assert lines[0] == "example demo"
-    assert len(lines) >= 7
+    assert "compare demo/run.csv --tool demo/tool.toml" in lines
     monkeypatch.chdir(tmp_path)
     for line in lines:
         ran = mwdcal(*shlex.split(line))
