@@ -58,8 +58,8 @@ SAMPLES = {
     "prior": "calibration",
 }
 """The kind of file that each argument or option takes, by its name."""
-OUTPUTS = ("output", "report", "plot")
-"""Options that name a file to write."""
+OUTPUTS = ("output", "report", "plot", "folder")
+"""Arguments and options that name what to write."""
 LIMITS = 'name = "lab"\n[spread]\ninclination_deg = 0.2\nazimuth_deg = 1.5\n'
 CALIBRATIONS = (
     ("servo.csv",),

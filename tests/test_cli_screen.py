@@ -55,6 +55,7 @@ COMMANDS = {
     "fleet": ("fleet.parquet", "--tool", "servo", "-o", "made/cals.parquet", "--workers", "1"),
     "noise": ("log.csv", "--to", "19", "--tool", "servo"),
     "stations": ("log.csv", "-o", "made/run2.csv"),
+    "profile": ("run.csv", "-o", "made/tool.toml"),
 }
 OTHERS = {name: (name, "--help") for name in COMMANDS} | {
     "failed": ("verify", "cal.json", "other.csv"),
@@ -104,6 +105,11 @@ def timeless(printed):
     return re.sub(r"\b[\d.]+ (s|tools/s)\b|time of one fit.*", "", printed)
 
 
+def uncoloured(printed):
+    """What a terminal was sent, without the colours of `click.style`; every other escape stays."""
+    return re.sub(r"\x1b\[(0|1|3[123])m", "", printed)
+
+
 def words(printed):
     """Words in plain characters, without rules between them and without measured times."""
     return re.sub("-{5,}", "", timeless(text.fitting(printed, "ascii"))).split()
@@ -139,12 +145,18 @@ def test_status_and_result_are_the_same_in_every_encoding(files, monkeypatch, no
 @pytest.mark.parametrize("encoding", ["utf-8", *ENCODINGS])
 @pytest.mark.parametrize("arguments", LINES.values(), ids=LINES)
 def test_a_terminal_sees_what_a_file_holds(files, monkeypatch, no_progress, arguments, encoding):
+    """The same words in the same order, but for colours and where lines are folded."""
     monkeypatch.chdir(files)
-    code, out, err = shown_on_a_terminal(encoding, *arguments)
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "160")
+    code, *printed = shown_on_a_terminal(encoding, *arguments)
     other, *said = shown(encoding, *arguments)
     assert code == other
-    assert "\x1b" not in out
-    assert [timeless(out), words(err)] == [timeless(said[0]), words(said[1])]
+    for part, expected in zip(map(uncoloured, printed), said, strict=True):
+        assert "\x1b" not in part
+        assert "\x1b" not in expected
+        assert words(part) == words(expected)
+        assert max(map(len, [*part.splitlines(), ""])) <= 160
 
 
 @posix
@@ -156,7 +168,7 @@ def test_a_progress_bar_is_drawn_in_every_encoding(files, monkeypatch, encoding)
     code, out, err = shown_on_a_terminal(encoding, "apply", *COMMANDS["apply"])
     assert code == 0
     assert "\x1b" in err
-    assert timeless(out) == timeless(shown(encoding, "apply", *COMMANDS["apply"])[1])
+    assert words(out) == words(shown(encoding, "apply", *COMMANDS["apply"])[1])
 
 
 @pytest.mark.parametrize("arguments", OTHERS.values(), ids=OTHERS)

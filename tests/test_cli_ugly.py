@@ -154,7 +154,7 @@ def test_references_that_contradict_each_other_never_pass_in_silence(tmp_path, n
         refused(made, 3)
         assert not left(tmp_path)
     else:
-        assert "times the declared noise" in made.out
+        assert "times the declared noise" in made.err
 
 
 GENERIC = {
@@ -258,7 +258,7 @@ def test_labels_of_markup_are_only_labels(tmp_path):
     run["ax"] = np.where(np.arange(48) == 20, run["ax"] + 0.1, run["ax"])
     made = ran(tmp_path, run)
     assert made.code == 0
-    assert "! station <script>alert(20)</script>: residual" in made.out
+    assert "! station <script>alert(20)</script>: residual" in made.err
 
 
 def test_groups_of_one_are_no_groups(tmp_path):
@@ -285,7 +285,7 @@ def test_what_nothing_determines_is_said(tmp_path):
     assert made.code == 0
     assert "accelerometer 9 of 12 determined   magnetometer 9 of 12 determined" in made.out
     for words in ("rotation about the tool's x axis", "y axis", "toolface zero", "strength"):
-        assert sum(words in s for s in made.out.splitlines() if s.startswith("! ")) == 1
+        assert sum(words in s for s in made.err.splitlines() if s.startswith("! ")) == 1
 
 
 @pytest.mark.parametrize("missing", ["magnetometer", "temperature_c", "station"])
@@ -339,7 +339,7 @@ def test_the_screen_names_twelve_stations_to_shoot_again(tmp_path):
     shown = ran(tmp_path, columns, "--order", 0)
     told = ran(tmp_path, columns, "--order", 0, "--json").json["findings"]
     count = sum(finding["id"] == "reshoot" for finding in told)
-    lines = [line for line in shown.out.splitlines() if line.startswith("! ")]
+    lines = [line for line in shown.err.splitlines() if line.startswith("! ")]
     assert count > 12
     assert sum("Re-shoot it" in line for line in lines) == 12
     assert lines[-1] == f"! … and {count - 12} more to re-shoot"

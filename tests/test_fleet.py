@@ -495,7 +495,7 @@ def test_files_of_a_folder_that_do_not_match(tmp_path):
 def test_order_0_on_a_wide_span_is_mentioned(tmp_path):
     path = write_fleet(tmp_path / "runs.parquet", {"T1": warm_run(1), "T2": short_run(2)})
     ran = mwdcal("fleet", path, "-o", tmp_path / "out.parquet", "--tool", "servo")
-    assert "1 tool spans more than 10 °C" in ran.out
+    assert "1 tool spans more than 10 °C" in ran.err
 
 
 # Parts, restart, cluster

@@ -117,12 +117,12 @@ def test_screen_and_page_name_the_doubtful_tools(tmp_path):
     runs = troubled()
     del runs["bare"]
     ran, page = said(tmp_path, runs)
-    assert "! accelerometer-residuals in 4 tools: off, a little off, named, alone" in ran.out
-    assert "! repeated-readings in 1 tool: copies" in ran.out
+    assert "! accelerometer-residuals in 4 tools: off, a little off, named, alone" in ran.err
+    assert "! repeated-readings in 1 tool: copies" in ran.err
     assert "All calibrated" not in page
     assert "Some doubtful" in page
     assert "accelerometer residuals in 4 tools" in page
-    assert "looks-like" not in ran.out
+    assert "looks-like" not in ran.out + ran.err
     ran, _ = said(tmp_path, runs, "--json")
     first = ran.json["findings"][0]
     assert first == {
@@ -163,4 +163,4 @@ def test_relative_magnetometers_are_apart_from_those_in_nt(tmp_path):
     assert parameter(page, "magnetometer, field = 1", "gain xx")[0::5] == ["1", "1/nT"]
     assert parameter(page, "magnetometer, field = 1", "offset x")[0::5] == ["1", "of the field"]
     assert "No tool has a parameter farther" in page
-    assert "! field-unknown in 1 tool: R" in ran.out
+    assert "! field-unknown in 1 tool: R" in ran.err

@@ -49,7 +49,7 @@ def test_each_tool_has_the_azimuths_of_its_own_file(folder):
     stated = json.loads(pq.read_schema(folder.parent / "cals.parquet").metadata[b"mwdcal"])
     assert stated["made"] == "x"
     assert not {"lab", "declination_deg", "azimuth_reference"} & set(stated)
-    assert "azimuths count from 3 norths, 0° to 7.5° from magnetic" in ran(folder).out
+    assert "azimuths count from 3 norths, 0° to 7.5° from magnetic" in ran(folder).err
 
 
 def test_mixed_rows_keep_the_azimuths_of_their_file(folder):
@@ -182,13 +182,13 @@ def test_tools_with_rows_in_several_folders_are_counted(folder):
         write_fleet(part / "0.parquet", {s: short_run(ord(s)) for s in serials})
     page = folder.parent / "fleet.html"
     said = ran(folder, "--report", page)
-    for text in (said.out, page.read_text("utf-8")):
+    for text in (said.err, page.read_text("utf-8")):
         assert "tools with rows in several folders: 2" in text
         assert "calibrate folder by folder" in text
     rows = calibrated(folder)
     assert {s: row["stations"] for s, row in rows.items()} == {"A": 28, "B": 56, "C": 56, "D": 28}
     year = mwdcal("fleet", folder / "year=2024", "-o", folder.parent / "o.parquet")
-    assert "several folders" not in year.out
+    assert "several folders" not in year.out + year.err
 
 
 def test_text_where_numbers_belong_is_refused_with_the_remedy(folder):

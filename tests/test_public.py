@@ -12,6 +12,7 @@ import pytest
 import mwdcal
 from cli_support import EXAMPLE, numbers, read_csv
 from cli_support import mwdcal as command
+from mwdcal.app.commands.example import CONTENTS
 from mwdcal.calibration.record import Calibration
 from mwdcal.files import documents
 from mwdcal.sensor.profile import TriadProfile
@@ -526,5 +527,5 @@ def test_the_bundled_example_is_what_its_script_writes(tmp_path):
     for name in ("make.py", "tool.toml"):
         shutil.copy(folder / name, tmp_path / name)
     subprocess.run([sys.executable, tmp_path / "make.py"], check=True, env=os.environ)
-    for name in ("run.csv", "rolltest.csv", "truth.json"):
+    for name in CONTENTS:
         assert (tmp_path / name).read_bytes() == (folder / name).read_bytes()

@@ -1,7 +1,13 @@
 """Make the bundled example: a SIMULATED servo instrument within Moosavi's Table 1.
 
-Writes run.csv (48 stations), rolltest.csv (12 toolfaces at 45°, taken separately) and
-truth.json beside this script. Same seed, same bytes.
+Writes beside this script what `mwdcal example` hands out, and truth.json. Same seed, same bytes.
+
+run.csv       48 stations
+rolltest.csv  12 toolfaces at 45°, taken separately
+surveys.csv   readings without references, to be corrected
+export.csv    the stations of run.csv as a German spreadsheet program would export them
+log.csv       a continuous log in which the tool rests six times
+static.csv    a continuous log of the tool at rest
 
     python examples/servo/make.py
 """
@@ -22,8 +28,13 @@ IDENTITY = {
     "operator": "examples/servo/make.py",
     "stand": "simulated, 0.01° inclination, 0.05° azimuth, 0.02° toolface",
 }
+IDENTITY_LINES = [f"# {k} = {json.dumps(v, ensure_ascii=False)}\n" for k, v in IDENTITY.items()]
 POWERS = np.array([1.0, 1e-3, 1e-6])
 """Of a drift, shares of the powers 1 to 3 of temperature, per °C."""
+RAW = ("ax", "ay", "az", "mx", "my", "mz")
+SAMPLING_HZ = 10
+SAMPLE_NOISE = 1e-3
+"""Of one sample of a log, V."""
 
 
 def factors(rng, scale, bias, alignment, scale_drift, bias_drift):
@@ -34,8 +45,52 @@ def factors(rng, scale, bias, alignment, scale_drift, bias_drift):
     return np.concatenate([*linear, rng.uniform(-alignment, alignment, 6)])
 
 
+def channels(run, profile):
+    """The raw channels of a run (n, 6), V: all lie along the tool axes."""
+    triads = (
+        run.accelerometer * profile.accelerometer.scale,
+        run.magnetometer * profile.magnetometer.scale,
+    )
+    return np.concatenate(triads, -1)
+
+
+def export(run) -> None:
+    """The stations with semicolons, decimal commas and vendor names: mg and nT, x along the tool."""
+    names = [
+        "Messpunkt",
+        "Temperatur (°C)",
+        *(f"G{i} (mg)" for i in "xyz"),
+        *(f"H{i} (nT)" for i in "xyz"),
+    ]
+    names += ["Neigung Soll (°)", "Azimut Soll (°)", "Rollwinkel Soll (°)", "Gesamtfeld Soll (nT)"]
+    angles = [np.degrees(run.known[name]) for name in ("inclination", "azimuth", "toolface")]
+    turned = np.roll(run.accelerometer * 1e3, 1, -1), np.roll(run.magnetometer, 1, -1)
+    rows = np.column_stack(
+        [run.temperature, *turned, *angles, run.known["field"] + np.zeros(run.count)]
+    )
+    with (HERE / "export.csv").open("w", encoding="cp1252", newline="\r\n") as stream:
+        stream.writelines(IDENTITY_LINES)
+        stream.write(";".join(names) + "\n")
+        for label, row in enumerate(rows, 1):
+            stream.write(
+                f"{label};" + ";".join(f"{cell:.2f}".replace(".", ",") for cell in row) + "\n"
+            )
+
+
+def log(name: str, level, rng) -> None:
+    """A continuous log: the level of every channel at each sample, V, with white noise."""
+    level = level + SAMPLE_NOISE * rng.normal(size=level.shape)
+    with (HERE / name).open("w", encoding="utf-8", newline="\n") as stream:
+        stream.writelines(IDENTITY_LINES)
+        stream.write(",".join(["time_s", *RAW]) + "\n")
+        for index, sample in enumerate(level):
+            stream.write(
+                f"{index / SAMPLING_HZ:.1f}," + ",".join(f"{v:.4f}" for v in sample) + "\n"
+            )
+
+
 def main() -> None:
-    """Simulate both runs and write them."""
+    """Simulate the runs and logs and write them."""
     rng = np.random.default_rng(SEED)
     profile = mwdcal.load_profile(HERE / "tool.toml")
     stand = profile.stand
@@ -46,7 +101,9 @@ def main() -> None:
     plans = {
         "run.csv": ([5, 45, 90, 135], 12, [0, 90, 180, 270], [25.0]),
         "rolltest.csv": ([45], 12, [60], [25.2]),
+        "surveys.csv": ([20, 60, 88], 4, [30, 75, 120], [25.1]),
     }
+    runs = {}
     for name, plan in plans.items():
         run = mwdcal.simulate(
             *plan,
@@ -56,7 +113,21 @@ def main() -> None:
             seed=rng,
         )
         logged = replace(run, temperature=np.round(run.temperature, 2), metadata=IDENTITY)
-        mwdcal.save(logged, HERE / name, profile, decimals=6)
+        runs[name] = logged
+        surveys = name == "surveys.csv"
+        mwdcal.save(
+            replace(logged, known={}, sd={}) if surveys else logged,
+            HERE / name,
+            profile,
+            decimals=6,
+        )
+    export(runs["run.csv"])
+    rests = channels(runs["surveys.csv"], profile)[::2]
+    seconds = np.cumsum([0, *[8, 3] * len(rests)])[:-1]
+    time = np.arange(0, seconds[-1], 1 / SAMPLING_HZ)
+    moving = [np.interp(time, seconds, np.repeat(channel, 2)) for channel in rests.T]
+    log("log.csv", np.stack(moving, -1), rng)
+    log("static.csv", np.tile(rests[0], (120 * SAMPLING_HZ, 1)), rng)
     document = {
         "simulated": True,
         "seed": SEED,

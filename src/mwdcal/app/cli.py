@@ -16,7 +16,7 @@ from mwdcal import __version__
 from mwdcal.app import interruption
 from mwdcal.app.block_pandas import without_pandas
 from mwdcal.app.messages import say, screens
-from mwdcal.app.text import harmless
+from mwdcal.app.text import harmless, laid_out
 from mwdcal.errors import MwdcalError, reason
 
 INTERNAL = 70
@@ -24,7 +24,7 @@ INTERNAL = 70
 COMPLETION = "_MWDCAL_COMPLETE"
 """Variable with which a shell asks for completions, which are bytes."""
 COMMANDS = (
-    *("apply", "calibrate", "compare", "completion", "convert"),
+    *("apply", "calibrate", "compare", "completion", "convert", "example"),
     *("fleet", "noise", "profile", "stations", "verify"),
 )
 """Modules of `mwdcal.app.commands` with a command of their name."""
@@ -71,7 +71,7 @@ def _status(arguments: list[str] | None) -> int:
             return cli.main(arguments, prog_name="mwdcal", standalone_mode=False) or 0
     except click.ClickException as error:
         error.show(usage := io.StringIO())
-        click.echo(harmless(usage.getvalue()), err=True, nl=False)
+        click.echo(laid_out(harmless(usage.getvalue()), sys.stderr), err=True, nl=False)
         return error.exit_code
     except (click.Abort, KeyboardInterrupt) as stop:
         return _ended(*interruption.report(stop.__cause__ or stop))

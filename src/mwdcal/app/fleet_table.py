@@ -15,9 +15,8 @@ import msgspec
 
 from mwdcal import __version__
 from mwdcal.app import pool, progress
-from mwdcal.app.commands.choices import options_of, prior_of
+from mwdcal.app.choices import options_of, prior_of
 from mwdcal.app.commands.options import Typed
-from mwdcal.app.messages import lines
 from mwdcal.app.pages.fleet_summary import FleetSummary, stated_options, summarise
 from mwdcal.app.text import plural
 from mwdcal.calibration.automatic.nonlinearity import with_strengths
@@ -59,8 +58,6 @@ def calibrate_table(
     if max(options.orders) and "temperature_c" not in source.columns:
         raise no_temperature(max(options.orders))
     unused = unused_columns(synonyms.unused(source.columns, source.used))
-    for line in lines(unused):
-        say(line)
     target = atomic.target(output)
     _check_target(target, runs)
     plan = Plan.of(source, profile, options)

@@ -16,7 +16,7 @@ from typing import IO, TYPE_CHECKING, Any
 
 import click
 
-from mwdcal.app.text import UNSAFE_BUT_LINES, fitting, harmless, one_line
+from mwdcal.app.text import UNSAFE_BUT_LINES, fitting, harmless, laid_out, one_line
 from mwdcal.errors import InputError, MwdcalError, reason
 
 if TYPE_CHECKING:
@@ -25,10 +25,25 @@ if TYPE_CHECKING:
 
 LONGEST_MESSAGE = 2000
 """Characters of a message that are shown: what a file is named or says may be of any length."""
+ONLY_ERRORS = "mwdcal.quiet"
+"""Where the context of a command says that it prints only errors, and JSON."""
+COLOURS = {"!": "yellow", "PASS": "green", "pass": "green", "FAIL": "red"}
+"""Colours of marks and verdicts on a terminal, where the words alone say the same."""
+_MARKED = re.compile(r"^(!|PASS|FAIL)(?= )|(?<=   )(pass|FAIL)(?=   |$)", re.MULTILINE)
+"""A mark or verdict at the beginning of a line, or alone in a cell of a table."""
 
 
 class Command(click.Command):
-    """A command whose errors name its options as they are typed."""
+    """A command whose errors name its options as they are typed, and which can be quiet."""
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        words = "Print nothing but errors and, with --json, the result."
+        self.params.append(
+            click.Option(
+                ["--quiet"], is_flag=True, expose_value=False, callback=_be_quiet, help=words
+            )
+        )
 
     def parse_args(self, context: click.Context, args: list[str]) -> list[str]:
         """Read the arguments, which are all text: outputs name the files that they are made of."""
@@ -37,6 +52,10 @@ class Command(click.Command):
                 raise InputError(f"'{word}': a name must be valid UTF-8. Rename the file.")
         return super().parse_args(context, args)
 
+    def get_help(self, context: click.Context) -> str:
+        """The help, as wide as the terminal."""
+        return laid_out(super().get_help(context), sys.stdout)
+
     def invoke(self, context: click.Context) -> Any:
         """Run the command."""
         try:
@@ -44,6 +63,17 @@ class Command(click.Command):
         except MwdcalError as error:
             error.args = (as_typed(str(error)),)
             raise
+
+
+def _be_quiet(context: click.Context, option: click.Parameter, typed: bool) -> None:
+    """Note that `--quiet` was typed."""
+    context.meta[ONLY_ERRORS] = typed
+
+
+def quiet() -> bool:
+    """Whether the command that runs was told to print nothing but errors and JSON."""
+    context = click.get_current_context(silent=True)
+    return bool(context and context.meta.get(ONLY_ERRORS))
 
 
 def as_typed(text: str) -> str:
@@ -126,11 +156,21 @@ def _occupy_closed_descriptors() -> None:
 
 
 def say(text: str) -> None:
-    """A message for people, on stderr and on one line; of a very long one the beginning and the end."""
+    """A message for people, on stderr, unless the command is quiet; of a very long one both ends."""
+    if quiet():
+        return
     line = one_line(text)
     if len(line) > LONGEST_MESSAGE:
         line = f"{line[: LONGEST_MESSAGE // 2]} … {line[-LONGEST_MESSAGE // 4 :]}"
-    click.echo(line, err=True)
+    click.echo(_on_screen(line, sys.stderr), err=True)
+
+
+def _on_screen(text: str, stream: Any) -> str:
+    """Text as a stream gets it: a terminal, folded lines, and colours if it shows them."""
+    shown = laid_out(text, stream)
+    if not stream.isatty() or os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb":
+        return shown
+    return _MARKED.sub(lambda word: click.style(word[0], fg=COLOURS[word[0]], bold=True), shown)
 
 
 def lines(findings: Iterable[Finding]) -> list[str]:
@@ -146,10 +186,13 @@ def to_json(result: Any) -> str:
 
 
 def print_result(result: Any, findings: Iterable[Finding] = ()) -> None:
-    """Findings on stderr, and the result on stdout: text as it is, anything else as JSON."""
+    """The result on stdout, text for people or else JSON; then findings on stderr."""
+    if not isinstance(result, str):
+        click.echo(_shown(to_json(result)))
+    elif not quiet():
+        click.echo(_on_screen(harmless(result), sys.stdout))
     for line in lines(findings):
         say(line)
-    click.echo(harmless(result) if isinstance(result, str) else _shown(to_json(result)))
 
 
 def _shown(document: str) -> str:

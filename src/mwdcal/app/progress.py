@@ -9,6 +9,8 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
+from mwdcal.app.messages import quiet
+
 PATIENCE = 2.0
 """Seconds before there is anything to see."""
 MOMENT = 0.1
@@ -21,7 +23,7 @@ def bar(label: str) -> Iterator[Callable[[int, int], None]]:
 
     The bar also moves while that is not known.
     """
-    if not sys.stderr.isatty():
+    if quiet() or not sys.stderr.isatty():
         yield lambda done, total: None
         return
     known: dict[str, Any] = {"completed": 0, "total": None}

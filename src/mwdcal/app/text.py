@@ -5,11 +5,24 @@ from __future__ import annotations
 import codecs
 import io
 import math
+import os
 import re
 import sys
+from collections.abc import Iterable, Sequence
+from typing import Any, TypeAlias
 
+NARROWEST, WIDEST = 80, 160
+"""Columns for which a terminal gets its tables and lines, however many it has."""
 WIDE = 300
-"""Width of a table whose last column holds remarks, which are never cut."""
+"""Width of a table in a file whose last column holds remarks, which are never cut."""
+UNCUT = 1_000_000
+"""Width that no table has."""
+BETWEEN = 3
+"""Blanks between two columns of a table."""
+READABLE = 24
+"""Least width to which a column of words is folded; its title, to half of it."""
+Column: TypeAlias = tuple[str, ...]
+"""The title of a column of a table, and its cells."""
 _PLAIN, _RAISED = "-+0123456789T", "⁻⁺⁰¹²³⁴⁵⁶⁷⁸⁹ᵀ"
 _HANDLER = "mwdcal.twins"
 TWINS = {chr(0xA0): " ", chr(0x2009): " ", chr(0x202F): " ", "‰": "per mille"} | dict(
@@ -107,24 +120,121 @@ def chance(probability: float | None) -> str:
     return "< 1e-9" if probability < 1e-9 else f"{probability:.2g}"
 
 
-def table(rows: list[list[str]], header: list[str], width: int = 160) -> str:
+def columns(stream: Any) -> int | None:
+    """Columns to fill on the terminal that a stream is; None where it is none."""
+    if not stream.isatty():
+        return None
+    stated = os.environ.get("COLUMNS", "")
+    try:
+        size = int(stated) if stated.isdecimal() else os.get_terminal_size(stream.fileno()).columns
+    except (OSError, ValueError):
+        size = 0
+    return min(max(size, NARROWEST), WIDEST)
+
+
+def laid_out(text: str, stream: Any) -> str:
+    """Text for a stream: on a terminal its lines are folded, elsewhere it stays as it is."""
+    width = columns(stream)
+    if width is None:
+        return text
+
+    def indent(line: str) -> str:
+        deeper = len(line) - len(line.lstrip(" ")) + 2
+        return "# " if " # " in f" {line}" else " " * deeper
+
+    lines = fitting(text, stream.encoding).split("\n")
+    return "\n".join(fold(line, width, indent(line)) for line in lines)
+
+
+def fold(line: str, width: int, indent: str = "") -> str:
+    """A line in lines of at most a width, never broken inside a word; after the first with an indent.
+
+    It is broken between its items, which two blanks or more separate, and within one only if that is too
+    long for a line.
+
+    >>> print(fold("12 stations   method joint   as it is", 20, "  "))
+    12 stations
+      method joint
+      as it is
+    """
+    from rich.cells import cell_len
+
+    if cell_len(line) <= width:
+        return line
+    lines = [""]
+    for gap, item in re.findall(r"(^ *| {2,})([^ ]+(?: [^ ]+)*)", line):
+        whole = cell_len(indent + item) <= width
+        for piece in [item] if whole else re.findall(r" ?[^ ]+", item):
+            longer = lines[-1] + gap * (piece[0] != " ") + piece
+            if cell_len(longer) <= width or not lines[-1]:
+                lines[-1] = longer
+            else:
+                lines.append(indent + piece.lstrip())
+    return "\n".join(lines)
+
+
+def table(rows: list[list[str]], header: list[str], width: int = WIDEST, names: int = 1) -> str:
     """Columns aligned: the first to the left, the others to the right.
 
-    Cells are shown as they are, on one line, in characters that stdout has.
+    Cells are shown as they are, on one line, in characters that stdout has. On a terminal too narrow for
+    it words are folded and the columns stand in several tables, which all begin with those that name the
+    rows: the first, or several. Elsewhere the table has at most a `width`.
     """
+    cells = [
+        [fitting(one_line(cell), sys.stdout.encoding) for cell in row] for row in [header, *rows]
+    ]
+    whole, room = list(zip(*cells, strict=True)), columns(sys.stdout)
+    if room is None:
+        return _drawn(whole, width)
+    return "\n\n".join(_drawn(some, UNCUT) for some in _abreast(whole, room, names))
+
+
+def _abreast(whole: Sequence[Column], room: int, names: int) -> list[list[Column]]:
+    """The columns of a table in as many tables as they need, with the first ones in each."""
+
+    def left(some: Sequence[Column]) -> int:
+        return room - sum(_width(column) + BETWEEN for column in some)
+
+    def folded(column: Column, width: int) -> Column:
+        return tuple(fold(cell, max(width, READABLE)) for cell in column)
+
+    narrow = [(fold(title, max(_width(cells), READABLE // 2)), *cells) for title, *cells in whole]
+    for each in (whole, narrow):
+        if left(each) + BETWEEN >= 0:
+            return [list(each)]
+    first = [folded(column, room // 2) for column in whole[:names]]
+    tables = [first]
+    for column in whole[names:]:
+        words = tuple(word for cell in column for word in cell.split(" "))
+        least = min(_width(column), max(READABLE, _width(words)))
+        if left(tables[-1]) < least and tables[-1] is not first:
+            tables.append(first)
+        tables[-1] = [*tables[-1], folded(column, left(tables[-1]))]
+    return tables
+
+
+def _width(column: Iterable[str]) -> int:
+    """Width of the longest line of some cells."""
+    from rich.cells import cell_len
+
+    return max((cell_len(line) for cell in column for line in cell.split("\n")), default=0)
+
+
+def _drawn(whole: Sequence[Column], width: int) -> str:
+    """The columns of a table side by side; those with folded cells begin at the left."""
     from rich import box
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
-    def cell(content: str) -> Text:
-        return Text(fitting(one_line(content), sys.stdout.encoding))
-
     aligned = Table(box=box.SIMPLE, pad_edge=False, show_edge=False)
-    for index, title in enumerate(header):
-        aligned.add_column(cell(title), justify="left" if index == 0 else "right", no_wrap=True)
-    for row in rows:
-        aligned.add_row(*map(cell, row))
+    tallest = max(title.count("\n") for title, *_ in whole)
+    for index, (title, *cells) in enumerate(whole):
+        words = index == 0 or any("\n" in cell for cell in cells)
+        lowered = Text("\n" * (tallest - title.count("\n")) + title)
+        aligned.add_column(lowered, justify="left" if words else "right", no_wrap=True)
+    for row in zip(*(cells for _, *cells in whole), strict=True):
+        aligned.add_row(*map(Text, row))
     shown = io.StringIO()  # not stdout, whose encoding would change the lines
     Console(file=shown, width=width, color_system=None, legacy_windows=False).print(aligned)
     return "\n".join(line.rstrip() for line in shown.getvalue().splitlines())

@@ -37,11 +37,10 @@ def command(
     Example: mwdcal calibrate run.csv --tool servo -o tool.json --report tool.html
     Exit: 0 calibrated, 2 input cannot be read, 3 fit failed or refused.
     """
-    from mwdcal.app.commands.choices import load_run, options_of, prior_of
+    from mwdcal.app.choices import load_run, options_of, prior_of
     from mwdcal.app.pages import calibration as page
     from mwdcal.calibration.automatic.auto import choose
     from mwdcal.calibration.calibrate import recorded
-    from mwdcal.calibration.diagnosis.findings import UNUSED
     from mwdcal.calibration.estimate import fit
     from mwdcal.files import documents
     from mwdcal.files.formats import atomic
@@ -57,6 +56,5 @@ def command(
 
         rendered = render(calibration)
     shown = (page.summary if as_json else page.screen)(calibration, choice, output, report)
-    unused = [finding for finding in calibration.findings if finding.id == UNUSED]
     atomic.write_all([(output, documents.encode(calibration)), (report, rendered)])
-    print_result(shown, unused)
+    print_result(shown, page.first_findings(calibration))

@@ -9,7 +9,7 @@ from pathlib import Path
 import click
 
 from mwdcal.app.commands import options
-from mwdcal.app.messages import as_typed, lines, print_result, say
+from mwdcal.app.messages import as_typed, print_result, say
 from mwdcal.app.text import one_line
 from mwdcal.errors import FitError
 
@@ -38,7 +38,7 @@ def command(
     Example: mwdcal compare run.csv --tool servo --report methods.html
     Exit: 0 compared, 2 input cannot be read, 3 every method refused.
     """
-    from mwdcal.app.commands.choices import load_run, order_of
+    from mwdcal.app.choices import load_run, order_of
     from mwdcal.app.pages import comparison as page
     from mwdcal.calibration.diagnosis.findings import unused_columns
     from mwdcal.calibration.options import Options
@@ -48,8 +48,6 @@ def command(
     options.check_outputs([], [run, tool], page=report)
     readings, profile = load_run(run, tool, decimal)
     unused = unused_columns(readings.unused)
-    for line in lines(unused):
-        say(line)
     result = compare(readings, profile, Options(order=order_of(order), seed=seed), progress=say)
     rows = tuple(replace(row, refused=as_typed(row.refused)) for row in result.rows)
     result = replace(result, rows=rows)
@@ -57,9 +55,7 @@ def command(
         atomic.write(
             report, page.render(result, profile.name, readings.run_sha256, readings.profile_sha256)
         )
-    if as_json:
-        print_result({**page.document(result), "findings": unused, "report": str(report or "")})
-    else:
-        written = f"\nwrote {one_line(report)} (report)" if report else ""
-        print_result(page.text(result, parameters) + written)
+    written = f"\nwrote {one_line(report)} (report)" if report else ""
+    document = {**page.document(result), "findings": unused, "report": str(report or "")}
+    print_result(document if as_json else page.text(result, parameters) + written, unused)
     sys.exit(0 if able(result.rows) else FitError.exit_code)

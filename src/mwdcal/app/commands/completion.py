@@ -6,6 +6,7 @@ import click
 from click.shell_completion import get_completion_class
 
 from mwdcal.app.commands import options
+from mwdcal.app.messages import quiet
 
 
 @options.command()
@@ -18,6 +19,6 @@ def command(context: click.Context, shell: str) -> None:
     Example: mwdcal completion bash >> ~/.bashrc
     """
     completion = get_completion_class(shell)
-    if completion is not None:
+    if completion is not None and not quiet():
         root = context.find_root().command
         click.echo(completion(root, {}, "mwdcal", "_MWDCAL_COMPLETE").source())

@@ -59,5 +59,5 @@ def command(
         stop.add_note("Finished parts are kept: the same command goes on from there.")
         raise
     shown = fleet_summary.document if as_json else fleet_summary.text
-    print_result(shown(summary, report))
+    print_result(shown(summary, report), fleet_summary.findings(summary))
     sys.exit(0 if summary.sound else FitError.exit_code)

@@ -6,11 +6,10 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mwdcal.app.messages import findings_as_typed, lines
+from mwdcal.app.messages import findings_as_typed
 from mwdcal.app.pages.page import written
 from mwdcal.app.text import chance, number, one_line, quantity, table
 from mwdcal.calibration.automatic.nonlinearity import CurveScore
-from mwdcal.calibration.diagnosis.findings import UNUSED
 from mwdcal.calibration.prediction import typical_accuracy
 from mwdcal.calibration.readings import simulated
 from mwdcal.calibration.record import Calibration, Choices, ErrorRow, Finding, OrderScore
@@ -20,7 +19,7 @@ if TYPE_CHECKING:
     from mwdcal.calibration.automatic.auto import Choice
 
 MOST_RESHOOTS = 12
-"""Most stations to re-shoot that the screen names."""
+"""Most stations to re-shoot that messages name."""
 PROFILE = " (see [stand] of the tool profile)"
 RUN_FIELDS = ("run", "stations", "excluded", "temperature_c", "method", "options", "seed")
 TRIAD = ("model", "order", "rank", "size", "undetermined", "variance_factor", "misfit_probability")
@@ -61,19 +60,20 @@ def screen(calibration: Calibration, choice: Choice, output: Path, report: Path 
         *([orders(calibration.orders)] if calibration.orders else []),
         *([curves(choice.curves)] if choice.curves else []),
         errors(calibration.errors),
-        "\n".join([*remarks(calibration), *_findings(calibration.findings)]),
+        "\n".join(remarks(calibration)),
     ]
     files = written(calibration=output, report=report)
     after = f"{files}   next: mwdcal verify {one_line(output)} ROLLTEST.csv"
     return "\n\n".join(blocks) + f"\n{after}"
 
 
-def _findings(findings: list[Finding]) -> list[str]:
-    """The findings, of stations to re-shoot the first ones; unused columns are said before."""
-    again = [finding for finding in findings if finding.id == "reshoot"]
+def first_findings(calibration: Calibration) -> list[Finding]:
+    """The findings; of stations to re-shoot the first ones, and how many there are besides."""
+    again = [finding for finding in calibration.findings if finding.id == "reshoot"]
     left = again[MOST_RESHOOTS:]
-    shown = lines(f for f in findings if f not in left and f.id != UNUSED)
-    return shown + ([f"! … and {len(left)} more to re-shoot"] if left else [])
+    shown = [finding for finding in calibration.findings if finding not in left]
+    more = Finding(id="reshoot", text=f"… and {len(left)} more to re-shoot")
+    return shown + ([more] if left else [])
 
 
 def remarks(calibration: Calibration) -> list[str]:
@@ -184,7 +184,7 @@ def orders(scores: list[OrderScore]) -> str:
         rows.append([*each, chosen])
     header = ["temperatures left out", "order", "χ² inside", "χ² ends", "error inside"]
     header += ["at the ends", "noise", "by chance", ""]
-    return f"{table(rows, header)}\n{ORDERS}{COMPARED if compared else ''}"
+    return f"{table(rows, header, names=2)}\n{ORDERS}{COMPARED if compared else ''}"
 
 
 def curves(scores: list[CurveScore]) -> str:

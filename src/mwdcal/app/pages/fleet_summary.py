@@ -12,7 +12,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from mwdcal.app.commands.choices import names
+from mwdcal.app.choices import names
 from mwdcal.app.commands.options import Typed
 from mwdcal.app.messages import as_typed
 from mwdcal.app.pages.calibration import choices
@@ -233,9 +233,8 @@ def document(summary: FleetSummary, report: Path | None) -> dict[str, Any]:
 def text(summary: FleetSummary, report: Path | None) -> str:
     """The summary for people: about one screen."""
     rows = [[k.status, str(k.tools), "" if k.status == OK else _first(k)] for k in summary.statuses]
-    statuses = [table(rows, ["status", "tools", "serials"]), *_doubts(summary)]
     spread = [[_title(n), *map(number, values)] for n, values in summary.spread.items() if values]
-    blocks = [_heading(summary), "\n".join(statuses)]
+    blocks = [_heading(summary), table(rows, ["status", "tools", "serials"])]
     if spread:
         blocks.append(table(spread, ["of sound tools", "1 %", "median", "99 %"]))
     if summary.orders:
@@ -255,22 +254,23 @@ def _heading(summary: FleetSummary) -> str:
     return one_line("   ".join([summary.runs, *counts, *how])) + options
 
 
-def _doubts(summary: FleetSummary) -> list[str]:
-    """Why tools were refused, and findings of the others."""
+def findings(summary: FleetSummary) -> list[Finding]:
+    """Why tools were refused, findings of the others, columns that are not used, and notes."""
     refused = [kind for kind in summary.statuses if kind.status != OK]
-    return [
-        *(f"! {kind.status}, for example: {one_line(kind.message)}" for kind in refused),
-        *(f"! {f.id} in {plural(f.tools, 'tool')}: {_first(f)}" for f in summary.findings),
+    texts = [
+        *((k.status, f"{k.status}, for example: {one_line(k.message)}") for k in refused),
+        *((f.id, f"{f.id} in {plural(f.tools, 'tool')}: {_first(f)}") for f in summary.findings),
+        *(("fleet", note) for note in summary.notes),
     ]
+    return [*(Finding(id=name, text=text) for name, text in texts), *summary.unused]
 
 
 def _remarks(summary: FleetSummary) -> list[str]:
-    """Own-axis terms, what is undetermined, and notes."""
+    """Own-axis terms, and what is undetermined."""
     nonlinear, undetermined = summary.nonlinear.items(), summary.undetermined.items()
     return [
         *(f"own-axis terms in {plural(count, 'tool')}: {name}" for name, count in nonlinear),
         *(f"undetermined in {plural(count, 'tool')}: {name}" for name, count in undetermined),
-        *(f"! {one_line(note)}" for note in summary.notes),
     ]
 
 

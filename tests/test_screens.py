@@ -1,0 +1,319 @@
+"""Screens on terminals of 80 and 120 columns, of every command, on the bundled example.
+
+`python tests/test_screens.py` rewrites the stored ones in `tests/screens`.
+"""
+
+import io
+import os
+import re
+import shutil
+import sys
+import tempfile
+from collections import Counter
+from contextlib import redirect_stderr, redirect_stdout
+from pathlib import Path
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+
+from cli_support import mwdcal, read_csv, servo_run, write_csv
+from mwdcal.app import cli, progress, text
+
+STORED = Path(__file__).parent / "screens"
+WIDTHS = (80, 120)
+SCREENS = {
+    "example": ("example", "new"),
+    "calibrate": ("calibrate", "demo/run.csv", "--tool", "demo/tool.toml", "-o", "made.json"),
+    "calibrate-moved": ("calibrate", "moved.csv", "--tool", "demo/tool.toml", "-o", "made.json"),
+    "calibrate-soaks": ("calibrate", "soaks.csv", "--tool", "demo/tool.toml", "-o", "made.json"),
+    "calibrate-refused": ("calibrate", "few.csv", "--tool", "demo/tool.toml", "-o", "made.json"),
+    "verify": ("verify", "tool.json", "demo/rolltest.csv"),
+    "verify-failed": ("verify", "tool.json", "demo/rolltest.csv", "--limits", "tight.toml"),
+    "verify-not-rolled": ("verify", "tool.json", "part.csv"),
+    "apply": ("apply", "tool.json", "hot.csv", "-o", "made.csv"),
+    "compare": ("compare", "demo/run.csv", "--tool", "demo/tool.toml"),
+    "compare-parameters": ("compare", "demo/run.csv", "--tool", "demo/tool.toml", "--parameters"),
+    "convert": ("convert", "tool.json", "--notation", "forward", "--temperature", "90"),
+    "fleet": ("fleet", "fleet.parquet", "--tool", "demo/tool.toml", "-o", "made.parquet",
+              "--workers", "1"),
+    "noise": ("noise", "demo/static.csv", "--tool", "demo/tool.toml"),
+    "profile": ("profile", "demo/export.csv", "-o", "made.toml"),
+    "stations": ("stations", "demo/log.csv", "-o", "stations.csv"),
+    "misused": ("calibrate", "demo/run.csv"),
+}  # fmt: skip
+"""Commands and what they run on."""
+WITHOUT_A_SCREEN = {"completion"}
+"""Commands whose result is a script."""
+
+
+class Terminal(io.TextIOWrapper):
+    """A stream that says it is a terminal."""
+
+    def __init__(self, encoding="utf-8"):
+        super().__init__(io.BytesIO(), encoding, newline="\n")
+
+    def isatty(self):
+        return True
+
+    def text(self):
+        self.flush()
+        return self.buffer.getvalue().decode(self.encoding)
+
+
+def seen(width, *arguments, encoding="utf-8", **variables):
+    """Exit status, stdout and stderr of a command on a terminal of a width."""
+    out, err = Terminal(encoding), Terminal(encoding)
+    typed = {"COLUMNS": str(width), "TERM": "dumb", "NO_COLOR": "", **variables}
+    with (
+        patch.dict(os.environ, typed),
+        redirect_stdout(out),
+        redirect_stderr(err),
+        pytest.raises(SystemExit) as stop,
+    ):
+        cli.main(list(arguments))
+    return stop.value.code or 0, out.text(), err.text()
+
+
+def changed(source, target, change):
+    """A file of the example with changed columns; `change` works on lists of cells."""
+    comments = [s for s in source.read_text("utf-8").splitlines() if s.startswith("#")]
+    columns = read_csv(source)
+    change(columns)
+    write_csv(target, columns, *(comment[2:] for comment in comments))
+
+
+def prepared(folder):
+    """The files that the screens are of."""
+    assert mwdcal("example", folder / "demo").code == 0
+    demo = folder / "demo"
+    fit = ("calibrate", demo / "run.csv", "--tool", demo / "tool.toml", "-o", folder / "tool.json")
+    assert mwdcal(*fit).code == 0
+
+    def moved(columns):
+        columns["az"][6] = f"{float(columns['az'][6]) + 0.0039:.6f}"
+        columns["remark"] = ["as it came"] * 48
+
+    def some(count):
+        return lambda columns: columns.update({k: v[:count] for k, v in columns.items()})
+
+    def hot(columns):
+        columns["temperature_c"][3] = "80.0"
+
+    changed(demo / "run.csv", folder / "moved.csv", moved)
+    changed(demo / "run.csv", folder / "few.csv", some(3))
+    changed(demo / "rolltest.csv", folder / "part.csv", some(4))
+    changed(demo / "surveys.csv", folder / "hot.csv", hot)
+    write_csv(folder / "soaks.csv", servo_run(temperatures=(0.0, 40.0, 80.0)))
+    limits = 'name = "tight"\n[error]\ninclination_deg = 0.001\nazimuth_deg = 2\n'
+    (folder / "tight.toml").write_text(limits, "utf-8")
+    fleet(folder)
+
+
+def fleet(folder):
+    """The example run as three tools, one with a station that moved and one with three stations."""
+    pq = pytest.importorskip("pyarrow.parquet")
+    pa = pytest.importorskip("pyarrow")
+    runs = [read_csv(folder / name) for name in ("demo/run.csv", "moved.csv", "few.csv")]
+    names = [name for name in runs[0] if name != "station"]
+    columns = {n: np.array([float(v) for run in runs for v in run[n]]) for n in names}
+    serials = [f"SIM-000{i}" for i, run in enumerate(runs, 1) for _ in run["ax"]]
+    pq.write_table(pa.table({"serial": serials, **columns}), folder / "fleet.parquet")
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("screens")
+    prepared(folder)
+    return folder
+
+
+@pytest.fixture
+def work(files, tmp_path, monkeypatch):
+    """A copy of the files to run in; nothing is said of how far a command is."""
+    monkeypatch.setattr(progress.slowly, "__defaults__", (600.0,))
+    monkeypatch.chdir(shutil.copytree(files, tmp_path / "work"))
+
+
+def screen(width, *arguments, **variables):
+    """What a terminal shows, with measured times and what varies with them blotted out."""
+    code, out, err = seen(width, *arguments, **variables)
+    shown = f"exit {code}\n--- stdout\n{out}--- stderr\n{err}"
+    for varying in (
+        r"[\d.]+(?= tools/s)",
+        r"[\d.]+(?= s, )",
+        "[0-9a-f]{64}",
+        r"(?<=mwdcal )\d[\w.]+",
+    ):
+        shown = re.sub(varying, lambda part: "?" * len(part[0]), shown)
+    times = re.compile(r"^(time of one fit, s)(.*)$", re.MULTILINE)
+    return times.sub(lambda line: line[1] + re.sub(r"\d", "0", line[2]), shown)
+
+
+def rounded(shown):
+    """Values of twelve digits to five, which are the same on every machine; blanks vary with their length."""
+    return re.sub("[ ─]+", " ", re.sub(r"(\d\.\d{4})\d*", r"\1", shown))
+
+
+def stored(name, width):
+    return STORED / f"{name}-{width}.txt"
+
+
+def words(shown):
+    """Words, without the rules of tables and the marks of comments."""
+    return re.findall(r"[^\s─#]+", shown)
+
+
+def test_every_command_has_a_screen():
+    assert {arguments[0] for arguments in SCREENS.values()} | WITHOUT_A_SCREEN == {
+        *cli.cli.commands
+    }
+
+
+@pytest.mark.parametrize("name", SCREENS)
+def test_screens_are_the_stored_ones_and_nothing_is_lost_or_too_wide(work, name):
+    whole = screen(160, *SCREENS[name])
+    for width in WIDTHS:
+        shutil.rmtree("new", ignore_errors=True)
+        shown = screen(width, *SCREENS[name])
+        assert max(map(len, shown.splitlines())) <= width
+        assert not Counter(words(whole)) - Counter(words(shown))
+        assert {*words(shown)} == {*words(whole)}
+        compared = rounded if name == "convert" else str
+        assert compared(shown) == compared(stored(name, width).read_text("utf-8"))
+
+
+@pytest.mark.parametrize("width", [1, 80, 160, 1000])
+def test_a_terminal_counts_as_80_to_160_columns(work, width):
+    clamped = min(max(width, 80), 160)
+    assert screen(width, *SCREENS["verify"]) == screen(clamped, *SCREENS["verify"])
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "cp1252", "cp850"])
+def test_lines_are_folded_in_the_characters_that_are_shown(work, encoding):
+    for name in ("calibrate", "verify", "compare"):
+        _, out, err = seen(80, *SCREENS[name], encoding=encoding)
+        assert max(map(len, (out + err).splitlines())) <= 80
+
+
+@pytest.mark.parametrize("name", sorted(cli.cli.commands))
+def test_help_fits_80_columns(name):
+    code, out, _ = seen(80, name, "--help")
+    assert code == 0
+    assert max(map(len, out.splitlines())) <= 80
+
+
+def test_a_comment_of_a_profile_goes_on_as_a_comment():
+    tomllib = pytest.importorskip("tomllib")
+    line = (
+        "noise = 0.1   # raw, 1 sigma of one station of 12 s; ax 0.0001, ay 0.0001; from static.csv"
+    )
+    out = Terminal()
+    with patch.dict(os.environ, COLUMNS="80"):
+        folded = text.laid_out(line, out)
+    assert "\n" in folded
+    assert tomllib.loads(folded) == {"noise": 0.1}
+
+
+def test_words_longer_than_a_line_stay_whole():
+    word = "a" * 100
+    assert text.fold(f"one {word} two", 80, "  ") == f"one\n  {word}\n  two"
+
+
+# Colour
+
+ESCAPE = re.compile(r"\x1b\[[0-9;]*m")
+
+
+@pytest.mark.parametrize("name", ["verify", "verify-failed", "calibrate-moved", "fleet"])
+def test_colour_is_on_a_terminal_alone_and_carries_nothing(work, name):
+    plain, shown = (screen(160, *SCREENS[name], TERM=term) for term in ("dumb", "xterm"))
+    assert ESCAPE.search(shown)
+    assert ESCAPE.sub("", shown) == plain
+    assert screen(160, *SCREENS[name], TERM="xterm", NO_COLOR="1") == plain
+    with patch.dict(os.environ, COLUMNS="80", TERM="xterm", FORCE_COLOR="1"):
+        piped = mwdcal(*SCREENS[name])
+    assert "\x1b" not in piped.out + piped.err
+
+
+def coloured(shown):
+    """Words in colour, each with the colour's number."""
+    return {(w, n) for n, w in re.findall(r"\x1b\[(\d+)m\x1b\[1m([^\x1b]*)\x1b\[0m", shown)}
+
+
+def test_verdicts_and_findings_have_their_colours(work):
+    assert coloured(seen(80, *SCREENS["verify"], TERM="xterm")[1]) == {
+        ("PASS", "32"),
+        ("pass", "32"),
+    }
+    failed = seen(80, *SCREENS["verify-failed"], TERM="xterm")[1]
+    assert coloured(failed) == {("FAIL", "31"), ("pass", "32")}
+    assert coloured(seen(80, *SCREENS["calibrate-moved"], TERM="xterm")[2]) == {("!", "33")}
+
+
+# Findings, and --quiet
+
+
+@pytest.mark.parametrize("name", SCREENS)
+def test_findings_are_on_stderr_alone_and_once(work, name):
+    ran = mwdcal(*SCREENS[name])
+    assert not [line for line in ran.out.splitlines() if line.startswith("!")]
+    findings = [line for line in ran.err.splitlines() if line.startswith("! ")]
+    assert len({*findings}) == len(findings)
+    if name in ("calibrate-moved", "fleet", "apply", "convert"):
+        assert findings
+
+
+@pytest.mark.parametrize("name", SCREENS)
+@pytest.mark.parametrize("terminal", [False, True])
+def test_a_quiet_command_prints_errors_alone(work, name, terminal):
+    arguments = SCREENS[name]
+    usual = mwdcal(*arguments)
+    shutil.rmtree("new", ignore_errors=True)
+    if terminal:
+        code, out, err = seen(80, *arguments, "--quiet")
+    else:
+        ran = mwdcal(*arguments, "--quiet")
+        code, out, err = ran.code, ran.out, ran.err
+    assert code == usual.code
+    assert out == ""
+    if code in (0, 1):
+        assert err == ""
+    else:
+        assert words(err)[-5:] == words(usual.err)[-5:]
+
+
+def untimed(document):
+    """A document without measured times."""
+    timed = ("seconds", "tools_per_second", "time", "parts_done_before")
+    if isinstance(document, dict):
+        return {k: untimed(v) for k, v in document.items() if k not in timed}
+    return [untimed(v) for v in document] if isinstance(document, list) else document
+
+
+@pytest.mark.parametrize("name", [n for n in SCREENS if n not in ("misused", "calibrate-refused")])
+def test_a_quiet_command_prints_its_json_all_the_same(work, name):
+    usual = mwdcal(*SCREENS[name], "--json")
+    shutil.rmtree("new", ignore_errors=True)
+    quiet = mwdcal(*SCREENS[name], "--json", "--quiet")
+    assert quiet.err == ""
+    assert untimed(quiet.json) == untimed(usual.json)
+    assert quiet.code == usual.code
+
+
+def test_a_quiet_completion_prints_nothing():
+    ran = mwdcal("completion", "zsh", "--quiet")
+    assert (ran.code, ran.out, ran.err) == (0, "", "")
+
+
+if __name__ == "__main__":
+    progress.slowly.__defaults__ = (600.0,)
+    with tempfile.TemporaryDirectory() as place:
+        prepared(Path(place))
+        os.chdir(place)
+        for each, words_typed in SCREENS.items():
+            for columns in WIDTHS:
+                shutil.rmtree("new", ignore_errors=True)
+                stored(each, columns).write_text(screen(columns, *words_typed), "utf-8")
+        os.chdir("/")
+    sys.exit(0)
