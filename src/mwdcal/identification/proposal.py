@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
 import msgspec
 import numpy as np
 
-from mwdcal.calibration.readings import TRIADS, Readings, simulated
+from mwdcal.calibration.readings import TRIADS, Readings
 from mwdcal.errors import FitError, InputError
 from mwdcal.files.contract import CHANNELS, MAPPED, units_of
 from mwdcal.files.formats import table as tables
@@ -36,14 +37,15 @@ MOST_NAMED = 6
 class Proposal(NamedTuple):
     """A profile, how the axes of each triad in it were told, and the run that told.
 
-    `unused` are columns of the table that are nothing of a run file.
+    `unused` are columns of the table that are nothing of a run file; `metadata` what it says of itself.
     """
 
     profile: Profile
     wirings: dict[str, Wiring]
     stations: int
     unused: tuple[str, ...]
-    simulated: list[str]
+    metadata: Mapping[str, object]
+    run_sha256: str
 
 
 def propose(path: str | os.PathLike[str]) -> Proposal:
@@ -83,7 +85,8 @@ def propose(path: str | os.PathLike[str]) -> Proposal:
         wirings,
         readings.count,
         readings.unused,
-        simulated(readings.metadata),
+        readings.metadata,
+        readings.run_sha256,
     )
 
 
