@@ -7,8 +7,8 @@ from typing import Any
 
 import msgspec
 
-from mwdcal import __version__
 from mwdcal.calibration.readings import is_simulated, serial_of
+from mwdcal.calibration.record import SOFTWARE
 
 DOCUMENT_VERSION = 1
 """Version of the documents: higher when a key goes, or changes its meaning."""
@@ -51,7 +51,7 @@ def enveloped(
     head = Envelope(
         schema_version=DOCUMENT_VERSION,
         command=command,
-        software=f"mwdcal {__version__}",
+        software=SOFTWARE,
         serial=next(filter(None, map(serial_of, metadata)), None),
         simulated=any(map(is_simulated, metadata)),
     )

@@ -7,7 +7,6 @@ from datetime import UTC, datetime
 
 import numpy as np
 
-from mwdcal import __version__
 from mwdcal.calibration import results
 from mwdcal.calibration.automatic.auto import Choice, choose
 from mwdcal.calibration.diagnosis.findings import described, findings
@@ -19,6 +18,7 @@ from mwdcal.calibration.options import Options
 from mwdcal.calibration.prediction import accuracy
 from mwdcal.calibration.readings import TRIADS, Readings, is_simulated, serial_of
 from mwdcal.calibration.record import (
+    SOFTWARE,
     BudgetRow,
     Calibration,
     Choices,
@@ -94,7 +94,7 @@ def _record(choice: Choice, fitted: FittedRuns) -> Calibration:
         run=readings.source,
         run_sha256=readings.run_sha256,
         prior_sha256=options.prior_sha256 or None,
-        software=f"mwdcal {__version__}",
+        software=SOFTWARE,
         method=options.method,
         options=Choices(
             parameters=options.parameters,

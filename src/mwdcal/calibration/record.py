@@ -16,6 +16,7 @@ from typing import Any, ClassVar
 import msgspec
 import numpy as np
 
+from mwdcal import __version__
 from mwdcal.calibration.readings import NANOTESLA, SOAK_GAP, Readings, simulated
 from mwdcal.errors import InputError
 from mwdcal.geometry.observables import OBSERVABLES
@@ -24,6 +25,8 @@ from mwdcal.sensor.models import Basis, Factors, Model, Polynomial
 from mwdcal.sensor.profile import Profile
 
 SCHEMA_VERSION = 1
+SOFTWARE = f"mwdcal {__version__}"
+"""Name and version of the program."""
 DIGITS = 12
 """Significant digits of every number in a calibration file."""
 MARGIN = 1.0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -36,12 +35,6 @@ if TYPE_CHECKING:
 MOST_RESHOOTS = 12
 """Most stations to re-shoot that the screen names."""
 PROFILE = " (see [stand] of the tool profile)"
-RECORDED = (
-    *("run", "stations", "excluded", "temperature_c", "method", "options", "seed", "errors"),
-    *("measures", "budget", "assumed_exact", "constants", "stand", "orders"),
-)
-TRIAD = ("model", "order", "rank", "size", "undetermined", "variance_factor", "misfit_probability")
-"""Parts of the record that the summary for machines repeats."""
 ORDERS = "error: rms per axis, with the noise; inside: interpolation, at the ends: extrapolation"
 COMPARED = """
 by chance: probability that noise alone gives such a term; chosen: the lowest order above which \
@@ -86,7 +79,9 @@ class CalibrationSummary(msgspec.Struct, frozen=True, kw_only=True):
     report: str
 
 
-def _attributes(record: object, names: Iterable[str]) -> dict[str, Any]:
+def _recorded(kind: type[msgspec.Struct], record: msgspec.Struct) -> dict[str, Any]:
+    """The fields of a summary that the record has too."""
+    names = {*kind.__struct_fields__} & {*record.__struct_fields__}
     return {name: getattr(record, name) for name in names}
 
 
@@ -94,11 +89,11 @@ def summary(
     calibration: Calibration, choice: Choice, output: Path, report: Path | None
 ) -> dict[str, Any]:
     """The result for machines."""
+    findings = findings_as_typed(calibration.findings)
     content = CalibrationSummary(
-        **_attributes(calibration, RECORDED),
-        triads={t.name: TriadSummary(**_attributes(t, TRIAD)) for t in calibration.triads},
+        **{**_recorded(CalibrationSummary, calibration), "findings": findings},
+        triads={t.name: TriadSummary(**_recorded(TriadSummary, t)) for t in calibration.triads},
         accuracy_1sigma_deg=typical_accuracy(calibration),
-        findings=findings_as_typed(calibration.findings),
         nonlinearity=choice.curves,
         calibration=str(output),
         report=str(report or ""),

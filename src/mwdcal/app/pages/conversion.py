@@ -8,12 +8,11 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from mwdcal import __version__
 from mwdcal.app.envelope import enveloped
 from mwdcal.app.pages.page import HELD, UNDETERMINED
 from mwdcal.app.text import one_line, raised, table
 from mwdcal.calibration.readings import Readings, simulated
-from mwdcal.calibration.record import Calibration, Finding
+from mwdcal.calibration.record import SOFTWARE, Calibration, Finding
 from mwdcal.files import documents
 from mwdcal.sensor.profile import Axis
 from mwdcal.use.notation import COURSE, Notation, convert, powers
@@ -132,7 +131,7 @@ def document(converted: Converted) -> dict[str, Any]:
         calibration=converted.path.name,
         calibrated=calibration.time,
         software=calibration.software,
-        converted_by=f"mwdcal {__version__}",
+        converted_by=SOFTWARE,
         calibrated_temperature_c=calibration.temperature_c,
         field_unit=calibration.field_unit,
         notation=converted.notation,

@@ -21,8 +21,6 @@ if TYPE_CHECKING:
 
 MOST_LINES = 40
 """Stations of a table on screen."""
-SEARCH = ("threshold", "stretch", "min_seconds", "trim_seconds")
-"""What the stations were searched with."""
 POINTS = 2000
 """Points of a line in the picture."""
 
@@ -52,7 +50,10 @@ def summary(stations: Stations, files: dict[str, str]) -> StationsSummary:
         log=stations.table.source,
         rows=len(stations.time),
         seconds=_seconds(stations),
-        **{name: getattr(stations, name) for name in SEARCH},
+        threshold=stations.threshold,
+        stretch=stations.stretch,
+        min_seconds=stations.min_seconds,
+        trim_seconds=stations.trim_seconds,
         stations=[dict(zip(columns, row, strict=True)) for row in rows],
         left=_left(stations),
         findings=stations.findings,
