@@ -416,7 +416,7 @@ WITH_FILES = [
     n for n, c in sorted(cli.commands.items()) if any(p.name in SAMPLES for p in c.params)
 ]
 """Commands that read a file."""
-RARE = {"compare": 0.2, "noise": 0.5}
+RARE = {"compare": 0.05, "noise": 0.15}
 """How often a command that takes long is run, against the others."""
 
 

@@ -293,3 +293,13 @@ def test_checksums_that_cannot_be_read_count_as_damage(kept):
     (checksums,) = kept[0].parent.glob("*.json")
     checksums.write_text("{")
     assert not check_kept()
+
+
+def test_vectors_alone_are_those_beside_the_angles(sound):
+    rng = np.random.default_rng(5)
+    columns = [*rng.normal(size=(3, 1000)), *3e4 * rng.normal(size=(3, 1000)), np.full(1000, 25.0)]
+    vectors = np.empty((6, 1000))
+    arguments = (columns, correction.numbers(sound), sound.reference_temperature)
+    result = correction_numba.run(*arguments, out=vectors)
+    assert result.columns is vectors
+    np.testing.assert_array_equal(vectors, correction_numba.run(*arguments).columns[:6])

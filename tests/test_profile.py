@@ -288,3 +288,42 @@ def test_bytes_that_an_encoding_does_not_have(german, tmp_path):
     tool.write_text(tool.read_text("utf-8").replace("cp1252", "utf-8"), "utf-8")
     message = refused(mwdcal("calibrate", run, "--tool", tool, "-o", tmp_path / "cal.json"), 2)
     assert "expected utf-8 text" in message
+
+
+def test_a_simulated_run_is_said_to_be_one(tmp_path):
+    run = write_csv(tmp_path / "run.csv", servo_run(), "simulated = true")
+    ran = mwdcal("profile", run, "-o", tmp_path / "tool.toml")
+    assert "48 stations   SIMULATED DATA" in ran.out
+    assert mwdcal("profile", run, "-o", tmp_path / "tool.toml", "--json").json["simulated"] is True
+
+
+def test_columns_that_are_not_understood_are_named(tmp_path):
+    run = write_csv(tmp_path / "run.csv", renamed(servo_run(), ref_azimuth_deg="Lage 2"))
+    message = refused(mwdcal("profile", run, "-o", tmp_path / "tool.toml"), 3)
+    assert "(no azimuth)" in message
+    assert "Columns not understood: 'Lage 2'." in message
+
+
+@pytest.mark.parametrize(
+    ("content", "status"),
+    [
+        (b"", 2),
+        (b"\xff\xfe", 2),
+        (b"\xff\xfea", 2),
+        (b"\x81\x8d\x8f\n" * 9, 2),
+        (b"a\0b;c;d;e\n1;2;3;4\n", 2),
+        (b"x" * 200_000, 2),
+        (b'"' + b"a;" * 100_000, 2),
+        (b"1;2;3;4;5\n" * 9, 2),
+        (b"a;b;c;d\n" * 9, 2),
+        (b"\n\n;;;;\n", 2),
+        (b"ax;ay;az;inc;tf\n1;2;3;4;5\n", 3),
+        (b"ax;ax;az;inc;tf\n1;2;3;4;5\n", 2),
+        (b"ax;ay;az;;tf\n1;2;3;4;5\n", 2),
+        (b"ax;ay;az;inc;tf\n" + b"1;2;3;4\n" * 8, 2),
+    ],
+)
+def test_what_is_no_table_ends_in_one_sentence(tmp_path, content, status):
+    (tmp_path / "x.csv").write_bytes(content)
+    refused(mwdcal("profile", tmp_path / "x.csv", "-o", tmp_path / "tool.toml"), status)
+    assert not (tmp_path / "tool.toml").exists()

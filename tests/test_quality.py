@@ -344,6 +344,23 @@ def test_uncertainties_without_any_weight_are_refused(record, kind):
         verify(record, roll(45, sd=sd), limits)
 
 
+@pytest.mark.parametrize("ratio", [1e2, 1e3, 1e7, 1e9])
+def test_uncertainties_too_far_apart_are_refused_and_others_judged(record, ratio):
+    """Four settings of twelve that are much better known do not determine a curve of five coefficients.
+
+    At ratios that leave digits they are judged.
+    """
+    sd = {**NOISE, "inclination": np.where(np.arange(12) % 3 == 0, 1.0, ratio) * 1e-4}
+    limits = Limits(name="i", error=Bounds(inclination_deg=0.1))
+    known = {**roll(45).known, "inclination": np.full(12, 45 * DEG)}
+    run = msgspec_replace(roll(45, sd=sd), known=known)
+    if ratio > 1e4:
+        with pytest.raises(InputError, match="too far apart to judge its inclination"):
+            verify(record, run, limits)
+    else:
+        assert rows_of(verify(record, run, limits))["error of inclination"].value is not None
+
+
 @pytest.mark.parametrize(
     ("order", "temperature", "outside"),
     [(0, 25.0, None), (0, 28.5, "finding"), (0, 31.0, "refused"), (1, 51.5, "refused")],

@@ -205,8 +205,30 @@ def test_station_to_reshoot_is_first_and_marked(page):
 
 def test_clean_fit_says_so(words):
     page = words(calibrated(moved=False))
-    assert '<p class="headline">Fit accepted</p>' in page
+    assert '<p class="headline">Calibrated – not yet verified</p>' in page
+    assert (
+        "<p>Fit accepted. Accuracy to expect (1σ, calibration alone, typical): inclination 0.0"
+        in page
+    )
     assert "No findings" in page
+    assert 'class="over"' not in page
+
+
+def test_errors_of_more_than_twice_what_is_expected_are_marked(words):
+    record = calibrated(moved=False)
+    one = record.errors[0]
+    wide = msgspec.structs.replace(one, after=2.5 * one.expected)
+    page = words(msgspec.structs.replace(record, errors=[wide, *record.errors[1:]]))
+    assert page.count('class="over"') == 1
+    assert "2.5 !</td>" in page
+
+
+def test_tables_scroll_and_colours_follow_the_reader(words):
+    """Every table of a page lies in a region that scrolls on a narrow screen."""
+    page = words(calibrated(moved=False))
+    assert page.count("<table") == page.count('<div class="scroll" role="region"') > 5
+    assert "@media (max-width: 640px)" in page
+    assert "@media (prefers-color-scheme: dark)" in page
 
 
 def test_metadata_is_escaped(words):
@@ -233,7 +255,8 @@ def test_station_labels_may_be_anything(whole):
 
 def test_undetermined_toolface_shows():
     page = render(calibrated(("toolface",), moved=False))
-    assert '<p class="headline">Toolface zero undetermined</p>' in page
+    assert '<p class="headline">Calibrated – not yet verified</p>' in page
+    assert "<p>Toolface zero undetermined. Accuracy to expect" in page
     assert "11 of 12" in page
     assert '<td class="free">undetermined</td>' in page
     assert "Not shown, for want of a reference: toolface·sin I." in page

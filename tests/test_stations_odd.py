@@ -11,7 +11,7 @@ from mwdcal.errors import InputError
 from mwdcal.files.formats.table import Table
 from mwdcal.logs import standstill
 from mwdcal.logs.clock import unlikely_seconds
-from mwdcal.logs.stations import find_stations
+from mwdcal.logs.stations import StandstillError, find_stations
 from test_stations import ACC, MAG, means, multi_rate, tumble, without
 
 
@@ -313,6 +313,21 @@ def test_a_channel_of_one_sample_warns_of_nothing():
     once = np.where(np.arange(len(log.columns["ax"])) == 700, 0.3, np.nan)
     with pytest.raises(InputError, match="no standstill of at least"):
         find_stations(without(log, **dict.fromkeys(MAG, once)))
+
+
+@pytest.mark.parametrize("share", [0.3, 0.5, 0.8])
+@pytest.mark.parametrize("later", [20.0, 42.7, 300.0])
+def test_a_clock_of_two_readings(later, share):
+    """Samples of one time are spread over the step to the next, the last ones beyond the log."""
+    log, *_ = tumble(2)
+    first = int(share * log.count)
+    clock = np.repeat([0.0, later], [first, log.count - first])
+    try:
+        table = find_stations(without(log, time_s=clock)).table
+    except StandstillError:
+        return
+    assert table.columns["samples"].min() >= 3
+    assert set(table.columns["start_s"]) | set(table.columns["end_s"]) <= {0.0, later}
 
 
 def test_a_refusal_says_how_long_it_stood_still(tmp_path):

@@ -20,7 +20,7 @@ _TRANSLATIONS = (
     ("axial", "Z "),
     ("tran(s|sverse|sversal)?[ _]*1", "X "),
     ("tran(s|sverse|sversal)?[ _]*2", "Y "),
-    ("neigung|inclinaison|inclinacion", "inclination"),
+    ("neigung|inklination|inclinaison|inclinacion", "inclination"),
     ("azimut(?!h)|acimut", "azimuth"),
     ("rollwinkel|roll angle|werkzeugwinkel", "toolface"),
     ("beschleunigung", "acc"),
@@ -30,6 +30,8 @@ _TRANSLATIONS = (
     ("temperature?n?", "temperature"),
     ("sollwert|soll|referenz|stand", "ref"),
     ("seriennummer|seriennr", "serial"),
+    ("gerat|sonde", "tool"),
+    (r"magn\b\.?|magnetisch", "magnetic"),
 )
 """Words of other languages and of WITSML, and the word of the field for each."""
 _LABELS = {

@@ -127,18 +127,25 @@ def _wirings(run: Table, readings: Readings) -> dict[str, Wiring]:
         absent = [name for name in NEEDED[kind] if np.isnan(known[name]).all()]
         whole = np.all([~np.isnan(known[name]) for name in NEEDED[kind]], 0)
         if absent or whole.sum() < LEAST_STATIONS:
-            raise FitError(
-                f"{run.source}: the axes of the {kind} are told by readings at known "
-                f"{', '.join(NEEDED[kind])}: at least {LEAST_STATIONS} stations, got {whole.sum()}"
-                f"{f' (no {absent[0]})' if absent else ''}. Add these columns, or write a profile "
-                'with axes such as ["+x", "+y", "+z"] (all 48 orders and signs are open).'
-            )
+            raise _unknown(kind, absent, int(whole.sum()), readings)
         raw = np.stack([tables.numbers(run, name) for name in CHANNELS[kind]], -1)[whole]
         result = wiring(raw, *_parts(kind, readings, whole))
         if not is_clear(result):
             raise FitError(f"{run.source}: {_choice(kind, result)}")
         results[kind] = result
     return results
+
+
+def _unknown(kind: str, absent: list[str], stations: int, readings: Readings) -> FitError:
+    """The refusal of a run without the references that tell the axes of a triad."""
+    lacking = f" (no {absent[0]})" if absent else ""
+    others = f" Columns not understood: {', '.join(readings.unused)}." if readings.unused else ""
+    return FitError(
+        f"{readings.source}: the axes of the {kind} are told by readings at known "
+        f"{', '.join(NEEDED[kind])}: at least {LEAST_STATIONS} stations, got {stations}{lacking}. Add these "
+        'columns, or write a profile with axes such as ["+x", "+y", "+z"] (all 48 orders and signs are open).'
+        f"{others}"
+    )
 
 
 def _parts(kind: str, readings: Readings, whole: Bools) -> list[Array]:
@@ -195,6 +202,8 @@ def as_toml(proposal: Proposal, source: str) -> str:
     if not isinstance(profile.table, msgspec.UnsetType):
         lines += ["", "[table]"]
         fields = msgspec.structs.asdict(profile.table)
+        if source.lower().endswith(".xlsx"):
+            fields = {key: fields[key] for key in ("header_line", "first_line")}
         lines += [f"{key} = {toml(value)}" for key, value in fields.items()]
     if not isinstance(profile.columns, msgspec.UnsetType):
         lines += ["", "[columns]   # column of a run file = column of this table"]

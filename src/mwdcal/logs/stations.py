@@ -114,7 +114,7 @@ def find_stations(
     limits, slow = _limits(activity, traces)
     value, stretch = _threshold(activity, limits, threshold, shortest + 2 * trim)
     standstills = standstill.standstills(activity, limits, value, shortest, trim, slow)
-    standstills = _with_samples(standstills, traces, findings)
+    standstills = _with_samples(standstills, time, traces, findings)
     findings += noisy_rests(activity, limits, standstills, value, shortest + 2 * trim)
     stations = Stations(
         Table({}, log.metadata, log.source), standstills, activity, value, stretch, shortest, trim, time,
@@ -304,9 +304,12 @@ def _within(time: Array, start: Array, end: Array) -> tuple[Ints, Ints]:
     return np.searchsorted(time, start), np.searchsorted(time, end, side="right")
 
 
-def _with_samples(standstills: Standstills, traces: Traces, findings: list[Finding]) -> Standstills:
-    """The same, without stations for which a slow channel has hardly a sample."""
-    places = [_within(time, standstills.start, standstills.end) for time, _ in traces.values()]
+def _with_samples(
+    standstills: Standstills, rows: Array, traces: Traces, findings: list[Finding]
+) -> Standstills:
+    """The same, without stations for which a slow channel, or the log, has hardly a sample."""
+    times = [rows, *(time for time, _ in traces.values())]
+    places = [_within(time, standstills.start, standstills.end) for time in times]
     enough = np.all([last - first >= LEAST_SAMPLES for first, last in places], axis=0)
     poor = int(np.count_nonzero(standstills.taken & ~enough))
     if poor:

@@ -214,8 +214,9 @@ def rows(
             tau[i] = s[_T, i] - reference
         field(tau, s[_G], s[_G + 1], s[_G + 2], count, triads[0])
         field(tau, s[_B], s[_B + 1], s[_B + 2], count, triads[1])
-        parts(s, count)
-        angles(s, count)
+        if last > 6:
+            parts(s, count)
+            angles(s, count)
         beyond += mask(s, count, low, high, blank, last)
         for k in range(last):
             for i in range(count):

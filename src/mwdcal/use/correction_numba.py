@@ -128,17 +128,19 @@ def run(
     units: Sequence[float] = (1.0,) * 6,
     limits: RowLimits = ANYTHING,
     workers: int | None = None,
+    out: Array | None = None,
 ) -> CorrectedRows:
     """All results of `columns`: three of gravity, three of the field, in tool order; temperature.
 
     Columns are (n,), in `units` (with their sign) per nominal g or nT; the last is °C, and
-    `reference` the temperature τ = 0. By default on all cores.
+    `reference` the temperature τ = 0. By default on all cores. `out` (6 or 13, n), which is filled
+    where given: with 6 rows the vectors alone.
     """
     from mwdcal.use import correction_kernels
 
     kept_code_is_sound()
     count = len(columns[-1])
-    out = np.empty((len(RESULTS), count))
+    out = np.empty((len(RESULTS), count)) if out is None else out
     channels = tuple(columns[:3]), tuple(columns[3:6]), columns[6]
     settings = tuple(map(float, units)), limits, reference, triads
 

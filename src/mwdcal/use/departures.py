@@ -34,6 +34,8 @@ NO_TOOLFACE = (
 NOT_DETERMINED = "it rests on a direction that the calibration leaves undetermined"
 SEEN = 0.7
 """Least share of the amplitude of each harmonic that stations should show."""
+WORST_CONDITION = 1e10
+"""Condition number of a curve's covariance above which its digits are those of rounding."""
 TINY = 1e-15
 
 
@@ -238,7 +240,8 @@ class RollTest:
         if curve.rough:
             where += f"; raw figure judged: {float(curve.scale):.2g} × the noise is left about a smooth curve"
             value, noise = raw, noise * float(curve.scale)
-        if not np.isfinite([value, noise, raw, *curve.coefficients, *curve.covariance.flat]).all():
+        numbers = [value, noise, raw, *curve.coefficients, *curve.covariance.flat]
+        if not np.isfinite(numbers).all() or np.linalg.cond(curve.covariance) > WORST_CONDITION:
             raise InputError(
                 f"{self.readings.source}: the uncertainties of {roll_set.label} are too far apart to judge "
                 f"its {name}. Check the columns sd_: they are in the unit of their column."

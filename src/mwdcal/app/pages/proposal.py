@@ -11,9 +11,9 @@ from msgspec.structs import asdict
 from mwdcal.app.envelope import enveloped
 from mwdcal.app.pages.page import written
 from mwdcal.app.text import one_line, plural, table
-from mwdcal.calibration.readings import TRIADS
+from mwdcal.calibration.readings import TRIADS, simulated
 from mwdcal.identification.proposal import Proposal, in_order
-from mwdcal.sensor.profile import Profile, TriadProfile
+from mwdcal.sensor.profile import Profile, TableFormat, TriadProfile
 
 SCALE_UNITS = {"accelerometer": "g", "magnetometer": "nT"}
 
@@ -57,16 +57,10 @@ def _triad(proposal: Proposal, kind: str) -> ProposedTriad:
 def screen(proposal: Proposal, run: Path, output: Path) -> str:
     """The result for people."""
     profile = proposal.profile
-    blocks = [
-        f"{one_line(run.name)}   {one_line(profile.name)}   {plural(proposal.stations, 'station')}"
-    ]
+    head = [run.name, profile.name, plural(proposal.stations, "station")]
+    blocks = ["   ".join(map(one_line, [*head, *simulated(proposal.metadata)]))]
     if not isinstance(profile.table, msgspec.UnsetType):
-        form = profile.table
-        sign = "tab" if form.delimiter == "\t" else f"'{form.delimiter}'"
-        blocks[0] += (
-            f"\n{form.encoding}, delimiter {sign}, decimal sign '{form.decimal}', names in line "
-            f"{form.header_line}, readings from line {form.first_line}"
-        )
+        blocks[0] += "\n" + _layout(profile.table, run.suffix.lower() == ".xlsx")
     if not isinstance(profile.columns, msgspec.UnsetType):
         rows = [[c, each.name, each.unit or "–"] for c, each in in_order(profile.columns)]
         blocks.append(table(rows, ["column of a run file", "column here", "unit here"]))
@@ -89,3 +83,14 @@ def screen(proposal: Proposal, run: Path, output: Path) -> str:
 
 def _scale(scale: float | None, unit: str) -> str:
     return f"{scale:g} raw units per {unit}" if scale else "left open: no field strength"
+
+
+def _layout(form: TableFormat, workbook: bool) -> str:
+    """How a table is written."""
+    if workbook:
+        return f"names in row {form.header_line}, readings from row {form.first_line}"
+    sign = "tab" if form.delimiter == "\t" else f"'{form.delimiter}'"
+    return (
+        f"{form.encoding}, delimiter {sign}, decimal sign '{form.decimal}', names in line "
+        f"{form.header_line}, readings from line {form.first_line}"
+    )

@@ -14,8 +14,8 @@ import numpy as np
 from mwdcal.app.messages import findings_as_typed
 from mwdcal.app.pages.calibration import how, known_inclinations
 from mwdcal.app.pages.page import HELD, banner, capital, environment, exponent, factor_places
-from mwdcal.app.text import plural, raised
-from mwdcal.calibration.prediction import accuracy_at, angles, middle_temperature
+from mwdcal.app.text import plural, quantity, raised
+from mwdcal.calibration.prediction import accuracy_at, angles, middle_temperature, typical_accuracy
 from mwdcal.calibration.readings import is_simulated
 from mwdcal.calibration.record import MAGNETIC, Calibration, Finding, TriadCalibration
 from mwdcal.errors import InputError
@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 
 LONG_TABLE = 60
 """A run of more stations has its station table at the end, as an annex."""
+LARGE_RATIO = 2.0
+"""Errors after the fit of more than this times what is expected are marked."""
 ACCURACY_INCLINATIONS = (5.0, 45.0, 90.0)
 """Inclinations of the table of predicted accuracy, degrees."""
 
@@ -53,6 +55,7 @@ def render(calibration: Calibration, verdict: Verdict | None = None) -> str:
         held=HELD,
         accuracy=_accuracy(calibration),
         titles=TITLES,
+        large=LARGE_RATIO,
         tolerance=RANK_TOLERANCE,
         when=_when(calibration.time),
     )
@@ -63,8 +66,14 @@ def outcome(calibration: Calibration, verdict: Verdict | None) -> dict[str, str]
     fit, level = _fit_outcome(calibration)
     word = "OK" if level == "good" else "Attention"
     if verdict is None:
-        after = "Not verified: run mwdcal verify on a roll test that was not used in the fit."
-        return banner(level, word, fit, after)
+        each = typical_accuracy(calibration).items()
+        expected = ", ".join(f"{name} {quantity(sd, '°')}" for name, sd in each)
+        after = (
+            f"{fit}. Accuracy to expect (1σ, calibration alone, typical): {expected or 'not stated'}. "
+            "Verify by a roll test that was not used in the fit: mwdcal verify."
+        )
+        unverified = "Calibrated – not yet verified"
+        return banner("open" if level == "good" else level, "Not verified", unverified, after)
     missed = sum(not row.passed for row in verdict.rows)
     count = plural(len(verdict.rows), "limit")
     if not verdict.passed:

@@ -54,7 +54,8 @@ def gain_shares(result: Fit, index: int) -> tuple[Array, Array]:
     some = slice(None if varies else 1)
     slope = triad.model.slope(params, triad.raw[:, some], problem.temperature[:, some]).mean(1)
     gain = diagonal(slope)
-    middle = np.median(np.linalg.norm(slope, axis=-1), -1, keepdims=True)
+    with np.errstate(over="ignore"):  # an infinite gain has no shares
+        middle = np.median(np.linalg.norm(slope, axis=-1), -1, keepdims=True)
     return gain, gain / middle
 
 

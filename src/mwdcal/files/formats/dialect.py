@@ -41,9 +41,11 @@ def decoded(data: bytes, encoding: str, source: str) -> str:
         text = data.decode("utf-8-sig" if encoding == "utf-8" else encoding)
     except UnicodeDecodeError as error:
         raise InputError(
-            f"{source}: expected {encoding} text, as the tool profile says; got byte "
-            f"0x{data[error.start]:02X} at position {error.start}. Correct `encoding` in [table]."
+            f"{source}: expected {encoding} text, as the tool profile says; {error.reason} at byte "
+            f"{error.start}. Correct 'encoding' in [table] of the profile."
         ) from None
+    if "\0" in text:
+        raise InputError(f"{source}: expected text; got a NUL byte. Save the table as text.")
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
@@ -97,11 +99,20 @@ def recognised_text(data: bytes, source: str) -> Export:
     """
     encoding = encoding_of(data)
     lines = decoded(data, encoding, source).split("\n")[:_LOOKED_AT]
-    tables = {d: list(csv.reader(lines, delimiter=d)) for d in DELIMITERS}
-    counts = {d: _block(rows)[1] for d, rows in tables.items()}
-    delimiter = max(DELIMITERS, key=lambda d: counts[d])
-    form = TableFormat(encoding=encoding, delimiter=delimiter)  # type: ignore[arg-type]
-    return recognised_rows(tables[delimiter], form, source)
+    tables = {delimiter: _cells(lines, delimiter, source) for delimiter in DELIMITERS}
+    best = max(DELIMITERS, key=lambda delimiter: _block(tables[delimiter])[1])
+    form = TableFormat(encoding=encoding, delimiter=best)  # type: ignore[arg-type]
+    return recognised_rows(tables[best], form, source)
+
+
+def _cells(lines: Sequence[str], delimiter: str, source: str) -> Rows:
+    """The cells of each line."""
+    try:
+        return [next(csv.reader([line], delimiter=delimiter), []) for line in lines]
+    except csv.Error as error:
+        raise InputError(
+            f"{source}: the file is no table of text ({error}). Name the file with the readings."
+        ) from None
 
 
 def recognised_rows(rows: Rows, form: TableFormat, source: str) -> Export:
@@ -136,17 +147,16 @@ def _is_number(cell: str) -> bool:
 
 
 def _block(rows: Rows) -> tuple[int, int]:
-    """Place of the first row of readings, and how many numbers are in these rows; (0, 0) without any.
+    """Place of the first row of readings, and how many numbers are in these rows; (0, 0) without any."""
+    readings = [place for place, row in enumerate(rows) if _is_reading(row)]
+    numbers = sum(_is_number(cell) for place in readings for cell in rows[place])
+    return (readings[0], numbers) if readings else (0, 0)
 
-    A row of readings has numbers in at least half of its cells, and in at least four.
-    """
-    counts = [sum(map(_is_number, row)) for row in rows]
-    filled = [sum(1 for cell in row if cell.strip()) for row in rows]
-    readings = [
-        n >= LEAST_COLUMNS and 2 * n >= width for n, width in zip(counts, filled, strict=True)
-    ]
-    total = sum(n for n, reading in zip(counts, readings, strict=True) if reading)
-    return (readings.index(True), total) if total else (0, 0)
+
+def _is_reading(row: Sequence[str]) -> bool:
+    """Whether a row has numbers in at least half of its cells, and in at least four."""
+    numbers = sum(map(_is_number, row))
+    return numbers >= LEAST_COLUMNS and 2 * numbers >= sum(bool(cell.strip()) for cell in row)
 
 
 def _head(rows: Rows, first: int, source: str) -> tuple[int, int | None]:
