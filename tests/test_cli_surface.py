@@ -1,13 +1,11 @@
 """The outside of the command line: exit codes, help, completion, pipes, and calibration files not to be trusted."""
 
-import inspect
 import json
 import os
 import subprocess
 import sys
 
 import click
-import msgspec
 import numpy as np
 import pytest
 
@@ -25,10 +23,10 @@ from cli_support import (
 )
 from mwdcal.app.cli import cli
 from mwdcal.app.commands import options
-from mwdcal.calibration.record import SCHEMA_VERSION, Calibration
 from mwdcal.errors import InputError
 from mwdcal.files import documents
 from mwdcal.use.correction import OUTSIDE
+from schemas import of_calibration_files
 
 COMMANDS = sorted(cli.commands)
 
@@ -227,30 +225,8 @@ def test_json_of_the_order_table(tmp_path):
 # Calibration files
 
 
-def schema():
-    """JSON Schema of a calibration file, from its definition in code."""
-    described = cleaned(json.loads(msgspec.json.encode(msgspec.json.schema(Calibration))))
-    return {
-        "$schema": "https://json-schema.org/draft/2020-12/schema",
-        "title": f"mwdcal calibration file, schema version {SCHEMA_VERSION}",
-        **described,
-    }
-
-
-def cleaned(value):
-    """Descriptions without the indent that docstrings have before Python 3.13."""
-    if isinstance(value, dict):
-        return {
-            key: inspect.cleandoc(item)
-            if key == "description" and isinstance(item, str)
-            else cleaned(item)
-            for key, item in value.items()
-        }
-    return [cleaned(item) for item in value] if isinstance(value, list) else value
-
-
 def test_the_published_schema_is_that_of_the_code():
-    assert documents.published_schema() == schema()
+    assert documents.published_schema() == of_calibration_files()
 
 
 RUNS = {
@@ -287,7 +263,7 @@ def test_every_calibration_file_is_valid(tmp_path, make):
         sign = {"ay": -1, "az": -1, "my": -1, "mz": -1}
         run = {**run, **{k: run[own[k]] * scale[k] * sign.get(k, 1) for k in own}}
     path = calibrated(tmp_path, run, *options)
-    validator.check_schema(schema())
+    validator.check_schema(of_calibration_files())
     validator(documents.published_schema()).validate(json.loads(path.read_bytes()))
     assert documents.encode(documents.read(path)) == path.read_bytes()
 

@@ -139,12 +139,8 @@ def screen(width, *arguments, **variables):
     """What a terminal shows, with measured times and what varies with them blotted out."""
     code, out, err = seen(width, *arguments, **variables)
     shown = f"exit {code}\n--- stdout\n{out}--- stderr\n{err}"
-    for varying in (
-        r"[\d.]+(?= tools/s)",
-        r"[\d.]+(?= s, )",
-        "[0-9a-f]{64}",
-        r"(?<=mwdcal )\d[\w.]+",
-    ):
+    shown = re.sub(r"[\d.]+ s, [\d.]+ tools/s", "? s, ? tools/s", shown)
+    for varying in ("[0-9a-f]{64}", r"(?<=mwdcal )\d[\w.]+"):
         shown = re.sub(varying, lambda part: "?" * len(part[0]), shown)
     times = re.compile(r"^(time of one fit, s)(.*)$", re.MULTILINE)
     return times.sub(lambda line: line[1] + re.sub(r"\d", "0", line[2]), shown)

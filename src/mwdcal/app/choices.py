@@ -27,7 +27,9 @@ def load_run(
     return replace(readings, profile_sha256=digest), profile
 
 
-def options_of(typed: Typed, prior: Prior = None, exclude: tuple[str, ...] = ()) -> Options:
+def options_of(
+    typed: Typed, prior: Prior = None, exclude: tuple[str, ...] = (), prior_sha256: str = ""
+) -> Options:
     """The options as typed, with the prior that `prior_of` has read."""
     triads = typed["nonlinearity"]
     curved = {"none": (), AUTO: AUTO}.get(triads, names(triads) or (triads,))
@@ -39,14 +41,17 @@ def options_of(typed: Typed, prior: Prior = None, exclude: tuple[str, ...] = ())
         "ignore": names(typed["ignore"]),
         "prior": prior,
     }
-    return Options(**{**typed, **read}, exclude=exclude)
+    return Options(**{**typed, **read}, exclude=exclude, prior_sha256=prior_sha256)
 
 
-def prior_of(word: str | None) -> Prior:
-    """The prior that a word names: a calibration file, or the tolerances of the profile."""
+def prior_of(word: str | None) -> tuple[Prior, str]:
+    """The prior that a word names, and the SHA-256 of its file.
+
+    A calibration file; or the tolerances of the profile, or nothing, which have no file.
+    """
     if not word:
-        return None
-    return DATASHEET if word == DATASHEET else documents.read(Path(word))
+        return None, ""
+    return (DATASHEET, "") if word == DATASHEET else documents.load(Path(word))
 
 
 def order_of(word: str) -> int | Literal["auto"]:

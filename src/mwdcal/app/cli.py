@@ -14,7 +14,6 @@ import click
 
 from mwdcal import __version__
 from mwdcal.app import interruption
-from mwdcal.app.block_pandas import without_pandas
 from mwdcal.app.messages import say, screens
 from mwdcal.app.text import harmless, laid_out
 from mwdcal.errors import MwdcalError, reason
@@ -100,3 +99,21 @@ def _ended(message: str, status: int, *notes: str) -> int:
     for line in (f"mwdcal: {message}", *notes):
         say(line)
     return status
+
+
+class WithoutPandas:
+    """An import finder by which pandas is not installed.
+
+    PyArrow loads pandas, where there is one, at the first array that it makes. That takes a
+    quarter of a second, and mwdcal has no use for it.
+    """
+
+    def find_spec(self, name: str, path: object = None, target: object = None) -> None:
+        """Refuse pandas, and leave all other modules to the finders that follow."""
+        if name == "pandas":
+            raise ModuleNotFoundError("mwdcal does without pandas", name=name)
+
+
+def without_pandas() -> None:
+    """To be called by processes that are ours alone: a command's own, and its workers."""
+    sys.meta_path.insert(0, WithoutPandas())

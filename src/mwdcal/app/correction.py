@@ -31,6 +31,15 @@ TEXT = (".csv", ".tsv")
 """Suffixes of text tables."""
 
 
+class Applied(msgspec.Struct, frozen=True, kw_only=True):
+    """What came of a table: its rows, those without results, and the table that was written."""
+
+    rows: int
+    blank: int
+    output: str
+    findings: list[Finding]
+
+
 def apply_to_any(
     calibration: Calibration,
     readings: Path,
@@ -39,19 +48,21 @@ def apply_to_any(
     missing: str,
     decimal: str,
     advance: Callable[[int, int], None],
-) -> tuple[RowCounts, list[Finding]]:
+) -> tuple[RowCounts, list[Finding], str]:
     """Correct a file into another: part by part, or whole where it is short text or a workbook.
 
-    What was seen in the rows, and what the reader should know. `advance` gets how much of a long
+    What was seen in the rows, what the reader should know, and the SHA-256 of the readings, empty
+    where they were not read as a whole. `advance` gets how much of a long
     table is done, and the whole. An export as the calibration's profile describes it is taken whole, and
     text that comes of it is written as it is.
     """
     profile = calibration.profile
     exported = _is_exported(readings, profile, decimal)
     if streaming.in_parts(readings, output) and not exported:
-        return streaming.apply_to_file(
+        streamed = streaming.apply_to_file(
             calibration, readings, output, outside, advance, missing=missing, decimal=decimal
         )
+        return *streamed, ""
     if readings.suffix.lower() in TEXT and (exported or output.suffix.lower() == ".xlsx"):
         _check_size(readings)
     source = read_export(readings, profile, decimal=decimal, rows=WHOLE_ROWS)
@@ -62,7 +73,8 @@ def apply_to_any(
     form = profile.table if exported and readings.suffix.lower() in TEXT else msgspec.UNSET
     tables.write(output, result, None if isinstance(form, msgspec.UnsetType) else form)
     formulas = carried.with_formulas(source.columns) if output.suffix.lower() in TEXT else []
-    return tally, findings + carried.copied([*source.columns], formulas, output.suffix.lower())
+    findings += carried.copied([*source.columns], formulas, output.suffix.lower())
+    return tally, findings, source.digest
 
 
 def _is_exported(readings: Path, profile: Profile, decimal: str) -> bool:

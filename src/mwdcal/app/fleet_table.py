@@ -13,10 +13,10 @@ from typing import Any
 
 import msgspec
 
-from mwdcal import __version__
 from mwdcal.app import pool, progress
 from mwdcal.app.choices import options_of, prior_of
 from mwdcal.app.commands.options import Typed
+from mwdcal.app.envelope import enveloped
 from mwdcal.app.pages.fleet_summary import FleetSummary, stated_options, summarise
 from mwdcal.app.text import plural
 from mwdcal.calibration.automatic.nonlinearity import with_strengths
@@ -118,16 +118,15 @@ def _finished(
 
 def _metadata(source: FleetTable, plan: Plan, typed: Typed, digest: str) -> dict[str, object]:
     """What the table of calibrations says of itself: the input's own, and how it was made."""
-    return {
-        **{k: v for k, v in source.metadata.items() if k != SERIAL},
+    stated = {k: v for k, v in source.metadata.items() if k != SERIAL}
+    content = {
         "fleet": source.name,
-        "software": f"mwdcal {__version__}",
         "options": stated_options(typed),
         "profile": plan.profile.name,
-        "profile_sha256": digest,
         "reference_temperature_c": plan.profile.reference_temperature_c,
         "noise_estimated": list(plan.noise_estimated),
     }
+    return {**stated, **enveloped("fleet", content, stated, profile=digest)}
 
 
 def _options(typed: Typed, profile: Profile) -> Options:
@@ -137,7 +136,7 @@ def _options(typed: Typed, profile: Profile) -> Options:
             f"`prior` {typed['prior']}: the prior of a fleet is 'datasheet', the tolerances in the tool "
             "profile. A previous calibration is of one tool: use it with mwdcal calibrate."
         )
-    options = with_strengths(options_of(typed, prior_of(typed["prior"])), profile)
+    options = with_strengths(options_of(typed, prior_of(typed["prior"])[0]), profile)
     profile_for(options.prior, profile)
     check_stand_errors(options.estimate, options.method)
     check_options(options)

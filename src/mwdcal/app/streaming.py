@@ -23,7 +23,7 @@ import numpy as np
 
 from mwdcal.app.messages import say
 from mwdcal.calibration.diagnosis.findings import unused_columns
-from mwdcal.calibration.readings import TRIADS, Readings
+from mwdcal.calibration.readings import TRIADS, Readings, is_simulated
 from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.errors import InputError
 from mwdcal.files import carried, contract, runs, streams, synonyms
@@ -118,6 +118,7 @@ def apply_to_file(
             done += size
             advance(done, source.size)
         total = _total(tallies, worker.moved)
+        total = total._replace(metadata=runs.identified(source.metadata, total.serials))
         if total.lacking == total.rows:
             raise nothing(source.name)
         remarks = worker.findings(total, outside)
@@ -394,6 +395,7 @@ def described(calibration: Calibration) -> dict[str, object]:
         "calibration_time": calibration.time,
         "azimuth_out": "magnetic",
         "field_unit": calibration.field_unit,
+        **({"simulated": True} if is_simulated(calibration.tool) else {}),
     }
 
 

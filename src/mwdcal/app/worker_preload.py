@@ -10,7 +10,7 @@ import gc
 
 import numpy as np
 
-from mwdcal.app.block_pandas import without_pandas
+from mwdcal.app.cli import without_pandas
 from mwdcal.calibration.options import Options
 from mwdcal.files.contract import CHANNELS, REFERENCES
 from mwdcal.files.formats import parquet

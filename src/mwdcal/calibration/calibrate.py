@@ -7,7 +7,6 @@ from datetime import UTC, datetime
 
 import numpy as np
 
-from mwdcal import __version__
 from mwdcal.calibration import results
 from mwdcal.calibration.automatic.auto import Choice, choose
 from mwdcal.calibration.diagnosis.findings import described, findings
@@ -17,8 +16,9 @@ from mwdcal.calibration.diagnosis.soundness import inconsistency
 from mwdcal.calibration.estimate import Fit, fit
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.prediction import accuracy
-from mwdcal.calibration.readings import TRIADS, Readings
+from mwdcal.calibration.readings import TRIADS, Readings, is_simulated, serial_of
 from mwdcal.calibration.record import (
+    SOFTWARE,
     BudgetRow,
     Calibration,
     Choices,
@@ -82,13 +82,19 @@ def _record(choice: Choice, fitted: FittedRuns) -> Calibration:
     to_file = results.to_file(result, reference)[0]
     low, high = results.temperature_range(result, prior)
     triads = [_triad(fitted, index) for index in range(len(result.problem.triads))]
+    tool = {k: str(v) for k, v in readings.metadata.items() if k in IDENTITY}
+    if prior and prior.simulated:
+        tool["simulated"] = str(True)
     return Calibration(
-        tool={k: str(v) for k, v in readings.metadata.items() if k in IDENTITY},
+        tool=tool,
+        serial=serial_of(tool),
+        simulated=is_simulated(tool),
         profile=choice.profile,
         profile_sha256=readings.profile_sha256,
         run=readings.source,
         run_sha256=readings.run_sha256,
-        software=f"mwdcal {__version__}",
+        prior_sha256=options.prior_sha256 or None,
+        software=SOFTWARE,
         method=options.method,
         options=Choices(
             parameters=options.parameters,

@@ -44,6 +44,7 @@ class Options:
         paper_weights: sum the squares as the method's paper does, unweighted.
         prior: what is known beforehand: "datasheet" (the tolerances in the profile), a previous
             calibration of the same tool, or knowledge of its parameters.
+        prior_sha256: of the file that a previous calibration was read from.
         exclude: labels of stations to leave out.
         seed: of the swarm.
 
@@ -61,6 +62,7 @@ class Options:
     robust: str | None = None
     paper_weights: bool = False
     prior: Knowledge | Calibration | Literal["datasheet"] | None = None
+    prior_sha256: str = ""
     exclude: tuple[str, ...] = ()
     seed: int = 0
 

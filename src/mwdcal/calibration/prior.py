@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 from msgspec.structs import replace as replace_struct
 
-from mwdcal.calibration.readings import HIGHEST, TRIADS, Readings
+from mwdcal.calibration.readings import HIGHEST, TRIADS, Readings, is_simulated
 from mwdcal.calibration.record import Calibration
 from mwdcal.errors import FitError, InputError
 from mwdcal.estimation.problem import Prior
@@ -36,6 +36,7 @@ class Knowledge:
     does not have are of no account; else they are an error. `stations` are the fingerprints of
     those that the knowledge comes from, `temperature` their range, °C; `common` names errors of the
     stand and of references that are part of its uncertainty, as `budget` of a calibration does.
+    `simulated`: it comes from simulated data.
     """
 
     source: str
@@ -47,6 +48,7 @@ class Knowledge:
     stations: tuple[str, ...] = ()
     temperature: tuple[float, float] | None = None
     common: tuple[str, ...] = ()
+    simulated: bool = False
 
 
 def prior_of(knowledge: Knowledge | None, models: Sequence[Model], batch: int) -> Prior:
@@ -206,6 +208,7 @@ def from_calibration(previous: Calibration, relative: bool = False) -> Knowledge
         stations=(*(row.digest for row in previous.station_rows), *previous.inherited),
         temperature=previous.temperature_c,
         common=tuple(row.source for row in previous.budget),
+        simulated=is_simulated(previous.tool),
     )
 
 

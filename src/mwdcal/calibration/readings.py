@@ -40,6 +40,12 @@ def is_simulated(metadata: Mapping[str, object]) -> bool:
     return str(metadata.get("simulated", "")).lower() not in ("", "0", "false", "no")
 
 
+def serial_of(metadata: Mapping[str, object]) -> str | None:
+    """The serial of the tool that metadata state; None where they state none."""
+    serial = metadata.get("serial")
+    return None if serial in (None, "") else str(serial)
+
+
 def simulated(*metadata: Mapping[str, object]) -> list[str]:
     """`SIMULATED`, for a heading, if the calibration, run or log is simulated; else nothing."""
     return [SIMULATED] if any(map(is_simulated, metadata)) else []

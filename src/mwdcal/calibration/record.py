@@ -16,6 +16,7 @@ from typing import Any, ClassVar
 import msgspec
 import numpy as np
 
+from mwdcal import __version__
 from mwdcal.calibration.readings import NANOTESLA, SOAK_GAP, Readings, simulated
 from mwdcal.errors import InputError
 from mwdcal.geometry.observables import OBSERVABLES
@@ -24,6 +25,8 @@ from mwdcal.sensor.models import Basis, Factors, Model, Polynomial
 from mwdcal.sensor.profile import Profile
 
 SCHEMA_VERSION = 1
+SOFTWARE = f"mwdcal {__version__}"
+"""Name and version of the program."""
 DIGITS = 12
 """Significant digits of every number in a calibration file."""
 MARGIN = 1.0
@@ -222,15 +225,20 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
     references without a declared uncertainty whose error no residual would show.
     `inherited` are the fingerprints of the stations behind the prior, if there was one;
     `excluded` the labels of stations of the run that were left out of the fit on request.
+    `serial` is that of the tool, None where the run states none; `simulated`: of the run or the prior.
     `sha256` is `content_sha256` of the record as it was made; earlier versions have none.
     """
 
     schema_version: int = SCHEMA_VERSION
+    command: str = "calibrate"
     tool: dict[str, str]
+    serial: str | None = None
+    simulated: bool = False
     profile: Profile
     profile_sha256: str
     run: str
     run_sha256: str
+    prior_sha256: str | None = None
     software: str
     method: str
     options: Choices = Choices()

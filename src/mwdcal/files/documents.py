@@ -91,7 +91,8 @@ def _unique(name: str, pairs: list[tuple[str, Any]]) -> None:
             )
 
 
-def published_schema() -> dict[str, Any]:
-    """The schema of a calibration file, as shipped with the package."""
-    text = resources.files("mwdcal").joinpath("calibration.schema.json").read_text("utf-8")
+def published_schema(command: str = "") -> dict[str, Any]:
+    """The schema of a calibration file, or of the document of a command, as shipped with the package."""
+    place = ("schemas", f"{command}.schema.json") if command else ("calibration.schema.json",)
+    text = resources.files("mwdcal").joinpath(*place).read_text("utf-8")
     return msgspec.json.decode(text, type=dict[str, Any])

@@ -11,10 +11,10 @@ from mwdcal.files.profiles import built_in, read_toml, toml_problem
 from mwdcal.use.verification import Limits
 
 
-def load_limits(name_or_path: str | os.PathLike[str] = "roll-test") -> Limits:
-    """A limits profile: built in by name, or a TOML file by path."""
+def load_limits(name_or_path: str | os.PathLike[str] = "roll-test") -> tuple[Limits, str]:
+    """A limits profile and the SHA-256 of its bytes: built in by name, or a TOML file by path."""
     name = os.fspath(name_or_path)
-    data, _ = read_toml(name, "limits", "limits profile")
+    data, digest = read_toml(name, "limits", "limits profile")
     try:
         limits = msgspec.toml.decode(data, type=Limits)
     except (msgspec.DecodeError, ValueError, RecursionError) as error:
@@ -28,4 +28,4 @@ def load_limits(name_or_path: str | os.PathLike[str] = "roll-test") -> Limits:
     for observable, value in bounds:
         if not 0 < value < float("inf"):
             raise InputError(f"{name}: the limit of {observable} must be positive; got {value}.")
-    return limits
+    return limits, digest

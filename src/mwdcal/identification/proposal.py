@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
 import msgspec
 import numpy as np
 
-from mwdcal.calibration.readings import TRIADS, Readings, simulated
+from mwdcal.calibration.readings import TRIADS, Readings
 from mwdcal.errors import FitError, InputError
 from mwdcal.files.contract import CHANNELS, MAPPED, units_of
 from mwdcal.files.formats import table as tables
@@ -40,7 +41,7 @@ class Proposal(NamedTuple):
     """A profile, how the axes of each triad in it were told, and the run that told.
 
     `unused` are columns of the table that are nothing of a run file, `by_value` columns of a run file whose
-    unit no name states.
+    unit no name states; `metadata` what the table says of itself.
     """
 
     profile: Profile
@@ -48,7 +49,8 @@ class Proposal(NamedTuple):
     stations: int
     unused: tuple[str, ...]
     by_value: set[str]
-    simulated: list[str]
+    metadata: Mapping[str, object]
+    run_sha256: str
 
 
 def propose(path: str | os.PathLike[str]) -> Proposal:
@@ -89,7 +91,8 @@ def propose(path: str | os.PathLike[str]) -> Proposal:
         readings.count,
         readings.unused,
         by_value,
-        simulated(readings.metadata),
+        readings.metadata,
+        readings.run_sha256,
     )
 
 

@@ -241,7 +241,7 @@ def verify(
     """
     _check_readings(rolltest, "rolltest")
     return judge(
-        calibration, rolltest, limits if isinstance(limits, Limits) else load_limits(limits)
+        calibration, rolltest, limits if isinstance(limits, Limits) else load_limits(limits)[0]
     )
 
 

@@ -50,7 +50,8 @@ class RowCounts(NamedTuple):
     """Rows of a table, counted by what the findings report of them.
 
     `beyond`: outside the calibrated temperatures; `moved`: outputs that rest on a free direction;
-    `lacking`: without a reading; `warmth`: lowest and highest temperature, °C.
+    `lacking`: without a reading; `warmth`: lowest and highest temperature, °C; `metadata`: what the
+    table says of itself.
     """
 
     rows: int
@@ -60,6 +61,7 @@ class RowCounts(NamedTuple):
     serials: tuple[str, ...] = ()
     strengths: Mapping[str, Strengths] = {}
     warmth: tuple[float, float] = (np.inf, -np.inf)
+    metadata: Mapping[str, object] = {}
 
     def blank(self, outside: str) -> int:
         """Number of rows without results: without a reading, or `outside` the temperatures."""
@@ -94,6 +96,7 @@ def counted(
     tally = RowCounts(
         readings.count + lacking, int(beyond.sum()), undetermined(calibration, readings), lacking, (),
         strengths.judged(calibration, columns, readings.known), warmth(readings.temperature),
+        readings.metadata,
     )  # fmt: skip
     about = findings(calibration, readings, tally, outside)
     strengths.check(calibration, tally.strengths, readings.name)

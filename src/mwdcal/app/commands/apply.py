@@ -44,24 +44,31 @@ def command(
     Example: mwdcal apply tool.json surveys.csv -o corrected.csv
     Exit: 0 written, 2 input cannot be read, or does not belong to the calibration.
     """
-    from mwdcal.app.correction import apply_to_any
+    from mwdcal.app.correction import Applied, apply_to_any
+    from mwdcal.app.envelope import enveloped
     from mwdcal.app.progress import bar
     from mwdcal.calibration.readings import simulated
     from mwdcal.files import documents
     from mwdcal.files.runs import BlankReadingError
 
     options.check_outputs([output], [calibration, readings])
-    fitted = documents.read(calibration)
+    fitted, digest = documents.load(calibration)
     try:
         with bar("correcting") as advance:
-            tally, findings = apply_to_any(
+            tally, findings, readings_digest = apply_to_any(
                 fitted, readings, output, outside, missing, decimal, advance
             )
     except BlankReadingError as error:
         advice = "Or leave the results of such rows blank: --missing blank."
         raise InputError(f"{error} {advice}") from None
     blank = tally.blank(outside)
-    document = {"rows": tally.rows, "blank": blank, "output": str(output), "findings": findings}
+    document = enveloped(
+        "apply",
+        Applied(rows=tally.rows, blank=blank, output=str(output), findings=findings),
+        *(fitted.tool, tally.metadata),
+        calibration=digest,
+        readings=readings_digest,
+    )
     corrected = f"{tally.rows} rows corrected" + (f", {blank} of them blank" if blank else "")
     screen = "   ".join([corrected, f"wrote {one_line(output)}", *simulated(fitted.tool)])
     print_result(document if as_json else screen, findings)

@@ -46,9 +46,9 @@ def command(
     from mwdcal.files.formats import atomic
 
     options.check_outputs([output], [run, tool, typed["prior"]], page=report)
-    prior = prior_of(typed["prior"])
+    prior, digest = prior_of(typed["prior"])
     readings, profile = load_run(run, tool, decimal, prior)
-    choice = choose(readings, profile, options_of(typed, prior, exclude), say)
+    choice = choose(readings, profile, options_of(typed, prior, exclude, digest), say)
     calibration = recorded(choice, fit(choice.readings, choice.options))
     rendered = ""
     if report:

@@ -39,6 +39,7 @@ def command(
     Exit: 0 compared, 2 input cannot be read, 3 every method refused.
     """
     from mwdcal.app.choices import load_run, order_of
+    from mwdcal.app.envelope import enveloped
     from mwdcal.app.pages import comparison as page
     from mwdcal.calibration.diagnosis.findings import unused_columns
     from mwdcal.calibration.options import Options
@@ -55,7 +56,11 @@ def command(
         atomic.write(
             report, page.render(result, profile.name, readings.run_sha256, readings.profile_sha256)
         )
-    written = f"\nwrote {one_line(report)} (report)" if report else ""
-    document = {**page.document(result), "findings": unused, "report": str(report or "")}
-    print_result(document if as_json else page.text(result, parameters) + written, unused)
+    if as_json:
+        digests = {"run": readings.run_sha256, "profile": readings.profile_sha256}
+        content = page.document(result, unused, report)
+        print_result(enveloped("compare", content, readings.metadata, **digests), unused)
+    else:
+        written = f"\nwrote {one_line(report)} (report)" if report else ""
+        print_result(page.text(result, parameters) + written, unused)
     sys.exit(0 if able(result.rows) else FitError.exit_code)

@@ -38,6 +38,7 @@ def command(folder: Path, as_json: bool) -> None:
     Example: mwdcal example demo
     Exit: 0 written, 2 a file of the same name is there, or DIR cannot be written.
     """
+    from mwdcal.app.envelope import ExampleDocument, enveloped
     from mwdcal.app.text import one_line, table
     from mwdcal.calibration.readings import SIMULATED
     from mwdcal.files.formats import atomic
@@ -56,7 +57,8 @@ def command(folder: Path, as_json: bool) -> None:
     rows = [[str(file), what] for file, what in zip(files, CONTENTS.values(), strict=True)]
     screen = f"{table(rows, [f'wrote, all {SIMULATED}', ''])}\n\n"
     screen += f"next: mwdcal calibrate {run} --tool {tool} -o tool.json"
-    document = {"simulated": True, "folder": str(folder), "files": [str(file) for file in files]}
+    written = ExampleDocument(folder=str(folder), files=[str(file) for file in files])
+    document = enveloped("example", written, {"simulated": True})
     print_result(document if as_json else screen)
 
 

@@ -40,6 +40,7 @@ def command(
     from msgspec.structs import replace
 
     from mwdcal.app import progress
+    from mwdcal.app.envelope import enveloped
     from mwdcal.app.pages import noise as page
     from mwdcal.app.pages.pictures import picture
     from mwdcal.calibration.diagnosis.findings import unused_columns
@@ -54,7 +55,7 @@ def command(
     between = (-np.inf if start is None else start, np.inf if end is None else end)
     check(between, **times)
     slowly = progress.slowly(say)
-    profile = load_profile(tool)[0] if tool else None
+    profile, digest = load_profile(tool) if tool else (None, "")
     readings = logs.read(log, options.column_names(columns), decimal=decimal, say=slowly)
     kind: Kind = "modified" if modified else "overlapping"
     noise = find_noise(readings, profile=profile, between=between, kind=kind, say=slowly, **times)
@@ -62,6 +63,7 @@ def command(
     noise = replace(noise, findings=findings_as_typed([*noise.findings, *unused]))
     drawn = picture(page.figure(noise), plot.suffix) if plot else b""
     rendered = page.render(noise) if report else ""
-    shown = (page.document if as_json else page.screen)(noise, plot, report)
+    digests = {"log": readings.digest, "profile": digest}
+    document = enveloped("noise", page.document(noise, plot, report), readings.metadata, **digests)
     atomic.write_all([(plot, drawn), (report, rendered)])
-    print_result(shown, noise.findings)
+    print_result(document if as_json else page.screen(noise, plot, report), noise.findings)

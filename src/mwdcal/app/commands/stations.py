@@ -40,6 +40,7 @@ def command(
     from dataclasses import replace
 
     from mwdcal.app import progress
+    from mwdcal.app.envelope import enveloped
     from mwdcal.app.pages import stations as page
     from mwdcal.app.pages.pictures import picture
     from mwdcal.files import logs
@@ -65,5 +66,6 @@ def command(
     table.write(output, stations.table)
     atomic.write_all([(plot, drawn)])
     files = {"output": str(output), "plot": str(plot or "")}
-    shown = {**page.summary(stations), **files} if as_json else page.screen(stations, files)
-    print_result(shown, stations.findings)
+    content = page.summary(stations, files)
+    document = enveloped("stations", content, readings.metadata, log=readings.digest)
+    print_result(document if as_json else page.screen(stations, files), stations.findings)

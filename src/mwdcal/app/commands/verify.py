@@ -27,6 +27,7 @@ def command(
     """
     from msgspec.structs import replace
 
+    from mwdcal.app.envelope import enveloped
     from mwdcal.app.pages.verification import screen
     from mwdcal.calibration.diagnosis.findings import unused_columns
     from mwdcal.files import documents, runs
@@ -34,16 +35,19 @@ def command(
     from mwdcal.use.verification import verify
 
     options.check_outputs([], [calibration, run, limits], page=report)
-    fitted = documents.read(calibration)
+    fitted, digest = documents.load(calibration)
     readings, _ = runs.read_run(run, fitted.profile, decimal=decimal)
-    result = verify(fitted, readings, load_limits(limits))
+    bounds, limits_digest = load_limits(limits)
+    result = verify(fitted, readings, bounds)
     findings = findings_as_typed(result.findings + unused_columns(readings.unused))
     result = replace(result, findings=findings)
-    shown = result if as_json else screen(result, fitted.tool, readings.metadata)
+    stated = fitted.tool, readings.metadata
+    digests = {"calibration": digest, "run": readings.run_sha256, "limits": limits_digest}
+    document = enveloped("verify", result, *stated, **digests)
     if report:
         from mwdcal.app.pages.report import render
         from mwdcal.files.formats import atomic
 
         atomic.write(report, render(fitted, result))
-    print_result(shown, result.findings)
+    print_result(document if as_json else screen(result, *stated), result.findings)
     sys.exit(0 if result.passed else 1)

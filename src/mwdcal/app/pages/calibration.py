@@ -2,17 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import msgspec
+
+from mwdcal.app.envelope import enveloped
 from mwdcal.app.messages import findings_as_typed
 from mwdcal.app.pages.page import written
 from mwdcal.app.text import chance, number, one_line, quantity, table
 from mwdcal.calibration.automatic.nonlinearity import CurveScore
 from mwdcal.calibration.prediction import typical_accuracy
 from mwdcal.calibration.readings import simulated
-from mwdcal.calibration.record import Calibration, Choices, ErrorRow, Finding, OrderScore
+from mwdcal.calibration.record import (
+    BudgetRow,
+    Calibration,
+    Choices,
+    Constant,
+    ErrorRow,
+    Finding,
+    Measures,
+    OrderScore,
+    StandErrors,
+    Undetermined,
+)
 from mwdcal.geometry.observables import TITLES
 
 if TYPE_CHECKING:
@@ -21,10 +34,6 @@ if TYPE_CHECKING:
 MOST_RESHOOTS = 12
 """Most stations to re-shoot that messages name."""
 PROFILE = " (see [stand] of the tool profile)"
-RUN_FIELDS = ("run", "stations", "excluded", "temperature_c", "method", "options", "seed")
-TRIAD = ("model", "order", "rank", "size", "undetermined", "variance_factor", "misfit_probability")
-ACCURACY = ("budget", "assumed_exact", "constants", "stand", "findings", "orders")
-"""Parts of the record that the summary for machines repeats."""
 ORDERS = "error: rms per axis, with the noise; inside: interpolation, at the ends: extrapolation"
 COMPARED = """
 by chance: probability that noise alone gives such a term; chosen: the lowest order above which \
@@ -32,7 +41,46 @@ none is below 0.001"""
 """What the table of orders means, and where orders were compared."""
 
 
-def _attributes(record: object, names: Iterable[str]) -> dict[str, Any]:
+class TriadSummary(msgspec.Struct, frozen=True, kw_only=True):
+    """A triad as the summary states it: the fields of `TriadCalibration` without its parameters."""
+
+    model: str
+    order: int
+    rank: int
+    size: int
+    undetermined: list[Undetermined]
+    variance_factor: float | None
+    misfit_probability: float | None
+
+
+class CalibrationSummary(msgspec.Struct, frozen=True, kw_only=True):
+    """What `calibrate` prints: fields of `Calibration`, accuracy, comparisons, and the files written."""
+
+    run: str
+    stations: int
+    excluded: list[str]
+    temperature_c: tuple[float, float] | None
+    method: str
+    options: Choices
+    seed: int | None
+    triads: dict[str, TriadSummary]
+    errors: list[ErrorRow]
+    measures: list[Measures]
+    accuracy_1sigma_deg: dict[str, float | None]
+    budget: list[BudgetRow]
+    assumed_exact: list[str]
+    constants: list[Constant]
+    stand: StandErrors
+    findings: list[Finding]
+    orders: list[OrderScore]
+    nonlinearity: list[CurveScore]
+    calibration: str
+    report: str
+
+
+def _recorded(kind: type[msgspec.Struct], record: msgspec.Struct) -> dict[str, Any]:
+    """The fields of a summary that the record has too."""
+    names = {*kind.__struct_fields__} & {*record.__struct_fields__}
     return {name: getattr(record, name) for name in names}
 
 
@@ -40,17 +88,23 @@ def summary(
     calibration: Calibration, choice: Choice, output: Path, report: Path | None
 ) -> dict[str, Any]:
     """The result for machines."""
-    return {
-        **_attributes(calibration, RUN_FIELDS),
-        "triads": {triad.name: _attributes(triad, TRIAD) for triad in calibration.triads},
-        **_attributes(calibration, ("errors", "measures")),
-        "accuracy_1sigma_deg": typical_accuracy(calibration),
-        **_attributes(calibration, ACCURACY),
-        "findings": findings_as_typed(calibration.findings),
-        "nonlinearity": choice.curves,
-        "calibration": str(output),
-        "report": str(report or ""),
-    }
+    findings = findings_as_typed(calibration.findings)
+    content = CalibrationSummary(
+        **{**_recorded(CalibrationSummary, calibration), "findings": findings},
+        triads={t.name: TriadSummary(**_recorded(TriadSummary, t)) for t in calibration.triads},
+        accuracy_1sigma_deg=typical_accuracy(calibration),
+        nonlinearity=choice.curves,
+        calibration=str(output),
+        report=str(report or ""),
+    )
+    return enveloped(
+        "calibrate",
+        content,
+        calibration.tool,
+        run=calibration.run_sha256,
+        profile=calibration.profile_sha256,
+        prior=calibration.prior_sha256 or "",
+    )
 
 
 def screen(calibration: Calibration, choice: Choice, output: Path, report: Path | None) -> str:

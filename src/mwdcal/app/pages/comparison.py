@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import msgspec
@@ -25,6 +26,7 @@ from mwdcal.app.pages.page import (
 from mwdcal.app.text import one_line, raised, superscript, table
 from mwdcal.calibration.methods import EVIDENCE
 from mwdcal.calibration.readings import SIMULATED
+from mwdcal.calibration.record import Finding, Measures
 from mwdcal.comparison.common_gauge import SCALE
 from mwdcal.comparison.compare import Comparison, Row, able
 from mwdcal.estimation.uncertainty import ROTATIONS
@@ -252,13 +254,59 @@ def _parameter(
     return ComparedParameter(title, unit, values, sd)
 
 
-def document(comparison: Comparison) -> dict[str, Any]:
-    """The result for machines, without the errors of single stations."""
-    shown: dict[str, Any] = msgspec.to_builtins(comparison, enc_hook=np.ndarray.tolist)
-    for row in shown["rows"]:
-        del row["station_errors"], row["course"]
-    del shown["labels"]
-    return shown
+class NotationValues(msgspec.Struct, frozen=True, kw_only=True):
+    """A `Notation` as lists."""
+
+    values: dict[str, list[Any]]
+    uncertainty: dict[str, list[Any]]
+    covariance: list[list[float | None]]
+
+
+class ComparedMethod(msgspec.Struct, frozen=True, kw_only=True):
+    """A `Row` without the errors of single stations and the course of the swarm."""
+
+    method: str
+    refused: str
+    ranks: dict[str, tuple[int, int]]
+    undetermined: list[str]
+    iterations: int
+    seconds: float
+    in_sample: dict[str, float | None]
+    held_out: dict[str, float | None]
+    resting: list[str]
+    lost: int
+    measures: list[Measures]
+    parameters: dict[str, NotationValues]
+    taken_out: dict[str, NotationValues]
+
+
+class ComparisonSummary(msgspec.Struct, frozen=True, kw_only=True):
+    """What `compare` prints: the fields of `Comparison`, unused columns, and the page."""
+
+    run: str
+    stations: int
+    simulated: bool
+    orders: tuple[int, int]
+    curved: list[str]
+    parts: int
+    seed: int
+    units: dict[str, str]
+    before: dict[str, float | None]
+    measures_before: list[Measures]
+    gauge: dict[str, list[str]]
+    rows: list[ComparedMethod]
+    advice: str
+    findings: list[Finding]
+    report: str
+
+
+def document(
+    comparison: Comparison, findings: list[Finding], report: Path | None
+) -> ComparisonSummary:
+    """The result for machines."""
+    shown = msgspec.to_builtins(comparison, enc_hook=np.ndarray.tolist)
+    files = {"findings": msgspec.to_builtins(findings), "report": str(report or "")}
+    return msgspec.convert({**shown, **files}, ComparisonSummary)
 
 
 def render(

@@ -5,17 +5,18 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
 
+from mwdcal.app.envelope import enveloped
 from mwdcal.app.pages.page import HELD, UNDETERMINED
 from mwdcal.app.text import one_line, raised, table
-from mwdcal.calibration.readings import Readings, is_simulated, simulated
-from mwdcal.calibration.record import Calibration, Finding
+from mwdcal.calibration.readings import Readings, simulated
+from mwdcal.calibration.record import SOFTWARE, Calibration, Finding
 from mwdcal.files import documents
+from mwdcal.sensor.profile import Axis
 from mwdcal.use.notation import COURSE, Notation, convert, powers
 
-CONVERSION_SCHEMA_VERSION = 1
-"""Version of the JSON document."""
 UNRECORDED = (
     "the calibration was made at unrecorded temperatures, without temperature terms: the values are "
     "the same at any temperature, and nothing says how good they are at {:g} °C."
@@ -39,6 +40,47 @@ class Converted(NamedTuple):
     temperature: float | str | None
     triads: dict[str, Notation]
     findings: list[Finding]
+
+
+class ConvertedTriad(msgspec.Struct, frozen=True, kw_only=True):
+    """The values of a triad in one notation, and what they are of."""
+
+    S: list[Any] | msgspec.UnsetType = msgspec.UNSET
+    o: list[Any] | msgspec.UnsetType = msgspec.UNSET
+    M: list[Any] | msgspec.UnsetType = msgspec.UNSET
+    b: list[Any] | msgspec.UnsetType = msgspec.UNSET
+    SF: list[Any] | msgspec.UnsetType = msgspec.UNSET
+    B: list[Any] | msgspec.UnsetType = msgspec.UNSET
+    m: list[Any] | msgspec.UnsetType = msgspec.UNSET
+    reference_temperature_c: float
+    axes: tuple[Axis, Axis, Axis]
+    unit: str
+    nominal_raw_per_unit: float | None
+    standard_uncertainty: dict[str, list[Any]]
+    covariance: list[list[float]]
+
+
+class ConversionSummary(msgspec.Struct, frozen=True, kw_only=True):
+    """What `convert` prints and writes: whose calibration it is, then the values of each triad.
+
+    `software` is that of the calibration; `converted_by` wrote this document.
+    """
+
+    tool: dict[str, str]
+    profile: str
+    run: str
+    calibration: str
+    calibrated: str
+    software: str
+    converted_by: str
+    calibrated_temperature_c: tuple[float, float] | None
+    field_unit: str
+    notation: str
+    temperature_c: float | str
+    findings: list[Finding]
+    powers_of: str | msgspec.UnsetType = msgspec.UNSET
+    accelerometer: ConvertedTriad
+    magnetometer: ConvertedTriad | msgspec.UnsetType = msgspec.UNSET
 
 
 def convert_file(path: Path, notation: str, temperature: float | str | None) -> Converted:
@@ -82,48 +124,38 @@ def document(converted: Converted) -> dict[str, Any]:
     course = isinstance(at, str)
     if at is None or (converted.notation == "factors" and not course):
         at = calibration.reference_temperature
-    return {
-        "schema_version": CONVERSION_SCHEMA_VERSION,
-        **_source(converted),
-        "calibrated_temperature_c": calibration.temperature_c,
-        "field_unit": calibration.field_unit,
-        "notation": converted.notation,
-        "temperature_c": at,
-        "findings": converted.findings,
-        **({"powers_of": "T - reference_temperature_c"} if course else {}),
+    content = ConversionSummary(
+        tool=calibration.tool,
+        profile=calibration.profile.name,
+        run=calibration.run,
+        calibration=converted.path.name,
+        calibrated=calibration.time,
+        software=calibration.software,
+        converted_by=SOFTWARE,
+        calibrated_temperature_c=calibration.temperature_c,
+        field_unit=calibration.field_unit,
+        notation=converted.notation,
+        temperature_c=at,
+        findings=converted.findings,
+        powers_of="T - reference_temperature_c" if course else msgspec.UNSET,
         **{name: _triad(converted, name) for name in converted.triads},
-    }
+    )
+    digests = {"calibration": converted.sha256, "run": calibration.run_sha256}
+    return enveloped("convert", content, calibration.tool, **digests)
 
 
-def _source(converted: Converted) -> dict[str, Any]:
-    """Where the values come from: tool, run and calibration file."""
-    calibration = converted.calibration
-    return {
-        "tool": calibration.tool,
-        "serial": calibration.tool.get("serial"),
-        "profile": calibration.profile.name,
-        "run": calibration.run,
-        "run_sha256": calibration.run_sha256,
-        "calibration": converted.path.name,
-        "calibration_sha256": converted.sha256,
-        "calibrated": calibration.time,
-        "software": calibration.software,
-        "simulated": is_simulated(calibration.tool),
-    }
-
-
-def _triad(converted: Converted, name: str) -> dict[str, Any]:
+def _triad(converted: Converted, name: str) -> ConvertedTriad:
     item, profile = converted.triads[name], getattr(converted.calibration.profile, name)
     triad = next(t for t in converted.calibration.triads if t.name == name)
-    return {
+    return ConvertedTriad(
         **{k: v.tolist() for k, v in item.values.items()},
-        "reference_temperature_c": converted.calibration.reference_temperature,
-        "axes": profile.axes,
-        "unit": triad.unit,
-        "nominal_raw_per_unit": profile.scale,
-        "standard_uncertainty": {k: v.tolist() for k, v in item.uncertainty.items()},
-        "covariance": item.covariance.tolist(),
-    }
+        reference_temperature_c=converted.calibration.reference_temperature,
+        axes=profile.axes,
+        unit=triad.unit,
+        nominal_raw_per_unit=profile.scale,
+        standard_uncertainty={k: v.tolist() for k, v in item.uncertainty.items()},
+        covariance=item.covariance.tolist(),
+    )
 
 
 def screen(converted: Converted) -> str:

@@ -14,6 +14,7 @@ import numpy as np
 
 from mwdcal.app.choices import names
 from mwdcal.app.commands.options import Typed
+from mwdcal.app.envelope import enveloped
 from mwdcal.app.messages import as_typed
 from mwdcal.app.pages.calibration import choices
 from mwdcal.app.pages.page import written
@@ -61,6 +62,7 @@ class FleetSummary:
 
     `unused` are columns that are not used, of all tools.
     `orders` and `nonlinear`: tools by triad and chosen order, and by triad with own-axis terms.
+    `metadata` are those of the table of calibrations.
     """
 
     runs: str
@@ -81,6 +83,7 @@ class FleetSummary:
     seconds: float
     notes: list[str]
     unused: list[Finding]
+    metadata: dict[str, Any]
 
     @property
     def sound(self) -> int:
@@ -97,6 +100,7 @@ def summarise(target: Path, typed: Typed, notes: list[str], **facts: Any) -> Fle
     shown = [n for n in columns if n.endswith(("_sd_deg", "_variance_factor")) or n in ERRORS]
     return FleetSummary(
         **facts,
+        metadata=parquet.metadata_of(whole.schema_arrow.metadata, target.name),
         tools=head.num_rows,
         method=typed["method"],
         order=options["order"],
@@ -221,13 +225,51 @@ def _undetermined(whole: Any, columns: list[str]) -> dict[str, int]:
     return counts
 
 
+class FleetFinding(msgspec.Struct, frozen=True, kw_only=True):
+    """Tools with one finding: how many, and the first serials; of the whole table also its text."""
+
+    id: str
+    tools: int
+    serials: list[Any]
+    text: str | msgspec.UnsetType = msgspec.UNSET
+    station: str | msgspec.UnsetType | None = msgspec.UNSET
+
+
+class FleetDocument(msgspec.Struct, frozen=True, kw_only=True):
+    """What `fleet` prints: the fields of `FleetSummary`, the number of calibrated tools, and the page."""
+
+    runs: str
+    output: str
+    tools: int
+    stations: int
+    method: str
+    order: int | str
+    options: dict[str, Any]
+    orders: dict[str, dict[str, int]]
+    nonlinear: dict[str, int]
+    statuses: list[StatusCount]
+    findings: list[FleetFinding]
+    spread: dict[str, list[float | None]]
+    undetermined: dict[str, int]
+    parts: int
+    parts_done_before: int
+    seconds: float
+    notes: list[str]
+    tools_per_second: float
+    calibrated: int
+    report: str
+
+
 def document(summary: FleetSummary, report: Path | None) -> dict[str, Any]:
     """The summary for machines."""
     shown: dict[str, Any] = msgspec.to_builtins(summary)
     whole = {"tools": summary.tools, "serials": []}
-    shown["findings"] += [{**each, **whole} for each in shown.pop("unused")]
+    shown["findings"] += [{**each, **whole} for each in shown["unused"]]
     shown["tools_per_second"] = round(summary.tools / summary.seconds, 1)
-    return {**shown, "calibrated": summary.sound, "report": str(report or "")}
+    files = {"calibrated": summary.sound, "report": str(report or "")}
+    content = msgspec.convert({**shown, **files}, FleetDocument)
+    stated = summary.metadata
+    return enveloped("fleet", content, stated, profile=stated["profile_sha256"])
 
 
 def text(summary: FleetSummary, report: Path | None) -> str:

@@ -39,9 +39,17 @@ UNSOUND_MARK = " (!)"
 """Behind the name of a channel whose figures do not hold."""
 
 
-def document(noise: Noise, plot: Path | None, report: Path | None) -> dict[str, Any]:
+class NoiseSummary(Noise, frozen=True, kw_only=True):
+    """What `noise` prints: the noise, and the files that were written."""
+
+    plot: str
+    report: str
+
+
+def document(noise: Noise, plot: Path | None, report: Path | None) -> NoiseSummary:
     """The result for machines."""
-    return {**msgspec.to_builtins(noise), "plot": str(plot or ""), "report": str(report or "")}
+    content = msgspec.structs.asdict(noise)
+    return NoiseSummary(**content, plot=str(plot or ""), report=str(report or ""))
 
 
 def screen(noise: Noise, plot: Path | None, report: Path | None) -> str:

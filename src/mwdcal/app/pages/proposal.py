@@ -6,42 +6,61 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+from msgspec.structs import asdict
 
+from mwdcal.app.envelope import enveloped
 from mwdcal.app.pages.page import written
 from mwdcal.app.text import one_line, plural, table
+from mwdcal.calibration.readings import TRIADS, simulated
 from mwdcal.identification.proposal import Proposal, in_order
-from mwdcal.sensor.profile import TableFormat
+from mwdcal.sensor.profile import Profile, TableFormat, TriadProfile
 
 SCALE_UNITS = {"accelerometer": "g", "magnetometer": "nT"}
 
 
+class ProposedTriad(TriadProfile, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A triad of the profile, and what its axes leave of the readings' variation, where there are any."""
+
+    unexplained: float | None = None
+    next_best: float | None = None
+
+
+class ProposalSummary(Profile, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What `profile` prints: the profile, how sure its axes are, and its file."""
+
+    run: str
+    stations: int
+    accelerometer: ProposedTriad
+    magnetometer: ProposedTriad
+    unit_by_values: list[str]
+    profile: str
+
+
 def summary(proposal: Proposal, run: Path, output: Path) -> dict[str, Any]:
     """The result for machines."""
-    profile = proposal.profile
-    return {
-        "run": run.name,
-        "stations": proposal.stations,
-        "simulated": bool(proposal.simulated),
-        "unit_by_values": sorted(proposal.by_value),
-        **msgspec.to_builtins(profile),
-        **{
-            kind: {
-                "axes": result.axes,
-                "scale": getattr(profile, kind).scale,
-                "unexplained": result.unexplained,
-                "next_best": result.next_best,
-            }
-            for kind, result in proposal.wirings.items()
-        },
-        "profile": str(output),
-    }
+    content = ProposalSummary(
+        **{**asdict(proposal.profile), **{kind: _triad(proposal, kind) for kind in TRIADS}},
+        run=run.name,
+        stations=proposal.stations,
+        unit_by_values=sorted(proposal.by_value),
+        profile=str(output),
+    )
+    return enveloped("profile", content, proposal.metadata, run=proposal.run_sha256)
+
+
+def _triad(proposal: Proposal, kind: str) -> ProposedTriad:
+    """A triad as the profile has it, and how sure its axes are."""
+    triad, result = asdict(getattr(proposal.profile, kind)), proposal.wirings.get(kind)
+    if result is None:
+        return ProposedTriad(**triad)
+    return ProposedTriad(**triad, unexplained=result.unexplained, next_best=result.next_best)
 
 
 def screen(proposal: Proposal, run: Path, output: Path) -> str:
     """The result for people."""
     profile = proposal.profile
-    head = [run.name, profile.name, plural(proposal.stations, "station"), *proposal.simulated]
-    blocks = ["   ".join(map(one_line, head))]
+    head = [run.name, profile.name, plural(proposal.stations, "station")]
+    blocks = ["   ".join(map(one_line, [*head, *simulated(proposal.metadata)]))]
     if not isinstance(profile.table, msgspec.UnsetType):
         blocks[0] += "\n" + _layout(profile.table, run.suffix.lower() == ".xlsx")
     if not isinstance(profile.columns, msgspec.UnsetType):

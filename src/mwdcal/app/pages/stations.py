@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+import msgspec
 import numpy as np
 
 from mwdcal.app.pages.page import channels_of
 from mwdcal.app.text import one_line, plural, table
+from mwdcal.calibration.record import Finding
 from mwdcal.files.contract import RAW
 from mwdcal.geometry.vectors import Array
 from mwdcal.logs.stations import Stations
@@ -19,25 +21,45 @@ if TYPE_CHECKING:
 
 MOST_LINES = 40
 """Stations of a table on screen."""
-SEARCH = ("threshold", "stretch", "min_seconds", "trim_seconds")
-"""What the stations were searched with."""
 POINTS = 2000
 """Points of a line in the picture."""
 
 
-def summary(stations: Stations) -> dict[str, Any]:
-    """The result for machines: one entry per station, and what was left."""
+class StationsSummary(msgspec.Struct, frozen=True, kw_only=True):
+    """What `stations` prints: an entry for each station, what was left, and the files written."""
+
+    log: str
+    rows: int
+    seconds: float
+    threshold: float
+    stretch: tuple[float, float] | None
+    min_seconds: float
+    trim_seconds: float
+    stations: list[dict[str, float | str | bool | None]]
+    left: list[dict[str, float | str]]
+    findings: list[Finding]
+    output: str
+    plot: str
+
+
+def summary(stations: Stations, files: dict[str, str]) -> StationsSummary:
+    """The result for machines."""
     columns = stations.table.columns
     rows = zip(*(np.asarray(column).tolist() for column in columns.values()), strict=True)
-    return {
-        "log": stations.table.source,
-        "rows": len(stations.time),
-        "seconds": _seconds(stations),
-        **{name: getattr(stations, name) for name in SEARCH},
-        "stations": [dict(zip(columns, row, strict=True)) for row in rows],
-        "left": _left(stations),
-        "findings": stations.findings,
-    }
+    return StationsSummary(
+        log=stations.table.source,
+        rows=len(stations.time),
+        seconds=_seconds(stations),
+        threshold=stations.threshold,
+        stretch=stations.stretch,
+        min_seconds=stations.min_seconds,
+        trim_seconds=stations.trim_seconds,
+        stations=[dict(zip(columns, row, strict=True)) for row in rows],
+        left=_left(stations),
+        findings=stations.findings,
+        output=files["output"],
+        plot=files["plot"],
+    )
 
 
 def _left(stations: Stations) -> list[dict[str, Any]]:

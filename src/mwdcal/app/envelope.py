@@ -1,0 +1,69 @@
+"""What every document for machines says of itself: its form, who wrote it, and from which files."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import msgspec
+
+from mwdcal.calibration.readings import is_simulated, serial_of
+from mwdcal.calibration.record import SOFTWARE
+
+DOCUMENT_VERSION = 1
+"""Version of the documents: higher when a key goes, or changes its meaning."""
+INPUTS = {
+    "apply": ("calibration", "readings"),
+    "calibrate": ("run", "profile", "prior"),
+    "compare": ("run", "profile"),
+    "convert": ("calibration", "run"),
+    "example": (),
+    "fleet": ("runs", "profile"),
+    "noise": ("log", "profile"),
+    "profile": ("run",),
+    "stations": ("log",),
+    "verify": ("calibration", "run", "limits"),
+}
+"""The files behind the document of each command, whose digests are its keys `…_sha256`."""
+
+
+class Envelope(msgspec.Struct, frozen=True, kw_only=True):
+    """The head of a document.
+
+    `software` is name and version; `serial` that of the tool, None where no input states one;
+    `simulated`: some input says that it is.
+    """
+
+    schema_version: int
+    command: str
+    software: str
+    serial: str | None
+    simulated: bool
+
+
+class ExampleDocument(msgspec.Struct, frozen=True, kw_only=True):
+    """The files that `example` has written, and their folder."""
+
+    folder: str
+    files: list[str]
+
+
+def enveloped(
+    command: str, content: object, *metadata: Mapping[str, object], **sha256: str
+) -> dict[str, Any]:
+    """The document of a command: its head, the SHA-256 of its input files, and the content.
+
+    `metadata` are what the inputs say of themselves, `sha256` the digests by name; one that was not
+    computed, or of a file that was not given, is None. Keys of the content stand before equal ones.
+    """
+    head = Envelope(
+        schema_version=DOCUMENT_VERSION,
+        command=command,
+        software=SOFTWARE,
+        serial=next(filter(None, map(serial_of, metadata)), None),
+        simulated=any(map(is_simulated, metadata)),
+    )
+    digests = {f"{name}_sha256": sha256.pop(name, "") or None for name in INPUTS[command]}
+    if sha256:
+        raise ValueError(f"{command} has no input {', '.join(sha256)}")
+    return {**msgspec.to_builtins(head), **digests, **msgspec.to_builtins(content)}

@@ -1,0 +1,110 @@
+"""The published JSON Schemas, from the definitions in code. Run as a script, it writes them."""
+
+from __future__ import annotations
+
+import inspect
+import json
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+import mwdcal
+from mwdcal.app import correction
+from mwdcal.app.envelope import DOCUMENT_VERSION, INPUTS, Envelope, ExampleDocument
+from mwdcal.app.pages import (
+    calibration,
+    comparison,
+    conversion,
+    fleet_summary,
+    noise,
+    proposal,
+    stations,
+)
+from mwdcal.calibration.record import SCHEMA_VERSION, Calibration
+from mwdcal.use.verification import Verdict
+
+DIALECT = "https://json-schema.org/draft/2020-12/schema"
+CONTENTS: dict[str, type] = {
+    "apply": correction.Applied,
+    "calibrate": calibration.CalibrationSummary,
+    "compare": comparison.ComparisonSummary,
+    "convert": conversion.ConversionSummary,
+    "example": ExampleDocument,
+    "fleet": fleet_summary.FleetDocument,
+    "noise": noise.NoiseSummary,
+    "profile": proposal.ProposalSummary,
+    "stations": stations.StationsSummary,
+    "verify": Verdict,
+}
+"""What follows the envelope in the document of each command."""
+DIGEST = {"anyOf": [{"type": "string", "pattern": "^[0-9a-f]{64}$"}, {"type": "null"}]}
+
+
+def of_calibration_files() -> dict[str, Any]:
+    """JSON Schema of a calibration file, from its definition in code."""
+    described = plain(msgspec.json.schema(Calibration))
+    title = f"mwdcal calibration file, schema version {SCHEMA_VERSION}"
+    return {"$schema": DIALECT, "title": title, **described}
+
+
+def of_command(command: str) -> dict[str, Any]:
+    """JSON Schema of the document of a command: its envelope and its content; nothing else may be there."""
+    types = (Envelope, CONTENTS[command])
+    _, parts = msgspec.json.schema_components(types, ref_template="#/$defs/{name}")
+    head, content = (closed(plain(parts.pop(each.__name__))) for each in types)
+    digests = {f"{name}_sha256": DIGEST for name in INPUTS[command]}
+    properties = {**head["properties"], **digests, **content["properties"]}
+    properties["schema_version"] = {"const": DOCUMENT_VERSION}
+    properties["command"] = {"const": command}
+    required = [*head["required"], *digests, *content["required"]]
+    return {
+        "$schema": DIALECT,
+        "title": f"mwdcal {command}, schema version {DOCUMENT_VERSION}",
+        "description": content["description"],
+        "type": "object",
+        "properties": properties,
+        "required": list(dict.fromkeys(required)),
+        "additionalProperties": False,
+        "$defs": {name: closed(plain(part)) for name, part in parts.items()},
+    }
+
+
+def plain(value: Any) -> Any:
+    """As JSON has it; descriptions without the indent that docstrings have before Python 3.13."""
+    value = json.loads(msgspec.json.encode(value))
+
+    def cleaned(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {
+                key: inspect.cleandoc(item)
+                if key == "description" and isinstance(item, str)
+                else cleaned(item)
+                for key, item in value.items()
+            }
+        return [cleaned(item) for item in value] if isinstance(value, list) else value
+
+    return cleaned(value)
+
+
+def closed(part: dict[str, Any]) -> dict[str, Any]:
+    """An object with the keys that it declares and no others; what has a default is written too."""
+    if "properties" not in part:
+        return part
+    fields = part["properties"].items()
+    required = [k for k, field in fields if k in part["required"] or "default" in field]
+    return {**part, "required": required, "additionalProperties": False}
+
+
+def write() -> None:
+    """Write all schemas into the package."""
+    package = Path(mwdcal.__file__).parent
+    (package / "schemas").mkdir(exist_ok=True)
+    files = {f"schemas/{command}.schema.json": of_command(command) for command in CONTENTS}
+    for name, schema in {**files, "calibration.schema.json": of_calibration_files()}.items():
+        text = json.dumps(schema, indent=2)
+        (package / name).write_text(text + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    write()
