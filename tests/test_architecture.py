@@ -25,7 +25,7 @@ FLOORS = (
     ("calibration",),
     ("use",),
     ("files", "profiles"),
-    ("comparison", "fleet", "identification", "logs", "planning", "registry", "survey"),
+    ("comparison", "firmware", "fleet", "identification", "logs", "planning", "registry", "survey"),
     ("library",),
     ("",),  # the package itself: its public names
     ("app",),
@@ -33,7 +33,7 @@ FLOORS = (
 )
 ARRAY_ROOMS = ("geometry", "estimation", "sensor.models")
 
-MAX_ROOMS = 20
+MAX_ROOMS = 21
 MAX_MODULES = 12
 MAX_FUNCTION_LINES = 50
 MAX_MODULE_LINES = 400

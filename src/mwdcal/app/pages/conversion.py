@@ -1,4 +1,4 @@
-"""A calibration in another notation: on the screen and for machines."""
+"""A calibration in another notation or as C sources: on the screen and for machines."""
 
 from __future__ import annotations
 
@@ -12,6 +12,9 @@ from mwdcal.app.text import one_line, raised, table
 from mwdcal.calibration.readings import Readings, is_simulated, simulated
 from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.files import documents
+from mwdcal.firmware.export import DEFAULT_BITS, FirmwareSources, export
+from mwdcal.firmware.statements import stated_errors
+from mwdcal.firmware.working_range import SHARE_OF
 from mwdcal.use.notation import COURSE, Notation, convert, powers
 
 CONVERSION_SCHEMA_VERSION = 1
@@ -84,7 +87,7 @@ def document(converted: Converted) -> dict[str, Any]:
         at = calibration.reference_temperature
     return {
         "schema_version": CONVERSION_SCHEMA_VERSION,
-        **_source(converted),
+        **_source(converted.calibration, converted.path, converted.sha256),
         "calibrated_temperature_c": calibration.temperature_c,
         "field_unit": calibration.field_unit,
         "notation": converted.notation,
@@ -95,17 +98,16 @@ def document(converted: Converted) -> dict[str, Any]:
     }
 
 
-def _source(converted: Converted) -> dict[str, Any]:
+def _source(calibration: Calibration, path: Path, sha256: str) -> dict[str, Any]:
     """Where the values come from: tool, run and calibration file."""
-    calibration = converted.calibration
     return {
         "tool": calibration.tool,
         "serial": calibration.tool.get("serial"),
         "profile": calibration.profile.name,
         "run": calibration.run,
         "run_sha256": calibration.run_sha256,
-        "calibration": converted.path.name,
-        "calibration_sha256": converted.sha256,
+        "calibration": path.name,
+        "calibration_sha256": sha256,
         "calibrated": calibration.time,
         "software": calibration.software,
         "simulated": is_simulated(calibration.tool),
@@ -130,18 +132,22 @@ def screen(converted: Converted) -> str:
     """The result for people: whose calibration it is, in which units, then the values."""
     calibration, at = converted.calibration, converted.temperature
     reference = calibration.reference_temperature
-    serial = calibration.tool.get("serial", calibration.profile.name)
-    first = [converted.path.name, serial, f"run {calibration.run}", calibration.software]
     stated = reference if at is None or converted.notation == "factors" else at
     shown = "course" if isinstance(stated, str) else f"{stated:g} °C"
     lines = [
-        [*first, *simulated(calibration.tool)],
-        [f"SHA-256 {converted.sha256}"],
+        *_heading(calibration, converted.path, converted.sha256),
         [f"notation {converted.notation}", f"temperature {shown}", _calibrated(converted)],
         [f"{t.name} raw per {t.unit}{_nominal(calibration, t.name)}" for t in calibration.triads],
     ]
     values = notation(converted.triads, reference if at == COURSE else None)
     return "\n".join(one_line("   ".join(line)) for line in lines) + "\n\n" + values
+
+
+def _heading(calibration: Calibration, path: Path, sha256: str) -> list[list[str]]:
+    """Whose calibration it is, in two lines."""
+    serial = calibration.tool.get("serial", calibration.profile.name)
+    first = [path.name, serial, f"run {calibration.run}", calibration.software]
+    return [[*first, *simulated(calibration.tool)], [f"SHA-256 {sha256}"]]
 
 
 def _calibrated(converted: Converted) -> str:
@@ -191,3 +197,77 @@ def _label(name: str, index: tuple[int, ...], power: int | None) -> str:
         index = index[:-1] if name in ("SF", "B") else index[1:]
     course = raised("·τ", power or 0)
     return name + "".join(f"[{i}]" for i in index) + course
+
+
+class Exported(NamedTuple):
+    """A calibration as C sources: where from, in which form, and what to know of it."""
+
+    path: Path
+    sha256: str
+    calibration: Calibration
+    form: str
+    word_bits: int | None
+    sources: FirmwareSources
+    findings: list[Finding]
+
+
+def export_file(path: Path, form: str, word_bits: int | None) -> Exported:
+    """Read a calibration file and make its C sources."""
+    calibration, sha256 = documents.load(path)
+    bits = (word_bits or DEFAULT_BITS) if form == "fixed-point" else None
+    sources = export(calibration, form, sha256, bits or DEFAULT_BITS)
+    findings = calibration.change_findings()
+    return Exported(path, sha256, calibration, form, bits, sources, findings)
+
+
+def export_document(exported: Exported, folder: Path) -> dict[str, Any]:
+    """The sources for machines: identity, files, and how exact they are."""
+    sources = exported.sources
+    return {
+        "schema_version": CONVERSION_SCHEMA_VERSION,
+        **_source(exported.calibration, exported.path, exported.sha256),
+        "calibrated_temperature_c": exported.calibration.temperature_c,
+        "field_unit": exported.calibration.field_unit,
+        "to": exported.form,
+        "word_bits": exported.word_bits,
+        "folder": str(folder),
+        "files": list(sources.files),
+        "errors": {_error_names(exported)[name]: error for name, error in sources.errors.items()},
+        "multiplied_by_share_across_axis_of": SHARE_OF,
+        "powers_of_two": sources.fractions,
+        "temperature_range_c": sources.work.temperatures,
+        "strongest": sources.work.strengths,
+        "findings": exported.findings,
+    }
+
+
+def _error_names(exported: Exported) -> dict[str, str]:
+    """Names of the errors with their units."""
+    field = "field" if exported.calibration.relative else "field_nt"
+    angles = {name: f"{name}_deg" for name in exported.sources.errors}
+    return angles | {"gravity": "gravity_g", "field": field}
+
+
+def export_screen(exported: Exported, folder: Path) -> str:
+    """The sources for people: whose calibration, how exact, and the files."""
+    stated = stated_errors(exported.calibration, exported.sources.errors)
+    heading = _heading(exported.calibration, exported.path, exported.sha256)
+    words = [f"{exported.word_bits} bits"] if exported.word_bits else []
+    lines = [*heading, [exported.form, *words]]
+    rows = [[_error_title(name), text.replace(" degrees", "°")] for name, text in stated.items()]
+    return "\n".join(
+        [
+            *(one_line("   ".join(line)) for line in lines),
+            "",
+            table(rows, ["", "largest difference from apply"]),
+            "",
+            f"wrote {one_line(folder)}: {', '.join(exported.sources.files)}",
+        ]
+    )
+
+
+def _error_title(name: str) -> str:
+    """What an error is of, and the share by which it is multiplied."""
+    if name not in SHARE_OF:
+        return name
+    return f"{name.replace('_', ' ')} · {SHARE_OF[name]} across the axis"
