@@ -14,6 +14,7 @@ from mwdcal.files.formats import text
 from mwdcal.files.formats.columns import Column
 from mwdcal.files.runs import from_readings, to_readings
 from mwdcal.firmware.c_text import initialiser
+from mwdcal.firmware.working_range import ANGLES_OUT
 from mwdcal.geometry.observables import OUTPUTS, RESULTS, VECTORS
 from mwdcal.geometry.vectors import AnyArray, Array, Ints
 from mwdcal.use.correction import reference
@@ -32,7 +33,7 @@ STATUS = {
 """Bits of the status by name, and what they mean; the last of fixed-point numbers alone."""
 EXPECTED = "expected_"
 """What stands before the name of a result in the table of test vectors."""
-_ATTITUDES = np.radians(
+_VECTOR_ATTITUDES = np.radians(
     np.array(
         [
             [0, 180, 0.5, 3, 30, 60, 90, 120, 150, 178],
@@ -42,38 +43,37 @@ _ATTITUDES = np.radians(
     )
 )
 """Inclination, azimuth, toolface (3, n)."""
-_QUANTITY = dict(zip(VECTORS, ["gravity"] * 3 + ["field"] * 3, strict=True)) | {
-    **{"gravity_g": "gravity", "field_nt": "field"}
-}
-"""The quantity of a column that is no angle."""
-_ANGLE_ORDER = ("inclination", "azimuth", "toolface", "magnetic_toolface")
+_QUANTITIES = {"g": "gravity", "nt": "field", "deg": "angle"}
+"""The quantity of a column by the end of its name."""
+_EXPECTED_DECIMALS = {"gravity": 10, "field": 5}
 
 
 def expected(calibration: Calibration) -> dict[str, Array]:
     """Columns of raw channels and temperature as in a run file, to 12 digits, and of the results."""
     ends = calibration.temperature_c or (calibration.reference_temperature,)
     warmths = np.unique([float(f"{t:.6g}") for t in (*ends, np.mean(ends))])
-    inclination, azimuth, toolface = (np.tile(angle, len(warmths)) for angle in _ATTITUDES)
-    warmth = np.repeat(warmths, _ATTITUDES.shape[-1])
+    inclination, azimuth, toolface = (np.tile(angle, len(warmths)) for angle in _VECTOR_ATTITUDES)
+    warmth = np.repeat(warmths, _VECTOR_ATTITUDES.shape[-1])
     readings = readings_at(calibration, inclination, azimuth, toolface, warmth)
     table = from_readings(readings, calibration.profile)
-    raw = {name: shortened(column) for name, column in table.columns.items() if name != "station"}
+    columns = {name: column for name, column in table.columns.items() if name != "station"}
+    raw = {name: _formatted(column, f".{DIGITS}g") for name, column in columns.items()}
     again, _ = to_readings(replace(table, columns=raw), calibration.profile)
     results = reference(calibration, again)
-    return raw | {
-        n: _rounded(results[n], decimals(calibration, _QUANTITY.get(n, n))) for n in RESULTS
-    }
+    quantities = {name: _QUANTITIES[name.rpartition("_")[2]] for name in RESULTS}
+    places = {name: decimals(calibration, quantity) for name, quantity in quantities.items()}
+    return raw | {name: _formatted(results[name], f".{places[name]}f") for name in RESULTS}
 
 
 def decimals(calibration: Calibration, quantity: str) -> int:
-    """Decimals of expected gravity, field and angles."""
-    if quantity == "field" and not calibration.relative:
-        return 5
-    return 10 if quantity in ("gravity", "field") else 8
+    """Decimals of expected gravity, field and angles; a relative field has those of gravity."""
+    like_gravity = quantity == "field" and calibration.relative
+    return _EXPECTED_DECIMALS.get("gravity" if like_gravity else quantity, 8)
 
 
-def _rounded(values: Array, places: int) -> Array:
-    return np.array([float(f"{value:.{places}f}") for value in values]) + 0.0
+def _formatted(values: Column, form: str) -> Array:
+    """Numbers as a format writes them; no negative zero."""
+    return np.array([float(f"{float(value):{form}}") for value in values]) + 0.0
 
 
 def words(columns: Mapping[str, Array], fractions: Mapping[str, int]) -> dict[str, Ints]:
@@ -83,12 +83,7 @@ def words(columns: Mapping[str, Array], fractions: Mapping[str, int]) -> dict[st
     return {n: np.rint(columns[n] * 2.0**p).astype(int) for n, p in powers.items() if p is not None}
 
 
-def shortened(values: Column) -> Array:
-    """Numbers to the digits of a calibration file; no negative zero."""
-    return np.array([float(f"{float(v):.{DIGITS}g}") for v in values]) + 0.0
-
-
-def parts(columns: Mapping[str, Array]) -> dict[str, Array]:
+def _sizes(columns: Mapping[str, Array]) -> dict[str, Array]:
     """What the status judges: gravity across the tool axis, field across it, and horizontal field (n,)."""
     g, b = (np.stack([columns[name] for name in names], -1) for names in (VECTORS[:3], VECTORS[3:]))
     b = np.nan_to_num(b)
@@ -103,7 +98,7 @@ def status(columns: Mapping[str, Array], weak: tuple[float, float]) -> Ints:
     -1 where a vector is too close to either to tell.
     """
     limits = dict(zip(("VERTICAL", "NO_NORTH", "AXIAL_FIELD"), (*weak, weak[1]), strict=True))
-    sizes = parts(columns)
+    sizes = _sizes(columns)
     lacking = {name: sizes[name] <= limit for name, limit in limits.items()}
     lacking["NO_NORTH"] = lacking["NO_NORTH"] & ~lacking["VERTICAL"]
     close = [np.abs(sizes[name] - limit) < limit / 8 for name, limit in limits.items()]
@@ -118,7 +113,7 @@ def initialisers(columns: Mapping[str, Array], words: Mapping[str, AnyArray], co
     zeros = np.zeros(count, int if words else float)
     triads = [np.stack([inputs.get(n, zeros) for n in names], -1) for names in CHANNELS.values()]
     vectors = np.stack([np.nan_to_num(columns[name]) for name in VECTORS], -1).reshape(-1, 2, 3)
-    angles = np.stack([np.nan_to_num(columns[OUTPUTS[name]]) for name in _ANGLE_ORDER], -1)
+    angles = np.stack([np.nan_to_num(columns[OUTPUTS[name]]) for name in ANGLES_OUT], -1)
     lines = []
     for i in range(count):
         parts = [*(t[i] for t in triads), inputs["temperature_c"][i]]

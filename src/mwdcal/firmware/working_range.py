@@ -19,17 +19,19 @@ from mwdcal.calibration.record import MAGNETIC, Calibration, TriadCalibration
 from mwdcal.files.contract import TEMPERATURE
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array
+from mwdcal.sensor.models import Model
 
 MARGIN_OF_STRENGTH = 1.1
-"""A strength may exceed that of the calibration's place by so much, and by what the Earth has."""
-ANGLES_OUT = ("inclination", "toolface", "azimuth", "magnetic_toolface")
-"""Angles of a correction in firmware; errors of all but the first count by a share."""
+"""A strength may be so many times that of the place of the calibration, and any that the Earth has."""
+ANGLES_OUT = ("inclination", "azimuth", "toolface", "magnetic_toolface")
+"""Angles of a correction in firmware, in their order; errors of all but the first count by a share."""
 SHARE_OF = {"toolface": "gravity", "azimuth": "gravity", "magnetic_toolface": "field"}
 """The vector whose part across the tool axis, as a share of it, weights the error of an angle."""
 _HIGHER_TERMS = 1.02
 """What a linear error leaves out, and the steps of the attitudes over which the largest is sought."""
-_INCLINATIONS = np.radians([0.5, *range(5, 180, 5), 179.5])
 _TURNS = np.radians(np.arange(0, 360, 15))
+_ALL_ATTITUDES = np.meshgrid(np.radians([0.5, *range(5, 180, 5), 179.5]), _TURNS, _TURNS)
+"""Inclinations, azimuths and toolfaces over which the largest error is sought."""
 _WARMTHS = 65
 
 
@@ -66,12 +68,17 @@ def _strength(calibration: Calibration, triad: TriadCalibration) -> float:
     return max(high / low if relative else high, MARGIN_OF_STRENGTH * here)
 
 
+def _model(calibration: Calibration, triad: TriadCalibration) -> tuple[Model, Array]:
+    """A triad's model and its parameters."""
+    return triad.functions(calibration.reference_temperature), np.array(triad.parameters)
+
+
 def _largest_raw(
     calibration: Calibration, triad: TriadCalibration, strength: float, ends: tuple[float, float]
 ) -> Array:
     """The largest raw value (3,) of each channel over all directions and the temperatures."""
     warmth = np.linspace(*ends, _WARMTHS)[:, None]
-    model, params = triad.functions(calibration.reference_temperature), np.array(triad.parameters)
+    model, params = _model(calibration, triad)
     fields = np.broadcast_to(strength * CORNERS, (_WARMTHS, *CORNERS.shape))
     corners = raw_reading(model, params, fields, np.broadcast_to(warmth, fields.shape[:-1]))
     zero, *axes = np.moveaxis(CORNER_SHARES.transpose() @ corners, -2, 0)
@@ -87,10 +94,7 @@ def rounding_errors(calibration: Calibration, work: WorkingRange, share: float) 
     for triad in calibration.triads:
         profile = getattr(calibration.profile, triad.name)
         raw = np.abs(profile.permutation) @ work.raw[triad.name] / (profile.scale or 1.0)
-        model, params = (
-            triad.functions(calibration.reference_temperature),
-            np.array(triad.parameters),
-        )
+        model, params = _model(calibration, triad)
         slope = np.abs(model.slope(params, raw[None], warmth)[0])
         zero = np.abs(model.fields(params, np.zeros((1, 3)), warmth)[0])
         errors.append(share * (slope @ raw + 2 * zero + work.strengths[triad.name]))
@@ -106,22 +110,14 @@ def angle_errors(
     what an angle is off by when it is written, both in radians. All but the inclination's are multiplied by the
     share of `SHARE_OF`; 180 where nothing is known.
     """
-    attitudes = np.meshgrid(_INCLINATIONS, _TURNS, _TURNS, indexing="ij")
-    g, b = calibration.fields(readings_at(calibration, *attitudes))
-    if not calibration.has_field:
-        b = np.zeros_like(g)
-    off = [*vectors, np.zeros(3)][:2]
-    both = np.concatenate(
-        [
-            e + turn * np.linalg.norm(v, axis=-1, keepdims=True)
-            for e, v in zip(off, (g, b), strict=True)
-        ],
-        -1,
+    g, b = calibration.fields(readings_at(calibration, *_ALL_ATTITUDES))
+    b = b if calibration.has_field else np.zeros_like(g)
+    off = (
+        error + turn * np.linalg.norm(vector, axis=-1, keepdims=True)
+        for error, vector in zip((*vectors, np.zeros(3)), (g, b), strict=False)
     )
-    errors = {}
-    for name in ANGLES_OUT:
-        if name in MAGNETIC and not calibration.has_field:
-            continue
+    both, errors = np.concatenate(list(off), -1), {}
+    for name in (n for n in ANGLES_OUT if calibration.has_field or n not in MAGNETIC):
         with np.errstate(divide="ignore", invalid="ignore"):  # an angle that does not exist there
             gradient = np.abs(OBSERVABLES[name].gradient(g, b))
             worst = np.nanmax(share(name, g, b) * (np.sum(gradient * both, -1) + turn))
