@@ -26,7 +26,7 @@ from cli_support import (
 from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import StationRow, rounded
 from mwdcal.files import documents
-from simulation import attitude
+from simulation import Tool, attitude
 from test_notation import AXES, SCALES, TRIADS, made, signed
 
 WARNINGS = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic")
@@ -220,6 +220,7 @@ def case(request, tmp_path_factory):
 
 
 @needs_compiler
+@pytest.mark.slow
 @pytest.mark.parametrize("bits", [None, 32, 24, 16, 13])
 def test_the_c_function_meets_apply_within_the_stated_error(tmp_path, case, bits):
     """10,000 random readings; and the bound is not idle: some quantity comes to a tenth of it."""
@@ -422,6 +423,31 @@ def test_text_of_others_stays_text(tmp_path, text, form):
     kept = text if len(text) < 200 else text[:200] + " ..."
     assert done.stdout.decode() == kept
     assert all(byte < 127 for path in folder.glob("*.[ch]") for byte in path.read_bytes())
+
+
+@needs_compiler
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("model", ["polynomial", "factors"])
+def test_counts_of_a_converter_and_iron_beyond_the_field(tmp_path, form, model):
+    """A run of 10⁶ counts per g, 2000 per nT, with offsets of up to 120 000 nT."""
+    run_columns = servo_run(tool=Tool.random(4, iron=120_000, noise=(1e-4, 15.0)))
+    text = 'name = "counts"\n'
+    for triad, names, scale, per_unit in zip(
+        TRIADS, (RAW[:3], RAW[3:]), SCALES, (1e6, 2e3), strict=True
+    ):
+        run_columns |= {n: np.round(run_columns[n] / scale * per_unit) for n in names}
+        text += (
+            f"[{triad}]\nscale = {per_unit}\nnoise = {per_unit * (15.0 if scale < 1 else 1e-4)}\n"
+        )
+    (tmp_path / "tool.toml").write_text(text)
+    calibration = calibrated(tmp_path, run_columns, "--model", model, tool=tmp_path / "tool.toml")
+    folder, stated = sources(tmp_path, calibration, form)
+    columns = {name: run_columns[name] for name in (*RAW, "temperature_c")}
+    found = by_c(folder, FORMS[form], columns, stated)
+    assert not found[0].any()
+    shares = worst(stated, found, applied(tmp_path, calibration, columns))
+    assert max(shares.values()) <= 1, shares
+    assert run(compiled(folder, FORMS[form])).returncode == 0
 
 
 @needs_compiler

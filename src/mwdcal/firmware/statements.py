@@ -57,7 +57,7 @@ def head(
         "",
         "Largest differences from mwdcal apply in that range. Those of toolface and azimuth are multiplied by the",
         "share of gravity across the tool axis, that of magnetic toolface by the share of the field across it.",
-        *_place(calibration),
+        _place(calibration),
         "",
         *(f"    {name.replace('_', ' '):<18} {text}" for name, text in stated),
     ]
@@ -97,13 +97,15 @@ def _strengths(calibration: Calibration, work: WorkingRange) -> str:
     return ", ".join(f"{names[n]} up to {s:.6g} {units[n]}" for n, s in work.strengths.items())
 
 
-def _place(calibration: Calibration) -> list[str]:
-    """The field at which the error of azimuth holds."""
+def _place(calibration: Calibration) -> str:
+    """Gravity and field at which the errors of the angles hold."""
+    earth = calibration.earth
+    place = f"Angles at {earth['gravity_g']:.6g} g"
     if not calibration.has_field:
-        return []
-    dip = f"{calibration.earth['dip_deg']:.4g} degrees of dip"
-    strength = "" if calibration.relative else f"{calibration.earth['field']:.6g} nT and "
-    return [f"Azimuth at {strength}{dip}: it grows as the horizontal field shrinks."]
+        return f"{place}."
+    strength = "" if calibration.relative else f", {earth['field']:.6g} nT"
+    dip = f"{earth['dip_deg']:.4g} degrees of dip"
+    return f"{place}{strength} and {dip}; those from the field grow as it shrinks."
 
 
 def status_macros(saturates: bool) -> str:
