@@ -23,6 +23,7 @@ from cli_support import (
     servo_run,
     write_csv,
 )
+from mwdcal import calibrate, read_run, save
 from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import StationRow, rounded
 from mwdcal.files import documents
@@ -445,6 +446,25 @@ def test_counts_of_a_converter_and_iron_beyond_the_field(tmp_path, form, model):
     columns = {name: run_columns[name] for name in (*RAW, "temperature_c")}
     found = by_c(folder, FORMS[form], columns, stated)
     assert not found[0].any()
+    shares = worst(stated, found, applied(tmp_path, calibration, columns))
+    assert max(shares.values()) <= 1, shares
+    assert run(compiled(folder, FORMS[form])).returncode == 0
+
+
+@needs_compiler
+@pytest.mark.parametrize("form", FORMS)
+def test_each_triad_keeps_its_model_and_order(tmp_path, form):
+    run_columns = servo_run(
+        inclinations=(5, 60, 110), toolfaces=6, temperatures=(25.0, 80.0, 130.0)
+    )
+    table, calibration = write_csv(tmp_path / "run.csv", run_columns), tmp_path / "cal.json"
+    fit = calibrate(read_run(table, "servo"), order=(2, 0))
+    save(fit, calibration)
+    models = [(t.model, t.order) for t in documents.read(calibration).triads]
+    assert models == [("factors", 2), ("polynomial", 0)]
+    folder, stated = sources(tmp_path, calibration, form)
+    columns = {name: run_columns[name] for name in (*RAW, "temperature_c")}
+    found = by_c(folder, FORMS[form], columns, stated)
     shares = worst(stated, found, applied(tmp_path, calibration, columns))
     assert max(shares.values()) <= 1, shares
     assert run(compiled(folder, FORMS[form])).returncode == 0

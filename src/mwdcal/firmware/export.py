@@ -94,7 +94,7 @@ def _fixed(calibration: Calibration, sha256: str, bits: int) -> FirmwareSources:
         reference=f"({fixed.reference})",
         lowest=f"({fixed.lowest})",
         highest=f"({fixed.highest})",
-        tau=fixed.temperature + fixed.span.half,
+        tau=fixed.temperature + fixed.form.half,
         weak_gravity=weak[0],
         weak_field=weak[1],
         coefficients=fixed_initialiser(fixed, order(calibration)),

@@ -29,9 +29,10 @@ _WEAK = 16
 """Errors below which a vector has no direction."""
 
 
-class Span(NamedTuple):
-    """Temperature: `half` is the power of two that |τ| does not exceed, `error` that of τ / 2^half."""
+class WordForm(NamedTuple):
+    """Words of some `bits`, over temperatures: |τ| does not exceed 2^half, `error` is that of τ / 2^half."""
 
+    bits: int
     half: int
     error: float
 
@@ -68,15 +69,14 @@ class FixedTriad:
 
 @dataclass(frozen=True)
 class FixedCalibration:
-    """A calibration in words of some bits; `temperature` is the fraction of the temperature.
+    """A calibration in words; `temperature` is the fraction of the temperature.
 
     `reference`, `lowest` and `highest` are temperatures as words. `angles`: errors in degrees, see `angle_errors`.
     """
 
-    bits: int
+    form: WordForm
     work: WorkingRange
     temperature: int
-    span: Span
     reference: int
     lowest: int
     highest: int
@@ -94,7 +94,7 @@ def quantised(calibration: Calibration, bits: int) -> FixedCalibration:
     """The calibration in words.
 
     Raises:
-        InputError: `word_bits` is out of range, a triad has own-axis terms, or the words are too short.
+        InputError: `word_bits` is out of range, a triad has own-axis terms, or scale factors could vanish.
     """
     low, high = WORD_BITS
     if not low <= bits <= high:
@@ -111,24 +111,20 @@ def quantised(calibration: Calibration, bits: int) -> FixedCalibration:
     words = np.rint(ends * 2.0**fraction).astype(int)
     half = max(math.ceil(math.log2(np.max(np.abs(ends - reference)) + 2.0**-fraction)), 0)
     off = 2.0 ** -(fraction + 1) + abs(float(words[2]) / 2.0**fraction - reference)
-    span = Span(half, off / 2.0**half)
-    triads = _triads(calibration, work, span, bits)
+    form = WordForm(bits, half, off / 2.0**half)
+    triads = _triads(calibration, work, form)
     turn = 2.0 ** -(bits + 3) + 2.0**-31  # of the steps by which vectors are turned
     angles = angle_errors(calibration, [t.error for t in triads], turn, math.pi / 2.0**bits)
-    return FixedCalibration(
-        bits, work, fraction, span, words[2], words[0], words[1], triads, angles
-    )
+    return FixedCalibration(form, work, fraction, words[2], words[0], words[1], triads, angles)
 
 
-def _triads(
-    calibration: Calibration, work: WorkingRange, span: Span, bits: int
-) -> tuple[FixedTriad, ...]:
+def _triads(calibration: Calibration, work: WorkingRange, form: WordForm) -> tuple[FixedTriad, ...]:
     """All triads in words, of the notation for raw channels whose coefficients are by power of τ."""
     factors = any(triad.model == "factors" for triad in calibration.triads)
     notations = convert(calibration, "factors" if factors else "affine", COURSE)
-    form = _of_factors if factors else _of_polynomial
+    convert_triad = _of_factors if factors else _of_polynomial
     return tuple(
-        form(calibration, triad, notations[triad.name].values, work, span, bits)
+        convert_triad(calibration, triad, notations[triad.name].values, work, form)
         for triad in calibration.triads
     )
 
@@ -138,16 +134,15 @@ def _of_polynomial(
     triad: TriadCalibration,
     values: Mapping[str, Array],
     work: WorkingRange,
-    span: Span,
-    bits: int,
+    form: WordForm,
 ) -> FixedTriad:
     """A triad whose field is M(τ) raw + b(τ)."""
     raw = work.raw[triad.name]
-    fraction = _fraction(raw.max(), bits)
+    fraction = _fraction(raw.max(), form.bits)
     gain, offset = np.moveaxis(values["M"], 0, -1), np.moveaxis(values["b"], 0, -1)
     reading = raw, np.full(3, 2.0 ** -(fraction + 1))
     strength = work.strengths[triad.name]
-    rest = _mixed(gain, offset, *reading, fraction, strength, span, bits)
+    rest = _mixed(gain, offset, *reading, fraction, strength, form)
     return FixedTriad(triad.name, fraction, fraction, *rest[:3], None, None, rest[3])
 
 
@@ -156,28 +151,27 @@ def _of_factors(
     triad: TriadCalibration,
     values: Mapping[str, Array],
     work: WorkingRange,
-    span: Span,
-    bits: int,
+    form: WordForm,
 ) -> FixedTriad:
     """A triad whose field is P (I - m) (raw / SF(τ) - B(τ))."""
     raw = work.raw[triad.name]
-    fraction = _fraction(raw.max(), bits)
-    scale = _words(values["SF"], span, bits)
+    fraction = _fraction(raw.max(), form.bits)
+    scale = _words(values["SF"], form)
     least = 2 * values["SF"][:, 0] - scale.size - scale.error
     if (least <= 0).any():
         raise InputError(
             f"the scale factors of the {triad.name} could vanish between the calibrated temperatures. Calibrate "
             "with a lower `order`."
         )
-    share, bias_size = raw / least, _words(values["B"], span, bits).size
-    middle = _fraction(float((share + bias_size).max()), bits)
-    bias = _words(values["B"], span, bits, middle)
+    share, bias_size = raw / least, _words(values["B"], form).size
+    middle = _fraction(float((share + bias_size).max()), form.bits)
+    bias = _words(values["B"], form, middle)
     off = (2.0 ** -(fraction + 1) + share * scale.error) / least + 2.0 ** -(middle + 1) + bias.error
     profile = getattr(calibration.profile, triad.name)
     gain = (profile.permutation @ (np.eye(3) - values["m"]))[..., None]
     reading = share + bias.size, off
     strength = work.strengths[triad.name]
-    rest = _mixed(gain, np.zeros((3, 1)), *reading, middle, strength, span, bits)
+    rest = _mixed(gain, np.zeros((3, 1)), *reading, middle, strength, form)
     return FixedTriad(triad.name, fraction, middle, *rest[:3], scale, bias, rest[3])
 
 
@@ -188,18 +182,17 @@ def _mixed(
     error: Array,
     fraction: int,
     strength: float,
-    span: Span,
-    bits: int,
+    form: WordForm,
 ) -> tuple[int, Words, Words, Array]:
     """Of gain (3, 3, K) · z + offset (3, K): the fraction, the words of both, and the error (3,).
 
     `size` and `error` (3,) are of z, which has the `fraction`.
     """
-    field = _fraction(strength, bits)
-    reach = _scaled(gain, span).sum(-1) @ size + _scaled(offset, span).sum(-1)
+    field = _fraction(strength, form.bits)
+    reach = _scaled(gain, form).sum(-1) @ size + _scaled(offset, form).sum(-1)
     most = _LARGEST_SUM - math.ceil(math.log2(reach.max())) - fraction
-    gains = _words(gain, span, bits, most)
-    offsets = _words(offset, span, bits, fraction + gains.fraction)
+    gains = _words(gain, form, most)
+    offsets = _words(offset, form, fraction + gains.fraction)
     total = (gains.size + gains.error) @ error + gains.error @ size + offsets.error
     return field, gains, offsets, total + 2.0 ** -(field + 1)
 
@@ -209,21 +202,21 @@ def _fraction(limit: float, bits: int) -> int:
     return math.floor(math.log2((2 ** (bits - 1) - _SPARE) / limit))
 
 
-def _scaled(values: Array, span: Span) -> Array:
+def _scaled(values: Array, form: WordForm) -> Array:
     """Sizes (..., K) of the terms of courses at the ends of the working temperatures."""
-    return np.asarray(np.abs(values) * 2.0 ** (span.half * np.arange(values.shape[-1])))
+    return np.asarray(np.abs(values) * 2.0 ** (form.half * np.arange(values.shape[-1])))
 
 
-def _words(values: Array, span: Span, bits: int, most: int | None = None) -> Words:
+def _words(values: Array, form: WordForm, most: int | None = None) -> Words:
     """Coefficients (..., K) by power of τ as words, all of one fraction, which is at most `most`."""
-    terms = _scaled(values, span)
+    terms = _scaled(values, form)
     size, limit = terms.sum(-1), float(terms.sum(-1).max())
-    fits = [_fraction(limit, bits)] if limit else []
+    fits = [_fraction(limit, form.bits)] if limit else []
     fraction = min([*fits, *([] if most is None else [most])], default=0)
     half_step = 2.0 ** -(fraction + 1)
     error, reach = np.full(size.shape, half_step), terms[..., -1]
     for term in np.moveaxis(terms, -1, 0)[-2::-1]:
-        error = 2 * half_step + error + (reach + error) * span.error
+        error = 2 * half_step + error + (reach + error) * form.error
         reach = reach + term
     words = np.rint(np.sign(values) * terms * 2.0**fraction).astype(int)
     return Words(words, fraction, size, error)
