@@ -87,7 +87,7 @@ def document(converted: Converted) -> dict[str, Any]:
         at = calibration.reference_temperature
     return {
         "schema_version": CONVERSION_SCHEMA_VERSION,
-        **_source(converted.calibration, converted.path, converted.sha256),
+        **_source(converted),
         "calibrated_temperature_c": calibration.temperature_c,
         "field_unit": calibration.field_unit,
         "notation": converted.notation,
@@ -98,16 +98,17 @@ def document(converted: Converted) -> dict[str, Any]:
     }
 
 
-def _source(calibration: Calibration, path: Path, sha256: str) -> dict[str, Any]:
+def _source(converted: Converted | Exported) -> dict[str, Any]:
     """Where the values come from: tool, run and calibration file."""
+    calibration = converted.calibration
     return {
         "tool": calibration.tool,
         "serial": calibration.tool.get("serial"),
         "profile": calibration.profile.name,
         "run": calibration.run,
         "run_sha256": calibration.run_sha256,
-        "calibration": path.name,
-        "calibration_sha256": sha256,
+        "calibration": converted.path.name,
+        "calibration_sha256": converted.sha256,
         "calibrated": calibration.time,
         "software": calibration.software,
         "simulated": is_simulated(calibration.tool),
@@ -135,7 +136,7 @@ def screen(converted: Converted) -> str:
     stated = reference if at is None or converted.notation == "factors" else at
     shown = "course" if isinstance(stated, str) else f"{stated:g} °C"
     lines = [
-        *_heading(calibration, converted.path, converted.sha256),
+        *_heading(converted),
         [f"notation {converted.notation}", f"temperature {shown}", _calibrated(converted)],
         [f"{t.name} raw per {t.unit}{_nominal(calibration, t.name)}" for t in calibration.triads],
     ]
@@ -143,11 +144,12 @@ def screen(converted: Converted) -> str:
     return "\n".join(one_line("   ".join(line)) for line in lines) + "\n\n" + values
 
 
-def _heading(calibration: Calibration, path: Path, sha256: str) -> list[list[str]]:
+def _heading(converted: Converted | Exported) -> list[list[str]]:
     """Whose calibration it is, in two lines."""
+    calibration = converted.calibration
     serial = calibration.tool.get("serial", calibration.profile.name)
-    first = [path.name, serial, f"run {calibration.run}", calibration.software]
-    return [[*first, *simulated(calibration.tool)], [f"SHA-256 {sha256}"]]
+    first = [converted.path.name, serial, f"run {calibration.run}", calibration.software]
+    return [[*first, *simulated(calibration.tool)], [f"SHA-256 {converted.sha256}"]]
 
 
 def _calibrated(converted: Converted) -> str:
@@ -225,7 +227,7 @@ def export_document(exported: Exported, folder: Path) -> dict[str, Any]:
     sources = exported.sources
     return {
         "schema_version": CONVERSION_SCHEMA_VERSION,
-        **_source(exported.calibration, exported.path, exported.sha256),
+        **_source(exported),
         "calibrated_temperature_c": exported.calibration.temperature_c,
         "field_unit": exported.calibration.field_unit,
         "to": exported.form,
@@ -251,7 +253,7 @@ def _error_names(exported: Exported) -> dict[str, str]:
 def export_screen(exported: Exported, folder: Path) -> str:
     """The sources for people: whose calibration, how exact, and the files."""
     stated = stated_errors(exported.calibration, exported.sources.errors)
-    heading = _heading(exported.calibration, exported.path, exported.sha256)
+    heading = _heading(exported)
     words = [f"{exported.word_bits} bits"] if exported.word_bits else []
     lines = [*heading, [exported.form, *words]]
     rows = [[_error_title(name), text.replace(" degrees", "°")] for name, text in stated.items()]
