@@ -403,9 +403,19 @@ WORDS = {
     "tool": (*("servo",) * 12, "generic", "sap6", "x"),
     "prior": ("datasheet",),
     "workers": ("1",),
+    "word_bits": ("32", "24", "16", "11"),
 }
 """Values of options that are not read off the command line itself."""
-USUAL = {"tool": 0.9, "seed": 0.03, "decimal": 0.05, "report": 0.04, "plot": 0.04}
+USUAL = {
+    "tool": 0.9,
+    "notation": 0.6,
+    "form": 0.5,
+    "output": 0.7,
+    "seed": 0.03,
+    "decimal": 0.05,
+    "report": 0.04,
+    "plot": 0.04,
+}
 """Share of command lines that have an option."""
 OTHERWISE = 0.08
 """The same, of options not named there."""
@@ -538,7 +548,7 @@ def promises(line: list[str], ran: cli_support.Ran, folder: Path, before: set[Pa
     """What of the promises to every command is not kept."""
     broken = []
     written = {p for p in folder.rglob("*") if p not in before}
-    named = {p for p in written if p.name.startswith("out-")}
+    named = {p for p in written if p.relative_to(folder).parts[0].startswith("out-")}
     pictures = {p for p in named if p.name.startswith("out-plot")}  # a refused log is drawn
     if ran.code not in ({0, 1, 2, 3} if line[0] == "verify" else {0, 2, 3}):
         broken.append(f"exit {ran.code}")
@@ -599,7 +609,9 @@ def repeated(line: list[str], folder: Path) -> list[str]:
     """Outputs that a second run writes otherwise; times apart."""
 
     def contents() -> dict[str, bytes]:
-        paths = (p for p in folder.glob("out-*") if p.is_file())
+        paths = (
+            p for stem in folder.glob("out-*") for p in (stem, *stem.rglob("*")) if p.is_file()
+        )
         return {
             p.name: re.sub(
                 rb'"(time|sha256)": *"[^"]*"|\d{4}-\d\d-\d\d[T ][\d:.+]*', b"", p.read_bytes()

@@ -351,3 +351,11 @@ def test_the_example(tmp_path):
     document = shown("example", tmp_path / "new")
     assert document["simulated"] is True
     assert len(document["files"]) == len(list((tmp_path / "new").iterdir()))
+
+
+@pytest.mark.parametrize("form", ["c-header", "fixed-point"])
+def test_sources_for_firmware(tmp_path, form):
+    cal = calibrated(tmp_path, servo_run())
+    document = shown("convert", cal, "--to", form, "-o", tmp_path / "out")
+    assert document["to"] == form
+    assert document["calibration_sha256"] == hashlib.sha256(cal.read_bytes()).hexdigest()

@@ -46,17 +46,17 @@ def readings_at(
     inclination: ArrayLike,
     azimuth: ArrayLike,
     toolface: ArrayLike,
-    temperature: float | None = None,
+    temperature: ArrayLike | None = None,
 ) -> Readings:
     """The readings (…, n) that this calibration turns into given attitudes (…, n).
 
-    Units: radians; °C, by default `middle_temperature`. Singular: nowhere; a vertical tool
+    Units: radians; °C, of all or of each (…, n), by default `middle_temperature`. Singular: nowhere; a vertical tool
     reads a definite vector.
     """
     inc, azi, face = np.broadcast_arrays(inclination, azimuth, toolface)
     vectors = reference_vectors(inc, azi, face, *_earth(calibration))
     at = middle_temperature(calibration) if temperature is None else temperature
-    warmth = np.full(vectors[0].shape[:-1], at)
+    warmth = np.broadcast_to(np.asarray(at, float), vectors[0].shape[:-1])
     raw = [
         raw_reading(
             t.functions(calibration.reference_temperature), np.array(t.parameters), v, warmth

@@ -1,4 +1,4 @@
-"""`mwdcal convert`: a calibration in another notation."""
+"""`mwdcal convert`: a calibration in another notation, or as C sources for firmware."""
 
 from __future__ import annotations
 
@@ -15,10 +15,19 @@ from mwdcal.errors import InputError
 @options.command()
 @options.CALIBRATION
 @click.option(
-    "--notation",
-    required=True,
-    type=click.Choice(["factors", "forward", "affine"]),
-    help="Form to print.",
+    "--notation", type=click.Choice(["factors", "forward", "affine"]), help="Form to print."
+)
+@click.option(
+    "--to",
+    "form",
+    type=click.Choice(["c-header", "fixed-point"]),
+    help="C sources with test vectors, in double precision or in whole numbers.",
+)
+@click.option(
+    "--word-bits",
+    metavar="12…32",
+    type=int,
+    help="Bits of the whole numbers of fixed-point. Default: 32.",
 )
 @click.option(
     "--temperature",
@@ -26,18 +35,53 @@ from mwdcal.errors import InputError
     help="One temperature, or 'course': coefficients by power of T - reference. "
     "Default: the reference temperature.",
 )
-@options.output(metavar="OUT.json", help="Write JSON here instead of printing.", required=False)
+@options.output(
+    metavar="OUT.json|DIR",
+    required=False,
+    help="Write JSON here instead of printing; with --to the folder of the sources.",
+)
 @options.JSON
 def command(
-    calibration: Path, notation: str, temperature: str | None, output: Path | None, as_json: bool
-) -> None:
-    """Print a CALIBRATION in another notation, in raw units, with covariance.
+    calibration: Path, notation: str | None, form: str | None, word_bits: int | None,
+    temperature: str | None, output: Path | None, as_json: bool,
+) -> None:  # fmt: skip
+    """Print a CALIBRATION in another notation, in raw units, with covariance, or write it as C sources.
 
     \b
     forward: raw = S·field + o    affine: field = M·raw + b    factors: SF, B, m (Moosavi)
     Example: mwdcal convert tool.json --notation forward --json
     Example: mwdcal convert tool.json --notation forward --temperature course
+    Example: mwdcal convert tool.json --to c-header -o firmware
+    Example: mwdcal convert tool.json --to fixed-point --word-bits 24 -o firmware
     """
+    _check_choice(notation, form, word_bits, temperature, output)
+    if form and output:
+        _write_sources(calibration, form, word_bits, output, as_json)
+    elif notation:
+        _convert(calibration, notation, temperature, output, as_json)
+
+
+def _check_choice(
+    notation: str | None, form: str | None, word_bits: int | None, temperature: str | None,
+    output: Path | None,
+) -> None:  # fmt: skip
+    """Refuse options that do not go together."""
+    if (notation is None) == (form is None):
+        raise InputError("`notation` or `form` must be given, and not both. Choose one.")
+    if form and output is None:
+        raise InputError("`form` needs the folder to write to. Add `output` DIR.")
+    if form and temperature is not None:
+        raise InputError(
+            "`temperature` goes with `notation`: sources hold for all temperatures. Omit it."
+        )
+    if word_bits is not None and form != "fixed-point":
+        raise InputError("`word_bits` goes with `form` fixed-point. Leave it out, or add that.")
+
+
+def _convert(
+    calibration: Path, notation: str, temperature: str | None, output: Path | None, as_json: bool
+) -> None:
+    """Print a calibration in a notation, or write it as JSON."""
     from mwdcal.app.pages import conversion
     from mwdcal.files.formats import atomic
 
@@ -48,6 +92,24 @@ def command(
     if output:
         atomic.write(output, to_json(document) + "\n")
     print_result(document if as_json else shown, converted.findings)
+
+
+def _write_sources(
+    calibration: Path, form: str, word_bits: int | None, folder: Path, as_json: bool
+) -> None:
+    """Write the C sources of a calibration into a folder, all or none."""
+    from mwdcal.app.pages import conversion
+    from mwdcal.files.formats import atomic
+
+    exported = conversion.export_file(calibration, form, word_bits)
+    files = {folder / name: text for name, text in exported.sources.files.items()}
+    with atomic.folder(folder):
+        options.check_outputs(files, [calibration])
+        atomic.write_all(files.items())
+    document = conversion.export_document(exported, folder)
+    print_result(
+        document if as_json else conversion.export_screen(exported, folder), exported.findings
+    )
 
 
 def _temperature(typed: str | None) -> float | str | None:

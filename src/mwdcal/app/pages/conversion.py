@@ -1,4 +1,4 @@
-"""A calibration in another notation: on the screen and for machines."""
+"""A calibration in another notation or as C sources: on the screen and for machines."""
 
 from __future__ import annotations
 
@@ -14,6 +14,9 @@ from mwdcal.app.text import one_line, raised, table
 from mwdcal.calibration.readings import Readings, simulated
 from mwdcal.calibration.record import SOFTWARE, Calibration, Finding
 from mwdcal.files import documents
+from mwdcal.firmware.export import DEFAULT_BITS, FirmwareSources, export
+from mwdcal.firmware.statements import stated_errors
+from mwdcal.firmware.working_range import SHARE_OF
 from mwdcal.sensor.profile import Axis
 from mwdcal.use.notation import COURSE, Notation, convert, powers
 
@@ -61,7 +64,7 @@ class ConvertedTriad(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ConversionSummary(msgspec.Struct, frozen=True, kw_only=True):
-    """What `convert` prints and writes: whose calibration it is, then the values of each triad.
+    """What `convert` prints and writes: whose calibration, then the values of each triad, or the sources.
 
     `software` is that of the calibration; `converted_by` wrote this document.
     """
@@ -75,12 +78,21 @@ class ConversionSummary(msgspec.Struct, frozen=True, kw_only=True):
     converted_by: str
     calibrated_temperature_c: tuple[float, float] | None
     field_unit: str
-    notation: str
-    temperature_c: float | str
     findings: list[Finding]
+    notation: str | msgspec.UnsetType = msgspec.UNSET
+    temperature_c: float | str | msgspec.UnsetType = msgspec.UNSET
     powers_of: str | msgspec.UnsetType = msgspec.UNSET
-    accelerometer: ConvertedTriad
+    accelerometer: ConvertedTriad | msgspec.UnsetType = msgspec.UNSET
     magnetometer: ConvertedTriad | msgspec.UnsetType = msgspec.UNSET
+    to: str | msgspec.UnsetType = msgspec.UNSET
+    word_bits: int | msgspec.UnsetType | None = msgspec.UNSET
+    folder: str | msgspec.UnsetType = msgspec.UNSET
+    files: list[str] | msgspec.UnsetType = msgspec.UNSET
+    errors: dict[str, float] | msgspec.UnsetType = msgspec.UNSET
+    multiplied_by_share_across_axis_of: dict[str, Any] | msgspec.UnsetType = msgspec.UNSET
+    powers_of_two: dict[str, Any] | msgspec.UnsetType = msgspec.UNSET
+    temperature_range_c: tuple[float, float] | msgspec.UnsetType | None = msgspec.UNSET
+    strongest: dict[str, Any] | msgspec.UnsetType = msgspec.UNSET
 
 
 def convert_file(path: Path, notation: str, temperature: float | str | None) -> Converted:
@@ -124,22 +136,36 @@ def document(converted: Converted) -> dict[str, Any]:
     course = isinstance(at, str)
     if at is None or (converted.notation == "factors" and not course):
         at = calibration.reference_temperature
+    triads: dict[str, Any] = {name: _triad(converted, name) for name in converted.triads}
     content = ConversionSummary(
-        tool=calibration.tool,
-        profile=calibration.profile.name,
-        run=calibration.run,
-        calibration=converted.path.name,
-        calibrated=calibration.time,
-        software=calibration.software,
-        converted_by=SOFTWARE,
-        calibrated_temperature_c=calibration.temperature_c,
-        field_unit=calibration.field_unit,
+        **_identity(converted),
+        **triads,
         notation=converted.notation,
         temperature_c=at,
-        findings=converted.findings,
         powers_of="T - reference_temperature_c" if course else msgspec.UNSET,
-        **{name: _triad(converted, name) for name in converted.triads},
     )
+    return _enveloped(converted, content)
+
+
+def _identity(converted: Converted | Exported) -> dict[str, Any]:
+    """Where the values come from: tool, run and calibration file."""
+    calibration = converted.calibration
+    return {
+        "tool": calibration.tool,
+        "profile": calibration.profile.name,
+        "run": calibration.run,
+        "calibration": converted.path.name,
+        "calibrated": calibration.time,
+        "software": calibration.software,
+        "converted_by": SOFTWARE,
+        "calibrated_temperature_c": calibration.temperature_c,
+        "field_unit": calibration.field_unit,
+        "findings": converted.findings,
+    }
+
+
+def _enveloped(converted: Converted | Exported, content: ConversionSummary) -> dict[str, Any]:
+    calibration = converted.calibration
     digests = {"calibration": converted.sha256, "run": calibration.run_sha256}
     return enveloped("convert", content, calibration.tool, **digests)
 
@@ -162,18 +188,23 @@ def screen(converted: Converted) -> str:
     """The result for people: whose calibration it is, in which units, then the values."""
     calibration, at = converted.calibration, converted.temperature
     reference = calibration.reference_temperature
-    serial = calibration.tool.get("serial", calibration.profile.name)
-    first = [converted.path.name, serial, f"run {calibration.run}", calibration.software]
     stated = reference if at is None or converted.notation == "factors" else at
     shown = "course" if isinstance(stated, str) else f"{stated:g} °C"
     lines = [
-        [*first, *simulated(calibration.tool)],
-        [f"SHA-256 {converted.sha256}"],
+        *_heading(converted),
         [f"notation {converted.notation}", f"temperature {shown}", _calibrated(converted)],
         [f"{t.name} raw per {t.unit}{_nominal(calibration, t.name)}" for t in calibration.triads],
     ]
     values = notation(converted.triads, reference if at == COURSE else None)
     return "\n".join(one_line("   ".join(line)) for line in lines) + "\n\n" + values
+
+
+def _heading(converted: Converted | Exported) -> list[list[str]]:
+    """Whose calibration it is, in two lines."""
+    calibration = converted.calibration
+    serial = calibration.tool.get("serial", calibration.profile.name)
+    first = [converted.path.name, serial, f"run {calibration.run}", calibration.software]
+    return [[*first, *simulated(calibration.tool)], [f"SHA-256 {converted.sha256}"]]
 
 
 def _calibrated(converted: Converted) -> str:
@@ -223,3 +254,74 @@ def _label(name: str, index: tuple[int, ...], power: int | None) -> str:
         index = index[:-1] if name in ("SF", "B") else index[1:]
     course = raised("·τ", power or 0)
     return name + "".join(f"[{i}]" for i in index) + course
+
+
+class Exported(NamedTuple):
+    """A calibration as C sources: where from, in which form, and what to know of it."""
+
+    path: Path
+    sha256: str
+    calibration: Calibration
+    form: str
+    word_bits: int | None
+    sources: FirmwareSources
+    findings: list[Finding]
+
+
+def export_file(path: Path, form: str, word_bits: int | None) -> Exported:
+    """Read a calibration file and make its C sources."""
+    calibration, sha256 = documents.load(path)
+    bits = (word_bits or DEFAULT_BITS) if form == "fixed-point" else None
+    sources = export(calibration, form, sha256, bits or DEFAULT_BITS)
+    findings = calibration.change_findings()
+    return Exported(path, sha256, calibration, form, bits, sources, findings)
+
+
+def export_document(exported: Exported, folder: Path) -> dict[str, Any]:
+    """The sources for machines: identity, files, and how exact they are."""
+    sources = exported.sources
+    content = ConversionSummary(
+        **_identity(exported),
+        to=exported.form,
+        word_bits=exported.word_bits,
+        folder=str(folder),
+        files=list(sources.files),
+        errors={_error_names(exported)[name]: error for name, error in sources.errors.items()},
+        multiplied_by_share_across_axis_of=dict(SHARE_OF),
+        powers_of_two=dict(sources.fractions),
+        temperature_range_c=sources.work.temperatures,
+        strongest=dict(sources.work.strengths),
+    )
+    return _enveloped(exported, content)
+
+
+def _error_names(exported: Exported) -> dict[str, str]:
+    """Names of the errors with their units."""
+    field = "field" if exported.calibration.relative else "field_nt"
+    angles = {name: f"{name}_deg" for name in exported.sources.errors}
+    return angles | {"gravity": "gravity_g", "field": field}
+
+
+def export_screen(exported: Exported, folder: Path) -> str:
+    """The sources for people: whose calibration, how exact, and the files."""
+    stated = stated_errors(exported.calibration, exported.sources.errors)
+    heading = _heading(exported)
+    words = [f"{exported.word_bits} bits"] if exported.word_bits else []
+    lines = [*heading, [exported.form, *words]]
+    rows = [[_error_title(name), text.replace(" degrees", "°")] for name, text in stated.items()]
+    return "\n".join(
+        [
+            *(one_line("   ".join(line)) for line in lines),
+            "",
+            table(rows, ["", "largest difference from apply"]),
+            "",
+            f"wrote {one_line(folder)}: {', '.join(exported.sources.files)}",
+        ]
+    )
+
+
+def _error_title(name: str) -> str:
+    """What an error is of, and the share by which it is multiplied."""
+    if name not in SHARE_OF:
+        return name
+    return f"{name.replace('_', ' ')} · {SHARE_OF[name]} across the axis"

@@ -98,11 +98,15 @@ def _hindrance(file: Path) -> str:
     if file.is_symlink() or (file.exists() and not file.is_file()):
         return "it is not a regular file. Name a file to write."
     if not file.parent.is_dir():
-        return f"the folder '{file.parent}' does not exist. Create it, or name another folder."
+        return _missing(file.parent)
     writable = stat.S_IWUSR | stat.S_IWGRP | stat.S_IWOTH  # for the superuser anything else is
     if file.exists() and not (file.stat().st_mode & writable and os.access(file, os.W_OK)):
         return "it is write-protected. Name another file, or remove the protection."
     return ""
+
+
+def _missing(folder: Path) -> str:
+    return f"the folder '{folder}' does not exist. Create it, or name another folder."
 
 
 def identity(file: Path | int) -> tuple[int, int] | None:
@@ -124,6 +128,28 @@ def _keep_permissions(old: Path, new: Path) -> None:
         with contextlib.suppress(OSError, AttributeError):  # Windows, or a group of others
             os.chown(new, -1, kept.st_gid)
         new.chmod(stat.S_IMODE(kept.st_mode) & 0o777)
+
+
+@contextlib.contextmanager
+def folder(path: Path) -> Iterator[None]:
+    """A folder for files, made if need be; one that was made goes again when the block fails."""
+    try:
+        path.mkdir()
+    except FileExistsError:
+        if not path.is_dir():
+            raise InputError(f"cannot write '{path}': it is not a folder. Name another.") from None
+        yield
+        return
+    except FileNotFoundError:
+        raise InputError(f"cannot write '{path}': {_missing(path.parent)}") from None
+    except (OSError, ValueError) as error:
+        raise _refusal(path, error) from error
+    try:
+        yield
+    except BaseException:
+        with contextlib.suppress(OSError):
+            path.rmdir()
+        raise
 
 
 @contextlib.contextmanager

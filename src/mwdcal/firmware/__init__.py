@@ -1,0 +1,1 @@
+"""A calibration for firmware: C sources, in double and in fixed-point numbers, with test vectors."""
