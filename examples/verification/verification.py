@@ -159,7 +159,7 @@ def chance(row: VerdictRow) -> float:
 
 def trials(rng: np.random.Generator, count: int, noise: tuple[float, float], knocked: bool):
     """Roll tests of many tools, each sort of knock alike often, sizes drawn evenly."""
-    limits = load_limits("roll-test")
+    limits = load_limits("roll-test")[0]
     for number in range(count):
         if number % PER_CALIBRATION == 0:
             sensors = tool(rng)
