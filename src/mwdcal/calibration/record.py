@@ -431,7 +431,8 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
         NaN where no uncertainty can be stated: where the observable rests on a free direction, and where
         that of azimuth or a toolface would exceed `LARGEST_ANGLE_SD`, as near vertical.
         """
-        return np.sqrt(self.covariance((name,), readings, noise)[..., 0, 0])
+        variance = self.covariance((name,), readings, noise)[..., 0, 0]
+        return np.sqrt(np.maximum(variance, 0.0))  # below zero by rounding alone
 
     def covariance(
         self, names: str | Sequence[str], readings: Readings, noise: bool = False
