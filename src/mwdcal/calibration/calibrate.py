@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from datetime import UTC, datetime
 
+import msgspec
 import numpy as np
 
 from mwdcal.calibration import results
@@ -87,13 +88,13 @@ def _record(choice: Choice, fitted: FittedRuns) -> Calibration:
         tool["simulated"] = str(True)
     return Calibration(
         tool=tool,
-        serial=serial_of(tool),
+        serial=serial_of(tool) or msgspec.UNSET,
         simulated=is_simulated(tool),
         profile=choice.profile,
         profile_sha256=readings.profile_sha256,
         run=readings.source,
         run_sha256=readings.run_sha256,
-        prior_sha256=options.prior_sha256 or None,
+        prior_sha256=options.prior_sha256 or msgspec.UNSET,
         software=SOFTWARE,
         method=options.method,
         options=Choices(

@@ -225,20 +225,21 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
     references without a declared uncertainty whose error no residual would show.
     `inherited` are the fingerprints of the stations behind the prior, if there was one;
     `excluded` the labels of stations of the run that were left out of the fit on request.
-    `serial` is that of the tool, None where the run states none; `simulated`: of the run or the prior.
+    `serial` is that of the tool, absent where the run states none; `simulated`: of the run or the prior;
+    `prior_sha256` of the file of the prior, absent where there was none.
     `sha256` is `content_sha256` of the record as it was made; earlier versions have none.
     """
 
     schema_version: int = SCHEMA_VERSION
     command: str = "calibrate"
     tool: dict[str, str]
-    serial: str | None = None
+    serial: str | msgspec.UnsetType = msgspec.UNSET
     simulated: bool = False
     profile: Profile
     profile_sha256: str
     run: str
     run_sha256: str
-    prior_sha256: str | None = None
+    prior_sha256: str | msgspec.UnsetType = msgspec.UNSET
     software: str
     method: str
     options: Choices = Choices()
