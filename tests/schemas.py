@@ -12,11 +12,11 @@ import msgspec
 import mwdcal
 from mwdcal.app import correction
 from mwdcal.app.envelope import DOCUMENT_VERSION, INPUTS, Envelope, ExampleDocument
-from mwdcal.app.pages import (
+from mwdcal.app.screens import (
     calibration,
     comparison,
     conversion,
-    fleet_summary,
+    fleet,
     noise,
     proposal,
     stations,
@@ -31,7 +31,7 @@ CONTENTS: dict[str, type] = {
     "compare": comparison.ComparisonSummary,
     "convert": conversion.ConversionSummary,
     "example": ExampleDocument,
-    "fleet": fleet_summary.FleetDocument,
+    "fleet": fleet.FleetDocument,
     "noise": noise.NoiseSummary,
     "profile": proposal.ProposalSummary,
     "stations": stations.StationsSummary,

@@ -12,7 +12,8 @@ from scipy.linalg import polar
 from scipy.spatial.transform import Rotation
 
 from cli_support import mwdcal, refused, servo_run, write_csv
-from mwdcal.app.pages import comparison as command
+from mwdcal.app.pages.comparison import render
+from mwdcal.app.screens import comparison as command
 from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.methods import EVIDENCE
 from mwdcal.calibration.options import Options
@@ -296,7 +297,7 @@ def test_a_run_that_nothing_can_calibrate():
     found = compare(make(1).select(np.arange(48) < 3), PROFILE)
     assert all(row.refused for row in found.rows)
     assert "no method" in found.advice
-    page = command.render(found)
+    page = render(found)
     assert all(row.refused.split("'")[0] in page for row in found.rows)
     assert "before" not in command.text(found)
     assert command.text(found).count("refused: ") == page.count("refused:</b>") == 1
@@ -323,7 +324,7 @@ def test_a_failing_part_is_counted_and_its_method_not_preferred(monkeypatch):
     assert SCATTER in rows["joint"].held_out
     assert "use swarm" in found.advice
     assert "stations no fit could judge" in command.text(found)
-    assert "stations no fit could judge" in command.render(found)
+    assert "stations no fit could judge" in render(found)
 
 
 class Page(HTMLParser):
@@ -351,7 +352,7 @@ class Page(HTMLParser):
 
 
 def test_the_page_is_whole_and_needs_nothing_else(whole):
-    page = command.render(whole, "<tool>", "ab" * 32)
+    page = render(whole, "<tool>", "ab" * 32)
     parsed = Page()
     parsed.feed(page)
     assert parsed.open == []
@@ -364,11 +365,11 @@ def test_the_page_is_whole_and_needs_nothing_else(whole):
     assert "&lt;tool&gt;" in page
     assert "ab" * 32 in page
     assert "SIMULATED" not in page
-    assert page == command.render(whole, "<tool>", "ab" * 32)
+    assert page == render(whole, "<tool>", "ab" * 32)
 
 
 def test_the_page_says_what_is_simulated_and_what_is_refused():
-    page = command.render(heated())
+    page = render(heated())
     assert "SIMULATED DATA" in page
     assert "<b>swarm refused:</b>" in page
     assert "SF x·τ" in page

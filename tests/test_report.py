@@ -15,10 +15,12 @@ import pytest
 from markupsafe import Markup
 
 from mwdcal.app import text
-from mwdcal.app.pages import calibration as screen
-from mwdcal.app.pages import conversion, pictures, report
-from mwdcal.app.pages.page import css, fixed, measured, number, signed
+from mwdcal.app.pages import pictures, report
+from mwdcal.app.pages.page import css
 from mwdcal.app.pages.report import render
+from mwdcal.app.screens import calibration as screen
+from mwdcal.app.screens import conversion
+from mwdcal.app.screens.numbers import fixed, measured, number, signed
 from mwdcal.calibration.automatic.auto import Choice
 from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.options import Options

@@ -17,7 +17,7 @@ from mwdcal.app import pool, progress
 from mwdcal.app.choices import options_of, prior_of
 from mwdcal.app.commands.options import Typed
 from mwdcal.app.envelope import enveloped
-from mwdcal.app.pages.fleet_summary import FleetSummary, stated_options, summarise
+from mwdcal.app.screens.fleet import FleetSummary, stated_options, summarise
 from mwdcal.app.text import plural
 from mwdcal.calibration.automatic.nonlinearity import with_strengths
 from mwdcal.calibration.diagnosis.findings import unused_columns

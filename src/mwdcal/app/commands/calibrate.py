@@ -38,7 +38,7 @@ def command(
     Exit: 0 calibrated, 2 input cannot be read, 3 fit failed or refused.
     """
     from mwdcal.app.choices import load_run, options_of, prior_of
-    from mwdcal.app.pages import calibration as page
+    from mwdcal.app.screens import calibration as screen
     from mwdcal.calibration.automatic.auto import choose
     from mwdcal.calibration.calibrate import recorded
     from mwdcal.calibration.estimate import fit
@@ -55,6 +55,6 @@ def command(
         from mwdcal.app.pages.report import render
 
         rendered = render(calibration)
-    shown = (page.summary if as_json else page.screen)(calibration, choice, output, report)
+    shown = (screen.summary if as_json else screen.screen)(calibration, choice, output, report)
     atomic.write_all([(output, documents.encode(calibration)), (report, rendered)])
-    print_result(shown, page.first_findings(calibration))
+    print_result(shown, screen.first_findings(calibration))

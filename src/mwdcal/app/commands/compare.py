@@ -40,7 +40,7 @@ def command(
     """
     from mwdcal.app.choices import load_run, order_of
     from mwdcal.app.envelope import enveloped
-    from mwdcal.app.pages import comparison as page
+    from mwdcal.app.screens import comparison as screen
     from mwdcal.calibration.diagnosis.findings import unused_columns
     from mwdcal.calibration.options import Options
     from mwdcal.comparison.compare import able, compare
@@ -53,14 +53,15 @@ def command(
     rows = tuple(replace(row, refused=as_typed(row.refused)) for row in result.rows)
     result = replace(result, rows=rows)
     if report:
-        atomic.write(
-            report, page.render(result, profile.name, readings.run_sha256, readings.profile_sha256)
-        )
+        from mwdcal.app.pages.comparison import render
+
+        sources = profile.name, readings.run_sha256, readings.profile_sha256
+        atomic.write(report, render(result, *sources))
     if as_json:
         digests = {"run": readings.run_sha256, "profile": readings.profile_sha256}
-        content = page.document(result, unused, report)
+        content = screen.document(result, unused, report)
         print_result(enveloped("compare", content, readings.metadata, **digests), unused)
     else:
         written = f"\nwrote {one_line(report)} (report)" if report else ""
-        print_result(page.text(result, parameters) + written, unused)
+        print_result(screen.text(result, parameters) + written, unused)
     sys.exit(0 if able(result.rows) else FitError.exit_code)

@@ -82,7 +82,7 @@ def _convert(
     calibration: Path, notation: str, temperature: str | None, output: Path | None, as_json: bool
 ) -> None:
     """Print a calibration in a notation, or write it as JSON."""
-    from mwdcal.app.pages import conversion
+    from mwdcal.app.screens import conversion
     from mwdcal.files.formats import atomic
 
     options.check_outputs([output], [calibration])
@@ -98,7 +98,7 @@ def _write_sources(
     calibration: Path, form: str, word_bits: int | None, folder: Path, as_json: bool
 ) -> None:
     """Write the C sources of a calibration into a folder, all or none."""
-    from mwdcal.app.pages import conversion
+    from mwdcal.app.screens import conversion
     from mwdcal.files.formats import atomic
 
     exported = conversion.export_file(calibration, form, word_bits)

@@ -47,7 +47,8 @@ def command(
 
     with pool.preparing(1 if scheduler else workers):  # these imports, in the workers too
         from mwdcal.app import fleet_table
-        from mwdcal.app.pages import fleet_report, fleet_summary
+        from mwdcal.app.pages import fleet_report
+        from mwdcal.app.screens import fleet as screen
         from mwdcal.files.formats import atomic
 
     options.check_outputs([output], [runs, tool], page=report)
@@ -58,6 +59,6 @@ def command(
     except KeyboardInterrupt as stop:
         stop.add_note("Finished parts are kept: the same command goes on from there.")
         raise
-    shown = fleet_summary.document if as_json else fleet_summary.text
-    print_result(shown(summary, report), fleet_summary.findings(summary))
+    shown = screen.document if as_json else screen.text
+    print_result(shown(summary, report), screen.findings(summary))
     sys.exit(0 if summary.sound else FitError.exit_code)

@@ -41,8 +41,9 @@ def command(
 
     from mwdcal.app import progress
     from mwdcal.app.envelope import enveloped
-    from mwdcal.app.pages import noise as page
+    from mwdcal.app.pages.noise import figure, render
     from mwdcal.app.pages.pictures import picture
+    from mwdcal.app.screens import noise as screen
     from mwdcal.calibration.diagnosis.findings import unused_columns
     from mwdcal.files import logs, synonyms
     from mwdcal.files.contract import COLUMNS
@@ -61,9 +62,11 @@ def command(
     noise = find_noise(readings, profile=profile, between=between, kind=kind, say=slowly, **times)
     unused = unused_columns(synonyms.unused(list(readings.columns), COLUMNS))
     noise = replace(noise, findings=findings_as_typed([*noise.findings, *unused]))
-    drawn = picture(page.figure(noise), plot.suffix) if plot else b""
-    rendered = page.render(noise) if report else ""
+    drawn = picture(figure(noise), plot.suffix) if plot else b""
+    rendered = render(noise) if report else ""
     digests = {"log": readings.digest, "profile": digest}
-    document = enveloped("noise", page.document(noise, plot, report), readings.metadata, **digests)
+    document = enveloped(
+        "noise", screen.document(noise, plot, report), readings.metadata, **digests
+    )
     atomic.write_all([(plot, drawn), (report, rendered)])
-    print_result(document if as_json else page.screen(noise, plot, report), noise.findings)
+    print_result(document if as_json else screen.screen(noise, plot, report), noise.findings)

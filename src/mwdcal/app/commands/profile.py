@@ -23,13 +23,13 @@ def command(run: Path, output: Path, as_json: bool) -> None:
     Example: mwdcal profile export.csv -o tool.toml
     Exit: 0 written, 2 input cannot be read, 3 a choice is left open (nothing is written).
     """
-    from mwdcal.app.pages import proposal as page
+    from mwdcal.app.screens import proposal as screen
     from mwdcal.calibration.diagnosis.findings import unused_columns
     from mwdcal.files.formats import atomic
     from mwdcal.identification.proposal import as_toml, propose
 
     options.check_outputs([output], [run])
     proposal = propose(run)
-    shown = (page.summary if as_json else page.screen)(proposal, run, output)
+    shown = (screen.summary if as_json else screen.screen)(proposal, run, output)
     atomic.write(output, as_toml(proposal, run.name))
     print_result(shown, unused_columns(proposal.unused))

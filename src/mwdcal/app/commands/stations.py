@@ -41,8 +41,9 @@ def command(
 
     from mwdcal.app import progress
     from mwdcal.app.envelope import enveloped
-    from mwdcal.app.pages import stations as page
     from mwdcal.app.pages.pictures import picture
+    from mwdcal.app.pages.stations import figure
+    from mwdcal.app.screens import stations as screen
     from mwdcal.files import logs
     from mwdcal.files.formats import atomic, table
     from mwdcal.logs.stations import StandstillError, find_stations
@@ -58,14 +59,14 @@ def command(
         for line in lines(error.analysis.findings):
             error.add_note(line)
         if plot:
-            atomic.write(plot, picture(page.figure(error.analysis), plot.suffix))
+            atomic.write(plot, picture(figure(error.analysis), plot.suffix))
             error.add_note(f"wrote {plot} (picture)")
         raise
     stations = replace(stations, findings=findings_as_typed(stations.findings))
-    drawn = picture(page.figure(stations), plot.suffix) if plot else b""
+    drawn = picture(figure(stations), plot.suffix) if plot else b""
     table.write(output, stations.table)
     atomic.write_all([(plot, drawn)])
     files = {"output": str(output), "plot": str(plot or "")}
-    content = page.summary(stations, files)
+    content = screen.summary(stations, files)
     document = enveloped("stations", content, readings.metadata, log=readings.digest)
-    print_result(document if as_json else page.screen(stations, files), stations.findings)
+    print_result(document if as_json else screen.screen(stations, files), stations.findings)

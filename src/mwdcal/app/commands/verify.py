@@ -28,7 +28,7 @@ def command(
     from msgspec.structs import replace
 
     from mwdcal.app.envelope import enveloped
-    from mwdcal.app.pages.verification import screen
+    from mwdcal.app.screens.verification import screen
     from mwdcal.calibration.diagnosis.findings import unused_columns
     from mwdcal.files import documents, runs
     from mwdcal.files.limits import load_limits

@@ -1,1 +1,1 @@
-"""What is shown of a result: on the screen, for machines, as a page with its figures."""
+"""Pages that need no network, and their figures."""

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mwdcal.app.pages.fleet_summary import (
+from mwdcal.app.pages.page import banner, environment
+from mwdcal.app.screens.fleet import (
     ERRORS,
     FleetSummary,
     is_doubt,
@@ -20,7 +21,6 @@ from mwdcal.app.pages.fleet_summary import (
     quantiles,
     unusual,
 )
-from mwdcal.app.pages.page import banner, environment
 from mwdcal.app.text import number, plural, raised
 from mwdcal.calibration.diagnosis.plausibility import NOISE_RATIO
 from mwdcal.calibration.prediction import STATED_ANGLES

@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mwdcal.app.messages import findings_as_typed
-from mwdcal.app.pages.calibration import how, known_inclinations
-from mwdcal.app.pages.page import HELD, banner, capital, environment, exponent, factor_places
+from mwdcal.app.pages.page import banner, environment
+from mwdcal.app.screens.calibration import how, known_inclinations
+from mwdcal.app.screens.numbers import HELD, capital, exponent, factor_places
 from mwdcal.app.text import plural, quantity, raised
 from mwdcal.calibration.prediction import accuracy_at, angles, middle_temperature, typical_accuracy
 from mwdcal.calibration.readings import is_simulated

@@ -16,8 +16,8 @@ from mwdcal.app.choices import names
 from mwdcal.app.commands.options import Typed
 from mwdcal.app.envelope import enveloped
 from mwdcal.app.messages import as_typed
-from mwdcal.app.pages.calibration import choices
-from mwdcal.app.pages.page import written
+from mwdcal.app.screens.calibration import choices
+from mwdcal.app.screens.numbers import written
 from mwdcal.app.text import number, one_line, plural, table
 from mwdcal.calibration.readings import HIGHEST, TRIADS
 from mwdcal.calibration.record import Choices, Finding

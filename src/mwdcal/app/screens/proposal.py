@@ -9,7 +9,7 @@ import msgspec
 from msgspec.structs import asdict
 
 from mwdcal.app.envelope import enveloped
-from mwdcal.app.pages.page import written
+from mwdcal.app.screens.numbers import written
 from mwdcal.app.text import one_line, plural, table
 from mwdcal.calibration.readings import TRIADS, simulated
 from mwdcal.identification.proposal import Proposal, in_order

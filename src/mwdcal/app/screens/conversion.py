@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 
 from mwdcal.app.envelope import enveloped
-from mwdcal.app.pages.page import HELD, UNDETERMINED
+from mwdcal.app.screens.numbers import HELD, UNDETERMINED
 from mwdcal.app.text import one_line, raised, table
 from mwdcal.calibration.readings import Readings, simulated
 from mwdcal.calibration.record import SOFTWARE, Calibration, Finding

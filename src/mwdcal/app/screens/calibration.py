@@ -9,7 +9,7 @@ import msgspec
 
 from mwdcal.app.envelope import enveloped
 from mwdcal.app.messages import findings_as_typed
-from mwdcal.app.pages.page import written
+from mwdcal.app.screens.numbers import written
 from mwdcal.app.text import chance, number, one_line, quantity, table
 from mwdcal.calibration.automatic.nonlinearity import CurveScore
 from mwdcal.calibration.prediction import typical_accuracy
