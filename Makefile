@@ -32,6 +32,8 @@ QUICK_TESTS := vectors observables models derivatives estimate efficiency expect
 CLOCK = set -e; start=$$(date +%s); \
 	trap 'code=$$?; echo "make $@: $$(($$(date +%s) - start)) s"; exit $$code' EXIT
 
+SPHINX := $(BIN)/sphinx-build -q -W --keep-going -d build/doctrees
+
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /  make \1\t/' | expand -t 20
 	@echo "Another interpreter: make PYTHON=python3.12 test, after make clean"
@@ -86,7 +88,8 @@ check: $(INSTALLED) ## lint, format, types, architecture, doctests, docs
 	echo "architecture"; $(BIN)/python -m pytest -q tests/test_architecture.py; \
 	echo "doctests"; $(ONE_THREAD) $(BIN)/python -m pytest -q --doctest-modules src \
 		--doctest-glob='*.md' docs; \
-	echo "docs"; $(BIN)/sphinx-build -q -W --keep-going -b html docs build/docs
+	echo "docs"; $(SPHINX) -b html docs build/docs; $(SPHINX) -b man docs build/man; \
+	cmp build/man/mwdcal.1 docs/mwdcal.1 || { echo "docs/mwdcal.1, the manual page, is old: make docs"; exit 1; }
 
 bench: $(MEASURED) ## time mwdcal against SciPy and other packages, write docs/benchmarks.md (QUICK=1: two minutes)
 	@$(CLOCK); $(ONE_THREAD) PYTHONPATH=tests $(BENCH)/python benchmarks/bench.py \
@@ -101,8 +104,9 @@ papers: $(INSTALLED) ## recompute the papers and rewrite their pages and figures
 verification: $(INSTALLED) ## count wrong verdicts of simulated roll tests and rewrite docs/verification.md (two minutes)
 	@$(CLOCK); $(ONE_THREAD) $(BIN)/python examples/verification/verification.py
 
-docs: $(INSTALLED) ## build the documentation into build/docs
-	@$(CLOCK); $(BIN)/sphinx-build -q -W --keep-going -b html docs build/docs; \
+docs: $(INSTALLED) ## build the documentation into build/docs, and the manual page docs/mwdcal.1
+	@$(CLOCK); $(SPHINX) -b html docs build/docs; $(SPHINX) -b man docs build/man; \
+	cp build/man/mwdcal.1 docs; \
 	echo "documentation: build/docs/index.html"
 
 clean: ## remove everything that can be made again

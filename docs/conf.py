@@ -39,6 +39,9 @@ napoleon_google_docstring = True
 napoleon_numpy_docstring = False
 napoleon_use_ivar = True
 
+man_pages = [("commands", project, "calibration of MWD directional tools", [author], 1)]
+today = release  # in place of a date: the same sources, the same manual
+
 html_theme = "furo"
 html_title = f"mwdcal {release}"
 html_math_renderer = "mathml"
