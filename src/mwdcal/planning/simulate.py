@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,6 +14,14 @@ from mwdcal.geometry.vectors import Array, reference_vectors
 from mwdcal.sensor.models import Basis, Factors
 
 
+class Earth(NamedTuple):
+    """Gravity, g, field, nT, and dip, radians, of a place."""
+
+    gravity: float = 1.0
+    field: float = 48_000.0
+    dip: float = float(np.radians(63.0))
+
+
 @dataclass(frozen=True)
 class StationPlan:
     """Attitudes (n,) in radians and temperatures (n,) in °C, in the order they are measured."""
@@ -21,6 +30,11 @@ class StationPlan:
     azimuth: Array
     toolface: Array
     temperature: Array
+
+    @property
+    def count(self) -> int:
+        """Number of stations."""
+        return len(self.inclination)
 
 
 def grid(

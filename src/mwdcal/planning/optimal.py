@@ -1,0 +1,185 @@
+"""The best stations out of candidates, by the information that each gives.
+
+Information matrices of independent stations add up. What all stations share (errors of the stand,
+uncertain references) are further unknowns, eliminated by a Schur complement, which keeps the
+criteria concave: the bound of Kiefer and Wolfowitz holds for them too.
+
+Reference: V. V. Fedorov, Theory of Optimal Experiments (1972), for the exchange of stations and the
+bound; D. M. Titterington, "Algorithms for computing D-optimal designs" (1976), for the weights.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mwdcal.calibration.estimate import Fit
+from mwdcal.geometry.vectors import Array, Bools, Ints, inverse
+
+WEIGHT_STEPS = 500
+"""Steps at most that the weights of the bound are improved by."""
+GAIN = 1e-9
+"""An exchange that improves the criterion by no more than this is none."""
+
+
+@dataclass(frozen=True)
+class Information:
+    """What candidate stations say of the parameters, in units in which all of them together say 1.
+
+    `rows` (n, m, k): whitened rows by k unknowns, of which the first `size` are the determined directions of
+    the parameters and the others what the stations share; `prior` (k, k) is their precision.
+    """
+
+    rows: Array
+    prior: Array
+    size: int
+
+    @property
+    def count(self) -> int:
+        """Number of candidates."""
+        return len(self.rows)
+
+    def of(self, weights: Array) -> Array:
+        """Information (k, k) of candidates that count with `weights` (n,)."""
+        weighed = self.rows * np.sqrt(weights)[:, None, None]
+        flat = weighed.reshape(-1, weighed.shape[-1])
+        return np.asarray(flat.T @ flat + self.prior)
+
+    @classmethod
+    def of_fit(cls, result: Fit) -> tuple[Information, Array]:
+        """Of the fit of all candidates, and the directions (p, r) in which it is: parameters = T · unknowns."""
+        linear = result.problem.linear(result.state)
+        weight = np.linalg.cholesky(linear.weight[0] + 1e-15 * np.eye(linear.weight.shape[-1]))
+        rows = weight.mT @ linear.design[0]
+        p, covariance = linear.size, result.analysis.covariance[0]
+        determined = result.analysis.determined
+        values, vectors = np.linalg.eigh(covariance / np.outer(*2 * [1 / determined.norms[0]]))
+        kept = values > values[-1] * 1e-14
+        turn = vectors[:, kept] * np.sqrt(values[kept]) / determined.norms[0][:, None]
+        shared = 1 / np.sqrt(np.diag(linear.prior[0])[p:])
+        whole = np.concatenate([rows[..., :p] @ turn, rows[..., p:] * shared], -1)
+        size = turn.shape[1]
+        prior = np.zeros((whole.shape[-1],) * 2)
+        prior[:size, :size] = turn.T @ linear.prior[0, :p, :p] @ turn
+        prior[size:, size:] = linear.prior[0, p:, p:] * np.outer(shared, shared)
+        return cls(whole, prior, size), turn
+
+
+@dataclass(frozen=True)
+class Design:
+    """Chosen candidates, and how good they are.
+
+    `chosen` (N,): their places among the candidates, in the order of these. `efficiency`: at least this
+    share of the best possible D-value per parameter, det(information)^(1/r), that N stations at the
+    candidates can have.
+    """
+
+    chosen: Ints
+    efficiency: float
+
+
+def best(information: Information, count: int, wanted: Array | None = None) -> Design:
+    """The best `count` of the candidates, each at most once.
+
+    Without `wanted` those of the largest determinant of the parameters' information (D-optimal), with it
+    those of the least tr(W V), W (r, r) being `wanted` and V the parameters' covariance: A-optimal where W
+    scales the parameters, I-optimal where it is the mean of what variances V gives over a range.
+    Method: stations added one by one, then exchanged as long as that gains.
+    """
+    chosen = _added(information, count, wanted)
+    while _exchange(information, chosen, wanted):
+        pass
+    return Design(np.flatnonzero(chosen), efficiency(information, chosen))
+
+
+def _added(information: Information, count: int, wanted: Array | None) -> Bools:
+    """A start: the station that gains most, one after the other."""
+    chosen = np.zeros(information.count, bool)
+    little = 1e-6 * information.of(np.ones(information.count))
+    for _ in range(count):
+        gains = _Gains(information, information.of(chosen * 1.0) + little, wanted).of_adding()
+        chosen[np.argmax(np.where(chosen, -np.inf, gains))] = True
+    return chosen
+
+
+def _exchange(information: Information, chosen: Bools, wanted: Array | None) -> bool:
+    """Replace each chosen station by the candidate that gains most, if one does; whether one did."""
+    improved = False
+    for place in np.flatnonzero(chosen):
+        chosen[place] = False
+        whole = information.of(chosen * 1.0)
+        if np.linalg.cond(whole) > 1e14:  # without it nothing can be said
+            chosen[place] = True
+            continue
+        gains = np.where(chosen, -np.inf, _Gains(information, whole, wanted).of_adding())
+        other = int(np.argmax(gains))
+        better = gains[other] > gains[place] + GAIN
+        chosen[other if better else place] = True
+        improved |= bool(better)
+    return improved
+
+
+@dataclass(frozen=True)
+class _Gains:
+    """What candidates add to a criterion where the information is `whole` (k, k)."""
+
+    information: Information
+    whole: Array
+    wanted: Array | None
+
+    def of_adding(self) -> Array:
+        """Gain (n,) of the criterion by each candidate."""
+        rows, size = self.information.rows, self.information.size
+        if self.wanted is None:
+            alone = _log_gain(rows[..., size:], self.whole[size:, size:])
+            return _log_gain(rows, self.whole) - alone
+        moved = rows @ inverse(self.whole)
+        inner = np.eye(rows.shape[1]) + moved @ rows.mT
+        seen = moved[..., :size] @ self.wanted @ moved[..., :size].mT
+        return np.asarray(np.trace(np.linalg.solve(inner, seen), axis1=-2, axis2=-1))
+
+
+def _log_gain(rows: Array, whole: Array) -> Array:
+    """log det (n,) of I + R M⁻¹ Rᵀ: what rows add to log det M."""
+    if not rows.shape[-1]:
+        return np.zeros(len(rows))
+    inner = np.eye(rows.shape[1]) + rows @ inverse(whole) @ rows.mT
+    return np.asarray(np.linalg.slogdet(inner)[1])
+
+
+def efficiency(information: Information, chosen: Bools) -> float:
+    """Share of the best D-value, per parameter, that as many stations at the candidates could have, at least.
+
+    Method: weights of the candidates approach the best ones, and what any others could still gain over
+    them is bounded by the steepest slope (Kiefer and Wolfowitz).
+    """
+    count, size = np.count_nonzero(chosen), information.size
+    reached = _log_det(information, chosen * 1.0)
+    weights = np.full(information.count, count / information.count)
+    bound = np.inf
+    for _ in range(WEIGHT_STEPS):
+        slopes = _slopes(information, weights)
+        mean = float(weights @ slopes) / count
+        bound = min(bound, _log_det(information, weights) + count * (float(slopes.max()) - mean))
+        if count * (slopes.max() - mean) < GAIN * size:
+            break
+        weights = weights * slopes / mean
+    return float(np.exp(min(reached - bound, 0.0) / size))
+
+
+def _log_det(information: Information, weights: Array) -> float:
+    """log det of the parameters' information, what is shared being eliminated."""
+    whole, size = information.of(weights), information.size
+    return float(np.linalg.slogdet(whole)[1] - np.linalg.slogdet(whole[size:, size:])[1])
+
+
+def _slopes(information: Information, weights: Array) -> Array:
+    """Change (n,) of `_log_det` by the weight of each candidate."""
+    whole, size, rows = information.of(weights), information.size, information.rows
+    slopes = np.einsum("nmi,ij,nmj->n", rows, inverse(whole), rows, optimize=True)
+    shared = rows[..., size:]
+    if shared.shape[-1]:
+        back = inverse(whole[size:, size:])
+        slopes = slopes - np.einsum("nmi,ij,nmj->n", shared, back, shared, optimize=True)
+    return np.asarray(slopes)
