@@ -13,30 +13,45 @@ from mwdcal.calibration.options import AUTO, Options
 from mwdcal.calibration.readings import HIGHEST, LEAST_TEMPERATURE_SPAN, SOAK_GAP, Readings
 from mwdcal.calibration.record import Calibration
 from mwdcal.errors import InputError
-from mwdcal.files.contract import CHANNELS
-from mwdcal.files.runs import from_readings, to_readings
+from mwdcal.estimation.evidence import ANGLES, EARTH
+from mwdcal.files.contract import CHANNELS, REFERENCES
+from mwdcal.files.formats.table import Table
+from mwdcal.files.runs import check_references, from_readings, to_readings
 from mwdcal.geometry.vectors import Array, reference_vectors
-from mwdcal.planning.simulate import Earth, StationPlan
+from mwdcal.planning.simulate import Earth
 from mwdcal.sensor.profile import Profile
 
 
-def nominal_run(plan: StationPlan, profile: Profile, earth: Earth) -> tuple[Readings, Profile]:
-    """What a nominal tool reads at the stations of a plan (n,), with the noise and stand of a profile.
+def nominal_run(plan: Table, profile: Profile) -> tuple[Readings, Profile]:
+    """What a nominal tool reads at the stations of a plan, with the noise and the stand of a profile.
+
+    Where the plan does not state gravity, field or dip they are those of `Earth`.
 
     Raises:
-        InputError: the profile does not state the noise of a triad.
+        InputError: the plan does not state an attitude, or the profile not the noise of a triad.
     """
     for kind in CHANNELS:
         if getattr(profile, kind).noise is None:
             raise InputError(
-                f"the profile {profile.name} does not state the noise of the {kind}, on which all "
-                f"uncertainties rest. Add 'noise' to its [{kind}]; mwdcal noise measures it."
+                f"the profile '{profile.name}' does not state the noise of the {kind}, on which every "
+                f"uncertainty rests. Add 'noise' to its [{kind}]; mwdcal noise measures it."
             )
-    fields = reference_vectors(plan.inclination, plan.azimuth, plan.toolface, *earth)
-    known = {name: getattr(plan, name) for name in ("inclination", "azimuth", "toolface")}
-    known |= {name: np.full(plan.count, value) for name, value in earth._asdict().items()}
-    readings = Readings(*fields, plan.temperature, known, metadata={"simulated": True})
-    return to_readings(from_readings(readings, profile), profile)
+    known = check_references(plan, profile, [])
+    for name in ANGLES:
+        blank = np.isnan(known.get(name, np.array([np.nan])))
+        if blank.any():
+            raise InputError(
+                f"{plan.source}: station {int(np.argmax(blank)) + 1} has no {REFERENCES[name].column}. A plan "
+                "states the attitude of every station."
+            )
+    for name, value in Earth()._asdict().items():
+        given = known.get(name, np.full(plan.count, np.nan))
+        known[name] = np.where(np.isnan(given), value, given)
+    fields = reference_vectors(*(known[name] for name in (*ANGLES, *EARTH)))
+    nominal = from_readings(Readings(*fields, known=known), profile)
+    columns = {**nominal.columns, **plan.columns}
+    whole = replace(plan, columns=columns, metadata={**plan.metadata, "simulated": True})
+    return to_readings(whole, profile)
 
 
 def highest_order(temperature: Array) -> int:
@@ -47,16 +62,18 @@ def highest_order(temperature: Array) -> int:
 
 
 def planned_fit(
-    plan: StationPlan, profile: Profile, options: Options, earth: Earth
+    plan: Table, profile: Profile, options: Options | None = None
 ) -> tuple[Choice, Fit]:
     """The fit of a plan's noise-free readings: its information is that of the plan.
 
-    Nothing is left to be seen in the readings: an order of "auto" is `highest_order`, and own-axis terms are
-    those that the options name.
+    Nothing is to be seen in such readings: an order of "auto" is the highest that the temperatures carry, and
+    own-axis terms are those that the options name.
     """
-    readings, scaled = nominal_run(plan, profile, earth)
+    options = options or Options()
+    readings, scaled = nominal_run(plan, profile)
     if options.order == AUTO:
-        options = replace(options, order=highest_order(plan.temperature))
+        soaks = readings.temperature
+        options = replace(options, order=0 if soaks is None else highest_order(soaks))
     if options.nonlinearity == AUTO:
         options = replace(options, nonlinearity=())
     choice = choose(readings, scaled, options, lambda _: None)
@@ -65,20 +82,14 @@ def planned_fit(
     return choice, replace(result, analysis=replace(result.analysis, variance_factor=one))
 
 
-def expected(
-    plan: StationPlan,
-    profile: Profile,
-    options: Options | None = None,
-    earth: Earth | None = None,
-) -> Calibration:
+def expected(plan: Table, profile: Profile, options: Options | None = None) -> Calibration:
     """The calibration that a plan will give, but for its values: uncertainties, rank, accuracy to expect.
 
-    Its parameters are those of a nominal tool, its residuals zero, and it is marked as simulated.
-    Source: to first order the covariance of a fit depends on the tool by its departures from nominal,
-    a few per cent, and on the noise not at all but for its size.
+    Its parameters are those of a nominal tool, its residuals zero, and it is marked as simulated. What real
+    tools depart from nominal, a few per cent, their uncertainties depart from these.
 
     Raises:
-        InputError: the profile does not state the noise.
+        InputError: the plan does not state an attitude, or the profile not the noise.
         FitError: no calibration can come of the plan; the message says what to add.
     """
-    return recorded(*planned_fit(plan, profile, options or Options(), earth or Earth()))
+    return recorded(*planned_fit(plan, profile, options))
