@@ -17,8 +17,10 @@ import numpy as np
 from mwdcal.calibration.estimate import Fit
 from mwdcal.geometry.vectors import Array, Bools, Ints, inverse
 
-WEIGHT_STEPS = 500
-"""Steps at most that the weights of the bound are improved by."""
+WEIGHT_STEPS = 300
+"""Steps at most by which the weights of the bound are improved."""
+CLOSE = 2e-3
+"""The bound on the D-value per parameter is looked for to this share of it."""
 GAIN = 1e-9
 """An exchange that improves the criterion by no more than this is none."""
 
@@ -79,34 +81,37 @@ class Design:
     efficiency: float
 
 
-def best(information: Information, count: int, wanted: Array | None = None) -> Design:
-    """The best `count` of the candidates, each at most once.
+def best(
+    information: Information, count: int, wanted: Array | None = None, kept: Bools | None = None
+) -> Design:
+    """The best `count` of the candidates, each at most once, `kept` (n,) ones among them.
 
     Without `wanted` those of the largest determinant of the parameters' information (D-optimal), with it
     those of the least tr(W V), W (r, r) being `wanted` and V the parameters' covariance: A-optimal where W
     scales the parameters, I-optimal where it is the mean of what variances V gives over a range.
     Method: stations added one by one, then exchanged as long as that gains.
     """
-    chosen = _added(information, count, wanted)
-    while _exchange(information, chosen, wanted):
+    kept = np.zeros(information.count, bool) if kept is None else kept
+    chosen = _added(information, count, wanted, kept)
+    while _exchange(information, chosen, wanted, kept):
         pass
     return Design(np.flatnonzero(chosen), efficiency(information, chosen))
 
 
-def _added(information: Information, count: int, wanted: Array | None) -> Bools:
-    """A start: the station that gains most, one after the other."""
-    chosen = np.zeros(information.count, bool)
+def _added(information: Information, count: int, wanted: Array | None, kept: Bools) -> Bools:
+    """A start: to those kept the station that gains most, one after the other."""
+    chosen = kept.copy()
     little = 1e-6 * information.of(np.ones(information.count))
-    for _ in range(count):
+    for _ in range(count - np.count_nonzero(kept)):
         gains = _Gains(information, information.of(chosen * 1.0) + little, wanted).of_adding()
         chosen[np.argmax(np.where(chosen, -np.inf, gains))] = True
     return chosen
 
 
-def _exchange(information: Information, chosen: Bools, wanted: Array | None) -> bool:
-    """Replace each chosen station by the candidate that gains most, if one does; whether one did."""
+def _exchange(information: Information, chosen: Bools, wanted: Array | None, kept: Bools) -> bool:
+    """Replace each chosen station, but for `kept` ones, by what gains most, if that does; whether one was."""
     improved = False
-    for place in np.flatnonzero(chosen):
+    for place in np.flatnonzero(chosen & ~kept):
         chosen[place] = False
         whole = information.of(chosen * 1.0)
         if np.linalg.cond(whole) > 1e14:  # without it nothing can be said
@@ -141,7 +146,7 @@ class _Gains:
 
 
 def _log_gain(rows: Array, whole: Array) -> Array:
-    """log det (n,) of I + R M⁻¹ Rᵀ: what rows add to log det M."""
+    """Log det (n,) of I + R M⁻¹ Rᵀ: what rows add to log det M."""
     if not rows.shape[-1]:
         return np.zeros(len(rows))
     inner = np.eye(rows.shape[1]) + rows @ inverse(whole) @ rows.mT
@@ -162,14 +167,14 @@ def efficiency(information: Information, chosen: Bools) -> float:
         slopes = _slopes(information, weights)
         mean = float(weights @ slopes) / count
         bound = min(bound, _log_det(information, weights) + count * (float(slopes.max()) - mean))
-        if count * (slopes.max() - mean) < GAIN * size:
+        if count * (slopes.max() - mean) < CLOSE * size:
             break
         weights = weights * slopes / mean
     return float(np.exp(min(reached - bound, 0.0) / size))
 
 
 def _log_det(information: Information, weights: Array) -> float:
-    """log det of the parameters' information, what is shared being eliminated."""
+    """Log det of the parameters' information, what is shared being eliminated."""
     whole, size = information.of(weights), information.size
     return float(np.linalg.slogdet(whole)[1] - np.linalg.slogdet(whole[size:, size:])[1])
 

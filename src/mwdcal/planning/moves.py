@@ -1,0 +1,85 @@
+"""How long a session at the stand takes, and the order of stations that makes it short."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mwdcal.geometry.vectors import Array, Ints
+
+MOST_ORDERED = 2_000
+"""Stations of one soak that are put in order; a longer plan keeps its own."""
+
+
+@dataclass(frozen=True)
+class Stand:
+    """How fast a stand is: its axes move at the same time.
+
+    `degrees_per_second` of an axis, `settle_seconds` between the end of a move and the reading,
+    `soak_minutes` until the tool has the temperature of the next soak.
+    """
+
+    degrees_per_second: float = 5.0
+    settle_seconds: float = 30.0
+    soak_minutes: float = 90.0
+
+
+def move_seconds(attitude: Array, stand: Stand) -> Array:
+    """Seconds (n, n) from each station to each other, of attitudes (n, 3) in degrees."""
+    difference = np.abs(attitude[:, None] - attitude)
+    difference[..., 1:] = np.minimum(difference[..., 1:] % 360, -difference[..., 1:] % 360)
+    return np.asarray(difference.max(-1) / stand.degrees_per_second + stand.settle_seconds)
+
+
+def session_seconds(attitude: Array, soak: Ints, stand: Stand) -> float:
+    """Duration of a session, from its first soak to its last reading, of stations in order.
+
+    `soak` (n,) numbers the temperatures; each change of it is a soak, and so is the first.
+    """
+    seconds = move_seconds(attitude, stand)
+    moves = float(seconds[np.arange(len(soak) - 1), np.arange(1, len(soak))].sum())
+    soaks = 1 + int(np.count_nonzero(np.diff(soak)))
+    return stand.settle_seconds + moves + 60.0 * stand.soak_minutes * soaks
+
+
+def shortest_order(attitude: Array, soak: Ints, stand: Stand) -> Ints:
+    """An order (n,) of the stations of each soak with short moves; the soaks keep theirs.
+
+    Method: the nearest station next, then any stretch turned round that this shortens (2-opt).
+    """
+    order: list[int] = []
+    for each in dict.fromkeys(soak.tolist()):
+        some = np.flatnonzero(soak == each)
+        if len(some) > MOST_ORDERED:
+            return np.arange(len(soak))
+        order += some[_tour(move_seconds(attitude[some], stand))].tolist()
+    return np.array(order)
+
+
+def _tour(seconds: Array) -> Ints:
+    """A short path through all stations, from the first on."""
+    left, path = set(range(1, len(seconds))), [0]
+    while left:
+        path.append(min(left, key=lambda other: (seconds[path[-1], other], other)))
+        left.remove(path[-1])
+    tour = np.array(path)
+    while _turned(tour, seconds):
+        pass
+    return tour
+
+
+def _turned(tour: Ints, seconds: Array) -> bool:
+    """Turn round, in place, each stretch whose turning shortens the path; whether one was."""
+    improved = False
+    for first in range(1, len(tour) - 1):
+        before, start, ends = tour[first - 1], tour[first], tour[first + 1 :]
+        after = np.append(tour[first + 2 :], -1)
+        gain = seconds[before, start] - seconds[before, ends]
+        leave = np.where(after >= 0, seconds[ends, after] - seconds[start, after], 0.0)
+        best = int(np.argmax(gain + leave))
+        if gain[best] + leave[best] > 1e-9:
+            last = first + 1 + best
+            tour[first : last + 1] = tour[first : last + 1][::-1]
+            improved = True
+    return improved
