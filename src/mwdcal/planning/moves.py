@@ -25,6 +25,10 @@ class Stand:
     soak_minutes: float = 90.0
 
 
+STAND = Stand()
+"""A stand of usual speed."""
+
+
 def move_seconds(attitude: Array, stand: Stand) -> Array:
     """Seconds (n, n) from each station to each other, of attitudes (n, 3) in degrees."""
     difference = np.abs(attitude[:, None] - attitude)

@@ -103,7 +103,7 @@ def _added(information: Information, count: int, wanted: Array | None, kept: Boo
     chosen = kept.copy()
     little = 1e-6 * information.of(np.ones(information.count))
     for _ in range(count - np.count_nonzero(kept)):
-        gains = _Gains(information, information.of(chosen * 1.0) + little, wanted).of_adding()
+        gains = _Gains(information, information.of(chosen.astype(np.float64)) + little, wanted).of_adding()
         chosen[np.argmax(np.where(chosen, -np.inf, gains))] = True
     return chosen
 
@@ -113,7 +113,7 @@ def _exchange(information: Information, chosen: Bools, wanted: Array | None, kep
     improved = False
     for place in np.flatnonzero(chosen & ~kept):
         chosen[place] = False
-        whole = information.of(chosen * 1.0)
+        whole = information.of(chosen.astype(np.float64))
         if np.linalg.cond(whole) > 1e14:  # without it nothing can be said
             chosen[place] = True
             continue
@@ -160,7 +160,7 @@ def efficiency(information: Information, chosen: Bools) -> float:
     them is bounded by the steepest slope (Kiefer and Wolfowitz).
     """
     count, size = np.count_nonzero(chosen), information.size
-    reached = _log_det(information, chosen * 1.0)
+    reached = _log_det(information, chosen.astype(np.float64))
     weights = np.full(information.count, count / information.count)
     bound = np.inf
     for _ in range(WEIGHT_STEPS):

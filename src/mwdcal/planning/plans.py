@@ -9,19 +9,28 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
+from mwdcal.calibration.readings import SOAK_GAP
 from mwdcal.errors import InputError
-from mwdcal.files.contract import CHANNELS, REFERENCES
+from mwdcal.estimation.evidence import ANGLES
+from mwdcal.files.contract import REFERENCES, check_columns
 from mwdcal.files.formats import table as tables
-from mwdcal.files.formats.table import Table
+from mwdcal.files.formats.columns import LABELS, Column
+from mwdcal.files.formats.table import Table, labels, numbers
 from mwdcal.files.profiles import built_in, read_toml, toml_problem
+from mwdcal.geometry.vectors import Array, Ints
 
 Values = float | list[float]
 MOST_STATIONS = 20_000
 """Stations of a plan, or candidates."""
 ROOM_TEMPERATURE = 25.0
 """Temperature of a plan that states none, °C."""
-DIRECTION = ("inclination", "azimuth", "toolface")
-"""What a plan states of each station."""
+
+
+PLANNED = (
+    *("station", "group", "temperature_c"),
+    *(prefix + reference.column for reference in REFERENCES.values() for prefix in ("", "sd_")),
+)
+"""Columns of a run file that count in a plan."""
 
 
 class PlannedStations(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -58,7 +67,7 @@ class Plan(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
         attitudes = [each for some in self.stations for each in some.attitudes]
         count = len(attitudes) * len(soaks)
         check_count(count, source)
-        columns = dict(zip(DIRECTION, np.tile(np.transpose(attitudes), len(soaks)), strict=True))
+        columns = dict(zip(ANGLES, np.tile(np.transpose(attitudes), len(soaks)), strict=True))
         place = {"gravity": self.gravity_g, "field": self.field_nt, "dip": self.dip_deg}
         columns |= {n: np.full(count, float(v)) for n, v in place.items() if v is not None}
         return Table(
@@ -99,9 +108,12 @@ def load_plan(name_or_path: str) -> Table:
     if path.suffix.lower() in tables.SUFFIXES:
         table = tables.read(path)
         check_count(table.count, table.source)
-        raw = {channel for channels in CHANNELS.values() for channel in channels}
-        kept = {name: cells for name, cells in table.columns.items() if name not in raw}
-        return replace(table, columns=kept)
+        check_columns(list(table.columns), table.source)
+        kept = [name for name in table.columns if name in PLANNED]
+        cells: dict[str, Column] = {
+            name: labels(table, name) if name in LABELS else numbers(table, name) for name in kept
+        }
+        return replace(table, columns=cells)
     data, _ = read_toml(name_or_path, "plans", "plan")
     try:
         plan = msgspec.toml.decode(data, type=Plan)
@@ -111,3 +123,67 @@ def load_plan(name_or_path: str) -> Table:
             f"{', '.join(built_in('plans'))} (docs, 'Plans')."
         ) from None
     return plan.table(path.name)
+
+
+def joined(first: Table, second: Table) -> Table:
+    """The stations of two plans, one after the other; what one does not state is blank there."""
+    names = dict.fromkeys([*first.columns, *second.columns])
+    columns = {name: _both(first, second, name) for name in names}
+    return replace(first, columns=columns, lines=range(1, first.count + second.count + 1))
+
+
+def _both(first: Table, second: Table, name: str) -> Column:
+    """A column of two plans, blank in the one that does not have it."""
+    if name in LABELS:
+        parts = [labels(plan, name) or [""] * plan.count for plan in (first, second)]
+        return parts[0] + parts[1]
+    blank = [np.full(plan.count, np.nan) for plan in (first, second)]
+    return np.concatenate(
+        [plan.columns.get(name, none) for plan, none in zip((first, second), blank, strict=True)]
+    )
+
+
+def taken(plan: Table, places: Ints) -> Table:
+    """The stations of a plan at some places, in that order, labelled by number."""
+    columns: dict[str, Column] = {
+        name: cells[places] for name, cells in plan.columns.items() if isinstance(cells, np.ndarray)
+    }
+    count = len(places)
+    stations = {"station": [str(number) for number in range(1, count + 1)]}
+    return replace(plan, columns=stations | columns, lines=range(1, count + 1))
+
+
+def at_temperatures(plan: Table, other: Table) -> Table:
+    """The attitudes of a plan at every soak of another, and at the place of that one."""
+    soaks = soak_temperatures(other)
+    everything = np.tile(np.arange(plan.count), max(len(soaks), 1))
+    result = taken(plan, everything)
+    place = {
+        name: np.full(result.count, other.columns[name][0])
+        for name in (REFERENCES[n].column for n in ("gravity", "field", "dip"))
+        if name in other.columns
+    }
+    warmth = {"temperature_c": np.repeat(soaks, plan.count)} if len(soaks) else {}
+    return replace(result, columns={**result.columns, **warmth, **place})
+
+
+def soak_temperatures(plan: Table) -> Array:
+    """The temperatures of the soaks of a plan, ascending: means of those closer than `SOAK_GAP`, °C."""
+    temperature = np.sort(np.asarray(plan.columns.get("temperature_c", ()), float))
+    temperature = temperature[~np.isnan(temperature)]
+    parts = np.split(temperature, 1 + np.flatnonzero(np.diff(temperature) > SOAK_GAP))
+    return np.array([part.mean() for part in parts if part.size])
+
+
+def soak_numbers(plan: Table) -> Ints:
+    """Which soak each station (n,) belongs to, by `soak_temperatures`; all zero without temperatures."""
+    soaks = soak_temperatures(plan)
+    if not len(soaks):
+        return np.zeros(plan.count, int)
+    temperature = np.asarray(plan.columns["temperature_c"], float)
+    return np.asarray(np.argmin(np.abs(temperature[:, None] - soaks), -1))
+
+
+def attitudes(plan: Table) -> Array:
+    """Inclination, azimuth and toolface (n, 3) in degrees."""
+    return np.stack([np.asarray(plan.columns[REFERENCES[n].column], float) for n in ANGLES], -1)
