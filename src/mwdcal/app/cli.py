@@ -24,21 +24,22 @@ COMPLETION = "_MWDCAL_COMPLETE"
 """Variable with which a shell asks for completions, which are bytes."""
 COMMANDS = (
     *("apply", "calibrate", "compare", "completion", "convert", "example"),
-    *("fleet", "noise", "profile", "stations", "verify"),
+    *("fleet", "noise", "planning.plan", "profile", "stations", "verify"),
 )
 """Modules of `mwdcal.app.commands` with a command of their name."""
 
 
 class Commands(UserDict[str, Any]):
-    """The commands by name; kept are the names, and each is imported when it is asked for."""
+    """The commands by name; kept are their modules, and each is imported when it is asked for."""
 
     def __getitem__(self, name: str) -> Any:
         """The command of the module of that name."""
-        return super().__getitem__(name) or import_module(f"mwdcal.app.commands.{name}").command
+        module = super().__getitem__(name)
+        return import_module(f"mwdcal.app.commands.{module}").command
 
 
 @click.group(
-    commands=Commands.fromkeys(COMMANDS),
+    commands=Commands({module.rpartition(".")[2]: module for module in COMMANDS}),
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
 @click.version_option(__version__, prog_name="mwdcal")

@@ -20,6 +20,7 @@ INPUTS = {
     "example": (),
     "fleet": ("runs", "profile"),
     "noise": ("log", "profile"),
+    "plan": ("profile", "measured"),
     "profile": ("run",),
     "stations": ("log",),
     "verify": ("calibration", "run", "limits"),

@@ -103,7 +103,9 @@ def _added(information: Information, count: int, wanted: Array | None, kept: Boo
     chosen = kept.copy()
     little = 1e-6 * information.of(np.ones(information.count))
     for _ in range(count - np.count_nonzero(kept)):
-        gains = _Gains(information, information.of(chosen.astype(np.float64)) + little, wanted).of_adding()
+        gains = _Gains(
+            information, information.of(chosen.astype(np.float64)) + little, wanted
+        ).of_adding()
         chosen[np.argmax(np.where(chosen, -np.inf, gains))] = True
     return chosen
 

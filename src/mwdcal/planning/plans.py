@@ -12,7 +12,7 @@ import numpy as np
 from mwdcal.calibration.readings import SOAK_GAP
 from mwdcal.errors import InputError
 from mwdcal.estimation.evidence import ANGLES
-from mwdcal.files.contract import REFERENCES, check_columns
+from mwdcal.files.contract import RAW, REFERENCES, check_columns
 from mwdcal.files.formats import table as tables
 from mwdcal.files.formats.columns import LABELS, Column
 from mwdcal.files.formats.table import Table, labels, numbers
@@ -187,3 +187,12 @@ def soak_numbers(plan: Table) -> Ints:
 def attitudes(plan: Table) -> Array:
     """Inclination, azimuth and toolface (n, 3) in degrees."""
     return np.stack([np.asarray(plan.columns[REFERENCES[n].column], float) for n in ANGLES], -1)
+
+
+def run_sheet(plan: Table) -> Table:
+    """The run file of a plan to be filled in: its columns, and blank ones for the readings."""
+    blank = {name: np.full(plan.count, np.nan) for name in RAW}
+    head = {
+        name: cells for name, cells in plan.columns.items() if name in ("station", "temperature_c")
+    }
+    return replace(plan, columns={**head, **blank, **plan.columns})

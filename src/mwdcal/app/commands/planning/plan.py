@@ -1,0 +1,122 @@
+"""`mwdcal plan`: what stations will give, before any is measured, and the best ones."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Unpack
+
+import click
+
+from mwdcal.app.commands import options
+from mwdcal.app.messages import print_result
+from mwdcal.errors import InputError
+
+
+@options.command()
+@click.option(
+    "--plan",
+    "plans",
+    multiple=True,
+    metavar="NAME|FILE",
+    help="A built-in plan, a TOML file of attitudes, or a run file; several are compared. "
+    "Default: twenty-four-state; with --stations the candidates to choose from.",
+)
+@click.option(
+    "--stations",
+    type=click.IntRange(1),
+    metavar="N",
+    help="The best N stations out of the candidates.",
+)
+@click.option(
+    "--accuracy",
+    metavar="ANGLE=DEG",
+    multiple=True,
+    help="The fewest stations that give an accuracy (1σ), such as azimuth=0.1; may be repeated.",
+)
+@click.option(
+    "--measured",
+    type=options.FILE,
+    metavar="RUN",
+    help="A run that is measured already: the best stations to add to it.",
+)
+@options.preset(
+    "--criterion",
+    type=click.Choice(["D", "A", "I"]),
+    default="I",
+    help="What the best stations are best in. D: all parameters together. A: each of them. I: the angles "
+    "between 5 and 120° inclination.",
+)
+@options.preset(
+    "--speed", type=float, default=5.0, metavar="DEG/S", help="Speed of the stand's axes."
+)
+@options.preset(
+    "--settle", type=float, default=30.0, metavar="S", help="From the end of a move to its reading."
+)
+@options.preset("--soak", type=float, default=90.0, metavar="MIN", help="To reach a temperature.")
+@options.tool()
+@options.fit_options("auto", "none", "datasheet", "the tolerances in the tool profile")
+@click.option(
+    "-o",
+    "--output",
+    type=options.FILE,
+    metavar="PLAN.csv",
+    help="Also write the plan: a run file with blank readings.",
+)
+@click.option(
+    "--html",
+    type=options.FILE,
+    metavar="PLAN.html",
+    help="Also write a run sheet to print and tick off.",
+)
+@options.JSON
+def command(
+    plans: tuple[str, ...], stations: int | None, accuracy: tuple[str, ...], measured: Path | None,
+    criterion: str, speed: float, settle: float, soak: float, tool: str | None, output: Path | None,
+    html: Path | None, as_json: bool, **typed: Unpack[options.Typed],
+) -> None:  # fmt: skip
+    """What a calibration from planned stations will give: uncertainty, rank, accuracy, hours at the stand.
+
+    Nothing is measured: a nominal tool with the noise and the stand of the profile.
+
+    \b
+    Example: mwdcal plan --stations 24 --tool servo -o plan.csv --html sheet.html
+    Exit: 0 planned, 2 input cannot be read, 3 the stations cannot give a calibration.
+    """
+    from mwdcal.app.choices import options_of, prior_of
+    from mwdcal.app.screens import plan as screen
+    from mwdcal.files import profiles
+    from mwdcal.files.formats import atomic, table
+    from mwdcal.planning import planned
+    from mwdcal.planning.moves import Stand
+    from mwdcal.planning.plans import load_plan, run_sheet
+
+    options.check_outputs([output], [tool, measured, *plans], page=html)
+    prior, _ = prior_of(typed["prior"])
+    profile, digest = profiles.load_profile(tool)
+    chosen = options_of(typed, prior)
+    stand = Stand(speed, settle, soak)
+    tables = [load_plan(name) for name in plans]
+    done = load_plan(str(measured)) if measured else None
+    if accuracy or stations or done:
+        if len(tables) > 1:
+            raise InputError("`plan`: one plan holds the candidates to choose from. Name it alone.")
+        candidates = tables[0] if tables else load_plan("candidates")
+        search = profile, chosen, criterion, stand
+        if accuracy:
+            wanted = screen.wanted_accuracy(accuracy)
+            result = [planned.smallest_plan(candidates, wanted, *search)]
+        else:
+            result = [planned.best_plan(candidates, stations or 1, *search, done)]
+    else:
+        tables = tables or [load_plan("twenty-four-state")]
+        result = [planned.judged(each, profile, chosen, stand) for each in tables]
+    shown = screen.document if as_json else screen.screen
+    digests = {"profile": digest, "measured": done.digest if done else ""}
+    text = shown(result, digests, output, html)
+    if output:
+        table.write(output, run_sheet(result[0].plan))
+    if html:
+        from mwdcal.app.pages.plan import render
+
+        atomic.write(html, render(result))
+    print_result(text, [])

@@ -1,0 +1,184 @@
+"""Plans and what they will give, on the screen and for machines."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from mwdcal.app.envelope import enveloped
+from mwdcal.app.screens.numbers import written
+from mwdcal.app.text import one_line, plural, quantity, table
+from mwdcal.calibration.prediction import accuracy_at, typical_accuracy
+from mwdcal.calibration.readings import SIMULATED
+from mwdcal.calibration.record import Calibration, TriadCalibration, Undetermined
+from mwdcal.errors import InputError
+from mwdcal.planning.planned import WORKING_INCLINATIONS, Planned
+
+MOST_LINES = 40
+"""Stations of a table on screen."""
+
+
+class PlannedTriad(msgspec.Struct, frozen=True, kw_only=True):
+    """What a plan will give of a triad: uncertainties (1σ) by parameter of the calibration file."""
+
+    standard_uncertainties: dict[str, float | None]
+    order: int
+    rank: int
+    size: int
+    undetermined: list[Undetermined]
+
+
+class PlanSummary(msgspec.Struct, frozen=True, kw_only=True):
+    """What `plan` prints of one plan.
+
+    `accuracy_deg` at 45° inclination, as `calibrate` states it; `accuracy_by_inclination_deg` by angle at
+    `inclinations_deg`. `efficiency_bound`: at least this share of the best D-value per parameter.
+    """
+
+    plan: str
+    stations: int
+    session_hours: float
+    accelerometer: PlannedTriad
+    magnetometer: PlannedTriad
+    accuracy_deg: dict[str, float | None]
+    inclinations_deg: list[float]
+    accuracy_by_inclination_deg: dict[str, list[float | None]]
+    rank: int
+    size: int
+    undetermined: list[Undetermined]
+    efficiency_bound: float
+
+
+class PlanDocument(PlanSummary, frozen=True, kw_only=True):
+    """What `plan` prints: the first plan, the others that it was compared with, and the files written."""
+
+    others: list[PlanSummary]
+    output: str
+    html: str
+
+
+def wanted_accuracy(words: Sequence[str]) -> dict[str, float]:
+    """Accuracies such as azimuth=0.1 as numbers, degrees, by angle."""
+    wanted = {}
+    for word in words:
+        name, _, value = word.partition("=")
+        try:
+            wanted[name] = float(value)
+        except ValueError:
+            wanted[name] = np.nan
+        if not 0 < wanted[name] < 180:
+            raise InputError(f"`accuracy` must be such as azimuth=0.1, in degrees; got {word!r}.")
+    return wanted
+
+
+def _facts(each: Planned) -> dict[str, Any]:
+    """The fields of a `PlanSummary`."""
+    calibration = each.calibration
+    by_triad = {triad.name: _triad(triad) for triad in calibration.triads}
+    free = {entry.id: entry for entry in calibration.undetermined()}
+    return {
+        "plan": each.plan.source,
+        "stations": each.plan.count,
+        "session_hours": each.seconds / 3600,
+        **by_triad,
+        "accuracy_deg": typical_accuracy(calibration),
+        "inclinations_deg": np.degrees(WORKING_INCLINATIONS).round(9).tolist(),
+        "accuracy_by_inclination_deg": _by_inclination(calibration),
+        "rank": sum(triad.rank for triad in calibration.triads),
+        "size": sum(triad.size for triad in calibration.triads),
+        "undetermined": list(free.values()),
+        "efficiency_bound": each.efficiency,
+    }
+
+
+def _triad(triad: TriadCalibration) -> PlannedTriad:
+    names = dict(zip(triad.parameter_names, triad.standard_uncertainties, strict=True))
+    return PlannedTriad(
+        standard_uncertainties=names,
+        order=triad.order,
+        rank=triad.rank,
+        size=triad.size,
+        undetermined=triad.undetermined,
+    )
+
+
+def _by_inclination(calibration: Calibration) -> dict[str, list[float | None]]:
+    """1σ by angle at the working inclinations, degrees; None: undetermined."""
+    each = accuracy_at(calibration, WORKING_INCLINATIONS.tolist())
+    return {
+        name: [None if np.isnan(sd) else float(np.degrees(sd)) for sd in values]
+        for name, values in each.items()
+    }
+
+
+def document(
+    plans: Sequence[Planned], digests: Mapping[str, str], output: Path | None, html: Path | None
+) -> dict[str, Any]:
+    """The result for machines."""
+    first, *others = map(_facts, plans)
+    files = {"output": str(output or ""), "html": str(html or "")}
+    content = PlanDocument(**first, others=[PlanSummary(**other) for other in others], **files)
+    return enveloped("plan", content, {"simulated": True}, **digests)
+
+
+def screen(
+    plans: Sequence[Planned], digests: Mapping[str, str], output: Path | None, html: Path | None
+) -> str:
+    """The result for people."""
+    facts = [PlanSummary(**_facts(each)) for each in plans]
+    head = f"{plans[0].calibration.profile.name}   expected of a nominal tool, nothing measured   {SIMULATED}"
+    blocks = [one_line(head), table(_rows(facts), ["", *(one_line(each.plan) for each in facts)])]
+    for each in facts:
+        blocks += [f"! {one_line(each.plan)}: {entry.text}" for entry in each.undetermined]
+    if len(plans) == 1:
+        blocks.append(stations(plans[0]))
+    if output or html:
+        blocks.append(written(plan=output, run_sheet=html))
+    return "\n\n".join(blocks)
+
+
+def _rows(facts: Sequence[PlanSummary]) -> list[list[str]]:
+    """What the plans give, a plan in each column."""
+    lines = [
+        ["stations", *(str(each.stations) for each in facts)],
+        ["at the stand", *(f"{each.session_hours:.1f} h" for each in facts)],
+        ["temperature order", *(_orders(each) for each in facts)],
+        ["determined", *(f"{each.rank} of {each.size}" for each in facts)],
+        ["D-efficiency, at least", *(f"{100 * each.efficiency_bound:.0f} %" for each in facts)],
+    ]
+    for name in facts[0].accuracy_by_inclination_deg:
+        for place, inclination in enumerate(facts[0].inclinations_deg):
+            cells = [each.accuracy_by_inclination_deg[name][place] for each in facts]
+            title = f"{name} at {inclination:.0f}° inclination, 1σ"
+            lines.append([title, *(quantity(sd, "°") for sd in cells)])
+    return lines
+
+
+def _orders(each: PlanSummary) -> str:
+    orders = dict.fromkeys((each.accelerometer.order, each.magnetometer.order))
+    return " and ".join(map(str, orders))
+
+
+def stations(planned: Planned) -> str:
+    """The stations of a plan, in order."""
+    columns = planned.plan.columns
+    titles = {
+        "station": "station", "temperature_c": "°C", "ref_inclination_deg": "inclination",
+        "ref_azimuth_deg": "azimuth", "ref_toolface_deg": "toolface",
+    }  # fmt: skip
+    names = [name for name in titles if name in columns]
+    rows = [
+        [one_line(_cell(columns[name][i])) for name in names]
+        for i in range(min(planned.plan.count, MOST_LINES))
+    ]
+    more = planned.plan.count - len(rows)
+    ends = f"\n… and {plural(more, 'more station')}" if more > 0 else ""
+    return table(rows, [titles[name] for name in names]) + ends
+
+
+def _cell(value: object) -> str:
+    return value if isinstance(value, str) else f"{value:g}"
