@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mwdcal.errors import InputError
 from mwdcal.geometry.vectors import Array, Ints
 
 MOST_ORDERED = 2_000
@@ -23,6 +24,19 @@ class Stand:
     degrees_per_second: float = 5.0
     settle_seconds: float = 30.0
     soak_minutes: float = 90.0
+
+    def __post_init__(self) -> None:
+        """Refuse a stand that does not move, and times below zero.
+
+        Raises `InputError`.
+        """
+        if not 0 < self.degrees_per_second < np.inf:
+            raise InputError(
+                f"`speed` must be more than 0 degrees per second; got {self.degrees_per_second:g}."
+            )
+        for name, value in (("settle", self.settle_seconds), ("soak", self.soak_minutes)):
+            if not 0 <= value < np.inf:
+                raise InputError(f"`{name}` must be a time of 0 or more; got {value:g}.")
 
 
 STAND = Stand()

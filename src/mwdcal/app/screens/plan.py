@@ -120,8 +120,12 @@ def document(
 ) -> dict[str, Any]:
     """The result for machines."""
     first, *others = map(_facts, plans)
-    files = {"output": str(output or ""), "html": str(html or "")}
-    content = PlanDocument(**first, others=[PlanSummary(**other) for other in others], **files)
+    content = PlanDocument(
+        **first,
+        others=[PlanSummary(**other) for other in others],
+        output=str(output or ""),
+        html=str(html or ""),
+    )
     return enveloped("plan", content, {"simulated": True}, **digests)
 
 

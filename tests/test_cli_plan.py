@@ -1,0 +1,134 @@
+"""`mwdcal plan`: what it says of a plan, the sheet that it writes, and what it refuses."""
+
+from __future__ import annotations
+
+import csv
+
+import numpy as np
+import pytest
+
+from cli_support import RAW, SCALE, SERVO_NOISE, mwdcal, refused
+from simulation import DEG, Tool
+
+ATTITUDE = ("ref_inclination_deg", "ref_azimuth_deg", "ref_toolface_deg")
+ONE_ATTITUDE = "name = 'one'\n[[stations]]\ninclination_deg = [45, 45, 45, 45, 45, 45]\n"
+
+
+def filled(sheet, seed):
+    """A run sheet with the readings of a simulated tool, which its profile says nothing of."""
+    with sheet.open(encoding="utf-8") as stream:
+        lines = stream.readlines()
+    head = [line for line in lines if line.startswith("#")]
+    rows = list(csv.DictReader(lines[len(head) :]))
+    angles = np.radians([[float(row[name]) for name in ATTITUDE] for row in rows]).T
+    tool = Tool.random(seed, noise=SERVO_NOISE, field=48_000.0, dip=63 * DEG)
+    rng = np.random.default_rng(seed)
+    # the stand of the profile: 0.01, 0.05 and 0.02°
+    off = angles + np.array([[0.01], [0.05], [0.02]]) * DEG * rng.normal(size=angles.shape)
+    for triad, (readings, scale) in enumerate(zip(tool.readings(rng, 1, *off), SCALE, strict=True)):
+        for row, reading in zip(rows, readings[0] * scale, strict=True):
+            row.update(
+                zip(RAW[3 * triad : 3 * triad + 3], map(repr, reading.tolist()), strict=True)
+            )
+            row |= {"ref_field_nt": "48000", "ref_dip_deg": "63"}
+    run = sheet.with_name("run.csv")
+    with run.open("w", encoding="utf-8", newline="") as stream:
+        stream.writelines(["# simulated = 'yes'\n".replace("'", '"')])
+        writer = csv.DictWriter(stream, [*rows[0]])
+        writer.writeheader()
+        writer.writerows(rows)
+    return run
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_filled_sheet_gives_the_accuracy_that_the_plan_stated(tmp_path, seed):
+    sheet = tmp_path / "plan.csv"
+    planned = mwdcal("plan", "--stations", 24, "--tool", "servo", "-o", sheet, "--json").json
+    run = filled(sheet, seed)
+    arguments = (run, "--tool", "servo", "--order", 0, "-o", tmp_path / "cal.json", "--json")
+    made = mwdcal("calibrate", *arguments).json
+    for kind in ("accelerometer", "magnetometer"):
+        triad = made["triads"][kind]
+        assert (triad["rank"], triad["size"]) == (planned[kind]["rank"], planned[kind]["size"])
+    scale = [
+        made["triads"][kind]["variance_factor"] ** 0.5 for kind in ("accelerometer", "magnetometer")
+    ]
+    for angle, stated in planned["accuracy_deg"].items():
+        # s is not known better than to 1 / √(2 · 60), and the tool departs from nominal by 5 %
+        low, high = 0.85 * min(scale), 1.15 * max(scale)
+        assert low < made["accuracy_1sigma_deg"][angle] / stated < high
+
+
+def test_a_plan_names_what_it_leaves_free():
+    shown = mwdcal("plan", "--plan", "roll-test", "--tool", "servo", "--method", "scalar")
+    assert shown.code == 3
+    document = mwdcal(
+        "plan", "--plan", "moosavi-12", "--tool", "servo", "--method", "scalar", "--json"
+    ).json
+    assert document["rank"] < document["size"]
+    assert {entry["id"] for entry in document["undetermined"]} >= {"toolface-zero"}
+    assert document["accuracy_deg"]["azimuth"] is None
+
+
+def test_plans_side_by_side():
+    names = ("six-state", "twelve-state")
+    plans = [word for name in names for word in ("--plan", name)]
+    document = mwdcal("plan", *plans, "--tool", "servo", "--json").json
+    both = [document, *document["others"]]
+    assert [each["stations"] for each in both] == [6, 12]
+    assert [each["plan"] for each in both] == list(names)
+    assert 0 < both[0]["efficiency_bound"] <= 1
+    shown = mwdcal("plan", *plans, "--tool", "servo").out
+    assert "six-state" in shown
+    assert "SIMULATED DATA" in shown
+
+
+def test_the_fewest_stations_for_an_accuracy():
+    wanted = ("--accuracy", "azimuth=0.04", "--accuracy", "inclination=0.02")
+    document = mwdcal("plan", *wanted, "--tool", "servo", "--json").json
+    reached = document["accuracy_by_inclination_deg"]
+    assert max(reached["azimuth"]) <= 0.04
+    assert max(reached["inclination"]) <= 0.02
+    fewer = mwdcal("plan", "--stations", document["stations"] - 1, "--tool", "servo", "--json").json
+    assert max(fewer["accuracy_by_inclination_deg"]["azimuth"]) > 0.04
+
+
+def test_the_next_stations_of_a_run_are_better_than_others(tmp_path):
+    run = tmp_path / "run.csv"
+    mwdcal("plan", "--plan", "six-state", "--tool", "servo", "-o", run)
+    arguments = ("--measured", run, "--tool", "servo", "--criterion", "D", "--json")
+    more = mwdcal("plan", "--stations", 6, *arguments).json
+    again = mwdcal("plan", "--plan", "twelve-state", "--tool", "servo", "--json").json
+    sd = [
+        np.array(list(each["accelerometer"]["standard_uncertainties"].values()))
+        for each in (more, again)
+    ]
+    assert more["stations"] == 6
+    assert np.log(sd[0]).sum() < np.log(sd[1]).sum()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        (("--plan", "nine-state"), 2, "twelve-state"),
+        (("--plan", "one.toml"), 3, "does not move"),
+        (("--stations", 505), 2, "between 1 and the 504 candidates"),
+        (("--stations", 3), 3, "stations"),
+        (("--stations", 12, "--plan", "six-state", "--plan", "moosavi-12"), 2, "Name it alone"),
+        (("--accuracy", "azimuth=0"), 2, "such as azimuth=0.1"),
+        (("--accuracy", "roll=1"), 2, "inclination, toolface, azimuth"),
+        (("--accuracy", "azimuth=0.0001"), 2, "do not give the wanted accuracy"),
+        (("--speed", 0), 2, "--speed"),
+        (("--measured", "nothing.csv"), 2, "nothing.csv"),
+    ],
+)
+def test_what_cannot_be_planned_ends_in_one_sentence(tmp_path, monkeypatch, arguments, code, words):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "one.toml").write_text(ONE_ATTITUDE)
+    message = refused(mwdcal("plan", *arguments, "--tool", "servo", "-o", "plan.csv"), code)
+    assert words in message
+    assert not (tmp_path / "plan.csv").exists()
+
+
+def test_a_profile_without_noise_cannot_be_planned_with():
+    assert "'noise'" in refused(mwdcal("plan", "--tool", "generic"), 2)
