@@ -11,6 +11,7 @@ from msgspec.structs import replace as with_changes
 
 from mwdcal.calibration import results
 from mwdcal.calibration.estimate import fit
+from mwdcal.calibration.prediction import accuracy_at, readings_at
 from mwdcal.errors import InputError
 from mwdcal.files.profiles import built_in, load_profile
 from mwdcal.geometry.vectors import reference_vectors
@@ -259,3 +260,33 @@ def test_a_plan_states_every_attitude(tmp_path):
     path.write_text("ref_inclination_deg,ref_azimuth_deg,ref_toolface_deg\n90,0,0\n45,,30\n")
     with pytest.raises(InputError, match="station 2 has no ref_azimuth_deg"):
         nominal_run(load_plan(str(path)), SERVO)
+
+
+def test_why_24_stations_cannot_beat_the_48_of_the_textbook():
+    """Not even 24 stations that serve the azimuth at 5° inclination alone are as good there as the 48.
+
+    The bound is of a convex function by its tangent: of any weights w of sum 24, tr(W V) - (24 max g - w·g),
+    g being the slopes tr(M V W V).
+    """
+    low = [np.radians(5.0)]
+    textbook = accuracy_at(expected(load_plan("moosavi-12"), SERVO), low)["azimuth"][0]
+    candidates = load_plan("candidates")
+    choice, planned = planned_fit(candidates, SERVO)
+    information, turn = Information.of_fit(planned)
+    to_file = results.to_file(planned, choice.profile.reference_temperature_c)[0]
+    made = expected(candidates, SERVO)
+    faces, azimuths = np.meshgrid(np.arange(12) * 30 * DEG, np.arange(12) * 30 * DEG)
+    at = readings_at(made, low[0], azimuths.ravel(), faces.ravel())
+    seen = made.sensitivity("azimuth", at) @ to_file @ turn
+    wanted = seen.T @ seen / len(seen)
+    weights, bound = np.full(candidates.count, 24 / candidates.count), 0.0
+    for _ in range(200):
+        covariance = np.linalg.inv(information.of(weights))
+        slopes = np.einsum(
+            "nmi,ij,nmj->n", information.rows, covariance @ wanted @ covariance, information.rows
+        )
+        value = np.trace(wanted @ covariance)
+        bound = max(bound, value - (24 * slopes.max() - weights @ slopes))
+        weights = weights * np.sqrt(slopes)
+        weights *= 24 / weights.sum()
+    assert np.degrees(np.sqrt(bound)) > 1.05 * np.degrees(textbook)

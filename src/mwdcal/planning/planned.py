@@ -13,12 +13,11 @@ import numpy as np
 from mwdcal.calibration import results
 from mwdcal.calibration.calibrate import recorded
 from mwdcal.calibration.options import Options
-from mwdcal.calibration.prediction import TWELFTHS, CalibratedTools, accuracy_at, angles
+from mwdcal.calibration.prediction import TWELFTHS, accuracy_at, angles, readings_at
 from mwdcal.calibration.record import Calibration
 from mwdcal.errors import FitError, InputError
 from mwdcal.files.formats.table import Table
-from mwdcal.geometry.observables import OBSERVABLES
-from mwdcal.geometry.vectors import Array, reference_vectors
+from mwdcal.geometry.vectors import Array
 from mwdcal.planning.expected import expected, planned_fit
 from mwdcal.planning.moves import STAND, Stand, session_seconds, shortest_order
 from mwdcal.planning.optimal import Information, best, efficiency
@@ -174,23 +173,11 @@ def _wanted(criterion: str, turn: Array, calibration: Calibration) -> Array | No
         sd = np.sqrt(np.diag(calibration.parameter_covariance))
         scaled = turn / np.where(sd > 0, sd, np.inf)[:, None]
         return np.asarray(scaled.T @ scaled)
+    grid = np.meshgrid(WORKING_INCLINATIONS, TWELFTHS, TWELFTHS, indexing="ij")
     whole = np.zeros((turn.shape[1],) * 2)
     for temperature in calibration.temperature_c or (None,):
-        for rows in _angle_rows(calibration, temperature).values():
-            moved = rows @ turn
+        readings = readings_at(calibration, *map(np.ravel, grid), temperature)
+        for name in angles(calibration):
+            moved = calibration.sensitivity(name, readings) @ turn
             whole += moved.T @ moved / np.sum(moved**2)
     return whole
-
-
-def _angle_rows(calibration: Calibration, temperature: float | None) -> dict[str, Array]:
-    """Changes (a, k) of each angle by the file's parameters, at attitudes of the working range."""
-    tools = CalibratedTools.of(calibration, temperature)
-    grid = np.meshgrid(WORKING_INCLINATIONS, TWELFTHS, TWELFTHS, indexing="ij")
-    fields = reference_vectors(*(angle.reshape(1, -1) for angle in grid), *tools.earth.T)
-    change = tools.changes(fields, noise=False)[0]
-    rows = {}
-    for name in angles(calibration):
-        gradient = OBSERVABLES[name].gradient(*fields)[0]
-        by_triad = gradient.reshape(len(gradient), -1, 3)[:, : len(change)]
-        rows[name] = np.einsum("nti,tnic->nc", by_triad, change)
-    return rows

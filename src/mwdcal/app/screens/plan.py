@@ -14,7 +14,7 @@ from mwdcal.app.screens.numbers import written
 from mwdcal.app.text import one_line, plural, quantity, table
 from mwdcal.calibration.prediction import accuracy_at, typical_accuracy
 from mwdcal.calibration.readings import SIMULATED
-from mwdcal.calibration.record import Calibration, TriadCalibration, Undetermined
+from mwdcal.calibration.record import Calibration, Finding, TriadCalibration, Undetermined
 from mwdcal.errors import InputError
 from mwdcal.planning.planned import WORKING_INCLINATIONS, Planned
 
@@ -115,6 +115,12 @@ def _by_inclination(calibration: Calibration) -> dict[str, list[float | None]]:
     }
 
 
+def findings(plans: Sequence[Planned]) -> list[Finding]:
+    """What the plans leave undetermined."""
+    entries = [(each, free) for each in plans for free in each.calibration.undetermined()]
+    return [Finding(id=free.id, text=f"{each.plan.source}: {free.text}") for each, free in entries]
+
+
 def document(
     plans: Sequence[Planned], digests: Mapping[str, str], output: Path | None, html: Path | None
 ) -> dict[str, Any]:
@@ -136,10 +142,8 @@ def screen(
     facts = [PlanSummary(**_facts(each)) for each in plans]
     head = f"{plans[0].calibration.profile.name}   expected of a nominal tool, nothing measured   {SIMULATED}"
     blocks = [one_line(head), table(_rows(facts), ["", *(one_line(each.plan) for each in facts)])]
-    for each in facts:
-        blocks += [f"! {one_line(each.plan)}: {entry.text}" for entry in each.undetermined]
     if len(plans) == 1:
-        blocks.append(stations(plans[0]))
+        blocks += [accuracy(facts[0]), stations(plans[0])]
     if output or html:
         blocks.append(written(plan=output, run_sheet=html))
     return "\n\n".join(blocks)
@@ -154,12 +158,20 @@ def _rows(facts: Sequence[PlanSummary]) -> list[list[str]]:
         ["determined", *(f"{each.rank} of {each.size}" for each in facts)],
         ["D-efficiency, at least", *(f"{100 * each.efficiency_bound:.0f} %" for each in facts)],
     ]
-    for name in facts[0].accuracy_by_inclination_deg:
-        for place, inclination in enumerate(facts[0].inclinations_deg):
-            cells = [each.accuracy_by_inclination_deg[name][place] for each in facts]
-            title = f"{name} at {inclination:.0f}° inclination, 1σ"
-            lines.append([title, *(quantity(sd, "°") for sd in cells)])
+    for name in facts[0].accuracy_deg:
+        cells = [quantity(each.accuracy_deg[name], "°") for each in facts]
+        lines.append([f"{name}, 1σ at 45° inclination", *cells])
     return lines
+
+
+def accuracy(each: PlanSummary) -> str:
+    """1σ of the angles at the working inclinations."""
+    columns = each.accuracy_by_inclination_deg
+    rows = [
+        [f"{inclination:g}°", *(quantity(columns[name][place], "°") for name in columns)]
+        for place, inclination in enumerate(each.inclinations_deg)
+    ]
+    return table(rows, ["1σ at inclination", *columns])
 
 
 def _orders(each: PlanSummary) -> str:

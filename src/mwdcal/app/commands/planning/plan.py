@@ -119,4 +119,4 @@ def command(
         from mwdcal.app.pages.plan import render
 
         atomic.write(html, render(result))
-    print_result(text, [])
+    print_result(text, screen.findings(result))
