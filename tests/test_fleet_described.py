@@ -342,3 +342,13 @@ def test_every_status_and_every_finding_has_its_sentence():
     for name in (name for names in named for name in names):
         assert " " in fleet_report.remark(name)
         assert "{" not in fleet_report.remark(name)
+
+
+def test_a_fleet_that_determines_no_angle(tmp_path):
+    runs = {f"T{seed}": short_run(seed) for seed in range(3)}
+    _, page = said(tmp_path, runs, "--method", "scalar")
+    assert "inclination undetermined; toolface undetermined; azimuth undetermined" in plain(page)
+    assert [row[5:] for row in table_of(page, "outcome")] == [["–", "3 tools"]] * 3
+    for row in worst_tools(page).values():
+        assert row[1:4] == ["undetermined"] * 3
+        assert row[-1].startswith("Inclination, toolface, azimuth undetermined; nothing determines")

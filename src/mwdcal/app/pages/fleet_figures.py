@@ -68,7 +68,7 @@ def draw_quality(panels: Sequence[Strips], serials: AnyArray, doubtful: Bools) -
     heights = [len(panel.series) + 1.5 + 0.4 * bool(panel.lines) for panel in panels]
     label = "Accuracy and residuals of the fleet, one mark per tool"
     ratios = {"height_ratios": heights}
-    figure, grid = plots.new_figure(label, 0.36 * sum(heights), len(panels), gridspec_kw=ratios)
+    figure, grid = plots.new_figure(label, 0.42 * sum(heights), len(panels), gridspec_kw=ratios)
     for axes, panel in zip(grid[:, 0], panels, strict=True):
         _draw(axes, panel, doubtful)
         if panel.unit:

@@ -283,9 +283,9 @@ class Fleet:
 
     def of(self, tool: int) -> Iterator[str]:
         """What is unusual in the accuracy and the parameters of one tool."""
-        for angle in self._sd:
-            if self._free[angle][tool]:
-                yield f"{angle} undetermined"
+        free = [angle for angle in self._sd if self._free[angle][tool]]
+        if free:
+            yield f"{', '.join(free)} undetermined"
         angle = max(self._ratio, key=lambda name: float(self._ratio[name][tool]), default="")
         if angle and self._ratio[angle][tool] > WIDE_SIGMA:
             yield f"1σ of {angle} {number(float(self._ratio[angle][tool]))} times the fleet's median"
@@ -346,9 +346,12 @@ class _Reasons:
     def _directions(self, lists: Mapping[str, Sequence[str]]) -> Iterator[str]:
         """What nothing determines, and of which triads."""
         free = {triad: lists.get(f"{triad}_undetermined") or () for triad in TRIADS}
+        groups: dict[str, list[str]] = {}
         for name in dict.fromkeys(name for names in free.values() for name in names):
             triads = " and ".join(triad for triad, names in free.items() if name in names)
-            yield f"nothing determines {name.replace('-', ' ')} of the {triads}"
+            groups.setdefault(triads, []).append(name.replace("-", " "))
+        for triads, names in groups.items():
+            yield f"nothing determines {', '.join(names)} of the {triads}"
 
 
 def _figures(fleet: Fleet) -> dict[str, Figure]:
