@@ -441,3 +441,20 @@ def test_signatures_are_on_the_first_printed_page():
     assert 'id="signatures"' in outcome
     printed = page[page.index("#outcome { display: flex") : page.index("</style>")]
     assert "#outcome > .sign { order: -2" in printed
+
+
+def test_a_simulated_roll_test_is_labelled_as_one():
+    real = msgspec.structs.replace(sound(), tool={"serial": "MWD-7"}, simulated=False)
+    result = verdict("one")
+    assert "SIMULATED DATA" not in render(real, result)
+    page = render(real, result, {"simulated": True})
+    assert "SIMULATED DATA" in page
+    assert "Simulated data." in page[page.index('id="verification"') : page.index('id="errors"')]
+
+
+def test_labels_of_the_roll_test_are_escaped():
+    result = verdict("one")
+    rows = [msgspec.structs.replace(row, station="<script>") for row in result.station_rows]
+    page = render(sound(), msgspec.structs.replace(result, station_rows=rows))
+    assert "<script" not in page
+    assert page.count("<td>&lt;script&gt;</td>") == 12

@@ -91,7 +91,7 @@ class VerdictPlots:
         sets = (each for row in self.verdict.rows for each in row.sets)
         labels = list(dict.fromkeys(each.label for each in sets if each.label))
         if not each.label:
-            return "stations outside of roll sets", (BEFORE, "+", "-")
+            return "stations outside of roll sets", (BEFORE, "p", "-")
         if len(labels) <= len(SET_LOOKS):
             return each.label, SET_LOOKS[labels.index(each.label)]
         return ("worst roll set", SET_LOOKS[0]) if worst else ("other roll sets", OTHER_SETS)

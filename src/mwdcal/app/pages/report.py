@@ -6,6 +6,7 @@ extra `report` (jinja2, matplotlib).
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from datetime import datetime
 from typing import TYPE_CHECKING, Any
 
@@ -39,8 +40,13 @@ ACCURACY_INCLINATIONS = (5.0, 45.0, 90.0)
 """Inclinations of the table of predicted accuracy, degrees."""
 
 
-def render(calibration: Calibration, verdict: Verdict | None = None) -> str:
-    """The report as HTML: the same input gives the same text, byte for byte."""
+def render(
+    calibration: Calibration, verdict: Verdict | None = None, *metadata: Mapping[str, object]
+) -> str:
+    """The report as HTML: the same input gives the same text, byte for byte.
+
+    `metadata` are those of the roll test behind the verdict.
+    """
     template = environment().get_template("report.html")
     return template.render(
         cal=calibration,
@@ -48,7 +54,7 @@ def render(calibration: Calibration, verdict: Verdict | None = None) -> str:
         verdict=verdict,
         banner=outcome(calibration, verdict),
         findings=_findings(calibration, verdict),
-        simulated=is_simulated(calibration.tool),
+        simulated=any(map(is_simulated, (calibration.tool, *metadata))),
         inclinations=known_inclinations(calibration),
         method="; ".join(how(calibration)),
         magnetic=MAGNETIC,
