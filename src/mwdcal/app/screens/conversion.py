@@ -111,7 +111,7 @@ def temperature_findings(
 
     The reference temperature counts as asked for where the values depend on it.
     """
-    varies = notation != "factors" and any(t.order for t in calibration.triads)
+    varies = notation != "factors" and calibration.thermal
     if isinstance(temperature, str) or (temperature is None and not varies):
         return []
     at = calibration.reference_temperature if temperature is None else temperature
