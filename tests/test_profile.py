@@ -10,6 +10,7 @@ from cli_support import mwdcal, numbers, read_csv, refused, servo_run, write_csv
 from mwdcal.calibration.readings import TRIADS
 from mwdcal.files.profiles import load_profile
 from mwdcal.geometry.observables import RESULTS
+from mwdcal.geometry.vectors import tool_from_earth
 from mwdcal.identification.columns import meaning
 from mwdcal.identification.wiring import is_clear, wiring
 
@@ -191,6 +192,38 @@ def test_an_axis_without_variation_stays_open():
     result = wiring(field * 2.0, field)
     assert not is_clear(result)
     assert sorted(result.alternatives) == [("+x", "+y", "+z"), ("+x", "+y", "-z")]
+
+
+def attitudes(*turns):
+    """North and down along the tool axes (n, 3), at attitudes in degrees."""
+    turn = tool_from_earth(*np.radians(np.broadcast_arrays(*turns)))
+    return turn[..., 0], turn[..., 2]
+
+
+def test_a_sign_that_the_dip_alone_would_tell_stays_open():
+    north, down = attitudes(np.repeat([45.0, 90.0], 12), 30.0, np.tile(np.arange(0, 360, 30), 2))
+    field = north * np.cos(np.radians(65)) + down * np.sin(np.radians(65))
+    result = wiring(field * 3.0, north, down)
+    assert not is_clear(result)
+    assert sorted(result.alternatives) == [("+x", "+y", "+z"), ("+x", "+y", "-z")]
+    assert is_clear(wiring(field * 3.0, field))
+
+
+def test_few_stations_never_tell_wrong_axes():
+    rng = np.random.default_rng(5)
+    told = 0
+    for case in range(300):
+        angles = rng.uniform([0, 0, 0], [180, 360, 360], (5 + case % 4, 3)).T
+        angles[1] = angles[1, 0] if case % 2 else angles[1]
+        north, down = attitudes(*angles)
+        dip = np.radians(rng.uniform(-85, 85))
+        raw = (north * np.cos(dip) + down * np.sin(dip)) @ (
+            np.eye(3) + 0.02 * rng.normal(size=(3, 3))
+        )
+        result = wiring(raw, north, down)
+        told += is_clear(result)
+        assert not is_clear(result) or result.axes == ("+x", "+y", "+z"), case
+    assert told > 100
 
 
 # -------------------------------------------------------------------------- names and files
