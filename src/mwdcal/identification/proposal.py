@@ -11,9 +11,11 @@ import msgspec
 import numpy as np
 
 from mwdcal.calibration.readings import TRIADS, Readings
+from mwdcal.calibration.record import Finding
 from mwdcal.errors import FitError, InputError
-from mwdcal.files.contract import CHANNELS, MAPPED, units_of
+from mwdcal.files.contract import CHANNELS, MAPPED, REFERENCES, units_of
 from mwdcal.files.formats import table as tables
+from mwdcal.files.formats.columns import shown
 from mwdcal.files.formats.dialect import Export
 from mwdcal.files.formats.table import Table
 from mwdcal.files.metadata import toml
@@ -33,6 +35,8 @@ UNRELATED = 0.9
 """Readings of which even the best axes leave more than this share have nothing to do with the references."""
 SAME_ANGLE = np.radians(1e-4)
 """Inclinations of a stand never agree with raw readings to this, radians."""
+SAME_GRAVITY = 2e-4
+"""A local gravity does not differ by more between stations, g; what tools measure does."""
 MOST_NAMED = 6
 """Alternatives that a message names."""
 
@@ -70,11 +74,15 @@ def propose(path: str | os.PathLike[str]) -> Proposal:
         except InputError:
             return None
 
-    columns, by_value = proposed(export.names, export.units, values, table.source)
+    stated = "azimuth_reference" in table.metadata
+    columns, by_value = proposed(
+        export.names, export.units, values, table.source, export.above, stated
+    )
     profile = Profile(name=Path(path).stem, table=form or msgspec.UNSET, columns=columns)
     run = renamed(table, profile)
     check_run(run)
     readings, _ = to_readings(run, profile)
+    _check_gravity(readings, columns)
     wirings = _wirings(run, readings)
     scales = {kind: _rounded(result.scale) for kind, result in wirings.items()}
     if readings.relative:
@@ -99,6 +107,8 @@ def propose(path: str | os.PathLike[str]) -> Proposal:
 def _is_documented(path: str | os.PathLike[str], export: Export) -> bool:
     """Whether a table, but for the names of its columns, is written as a run file is."""
     suffix, form = Path(path).suffix.lower(), export.form
+    if form.first_line != form.header_line + 1 and suffix != ".parquet":
+        return False
     if suffix in (".csv", ".tsv") and form.delimiter != {".csv": ",", ".tsv": "\t"}[suffix]:
         return False
     try:
@@ -141,6 +151,18 @@ def _wirings(run: Table, readings: Readings) -> dict[str, Wiring]:
         results[kind] = result
         _check_independent(readings, results)
     return results
+
+
+def _check_gravity(readings: Readings, columns: Mapping[str, ColumnSource]) -> None:
+    """Refuse a gravity that differs from station to station: the tool has measured it."""
+    gravity = readings.reference("gravity")
+    if np.ptp(gravity) <= SAME_GRAVITY:
+        return
+    name, apart = columns[REFERENCES["gravity"].column].name, 1000 * np.ptp(gravity)
+    raise FitError(
+        f"{readings.source}: {shown(name)} differs between stations by {apart:.2g} mg, as no local gravity does: "
+        "the tool has measured it. Remove the column, or put the gravity of the place into it."
+    )
 
 
 def _check_independent(readings: Readings, results: dict[str, Wiring]) -> None:
@@ -201,6 +223,25 @@ def _choice(kind: str, result: Wiring) -> str:
         f"the readings leave the axes of the {kind} open: {named}{f' or {more} others' if more > 0 else ''}. "
         "Add stations at other inclinations and toolfaces, or write the axes into a profile."
     )
+
+
+def left_handed(proposal: Proposal) -> list[Finding]:
+    """A finding on triads whose channels x, y, z are a left-handed set by the axes proposed."""
+    triads = [
+        kind
+        for kind, result in proposal.wirings.items()
+        if np.linalg.det(TriadProfile(axes=result.axes).permutation) < 0  # type: ignore[arg-type]
+    ]
+    if not triads:
+        return []
+    return [
+        Finding(
+            id="left-handed",
+            text=f"{' and '.join(triads)}: by the axes proposed the channels x, y, z are a left-handed set. If the "
+            "tool is not built so, a reference angle counts the other way: toolface anticlockwise, or inclination "
+            "from below.",
+        )
+    ]
 
 
 def as_toml(proposal: Proposal, source: str) -> str:
