@@ -465,11 +465,12 @@ def test_what_is_no_table_ends_in_one_sentence(tmp_path, content, status):
     assert not (tmp_path / "tool.toml").exists()
 
 
-def test_angles_computed_from_the_readings_are_no_reference(tmp_path):
+@pytest.mark.parametrize("decimals", [12, 3, 2])
+def test_angles_computed_from_the_readings_are_no_reference(tmp_path, decimals):
     """A tool that writes its inclination beside the raw channels, and nothing of the stand."""
     run = servo_run()
     across = np.hypot(run["ax"], run["ay"])
-    run["ref_inclination_deg"] = np.degrees(np.arctan2(across, run["az"]))
+    run["ref_inclination_deg"] = np.round(np.degrees(np.arctan2(across, run["az"])), decimals)
     path = write_csv(tmp_path / "run.csv", renamed(run, ref_inclination_deg="Inc (deg)"))
     message = refused(mwdcal("profile", path, "-o", tmp_path / "tool.toml"), 3)
     assert "computed from them" in message

@@ -35,6 +35,8 @@ UNRELATED = 0.9
 """Readings of which even the best axes leave more than this share have nothing to do with the references."""
 SAME_ANGLE = np.radians(1e-4)
 """Inclinations of a stand never agree with raw readings to this, radians."""
+LAST_PLACES = (0.1, 0.01, 0.001)
+"""Units in the last place of angles, degrees."""
 SAME_GRAVITY = 2e-4
 """A local gravity does not differ by more between stations, g; what tools measure does."""
 MOST_NAMED = 6
@@ -171,13 +173,25 @@ def _check_independent(readings: Readings, results: dict[str, Wiring]) -> None:
     permutation = TriadProfile(axes=result.axes).permutation  # type: ignore[arg-type]
     vectors = readings.accelerometer @ permutation.transpose()
     computed = OBSERVABLES["inclination"].value(vectors, vectors)
-    apart = np.abs(computed - readings.reference("inclination"))
-    if np.nanmax(apart) < SAME_ANGLE:
+    stated = readings.reference("inclination")
+    same = SAME_ANGLE + _last_place(stated[~np.isnan(stated)]) / 2
+    if np.nanmax(np.abs(computed - stated)) < same:
         raise FitError(
             f"{readings.source}: the inclinations are those that the readings themselves give, to "
-            f"{np.degrees(SAME_ANGLE):.1g}°: they were computed from them. A calibration needs the angles of the "
+            f"{np.degrees(same):.1g}°: they were computed from them. A calibration needs the angles of the "
             "stand: name their columns as references, such as 'Ref Inc'."
         )
+
+
+def _last_place(angles: Array) -> float:
+    """The unit in the last place, radians, of angles given to a hundredth or thousandth of a degree, else zero.
+
+    Stands that are read to a tenth or less agree with a sound tool by chance.
+    """
+    steps = {place: np.degrees(angles) / place for place in LAST_PLACES}
+    fine = (p for p, step in steps.items() if np.allclose(step, np.round(step), rtol=0, atol=1e-6))
+    place = next(fine, LAST_PLACES[0])
+    return 0.0 if place == LAST_PLACES[0] else float(np.radians(place))
 
 
 def _unknown(kind: str, absent: list[str], stations: int, readings: Readings) -> FitError:
