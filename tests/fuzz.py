@@ -549,7 +549,9 @@ def promises(line: list[str], ran: cli_support.Ran, folder: Path, before: set[Pa
     broken = []
     written = {p for p in folder.rglob("*") if p not in before}
     named = {p for p in written if p.relative_to(folder).parts[0].startswith("out-")}
-    shown = {p for p in named if p.name.startswith(("out-plot", "out-report"))}  # of a refused log too
+    shown = {
+        p for p in named if p.name.startswith(("out-plot", "out-report"))
+    }  # of a refused log too
     if ran.code not in ({0, 1, 2, 3} if line[0] == "verify" else {0, 2, 3}):
         broken.append(f"exit {ran.code}")
     if written - named:

@@ -47,7 +47,7 @@ def movement(channels: Mapping[str, Cells]) -> list[Finding]:
             name = max(triad, key=lambda n: float(ranges[n].max()))
             first, seconds = int(np.argmax(ranges[name])), _window(triad[name])
             text = (
-                f"this log is not at rest: {name} changes by {ranges[name][first]:.3g} within {seconds:.3g} s about "
+                f"this log is not at rest: {name} changes by {ranges[name][first]:.4g} within {seconds:.3g} s about "
                 f"{triad[name].start[first] + seconds / 2:.4g} s after the start, as {CAUSES[kind]}. Run mwdcal "
                 "stations, or choose a part at rest by `start` and `end`."
             )

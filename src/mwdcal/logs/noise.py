@@ -160,6 +160,7 @@ def find_noise(
     if kind not in KINDS:
         raise InputError(f"`kind` must be {' or '.join(KINDS)}; got {kind!r}.")
     findings: list[Finding] = []
+    remarks: list[Finding] = []
     rows, rate = regular.section(log, sampling_hz, between, findings)
     samples = rows.stop - rows.start
     seconds = samples / rate
@@ -174,13 +175,14 @@ def find_noise(
             findings.append(Finding(id="channel-left-out", text=f"{error} It was left out."))
             continue
         cells[name] = movement.cells_of(*taken)
-        channel = _channel(name, *taken, station, kind, findings)
+        channel = _channel(name, *taken, station, kind, remarks)
         channels[name] = channel if profile is None else _physical(name, channel, profile)
     if not channels:
-        remarks = " ".join(finding.text for finding in findings)
-        raise InputError(f"{log.source}: no channel that could be used. {remarks}")
-    if moved := movement.movement(cells):
-        findings = moved + [finding for finding in findings if finding.id not in DOUBTS]
+        reasons = " ".join(finding.text for finding in findings)
+        raise InputError(f"{log.source}: no channel that could be used. {reasons}")
+    moved = movement.movement(cells)
+    findings = moved + findings if moved else findings + remarks
+    if moved:
         channels = {name: replace(c, doubts=[moved[0].id]) for name, c in channels.items()}
     withheld = _withheld(channels)
     return Noise(

@@ -107,20 +107,19 @@ def _banner(stations: Stations, output: str, why: str) -> dict[str, str]:
 
 def _table(stations: Stations) -> dict[str, Any]:
     """Titles of the table of stations, and rows: plain cells, means with their 1σ, and what drifts."""
-    columns, count = stations.table.columns, range(stations.table.count)
+    columns = stations.table.columns
     plain = {name: look for name, look in PLAIN_COLUMNS.items() if name in columns}
     channels = [name for name in RAW if name in columns]
     titles = [*(title for title, _ in plain.values()), *(f"{name}, raw" for name in channels)]
+    cells = [(columns[name], places) for name, (_, places) in plain.items()]
     rows = [
         {
-            "plain": [
-                columns["station"][i],
-                *(fixed(float(columns[n][i]), places) for n, (_, places) in plain.items()),
-            ],
+            "station": columns["station"][i],
+            "plain": [fixed(float(column[i]), places) for column, places in cells],
             "means": [measured(*(float(columns[n][i]) for n in (c, f"sd_{c}"))) for c in channels],
             "drifts": columns["drifting"][i],
         }
-        for i in count
+        for i in range(stations.table.count)
     ]
     return {"titles": ["station", *titles, "drifts"], "rows": rows}
 
