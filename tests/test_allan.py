@@ -3,6 +3,7 @@
 Simulated records come from filters written here, not from the covariances of the package.
 """
 
+import hashlib
 import os
 import re
 from functools import cache
@@ -807,6 +808,7 @@ def test_the_report_needs_nothing_else(tmp_path, log):
         "ax, µg",
         "degrees of freedom",
         "SIMULATED",
+        hashlib.sha256(log.read_bytes()).hexdigest(),
     ):
         assert part in text
     assert "http" not in text

@@ -25,8 +25,8 @@ AXIS_MARKERS = {"x": "o", "y": "s", "z": "^"}
 """Markers of the channels of a triad."""
 
 
-def render(noise: Noise) -> str:
-    """The report: one HTML page that needs nothing else; the same noise, the same bytes."""
+def render(noise: Noise, log_sha256: str = "", profile: str = "", profile_sha256: str = "") -> str:
+    """The report as HTML, with the name of its tool profile and the SHA-256 of its sources."""
     template = environment().get_template("noise.html")
     return template.render(
         result=noise,
@@ -38,6 +38,9 @@ def render(noise: Noise) -> str:
         tables=tables(noise),
         toml=profile_lines(noise),
         rounded=rounded,
+        log_sha256=log_sha256,
+        profile=profile,
+        profile_sha256=profile_sha256,
         version=__version__,
     )
 
