@@ -148,7 +148,7 @@ def test_a_log_without_a_standstill_has_its_page(tmp_path):
 def test_without_a_page_the_refusal_names_it(tmp_path):
     log = write_csv(tmp_path / "log.csv", tumble(3, stations=4)[0].columns)
     ran = mwdcal("stations", log, "-o", tmp_path / "run.csv", "--min-seconds", 60)
-    assert "--plot or --report shows the log." in ran.err
+    assert "--report or --plot shows the log." in ran.err
     assert ran.code == 2
 
 

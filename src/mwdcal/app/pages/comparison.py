@@ -94,8 +94,8 @@ def _heading(comparison: Comparison, metadata: Mapping[str, object]) -> list[str
 def _banner(comparison: Comparison) -> dict[str, str]:
     """The advice, and why."""
     headline, _, why = comparison.advice.partition(": ")
-    level = "good" if able(comparison.rows) else "bad"
-    return banner(level, "Advice", capital(headline), capital(why))
+    level, word = ("good", "Advice") if able(comparison.rows) else ("bad", "Refused")
+    return banner(level, word, capital(headline), capital(why))
 
 
 @plots.style()

@@ -89,7 +89,7 @@ def shown_in(plot: Path | None, report: Path | None) -> str:
     """Where a log without a station is shown."""
     if plot or report:
         return written(picture=plot, report=report)
-    return "--plot or --report shows the log."
+    return "--report or --plot shows the log."
 
 
 def next_command(output: str) -> str:
