@@ -549,7 +549,9 @@ def promises(line: list[str], ran: cli_support.Ran, folder: Path, before: set[Pa
     broken = []
     written = {p for p in folder.rglob("*") if p not in before}
     named = {p for p in written if p.relative_to(folder).parts[0].startswith("out-")}
-    pictures = {p for p in named if p.name.startswith("out-plot")}  # a refused log is drawn
+    shown = {
+        p for p in named if p.name.startswith(("out-plot", "out-report"))
+    }  # of a refused log too
     if ran.code not in ({0, 1, 2, 3} if line[0] == "verify" else {0, 2, 3}):
         broken.append(f"exit {ran.code}")
     if written - named:
@@ -559,7 +561,7 @@ def promises(line: list[str], ran: cli_support.Ran, folder: Path, before: set[Pa
             broken.append(f"{len(ran.messages)} messages, {len(ran.err)} characters")
         if ran.out.strip():
             broken.append("refused, and a result on stdout")
-        if named - (pictures if line[0] == "stations" else set()):
+        if named - (shown if line[0] == "stations" else set()):
             broken.append(f"refused, and written: {sorted(p.name for p in named)}")
     if re.search(r"Traceback|Warning:|<class |array\(", ran.err):
         broken.append("a message of Python's")
