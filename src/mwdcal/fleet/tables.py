@@ -368,7 +368,8 @@ def _batches(piece: Piece, columns: tuple[str, ...], size: int = 0) -> Iterator[
         yield _complete(_run_rows(piece, wanted), piece, columns)
         return
     arrow, pq = parquet.modules(piece.path)
-    encoded = [name for name in TEXTS if name in wanted]
+    present = pq.read_schema(piece.path).names if RUN_FILE in columns else wanted
+    encoded = [name for name in TEXTS if name in wanted and name in present]
     with (
         parquet.reading(piece.path),
         pq.ParquetFile(piece.path, read_dictionary=encoded) as file,
