@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import os
 
 import numpy as np
 import pytest
@@ -199,6 +200,28 @@ def test_serials_that_contradict_each_other(lab):
         "a.csv: the metadata state the serial 'A', the column 'serial' 'B'" in rows["a"]["message"]
     )
     assert "b.csv, line 22, column 'serial': must be filled in" in rows["b"]["message"]
+
+
+@pytest.mark.parametrize(("stated", "serial"), [("serial = 0", "0"), ('serial = " "', "a b")])
+def test_serials_that_are_no_text(lab, stated, serial):
+    write_csv(lab / "a b.csv", short_run(1), stated)
+    rows, table, _ = calibrated(lab)
+    assert list(rows) == [serial]
+    assert by_serial(table, serial)["serial"] == serial
+
+
+def test_folders_name_what_files_do_not(lab):
+    for name in ("serial=X%2F1", "Bohrung 7"):
+        (lab / name).mkdir()
+        write_csv(lab / name / f"run of {name[-1]}.csv", short_run(len(name)))
+    assert set(calibrated(lab)[0]) == {"X/1", "run of 7"}
+
+
+@pytest.mark.skipif(os.name == "nt", reason="names are text there")
+def test_a_name_that_is_no_text_is_refused(lab):
+    write_csv(lab / "a.csv", short_run(1)).rename(os.fsdecode(os.fsencode(lab) + b"/\xff.csv"))
+    ran = mwdcal("fleet", lab, "-o", lab.parent / "o.parquet")
+    assert "must be valid UTF-8" in refused(ran, 2)
 
 
 def test_a_single_file_that_is_no_run_is_refused(tmp_path):

@@ -38,10 +38,10 @@ def serials(table: Table, otherwise: str) -> list[str]:
     Raises:
         InputError: the metadata name another tool than the column, or a row of many tools names none.
     """
-    stated = str(table.metadata.get(SERIAL) or "").strip()
+    stated = _stated(table)
     cells = labels(table, SERIAL)
     named = list(dict.fromkeys(filter(None, cells)))
-    if stated and named and named != [stated]:
+    if stated and named and named != [stated.strip()]:
         raise InputError(
             f"{table.source}: the metadata state the serial {shown(stated)}, the column '{SERIAL}' "
             f"{', '.join(map(shown, named[:2]))}{' …' if len(named) > 2 else ''}. Correct one of them."
@@ -59,7 +59,13 @@ def run_of(table: Table, serial: str) -> Table:
         rows = [row for row, cell in enumerate(cells) if cell == serial]
         table = _rows(table, rows, f"{SERIAL} {serial} of {table.source}")
     runs.check_run(table)
-    return replace(table, metadata={SERIAL: serial, **table.metadata})
+    return replace(table, metadata={**table.metadata, SERIAL: _stated(table) or serial})
+
+
+def _stated(table: Table) -> str:
+    """The serial in the metadata of a table, empty where there is none."""
+    stated = table.metadata.get(SERIAL)
+    return "" if stated is None or not str(stated).strip() else str(stated)
 
 
 def _rows(table: Table, rows: Sequence[int], source: str) -> Table:

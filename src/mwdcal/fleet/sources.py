@@ -202,12 +202,15 @@ def input_files(path: Path) -> tuple[list[Path], list[Path]]:
         and not any(part.startswith(HIDDEN) for part in file.relative_to(path).parts)
     )
     paths = [file for file in visible if file.suffix.lower() in SUFFIXES]
+    for file in paths:
+        if str(file) != str(file).encode("utf-8", "ignore").decode():
+            raise InputError(f"{str(file)!r}: a name must be valid UTF-8. Rename the file.")
     if not paths:
         raise InputError(
             f"'{path}' is a folder without files that end in {', '.join(SUFFIXES)}. Name a table, or a "
             "folder of run files."
         )
-    return paths, [file for file in visible if file not in set(paths)]
+    return paths, [file for file in visible if file.suffix.lower() not in SUFFIXES]
 
 
 def _described(file: Path, root: Path, profile: Profile) -> _File:
