@@ -120,11 +120,24 @@ def test_tables_as_another_program_writes_them(lab):
         check_same(by_serial(table, serial), alone(run, *FIT, tool=profile))
 
 
-def test_options_reach_the_record(lab):
-    path = write_csv(lab / "a.csv", servo_run(3, temperatures=(20.0, 60.0, 100.0)), 'serial = "A"')
-    options = ("--order", "auto", "--robust", "huber", "--ignore", "dip")
+OPTIONS = {
+    "orders": ("--order", "auto", "--nonlinearity", "none", "--robust", "huber", "--ignore", "dip"),
+    "datasheet": (*FIT, "--prior", "datasheet"),
+    "stand": (*FIT, "--estimate", "azimuth-zero"),
+    "curves": (*FIT[:3], "accelerometer", "--method", "scalar"),
+}
+
+
+@pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS)
+def test_options_reach_the_record(lab, options):
+    soaks = (20.0, 60.0, 100.0) if "auto" in options else (25.0,)
+    columns = {
+        **servo_run(3, temperatures=soaks),
+        "sd_ref_azimuth_deg": np.full(48 * len(soaks), 0.1),
+    }
+    path = write_csv(lab / "a.csv", columns, 'serial = "A"')
     _, table, _ = calibrated(lab, *options)
-    check_same(by_serial(table, "A"), alone(path, "--nonlinearity", "none", *options))
+    check_same(by_serial(table, "A"), alone(path, *options))
 
 
 def test_a_bad_file_is_the_status_of_its_tool(lab):
@@ -200,6 +213,14 @@ def test_serials_that_contradict_each_other(lab):
         "a.csv: the metadata state the serial 'A', the column 'serial' 'B'" in rows["a"]["message"]
     )
     assert "b.csv, line 22, column 'serial': must be filled in" in rows["b"]["message"]
+
+
+def test_a_column_that_looks_like_the_serial(lab):
+    write_csv(lab / "a.csv", {"Serial No": ["A"] * 14 + ["B"] * 14, **short_run(1)})
+    write_csv(lab / "b.csv", {"Serial No": ["A"] * 28, **short_run(2)})
+    rows, _, _ = calibrated(lab)
+    assert [rows[s]["status"] for s in ("a", "b")] == ["bad-input", "ok"]
+    assert "a.csv: the column 'Serial No' names several tools" in rows["a"]["message"]
 
 
 @pytest.mark.parametrize(("stated", "serial"), [("serial = 0", "0"), ('serial = " "', "a b")])

@@ -85,7 +85,8 @@ def _digest(serial: str) -> str:
 @contextmanager
 def _whole(folder: Path) -> Iterator[Path]:
     """A folder to fill, which has its name when the block ends without an error."""
-    unfinished = folder.resolve().with_name(f".mwdcal-{folder.resolve().name}.tmp")
+    folder = folder.resolve()
+    unfinished = folder.with_name(f".mwdcal-{folder.name}.tmp")
     try:
         shutil.rmtree(unfinished, ignore_errors=True)  # of a command that was killed
         unfinished.mkdir()

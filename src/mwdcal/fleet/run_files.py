@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from mwdcal.errors import InputError
-from mwdcal.files import runs
+from mwdcal.files import runs, synonyms
 from mwdcal.files.formats import table as tables
 from mwdcal.files.formats.columns import shown
 from mwdcal.files.formats.table import Table, labels
@@ -49,7 +49,19 @@ def serials(table: Table, otherwise: str) -> list[str]:
     if len(named) > 1 and "" in cells:
         problem = "must be filled in; got a blank cell. Say which tool the station belongs to."
         raise tables.cell_error(table, SERIAL, cells.index(""), problem)
+    if not stated and not named:
+        _check_near_misses(table)
     return named or [stated or otherwise]
+
+
+def _check_near_misses(table: Table) -> None:
+    """Refuse a table that seems to tell several tools apart by a column of another name."""
+    for name in table.columns:
+        if synonyms.resembled(name) == (SERIAL, "") and len(set(labels(table, name)) - {""}) > 1:
+            raise InputError(
+                f"{table.source}: the column {shown(name)} names several tools. Rename it to '{SERIAL}', or name it "
+                "under [columns] of the tool profile."
+            )
 
 
 def run_of(table: Table, serial: str) -> Table:
