@@ -127,7 +127,9 @@ def _findings(calibration: Calibration, verdict: Verdict | None) -> list[Finding
 
 
 def _when(time: str) -> str:
-    """A time of the record as people write it."""
+    """A time of the record as people write it; of a tool in a fleet's table it is the day."""
+    if "T" not in time:
+        return time
     try:
         return datetime.fromisoformat(time).strftime("%Y-%m-%d %H:%M UTC")
     except ValueError:
