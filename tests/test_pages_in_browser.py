@@ -238,7 +238,7 @@ def test_a_page_can_be_read_by_everybody(written, open_page, name):
     for view in views:
         seen.look(*view)
         faults[view] = seen.faults()
-        if seen.page.locator("figure").count():
+        if view[0] == WIDTHS[0] and seen.page.locator("figure").count():
             light = seen.light("figure")
             assert light > 200 if view[1] == "light" else light < 90, (view, light)
     seen.shorten()
@@ -422,8 +422,7 @@ def test_points_of_a_picture_say_their_station_and_value(written, open_page):
         told.append(page.inner_text(".tip"))
     labels = [re.fullmatch(r"station (\S+): (\S+) σ", line)[1] for line in told]
     misfits = [number(line.partition(":")[2]) for line in told]
-    place = page.locator("#stations thead th").all_inner_texts().index("misfit, σ")
-    shown = [number(expected[label][place]) for label in labels]
+    shown = [number(expected[label][-2]) for label in labels]
     assert misfits == pytest.approx(shown, abs=0.0501)
     assert len(set(labels)) == 8
     page.keyboard.press("Escape")
