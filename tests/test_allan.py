@@ -811,7 +811,8 @@ def test_the_report_needs_nothing_else(tmp_path, log):
         hashlib.sha256(log.read_bytes()).hexdigest(),
     ):
         assert part in text
-    assert "http" not in text
+    assert "http:" not in text
+    assert "https:" not in text
 
 
 def test_an_output_never_replaces_the_log(log):

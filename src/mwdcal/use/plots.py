@@ -8,7 +8,7 @@ line style of its own.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
@@ -39,6 +39,8 @@ AXES = {"x": AFTER, "y": MARKED, "z": "#111827"}
 """Colours of the channels of a triad."""
 LINES: dict[str, Any] = {"x": "-", "y": (0, (5, 1.5)), "z": (0, (1.5, 1.2))}
 """Line styles of the channels of a triad."""
+POINT_NAMES = "points"
+"""Start of the gid of a line whose label names its points, below a first `_`, one on each line."""
 ACCURACY_OF = {"of the calibration alone": False, "of one reading: calibration and noise": True}
 """What an accuracy is of, and whether the noise of one reading is in it."""
 TEMPERATURES = 41
@@ -146,17 +148,40 @@ def stems(axes: Axes, where: AnyArray, heights: Array, **look: Any) -> None:
     axes.plot(np.repeat(where, 3), ends.ravel(), **look)
 
 
+def named_points(
+    axes: Axes, where: AnyArray, heights: Array, names: Iterable[str], *marker: str, **look: Any
+) -> None:
+    """Markers, each with a name that a page shows for a closer look."""
+    drawn = np.isfinite(heights)
+    shown = (" ".join(name.split()) for name, here in zip(names, drawn, strict=True) if here)
+    gid = f"{POINT_NAMES}-{sum(len(each.lines) for each in axes.figure.axes)}"
+    label = "\n".join(["_", *shown])
+    axes.plot(where[drawn], heights[drawn], *marker, gid=gid, label=label, **look)
+
+
 def _station_stems(
-    axes: Axes, rows: Sequence[StationRow], values: Sequence[float], colour: str, marker: str
+    axes: Axes,
+    rows: Sequence[StationRow],
+    values: Sequence[float],
+    unit: str,
+    colour: str,
+    marker: str,
 ) -> None:
     """Stems over the stations; the ones to re-shoot have a triangle and their label."""
     where, heights = np.arange(len(rows)), np.asarray(values, float)
     marked = np.array([row.reshoot for row in rows])
     small = 3.6 if len(rows) <= 80 else 2.2
     stems(axes, where, heights, color=colour, lw=0.7, alpha=0.6)
-    plain = where[~marked], heights[~marked]
-    axes.plot(*plain, marker, color=colour, ms=small, mfc="white", mew=0.9)
-    axes.plot(where[marked], heights[marked], "^", color=MARKED, ms=6)
+    names = np.array(
+        [
+            f"station {row.station}: {quantity(value, unit).replace('-', '−')}"
+            for row, value in zip(rows, heights.tolist(), strict=True)
+        ],
+        object,
+    )
+    plain: dict[str, Any] = {"color": colour, "ms": small, "mfc": "white", "mew": 0.9}
+    named_points(axes, where[~marked], heights[~marked], names[~marked], marker, **plain)
+    named_points(axes, where[marked], heights[marked], names[marked], "^", color=MARKED, ms=6)
     for index in np.flatnonzero(marked & ~np.isnan(heights)).tolist():
         _name_station(axes, index, float(heights[index]), rows[index].station)
     axes.grid(axis="x", visible=False)
@@ -374,7 +399,7 @@ class Plots:
         series = (("errors_before", BEFORE, "o"), ("errors", AFTER, "s"))
         for axes, (errors, *look) in zip(panels, series, strict=True):
             values = [getattr(station, errors).get(observable, np.nan) for station in stations]
-            _station_stems(axes, stations, values, *look)
+            _station_stems(axes, stations, values, unit, *look)
             axes.axhline(0, color="#4b5563", lw=0.6, zorder=1)
             axes.set_ylabel(label)
         if row.expected:
@@ -400,7 +425,7 @@ class Plots:
         rows, limit = self.calibration.station_rows, reshoot_limit(self.calibration)
         figure, [[axes]] = new_figure("Misfit of each station in standard deviations", 1.7)
         misfits = [row.deviation for row in rows]
-        _station_stems(axes, rows, misfits, AFTER, "s")
+        _station_stems(axes, rows, misfits, "σ", AFTER, "s")
         axes.axhline(limit, color=MARKED, lw=1, ls=(0, (5, 3)))
         axes.set(ylabel="misfit of the station, σ", ylim=(0, max(limit, *misfits) * 1.2))
         place = {"xycoords": ("axes fraction", "data"), "ha": "right", "va": "bottom"}
