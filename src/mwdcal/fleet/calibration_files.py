@@ -16,7 +16,7 @@ from mwdcal.files.formats import members
 
 PLAIN = " ._-+,=@()"
 """Characters besides letters and digits that stay as they are in the name of a file."""
-LONGEST_NAME = 120
+LONGEST_FILE_NAME = 120
 """Bytes of the name of a file, without its suffix."""
 RESERVED = {
     "con",
@@ -68,9 +68,9 @@ def file_name(serial: str) -> str:
     name = _escaped(name[:place]) + inner + _escaped(name[place + len(inner) :])
     if name.partition(".")[0].strip().casefold() in RESERVED:
         name = _escaped(name[0]) + name[1:]
-    if len(name.encode()) <= LONGEST_NAME:
+    if len(name.encode()) <= LONGEST_FILE_NAME:
         return name
-    return name.encode()[: LONGEST_NAME - 10].decode(errors="ignore") + _digest(serial)
+    return name.encode()[: LONGEST_FILE_NAME - 10].decode(errors="ignore") + _digest(serial)
 
 
 def _escaped(text: str) -> str:

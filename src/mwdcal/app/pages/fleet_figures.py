@@ -36,7 +36,7 @@ TICKS = 12
 """Numbers along the axes of a row of panels: more would run into each other."""
 LOGARITHMIC = 8.0
 """Largest over smallest value from which an axis of positive values is logarithmic."""
-LONGEST_NAME = 16
+CUT_SERIAL = 16
 """Characters of a serial that a figure shows."""
 ONE_AXIS_OR_TWO = ("gain", "square", "cube")
 """Parameters of one axis or of two: a panel for each."""
@@ -233,7 +233,7 @@ def _name_largest(axes: Axes, panel: Strips, serials: AnyArray) -> None:
             continue
         largest = int(np.nanargmax(values))
         name = one_line(serials[largest])
-        name = name if len(name) <= LONGEST_NAME else f"{name[: LONGEST_NAME - 1]}…"
+        name = name if len(name) <= CUT_SERIAL else f"{name[: CUT_SERIAL - 1]}…"
         words = f"worst {number(float(values[largest]))}{unit(panel.unit)}\n{name}"
         axes.annotate(words, (1.0, place), (5, 0), **beside)
 

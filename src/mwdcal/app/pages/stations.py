@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 POINTS = 2000
 """Points of a line in the picture."""
-LONGEST_NAME = 40
+LONGEST_LOG_NAME = 40
 """Characters of the name of a log that have room above the picture."""
 NUMBER_ROOM = 0.014
 """Room of a digit above the picture, as a share of its width."""
@@ -204,7 +204,7 @@ def _number_stations(axes: Axes, stations: Stations) -> None:
             axes.annotate(str(number), (middle, 1.0), place, textcoords="offset points", **look)
             free = middle + half
     log = stations.table.source
-    log = log if len(log) <= LONGEST_NAME else f"…{log[-LONGEST_NAME:]}"
+    log = log if len(log) <= LONGEST_LOG_NAME else f"…{log[-LONGEST_LOG_NAME:]}"
     axes.set_title(
         f"{log}: stations taken {stations.table.count} (filled, numbered), "
         f"calm intervals left {len(left(stations))} (hatched)",
