@@ -118,7 +118,8 @@ def command(runs: Path, output: Path, *options: str) -> tuple[float, float]:
     """Seconds of one run of the command, and the largest memory of any of its processes, MB."""
     begun = time.perf_counter()
     subprocess.run(
-        [str(MWDCAL), "fleet", str(runs), "-o", str(output), "--tool", "servo", *options],
+        [str(MWDCAL), "fleet", str(runs), "-o", str(output), "--tool", "servo", "--no-records",
+         *options],
         check=True, capture_output=True,
     )  # fmt: skip
     seconds = time.perf_counter() - begun

@@ -58,7 +58,7 @@ SAMPLES = {
     "prior": "calibration",
 }
 """The kind of file that each argument or option takes, by its name."""
-OUTPUTS = ("output", "report", "plot", "folder")
+OUTPUTS = ("output", "report", "plot", "folder", "calibrations")
 """Arguments and options that name what to write."""
 LIMITS = 'name = "lab"\n[spread]\ninclination_deg = 0.2\nazimuth_deg = 1.5\n'
 CALIBRATIONS = (
@@ -118,11 +118,15 @@ def samples(folder: Path) -> dict[str, list[Any]]:
         for name in servo_run(0, (10, 60, 110), 6)
     }
     fleet = {"serial": [f"T{i // 18}" for i in range(72)], **fleet}
+    table = folder / "cals.parquet"
+    runs_of_many = write_csv(folder / "fleet.csv", fleet, "simulated = true")
+    ran = cli_support.mwdcal("fleet", runs_of_many, "-o", table, "--tool", "servo", "--workers", 1)
+    assert ran.code == 0, ran
     return {
         "run": list(tables.values()),
         "log": [log(4, 4.0, (20, 80, 120)), log(5, 20.0, (20,))],
         "fleet": [fleet],
-        "calibration": calibrations,
+        "calibration": [*calibrations, table.read_bytes()],
         "profile": [(EXAMPLE / "tool.toml").read_text("utf-8")],
         "limits": [LIMITS],
     }
@@ -437,11 +441,27 @@ def files(r: random.Random, kind: str, sound: dict[str, list[Any]], stem: Path) 
         plain = (".txt",) if kind == "log" else ()
         path = table_file(r, sample, stem, (*(".csv",) * 4, ".tsv", ".parquet", ".xlsx", *plain))
     elif kind == "fleet":
-        path = table_file(r, sample, stem, (".parquet",))
+        path = table_file(r, sample, stem, (".parquet", ".parquet", ".csv", ".xlsx"))
+        if r.random() < 0.2:
+            return folder_of_runs(r, sound, stem)
+    elif isinstance(sample, bytes):
+        path = stem.with_suffix(".parquet")
+        path.write_bytes(sample)
+        damaged(r, path)
+        return Path(f"{path}#{r.choice(('T0', 'T1', 'T2', 'T9', '', '#', ' T0', '../T0'))}")
     else:
         path = (document_file if kind == "calibration" else toml_file)(r, sample, stem)
     damaged(r, path)
     return path
+
+
+def folder_of_runs(r: random.Random, sound: dict[str, list[Any]], folder: Path) -> Path:
+    """A folder with run files, damaged or not, and a file that is none."""
+    folder.mkdir()
+    for place in range(r.choice((1, 2, 3))):
+        files(r, r.choice(("run", "run", "fleet")), sound, folder / f"{place}")
+    (folder / "notes.txt").write_text("not a run")
+    return folder
 
 
 def value(r: random.Random, p: click.Parameter, sound: dict[str, list[Any]], folder: Path) -> str:
@@ -549,7 +569,9 @@ def promises(line: list[str], ran: cli_support.Ran, folder: Path, before: set[Pa
     broken = []
     written = {p for p in folder.rglob("*") if p not in before}
     named = {p for p in written if p.relative_to(folder).parts[0].startswith("out-")}
-    pictures = {p for p in named if p.name.startswith("out-plot")}  # a refused log is drawn
+    shown = {
+        p for p in named if p.name.startswith(("out-plot", "out-report"))
+    }  # of a refused log too
     if ran.code not in ({0, 1, 2, 3} if line[0] == "verify" else {0, 2, 3}):
         broken.append(f"exit {ran.code}")
     if written - named:
@@ -559,7 +581,7 @@ def promises(line: list[str], ran: cli_support.Ran, folder: Path, before: set[Pa
             broken.append(f"{len(ran.messages)} messages, {len(ran.err)} characters")
         if ran.out.strip():
             broken.append("refused, and a result on stdout")
-        if named - (pictures if line[0] == "stations" else set()):
+        if named - (shown if line[0] == "stations" else set()):
             broken.append(f"refused, and written: {sorted(p.name for p in named)}")
     if re.search(r"Traceback|Warning:|<class |array\(", ran.err):
         broken.append("a message of Python's")

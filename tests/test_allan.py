@@ -3,7 +3,9 @@
 Simulated records come from filters written here, not from the covariances of the package.
 """
 
+import hashlib
 import os
+import re
 from functools import cache
 
 import numpy as np
@@ -14,6 +16,7 @@ from mwdcal.files import logs
 from mwdcal.files.profiles import load_profile
 from mwdcal.logs import allan, noise_terms
 from mwdcal.logs.noise import find_noise
+from test_stations import tumble
 
 KINDS = ("overlapping", "modified", "standard")
 BATCHES = [(), (1,), (3, 1, 2)]
@@ -583,6 +586,106 @@ def test_what_does_not_hold_is_marked_and_not_recommended(tmp_path, change, doub
     assert "ax (!)" in (tmp_path / "r.html").read_text("utf-8")
 
 
+def moving(seed=3):
+    """Columns of a log with twelve standstills."""
+    table, *_ = tumble(seed, stations=12, hz=RATE)
+    return {name: value for name, value in table.columns.items() if name != "time_s"}
+
+
+def turned_slowly(columns, degrees_a_second=2.0):
+    """The log at rest, turned about its y axis for half a minute in the middle."""
+    angle = np.radians(degrees_a_second) * np.clip(np.arange(6000) / RATE - 45, 0, 30)
+    x, z = columns["ax"], columns["az"]
+    turned = {
+        "ax": x * np.cos(angle) + z * np.sin(angle),
+        "az": z * np.cos(angle) - x * np.sin(angle),
+    }
+    return {**columns, **turned}
+
+
+def warmed(columns, share=0.1):
+    """The log at rest with a warming-up of a tenth of the signal, time constant 20 s."""
+    course = 1 - np.exp(-np.arange(6000) / RATE / 20)
+    return {
+        name: value + share * np.median(np.abs(value)) * course for name, value in columns.items()
+    }
+
+
+def altered(columns, names, add):
+    return {n: v + add if n in names else v for n, v in columns.items()}
+
+
+SECONDS = np.arange(6000) / RATE
+
+
+@pytest.mark.parametrize(
+    ("columns", "moves"),
+    [
+        (moving, True),
+        (lambda: turned_slowly(static()), True),
+        (lambda: altered(static(), ("mx", "mz"), 0.3 * (SECONDS > 60)), True),
+        (static, False),
+        (lambda: warmed(static()), False),
+        (lambda: altered(static(), ("ax",), 1.0 * (SECONDS > 60)), False),  # one channel: a fault
+        (lambda: altered(static(), ("ax", "ay"), 2.0 * (np.arange(6000) == 3000)), False),
+        (lambda: altered(static(), ("ax", "ay", "az"), 3e-3 * (SECONDS > 60)), False),
+        (lambda: altered(static(), ("ax", "ay", "az"), 0.3 * np.sin(40 * SECONDS)), False),
+        (lambda: {n: v - v.mean() for n, v in static().items()}, False),  # without any signal
+    ],
+    ids=["log", "slow", "iron", "rest", "warm", "fault", "spike", "knock", "vibration", "zero"],
+)
+def test_a_log_that_is_not_at_rest_is_called_so_and_no_other(tmp_path, columns, moves):
+    path = write_csv(tmp_path / "log.csv", columns(), f"sampling_hz = {RATE}")
+    ran = mwdcal("noise", path, "--json", "--report", tmp_path / "n.html")
+    page = (tmp_path / "n.html").read_text("utf-8")
+    ids = [finding["id"] for finding in ran.json["findings"]]
+    assert (ids[:1] == ["not-at-rest"]) == ("not-at-rest" in ids) == moves
+    assert ("This log is not at rest: run mwdcal stations" in page) == moves
+    assert ("Run mwdcal stations" in ran.err) == moves
+    if moves:
+        assert not {"event", "misfit"} & set(ids)
+        assert ran.json["profile"] == {}
+        assert {c["doubts"][0] for c in ran.json["channels"].values()} == {"not-at-rest"}
+        assert "At rest –" not in page
+
+
+def test_the_move_that_is_named_is_that_of_the_log(tmp_path):
+    columns = altered(static(), ("ax", "ay"), 0.5 * (SECONDS > 60))
+    columns["ay"] = columns["ay"] + 0.25 * (SECONDS > 60)
+    path = write_csv(tmp_path / "log.csv", columns, f"sampling_hz = {RATE}")
+    (text,) = (f["text"] for f in mwdcal("noise", path, "--json").json["findings"])
+    name, size, place = re.search(r"(\w+) changes by (\S+) within 5 s about (\S+) s", text).groups()
+    assert name == "ay"
+    assert float(size) == pytest.approx(0.75, abs=0.01)
+    assert abs(float(place) - 60) <= 2.5
+
+
+def test_the_verdict_of_the_page(tmp_path, log):
+    page, report = tmp_path / "n.html", ("--report", tmp_path / "n.html")
+    found = mwdcal("noise", log, "--json", *report).json
+    sound = page.read_text("utf-8")
+    assert "At rest – noise of 6 channels found" in sound
+    for kind, names in (("accelerometer", "ax ay az"), ("magnetometer", "mx my mz")):
+        each = [found["channels"][name]["station"]["noise"] for name in names.split()]
+        figure = f"{np.sqrt(np.mean(np.square(each))):.2e}"
+        digits, power = figure.split("e")
+        raised = power.lstrip("-0").translate(str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹"))
+        decimal = f"{float(figure):.{2 + int(power.lstrip('-'))}f}"
+        assert f"{kind} {digits}×10⁻{raised} raw" in sound or f"{kind} {decimal} raw" in sound
+    bad = altered(static(), ("ay",), 0.5 * (np.arange(6000) == 3000))
+    mwdcal("noise", write_csv(tmp_path / "bad.csv", bad, "sampling_hz = 50"), *report)
+    assert "Some figures do not hold – 1 of 6 channels" in page.read_text("utf-8")
+    bad = {name: v + 3e-3 * np.sin(np.arange(6000) / 9) for name, v in static().items()}
+    mwdcal("noise", write_csv(tmp_path / "bad.csv", bad, "sampling_hz = 50"), *report)
+    assert "The figures do not hold – 6 of 6 channels" in page.read_text("utf-8")
+    dead = {**static(), "my": np.full(6000, 0.5)}
+    mwdcal("noise", write_csv(tmp_path / "bad.csv", dead, "sampling_hz = 50"), *report)
+    text = page.read_text("utf-8")
+    assert "At rest – noise of 5 channels found" in text
+    assert 'class="banner attention"' in text
+    assert text.index('class="banner') < text.index("my reads 0.5") < text.index("<h2>")
+
+
 def test_noise_between_two_codes_is_no_event(tmp_path):
     """Noise of 0.3 steps on the edge of a code: most differences are 0, none is an event."""
     rng = np.random.default_rng(3)
@@ -705,9 +808,11 @@ def test_the_report_needs_nothing_else(tmp_path, log):
         "ax, µg",
         "degrees of freedom",
         "SIMULATED",
+        hashlib.sha256(log.read_bytes()).hexdigest(),
     ):
         assert part in text
-    assert "http" not in text
+    assert "http:" not in text
+    assert "https:" not in text
 
 
 def test_an_output_never_replaces_the_log(log):

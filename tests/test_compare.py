@@ -357,7 +357,7 @@ def test_the_page_is_whole_and_needs_nothing_else(whole):
     parsed.feed(page)
     assert parsed.open == []
     assert all(link.startswith("#") for link in parsed.links)
-    assert not re.search(r"https?:|@import|<script|url\((?!#)", page)
+    assert not re.search(r"https?:|@import|<script[^>]|url\((?!#)", page)
     assert len(parsed.ids) == len(set(parsed.ids))
     assert all(f"<th>{method}</th>" in page for method in EVIDENCE)
     assert page.count("<svg") == 4
@@ -374,6 +374,134 @@ def test_the_page_says_what_is_simulated_and_what_is_refused():
     assert "<b>swarm refused:</b>" in page
     assert "SF x·τ" in page
     assert page.count("<svg") == 3
+
+
+def worse(comparison, method, factor):
+    """The same with errors of one method this many times as large."""
+
+    def times(values):
+        return {name: value * factor for name, value in values.items()}
+
+    rows = tuple(
+        replace(
+            row,
+            in_sample=times(row.in_sample),
+            held_out=times(row.held_out),
+            station_errors=times(row.station_errors),
+        )
+        if row.method == method
+        else row
+        for row in comparison.rows
+    )
+    return replace(comparison, rows=rows, advice=module.advice(rows))
+
+
+def texts(figure):
+    """What stands in a figure, with its place in pixels and size."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return {
+        text: text.get_window_extent(canvas.get_renderer())
+        for axes in figure.axes
+        for text in axes.texts
+    }
+
+
+def separate(figure):
+    """Texts of the figure that overlap another one or the edge of the page, or are small."""
+    places = list(texts(figure).items())
+    boxes = [box for _, box in places]
+    return [
+        text.get_text()
+        for i, (text, box) in enumerate(places)
+        if text.get_fontsize() < 6.5
+        or not -1 < box.x0 < box.x1 < figure.bbox.width + 1
+        or any(box.overlaps(other) for j, other in enumerate(boxes) if j != i)
+    ]
+
+
+@pytest.mark.parametrize("method", ["joint", "scalar"])
+def test_a_method_far_worse_flattens_no_other(whole, method):
+    figures = pytest.importorskip("mwdcal.app.pages.comparison")
+    bad = worse(whole, method, 100)
+    index = [row.method for row in whole.rows].index(method)
+    others = [i for i in range(6) if i != index]
+    panels = np.reshape(figures.draw_stations(bad).axes, (6, 6))
+    for line, name in zip(panels, whole.units, strict=True):
+        reach = [np.nanmax(np.abs(row.station_errors[name])) for row in bad.rows]
+        edges = [min(np.abs(axes.get_ylim())) for axes in line]
+        assert all(edge >= each for edge, each in zip(edges, reach, strict=True))  # nothing cut
+        # of every method's panel at least a fifth is used, whatever another needs
+        assert all(edge <= 5 * each for edge, each in zip(edges, reach, strict=True))
+        (said,) = (text.get_text() for text in line[index].texts)
+        value = float(re.match(r"to ([\d.]+)", said)[1])
+        assert value == pytest.approx(reach[index], rel=0.01)
+        assert said.endswith(whole.units[name].partition(" ")[0])
+        labelled = [axes for axes in line if axes.yaxis.get_tick_params()["labelleft"]]
+        assert len(labelled) == 1
+        assert not labelled[0].texts
+        assert len({line[i].get_ylim() for i in others if not line[i].texts}) == 1
+    assert separate(figures.draw_stations(bad)) == []
+
+
+@pytest.mark.parametrize("method", ["joint", "scalar"])
+def test_ratios_beyond_the_axis_have_their_value_at_its_edge(whole, method):
+    figures = pytest.importorskip("mwdcal.app.pages.comparison")
+    bad = worse(whole, method, 100)
+    figure = figures.draw_errors(bad)
+    (axes,) = figure.axes
+    low, high = axes.get_xlim()
+    assert high <= 12
+    expected = []
+    for name in whole.units:
+        best = min(row.held_out[name] for row in bad.rows)
+        each = {row.method: row.held_out[name] / best for row in bad.rows}
+        expected += [(who, ratio) for who, ratio in each.items() if ratio > 10]
+    said = [re.match(r"(\S+): ([\d.]+)", text.get_text()).groups() for text in axes.texts]
+    assert sorted(who for who, _ in said) == sorted(who for who, _ in expected)
+    values = sorted(float(value) for _, value in said)
+    np.testing.assert_allclose(values, sorted(ratio for _, ratio in expected), rtol=0.01)
+    assert len(said) >= 6
+    for line in (line for line in axes.lines if line.get_marker() != "None"):
+        drawn = np.asarray(line.get_xdata(), float)
+        assert np.all((drawn[~np.isnan(drawn)] > low) & (drawn[~np.isnan(drawn)] < high))
+    assert separate(figure) == []
+
+
+def test_parameters_beyond_the_axis_have_an_arrow_and_the_largest_its_value(whole):
+    figures = pytest.importorskip("mwdcal.app.pages.comparison")
+    rows = list(whole.rows)
+    first, last = rows[0].parameters["accelerometer"], rows[-1].parameters["accelerometer"]
+    values = {name: value.copy() for name, value in last.values.items()}
+    values["B"][1, 0] = first.values["B"][1, 0] - 345 * first.uncertainty["B"][1, 0]
+    changed = {**rows[-1].parameters, "accelerometer": replace(last, values=values)}
+    rows[-1] = replace(rows[-1], parameters=changed)
+    figure = figures.draw_parameters(replace(whole, rows=tuple(rows)))
+    top = figure.axes[0]
+    assert max(np.abs(top.get_ylim())) <= 15
+    assert [text.get_text() for text in top.texts] == ["−345"]
+    place = [label.get_text() for label in top.get_xticklabels()].index("B y")
+    assert abs(top.texts[0].xy[0] - place) < 0.5
+    assert separate(figure) == []
+
+
+def test_the_page_has_serial_and_dates_as_text(whole):
+    stated = {"serial": "<b>S</b>", "date": "2026-03-04"}
+    page = render(whole, metadata=stated, time="2026-11-22 17:00 UTC")
+    assert "&lt;b&gt;S&lt;/b&gt;" in page
+    assert "<b>S</b>" not in page
+    assert "measured 2026-03-04" in page
+    assert "2026-11-22 17:00 UTC" in page
+    assert not re.search(r"measured \d", render(whole))
+
+
+def test_a_relative_field_has_no_nanotesla_on_the_page():
+    found = compare(make(1, unknown=("field",)), PROFILE)
+    page = render(found)
+    assert not re.search(r"\bnT\b", re.sub(r"<svg.*?</svg>", "", page, flags=re.DOTALL))
+    assert page.index("banner good") < page.index("<svg")
 
 
 def test_long_runs_show_the_worst_of_each_part():

@@ -570,6 +570,20 @@ def test_what_does_not_go_together_is_refused(tmp_path, monkeypatch, options, wo
     assert [path.name for path in tmp_path.iterdir()] == ["cal.json"]
 
 
+def test_words_in_which_north_has_no_direction_are_refused(tmp_path):
+    """Test vectors too close to tell were left out, all of them: C without any does not compile."""
+    record = whole(made("polynomial"))
+    for dip in (87.0, 88.0, 89.0, 89.5):
+        earth = {**record.earth, "dip_deg": dip}
+        calibration = saved(tmp_path, msgspec.structs.replace(record, earth=earth))
+        ran = mwdcal(
+            "convert", calibration, "--to", "fixed-point", "--word-bits", 12, "-o", tmp_path / "c"
+        )
+        assert "has no azimuth. Use more --word-bits" in refused(ran, 2)
+        assert not (tmp_path / "c").exists()
+        sources(tmp_path, calibration, "fixed-point", "--word-bits", 32)
+
+
 def test_files_are_replaced_together_and_an_input_stays(tmp_path):
     calibration = saved(tmp_path, whole(made("factors")))
     folder, stated = sources(tmp_path, calibration, "c-header")

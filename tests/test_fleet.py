@@ -84,7 +84,9 @@ def write_fleet(path, tools, metadata=None, **options):
 def calibrated(path, *options, tool="servo", code=0):
     """The table of calibrations as rows by serial."""
     output = path.with_name("cals.parquet")
-    ran = mwdcal("fleet", path, "-o", output, "--tool", tool, "--workers", 1, *options)
+    ran = mwdcal(
+        "fleet", path, "-o", output, "--tool", tool, "--workers", 1, "--no-records", *options
+    )
     assert ran.code == code, ran
     return {row["serial"]: row for row in pq.read_table(output).to_pylist()}
 
@@ -458,7 +460,10 @@ def test_wrong_paths(tmp_path):
     assert "part of the input" in refused(inside, 2)
     csv = tmp_path / "runs.csv"
     csv.write_text("serial,ax,ay,az\n")
-    assert "Convert" in refused(mwdcal("fleet", csv, "-o", output), 2)
+    assert "no stations" in refused(mwdcal("fleet", csv, "-o", output), 2)
+    other = tmp_path / "runs.txt"
+    other.write_text("serial,ax,ay,az\n")
+    assert "Convert" in refused(mwdcal("fleet", other, "-o", output), 2)
     good.write_bytes(b"PAR1 and nothing")
     assert "complete Parquet file" in refused(mwdcal("fleet", good, "-o", output), 2)
 
@@ -731,7 +736,7 @@ def test_workers_end_with_the_command_that_was_killed(tmp_path):
 
 def test_other_options_or_input_are_other_parts(fleet):
     path, _ = fleet
-    source = sources.open_source(path)
+    source = sources.open_source(path, load_profile("servo")[0])
     part = fleet_tables.partitions(source, fleet_tables.find_tools(source), path.parent, print)[0]
     profile = load_profile("servo")[0]
     plan = Plan.of(source, profile, Options())
@@ -829,7 +834,7 @@ def test_partitions_are_of_whole_tools_and_bounded(tmp_path, monkeypatch, batch)
     path = write_fleet(
         tmp_path / "runs.parquet", {i: short_run(i) for i in range(9)}, row_group_size=37
     )
-    source = sources.open_source(path)
+    source = sources.open_source(path, load_profile("servo")[0])
     tools = fleet_tables.find_tools(source)
     assert tools.count == 9
     assert tools.together

@@ -121,7 +121,8 @@ def test_screen_and_page_name_the_doubtful_tools(tmp_path):
     assert "! repeated-readings in 1 tool: copies" in ran.err
     assert "All calibrated" not in page
     assert "Some doubtful" in page
-    assert "accelerometer residuals in 4 tools" in page
+    assert "4 tools doubtful: residuals of the accelerometer are larger" in page
+    assert "5 doubtful, none verified yet" in page
     assert "looks-like" not in ran.out + ran.err
     ran, _ = said(tmp_path, runs, "--json")
     first = ran.json["findings"][0]

@@ -40,7 +40,8 @@ def small_fleet(folder, mixed=False):
 
 def fleet(path, *options):
     output = path.with_name("cals.parquet")
-    given = ("--tool", "servo", "--method", "least-squares", "--workers", 1, *options)
+    given = ("--tool", "servo", "--method", "least-squares", "--workers", 1)
+    given += ("--no-records", *options)
     return mwdcal("fleet", path, "-o", output, *given), output
 
 

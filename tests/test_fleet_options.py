@@ -384,7 +384,7 @@ def test_an_option_that_both_commands_have_is_one():
     from mwdcal.app.commands import fleet as table
 
     calibrate, fleet = ({p.name: p for p in module.command.params} for module in (run, table))
-    own = {"runs", "workers", "scheduler"}
+    own = {"runs", "workers", "scheduler", "records", "calibrations"}
     assert set(fleet) - set(calibrate) == own
     assert set(calibrate) - set(fleet) == {"run", "exclude", "decimal"}
     for name in ("method", "robust", "estimate", "ignore", "parameters", "order", "nonlinearity"):

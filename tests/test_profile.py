@@ -10,6 +10,7 @@ from cli_support import mwdcal, numbers, read_csv, refused, servo_run, write_csv
 from mwdcal.calibration.readings import TRIADS
 from mwdcal.files.profiles import load_profile
 from mwdcal.geometry.observables import RESULTS
+from mwdcal.geometry.vectors import tool_from_earth
 from mwdcal.identification.columns import meaning
 from mwdcal.identification.wiring import is_clear, wiring
 
@@ -120,6 +121,20 @@ OPEN = {
         renamed(changed(temperature_c=np.full(48, 77.0)), temperature_c="Temp"),
         "neither its name nor its values say whether it is in °C or °F or K",
     ),
+    "gal or milli-g": (
+        renamed(changed(ref_gravity_g=np.full(48, 981.2)), ref_gravity_g="Gtotal"), "in g or mg or m/s²",
+    ),
+    "a measured gravity": (
+        renamed(changed(ref_gravity_g=1 + 1e-3 * np.arange(48) / 47), ref_gravity_g="Gtotal (g)"),
+        "differs between stations by 1 mg",
+    ),
+    "cold and hot in °F": (
+        renamed(changed(temperature_c=np.linspace(14, 248, 48)), temperature_c="Temp"), "in °C or °F or K",
+    ),
+    "two units in a triad": (renamed(servo_run(), ax="Gx (mg)", ay="Gy (mg)", az="Gz (g)"), "'Gx (mg)' is in mg"),
+    "another unit of noise": (
+        renamed(changed(sd_mx=np.full(48, 1.0)), mx="mx (nT)", sd_mx="sd_mx (uT)"), "'mx (nT)' is in nT, 'sd_mx (uT)'",
+    ),
     "no unit of angles": (
         renamed(changed(ref_inclination_deg=np.radians(servo_run()["ref_inclination_deg"])),
                 ref_inclination_deg="Inc"),
@@ -154,6 +169,86 @@ def test_a_comma_that_may_separate_thousands_is_asked(tmp_path):
     path.write_text(path.read_text().replace(".0;", ";").replace(".0\n", "\n"))
     message = refused(mwdcal("profile", path, "-o", tmp_path / "tool.toml"), 3)
     assert "may be a decimal sign or separate thousands" in message
+
+
+def test_a_point_that_may_separate_thousands_is_asked(tmp_path):
+    run = {k: np.round(v) for k, v in servo_run().items()}
+    raw = {k: [cell.replace(",", ".") for cell in v] for k, v in thousands(servo_run()).items()}
+    path = write_csv(tmp_path / "run.csv", {**run, **raw}, delimiter=";")
+    path.write_text(path.read_text().replace(".0;", ";").replace(".0\n", "\n"))
+    message = refused(mwdcal("profile", path, "-o", tmp_path / "tool.toml"), 3)
+    assert "the point in" in message
+
+
+def test_three_decimals_below_one_do_not_separate_thousands(tmp_path):
+    run = {
+        k: v if k == "station" else [f"{x:.3f}".replace(".", ",") for x in v]
+        for k, v in servo_run().items()
+    }
+    path = write_csv(tmp_path / "run.csv", run, delimiter=";")
+    ran = mwdcal("profile", path, "-o", tmp_path / "tool.toml", "--json")
+    assert ran.code == 0, ran.err
+    assert ran.json["table"]["decimal"] == ","
+
+
+@pytest.mark.parametrize("line", ["Azimuth reference: True North", "Azimut rechtweisend;;;"])
+def test_north_by_a_line_above_the_table(tmp_path, line):
+    path = write_csv(tmp_path / "run.csv", servo_run(), delimiter=";")
+    text = path.read_text()
+    path.write_text(f"{line}\n{text}")
+    message = refused(mwdcal("profile", path, "-o", tmp_path / "tool.toml"), 3)
+    assert "true or grid north by the line" in message
+    path.write_text(f'# azimuth_reference = "magnetic"\n{line}\n{text}')
+    assert mwdcal("profile", path, "-o", tmp_path / "tool.toml").code == 0
+
+
+def test_a_column_from_true_north_with_its_declination_is_taken(tmp_path):
+    run = renamed(servo_run(), ref_azimuth_deg="Azimuth true")
+    lines = ('azimuth_reference = "true"', "declination_deg = 0.0")
+    path = write_csv(tmp_path / "run.csv", run, *lines)
+    assert mwdcal("profile", path, "-o", tmp_path / "tool.toml").code == 0
+
+
+THEIRS = {"temperature_c": "Temp", "ax": "Gx", "ay": "Gy", "az": "Gz"}
+UNITS = {"Temp": "°C", "Gx": "mg", "Gy": "mg", "Gz": "mg"}
+
+
+@pytest.fixture
+def with_units(tmp_path):
+    """A table with a line of units below its names, and its profile."""
+    path = write_csv(tmp_path / "run.csv", renamed(servo_run(), **THEIRS))
+    _with_units(path, UNITS)
+    tool = tmp_path / "tool.toml"
+    ran = mwdcal("profile", path, "-o", tool, "--json")
+    assert ran.code == 0, ran.err
+    assert ran.json["table"]["first_line"] == 3
+    assert ran.json["accelerometer"]["scale"] == pytest.approx(3.0, rel=0.1)
+    return path, tool
+
+
+def _with_units(path, units):
+    names, *rows = path.read_text("utf-8").splitlines()
+    line = ",".join(units.get(name, "") for name in names.split(","))
+    path.write_text("\n".join([names, line, *rows]) + "\n", "utf-8")
+
+
+def test_a_table_without_the_line_of_units_does_not_lose_a_station(with_units, tmp_path):
+    _, tool = with_units
+    other = write_csv(tmp_path / "other.csv", renamed(servo_run(2), **THEIRS))
+    message = refused(mwdcal("calibrate", other, "--tool", tool, "-o", tmp_path / "cal.json"), 2)
+    assert "other.csv, line 2: readings that by first_line = 3" in message
+
+
+@pytest.mark.parametrize("unit", [{"Temp": "°F"}, {"Gx": "g"}])
+def test_other_units_below_the_names_are_refused(with_units, tmp_path, unit):
+    path, tool = with_units
+    path.write_text(path.read_text().replace(path.read_text().splitlines()[1] + "\n", ""))
+    _with_units(path, UNITS | unit)
+    message = refused(mwdcal("calibrate", path, "--tool", tool, "-o", tmp_path / "cal.json"), 2)
+    assert (
+        f"line 2: '{next(iter(unit))}' is in {next(iter(unit.values()))}, by the tool profile"
+        in message
+    )
 
 
 def test_mixed_decimal_signs_are_refused(tmp_path):
@@ -191,6 +286,47 @@ def test_an_axis_without_variation_stays_open():
     result = wiring(field * 2.0, field)
     assert not is_clear(result)
     assert sorted(result.alternatives) == [("+x", "+y", "+z"), ("+x", "+y", "-z")]
+
+
+def attitudes(*turns):
+    """North and down along the tool axes (n, 3), at attitudes in degrees."""
+    turn = tool_from_earth(*np.radians(np.broadcast_arrays(*turns)))
+    return turn[..., 0], turn[..., 2]
+
+
+def test_a_sign_that_the_dip_alone_would_tell_stays_open():
+    north, down = attitudes(np.repeat([45.0, 90.0], 12), 30.0, np.tile(np.arange(0, 360, 30), 2))
+    field = north * np.cos(np.radians(65)) + down * np.sin(np.radians(65))
+    result = wiring(field * 3.0, north, down)
+    assert not is_clear(result)
+    assert sorted(result.alternatives) == [("+x", "+y", "+z"), ("+x", "+y", "-z")]
+    assert is_clear(wiring(field * 3.0, field))
+
+
+def test_few_stations_never_tell_wrong_axes():
+    rng = np.random.default_rng(5)
+    told = 0
+    for case in range(300):
+        angles = rng.uniform([0, 0, 0], [180, 360, 360], (5 + case % 4, 3)).T
+        angles[1] = angles[1, 0] if case % 2 else angles[1]
+        north, down = attitudes(*angles)
+        dip = np.radians(rng.uniform(-85, 85))
+        raw = (north * np.cos(dip) + down * np.sin(dip)) @ (
+            np.eye(3) + 0.02 * rng.normal(size=(3, 3))
+        )
+        result = wiring(raw, north, down)
+        told += is_clear(result)
+        assert not is_clear(result) or result.axes == ("+x", "+y", "+z"), case
+    assert told > 100
+
+
+def test_a_left_handed_triad_is_said_to_be_one(tmp_path):
+    run = changed(mx=None, my=None, mz=None)
+    run["ref_toolface_deg"] = 360 - run["ref_toolface_deg"]
+    path = write_csv(tmp_path / "run.csv", run)
+    ran = mwdcal("profile", path, "-o", tmp_path / "tool.toml")
+    assert ran.code == 0
+    assert "left-handed" in ran.err
 
 
 # -------------------------------------------------------------------------- names and files
@@ -329,11 +465,12 @@ def test_what_is_no_table_ends_in_one_sentence(tmp_path, content, status):
     assert not (tmp_path / "tool.toml").exists()
 
 
-def test_angles_computed_from_the_readings_are_no_reference(tmp_path):
+@pytest.mark.parametrize("decimals", [12, 3, 2])
+def test_angles_computed_from_the_readings_are_no_reference(tmp_path, decimals):
     """A tool that writes its inclination beside the raw channels, and nothing of the stand."""
     run = servo_run()
     across = np.hypot(run["ax"], run["ay"])
-    run["ref_inclination_deg"] = np.degrees(np.arctan2(across, run["az"]))
+    run["ref_inclination_deg"] = np.round(np.degrees(np.arctan2(across, run["az"])), decimals)
     path = write_csv(tmp_path / "run.csv", renamed(run, ref_inclination_deg="Inc (deg)"))
     message = refused(mwdcal("profile", path, "-o", tmp_path / "tool.toml"), 3)
     assert "computed from them" in message

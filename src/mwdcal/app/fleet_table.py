@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import time
 from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -28,6 +30,7 @@ from mwdcal.calibration.prior import DATASHEET, profile_for
 from mwdcal.errors import InputError, reason
 from mwdcal.files import profiles, synonyms
 from mwdcal.files.formats import atomic, parquet
+from mwdcal.files.formats.members import RECORD
 from mwdcal.fleet import kept
 from mwdcal.fleet.parts import Plan, load, solve
 from mwdcal.fleet.sources import SERIAL, FleetTable, check_unchanged, open_source
@@ -35,6 +38,8 @@ from mwdcal.fleet.tables import Partition, Tools, find_tools, in_several_folders
 from mwdcal.sensor.profile import Profile
 from mwdcal.use.correction_numba import cores
 
+RECORDED = 500
+"""Most tools of a fleet whose table holds their whole calibrations unless asked otherwise."""
 EVERY = 5.0
 """Seconds between two lines of progress."""
 NEEDED_AT_THE_END = ("pyarrow.compute", "rich.console", "rich.table")
@@ -48,22 +53,28 @@ def calibrate_table(
     typed: Typed,
     workers: int | None,
     scheduler: str | None,
+    records: bool | None,
     say: Callable[[str], None],
 ) -> FleetSummary:
-    """Calibrate every tool of the table; the output is written at the end, as a whole."""
+    """Calibrate every tool of the table; the output is written at the end, as a whole.
+
+    `records`: whether it holds the whole calibration of each tool; by default that of a few.
+    """
     begun = time.perf_counter()
     profile, digest = profiles.load_profile(tool)
     options = _options(typed, profile)
-    source = open_source(runs)
+    source = open_source(runs, profile, progress.slowly(say, EVERY))
     if max(options.orders) and "temperature_c" not in source.columns:
         raise no_temperature(max(options.orders))
     unused = unused_columns(synonyms.unused(source.columns, source.used))
     target = atomic.target(output)
     _check_target(target, runs)
-    plan = Plan.of(source, profile, options)
-    steps = pool.Steps(partial(load, plan), partial(solve, plan))
     with _place_of_parts(target, output) as folder:
         tools = find_tools(source)
+        plan = Plan.of(source, profile, options)
+        if records or (records is None and tools.count <= RECORDED):
+            plan = _with_records(plan, digest, runs)
+        steps = pool.Steps(partial(load, plan), partial(solve, plan))
         whole = partitions(source, tools, folder, say)
         parts = {folder / f"{plan.key(part)}.arrow": part for part in whole}
         done = _finished(parts, tools, source, say)
@@ -80,12 +91,21 @@ def calibrate_table(
         notes=[*source.notes, *in_several_folders(source, tools)],
         runs=runs.name,
         output=str(output),
-        stations=source.rows,
+        stations=source.stations,
         parts=len(parts),
         parts_done_before=len(done),
         seconds=round(time.perf_counter() - begun, 3),
         unused=unused,
     )
+
+
+def _with_records(plan: Plan, profile_sha256: str, runs: Path) -> Plan:
+    """The plan with the whole calibration of each tool, which states where it comes from."""
+    runs_sha256 = ""
+    if runs.is_file():
+        with runs.open("rb") as stream:
+            runs_sha256 = hashlib.file_digest(stream, "sha256").hexdigest()
+    return replace(plan, records=True, profile_sha256=profile_sha256, runs_sha256=runs_sha256)
 
 
 @contextlib.contextmanager
@@ -109,7 +129,7 @@ def _finished(
 ) -> set[Path]:
     """The parts that were done before; says how many there are, and are to do again."""
     done, damaged = kept.finished(paths)
-    fleet = f"{plural(tools.count, 'tool')}, {plural(source.rows, 'station')}"
+    fleet = f"{plural(tools.count, 'tool')}, {plural(source.stations, 'station')}"
     say(f"{fleet}, {plural(len(paths), 'part')}, {len(done)} done before")
     if damaged:
         say(f"! {plural(damaged, 'part')} done before, but damaged: computed again")
@@ -215,8 +235,15 @@ def _merge(
             for part in parts:
                 if writer is None:
                     schema = part.schema.with_metadata(described)
-                    texts = [f.name for f in schema if not arrow.types.is_floating(f.type)]
-                    writer = pq.ParquetWriter(stream.name, schema, use_dictionary=texts)
+                    texts = [
+                        f.name
+                        for f in schema
+                        if not arrow.types.is_floating(f.type) and f.name != RECORD
+                    ]
+                    packing = {n: "zstd" if n == RECORD else "snappy" for n in schema.names}
+                    writer = pq.ParquetWriter(
+                        stream.name, schema, use_dictionary=texts, compression=packing
+                    )
                 writer.write_table(part.cast(writer.schema))
             _close(writer)
         except OSError as error:

@@ -202,29 +202,32 @@ def _with_noise(covariance: Array, free: Array, count: int) -> tuple[Array, Arra
 
 
 @dataclass(frozen=True)
-class AccuracyMap:
-    """1σ over the attitude sphere: root mean square over toolface.
+class AccuracyCurve:
+    """1σ (n,) of an angle over inclination, radians: root mean square over toolface.
 
-    `sd` holds (inclination, azimuth) arrays by angle, radians; NaN where an angle rests on
-    a direction that no evidence determines.
+    `typical`: over azimuth too; `least` and `largest`: at the best and the worst azimuth. NaN where
+    no uncertainty can be stated at some azimuth or toolface, as in `Calibration.uncertainty`.
     """
 
-    inclination: Array
-    azimuth: Array
-    sd: dict[str, Array]
+    typical: Array
+    least: Array
+    largest: Array
 
 
-def accuracy_map(calibration: Calibration) -> AccuracyMap:
-    """1σ of the calibration from 2 to 178° inclination."""
-    inclination = np.radians(np.linspace(2, 178, 45))
-    azimuth = np.radians(np.linspace(0, 360, 25))
-    grid = np.meshgrid(inclination, azimuth, indexing="ij")
+def accuracy_curves(
+    calibration: Calibration, inclination: Array, noise: bool = False
+) -> dict[str, AccuracyCurve]:
+    """1σ by angle at inclinations (n,), radians: of the calibration, or of one reading too."""
+    grid = np.meshgrid(inclination, TWELFTHS, indexing="ij")
     square = {name: np.zeros(grid[0].shape) for name in angles(calibration)}
     for toolface in TWELFTHS:  # one at a time, for memory
         readings = readings_at(calibration, *grid, toolface)
         for name, total in square.items():
-            total += calibration.uncertainty(name, readings) ** 2 / len(TWELFTHS)
-    return AccuracyMap(inclination, azimuth, {name: np.sqrt(s) for name, s in square.items()})
+            total += calibration.uncertainty(name, readings, noise) ** 2 / len(TWELFTHS)
+    return {
+        name: AccuracyCurve(np.sqrt(s.mean(-1)), np.sqrt(s.min(-1)), np.sqrt(s.max(-1)))
+        for name, s in square.items()
+    }
 
 
 def accuracy_at(

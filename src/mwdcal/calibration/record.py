@@ -367,8 +367,13 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
         """Whether the magnetometer was calibrated to a field of one."""
         return self.has_field and self.field_unit != NANOTESLA
 
+    @property
+    def thermal(self) -> bool:
+        """Whether the calibration has temperature terms."""
+        return any(triad.order for triad in self.triads)
+
     def _temperature(self, readings: Readings) -> Array:
-        if readings.temperature is None and any(t.order for t in self.triads):
+        if readings.temperature is None and self.thermal:
             raise InputError(
                 f"{readings.name}: the calibration has temperature terms, and the "
                 "column 'temperature_c' is missing or blank. Add it, or calibrate with `order` 0."
@@ -541,7 +546,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
 
         A calibration without temperature terms holds for the soak it was made in: `SOAK_GAP`.
         """
-        return MARGIN if any(t.order for t in self.triads) else SOAK_GAP
+        return MARGIN if self.thermal else SOAK_GAP
 
     def outside(self, readings: Readings, margin: float | None = None) -> Bools:
         """Stations (…, n) outside the calibrated temperature range by more than a margin, °C.

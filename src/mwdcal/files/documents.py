@@ -16,7 +16,7 @@ import msgspec
 from mwdcal.calibration.diagnosis.soundness import check
 from mwdcal.calibration.record import SCHEMA_VERSION, Calibration, document_sha256, sealed
 from mwdcal.errors import InputError, reason
-from mwdcal.files.formats import atomic
+from mwdcal.files.formats import atomic, members
 from mwdcal.files.profiles import check_profile
 
 _DIGITS = 30
@@ -26,8 +26,13 @@ _UNREADABLE = "No command would read such a file: calibrate again, or correct th
 
 
 def encode(calibration: Calibration) -> bytes:
-    """The bytes of a calibration file: two spaces of indent, one newline at the end."""
-    return msgspec.json.format(msgspec.json.encode(calibration), indent=2) + b"\n"
+    """The bytes of a calibration file."""
+    return laid_out(msgspec.json.encode(calibration))
+
+
+def laid_out(record: bytes) -> bytes:
+    """JSON as a calibration file has it: two spaces of indent, one newline at the end."""
+    return msgspec.json.format(record, indent=2) + b"\n"
 
 
 def write(path: str | os.PathLike[str], calibration: Calibration) -> None:
@@ -45,12 +50,14 @@ def read(path: str | os.PathLike[str]) -> Calibration:
 
 
 def load(path: str | os.PathLike[str]) -> tuple[Calibration, str]:
-    """A calibration file, and the SHA-256 of its bytes."""
-    name = Path(path).name
-    try:
-        data = Path(path).read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({reason(error)}). Check the path.") from None
+    """A calibration file, and the SHA-256 of its bytes.
+
+    `cals.parquet#SERIAL` is the calibration of one tool in the table of a fleet; the SHA-256 is that of the table.
+    """
+    file, _ = members.split(path)
+    data, name, digest = (
+        members.read(path) if file.suffix.lower() == members.SUFFIX else _whole_file(file)
+    )
     try:
         calibration = _decoded(data, name)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
@@ -59,7 +66,16 @@ def load(path: str | os.PathLike[str]) -> tuple[Calibration, str]:
         ) from None
     check(calibration, name, _AS_WRITTEN)
     check_profile(calibration.profile, name)
-    return calibration, hashlib.sha256(data).hexdigest()
+    return calibration, digest
+
+
+def _whole_file(path: Path) -> members.Member:
+    """The bytes of a calibration file, its name and its digest."""
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({reason(error)}). Check the path.") from None
+    return members.Member(data, path.name, hashlib.sha256(data).hexdigest())
 
 
 def _decoded(data: bytes, name: str) -> Calibration:

@@ -10,6 +10,7 @@ import os
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -25,14 +26,16 @@ from mwdcal.files.contract import (
     Range,
     check_columns,
     magnetic_offset,
+    units_of,
 )
 from mwdcal.files.faults import BlankReadingError as BlankReadingError
 from mwdcal.files.faults import Cells, columns_of, faults, faults_beside_readings, refuse
 from mwdcal.files.formats import table as tables
 from mwdcal.files.formats.columns import LABELS, Column, shown
+from mwdcal.files.formats.dialect import holds_numbers
 from mwdcal.files.formats.table import Table, labels
 from mwdcal.geometry.vectors import Array
-from mwdcal.sensor.profile import ColumnSource, Profile, TriadProfile
+from mwdcal.sensor.profile import ColumnSource, Profile, TableFormat, TriadProfile
 
 ROWS_OF_LOG = 1000
 """Rows of a table with times from which it is a log."""
@@ -66,6 +69,7 @@ def read_export(
     try:
         table = tables.read(path, rows=rows, export=form)
         if is_export(table.columns, profile):
+            _check_below_names(path, form, profile)
             return table
         problem = _not_as_stated(table, profile)
     except InputError as error:
@@ -78,6 +82,26 @@ def read_export(
         f"{problem} If the table is laid out otherwise than the tool profile says, correct [table] there, "
         "or propose a profile for it: mwdcal profile."
     )
+
+
+def _check_below_names(path: str | os.PathLike[str], form: TableFormat, profile: Profile) -> None:
+    """Refuse readings in a line that is not read, and units other than the profile's in a line of units."""
+    if form.first_line == form.header_line + 1:
+        return
+    (_, names), *skipped = tables.below_names(path, form) or [(0, [])]
+    theirs = {each.name: each.unit for each in _sources(profile).values() if each.unit}
+    for line, cells in skipped:
+        where = f"{Path(path).name}, line {line}"
+        if holds_numbers(cells):
+            raise InputError(
+                f"{where}: readings that by first_line = {form.first_line} of the tool profile would not be read."
+            )
+        for name, unit in zip(names, map(synonyms.unit_of, cells), strict=False):
+            if unit and unit != theirs.get(name.strip(), unit):
+                raise InputError(
+                    f"{where}: {shown(name.strip())} is in {unit}, by the tool profile in "
+                    f"{theirs[name.strip()]}."
+                )
 
 
 def _sources(profile: Profile) -> dict[str, ColumnSource]:
@@ -125,7 +149,10 @@ def renamed(table: Table, profile: Profile) -> Table:
         column = theirs.get(name, name)
         columns[column] = cells
         if name in theirs and column not in LABELS:
-            factor, offset = synonyms.FACTORS.get(sources[column].unit, (1.0, 0.0))
+            unit = (
+                sources[column].unit if units_of(column) else ""
+            )  # that of a raw channel is a note
+            factor, offset = synonyms.FACTORS.get(unit, (1.0, 0.0))
             values = tables.numbers(table, name)
             columns[column] = values * factor + offset if (factor, offset) != (1.0, 0.0) else values
     return replace(table, columns=columns)

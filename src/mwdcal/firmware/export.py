@@ -101,8 +101,22 @@ def _fixed(calibration: Calibration, sha256: str, bits: int) -> FirmwareSources:
     )
     steps = fixed.triads[0].field, fixed.triads[-1].field
     limits = math.ldexp(weak[0], -steps[0]), math.ldexp(weak[1], -steps[1])
+    _check_north(calibration, bits, limits[1])
     files = _files("fixed", header, calibration, sha256, limits, fractions)
     return FirmwareSources(files, errors, fixed.work, fractions)
+
+
+def _check_north(calibration: Calibration, bits: int, weak: float) -> None:
+    """Refuse words in which the horizontal field of the calibration's place has no direction."""
+    if not calibration.has_field:
+        return
+    level = calibration.earth["field"] * math.cos(math.radians(calibration.earth["dip_deg"]))
+    if level <= vectors.CLEARLY * weak:
+        unit = statements.field_unit(calibration)
+        raise InputError(
+            f"in words of {bits} bits a field below {weak:.3g} {unit} has no direction, so that the horizontal one, "
+            f"{level:.3g} {unit}, has no azimuth. Use more `word_bits`, or form c-header."
+        )
 
 
 def _common(

@@ -45,6 +45,8 @@ _VECTOR_ATTITUDES = np.radians(
 """Inclination, azimuth, toolface (3, n)."""
 _QUANTITIES = {"g": "gravity", "nt": "field", "deg": "angle"}
 """The quantity of a column by the end of its name."""
+CLEARLY = 1.125
+"""A size so many times a limit, or less than the limit by as much, clearly is on its side."""
 _EXPECTED_DECIMALS = {"gravity": 10, "field": 5}
 
 
@@ -101,7 +103,7 @@ def status(columns: Mapping[str, Array], weak: tuple[float, float]) -> Ints:
     sizes = _sizes(columns)
     lacking = {name: sizes[name] <= limit for name, limit in limits.items()}
     lacking["NO_NORTH"] = lacking["NO_NORTH"] & ~lacking["VERTICAL"]
-    close = [np.abs(sizes[name] - limit) < limit / 8 for name, limit in limits.items()]
+    close = [np.abs(sizes[name] - limit) < (CLEARLY - 1) * limit for name, limit in limits.items()]
     codes = sum(flags * STATUS[name][0] for name, flags in lacking.items())
     return np.where(np.any(close, 0), -1, codes)
 

@@ -4,20 +4,23 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from typing import Any
 
 import msgspec
 import numpy as np
 
 from mwdcal import __version__
+from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.diagnosis.refusals import BAD_INPUT
 from mwdcal.calibration.options import AUTO, Options
 from mwdcal.calibration.readings import HIGHEST, TRIADS
-from mwdcal.errors import InputError
+from mwdcal.errors import InputError, MwdcalError
 from mwdcal.estimation.batch import put
 from mwdcal.files.contract import AZIMUTH_KEYS, CHANNELS
 from mwdcal.files.formats import parquet
+from mwdcal.files.formats.members import RECORD
 from mwdcal.fleet.calibrate import LISTS, OK, Outcome, calibrate_batch, names
 from mwdcal.fleet.runs import Rows, batches, refused_tools
 from mwdcal.fleet.sources import SERIAL, FleetTable
@@ -31,7 +34,11 @@ WHOLE_NUMBERS = ("rank", "size", "order")
 
 @dataclass(frozen=True)
 class Plan:
-    """What is to be done to every partition."""
+    """What is to be done to every partition.
+
+    `records`: the table gets the calibration file of each tool, with the digests of the profile and, where
+    it is one file, of the runs.
+    """
 
     source: str
     metadata: Mapping[str, object]
@@ -39,6 +46,9 @@ class Plan:
     profile: Profile
     options: Options
     version: str = __version__
+    records: bool = False
+    profile_sha256: str = ""
+    runs_sha256: str = ""
 
     @classmethod
     def of(cls, source: FleetTable, profile: Profile, options: Options) -> Plan:
@@ -80,7 +90,7 @@ def solve(plan: Plan, loaded: bytes) -> bytes:
         )
     arrow, _ = parquet.modules(plan.source)
     table = arrow.ipc.open_stream(loaded).read_all()
-    rows = Rows(table, plan.source, plan.metadata, plan.profile)
+    rows = Rows(table, plan.source, plan.metadata, plan.profile, plan.runs_sha256)
     return packed(_result(rows, plan))
 
 
@@ -126,7 +136,7 @@ def _table(rows: Rows, plan: Plan, whole: Outcome) -> Any:
             SERIAL: rows.serials,
             "status": arrow.array(whole.status, text),
             "message": arrow.array(whole.message, text),
-            "stations": arrow.array(rows.counts, arrow.int32()),
+            "stations": arrow.array(np.where(rows.unread, 0, rows.counts), arrow.int32()),
             "temperature_min_c": arrow.array(low, mask=np.isnan(low)),
             "temperature_max_c": arrow.array(high, mask=np.isnan(high)),
             **{name: lists[name] for name in LISTS[:2]},
@@ -136,8 +146,25 @@ def _table(rows: Rows, plan: Plan, whole: Outcome) -> Any:
             "method": arrow.repeat(plan.options.method, len(rows.counts)),
             "model": arrow.array(kinds[np.nan_to_num(order + 1).astype(int)], text),
             "order": _numbers("order", order),
+            **({RECORD: arrow.array(_records(rows, plan, whole), text)} if plan.records else {}),
         }
     )
+
+
+def _records(rows: Rows, plan: Plan, whole: Outcome) -> list[bytes | None]:
+    """What `mwdcal calibrate` writes for each sound tool, None for others; of its time the day.
+
+    So another run on the same day gives the same bytes.
+    """
+    records: list[bytes | None] = [None] * len(rows.counts)
+    for tool in np.flatnonzero(whole.status == OK).tolist():
+        readings, profile = rows.alone(tool)
+        readings = replace(readings, profile_sha256=plan.profile_sha256)
+        with suppress(MwdcalError):  # of a tool that is sound by a hair in the batch alone
+            calibration = calibrate(readings, profile, plan.options)
+            day = calibration.time.partition("T")[0]
+            records[tool] = msgspec.json.encode(msgspec.structs.replace(calibration, time=day))
+    return records
 
 
 def _numbers(name: str, values: Array) -> Any:

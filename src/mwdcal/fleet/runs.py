@@ -7,8 +7,9 @@ about a cell that a run file may not have is that of the tool's rows as a run.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,10 +20,12 @@ from mwdcal.errors import InputError, MwdcalError
 from mwdcal.files.contract import COLUMNS, RANGES
 from mwdcal.files.faults import faults
 from mwdcal.files.formats import parquet
-from mwdcal.files.formats.columns import as_text
+from mwdcal.files.formats.columns import as_text, shown
 from mwdcal.files.formats.table import Table
 from mwdcal.files.runs import convert, to_readings
+from mwdcal.fleet import run_files
 from mwdcal.fleet.choices import alike
+from mwdcal.fleet.run_files import FAULT, RUN_FILE
 from mwdcal.fleet.sources import AZIMUTH, OFFSET, SERIAL
 from mwdcal.fleet.tables import one_chunk
 from mwdcal.geometry.vectors import AnyArray, Array, Bools, Ints
@@ -33,12 +36,17 @@ GROUP, STATION = "group", "station"
 
 @dataclass(frozen=True)
 class Rows:
-    """The stations of T tools, the rows of each together: an Arrow table."""
+    """The stations of T tools, the rows of each together: an Arrow table.
+
+    `digest` is that of the file that all of them come from, if it is known.
+    """
 
     table: Any
     source: str
     metadata: Mapping[str, object]
     profile: Profile
+    digest: str = ""
+    _run_files: dict[str, Table] = field(init=False, repr=False, default_factory=dict)
 
     @cached_property
     def starts(self) -> Ints:
@@ -91,13 +99,61 @@ class Rows:
         arrow, _ = parquet.modules(self.source)
         part = self.table.slice(self.starts[tool], self.counts[tool])
         serial = part.column(SERIAL)[0].as_py()
+        if run := self._run(tool, str(serial)):
+            return to_readings(run, self.profile)
         lines = (part.column("#row").to_numpy() + 1).tolist()
         names = [name for name in part.column_names if name in COLUMNS]
         columns = {name: parquet.as_column(name, part.column(name), arrow) for name in names}
         place = self.source if self.source.endswith(".parquet") else f"{self.source}/*.parquet"
         source = f"serial {serial} of {place}"
         metadata = {**self.metadata, SERIAL: str(serial), **self._north(tool, source)}
-        return to_readings(Table(columns, metadata, source, lines), self.profile)
+        table = Table(columns, metadata, source, lines, self.digest)
+        return to_readings(table, self.profile)
+
+    def _run(self, tool: int, serial: str) -> Table | None:
+        """The run of a tool that comes from a run file; refuses one of several, or that cannot be read."""
+        paths = self._texts(RUN_FILE, tool)
+        if len(paths) > 1:
+            files = sorted(path or self.source for path in paths)
+            names = {Path(file).name for file in files}
+            each = sorted(names) if len(names) == len(files) else files
+            raise InputError(
+                f"the serial {shown(serial)} is that of {' and '.join(each)}. A run file is a whole run: correct "
+                "the serial in one of them, or take it out of the folder."
+            )
+        for fault in filter(None, self._texts(FAULT, tool)):
+            raise InputError(fault)
+        path = paths[0]
+        if path is None:
+            return None
+        if path not in self._run_files:
+            self._run_files[path] = run_files.read(Path(path), self.profile)
+        return run_files.run_of(self._run_files[path], serial)
+
+    def _texts(self, name: str, tool: int) -> list[str | None]:
+        """The different cells of a tool in a column of text."""
+        if name not in self.table.column_names:
+            return [None]
+        column = self.table.column(name).slice(self.starts[tool], self.counts[tool])
+        return list(column.unique().to_pylist())
+
+    @cached_property
+    def doubtful(self) -> Bools:
+        """Tools (T,) with rows in several run files, or in one that cannot be read."""
+        doubtful = np.zeros(len(self.counts), bool)
+        if RUN_FILE in self.table.column_names:
+            codes = one_chunk(self.table.column(RUN_FILE)).indices.fill_null(-1).to_numpy()
+            first = self.starts[:-1]
+            low, high = np.minimum.reduceat(codes, first), np.maximum.reduceat(codes, first)
+            doubtful = (low < high) | self.unread
+        return doubtful
+
+    @cached_property
+    def unread(self) -> Bools:
+        """Tools (T,) with a run file that cannot be read."""
+        if FAULT not in self.table.column_names:
+            return np.zeros(len(self.counts), bool)
+        return self.any(self.table.column(FAULT).is_valid().to_numpy())
 
     def members(self, tools: Ints) -> Alone:
         """The same for some tools, by place among these."""
@@ -133,7 +189,9 @@ def refused_tools(rows: Rows) -> dict[int, str]:
     for fault in faults(rows.numbers.get, rows.starts, rows.profile):
         wrong |= fault.cells.any(0)
     refused = {}
-    for tool in np.flatnonzero(rows.any(wrong) | (rows.offsets[1] > rows.offsets[0])):
+    for tool in np.flatnonzero(
+        rows.any(wrong) | (rows.offsets[1] > rows.offsets[0]) | rows.doubtful
+    ):
         try:
             rows.alone(int(tool))
         except MwdcalError as error:

@@ -1,13 +1,14 @@
-"""The input of a fleet: a Parquet file or a folder of them, and what they state about their rows.
+"""The input of a fleet: a table or a folder of tables and run files, and what they state about their rows.
 
 Names of folders (`serial=MWD-17`) state a column of the rows below them. The metadata of a file
-hold for its own rows: which north their azimuths count from becomes a column of the table.
+hold for its own rows: which north their azimuths count from becomes a column of the table. A run
+file that cannot be read is a tool with one row, which says why.
 """
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -21,9 +22,12 @@ from mwdcal.files import contract, synonyms
 from mwdcal.files.contract import REFERENCES, magnetic_offset
 from mwdcal.files.formats import parquet
 from mwdcal.files.formats.columns import LABELS, check_names
-from mwdcal.files.formats.table import check_file
+from mwdcal.files.formats.table import SUFFIXES, check_file
+from mwdcal.fleet import run_files
+from mwdcal.fleet.run_files import FAULT, RUN_FILE
+from mwdcal.fleet.run_files import SERIAL as SERIAL
+from mwdcal.sensor.profile import Profile
 
-SERIAL = "serial"
 OFFSET = "#offset"
 """Column of stated azimuth minus magnetic azimuth, °; there where a file's metadata say so."""
 AZIMUTH = REFERENCES["azimuth"].column
@@ -31,6 +35,11 @@ BLANK = ("", "__HIVE_DEFAULT_PARTITION__")
 """How folder names spell a blank cell."""
 LARGEST_GROUP = 20_000_000
 """Rows of the largest row group that is read; it is dealt as a whole."""
+PARQUET = ".parquet"
+HIDDEN = ("_", ".", "~$")
+"""How names begin of files and folders that are left alone: notes of systems and programs."""
+NAMES_SHOWN = 3
+"""Most files that a note names."""
 
 Keys = tuple[tuple[str, str | float | None], ...]
 Stamp = tuple[int, int, int]
@@ -41,10 +50,11 @@ DEALT: Stamp = (0, 0, 0)
 
 @dataclass(frozen=True)
 class Piece:
-    """One row group of a Parquet file.
+    """One row group of a Parquet file, or a run file.
 
     `keys` are the columns that its folders and its metadata state. `text`: its serials are
-    taken as text, because those of some file are.
+    taken as text, because those of some file are. `profile`: that by which a run file is read, as
+    JSON; empty for Parquet tables.
     """
 
     path: str
@@ -53,6 +63,7 @@ class Piece:
     rows: int
     keys: Keys
     text: bool = False
+    profile: str = ""
 
 
 @dataclass(frozen=True)
@@ -71,9 +82,14 @@ class FleetTable:
         return sum(piece.rows for piece in self.pieces)
 
     @property
+    def stations(self) -> int:
+        """The same without the rows of files that cannot be read."""
+        return sum(piece.rows for piece in self.pieces if FAULT not in dict(piece.keys))
+
+    @property
     def used(self) -> tuple[str, ...]:
         """The columns that a run has, and the serial."""
-        known = (*contract.COLUMNS, SERIAL, OFFSET)
+        known = (*contract.COLUMNS, SERIAL, OFFSET, RUN_FILE, FAULT)
         return tuple(name for name in self.columns if name in known)
 
     @property
@@ -94,19 +110,25 @@ class _File:
     offset: float
 
 
-def open_source(path: Path) -> FleetTable:
-    """The table at `path`, its columns checked; refuses what is not a table of many tools."""
-    paths = input_files(path)
-    files = [_look(file, path) for file in paths]
-    columns = files[0].columns
-    for file, described in zip(paths, files, strict=True):
-        if odd := sorted(set(described.columns) ^ set(columns)):
-            raise InputError(
-                f"{file}: all files of '{path.name}' must have the same columns; '{odd[0]}' is in some "
-                f"and not in others ({paths[0].name} …). Write the table again."
-            )
-    _check_columns(columns, path.name)
-    source = _joined(path.name, files)
+def open_source(
+    path: Path, profile: Profile, progress: Callable[[str], None] = lambda text: None
+) -> FleetTable:
+    """The table at `path`, its columns checked; refuses what is not a table of many tools.
+
+    Run files are read by the `profile`.
+    """
+    paths, others = input_files(path)
+    mixed = any(file.suffix.lower() != PARQUET for file in paths)
+    files = []
+    for count, file in enumerate(paths, 1):
+        files.append(_described(file, path, profile) if mixed else _look(file, path))
+        progress(f"file {count} of {len(paths)} read")
+    if not mixed:
+        _check_same_columns(path, paths, files)
+        _check_columns(files[0].columns, path.name)
+    elif not path.is_dir() and (fault := dict(files[0].pieces[0].keys).get(FAULT)):
+        raise InputError(str(fault))
+    source = _joined(path.name, files, _left_alone(others) if mixed else [])
     if source.rows == 0:
         raise InputError(f"{path.name}: the table has no rows. Add one row per station.")
     largest = max(piece.rows for piece in source.pieces)
@@ -118,50 +140,119 @@ def open_source(path: Path) -> FleetTable:
     return source
 
 
-def _joined(name: str, files: Sequence[_File]) -> FleetTable:
+def _check_same_columns(path: Path, paths: Sequence[Path], files: Sequence[_File]) -> None:
+    """Refuse Parquet files of which some have columns that others lack."""
+    for file, described in zip(paths, files, strict=True):
+        if odd := sorted(set(described.columns) ^ set(files[0].columns)):
+            raise InputError(
+                f"{file}: all files of '{path.name}' must have the same columns; '{odd[0]}' is in some "
+                f"and not in others ({paths[0].name} …). Write the table again."
+            )
+
+
+def _joined(name: str, files: Sequence[_File], notes: list[str]) -> FleetTable:
     """The table of all files: each with its own azimuths, and serials of one kind."""
-    columns, notes, pieces = files[0].columns, [], []
+    columns, pieces = [*dict.fromkeys(name for file in files for name in file.columns)], []
     text, offsets = any(file.text for file in files), sorted({file.offset for file in files})
     for file in files:
         stated: Keys = ((OFFSET, file.offset),) if any(offsets) else ()
         pieces += [replace(p, keys=(*p.keys, *stated), text=text) for p in file.pieces]
     if any(offsets):
-        columns = (*columns, OFFSET)
+        columns.append(OFFSET)
     if len(offsets) > 1:
         notes.append(
             f"azimuths count from {len(offsets)} norths, {offsets[0]:g}° to {offsets[-1]:g}° from "
             "magnetic: each file's metadata hold for its own rows."
         )
-    metadata = _agreed([file.metadata for file in files])
-    return FleetTable(name, tuple(pieces), columns, metadata, tuple(notes))
+    metadata = _agreed([file.metadata for file in files if FAULT not in file.columns])
+    return FleetTable(name, tuple(pieces), tuple(columns), metadata, tuple(notes))
+
+
+def _left_alone(others: Sequence[Path]) -> list[str]:
+    """What to say of files in a folder that are not tables."""
+    if not others:
+        return []
+    more = " …" if len(others) > NAMES_SHOWN else ""
+    names = ", ".join(file.name for file in others[:NAMES_SHOWN]) + more
+    kinds = f"{', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]}"
+    return [f"files left alone, as their names do not end in {kinds}: {len(others)} ({names})."]
 
 
 def _agreed(stated: Sequence[Mapping[str, object]]) -> dict[str, object]:
     """Metadata on which all files agree; a fleet is simulated if one file is."""
-    agreed = {k: v for k, v in stated[0].items() if all(k in s and s[k] == v for s in stated)}
+    first = next(iter(stated), {})
+    agreed = {k: v for k, v in first.items() if all(k in s and s[k] == v for s in stated)}
     return agreed | next(({"simulated": s["simulated"]} for s in stated if is_simulated(s)), {})
 
 
-def input_files(path: Path) -> list[Path]:
-    """The Parquet files of a table: itself, or all in a folder, in order of their names."""
-    if path.is_dir():
-        hidden = ("_", ".")
-        paths = sorted(
-            file
-            for file in path.rglob("*.parquet")
-            if file.is_file()
-            and not any(part.startswith(hidden) for part in file.relative_to(path).parts)
-        )
-        if not paths:
-            raise InputError(f"'{path}' is a folder without .parquet files. Name a Parquet table.")
-        return paths
-    check_file(path)
-    if path.suffix.lower() != ".parquet":
+def input_files(path: Path) -> tuple[list[Path], list[Path]]:
+    """The tables and run files at a path, itself or all in a folder, by name; and the other files there."""
+    if not path.is_dir():
+        check_file(path)
+        if path.suffix.lower() not in SUFFIXES:
+            raise InputError(
+                f"'{path}': a fleet is read from a file whose name ends in {', '.join(SUFFIXES)}, or a folder "
+                f"of such; got '{path.suffix or 'no suffix'}'. Convert the table, with a column '{SERIAL}'."
+            )
+        return [path], []
+    visible = sorted(
+        file
+        for file in path.rglob("*")
+        if file.is_file()
+        and not any(part.startswith(HIDDEN) for part in file.relative_to(path).parts)
+    )
+    paths = [file for file in visible if file.suffix.lower() in SUFFIXES]
+    for file in paths:
+        if str(file) != str(file).encode("utf-8", "ignore").decode():
+            raise InputError(f"{str(file)!r}: a name must be valid UTF-8. Rename the file.")
+    if not paths:
         raise InputError(
-            f"'{path}': a fleet is read from a Parquet file or a folder of them; got "
-            f"'{path.suffix or 'no suffix'}'. Convert the table, with a column 'serial'."
+            f"'{path}' is a folder without files that end in {', '.join(SUFFIXES)}. Name a table, or a "
+            "folder of run files."
         )
-    return [path]
+    return paths, [file for file in visible if file.suffix.lower() not in SUFFIXES]
+
+
+def _described(file: Path, root: Path, profile: Profile) -> _File:
+    """One file of a folder with run files; what is wrong with it is data."""
+    if file.suffix.lower() != PARQUET:
+        return _look_at_runs(file, root, profile)
+    try:
+        table = _look(file, root)
+        if SERIAL not in table.columns:
+            return _look_at_runs(file, root, profile)
+        _check_columns(table.columns, file.name)
+    except InputError as error:
+        return _refused(file, file.stem, error)
+    return table
+
+
+def _look_at_runs(file: Path, root: Path, profile: Profile) -> _File:
+    """The run of a tool, or those of many, in one file."""
+    stamp, serial = _stamp(file), dict(_keys(file, root)).get(SERIAL) or file.stem
+    try:
+        table = run_files.read(file, profile)
+        stated = run_files.serials(table, str(serial))
+        serial = stated[0] if len(stated) == 1 else serial
+        run_files.run_of(table, stated[0])
+        north = AZIMUTH in table.columns
+        offset = magnetic_offset(table.metadata, table.source) if north else 0.0
+    except InputError as error:
+        return _refused(file, str(serial), error)
+    keys: Keys = ((RUN_FILE, str(file.resolve())),)
+    if len(stated) == 1:
+        keys = (*keys, (SERIAL, serial))
+    known = msgspec.json.encode(profile).decode()
+    piece = Piece(str(file.resolve()), stamp, 0, table.count, keys, profile=known)
+    columns = tuple(dict.fromkeys((*table.columns, *dict(keys))))
+    return _File([piece], columns, dict(table.metadata), True, offset)
+
+
+def _refused(file: Path, serial: str, error: InputError) -> _File:
+    """A file that cannot be read as a tool with one row."""
+    path = str(file.resolve())
+    keys: Keys = ((RUN_FILE, path), (SERIAL, serial), (FAULT, str(error)))
+    return _File([Piece(path, _stamp(file), 0, 1, keys)], tuple(dict(keys)), {}, True, 0.0)
 
 
 def _look(file: Path, root: Path) -> _File:

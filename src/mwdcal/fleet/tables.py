@@ -16,12 +16,16 @@ from pathlib import Path
 from threading import Lock
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from mwdcal.errors import InputError, reason
+from mwdcal.files.contract import RANGES
 from mwdcal.files.formats import parquet
 from mwdcal.files.formats.columns import LABELS
-from mwdcal.fleet import kept
+from mwdcal.files.formats.table import labels
+from mwdcal.fleet import kept, run_files
+from mwdcal.fleet.run_files import FAULT, RUN_FILE
 from mwdcal.fleet.sources import (
     DEALT,
     OFFSET,
@@ -33,7 +37,10 @@ from mwdcal.fleet.sources import (
     pieces_of,
 )
 from mwdcal.geometry.vectors import Ints
+from mwdcal.sensor.profile import Profile
 
+TEXTS = (*LABELS, RUN_FILE, FAULT)
+"""Columns of text."""
 TOOL = "#tool"
 """Column of dealt rows: number of the tool, in order of first appearance."""
 ROW = "#row"
@@ -121,7 +128,10 @@ def one_chunk(column: Any) -> Any:
 def in_several_folders(source: FleetTable, tools: Tools) -> list[str]:
     """What to say of tools with rows in folders that state different values of a column."""
     numbers: dict[Any, int] = {}
-    stated = [tuple(k for k in p.keys if k[0] not in (SERIAL, OFFSET)) for p in source.pieces]
+    stated = [
+        tuple(k for k in p.keys if k[0] not in (SERIAL, OFFSET, RUN_FILE, FAULT))
+        for p in source.pieces
+    ]
     folder = np.array([numbers.setdefault(keys, len(numbers)) for keys in stated])
     if len(numbers) == 1:
         return []
@@ -346,38 +356,62 @@ def _reading(piece: Piece, columns: tuple[str, ...]) -> _Reading:
 
 
 def _batches(piece: Piece, columns: tuple[str, ...], size: int = 0) -> Iterator[Any]:
-    """The rows of a row group in tables, with the values that its folder names state."""
-    arrow, pq = parquet.modules(piece.path)
-    keys = dict(piece.keys)
-    wanted = [name for name in columns if name not in keys]
-    labels = [name for name in LABELS if name in wanted]
+    """The rows of a piece in tables, with the values that its folder names state."""
     if not Path(piece.path).exists():
         raise InputError(
             f"'{piece.path}': no such file on this machine. Workers on other machines must see "
             "the table, and the folder of the output, under the same paths."
         )
+    keys = dict(piece.keys)
+    wanted = [name for name in columns if name not in keys]
+    if RUN_FILE in keys:
+        yield _complete(_run_rows(piece, wanted), piece, columns)
+        return
+    arrow, pq = parquet.modules(piece.path)
+    present = pq.read_schema(piece.path).names if RUN_FILE in columns else wanted
+    encoded = [name for name in TEXTS if name in wanted and name in present]
     with (
         parquet.reading(piece.path),
-        pq.ParquetFile(piece.path, read_dictionary=labels) as file,
+        pq.ParquetFile(piece.path, read_dictionary=encoded) as file,
     ):
         for batch in file.iter_batches(size or BATCH, [piece.group], wanted):
             yield _complete(arrow.Table.from_batches([batch]), piece, columns)
 
 
+def _run_rows(piece: Piece, wanted: Sequence[str]) -> Any:
+    """The columns of a run file that a run has; one row without any where it cannot be read."""
+    arrow, _ = parquet.modules(piece.path)
+    if not piece.profile:
+        return arrow.table({"": arrow.nulls(piece.rows)})
+    profile = msgspec.json.decode(piece.profile, type=Profile)
+    table = run_files.read(Path(piece.path), profile)
+    names = [name for name in wanted if name in table.columns]
+    columns = {
+        name: arrow.array(run_files.numbers(table, name), from_pandas=True)
+        if name in RANGES
+        else arrow.array(labels(table, name), arrow.string())
+        for name in names
+    }
+    return arrow.table({"": arrow.nulls(table.count), **columns})
+
+
 def _complete(table: Any, piece: Piece, columns: tuple[str, ...]) -> Any:
-    """Rows with the columns that their piece states: labels as text, encoded, the rest as numbers."""
+    """Rows with the columns that their piece states: labels as text, encoded, the rest as numbers.
+
+    A column that the file lacks is blank.
+    """
     arrow, _ = parquet.modules(piece.path)
     stated = dict(piece.keys)
     arrays = {}
     for name in columns:
-        if name in stated:
-            kind = arrow.string() if name in LABELS else arrow.float64()
-            cells = arrow.repeat(arrow.scalar(stated[name], kind), len(table))
+        if name in stated or name not in table.column_names:
+            kind = arrow.string() if name in TEXTS else arrow.float64()
+            cells = arrow.repeat(arrow.scalar(stated.get(name), kind), len(table))
             table = table.append_column(name, cells)
         column = table.column(name)
         if name == SERIAL:
             column = _encoded(column, piece)
-        elif name in LABELS:
+        elif name in TEXTS:
             column = _texts(column, piece, name)
         elif name not in (TOOL, ROW):
             column = column.cast(arrow.float64(), safe=False)

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from mwdcal.errors import FitError
-from mwdcal.files.contract import MAPPED, RAW, REFERENCES, forms, units_of
+from mwdcal.files.contract import CHANNELS, MAPPED, RAW, REFERENCES, forms, units_of
 from mwdcal.files.formats.columns import shown
 from mwdcal.files.synonyms import Resemblance, resembled, unit_of
 from mwdcal.geometry.vectors import Array
@@ -45,16 +45,21 @@ _MEASURED = re.compile(
     re.IGNORECASE,
 )
 """Words of angles that the tool itself has measured: no references."""
-_OTHER_NORTH = re.compile(r"true|grid|geographi|wahr|gitter", re.IGNORECASE)
+_OTHER_NORTH = re.compile(r"true|grid|geogra|wahr|gitter|rechtweisend", re.IGNORECASE)
+_OF_NORTH = re.compile(r"north|nord|azi|azm|heading", re.IGNORECASE)
+"""Words of the north that azimuths count from."""
+_IN_BRACKETS = re.compile(r"[(\[]([^)\]]*)[)\]]\s*$")
 _BY_VALUE: dict[str, tuple[tuple[str, float, float], ...]] = {
-    "ref_gravity_g": (("g", 0.9, 1.1), ("m/s²", 9.0, 10.5), ("mg", 900.0, 1100.0)),
+    "ref_gravity_g": (("g", 0.9, 1.1), ("m/s²", 9.0, 10.5), ("mg", 990.0, 1010.0)),
     "ref_field_nt": (
         ("nT", 15_000.0, 80_000.0), ("µT", 15.0, 80.0), ("gauss", 0.15, 0.8), ("mT", 0.015, 0.08),
     ),
 }  # fmt: skip
-"""Units of quantities of which the Earth has but one range of values."""
+"""Units of quantities of which the Earth has but one range of values; 980 may be milli-g or gal."""
 COOLEST_FAHRENHEIT = 45.0
 """Numbers below it are degrees Celsius: no tool is calibrated below 7 °C alone."""
+HOTTEST_CELSIUS = 200.0
+"""Numbers above it may be degrees Fahrenheit: hardly a tool works above 200 °C."""
 
 Values = Callable[[str], Array | None]
 """The numbers of a column by its name; None where it holds no numbers."""
@@ -83,13 +88,23 @@ def meaning(name: str, unit: str = "") -> Resemblance | None:
         return None
     near = {form: column for column in MAPPED for form in forms(column)}
     spelt = next((near[form] for form in forms(plain) if form in near), None)
-    return resembled(plain) or (Resemblance(spelt) if spelt else None)
+    stated = _IN_BRACKETS.search(plain)
+    return resembled(plain) or (
+        Resemblance(spelt, unit_of(stated[1]) if stated else "") if spelt else None
+    )
 
 
 def proposed(
-    names: Sequence[str], units: Sequence[str], values: Values, source: str
+    names: Sequence[str],
+    units: Sequence[str],
+    values: Values,
+    source: str,
+    above: Sequence[str] = (),
+    north_is_stated: bool = False,
 ) -> tuple[dict[str, ColumnSource], set[str]]:
     """The columns of a table by the name that they have in a run file, and those with a unit by their values.
+
+    `above`: lines above the names. `north_is_stated`: the table's metadata say what azimuths count from.
 
     Raises:
         FitError: two columns of which each may be one of the run file's, a unit that neither name nor
@@ -108,12 +123,8 @@ def proposed(
                 name=name, unit=_unit(column, name, meanings[name].unit, values(name), source)
             )
     azimuth = chosen.get(REFERENCES["azimuth"].column)
-    if azimuth and _OTHER_NORTH.search(azimuth.name):
-        raise FitError(
-            f"{source}: {shown(azimuth.name)} counts from true or grid north. Put the lines "
-            '# azimuth_reference = "true" and # declination_deg = … above the table (east is positive), or '
-            "name the column without that word where it is magnetic."
-        )
+    if azimuth and not north_is_stated:
+        _check_north(azimuth.name, above, source)
     absent = [name for name in RAW[:3] if name not in chosen]
     if absent:
         raise FitError(
@@ -125,8 +136,37 @@ def proposed(
             f"{source}: of the magnetometers only {', '.join(n for n in RAW[3:] if n in chosen)} can be told by "
             "name. Name all three such as Bx, By, Bz or mx, my, mz."
         )
+    _check_units_of_triads(chosen, source)
     by_value = {c for c, each in chosen.items() if each.unit and not meanings[each.name].unit}
     return _labels(names, chosen) | chosen, by_value
+
+
+def _check_units_of_triads(chosen: Mapping[str, ColumnSource], source: str) -> None:
+    """Refuse channels of a triad, or their standard uncertainties, of which two state different units."""
+    for names in CHANNELS.values():
+        columns = [*names, *(f"sd_{name}" for name in names)]
+        stated = [chosen[c] for c in columns if c in chosen and chosen[c].unit]
+        other = next((each for each in stated if each.unit != stated[0].unit), None)
+        if other:
+            raise FitError(
+                f"{source}: {shown(stated[0].name)} is in {stated[0].unit}, {shown(other.name)} in {other.unit}. "
+                "Give the channels of a triad in one unit: their scale is one."
+            )
+
+
+def _check_north(name: str, above: Sequence[str], source: str) -> None:
+    """Refuse azimuths that by their name, or by a line above the table, count from true or grid north."""
+    line = next(
+        (each for each in above if _OTHER_NORTH.search(each) and _OF_NORTH.search(each)), ""
+    )
+    if not line and not _OTHER_NORTH.search(name):
+        return
+    said = f"by the line {shown(line)}" if line else "by its name"
+    raise FitError(
+        f"{source}: {shown(name)} counts from true or grid north {said}. Put the lines "
+        '# azimuth_reference = "true" and # declination_deg = … above the table (east is positive), or '
+        '# azimuth_reference = "magnetic" where it is magnetic.'
+    )
 
 
 def _one(column: str, candidates: Sequence[str], source: str) -> str:
@@ -169,7 +209,7 @@ def _maybe_radians(angles: Array) -> bool:
 
 
 def _maybe_fahrenheit(temperatures: Array) -> bool:
-    return bool(temperatures.min() >= COOLEST_FAHRENHEIT)
+    return bool(temperatures.min() >= COOLEST_FAHRENHEIT or temperatures.max() > HOTTEST_CELSIUS)
 
 
 def _open(name: str, column: str, allowed: Sequence[str], source: str) -> FitError:

@@ -11,9 +11,11 @@ import msgspec
 import numpy as np
 
 from mwdcal.calibration.readings import TRIADS, Readings
+from mwdcal.calibration.record import Finding
 from mwdcal.errors import FitError, InputError
-from mwdcal.files.contract import CHANNELS, MAPPED, units_of
+from mwdcal.files.contract import CHANNELS, MAPPED, REFERENCES, units_of
 from mwdcal.files.formats import table as tables
+from mwdcal.files.formats.columns import shown
 from mwdcal.files.formats.dialect import Export
 from mwdcal.files.formats.table import Table
 from mwdcal.files.metadata import toml
@@ -33,6 +35,10 @@ UNRELATED = 0.9
 """Readings of which even the best axes leave more than this share have nothing to do with the references."""
 SAME_ANGLE = np.radians(1e-4)
 """Inclinations of a stand never agree with raw readings to this, radians."""
+LAST_PLACES = (0.1, 0.01, 0.001)
+"""Units in the last place of angles, degrees."""
+SAME_GRAVITY = 2e-4
+"""A local gravity does not differ by more between stations, g; what tools measure does."""
 MOST_NAMED = 6
 """Alternatives that a message names."""
 
@@ -70,11 +76,15 @@ def propose(path: str | os.PathLike[str]) -> Proposal:
         except InputError:
             return None
 
-    columns, by_value = proposed(export.names, export.units, values, table.source)
+    stated = "azimuth_reference" in table.metadata
+    columns, by_value = proposed(
+        export.names, export.units, values, table.source, export.above, stated
+    )
     profile = Profile(name=Path(path).stem, table=form or msgspec.UNSET, columns=columns)
     run = renamed(table, profile)
     check_run(run)
     readings, _ = to_readings(run, profile)
+    _check_gravity(readings, columns)
     wirings = _wirings(run, readings)
     scales = {kind: _rounded(result.scale) for kind, result in wirings.items()}
     if readings.relative:
@@ -99,6 +109,8 @@ def propose(path: str | os.PathLike[str]) -> Proposal:
 def _is_documented(path: str | os.PathLike[str], export: Export) -> bool:
     """Whether a table, but for the names of its columns, is written as a run file is."""
     suffix, form = Path(path).suffix.lower(), export.form
+    if form.first_line != form.header_line + 1 and suffix != ".parquet":
+        return False
     if suffix in (".csv", ".tsv") and form.delimiter != {".csv": ",", ".tsv": "\t"}[suffix]:
         return False
     try:
@@ -143,19 +155,43 @@ def _wirings(run: Table, readings: Readings) -> dict[str, Wiring]:
     return results
 
 
+def _check_gravity(readings: Readings, columns: Mapping[str, ColumnSource]) -> None:
+    """Refuse a gravity that differs from station to station: the tool has measured it."""
+    gravity = readings.reference("gravity")
+    if np.ptp(gravity) <= SAME_GRAVITY:
+        return
+    name, apart = columns[REFERENCES["gravity"].column].name, 1000 * np.ptp(gravity)
+    raise FitError(
+        f"{readings.source}: {shown(name)} differs between stations by {apart:.2g} mg, as no local gravity does: "
+        "the tool has measured it. Remove the column, or put the gravity of the place into it."
+    )
+
+
 def _check_independent(readings: Readings, results: dict[str, Wiring]) -> None:
     """Refuse inclinations that were computed from the readings: they are no reference."""
     result = results["accelerometer"]
     permutation = TriadProfile(axes=result.axes).permutation  # type: ignore[arg-type]
     vectors = readings.accelerometer @ permutation.transpose()
     computed = OBSERVABLES["inclination"].value(vectors, vectors)
-    apart = np.abs(computed - readings.reference("inclination"))
-    if np.nanmax(apart) < SAME_ANGLE:
+    stated = readings.reference("inclination")
+    same = SAME_ANGLE + _last_place(stated[~np.isnan(stated)]) / 2
+    if np.nanmax(np.abs(computed - stated)) < same:
         raise FitError(
             f"{readings.source}: the inclinations are those that the readings themselves give, to "
-            f"{np.degrees(SAME_ANGLE):.1g}°: they were computed from them. A calibration needs the angles of the "
+            f"{np.degrees(same):.1g}°: they were computed from them. A calibration needs the angles of the "
             "stand: name their columns as references, such as 'Ref Inc'."
         )
+
+
+def _last_place(angles: Array) -> float:
+    """The unit in the last place, radians, of angles given to a hundredth or thousandth of a degree, else zero.
+
+    Stands that are read to a tenth or less agree with a sound tool by chance.
+    """
+    steps = {place: np.degrees(angles) / place for place in LAST_PLACES}
+    fine = (p for p, step in steps.items() if np.allclose(step, np.round(step), rtol=0, atol=1e-6))
+    place = next(fine, LAST_PLACES[0])
+    return 0.0 if place == LAST_PLACES[0] else float(np.radians(place))
 
 
 def _unknown(kind: str, absent: list[str], stations: int, readings: Readings) -> FitError:
@@ -201,6 +237,25 @@ def _choice(kind: str, result: Wiring) -> str:
         f"the readings leave the axes of the {kind} open: {named}{f' or {more} others' if more > 0 else ''}. "
         "Add stations at other inclinations and toolfaces, or write the axes into a profile."
     )
+
+
+def left_handed(proposal: Proposal) -> list[Finding]:
+    """A finding on triads whose channels x, y, z are a left-handed set by the axes proposed."""
+    triads = [
+        kind
+        for kind, result in proposal.wirings.items()
+        if np.linalg.det(TriadProfile(axes=result.axes).permutation) < 0  # type: ignore[arg-type]
+    ]
+    if not triads:
+        return []
+    return [
+        Finding(
+            id="left-handed",
+            text=f"{' and '.join(triads)}: by the axes proposed the channels x, y, z are a left-handed set. If the "
+            "tool is not built so, a reference angle counts the other way: toolface anticlockwise, or inclination "
+            "from below.",
+        )
+    ]
 
 
 def as_toml(proposal: Proposal, source: str) -> str:

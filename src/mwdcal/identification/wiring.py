@@ -18,6 +18,8 @@ EXPLAINED = 0.3
 """Largest share of the channels' variation that the right axes leave: misalignment, noise, bias."""
 ALTERNATIVE = 0.2
 """By how much less they leave than any others."""
+LEAST_WITHOUT, LEAST_RATIO = 0.1, 2.0
+"""A sign is told where without the component that tells it this share would be left, and so many times as much."""
 LEAST_STATIONS = 5
 
 
@@ -36,7 +38,8 @@ def wiring(raw: Array, *parts: Array) -> Wiring:
 
     `parts` (n, 3) each: components of the field at right angles to each other, which may come in unknown
     shares; the sign of the first is known. The scale is in raw units per unit of the field.
-    Singular: a channel or a component that hardly varies explains nothing; its axis and sign stay open.
+    Singular: a channel or a component that hardly varies explains nothing; its axis and sign stay open. So does the
+    sign where the other component explains the readings as well, as at two inclinations and one azimuth.
     """
     shares, sizes = np.ones((2, 3, 3)), np.zeros((3, 3))
     moved = raw - raw.mean(0)
@@ -48,13 +51,14 @@ def wiring(raw: Array, *parts: Array) -> Wiring:
         if not seen[0]:
             continue
         columns = design[:, seen]
-        slope, *_ = np.linalg.lstsq(columns, moved, rcond=1e-9)
+        slope, share = _line(columns, moved)
         sizes[:, axis] = np.linalg.norm(slope, axis=0)
-        left = np.sqrt(np.mean((moved - columns @ slope) ** 2, 0))
-        share = np.where(spread > 0.02 * spread.max(), left / np.maximum(spread, 1e-300), 1.0)
+        alive = spread > 0.02 * spread.max()
+        bare = _line(columns[:, 1:], moved)[1]
+        signed = (bare > np.maximum(LEAST_WITHOUT, LEAST_RATIO * share)) | (columns.shape[1] == 1)
         for sign in (0, 1):
             right = slope[0] > 0 if sign == 0 else slope[0] < 0
-            shares[sign, :, axis] = np.where(right, share, 1.0)
+            shares[sign, :, axis] = np.where(alive & (right | ~signed), share, 1.0)
     ranked = sorted(
         (float(np.sqrt(np.mean(shares[signs, range(3), order] ** 2))), order, signs)
         for order in permutations(range(3))
@@ -66,6 +70,18 @@ def wiring(raw: Array, *parts: Array) -> Wiring:
     return Wiring(
         _named(order, signs), scale, best, ranked[1][0], [_named(*each[1:]) for each in near]
     )
+
+
+def _line(columns: Array, moved: Array) -> tuple[Array, Array]:
+    """Slopes (K, 3) of the channels on columns (n, K), and the share of their variation that is left (3,).
+
+    Per degree of freedom: few stations do not seem explained by many columns.
+    """
+    count, width = columns.shape
+    slope, *_ = np.linalg.lstsq(columns, moved, rcond=1e-9)
+    spread = np.sqrt(np.sum(moved**2, 0) / (count - 1))
+    left = np.sqrt(np.sum((moved - columns @ slope) ** 2, 0) / (count - 1 - width))
+    return np.asarray(slope), np.asarray(np.minimum(left / np.maximum(spread, 1e-300), 1.0))
 
 
 def _named(order: tuple[int, ...], signs: tuple[int, ...]) -> tuple[str, ...]:

@@ -20,6 +20,7 @@ from mwdcal.library.tasks import (
 )
 from mwdcal.sensor.profile import Profile
 from mwdcal.use import plots as plots  # puts `plot` on calibrations
+from mwdcal.use import verdict_plots as verdict_plots  # and on verdicts
 
 __all__ = [
     "Calibration",

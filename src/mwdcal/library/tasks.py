@@ -317,7 +317,7 @@ def save(
 
 
 def load(path: Path) -> Calibration:
-    """Read a calibration file.
+    """Read a calibration file, or one tool in the table of a fleet: `cals.parquet#SERIAL`.
 
     Raises:
         InputError: the file cannot be read, is not a calibration file, or was damaged.

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import msgspec
 import numpy as np
+from msgspec.structs import replace
 
 from mwdcal.calibration.readings import is_simulated
 from mwdcal.calibration.record import Finding
@@ -23,10 +24,11 @@ from mwdcal.files.formats.columns import shown
 from mwdcal.files.formats.table import Table
 from mwdcal.files.logs import Say, silent
 from mwdcal.geometry.vectors import Array
-from mwdcal.logs import allan, noise_terms, regular
+from mwdcal.logs import allan, movement, noise_terms, regular
 from mwdcal.logs.allan import Kind, Moments
 from mwdcal.logs.clock import ANY, DURATION, RATE, SAME_DURATION, check_argument, is_number
 from mwdcal.logs.noise_terms import NoiseTerms
+from mwdcal.logs.standstill import Cells
 from mwdcal.sensor.profile import Profile
 
 KINDS = ("overlapping", "modified")
@@ -48,6 +50,7 @@ UNEVEN = 2.0
 COARSE = 0.5
 """Noise of one sample, in steps of the converter, below which the steps hide it."""
 DOUBTS = {
+    movement.NOT_AT_REST: "the tool was not at rest",
     "event": "a spike or a move",
     "misfit": "noise that the five terms do not describe",
     "slow": "less than a sample in a station",
@@ -157,11 +160,13 @@ def find_noise(
     if kind not in KINDS:
         raise InputError(f"`kind` must be {' or '.join(KINDS)}; got {kind!r}.")
     findings: list[Finding] = []
+    remarks: list[Finding] = []
     rows, rate = regular.section(log, sampling_hz, between, findings)
     samples = rows.stop - rows.start
     seconds = samples / rate
     station = _station_seconds(station_seconds, seconds, rate, log.source)
     channels: dict[str, ChannelNoise] = {}
+    cells: dict[str, Cells] = {}
     for name in (name for name in RAW if name in log.columns):
         say(f"Allan variances of {name}, {samples} samples")
         try:
@@ -169,11 +174,16 @@ def find_noise(
         except regular.UnusableChannelError as error:
             findings.append(Finding(id="channel-left-out", text=f"{error} It was left out."))
             continue
-        channel = _channel(name, *taken, station, kind, findings)
+        cells[name] = movement.cells_of(*taken)
+        channel = _channel(name, *taken, station, kind, remarks)
         channels[name] = channel if profile is None else _physical(name, channel, profile)
     if not channels:
-        remarks = " ".join(finding.text for finding in findings)
-        raise InputError(f"{log.source}: no channel that could be used. {remarks}")
+        reasons = " ".join(finding.text for finding in findings)
+        raise InputError(f"{log.source}: no channel that could be used. {reasons}")
+    moved = movement.movement(cells)
+    findings = moved + findings if moved else findings + remarks
+    if moved:
+        channels = {name: replace(c, doubts=[moved[0].id]) for name, c in channels.items()}
     withheld = _withheld(channels)
     return Noise(
         log=log.source,
@@ -357,7 +367,7 @@ def _physical(name: str, channel: ChannelNoise, profile: Profile) -> ChannelNois
     scale = getattr(profile, kind).scale
     if scale is None:
         return channel
-    return msgspec.structs.replace(channel, unit=PHYSICAL[kind], scale=float(scale))
+    return replace(channel, unit=PHYSICAL[kind], scale=float(scale))
 
 
 def _withheld(channels: dict[str, ChannelNoise]) -> dict[str, str]:

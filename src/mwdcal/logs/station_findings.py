@@ -13,6 +13,8 @@ from mwdcal.logs import standstill
 from mwdcal.logs.standstill import Activity, Standstills
 from mwdcal.logs.station_means import ChannelMean
 
+ALL_STILL = "all-still"
+"""The finding on a log that is one station."""
 MANY_SPIKES = 0.01
 """Share of spikes that is reported."""
 MOST_LISTED = 12
@@ -49,7 +51,7 @@ def about(rows: Rows, standstills: Standstills, seconds: float) -> Iterator[Find
         yield Finding(id="slow-movement", text=text)
     if len(start) == 1 and end[0] - start[0] > 0.9 * seconds:
         text = "the log stands still from end to end: one station. A calibration needs several attitudes."
-        yield Finding(id="all-still", text=text)
+        yield Finding(id=ALL_STILL, text=text)
     yield from _spikes(rows)
     for name, row in rows.items():
         yield from _unreliable(name, row)

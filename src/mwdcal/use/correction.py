@@ -142,7 +142,7 @@ def compiled(
     """The same columns by the compiled loops; None for few rows, or a model they do not have."""
     shape = readings.accelerometer.shape[:-1]
     triads = numbers(calibration)
-    unknown = readings.temperature is None and any(t.order for t in calibration.triads)
+    unknown = readings.temperature is None and calibration.thermal
     few = np.prod(shape) < (COMPILED_ROWS if least is None else least)
     if few or triads is None or unknown or not correction_numba.available():
         return None

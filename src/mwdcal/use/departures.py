@@ -43,13 +43,18 @@ TINY = 1e-15
 class Statistic:
     """Spread or error of an observable in a roll set, or error of one station: radians, g or nT.
 
-    `value` is without noise, `raw` with it; `where` says in words what was judged.
+    `value` is without noise, `raw` with it; `where` says in words what was judged, `label` which set.
+    `part` (k,): what the stations `index` show, noise included: errors, or departures from the
+    middle of the set.
     """
 
     value: float
     uncertainty: float
     raw: float
     where: str
+    index: Ints
+    part: Array
+    label: str = ""
     curve: Curve | None = None
 
 
@@ -172,10 +177,16 @@ class RollTest:
             return Departures(skipped="; ".join(apart))
         free = any(self._free_spread(name, s.index) for s in fit)
         unrolled = f"{wrong[0].label} was not rolled: {gaps[wrong[0].label]}" if wrong else ""
-        raws = ((s.label, float(np.ptp(self._centred(name, s.index)))) for s in wrong)
         statistics = [self._curve_of(name, s, False) for s in rolled]
-        statistics += [Statistic(raw, 0.0, raw, label) for label, raw in raws]
+        statistics += [self._unrolled(name, s) for s in wrong]
         return self._outcome(name, statistics, free, unrolled, apart)
+
+    def _unrolled(self, name: str, roll_set: RollSet) -> Statistic:
+        """Spread, with its noise, of a set that was not rolled."""
+        index, label = roll_set.index, roll_set.label
+        part = self._centred(name, index)
+        raw, middle = float(np.ptp(part)), (part.max() + part.min()) / 2
+        return Statistic(raw, 0.0, raw, label, index, part - middle, label)
 
     def error(self, name: str) -> Departures:
         """The largest noise-free departure from the reference: of rolled sets, and other stations.
@@ -217,12 +228,14 @@ class RollTest:
         inside = np.concatenate([s.index for s in whole]) if whole else ()
         alone = judged[~np.isin(judged, inside)]
         reference = np.hypot(self.readings.uncertainty(name), self._common(name))
-        error, sd = np.abs(self._error(name)), np.hypot(self._noise(name), reference)
-        each = zip(error[alone].tolist(), sd[alone].tolist(), alone, strict=True)
+        error, sd = self._error(name), np.hypot(self._noise(name), reference)
         return [self._curve_of(name, s, True) for s in whole] + [
-            Statistic(off, off_sd, off, f"station {self.readings.labels[i]}")
-            for off, off_sd, i in each
-        ]
+            Statistic(
+                abs(float(error[i])), float(sd[i]), abs(float(error[i])),
+                f"station {self.readings.labels[i]}", alone[k : k + 1], error[i : i + 1],
+            )
+            for k, i in enumerate(alone)
+        ]  # fmt: skip
 
     def _curve_of(self, name: str, roll_set: RollSet, error: bool) -> Statistic:
         """Noise-free spread, or largest error, of a rolled set."""
@@ -246,7 +259,11 @@ class RollTest:
                 f"{self.readings.source}: the uncertainties of {roll_set.label} are too far apart to judge "
                 f"its {name}. Check the columns sd_: they are in the unit of their column."
             )
-        return Statistic(value, float(np.hypot(noise, common)), raw, where, curve)
+        if not error:
+            curve, middle = roll_test.about_middle(curve)
+            part = part - middle
+        sd_value = float(np.hypot(noise, common))
+        return Statistic(value, sd_value, raw, where, index, part, roll_set.label, curve)
 
     def _reference_sd(self, name: str, roll_set: RollSet, error: bool) -> tuple[Array, float]:
         """Standard uncertainty of the reference: per station (k,), and what the set shares."""

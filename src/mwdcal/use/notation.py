@@ -14,11 +14,12 @@ M and b of degree n. The other pairs are quotients of polynomials, and are refus
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from mwdcal.calibration.prediction import middle_temperature
 from mwdcal.calibration.readings import TRIADS
 from mwdcal.calibration.record import FREE_SHARE, Calibration, TriadCalibration
 from mwdcal.errors import InputError
@@ -89,6 +90,42 @@ def convert(
         )
     at = calibration.reference_temperature if temperature is None else temperature
     return {triad.name: _one(calibration, triad, notation, at) for triad in calibration.triads}
+
+
+@dataclass(frozen=True)
+class ChannelCourse:
+    """Scale and bias (n, 3) of the channels of a triad at n temperatures, and their 1σ.
+
+    Units: `scale` in raw units per g, nT or field of one along the channel's own axis; `bias`, the reading
+    at zero field, in g, nT or fields, by the scale at the middle temperature. 1σ is NaN where the
+    value moves with a direction that no evidence determines.
+    """
+
+    scale: Array
+    scale_sd: Array
+    bias: Array
+    bias_sd: Array
+
+
+def channel_courses(
+    calibration: Calibration, temperatures: Sequence[float]
+) -> dict[str, ChannelCourse]:
+    """How scale and bias of each channel vary with temperature (n,), °C, by triad."""
+    middle = convert(calibration, "forward", middle_temperature(calibration))
+    at = [convert(calibration, "forward", temperature) for temperature in temperatures]
+    courses = {}
+    for name, reference in middle.items():
+        back = getattr(calibration.profile, name).permutation.transpose()
+        place = np.arange(3), np.abs(back).argmax(-1)
+        sign, unit = back[place], np.abs(reference.values["S"][place])
+        each = [notations[name] for notations in at]
+        courses[name] = ChannelCourse(
+            scale=np.stack([n.values["S"][place] * sign for n in each]),
+            scale_sd=np.stack([n.uncertainty["S"][place] for n in each]),
+            bias=np.stack([n.values["o"] / unit for n in each]),
+            bias_sd=np.stack([n.uncertainty["o"] / unit for n in each]),
+        )
+    return courses
 
 
 def _one(

@@ -1,31 +1,37 @@
 """Figures of a calibration, and the style of all figures: the same input, the same figure.
 
 A figure is a Matplotlib figure whose label says what it shows. Colours are told apart by
-colour-blind readers, and never carry a meaning alone: every series has a marker of its own and
-every contour its number.
+colour-blind readers, and never carry a meaning alone: every series has a marker or a
+line style of its own.
 """
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from mwdcal.calibration.prediction import AccuracyMap, accuracy_map, angles
+from mwdcal.calibration.prediction import (
+    TYPICAL,
+    accuracy_at,
+    accuracy_curves,
+    middle_temperature,
+)
+from mwdcal.calibration.readings import TRIADS, soaks
 from mwdcal.calibration.record import Calibration, ErrorRow, OrderScore, StationRow
 from mwdcal.calibration.residuals import RESHOOT
 from mwdcal.errors import InputError
 from mwdcal.geometry.observables import TITLES
-from mwdcal.geometry.vectors import AnyArray, Array
+from mwdcal.geometry.vectors import AnyArray, Array, Ints
+from mwdcal.use.notation import ChannelCourse, channel_courses
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.axis import Axis
-    from matplotlib.contour import ContourSet
     from matplotlib.figure import Figure
 
 BEFORE, AFTER, MARKED, BAND = "#6b7280", "#0072b2", "#d55e00", "#dbe7f0"
@@ -33,6 +39,12 @@ AXES = {"x": AFTER, "y": MARKED, "z": "#111827"}
 """Colours of the channels of a triad."""
 LINES: dict[str, Any] = {"x": "-", "y": (0, (5, 1.5)), "z": (0, (1.5, 1.2))}
 """Line styles of the channels of a triad."""
+POINT_NAMES = "points"
+"""Start of the gid of a line whose label names its points, below a first `_`, one on each line."""
+ACCURACY_OF = {"of the calibration alone": False, "of one reading: calibration and noise": True}
+"""What an accuracy is of, and whether the noise of one reading is in it."""
+TEMPERATURES = 41
+"""Points of a curve over temperature."""
 WIDTH = 7.1
 """Of a figure, inches."""
 NOTE: dict[str, Any] = {"textcoords": "offset points", "color": "#9a3d00", "fontsize": 7}
@@ -136,17 +148,40 @@ def stems(axes: Axes, where: AnyArray, heights: Array, **look: Any) -> None:
     axes.plot(np.repeat(where, 3), ends.ravel(), **look)
 
 
+def named_points(
+    axes: Axes, where: AnyArray, heights: Array, names: Iterable[str], *marker: str, **look: Any
+) -> None:
+    """Markers, each with a name that a page shows for a closer look."""
+    drawn = np.isfinite(heights)
+    shown = (" ".join(name.split()) for name, here in zip(names, drawn, strict=True) if here)
+    gid = f"{POINT_NAMES}-{sum(len(each.lines) for each in axes.figure.axes)}"
+    label = "\n".join(["_", *shown])
+    axes.plot(where[drawn], heights[drawn], *marker, gid=gid, label=label, **look)
+
+
 def _station_stems(
-    axes: Axes, rows: Sequence[StationRow], values: Sequence[float], colour: str, marker: str
+    axes: Axes,
+    rows: Sequence[StationRow],
+    values: Sequence[float],
+    unit: str,
+    colour: str,
+    marker: str,
 ) -> None:
     """Stems over the stations; the ones to re-shoot have a triangle and their label."""
     where, heights = np.arange(len(rows)), np.asarray(values, float)
     marked = np.array([row.reshoot for row in rows])
     small = 3.6 if len(rows) <= 80 else 2.2
     stems(axes, where, heights, color=colour, lw=0.7, alpha=0.6)
-    plain = where[~marked], heights[~marked]
-    axes.plot(*plain, marker, color=colour, ms=small, mfc="white", mew=0.9)
-    axes.plot(where[marked], heights[marked], "^", color=MARKED, ms=6)
+    names = np.array(
+        [
+            f"station {row.station}: {quantity(value, unit).replace('-', '−')}"
+            for row, value in zip(rows, heights.tolist(), strict=True)
+        ],
+        object,
+    )
+    plain: dict[str, Any] = {"color": colour, "ms": small, "mfc": "white", "mew": 0.9}
+    named_points(axes, where[~marked], heights[~marked], names[~marked], marker, **plain)
+    named_points(axes, where[marked], heights[marked], names[marked], "^", color=MARKED, ms=6)
     for index in np.flatnonzero(marked & ~np.isnan(heights)).tolist():
         _name_station(axes, index, float(heights[index]), rows[index].station)
     axes.grid(axis="x", visible=False)
@@ -173,71 +208,67 @@ def _station_axis(axes: Axes, labels: Sequence[str]) -> None:
     axes.set_xlabel("station")
 
 
-def _sphere(axes: Axes, chart: AccuracyMap, values: Array, name: str) -> None:
-    axes.set_title(f"{name}, 1σ in °")
-    axes.set_xlabel("azimuth, °")
-    axes.set(xlim=(0, 360), ylim=(0, 180), xticks=range(0, 361, 90), yticks=range(0, 181, 30))
-    axes.grid(visible=False)
-    if np.isnan(values).all():
-        axes.set_facecolor("#f3f4f6")
-        text = "undetermined:\nno uncertainty\ncan be quoted"
-        axes.patch.set_hatch("////")
-        box = {"facecolor": "white", "edgecolor": "#9ca3af", "boxstyle": "round,pad=0.5"}
-        axes.text(180, 90, text, ha="center", va="center", fontsize=8, bbox=box)
-        return
-    _contours(axes, np.degrees(chart.azimuth), np.degrees(chart.inclination), values)
+def _accuracy_panel(axes: Axes, x: Array, curves: Mapping[str, Array]) -> None:
+    """1σ of each angle, radians, in degrees on a logarithmic axis; undetermined ones in words."""
+    for (name, sd), axis in zip(curves.items(), LINES, strict=False):
+        if not np.isnan(sd).all():
+            axes.plot(x, np.degrees(sd), color=AXES[axis], ls=LINES[axis], lw=1.3, label=name)
+    axes.set_yscale("log")
+    _undetermined(axes, [name for name, sd in curves.items() if np.isnan(sd).all()])
 
 
-def _contours(axes: Axes, x: Array, y: Array, values: Array) -> None:
-    import matplotlib as mpl
-    from matplotlib.colors import BoundaryNorm, ListedColormap
-    from matplotlib.patheffects import withStroke
-
-    levels = contour_levels(values)
-    # a grey print keeps the order
-    shades = mpl.colormaps["Blues"](np.linspace(0.06, 0.72, len(levels) - 1))
-    drawn = np.ma.masked_invalid(values)
-    norm = BoundaryNorm(levels, len(levels) - 1)
-    axes.set_facecolor("#f3f4f6")
-    filled = axes.contourf(x, y, drawn, levels=levels, cmap=ListedColormap(shades), norm=norm)
-    lines = axes.contour(x, y, drawn, levels=levels[1:-1], colors="#374151", linewidths=0.4)
-    for text in axes.clabel(lines, fmt=_short, fontsize=6, colors="#111827"):
-        text.set_path_effects([withStroke(linewidth=1.6, foreground="white")])
-    _colour_bar(axes, filled, levels)
+def _undetermined(axes: Axes, names: Sequence[str]) -> None:
+    """Says what has no curve, and why."""
+    if names:
+        text = f"{', '.join(names)}: undetermined,\nno uncertainty can be quoted"
+        box = {"facecolor": "white", "edgecolor": "#9ca3af", "boxstyle": "round,pad=0.4"}
+        axes.text(0.5, 0.93, text, ha="center", va="top", transform=axes.transAxes, bbox=box)
 
 
-def _colour_bar(axes: Axes, filled: ContourSet, levels: Array) -> None:
-    """The bar below the contours, with up to six of their numbers."""
-    bar = axes.figure.colorbar(
-        filled, ax=axes, orientation="horizontal", aspect=22, pad=0.03, spacing="uniform"
-    )
-    every = -(-len(levels) // 6)
-    bar.set_ticks(levels[::every].tolist(), labels=[_short(v) for v in levels[::every]])
-    bar.ax.tick_params(labelsize=6, length=2)
-    bar.set_label("1σ, °", fontsize=7)
-
-
-def contour_levels(values: Array) -> Array:
-    """Round levels that enclose the values: 1-2-5 over a wide range, equal steps over a narrow."""
-    low, high = float(np.nanmin(values)), float(np.nanmax(values))
-    low, high = max(low, 1e-9), max(high, 1.02e-9)
-    if high / low > 4:
-        decades = np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1)
-        parts = [1, 2, 5] if high / low > 12 else [1, 1.5, 2, 3, 5, 7]
-        steps = np.outer(10.0**decades, parts).ravel()
+def _accuracy_axes(figure: Figure, panels: Sequence[Axes]) -> Figure:
+    """What both panels share: plain numbers, and one legend of all curves."""
+    low, high = panels[0].get_ylim()
+    plain_numbers(panels[0].yaxis, *((1.0, 2.0, 5.0) if high / low < 300 else (1.0,)))
+    panels[0].set_ylabel("1σ, °")
+    handles, labels = panels[0].get_legend_handles_labels()
+    place: dict[str, Any] = {"loc": "outside upper left", "ncols": max(len(labels), 1)}
+    if labels:
+        figure.legend(handles, labels, handlelength=3, **place)
     else:
-        rough = max(high - low, 0.02 * high) / 6
-        power = 10.0 ** np.floor(np.log10(rough))
-        width = power * min(n for n in (1, 2, 5, 10) if n * power >= rough)
-        steps = np.arange(np.floor(low / width), np.ceil(high / width) + 1) * width
-        steps = np.append(steps, steps[-1] + width)
-    first = max(int(np.searchsorted(steps, low, "right")) - 1, 0)
-    last = int(np.searchsorted(steps, high, "left"))
-    return np.asarray(steps[first : max(last, first + 2) + 1])
+        panels[0].yaxis.set_major_formatter(lambda value, _: "")
+    return figure
 
 
-def _short(value: float) -> str:
-    return f"{value:.3g}" if value >= 1e-4 else f"{value:.1e}"
+def _channel_curves(axes: Axes, x: Array, values: Array, labels: Sequence[str]) -> None:
+    """A curve (n,) for each channel, columns of `values`; undetermined ones in words."""
+    series = dict(zip(labels, values.transpose(), strict=True))
+    free = [label for label, column in series.items() if np.isnan(column).all()]
+    for (label, column), axis in zip(series.items(), LINES, strict=True):
+        axes.plot(x, column, color=AXES[axis], ls=LINES[axis], lw=1.2, label=label)
+    axes.margins(x=0.02, y=0.08)
+    _undetermined(axes, free)
+
+
+def _errors_by_temperature(
+    axes: Axes, row: ErrorRow, stations: Sequence[StationRow], soak: Ints
+) -> None:
+    """Errors of an observable at each station over temperature, and the mean of each soak."""
+    warmth = np.array([station.temperature_c for station in stations])
+    values = np.array([station.errors.get(row.observable, np.nan) for station in stations])
+    marked = np.array([station.reshoot for station in stations])
+    if row.expected:
+        axes.axhspan(-row.expected, row.expected, color=BAND, lw=0, zorder=0.5)
+    axes.axhline(0, color="#4b5563", lw=0.6, zorder=1)
+    axes.plot(warmth[~marked], values[~marked], "s", color=AFTER, mfc="none", ms=3, mew=0.7)
+    axes.plot(warmth[marked], values[marked], "^", color=MARKED, ms=5)
+    given = ~np.isnan(values)
+    means = [
+        [warmth[here].mean(), values[here].mean()]
+        for here in (given & (soak == number) for number in np.unique(soak[given]))
+    ]
+    axes.plot(*np.transpose(means), "_-", color="#111827", lw=1, ms=14, mew=1.6)
+    axes.margins(x=0.06, y=0.1)
+    axes.set_ylabel(f"{TITLES[row.observable]}, {row.unit.partition(' ')[0]}")
 
 
 def reshoot_limit(calibration: Calibration) -> float:
@@ -259,13 +290,101 @@ class Plots:
 
     @style()
     def accuracy(self) -> Figure:
-        """1σ of each angle over inclination and azimuth, degrees, root mean square over toolface."""
-        chart, names = accuracy_map(self.calibration), angles(self.calibration)
-        label = "Predicted 1σ over inclination and azimuth"
-        figure, [panels] = new_figure(label, 2.75, columns=len(names), sharey=True)
-        for axes, name in zip(panels, names, strict=True):
-            _sphere(axes, chart, np.degrees(chart.sd[name]), name)
-        panels[0].set_ylabel("inclination, °")
+        """1σ of each angle over inclination, degrees: of the calibration alone, and of one reading.
+
+        Root mean square over toolface and azimuth; the band is from the best to the worst azimuth.
+        """
+        x = np.linspace(2, 178, 45)
+        figure, [panels] = new_figure("Predicted 1σ over inclination", 2.5, columns=2, sharey=True)
+        for axes, (title, noise) in zip(panels, ACCURACY_OF.items(), strict=True):
+            curves = accuracy_curves(self.calibration, np.radians(x), noise)
+            _accuracy_panel(axes, x, {name: curve.typical for name, curve in curves.items()})
+            for curve in curves.values():
+                ends = np.degrees([curve.least, curve.largest])
+                axes.fill_between(x, *ends, color=AXES["z"], alpha=0.15, lw=0)
+            axes.set(title=title, xlabel="inclination, °", xlim=(0, 180), xticks=range(0, 181, 30))
+        return _accuracy_axes(figure, panels)
+
+    @style()
+    def accuracy_over_temperature(self) -> Figure:
+        """1σ of each angle at 45° inclination over temperature, degrees; as `accuracy`."""
+        x, label = self._temperatures(), "Predicted 1σ over temperature"
+        figure, [panels] = new_figure(label, 2.1, columns=2, sharey=True)
+        for axes, (title, noise) in zip(panels, ACCURACY_OF.items(), strict=True):
+            each = [accuracy_at(self.calibration, [TYPICAL], noise, at) for at in x.tolist()]
+            curves = {name: np.array([sd[name][0] for sd in each]) for name in each[0]}
+            _accuracy_panel(axes, x, curves)
+            axes.set(title=title, xlabel="temperature, °C")
+        return _accuracy_axes(figure, panels)
+
+    @style()
+    def temperature(self) -> Figure:
+        """Scale and bias of each channel over temperature, as changes, and the 1σ of both."""
+        x, middle = self._temperatures(), middle_temperature(self.calibration)
+        courses = channel_courses(self.calibration, [middle, *x.tolist()])
+        label = "Scale and bias of each channel over temperature, with 1σ"
+        across: dict[str, Any] = {"sharex": True, "gridspec_kw": {"hspace": 0.06}}
+        figure, panels = new_figure(label, 5.6, 4, len(courses), **across)
+        for column, (triad, course) in zip(panels.transpose(), courses.items(), strict=True):
+            names = [f"{triad[0]}{axis}" for axis in AXES]
+            for axes, (title, values) in zip(column, self._shown(triad, course), strict=True):
+                _channel_curves(axes, x, values, names)
+                axes.set_ylabel(title)
+            column[0].set_title(f"{triad}: change since {middle:g} °C", pad=16)
+            place: dict[str, Any] = {"loc": "lower left", "bbox_to_anchor": (0, 0.99)}
+            column[0].legend(ncols=3, borderpad=0.1, handlelength=3, **place)
+            column[-1].set_xlabel("temperature, °C")
+        return figure
+
+    def _shown(self, triad: str, course: ChannelCourse) -> list[tuple[str, Array]]:
+        """Title and values (n, 3) of each panel of a triad, the first row of a course being the middle."""
+        unit = (
+            "mg" if triad == TRIADS[0] else "‰ of the field" if self.calibration.relative else "nT"
+        )
+        size, scale = 1.0 if unit == "nT" else 1e3, course.scale[0]
+        return [
+            ("scale, %", 100 * (course.scale[1:] / scale - 1)),
+            ("1σ of scale, %", 100 * course.scale_sd[1:] / scale),
+            (f"bias, {unit}", size * (course.bias[1:] - course.bias[0])),
+            (f"1σ of bias, {unit}", size * course.bias_sd[1:]),
+        ]
+
+    @property
+    def over_temperature(self) -> bool:
+        """Whether the calibration has temperature terms, and a range of temperatures."""
+        low, high = self.calibration.temperature_c or (0.0, 0.0)
+        return self.calibration.thermal and low < high
+
+    def _temperatures(self) -> Array:
+        """Temperatures over the calibrated range; refuses where nothing varies with them."""
+        if not self.over_temperature or self.calibration.temperature_c is None:
+            raise InputError(
+                "the calibration has no temperature terms, so that nothing varies with temperature. "
+                "Calibrate a run of several temperatures, with `order` 1 or more."
+            )
+        return np.linspace(*self.calibration.temperature_c, TEMPERATURES)
+
+    @style()
+    def errors_by_temperature(self) -> Figure:
+        """Errors after the fit at each station over its temperature, an observable in each panel."""
+        stations = [row for row in self.calibration.station_rows if row.temperature_c is not None]
+        rows = self.calibration.errors
+        if not stations or not rows:
+            raise InputError(
+                "no station of the run has both a temperature and a reference. Calibrate a run with "
+                "the column temperature_c."
+            )
+        soak = soaks(np.array([row.temperature_c for row in stations]))
+        height = -(-len(rows) // 2)
+        label = "Errors left at each station over its temperature"
+        figure, panels = new_figure(label, 0.3 + 1.35 * height, height, 2, sharex=True)
+        for axes, row in zip(panels.ravel(), rows, strict=False):
+            _errors_by_temperature(axes, row, stations, soak)
+        for axes in panels.ravel()[len(rows) :]:
+            axes.set_visible(False)
+        for axes in panels.ravel()[: len(rows)][-2:]:
+            axes.xaxis.set_tick_params(labelbottom=True)
+            axes.set_xlabel("temperature, °C")
         return figure
 
     @style()
@@ -280,7 +399,7 @@ class Plots:
         series = (("errors_before", BEFORE, "o"), ("errors", AFTER, "s"))
         for axes, (errors, *look) in zip(panels, series, strict=True):
             values = [getattr(station, errors).get(observable, np.nan) for station in stations]
-            _station_stems(axes, stations, values, *look)
+            _station_stems(axes, stations, values, unit, *look)
             axes.axhline(0, color="#4b5563", lw=0.6, zorder=1)
             axes.set_ylabel(label)
         if row.expected:
@@ -306,7 +425,7 @@ class Plots:
         rows, limit = self.calibration.station_rows, reshoot_limit(self.calibration)
         figure, [[axes]] = new_figure("Misfit of each station in standard deviations", 1.7)
         misfits = [row.deviation for row in rows]
-        _station_stems(axes, rows, misfits, AFTER, "s")
+        _station_stems(axes, rows, misfits, "σ", AFTER, "s")
         axes.axhline(limit, color=MARKED, lw=1, ls=(0, (5, 3)))
         axes.set(ylabel="misfit of the station, σ", ylim=(0, max(limit, *misfits) * 1.2))
         place = {"xycoords": ("axes fraction", "data"), "ha": "right", "va": "bottom"}

@@ -8,7 +8,7 @@ value, which noise drives apart. Arrays in, arrays out; angles are radians.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -67,6 +67,10 @@ class Curve:
     covariance: Array
     square: Array
     freedom: int
+
+    def at(self, toolface: Array) -> Array:
+        """Values (..., n) at toolfaces (n,)."""
+        return self.coefficients @ basis(toolface).swapaxes(-1, -2)
 
     @property
     def amplitudes(self) -> Array:
@@ -179,9 +183,17 @@ def _corrected(drawn: Array) -> tuple[Array, Array]:
 
 def ends(curve: Curve) -> tuple[Array, Array, Array]:
     """Toolfaces (...) where the curve is greatest, least, and farthest from zero."""
-    values = curve.coefficients @ basis(CIRCLE).swapaxes(-1, -2)
-    farthest = np.abs(values).argmax(-1)
-    return CIRCLE[values.argmax(-1)], CIRCLE[values.argmin(-1)], CIRCLE[farthest]
+    course = curve.at(CIRCLE)
+    farthest = np.abs(course).argmax(-1)
+    return CIRCLE[course.argmax(-1)], CIRCLE[course.argmin(-1)], CIRCLE[farthest]
+
+
+def about_middle(curve: Curve) -> tuple[Curve, Array]:
+    """The curve less the middle (...) between its greatest and its least value, and that middle."""
+    course = curve.at(CIRCLE)
+    middle = (course.max(-1) + course.min(-1)) / 2
+    first = np.arange(COEFFICIENTS) == 0
+    return replace(curve, coefficients=curve.coefficients - middle[..., None] * first), middle
 
 
 def _measures(coefficients: Array) -> tuple[Array, Array]:

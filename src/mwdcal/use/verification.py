@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Literal
+from typing import Any, ClassVar, Literal
 
 import msgspec
 import numpy as np
 
 from mwdcal.calibration.readings import Readings
-from mwdcal.calibration.record import MARGIN, Calibration, Finding, html_table
+from mwdcal.calibration.record import MARGIN, Calibration, Finding, html_table, stated
 from mwdcal.errors import InputError
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.use.departures import LEVEL, Departures, RollTest, Statistic
 
 COVERAGE = 2.0
 """Coverage factor of the guard band and of the remark that a value is close to its limit."""
+SPREAD_OF = "spread of "
+"""How the name of a limit on a spread begins."""
 WEAK = 0.5
 """A test whose 1σ is a larger share of the limit hardly distinguishes a good tool from a bad one."""
 NAMED_HARMONIC = 3.0
@@ -74,6 +76,40 @@ class Limits(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     error: Bounds = Bounds()
 
 
+class JudgedSet(msgspec.Struct, frozen=True, kw_only=True):
+    """What one roll set shows of one limit, or, without a `label`, the stations outside of roll sets.
+
+    `stations` are their places in `Verdict.station_rows`, from 0. `coefficients` of the curve that
+    was judged: mean, cos t, cos 2t, sin t, sin 2t of toolface t, in the unit of the limit; None:
+    the set was not rolled, or the figure judged is the raw one of each station.
+    """
+
+    label: str
+    stations: list[int]
+    coefficients: list[float] | None
+    value: float
+    uncertainty: float
+    passed: bool
+
+
+class VerifiedStation(msgspec.Struct, frozen=True, kw_only=True):
+    """One station of the test: attitude as corrected, and what it shows of each limit, noise included.
+
+    `toolface_deg` is the one by which the tool was rolled: near vertical the magnetic one.
+    `departures`, by name of the limit and in its unit: of an error, the error; of a spread, the
+    departure from the middle of its roll set's curve. `over` names the limits that they exceed; of a
+    spread, by more than half of it.
+    """
+
+    station: str
+    temperature_c: float | None
+    inclination_deg: float | None
+    azimuth_deg: float | None
+    toolface_deg: float | None
+    departures: dict[str, float]
+    over: list[str]
+
+
 class VerdictRow(msgspec.Struct, frozen=True, kw_only=True):
     """One limit: the noise-free value, its standard uncertainty, and the decision.
 
@@ -92,6 +128,12 @@ class VerdictRow(msgspec.Struct, frozen=True, kw_only=True):
     note: str
     raw: float | None = None
     harmonics: tuple[float, float] | None = None
+    sets: list[JudgedSet] = []
+
+    @property
+    def bound(self) -> float:
+        """What a departure may be, up or down: the limit on an error, half of that on a spread."""
+        return self.limit / 2 if self.name.startswith(SPREAD_OF) else self.limit
 
 
 class Verdict(msgspec.Struct, frozen=True, kw_only=True):
@@ -105,6 +147,10 @@ class Verdict(msgspec.Struct, frozen=True, kw_only=True):
     stations: int
     rows: list[VerdictRow]
     findings: list[Finding]
+    station_rows: list[VerifiedStation] = []
+
+    plot: ClassVar[Any]
+    """Figures of the verdict, as `Calibration.plot`."""
 
     def __repr__(self) -> str:
         failed = ", ".join(row.name for row in self.rows if not row.passed)
@@ -140,26 +186,58 @@ def verify(calibration: Calibration, readings: Readings, limits: Limits) -> Verd
     for check in (_check_tool, _check_independent, _check_temperature):
         check(calibration, readings)
     test = RollTest(calibration, readings)
-    outcomes = [(f"spread of {n}", n, most, test.spread(n)) for n, most in limits.spread.items()]
+    outcomes = [(SPREAD_OF + n, n, most, test.spread(n)) for n, most in limits.spread.items()]
     outcomes += [(f"error of {n}", n, most, test.error(n)) for n, most in limits.error.items()]
     skipped = _skipped({title: outcome.skipped for title, *_, outcome in outcomes})
     guard = COVERAGE if limits.rule == "guarded" else 0.0
-    judged = [_judged(*outcome, guard) for outcome in outcomes if not outcome[-1].skipped]
+    outcomes = [outcome for outcome in outcomes if not outcome[-1].skipped]
+    judged = [_judged(*outcome, guard) for outcome in outcomes]
     if not judged:
         raise InputError(
             f"{readings.name}: no limit of '{limits.name}' applies: {'; '.join(skipped)}. Add what "
             "is missing, or choose other `limits`."
         )
+    rows = [row for row, _ in judged]
     return Verdict(
-        passed=all(row.passed for row, _ in judged),
+        passed=all(row.passed for row in rows),
         rule=RULES[limits.rule],
         limits=limits.name,
         source=limits.source,
         run=readings.source,
         stations=readings.count,
-        rows=[row for row, _ in judged],
+        rows=rows,
         findings=sum((about for _, about in judged), [*_findings(test, skipped)]),
+        station_rows=_station_rows(test, rows, [outcome[-1] for outcome in outcomes]),
     )
+
+
+def _station_rows(
+    test: RollTest, rows: Sequence[VerdictRow], outcomes: Sequence[Departures]
+) -> list[VerifiedStation]:
+    """Every station of the test, with its departures in each row that has statistics of it."""
+    readings = test.readings
+    departures: list[dict[str, float]] = [{} for _ in range(readings.count)]
+    for row, outcome in zip(rows, outcomes, strict=True):
+        factor = _scale(row.unit)
+        for statistic in outcome.statistics:
+            for i, part in zip(statistic.index, (statistic.part * factor).tolist(), strict=True):
+                departures[i][row.name] = part
+    bounds = {row.name: row.bound for row in rows}
+    attitude = test.value("inclination"), test.value("azimuth"), test.toolface
+    warmth = (
+        np.full(readings.count, np.nan) if readings.temperature is None else readings.temperature
+    )
+    each = np.stack([warmth, *np.degrees(attitude)], -1)
+    names = ("temperature_c", "inclination_deg", "azimuth_deg", "toolface_deg")
+    return [
+        VerifiedStation(
+            station=label,
+            **dict(zip(names, map(stated, values), strict=True)),
+            departures=shown,
+            over=[name for name, value in shown.items() if abs(value) > bounds[name]],
+        )
+        for label, values, shown in zip(readings.labels, each, departures, strict=True)
+    ]
 
 
 def _skipped(reasons: dict[str, str]) -> list[str]:
@@ -231,8 +309,8 @@ def _judged(
     title: str, name: str, limit: float, outcome: Departures, guard: float
 ) -> tuple[VerdictRow, list[Finding]]:
     """The decision on one limit, by the worst set or station, and the findings about it."""
-    inside = OBSERVABLES[name].unit
-    factor, unit = (float(np.degrees(1)), "°") if inside == "rad" else (1.0, inside)
+    unit = OBSERVABLES[name].unit.replace("rad", "°")
+    factor = _scale(unit)
     findings = [Finding(id="partly-judged", text=f"{title}: {text}.") for text in outcome.apart]
     if outcome.unseen:
         findings.append(_finding("harmonic-unseen", title=title))
@@ -241,6 +319,7 @@ def _judged(
         row = VerdictRow(
             name=title, unit=unit, value=None if outcome.unrolled else most, uncertainty=None,
             limit=limit, passed=False, note=f"cannot be passed: {outcome.blocked}", raw=most,
+            sets=_sets(outcome, factor, 0.0, -1.0),
         )  # fmt: skip
         return row, findings
     worst = max(outcome.statistics, key=lambda each: each.value + guard * each.uncertainty)
@@ -249,13 +328,40 @@ def _judged(
     row = VerdictRow(
         name=title, unit=unit, value=value, uncertainty=sd, limit=limit, passed=passed,
         note=worst.where + _remark(value, sd, limit, passed), raw=most,
-        harmonics=_harmonics(worst, factor),
+        harmonics=_harmonics(worst, factor), sets=_sets(outcome, factor, guard, limit),
     )  # fmt: skip
     if sd > WEAK * limit:
         findings.append(_finding("weak-test", row=row))
     if causes := _causes(row, name, worst):
         findings.append(_finding("roll-harmonics", row=row, causes="; ".join(causes)))
     return row, findings
+
+
+def _scale(unit: str) -> float:
+    """Factor from the unit of calculation to that of a limit."""
+    return float(np.degrees(1)) if unit == "°" else 1.0
+
+
+def _sets(outcome: Departures, factor: float, guard: float, limit: float) -> list[JudgedSet]:
+    """The roll sets behind a row, and the stations outside of them as one; none passes below zero."""
+    by_label: dict[str, list[Statistic]] = {}
+    for each in outcome.statistics:
+        by_label.setdefault(each.label, []).append(each)
+    sets = []
+    for label, members in by_label.items():
+        worst = max(members, key=lambda each: each.value + guard * each.uncertainty)
+        value, sd, curve = worst.value * factor, worst.uncertainty * factor, worst.curve
+        sets.append(
+            JudgedSet(
+                label=label,
+                stations=np.concatenate([each.index for each in members]).tolist(),
+                coefficients=None if curve is None else (curve.coefficients * factor).tolist(),
+                value=value,
+                uncertainty=sd,
+                passed=value + guard * sd <= limit,
+            )
+        )
+    return sets
 
 
 def _remark(value: float, sd: float, limit: float, passed: bool) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 
 import click
@@ -56,7 +57,8 @@ def command(
         from mwdcal.app.pages.comparison import render
 
         sources = profile.name, readings.run_sha256, readings.profile_sha256
-        atomic.write(report, render(result, *sources))
+        time = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
+        atomic.write(report, render(result, *sources, readings.metadata, time))
     if as_json:
         digests = {"run": readings.run_sha256, "profile": readings.profile_sha256}
         content = screen.document(result, unused, report)

@@ -10,7 +10,7 @@ import click
 
 from mwdcal.app.commands import options
 from mwdcal.app.messages import print_result, say
-from mwdcal.errors import FitError
+from mwdcal.errors import FitError, InputError
 
 
 @options.command()
@@ -29,18 +29,35 @@ from mwdcal.errors import FitError
     metavar="ADDRESS",
     help="Use the workers of this Dask scheduler instead, such as tcp://host:8786.",
 )
+@click.option(
+    "--records/--no-records",
+    default=None,
+    help="Whether the table holds the whole calibration of each tool, for CALS.parquet#SERIAL. Default: "
+    "where it has at most 500 tools.",
+)
+@click.option(
+    "--calibrations",
+    type=options.FILE,
+    metavar="DIR",
+    help="Also write the calibration file of each tool into this folder, which must be new or empty.",
+)
 @options.report(metavar="FLEET.html", help="Also write a summary page of the fleet.")
 @options.JSON
 def command(
     runs: Path, output: Path, tool: str | None, workers: int | None,
-    scheduler: str | None, report: Path | None, as_json: bool, **typed: Unpack[options.Typed],
+    scheduler: str | None, records: bool | None, calibrations: Path | None, report: Path | None,
+    as_json: bool, **typed: Unpack[options.Typed],
 ) -> None:  # fmt: skip
-    """Calibrate many tools: RUNS is a Parquet table, or a folder of them, with a column `serial`.
+    """Calibrate many tools: RUNS is a folder of run files, or a table with a column `serial`.
+
+    Run files and tables are CSV, TSV, XLSX or Parquet. One tool of the result is named
+    CALS.parquet#SERIAL in apply, verify and convert.
 
     Interrupted, the same command goes on where it was: finished parts are kept beside the output.
 
     \b
     Example: mwdcal fleet runs.parquet -o cals.parquet --tool servo --report fleet.html
+    Example: mwdcal fleet folder -o cals.parquet --tool tool.toml --calibrations tools
     Exit: 0 at least one tool calibrated, 2 input cannot be read, 3 not a single one.
     """
     from mwdcal.app import pool
@@ -49,11 +66,23 @@ def command(
         from mwdcal.app import fleet_table
         from mwdcal.app.pages import fleet_report
         from mwdcal.app.screens import fleet as screen
+        from mwdcal.app.text import plural
         from mwdcal.files.formats import atomic
+        from mwdcal.fleet import calibration_files
 
     options.check_outputs([output], [runs, tool], page=report)
+    if calibrations:
+        if records is False:
+            raise InputError("`calibrations` needs the whole calibrations: leave out --no-records.")
+        calibration_files.check(calibrations)
+        records = True
     try:
-        summary = fleet_table.calibrate_table(runs, output, tool, typed, workers, scheduler, say)
+        summary = fleet_table.calibrate_table(
+            runs, output, tool, typed, workers, scheduler, records, say
+        )
+        if calibrations:
+            count = calibration_files.write(output, calibrations)
+            say(f"wrote {plural(count, 'calibration file')} to {calibrations}")
         if report:
             atomic.write(report, fleet_report.render(output, summary))
     except KeyboardInterrupt as stop:

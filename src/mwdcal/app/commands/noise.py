@@ -63,7 +63,8 @@ def command(
     unused = unused_columns(synonyms.unused(list(readings.columns), COLUMNS))
     noise = replace(noise, findings=findings_as_typed([*noise.findings, *unused]))
     drawn = picture(figure(noise), plot.suffix) if plot else b""
-    rendered = render(noise) if report else ""
+    sources = readings.digest, profile.name if profile else "", digest
+    rendered = render(noise, *sources) if report else ""
     digests = {"log": readings.digest, "profile": digest}
     document = enveloped(
         "noise", screen.document(noise, plot, report), readings.metadata, **digests

@@ -26,10 +26,10 @@ def command(run: Path, output: Path, as_json: bool) -> None:
     from mwdcal.app.screens import proposal as screen
     from mwdcal.calibration.diagnosis.findings import unused_columns
     from mwdcal.files.formats import atomic
-    from mwdcal.identification.proposal import as_toml, propose
+    from mwdcal.identification.proposal import as_toml, left_handed, propose
 
     options.check_outputs([output], [run])
     proposal = propose(run)
     shown = (screen.summary if as_json else screen.screen)(proposal, run, output)
     atomic.write(output, as_toml(proposal, run.name))
-    print_result(shown, unused_columns(proposal.unused))
+    print_result(shown, left_handed(proposal) + unused_columns(proposal.unused))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from mwdcal.app.commands import options
-from mwdcal.app.messages import findings_as_typed, lines, print_result, say
+from mwdcal.app.messages import as_typed, findings_as_typed, lines, print_result, say
 
 
 @options.command()
@@ -25,11 +25,12 @@ from mwdcal.app.messages import findings_as_typed, lines, print_result, say
     "Movement that is still rest, in noise floors. Default: found from the log.",
 )
 @options.plot(help="Also draw what was taken and left.")
+@options.report(metavar="PAGE.html")
 @options.DECIMAL
 @options.JSON
 def command(
-    log: Path, output: Path, columns: str, plot: Path | None, decimal: str, as_json: bool,
-    **search: float | None,
+    log: Path, output: Path, columns: str, plot: Path | None, report: Path | None, decimal: str,
+    as_json: bool, **search: float | None,
 ) -> None:  # fmt: skip
     """Find the standstills in a continuous LOG and write each as a station of a run file.
 
@@ -42,31 +43,32 @@ def command(
     from mwdcal.app import progress
     from mwdcal.app.envelope import enveloped
     from mwdcal.app.pages.pictures import picture
-    from mwdcal.app.pages.stations import figure
+    from mwdcal.app.pages.stations import figure, render
     from mwdcal.app.screens import stations as screen
     from mwdcal.files import logs
     from mwdcal.files.formats import atomic, table
     from mwdcal.logs.stations import StandstillError, find_stations
 
-    options.check_outputs([output], [log], picture=plot)
+    options.check_outputs([output], [log], picture=plot, page=report)
     slowly = progress.slowly(say)
     readings = logs.read(log, options.column_names(columns), decimal=decimal, say=slowly)
+    refusal = None
     try:
         stations = find_stations(readings, say=slowly, **search)
     except StandstillError as error:  # the picture helps most then
-        if not plot:
-            error.add_note("--plot shows the log.")
-        for line in lines(error.analysis.findings):
-            error.add_note(line)
-        if plot:
-            atomic.write(plot, picture(figure(error.analysis), plot.suffix))
-            error.add_note(f"wrote {plot} (picture)")
-        raise
+        refusal, stations = error, error.analysis
     stations = replace(stations, findings=findings_as_typed(stations.findings))
+    why = as_typed(str(refusal or ""))
     drawn = picture(figure(stations), plot.suffix) if plot else b""
-    table.write(output, stations.table)
-    atomic.write_all([(plot, drawn)])
-    files = {"output": str(output), "plot": str(plot or "")}
+    rendered = render(stations, readings.digest, str(output), why) if report else ""
+    if not refusal:
+        table.write(output, stations.table)
+    atomic.write_all([(plot, drawn), (report, rendered)])
+    if refusal:
+        for line in [*lines(stations.findings), screen.shown_in(plot, report)]:
+            refusal.add_note(line)
+        raise refusal
+    files = {"output": str(output), "plot": str(plot or ""), "report": str(report or "")}
     content = screen.summary(stations, files)
     document = enveloped("stations", content, readings.metadata, log=readings.digest)
     print_result(document if as_json else screen.screen(stations, files), stations.findings)

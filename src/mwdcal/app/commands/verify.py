@@ -48,6 +48,6 @@ def command(
         from mwdcal.app.pages.report import render
         from mwdcal.files.formats import atomic
 
-        atomic.write(report, render(fitted, result))
+        atomic.write(report, render(fitted, result, *stated))
     print_result(document if as_json else screen(result, *stated), result.findings)
     sys.exit(0 if result.passed else 1)

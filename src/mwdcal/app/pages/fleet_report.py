@@ -1,371 +1,389 @@
-"""The summary page of a fleet: statuses, distributions, outliers, in one HTML file.
+"""The summary page of a fleet: how many are calibrated and how well, the worst tools, and every tool as a mark.
 
 It reads the table of calibrations column by column, whatever its length.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mwdcal.app.pages import fleet_figures
+from mwdcal.app.pages.fleet_columns import (
+    FAR,
+    FEWEST_TOOLS,
+    RELATIVE_KIND,
+    FleetParameter,
+    SoundTools,
+    distance,
+    kinds_of,
+    nominal_unit,
+    parameters_of,
+)
+from mwdcal.app.pages.fleet_figures import Strips
 from mwdcal.app.pages.page import banner, environment
 from mwdcal.app.screens.fleet import (
     ERRORS,
+    SERIALS_SHOWN,
+    FleetFinding,
     FleetSummary,
     is_doubt,
-    numbers,
-    quantiles,
     unusual,
 )
-from mwdcal.app.text import number, plural, raised
+from mwdcal.app.screens.numbers import capital, number, unit
+from mwdcal.app.text import number as brief
+from mwdcal.app.text import plural
 from mwdcal.calibration.diagnosis.plausibility import NOISE_RATIO
-from mwdcal.calibration.prediction import STATED_ANGLES
 from mwdcal.calibration.readings import TRIADS, is_simulated
-from mwdcal.files.formats import parquet
 from mwdcal.fleet.calibrate import OK
 from mwdcal.fleet.sources import SERIAL
-from mwdcal.geometry.vectors import AnyArray, Array, Bools
-from mwdcal.use import plots
+from mwdcal.geometry.vectors import Array, Ints
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-RELATIVE_KIND = "field = 1"
-"""The kind of magnetometers of which the strength of the field is not known."""
-TRIAD_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#4b5563")
-DASHES: tuple[Any, ...] = ("-", "--", ":", "-.", (0, (5, 1)), (0, (1, 1)))
-BINS = (12, 40)
-"""Fewest and most bins: as many as half the root of the number of tools."""
-ABREAST = 3
-"""Most panels in a row."""
-TICKS = 12
-"""Numbers along the axes of a row of panels: more would run into each other."""
-FAR = 6.0
-"""Robust standard deviations from the fleet's median beyond which a tool is an outlier."""
-FEWEST_TOOLS = 20
-"""Sound tools without which there is no fleet to be an outlier of."""
-SPREAD = 1.4826
-"""Standard deviation of a normal variable by its median absolute deviation."""
-ONE_AXIS_OR_TWO = ("gain", "square", "cube")
-"""Parameters of one axis or of two: a panel for each."""
-Panel = tuple[str, str, Mapping[str, Array]]
-"""Title, name of the axis, and values by name."""
+WORST_TOOLS = 25
+"""Most tools in the table of the worst."""
+WIDE_SIGMA = 2.0
+"""Times the fleet's median beyond which the accuracy of a tool is remarked."""
+STATIONS_OF_A_TOOL = 4
+"""Most stations to re-measure that the table of tools names."""
+
+REFUSED = {
+    "bad-input": "a cell or an option is not what a run can have",
+    "too-few-stations": "fewer stations than the parameters need",
+    "common-errors": "the stand declares errors that all stations share, and this method takes it as exact",
+    "channel": "a channel is dead, or moves as no field explains",
+    "temperature-span": "temperatures too few or too close together for this order",
+    "missing-reference": "a reference angle that this method needs is blank",
+    "noise": "the declared noise is so large a share of the field that its unit is probably wrong",
+    "not-converged": "the fit did not settle",
+    "not-finite": "the fit did not settle",
+    "unsound": "the fit has no valid covariance, or gains that no sensor has",
+    "weak-geometry": "the readings do not determine all parameters",
+    "no-redundancy": "no reading is left over to estimate the noise from",
+    "gain": "a gain is far from nominal or has the wrong sign",
+    "residuals": "no error of a sensor explains the residuals",
+    "earth": "a gravity, field or dip that no place on Earth has",
+    "errors": "errors against the references far larger than the misfit explains",
+    "inseparable": "the stations cannot tell errors of the stand from those of the sensors",
+    "failed": "the fit stopped with an error",
+}
+"""Why tools of a status are refused."""
+REMARKED = {
+    "noise": "residuals of the {triad} are far below the declared noise",
+    "residuals": "residuals of the {triad} are larger than the declared noise explains",
+    "no-redundancy": "nothing in the run checks the fit",
+    "scatter": "strengths, dip or directions vary from station to station beyond the noise",
+    "repeated-readings": "some stations are copies of others",
+    "temperature-misfit": "the {triad} varies with temperature as its order does not follow",
+    "temperature-untested": "nothing tests the terms of temperature between the temperatures of the run",
+    "prior-shared": "run and prior count a common error as two",
+    "prior-only": "some parameters rest on the prior alone",
+    "prior-conflict": "the run departs from the prior",
+    "nonlinearity-ignored": "the model leaves out a nonlinearity that the profile declares",
+    "field-unknown": "the strength of the field is unknown: the magnetometer is calibrated to field = 1",
+    "restricted": "the model leaves out misalignments",
+    "reshoot": "one or more stations should be re-measured; chance alone gives one such tool in a hundred",
+    "distrusted": "the robust fit gives some stations little weight",
+    "unused-columns": "some columns are not used",
+}
+"""What a finding says of tools, by its id or the end of it."""
 
 
-@dataclass(frozen=True)
-class FleetParameter:
-    """A column of parameters over the sound tools, NaN where a tool does not have it.
+def remark(finding: str) -> str:
+    """What a finding says of tools.
 
-    Magnetometers calibrated to nT and to a field of one are of different `kind`.
+    >>> remark("magnetometer-noise")
+    'residuals of the magnetometer are far below the declared noise'
     """
-
-    triad: str
-    kind: str
-    title: str
-    unit: str
-    values: Array
-    sd: Array
-
-    @property
-    def sensors(self) -> str:
-        """What may be compared."""
-        return f"{self.triad}, {self.kind}" if self.kind else self.triad
-
-    @property
-    def tools(self) -> int:
-        """Number of tools that have it."""
-        return int(np.sum(~np.isnan(self.values)))
-
-    @property
-    def quantiles(self) -> list[float]:
-        """1 %, median and 99 %."""
-        return quantiles(self.values)
-
-    @property
-    def typical_sd(self) -> float | None:
-        """Median of the standard uncertainties."""
-        return None if np.isnan(self.sd).all() else float(np.nanmedian(self.sd))
-
-
-class SoundTools:
-    """The calibrated tools of a table of calibrations, read column by column."""
-
-    def __init__(self, path: Path) -> None:
-        _, pq = parquet.modules(path.name)
-        self._file = pq.ParquetFile(path)
-        self.names: list[str] = self._file.schema_arrow.names
-        self.metadata = parquet.metadata_of(self._file.schema_arrow.metadata, path.name)
-        self._rows: Bools = np.array(self._column("status").to_pylist(), object) == OK
-        self.count = int(self._rows.sum())
-
-    def _column(self, name: str) -> Any:
-        return self._file.read([name]).column(0)
-
-    def numbers(self, name: str) -> Array:
-        """A column of numbers, NaN where there is none."""
-        return numbers(self._file, name)[self._rows]
-
-    def words(self, name: str) -> AnyArray:
-        """A column of text or labels."""
-        return np.array(self._column(name).to_pylist(), object)[self._rows]
+    triad, _, end = finding.partition("-")
+    if triad in TRIADS:
+        return REMARKED[end].format(triad=triad)
+    if finding.startswith("looks-like-"):
+        return f"residuals look like {finding.removeprefix('looks-like-').replace('-', ' ')}"
+    return REMARKED.get(finding, finding.replace("-", " "))
 
 
 def render(calibrations: Path, summary: FleetSummary) -> str:
-    """The page as HTML: the same table gives the same text but for the time it took."""
-    template = environment().get_template("fleet.html")
-    tools = SoundTools(calibrations)
-    parameters = _parameters(tools) if tools.count else []
-    estimated: Any = tools.metadata["noise_estimated"]
-    return template.render(
+    """The page as HTML: the same table, written at the same time, gives the same text."""
+    fleet = Fleet(SoundTools(calibrations))
+    tools = fleet.tools
+    written = datetime.fromtimestamp(calibrations.stat().st_mtime, UTC)
+    return environment().get_template("fleet.html").render(
         result=summary,
         metadata=tools.metadata,
         simulated=is_simulated(tools.metadata),
-        banner=_banner(summary),
+        written=written.strftime("%Y-%m-%d %H:%M UTC"),
+        banner=_banner(summary, fleet),
         options="; ".join(unusual(summary.options)) or "defaults",
         stand={name: summary.spread[name] for name in ERRORS if summary.spread.get(name)},
-        short=number,
-        estimated=estimated,
-        figures=_figures(tools, parameters, estimated) if tools.count else {},
-        parameters=parameters,
-        outliers=_outliers(tools, parameters),
-        suspects=_suspects(tools),
+        short=brief,
+        remark=remark,
+        refused=[(k, REFUSED[k.status]) for k in summary.statuses if k.status != OK],
+        is_doubt=is_doubt,
+        fleet=fleet,
+        figures=_figures(fleet) if tools.count else {},
         far=FAR,
         fewest=FEWEST_TOOLS,
         suspect=NOISE_RATIO,
+        marks=fleet_figures,
+    )  # fmt: skip
+
+
+def _banner(summary: FleetSummary, fleet: Fleet) -> dict[str, str]:
+    """How many are calibrated, and the accuracy to expect of them."""
+    refused, doubtful = summary.tools - summary.sound, int(fleet.doubtful.sum())
+    headline = f"{summary.sound} of {plural(summary.tools, 'tool')} calibrated"
+    if not summary.sound:
+        after = "No accuracy can be expected of any tool: see the reasons below."
+        return banner("bad", "None calibrated", headline, after)
+    counts = {"refused": refused, "doubtful": doubtful}
+    rest = [f"{count} {word}" for word, count in counts.items() if count]
+    headline += (
+        f" – {', '.join([*rest, 'none verified yet' if summary.sound > 1 else 'not verified yet'])}"
+    )
+    each = "; ".join(map(_expected, fleet.accuracy))
+    after = (
+        f"Accuracy to expect (1σ, calibration alone, at 45° inclination): {each}. Verify each tool by a "
+        "roll test that was not used in its fit: mwdcal verify."
+    )
+    if not rest:
+        return banner("open", "All calibrated", headline, after)
+    return banner("attention", f"Some {rest[0].split()[1]}", headline, after)
+
+
+def _expected(row: AngleAccuracy) -> str:
+    """The accuracy of an angle over the fleet in words."""
+    if row.worst is None:
+        return f"{row.angle} undetermined"
+    values = f"{number(row.median)}° median, {number(row.worst)}° worst"
+    free = f", undetermined in {plural(row.undetermined, 'tool')}" if row.undetermined else ""
+    return f"{row.angle} {values if row.tools > 1 else f'{number(row.median)}°'}{free}"
+
+
+@dataclass(frozen=True)
+class AngleAccuracy:
+    """1σ of an angle over the tools that have one, degrees, and how many do not determine it."""
+
+    angle: str
+    tools: int
+    undetermined: int
+    median: float | None = None
+    high: float | None = None
+    worst: float | None = None
+    serial: Any = None
+
+
+@dataclass(frozen=True)
+class WorstTool:
+    """A row of the table of the worst tools: 1σ by angle, degrees, and what is the matter with it."""
+
+    serial: Any
+    doubtful: bool
+    accuracy: list[str]
+    sentence: str
+
+
+class Fleet:
+    """What the page says of the calibrated tools."""
+
+    def __init__(self, tools: SoundTools) -> None:
+        self.tools = tools
+        self.estimated: Any = tools.metadata["noise_estimated"]
+        self.parameters = parameters_of(tools) if tools.count else []
+        self.doubtful = tools.doubtful()
+        self.serials = tools.words(SERIAL)
+        self._sd = tools.accuracy()
+        self._free = tools.undetermined()
+
+    @cached_property
+    def accuracy(self) -> list[AngleAccuracy]:
+        """The accuracy to expect, by angle."""
+        rows = []
+        for angle, sd in self._sd.items():
+            tools, free = int(np.sum(~np.isnan(sd))), int(self._free[angle].sum())
+            if tools:
+                worst = int(np.nanargmax(sd))
+                median, high = np.nanquantile(sd, (0.5, 0.99)).tolist()
+                ends = {"worst": float(sd[worst]), "serial": self.serials[worst]}
+                rows.append(AngleAccuracy(angle, tools, free, median, high, **ends))
+            elif free:
+                rows.append(AngleAccuracy(angle, 0, free))
+        return rows
+
+    @property
+    def suspects(self) -> FleetFinding:
+        """Tools with residuals far larger than noise alone would give."""
+        each = [np.nan_to_num(self.tools.residuals(triad)) for triad in self.tools.triads]
+        return self._beyond("residuals", np.max(each, 0), NOISE_RATIO)
+
+    @property
+    def outliers(self) -> FleetFinding:
+        """Tools with a parameter far from the fleet's median."""
+        return self._beyond("outlier", self._away[1], FAR)
+
+    def _beyond(self, name: str, values: Array, limit: float) -> FleetFinding:
+        """Tools whose value is beyond a limit, the farthest first."""
+        count = int(np.sum(values > limit))
+        first = np.argsort(-values, kind="stable")[: min(count, SERIALS_SHOWN)]
+        return FleetFinding(id=name, tools=count, serials=self.serials[first].tolist())
+
+    @cached_property
+    def _away(self) -> tuple[Ints, Array]:
+        """The parameter that is farthest from the fleet, and how far, of each tool."""
+        away = np.zeros((1, self.tools.count))
+        if self.parameters:
+            away = np.nan_to_num([distance(each.values) for each in self.parameters])
+        return away.argmax(0), away.max(0)
+
+    @cached_property
+    def _ratio(self) -> dict[str, Array]:
+        """Each 1σ over the fleet's median, 0 where there is none."""
+        rows = [row for row in self.accuracy if row.median]
+        return {r.angle: np.nan_to_num(self._sd[r.angle] / (r.median or 1.0)) for r in rows}
+
+    @cached_property
+    def worst(self) -> list[WorstTool]:
+        """The worst tools first: doubtful ones, then those that leave an angle undetermined, then the others.
+
+        Among equals by 1σ over the fleet's median, or by the farthest parameter.
+        """
+        none = np.zeros(self.tools.count)
+        ratio = np.max([none, *self._ratio.values()], 0)
+        score = np.maximum(ratio / WIDE_SIGMA, self._away[1] / FAR)
+        free = np.sum([none, *self._free.values()], 0)
+        first = np.lexsort((-score, -free, ~self.doubtful))[:WORST_TOOLS].tolist()
+        reasons = _Reasons(self, first)
+        return [
+            WorstTool(
+                self.serials[i],
+                bool(self.doubtful[i]),
+                [self._shown(angle, i) for angle in self._sd],
+                capital("; ".join(reasons.of(i))) + ".",
+            )
+            for i in first
+        ]
+
+    def _shown(self, angle: str, tool: int) -> str:
+        """The accuracy of one tool."""
+        free = bool(self._free[angle][tool])
+        return "undetermined" if free else number(float(self._sd[angle][tool]))
+
+    @property
+    def titles(self) -> list[str]:
+        """Titles of the columns of accuracy."""
+        return [f"{angle} 1σ, °" for angle in self._sd]
+
+    def of(self, tool: int) -> Iterator[str]:
+        """What is unusual in the accuracy and the parameters of one tool."""
+        free = [angle for angle in self._sd if self._free[angle][tool]]
+        if free:
+            yield f"{', '.join(free)} undetermined"
+        angle = max(self._ratio, key=lambda name: float(self._ratio[name][tool]), default="")
+        if angle and self._ratio[angle][tool] > WIDE_SIGMA:
+            yield f"1σ of {angle} {number(float(self._ratio[angle][tool]))} times the fleet's median"
+        which, far = self._away
+        if far[tool] > FAR:
+            yield _outlier(self.parameters[which[tool]], tool, float(far[tool]))
+
+    def typical(self, tool: int) -> str:
+        """The accuracy of a tool without anything unusual."""
+        if self.tools.count == 1 or not self._ratio:
+            return "nothing unusual"
+        angle = max(self._ratio, key=lambda name: float(self._ratio[name][tool]))
+        ratio = number(float(self._ratio[angle][tool]))
+        return f"nothing unusual: 1σ of {angle} is {ratio} times the fleet's median"
+
+
+def _outlier(parameter: FleetParameter, tool: int, far: float) -> str:
+    """How far the farthest parameter of a tool is from the fleet."""
+    per = unit(parameter.unit)
+    value, median = (number(v, 4) + per for v in (parameter.values[tool], parameter.quantiles[1]))
+    name = f"{parameter.sensors} {parameter.title}"
+    return (
+        f"{name} is {value}, the fleet's median {median} ({number(far)} robust standard deviations)"
     )
 
 
-def _banner(summary: FleetSummary) -> dict[str, str]:
-    """The result in one sentence."""
-    refused = summary.tools - summary.sound
-    doubts = [
-        f"{finding.id.replace('-', ' ')} in {plural(finding.tools, 'tool')}"
-        for finding in summary.findings
-        if is_doubt(finding.id)
+class _Reasons:
+    """What is the matter with some tools, from their findings and directions."""
+
+    def __init__(self, fleet: Fleet, some: Sequence[int]) -> None:
+        tools, names = fleet.tools, ("findings", "reshoot", *(f"{t}_undetermined" for t in TRIADS))
+        columns = {name: tools.words(name) for name in names if name in tools.names}
+        self._lists = {i: {name: cells[i] or [] for name, cells in columns.items()} for i in some}
+        self._residuals = {triad: tools.residuals(triad) for triad in tools.triads}
+        self._fleet = fleet
+
+    def of(self, tool: int) -> list[str]:
+        """Each in a few words, the gravest first; of a tool without any, its accuracy."""
+        lists = self._lists[tool]
+        each = [*self._doubts(tool, lists["findings"]), *self._fleet.of(tool)]
+        each += self._directions(lists)
+        stations, more = lists["reshoot"][:STATIONS_OF_A_TOOL], len(lists["reshoot"])
+        if stations:
+            dots = " …" if more > len(stations) else ""
+            each.append(f"re-measure station {', '.join(stations)}{dots}")
+        return each or [self._fleet.typical(tool)]
+
+    def _doubts(self, tool: int, findings: Sequence[str]) -> Iterator[str]:
+        """Why the fit is doubtful."""
+        for finding in filter(is_doubt, findings):
+            triad = finding.removesuffix("-residuals")
+            if triad in self._residuals:
+                times = number(float(self._residuals[triad][tool]))
+                yield f"residuals of the {triad} are {times} times the declared noise"
+            else:
+                yield remark(finding)
+
+    def _directions(self, lists: Mapping[str, Sequence[str]]) -> Iterator[str]:
+        """What nothing determines, and of which triads."""
+        free = {triad: lists.get(f"{triad}_undetermined") or () for triad in TRIADS}
+        groups: dict[str, list[str]] = {}
+        for name in dict.fromkeys(name for names in free.values() for name in names):
+            triads = " and ".join(triad for triad, names in free.items() if name in names)
+            groups.setdefault(triads, []).append(name.replace("-", " "))
+        for triads, names in groups.items():
+            yield f"nothing determines {', '.join(names)} of the {triads}"
+
+
+def _figures(fleet: Fleet) -> dict[str, Figure]:
+    """Accuracy, residuals and parameters as strips."""
+    tools, estimated = fleet.tools, fleet.estimated
+    # a triad without a parameter in any sound tool has no strip either
+    triads = list(dict.fromkeys(p.triad for p in fleet.parameters))
+    accuracy = {row.angle: tools.accuracy()[row.angle] for row in fleet.accuracy}
+    panels = [
+        Strips("1σ of the calibration at 45° inclination", "1σ, °", accuracy, "°", positive=True)
     ]
-    headline = f"{summary.sound} of {plural(summary.tools, 'tool')} calibrated"
-    after = "Every tool has parameters with their uncertainty."
-    if refused:
-        after = f"{plural(refused, 'tool')} without a result: see the reasons below."
-    after = "; ".join([after.rstrip("."), *doubts]) + "." if doubts else after
-    if not summary.sound:
-        return banner("bad", "None calibrated", headline, after)
-    if refused or doubts:
-        word = "Some refused" if refused else "Some doubtful"
-        return banner("attention", word, headline, after)
-    return banner("good", "All calibrated", headline, after)
-
-
-def _parameters(tools: SoundTools) -> list[FleetParameter]:
-    """All columns of parameters, with units that people use."""
-    parameters = []
-    kinds = _kinds(tools)
-    nominal = _nominal(tools, kinds)
-    for name in tools.names:
-        triad, _, rest = name.partition("_")
-        if triad not in TRIADS or f"{name}_sd" not in tools.names:
-            continue
-        every, spread = _comparable(tools, triad, rest), tools.numbers(f"{name}_sd")
-        for kind, which in kinds.items() if triad == TRIADS[1] else [("", True)]:
-            values, sd = (np.where(which, v, np.nan) for v in (every, spread))
-            if not np.isnan(values).all():
-                unit, factor = _unit(rest, triad, bool(kind), nominal)
-                each = FleetParameter(triad, kind, _title(rest), unit, values * factor, sd * factor)
-                parameters.append(each)
-    return sorted(parameters, key=lambda each: each.sensors)
-
-
-def _kinds(tools: SoundTools) -> dict[str, Bools]:
-    """Which tools are calibrated to nT, and which to a field of one: they do not compare."""
-    units = tools.words("field_unit")
-    relative = np.array([unit not in (None, "nT") for unit in units])
-    kinds = {"": units == "nT", RELATIVE_KIND: relative}
-    return {name: which for name, which in kinds.items() if which.any()}
-
-
-def _nominal(tools: SoundTools, kinds: Mapping[str, Bools]) -> str:
-    """Unit of the nominal readings of magnetometers calibrated to a field of one.
-
-    nT, or none where the profile states no scale: then they are relative too, and gains near 1, as
-    the fit refuses others. In nT a gain is one over the strength, and a scale is the strength.
-    """
-    which = kinds.get(RELATIVE_KIND, np.zeros(tools.count, bool))
-    for name in ("gain_xx", "scale_x", "radius"):
-        if f"{TRIADS[1]}_{name}" in tools.names:
-            values = _comparable(tools, TRIADS[1], name)[which]
-            if not np.isnan(values).all():
-                return "" if 0.01 < abs(np.nanmedian(values)) < 100.0 else "nT"
-    return "nT"
-
-
-def _comparable(tools: SoundTools, triad: str, name: str) -> Array:
-    """A column but for tools with own-axis terms, whose other parameters are of scaled readings."""
-    values, radius = tools.numbers(f"{triad}_{name}"), f"{triad}_radius"
-    if radius not in tools.names or name.startswith(("square", "cube", "radius")):
-        return values
-    return np.where(np.isnan(tools.numbers(radius)), values, np.nan)
-
-
-def _unit(name: str, triad: str, relative: bool, nominal: str) -> tuple[str, float]:
-    """Unit and factor of a parameter: offsets in mg or nT, the rest as shares of nominal.
-
-    A `relative` field has no unit, whatever that of the `nominal` readings: a factor's scale has
-    theirs, and a gain one over it.
-    """
-    kind, _, rest = name.partition("_")
-    per = raised("/°C", int(rest.partition("_t")[2] or 0))
-    if kind in ("offset", "bias", "square", "cube"):
-        field = "of the field" if relative else "nT"
-        return (f"mg{per}", 1e3) if triad == TRIADS[0] else (f"{field}{per}", 1.0)
-    if relative and nominal and kind in ("gain", "scale"):
-        return (f"1/{nominal}" if kind == "gain" else nominal) + per, 1.0
-    return per.replace("/", "1/"), 1.0
-
-
-def _title(name: str) -> str:
-    """The parameter as its calibration file calls it.
-
-    >>> _title("gain_xy_t1")
-    'gain xy·τ'
-    """
-    steady, _, power = name.partition("_t")
-    return steady.replace("_", " ") + raised("·τ", int(power or 0))
-
-
-def _figures(
-    tools: SoundTools, parameters: list[FleetParameter], estimated: list[str]
-) -> dict[str, Figure]:
-    """Distributions of the parameters, and of residuals, noise and accuracy."""
-    triads = dict.fromkeys(p.triad for p in parameters)
-    declared = [triad for triad in triads if triad not in estimated]
-    s = {f"{triad} s": _residuals(tools, triad) for triad in declared}
-    panels: list[Panel] = [("residuals ÷ what noise alone would give, s", "s", s)] if s else []
+    s = {triad: tools.residuals(triad) for triad in triads if triad not in estimated}
+    if s:
+        lines = {"as noise: 1": 1.0, f"suspect: {number(NOISE_RATIO, 1)}": NOISE_RATIO}
+        title = "residuals ÷ what noise alone would give, s"
+        panels.append(Strips(title, "s (no unit)", s, lines=lines, positive=True))
     panels += [_noise(tools, triad) for triad in triads if triad in estimated]
-    angles = STATED_ANGLES[: 1 + len(triads)]
-    accuracy = {angle: tools.numbers(f"{angle}_sd_deg") for angle in angles}
-    panels.append(("1σ of the calibration at 45°", "1σ, °", accuracy))
-    steady = [p for p in parameters if "τ" not in p.title]
-    return {"parameters": draw_parameters(steady), "quality": draw_quality(panels)}
+    steady = [p for p in fleet.parameters if "τ" not in p.title]
+    return {
+        "quality": fleet_figures.draw_quality(panels, fleet.serials, fleet.doubtful),
+        "parameters": fleet_figures.draw_parameters(steady),
+    }
 
 
-def _residuals(tools: SoundTools, triad: str) -> Array:
-    """Residuals of a triad divided by what noise alone would give."""
-    return np.sqrt(tools.numbers(f"{triad}_variance_factor"))
-
-
-def _noise(tools: SoundTools, triad: str) -> Panel:
+def _noise(tools: SoundTools, triad: str) -> Strips:
     """The panel of the noise estimated from each tool's residuals; of one kind of magnetometers."""
     values = tools.numbers(f"{triad}_noise")
-    title = f"{triad}: estimated noise"
+    title = f"{triad}: estimated noise of one reading"
     if triad == TRIADS[0]:
-        return title, "1σ, mg", {triad: 1e3 * values}
-    kinds = _kinds(tools)
+        return Strips(title, "1σ, mg", {triad: 1e3 * values}, "mg", positive=True)
+    kinds = kinds_of(tools)
     kind, which = next(iter(kinds.items()))
-    relative = kind == RELATIVE_KIND and not _nominal(tools, kinds)
-    return title, "1σ of the field" if relative else "1σ, nT", {triad: values[which]}
-
-
-def _outliers(
-    tools: SoundTools, parameters: list[FleetParameter]
-) -> list[tuple[Any, FleetParameter, float, float]]:
-    """Tools far from the fleet: serial, farthest parameter, value, distance; the farthest first."""
-    if tools.count < FEWEST_TOOLS:
-        return []
-    away = np.nan_to_num([distance(each.values) for each in parameters])
-    which, farthest = away.argmax(0), away.max(0)
-    serials, outliers = tools.words(SERIAL), []
-    for i in np.argsort(-farthest, kind="stable")[: int(np.sum(farthest > FAR))]:
-        each = parameters[which[i]]
-        outliers.append((serials[i], each, float(each.values[i]), float(farthest[i])))
-    return outliers
-
-
-def _suspects(tools: SoundTools) -> list[tuple[Any, str, float]]:
-    """Sound tools with large residuals: serial, triad, s; the largest first."""
-    serials, suspects = tools.words(SERIAL), []
-    for triad in TRIADS:
-        if f"{triad}_variance_factor" in tools.names:
-            s = _residuals(tools, triad)
-            suspects += [(serials[i], triad, float(s[i])) for i in np.flatnonzero(s > NOISE_RATIO)]
-    return sorted(suspects, key=lambda row: -row[2])
-
-
-def distance(values: Array) -> Array:
-    """Robust standard deviations (n,) from the median; 0 for few values, or where most are equal."""
-    if np.sum(~np.isnan(values)) < FEWEST_TOOLS:
-        return np.zeros(len(values))
-    away = np.abs(values - np.nanmedian(values))
-    spread = SPREAD * np.nanmedian(away)
-    return away / spread if spread > 0 else np.zeros(len(values))
-
-
-@plots.style()
-def draw_parameters(parameters: Sequence[FleetParameter]) -> Figure:
-    """Number of tools by value of each steady parameter: a row of panels for each triad."""
-    lines = _lines(parameters)
-    columns, label = max(map(len, lines)), "Distributions of the fleet's parameters"
-    figure, grid = plots.new_figure(label, 2.1 * len(lines), len(lines), columns)
-    for row, line in zip(grid, lines, strict=True):
-        row[0].set_ylabel("tools")
-        for axes in row[len(line) :]:
-            axes.set_axis_off()
-        for axes, (title, members) in zip(row, line, strict=False):
-            axes.set(title=title, xlabel=members[0].unit or "share of nominal")
-            _steps(axes, {m.title.partition(" ")[2]: m.values for m in members})
-            axes.locator_params(axis="x", nbins=TICKS // columns)
-    return figure
-
-
-def _lines(parameters: Sequence[FleetParameter]) -> list[list[tuple[str, list[FleetParameter]]]]:
-    """Panels in rows, each row of one triad: title and parameters of a panel."""
-    triads: dict[str, dict[str, list[FleetParameter]]] = {}
-    for each in parameters:
-        kind, _, axes = each.title.partition(" ")
-        if kind in ONE_AXIS_OR_TWO:
-            kind = f"{'own' if len(set(axes)) == 1 else 'cross'}-axis {kind}"
-        triad = each.kind or each.triad
-        title = f"{triad}: {kind}"
-        triads.setdefault(triad, {}).setdefault(title, []).append(each)
-    return [
-        list(panels.items())[first : first + ABREAST]
-        for panels in triads.values()
-        for first in range(0, len(panels), ABREAST)
-    ]
-
-
-@plots.style()
-def draw_quality(panels: Sequence[Panel]) -> Figure:
-    """Number of tools by residuals over noise or by noise, and by 1σ of each angle."""
-    label = "Distributions of residuals and accuracy"
-    figure, [row] = plots.new_figure(label, 2.2, columns=len(panels))
-    row[0].set_ylabel("tools")
-    for axes, (title, quantity, series) in zip(row, panels, strict=True):
-        axes.set(title=title, xlabel=quantity)
-        axes.locator_params(axis="x", nbins=TICKS // len(panels))
-        _steps(axes, series, abreast=3 if len(panels) < 3 else 1)
-    return figure
-
-
-def _steps(axes: Axes, series: Mapping[str, Array], abreast: int = 3) -> None:
-    """Step histograms over common bins, each with its own colour and dash; so many names in a line."""
-    usable = {name: values[np.isfinite(values)] for name, values in series.items()}
-    usable = {name: values for name, values in usable.items() if values.size}
-    if not usable:
-        axes.text(0.5, 0.5, "undetermined", ha="center", va="center", transform=axes.transAxes)
-        return
-    every = np.concatenate([values[distance(values) <= FAR] for values in usable.values()])
-    low, high = every.min(), every.max()
-    margin = 0.05 * (high - low) or max(abs(high), 1e-9) * 1e-3
-    most = max(values.size for values in usable.values())
-    edges = np.linspace(low - margin, high + margin, int(np.clip(most**0.5 / 2, *BINS)) + 1)
-    for (name, values), colour, dash in zip(usable.items(), TRIAD_COLOURS, DASHES, strict=False):
-        counts, _ = np.histogram(values, edges)
-        axes.stairs(counts, edges, label=name, color=colour, ls=dash, lw=1.0)
-    rows = -(-len(usable) // abreast)
-    axes.legend(ncols=abreast, loc="upper left", handlelength=2.2, columnspacing=1.0)
-    axes.set_ylim(bottom=0, top=axes.get_ylim()[1] * (1.1 + 0.15 * rows))
+    relative = kind == RELATIVE_KIND and not nominal_unit(tools, kinds)
+    scale, name = ("1σ of the field", "") if relative else ("1σ, nT", "nT")
+    return Strips(title, scale, {triad: np.where(which, values, np.nan)}, name, positive=True)

@@ -7,10 +7,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mwdcal import __version__
-from mwdcal.app.pages.page import environment
+from mwdcal.app.pages.page import banner, environment
 from mwdcal.app.screens.noise import heading, marked, profile_lines, rounded, scaled, tables
-from mwdcal.app.screens.numbers import channels_of
+from mwdcal.app.screens.numbers import channels_of, number
+from mwdcal.app.text import plural
+from mwdcal.calibration.diagnosis.findings import UNUSED
 from mwdcal.calibration.readings import SIMULATED
+from mwdcal.logs.movement import NOT_AT_REST
 from mwdcal.logs.noise import ChannelNoise, Noise
 from mwdcal.use import plots
 
@@ -22,19 +25,45 @@ AXIS_MARKERS = {"x": "o", "y": "s", "z": "^"}
 """Markers of the channels of a triad."""
 
 
-def render(noise: Noise) -> str:
-    """The report: one HTML page that needs nothing else; the same noise, the same bytes."""
+def render(noise: Noise, log_sha256: str = "", profile: str = "", profile_sha256: str = "") -> str:
+    """The report as HTML, with the name of its tool profile and the SHA-256 of its sources."""
     template = environment().get_template("noise.html")
     return template.render(
         result=noise,
         simulated=noise.simulated,
+        banner=_banner(noise),
+        findings=[f for f in noise.findings if f.id != NOT_AT_REST],
         heading=heading(noise),
         figure=figure(noise),
         tables=tables(noise),
         toml=profile_lines(noise),
         rounded=rounded,
+        log_sha256=log_sha256,
+        profile=profile,
+        profile_sha256=profile_sha256,
         version=__version__,
     )
+
+
+def _banner(noise: Noise) -> dict[str, str]:
+    """Whether the log is one of a tool at rest, which figures hold, and what to do."""
+    moved = next((f for f in noise.findings if f.id == NOT_AT_REST), None)
+    if moved:
+        headline = "This log is not at rest: run mwdcal stations"
+        return banner("bad", "Not at rest", headline, moved.text.partition(": ")[2])
+    count = plural(len(noise.channels), "channel")
+    if noise.withheld:
+        doubtful = sum(bool(channel.doubts) for channel in noise.channels.values())
+        some = "Some" if doubtful < len(noise.channels) else "The"
+        headline = f"{some} figures do not hold – {doubtful} of {count}"
+        why = "; ".join(f"{kind}: {reason}" for kind, reason in noise.withheld.items())
+        return banner("attention", "Attention", headline, f"No noise for the profile of the {why}.")
+    headline = f"At rest – noise of {count} found"
+    named = ", ".join(f"{kind} {number(value)} raw" for kind, value in noise.profile.items())
+    after = f"1σ of a station of {rounded(noise.station_seconds)} s, for the tool profile: {named}."
+    if any(finding.id != UNUSED for finding in noise.findings):
+        return banner("attention", "Attention", headline, f"See the findings below. {after}")
+    return banner("good", "OK", headline, after)
 
 
 @plots.style()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from base64 import b64encode
+from hashlib import sha256
 from typing import TYPE_CHECKING
 
 from mwdcal.app.pages import pictures
@@ -16,9 +18,11 @@ def environment() -> Environment:
     """The templates, and what they call; refuses where what draws a page is missing."""
     pictures.require("the report", "matplotlib", "jinja2")
     from jinja2 import Environment, PackageLoader, StrictUndefined
+    from markupsafe import Markup
 
+    loader = PackageLoader("mwdcal.app.pages")
     environment = Environment(
-        loader=PackageLoader("mwdcal.app.pages"),
+        loader=loader,
         autoescape=True,
         undefined=StrictUndefined,
         finalize=lambda shown: harmless(shown) if type(shown) is str else shown,
@@ -27,6 +31,9 @@ def environment() -> Environment:
     )
     environment.filters |= {function.__name__: function for function in FILTERS}
     environment.filters["svg"] = pictures.svg
+    script = loader.get_source(environment, "page.js")[0]
+    digest = b64encode(sha256(script.encode()).digest()).decode()
+    environment.globals |= {"script": Markup(script), "script_sha256": digest}
     return environment
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from mwdcal.app.text import harmless
 from mwdcal.errors import InputError
-from mwdcal.use.plots import style
+from mwdcal.use.plots import POINT_NAMES, style
 
 if TYPE_CHECKING:
     from markupsafe import Markup
@@ -39,7 +39,10 @@ def picture(figure: Figure, suffix: str) -> bytes:
 
 
 def svg(figure: Figure, key: str) -> Markup:
-    """An element to put into HTML: no prologue, no names of schemas, ids that start with `key`."""
+    """An element to put into HTML: no prologue, no names of schemas, ids that start with `key`.
+
+    It takes the focus, so that a picture wider than the screen can be scrolled by keys.
+    """
     from markupsafe import Markup
 
     text = "<svg" + picture(figure, ".svg").decode().partition("<svg")[2]
@@ -50,9 +53,30 @@ def svg(figure: Figure, key: str) -> Markup:
     text = re.sub(r'(\bid="|href="#|url\(#)', rf"\g<1>{key}-", text)
     text = re.sub(r'\b(d|x|y)="[^"]*"', _shortened, text)
     text = re.sub(r'<g([^<>]*)>\s*((?:<use [^<>]* style="([^"]*)"/>\s*)+)</g>', _gathered, text)
+    for line in figure.findobj(lambda artist: (artist.get_gid() or "").startswith(POINT_NAMES)):
+        _, *names = str(line.get_label()).split("\n")
+        text = _with_names(text, f'<g id="{key}-{line.get_gid()}">', names)
     head, rest = harmless(text).split(">", 1)
     text = re.sub(r' (width|height|version)="[^"]*"', "", head) + ">" + rest
-    return Markup(text.replace("<svg", f'<svg role="img" aria-label="{figure.get_label()}"', 1))
+    seen = f'<svg role="img" aria-label="{figure.get_label()}" tabindex="0"'
+    return Markup(text.replace("<svg", seen, 1))
+
+
+def _with_names(text: str, start: str, names: list[str]) -> str:
+    """The markers of a line with their names, if all of them are in the picture."""
+    from markupsafe import escape
+
+    before, _, after = text.partition(start)
+    markers, end, rest = after.partition("</g>")
+    if markers.count("<use ") != len(names):
+        return text
+    each = iter(names)
+    titled = re.sub(
+        "(<use [^<>]*)/>",
+        lambda use: f"{use[1]}><title>{escape(next(each))}</title></use>",
+        markers,
+    )
+    return before + start + titled + end + rest
 
 
 def _shortened(path: re.Match[str]) -> str:

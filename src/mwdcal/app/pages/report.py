@@ -6,6 +6,7 @@ extra `report` (jinja2, matplotlib).
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from datetime import datetime
 from typing import TYPE_CHECKING, Any
 
@@ -17,17 +18,20 @@ from mwdcal.app.screens.calibration import how, known_inclinations
 from mwdcal.app.screens.numbers import HELD, capital, exponent, factor_places
 from mwdcal.app.text import plural, quantity, raised
 from mwdcal.calibration.prediction import accuracy_at, angles, middle_temperature, typical_accuracy
-from mwdcal.calibration.readings import is_simulated
+from mwdcal.calibration.readings import is_simulated, soaks
 from mwdcal.calibration.record import MAGNETIC, Calibration, Finding, TriadCalibration
 from mwdcal.errors import InputError
 from mwdcal.estimation.solvers import RANK_TOLERANCE
 from mwdcal.geometry.observables import TITLES
 from mwdcal.use import plots
+from mwdcal.use import verdict_plots as verdict_plots  # puts `plot` on verdicts
 from mwdcal.use.notation import Notation, convert
 
 if TYPE_CHECKING:
-    from mwdcal.use.verification import Verdict
+    from mwdcal.use.verification import Verdict, VerdictRow
 
+SHOWN_DEPARTURES = {"spread": "departure from the middle of the roll set", "error": "error"}
+"""What the stations of a roll test show of each kind of limit."""
 LONG_TABLE = 60
 """A run of more stations has its station table at the end, as an annex."""
 LARGE_RATIO = 2.0
@@ -36,8 +40,13 @@ ACCURACY_INCLINATIONS = (5.0, 45.0, 90.0)
 """Inclinations of the table of predicted accuracy, degrees."""
 
 
-def render(calibration: Calibration, verdict: Verdict | None = None) -> str:
-    """The report as HTML: the same input gives the same text, byte for byte."""
+def render(
+    calibration: Calibration, verdict: Verdict | None = None, *metadata: Mapping[str, object]
+) -> str:
+    """The report as HTML: the same input gives the same text, byte for byte.
+
+    `metadata` are those of the roll test behind the verdict.
+    """
     template = environment().get_template("report.html")
     return template.render(
         cal=calibration,
@@ -45,7 +54,7 @@ def render(calibration: Calibration, verdict: Verdict | None = None) -> str:
         verdict=verdict,
         banner=outcome(calibration, verdict),
         findings=_findings(calibration, verdict),
-        simulated=is_simulated(calibration.tool),
+        simulated=any(map(is_simulated, (calibration.tool, *metadata))),
         inclinations=known_inclinations(calibration),
         method="; ".join(how(calibration)),
         magnetic=MAGNETIC,
@@ -55,6 +64,8 @@ def render(calibration: Calibration, verdict: Verdict | None = None) -> str:
         parameters=_parameters(calibration),
         held=HELD,
         accuracy=_accuracy(calibration),
+        soaked=_soaked(calibration),
+        kinds=_kinds(verdict),
         titles=TITLES,
         large=LARGE_RATIO,
         tolerance=RANK_TOLERANCE,
@@ -68,17 +79,20 @@ def outcome(calibration: Calibration, verdict: Verdict | None) -> dict[str, str]
     word = "OK" if level == "good" else "Attention"
     if verdict is None:
         each = typical_accuracy(calibration).items()
-        expected = ", ".join(f"{name} {quantity(sd, '°')}" for name, sd in each)
+        expected = ", ".join(
+            f"{name} {'undetermined' if sd is None else quantity(sd, '°')}" for name, sd in each
+        )
         after = (
             f"{fit}. Accuracy to expect (1σ, calibration alone, typical): {expected or 'not stated'}. "
             "Verify by a roll test that was not used in the fit: mwdcal verify."
         )
         unverified = "Calibrated – not yet verified"
         return banner("open" if level == "good" else level, "Not verified", unverified, after)
-    missed = sum(not row.passed for row in verdict.rows)
+    missed = [row.name for row in verdict.rows if not row.passed]
     count = plural(len(verdict.rows), "limit")
     if not verdict.passed:
-        return banner("bad", "Failed", f"Verification failed – {missed} of {count} not met", fit)
+        headline = f"Verification failed – {len(missed)} of {count} not met"
+        return banner("bad", "Failed", headline, f"Not met: {', '.join(missed)}. {fit}.")
     return banner(level, word, f"Verification passed – {count} met", fit)
 
 
@@ -113,7 +127,9 @@ def _findings(calibration: Calibration, verdict: Verdict | None) -> list[Finding
 
 
 def _when(time: str) -> str:
-    """A time of the record as people write it."""
+    """A time of the record as people write it; of a tool in a fleet's table it is the day."""
+    if "T" not in time:
+        return time
     try:
         return datetime.fromisoformat(time).strftime("%Y-%m-%d %H:%M UTC")
     except ValueError:
@@ -168,11 +184,27 @@ def _unit(triad: TriadCalibration) -> str:
     return triad.unit if triad.unit in ("g", "nT") else ""
 
 
+def _kinds(verdict: Verdict | None) -> list[tuple[str, list[tuple[VerdictRow, int]]]]:
+    """Columns of the stations of a roll test: limits of each kind, with the decimals of their 1σ."""
+    kinds: dict[str, list[tuple[VerdictRow, int]]] = {}
+    for row in verdict.rows if verdict else ():
+        if row.sets:
+            places = min(max(1 - exponent(row.uncertainty or row.limit / 100), 0), 9)
+            kinds.setdefault(SHOWN_DEPARTURES[row.name.partition(" ")[0]], []).append((row, places))
+    return list(kinds.items())
+
+
+def _soaked(calibration: Calibration) -> bool:
+    """Whether stations of several soaks have errors to draw against temperature."""
+    warmth = [r.temperature_c for r in calibration.station_rows if r.temperature_c is not None]
+    return bool(calibration.errors and warmth and soaks(np.array(warmth)).any())
+
+
 def _accuracy(calibration: Calibration) -> dict[str, Any]:
     """1σ in degrees by angle: of the calibration alone, and of one reading."""
     middle = middle_temperature(calibration)
     cases = [(inclination, middle) for inclination in ACCURACY_INCLINATIONS]
-    if any(t.order for t in calibration.triads) and calibration.temperature_c:
+    if calibration.thermal and calibration.temperature_c:
         cases += [(45.0, t) for t in calibration.temperature_c]
     names = angles(calibration)
     rows = []
@@ -181,4 +213,6 @@ def _accuracy(calibration: Calibration) -> dict[str, Any]:
         both = [accuracy_at(calibration, at, noise, temperature) for noise in (False, True)]
         sd = [float(np.degrees(each[name][0])) for name in names for each in both]
         rows.append((inclination, temperature, sd))
-    return {"names": names, "rows": rows, "temperature": middle}
+    pairs = [sd[2 * i] for *_, sd in rows for i in range(len(names))]
+    stated = [n for n, sd in zip(names * len(rows), pairs, strict=True) if not np.isnan(sd)]
+    return {"names": names, "rows": rows, "temperature": middle, "stated": stated}

@@ -1,4 +1,4 @@
-"""Stations found in a log, as a picture."""
+"""The page of the stations found in a log, and its figure."""
 
 from __future__ import annotations
 
@@ -6,9 +6,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mwdcal.app.screens.numbers import channels_of
-from mwdcal.app.screens.stations import left
+from mwdcal import __version__
+from mwdcal.app.pages.page import banner, environment
+from mwdcal.app.screens.numbers import capital, channels_of, fixed, measured
+from mwdcal.app.screens.stations import extent, left, next_command, search, share
+from mwdcal.app.text import plural
+from mwdcal.calibration.diagnosis.findings import UNUSED
+from mwdcal.calibration.readings import is_simulated, serial_of
+from mwdcal.files.contract import RAW
 from mwdcal.geometry.vectors import Array
+from mwdcal.logs.station_findings import ALL_STILL
 from mwdcal.logs.stations import Stations
 from mwdcal.use import plots
 
@@ -18,6 +25,103 @@ if TYPE_CHECKING:
 
 POINTS = 2000
 """Points of a line in the picture."""
+LONGEST_LOG_NAME = 40
+"""Characters of the name of a log that have room above the picture."""
+NUMBER_ROOM = 0.014
+"""Room of a digit above the picture, as a share of its width."""
+PLAIN_COLUMNS = {
+    "start_s": ("start, s", 2),
+    "end_s": ("end, s", 2),
+    "samples": ("samples", 0),
+    "temperature_c": ("T, °C", 2),
+    "drift_temperature_c": ("its drift, °C", 2),
+}
+"""Columns of the table of stations without an uncertainty: title and decimals."""
+LEFT_OUT = {
+    "short": "too short once trimmed",
+    "moves slowly": "moves slowly, by more than a tool at rest can",
+}
+"""Why an interval was left out, in words."""
+
+
+def render(stations: Stations, log_sha256: str, output: str = "", why: str = "") -> str:
+    """The stations as HTML, with the run file that they were written to.
+
+    A log without a station has none, but the reason `why`.
+    """
+    metadata = stations.table.metadata
+    return (
+        environment()
+        .get_template("standstills.html")
+        .render(
+            result=stations,
+            log=stations.table.source,
+            heading=_heading(stations),
+            serial=serial_of(metadata),
+            simulated=is_simulated(metadata),
+            banner=_banner(stations, output, why),
+            figure=figure(stations),
+            **_table(stations),
+            left=left(stations),
+            reasons=LEFT_OUT,
+            search=search(stations),
+            log_sha256=log_sha256,
+            output=output,
+            version=__version__,
+        )
+    )
+
+
+def _heading(stations: Stations) -> list[str]:
+    """The log, unless it is the name of the page, its extent, and when it was recorded, if it says so."""
+    metadata = stations.table.metadata
+    log = [stations.table.source] if serial_of(metadata) else []
+    date = [f"recorded {metadata['date']}"] if metadata.get("date") else []
+    return [*log, ", ".join(extent(stations)), *date]
+
+
+def _banner(stations: Stations, output: str, why: str) -> dict[str, str]:
+    """How many stations there are, what is doubtful, and what to do next."""
+    if not stations.table.count:
+        reason = why.removeprefix(f"{stations.table.source}: ")
+        return banner("bad", "No station", "No standstill found in this log", capital(reason))
+    ids = [finding.id for finding in stations.findings if finding.id != UNUSED]
+    headline = (
+        f"{plural(stations.table.count, 'station')} found – at rest {share(stations)} of the time"
+    )
+    if ALL_STILL in ids:
+        after = f"A calibration needs several attitudes. Noise of the tool: mwdcal noise {stations.table.source}"
+        return banner("attention", "At rest throughout", headline, after)
+    enter = f"enter the angles of the stand in {output} (ref_inclination_deg, …), then "
+    stated = any(name.startswith("ref_") for name in stations.table.columns)
+    after = f"Next: {'' if stated else enter}{next_command(output)}"
+    if not ids:
+        some = len(left(stations))
+        passed = (
+            f"{plural(some, 'calm interval')} left out, see below" if some else "Nothing left out"
+        )
+        return banner("good", "OK", headline, f"{passed}. {after}")
+    seen = "the finding" if len(ids) == 1 else f"the {len(ids)} findings"
+    return banner("attention", "Attention", headline, f"See {seen} below. {after}")
+
+
+def _table(stations: Stations) -> dict[str, Any]:
+    """Titles of the table of stations, and rows: plain cells, means with their 1σ, and what drifts."""
+    columns = stations.table.columns
+    plain = {name: look for name, look in PLAIN_COLUMNS.items() if name in columns}
+    channels = [name for name in RAW if name in columns]
+    titles = [*(title for title, _ in plain.values()), *(f"{name}, raw" for name in channels)]
+    cells = [(columns[name], places) for name, (_, places) in plain.items()]
+    rows = [
+        {
+            "station": columns["station"][i],
+            "plain": [fixed(float(column[i]), places) for column, places in cells],
+            "means": [measured(*(float(columns[n][i]) for n in (c, f"sd_{c}"))) for c in channels],
+            "drifts": columns["drifting"][i],
+        }
+        for i in range(stations.table.count)
+    ]
+    return {"titles": ["station", *titles, "drifts"], "rows": rows}
 
 
 @plots.style()
@@ -88,15 +192,21 @@ def _shade(axes: Axes, stations: Stations) -> None:
 
 
 def _number_stations(axes: Axes, stations: Stations) -> None:
+    """Numbers of the stations above them, as many as have room."""
     start, end = stations.intervals.stations
-    middle = (start + end) / 2
-    every = max(1, -(-len(middle) // 30))
-    across = ("data", "axes fraction")
-    look: dict[str, Any] = {"xycoords": across, "textcoords": "offset points", "fontsize": 6}
-    for i in range(0, len(middle), every):
-        axes.annotate(str(i + 1), (middle[i], 1.0), (0, 2), ha="center", **look)
+    room = NUMBER_ROOM * float(stations.time[-1] - stations.time[0])
+    look: dict[str, Any] = {"xycoords": ("data", "axes fraction"), "fontsize": 6.5, "ha": "center"}
+    free = -np.inf
+    for number, middle in enumerate(((start + end) / 2).tolist(), 1):
+        half = room * len(str(number)) / 2
+        if middle - half >= free:
+            place = (0, 2)
+            axes.annotate(str(number), (middle, 1.0), place, textcoords="offset points", **look)
+            free = middle + half
+    log = stations.table.source
+    log = log if len(log) <= LONGEST_LOG_NAME else f"…{log[-LONGEST_LOG_NAME:]}"
     axes.set_title(
-        f"{stations.table.source}: stations taken {stations.table.count} (filled, numbered), "
+        f"{log}: stations taken {stations.table.count} (filled, numbered), "
         f"calm intervals left {len(left(stations))} (hatched)",
         pad=12,
     )

@@ -149,21 +149,28 @@ def effort(comparison: Comparison) -> list[list[str]]:
 
 def notes(comparison: Comparison) -> list[str]:
     """What each method leaves free, and what the tables mean."""
-    rows = able(comparison.rows)
-    if not rows:
-        return []
-    lines = [
+    measure = "|e|: length of the vector error, as a share of the reference vector (Moradi)"
+    stated = [measure] if comparison.measures_before and able(comparison.rows) else []
+    return [*undetermined(comparison), *stated, *marks(comparison)]
+
+
+def undetermined(comparison: Comparison) -> list[str]:
+    """What each method leaves free."""
+    return [
         f"{row.method} leaves undetermined: {', '.join(row.undetermined)}"
-        for row in rows
+        for row in able(comparison.rows)
         if row.undetermined
     ]
-    if comparison.measures_before:
-        lines.append("|e|: length of the vector error, as a share of the reference vector (Moradi)")
+
+
+def marks(comparison: Comparison) -> list[str]:
+    """What marks in the tables mean, where there are any."""
+    if not able(comparison.rows):
+        return []
     if any(CONVENTION_MARK in cell for row in figures(comparison) for cell in row):
-        lines.append(
-            f"{CONVENTION_MARK} rests on a direction that the method leaves free: kept at nominal"
-        )
-    return lines
+        rests = "rests on a direction that the method leaves free: kept at nominal"
+        return [f"{CONVENTION_MARK} {rests}"]
+    return []
 
 
 def gauge(comparison: Comparison) -> str:

@@ -14,6 +14,7 @@ from mwdcal.app.text import one_line, raised, table
 from mwdcal.calibration.readings import Readings, simulated
 from mwdcal.calibration.record import SOFTWARE, Calibration, Finding
 from mwdcal.files import documents
+from mwdcal.files.formats import members
 from mwdcal.firmware.export import DEFAULT_BITS, FirmwareSources, export
 from mwdcal.firmware.statements import stated_errors
 from mwdcal.firmware.working_range import SHARE_OF
@@ -111,7 +112,7 @@ def temperature_findings(
 
     The reference temperature counts as asked for where the values depend on it.
     """
-    varies = notation != "factors" and any(t.order for t in calibration.triads)
+    varies = notation != "factors" and calibration.thermal
     if isinstance(temperature, str) or (temperature is None and not varies):
         return []
     at = calibration.reference_temperature if temperature is None else temperature
@@ -154,7 +155,7 @@ def _identity(converted: Converted | Exported) -> dict[str, Any]:
         "tool": calibration.tool,
         "profile": calibration.profile.name,
         "run": calibration.run,
-        "calibration": converted.path.name,
+        "calibration": members.name_of(converted.path),
         "calibrated": calibration.time,
         "software": calibration.software,
         "converted_by": SOFTWARE,
@@ -203,7 +204,12 @@ def _heading(converted: Converted | Exported) -> list[list[str]]:
     """Whose calibration it is, in two lines."""
     calibration = converted.calibration
     serial = calibration.tool.get("serial", calibration.profile.name)
-    first = [converted.path.name, serial, f"run {calibration.run}", calibration.software]
+    first = [
+        members.name_of(converted.path),
+        serial,
+        f"run {calibration.run}",
+        calibration.software,
+    ]
     return [[*first, *simulated(calibration.tool)], [f"SHA-256 {converted.sha256}"]]
 
 

@@ -47,22 +47,20 @@ class StatusCount:
     message: str
 
 
-@dataclass(frozen=True)
-class FindingCount:
-    """Sound tools with one finding: how many, and the first serials."""
+class FleetFinding(msgspec.Struct, frozen=True, kw_only=True):
+    """Tools with one finding: how many, and the first serials; of the whole table also its text."""
 
     id: str
     tools: int
     serials: list[Any]
+    text: str | msgspec.UnsetType = msgspec.UNSET
+    station: str | msgspec.UnsetType | None = msgspec.UNSET
 
 
-@dataclass(frozen=True)
-class FleetSummary:
+class FleetCounts(msgspec.Struct, frozen=True, kw_only=True):
     """What came of a fleet. `spread` has the 1 %, 50 % and 99 % point of columns of sound tools.
 
-    `unused` are columns that are not used, of all tools.
     `orders` and `nonlinear`: tools by triad and chosen order, and by triad with own-axis terms.
-    `metadata` are those of the table of calibrations.
     """
 
     runs: str
@@ -75,13 +73,18 @@ class FleetSummary:
     orders: dict[str, dict[str, int]]
     nonlinear: dict[str, int]
     statuses: list[StatusCount]
-    findings: list[FindingCount]
-    spread: dict[str, list[float]]
+    findings: list[FleetFinding]
+    spread: dict[str, list[float | None]]
     undetermined: dict[str, int]
     parts: int
     parts_done_before: int
     seconds: float
     notes: list[str]
+
+
+class FleetSummary(FleetCounts, frozen=True, kw_only=True):
+    """What screens and pages show: columns of all tools that are not used, and the table's metadata too."""
+
     unused: list[Finding]
     metadata: dict[str, Any]
 
@@ -89,6 +92,14 @@ class FleetSummary:
     def sound(self) -> int:
         """Number of calibrated tools."""
         return sum(kind.tools for kind in self.statuses if kind.status == OK)
+
+
+class FleetDocument(FleetCounts, frozen=True, kw_only=True):
+    """What `fleet` prints: the fields of `FleetSummary`, the number of calibrated tools, and the page."""
+
+    tools_per_second: float
+    calibrated: int
+    report: str
 
 
 def summarise(target: Path, typed: Typed, notes: list[str], **facts: Any) -> FleetSummary:
@@ -109,7 +120,7 @@ def summarise(target: Path, typed: Typed, notes: list[str], **facts: Any) -> Fle
         nonlinear=_nonlinear(whole, columns),
         statuses=_kinds(head),
         findings=_findings(head),
-        spread={name: quantiles(numbers(whole, name)) for name in shown},
+        spread={name: [*quantiles(numbers(whole, name))] for name in shown},
         undetermined=_undetermined(whole, columns),
         notes=notes + (_wide(whole) if typed["order"] == "0" else []),
     )
@@ -176,7 +187,7 @@ def _kinds(head: Any) -> list[StatusCount]:
     return kinds
 
 
-def _findings(head: Any) -> list[FindingCount]:
+def _findings(head: Any) -> list[FleetFinding]:
     """Findings with their tools: doubts of the fit first, then by number."""
     column = one_chunk(head.column("findings"))
     ids = column.flatten().dictionary_encode()
@@ -185,7 +196,7 @@ def _findings(head: Any) -> list[FindingCount]:
     for code, name in enumerate(ids.dictionary.to_pylist()):
         tools = tool[ids.indices.to_numpy() == code]
         serials = head.column(SERIAL).take(tools[:SERIALS_SHOWN]).to_pylist()
-        findings.append(FindingCount(name, len(tools), serials))
+        findings.append(FleetFinding(id=name, tools=len(tools), serials=serials))
     return sorted(findings, key=lambda f: (not is_doubt(f.id), -f.tools, f.id))
 
 
@@ -225,49 +236,19 @@ def _undetermined(whole: Any, columns: list[str]) -> dict[str, int]:
     return counts
 
 
-class FleetFinding(msgspec.Struct, frozen=True, kw_only=True):
-    """Tools with one finding: how many, and the first serials; of the whole table also its text."""
-
-    id: str
-    tools: int
-    serials: list[Any]
-    text: str | msgspec.UnsetType = msgspec.UNSET
-    station: str | msgspec.UnsetType | None = msgspec.UNSET
-
-
-class FleetDocument(msgspec.Struct, frozen=True, kw_only=True):
-    """What `fleet` prints: the fields of `FleetSummary`, the number of calibrated tools, and the page."""
-
-    runs: str
-    output: str
-    tools: int
-    stations: int
-    method: str
-    order: int | str
-    options: dict[str, Any]
-    orders: dict[str, dict[str, int]]
-    nonlinear: dict[str, int]
-    statuses: list[StatusCount]
-    findings: list[FleetFinding]
-    spread: dict[str, list[float | None]]
-    undetermined: dict[str, int]
-    parts: int
-    parts_done_before: int
-    seconds: float
-    notes: list[str]
-    tools_per_second: float
-    calibrated: int
-    report: str
-
-
 def document(summary: FleetSummary, report: Path | None) -> dict[str, Any]:
     """The summary for machines."""
-    shown: dict[str, Any] = msgspec.to_builtins(summary)
-    whole = {"tools": summary.tools, "serials": []}
-    shown["findings"] += [{**each, **whole} for each in shown["unused"]]
-    shown["tools_per_second"] = round(summary.tools / summary.seconds, 1)
-    files = {"calibrated": summary.sound, "report": str(report or "")}
-    content = msgspec.convert({**shown, **files}, FleetDocument)
+    counts = {name: getattr(summary, name) for name in FleetCounts.__struct_fields__}
+    unused = [
+        FleetFinding(**msgspec.to_builtins(each), tools=summary.tools, serials=[])
+        for each in summary.unused
+    ]
+    content = FleetDocument(
+        **{**counts, "findings": [*summary.findings, *unused]},
+        tools_per_second=round(summary.tools / summary.seconds, 1),
+        calibrated=summary.sound,
+        report=str(report or ""),
+    )
     stated = summary.metadata
     return enveloped("fleet", content, stated, profile=stated["profile_sha256"])
 
@@ -316,7 +297,7 @@ def _remarks(summary: FleetSummary) -> list[str]:
     ]
 
 
-def _first(some: StatusCount | FindingCount) -> str:
+def _first(some: StatusCount | FleetFinding) -> str:
     """The first serials of some tools."""
     return ", ".join(map(one_line, some.serials)) + (" …" if some.tools > len(some.serials) else "")
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
 
+from mwdcal.app.screens.noise import rounded
+from mwdcal.app.screens.numbers import written
 from mwdcal.app.text import one_line, plural, table
 from mwdcal.calibration.record import Finding
 from mwdcal.files.contract import RAW
@@ -31,6 +34,7 @@ class StationsSummary(msgspec.Struct, frozen=True, kw_only=True):
     findings: list[Finding]
     output: str
     plot: str
+    report: str
 
 
 def summary(stations: Stations, files: dict[str, str]) -> StationsSummary:
@@ -48,8 +52,7 @@ def summary(stations: Stations, files: dict[str, str]) -> StationsSummary:
         stations=[dict(zip(columns, row, strict=True)) for row in rows],
         left=left(stations),
         findings=stations.findings,
-        output=files["output"],
-        plot=files["plot"],
+        **files,
     )
 
 
@@ -71,38 +74,57 @@ def _seconds(stations: Stations) -> float:
 
 def screen(stations: Stations, files: dict[str, str]) -> str:
     """What was found, for people."""
-    picture = f"   {files['plot']} (picture)" if files["plot"] else ""
-    after = f"next: mwdcal calibrate {files['output']} -o CAL.json"
+    outputs = written(run=files["output"], picture=files["plot"], report=files["report"])
     lines = [
-        one_line("   ".join(_heading(stations))),
-        "   ".join(_search(stations)),
+        one_line("   ".join(heading(stations))),
+        "   ".join(search(stations)),
         "",
         _stations_table(stations),
-        one_line(f"wrote {files['output']}{picture}   {after}"),
+        f"{outputs}   next: {one_line(next_command(files['output']))}",
     ]
     return "\n".join(lines)
 
 
-def _heading(stations: Stations) -> list[str]:
+def shown_in(plot: Path | None, report: Path | None) -> str:
+    """Where a log without a station is shown."""
+    if plot or report:
+        return written(picture=plot, report=report)
+    return "--report or --plot shows the log."
+
+
+def next_command(output: str) -> str:
+    """What to do with the run."""
+    return f"mwdcal calibrate {output} -o CAL.json"
+
+
+def heading(stations: Stations) -> list[str]:
     """The log, and how much of it the stations are."""
-    whole = _seconds(stations)
-    start, end = (np.asarray(stations.table.columns[name]) for name in ("start_s", "end_s"))
-    share = 100 * float((end - start).sum()) / whole
     return [
         stations.table.source,
-        f"{len(stations.time)} rows",
-        f"{whole:.6g} s",
-        f"{plural(stations.table.count, 'station')}, {share:.0f} % of the time",
+        *extent(stations),
+        f"{plural(stations.table.count, 'station')}, {share(stations)} of the time",
     ]
 
 
-def _search(stations: Stations) -> list[str]:
+def extent(stations: Stations) -> list[str]:
+    """Rows and seconds of the log."""
+    return [f"{len(stations.time)} rows", f"{_seconds(stations):.6g} s"]
+
+
+def share(stations: Stations) -> str:
+    """How much of the time of the log the stations are."""
+    columns = stations.table.columns
+    start, end = (np.asarray(columns.get(name, ()), float) for name in ("start_s", "end_s"))
+    return f"{100 * float((end - start).sum()) / _seconds(stations):.0f} %"
+
+
+def search(stations: Stations) -> list[str]:
     """How stations were searched for, and what was left."""
     short = sum(each["reason"] == "short" for each in left(stations))
-    same = " (the same stations from {:.3g} to {:.3g})"
-    stretch = same.format(*stations.stretch) if stations.stretch else " (given)"
+    same = " (the same stations from {} to {})"
+    stretch = same.format(*map(rounded, stations.stretch)) if stations.stretch else " (given)"
     return [
-        f"threshold {stations.threshold:.3g} noise floors{stretch}",
+        f"threshold {rounded(stations.threshold)} noise floors{stretch}",
         f"at least {stations.min_seconds:g} s after {stations.trim_seconds:g} s trimmed off each end",
         f"left: {short} too short, {len(left(stations)) - short} moving slowly",
     ]

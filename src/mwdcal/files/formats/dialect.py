@@ -22,17 +22,21 @@ LEAST_COLUMNS = 4
 """Columns that a table with three channels and a reference has at least."""
 _LOOKED_AT = 2000
 """Lines in which the layout of a table shows."""
-_THOUSANDS = re.compile(r"[+-]?\d{1,3},\d{3}")
+_THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}[.,]\d{3}")
 
 Rows = Sequence[Sequence[str]]
 
 
 class Export(NamedTuple):
-    """A table as it was exported: how it is written, its column names, and their units if a line has them."""
+    """A table as it was exported: how it is written, its column names, and their units if a line has them.
+
+    `above`: the lines above the names that are not metadata.
+    """
 
     form: TableFormat
     names: list[str]
     units: list[str]
+    above: tuple[str, ...] = ()
 
 
 def decoded(data: bytes, encoding: str, source: str) -> str:
@@ -124,6 +128,8 @@ def recognised_rows(rows: Rows, form: TableFormat, source: str) -> Export:
             f"at least {LEAST_COLUMNS} columns, and names above them."
         )
     header, units = _head(rows, first, source)
+    below = range((header if units is None else units) + 1, first)
+    first = next((place for place in below if holds_numbers(rows[place])), first)
     names = [name.strip() for name in rows[header]]
     while names and not names[-1]:
         names.pop()
@@ -133,12 +139,13 @@ def recognised_rows(rows: Rows, form: TableFormat, source: str) -> Export:
         TableFormat(
             encoding=form.encoding,
             delimiter=form.delimiter,
-            decimal=_decimal(cells, source),  # type: ignore[arg-type]
+            decimal=_decimal(cells, form.delimiter, source),  # type: ignore[arg-type]
             header_line=header + 1,
             first_line=first + 1,
         ),
         names,
         [*under, *[""] * len(names)][: len(names)],
+        tuple(line for line in map(" ".join, rows[:header]) if not is_metadata(line)),
     )
 
 
@@ -157,6 +164,22 @@ def _is_reading(row: Sequence[str]) -> bool:
     """Whether a row has numbers in at least half of its cells, and in at least four."""
     numbers = sum(map(_is_number, row))
     return numbers >= LEAST_COLUMNS and 2 * numbers >= sum(bool(cell.strip()) for cell in row)
+
+
+def holds_numbers(row: Sequence[str]) -> bool:
+    """Whether at least half of a row's cells that are filled in are numbers, and any.
+
+    >>> [holds_numbers(row) for row in (["P1", "0.1"], ["", "mg", "°"], [""])]
+    [True, False, False]
+    """
+    numbers = sum(map(_is_number, row))
+    return numbers > 0 and 2 * numbers >= sum(bool(cell.strip()) for cell in row)
+
+
+def below_names(data: bytes, form: TableFormat, source: str) -> Rows:
+    """The names of the columns, and the lines between them and the first readings."""
+    lines = decoded(data, form.encoding, source).split("\n")
+    return _cells(lines[form.header_line - 1 : form.first_line - 1], form.delimiter, source)
 
 
 def _head(rows: Rows, first: int, source: str) -> tuple[int, int | None]:
@@ -182,7 +205,7 @@ def is_unit(cell: str) -> bool:
     return not bare.strip("-–") or bool(unit_of(bare))
 
 
-def _decimal(cells: Sequence[str], source: str) -> str:
+def _decimal(cells: Sequence[str], delimiter: str, source: str) -> str:
     """The decimal sign of the numbers in some cells."""
     numbers = [cell for cell in cells if _is_number(cell)]
     commas = [cell for cell in numbers if "," in cell]
@@ -192,9 +215,11 @@ def _decimal(cells: Sequence[str], source: str) -> str:
             f"{source}: numbers with a comma ({commas[0]}) and with a point ({points[0]}) are mixed. Export "
             "the table with one decimal sign and without thousands separators."
         )
-    if commas and all(map(_THOUSANDS.fullmatch, commas)):
-        raise FitError(
-            f"{source}: the comma in {commas[0]} may be a decimal sign or separate thousands. Export the "
-            "table with more or fewer decimals, or without thousands separators."
-        )
+    for sign, marked in (("comma", commas), ("point", points)):
+        foreign = sign == "comma" or delimiter != TableFormat().delimiter
+        if marked and foreign and all(map(_THOUSANDS.fullmatch, marked)):
+            raise FitError(
+                f"{source}: the {sign} in {marked[0]} may be a decimal sign or separate thousands. Export the "
+                "table with more or fewer decimals, or without thousands separators."
+            )
     return "," if commas else "."

@@ -153,6 +153,19 @@ def recognised(path: str | os.PathLike[str]) -> dialect.Export:
     return dialect.recognised_text(data, file.name)
 
 
+def below_names(path: str | os.PathLike[str], form: TableFormat) -> list[tuple[int, Sequence[str]]]:
+    """The names of the columns of an export, and what stands between them and the readings, by line or row."""
+    file = Path(path)
+    data, suffix = _content(file), _suffix(file)
+    places = range(form.header_line, form.first_line)
+    if suffix == ".xlsx":
+        rows = dict(workbook.read_rows(data, file.name))
+        return [(place, [as_text(cell) for cell in rows.get(place, ())]) for place in places]
+    if _FORMATS[suffix] is not text:
+        return []
+    return list(zip(places, dialect.below_names(data, form, file.name), strict=False))
+
+
 def _suffix(path: Path) -> str:
     suffix = path.suffix.lower()
     if suffix not in _FORMATS:

@@ -1,0 +1,156 @@
+"""One tool out of the table of a fleet, as `cals.parquet#SERIAL` names it."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Iterator
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from mwdcal.errors import InputError, reason
+from mwdcal.files.formats import parquet
+from mwdcal.files.formats.columns import as_text, shown
+
+RECORD = "calibration"
+"""Column of the calibration file of each sound tool, without line breaks."""
+MARK = "#"
+"""What stands between the file of a fleet's table and a serial."""
+SUFFIX = ".parquet"
+_SHOWN = 5
+"""Most serials that a message names."""
+_HEAD = ["serial", "status", "message"]
+
+
+class Member(NamedTuple):
+    """The calibration of a tool as it stands in the table, what to call it, and the table's SHA-256."""
+
+    record: bytes
+    name: str
+    digest: str
+
+
+def split(path: str | os.PathLike[str]) -> tuple[Path, str | None]:
+    """The file that a path names, and the serial behind it; None where there is none.
+
+    A file that has the whole name is meant by it.
+    """
+    text = os.fspath(path)
+    places = [place for place, character in enumerate(text) if character == MARK]
+    for place in [] if Path(text).exists() else places:
+        file = Path(text[:place])
+        if file.suffix.lower() == SUFFIX and file.is_file():
+            return file, text[place + 1 :]
+    return Path(text), None
+
+
+def name_of(path: str | os.PathLike[str]) -> str:
+    """What messages and documents call a calibration: its file, with the serial of a tool in it."""
+    file, serial = split(path)
+    return file.name if serial is None else f"{file.name}{MARK}{serial}"
+
+
+def read(path: str | os.PathLike[str]) -> Member:
+    """The calibration of one tool; of the only one where the path names none.
+
+    Raises:
+        InputError: the file is not the table of a fleet, or has no calibration of such a tool.
+    """
+    file, serial = split(path)
+    try:
+        with file.open("rb") as stream:
+            digest = hashlib.file_digest(stream, "sha256").hexdigest()
+    except OSError as error:
+        raise InputError(f"{file}: cannot be read ({reason(error)}). Check the path.") from None
+    table, schema = parquet.opened(file, file.name)
+    missing = [name for name in _HEAD if name not in schema.names]
+    if missing:
+        raise InputError(
+            f"{file.name} is not a table of calibrations: the column '{missing[0]}' is missing. Use a calibration "
+            "file, or a table that mwdcal fleet wrote."
+        )
+    group, row, cells = _tool(table, file, serial)
+    if cells.status != "ok":
+        raise InputError(
+            f"{file.name}: the tool {shown(cells.serial)} was not calibrated, status {cells.status}: {cells.message}"
+        )
+    name = f"{file.name}{MARK}{cells.serial}"
+    return Member(_record(table, file.name, group, row, name), name, digest)
+
+
+def records(path: Path) -> Iterator[tuple[str, bytes]]:
+    """Serial and calibration of each tool in the table of a fleet that has one."""
+    table, _ = parquet.opened(path, path.name)
+    for group in range(table.num_row_groups):
+        serials, cells = (_cells(table, path.name, group, n) for n in (_HEAD[0], RECORD))
+        yield from ((s, cell.encode()) for s, cell in zip(serials, cells, strict=True) if cell)
+
+
+class _Row(NamedTuple):
+    """What the table says of a tool besides its results."""
+
+    serial: str
+    status: str
+    message: str
+
+
+def _tool(table: Any, file: Path, serial: str | None) -> tuple[int, int, _Row]:
+    """Where the only tool, or that of a serial, stands: row group, row, and what is said of it.
+
+    A path does not keep every character of a serial, such as a slash at its end: one that makes the same
+    path will do.
+    """
+    named = [_cells(table, file.name, group, _HEAD[0]) for group in range(table.num_row_groups)]
+    serials = [each for group in named for each in group]
+    if serial is None and len(serials) == 1:
+        serial = serials[0]
+    if serial is None:
+        raise InputError(
+            f"{file.name} has the calibrations of {len(serials)} tools. Name one of them behind a {MARK}, such as "
+            f"'{file.name}{MARK}{serials[0]}'."
+        )
+    meant = Path(f"{file}{MARK}{serial}")
+    alike = [each for each in serials if Path(f"{file}{MARK}{each}") == meant]
+    if serial not in serials and not alike:
+        raise InputError(f"{file.name} has no tool {shown(serial)}. {_advice(serial, serials)}")
+    serial = serial if serial in serials else alike[0]
+    group = next(place for place, each in enumerate(named) if serial in each)
+    row = named[group].index(serial)
+    status, message = (_cells(table, file.name, group, n)[row] for n in _HEAD[1:])
+    return group, row, _Row(serial, status, message)
+
+
+def _advice(serial: str, serials: list[str]) -> str:
+    """The serials that look like one, or else the first."""
+    near = get_close_matches(serial, serials)
+    first = [shown(each) for each in (near or serials)[:_SHOWN]]
+    if near:
+        return f"Is it {' or '.join(first)}? Correct the serial."
+    more = " …" if len(serials) > _SHOWN else ""
+    return f"Its tools are {', '.join(first)}{more}: correct the serial."
+
+
+def _cells(table: Any, source: str, group: int, name: str) -> list[str]:
+    """A column of a row group as text."""
+    arrow, _ = parquet.modules(source)
+    with parquet.reading(source):
+        column = table.read_row_group(group, [name]).column(name)
+        if arrow.types.is_dictionary(column.type):
+            column = column.cast(column.type.value_type)
+        return [as_text(cell) for cell in column.to_pylist()]
+
+
+def _record(table: Any, source: str, group: int, row: int, name: str) -> bytes:
+    """The calibration in a row."""
+    if RECORD not in table.schema_arrow.names:
+        raise InputError(
+            f"{source} has no column '{RECORD}', which holds the whole calibration of each tool. Calibrate the fleet "
+            "again with it (mwdcal fleet, `records`)."
+        )
+    record = _cells(table, source, group, RECORD)[row]
+    if not record:
+        raise InputError(
+            f"{name}: the table has no whole calibration of this tool. Calibrate it alone: mwdcal calibrate."
+        )
+    return record.encode()

@@ -1,0 +1,435 @@
+"""Pages as a reader has them: in Chromium, wide and narrow, light and dark, printed, without the network.
+
+Skips where Chromium or what drives it (the extra `dev`) is missing; `page_faults.js` says what a
+reader could not read.
+"""
+
+import io
+import re
+import shutil
+from importlib.resources import files
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cli_support import EXAMPLE, mwdcal, read_csv, servo_run, write_csv
+from mwdcal.app import cli
+
+playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+axe = pytest.importorskip("axe_playwright_python", reason="axe-core is not installed")
+pypdf = pytest.importorskip("pypdf", reason="pypdf is not installed")
+pytest.importorskip("matplotlib", reason="matplotlib is not installed")
+
+from matplotlib.patheffects import withStroke  # noqa: E402
+from PIL import Image  # noqa: E402
+
+from mwdcal.app.pages.page import environment  # noqa: E402
+from mwdcal.use import plots  # noqa: E402
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "chrome"))), None)
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed: no page was looked at"),
+]
+FAULTS = (Path(__file__).parent / "page_faults.js").read_text("utf-8")
+AXE = files(axe).joinpath("axe.min.js").read_text("utf-8")
+RUN_AXE = "axe.run(document, {resultTypes: ['violations'], selectors: false, elementRef: false})"
+WIDTHS = (1280, 420)
+SCHEMES = ("light", "dark")
+MOST_SHEETS = 16
+"""Of paper, for any sample."""
+TOOL = ("--tool", EXAMPLE / "tool.toml")
+SAMPLES = {
+    "calibrate": ("calibrate", "moved.csv", *TOOL, "-o", "new.json"),
+    "calibrate-soaks": ("calibrate", "soaks.csv", *TOOL, "--order", "1", "-o", "new.json"),
+    "verify": ("verify", "tool.json", EXAMPLE / "rolltest.csv"),
+    "verify-failed": ("verify", "tool.json", EXAMPLE / "rolltest.csv", "--limits", "tight.toml"),
+    "compare": ("compare", EXAMPLE / "run.csv", *TOOL),
+    "fleet": ("fleet", "fleet.parquet", *TOOL, "-o", "new.parquet", "--workers", "1"),
+    "noise": ("noise", EXAMPLE / "static.csv", *TOOL),
+    "noise-moving": ("noise", EXAMPLE / "log.csv", *TOOL),
+    "stations": ("stations", EXAMPLE / "log.csv", "-o", "new.csv"),
+}
+"""Commands that also write a page, by the name of the sample."""
+
+
+def with_a_page():
+    """Commands that can write a page."""
+    return {
+        name
+        for name, command in cli.cli.commands.items()
+        if any({"--report", "--html"} & {*option.opts} for option in command.params)
+    }
+
+
+PAGES = [name for name, typed in SAMPLES.items() if typed[0] in with_a_page()]
+
+
+def test_every_command_with_a_page_has_a_sample():
+    missing = with_a_page() - {typed[0] for typed in SAMPLES.values()}
+    assert not missing, f"add a sample of {', '.join(missing)} to SAMPLES, so that its page is seen"
+
+
+# ------------------------------------------------------------------ the pages
+
+
+def moved(source, target):
+    """The run of the example with one station that moved."""
+    columns = read_csv(source)
+    columns["az"][6] = f"{float(columns['az'][6]) + 0.0039:.6f}"
+    return write_csv(target, columns, 'simulated = "yes"', 'serial = "T-7"')
+
+
+def fleet(target):
+    """Thirty tools, some with a fault."""
+    fleets = pytest.importorskip("test_fleet", reason="pyarrow is not installed")
+    tools = {f"T{seed:03}": fleets.short_run(seed) for seed in range(27)}
+    tools["T027"] = fleets.short_run(27, mx=np.zeros(28))
+    tools["T028"] = {k: v[:3] for k, v in fleets.short_run(28).items()}
+    tools["T029"] = fleets.short_run(29, ref_field_nt=np.full(28, np.nan))
+    fleets.write_fleet(target, tools, {"simulated": True})
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("pages")
+    moved(EXAMPLE / "run.csv", folder / "moved.csv")
+    soaks = servo_run(3, (10, 60, 110), 6, (20.0, 60.0, 100.0, 140.0))
+    write_csv(folder / "soaks.csv", soaks, 'simulated = "yes"', 'serial = "T-8"')
+    limits = 'name = "tight"\n[error]\ninclination_deg = 0.001\nazimuth_deg = 2\n'
+    (folder / "tight.toml").write_text(limits, "utf-8")
+    ran = mwdcal("calibrate", EXAMPLE / "run.csv", *TOOL, "-o", folder / "tool.json")
+    assert ran.code == 0, ran
+    fleet(folder / "fleet.parquet")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with playwright.sync_playwright() as driver:
+        chromium = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        yield chromium
+        chromium.close()
+
+
+def blank(sheet):
+    """Whether nothing is on it but the foot."""
+    text, drawn = sheet
+    return drawn < 1500 and len(text) < 150
+
+
+class Seen:
+    """A page in the browser, what it asked for and what the browser complained of."""
+
+    def __init__(self, browser, path, **options):
+        self.context = browser.new_context(**options)
+        self.page = self.context.new_page()
+        self.complaints = []
+        self.page.on("console", lambda message: self.complaints.append(message.text))
+        self.page.on("pageerror", lambda error: self.complaints.append(str(error)))
+        self.page.on("request", self._request)
+        self.path = path
+        self.page.goto(path.as_uri())
+
+    def _request(self, request):
+        if request.url != self.path.as_uri():
+            self.complaints.append(request.url)
+
+    def look(self, width, scheme):
+        self.page.set_viewport_size({"width": width, "height": 900})
+        self.page.emulate_media(color_scheme=scheme)
+
+    def faults(self):
+        return self.page.evaluate(FAULTS)
+
+    def accessibility_faults(self):
+        """What axe-core calls serious, or worse."""
+        found = self.page.evaluate(RUN_AXE)["violations"]
+        return [
+            f"{rule['id']}: {rule['nodes'][0]['html'][:200]}"
+            for rule in found
+            if rule["impact"] in ("serious", "critical")
+        ]
+
+    def shorten(self):
+        """Leaves out what axe-core would look at for minutes: the insides of pictures, rows like others."""
+        self.page.evaluate(AXE)
+        self.page.evaluate(
+            """() => {
+                document.querySelectorAll("svg").forEach((svg) => svg.replaceChildren());
+                for (const body of document.querySelectorAll("tbody"))
+                    [...body.rows].slice(6).forEach((row) => row.className || row.remove());
+            }"""
+        )
+
+    def paper(self):
+        """The text of each printed page, with blanks as they may be, and how much is drawn on it."""
+        printed = pypdf.PdfReader(io.BytesIO(self.page.pdf(prefer_css_page_size=True)))
+        return [
+            (" ".join(page.extract_text().split()), len(page.get_contents().get_data()))
+            for page in printed.pages
+        ]
+
+    def paper_faults(self):
+        """What is missing on the first sheet, and sheets with nothing on them."""
+        headlines = self.page.locator(".headline").all_inner_texts()[:1]
+        first = [" ".join(text.split()) for text in headlines]
+        if self.page.locator("#signatures").count():
+            first += ["Calibrated by", "Approved by", "name", "signature", "date"]
+        paper = self.paper()
+        faults = [f"not on the first sheet: {words}" for words in first if words not in paper[0][0]]
+        faults += [
+            f"blank: sheet {number}" for number, sheet in enumerate(paper, 1) if blank(sheet)
+        ]
+        return faults + [f"{len(paper)} sheets"] * (len(paper) > MOST_SHEETS)
+
+    def light(self, selector):
+        """Mean lightness of an element, 0 to 255."""
+        shot = self.page.locator(selector).first.screenshot()
+        return float(np.mean(Image.open(io.BytesIO(shot)).convert("L")))
+
+
+@pytest.fixture
+def open_page(browser):
+    """Opens files, and closes them at the end."""
+    seen = []
+
+    def opened(path, **options):
+        seen.append(Seen(browser, path, **options))
+        return seen[-1]
+
+    yield opened
+    for each in seen:
+        each.context.close()
+
+
+@pytest.fixture
+def written(folder, monkeypatch):
+    """The page of a sample."""
+    monkeypatch.chdir(folder)
+
+    def page(name):
+        path = folder / f"{name}.html"
+        if not path.exists():
+            option = {"--report", "--html"} & {
+                opt for param in cli.cli.commands[SAMPLES[name][0]].params for opt in param.opts
+            }
+            ran = mwdcal(*SAMPLES[name], *option, path)
+            assert path.exists(), ran
+        return path
+
+    return page
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_a_page_can_be_read_by_everybody(written, open_page, name):
+    seen = open_page(written(name))
+    views = [*product(WIDTHS, SCHEMES)]
+    faults = {"printed": seen.paper_faults()}
+    for view in views:
+        seen.look(*view)
+        faults[view] = seen.faults()
+        if view[0] == WIDTHS[0] and seen.page.locator("figure").count():
+            light = seen.light("figure")
+            assert light > 200 if view[1] == "light" else light < 90, (view, light)
+    seen.shorten()
+    for view in zip(WIDTHS, SCHEMES, strict=True):
+        seen.look(*view)
+        faults[view] += seen.accessibility_faults()
+    assert faults == {"printed": [], **{view: [] for view in views}}
+    assert seen.complaints == []
+
+
+def test_a_page_says_the_same_without_its_script(written, open_page):
+    plain = open_page(written("calibrate"), java_script_enabled=False)
+    helped = open_page(written("calibrate"))
+    assert plain.page.inner_text("main") == helped.page.inner_text("main")
+
+
+# ------------------------------------------------------------------ planted faults are found
+
+
+@pytest.fixture
+def planted(tmp_path, open_page):
+    """Opens a page with our layout and this content."""
+
+    def opened(content, **options):
+        blocks = {"title": "T", "footer": "f", "kind": "k", "name": "n", "side": "s"}
+        template = "{% extends 'layout.html' %}" + "".join(
+            f"{{% block {name} %}}{text}{{% endblock %}}"
+            for name, text in {**blocks, "content": content}.items()
+        )
+        path = tmp_path / "planted.html"
+        path.write_text(environment().from_string(template).render(simulated=False, **options))
+        seen = open_page(path)
+        seen.look(420, "light")
+        return seen
+
+    return opened
+
+
+@plots.style()
+def picture(*places, **look):
+    figure, [[axes]] = plots.new_figure("two texts", 2)
+    for place in places:
+        axes.annotate("a word in a picture", place, xycoords="figure fraction", **look)
+    return figure
+
+
+PLACED = "<p style='position: absolute; margin: 0; left: {}px; top: {}px'>words that stand here</p>"
+PICTURE = "<figure>{{ drawn | svg('planted') }}</figure>"
+
+
+@pytest.mark.parametrize(
+    ("fault", "content", "drawn"),
+    [
+        ("overlap", PLACED.format(20, 200) + PLACED.format(60, 208), None),
+        ("overlap", PICTURE, ((0.3, 0.5), (0.35, 0.53))),
+        ("cut", "<div style='overflow: hidden; height: 6px'>cut off</div>", None),
+        ("cut", PICTURE, ((0.95, 0.5),)),
+        ("out of its cell", "<table style='table-layout: fixed; width: 40px'><tr><td>far too wide a cell", None),
+        ("beyond the page", PLACED.format(-30, 200), None),
+        ("the page is", "<div style='width: 600px'>wide</div>", None),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_read_is_found(planted, fault, content, drawn):
+    options = {"drawn": picture(*drawn)} if drawn else {}
+    found = planted(content, **options).faults()
+    assert any(line.startswith(fault) for line in found), found
+
+
+def test_words_with_a_halo_are_words(planted):
+    halo = {"path_effects": [withStroke(linewidth=2, foreground="white")]}
+    assert planted(PICTURE, drawn=picture((0.3, 0.5), (0.35, 0.53), **halo)).faults()
+    assert not planted(PICTURE, drawn=picture((0.3, 0.5), (0.3, 0.7), **halo)).faults()
+
+
+def test_words_side_by_side_are_no_fault(planted):
+    apart = PLACED.format(20, 200) + PLACED.format(20, 222)
+    assert planted(apart).faults() == []
+    drawn = picture((0.1, 0.5), (0.16, 0.5), (0.6, 0.5), rotation=60)
+    assert planted(PICTURE, drawn=drawn).faults() == []
+
+
+def test_inaccessible_content_is_found(planted):
+    seen = planted("<p style='color: #aaa'>pale</p>")
+    seen.shorten()
+    (fault,) = seen.accessibility_faults()
+    assert fault.startswith("color-contrast")
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "<img src='http://127.0.0.1:9/a.png' alt=''>",
+        "<script src='http://127.0.0.1:9/a.js'></script>",
+        "<script>document.title = 'run'</script>",
+        "<p onclick='alert(1)'>text</p><script>document.querySelector('p').click()</script>",
+    ],
+)
+def test_a_page_may_ask_for_nothing_and_run_nothing_but_its_script(planted, content):
+    seen = planted(content)
+    assert any("Content Security Policy" in line for line in seen.complaints)
+    assert seen.page.title() == "T"
+
+
+def test_a_blank_sheet_is_found(planted):
+    seen = planted("<p>one</p><div class='page'></div><p class='page'>" + "words " * 60 + "</p>")
+    assert [blank(sheet) for sheet in seen.paper()] == [True, True, False]
+
+
+def test_heads_are_repeated_on_paper(planted):
+    rows = [(f"P{number}", str(number)) for number in range(120)]
+    paper = planted(table_of(rows)).paper()
+    assert len(paper) > 2
+    assert all("label" in text and "first" in text for text, _ in paper)
+
+
+# ------------------------------------------------------------------ a closer look
+
+
+CELLS = ["10", "−2.5", "–", "3.0×10⁻²", "7", "1e-3", "9", "8", "−11"]
+UPWARDS = ["−11", "−2.5", "1e-3", "3.0×10⁻²", "7", "8", "9", "10", "–"]
+LABELS = ["P10", "P9", "P1", "P2", "P3", "P4", "P5", "P6", "P7"]
+HEADS = "<tr><th rowspan=2>label</th><th colspan=2>values</th></tr><tr><th>first</th><th></th></tr>"
+
+
+def table_of(rows):
+    body = "".join(f"<tr><td>{label}</td><td>{cell}</td><td>x</td></tr>" for label, cell in rows)
+    return f"<table><thead>{HEADS}</thead><tbody>{body}</tbody></table>"
+
+
+def column(page, number):
+    return page.locator(f"tbody td:nth-child({number})").all_inner_texts()
+
+
+def test_tables_are_sorted_by_numbers_with_dashes_last(planted):
+    page = planted(table_of(zip(LABELS, CELLS, strict=True))).page
+    assert page.locator("th [role=button]").all_inner_texts() == ["label", "first"]
+    head = page.locator("th", has_text="first")
+    states = []
+    for _ in range(3):
+        head.get_by_role("button").click()
+        states.append((head.get_attribute("aria-sort"), column(page, 2)))
+    assert states == [
+        ("ascending", UPWARDS),
+        ("descending", [*UPWARDS[-2::-1], "–"]),
+        ("none", CELLS),
+    ]
+
+
+def test_tables_are_sorted_by_the_keyboard_and_by_labels(planted):
+    page = planted(table_of(zip(LABELS, CELLS, strict=True))).page
+    page.keyboard.press("Tab")
+    page.keyboard.press("Enter")
+    assert column(page, 1) == ["P1", "P2", "P3", "P4", "P5", "P6", "P7", "P9", "P10"]
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        table_of([*zip(LABELS, CELLS, strict=True)][:5]),
+        table_of(zip(LABELS, CELLS, strict=True)).replace("<td>x", "<td rowspan=2>x", 1),
+    ],
+)
+def test_short_and_grouped_tables_stay(planted, content):
+    assert planted(content).page.get_by_role("button").count() == 0
+
+
+def number(text):
+    return float(re.search(r"[−\d.]+", text)[0].replace("−", "-"))
+
+
+def test_points_of_a_picture_say_their_station_and_value(written, open_page):
+    seen = open_page(written("calibrate"))
+    page = seen.page
+    rows = page.locator("#stations tbody tr")
+    expected = {row.split("\t")[0]: row.split("\t") for row in rows.all_inner_texts()}
+    picture = page.locator("figure svg", has=page.locator("use[data-name]")).last
+    picture.focus()
+    told = []
+    for _ in range(8):
+        page.keyboard.press("ArrowRight")
+        told.append(page.inner_text(".tip"))
+    labels = [re.fullmatch(r"station (\S+): (\S+) σ", line)[1] for line in told]
+    misfits = [number(line.partition(":")[2]) for line in told]
+    shown = [number(expected[label][-2]) for label in labels]
+    assert misfits == pytest.approx(shown, abs=0.0501)
+    assert len(set(labels)) == 8
+    page.keyboard.press("Escape")
+    assert page.inner_text(".tip") == ""
+    box = picture.locator("use[data-name]").nth(4).bounding_box()
+    page.mouse.move(box["x"] + box["width"] / 2 + 2, box["y"] + box["height"] / 2)
+    assert page.inner_text(".tip") == told[4]
+    assert seen.faults() == [] or page.locator(".tip").count() == 1
+
+
+def test_names_of_points_are_escaped(planted):
+    figure = picture((0.1, 0.1))
+    plots.named_points(figure.axes[0], np.arange(2), np.array([1.0, np.nan]), ["<b>&", "lost"], "o")
+    page = planted(PICTURE, drawn=figure).page
+    assert page.locator("use[data-name]").evaluate_all("all => all.map((x) => x.dataset.name)") == [
+        "<b>&"
+    ]
