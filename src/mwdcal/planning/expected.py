@@ -44,14 +44,22 @@ def nominal_run(plan: Table, profile: Profile) -> tuple[Readings, Profile]:
                 f"{plan.source}: station {int(np.argmax(blank)) + 1} has no {REFERENCES[name].column}. A plan "
                 "states the attitude of every station."
             )
-    for name, value in Earth()._asdict().items():
-        given = known.get(name, np.full(plan.count, np.nan))
-        known[name] = np.where(np.isnan(given), value, given)
+    known |= dict(zip(EARTH, planned_earth(plan), strict=True))
     fields = reference_vectors(*(known[name] for name in (*ANGLES, *EARTH)))
     nominal = from_readings(Readings(*fields, known=known), profile)
     columns = {**nominal.columns, **plan.columns}
     whole = replace(plan, columns=columns, metadata={**plan.metadata, "simulated": True})
     return to_readings(whole, profile)
+
+
+def planned_earth(plan: Table) -> list[Array]:
+    """Gravity, g, field, nT, and dip, radians, at each station (n,) of a plan."""
+    earth = []
+    for name, usual in Earth()._asdict().items():
+        reference = REFERENCES[name]
+        given = np.asarray(plan.columns.get(reference.column, np.full(plan.count, np.nan)), float)
+        earth.append(np.where(np.isnan(given), usual, given * reference.factor))
+    return earth
 
 
 def highest_order(temperature: Array) -> int:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import cast
 
@@ -97,7 +97,7 @@ def best_plan(
     new = new[np.argsort(soak_numbers(taken(whole, new)), kind="stable")]
     chosen = taken(whole, new)
     new = new[shortest_order(attitudes(chosen), soak_numbers(chosen), stand)]
-    plan = taken(whole, new)
+    plan = replace(taken(whole, new), source=f"{count} of {candidates.source}")
     everything = taken(whole, np.concatenate([np.arange(before), new]))
     given = expected(everything, profile, options)
     return Planned(
@@ -176,7 +176,9 @@ def _wanted(criterion: str, turn: Array, calibration: Calibration) -> Array | No
     grid = np.meshgrid(WORKING_INCLINATIONS, TWELFTHS, TWELFTHS, indexing="ij")
     whole = np.zeros((turn.shape[1],) * 2)
     for temperature in calibration.temperature_c or (None,):
-        readings = readings_at(calibration, *map(np.ravel, grid), temperature)
+        readings = readings_at(
+            calibration, grid[0].ravel(), grid[1].ravel(), grid[2].ravel(), temperature
+        )
         for name in angles(calibration):
             moved = calibration.sensitivity(name, readings) @ turn
             whole += moved.T @ moved / np.sum(moved**2)

@@ -11,15 +11,23 @@ import numpy as np
 
 from mwdcal.app.envelope import enveloped
 from mwdcal.app.screens.numbers import written
-from mwdcal.app.text import one_line, plural, quantity, table
+from mwdcal.app.text import one_line, quantity, table
 from mwdcal.calibration.prediction import accuracy_at, typical_accuracy
 from mwdcal.calibration.readings import SIMULATED
 from mwdcal.calibration.record import Calibration, Finding, TriadCalibration, Undetermined
 from mwdcal.errors import InputError
+from mwdcal.files.formats.table import Table
 from mwdcal.planning.planned import WORKING_INCLINATIONS, Planned
 
 MOST_LINES = 40
 """Stations of a table on screen."""
+PLACE = "1σ, calibration alone, at 45° inclination"
+"""What the accuracy of a plan is of."""
+STATION_TITLES = {
+    "station": "station", "temperature_c": "T, °C", "ref_inclination_deg": "inclination, °",
+    "ref_azimuth_deg": "azimuth, °", "ref_toolface_deg": "toolface, °",
+}  # fmt: skip
+"""Columns of the table of stations, and how they are headed."""
 
 
 class PlannedTriad(msgspec.Struct, frozen=True, kw_only=True):
@@ -75,7 +83,12 @@ def wanted_accuracy(words: Sequence[str]) -> dict[str, float]:
     return wanted
 
 
-def _facts(each: Planned) -> dict[str, Any]:
+def facts(each: Planned) -> PlanSummary:
+    """What is said of a plan."""
+    return PlanSummary(**_fields(each))
+
+
+def _fields(each: Planned) -> dict[str, Any]:
     """The fields of a `PlanSummary`."""
     calibration = each.calibration
     by_triad = {triad.name: _triad(triad) for triad in calibration.triads}
@@ -125,7 +138,7 @@ def document(
     plans: Sequence[Planned], digests: Mapping[str, str], output: Path | None, html: Path | None
 ) -> dict[str, Any]:
     """The result for machines."""
-    first, *others = map(_facts, plans)
+    first, *others = map(_fields, plans)
     content = PlanDocument(
         **first,
         others=[PlanSummary(**other) for other in others],
@@ -139,17 +152,20 @@ def screen(
     plans: Sequence[Planned], digests: Mapping[str, str], output: Path | None, html: Path | None
 ) -> str:
     """The result for people."""
-    facts = [PlanSummary(**_facts(each)) for each in plans]
+    summaries = [facts(each) for each in plans]
     head = f"{plans[0].calibration.profile.name}   expected of a nominal tool, nothing measured   {SIMULATED}"
-    blocks = [one_line(head), table(_rows(facts), ["", *(one_line(each.plan) for each in facts)])]
+    blocks = [
+        one_line(head),
+        table(comparison_rows(summaries), ["", *(one_line(each.plan) for each in summaries)]),
+    ]
     if len(plans) == 1:
-        blocks += [accuracy(facts[0]), stations(plans[0])]
+        blocks += [accuracy(summaries[0]), stations(plans[0])]
     if output or html:
-        blocks.append(written(plan=output, run_sheet=html))
+        blocks.append(written(**{"plan": output, "run sheet": html}))
     return "\n\n".join(blocks)
 
 
-def _rows(facts: Sequence[PlanSummary]) -> list[list[str]]:
+def comparison_rows(facts: Sequence[PlanSummary]) -> list[list[str]]:
     """What the plans give, a plan in each column."""
     lines = [
         ["stations", *(str(each.stations) for each in facts)],
@@ -164,14 +180,18 @@ def _rows(facts: Sequence[PlanSummary]) -> list[list[str]]:
     return lines
 
 
-def accuracy(each: PlanSummary) -> str:
-    """1σ of the angles at the working inclinations."""
+def accuracy_rows(each: PlanSummary) -> list[list[str]]:
+    """1σ of the angles, a working inclination in each row."""
     columns = each.accuracy_by_inclination_deg
-    rows = [
+    return [
         [f"{inclination:g}°", *(quantity(columns[name][place], "°") for name in columns)]
         for place, inclination in enumerate(each.inclinations_deg)
     ]
-    return table(rows, ["1σ at inclination", *columns])
+
+
+def accuracy(each: PlanSummary) -> str:
+    """1σ of the angles at the working inclinations."""
+    return table(accuracy_rows(each), ["1σ at inclination", *each.accuracy_by_inclination_deg])
 
 
 def _orders(each: PlanSummary) -> str:
@@ -180,21 +200,21 @@ def _orders(each: PlanSummary) -> str:
 
 
 def stations(planned: Planned) -> str:
-    """The stations of a plan, in order."""
-    columns = planned.plan.columns
-    titles = {
-        "station": "station", "temperature_c": "°C", "ref_inclination_deg": "inclination",
-        "ref_azimuth_deg": "azimuth", "ref_toolface_deg": "toolface",
-    }  # fmt: skip
-    names = [name for name in titles if name in columns]
-    rows = [
-        [one_line(_cell(columns[name][i])) for name in names]
-        for i in range(min(planned.plan.count, MOST_LINES))
+    """The stations of a plan, in order, up to `MOST_LINES`."""
+    titles, rows = station_rows(planned.plan)
+    more = len(rows) - MOST_LINES
+    ends = f"\n… and {more} more" if more > 0 else ""
+    return table([[*map(one_line, row)] for row in rows[:MOST_LINES]], titles) + ends
+
+
+def station_rows(plan: Table) -> tuple[list[str], list[list[str]]]:
+    """Titles and cells of the stations of a plan, in order."""
+    names = [name for name in STATION_TITLES if name in plan.columns]
+    columns = [[_cell(value) for value in plan.columns[name]] for name in names]
+    return [STATION_TITLES[name] for name in names], [
+        list(row) for row in zip(*columns, strict=True)
     ]
-    more = planned.plan.count - len(rows)
-    ends = f"\n… and {plural(more, 'more station')}" if more > 0 else ""
-    return table(rows, [titles[name] for name in names]) + ends
 
 
-def _cell(value: object) -> str:
+def _cell(value: str | float) -> str:
     return value if isinstance(value, str) else f"{value:g}"

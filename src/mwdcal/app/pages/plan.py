@@ -1,0 +1,124 @@
+"""The run sheet of a plan, to print and tick off, with what the plan will give."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mwdcal import __version__
+from mwdcal.app.pages.page import banner, environment
+from mwdcal.app.screens.plan import PLACE, accuracy_rows, comparison_rows, facts, station_rows
+from mwdcal.app.text import plural, quantity
+from mwdcal.calibration.prediction import accuracy_at
+from mwdcal.calibration.readings import TRIADS
+from mwdcal.geometry.vectors import Array, Ints, reference_vectors
+from mwdcal.planning.expected import planned_earth
+from mwdcal.planning.planned import Planned
+from mwdcal.planning.plans import attitudes, soak_numbers
+from mwdcal.use import plots
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+PLAN_LOOKS: tuple[dict[str, Any], ...] = (
+    {"color": plots.AFTER, "ls": "-"},
+    {"color": plots.MARKED, "ls": (0, (5, 1.5))},
+    {"color": "#111827", "ls": (0, (1.5, 1.2))},
+    {"color": plots.BEFORE, "ls": (0, (6, 1.5, 1, 1.5))},
+)
+"""Lines of plans that are compared."""
+SOAK_MARKERS = "os^Dv"
+"""Markers of stations by soak."""
+
+
+def render(plans: Sequence[Planned]) -> str:
+    """The sheet of the first plan, and the others beside it, as HTML."""
+    first, summaries = plans[0], [facts(each) for each in plans]
+    soaks = soak_numbers(first.plan)
+    template = environment().get_template("plan.html")
+    return template.render(
+        plan=first.plan.source,
+        profile=first.calibration.profile.name,
+        summary=summaries[0],
+        banner=_banner(first),
+        findings=first.calibration.undetermined(),
+        simulated=True,
+        titles=station_rows(first.plan)[0],
+        rows=zip(station_rows(first.plan)[1], np.diff(soaks, prepend=soaks[:1]) != 0, strict=True),
+        compared=comparison_rows(summaries),
+        plans=[each.plan for each in summaries],
+        accuracy=accuracy_rows(summaries[0]),
+        coverage=draw_coverage(first),
+        curves=draw_accuracy(plans),
+        version=__version__,
+    )
+
+
+def _banner(planned: Planned) -> dict[str, str]:
+    """How long it takes, and what it will give."""
+    summary, free = facts(planned), planned.calibration.undetermined()
+    expected = ", ".join(
+        f"{name} {quantity(sd, '°')}" for name, sd in summary.accuracy_deg.items() if sd is not None
+    )
+    headline = (
+        f"{plural(summary.stations, 'station')} – about {summary.session_hours:.1f} h at the stand"
+    )
+    after = (
+        f"{summary.rank} of {summary.size} parameters determined. Accuracy to expect ({PLACE}): "
+        f"{expected or 'none can be stated'}."
+    )
+    return banner("attention" if free else "open", "Planned – nothing measured", headline, after)
+
+
+@plots.style()
+def draw_coverage(planned: Planned) -> Figure:
+    """The directions of gravity and of the field in the tool at each station, by soak."""
+    label = "Directions of gravity and field in the axes of the tool"
+    figure, [panels] = plots.new_figure(label, 2.4, columns=2, sharey=True)
+    degrees, soaks = attitudes(planned.plan), soak_numbers(planned.plan)
+    both = reference_vectors(*np.radians(degrees).T, *planned_earth(planned.plan))
+    for axes, triad, vectors in zip(panels, TRIADS, both, strict=True):
+        _directions(axes, vectors, soaks)
+        name = {"accelerometer": "gravity", "magnetometer": "magnetic field"}[triad]
+        axes.set(title=f"{name} ({triad})", xlabel="direction about the tool axis, from x to y, °")
+    panels[0].set_ylabel("above the x-y plane, to z, °")
+    return figure
+
+
+def _directions(axes: Axes, vectors: Array, soaks: Ints) -> None:
+    """Longitude and latitude of vectors (n, 3) in the tool's axes."""
+    longitude = np.degrees(np.arctan2(vectors[:, 1], vectors[:, 0]))
+    latitude = np.degrees(np.arctan2(vectors[:, 2], np.hypot(vectors[:, 0], vectors[:, 1])))
+    for number in np.unique(soaks).tolist():
+        some = soaks == number
+        marker = SOAK_MARKERS[number % len(SOAK_MARKERS)]
+        axes.plot(longitude[some], latitude[some], marker, mfc="none", color=plots.AFTER, alpha=0.8)
+    axes.set(
+        xlim=(-185, 185), ylim=(-95, 95), xticks=range(-180, 181, 90), yticks=range(-90, 91, 45)
+    )
+
+
+@plots.style()
+def draw_accuracy(plans: Sequence[Planned]) -> Figure:
+    """1σ of each angle over inclination, a line for each plan."""
+    x = np.linspace(2, 178, 45)
+    curves = [accuracy_at(each.calibration, np.radians(x).tolist()) for each in plans]
+    names = list(curves[0])
+    label = "Expected 1σ over inclination"
+    figure, [panels] = plots.new_figure(label, 2.3, columns=len(names))
+    for axes, name in zip(panels, names, strict=True):
+        for place, (each, sd) in enumerate(zip(plans, curves, strict=True)):
+            look = PLAN_LOOKS[place % len(PLAN_LOOKS)]
+            axes.plot(x, np.degrees(sd[name]), label=each.plan.source[:30], **look)
+        axes.set(title=name, xlabel="inclination, °", xlim=(0, 180), xticks=range(0, 181, 45))
+        if np.isfinite(np.concatenate([sd[name] for sd in curves])).any():
+            axes.set_yscale("log")
+            plots.plain_numbers(axes.yaxis, 1.0, 2.0, 5.0)
+    panels[0].set_ylabel("1σ, °")
+    if len(plans) > 1:
+        handles, labels = panels[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside upper left", ncols=min(len(labels), 4))
+    return figure
