@@ -23,18 +23,19 @@ class SensorEffects(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
 
     `turn_on`: bias that each switching on leaves, constant until the next (1σ). `instability`: bias that
     wanders about zero (1σ), forgotten with the time constant `instability_minutes` (`wandering`).
-    `resolution`: step of the converter. `saturation`: largest reading of either sign.
+    `resolution`: step of the converter. `saturation`: largest reading of either sign, if there is one.
     """
 
     turn_on: float = 0.0
     instability: float = 0.0
     instability_minutes: float = 60.0
     resolution: float = 0.0
-    saturation: float = math.inf
+    saturation: float | None = None
 
     def recorded(self, reading: Array) -> Array:
         """What the converter gives of readings: cut at the saturation, rounded to the resolution."""
-        cut = np.clip(reading, -self.saturation, self.saturation)
+        most = self.saturation
+        cut = reading if most is None else np.clip(reading, -most, most)
         return np.rint(cut / self.resolution) * self.resolution if self.resolution else cut
 
 
@@ -102,7 +103,8 @@ def load_effects(name_or_path: str) -> tuple[Effects, str]:
         ) from None
     for section, values in msgspec.to_builtins(effects).items():
         for key, value in values.items():
-            _check(f"{name_or_path}, key '{section}.{key}'", key, value)
+            if value is not None:
+                _check(f"{name_or_path}, key '{section}.{key}'", key, value)
     return effects, digest
 
 
@@ -110,9 +112,8 @@ def _check(where: str, key: str, value: float) -> None:
     """Refuse a size that no effect has."""
     positive = key in ("instability_minutes", "variation_minutes", "saturation")
     low = -LARGEST_EFFECT if key == "drift_c_per_hour" else 0.0
-    endless = key == "saturation" and value == math.inf
-    if not (endless or low <= value <= LARGEST_EFFECT) or (positive and value == 0):
-        word = "above 0" if positive else f"between {low:g}"
+    if not low <= value <= LARGEST_EFFECT or (positive and value == 0):
+        word = "above 0" if positive else f"at least {low:g}"
         raise InputError(
             f"{where}: must be {word} and at most {LARGEST_EFFECT:g}; got {value}. Correct it, or leave it out."
         )

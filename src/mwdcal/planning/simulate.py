@@ -276,9 +276,7 @@ def simulated(
     return Simulation(result, angles, warmth, turn_on)
 
 
-def _settings(
-    session: Readings, name: str, effects: Effects, common: Mapping[str, Array]
-) -> Array:
+def _settings(session: Readings, name: str, effects: Effects, common: Mapping[str, Array]) -> Array:
     """Angles (..., n) that the stand has turned to, the error of each setting apart."""
     stated, play = session.known[name], effects.stand.backlash(name)
     zero = np.asarray(common.get(f"{name}-zero", 0.0))[..., None]
@@ -296,7 +294,9 @@ def _vectors(
     )
     attitude = tool_from_earth(*(angles[name] for name in ANGLES))
     if "stand-north" in common:
-        turn = np.stack([common["stand-north"], common["stand-east"], 0 * common["stand-north"]], -1)
+        turn = np.stack(
+            [common["stand-north"], common["stand-east"], 0 * common["stand-north"]], -1
+        )
         attitude = attitude @ rotation(turn)[..., None, :, :]
     earth = [earth_gravity(gravity), earth_field(field, dip)]
     if effects.earth.variation_nt:
