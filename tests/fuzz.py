@@ -56,11 +56,15 @@ SAMPLES = {
     "tool": "profile",
     "limits": "limits",
     "prior": "calibration",
+    "effects": "effects",
+    "plan": "plan",
 }
 """The kind of file that each argument or option takes, by its name."""
-OUTPUTS = ("output", "report", "plot", "folder")
+OUTPUTS = ("output", "report", "plot", "folder", "truth")
 """Arguments and options that name what to write."""
 LIMITS = 'name = "lab"\n[spread]\ninclination_deg = 0.2\nazimuth_deg = 1.5\n'
+PLAN = 'name = "lab"\ntemperature_c = [25, 60]\n[[stations]]\ninclination_deg = [5, 60, 120]\ntoolface_deg = [0, 90]\n'
+EFFECTS = "[accelerometer]\nturn_on = 2e-4\n[stand]\ntilt_deg = 0.1\n[earth]\nvariation_nt = 20.0\n"
 CALIBRATIONS = (
     ("servo.csv",),
     ("servo.csv", "--parameters", "9"),
@@ -125,6 +129,8 @@ def samples(folder: Path) -> dict[str, list[Any]]:
         "calibration": calibrations,
         "profile": [(EXAMPLE / "tool.toml").read_text("utf-8")],
         "limits": [LIMITS],
+        "effects": [EFFECTS],
+        "plan": [PLAN],
     }
 
 
@@ -402,6 +408,8 @@ WORDS = {
     "limits": ("moosavi", "moradi", "x"),
     "tool": (*("servo",) * 12, "generic", "sap6", "x"),
     "prior": ("datasheet",),
+    "plan": ("six-state", "moosavi-12", "roll-test", "x"),
+    "effects": ("none", "x"),
     "workers": ("1",),
     "word_bits": ("32", "24", "16", "11"),
 }

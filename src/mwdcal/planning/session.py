@@ -16,7 +16,7 @@ from mwdcal.files.runs import from_readings
 from mwdcal.geometry.vectors import Array
 from mwdcal.planning.effects import Effects
 from mwdcal.planning.expected import highest_order, nominal_run
-from mwdcal.planning.moves import STAND, Stand, move_seconds
+from mwdcal.planning.moves import Stand, move_seconds
 from mwdcal.planning.plans import ROOM_TEMPERATURE, attitudes, soak_numbers, soak_temperatures
 from mwdcal.planning.simulate import Simulation, Truth, common_errors, simulated
 from mwdcal.sensor.profile import Profile
@@ -69,9 +69,9 @@ class Session:
         return simulated(truth, readings, rng, self.effects, common, self.minutes)
 
 
-def station_minutes(plan: Table, stand: Stand = STAND) -> Array:
+def station_minutes(plan: Table, stand: Stand | None = None) -> Array:
     """When each station (n,) is read: moves, and a soak at each change of temperature."""
-    attitude, soak = attitudes(plan), soak_numbers(plan)
+    stand, attitude, soak = stand or Stand(), attitudes(plan), soak_numbers(plan)
     steps = [move_seconds(attitude[i : i + 2], stand)[0, 1] / 60 for i in range(plan.count - 1)]
     first = soak_temperatures(plan)[soak[:1]]
     changed = np.concatenate([first != ROOM_TEMPERATURE or [False], np.diff(soak) != 0])
@@ -140,9 +140,9 @@ def calibrated_tool(calibration: Calibration) -> tuple[Truth, Profile]:
         if part.noise is None:
             noise = replace_struct(part, noise=triad.noise * (part.scale or 1.0))
             profile = replace_struct(profile, **{triad.name: noise})
-    parameters = [np.array(triad.parameters) for triad in triads] + [None]
+    first, *second = (np.array(triad.parameters) for triad in triads)
     tool = Truth(
-        *parameters[:2], order=max(triad.order for triad in triads), reference=reference,
+        first, second[0] if second else None, order=max(triad.order for triad in triads), reference=reference,
         forms=tuple(triad.functions(reference) for triad in triads),
     )  # fmt: skip
     return tool, profile

@@ -44,7 +44,7 @@ SERVO = {
 Scale ± 5 %, bias ± 10 mg, axis alignment ± 2 mrad, scale drift ± 180 ppm/°C, bias drift ± 100 µg/°C.
 The magnetometer: scale ± 2 %, hard iron ± 1 % of 50 µT, alignment ± 4 mrad.
 """
-COURSE = np.array([1.0, 1e-3, 1e-6])
+DRIFT_POWERS = np.array([1.0, 1e-3, 1e-6])
 """Powers of a drift over temperature: the square and the cube are a tenth and a hundredth of it over 100 °C."""
 
 
@@ -112,15 +112,15 @@ class Truth:
     def triads(self) -> dict[str, tuple[Model, Array]]:
         """Model and parameters by triad."""
         parameters = [p for p in (self.accelerometer, self.magnetometer) if p is not None]
-        models = self.forms or (self.model,) * len(parameters)
+        models: tuple[Model, ...] = self.forms or (self.model,) * len(parameters)
         return dict(zip(TRIADS, zip(models, parameters, strict=True), strict=False))
 
     def readings(self, vectors: tuple[Array, Array], temperature: Array) -> dict[str, Array]:
         """Readings (..., n, 3) of each triad without noise, nominal units: the model, inverted."""
-        steps = {True: {}, False: {"steps": 1}}
+        pairs = zip(self.triads.items(), vectors, strict=False)
         return {
-            name: raw_reading(model, params, vector, temperature, **steps[model.curved])
-            for (name, (model, params)), vector in zip(self.triads.items(), vectors, strict=False)
+            name: raw_reading(model, params, vector, temperature, *() if model.curved else (1,))
+            for (name, (model, params)), vector in pairs
         }
 
 
@@ -138,11 +138,13 @@ def drawn(
     drawn at every order.
     """
     unit = rng.uniform(-ROOT3, ROOT3, (*lead, len(TRIADS), 30))
-    parameters = []
-    for place, name in enumerate(TRIADS):
-        sheet = getattr(profile, name).datasheet or SERVO[name]
-        parameters.append(_factors(unit[..., place, :], sheet, SERVO[name], order))
-    return Truth(*parameters, order=order, reference=profile.reference_temperature_c)
+    first, second = (
+        _factors(
+            unit[..., k, :], getattr(profile, name).datasheet or SERVO[name], SERVO[name], order
+        )
+        for k, name in enumerate(TRIADS)
+    )
+    return Truth(first, second, order=order, reference=profile.reference_temperature_c)
 
 
 def _factors(unit: Array, sheet: Datasheet, usual: Datasheet, order: int) -> Array:
@@ -156,7 +158,7 @@ def _factors(unit: Array, sheet: Datasheet, usual: Datasheet, order: int) -> Arr
     for start, middle, name in ((0, 1.0, "scale"), (12, 0.0, "bias")):
         steady = middle + tolerance(name) * unit[..., start : start + 3, None]
         drift = unit[..., start + 3 : start + 12].reshape(*unit.shape[:-1], 3, 3)
-        powers = tolerance(f"{name}_per_c") * drift * COURSE
+        powers = tolerance(f"{name}_per_c") * drift * DRIFT_POWERS
         parts.append(np.concatenate([steady, powers], -1)[..., : order + 1])
     linear = [part.reshape(*unit.shape[:-1], -1) for part in parts]
     turns = np.radians(tolerance("misalignment_deg")) * unit[..., 24:]
@@ -183,7 +185,7 @@ def run(
     known |= {name: np.full(plan.count, getattr(truth, name)) for name in CONSTANTS}
     blank = np.zeros((plan.count, 3))
     sd = {name: size + blank for name, size in zip(TRIADS, noise, strict=True)}
-    sd |= dict(zip(ANGLES, stand, strict=True))
+    sd |= {name: np.asarray(size) for name, size in zip(ANGLES, stand, strict=True)}
     session = Readings(blank, blank, plan.temperature, known, sd)
     result = simulated(truth, session, rng).readings
     return Readings(
@@ -217,7 +219,7 @@ def common_errors(
     Zeros of the scales in radians, such that reading = value + zero; `stand-north` and `stand-east`, turns of
     the stand's frame, of a tilt; by what gravity, field and dip exceed their references.
     """
-    errors = {}
+    errors: dict[str, Array] = {}
     for name in (*COMMON, *CONSTANTS):
         size = float(session.uncertainty(name).max(initial=0.0))
         if name not in CONSTANTS:
@@ -281,7 +283,7 @@ def _settings(session: Readings, name: str, effects: Effects, common: Mapping[st
     stated, play = session.known[name], effects.stand.backlash(name)
     zero = np.asarray(common.get(f"{name}-zero", 0.0))[..., None]
     lag = play / 2 * approach(stated) if play else 0.0
-    return stated - zero - lag
+    return np.asarray(stated - zero - lag)
 
 
 def _vectors(
