@@ -35,7 +35,7 @@ CONTENTS: dict[str, type] = {
     "fleet": fleet.FleetDocument,
     "noise": noise.NoiseSummary,
     "profile": proposal.ProposalSummary,
-    "simulate": simulation.TruthSummary,
+    "simulate": simulation.SimulationSummary,
     "stations": stations.StationsSummary,
     "verify": Verdict,
 }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -18,7 +19,7 @@ from mwdcal.calibration.prediction import accuracy, middle_temperature
 from mwdcal.calibration.readings import CONSTANTS, TRIADS, Readings
 from mwdcal.calibration.record import Calibration
 from mwdcal.errors import FitError, InputError
-from mwdcal.estimation.batch import take
+from mwdcal.estimation.rank import Free
 from mwdcal.files.contract import REFERENCES
 from mwdcal.files.formats.table import Table
 from mwdcal.geometry.observables import OBSERVABLES
@@ -52,14 +53,20 @@ class Judged:
     sets: tuple[RollSet, ...]
 
     @property
-    def unit(self) -> tuple[str, float]:
-        """The unit of the limit as in the name of a column, and how many of it are one inside."""
+    def unit(self) -> str:
+        """The unit of the limit."""
         inside = OBSERVABLES[self.name].unit
-        return ("deg", float(np.degrees(1))) if inside == "rad" else (inside.lower(), 1.0)
+        return "°" if inside == "rad" else inside
+
+    @property
+    def factor(self) -> float:
+        """How many of the unit are one inside."""
+        return float(np.degrees(1)) if self.unit == "°" else 1.0
 
     def column(self, word: str = "") -> str:
         """The name of a column: spread_inclination_deg, or with a word before the unit."""
-        return "_".join(filter(None, (self.kind, self.name, word, self.unit[0])))
+        unit = "deg" if self.unit == "°" else self.unit.lower()
+        return "_".join(filter(None, (self.kind, self.name, word, unit)))
 
 
 @dataclass(frozen=True)
@@ -138,6 +145,11 @@ class Procedure:
             )
         return judged
 
+    @property
+    def guard(self) -> float:
+        """Standard uncertainties that a figure must stay away from its limit."""
+        return COVERAGE if self.limits.rule == "guarded" else 0.0
+
     def parts(self, count: int) -> list[tuple[int, int]]:
         """Number and size of each part of so many tools."""
         return [(k, min(PART, count - first)) for k, first in enumerate(range(0, count, PART))]
@@ -177,8 +189,9 @@ class Procedure:
         self, tools: Truth, result: Fit, test: Readings, sound: Bools
     ) -> dict[str, AnyArray]:
         """Every figure of the roll test, what is true of it, and both verdicts."""
-        guard = COVERAGE if self.limits.rule == "guarded" else 0.0
-        passed, good, columns = sound.copy(), np.ones(len(sound), bool), {}
+        guard = self.guard
+        passed, good = sound.copy(), np.ones(len(sound), bool)
+        columns: dict[str, AnyArray] = {}
         nominal = RollTest(self.calibration, self.testing.readings)
         seen = _Seen(result, test, nominal)
         for limit in self.judged:
@@ -212,7 +225,7 @@ class Procedure:
                 value = observable.difference(value, at[limit.name])
             value = value if limit.kind == "error" else _centred(value, limit.name)
             span = np.abs(value).max(-1) if limit.kind == "error" else np.ptp(value, axis=-1)
-            worst = np.maximum(worst, span * limit.unit[1])
+            worst = np.maximum(worst, span * limit.factor)
         return worst
 
     def _errors(self, tools: Truth, result: Fit) -> dict[str, Array]:
@@ -227,7 +240,7 @@ class Procedure:
         known = self.calibrating.readings.known
         at |= {name: np.full(warmth.shape, np.mean(known[name])) for name in CONSTANTS}
         fields = _through(tools, result, at, warmth)
-        free = [[] for _ in result.status]
+        free: list[list[Free]] = [[] for _ in result.status]
         stated = results.calibrated_tools(
             result, free, calibration.reference_temperature, self.options.knowledge
         )
@@ -244,7 +257,8 @@ class Procedure:
 
     def _parameters(self, result: Fit) -> dict[str, Array]:
         """Parameters as in a calibration file, and their standard uncertainties."""
-        covariance, free = results.StatedCovariance(result).total, [[] for _ in result.status]
+        covariance = results.StatedCovariance(result).total
+        free: list[list[Free]] = [[] for _ in result.status]
         columns = {}
         for index, triad in enumerate(TRIADS[: len(result.problem.triads)]):
             each = results.triad_results(
@@ -254,6 +268,11 @@ class Procedure:
                 columns[column(triad, name)] = each.parameters[:, place]
                 columns[f"{column(triad, name)}_sd"] = each.sd[:, place]
         return columns
+
+
+def solved(procedure: Procedure, part: tuple[int, int]) -> bytes:
+    """`Procedure.repeated` in another process."""
+    return pickle.dumps(procedure.repeated(part))
 
 
 def column(triad: str, parameter: str) -> str:
@@ -271,9 +290,12 @@ def _true_parameters(tools: Truth) -> dict[str, Array]:
 
 def _alike(tool: Truth, count: int) -> Truth:
     """One tool so many times."""
-    first, second = tool.accelerometer, tool.magnetometer
-    both = [None if p is None else np.tile(p, (count, 1)) for p in (first, second)]
-    return replace(tool, accelerometer=both[0], magnetometer=both[1])
+    second = tool.magnetometer
+    return replace(
+        tool,
+        accelerometer=np.tile(tool.accelerometer, (count, 1)),
+        magnetometer=None if second is None else np.tile(second, (count, 1)),
+    )
 
 
 def _member(readings: Readings, place: int) -> Readings:
@@ -351,13 +373,14 @@ class _Seen:
     def noise(self, name: str) -> Array:
         """Standard uncertainty (B, n) of an observable by the noise of the readings."""
         gradient, square = np.nan_to_num(OBSERVABLES[name].gradient(*self.fields)), 0.0
-        for k, (triad, where) in enumerate(zip(self.result.problem.triads, self.result.problem.slices(), strict=True)):  # fmt: skip
+        problem = self.result.problem
+        for k, (triad, where) in enumerate(zip(problem.triads, problem.slices(), strict=True)):
             slope = triad.model.slope(
                 self.result.state.params[:, where], self.raws[k], _warmth(self.test)
             )
             moved = np.einsum("bni,bnij->bnj", gradient[..., 3 * k : 3 * k + 3], slope)
             square = square + np.sum((moved * self.test.sd[TRIADS[k]]) ** 2, -1)
-        return np.sqrt(square)
+        return np.asarray(np.sqrt(square))
 
     def figure(self, limit: Judged, guard: float) -> tuple[Array, Array]:
         """Noise-free figure (B,) of a limit and its standard uncertainty, of the worst set of each tool."""
@@ -373,7 +396,7 @@ class _Seen:
             sd = np.hypot(self.noise(name)[:, each.index], alone)
             one = roll_test.figure(part, sd, self.toolface[:, each.index], error)
             figures.append(np.stack([one.value, np.hypot(one.uncertainty, shared)]))
-        whole = np.stack(figures) * limit.unit[1]
+        whole = np.stack(figures) * limit.factor
         worst = np.argmax(whole[:, 0] + guard * whole[:, 1], 0)
         value, sd = np.take_along_axis(whole, worst[None, None], 0)[0]
         return value, sd
