@@ -58,6 +58,7 @@ SAMPLES = {
     "prior": "calibration",
     "effects": "effects",
     "plan": "plan",
+    "rolltest": "plan",
 }
 """The kind of file that each argument or option takes, by its name."""
 OUTPUTS = ("output", "report", "plot", "folder", "truth")
@@ -409,7 +410,9 @@ WORDS = {
     "tool": (*("servo",) * 12, "generic", "sap6", "x"),
     "prior": ("datasheet",),
     "plan": ("six-state", "moosavi-12", "roll-test", "x"),
+    "rolltest": ("roll-test", "acceptance-104", "six-state"),
     "effects": ("none", "x"),
+    "repeat": ("1", "3", "20", "0"),
     "workers": ("1",),
     "word_bits": ("32", "24", "16", "11"),
 }

@@ -47,7 +47,7 @@ def _errors(axes: Axes, columns: Mapping[str, AnyArray]) -> None:
         xscale="log", xlabel="largest error over the working range, °", ylabel="share of tools, %"
     )
     plots.plain_numbers(axes.xaxis, 1.0, 2.0, 5.0)
-    axes.legend(loc="lower right")
+    axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.06), ncols=3)
 
 
 def _figures(axes: Axes, columns: Mapping[str, AnyArray], judged: Sequence[Judged]) -> None:
@@ -63,4 +63,5 @@ def _figures(axes: Axes, columns: Mapping[str, AnyArray], judged: Sequence[Judge
     axes.axhline(1.0, color=plots.BEFORE, lw=0.7, ls=(0, (4, 3)))
     axes.axvline(1.0, color=plots.BEFORE, lw=0.7, ls=(0, (4, 3)))
     axes.set(xlabel="true figure over its limit", ylabel="figure of the roll test over its limit")
-    axes.legend(loc="upper left", markerscale=1.5)
+    axes.set_title("filled: wrong verdict")
+    axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.06), ncols=3, markerscale=1.5)
