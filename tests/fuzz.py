@@ -56,11 +56,18 @@ SAMPLES = {
     "tool": "profile",
     "limits": "limits",
     "prior": "calibration",
+    "effects": "effects",
+    "plan": "plan",
+    "rolltest": "plan",
+    "plans": "plan",
+    "measured": "run",
 }
 """The kind of file that each argument or option takes, by its name."""
-OUTPUTS = ("output", "report", "plot", "folder", "calibrations")
+OUTPUTS = ("output", "report", "plot", "folder", "calibrations", "truth", "html")
 """Arguments and options that name what to write."""
 LIMITS = 'name = "lab"\n[spread]\ninclination_deg = 0.2\nazimuth_deg = 1.5\n'
+PLAN = 'name = "lab"\ntemperature_c = [25, 60]\n[[stations]]\ninclination_deg = [5, 60, 120]\ntoolface_deg = [0, 90]\n'
+EFFECTS = "[accelerometer]\nturn_on = 2e-4\n[stand]\ntilt_deg = 0.1\n[earth]\nvariation_nt = 20.0\n"
 CALIBRATIONS = (
     ("servo.csv",),
     ("servo.csv", "--parameters", "9"),
@@ -129,6 +136,8 @@ def samples(folder: Path) -> dict[str, list[Any]]:
         "calibration": [*calibrations, table.read_bytes()],
         "profile": [(EXAMPLE / "tool.toml").read_text("utf-8")],
         "limits": [LIMITS],
+        "effects": [EFFECTS],
+        "plan": [PLAN],
     }
 
 
@@ -406,6 +415,10 @@ WORDS = {
     "limits": ("moosavi", "moradi", "x"),
     "tool": (*("servo",) * 12, "generic", "sap6", "x"),
     "prior": ("datasheet",),
+    "plan": ("six-state", "moosavi-12", "roll-test", "x"),
+    "rolltest": ("roll-test", "acceptance-104", "six-state"),
+    "effects": ("none", "x"),
+    "repeat": ("1", "3", "20", "0"),
     "workers": ("1",),
     "word_bits": ("32", "24", "16", "11"),
 }

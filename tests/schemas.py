@@ -19,6 +19,7 @@ from mwdcal.app.screens import (
     fleet,
     noise,
     proposal,
+    simulation,
     stations,
 )
 from mwdcal.calibration.record import SCHEMA_VERSION, Calibration
@@ -34,6 +35,7 @@ CONTENTS: dict[str, type] = {
     "fleet": fleet.FleetDocument,
     "noise": noise.NoiseSummary,
     "profile": proposal.ProposalSummary,
+    "simulate": simulation.SimulationSummary,
     "stations": stations.StationsSummary,
     "verify": Verdict,
 }

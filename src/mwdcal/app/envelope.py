@@ -22,6 +22,7 @@ INPUTS = {
     "noise": ("log", "profile"),
     "plan": ("profile", "measured"),
     "profile": ("run",),
+    "simulate": ("plan", "profile", "calibration", "effects"),
     "stations": ("log",),
     "verify": ("calibration", "run", "limits"),
 }

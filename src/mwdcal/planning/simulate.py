@@ -1,17 +1,51 @@
-"""Simulated runs of a known tool: for examples, tests and studies. Always labelled simulated."""
+"""Simulated tools and their readings, of many at once: for planning, examples, tests and studies.
+
+Tools lead the axes, then stations (n,), the component axis is last. Always labelled simulated.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from mwdcal.calibration.prediction import raw_reading
-from mwdcal.calibration.readings import Readings
+from mwdcal.calibration.readings import CONSTANTS, TRIADS, Readings
 from mwdcal.estimation.evidence import ANGLES
-from mwdcal.geometry.vectors import Array, reference_vectors
-from mwdcal.sensor.models import Basis, Factors
+from mwdcal.geometry.vectors import (
+    Array,
+    earth_field,
+    earth_gravity,
+    reference_vectors,
+    rotation,
+    tool_from_earth,
+)
+from mwdcal.planning.effects import Effects, approach, response, wandering
+from mwdcal.planning.plans import ROOM_TEMPERATURE
+from mwdcal.sensor.models import Basis, Factors, Model
+from mwdcal.sensor.profile import COMMON, Datasheet, Profile
+
+ROOT3 = np.sqrt(3.0)
+"""Half the width of a uniform distribution, in its standard deviations."""
+SERVO = {
+    "accelerometer": Datasheet(
+        scale=0.05 / ROOT3, bias=0.010 / ROOT3, misalignment_deg=np.degrees(2e-3) / ROOT3,
+        scale_per_c=180e-6 / ROOT3, bias_per_c=100e-6 / ROOT3,
+    ),
+    "magnetometer": Datasheet(
+        scale=0.02 / ROOT3, bias=500.0 / ROOT3, misalignment_deg=np.degrees(4e-3) / ROOT3,
+        scale_per_c=100e-6 / ROOT3, bias_per_c=2.0 / ROOT3,
+    ),
+}  # fmt: skip
+"""A servo instrument within the limits of Moosavi's Table 1, 1σ of uniform distributions.
+
+Scale ± 5 %, bias ± 10 mg, axis alignment ± 2 mrad, scale drift ± 180 ppm/°C, bias drift ± 100 µg/°C.
+The magnetometer: scale ± 2 %, hard iron ± 1 % of 50 µT, alignment ± 4 mrad.
+"""
+DRIFT_POWERS = np.array([1.0, 1e-3, 1e-6])
+"""Powers of a drift over temperature: the square and the cube are a tenth and a hundredth of it over 100 °C."""
 
 
 class Earth(NamedTuple):
@@ -55,60 +89,87 @@ def grid(
 
 @dataclass(frozen=True)
 class Truth:
-    """A tool of two triads of factors (30 each at order 3), and the earth it stands on."""
+    """Tools of two triads, parameters (..., k) each, and the earth they stand on.
+
+    The parameters are factors (30 at order 3) unless `forms` gives the models of the triads.
+    """
 
     accelerometer: Array
-    magnetometer: Array
+    magnetometer: Array | None
     order: int = 3
     reference: float = 30.0
     gravity: float = 1.0
     field: float = 48_000.0
     dip: float = np.radians(63.0)
+    forms: tuple[Model, ...] = ()
 
     @property
     def model(self) -> Factors:
         """The model of both triads."""
         return Factors(Basis(self.order, self.reference))
 
+    @property
+    def triads(self) -> dict[str, tuple[Model, Array]]:
+        """Model and parameters by triad."""
+        parameters = [p for p in (self.accelerometer, self.magnetometer) if p is not None]
+        models: tuple[Model, ...] = self.forms or (self.model,) * len(parameters)
+        return dict(zip(TRIADS, zip(models, parameters, strict=True), strict=False))
+
+    def readings(self, vectors: tuple[Array, Array], temperature: Array) -> dict[str, Array]:
+        """Readings (..., n, 3) of each triad without noise, nominal units: the model, inverted."""
+        pairs = zip(self.triads.items(), vectors, strict=False)
+        return {
+            name: raw_reading(model, params, vector, temperature, *() if model.curved else (1,))
+            for (name, (model, params)), vector in pairs
+        }
+
 
 def servo(rng: np.random.Generator) -> Truth:
-    """A servo instrument within the datasheet limits of Moosavi's Table 1.
+    """A servo instrument within the datasheet limits of Moosavi's Table 1: see `SERVO`."""
+    return drawn(rng, Profile(name="servo"))
 
-    Scale ± 5 %, bias ± 10 mg, axis alignment ± 2 mrad, scale drift ± 180 ppm/°C, bias drift
-    ± 100 µg/°C, with a tenth and a hundredth of the drift over 100 °C in the square and the
-    cube. The magnetometer: scale ± 2 %, hard iron ± 1 % of 50 µT, alignment ± 4 mrad.
+
+def drawn(
+    rng: np.random.Generator, profile: Profile, order: int = 3, lead: tuple[int, ...] = ()
+) -> Truth:
+    """Tools within the tolerances of a profile's datasheets; what these do not state is as of `SERVO`.
+
+    Every tolerance is the standard deviation of a uniform distribution, about nominal. The same numbers are
+    drawn at every order.
     """
-    return Truth(
-        _triad(rng, 0.05, 0.010, 2e-3, 180e-6, 100e-6), _triad(rng, 0.02, 500.0, 4e-3, 100e-6, 2.0)
+    unit = rng.uniform(-ROOT3, ROOT3, (*lead, len(TRIADS), 30))
+    first, second = (
+        _factors(
+            unit[..., k, :], getattr(profile, name).datasheet or SERVO[name], SERVO[name], order
+        )
+        for k, name in enumerate(TRIADS)
     )
+    return Truth(first, second, order=order, reference=profile.reference_temperature_c)
 
 
-def _triad(
-    rng: np.random.Generator,
-    scale: float,
-    bias: float,
-    alignment: float,
-    scale_drift: float,
-    bias_drift: float,
-) -> Array:
-    course = np.array([1.0, 1e-3, 1e-6])
-    terms = []
-    for middle, spread, drift in ((1.0, scale, scale_drift), (0.0, bias, bias_drift)):
-        steady = middle + rng.uniform(-spread, spread, (3, 1))
-        terms += [steady, drift * rng.uniform(-1, 1, (3, 3)) * course]
-    scales, biases = np.hstack(terms[:2]), np.hstack(terms[2:])
-    return np.concatenate([scales.ravel(), biases.ravel(), rng.uniform(-alignment, alignment, 6)])
+def _factors(unit: Array, sheet: Datasheet, usual: Datasheet, order: int) -> Array:
+    """Factors (..., k) within tolerances, of numbers (..., 30) of standard deviation 1."""
+
+    def tolerance(name: str) -> float:
+        stated = getattr(sheet, name)
+        return float(getattr(usual, name) if stated is None else stated)
+
+    parts = []
+    for start, middle, name in ((0, 1.0, "scale"), (12, 0.0, "bias")):
+        steady = middle + tolerance(name) * unit[..., start : start + 3, None]
+        drift = unit[..., start + 3 : start + 12].reshape(*unit.shape[:-1], 3, 3)
+        powers = tolerance(f"{name}_per_c") * drift * DRIFT_POWERS
+        parts.append(np.concatenate([steady, powers], -1)[..., : order + 1])
+    linear = [part.reshape(*unit.shape[:-1], -1) for part in parts]
+    turns = np.radians(tolerance("misalignment_deg")) * unit[..., 24:]
+    return np.concatenate([*linear, turns], -1)
 
 
 def reading(truth: Truth, plan: StationPlan) -> tuple[Array, Array]:
     """What the tool's channels read (n, 3) without noise, nominal units: the model, inverted."""
-    fields = reference_vectors(
-        plan.inclination, plan.azimuth, plan.toolface, truth.gravity, truth.field, truth.dip
-    )
-    g, b = (
-        raw_reading(truth.model, params, field, plan.temperature, steps=1)
-        for params, field in zip((truth.accelerometer, truth.magnetometer), fields, strict=True)
-    )
+    angles = plan.inclination, plan.azimuth, plan.toolface
+    vectors = reference_vectors(*angles, truth.gravity, truth.field, truth.dip)
+    g, b = truth.readings(vectors, plan.temperature).values()
     return g, b
 
 
@@ -120,19 +181,143 @@ def run(
     stand: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> Readings:
     """Readings with noise (g, nT), at a stand whose angles are off by `stand` (radians, 1 σ)."""
-    count = len(plan.inclination)
     known = {name: getattr(plan, name) for name in ANGLES}
-    off = {
-        name: known[name] + sd * rng.normal(size=count)
-        for name, sd in zip(ANGLES, stand, strict=True)
-    }
-    g, b = reading(truth, replace(plan, **off))
-    known |= {name: np.full(count, getattr(truth, name)) for name in ("gravity", "field", "dip")}
+    known |= {name: np.full(plan.count, getattr(truth, name)) for name in CONSTANTS}
+    blank = np.zeros((plan.count, 3))
+    sd = {name: size + blank for name, size in zip(TRIADS, noise, strict=True)}
+    sd |= {name: np.asarray(size) for name, size in zip(ANGLES, stand, strict=True)}
+    session = Readings(blank, blank, plan.temperature, known, sd)
+    result = simulated(truth, session, rng).readings
     return Readings(
-        g + noise[0] * rng.normal(size=g.shape),
-        b + noise[1] * rng.normal(size=b.shape),
+        result.accelerometer,
+        result.magnetometer,
         plan.temperature,
         known,
-        station=tuple(str(i + 1) for i in range(count)),
-        metadata={"simulated": True},
+        station=tuple(str(i + 1) for i in range(plan.count)),
+        metadata=result.metadata,
     )
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """Readings of tools (..., n, 3), and what is true of their sessions.
+
+    `angles` by name and `temperature` of the sensors (..., n), radians and °C; `turn_on` (..., 3) by triad.
+    """
+
+    readings: Readings
+    angles: dict[str, Array]
+    temperature: Array
+    turn_on: dict[str, Array]
+
+
+def common_errors(
+    rng: np.random.Generator, session: Readings, effects: Effects, lead: tuple[int, ...]
+) -> dict[str, Array]:
+    """Errors (...,) that all stations of a stand have in common, of standard deviations that `session` states.
+
+    Zeros of the scales in radians, such that reading = value + zero; `stand-north` and `stand-east`, turns of
+    the stand's frame, of a tilt; by what gravity, field and dip exceed their references.
+    """
+    errors: dict[str, Array] = {}
+    for name in (*COMMON, *CONSTANTS):
+        size = float(session.uncertainty(name).max(initial=0.0))
+        if name not in CONSTANTS:
+            size = float(np.hypot(size, effects.stand.common(name)))
+        turns = ("stand-north", "stand-east") if name == "tilt" else (name,)
+        if size:
+            share = size / np.sqrt(len(turns))
+            errors |= {turn: share * rng.normal(size=lead) for turn in turns}
+    return errors
+
+
+def simulated(
+    truth: Truth,
+    session: Readings,
+    rng: np.random.Generator,
+    effects: Effects | None = None,
+    common: Mapping[str, Array] | None = None,
+    minutes: Array | None = None,
+) -> Simulation:
+    """What tools read in a session: `session` has references, uncertainties and temperatures of its stations.
+
+    White noise and errors of each setting are those that `session` states; errors of the stand are `common`,
+    by default drawn. `minutes` (n,) are the times of the stations, by default one each minute.
+    """
+    effects = effects or Effects()
+    lead, count = truth.accelerometer.shape[:-1], session.count
+    times = np.arange(1.0, count + 1) if minutes is None else minutes
+    common = common_errors(rng, session, effects, lead) if common is None else common
+    angles = {
+        name: _settings(session, name, effects, common)
+        + session.uncertainty(name) * rng.normal(size=(*lead, count))
+        for name in ANGLES
+    }
+    vectors = _vectors(session, angles, rng, effects, common, times)
+    warmth, recorded = _temperatures(session, effects, times)
+    readings, turn_on = {}, {}
+    for name, exact in truth.readings(vectors, warmth).items():
+        sensor = getattr(effects, name)
+        whole = exact
+        if sensor.turn_on:
+            turn_on[name] = sensor.turn_on * rng.normal(size=(*lead, 3))
+            whole = whole + turn_on[name][..., None, :]
+        if sensor.instability:
+            size = sensor.instability, sensor.instability_minutes
+            whole = whole + wandering(rng, exact.shape, times, *size)
+        readings[name] = sensor.recorded(whole + session.sd[name] * rng.normal(size=exact.shape))
+    result = Readings(
+        **{**dict.fromkeys(TRIADS), **readings},
+        temperature=recorded,
+        known=session.known,
+        sd=session.sd,
+        group=session.group,
+        station=session.station,
+        metadata={**session.metadata, "simulated": True},
+    )
+    return Simulation(result, angles, warmth, turn_on)
+
+
+def _settings(session: Readings, name: str, effects: Effects, common: Mapping[str, Array]) -> Array:
+    """Angles (..., n) that the stand has turned to, the error of each setting apart."""
+    stated, play = session.known[name], effects.stand.backlash(name)
+    zero = np.asarray(common.get(f"{name}-zero", 0.0))[..., None]
+    lag = play / 2 * approach(stated) if play else 0.0
+    return np.asarray(stated - zero - lag)
+
+
+def _vectors(
+    session: Readings, angles: Mapping[str, Array], rng: np.random.Generator, effects: Effects,
+    common: Mapping[str, Array], minutes: Array,
+) -> tuple[Array, Array]:  # fmt: skip
+    """Gravity and field (..., n, 3) in the frames of the tools."""
+    gravity, field, dip = (
+        session.known[name] + np.asarray(common.get(name, 0.0))[..., None] for name in CONSTANTS
+    )
+    attitude = tool_from_earth(*(angles[name] for name in ANGLES))
+    if "stand-north" in common:
+        turn = np.stack(
+            [common["stand-north"], common["stand-east"], 0 * common["stand-north"]], -1
+        )
+        attitude = attitude @ rotation(turn)[..., None, :, :]
+    earth = [earth_gravity(gravity), earth_field(field, dip)]
+    if effects.earth.variation_nt:
+        size = effects.earth.variation_nt, effects.earth.variation_minutes
+        earth[1] = earth[1] + wandering(rng, attitude.shape[:-1], minutes, *size)
+    g, b = (np.einsum("...ij,...j->...i", attitude, vector) for vector in earth)
+    return g, b
+
+
+def _temperatures(
+    session: Readings, effects: Effects, minutes: Array
+) -> tuple[Array, Array | None]:
+    """Temperatures (n,) of the sensors, and those that are recorded, °C."""
+    if session.temperature is None:
+        return np.full(session.count, ROOM_TEMPERATURE), None
+    course = effects.temperature
+    drift = course.drift_c_per_hour / 60 * (minutes - minutes[0])
+    sensors, thermometer = (
+        response(session.temperature, minutes, constant, ROOM_TEMPERATURE) + drift
+        for constant in (course.sensor_minutes, course.thermometer_minutes)
+    )
+    return sensors, thermometer

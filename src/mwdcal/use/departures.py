@@ -133,7 +133,7 @@ class RollTest:
         known = self.readings.known.get(name, np.nan)
         return OBSERVABLES[name].difference(self.value(name), known)
 
-    def _loose(self, index: Ints) -> str:
+    def loose(self, index: Ints) -> str:
         """Why stations do not determine a curve of two harmonics; empty where they do."""
         if not index.size or np.isnan(self.toolface[index]).any():
             return NO_TOOLFACE
@@ -145,7 +145,7 @@ class RollTest:
             "five or more, well apart"
         )
 
-    def _unfit(self, name: str, roll_set: RollSet) -> str:
+    def unfit(self, name: str, roll_set: RollSet) -> str:
         """Why a roll set has no spread of an observable; empty where it has."""
         if not roll_set.one_azimuth and name not in LEVEL:
             return f"stations of one direction need group or {REFERENCE_COLUMNS['azimuth']}"
@@ -163,9 +163,9 @@ class RollTest:
         lacks = self._lacks(name)
         if lacks or not self.sets:
             return Departures(skipped=lacks or f"no {ROLL_SET} stations of one direction")
-        unfit = {s.label: self._unfit(name, s) for s in self.sets}
+        unfit = {s.label: self.unfit(name, s) for s in self.sets}
         fit = [s for s in self.sets if not unfit[s.label]]
-        gaps = {s.label: self._loose(s.index) for s in fit}
+        gaps = {s.label: self.loose(s.index) for s in fit}
         rolled = [s for s in fit if not gaps[s.label]]
         wrong = [s for s in fit if gaps[s.label] and (s.declared or (s.one_azimuth and not rolled))]
         kept = {s.label for s in (*rolled, *wrong)}
@@ -224,7 +224,7 @@ class RollTest:
     def _errors(self, name: str, judged: Ints) -> list[Statistic]:
         """Largest errors of rolled sets, and of each station outside of them."""
         seen = [replace(s, index=s.index[np.isin(s.index, judged)]) for s in self.sets]
-        whole = [s for s in seen if not self._loose(s.index) and (s.one_azimuth or name in LEVEL)]
+        whole = [s for s in seen if not self.loose(s.index) and (s.one_azimuth or name in LEVEL)]
         inside = np.concatenate([s.index for s in whole]) if whole else ()
         alone = judged[~np.isin(judged, inside)]
         reference = np.hypot(self.readings.uncertainty(name), self._common(name))
@@ -241,18 +241,15 @@ class RollTest:
         """Noise-free spread, or largest error, of a rolled set."""
         index = roll_set.index
         part = self._error(name)[index] if error else self._centred(name, index)
-        each, common = self._reference_sd(name, roll_set, error)
+        each, common = self.reference_sd(name, roll_set, error)
         sd = np.hypot(self._noise(name)[index], each)
-        curve = roll_test.fitted(part, sd, self.toolface[index])
-        turn, (most, least, farthest) = roll_test.extent(curve), np.degrees(roll_test.ends(curve))
-        raw = float(np.abs(part).max() if error else np.ptp(part))
-        value = float(turn.largest if error else turn.range)
-        noise = float(turn.largest_sd if error else turn.range_sd)
+        judged = roll_test.figure(part, sd, self.toolface[index], error)
+        curve, (most, least, farthest) = judged.curve, np.degrees(roll_test.ends(judged.curve))
+        value, noise, raw = float(judged.value), float(judged.uncertainty), float(judged.raw)
         at = f"toolface {farthest:.0f}°" if error else f"toolfaces {least:.0f}° to {most:.0f}°"
         where = f"{roll_set.label}; {at}"
         if curve.rough:
             where += f"; raw figure judged: {float(curve.scale):.2g} × the noise is left about a smooth curve"
-            value, noise = raw, noise * float(curve.scale)
         numbers = [value, noise, raw, *curve.coefficients, *curve.covariance.flat]
         if not np.isfinite(numbers).all() or np.linalg.cond(curve.covariance) > WORST_CONDITION:
             raise InputError(
@@ -265,7 +262,7 @@ class RollTest:
         sd_value = float(np.hypot(noise, common))
         return Statistic(value, sd_value, raw, where, index, part, roll_set.label, curve)
 
-    def _reference_sd(self, name: str, roll_set: RollSet, error: bool) -> tuple[Array, float]:
+    def reference_sd(self, name: str, roll_set: RollSet, error: bool) -> tuple[Array, float]:
         """Standard uncertainty of the reference: per station (k,), and what the set shares."""
         sd = self.readings.uncertainty(name)[roll_set.index]
         shared = float(self._common(name)[roll_set.index].max()) if error else 0.0

@@ -140,7 +140,7 @@ def _one(
 
     def values(params: AnyArray) -> dict[str, AnyArray]:
         if notation == triad.model:
-            return _stored_factors(params, permutation, scale)
+            return channel_factors(params, permutation, scale)
         if course and triad.order and notation == "forward":
             return _forward_course(params, permutation, scale)
         if course and triad.order:  # the parameters of the polynomial model themselves
@@ -197,7 +197,7 @@ def _steady(
     return {"SF": scale[:, None], "B": bias[:, None], "m": -mixing * (1 - np.eye(3))}
 
 
-def _stored_factors(params: AnyArray, permutation: Array, scale: Array) -> dict[str, AnyArray]:
+def channel_factors(params: AnyArray, permutation: Array, scale: Array) -> dict[str, AnyArray]:
     """Stored factors, tool axes and nominal units, to channels and raw units: exact."""
     gain, bias, mixing = factor_parts(params)
     back = permutation.transpose()

@@ -181,6 +181,30 @@ def _corrected(drawn: Array) -> tuple[Array, Array]:
     return np.maximum(curve - bias.mean(-1), 0.0), np.sqrt(np.mean(bias**2, -1))
 
 
+@dataclass(frozen=True)
+class Figure:
+    """Spread of an observable in roll sets (...), or its largest error: without noise, its 1σ, and `raw` with it."""
+
+    value: Array
+    uncertainty: Array
+    raw: Array
+    curve: Curve
+
+
+def figure(part: Array, sd: Array, toolface: Array, error: bool) -> Figure:
+    """The figure to judge of values (..., n) about their middle, or of errors, of independent `sd`.
+
+    Definition: range or largest departure of the curve, by `extent`; where the error is not smooth, the raw figure.
+    """
+    curve = fitted(part, sd, toolface)
+    turn = extent(curve)
+    raw = np.abs(part).max(-1) if error else np.ptp(part, axis=-1)
+    value, noise = (turn.largest, turn.largest_sd) if error else (turn.range, turn.range_sd)
+    rough = curve.rough
+    sd = np.where(rough, noise * curve.scale, noise)
+    return Figure(np.where(rough, raw, value), sd, raw, curve)
+
+
 def ends(curve: Curve) -> tuple[Array, Array, Array]:
     """Toolfaces (...) where the curve is greatest, least, and farthest from zero."""
     course = curve.at(CIRCLE)

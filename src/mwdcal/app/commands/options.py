@@ -42,7 +42,9 @@ DECIMAL = preset(
     "--decimal", default=".", metavar="SIGN", help="Decimal sign of numbers in text files."
 )
 JSON = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
-SEED = preset("--seed", type=click.IntRange(0), default=0, help="Seed of the swarm.")
+SEED = preset(
+    "--seed", type=click.IntRange(0), default=0, help="Seed of all that is drawn at random."
+)
 COLUMN_NAMES = click.option(
     "--columns", default="", metavar="NAMES",
     help="Columns of a text log without column names, such as time_s,ax,ay,az.",

@@ -95,22 +95,30 @@ def check_decimal(decimal: str) -> None:
 
 
 def write(path: str | os.PathLike[str], table: Table, export: TableFormat | None = None) -> None:
-    """Write the table atomically, in the format of the suffix; the same table, the same bytes.
+    """Write the table atomically: see `rendered`."""
+    atomic.write(path, rendered(path, table, export))
+
+
+def rendered(
+    path: str | os.PathLike[str], table: Table, export: TableFormat | None = None
+) -> bytes | str:
+    """The table in the format of the suffix of a file; the same table, the same bytes.
 
     `export`: text with that delimiter, decimal sign and encoding.
     """
     file = Path(path)
     form = _FORMATS[_suffix(file)]
     check_names(list(table.columns), file.name)
+    content: bytes | str
     if export and form is text:
         content = text.render(table.columns, table.metadata, export.delimiter, export.decimal)
         encoding = "utf-8-sig" if export.encoding == "utf-8" else export.encoding
-        atomic.write(file, content.encode(encoding, "replace"))
-    elif form is text:
+        return content.encode(encoding, "replace")
+    if form is text:
         delimiter = "\t" if file.suffix.lower() == ".tsv" else ","
-        atomic.write(file, text.render(pointed(table), table.metadata, delimiter))
-    else:
-        atomic.write(file, form.render(_typed(table), table.metadata, file.name))
+        return text.render(pointed(table), table.metadata, delimiter)
+    content = form.render(_typed(table), table.metadata, file.name)
+    return content
 
 
 def numbers(table: Table, name: str) -> Array:

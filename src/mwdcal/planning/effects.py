@@ -1,0 +1,161 @@
+"""What happens to readings besides white noise: effects of sensors, stand, oven and Earth, each by its physics.
+
+Sizes of everything that is drawn are standard deviations. All effects are zero unless a file says otherwise.
+"""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+import numpy as np
+
+from mwdcal.errors import InputError
+from mwdcal.files.profiles import built_in, read_toml, toml_problem
+from mwdcal.geometry.vectors import Array, centred
+
+LARGEST_EFFECT = 1e6
+"""No size of an effect is larger, in its unit."""
+
+
+class SensorEffects(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Of each channel of a triad, in g or nT.
+
+    `turn_on`: bias that each switching on leaves, constant until the next (1σ). `instability`: bias that
+    wanders about zero (1σ), forgotten with the time constant `instability_minutes` (`wandering`).
+    `resolution`: step of the converter. `saturation`: largest reading of either sign, if there is one.
+    """
+
+    turn_on: float = 0.0
+    instability: float = 0.0
+    instability_minutes: float = 60.0
+    resolution: float = 0.0
+    saturation: float | None = None
+
+    def recorded(self, reading: Array) -> Array:
+        """What the converter gives of readings: cut at the saturation, rounded to the resolution."""
+        most = self.saturation
+        cut = reading if most is None else np.clip(reading, -most, most)
+        return np.rint(cut / self.resolution) * self.resolution if self.resolution else cut
+
+
+class StandEffects(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Errors of the stand beside those that the tool profile declares, degrees.
+
+    `…_zero_deg`, `tilt_deg`: common to the session (1σ). `backlash_…_deg`: play of the gear; the table lags
+    behind its scale by half of it, against the direction of approach (`approach`).
+    """
+
+    inclination_zero_deg: float = 0.0
+    azimuth_zero_deg: float = 0.0
+    toolface_zero_deg: float = 0.0
+    tilt_deg: float = 0.0
+    backlash_inclination_deg: float = 0.0
+    backlash_azimuth_deg: float = 0.0
+    backlash_toolface_deg: float = 0.0
+
+    def common(self, name: str) -> float:
+        """Standard deviation, radians, of an error such as "azimuth-zero"."""
+        return math.radians(getattr(self, f"{name.replace('-', '_')}_deg"))
+
+    def backlash(self, angle: str) -> float:
+        """Play of the axis of an angle, radians."""
+        return math.radians(getattr(self, f"backlash_{angle}_deg"))
+
+
+class TemperatureEffects(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """How sensors and thermometer follow the oven, each with its time constant (`response`).
+
+    `drift_c_per_hour`: how fast both warm from the first reading on.
+    """
+
+    sensor_minutes: float = 0.0
+    thermometer_minutes: float = 0.0
+    drift_c_per_hour: float = 0.0
+
+
+class EarthEffects(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Variation of the Earth's field: each of its components (north, east, down) wanders, nT (1σ)."""
+
+    variation_nt: float = 0.0
+    variation_minutes: float = 60.0
+
+
+class Effects(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """All effects of a session."""
+
+    accelerometer: SensorEffects = SensorEffects()
+    magnetometer: SensorEffects = SensorEffects()
+    stand: StandEffects = StandEffects()
+    temperature: TemperatureEffects = TemperatureEffects()
+    earth: EarthEffects = EarthEffects()
+
+
+def load_effects(name_or_path: str) -> tuple[Effects, str]:
+    """Effects and the SHA-256 of their file: built in by name, or a TOML file by path."""
+    data, digest = read_toml(name_or_path, "effects", "file of effects")
+    try:
+        effects = msgspec.toml.decode(data, type=Effects)
+    except (msgspec.DecodeError, ValueError, RecursionError) as error:
+        raise InputError(
+            f"{name_or_path} is not a file of effects: {toml_problem(error)}. Compare it with the built-in ones: "
+            f"{', '.join(built_in('effects'))} (docs, 'Planning')."
+        ) from None
+    for section, values in msgspec.to_builtins(effects).items():
+        for key, value in values.items():
+            if value is not None:
+                _check(f"{name_or_path}, key '{section}.{key}'", key, value)
+    return effects, digest
+
+
+def _check(where: str, key: str, value: float) -> None:
+    """Refuse a size that no effect has."""
+    positive = key in ("instability_minutes", "variation_minutes", "saturation")
+    low = -LARGEST_EFFECT if key == "drift_c_per_hour" else 0.0
+    if not low <= value <= LARGEST_EFFECT or (positive and value == 0):
+        word = "above 0" if positive else f"at least {low:g}"
+        raise InputError(
+            f"{where}: must be {word} and at most {LARGEST_EFFECT:g}; got {value}. Correct it, or leave it out."
+        )
+
+
+def wandering(
+    rng: np.random.Generator, shape: tuple[int, ...], minutes: Array, sd: float, correlation: float
+) -> Array:
+    """What wanders (..., n, c) of `shape`, at times (n,) in minutes: a Gauss-Markov process of the first order.
+
+    Definition: stationary, normal, of standard deviation `sd`, correlated by exp(-Δt / `correlation`).
+    """
+    result = sd * rng.normal(size=shape)
+    kept = np.exp(-np.diff(minutes) / correlation)
+    for place, share in enumerate(kept, 1):
+        result[..., place, :] *= np.sqrt(1 - share**2)
+        result[..., place, :] += share * result[..., place - 1, :]
+    return result
+
+
+def response(level: Array, minutes: Array, time_constant: float, start: float) -> Array:
+    """How something follows levels (n,) that change when the one before was last read, minutes (n,).
+
+    Definition: dy/dt = (level - y) / `time_constant`; y is `start` at time 0. It follows at once where the
+    time constant is zero.
+    """
+    if not time_constant:
+        return level
+    result, value = np.empty(len(level)), start
+    for place, step in enumerate(np.diff(minutes, prepend=0.0)):
+        value = level[place] + (value - level[place]) * math.exp(-step / time_constant)
+        result[place] = value
+    return result
+
+
+def approach(setting: Array) -> Array:
+    """From where each setting (n,) of an axis is approached: 1 from below, -1 from above; radians.
+
+    The axis turns the shorter way; where it stays, so does the direction. The first is approached from below.
+    """
+    direction, result = 1.0, []
+    for step in centred(np.diff(setting, prepend=setting[:1])):
+        direction = float(np.sign(step)) or direction
+        result.append(direction)
+    return np.array(result)

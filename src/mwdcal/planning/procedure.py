@@ -1,0 +1,402 @@
+"""A whole procedure many times: tools, a plan, a stand, noise, the fit, a roll test and its verdict."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from mwdcal.calibration import results
+from mwdcal.calibration.calibrate import recorded
+from mwdcal.calibration.diagnosis.flags import FittedRuns
+from mwdcal.calibration.diagnosis.refusals import fit_refusals
+from mwdcal.calibration.estimate import Fit, fit
+from mwdcal.calibration.options import Options
+from mwdcal.calibration.prediction import accuracy, middle_temperature
+from mwdcal.calibration.readings import CONSTANTS, TRIADS, Readings
+from mwdcal.calibration.record import Calibration
+from mwdcal.errors import FitError, InputError
+from mwdcal.estimation.rank import Free
+from mwdcal.files.contract import REFERENCES
+from mwdcal.files.formats.table import Table
+from mwdcal.geometry.observables import OBSERVABLES
+from mwdcal.geometry.vectors import AnyArray, Array, Bools, reference_vectors
+from mwdcal.planning.effects import Effects
+from mwdcal.planning.expected import planned_fit
+from mwdcal.planning.planned import WORKING_INCLINATIONS
+from mwdcal.planning.session import Session
+from mwdcal.planning.simulate import Truth, drawn
+from mwdcal.sensor.profile import Profile
+from mwdcal.use import roll_test
+from mwdcal.use.departures import LEVEL, UNDEFINED_AT_VERTICAL, RollTest
+from mwdcal.use.roll_sets import RollSet
+from mwdcal.use.verification import COVERAGE, Limits
+
+PART = 200
+"""Tools that are simulated and fitted at once, with random numbers of their own."""
+SIXTHS = np.arange(6) * np.pi / 3
+"""Azimuths and toolfaces at which errors over the working range are taken."""
+CALIBRATED = "ok"
+"""Status of a tool that is calibrated; else the id of the refusal."""
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A limit and the roll sets that it is judged by: `spread` or `error` of an observable."""
+
+    kind: str
+    name: str
+    limit: float
+    sets: tuple[RollSet, ...]
+
+    @property
+    def unit(self) -> str:
+        """The unit of the limit."""
+        inside = OBSERVABLES[self.name].unit
+        return "°" if inside == "rad" else inside
+
+    @property
+    def factor(self) -> float:
+        """How many of the unit are one inside."""
+        return float(np.degrees(1)) if self.unit == "°" else 1.0
+
+    def column(self, word: str = "") -> str:
+        """The name of a column: spread_inclination_deg, or with a word before the unit."""
+        unit = "deg" if self.unit == "°" else self.unit.lower()
+        return "_".join(filter(None, (self.kind, self.name, word, unit)))
+
+
+@dataclass(frozen=True)
+class Procedure:
+    """What is repeated: both sessions, how to fit, the limits of the roll test, and the seed.
+
+    `calibration` is that of a nominal tool that reads without noise, `options` say `auto` nowhere; `tool` is the
+    one that is measured again and again, else each is drawn, of an `order`.
+    """
+
+    calibrating: Session
+    testing: Session
+    options: Options
+    limits: Limits
+    calibration: Calibration
+    seed: int
+    order: int
+    tool: Truth | None = None
+
+    @classmethod
+    def of(
+        cls, plan: Table, test: Table, profile: Profile, options: Options, limits: Limits, seed: int,
+        effects: Effects | None = None, order: int | None = None, tool: Truth | None = None,
+    ) -> Procedure:  # fmt: skip
+        """The procedure of a plan and the plan of a roll test, which is taken at the place of the former.
+
+        Raises:
+            InputError: the plan does not state an attitude, the profile not the noise, or no limit can be judged.
+            FitError: no calibration can come of the plan; the message says what to add.
+        """
+        choice, result = planned_fit(plan, profile, options)
+        calibration = recorded(choice, result)
+        if free := calibration.undetermined():
+            raise FitError(
+                f"{plan.source} leaves a direction undetermined: {free[0].text}. Add what determines it, or choose "
+                "another `method`."
+            )
+        place = {REFERENCES[name].column for name in CONSTANTS} & {*plan.columns}
+        there = {
+            name: np.full(test.count, plan.columns[name][0]) for name in place - {*test.columns}
+        }
+        testing = Session.of(replace(test, columns={**test.columns, **there}), profile, effects)
+        most = max(choice.options.orders) if order is None else order
+        return cls(
+            Session.of(plan, profile, effects), testing, choice.options, limits, calibration, seed,
+            most, tool,
+        )  # fmt: skip
+
+    @cached_property
+    def judged(self) -> list[Judged]:
+        """The limits that the roll test can be judged by.
+
+        Raises:
+            InputError: there is none, or a limit that no tool could pass.
+        """
+        readings, calibration = self.testing.readings, self.calibration
+        if calibration.outside(readings).any():
+            low, high = calibration.temperature_c or (np.nan, np.nan)
+            raise InputError(
+                f"{self.testing.plan.source} lies outside the calibrated range {low:.1f}…{high:.1f} °C. Choose a "
+                "`rolltest` within it."
+            )
+        test, judged = RollTest(calibration, readings), []
+        for kind in ("spread", "error"):
+            for name, limit in getattr(self.limits, kind).items():
+                outcome = getattr(test, kind)(name)
+                if outcome.blocked:
+                    raise InputError(f"{kind} of {name} cannot be passed: {outcome.blocked}.")
+                sets = tuple(s for s in test.sets if _fits(test, kind, name, s))
+                if not outcome.skipped and sets:
+                    judged.append(Judged(kind, name, limit, sets))
+        if not judged:
+            raise InputError(
+                f"{self.testing.plan.source}: no limit of '{self.limits.name}' applies to a roll set of it. Choose "
+                "another `rolltest`, or other `limits`."
+            )
+        return judged
+
+    @property
+    def guard(self) -> float:
+        """Standard uncertainties that a figure must stay away from its limit."""
+        return COVERAGE if self.limits.rule == "guarded" else 0.0
+
+    def parts(self, count: int) -> list[tuple[int, int]]:
+        """Number and size of each part of so many tools."""
+        return [(k, min(PART, count - first)) for k, first in enumerate(range(0, count, PART))]
+
+    def repeated(self, part: tuple[int, int]) -> dict[str, AnyArray]:
+        """What became of the tools of a part, by column: a row for each; the same for the same seed."""
+        number, count = part
+        rng = np.random.default_rng([self.seed, 3, number])
+        profile = self.calibrating.profile
+        tools = (
+            drawn(rng, profile, self.order, (count,))
+            if self.tool is None
+            else _alike(self.tool, count)
+        )
+        common = self.calibrating.common(rng, (count,))
+        readings = self.calibrating.measured(tools, rng, common).readings
+        test = self.testing.measured(tools, rng, common).readings
+        result = fit(readings, self.options)
+        columns: dict[str, AnyArray] = {"status": self._status(readings, result)}
+        sound = columns["status"] == CALIBRATED
+        columns |= self._verdict(tools, result, test, sound)
+        columns |= self._errors(tools, result) | self._parameters(result)
+        return columns | _true_parameters(tools)
+
+    def _status(self, readings: Readings, result: Fit) -> AnyArray:
+        """Why a tool is refused, or that it is calibrated."""
+        profile, count = self.calibrating.profile, len(result.status)
+        fitted = FittedRuns(
+            readings, profile, self.options, result, lambda k: (_member(readings, k), profile)
+        )
+        status = np.full(count, CALIBRATED, object)
+        for flag in fit_refusals(fitted):
+            status[flag.members & (status == CALIBRATED)] = flag.id
+        return status
+
+    def _verdict(
+        self, tools: Truth, result: Fit, test: Readings, sound: Bools
+    ) -> dict[str, AnyArray]:
+        """Every figure of the roll test, what is true of it, and both verdicts."""
+        guard = self.guard
+        passed, good = sound.copy(), np.ones(len(sound), bool)
+        columns: dict[str, AnyArray] = {}
+        nominal = RollTest(self.calibration, self.testing.readings)
+        seen = _Seen(result, test, nominal)
+        for limit in self.judged:
+            value, sd = seen.figure(limit, guard)
+            true = self._true_figure(tools, result, limit)
+            passed &= value + guard * sd <= limit.limit
+            good &= true <= limit.limit
+            columns |= {limit.column(): value, limit.column("sd"): sd, limit.column("true"): true}
+        return {"passed": passed, "good": good, **columns}
+
+    def _true_figure(self, tools: Truth, result: Fit, limit: Judged) -> Array:
+        """The figure (B,) of a limit without noise, over the whole turn of its worst set."""
+        known, warmth = self.testing.readings.known, _warmth(self.testing.readings)
+        observable, worst = OBSERVABLES[limit.name], np.zeros(len(result.status))
+        for each in limit.sets:
+            first = each.index[0]
+            attitude = [
+                np.full(roll_test.CURVE_POINTS, known[n][first]) for n in ("inclination", "azimuth")
+            ]
+            at = dict(
+                zip(
+                    ("inclination", "azimuth", "toolface"),
+                    [*attitude, roll_test.CIRCLE],
+                    strict=True,
+                )
+            )
+            at |= {name: np.full(roll_test.CURVE_POINTS, known[name][first]) for name in CONSTANTS}
+            fields = _through(tools, result, at, np.full(roll_test.CURVE_POINTS, warmth[first]))
+            value = observable.value(*fields)
+            if limit.kind == "error" or limit.name == "toolface":
+                value = observable.difference(value, at[limit.name])
+            value = value if limit.kind == "error" else _centred(value, limit.name)
+            span = np.abs(value).max(-1) if limit.kind == "error" else np.ptp(value, axis=-1)
+            worst = np.maximum(worst, span * limit.factor)
+        return worst
+
+    def _errors(self, tools: Truth, result: Fit) -> dict[str, Array]:
+        """Root mean square and largest error of each angle over the working range, and the accuracy stated."""
+        calibration = self.calibration
+        low, high = calibration.temperature_c or (0.0, 0.0)
+        middle = middle_temperature(calibration)
+        temperatures = sorted({low, middle, high}) if self.order else [middle]
+        grid = np.meshgrid(WORKING_INCLINATIONS, SIXTHS, SIXTHS, temperatures, indexing="ij")
+        *angles, warmth = (axis.ravel() for axis in grid)
+        at = dict(zip(("inclination", "azimuth", "toolface"), angles, strict=True))
+        known = self.calibrating.readings.known
+        at |= {name: np.full(warmth.shape, np.mean(known[name])) for name in CONSTANTS}
+        fields = _through(tools, result, at, warmth)
+        free: list[list[Free]] = [[] for _ in result.status]
+        stated = results.calibrated_tools(
+            result, free, calibration.reference_temperature, self.options.knowledge
+        )
+        sd = accuracy(stated, results.StatedCovariance(result).total)
+        columns = {}
+        for name, each in sd.items():
+            off = np.degrees(
+                OBSERVABLES[name].difference(OBSERVABLES[name].value(*fields), at[name])
+            )
+            columns[f"{name}_error_rms_deg"] = np.sqrt(np.mean(off**2, -1))
+            columns[f"{name}_error_max_deg"] = np.abs(off).max(-1)
+            columns[f"{name}_sd_deg"] = np.degrees(each)
+        return columns
+
+    def _parameters(self, result: Fit) -> dict[str, Array]:
+        """Parameters as in a calibration file, and their standard uncertainties."""
+        covariance = results.StatedCovariance(result).total
+        free: list[list[Free]] = [[] for _ in result.status]
+        columns = {}
+        for index, triad in enumerate(TRIADS[: len(result.problem.triads)]):
+            each = results.triad_results(
+                result, index, covariance, free, self.calibration.reference_temperature
+            )
+            for place, name in enumerate(each.model.names):
+                columns[column(triad, name)] = each.parameters[:, place]
+                columns[f"{column(triad, name)}_sd"] = each.sd[:, place]
+        return columns
+
+
+def solved(procedure: Procedure, part: tuple[int, int]) -> bytes:
+    """`Procedure.repeated` in another process."""
+    return pickle.dumps(procedure.repeated(part))
+
+
+def column(triad: str, parameter: str) -> str:
+    """The column of a parameter, as in a fleet's table: magnetometer_gain_xy_t1."""
+    return f"{triad}_{parameter}".replace("-", "_").replace("·", "_t")
+
+
+def _true_parameters(tools: Truth) -> dict[str, Array]:
+    return {
+        f"true_{column(triad, name)}": params[:, place]
+        for triad, (model, params) in tools.triads.items()
+        for place, name in enumerate(model.finished(tools.reference)[0].names)
+    }
+
+
+def _alike(tool: Truth, count: int) -> Truth:
+    """One tool so many times."""
+    second = tool.magnetometer
+    return replace(
+        tool,
+        accelerometer=np.tile(tool.accelerometer, (count, 1)),
+        magnetometer=None if second is None else np.tile(second, (count, 1)),
+    )
+
+
+def _member(readings: Readings, place: int) -> Readings:
+    """The readings of one tool of several."""
+    magnetometer = readings.magnetometer
+    return replace(
+        readings, accelerometer=readings.accelerometer[place],
+        magnetometer=None if magnetometer is None else magnetometer[place],
+    )  # fmt: skip
+
+
+def _fits(test: RollTest, kind: str, name: str, roll_set: RollSet) -> bool:
+    """Whether a roll set has a figure of an observable."""
+    steep = name in UNDEFINED_AT_VERTICAL and test.near[roll_set.index].any()
+    level = roll_set.one_azimuth or name in LEVEL
+    return bool(level and not steep and not test.loose(roll_set.index))
+
+
+def _warmth(readings: Readings) -> Array:
+    return np.zeros(readings.count) if readings.temperature is None else readings.temperature
+
+
+def _corrected(result: Fit, raws: Sequence[Array], temperature: Array) -> tuple[Array, Array]:
+    """Gravity and field (B, n, 3) that the fits make of nominal readings."""
+    fields = [
+        triad.model.fields(result.state.params[:, where], raw, temperature)
+        for triad, where, raw in zip(
+            result.problem.triads, result.problem.slices(), raws, strict=True
+        )
+    ]
+    return fields[0], fields[1] if len(fields) > 1 else np.full_like(fields[0], np.nan)
+
+
+def _through(
+    tools: Truth, result: Fit, at: Mapping[str, Array], temperature: Array
+) -> tuple[Array, Array]:
+    """Gravity and field (B, n, 3) that calibrated tools give at attitudes (n,), without noise."""
+    names = ("inclination", "azimuth", "toolface", *CONSTANTS)
+    vectors = reference_vectors(*(at[name] for name in names))
+    return _corrected(result, [*tools.readings(vectors, temperature).values()], temperature)
+
+
+def _centred(value: Array, name: str) -> Array:
+    """Values (..., n) about their middle."""
+    periodic = OBSERVABLES[name].period
+    middle = np.angle(np.mean(np.exp(1j * value), -1)) if periodic else value.mean(-1)
+    return OBSERVABLES[name].difference(value, middle[..., None])
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """Roll tests of calibrated tools, as `RollTest` sees one: `nominal` has what all have in common."""
+
+    result: Fit
+    test: Readings
+    nominal: RollTest
+
+    @cached_property
+    def raws(self) -> list[Array]:
+        """Readings (B, n, 3) of each triad."""
+        return [getattr(self.test, name) for name in self.test.triads]
+
+    @cached_property
+    def fields(self) -> tuple[Array, Array]:
+        """Corrected vectors (B, n, 3)."""
+        return _corrected(self.result, self.raws, _warmth(self.test))
+
+    @cached_property
+    def toolface(self) -> Array:
+        """Toolface (B, n) by which the tools were rolled: near vertical the magnetic one."""
+        name = "toolface" if len(self.raws) == 1 else "magnetic_toolface"
+        near = OBSERVABLES[name].value(*self.fields)
+        return np.where(self.nominal.near, near, OBSERVABLES["toolface"].value(*self.fields))
+
+    def noise(self, name: str) -> Array:
+        """Standard uncertainty (B, n) of an observable by the noise of the readings."""
+        gradient, square = np.nan_to_num(OBSERVABLES[name].gradient(*self.fields)), 0.0
+        problem = self.result.problem
+        for k, (triad, where) in enumerate(zip(problem.triads, problem.slices(), strict=True)):
+            slope = triad.model.slope(
+                self.result.state.params[:, where], self.raws[k], _warmth(self.test)
+            )
+            moved = np.einsum("bni,bnij->bnj", gradient[..., 3 * k : 3 * k + 3], slope)
+            square = square + np.sum((moved * self.test.sd[TRIADS[k]]) ** 2, -1)
+        return np.asarray(np.sqrt(square))
+
+    def figure(self, limit: Judged, guard: float) -> tuple[Array, Array]:
+        """Noise-free figure (B,) of a limit and its standard uncertainty, of the worst set of each tool."""
+        name, error = limit.name, limit.kind == "error"
+        observable, figures = OBSERVABLES[name], []
+        value = observable.value(*self.fields)
+        if error or name == "toolface":
+            value = observable.difference(value, self.test.known[name])
+        for each in limit.sets:
+            part = value[:, each.index]
+            part = part if error else _centred(part, name)
+            alone, shared = self.nominal.reference_sd(name, each, error)
+            sd = np.hypot(self.noise(name)[:, each.index], alone)
+            one = roll_test.figure(part, sd, self.toolface[:, each.index], error)
+            figures.append(np.stack([one.value, np.hypot(one.uncertainty, shared)]))
+        whole = np.stack(figures) * limit.factor
+        worst = np.argmax(whole[:, 0] + guard * whole[:, 1], 0)
+        value, sd = np.take_along_axis(whole, worst[None, None], 0)[0]
+        return value, sd
