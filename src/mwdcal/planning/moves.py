@@ -39,7 +39,7 @@ class Stand:
                 raise InputError(f"`{name}` must be a time of 0 or more; got {value:g}.")
 
 
-STAND = Stand()
+USUAL_STAND = Stand()
 """A stand of usual speed."""
 
 

@@ -19,14 +19,14 @@ from mwdcal.errors import FitError, InputError
 from mwdcal.files.formats.table import Table
 from mwdcal.geometry.vectors import Array
 from mwdcal.planning.expected import expected, planned_fit
-from mwdcal.planning.moves import STAND, Stand, session_seconds, shortest_order
+from mwdcal.planning.moves import USUAL_STAND, Stand, session_seconds, shortest_order
 from mwdcal.planning.optimal import Information, best, efficiency
 from mwdcal.planning.plans import at_temperatures, attitudes, joined, load_plan, soak_numbers, taken
 from mwdcal.sensor.profile import Profile
 
 WORKING_INCLINATIONS = np.radians([5.0, 30.0, 60.0, 90.0, 120.0])
 """Inclinations over which an I-optimal plan makes the angles accurate."""
-FEWEST = 8
+FEWEST_PLANNED = 8
 """Stations with which the search for the smallest plan begins."""
 CRITERIA = ("D", "A", "I")
 """What a best plan is best in: all parameters together, each of them, the angles."""
@@ -50,7 +50,7 @@ def judged(
     plan: Table,
     profile: Profile,
     options: Options | None = None,
-    stand: Stand = STAND,
+    stand: Stand = USUAL_STAND,
     candidates: Table | None = None,
 ) -> Planned:
     """What a plan will give; its efficiency is among its own stations and the `candidates` at its temperatures.
@@ -74,7 +74,7 @@ def best_plan(
     profile: Profile,
     options: Options | None = None,
     criterion: str = "D",
-    stand: Stand = STAND,
+    stand: Stand = USUAL_STAND,
     measured: Table | None = None,
 ) -> Planned:
     """The best stations out of candidates, `count` of them beside those already `measured`.
@@ -111,7 +111,7 @@ def smallest_plan(
     profile: Profile,
     options: Options | None = None,
     criterion: str = "I",
-    stand: Stand = STAND,
+    stand: Stand = USUAL_STAND,
 ) -> Planned:
     """The best plan of the fewest stations that gives wanted accuracies, 1σ in degrees by angle.
 
@@ -136,7 +136,7 @@ def smallest_plan(
         made = plan(count)
         return made is not None and _reached(made.calibration, accuracy_deg)
 
-    high = FEWEST
+    high = FEWEST_PLANNED
     while high < candidates.count and not enough(high):
         high = min(2 * high, candidates.count)
     counts = range(1 + high // 2, high + 1)

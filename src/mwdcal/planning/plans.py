@@ -20,7 +20,7 @@ from mwdcal.files.profiles import built_in, read_toml, toml_problem
 from mwdcal.geometry.vectors import Array, Ints
 
 Values = float | list[float]
-MOST_STATIONS = 20_000
+MOST_PLANNED = 20_000
 """Stations of a plan, or candidates."""
 ROOM_TEMPERATURE = 25.0
 """Temperature of a plan that states none, °C."""
@@ -47,7 +47,7 @@ class PlannedStations(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
         return list(product(*map(_listed, every)))
 
 
-class Plan(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class PlanFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """What is to be measured, in order: all stations at each temperature, °C.
 
     `gravity_g`, `field_nt` and `dip_deg` are of the place, where the plan depends on them.
@@ -88,9 +88,9 @@ def _listed(values: Values) -> list[float]:
 
 def check_count(count: int, source: str) -> None:
     """Refuse a plan of no stations, or of too many."""
-    if not 1 <= count <= MOST_STATIONS:
+    if not 1 <= count <= MOST_PLANNED:
         raise InputError(
-            f"{source}: a plan has from 1 to {MOST_STATIONS} stations; this one has {count}. List the attitudes "
+            f"{source}: a plan has from 1 to {MOST_PLANNED} stations; this one has {count}. List the attitudes "
             "and temperatures that are to be measured, or a coarser grid of candidates."
         )
 
@@ -116,7 +116,7 @@ def load_plan(name_or_path: str) -> Table:
         return replace(table, columns=cells)
     data, _ = read_toml(name_or_path, "plans", "plan")
     try:
-        plan = msgspec.toml.decode(data, type=Plan)
+        plan = msgspec.toml.decode(data, type=PlanFile)
     except (msgspec.DecodeError, ValueError, RecursionError) as error:
         raise InputError(
             f"{name_or_path} is not a plan: {toml_problem(error)}. Compare it with the built-in ones: "

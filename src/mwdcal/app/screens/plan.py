@@ -11,6 +11,7 @@ import numpy as np
 
 from mwdcal.app.envelope import enveloped
 from mwdcal.app.screens.numbers import written
+from mwdcal.app.screens.stations import MOST_LINES
 from mwdcal.app.text import one_line, quantity, table
 from mwdcal.calibration.prediction import accuracy_at, typical_accuracy
 from mwdcal.calibration.readings import SIMULATED
@@ -19,8 +20,6 @@ from mwdcal.errors import InputError
 from mwdcal.files.formats.table import Table
 from mwdcal.planning.planned import WORKING_INCLINATIONS, Planned
 
-MOST_LINES = 40
-"""Stations of a table on screen."""
 PLACE = "1σ, calibration alone, at 45° inclination"
 """What the accuracy of a plan is of."""
 STATION_TITLES = {
