@@ -51,6 +51,7 @@ SAMPLES = {
     "noise": ("noise", EXAMPLE / "static.csv", *TOOL),
     "noise-moving": ("noise", EXAMPLE / "log.csv", *TOOL),
     "stations": ("stations", EXAMPLE / "log.csv", "-o", "new.csv"),
+    "plan": ("plan", *TOOL, "--plan", "laboratory-thermal", "--plan", "moosavi-12"),
 }
 """Commands that also write a page, by the name of the sample."""
 
