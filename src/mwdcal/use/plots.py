@@ -39,6 +39,15 @@ AXES = {"x": AFTER, "y": MARKED, "z": "#111827"}
 """Colours of the channels of a triad."""
 LINES: dict[str, Any] = {"x": "-", "y": (0, (5, 1.5)), "z": (0, (1.5, 1.2))}
 """Line styles of the channels of a triad."""
+SERIES: tuple[tuple[str, str, Any], ...] = (
+    (AFTER, "o", "-"),
+    ("#e69f00", "s", (0, (5, 1.5))),
+    ("#009e73", "^", (0, (1.5, 1.2))),
+    ("#cc79a7", "x", "-."),
+    ("#7c3aed", "D", (0, (8, 2, 1, 2, 1, 2))),
+    ("#4b5563", "v", (0, (3, 3))),
+)
+"""Colour, marker and line style of up to six series: methods, roll sets, plans."""
 POINT_NAMES = "points"
 """Start of the gid of a line whose label names its points, below a first `_`, one on each line."""
 ACCURACY_OF = {"of the calibration alone": False, "of one reading: calibration and noise": True}

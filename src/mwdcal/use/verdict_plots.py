@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mwdcal.errors import InputError
-from mwdcal.use.plots import AFTER, BEFORE, MARKED, new_figure, quantity, style
+from mwdcal.use.plots import BEFORE, MARKED, SERIES, new_figure, quantity, style
 from mwdcal.use.roll_test import basis
 from mwdcal.use.verification import JudgedSet, Verdict, VerdictRow
 
@@ -17,17 +17,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-SET_LOOKS: tuple[tuple[str, str, Any], ...] = (
-    (AFTER, "o", "-"),
-    ("#e69f00", "s", (0, (5, 1.5))),
-    ("#009e73", "^", (0, (1.5, 1.2))),
-    ("#cc79a7", "x", "-."),
-    ("#7c3aed", "D", (0, (8, 2, 1, 2, 1, 2))),
-    ("#4b5563", "v", (0, (3, 3))),
-)
-"""Colour, marker and line of the first roll sets; of more, one set alone stands out."""
 OTHER_SETS = ("#9ca3af", ".", "-")
-"""Look of all but the worst where there are many roll sets, and of stations outside of them."""
+"""Colour, marker and line of all but the worst where there are many roll sets, and of stations outside of them."""
 DRAWN_TOOLFACES = np.radians(np.arange(0, 361, 3))
 """Toolfaces at which a curve is drawn."""
 OFF_PICTURE = 8.0
@@ -92,9 +83,9 @@ class VerdictPlots:
         labels = list(dict.fromkeys(each.label for each in sets if each.label))
         if not each.label:
             return "stations outside of roll sets", (BEFORE, "p", "-")
-        if len(labels) <= len(SET_LOOKS):
-            return each.label, SET_LOOKS[labels.index(each.label)]
-        return ("worst roll set", SET_LOOKS[0]) if worst else ("other roll sets", OTHER_SETS)
+        if len(labels) <= len(SERIES):
+            return each.label, SERIES[labels.index(each.label)]
+        return ("worst roll set", SERIES[0]) if worst else ("other roll sets", OTHER_SETS)
 
     def _draw_set(self, axes: Axes, row: VerdictRow, each: JudgedSet, worst: bool) -> None:
         """Stations of a set as markers, and its curve."""

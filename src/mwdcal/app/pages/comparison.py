@@ -37,8 +37,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-METHOD_COLOURS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#d55e00", "#4b5563")
-LOOKS = dict(zip(EVIDENCE, zip(METHOD_COLOURS, "os^xDv", strict=True), strict=True))
+LOOKS = {method: look[:2] for method, look in zip(EVIDENCE, plots.SERIES, strict=True)}
+"""Colour and marker of each method."""
 STATED = {"serial": "", "date": "measured "}
 """What the heading takes from the metadata of the run, and what stands before it."""
 ROW_HEIGHT = 0.6

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -23,13 +23,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-PLAN_LOOKS: tuple[dict[str, Any], ...] = (
-    {"color": plots.AFTER, "ls": "-"},
-    {"color": plots.MARKED, "ls": (0, (5, 1.5))},
-    {"color": "#111827", "ls": (0, (1.5, 1.2))},
-    {"color": plots.BEFORE, "ls": (0, (6, 1.5, 1, 1.5))},
-)
-"""Lines of plans that are compared."""
 SOAK_MARKERS = "os^Dv"
 """Markers of stations by soak."""
 
@@ -111,8 +104,8 @@ def draw_accuracy(plans: Sequence[Planned]) -> Figure:
     figure, [panels] = plots.new_figure(label, 2.3, columns=len(names))
     for axes, name in zip(panels, names, strict=True):
         for place, (each, sd) in enumerate(zip(plans, curves, strict=True)):
-            look = PLAN_LOOKS[place % len(PLAN_LOOKS)]
-            axes.plot(x, np.degrees(sd[name]), label=each.plan.source[:30], **look)
+            colour, _, line = plots.SERIES[place % len(plots.SERIES)]
+            axes.plot(x, np.degrees(sd[name]), ls=line, color=colour, label=each.plan.source[:30])
         axes.set(title=name, xlabel="inclination, °", xlim=(0, 180), xticks=range(0, 181, 45))
         if np.isfinite(np.concatenate([sd[name] for sd in curves])).any():
             axes.set_yscale("log")
