@@ -68,7 +68,7 @@ def _with_names(text: str, start: str, names: list[str]) -> str:
 
     before, _, after = text.partition(start)
     markers, end, rest = after.partition("</g>")
-    if markers.count("<use ") != len(names):
+    if not end or markers.count("<use ") != len(names):
         return text
     each = iter(names)
     titled = re.sub(
