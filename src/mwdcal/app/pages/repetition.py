@@ -57,7 +57,13 @@ def _figures(axes: Axes, columns: Mapping[str, AnyArray], judged: Sequence[Judge
         value, true = (columns[each.column(word)] / each.limit for word in ("", "true"))
         colour, marker = colours[place % len(colours)], LIMIT_MARKERS[place % len(LIMIT_MARKERS)]
         wrong = (value <= 1) != (true <= 1)
-        look: dict[str, Any] = {"ls": "", "marker": marker, "mec": colour, "mew": 0.5, "rasterized": True}
+        look: dict[str, Any] = {
+            "ls": "",
+            "marker": marker,
+            "mec": colour,
+            "mew": 0.5,
+            "rasterized": True,
+        }
         axes.plot(true, value, mfc="none", ms=2.6, label=f"{each.kind} of {each.name}", **look)
         axes.plot(true[wrong], value[wrong], mfc=colour, ms=4.0, **look)
     axes.axhline(1.0, color=plots.BEFORE, lw=0.7, ls=(0, (4, 3)))
