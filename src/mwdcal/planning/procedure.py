@@ -36,7 +36,7 @@ from mwdcal.use.departures import LEVEL, UNDEFINED_AT_VERTICAL, RollTest
 from mwdcal.use.roll_sets import RollSet
 from mwdcal.use.verification import COVERAGE, Limits
 
-PART = 200
+TOOLS_AT_ONCE = 200
 """Tools that are simulated and fitted at once, with random numbers of their own."""
 SIXTHS = np.arange(6) * np.pi / 3
 """Azimuths and toolfaces at which errors over the working range are taken."""
@@ -153,7 +153,10 @@ class Procedure:
 
     def parts(self, count: int) -> list[tuple[int, int]]:
         """Number and size of each part of so many tools."""
-        return [(k, min(PART, count - first)) for k, first in enumerate(range(0, count, PART))]
+        return [
+            (k, min(TOOLS_AT_ONCE, count - first))
+            for k, first in enumerate(range(0, count, TOOLS_AT_ONCE))
+        ]
 
     def repeated(self, part: tuple[int, int]) -> dict[str, AnyArray]:
         """What became of the tools of a part, by column: a row for each; the same for the same seed."""

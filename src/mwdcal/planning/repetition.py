@@ -13,6 +13,7 @@ from mwdcal.planning.procedure import CALIBRATED, Judged
 
 PERCENTILES = (5, 50, 95, 99)
 """Of each distribution that is stated."""
+Percentiles = dict[str, float | None]
 SIDE = 1.959963984540054
 """Standard deviations that hold 95 % of a normal distribution."""
 
@@ -43,8 +44,8 @@ class LimitRow(msgspec.Struct, frozen=True, kw_only=True):
     name: str
     unit: str
     limit: float
-    value: dict[str, float]
-    true: dict[str, float]
+    value: Percentiles
+    true: Percentiles
     wrong: Share
 
 
@@ -64,7 +65,7 @@ class Repetition(msgspec.Struct, frozen=True, kw_only=True):
     good: Share
     wrong_pass: Share
     wrong_fail: Share
-    errors_deg: dict[str, dict[str, dict[str, float]]]
+    errors_deg: dict[str, dict[str, Percentiles]]
     limits: list[LimitRow]
 
 
@@ -104,24 +105,20 @@ def summarised(
 def _limit_row(
     limit: Judged, columns: Mapping[str, AnyArray], sound: Bools, guard: float
 ) -> LimitRow:
-    value, sd, true = (columns[limit.column(word)][sound] for word in ("", "sd", "true"))
-    accepted = value + guard * sd <= limit.limit
+    value, sd, true = (columns[limit.column(word)] for word in ("", "sd", "true"))
+    wrong = (value + guard * sd <= limit.limit) != (true <= limit.limit)
     return LimitRow(
         name=f"{limit.kind} of {limit.name}",
         unit=limit.unit,
         limit=limit.limit,
-        value=_percentiles(value),
-        true=_percentiles(true),
-        wrong=Share.of(accepted != (true <= limit.limit)),
+        value=_percentiles(value[sound]),
+        true=_percentiles(true[sound]),
+        wrong=Share.of(sound & wrong),
     )
 
 
-def _percentiles(values: Array) -> dict[str, float]:
-    """The percentiles of a column, by name such as p95; none where it is empty."""
+def _percentiles(values: Array) -> Percentiles:
+    """The percentiles of a column, by name such as p95; None where it is empty."""
     known = values[np.isfinite(values)]
-    if not known.size:
-        return {}
-    return {
-        f"p{percent}": float(value)
-        for percent, value in zip(PERCENTILES, np.percentile(known, PERCENTILES), strict=True)
-    }
+    of = np.percentile(known, PERCENTILES).tolist() if known.size else [None] * len(PERCENTILES)
+    return {f"p{percent}": value for percent, value in zip(PERCENTILES, of, strict=True)}
