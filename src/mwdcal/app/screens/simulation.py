@@ -39,10 +39,10 @@ class TrueAttitude(msgspec.Struct, frozen=True, kw_only=True):
 class SimulationSummary(msgspec.Struct, frozen=True, kw_only=True):
     """What `simulate` writes of the truth behind a run, and prints.
 
-    Parameters by triad in raw units, as `convert --notation factors` prints them (SF, B, m; of a calibration that
-    is linear in its parameters above order 0: M, b). `stand`: errors common to the session, such that reading =
-    value + zero. `turn_on`: bias of the channels along the tool axes, g or nT. Of many repetitions `repetition`
-    has what they show, and what is true of a single run is empty.
+    Parameters by triad in raw units, as `convert` prints them in this `notation`: factors (SF, B, m), or affine (M, b)
+    for a calibration that is linear in its parameters above order 0. `stand`: errors common to the session, such
+    that reading = value + zero. `turn_on`: bias of the channels along the tool axes, g or nT. Of many repetitions
+    `repetition` has what they show, and what is true of a single run is empty.
     """
 
     seed: int
@@ -50,6 +50,7 @@ class SimulationSummary(msgspec.Struct, frozen=True, kw_only=True):
     tool: str
     order: int
     reference_temperature_c: float
+    notation: str = "factors"
     accelerometer: dict[str, Any] | None = None
     magnetometer: dict[str, Any] | None = None
     earth: dict[str, float] = {}
