@@ -8,8 +8,11 @@ import msgspec
 import numpy as np
 
 from mwdcal.calibration.prediction import STATED_ANGLES
+from mwdcal.calibration.record import SOFTWARE
+from mwdcal.files.formats.columns import Column
+from mwdcal.files.formats.table import Table
 from mwdcal.geometry.vectors import AnyArray, Array, Bools
-from mwdcal.planning.procedure import CALIBRATED, Judged
+from mwdcal.planning.procedure import CALIBRATED, Judged, Procedure
 
 PERCENTILES = (5, 50, 95, 99)
 """Of each distribution that is stated."""
@@ -73,6 +76,20 @@ def joined(parts: Sequence[Mapping[str, AnyArray]]) -> dict[str, AnyArray]:
     """The columns of all parts, in order, with the number of each tool first."""
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     return {"tool": np.arange(1.0, len(columns["status"]) + 1), **columns}
+
+
+def as_table(columns: Mapping[str, AnyArray], procedure: Procedure) -> Table:
+    """The table of all tools, labelled as simulated."""
+    cells: dict[str, Column] = {
+        name: values.tolist() if values.dtype == object else values
+        for name, values in columns.items()
+    }
+    labels = {
+        "simulated": True, "seed": procedure.seed, "plan": procedure.calibrating.plan.source,
+        "rolltest": procedure.testing.plan.source, "limits": procedure.limits.name,
+        "tool": procedure.calibrating.profile.name, "software": SOFTWARE,
+    }  # fmt: skip
+    return Table(cells, labels, "tools")
 
 
 def summarised(

@@ -17,7 +17,9 @@ if TYPE_CHECKING:
     from mwdcal.calibration.options import Options
     from mwdcal.calibration.record import Calibration
     from mwdcal.files.formats.table import Table
+    from mwdcal.geometry.vectors import AnyArray
     from mwdcal.planning.effects import Effects
+    from mwdcal.planning.procedure import Procedure
     from mwdcal.planning.simulate import Truth
     from mwdcal.sensor.profile import Profile
 
@@ -190,7 +192,6 @@ def _repeat(
     from mwdcal.app import pool
 
     with pool.preparing(workers):  # these imports, in the workers too
-        from mwdcal.app import repetition
         from mwdcal.app.pages.pictures import picture
         from mwdcal.app.pages.repetition import figure
         from mwdcal.app.screens import simulation as screen
@@ -198,6 +199,7 @@ def _repeat(
         from mwdcal.files.limits import load_limits
         from mwdcal.planning.plans import load_plan
         from mwdcal.planning.procedure import Procedure
+        from mwdcal.planning.repetition import as_table, summarised
 
     test, (bounds, digest) = load_plan(rolltest), load_limits(limits)
     procedure = Procedure.of(
@@ -205,7 +207,8 @@ def _repeat(
         seed, scene.effects, scene.order, scene.tool,
     )  # fmt: skip
     digests = {**scene.digests, "rolltest": test.digest, "limits": digest}
-    columns, summary = repetition.repeated(procedure, count, workers)
+    columns = _columns(procedure, count, workers)
+    summary = summarised(columns, procedure.judged, procedure.guard)
     facts = {
         "seed": seed, "order": procedure.order, "repetition": summary,
         "reference_temperature_c": scene.profile.reference_temperature_c,
@@ -213,8 +216,27 @@ def _repeat(
     document = screen.document(
         procedure.calibrating, facts, digests, None, output=output, plot=plot
     )
-    rendered = table.rendered(output, repetition.as_table(columns, procedure))
+    rendered = table.rendered(output, as_table(columns, procedure))
     title = scene.plan.source, procedure.guard
     drawn = picture(figure(columns, procedure.judged, *title), plot.suffix) if plot else b""
     atomic.write_all([(output, rendered), (plot, drawn)])
     print_result(document if as_json else screen.repeated(document))
+
+
+def _columns(procedure: Procedure, count: int, workers: int | None) -> dict[str, AnyArray]:
+    """The columns of all tools, by all cores; they do not depend on how many these are."""
+    import pickle
+    from functools import partial
+
+    from mwdcal.app import pool, progress
+    from mwdcal.planning.procedure import solved
+    from mwdcal.planning.repetition import joined
+    from mwdcal.use.correction_numba import cores
+
+    parts, done = procedure.parts(count), {}
+    steps = pool.Steps(tuple, partial(solved, procedure))
+    with progress.bar("simulating") as show:
+        for index, result in pool.results(steps, parts, workers or cores(), None):
+            done[index] = pickle.loads(result)  # of our own workers
+            show(len(done), len(parts))
+    return joined([done[index] for index in range(len(parts))])
