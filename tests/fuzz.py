@@ -432,6 +432,7 @@ USUAL = {
     "decimal": 0.05,
     "report": 0.04,
     "plot": 0.04,
+    "repeat": 0.5,
 }
 """Share of command lines that have an option."""
 OTHERWISE = 0.08

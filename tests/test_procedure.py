@@ -185,6 +185,15 @@ def test_shares_are_counted_over_all_tools():
     assert found.errors_deg["inclination"]["max"]["p50"] == 2.0  # of those calibrated
 
 
+def test_where_no_tool_is_calibrated_there_are_no_percentiles():
+    columns = procedure(profile=EXACT).repeated((0, 3))
+    columns["status"] = np.array(["gain"] * 3, object)
+    found = summarised(columns, procedure(profile=EXACT).judged, 0.0)
+    assert found.calibrated.count == 0
+    assert set(found.limits[0].value.values()) == {None}
+    assert found.limits[0].wrong.count == 0
+
+
 def repeat(folder, name, *options, count=30, plan="six-state"):
     output = folder / f"{name}.parquet"
     return command("simulate", "--plan", plan, "--repeat", count, "-o", output, *options), output

@@ -350,7 +350,7 @@ def test_a_run_without_noise_gives_back_the_truth(tmp_path):
     assert ran.code == 0, ran
     got = command("convert", calibration, "--notation", "factors", "--json").json
     wanted = json.loads(truth.read_text())
-    assert wanted["order"] == 3
+    assert (wanted["order"], wanted["notation"]) == (3, "factors")
     for triad in ("accelerometer", "magnetometer"):
         for name, value in wanted[triad].items():
             size = np.abs(np.array(value)).max(0)
@@ -407,6 +407,26 @@ def test_the_tool_of_a_calibration(tmp_path):
     ran = command("simulate", "--plan", "roll-test", "--calibration", calibration, "-o", roll)
     assert ran.code == 0, ran
     assert command("verify", calibration, roll).code == 0
+
+
+def test_the_tool_of_a_warm_calibration_is_written_as_convert_writes_it(tmp_path):
+    """One that is linear in its parameters over temperature has no factors."""
+    _, run, _ = simulate(tmp_path, "run", plan="moosavi-30")
+    calibration = tmp_path / "cal.json"
+    fit_options = ("--order", 2, "--model", "polynomial", "-o", calibration)
+    assert command("calibrate", run, "--tool", "servo", *fit_options).code == 0
+    truth = tmp_path / "again.json"
+    ran = command(
+        "simulate", "--calibration", calibration, "-o", tmp_path / "r.csv", "--truth", truth
+    )
+    assert ran.code == 0, ran
+    written = json.loads(truth.read_text())
+    assert written["notation"] == "affine"
+    line = ("convert", calibration, "--notation", "affine", "--temperature", "course", "--json")
+    wanted = command(*line).json
+    for triad in ("accelerometer", "magnetometer"):
+        np.testing.assert_allclose(written[triad]["M"], wanted[triad]["M"], rtol=1e-9)
+        np.testing.assert_allclose(written[triad]["b"], wanted[triad]["b"], rtol=1e-9)
 
 
 def test_plans_give_a_truth_of_the_order_that_their_soaks_carry(tmp_path):

@@ -22,7 +22,7 @@ INPUTS = {
     "noise": ("log", "profile"),
     "plan": ("profile", "measured"),
     "profile": ("run",),
-    "simulate": ("plan", "profile", "calibration", "effects"),
+    "simulate": ("plan", "profile", "calibration", "effects", "rolltest", "limits"),
     "stations": ("log",),
     "verify": ("calibration", "run", "limits"),
 }

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import pickle
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property, partial
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from mwdcal.calibration.prediction import accuracy, middle_temperature
 from mwdcal.calibration.readings import CONSTANTS, TRIADS, Readings
 from mwdcal.calibration.record import Calibration
 from mwdcal.errors import FitError, InputError
+from mwdcal.estimation.evidence import ANGLES
 from mwdcal.estimation.rank import Free
 from mwdcal.files.contract import REFERENCES
 from mwdcal.files.formats.table import Table
@@ -35,7 +36,7 @@ from mwdcal.use.departures import LEVEL, UNDEFINED_AT_VERTICAL, RollTest
 from mwdcal.use.roll_sets import RollSet
 from mwdcal.use.verification import COVERAGE, Limits
 
-PART = 200
+TOOLS_AT_ONCE = 200
 """Tools that are simulated and fitted at once, with random numbers of their own."""
 SIXTHS = np.arange(6) * np.pi / 3
 """Azimuths and toolfaces at which errors over the working range are taken."""
@@ -152,7 +153,10 @@ class Procedure:
 
     def parts(self, count: int) -> list[tuple[int, int]]:
         """Number and size of each part of so many tools."""
-        return [(k, min(PART, count - first)) for k, first in enumerate(range(0, count, PART))]
+        return [
+            (k, min(TOOLS_AT_ONCE, count - first))
+            for k, first in enumerate(range(0, count, TOOLS_AT_ONCE))
+        ]
 
     def repeated(self, part: tuple[int, int]) -> dict[str, AnyArray]:
         """What became of the tools of a part, by column: a row for each; the same for the same seed."""
@@ -193,40 +197,37 @@ class Procedure:
         passed, good = sound.copy(), np.ones(len(sound), bool)
         columns: dict[str, AnyArray] = {}
         nominal = RollTest(self.calibration, self.testing.readings)
-        seen = _Seen(result, test, nominal)
+        seen, turned = _Seen(result, test, nominal), cache(partial(self._turned, tools, result))
         for limit in self.judged:
             value, sd = seen.figure(limit, guard)
-            true = self._true_figure(tools, result, limit)
+            true = self._true_figure(limit, turned)
             passed &= value + guard * sd <= limit.limit
             good &= true <= limit.limit
             columns |= {limit.column(): value, limit.column("sd"): sd, limit.column("true"): true}
         return {"passed": passed, "good": good, **columns}
 
-    def _true_figure(self, tools: Truth, result: Fit, limit: Judged) -> Array:
+    def _turned(self, tools: Truth, result: Fit, first: int) -> dict[str, Array]:
+        """Every observable (B, t) over a whole turn at the direction of a station, without noise.
+
+        With `…-error`, its departure from what is true there.
+        """
+        nominal, count = self.testing.readings, roll_test.CURVE_POINTS
+        at = {name: np.full(count, value[first]) for name, value in nominal.known.items()}
+        at["toolface"] = roll_test.CIRCLE
+        fields = _through(tools, result, at, np.full(count, _warmth(nominal)[first]))
+        turn = {name: OBSERVABLES[name].value(*fields) for name in at}
+        return turn | {f"{n}-error": OBSERVABLES[n].difference(turn[n], at[n]) for n in at}
+
+    def _true_figure(self, limit: Judged, turned: Callable[[int], dict[str, Array]]) -> Array:
         """The figure (B,) of a limit without noise, over the whole turn of its worst set."""
-        known, warmth = self.testing.readings.known, _warmth(self.testing.readings)
-        observable, worst = OBSERVABLES[limit.name], np.zeros(len(result.status))
+        figures = []
         for each in limit.sets:
-            first = each.index[0]
-            attitude = [
-                np.full(roll_test.CURVE_POINTS, known[n][first]) for n in ("inclination", "azimuth")
-            ]
-            at = dict(
-                zip(
-                    ("inclination", "azimuth", "toolface"),
-                    [*attitude, roll_test.CIRCLE],
-                    strict=True,
-                )
-            )
-            at |= {name: np.full(roll_test.CURVE_POINTS, known[name][first]) for name in CONSTANTS}
-            fields = _through(tools, result, at, np.full(roll_test.CURVE_POINTS, warmth[first]))
-            value = observable.value(*fields)
-            if limit.kind == "error" or limit.name == "toolface":
-                value = observable.difference(value, at[limit.name])
-            value = value if limit.kind == "error" else _centred(value, limit.name)
-            span = np.abs(value).max(-1) if limit.kind == "error" else np.ptp(value, axis=-1)
-            worst = np.maximum(worst, span * limit.factor)
-        return worst
+            turn = turned(int(each.index[0]))
+            off = turn[f"{limit.name}-error"]
+            part = _centred(off if limit.name == "toolface" else turn[limit.name], limit.name)
+            error = limit.kind == "error"
+            figures.append(np.abs(off).max(-1) if error else np.ptp(part, axis=-1))
+        return np.asarray(np.max(figures, 0) * limit.factor)
 
     def _errors(self, tools: Truth, result: Fit) -> dict[str, Array]:
         """Root mean square and largest error of each angle over the working range, and the accuracy stated."""
@@ -236,7 +237,7 @@ class Procedure:
         temperatures = sorted({low, middle, high}) if self.order else [middle]
         grid = np.meshgrid(WORKING_INCLINATIONS, SIXTHS, SIXTHS, temperatures, indexing="ij")
         *angles, warmth = (axis.ravel() for axis in grid)
-        at = dict(zip(("inclination", "azimuth", "toolface"), angles, strict=True))
+        at = dict(zip(ANGLES, angles, strict=True))
         known = self.calibrating.readings.known
         at |= {name: np.full(warmth.shape, np.mean(known[name])) for name in CONSTANTS}
         fields = _through(tools, result, at, warmth)
@@ -333,8 +334,7 @@ def _through(
     tools: Truth, result: Fit, at: Mapping[str, Array], temperature: Array
 ) -> tuple[Array, Array]:
     """Gravity and field (B, n, 3) that calibrated tools give at attitudes (n,), without noise."""
-    names = ("inclination", "azimuth", "toolface", *CONSTANTS)
-    vectors = reference_vectors(*(at[name] for name in names))
+    vectors = reference_vectors(*(at[name] for name in (*ANGLES, *CONSTANTS)))
     return _corrected(result, [*tools.readings(vectors, temperature).values()], temperature)
 
 

@@ -8,11 +8,15 @@ import msgspec
 import numpy as np
 
 from mwdcal.calibration.prediction import STATED_ANGLES
+from mwdcal.calibration.record import SOFTWARE
+from mwdcal.files.formats.columns import Column
+from mwdcal.files.formats.table import Table
 from mwdcal.geometry.vectors import AnyArray, Array, Bools
-from mwdcal.planning.procedure import CALIBRATED, Judged
+from mwdcal.planning.procedure import CALIBRATED, Judged, Procedure
 
 PERCENTILES = (5, 50, 95, 99)
 """Of each distribution that is stated."""
+Percentiles = dict[str, float | None]
 SIDE = 1.959963984540054
 """Standard deviations that hold 95 % of a normal distribution."""
 
@@ -43,8 +47,8 @@ class LimitRow(msgspec.Struct, frozen=True, kw_only=True):
     name: str
     unit: str
     limit: float
-    value: dict[str, float]
-    true: dict[str, float]
+    value: Percentiles
+    true: Percentiles
     wrong: Share
 
 
@@ -64,7 +68,7 @@ class Repetition(msgspec.Struct, frozen=True, kw_only=True):
     good: Share
     wrong_pass: Share
     wrong_fail: Share
-    errors_deg: dict[str, dict[str, dict[str, float]]]
+    errors_deg: dict[str, dict[str, Percentiles]]
     limits: list[LimitRow]
 
 
@@ -72,6 +76,20 @@ def joined(parts: Sequence[Mapping[str, AnyArray]]) -> dict[str, AnyArray]:
     """The columns of all parts, in order, with the number of each tool first."""
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     return {"tool": np.arange(1.0, len(columns["status"]) + 1), **columns}
+
+
+def as_table(columns: Mapping[str, AnyArray], procedure: Procedure) -> Table:
+    """The table of all tools, labelled as simulated."""
+    cells: dict[str, Column] = {
+        name: values.tolist() if values.dtype == object else values
+        for name, values in columns.items()
+    }
+    labels = {
+        "simulated": True, "seed": procedure.seed, "plan": procedure.calibrating.plan.source,
+        "rolltest": procedure.testing.plan.source, "limits": procedure.limits.name,
+        "tool": procedure.calibrating.profile.name, "software": SOFTWARE,
+    }  # fmt: skip
+    return Table(cells, labels, "tools")
 
 
 def summarised(
@@ -104,24 +122,20 @@ def summarised(
 def _limit_row(
     limit: Judged, columns: Mapping[str, AnyArray], sound: Bools, guard: float
 ) -> LimitRow:
-    value, sd, true = (columns[limit.column(word)][sound] for word in ("", "sd", "true"))
-    accepted = value + guard * sd <= limit.limit
+    value, sd, true = (columns[limit.column(word)] for word in ("", "sd", "true"))
+    wrong = (value + guard * sd <= limit.limit) != (true <= limit.limit)
     return LimitRow(
         name=f"{limit.kind} of {limit.name}",
         unit=limit.unit,
         limit=limit.limit,
-        value=_percentiles(value),
-        true=_percentiles(true),
-        wrong=Share.of(accepted != (true <= limit.limit)),
+        value=_percentiles(value[sound]),
+        true=_percentiles(true[sound]),
+        wrong=Share.of(sound & wrong),
     )
 
 
-def _percentiles(values: Array) -> dict[str, float]:
-    """The percentiles of a column, by name such as p95; none where it is empty."""
+def _percentiles(values: Array) -> Percentiles:
+    """The percentiles of a column, by name such as p95; None where it is empty."""
     known = values[np.isfinite(values)]
-    if not known.size:
-        return {}
-    return {
-        f"p{percent}": float(value)
-        for percent, value in zip(PERCENTILES, np.percentile(known, PERCENTILES), strict=True)
-    }
+    of = np.percentile(known, PERCENTILES).tolist() if known.size else [None] * len(PERCENTILES)
+    return {f"p{percent}": value for percent, value in zip(PERCENTILES, of, strict=True)}

@@ -20,7 +20,7 @@ from mwdcal.planning.moves import Stand, move_seconds
 from mwdcal.planning.plans import ROOM_TEMPERATURE, attitudes, soak_numbers, soak_temperatures
 from mwdcal.planning.simulate import Simulation, Truth, common_errors, simulated
 from mwdcal.sensor.profile import Profile
-from mwdcal.use.notation import channel_factors, convert
+from mwdcal.use.notation import COURSE, channel_factors, convert
 
 TILT = ("stand-north", "stand-east")
 """The two turns of the stand's frame that a tilt consists of."""
@@ -150,21 +150,24 @@ def calibrated_tool(calibration: Calibration) -> tuple[Truth, Profile]:
 
 def tool_facts(
     tool: Truth, profile: Profile, calibration: Calibration | None = None
-) -> dict[str, dict[str, list[object]]]:
-    """Parameters of one tool by triad, in raw units and the order of the channels: SF, B, m.
+) -> dict[str, object]:
+    """Parameters of one tool by triad, in raw units and the order of the channels, and their `notation`.
 
-    Of a calibration that is linear in its parameters at an order above 0, which no factors can give: M, b by
-    power of T - reference (`use.notation`).
+    Factors (SF, B, m); of a calibration that is linear in its parameters at an order above 0, which no factors can
+    give, affine (M, b) by power of T - reference: see `use.notation`.
     """
+    notation = "factors"
     if calibration is None:
         values = {
             name: _factors(params, profile, name) for name, (_, params) in tool.triads.items()
         }
     else:
         linear = any(t.order and t.model != "factors" for t in calibration.triads)
-        word = ("affine", "course") if linear else ("factors", None)
-        values = {name: each.values for name, each in convert(calibration, *word).items()}
-    return {name: {k: v.tolist() for k, v in each.items()} for name, each in values.items()}
+        notation = "affine" if linear else "factors"
+        each = convert(calibration, notation, COURSE if linear else None)
+        values = {name: triad.values for name, triad in each.items()}
+    lists = {name: {k: v.tolist() for k, v in triad.items()} for name, triad in values.items()}
+    return {"notation": notation, **lists}
 
 
 def _factors(params: Array, profile: Profile, triad: str) -> dict[str, Array]:

@@ -24,14 +24,17 @@ LIMIT_MARKERS = "osD^vP*X<>"
 
 
 @plots.style()
-def figure(columns: Mapping[str, AnyArray], judged: Sequence[Judged], plan: str) -> Figure:
-    """Errors of all tools, and figures of the roll test against the true ones."""
+def figure(
+    columns: Mapping[str, AnyArray], judged: Sequence[Judged], plan: str, guard: float = 0.0
+) -> Figure:
+    """Errors of all tools, and figures of the roll test against the true ones, judged with a `guard`."""
     sound = columns["status"] == CALIBRATED
     label = "Largest error of each angle over the tools, and figures of the roll test against the true ones"
     figure, [[errors, figures]] = plots.new_figure(label, 3.4, columns=2)
     figure.suptitle(f"{plan}, {plural(len(sound), 'tool')}   {SIMULATED}", fontsize=8)
-    _errors(errors, {name: values[sound] for name, values in columns.items()})
-    _figures(figures, {name: values[sound] for name, values in columns.items()}, judged)
+    calibrated = {name: values[sound] for name, values in columns.items()}
+    _errors(errors, calibrated)
+    _figures(figures, calibrated, judged, guard)
     return figure
 
 
@@ -50,13 +53,17 @@ def _errors(axes: Axes, columns: Mapping[str, AnyArray]) -> None:
     axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.06), ncols=3)
 
 
-def _figures(axes: Axes, columns: Mapping[str, AnyArray], judged: Sequence[Judged]) -> None:
+def _figures(
+    axes: Axes, columns: Mapping[str, AnyArray], judged: Sequence[Judged], guard: float
+) -> None:
     """Figures of the roll test over the true ones, both as shares of their limit; wrong verdicts are filled."""
-    colours = [*plots.AXES.values(), plots.BEFORE]
     for place, each in enumerate(judged):
-        value, true = (columns[each.column(word)] / each.limit for word in ("", "true"))
-        colour, marker = colours[place % len(colours)], LIMIT_MARKERS[place % len(LIMIT_MARKERS)]
-        wrong = (value <= 1) != (true <= 1)
+        value, sd, true = (columns[each.column(word)] / each.limit for word in ("", "sd", "true"))
+        colour, marker = (
+            plots.SERIES[place % len(plots.SERIES)][0],
+            LIMIT_MARKERS[place % len(LIMIT_MARKERS)],
+        )
+        wrong = (value + guard * sd <= 1) != (true <= 1)
         look: dict[str, Any] = {
             "ls": "",
             "marker": marker,
@@ -69,5 +76,5 @@ def _figures(axes: Axes, columns: Mapping[str, AnyArray], judged: Sequence[Judge
     axes.axhline(1.0, color=plots.BEFORE, lw=0.7, ls=(0, (4, 3)))
     axes.axvline(1.0, color=plots.BEFORE, lw=0.7, ls=(0, (4, 3)))
     axes.set(xlabel="true figure over its limit", ylabel="figure of the roll test over its limit")
-    axes.set_title("filled: wrong verdict")
-    axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.06), ncols=3, markerscale=1.5)
+    axes.set_title("filled: wrong decision")
+    axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.06), ncols=2, markerscale=1.5)

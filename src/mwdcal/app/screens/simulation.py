@@ -9,7 +9,7 @@ from typing import Any
 import msgspec
 
 from mwdcal.app.envelope import enveloped
-from mwdcal.app.screens.numbers import number, written
+from mwdcal.app.screens.numbers import fixed, number, written
 from mwdcal.app.text import one_line, plural, quantity, table
 from mwdcal.calibration.readings import SIMULATED
 from mwdcal.planning.effects import Effects
@@ -39,10 +39,10 @@ class TrueAttitude(msgspec.Struct, frozen=True, kw_only=True):
 class SimulationSummary(msgspec.Struct, frozen=True, kw_only=True):
     """What `simulate` writes of the truth behind a run, and prints.
 
-    Parameters by triad in raw units, as `convert --notation factors` prints them (SF, B, m; of a calibration that
-    is linear in its parameters above order 0: M, b). `stand`: errors common to the session, such that reading =
-    value + zero. `turn_on`: bias of the channels along the tool axes, g or nT. Of many repetitions `repetition`
-    has what they show, and what is true of a single run is empty.
+    Parameters by triad in raw units, as `convert` prints them in this `notation`: factors (SF, B, m), or affine (M, b)
+    for a calibration that is linear in its parameters above order 0. `stand`: errors common to the session, such
+    that reading = value + zero. `turn_on`: bias of the channels along the tool axes, g or nT. Of many repetitions
+    `repetition` has what they show, and what is true of a single run is empty.
     """
 
     seed: int
@@ -50,6 +50,7 @@ class SimulationSummary(msgspec.Struct, frozen=True, kw_only=True):
     tool: str
     order: int
     reference_temperature_c: float
+    notation: str = "factors"
     accelerometer: dict[str, Any] | None = None
     magnetometer: dict[str, Any] | None = None
     earth: dict[str, float] = {}
@@ -101,50 +102,57 @@ def screen(document: Mapping[str, Any]) -> str:
 
 def repeated(document: Mapping[str, Any]) -> str:
     """Many repetitions for people: the verdicts first."""
-    found = msgspec.convert(document["repetition"], Repetition)
+    result = msgspec.convert(document["repetition"], Repetition)
     head = [
-        document["tool"], document["plan"], plural(found.tools, "tool"), f"order {document['order']}",
+        document["tool"], document["plan"], plural(result.tools, "tool"), f"order {document['order']}",
         f"seed {document['seed']}", SIMULATED,
     ]  # fmt: skip
     words = {
-        "calibrated": found.calibrated, "passed": found.passed, "good": found.good,
-        "passed, not good (consumer's risk)": found.wrong_pass,
-        "good, not passed (producer's risk)": found.wrong_fail,
+        "calibrated": result.calibrated, "passed": result.passed, "good": result.good,
+        "passed, not good (consumer's risk)": result.wrong_pass,
+        "good, not passed (producer's risk)": result.wrong_fail,
     }  # fmt: skip
     verdicts = table(
         [[name, str(share.count), *_percent(share)] for name, share in words.items()],
         ["of all tools", "tools", "share", "95 % interval"],
     )
     files = written(tools=document["output"], picture=document["plot"])
-    refused = [f"refused: {', '.join(f'{k} {v}' for k, v in found.refused.items())}"] * bool(
-        found.refused
+    refused = [f"refused: {', '.join(f'{k} {v}' for k, v in result.refused.items())}"] * bool(
+        result.refused
     )
-    blocks = [one_line("   ".join(head)), verdicts, *refused, _errors(found), _limits(found), files]
+    blocks = [
+        one_line("   ".join(head)),
+        verdicts,
+        *refused,
+        _errors(result),
+        _limits(result),
+        files,
+    ]
     return "\n\n".join(blocks)
 
 
 def _percent(share: Share) -> list[str]:
     """A share and its interval, in percent."""
-    low, high = (number(100 * value, 3) for value in (share.low, share.high))
+    low, high = (fixed(100 * value, 2) for value in (share.low, share.high))
     return [f"{number(100 * share.share, 3)} %", f"{low}…{high} %"]
 
 
-def _errors(found: Repetition) -> str:
+def _errors(result: Repetition) -> str:
     """Percentiles over the tools of the errors of each angle."""
     titles = {"rms": "rms error", "max": "largest error", "stated": "stated 1σ, 45°"}
     rows = [
         [f"{angle}, {title}", *(f"{number(value)}°" for value in each[word].values())]
-        for angle, each in found.errors_deg.items()
+        for angle, each in result.errors_deg.items()
         for word, title in titles.items()
     ]
     return table(rows, ["over the working range", *_titles()])
 
 
-def _limits(found: Repetition) -> str:
+def _limits(result: Repetition) -> str:
     """Percentiles of the figures of the roll test, measured and true."""
     rows = [
         [f"{row.name}, {word}", *(quantity(v, row.unit) for v in values.values()), quantity(row.limit, row.unit), wrong]
-        for row in found.limits
+        for row in result.limits
         for word, values, wrong in (
             ("roll test", row.value, _percent(row.wrong)[0]), ("true", row.true, ""),
         )

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Unpack
+from typing import TYPE_CHECKING, Unpack
 
 import click
 from click.core import ParameterSource
@@ -11,6 +12,16 @@ from click.core import ParameterSource
 from mwdcal.app.commands import options
 from mwdcal.app.messages import print_result, to_json
 from mwdcal.errors import InputError
+
+if TYPE_CHECKING:
+    from mwdcal.calibration.options import Options
+    from mwdcal.calibration.record import Calibration
+    from mwdcal.files.formats.table import Table
+    from mwdcal.geometry.vectors import AnyArray
+    from mwdcal.planning.effects import Effects
+    from mwdcal.planning.procedure import Procedure
+    from mwdcal.planning.simulate import Truth
+    from mwdcal.sensor.profile import Profile
 
 MOST_TOOLS = 100_000
 """Repetitions of a procedure."""
@@ -78,11 +89,11 @@ def command(
     options.check_outputs(
         [output, truth], [plan, tool, calibration, effects, rolltest, limits], plot
     )
-    scene = _Scene(plan, tool, calibration, effects, typed)
+    scene = _scene(plan, tool, calibration, effects, typed)
     if repeat:
-        _repeat(scene, repeat, rolltest, limits, workers, output, plot, as_json)
+        _repeat(scene, typed["seed"], repeat, rolltest, limits, workers, output, plot, as_json)
     else:
-        _simulate(scene, output, truth, as_json)
+        _simulate(scene, typed["seed"], output, truth, as_json)
 
 
 def _check(
@@ -108,34 +119,48 @@ def _check(
         raise InputError(f"`{inert[0]}` goes with `repeat`. Leave it out, or add `repeat`.")
 
 
+@dataclass(frozen=True)
 class _Scene:
-    """What is simulated: the plan, the tool, the effects, and the fit as typed."""
+    """What is simulated: plan, profile, effects, the tool of a calibration, the fit; digests of their files."""
 
-    def __init__(
-        self, plan: str, tool: str | None, calibration: Path | None, effects: str | None,
-        typed: options.Typed,
-    ) -> None:  # fmt: skip
-        from mwdcal.app.choices import options_of, prior_of
-        from mwdcal.calibration.options import AUTO
-        from mwdcal.files import documents, profiles
-        from mwdcal.planning.effects import load_effects
-        from mwdcal.planning.plans import load_plan
-        from mwdcal.planning.session import calibrated_tool
+    plan: Table
+    profile: Profile
+    effects: Effects
+    options: Options
+    digests: dict[str, str]
+    record: Calibration | None = None
+    tool: Truth | None = None
 
-        self.options = options_of(typed, prior_of(typed["prior"])[0])
-        self.seed = typed["seed"]
-        self.order = None if self.options.order == AUTO else max(self.options.orders)
-        self.plan, self.record, self.tool = load_plan(plan), None, None
-        self.effects, digest = load_effects(effects or "none")
-        self.digests = {"plan": self.plan.digest, "effects": digest if effects else ""}
-        if calibration:
-            self.record, self.digests["calibration"] = documents.load(calibration)
-            self.tool, self.profile = calibrated_tool(self.record)
-        else:
-            self.profile, self.digests["profile"] = profiles.load_profile(tool or "servo")
+    @property
+    def order(self) -> int | None:
+        """The order of a tool drawn; None: as the plan allows."""
+        return None if self.options.order == "auto" else max(self.options.orders)
 
 
-def _simulate(scene: _Scene, output: Path, truth: Path | None, as_json: bool) -> None:
+def _scene(
+    plan: str, tool: str | None, calibration: Path | None, effects: str | None,
+    typed: options.Typed,
+) -> _Scene:  # fmt: skip
+    """The files that the command names, read."""
+    from mwdcal.app.choices import options_of, prior_of
+    from mwdcal.files import documents, profiles
+    from mwdcal.planning.effects import load_effects
+    from mwdcal.planning.plans import load_plan
+    from mwdcal.planning.session import calibrated_tool
+
+    chosen = options_of(typed, prior_of(typed["prior"])[0])
+    table = load_plan(plan)
+    physics, digest = load_effects(effects or "none")
+    digests = {"plan": table.digest, "effects": digest if effects else ""}
+    if calibration:
+        record, digests["calibration"] = documents.load(calibration)
+        true, profile = calibrated_tool(record)
+        return _Scene(table, profile, physics, chosen, digests, record, true)
+    profile, digests["profile"] = profiles.load_profile(tool or "servo")
+    return _Scene(table, profile, physics, chosen, digests)
+
+
+def _simulate(scene: _Scene, seed: int, output: Path, truth: Path | None, as_json: bool) -> None:
     """One run."""
     import numpy as np
 
@@ -145,13 +170,13 @@ def _simulate(scene: _Scene, output: Path, truth: Path | None, as_json: bool) ->
     from mwdcal.planning import session as sessions
     from mwdcal.planning.simulate import drawn
 
-    rng = np.random.default_rng([scene.seed, 2])
+    rng = np.random.default_rng([seed, 2])
     session = sessions.Session.of(scene.plan, scene.profile, scene.effects)
     order = session.highest_order if scene.order is None else scene.order
     tool = scene.tool or drawn(rng, scene.profile, order)
     known = serial_of(scene.record.tool) if scene.record else None
-    serial = known or f"SIM-{scene.seed}"
-    run, facts = sessions.simulated_run(session, tool, scene.seed, rng, serial)
+    serial = known or f"SIM-{seed}"
+    run, facts = sessions.simulated_run(session, tool, seed, rng, serial)
     facts |= sessions.tool_facts(tool, session.profile, scene.record)
     document = screen.document(session, facts, scene.digests, serial, output=output, truth=truth)
     rendered = table.rendered(output, run)
@@ -160,14 +185,13 @@ def _simulate(scene: _Scene, output: Path, truth: Path | None, as_json: bool) ->
 
 
 def _repeat(
-    scene: _Scene, count: int, rolltest: str, limits: str, workers: int | None, output: Path,
+    scene: _Scene, seed: int, count: int, rolltest: str, limits: str, workers: int | None, output: Path,
     plot: Path | None, as_json: bool,
 ) -> None:  # fmt: skip
     """A whole procedure many times."""
     from mwdcal.app import pool
 
     with pool.preparing(workers):  # these imports, in the workers too
-        from mwdcal.app import repetition
         from mwdcal.app.pages.pictures import picture
         from mwdcal.app.pages.repetition import figure
         from mwdcal.app.screens import simulation as screen
@@ -175,22 +199,44 @@ def _repeat(
         from mwdcal.files.limits import load_limits
         from mwdcal.planning.plans import load_plan
         from mwdcal.planning.procedure import Procedure
+        from mwdcal.planning.repetition import as_table, summarised
 
+    test, (bounds, digest) = load_plan(rolltest), load_limits(limits)
     procedure = Procedure.of(
-        scene.plan, load_plan(rolltest), scene.profile, scene.options, load_limits(limits)[0],
-        scene.seed, scene.effects, scene.order, scene.tool,
+        scene.plan, test, scene.profile, scene.options, bounds,
+        seed, scene.effects, scene.order, scene.tool,
     )  # fmt: skip
-    columns, summary = repetition.repeated(procedure, count, workers)
+    digests = {**scene.digests, "rolltest": test.digest, "limits": digest}
+    columns = _columns(procedure, count, workers)
+    summary = summarised(columns, procedure.judged, procedure.guard)
     facts = {
-        "seed": scene.seed, "order": procedure.order, "repetition": summary,
+        "seed": seed, "order": procedure.order, "repetition": summary,
         "reference_temperature_c": scene.profile.reference_temperature_c,
     }  # fmt: skip
     document = screen.document(
-        procedure.calibrating, facts, scene.digests, None, output=output, plot=plot
+        procedure.calibrating, facts, digests, None, output=output, plot=plot
     )
-    rendered = table.rendered(output, repetition.as_table(columns, procedure))
-    drawn = (
-        picture(figure(columns, procedure.judged, scene.plan.source), plot.suffix) if plot else b""
-    )
+    rendered = table.rendered(output, as_table(columns, procedure))
+    title = scene.plan.source, procedure.guard
+    drawn = picture(figure(columns, procedure.judged, *title), plot.suffix) if plot else b""
     atomic.write_all([(output, rendered), (plot, drawn)])
     print_result(document if as_json else screen.repeated(document))
+
+
+def _columns(procedure: Procedure, count: int, workers: int | None) -> dict[str, AnyArray]:
+    """The columns of all tools, by all cores; they do not depend on how many these are."""
+    import pickle
+    from functools import partial
+
+    from mwdcal.app import pool, progress
+    from mwdcal.planning.procedure import solved
+    from mwdcal.planning.repetition import joined
+    from mwdcal.use.correction_numba import cores
+
+    parts, done = procedure.parts(count), {}
+    steps = pool.Steps(tuple, partial(solved, procedure))
+    with progress.bar("simulating") as show:
+        for index, result in pool.results(steps, parts, workers or cores(), None):
+            done[index] = pickle.loads(result)  # of our own workers
+            show(len(done), len(parts))
+    return joined([done[index] for index in range(len(parts))])
