@@ -133,8 +133,8 @@ def smallest_plan(
             return None
 
     def enough(count: int) -> bool:
-        made = plan(count)
-        return made is not None and _reached(made.calibration, accuracy_deg)
+        result = plan(count)
+        return result is not None and _reached(result.calibration, accuracy_deg)
 
     high = FEWEST_PLANNED
     while high < candidates.count and not enough(high):
