@@ -362,3 +362,21 @@ def test_sources_for_firmware(tmp_path, form):
     document = shown("convert", cal, "--to", form, "-o", tmp_path / "out")
     assert document["to"] == form
     assert document["calibration_sha256"] == hashlib.sha256(cal.read_bytes()).hexdigest()
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ("--plan", "six-state", "--plan", "laboratory-thermal"),
+        ("--plan", "moosavi-12", "--method", "scalar"),
+        ("--stations", 8, "--criterion", "D"),
+    ],
+)
+def test_plans(tmp_path, options):
+    sheets = ("-o", tmp_path / "plan.csv", "--html", tmp_path / "plan.html")
+    document = shown("plan", *options, "--tool", EXAMPLE / "tool.toml", *sheets)
+    assert (document["serial"], document["simulated"]) == (None, True)
+    assert document["profile_sha256"] == sha256(EXAMPLE / "tool.toml")
+    assert document["measured_sha256"] is None
+    more = ("--measured", tmp_path / "plan.csv", "--tool", EXAMPLE / "tool.toml")
+    assert shown("plan", *more)["measured_sha256"] == sha256(tmp_path / "plan.csv")
