@@ -39,6 +39,9 @@ SCREENS = {
               "--workers", "1"),
     "noise": ("noise", "demo/static.csv", "--tool", "demo/tool.toml"),
     "profile": ("profile", "demo/export.csv", "-o", "made.toml"),
+    "simulate": ("simulate", "--plan", "six-state", "--effects", "stand.toml", "-o", "made.csv"),
+    "simulate-repeat": ("simulate", "--plan", "six-state", "--repeat", "20", "--limits", "tight.toml",
+                        "--workers", "1", "-o", "made.parquet"),
     "stations": ("stations", "demo/log.csv", "-o", "stations.csv"),
     "misused": ("calibrate", "demo/run.csv"),
 }  # fmt: skip
@@ -107,6 +110,9 @@ def prepared(folder):
     write_csv(folder / "soaks.csv", servo_run(temperatures=(0.0, 40.0, 80.0)))
     limits = 'name = "tight"\n[error]\ninclination_deg = 0.001\nazimuth_deg = 2\n'
     (folder / "tight.toml").write_text(limits, "utf-8")
+    (folder / "stand.toml").write_text(
+        "[stand]\nazimuth_zero_deg = 0.1\ntilt_deg = 0.05\n", "utf-8"
+    )
     fleet(folder)
 
 

@@ -95,7 +95,7 @@ def screen(document: Mapping[str, Any]) -> str:
         if rows
         else "no error common to the stations of the stand"
     )
-    follow = f"next: mwdcal calibrate {document['output']} -o CAL.json"
+    follow = f"next: mwdcal calibrate {document['output']} --tool TOOL.toml -o CAL.json"
     files = written(run=document["output"], truth=document["truth"])
     return "\n\n".join([one_line("   ".join(head)), errors, f"{files}   {one_line(follow)}"])
 
