@@ -38,6 +38,8 @@ SCREENS = {
     "fleet": ("fleet", "fleet.parquet", "--tool", "demo/tool.toml", "-o", "made.parquet",
               "--workers", "1"),
     "noise": ("noise", "demo/static.csv", "--tool", "demo/tool.toml"),
+    "plan": ("plan", "--tool", "demo/tool.toml", "--plan", "six-state", "--plan", "moosavi-30"),
+    "plan-best": ("plan", "--tool", "demo/tool.toml", "--stations", "8"),
     "profile": ("profile", "demo/export.csv", "-o", "made.toml"),
     "simulate": ("simulate", "--plan", "six-state", "--effects", "stand.toml", "-o", "made.csv"),
     "simulate-repeat": ("simulate", "--plan", "six-state", "--repeat", "20", "--limits", "tight.toml",

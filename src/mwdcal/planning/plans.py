@@ -12,7 +12,7 @@ import numpy as np
 from mwdcal.calibration.readings import SOAK_GAP
 from mwdcal.errors import InputError
 from mwdcal.estimation.evidence import ANGLES
-from mwdcal.files.contract import RAW, REFERENCES, check_columns
+from mwdcal.files.contract import RAW, REFERENCES
 from mwdcal.files.formats import table as tables
 from mwdcal.files.formats.columns import LABELS, Column
 from mwdcal.files.formats.table import Table, labels, numbers
@@ -108,7 +108,6 @@ def load_plan(name_or_path: str) -> Table:
     if path.suffix.lower() in tables.SUFFIXES:
         table = tables.read(path)
         check_count(table.count, table.source)
-        check_columns(list(table.columns), table.source)
         kept = [name for name in table.columns if name in PLANNED]
         cells: dict[str, Column] = {
             name: labels(table, name) if name in LABELS else numbers(table, name) for name in kept
