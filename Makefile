@@ -46,7 +46,7 @@ demo: $(INSTALLED) ## calibrate the example tool, verify it, write its report
 	echo "report: build/demo/tool.html"
 
 test: $(INSTALLED) ## run the tests on all cores
-	@$(CLOCK); $(ONE_THREAD) $(BIN)/python -m pytest -q -rs -n auto
+	@$(CLOCK); $(ONE_THREAD) $(BIN)/python -m pytest -q -rs --durations=25 --durations-min=5 -n auto
 
 test-quick: $(INSTALLED) ## run the most telling tests (under a minute)
 	@$(CLOCK); $(ONE_THREAD) $(BIN)/python $(QUICK)

@@ -232,7 +232,8 @@ def unweighted_pulls(problem: Problem, even: Problem, state: State) -> dict[int,
 def _inverse_where_known(information: Array) -> Array:
     """Inverse (B, k, k) of an information matrix, zero along directions that it says nothing of."""
     scales = outer(np.sqrt(np.maximum(diagonal(information), 1e-300)))
-    inner = np.linalg.pinv(finite(information / scales), rcond=1e-12, hermitian=True)
+    scaled = np.clip(finite(information / scales), -1.0, 1.0)  # beyond by rounding alone
+    inner = np.linalg.pinv(scaled, rcond=1e-12, hermitian=True)
     return np.asarray(inner / scales)
 
 
