@@ -1,9 +1,16 @@
-"""One BLAS thread per test process: many processes of many threads only wait for each other."""
+"""One BLAS thread per test process: many processes of many threads only wait for each other.
+
+A job in the background ignores Ctrl-C, and so would the commands that the tests start.
+"""
 
 import os
+import signal
 
 for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(name, "1")
+
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_configure(config):

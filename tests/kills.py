@@ -174,7 +174,8 @@ def disturbed(
         wrong.append("the output is neither the old nor the new one")
     if code == 0 and not new:
         wrong.append("status 0 without the new output")
-    unready = code == 1 and "init_import_site" in error  # Python itself was not ready
+    starting = ("init_import_site", "Could not import runpy")  # Python itself was not ready
+    unready = code == 1 and any(words in error for words in starting)
     early = (code == -number or unready) and name != "SIGKILL"
     if not early and code not in (0, -number if name == "SIGKILL" else 128 + number):
         wrong.append(f"status {code}: {error[-300:]!r}")
@@ -208,6 +209,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--commands", default="calibrate,apply,stations,fleet")
     given = parser.parse_args()
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores it
     os.environ["PYTHONPATH"] = os.pathsep.join(
         [str(ROOT / "src"), os.environ.get("PYTHONPATH", "")]
     )
