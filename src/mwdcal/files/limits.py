@@ -4,24 +4,15 @@ from __future__ import annotations
 
 import os
 
-import msgspec
-
 from mwdcal.errors import InputError
-from mwdcal.files.profiles import built_in, read_toml, toml_problem
+from mwdcal.files.profiles import decoded_toml
 from mwdcal.use.verification import Limits
 
 
 def load_limits(name_or_path: str | os.PathLike[str] = "roll-test") -> tuple[Limits, str]:
     """A limits profile and the SHA-256 of its bytes: built in by name, or a TOML file by path."""
     name = os.fspath(name_or_path)
-    data, digest = read_toml(name, "limits", "limits profile")
-    try:
-        limits = msgspec.toml.decode(data, type=Limits)
-    except (msgspec.DecodeError, ValueError, RecursionError) as error:
-        raise InputError(
-            f"{name} is not a limits profile: {toml_problem(error)}. Compare it with the built-in ones: "
-            f"{', '.join(built_in('limits'))} (docs, 'Files')."
-        ) from None
+    limits, digest = decoded_toml(name, Limits, "limits", "limits profile", "Files")
     bounds = [*limits.spread.items(), *limits.error.items()]
     if not bounds:
         raise InputError(f"{name} sets no limit: fill in [spread] or [error].")

@@ -8,7 +8,7 @@ import re
 from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 
@@ -25,6 +25,7 @@ from mwdcal.sensor.profile import (
     TriadProfile,
 )
 
+_Decoded = TypeVar("_Decoded", bound=msgspec.Struct)
 _SUFFIX = ".toml"
 _LARGEST = 1_000_000
 _SECTIONS: dict[str, type[msgspec.Struct]] = {
@@ -121,6 +122,23 @@ def read_toml(name: str, folder: str, kind: str) -> tuple[bytes, str]:
         f"{kind} must be a built-in name ({', '.join(names)}) or the path of a TOML "
         f"file; got '{name}', which is neither.{meant} Check the name or the path."
     )
+
+
+def decoded_toml(
+    name: str, struct: type[_Decoded], folder: str, kind: str, page: str
+) -> tuple[_Decoded, str]:
+    """What a TOML file says as a `struct`, and the file's SHA-256; `name`, `folder`, `kind` as of `read_toml`.
+
+    `page` of the documentation says what such a file holds.
+    """
+    data, digest = read_toml(name, folder, kind)
+    try:
+        return msgspec.toml.decode(data, type=struct), digest
+    except (msgspec.DecodeError, ValueError, RecursionError) as error:
+        raise InputError(
+            f"{name} is not a {kind}: {toml_problem(error)}. Compare it with the built-in ones: "
+            f"{', '.join(built_in(folder))} (docs, '{page}')."
+        ) from None
 
 
 def _profile(data: bytes, source: str) -> Profile:

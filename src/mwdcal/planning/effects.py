@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 
 from mwdcal.errors import InputError
-from mwdcal.files.profiles import built_in, read_toml, toml_problem
+from mwdcal.files.profiles import decoded_toml
 from mwdcal.geometry.vectors import Array, centred
 
 LARGEST_EFFECT = 1e6
@@ -93,14 +93,7 @@ class Effects(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
 
 def load_effects(name_or_path: str) -> tuple[Effects, str]:
     """Effects and the SHA-256 of their file: built in by name, or a TOML file by path."""
-    data, digest = read_toml(name_or_path, "effects", "file of effects")
-    try:
-        effects = msgspec.toml.decode(data, type=Effects)
-    except (msgspec.DecodeError, ValueError, RecursionError) as error:
-        raise InputError(
-            f"{name_or_path} is not a file of effects: {toml_problem(error)}. Compare it with the built-in ones: "
-            f"{', '.join(built_in('effects'))} (docs, 'Planning')."
-        ) from None
+    effects, digest = decoded_toml(name_or_path, Effects, "effects", "file of effects", "Planning")
     for section, values in msgspec.to_builtins(effects).items():
         for key, value in values.items():
             if value is not None:

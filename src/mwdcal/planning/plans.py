@@ -16,7 +16,7 @@ from mwdcal.files.contract import RAW, REFERENCES
 from mwdcal.files.formats import table as tables
 from mwdcal.files.formats.columns import LABELS, Column
 from mwdcal.files.formats.table import Table, labels, numbers
-from mwdcal.files.profiles import built_in, read_toml, toml_problem
+from mwdcal.files.profiles import decoded_toml
 from mwdcal.geometry.vectors import Array, Ints
 
 Values = float | list[float]
@@ -113,14 +113,7 @@ def load_plan(name_or_path: str) -> Table:
             name: labels(table, name) if name in LABELS else numbers(table, name) for name in kept
         }
         return replace(table, columns=cells)
-    data, _ = read_toml(name_or_path, "plans", "plan")
-    try:
-        plan = msgspec.toml.decode(data, type=PlanFile)
-    except (msgspec.DecodeError, ValueError, RecursionError) as error:
-        raise InputError(
-            f"{name_or_path} is not a plan: {toml_problem(error)}. Compare it with the built-in ones: "
-            f"{', '.join(built_in('plans'))} (docs, 'Plans')."
-        ) from None
+    plan, _ = decoded_toml(name_or_path, PlanFile, "plans", "plan", "Plans")
     return plan.table(path.name)
 
 
