@@ -60,6 +60,7 @@ def render(stations: Stations, log_sha256: str, output: str = "", why: str = "")
             serial=serial_of(metadata),
             simulated=is_simulated(metadata),
             banner=_banner(stations, output, why),
+            findings=stations.findings,
             figure=figure(stations),
             **_table(stations),
             left=left(stations),
