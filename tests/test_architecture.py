@@ -25,6 +25,7 @@ FLOORS = (
     ("calibration",),
     ("use",),
     ("files", "profiles"),
+    ("faults",),
     ("comparison", "firmware", "fleet", "identification", "logs", "planning", "registry", "survey"),
     ("library",),
     ("",),  # the package itself: its public names

@@ -1,0 +1,1 @@
+"""Commands for surveys and the references they need."""

@@ -1,0 +1,1 @@
+"""Faults of a tool that comes back from a well: their physics, and which of them readings show."""

@@ -1,0 +1,1 @@
+"""Formats of other programs: WITSML, LAS, axis conventions of tool makers."""

@@ -1,0 +1,1 @@
+"""In the well: references, surveys with their uncertainty, acceptance, well path, interference."""
