@@ -160,9 +160,7 @@ def _north_toolface_gradient(g: Array, b: Array) -> Array:
     part = (np.sum(across * down, -1) / (1 + down[..., 2]))[..., None]
     of_down = -share[..., None] * (across - part * axis) - part * b
     of_down = of_down - np.sum(of_down * down, -1, keepdims=True) * down
-    return _six(
-        of_down / np.linalg.norm(g, axis=-1, keepdims=True), across - part * (down + axis)
-    )
+    return _six(of_down / np.linalg.norm(g, axis=-1, keepdims=True), across - part * (down + axis))
 
 
 def _dip_gradient(g: Array, b: Array) -> Array:
@@ -207,9 +205,7 @@ OBSERVABLES: dict[str, Observable] = {
     "magnetic_toolface": Observable(
         magnetic_toolface, lambda g, b: _six(np.zeros_like(g), _turning(b)), 2 * np.pi, "rad"
     ),
-    "north_toolface": Observable(
-        north_toolface, _north_toolface_gradient, 2 * np.pi, "rad"
-    ),
+    "north_toolface": Observable(north_toolface, _north_toolface_gradient, 2 * np.pi, "rad"),
     "gravity": Observable(gravity, lambda g, b: _six(_unit(g), np.zeros_like(b)), 0.0, "g"),
     "field": Observable(field, lambda g, b: _six(np.zeros_like(g), _unit(b)), 0.0, "nT"),
     "dip": Observable(dip, _dip_gradient, 0.0, "rad"),
