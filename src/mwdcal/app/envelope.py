@@ -24,6 +24,7 @@ INPUTS = {
     "profile": ("run",),
     "simulate": ("plan", "profile", "calibration", "effects", "rolltest", "limits"),
     "stations": ("log",),
+    "survey": ("calibration", "readings", "reference", "limits"),
     "verify": ("calibration", "run", "limits"),
 }
 """The files behind the document of each command, whose digests are its keys `…_sha256`."""
