@@ -16,7 +16,7 @@ from mwdcal.errors import InputError
 @options.CALIBRATION
 @options.argument("readings")
 @options.output(metavar="OUT", help="Table to write; format by suffix.")
-@options.OUTSIDE
+@options.WHERE_OUTSIDE
 @options.preset(
     "--missing",
     type=click.Choice(["refuse", "blank"]),

@@ -38,7 +38,7 @@ preset = partial(click.option, show_default=True)
 CALIBRATION = argument("calibration")
 RUN = argument("run")
 LOG = argument("log")
-OUTSIDE = preset(
+WHERE_OUTSIDE = preset(
     "--outside",
     default="blank",
     metavar="blank|refuse|extrapolate",

@@ -38,7 +38,7 @@ from mwdcal.errors import InputError
 @click.option(
     "--tie-in", metavar="N,E,TVD", help="Position of the first station, m. Default: 0,0,0."
 )
-@options.OUTSIDE
+@options.WHERE_OUTSIDE
 @click.option(
     "--html", type=options.FILE, metavar="S.html", help="Also write a page with the pictures."
 )
