@@ -8,10 +8,8 @@ from typing import Any
 import msgspec
 
 from mwdcal.calibration.readings import is_simulated, serial_of
-from mwdcal.calibration.record import SOFTWARE
+from mwdcal.calibration.record import DOCUMENT_VERSION, SOFTWARE
 
-DOCUMENT_VERSION = 1
-"""Version of the documents: higher when a key goes, or changes its meaning."""
 INPUTS = {
     "apply": ("calibration", "readings"),
     "calibrate": ("run", "profile", "prior"),

@@ -25,6 +25,8 @@ from mwdcal.sensor.models import Basis, Factors, Model, Polynomial
 from mwdcal.sensor.profile import Profile
 
 SCHEMA_VERSION = 1
+DOCUMENT_VERSION = 1
+"""Version of what commands print for machines: higher when a key goes, or changes its meaning."""
 SOFTWARE = f"mwdcal {__version__}"
 """Name and version of the program."""
 DIGITS = 12
