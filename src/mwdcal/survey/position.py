@@ -20,11 +20,9 @@ from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import FREE_SHARE, Calibration
 from mwdcal.errors import InputError
 from mwdcal.geometry.observables import is_vertical
-from mwdcal.geometry.vectors import Array, ArrayLike, eigen, wrap
+from mwdcal.geometry.vectors import Array, ArrayLike, eigen, outer, wrap
 from mwdcal.survey.path import Arcs, arcs, hole_direction
-
-STATIONS_AT_ONCE = 4096
-"""Stations of a well that are worked on together, for memory."""
+from mwdcal.survey.stations import STATIONS_AT_ONCE
 
 
 @dataclass(frozen=True)
@@ -101,13 +99,14 @@ def direction_errors(
     readings: Readings,
     north: float = 0.0,
     declination_sd: float = 0.0,
+    declination_noise: float = 0.0,
 ) -> DirectionErrors:
     """The direction of the hole at readings (…, n), with its errors from the calibration and from noise.
 
     Errors of the calibration last over the well, with the uncertainty of north as one cause more; noise is new at every
     station.
     Units: radians. `north`: declination, for azimuths from true north, less convergence, for those from
-    grid north; `declination_sd`: its standard uncertainty.
+    grid north; `declination_sd`: its standard uncertainty, and `declination_noise` what is new at every station.
     Singular: finite at vertical. NaN where the direction rests on what no evidence determines, and without a field.
     """
     g, b = calibration.fields(readings)
@@ -117,12 +116,13 @@ def direction_errors(
     shifts = change @ _factor(calibration.parameter_covariance)
     shifts = np.where(np.any(free, (-1, -2), keepdims=True), np.nan, shifts.swapaxes(-1, -2))
     inclination = np.arctan2(np.hypot(g[..., 0], g[..., 1]), g[..., 2])
-    turn = np.stack([np.zeros_like(inclination), np.sin(inclination) * declination_sd], -1)
+    turn = np.stack([np.zeros_like(inclination), np.sin(inclination)], -1)
     return DirectionErrors(
         inclination=inclination,
         azimuth=wrap(azimuth + north),
-        systematic=np.concatenate([shifts, turn[..., None, :]], -2),
-        random=gradient @ calibration.noise_covariance(readings) @ gradient.mT,
+        systematic=np.concatenate([shifts, turn[..., None, :] * declination_sd], -2),
+        random=gradient @ calibration.noise_covariance(readings) @ gradient.mT
+        + declination_noise**2 * outer(turn),
     )
 
 
@@ -172,6 +172,7 @@ def calibrated_path(
     north: float = 0.0,
     declination_sd: float = 0.0,
     start: ArrayLike = (0.0, 0.0, 0.0),
+    declination_noise: float = 0.0,
 ) -> tuple[Array, Array]:
     """Positions (n, 3), north, east, true vertical depth, m, of readings in a well, and their covariance (n, 3, 3).
 
@@ -191,7 +192,9 @@ def calibrated_path(
         chosen = np.zeros(len(depth), bool)
         chosen[where] = True
         some = readings.select(chosen)
-        return depth[where], direction_errors(calibration, some, north, declination_sd)
+        return depth[where], direction_errors(
+            calibration, some, north, declination_sd, declination_noise
+        )
 
     both = list(_along(len(depth), part, start))
     return np.concatenate([p for p, _ in both]), np.concatenate([c for _, c in both])

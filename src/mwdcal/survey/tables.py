@@ -5,17 +5,19 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import replace
+from math import radians
 
 import numpy as np
 
-from mwdcal.calibration.readings import Readings, is_simulated
+from mwdcal.calibration.readings import CONSTANTS, Readings, is_simulated
 from mwdcal.calibration.record import Calibration
 from mwdcal.errors import InputError
 from mwdcal.files import synonyms
-from mwdcal.files.contract import check_columns, stated_norths
+from mwdcal.files.contract import REFERENCES, check_columns, stated_norths
 from mwdcal.files.formats.table import Table, cell_error, numbers
 from mwdcal.files.runs import renamed, to_readings
 from mwdcal.geometry.vectors import Array
+from mwdcal.survey.references import MEASURABLE, EarthReference
 from mwdcal.survey.well import North, Well
 
 MEASURED_DEPTH = "md_m"
@@ -27,8 +29,12 @@ _DEPTHS = re.compile(
 )
 
 
-def survey_readings(table: Table, calibration: Calibration) -> tuple[Readings, Array | None, North]:
-    """The readings of a table, measured depths (n,) if it has them, and the norths that its metadata give.
+def survey_readings(
+    table: Table, calibration: Calibration, reference: EarthReference | None = None
+) -> tuple[Readings, Array | None, North]:
+    """The readings of a table, measured depths (n,) if it has them, and the norths that azimuths may count from.
+
+    What the table states of gravity, field, dip, declination and convergence stands before the `reference`.
 
     Raises:
         InputError: a table that cannot be read, depths under another name or in another unit.
@@ -38,7 +44,25 @@ def survey_readings(table: Table, calibration: Calibration) -> tuple[Readings, A
     if calibration.thermal:
         synonyms.check_evidence(list(table.columns), table.source, ("temperature_c",))
     readings, _ = to_readings(table, calibration.profile)
-    return readings, _depths(table), _norths(table)
+    if reference is not None:
+        readings = _referenced(readings, reference)
+    return readings, _depths(table), _norths(table, reference)
+
+
+def _referenced(readings: Readings, reference: EarthReference) -> Readings:
+    """The readings with gravity, field and dip of the place where the table states none.
+
+    Their uncertainty is of one station: what all share, and what changes from one to the next.
+    """
+    known, sd = dict(readings.known), dict(readings.sd)
+    for name in CONSTANTS:
+        key, factor = MEASURABLE[name], REFERENCES[name].factor
+        shared, alone = (getattr(reference, f"{p}{key}", 0.0) for p in ("sd_", "sd_random_"))
+        stated = np.broadcast_to(known.get(name, np.nan), readings.count)
+        blank = np.isnan(stated)
+        known[name] = np.where(blank, getattr(reference, key) * factor, stated)
+        sd[name] = np.where(blank, np.hypot(shared, alone) * factor, readings.uncertainty(name))
+    return replace(readings, known=known, sd=sd)
 
 
 def _depths(table: Table) -> Array | None:
@@ -59,14 +83,18 @@ def _depths(table: Table) -> Array | None:
     return None if np.isnan(depths).all() else depths
 
 
-def _norths(table: Table) -> North:
-    """What the metadata say of declination and convergence."""
+def _norths(table: Table, reference: EarthReference | None) -> North:
+    """What metadata and reference say of declination and convergence."""
     stated = stated_norths(table.metadata, table.source)
-    declination, convergence = (
-        None if stated.get(key) is None else float(np.radians(stated[key]))
-        for key in ("declination_deg", "convergence_deg")
-    )
-    return North(declination, 0.0, convergence)
+    convergence = stated.get("convergence_deg", reference.convergence_deg if reference else None)
+    sd, noise = 0.0, 0.0
+    if "declination_deg" in stated or reference is None:
+        declination = stated.get("declination_deg")
+    else:
+        declination = reference.declination_deg
+        sd, noise = reference.sd_declination_deg, reference.sd_random_declination_deg
+    north = (None if angle is None else radians(angle) for angle in (declination, convergence))
+    return North(next(north), radians(sd), next(north), radians(noise))
 
 
 def surveyed_table(table: Table, well: Well) -> Table:

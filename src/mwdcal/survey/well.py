@@ -40,12 +40,14 @@ UNKNOWN_GRAVITY = 0.0015
 class North:
     """The norths that azimuths may count from, radians: true = magnetic + declination, grid = true - convergence.
 
-    None: not known. `declination_sd`: standard uncertainty.
+    None: not known. `declination_sd`: standard uncertainty that the stations share, `declination_noise` that of
+    what changes from one to the next.
     """
 
     declination: float | None = None
     declination_sd: float = 0.0
     convergence: float | None = None
+    declination_noise: float = 0.0
 
     @property
     def name(self) -> str:
@@ -198,7 +200,13 @@ def _positions(
     if whole.any():
         some = readings if whole.all() else readings.select(whole)
         place[whole], covariance[whole] = calibrated_path(
-            calibration, some, md[whole], north.offset, north.declination_sd, start
+            calibration,
+            some,
+            md[whole],
+            north.offset,
+            north.declination_sd,
+            start,
+            north.declination_noise,
         )
     return Position(md, place, covariance)
 

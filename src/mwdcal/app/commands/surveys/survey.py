@@ -63,6 +63,7 @@ def command(
     from mwdcal.files.formats import table as tables
     from mwdcal.files.runs import MOST_ROWS, read_export
     from mwdcal.survey.acceptance import load_survey_limits
+    from mwdcal.survey.references import load_reference
     from mwdcal.survey.tables import survey_readings, surveyed_table
     from mwdcal.survey.well import well
 
@@ -70,7 +71,8 @@ def command(
     fitted, digest = documents.load(calibration)
     bounds, limits_digest = load_survey_limits(limits)
     source = read_export(readings, fitted.profile, decimal=decimal, rows=MOST_ROWS)
-    read, md, north = survey_readings(source, fitted)
+    place, place_digest = load_reference(reference) if reference else (None, "")
+    read, md, north = survey_readings(source, fitted, place)
     result = well(
         fitted, read, bounds, north, md, _three("tie_in", tie_in), _switch(switch), outside
     )
@@ -82,6 +84,7 @@ def command(
         *(fitted.tool, read.metadata),
         calibration=digest,
         readings=source.digest,
+        reference=place_digest,
         limits=limits_digest,
     )
     tables.write(output, corrected)
