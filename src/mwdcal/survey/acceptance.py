@@ -24,8 +24,12 @@ from mwdcal.use.strengths import STRENGTH_UNITS
 
 MS2_PER_G = STRENGTH_UNITS["gravity"]["m/s²"]
 STRENGTH_NAMES = SURVEYED[STRENGTHS]
-SURVEY_UNITS = {"gravity": ("mg", 1e3), "field": ("nT", 1.0), "dip": ("°", float(np.degrees(1.0)))}
-"""Unit in which a departure is shown, and its factor."""
+SURVEY_UNITS = {
+    "gravity": ("mg", 1e3, 2),
+    "field": ("nT", 1.0, 0),
+    "dip": ("°", float(np.degrees(1.0)), 2),
+}
+"""Unit in which a departure is shown, its factor, and decimals."""
 
 
 class SensorTerms(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -120,8 +124,8 @@ class Judgement:
 
     def _finding(self, i: int) -> str:
         parts = [
-            f"{name} {self.departure[i, k] * factor:+.3g} {unit} (at most {self.bound[i, k] * factor:.3g})"
-            for k, (name, (unit, factor)) in enumerate(SURVEY_UNITS.items())
+            f"{name} {self.departure[i, k] * factor:+.{digits}f} {unit} (at most {self.bound[i, k] * factor:.{digits}f})"
+            for k, (name, (unit, factor, digits)) in enumerate(SURVEY_UNITS.items())
             if abs(self.departure[i, k]) > self.bound[i, k]
         ]
         if self.distance[i] > self.largest[i]:

@@ -88,6 +88,13 @@ def command(
         limits=limits_digest,
     )
     tables.write(output, corrected)
+    if html:
+        from mwdcal.app.pages.surveys.survey import render
+        from mwdcal.files.formats import atomic
+
+        digests = {"calibration": digest, "readings": source.digest, "reference": place_digest}
+        stated = {name: each for name, each in digests.items() if each}
+        atomic.write(html, render(result, findings, {**stated, "limits": limits_digest}))
     shown = screens.screen(result, str(output), str(html or ""), fitted.tool, read.metadata)
     print_result(document if as_json else shown, findings)
 

@@ -15,6 +15,8 @@ from mwdcal.survey.well import Well
 
 MOST_SURVEYS = 30
 """Surveys of a table on screen."""
+OUTCOMES = {"true": "accepted", "false": "REJECTED", "": "not judged"}
+"""What the column `accepted` says, in words."""
 
 
 class EndOfPath(msgspec.Struct, frozen=True, kw_only=True):
@@ -152,7 +154,7 @@ def survey_rows(well: Well, most: int) -> tuple[list[str], list[list[str]]]:
     header = ["station", *(["md m"] if well.position else [])]
     for name, title in shown.items():
         header += [title, "1σ"] if name in angles else [title]
-    rows = []
+    modelled, rows = well.limits.probability is not None, []
     for i, label in enumerate(well.readings.labels[:most]):
         row = [label, *([fixed(well.position.md[i], 2)] if well.position else [])]
         for name in shown:
@@ -160,5 +162,7 @@ def survey_rows(well: Well, most: int) -> tuple[list[str], list[list[str]]]:
             if name in angles:
                 row.append(fixed(columns[f"sd_{name}"][i], 2))
         kind = str(columns["toolface_kind"][i])
-        rows.append([*row, kind, well.remarks[i] or "accepted"])
-    return [*header, "from", ""], rows
+        distance = well.judgement.distance[i]
+        model = [fixed(distance, 1) if well.judgement.judged[i] else "–"] if modelled else []
+        rows.append([*row, kind, *model, OUTCOMES[str(columns["accepted"][i])]])
+    return [*header, "from", *(["distance"] if modelled else []), ""], rows
