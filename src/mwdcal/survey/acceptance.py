@@ -123,10 +123,11 @@ class Judgement:
         ]
 
     def _finding(self, i: int) -> str:
+        off, most = self.departure[i], self.bound[i]
         parts = [
-            f"{name} {self.departure[i, k] * factor:+.{digits}f} {unit} (at most {self.bound[i, k] * factor:.{digits}f})"
+            f"{name} {off[k] * factor:+.{digits}f} {unit} (at most {most[k] * factor:.{digits}f})"
             for k, (name, (unit, factor, digits)) in enumerate(SURVEY_UNITS.items())
-            if abs(self.departure[i, k]) > self.bound[i, k]
+            if abs(off[k]) > most[k]
         ]
         if self.distance[i] > self.largest[i]:
             parts.append(f"distance {self.distance[i]:.2f} (at most {self.largest[i]:.2f})")

@@ -20,6 +20,8 @@ ELLIPSE_SDS = 2.0
 """Standard deviations of the ellipses of position."""
 ELLIPSE_SHARE = 0.08
 """Largest half axis of an ellipse as a share of the path."""
+LARGEST_DRAWN_SD = 2.0
+"""Standard uncertainty up to which an angle is drawn, degrees: near vertical that of azimuth grows without end."""
 MOST_ELLIPSES = 12
 """Ellipses of position on a map."""
 MOST_MARKS = 400
@@ -128,7 +130,7 @@ def angles(well: Well) -> Figure:
 
 
 def _angle_track(axes: Axes, depth: Array, value: Array, sd: Array) -> None:
-    there = ~np.isnan(value) & ~np.isnan(depth) & ~np.isnan(sd)
+    there = ~np.isnan(value) & ~np.isnan(depth) & (sd < LARGEST_DRAWN_SD)
     marker = "." if there.sum() <= MOST_MARKS else ""
     breaks = np.where(
         np.abs(np.diff(value[there], prepend=value[there][:1])) > 180, np.nan, value[there]
