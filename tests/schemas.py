@@ -23,6 +23,7 @@ from mwdcal.app.screens import (
     simulation,
     stations,
 )
+from mwdcal.app.screens.surveys import survey
 from mwdcal.calibration.record import DOCUMENT_VERSION, SCHEMA_VERSION, Calibration
 from mwdcal.use.verification import Verdict
 
@@ -39,6 +40,7 @@ CONTENTS: dict[str, type] = {
     "profile": proposal.ProposalSummary,
     "simulate": simulation.SimulationSummary,
     "stations": stations.StationsSummary,
+    "survey": survey.SurveySummary,
     "verify": Verdict,
 }
 """What follows the envelope in the document of each command."""

@@ -23,8 +23,8 @@ WELL_FINDINGS = {
     "survey again.",
     "not-judged": "{count} of {rows} surveys are not judged: no reference for |g|, |b| or dip. Give `reference`, or "
     "columns ref_gravity_g, ref_field_nt, ref_dip_deg.",
-    "laboratory-gravity": "the calibration took the laboratory's gravity as 1 g, so that |g| is in units of it: it "
-    "departs from the reference by up to 0.3 %, and is judged with that. Calibrate with ref_gravity_g.",
+    "laboratory-gravity": "the calibration's gravity is 1 g, as where its run states none: |g| is then in units of the laboratory's "
+    "gravity, and judged with 1.5 mg more of uncertainty. Calibrate with ref_gravity_g.",
     "magnetic-north": "no declination: azimuths and the well path count from magnetic north.",
     "path-from-first": "the well path starts at the first station, at north 0, east 0 and TVD 0. `tie-in` gives its "
     "position.",
