@@ -20,6 +20,7 @@ from mwdcal.app.screens import (
     noise,
     plan,
     proposal,
+    reference,
     simulation,
     stations,
 )
@@ -37,6 +38,7 @@ CONTENTS: dict[str, type] = {
     "noise": noise.NoiseSummary,
     "plan": plan.PlanDocument,
     "profile": proposal.ProposalSummary,
+    "reference": reference.ReferenceSummary,
     "simulate": simulation.SimulationSummary,
     "stations": stations.StationsSummary,
     "verify": Verdict,
