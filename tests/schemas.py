@@ -20,6 +20,7 @@ from mwdcal.app.screens import (
     noise,
     plan,
     proposal,
+    reference,
     simulation,
     stations,
 )
@@ -38,6 +39,7 @@ CONTENTS: dict[str, type] = {
     "noise": noise.NoiseSummary,
     "plan": plan.PlanDocument,
     "profile": proposal.ProposalSummary,
+    "reference": reference.ReferenceSummary,
     "simulate": simulation.SimulationSummary,
     "stations": stations.StationsSummary,
     "survey": survey.SurveySummary,
