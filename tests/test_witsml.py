@@ -256,6 +256,7 @@ texts = st.text(
         "=1+1",
     ]
 )
+kinds = st.sampled_from(["gravity", "magnetic"])
 words = texts.filter(lambda text: not text.strip() or not _numeric(text.replace("_", "x")))
 finite = st.floats(allow_nan=False, allow_infinity=False)
 cells = finite | st.just(np.nan)
@@ -306,7 +307,9 @@ def tables(draw):
     names = draw(st.lists(st.sampled_from(KNOWN), unique=True))
     columns |= {name: numbers(cells) for name in names if name != "md_m"}
     for name in draw(st.lists(st.sampled_from(LABELLED), unique=True)):
-        columns[name] = draw(st.lists(words, min_size=count, max_size=count))
+        columns[name] = draw(
+            st.lists(kinds if name == "toolface_kind" else words, min_size=count, max_size=count)
+        )
         if name not in ("station",) and not any(cell.strip() for cell in columns[name]):
             columns[name][0] = (
                 "x"  # a wholly blank column of text becomes one of numbers in typed formats
@@ -350,6 +353,21 @@ def test_elements_are_in_the_order_of_the_schema_with_their_units(tmp_path):
     ]
     assert raw["gravAxialRaw"] == "m/s2"
     assert raw["magAxialRaw"] == "uT"
+
+
+def test_a_magnetic_toolface_is_not_called_a_gravity_toolface(tmp_path):
+    columns = {"md_m": np.ones(3), "toolface_deg": np.array([10.0, 20.0, np.nan])}
+    table = Table(columns | {"toolface_kind": ["gravity", "magnetic", "magnetic"]})
+    root = ElementTree.fromstring(rendered("t.xml", table))
+    first, second, third = root.iter(f"{SERIES}trajectoryStation")
+    assert (first.findtext(f"{SERIES}gtf"), first.find(f"{SERIES}mtf")) == ("10.0", None)
+    assert (second.find(f"{SERIES}gtf"), second.findtext(f"{SERIES}mtf")) == (None, "20.0")
+    assert (third.find(f"{SERIES}gtf"), third.find(f"{SERIES}mtf")) == (None, None)
+    same(table, round_trip(tmp_path, table))
+    both = Table({**table.columns, "magnetic_toolface_deg": np.array([30.0, 20.0, np.nan])})
+    first = next(ElementTree.fromstring(rendered("t.xml", both)).iter(f"{SERIES}trajectoryStation"))
+    assert (first.find(f"{SERIES}gtf"), first.findtext(f"{SERIES}mtf")) == (None, "30.0")
+    same(both, round_trip(tmp_path, both))
 
 
 def test_raw_channels_of_unknown_unit_are_not_called_a_gravity(tmp_path):

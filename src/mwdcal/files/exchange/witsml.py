@@ -70,15 +70,30 @@ _CARRIED = re.compile(r"witsml ([A-Za-z0-9/]+)(?: \((\S+)\))?")
 _EXTENSION = "mwdcal metadata"
 _UNWRITABLE_XML = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ud800-\udfff\ufffe\uffff]")
 _LONGEST_UID = 64
+_KIND, _NEAR_VERTICAL = "toolface_kind", "magnetic"
+"""The column that says which kind of toolface a station has, and one of its words."""
 _TYPE = "typeTrajStation"
 _NO_TYPE = ("unknown", "")
 
 
 class _Place(NamedTuple):
-    """Where a column stands in a station: an element with its unit of measure, or an extension."""
+    """Where a column stands in a station: an element with its unit of measure.
+
+    Attributes:
+        magnetic: the element of stations whose toolface is magnetic, where that may be another one.
+    """
 
     path: str
     uom: str = ""
+    magnetic: str = ""
+
+    def of(self, kind: str) -> str:
+        """The element at a station with a toolface of this kind."""
+        return self.magnetic if self.magnetic and kind == _NEAR_VERTICAL else self.path
+
+    def leaf(self, station: Station) -> Leaf | None:
+        """The element in a station that has been read."""
+        return station.leaves.get(self.path) or station.leaves.get(self.magnetic)
 
 
 def parse(data: bytes, source: str) -> Parts:
@@ -170,8 +185,7 @@ def _described(
             continue
         place = places.get(name)
         leaves = [
-            station.leaves.get(place.path) if place else station.extensions.get(name)
-            for station in stations
+            place.leaf(station) if place else station.extensions.get(name) for station in stations
         ]
         if name in described.texts:
             columns[name] = [leaf.text if leaf else "" for leaf in leaves]
@@ -190,6 +204,10 @@ def _places(names: Sequence[str], metadata: Mapping[str, object]) -> dict[str, _
         for name in names
         if name in _OURS and (magnetic or _OURS[name][1] != "nT" or name.startswith("ref_"))
     }
+    if _KIND in names and "toolface_deg" in places:
+        places["toolface_deg"] = _Place(*_OURS["toolface_deg"], _OURS["magnetic_toolface_deg"][0])
+        if "magnetic_toolface_deg" in names:  # the element is taken
+            del places["toolface_deg"]
     if azimuth := _azimuth(names):
         places[azimuth] = _Place("azi", "dega")
     for kind, (_, elements, channels) in _RAW_ELEMENTS.items():
@@ -198,7 +216,7 @@ def _places(names: Sequence[str], metadata: Mapping[str, object]) -> dict[str, _
             places |= {
                 c: _Place(f"rawData/{e}", uom) for c, e in zip(channels, elements, strict=True)
             }
-    taken = {place.path for place in places.values()}
+    taken = {path for place in places.values() for path in (place.path, place.magnetic)}
     for name in names:
         carried = _CARRIED.fullmatch(name)
         if carried and carried[1] in OF_STATION and carried[1] not in taken:
@@ -311,7 +329,9 @@ def _station(
     typed = any(place.path == _TYPE for place in places.values())
     elements = {} if typed else {_TYPE: _NO_TYPE}
     elements |= {
-        place.path: (cells[name], place.uom) for name, place in places.items() if cells[name]
+        place.of(cells.get(_KIND, "")): (cells[name], place.uom)
+        for name, place in places.items()
+        if cells[name]
     }
     present = [path for path in OF_STATION if path in elements]
     for container, paths in groupby(present, lambda path: path.rpartition("/")[0]):

@@ -15,7 +15,7 @@ from mwdcal.files.exchange.witsml_schema import NAMESPACE, OLD_NAMESPACE, Leaf
 from mwdcal.files.formats.columns import shown
 
 _DEEPEST_ELEMENT = 24
-MOST_ELEMENTS = 2_000_000
+MOST_ELEMENTS = 1_000_000
 _LONGEST_PART = 1 << 20
 _PIECE_OF_XML = 1 << 16
 _ROOT = ("trajectorys", "trajectory")
@@ -137,7 +137,7 @@ class _Collector:
                 part = f"{name}[{siblings[name]}]" if name not in _STATION else name
         self._open.append(_Open(name, given.get("uom", ""), line))
         self._path.append(part)
-        place = tuple(each.name for each in self._open)
+        place = tuple(self._path) if len(self._path) <= len(_STATION) else ()
         if place == _ROOT:
             self._trajectories += 1
             self.at_most(self._trajectories, 1, "elements 'trajectory'")
@@ -166,13 +166,12 @@ class _Collector:
     def end(self, tag: str) -> None:
         """The innermost element ends."""
         element = self._open.pop()
-        path = [*self._path]
-        self._path.pop()
-        if len(path) <= len(_ROOT) or tuple(path[:2]) != _ROOT:
-            return
-        at_station = len(path) > len(_STATION) and path[2] == _STATION[2]
+        path = self._path
+        at_station = len(path) > len(_STATION) and path[2] == _STATION[2] and path[1] == _ROOT[1]
         inside = path[len(_STATION) :] if at_station else path[len(_ROOT) :]
-        if not inside or path[-1] == _STATION[2]:
+        outside = path[1:2] != [_ROOT[1]] or path[-1] == _STATION[2]
+        self._path = path[:-1]
+        if outside or not inside:
             return
         if any(each.name == _EXTENSIONS for each in self._open):
             self._extension[element.name] = self._leaf(element)

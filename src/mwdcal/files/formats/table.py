@@ -123,6 +123,9 @@ def rendered(
         delimiter = "\t" if file.suffix.lower() == ".tsv" else ","
         return text.render(pointed(table), table.metadata, delimiter)
     content = form.render(_typed(table), table.metadata, file.name)
+    if file.suffix.lower() in EXCHANGED:  # what could not be read again
+        advice = "Write Parquet."
+        at_most(len(content), _LARGEST_TEXT, file.name, "the file", "bytes", advice)
     return content
 
 
