@@ -141,12 +141,14 @@ def position_covariance(
     azimuth: ArrayLike,
     systematic: ArrayLike | None = None,
     random: ArrayLike | None = None,
+    balanced: bool = False,
 ) -> Array:
     """Covariance (…, n, 3, 3) of the positions (north, east, down) of survey stations, m².
 
     `systematic` (…, n, k, 2 or 3): shifts upward, sideways and, where there is a third, in measured depth, by one
     standard deviation of each of k independent causes that last over the well. `random` (…, n, 2, 2 or 3, 3):
     covariance of the same of the errors that are new at every station.
+    `balanced`: by the balanced tangential method, as the numbers of published error models are.
     The first station is where the path starts: its position is exact, its direction has the errors given for it.
     Units: m, radians. Singular: finite at vertical, with any number for the azimuth that the shifts refer to.
     Memory: of the result and of the causes given, however many stations there are.
@@ -162,7 +164,9 @@ def position_covariance(
         errors = DirectionErrors(inc[..., where], azi[..., where], lasting[stations], new[stations])
         return md[..., where], errors
 
-    return np.concatenate([covariance for _, covariance in _along(md.shape[-1], part)], -3)
+    return np.concatenate(
+        [covariance for _, covariance in _along(md.shape[-1], part, balanced=balanced)], -3
+    )
 
 
 def calibrated_path(
@@ -204,6 +208,7 @@ def _along(
     count: int,
     part: Callable[[slice], tuple[Array, DirectionErrors]],
     start: ArrayLike = (0.0, 0.0, 0.0),
+    balanced: bool = False,
 ) -> Iterator[tuple[Array, Array]]:
     """Positions (…, m, 3) and covariance (…, m, 3, 3) of all stations of a well, some at a time."""
     sums = None
@@ -213,7 +218,7 @@ def _along(
         )  # from the last one of the part before
         md, errors = part(where)
         sums = sums or _no_sums(md, errors, start)
-        position, covariance, sums = _part_of_path(md, errors, sums)
+        position, covariance, sums = _part_of_path(md, errors, sums, balanced)
         skipped = first - where.start
         yield position[..., skipped:, :], covariance[..., skipped:, :, :]
 
@@ -225,10 +230,12 @@ def _no_sums(md: Array, errors: DirectionErrors, start: ArrayLike) -> _Sums:
     return _Sums(position, np.zeros((*wells, causes, 3)), np.zeros((*wells, 3, 3)), arrival)
 
 
-def _part_of_path(md: Array, errors: DirectionErrors, before: _Sums) -> tuple[Array, Array, _Sums]:
+def _part_of_path(
+    md: Array, errors: DirectionErrors, before: _Sums, balanced: bool
+) -> tuple[Array, Array, _Sums]:
     """Positions and covariance of stations the first of which has the sums `before`, and those of the last."""
     inclination, azimuth, random = errors.inclination, errors.azimuth, errors.random
-    arc = arcs(md, hole_direction(inclination, azimuth))
+    arc = arcs(md, hole_direction(inclination, azimuth), balanced)
     turns = tilts(inclination, azimuth)
     leaving, arriving = _steps(arc, turns, errors.systematic)
     position = _sums_from(before.position, arc.displacement, -2)
