@@ -213,9 +213,8 @@ def _along(
     """Positions (…, m, 3) and covariance (…, m, 3, 3) of all stations of a well, some at a time."""
     sums = None
     for first in range(0, max(count, 1), STATIONS_AT_ONCE):
-        where = slice(
-            max(first - 1, 0), first + STATIONS_AT_ONCE
-        )  # from the last one of the part before
+        # each part begins with the last station of the one before
+        where = slice(max(first - 1, 0), first + STATIONS_AT_ONCE)
         md, errors = part(where)
         sums = sums or _no_sums(md, errors, start)
         position, covariance, sums = _part_of_path(md, errors, sums, balanced)

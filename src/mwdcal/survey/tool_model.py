@@ -20,30 +20,25 @@ from mwdcal.calibration.record import FREE_SHARE, SOFTWARE, Calibration, stated
 from mwdcal.errors import FitError
 from mwdcal.files.formats import atomic
 from mwdcal.geometry.vectors import Array, ArrayLike, reference_vectors
+from mwdcal.survey.acceptance import MS2_PER_G, SensorTerms, load_survey_limits
 from mwdcal.survey.position import direction_gradient
-
-STANDARD_GRAVITY = 9.80665
-"""Metres per second squared for 1 g."""
 
 
 class TermKind(NamedTuple):
-    """A sensor term of every axis: triad, whether of scale, unit, and 1σ in the generic model of the industry."""
+    """A sensor term of every axis: its triad, whether of scale, its unit, and its name in `SensorTerms`."""
 
     triad: int
     scale: bool
     unit: str
-    owsg: float
+    generic: str
 
 
 SENSOR_KINDS = {
-    "AB": TermKind(0, False, "m/s2", 0.004),
-    "AS": TermKind(0, True, "-", 0.0005),
-    "MB": TermKind(1, False, "nT", 70.0),
-    "MS": TermKind(1, True, "-", 0.0016),
+    "AB": TermKind(0, False, "m/s2", "accelerometer_bias_ms2"),
+    "AS": TermKind(0, True, "-", "accelerometer_scale"),
+    "MB": TermKind(1, False, "nT", "magnetometer_bias_nt"),
+    "MS": TermKind(1, True, "-", "magnetometer_scale"),
 }
-"""Reference: OWSG set A, Rev 5.1 of 8 October 2020, MWD and EMS."""
-
-
 FORMULAS: dict[str, tuple[str, ...]] = {
     "ABXY-TI1S": ("-Cos(Inc) / Gfield", "Tan(Dip) * Cos(Inc) * Sin(AzM) / Gfield"),
     "ABXY-TI2S": (
@@ -73,7 +68,7 @@ Reference: SPE 67616; ISCWSA MWD Rev 5."""
 
 
 class SensorTerm(msgspec.Struct, frozen=True, kw_only=True):
-    """1σ of one sensor term of a calibrated tool, and its ratio to the generic model's; None: undetermined.
+    """1σ of one sensor term of a calibrated tool, and its ratio to that of the OWSG model; None: undetermined.
 
     Of an axis ("ABX"), or of both axes across the tool ("ABXY"), as error models use it: root mean square.
     """
@@ -90,7 +85,7 @@ def term_shifts(
     azimuth: ArrayLike,
     field: ArrayLike,
     dip: ArrayLike,
-    gravity: ArrayLike = STANDARD_GRAVITY,
+    gravity: ArrayLike = MS2_PER_G,
 ) -> dict[str, Array]:
     """Shifts (…, 2) of the hole's direction, upward and sideways, by one unit of each sensor term.
 
@@ -103,7 +98,7 @@ def term_shifts(
     vectors = reference_vectors(inclination, azimuth, 0.0, gravity, field, dip)
     _, gradient = direction_gradient(*vectors)
     result: dict[str, Array] = {}
-    for kind, (triad, scale, _, _) in SENSOR_KINDS.items():
+    for kind, (triad, scale, *_) in SENSOR_KINDS.items():
         x, y, z = (gradient[..., 3 * triad + axis] for axis in range(3))
         vx, vy, vz = (vectors[triad][..., axis, None] for axis in range(3))
         across = [y, x]
@@ -124,37 +119,32 @@ def sensor_terms(calibration: Calibration, temperature: float | None = None) -> 
     At `temperature`, °C, by default `prediction.middle_temperature`. None: undetermined, without a magnetometer, and
     MB without a known field. Correlations between terms are lost.
     """
-    rows = _rows(calibration, temperature)
-    size = len(calibration.parameters)
-    covariance, free = calibration.parameter_covariance, calibration.free_directions
-    variance = np.einsum("taqi,ij,taqj->taq", rows, covariance, rows)
-    moved = np.abs(rows @ free.reshape(-1, size).transpose()).max(-1, initial=0.0) > FREE_SHARE
-    variance = np.where(moved, np.nan, variance)
-    field = np.nan if calibration.relative else calibration.earth.get("field", np.nan)
-    unit = STANDARD_GRAVITY * calibration.earth["gravity_g"], field
-    terms: list[SensorTerm] = []
-    for kind, (triad, scale, _, _) in SENSOR_KINDS.items():
-        if triad < len(rows):
-            square = (
-                variance[triad, :, 1:].sum(-1)
-                if scale
-                else variance[triad, :, 0] * unit[triad] ** 2
+    sd = _axis_sds(calibration, temperature)
+    generic: SensorTerms = load_survey_limits()[0].sensor
+    terms = []
+    for kind, (triad, scale, unit, name) in SENSOR_KINDS.items():
+        x, y, z = sd[triad, int(scale)].tolist()
+        usual = getattr(generic, name)
+        for axes, value in {"X": x, "Y": y, "XY": np.hypot(x, y) / np.sqrt(2), "Z": z}.items():
+            each = stated(value), stated(value / usual)
+            terms.append(
+                SensorTerm(name=kind + axes, unit=unit, value=each[0], owsg=usual, ratio=each[1])
             )
-        else:
-            square = np.full(3, np.nan)
-        square = np.insert(square, 2, square[:2].mean())
-        terms += [
-            _term(kind, axes, v)
-            for axes, v in zip(("X", "Y", "XY", "Z"), np.sqrt(square), strict=True)
-        ]
     return terms
 
 
-def _term(kind: str, axes: str, value: float) -> SensorTerm:
-    _, _, unit, owsg = SENSOR_KINDS[kind]
-    return SensorTerm(
-        name=kind + axes, unit=unit, value=stated(value), owsg=owsg, ratio=stated(value / owsg)
-    )
+def _axis_sds(calibration: Calibration, temperature: float | None) -> Array:
+    """1σ (2, 2, 3) of bias, m/s² and nT, and scale of every axis of both triads; NaN: undetermined."""
+    rows = _rows(calibration, temperature)
+    variance = np.einsum("taqi,ij,taqj->qta", rows, calibration.parameter_covariance, rows)
+    moved = np.abs(np.einsum("taqi,ki->kqta", rows, calibration.free_directions))
+    variance = np.where(moved.max(0, initial=0.0) > FREE_SHARE, np.nan, variance)
+    field = np.nan if calibration.relative else calibration.earth.get("field", np.nan)
+    strength = np.array([[MS2_PER_G * calibration.earth["gravity_g"]], [field]])[: len(rows)]
+    result = np.full((2, 2, 3), np.nan)
+    result[: len(rows), 0] = np.sqrt(variance[0]) * strength
+    result[: len(rows), 1] = np.sqrt(variance[1:].sum(0))
+    return result
 
 
 def _rows(calibration: Calibration, temperature: float | None) -> Array:
