@@ -233,16 +233,18 @@ def _part_of_path(
     md: Array, errors: DirectionErrors, before: _Sums, balanced: bool
 ) -> tuple[Array, Array, _Sums]:
     """Positions and covariance of stations the first of which has the sums `before`, and those of the last."""
-    inclination, azimuth, random = errors.inclination, errors.azimuth, errors.random
-    arc = arcs(md, hole_direction(inclination, azimuth), balanced)
-    turns = tilts(inclination, azimuth)
-    leaving, arriving = _steps(arc, turns, errors.systematic)
+    arc = arcs(md, hole_direction(errors.inclination, errors.azimuth), balanced)
+    upper, lower = _reach(arc, tilts(errors.inclination, errors.azimuth))
+    shifts, random = errors.systematic, errors.random
+    rows = slice(shifts.shape[-1])
+    step = (
+        shifts[..., :-1, :, :] @ upper[..., rows, :] + shifts[..., 1:, :, :] @ lower[..., rows, :]
+    )
     position = _sums_from(before.position, arc.displacement, -2)
-    shift = _sums_from(before.shift, leaving + arriving, -3)
-    unit = np.broadcast_to(np.eye(random.shape[-1]), random.shape)
-    leaving, arriving = _steps(arc, turns, unit)
-    arrival = np.concatenate([before.arrival[..., None, :, :], arriving], -3)
-    through = arrival[..., :-1, :, :] + leaving
+    shift = _sums_from(before.shift, step, -3)
+    rows = slice(random.shape[-1])
+    arrival = np.concatenate([before.arrival[..., None, :, :], lower[..., rows, :]], -3)
+    through = arrival[..., :-1, :, :] + upper[..., rows, :]
     passed = through.mT @ random[..., :-1, :, :] @ through
     settled = _sums_from(before.settled, passed, -3)
     covariance = settled + arrival.mT @ random @ arrival + shift.mT @ shift
@@ -250,18 +252,14 @@ def _part_of_path(
     return position, covariance, last
 
 
-def _steps(arc: Arcs, turns: Array, shifts: Array) -> tuple[Array, Array]:
-    """Changes (…, n - 1, k, 3) of each step by shifts (…, n, k, 2 or 3) at its upper and at its lower end."""
-    turned = shifts[..., :2] @ turns
-    upper, lower = (
-        part @ end.mT
-        for part, end in zip(
-            (turned[..., :-1, :, :], turned[..., 1:, :, :]), arc.by_directions(), strict=True
-        )
+def _reach(arc: Arcs, turns: Array) -> tuple[Array, Array]:
+    """Changes (…, n - 1, 3, 3) of each step by a shift upward, sideways and in depth at its upper and lower end."""
+    upper, lower = arc.by_directions()
+    along = arc.by_length[..., None, :]
+    return (
+        np.concatenate([turns[..., :-1, :, :] @ upper.mT, -along], -2),
+        np.concatenate([turns[..., 1:, :, :] @ lower.mT, along], -2),
     )
-    along = shifts[..., 2:].sum(-1, keepdims=True) * np.ones(3)
-    by_length = arc.by_length[..., None, :]
-    return upper - along[..., :-1, :, :] * by_length, lower + along[..., 1:, :, :] * by_length
 
 
 def _sums_from(first: Array, steps: Array, axis: int) -> Array:
