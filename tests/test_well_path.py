@@ -30,6 +30,9 @@ from simulation import Tool
 from test_calibrate import PROFILE, make, many_runs
 
 SURVEYS = Path(os.environ.get("MWDCAL_DATA", "")) / "survey"
+needs_published_wells = pytest.mark.skipif(
+    "MWDCAL_DATA" not in os.environ, reason="published wells: set MWDCAL_DATA"
+)
 STATIONS = 12
 
 
@@ -44,7 +47,7 @@ def random_wells(seed, wells=5, count=STATIONS):
     return md, inclination, azimuth
 
 
-@pytest.mark.skipif(not SURVEYS.is_dir(), reason="needs the published wells")
+@needs_published_wells
 def test_the_iscwsa_clearance_wells_within_their_rounding():
     wells = json.loads((SURVEYS / "iscwsa_clearance_wells.json").read_text())["wells"]
     assert len(wells) == 12
