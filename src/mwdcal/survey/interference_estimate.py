@@ -133,7 +133,7 @@ def estimate(
     names = [f"{t.name} {name}" for t in calibration.triads for name in t.parameter_names]
     rows = [names.index(name) for name in known.names]
     gain, inner = -left @ weighed.T, maps[:, rows]
-    stated = results.StatedCovariance(result)
+    stated = results.StatedCovariance(_no_quieter(result))
     spread, cautious = (
         gain @ (inner @ covariance @ inner.mT) @ gain.T + left
         for covariance in (stated.total, _cautious(result))
@@ -145,7 +145,7 @@ def estimate(
         result=result,
         parameters=parameters,
         covariance=stated.in_file(reference),
-        size=(parameters[:, rows] - known.expected) @ gain.T,
+        size=_unscaled((parameters[:, rows] - known.expected) @ gain.T),
         spread=spread,
         azimuth_sd=np.sqrt(np.einsum("bni,bij,bnj->bn", moved, cautious, moved)),
         bound=known,
@@ -219,6 +219,18 @@ def _by_interference(result: Fit, assumed: Assumed) -> Array:
     g, b = result.problem.fields(result.state)
     azimuth = np.nan_to_num(OBSERVABLES["azimuth"].gradient(g, b)[..., 3:])
     return np.concatenate([azimuth, azimuth * b], -1) if assumed.scale else azimuth
+
+
+def _unscaled(size: Array) -> Array:
+    """The size (B, d) of interference from the change that takes it off: that divides offsets by scales too."""
+    scales = size[:, 3:] if size.shape[1] > 3 else 0.0
+    return np.concatenate([size[:, :3] * (1 + scales), size[:, 3:]], -1)
+
+
+def _no_quieter(result: Fit) -> Fit:
+    """The fit with s² of at least one: that few surveys scatter little does not make the noise small."""
+    factor = np.fmax(result.analysis.variance_factor, 1.0)
+    return replace(result, analysis=replace(result.analysis, variance_factor=factor))
 
 
 def _cautious(result: Fit) -> Array:
