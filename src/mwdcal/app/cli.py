@@ -24,7 +24,16 @@ COMPLETION = "_MWDCAL_COMPLETE"
 """Variable with which a shell asks for completions, which are bytes."""
 COMMANDS = (
     *("apply", "calibrate", "compare", "completion", "convert", "example"),
-    *("fleet", "noise", "planning.plan", "profile", "planning.simulate", "stations", "verify"),
+    *(
+        "fleet",
+        "noise",
+        "planning.plan",
+        "profile",
+        "planning.simulate",
+        "stations",
+        "surveys.survey",
+        "verify",
+    ),
 )
 """Modules of `mwdcal.app.commands` with a command of their name."""
 

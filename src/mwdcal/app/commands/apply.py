@@ -16,13 +16,7 @@ from mwdcal.errors import InputError
 @options.CALIBRATION
 @options.argument("readings")
 @options.output(metavar="OUT", help="Table to write; format by suffix.")
-@options.preset(
-    "--outside",
-    default="blank",
-    metavar="blank|refuse|extrapolate",
-    help="Results of rows more than 1 °C (without temperature terms: 5 °C) outside the calibrated "
-    "temperatures: none; refuse the file; or extrapolated, and marked in a column 'extrapolated'.",
-)
+@options.WHERE_OUTSIDE
 @options.preset(
     "--missing",
     type=click.Choice(["refuse", "blank"]),

@@ -38,6 +38,13 @@ preset = partial(click.option, show_default=True)
 CALIBRATION = argument("calibration")
 RUN = argument("run")
 LOG = argument("log")
+WHERE_OUTSIDE = preset(
+    "--outside",
+    default="blank",
+    metavar="blank|refuse|extrapolate",
+    help="Results of rows more than 1 °C (without temperature terms: 5 °C) outside the calibrated "
+    "temperatures: none; refuse the file; or extrapolated, and marked as such.",
+)
 DECIMAL = preset(
     "--decimal", default=".", metavar="SIGN", help="Decimal sign of numbers in text files."
 )
