@@ -330,7 +330,9 @@ def test_uncertainty_of_a_global_model_where_none_is_stated() -> None:
         sd={k: v for k, v in readings.sd.items() if k in ("accelerometer", "magnetometer")},
     )
     stated, usual = (interference(laboratory(), r).summary for r in (readings, bare))
-    assert usual.interference == stated.interference  # the wells' own are as large
+    assert usual.interference.axial_nt == pytest.approx(
+        stated.interference.axial_nt, abs=1
+    )  # as large
     assert "reference-uncertainty-assumed" in {f.id for f in usual.findings}
 
 

@@ -336,10 +336,10 @@ def _findings(
             f"{name}: the interference is more than {BEYOND_ASSUMED:g} times what was assumed (1σ). Assume more, with "
             "`axial_nt`, `cross_axial_nt` or `scale`, and look for another cause, such as a magnetised tool."
         )
-    if bare := [n for n in USUAL_SD if (readings.uncertainty(n) <= 0).any()]:
+    if bare := [n for n in ("field", "dip") if (readings.uncertainty(n) <= 0).any()]:
         texts["reference-uncertainty-assumed"] = (
             f"no uncertainty is stated for the reference of {' and '.join(bare)}: that of a global field model is "
-            f"assumed ({USUAL_SD['field']:g} nT, {np.degrees(USUAL_SD['dip']):.2g}°). State sd_ref_field_nt and "
+            f"assumed ({USUAL_SD['field']:.0f} nT, {np.degrees(USUAL_SD['dip']):.1g}°). State sd_ref_field_nt and "
             "sd_ref_dip_deg."
         )
     return [Finding(id=key, text=text) for key, text in texts.items()] + _doubtful(whole, rows)

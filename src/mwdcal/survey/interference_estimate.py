@@ -23,11 +23,17 @@ from mwdcal.errors import InputError
 from mwdcal.estimation.uncertainty import TANGENT_STEP, analyse, tangent
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array, diagonal
+from mwdcal.survey.references import PLACE_SD
+from mwdcal.survey.well import UNKNOWN_GRAVITY, unknown_gravity
 
 OFFSET_NAMES = ("cross-axial x", "cross-axial y", "axial")
 """Directions of interference, in the order of the tool axes x, y, z."""
-USUAL_SD = {"field": 130.0, "dip": float(np.radians(0.20))}
-"""1σ of a global field model where the readings state none, nT and rad: OWSG Rev 5.1, MFI and MDI."""
+USUAL_SD = {
+    "gravity": UNKNOWN_GRAVITY,
+    "field": PLACE_SD.field_nt,
+    "dip": float(np.radians(PLACE_SD.dip_deg)),
+}
+"""1σ of references, common to a well, where the readings state none, g, nT and rad: those of global models."""
 DETERMINED_SHARE = 0.5
 """A direction is determined by the readings if they leave less than this share of what was assumed."""
 
@@ -180,7 +186,9 @@ def surveys(calibration: Calibration, readings: Readings) -> Readings:
     }
     for name in CONSTANTS:
         stated = readings.uncertainty(name)
-        sd[name] = np.where(stated > 0, stated, USUAL_SD.get(name, 0.0))
+        sd[name] = np.where(stated > 0, stated, USUAL_SD[name])
+    if unknown_gravity(calibration):
+        sd["gravity"] = np.hypot(sd["gravity"], UNKNOWN_GRAVITY)
     known = {name: readings.reference(name) for name in CONSTANTS}
     return replace(readings, known=known, sd=sd)
 
