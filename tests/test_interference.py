@@ -10,6 +10,8 @@ import msgspec
 import numpy as np
 import pytest
 
+from mwdcal.app.pages.surveys.interference import render
+from mwdcal.app.screens.surveys.interference import screen
 from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import Readings
@@ -128,7 +130,10 @@ def test_a_field_that_wanders_between_stations_is_not_taken_for_interference() -
     readings = surveyed(laboratory(), where, 40, seed=8)
     whole = estimate(laboratory(), readings, PLAIN)
     assert np.degrees(whole.azimuth_sd.max(-1)).min() > 1.3
-    assert whole.determined.all()  # were the field the same at all stations, as the fit takes it
+    same_field = np.sqrt(np.diagonal(whole.spread, axis1=-2, axis2=-1))
+    assert (
+        whole.sd[:, 2] > 5 * same_field[:, 2]
+    ).all()  # of a field that is the same at all stations
 
 
 def test_robust_weights_leave_the_statistics_as_they_are() -> None:
@@ -373,3 +378,29 @@ WRONG = {"axial_nt": 0.0, "cross_axial_nt": -1.0, "scale": 1.5, "largest_azimuth
 def test_assumptions_that_cannot_be(name: str) -> None:
     with pytest.raises(InputError, match=f"`{name}` must be"):
         Assumed(**{name: WRONG[name]})
+
+
+def test_screen_says_what_the_analysis_says() -> None:
+    result = interference(laboratory(), well())
+    text = screen(result, result.calibration.tool)
+    assert "SIMULATED DATA" in text
+    assert re.search(r"^separable: .* 1° allowed\)$", text, re.M)
+    assert re.search(r"^axial +14\d\d +1\d +nT +3000 +yes$", text, re.M)
+    assert text.count("\nS") == 30
+    refused = interference(laboratory(), well(horizontal_east(7)))
+    assert "NOT separable from azimuth" in screen(refused)
+    assert "is missing: one at inclination" in screen(refused)
+
+
+def test_page_shows_before_and_after_and_is_the_same_twice() -> None:
+    hostile = replace(well(), source="<script>x</script>\x1b[2J.csv")
+    result = interference(laboratory(), hostile, depth=np.linspace(800, 2540, 30))
+    page = render(result, {"readings": "ab" * 32})
+    assert page == render(result, {"readings": "ab" * 32})
+    assert "SIMULATED DATA" in page
+    assert "<script>x" not in page
+    assert "\x1b" not in page
+    assert page.count("<svg") == 2
+    assert "measured depth, m" in page
+    refused = render(interference(laboratory(), well(horizontal_east(7))), {})
+    assert "Interference cannot be separated from azimuth" in refused

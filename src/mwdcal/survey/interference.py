@@ -13,7 +13,7 @@ from mwdcal.calibration.residuals import RESHOOT
 from mwdcal.errors import FitError
 from mwdcal.estimation.uncertainty import station_misfit
 from mwdcal.geometry.observables import OBSERVABLES
-from mwdcal.geometry.vectors import Array, Bools
+from mwdcal.geometry.vectors import Array, Bools, centred
 from mwdcal.survey.interference_estimate import (
     USUAL_SD,
     Assumed,
@@ -77,6 +77,7 @@ class InterferenceStation(msgspec.Struct, frozen=True, kw_only=True):
     inclination_deg: float
     azimuth_before_deg: float | None
     azimuth_after_deg: float | None
+    azimuth_change_deg: float | None
     sd_azimuth_before_deg: float | None
     sd_azimuth_after_deg: float | None
     field_before_nt: float
@@ -289,6 +290,8 @@ def _station_rows(
         columns[f"field_{when}_nt"] = OBSERVABLES["field"].value(*vectors)
         sd = record.uncertainty("azimuth", readings, noise=True)
         columns[f"sd_azimuth_{when}_deg"] = np.degrees(sd)
+    change = np.radians(columns["azimuth_after_deg"] - columns["azimuth_before_deg"])
+    columns["azimuth_change_deg"] = np.degrees(centred(change))
     columns["inclination_deg"] = np.degrees(OBSERVABLES["inclination"].value(*vectors))
     columns["ref_field_nt"] = readings.reference("field")
     columns["ref_dip_deg"] = np.degrees(readings.reference("dip"))

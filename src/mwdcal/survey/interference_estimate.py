@@ -80,10 +80,10 @@ class Assumed:
 class Estimate:
     """Interference of B wells: arrays with a leading axis.
 
-    `parameters` (B, k) and `covariance` (B, k, k) are those of the corrected calibration; `size` (B, d)
-    and `spread` (B, d, d) the interference by `Assumed.names` with its covariance; `azimuth_sd` (B, n)
-    the 1σ that it leaves in the azimuth of each station, rad, if field and dip also depart from station to
-    station; `bound` and `released` are the laboratory's knowledge without and with interference.
+    `parameters` (B, k) and `covariance` (B, k, k) are those of the corrected calibration; `size` (B, d) and
+    `spread` (B, d, d) the interference by `Assumed.names` with its covariance. If field and dip also depart
+    from station to station, its covariance is `cautious_spread`, and `azimuth_sd` (B, n) the 1σ that it leaves
+    in the azimuths, rad. `bound` and `released` are the laboratory's knowledge without and with interference.
     """
 
     readings: Readings
@@ -93,14 +93,16 @@ class Estimate:
     covariance: Array
     size: Array
     spread: Array
+    cautious_spread: Array
     azimuth_sd: Array
     bound: Knowledge
     released: Knowledge
 
     @property
     def sd(self) -> Array:
-        """1σ (B, d) of each direction."""
-        return np.asarray(np.sqrt(diagonal(self.spread)))
+        """1σ (B, d) of each direction: where interference is not separable, the cautious one."""
+        spread = np.where(self.separable[:, None, None], self.spread, self.cautious_spread)
+        return np.asarray(np.sqrt(diagonal(spread)))
 
     @property
     def determined(self) -> Array:
@@ -153,6 +155,7 @@ def estimate(
         covariance=stated.in_file(reference),
         size=_unscaled((parameters[:, rows] - known.expected) @ gain.T),
         spread=spread,
+        cautious_spread=cautious,
         azimuth_sd=np.sqrt(np.einsum("bni,bij,bnj->bn", moved, cautious, moved)),
         bound=known,
         released=released,
