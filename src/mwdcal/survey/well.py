@@ -191,7 +191,7 @@ def _scaled(calibration: Calibration, readings: Readings) -> Readings:
 
 def unknown_gravity(calibration: Calibration) -> bool:
     """Whether the calibration took gravity as exactly 1 g, which no reference says."""
-    return calibration.earth.get("gravity") == 1.0
+    return calibration.earth["gravity_g"] == 1.0
 
 
 def _positions(
