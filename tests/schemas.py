@@ -20,11 +20,10 @@ from mwdcal.app.screens import (
     noise,
     plan,
     proposal,
-    reference,
     simulation,
     stations,
 )
-from mwdcal.app.screens.surveys import survey
+from mwdcal.app.screens.surveys import reference, survey
 from mwdcal.calibration.record import DOCUMENT_VERSION, SCHEMA_VERSION, Calibration
 from mwdcal.use.verification import Verdict
 

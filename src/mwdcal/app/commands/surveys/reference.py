@@ -101,10 +101,10 @@ def command(
                --fill run.csv -o filled.csv
     Exit: 0 done, 2 input cannot be read.
     """
-    from mwdcal.app.screens import reference as screen
+    from mwdcal.app.screens.surveys import reference as screen
     from mwdcal.files.formats import atomic, table
-    from mwdcal.survey.reference_columns import fill
-    from mwdcal.survey.references import MEASURABLE, reference_at
+    from mwdcal.survey.place.reference_columns import fill
+    from mwdcal.survey.place.references import MEASURABLE, reference_at
 
     options.check_outputs([output], [run])
     if run and not output:

@@ -63,7 +63,7 @@ def command(
     from mwdcal.files.formats import table as tables
     from mwdcal.files.runs import MOST_ROWS, read_export
     from mwdcal.survey.acceptance import load_survey_limits
-    from mwdcal.survey.references import load_reference
+    from mwdcal.survey.place.references import load_reference
     from mwdcal.survey.tables import survey_readings, surveyed_table
     from mwdcal.survey.well import well
 

@@ -20,7 +20,7 @@ from mwdcal.calibration.readings import EARTH_RANGES
 from mwdcal.calibration.record import DOCUMENT_VERSION, Finding
 from mwdcal.errors import InputError, reason
 from mwdcal.files.contract import AZIMUTH_KEYS, REFERENCES, ROTATION, Range, magnetic_offset
-from mwdcal.survey import earth
+from mwdcal.survey.place import earth
 from mwdcal.use.strengths import STRENGTH_UNITS
 
 MEASURABLE = {

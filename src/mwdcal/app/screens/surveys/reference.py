@@ -13,8 +13,8 @@ from mwdcal.app.screens.numbers import fixed, signed, written
 from mwdcal.app.text import one_line, table
 from mwdcal.calibration.readings import simulated
 from mwdcal.calibration.record import Finding
-from mwdcal.survey.reference_columns import FilledRun
-from mwdcal.survey.references import MEASURABLE, STANDARD_GRAVITY, EarthReference
+from mwdcal.survey.place.reference_columns import FilledRun
+from mwdcal.survey.place.references import MEASURABLE, STANDARD_GRAVITY, EarthReference
 
 DECIMALS = {"gravity": 6, "field": 1, "dip": 3, "declination": 3}
 """Digits behind the point of each value; uncertainties have as many."""

@@ -15,7 +15,7 @@ from mwdcal.files.formats.columns import Column, shown
 from mwdcal.files.formats.table import Table, numbers
 from mwdcal.files.runs import check_run
 from mwdcal.geometry.vectors import Array, Bools
-from mwdcal.survey.references import MEASURABLE, EarthReference
+from mwdcal.survey.place.references import MEASURABLE, EarthReference
 
 FILLED = ("gravity", "field", "dip")
 """References of a run that are those of a place."""
