@@ -18,7 +18,7 @@ from mwdcal.geometry.vectors import reference_vectors
 from mwdcal.planning.expected import expected, nominal_run, planned_earth, planned_fit
 from mwdcal.planning.moves import Stand, move_seconds, session_seconds, shortest_order
 from mwdcal.planning.optimal import Information, best, efficiency
-from mwdcal.planning.planned import best_plan, judged
+from mwdcal.planning.planned import WORKING_INCLINATIONS, best_plan, judged, smallest_plan
 from mwdcal.planning.plans import load_plan, run_sheet
 from simulation import DEG, attitude
 
@@ -320,6 +320,22 @@ def test_columns_under_other_names_are_not_left_out_of_a_plan(tmp_path, name):
     """As of a run: a plan at two temperatures is not taken for one at none."""
     with pytest.raises(InputError, match=name):
         written_plan(tmp_path / "plan.csv", f",{name}", (",20", ",90"))
+
+
+def test_the_fewest_stations_carry_the_temperature_terms_of_all_candidates(tmp_path):
+    """And the accuracy holds between the soaks and at their ends, not at the reference temperature alone."""
+    path = tmp_path / "warm.toml"
+    path.write_text(
+        "name = 'warm'\ntemperature_c = [20, 90, 160]\n[[stations]]\ninclination_deg = [5, 90, 175]\n"
+        "azimuth_deg = [0, 120, 240]\ntoolface_deg = [0, 120, 240]\n"
+    )
+    wanted = {"azimuth": 0.25}
+    result = smallest_plan(load_plan(str(path)), wanted, SERVO)
+    assert [triad.order for triad in result.calibration.triads] == [2, 2]
+    for temperature in np.linspace(20, 160, 15):
+        each = accuracy_at(result.calibration, WORKING_INCLINATIONS, temperature=temperature)
+        # the temperatures that are looked at lie 23 °C apart
+        assert np.degrees(each["azimuth"]).max() < 1.02 * wanted["azimuth"]
 
 
 def test_why_24_stations_cannot_beat_the_48_of_the_textbook():
