@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from math import radians
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from mwdcal.app.commands import options
 from mwdcal.app.messages import findings_as_typed, print_result
 from mwdcal.errors import InputError
+
+if TYPE_CHECKING:
+    from mwdcal.calibration.readings import Readings
+    from mwdcal.calibration.record import Calibration
+    from mwdcal.geometry.vectors import Array
+    from mwdcal.survey.multistation.interference import Interference
 
 
 @options.command()
@@ -21,6 +29,15 @@ from mwdcal.errors import InputError
     type=options.FILE,
     metavar="REF.json",
     help="Gravity, field, dip and declination of the place: what mwdcal reference --json prints.",
+)
+@click.option(
+    "--msa",
+    is_flag=True,
+    help="Multi-station analysis first: take the drill string's interference, as all surveys show it, off the "
+    "magnetometer.",
+)
+@click.option(
+    "--msa-html", type=options.FILE, metavar="M.html", help="Also write a page of that analysis."
 )
 @options.preset(
     "--limits",
@@ -45,8 +62,9 @@ from mwdcal.errors import InputError
 @options.DECIMAL
 @options.JSON
 def command(
-    calibration: Path, readings: Path, output: Path, reference: Path | None, limits: str, switch: str,
-    tie_in: str | None, outside: str, html: Path | None, decimal: str, as_json: bool,
+    calibration: Path, readings: Path, output: Path, reference: Path | None, msa: bool,
+    msa_html: Path | None, limits: str, switch: str, tie_in: str | None, outside: str,
+    html: Path | None, decimal: str, as_json: bool,
 ) -> None:  # fmt: skip
     """Surveys of a well: READINGS in their order, corrected by the CALIBRATION of their tool.
 
@@ -55,11 +73,14 @@ def command(
 
     \b
     Example: mwdcal survey tool.json surveys.csv --reference here.json -o well.csv --html well.html
-    Exit: 0 written, 2 input cannot be read, or does not belong to the calibration.
+    Exit: 0 written, 2 input cannot be read, or does not belong to the calibration, 3 with --msa: the surveys do not
+    separate interference from azimuth.
     """
     from mwdcal.app.envelope import enveloped
+    from mwdcal.app.screens.surveys import interference as screens_of_msa
     from mwdcal.app.screens.surveys import survey as screens
     from mwdcal.files import documents
+    from mwdcal.files.formats import atomic
     from mwdcal.files.formats import table as tables
     from mwdcal.files.runs import MOST_ROWS, read_export
     from mwdcal.survey.acceptance import load_survey_limits
@@ -67,36 +88,68 @@ def command(
     from mwdcal.survey.tables import survey_readings, surveyed_table
     from mwdcal.survey.well import well
 
-    options.check_outputs([output], [calibration, readings, reference, limits], page=html)
+    if msa_html and not msa:
+        raise InputError("`msa_html` goes with `msa`. Leave it out, or add `msa`.")
+    inputs = [calibration, readings, reference, limits]
+    options.check_outputs([output, msa_html], inputs, page=html)
+    start, ends = _three("tie_in", tie_in), _switch(switch)
     fitted, digest = documents.load(calibration)
     bounds, limits_digest = load_survey_limits(limits)
     source = read_export(readings, fitted.profile, decimal=decimal, rows=MOST_ROWS)
     place, place_digest = load_reference(reference) if reference else (None, "")
+    digests = {
+        "calibration": digest, "readings": source.digest, "reference": place_digest,
+        "limits": limits_digest,
+    }  # fmt: skip
     read, md, north = survey_readings(source, fitted, place)
-    result = well(
-        fitted, read, bounds, north, md, _three("tie_in", tie_in), _switch(switch), outside
-    )
-    corrected = surveyed_table(source, result)
+    stated, analysis = (fitted.tool, read.metadata), None
+    pages: list[tuple[Path, bytes | str]] = []
+    if msa:
+        analysis, page = _analysed(fitted, read, md, digests if msa_html else None)
+        pages += [(msa_html, page)] if msa_html else []
+        if not analysis.summary.separable:
+            atomic.write_all(pages)
+            if as_json:
+                refused = screens.refusal(analysis.summary, bounds, north)
+                print_result(enveloped("survey", refused, *stated, **digests), [])
+            analysis.check()
+        fitted = analysis.calibration
+    result = well(fitted, read, bounds, north, md, start, ends, outside)
     findings = findings_as_typed(result.findings)
-    document = enveloped(
-        "survey",
-        screens.summary(result, str(output), str(html or "")),
-        *(fitted.tool, read.metadata),
-        calibration=digest,
-        readings=source.digest,
-        reference=place_digest,
-        limits=limits_digest,
-    )
-    tables.write(output, corrected)
     if html:
         from mwdcal.app.pages.surveys.survey import render
-        from mwdcal.files.formats import atomic
 
-        digests = {"calibration": digest, "readings": source.digest, "reference": place_digest}
-        stated = {name: each for name, each in digests.items() if each}
-        atomic.write(html, render(result, findings, {**stated, "limits": limits_digest}))
-    shown = screens.screen(result, str(output), str(html or ""), fitted.tool, read.metadata)
+        pages.append((html, render(result, findings, _named(digests))))
+    content = tables.rendered(output, surveyed_table(source, result))
+    atomic.write_all([(output, content), *pages])
+    summary = screens.summary(
+        result, str(output), str(html or ""), analysis.summary if analysis else None
+    )
+    document = enveloped("survey", summary, *stated, **digests)
+    shown = screens.screen(result, summary, *stated)
+    if analysis:
+        shown = f"{screens_of_msa.screen(analysis, *stated)}\n\n{shown}"
+        findings = findings_as_typed(analysis.summary.findings) + findings
     print_result(document if as_json else shown, findings)
+
+
+def _analysed(
+    fitted: Calibration, read: Readings, md: Array | None, digests: Mapping[str, str] | None
+) -> tuple[Interference, str]:
+    """The multi-station analysis, and its page where `digests` of the files are given."""
+    from mwdcal.survey.multistation.interference import interference
+
+    analysis = interference(fitted, read, depth=md)
+    if digests is None:
+        return analysis, ""
+    from mwdcal.app.pages.surveys.interference import render
+
+    return analysis, render(analysis, _named(digests))
+
+
+def _named(digests: Mapping[str, str]) -> dict[str, str]:
+    """Digests of the files that there are."""
+    return {name: digest for name, digest in digests.items() if digest}
 
 
 def _numbers(name: str, text: str, count: int) -> list[float]:
