@@ -239,6 +239,21 @@ def test_the_path_turns_with_north():
     np.testing.assert_allclose(turned, turn @ covariance @ turn.T, atol=1e-12)
 
 
+def test_north_that_changes_from_station_to_station():
+    """A turn of each direction about the vertical: half the legs around a station, times its sine of inclination."""
+    record, (md, *angles) = calibrate(make(), PROFILE), planned_well()
+    readings = readings_at(record, *angles)
+    errors = [direction_errors(record, readings, declination_noise=noise) for noise in (0.0, 0.01)]
+    added = position_covariance(md, *angles[:2], random=errors[1].random - errors[0].random)
+    level = angles[0] > np.radians(89)
+    arm = 60.0 * np.sin(angles[0])
+    arm[0] /= 2
+    most = 0.01**2 * (np.cumsum(arm**2) - arm**2 + (arm / 2) ** 2)
+    across = added[:, 0, 0] + added[:, 1, 1]
+    np.testing.assert_allclose(across[level], most[level], rtol=0.01)
+    assert not added[:, 2, 2].max() > 1e-3 * across.max()
+
+
 def test_what_no_evidence_determines_leaves_no_covariance():
     """Toolface zero moves no hole; the direction of the field in the tool does."""
     md, *angles = planned_well()
