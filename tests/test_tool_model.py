@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -167,6 +169,7 @@ def hostile_well():
     return md, inclination, azimuth
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_welleng_takes_the_tool_model_and_has_our_covariance(tmp_path):
     welleng = pytest.importorskip("welleng.survey")
@@ -194,3 +197,23 @@ def test_welleng_takes_the_tool_model_and_has_our_covariance(tmp_path):
         np.testing.assert_allclose(ours, errors.errors[name].cov_NEV, rtol=1e-6, atol=1e-9)
     together = position_covariance(md, inclination, azimuth, np.stack(causes, -2), balanced=True)
     np.testing.assert_allclose(together, survey.cov_nev, rtol=1e-6, atol=1e-9)
+
+
+def test_the_tool_model_has_the_fields_of_iscwsa_and_says_what_is_simulated(tmp_path):
+    """As the published schema, which welleng carries, requires; and nothing else."""
+    errors = pytest.importorskip("welleng.errors")
+    schemas = Path(errors.__file__).with_name("iscwsa_schema")
+    path = tmp_path / "model.json"
+    record = msgspec.structs.replace(calibrate(make(), PROFILE), simulated=True)
+    write_tool_model(path, record)
+    model = json.loads(path.read_text())
+    required = {
+        name: set(json.loads((schemas / f"{name}.json").read_text())["required"])
+        for name in ("draft", "metadata", "error_term")
+    }
+    assert set(model) == required["draft"]
+    assert set(model["metadata"]) == required["metadata"]
+    assert {frozenset(term) for term in model["terms"]} == {frozenset(required["error_term"])}
+    assert "simulated" in model["metadata"]["tags"]
+    write_tool_model(tmp_path / "again.json", record)
+    assert path.read_bytes() == (tmp_path / "again.json").read_bytes()
