@@ -20,8 +20,9 @@ from mwdcal.calibration.record import FREE_SHARE, SOFTWARE, Calibration, stated
 from mwdcal.errors import FitError
 from mwdcal.files.formats import atomic
 from mwdcal.geometry.vectors import Array, ArrayLike, reference_vectors
-from mwdcal.survey.acceptance import MS2_PER_G, SensorTerms, load_survey_limits
+from mwdcal.survey.acceptance import SensorTerms, load_survey_limits
 from mwdcal.survey.position import direction_gradient
+from mwdcal.use.strengths import STANDARD_GRAVITY
 
 
 class TermKind(NamedTuple):
@@ -85,7 +86,7 @@ def term_shifts(
     azimuth: ArrayLike,
     field: ArrayLike,
     dip: ArrayLike,
-    gravity: ArrayLike = MS2_PER_G,
+    gravity: ArrayLike = STANDARD_GRAVITY,
 ) -> dict[str, Array]:
     """Shifts (…, 2) of the hole's direction, upward and sideways, by one unit of each sensor term.
 
@@ -140,7 +141,7 @@ def _axis_sds(calibration: Calibration, temperature: float | None) -> Array:
     moved = np.abs(np.einsum("taqi,ki->kqta", rows, calibration.free_directions))
     variance = np.where(moved.max(0, initial=0.0) > FREE_SHARE, np.nan, variance)
     field = np.nan if calibration.relative else calibration.earth.get("field", np.nan)
-    strength = np.array([[MS2_PER_G * calibration.earth["gravity_g"]], [field]])[: len(rows)]
+    strength = np.array([[STANDARD_GRAVITY * calibration.earth["gravity_g"]], [field]])[: len(rows)]
     result = np.full((2, 2, 3), np.nan)
     result[: len(rows), 0] = np.sqrt(variance[0]) * strength
     result[: len(rows), 1] = np.sqrt(variance[1:].sum(0))

@@ -21,7 +21,7 @@ from mwdcal.calibration.record import DOCUMENT_VERSION, Finding
 from mwdcal.errors import InputError, reason
 from mwdcal.files.contract import AZIMUTH_KEYS, REFERENCES, ROTATION, Range, magnetic_offset
 from mwdcal.survey.place import earth
-from mwdcal.use.strengths import STRENGTH_UNITS
+from mwdcal.use.strengths import STANDARD_GRAVITY
 
 MEASURABLE = {
     "gravity": "gravity_g",
@@ -30,8 +30,6 @@ MEASURABLE = {
     "declination": "declination_deg",
 }
 """Values that may be measured, and their keys with the unit."""
-STANDARD_GRAVITY = STRENGTH_UNITS["gravity"]["m/s²"]
-"""1 g, m/s²."""
 GRAVITY_ANOMALY = 4.2e-4
 """Spread of real gravity about normal gravity, m/s²: √1795 mGal (Tscherning and Rapp 1974)."""
 GRADIENT_IN_ROCK = 2.24e-6

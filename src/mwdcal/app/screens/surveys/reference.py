@@ -14,7 +14,8 @@ from mwdcal.app.text import one_line, table
 from mwdcal.calibration.readings import simulated
 from mwdcal.calibration.record import Finding
 from mwdcal.survey.place.reference_columns import FilledRun
-from mwdcal.survey.place.references import MEASURABLE, STANDARD_GRAVITY, EarthReference
+from mwdcal.survey.place.references import MEASURABLE, EarthReference
+from mwdcal.use.strengths import STANDARD_GRAVITY
 
 DECIMALS = {"gravity": 6, "field": 1, "dip": 3, "declination": 3}
 """Digits behind the point of each value; uncertainties have as many."""
