@@ -90,8 +90,9 @@ def command(
     inputs = [calibration, readings, reference, limits]
     options.check_outputs([output, msa_html], inputs, page=html)
     start, ends = _three("tie_in", tie_in), _switch(switch)
-    scene = _scene(calibration, readings, reference, limits, decimal)
-    fitted, analysis, pages = scene.calibration, None, []
+    scene = _read(calibration, readings, reference, limits, decimal)
+    fitted, analysis = scene.calibration, None
+    pages: list[tuple[Path, bytes | str]] = []
     if msa:
         analysis, pages = _analysed(scene, msa_html, as_json)
         fitted = analysis.calibration
@@ -107,7 +108,7 @@ def command(
 
 
 @dataclass(frozen=True)
-class _Scene:
+class _WellInputs:
     """What the command was given; digests of its files."""
 
     calibration: Calibration
@@ -129,9 +130,9 @@ class _Scene:
         return {name: digest for name, digest in self.digests.items() if digest}
 
 
-def _scene(
+def _read(
     calibration: Path, readings: Path, reference: Path | None, limits: str, decimal: str
-) -> _Scene:
+) -> _WellInputs:
     """The files read."""
     from mwdcal.files import documents
     from mwdcal.files.runs import MOST_ROWS, read_export
@@ -145,11 +146,13 @@ def _scene(
     place, place_digest = load_reference(reference) if reference else (None, "")
     read, md, north = survey_readings(source, fitted, place)
     digests = {"calibration": digest, "readings": source.digest, "reference": place_digest}
-    return _Scene(fitted, source, read, md, north, bounds, {**digests, "limits": limits_digest})
+    return _WellInputs(
+        fitted, source, read, md, north, bounds, {**digests, "limits": limits_digest}
+    )
 
 
 def _analysed(
-    scene: _Scene, page: Path | None, as_json: bool
+    scene: _WellInputs, page: Path | None, as_json: bool
 ) -> tuple[Interference, list[tuple[Path, bytes | str]]]:
     """The multi-station analysis and its page; one that is not separable is printed and refused."""
     from mwdcal.app.envelope import enveloped
@@ -173,7 +176,7 @@ def _analysed(
 
 
 def _print(
-    scene: _Scene,
+    scene: _WellInputs,
     result: Well,
     analysis: Interference | None,
     files: tuple[str, str],
