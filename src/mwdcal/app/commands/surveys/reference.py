@@ -80,7 +80,9 @@ def measured(function: options.Function) -> options.Function:
     help="A run whose blank references are filled.",
 )
 @options.output(
-    required=False, metavar="REF.json|RUN", help="Reference to write; with --fill the filled run."
+    required=False,
+    metavar="REF.json|RUN.csv",
+    help="Reference to write; with --fill the filled run.",
 )
 @options.DECIMAL
 @options.JSON
