@@ -12,8 +12,8 @@ import pytest
 
 from cli_support import EXAMPLE, mwdcal, read_csv, refused, write_csv
 from mwdcal.errors import InputError
-from mwdcal.survey import earth
-from mwdcal.survey.references import (
+from mwdcal.survey.place import earth
+from mwdcal.survey.place.references import (
     MOMENT_SD,
     PLACE_SD,
     EarthReference,
@@ -330,6 +330,7 @@ def test_near_a_magnetic_pole_azimuths_are_reported_as_unreliable():
         (("--sd-dip-deg", 0.1), "--sd-dip-deg is of a measured value. Add --dip-deg"),
         (("--field-nt", 50_000, "--sd-field-nt", -1), "--sd-field-nt must be between 0"),
         (("--fill", "run.csv"), "--fill needs a file"),
+        (("-o", "ref.csv"), "--output 'ref.csv': a reference is written as JSON"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_is_refused(options, words):
