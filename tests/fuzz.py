@@ -456,6 +456,10 @@ WORDS = {
     "repeat": ("1", "3", "20", "0"),
     "workers": ("1",),
     "word_bits": ("32", "24", "16", "11"),
+    "day": (*("2026-07-01",) * 6, "2025-01-01", "1950-06-30", "2024-02-30", "1.7.2026"),
+    "crs": ("EPSG:23031", "EPSG:4326", "EPSG:2048", "EPSG:1"),
+    "field_nt": ("48000", "51000.5", "48"),
+    "gravity_g": ("1.0013", "9.81"),
 }
 """Values of options that are not read off the command line itself."""
 USUAL = {

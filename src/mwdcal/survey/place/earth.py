@@ -6,6 +6,7 @@ Nothing is loaded from a network: coefficients and projections are those of the 
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Sequence
 from datetime import date
 from functools import cache
@@ -36,6 +37,7 @@ _WMM_FILE = "wmm/WMM_2025.COF"
 _IGRF_FILE = "IGRF14.shc"
 _HIGHEST_DEGREE = 133
 """Of pygeomag's high resolution. IGRF needs 13, one more than its usual one."""
+_CODE = re.compile(r"[A-Za-z]+:\w+")
 _GRID_AXES = {"east", "north", "up"}
 
 
@@ -203,10 +205,11 @@ def grid_convergence(crs: str, latitude_deg: float, longitude_deg: float) -> Gri
     """
     library = _library("pyproj", "The convergence of a grid")
     try:
-        system = library.CRS.from_user_input(crs)
+        system = library.CRS.from_user_input(crs if _CODE.fullmatch(crs) else "")
     except library.exceptions.CRSError:
         raise InputError(
-            f"`crs` must name a projected coordinate system, such as EPSG:32631; got {crs!r}."
+            f"`crs` must be the code of a projected coordinate system, such as EPSG:32631; got {crs!r}. "
+            "Name that of the well plan."
         ) from None
     axes = {axis.direction for axis in system.axis_info}
     if not system.is_projected or not axes <= _GRID_AXES:

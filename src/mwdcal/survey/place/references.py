@@ -177,7 +177,7 @@ def reference_at(
     given = {MEASURABLE[name]: value for name, value in measured.items()}
     stated = {f"sd_{MEASURABLE[name]}": value for name, value in uncertainties.items()}
     check_ranges({**place, **given, **stated})
-    for name in uncertainties.keys() - measured.keys():
+    for name in sorted(uncertainties.keys() - measured.keys()):
         key = MEASURABLE[name]
         raise InputError(
             f"`sd_{key}` is of a measured value. Add `{key}`, or leave out `sd_{key}`."
@@ -195,10 +195,10 @@ def reference_at(
         **spread,
         **described,
         convergence_deg=grid.convergence_deg if grid else None,
-        crs=crs,
+        crs=crs or None,
         measured=[name for name in MEASURABLE if name in measured],
         sources=_sources(described.get("coefficients"), measured, grid),
-        findings=_findings(place, values, described.get("model"), measured, uncertainties, grid),
+        findings=_findings(values, altitude_m, measured, uncertainties, grid),
     )
 
 
@@ -243,15 +243,9 @@ def _sources(
     coefficients: str | None, measured: Mapping[str, float], grid: earth.Grid | None
 ) -> dict[str, str]:
     """Where each value comes from, and the uncertainties of those that were not measured."""
-    gravity = "WGS84 normal gravity (NIMA TR8350.2)"
-    sources = {
-        name: "measured"
-        if name in measured
-        else gravity
-        if name == "gravity"
-        else str(coefficients)
-        for name in MEASURABLE
-    }
+    sources = dict.fromkeys(MEASURABLE, str(coefficients))
+    sources["gravity"] = "WGS84 normal gravity (NIMA TR8350.2)"
+    sources |= dict.fromkeys(measured, "measured")
     sources["sd_gravity"] = "stated" if "gravity" in measured else GRAVITY_SD_SOURCE
     sources["sd_field_dip_declination"] = (
         OWSG if not GEOMAGNETIC & measured.keys() else f"{OWSG}; of measured values as stated"
@@ -260,8 +254,8 @@ def _sources(
 
 
 def _findings(
-    place: Mapping[str, float], values: Mapping[str, float], model: str | None,
-    measured: Mapping[str, float], uncertainties: Mapping[str, float], grid: earth.Grid | None,
+    values: Mapping[str, float], altitude_m: float, measured: Mapping[str, float],
+    uncertainties: Mapping[str, float], grid: earth.Grid | None,
 ) -> list[Finding]:  # fmt: skip
     """What the reader should know of a reference."""
     findings = []
@@ -277,7 +271,7 @@ def _findings(
             "a magnetic pole."
         )
         findings.append(Finding(id="magnetic-pole", text=text))
-    if place["altitude_m"] < LOWEST_LAND and "gravity" not in measured:
+    if altitude_m < LOWEST_LAND and "gravity" not in measured:
         text = (
             "below ground gravity does not follow the free-air gradient of normal gravity: its "
             "uncertainty is enlarged. Measure gravity, or use the altitude of the ground."

@@ -80,7 +80,9 @@ def measured(function: options.Function) -> options.Function:
     help="A run whose blank references are filled.",
 )
 @options.output(
-    required=False, metavar="REF.json|RUN", help="Reference to write; with --fill the filled run."
+    required=False,
+    metavar="REF.json|RUN.csv",
+    help="Reference to write; with --fill the filled run.",
 )
 @options.DECIMAL
 @options.JSON
@@ -109,6 +111,10 @@ def command(
     options.check_outputs([output], [run])
     if run and not output:
         raise InputError("`run` needs a file for the filled run. Add `output`.")
+    if output and not run and output.suffix.lower() != ".json":
+        raise InputError(
+            f"`output` '{output}': a reference is written as JSON. Name a file that ends in .json, or add `run`."
+        )
     values, sd = (
         {name: typed[prefix + key] for name, key in MEASURABLE.items()} for prefix in ("", "sd_")
     )
