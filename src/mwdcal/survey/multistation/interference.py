@@ -20,6 +20,8 @@ from mwdcal.survey.multistation.interference_estimate import (
     Estimate,
     estimate,
     misfits,
+    surveys,
+    varied,
 )
 from mwdcal.survey.multistation.separability import missing
 
@@ -159,6 +161,11 @@ def interference(
             f"{count} of {readings.count} can be used. Add surveys, best at other toolfaces."
         )
     chosen = readings if used.all() else readings.select(used)
+    if not varied(surveys(calibration, chosen)):
+        raise FitError(
+            f"{readings.name}: all surveys are at one attitude and one toolface, and tell no more than one. Add "
+            "surveys at other toolfaces."
+        )
     whole = estimate(calibration, chosen, assumed)
     corrected = corrected_calibration(calibration, whole)
     depths = np.full(count, np.nan) if depth is None else np.asarray(depth, float)[used]

@@ -22,7 +22,7 @@ from mwdcal.calibration.record import Calibration
 from mwdcal.errors import InputError
 from mwdcal.estimation.uncertainty import TANGENT_STEP, analyse, tangent
 from mwdcal.geometry.observables import OBSERVABLES
-from mwdcal.geometry.vectors import Array, diagonal
+from mwdcal.geometry.vectors import Array, Bools, diagonal
 from mwdcal.survey.place.references import PLACE_SD
 from mwdcal.survey.well import UNKNOWN_GRAVITY, unknown_gravity
 
@@ -34,6 +34,8 @@ USUAL_SD = {
     "dip": float(np.radians(PLACE_SD.dip_deg)),
 }
 """1σ of references, common to a well, where the readings state none, g, nT and rad: those of global models."""
+LEAST_VARIATION = float(np.radians(2.0))
+"""Directions of gravity and field in the tool that differ by less, rad, make of many surveys one."""
 DETERMINED_SHARE = 0.5
 """A direction is determined by the readings if they leave less than this share of what was assumed."""
 
@@ -112,7 +114,7 @@ class Estimate:
     @property
     def separable(self) -> Array:
         """Whether (B,) the azimuth of every station is of use after the correction."""
-        whole = self.result.analysis.determined.keep.all(-1)
+        whole = self.result.analysis.determined.keep.all(-1) & varied(self.readings)
         limit = np.radians(self.assumed.largest_azimuth_sd_deg)
         return np.asarray(whole & (self.azimuth_sd.max(-1) <= limit))
 
@@ -194,6 +196,15 @@ def surveys(calibration: Calibration, readings: Readings) -> Readings:
         sd["gravity"] = np.hypot(sd["gravity"], UNKNOWN_GRAVITY)
     known = {name: readings.reference(name) for name in CONSTANTS}
     return replace(readings, known=known, sd=sd)
+
+
+def varied(readings: Readings) -> Bools:
+    """Whether (...) surveys differ in attitude or toolface: gravity or field in the tool by `LEAST_VARIATION`."""
+    turned = []
+    for value in (readings.accelerometer, readings.magnetometer):
+        unit = np.asarray(value) / np.linalg.norm(np.asarray(value), axis=-1, keepdims=True)
+        turned.append(np.linalg.norm(unit - unit[..., :1, :], axis=-1).max(-1))
+    return np.asarray(np.maximum(*turned) > LEAST_VARIATION)
 
 
 def _options(calibration: Calibration, assumed: Assumed) -> Options:

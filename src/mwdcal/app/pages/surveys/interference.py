@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -112,7 +112,7 @@ def draw_strengths(summary: MultiStationAnalysis) -> Figure:
         _mark(axes, off, depth, rows)
     panels[0].set(xlabel="|b| less reference, nT", ylabel=title)
     panels[1].set(xlabel="dip less reference, °")
-    _finish(figure, panels[0], depth)
+    _finish(figure, panels, depth)
     return figure
 
 
@@ -137,8 +137,7 @@ def draw_azimuths(summary: MultiStationAnalysis) -> Figure:
     for (name, word), (colour, marker, line) in zip(names.items(), plots.SERIES[1:], strict=False):
         panels[1].plot(_column(rows, name), depth, ls=line, marker=marker, color=colour, label=word)
     panels[1].set(xlabel="inclination, azimuth, °")
-    panels[1].legend(loc="upper right")
-    _finish(figure, first, depth)
+    _finish(figure, panels, depth)
     return figure
 
 
@@ -156,8 +155,10 @@ def _mark(axes: Axes, value: Array, depth: Array, rows: list[InterferenceStation
         axes.plot(value[some], depth[some], "x", ms=7, color=plots.MARKED, label="doubtful")
 
 
-def _finish(figure: Figure, axes: Axes, depth: Array) -> None:
+def _finish(figure: Figure, panels: Sequence[Axes], depth: Array) -> None:
     """Depth downwards, and one legend above the panels."""
     room = 0.03 * max(float(np.ptp(depth)), 1.0)
-    axes.set_ylim(float(depth.max()) + room, float(depth.min()) - room)
-    figure.legend(*axes.get_legend_handles_labels(), loc="outside upper left", ncols=4)
+    panels[0].set_ylim(float(depth.max()) + room, float(depth.min()) - room)
+    pairs = [zip(*axes.get_legend_handles_labels(), strict=True) for axes in panels]
+    handles = {label: handle for each in pairs for handle, label in each}
+    figure.legend(handles.values(), handles, loc="outside upper left", ncols=5)
