@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from dataclasses import replace
 from functools import cache
@@ -18,7 +19,7 @@ from mwdcal.calibration.readings import Readings
 from mwdcal.errors import InputError
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import centred, diagonal, reference_vectors
-from mwdcal.planning.simulate import Earth, grid, run, servo
+from mwdcal.planning.simulate import Earth, Truth, grid, run, servo
 from mwdcal.survey.acceptance import (
     STRENGTH_NAMES,
     Judgement,
@@ -375,3 +376,103 @@ def test_long_well_is_like_its_parts(example, tmp_path):
         if name.endswith(("_deg", "_m", "_nt", "_g")):
             one, other = (np.array(t[name], float) for t in (whole, parts))
             np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12)
+
+
+# ------------------------------------------------------------------ multi-station analysis
+
+
+def with_iron(folder, axial, inclination=None, azimuth=None):
+    """The example's well, or 30 surveys at one attitude, with axial interference; nominal nT by the profile."""
+    columns = read_csv(EXAMPLE / "well.csv")
+    if inclination is not None:
+        roll = np.radians(np.arange(30) * 77.0)
+        g, b = reference_vectors(inclination, azimuth, roll, 1.0, 48_000.0, np.radians(63))
+        truth = json.loads((EXAMPLE / "truth.json").read_text("utf-8"))
+        tool = Truth(np.array(truth["accelerometer"]), np.array(truth["magnetometer"]))
+        raw = tool.readings((g, b + np.array([0, 0, axial])), np.full(30, 25.1))
+        noise = np.random.default_rng(5).normal(size=(6, 30))
+        columns = {name: values[:30] for name, values in columns.items()}
+        for k, name in enumerate(("ax", "ay", "az")):
+            columns[name] = raw["accelerometer"][:, k] * 3.0 + 3e-4 * noise[k]
+        for k, name in enumerate(("mx", "my", "mz")):
+            columns[name] = raw["magnetometer"][:, k] * 5e-5 + 7.5e-4 * noise[3 + k]
+    else:
+        columns["mz"] = [f"{float(value) + 5e-5 * axial:.6f}" for value in columns["mz"]]
+    columns |= {"sd_ref_field_nt": ["130"] * len(columns["ax"])}
+    columns |= {"sd_ref_dip_deg": ["0.2"] * len(columns["ax"])}
+    return write_csv(folder / "iron.csv", columns, "simulated = true")
+
+
+def test_msa_takes_axial_interference_off(example, tmp_path):
+    source, out = with_iron(tmp_path, 1500), tmp_path / "out.csv"
+    plain = cli("survey", example, source, "-o", out, "--json").json
+    assert plain["rejected"] > 20
+    assert plain["interference"] is plain["separable"] is None
+    ran = cli(
+        "survey", example, source, "-o", out, "--msa", "--json", "--msa-html", tmp_path / "m.html"
+    )
+    assert ran.code == 0, ran
+    size = ran.json["interference"]
+    # 1500 nT on the sensor, whose scale is within 2 % of nominal
+    assert size["axial_nt"] == pytest.approx(1500, abs=3 * size["sd_axial_nt"] + 30)
+    assert ran.json["separable"] is True
+    assert ran.json["rejected"] == 0
+    columns = read_csv(out)
+    depth = np.array(columns["md_m"], float)
+    true = 20 + 0.06 * np.maximum(depth - 600, 0)
+    off = (np.array(columns["azimuth_magnetic_deg"], float) - true + 180) % 360 - 180
+    sd = np.array(columns["sd_azimuth_magnetic_deg"], float)
+    assert np.abs(off / sd).max() < 4
+    assert "SIMULATED" in (tmp_path / "m.html").read_text("utf-8")
+
+
+def test_msa_near_horizontal_east_west_is_refused(example, tmp_path):
+    source, out = with_iron(tmp_path, 1500, np.radians(89), np.radians(90)), tmp_path / "out.csv"
+    ran = cli("survey", example, source, "-o", out, "--msa")
+    assert "do not separate interference from azimuth" in refused(ran, 3)
+    assert not out.exists()
+    ran = cli("survey", example, source, "-o", out, "--msa", "--json")
+    assert ran.code == 3
+    assert ran.json["separable"] is False
+    assert ran.json["msa"]["missing"]
+    assert not out.exists()
+    north = with_iron(tmp_path, 1500, np.radians(60), np.radians(10))
+    assert cli("survey", example, north, "-o", out, "--msa", "--json").json["separable"] is True
+
+
+def test_page_of_the_analysis_goes_with_it(example, tmp_path):
+    ran = cli(
+        "survey",
+        example,
+        EXAMPLE / "well.csv",
+        "-o",
+        tmp_path / "o.csv",
+        "--msa-html",
+        tmp_path / "m.html",
+    )
+    assert "--msa" in refused(ran, 2)
+
+
+# ------------------------------------------------------------------ sensor terms
+
+
+def test_tool_model_of_a_calibration(example, tmp_path):
+    ran = cli("convert", example, "--to", "tool-model", "-o", tmp_path / "m.json", "--json")
+    assert ran.code == 0, ran
+    terms = {term["name"]: term for term in ran.json["terms"]}
+    model = json.loads((tmp_path / "m.json").read_text("utf-8"))
+    values = {term["name"]: term["value"] for term in model["terms"]}
+    assert values["ABZ"] == pytest.approx(terms["ABZ"]["value"])
+    assert terms["MBZ"]["ratio"] == pytest.approx(terms["MBZ"]["value"] / 70)
+    assert "ABXY" in cli("convert", example, "--to", "tool-model", "-o", tmp_path / "m.json").out
+    bad = cli(
+        "convert",
+        example,
+        "--to",
+        "tool-model",
+        "-o",
+        tmp_path / "m.json",
+        "--temperature",
+        "course",
+    )
+    assert "--temperature" in refused(bad, 2)
