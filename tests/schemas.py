@@ -23,6 +23,7 @@ from mwdcal.app.screens import (
     simulation,
     stations,
 )
+from mwdcal.app.screens.surveys import reference, survey
 from mwdcal.calibration.record import DOCUMENT_VERSION, SCHEMA_VERSION, Calibration
 from mwdcal.use.verification import Verdict
 
@@ -37,8 +38,10 @@ CONTENTS: dict[str, type] = {
     "noise": noise.NoiseSummary,
     "plan": plan.PlanDocument,
     "profile": proposal.ProposalSummary,
+    "reference": reference.ReferenceSummary,
     "simulate": simulation.SimulationSummary,
     "stations": stations.StationsSummary,
+    "survey": survey.SurveySummary,
     "verify": Verdict,
 }
 """What follows the envelope in the document of each command."""

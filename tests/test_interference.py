@@ -21,8 +21,8 @@ from mwdcal.estimation.batch import take
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import centred
 from mwdcal.planning.simulate import grid, run, servo
-from mwdcal.survey.interference import deviations, interference
-from mwdcal.survey.interference_estimate import Assumed, Estimate, estimate, misfits
+from mwdcal.survey.multistation.interference import deviations, interference
+from mwdcal.survey.multistation.interference_estimate import Assumed, Estimate, estimate, misfits
 from simulation import DEG, Tool, attitude
 from test_calibrate import PROFILE, make
 from wells import (

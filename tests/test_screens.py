@@ -45,6 +45,7 @@ SCREENS = {
     "simulate-repeat": ("simulate", "--plan", "six-state", "--repeat", "20", "--limits", "tight.toml",
                         "--workers", "1", "-o", "made.parquet"),
     "stations": ("stations", "demo/log.csv", "-o", "stations.csv"),
+    "survey": ("survey", "tool.json", "demo/well.csv", "-o", "made.csv"),
     "misused": ("calibrate", "demo/run.csv"),
 }  # fmt: skip
 """Commands and what they run on."""

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from functools import cache
+from unittest.mock import patch
 
 import numpy as np
 import pytest
 from scipy.stats import chi2
 
 import mwdcal
+from cli_support import EXAMPLE, read_csv, refused, write_csv
+from cli_support import mwdcal as cli
 from mwdcal.calibration.readings import Readings
 from mwdcal.errors import InputError
 from mwdcal.geometry.observables import OBSERVABLES
@@ -23,6 +27,7 @@ from mwdcal.survey.acceptance import (
     judged,
     load_survey_limits,
 )
+from mwdcal.survey.path import well_path
 from mwdcal.survey.stations import STRENGTHS, SURVEYED, surveyed, switched
 
 EARTH = Earth()
@@ -222,3 +227,151 @@ def test_limits_that_are_none(tmp_path, text, message):
 
 def test_strengths_lie_where_they_are_said_to():
     assert SURVEYED[STRENGTHS] == ("gravity", "field", "dip")
+
+
+# ------------------------------------------------------------------ the command
+
+
+@pytest.fixture(scope="module")
+def example(tmp_path_factory):
+    """The calibration of the bundled example."""
+    folder = tmp_path_factory.mktemp("well")
+    fit = ("calibrate", EXAMPLE / "run.csv", "--tool", EXAMPLE / "tool.toml")
+    assert cli(*fit, "-o", folder / "tool.json").code == 0
+    return folder / "tool.json"
+
+
+def surveyed_file(example, folder, columns=None, *options, metadata=()):
+    """The table that `survey` makes of the example's well, changed; and the document it prints."""
+    source = EXAMPLE / "well.csv"
+    if columns is not None:
+        stated = ("simulated = true", *metadata)
+        source = write_csv(folder / "in.csv", {**read_csv(source), **columns}, *stated)
+    out = folder / "out.csv"
+    ran = cli("survey", example, source, "-o", out, "--json", *options)
+    assert ran.code == 0, ran
+    return read_csv(out), ran.json
+
+
+def test_columns_of_a_well(example, tmp_path):
+    columns, document = surveyed_file(example, tmp_path)
+    given = read_csv(EXAMPLE / "well.csv")
+    assert [*columns][: len(given)] == [*given]
+    values = {k: np.array(v, float) for k, v in columns.items() if k.endswith(("_deg", "_m"))}
+    depth = np.array(given["md_m"], float)
+    inclination = np.minimum(np.maximum(0.08 * (depth - 120), 0.5), 70)
+    azimuth = 20 + 0.06 * np.maximum(depth - 600, 0) + 2.4
+    for name, true in {"inclination": inclination, "azimuth_true": azimuth}.items():
+        off = (values[f"{name}_deg"] - true + 180) % 360 - 180
+        assert np.abs(off / values[f"sd_{name}_deg"]).max() < 4
+    assert (values["azimuth_true_deg"] - values["azimuth_magnetic_deg"]) % 360 == pytest.approx(2.4)
+    assert "azimuth_grid_deg" not in columns
+    assert set(columns["accepted"]) == {"true"}
+    assert set(columns["toolface_kind"]) == {"gravity", "magnetic"}
+    assert document["accepted"] == document["rows"] == 36
+    assert document["north"] == "true"
+    assert document["simulated"] is True
+    reference = well_path(depth, np.radians(inclination), np.radians(azimuth))
+    for k, name in enumerate(("north_m", "east_m", "tvd_m")):
+        assert values[name] == pytest.approx(reference[:, k], abs=5 * values[f"sd_{name}"].max())
+        assert document["end"][name] == pytest.approx(float(columns[name][-1]), abs=1e-6)
+
+
+def test_reference_file_gives_norths_and_limits(example, tmp_path):
+    place = tmp_path / "here.json"
+    made = cli(
+        *("reference", "--latitude", "60", "--longitude", "3.5", "--altitude-m", "0"),
+        *("--date", "2026-06-01", "--crs", "EPSG:23031", "--field-nt", "48000"),
+        *("--dip-deg", "63", "--gravity-g", "1", "--json"),
+    )
+    assert made.code == 0, made
+    place.write_text(made.out)
+    blank = dict.fromkeys(("ref_gravity_g", "ref_field_nt", "ref_dip_deg"), [""] * 36)
+    columns, document = surveyed_file(example, tmp_path, blank, "--reference", place)
+    stated = made.json
+    true, grid, magnetic = (
+        np.array(columns[f"azimuth_{name}_deg"], float) for name in ("true", "grid", "magnetic")
+    )
+    assert (true - magnetic) % 360 == pytest.approx(stated["declination_deg"] % 360)
+    assert (true - grid) % 360 == pytest.approx(stated["convergence_deg"] % 360)
+    sd = np.array(columns["sd_azimuth_grid_deg"], float)
+    alone = np.array(columns["sd_azimuth_magnetic_deg"], float)
+    shared = np.hypot(stated["sd_declination_deg"], stated["sd_random_declination_deg"])
+    assert sd == pytest.approx(np.hypot(alone, shared))
+    assert document["not_judged"] == 0
+    assert document["north"] == "grid"
+    assert document["reference_sha256"]
+
+
+def test_without_reference_nothing_is_accepted(example, tmp_path):
+    blank = dict.fromkeys(("ref_gravity_g", "ref_field_nt", "ref_dip_deg"), [""] * 36)
+    columns, document = surveyed_file(example, tmp_path, blank)
+    assert set(columns["accepted"]) == {""}
+    assert document["not_judged"] == 36
+    assert "not-judged" in {finding["id"] for finding in document["findings"]}
+    assert document["north"] == "magnetic"
+    assert "azimuth_true_deg" not in columns
+
+
+def test_hot_stations_have_no_result_and_no_position(example, tmp_path):
+    warm = ["25.1"] * 36
+    warm[5] = "90"
+    columns, document = surveyed_file(example, tmp_path, {"temperature_c": warm})
+    assert columns["inclination_deg"][5] == columns["tvd_m"][5] == columns["accepted"][5] == ""
+    assert columns["tvd_m"][6] != ""
+    assert document["blank"] == 1
+    assert {"outside-temperature", "left-out"} <= {f["id"] for f in document["findings"]}
+    columns, _ = surveyed_file(
+        example, tmp_path, {"temperature_c": warm}, "--outside", "extrapolate"
+    )
+    assert columns["inclination_deg"][5] != ""
+    assert columns["sd_inclination_deg"][5] == ""
+
+
+def test_tie_in_moves_the_path(example, tmp_path):
+    first, _ = surveyed_file(example, tmp_path)
+    moved, document = surveyed_file(example, tmp_path, None, "--tie-in", "100,-20,1000")
+    for name, shift in (("north_m", 100), ("east_m", -20), ("tvd_m", 1000)):
+        gap = np.array(moved[name], float) - np.array(first[name], float)
+        assert gap == pytest.approx(shift)
+    assert "path-from-first" not in {f["id"] for f in document["findings"]}
+
+
+@pytest.mark.parametrize(
+    ("columns", "options", "message"),
+    [
+        ({"md_m": [str(1000 - i) for i in range(36)]}, (), "must increase"),
+        ({"md_m": ["-5", *map(str, range(35))]}, (), "between 0 and 20000"),
+        ({"accepted": ["x"] * 36}, (), "'accepted' is there already"),
+        ({"MD (ft)": ["1"] * 36}, (), "column 'md_m' twice|measured depths must be in metres"),
+        ({}, ("--switch", "5"), "--switch"),
+        ({}, ("--switch", "6,5"), "--switch"),
+        ({}, ("--tie-in", "1,2"), "--tie-in"),
+        ({}, ("--limits", "nothing"), "nothing"),
+        ({}, ("--outside", "hide"), "--outside"),
+    ],
+)
+def test_bad_input_of_a_well(example, tmp_path, columns, options, message):
+    given = read_csv(EXAMPLE / "well.csv")
+    if "MD (ft)" in columns:
+        del given["md_m"]
+    source = write_csv(tmp_path / "in.csv", {**given, **columns}, "simulated = true")
+    ran = cli("survey", example, source, "-o", tmp_path / "out.csv", *options)
+    assert re.search(message, refused(ran, 2))
+    assert not (tmp_path / "out.csv").exists()
+
+
+def test_long_well_is_like_its_parts(example, tmp_path):
+    """Results do not depend on how many stations are worked on at once."""
+    from mwdcal.survey import position, stations
+
+    whole, _ = surveyed_file(example, tmp_path)
+    with (
+        patch.object(stations, "STATIONS_AT_ONCE", 7),
+        patch.object(position, "STATIONS_AT_ONCE", 5),
+    ):
+        parts, _ = surveyed_file(example, tmp_path)
+    for name in whole:
+        if name.endswith(("_deg", "_m", "_nt", "_g")):
+            one, other = (np.array(t[name], float) for t in (whole, parts))
+            np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12)

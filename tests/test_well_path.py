@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +31,9 @@ from simulation import Tool
 from test_calibrate import PROFILE, make, many_runs
 
 SURVEYS = Path(os.environ.get("MWDCAL_DATA", "")) / "survey"
+needs_published_wells = pytest.mark.skipif(
+    "MWDCAL_DATA" not in os.environ, reason="published wells: set MWDCAL_DATA"
+)
 STATIONS = 12
 
 
@@ -44,7 +48,7 @@ def random_wells(seed, wells=5, count=STATIONS):
     return md, inclination, azimuth
 
 
-@pytest.mark.skipif(not SURVEYS.is_dir(), reason="needs the published wells")
+@needs_published_wells
 def test_the_iscwsa_clearance_wells_within_their_rounding():
     wells = json.loads((SURVEYS / "iscwsa_clearance_wells.json").read_text())["wells"]
     assert len(wells) == 12
@@ -170,8 +174,10 @@ def planned_well():
     return md, inclination, azimuth, toolface
 
 
-def calibrated_wells(md, inclination, azimuth, toolface, count=WELLS):
-    """Paths (count, n, 3) of one well by one tool, calibrated anew for each of them from readings with noise."""
+@cache
+def calibrated_wells(count=WELLS):
+    """Paths (count, n, 3) of the planned well by one tool, calibrated anew for each from readings with noise."""
+    md, inclination, azimuth, toolface = planned_well()
     tool, rng = Tool.random(7), np.random.default_rng(3)
     result = fit(many_runs(count, 5, (5, 45, 90, 135), 12), Options())
     assert (result.status == 0).all()
@@ -192,7 +198,7 @@ def test_covariance_of_ten_thousand_calibrated_wells(north_sd):
     """Standard deviations within 3 % along each axis, and in every other direction: correlations too."""
     md, *angles = planned_well()
     turn = rotation(north_sd * np.random.default_rng(1).standard_normal((WELLS, 1)) * [0, 0, 1])
-    errors = calibrated_wells(md, *angles) @ turn.mT - well_path(md, *angles[:2])
+    errors = calibrated_wells() @ turn.mT - well_path(md, *angles[:2])
     drawn = np.einsum("wni,wnj->nij", errors, errors) / WELLS
     record, readings = calibrate(make(), PROFILE), Readings(*Tool.random(7).clean(*angles))
     path, covariance = calibrated_path(record, readings, md, declination_sd=north_sd)
@@ -231,6 +237,21 @@ def test_the_path_turns_with_north():
     other, turned = calibrated_path(record, readings, md, 0.4, start=turn @ (3.0, -5.0, 7.0))
     np.testing.assert_allclose(other, path @ turn.T, atol=1e-8)
     np.testing.assert_allclose(turned, turn @ covariance @ turn.T, atol=1e-12)
+
+
+def test_north_that_changes_from_station_to_station():
+    """A turn of each direction about the vertical: half the legs around a station, times its sine of inclination."""
+    record, (md, *angles) = calibrate(make(), PROFILE), planned_well()
+    readings = readings_at(record, *angles)
+    errors = [direction_errors(record, readings, declination_noise=noise) for noise in (0.0, 0.01)]
+    added = position_covariance(md, *angles[:2], random=errors[1].random - errors[0].random)
+    level = angles[0] > np.radians(89)
+    arm = 60.0 * np.sin(angles[0])
+    arm[0] /= 2
+    most = 0.01**2 * (np.cumsum(arm**2) - arm**2 + (arm / 2) ** 2)
+    across = added[:, 0, 0] + added[:, 1, 1]
+    np.testing.assert_allclose(across[level], most[level], rtol=0.01)
+    assert not added[:, 2, 2].max() > 1e-3 * across.max()
 
 
 def test_what_no_evidence_determines_leaves_no_covariance():

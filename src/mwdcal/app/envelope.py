@@ -20,6 +20,7 @@ INPUTS = {
     "noise": ("log", "profile"),
     "plan": ("profile", "measured"),
     "profile": ("run",),
+    "reference": ("run",),
     "simulate": ("plan", "profile", "calibration", "effects", "rolltest", "limits"),
     "stations": ("log",),
     "survey": ("calibration", "readings", "reference", "limits"),

@@ -20,9 +20,8 @@ from mwdcal.files.profiles import decoded_toml
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array, Bools, diagonal
 from mwdcal.survey.stations import STRENGTHS, SURVEYED, Surveys
-from mwdcal.use.strengths import STRENGTH_UNITS
+from mwdcal.use.strengths import STANDARD_GRAVITY
 
-MS2_PER_G = STRENGTH_UNITS["gravity"]["m/s²"]
 STRENGTH_NAMES = SURVEYED[STRENGTHS]
 SURVEY_UNITS = {
     "gravity": ("mg", 1e3, 2),
@@ -43,7 +42,7 @@ class SensorTerms(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
 
     def covariance(self, g: Array, b: Array) -> Array:
         """Covariance (..., 6) on the diagonal, of both vectors (..., 3): g² and nT²."""
-        gravity = self.accelerometer_bias_ms2 / MS2_PER_G
+        gravity = self.accelerometer_bias_ms2 / STANDARD_GRAVITY
         variance = np.concatenate(
             [
                 gravity**2 + (self.accelerometer_scale * g) ** 2,
@@ -65,7 +64,7 @@ class ReferenceTerms(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     def sd(self, name: str) -> float:
         """That of gravity, field or dip in g, nT or radians."""
         return {
-            "gravity": self.gravity_ms2 / MS2_PER_G,
+            "gravity": self.gravity_ms2 / STANDARD_GRAVITY,
             "field": self.field_nt,
             "dip": float(np.radians(self.dip_deg)),
         }[name]

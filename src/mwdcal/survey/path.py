@@ -37,12 +37,14 @@ def hole_direction(inclination: ArrayLike, azimuth: ArrayLike) -> Array:
 class Arcs:
     """Arcs between neighbouring stations: unit vectors (…, n - 1, 3) at both ends, course length (…, n - 1), m.
 
+    `balanced`: by the balanced tangential method, s = 1/2 whatever the dogleg.
     Singular: NaN where both ends point in exactly opposite directions, as the plane of the arc is not known.
     """
 
     upper: Array
     lower: Array
     length: Array
+    balanced: bool = False
 
     @property
     def dogleg(self) -> Array:
@@ -56,6 +58,8 @@ class Arcs:
 
     def _share(self) -> Array:
         """The share s = tan(β/2) / β of the sum of both directions."""
+        if self.balanced:
+            return np.full_like(self.length, 0.5)
         sine, cosine = self._half()
         angle = 2 * np.arctan2(sine, cosine)
         straight = angle < _SHORT
@@ -87,6 +91,8 @@ class Arcs:
 
     def _bend(self) -> Array:
         """The derivative s' of that share with respect to cos β."""
+        if self.balanced:
+            return np.zeros_like(self.length)
         sine, cosine = self._half()
         angle = 2 * np.arctan2(sine, cosine)
         straight = angle < _SHORT
@@ -99,9 +105,10 @@ class Arcs:
         )
 
 
-def arcs(md: ArrayLike, direction: Array) -> Arcs:
+def arcs(md: ArrayLike, direction: Array, balanced: bool = False) -> Arcs:
     """The arcs between stations at measured depths (…, n), m, with directions (…, n, 3)."""
-    return Arcs(direction[..., :-1, :], direction[..., 1:, :], np.diff(np.asarray(md, float)))
+    length = np.diff(np.asarray(md, float))
+    return Arcs(direction[..., :-1, :], direction[..., 1:, :], length, balanced)
 
 
 def well_path(

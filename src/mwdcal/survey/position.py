@@ -141,12 +141,14 @@ def position_covariance(
     azimuth: ArrayLike,
     systematic: ArrayLike | None = None,
     random: ArrayLike | None = None,
+    balanced: bool = False,
 ) -> Array:
     """Covariance (…, n, 3, 3) of the positions (north, east, down) of survey stations, m².
 
     `systematic` (…, n, k, 2 or 3): shifts upward, sideways and, where there is a third, in measured depth, by one
     standard deviation of each of k independent causes that last over the well. `random` (…, n, 2, 2 or 3, 3):
     covariance of the same of the errors that are new at every station.
+    `balanced`: by the balanced tangential method, as the numbers of published error models are.
     The first station is where the path starts: its position is exact, its direction has the errors given for it.
     Units: m, radians. Singular: finite at vertical, with any number for the azimuth that the shifts refer to.
     Memory: of the result and of the causes given, however many stations there are.
@@ -162,7 +164,9 @@ def position_covariance(
         errors = DirectionErrors(inc[..., where], azi[..., where], lasting[stations], new[stations])
         return md[..., where], errors
 
-    return np.concatenate([covariance for _, covariance in _along(md.shape[-1], part)], -3)
+    return np.concatenate(
+        [covariance for _, covariance in _along(md.shape[-1], part, balanced=balanced)], -3
+    )
 
 
 def calibrated_path(
@@ -204,16 +208,16 @@ def _along(
     count: int,
     part: Callable[[slice], tuple[Array, DirectionErrors]],
     start: ArrayLike = (0.0, 0.0, 0.0),
+    balanced: bool = False,
 ) -> Iterator[tuple[Array, Array]]:
     """Positions (…, m, 3) and covariance (…, m, 3, 3) of all stations of a well, some at a time."""
     sums = None
     for first in range(0, max(count, 1), STATIONS_AT_ONCE):
-        where = slice(
-            max(first - 1, 0), first + STATIONS_AT_ONCE
-        )  # from the last one of the part before
+        # each part begins with the last station of the one before
+        where = slice(max(first - 1, 0), first + STATIONS_AT_ONCE)
         md, errors = part(where)
         sums = sums or _no_sums(md, errors, start)
-        position, covariance, sums = _part_of_path(md, errors, sums)
+        position, covariance, sums = _part_of_path(md, errors, sums, balanced)
         skipped = first - where.start
         yield position[..., skipped:, :], covariance[..., skipped:, :, :]
 
@@ -225,18 +229,22 @@ def _no_sums(md: Array, errors: DirectionErrors, start: ArrayLike) -> _Sums:
     return _Sums(position, np.zeros((*wells, causes, 3)), np.zeros((*wells, 3, 3)), arrival)
 
 
-def _part_of_path(md: Array, errors: DirectionErrors, before: _Sums) -> tuple[Array, Array, _Sums]:
+def _part_of_path(
+    md: Array, errors: DirectionErrors, before: _Sums, balanced: bool
+) -> tuple[Array, Array, _Sums]:
     """Positions and covariance of stations the first of which has the sums `before`, and those of the last."""
-    inclination, azimuth, random = errors.inclination, errors.azimuth, errors.random
-    arc = arcs(md, hole_direction(inclination, azimuth))
-    turns = tilts(inclination, azimuth)
-    leaving, arriving = _steps(arc, turns, errors.systematic)
+    arc = arcs(md, hole_direction(errors.inclination, errors.azimuth), balanced)
+    upper, lower = _reach(arc, tilts(errors.inclination, errors.azimuth))
+    shifts, random = errors.systematic, errors.random
+    rows = slice(shifts.shape[-1])
+    step = (
+        shifts[..., :-1, :, :] @ upper[..., rows, :] + shifts[..., 1:, :, :] @ lower[..., rows, :]
+    )
     position = _sums_from(before.position, arc.displacement, -2)
-    shift = _sums_from(before.shift, leaving + arriving, -3)
-    unit = np.broadcast_to(np.eye(random.shape[-1]), random.shape)
-    leaving, arriving = _steps(arc, turns, unit)
-    arrival = np.concatenate([before.arrival[..., None, :, :], arriving], -3)
-    through = arrival[..., :-1, :, :] + leaving
+    shift = _sums_from(before.shift, step, -3)
+    rows = slice(random.shape[-1])
+    arrival = np.concatenate([before.arrival[..., None, :, :], lower[..., rows, :]], -3)
+    through = arrival[..., :-1, :, :] + upper[..., rows, :]
     passed = through.mT @ random[..., :-1, :, :] @ through
     settled = _sums_from(before.settled, passed, -3)
     covariance = settled + arrival.mT @ random @ arrival + shift.mT @ shift
@@ -244,18 +252,14 @@ def _part_of_path(md: Array, errors: DirectionErrors, before: _Sums) -> tuple[Ar
     return position, covariance, last
 
 
-def _steps(arc: Arcs, turns: Array, shifts: Array) -> tuple[Array, Array]:
-    """Changes (…, n - 1, k, 3) of each step by shifts (…, n, k, 2 or 3) at its upper and at its lower end."""
-    turned = shifts[..., :2] @ turns
-    upper, lower = (
-        part @ end.mT
-        for part, end in zip(
-            (turned[..., :-1, :, :], turned[..., 1:, :, :]), arc.by_directions(), strict=True
-        )
+def _reach(arc: Arcs, turns: Array) -> tuple[Array, Array]:
+    """Changes (…, n - 1, 3, 3) of each step by a shift upward, sideways and in depth at its upper and lower end."""
+    upper, lower = arc.by_directions()
+    along = arc.by_length[..., None, :]
+    return (
+        np.concatenate([turns[..., :-1, :, :] @ upper.mT, -along], -2),
+        np.concatenate([turns[..., 1:, :, :] @ lower.mT, along], -2),
     )
-    along = shifts[..., 2:].sum(-1, keepdims=True) * np.ones(3)
-    by_length = arc.by_length[..., None, :]
-    return upper - along[..., :-1, :, :] * by_length, lower + along[..., 1:, :, :] * by_length
 
 
 def _sums_from(first: Array, steps: Array, axis: int) -> Array:

@@ -17,14 +17,14 @@ from mwdcal.files.contract import REFERENCES, check_columns, stated_norths
 from mwdcal.files.formats.table import Table, cell_error, numbers
 from mwdcal.files.runs import renamed, to_readings
 from mwdcal.geometry.vectors import Array
-from mwdcal.survey.references import MEASURABLE, EarthReference
+from mwdcal.survey.place.references import MEASURABLE, EarthReference
 from mwdcal.survey.well import North, Well
 
 MEASURED_DEPTH = "md_m"
 """The column of measured depths, m."""
 LARGEST_DEPTH = 20_000.0
 """No hole is longer, m."""
-_DEPTHS = re.compile(
+_DEPTH_NAMES = re.compile(
     r"(md|(measured|bit|survey)?[ _]?depth)[ _]*[\[(]?(m|ft|feet|met(re|er)s?)?[\])]?"
 )
 
@@ -68,7 +68,7 @@ def _referenced(readings: Readings, reference: EarthReference) -> Readings:
 def _depths(table: Table) -> Array | None:
     if MEASURED_DEPTH not in table.columns:
         for name in table.columns:
-            if _DEPTHS.fullmatch(name.strip().lower()):
+            if _DEPTH_NAMES.fullmatch(name.strip().lower()):
                 raise InputError(
                     f"{table.source}: column '{name}': measured depths must be in metres, in a column "
                     f"'{MEASURED_DEPTH}'. Rename it, and convert feet (× 0.3048)."

@@ -23,8 +23,8 @@ WELL_FINDINGS = {
     "survey again.",
     "not-judged": "{count} of {rows} surveys are not judged: no reference for |g|, |b| or dip. Give `reference`, or "
     "columns ref_gravity_g, ref_field_nt, ref_dip_deg.",
-    "laboratory-gravity": "the calibration took the laboratory's gravity as 1 g, so that |g| is in units of it: it "
-    "departs from the reference by up to 0.3 %, and is judged with that. Calibrate with ref_gravity_g.",
+    "laboratory-gravity": "the calibration's gravity is 1 g, as where its run states none: |g| is then in units of the "
+    "laboratory's gravity, and judged with 1.5 mg more of uncertainty. Calibrate with ref_gravity_g.",
     "magnetic-north": "no declination: azimuths and the well path count from magnetic north.",
     "path-from-first": "the well path starts at the first station, at north 0, east 0 and TVD 0. `tie-in` gives its "
     "position.",
@@ -55,6 +55,11 @@ class North:
         if self.declination is None:
             return "magnetic"
         return "true" if self.convergence is None else "grid"
+
+    @property
+    def declination_uncertainty(self) -> float:
+        """Standard uncertainty of the declination at one station."""
+        return float(np.hypot(self.declination_sd, self.declination_noise))
 
     @property
     def offset(self) -> float:
@@ -111,7 +116,8 @@ class Well:
         )
         columns = _angle("inclination", *inclination)
         for name, offset in norths.items():
-            sd = np.hypot(azimuth[1], self.north.declination_sd if name != "magnetic" else 0.0)
+            turned = self.north.declination_uncertainty if name != "magnetic" else 0.0
+            sd = np.hypot(azimuth[1], turned)
             columns |= _angle(f"azimuth_{name}", wrap(azimuth[0] + offset), sd)
         columns |= _angle("toolface", *toolface)
         kinds = np.where(self.surveys.magnetic, "magnetic", "gravity")

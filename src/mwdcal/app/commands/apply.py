@@ -29,7 +29,7 @@ def command(
     calibration: Path, readings: Path, output: Path, outside: str, missing: str, decimal: str,
     as_json: bool,
 ) -> None:  # fmt: skip
-    """Correct READINGS (CSV, TSV, Parquet or XLSX) with the CALIBRATION of their tool.
+    """Correct READINGS (CSV, TSV, Parquet, XLSX, WITSML or LAS) with the CALIBRATION of their tool.
 
     Writes the columns of READINGS as they are and, beside them: gravity and field along the tool
     axes, inclination, azimuth (magnetic), toolface, dip and strengths.

@@ -2,14 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from math import radians
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from mwdcal.app.commands import options
 from mwdcal.app.messages import findings_as_typed, print_result
 from mwdcal.errors import InputError
+
+if TYPE_CHECKING:
+    from mwdcal.calibration.readings import Readings
+    from mwdcal.calibration.record import Calibration
+    from mwdcal.files.formats.table import Table
+    from mwdcal.geometry.vectors import Array
+    from mwdcal.survey.acceptance import SurveyLimits
+    from mwdcal.survey.multistation.interference import Interference
+    from mwdcal.survey.well import North, Well
 
 
 @options.command()
@@ -21,6 +33,15 @@ from mwdcal.errors import InputError
     type=options.FILE,
     metavar="REF.json",
     help="Gravity, field, dip and declination of the place: what mwdcal reference --json prints.",
+)
+@click.option(
+    "--msa",
+    is_flag=True,
+    help="Multi-station analysis first: take the drill string's interference, as all surveys show it, off the "
+    "magnetometer.",
+)
+@click.option(
+    "--msa-html", type=options.FILE, metavar="M.html", help="Also write a page of that analysis."
 )
 @options.preset(
     "--limits",
@@ -45,8 +66,9 @@ from mwdcal.errors import InputError
 @options.DECIMAL
 @options.JSON
 def command(
-    calibration: Path, readings: Path, output: Path, reference: Path | None, limits: str, switch: str,
-    tie_in: str | None, outside: str, html: Path | None, decimal: str, as_json: bool,
+    calibration: Path, readings: Path, output: Path, reference: Path | None, msa: bool,
+    msa_html: Path | None, limits: str, switch: str, tie_in: str | None, outside: str,
+    html: Path | None, decimal: str, as_json: bool,
 ) -> None:  # fmt: skip
     """Surveys of a well: READINGS in their order, corrected by the CALIBRATION of their tool.
 
@@ -55,47 +77,120 @@ def command(
 
     \b
     Example: mwdcal survey tool.json surveys.csv --reference here.json -o well.csv --html well.html
-    Exit: 0 written, 2 input cannot be read, or does not belong to the calibration.
+    Exit: 0 written, 2 input cannot be read, or does not belong to the calibration, 3 with --msa: the surveys do not
+    separate interference from azimuth.
     """
-    from mwdcal.app.envelope import enveloped
-    from mwdcal.app.screens.surveys import survey as screens
-    from mwdcal.files import documents
+    from mwdcal.files.formats import atomic
     from mwdcal.files.formats import table as tables
-    from mwdcal.files.runs import MOST_ROWS, read_export
-    from mwdcal.survey.acceptance import load_survey_limits
-    from mwdcal.survey.references import load_reference
-    from mwdcal.survey.tables import survey_readings, surveyed_table
+    from mwdcal.survey.tables import surveyed_table
     from mwdcal.survey.well import well
 
-    options.check_outputs([output], [calibration, readings, reference, limits], page=html)
+    if msa_html and not msa:
+        raise InputError("`msa_html` goes with `msa`. Leave it out, or add `msa`.")
+    inputs = [calibration, readings, reference, limits]
+    options.check_outputs([output, msa_html], inputs, page=html)
+    start, ends = _three("tie_in", tie_in), _switch(switch)
+    scene = _scene(calibration, readings, reference, limits, decimal)
+    fitted, analysis, pages = scene.calibration, None, []
+    if msa:
+        analysis, pages = _analysed(scene, msa_html, as_json)
+        fitted = analysis.calibration
+    result = well(fitted, scene.readings, scene.limits, scene.north, scene.md, start, ends, outside)
+    if html:
+        from mwdcal.app.pages.surveys.survey import render
+
+        findings = findings_as_typed(result.findings)
+        pages.append((html, render(result, findings, scene.named)))
+    content = tables.rendered(output, surveyed_table(scene.table, result))
+    atomic.write_all([(output, content), *pages])
+    _print(scene, result, analysis, (str(output), str(html or "")), as_json)
+
+
+@dataclass(frozen=True)
+class _Scene:
+    """What the command was given; digests of its files."""
+
+    calibration: Calibration
+    table: Table
+    readings: Readings
+    md: Array | None
+    north: North
+    limits: SurveyLimits
+    digests: dict[str, str]
+
+    @property
+    def stated(self) -> tuple[Mapping[str, object], Mapping[str, object]]:
+        """What calibration and readings say of themselves."""
+        return self.calibration.tool, self.readings.metadata
+
+    @property
+    def named(self) -> dict[str, str]:
+        """Digests of the files that there are."""
+        return {name: digest for name, digest in self.digests.items() if digest}
+
+
+def _scene(
+    calibration: Path, readings: Path, reference: Path | None, limits: str, decimal: str
+) -> _Scene:
+    """The files read."""
+    from mwdcal.files import documents
+    from mwdcal.files.runs import MOST_ROWS, read_export
+    from mwdcal.survey.acceptance import load_survey_limits
+    from mwdcal.survey.place.references import load_reference
+    from mwdcal.survey.tables import survey_readings
+
     fitted, digest = documents.load(calibration)
     bounds, limits_digest = load_survey_limits(limits)
     source = read_export(readings, fitted.profile, decimal=decimal, rows=MOST_ROWS)
     place, place_digest = load_reference(reference) if reference else (None, "")
     read, md, north = survey_readings(source, fitted, place)
-    result = well(
-        fitted, read, bounds, north, md, _three("tie_in", tie_in), _switch(switch), outside
-    )
-    corrected = surveyed_table(source, result)
-    findings = findings_as_typed(result.findings)
-    document = enveloped(
-        "survey",
-        screens.summary(result, str(output), str(html or "")),
-        *(fitted.tool, read.metadata),
-        calibration=digest,
-        readings=source.digest,
-        reference=place_digest,
-        limits=limits_digest,
-    )
-    tables.write(output, corrected)
-    if html:
-        from mwdcal.app.pages.surveys.survey import render
-        from mwdcal.files.formats import atomic
+    digests = {"calibration": digest, "readings": source.digest, "reference": place_digest}
+    return _Scene(fitted, source, read, md, north, bounds, {**digests, "limits": limits_digest})
 
-        digests = {"calibration": digest, "readings": source.digest, "reference": place_digest}
-        stated = {name: each for name, each in digests.items() if each}
-        atomic.write(html, render(result, findings, {**stated, "limits": limits_digest}))
-    shown = screens.screen(result, str(output), str(html or ""), fitted.tool, read.metadata)
+
+def _analysed(
+    scene: _Scene, page: Path | None, as_json: bool
+) -> tuple[Interference, list[tuple[Path, bytes | str]]]:
+    """The multi-station analysis and its page; one that is not separable is printed and refused."""
+    from mwdcal.app.envelope import enveloped
+    from mwdcal.app.screens.surveys.survey import refusal
+    from mwdcal.files.formats import atomic
+    from mwdcal.survey.multistation.interference import interference
+
+    analysis = interference(scene.calibration, scene.readings, depth=scene.md)
+    pages: list[tuple[Path, bytes | str]] = []
+    if page:
+        from mwdcal.app.pages.surveys.interference import render
+
+        pages.append((page, render(analysis, scene.named)))
+    if not analysis.summary.separable:
+        atomic.write_all(pages)
+        if as_json:
+            refused = refusal(analysis.summary, scene.limits, scene.north)
+            print_result(enveloped("survey", refused, *scene.stated, **scene.digests), [])
+        analysis.check()
+    return analysis, pages
+
+
+def _print(
+    scene: _Scene,
+    result: Well,
+    analysis: Interference | None,
+    files: tuple[str, str],
+    as_json: bool,
+) -> None:
+    """What came of it."""
+    from mwdcal.app.envelope import enveloped
+    from mwdcal.app.screens.surveys import interference as screens_of_msa
+    from mwdcal.app.screens.surveys import survey as screens
+
+    msa = analysis.summary if analysis else None
+    summary = screens.summary(result, *files, msa)
+    document = enveloped("survey", summary, *scene.stated, **scene.digests)
+    shown = screens.screen(result, summary, *scene.stated)
+    if analysis:
+        shown = f"{screens_of_msa.screen(analysis, *scene.stated)}\n\n{shown}"
+    findings = findings_as_typed([*(msa.findings if msa else []), *result.findings])
     print_result(document if as_json else shown, findings)
 
 

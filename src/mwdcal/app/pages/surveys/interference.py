@@ -19,7 +19,11 @@ from mwdcal.app.screens.surveys.interference import (
 from mwdcal.app.text import plural
 from mwdcal.calibration.readings import is_simulated, serial_of
 from mwdcal.geometry.vectors import Array
-from mwdcal.survey.interference import Interference, InterferenceStation, MultiStationAnalysis
+from mwdcal.survey.multistation.interference import (
+    Interference,
+    InterferenceStation,
+    MultiStationAnalysis,
+)
 from mwdcal.use import plots
 
 if TYPE_CHECKING:

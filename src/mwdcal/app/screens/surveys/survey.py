@@ -11,7 +11,9 @@ from mwdcal.app.screens.numbers import fixed, written
 from mwdcal.app.text import one_line, plural, table
 from mwdcal.calibration.readings import simulated
 from mwdcal.calibration.record import Finding
-from mwdcal.survey.well import Well
+from mwdcal.survey.acceptance import SurveyLimits
+from mwdcal.survey.multistation.interference import InterferenceSize, MultiStationAnalysis
+from mwdcal.survey.well import North, Well
 
 MOST_SURVEYS = 30
 """Surveys of a table on screen."""
@@ -34,7 +36,10 @@ class EndOfPath(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class SurveySummary(msgspec.Struct, frozen=True, kw_only=True):
-    """What `survey` prints: stations counted by outcome, what they were judged by, where the path ends."""
+    """What `survey` prints: stations counted by outcome, what they were judged by, where the path ends.
+
+    `msa` is the multi-station analysis, if one was asked for; `interference` and `separable` are of it.
+    """
 
     rows: int
     accepted: int
@@ -50,9 +55,38 @@ class SurveySummary(msgspec.Struct, frozen=True, kw_only=True):
     findings: list[Finding]
     output: str
     html: str
+    interference: InterferenceSize | None = None
+    separable: bool | None = None
+    msa: MultiStationAnalysis | None = None
 
 
-def summary(well: Well, output: str, html: str) -> SurveySummary:
+def refusal(msa: MultiStationAnalysis, limits: SurveyLimits, north: North) -> SurveySummary:
+    """What a multi-station analysis says that cannot be used: no survey is judged, nothing is written."""
+    rows = len(msa.station_rows)
+    return SurveySummary(
+        rows=rows,
+        accepted=0,
+        rejected=0,
+        not_judged=rows,
+        blank=rows,
+        north=north.name,
+        declination_deg=_degrees(north.declination),
+        convergence_deg=_degrees(north.convergence),
+        limits=limits.name,
+        source=limits.source,
+        end=None,
+        findings=msa.findings,
+        output="",
+        html="",
+        interference=msa.interference,
+        separable=msa.separable,
+        msa=msa,
+    )
+
+
+def summary(
+    well: Well, output: str, html: str, msa: MultiStationAnalysis | None = None
+) -> SurveySummary:
     """The result for machines."""
     judged, accepted = well.judgement.judged, well.judgement.accepted
     north = well.north
@@ -71,6 +105,9 @@ def summary(well: Well, output: str, html: str) -> SurveySummary:
         findings=well.findings,
         output=output,
         html=html,
+        interference=msa.interference if msa else None,
+        separable=msa.separable if msa else None,
+        msa=msa,
     )
 
 
@@ -102,9 +139,8 @@ def _stated(value: float) -> float | None:
     return None if np.isnan(value) else value
 
 
-def screen(well: Well, output: str, html: str, *metadata: Mapping[str, object]) -> str:
+def screen(well: Well, facts: SurveySummary, *metadata: Mapping[str, object]) -> str:
     """The surveys for people; `metadata` of calibration and readings."""
-    facts = summary(well, output, html)
     counts = [f"{facts.accepted} accepted", f"{facts.rejected} rejected"]
     if facts.not_judged:
         counts.append(f"{facts.not_judged} not judged")
@@ -117,7 +153,12 @@ def screen(well: Well, output: str, html: str, *metadata: Mapping[str, object]) 
     if facts.end:
         lines.append(end_in_words(facts.end, facts.north))
     return "\n".join(
-        [*map(one_line, lines), "", survey_table(well), written(table=output, page=html)]
+        [
+            *map(one_line, lines),
+            "",
+            survey_table(well),
+            written(table=facts.output, page=facts.html),
+        ]
     )
 
 

@@ -233,7 +233,8 @@ def _covers(system: Any, longitude: float, latitude: float) -> bool:
     if area is None:
         return True
     beyond = (area.east - area.west) % 360.0 or 360.0
-    return bool(area.south <= latitude <= area.north and (longitude - area.west) % 360.0 <= beyond)
+    inside = area.south <= latitude <= area.north and (longitude - area.west) % 360.0 <= beyond
+    return bool(inside)
 
 
 def _library(name: str, what: str) -> Any:

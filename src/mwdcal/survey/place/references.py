@@ -20,8 +20,8 @@ from mwdcal.calibration.readings import EARTH_RANGES
 from mwdcal.calibration.record import DOCUMENT_VERSION, Finding
 from mwdcal.errors import InputError, reason
 from mwdcal.files.contract import AZIMUTH_KEYS, REFERENCES, ROTATION, Range, magnetic_offset
-from mwdcal.survey import earth
-from mwdcal.use.strengths import STRENGTH_UNITS
+from mwdcal.survey.place import earth
+from mwdcal.use.strengths import STANDARD_GRAVITY
 
 MEASURABLE = {
     "gravity": "gravity_g",
@@ -30,8 +30,6 @@ MEASURABLE = {
     "declination": "declination_deg",
 }
 """Values that may be measured, and their keys with the unit."""
-STANDARD_GRAVITY = STRENGTH_UNITS["gravity"]["m/s²"]
-"""1 g, m/s²."""
 GRAVITY_ANOMALY = 4.2e-4
 """Spread of real gravity about normal gravity, m/s²: √1795 mGal (Tscherning and Rapp 1974)."""
 GRADIENT_IN_ROCK = 2.24e-6
@@ -58,6 +56,8 @@ PLACE_SD = FieldSd(*(math.hypot(*terms) for terms in (
 MOMENT_SD = FieldSd(60.0, 0.08, 0.10, 3000.0)
 """Of each station its own: MFIR, MDIR, DECR and DBHR."""
 GEOMAGNETIC = {"field", "dip", "declination"}
+LOWEST_LAND = -500.0
+"""Altitude below which there is no open ground, m."""
 LEAST_HORIZONTAL = 6000.0
 """Horizontal field below which magnetic azimuths need caution by the World Magnetic Model, nT."""
 ALTITUDES = Range(-15_000.0, 100_000.0, "m")
@@ -68,7 +68,6 @@ RANGES_OF_REFERENCE = {
     "longitude_deg": Range(-180.0, 360.0, "°"),
     "altitude_m": ALTITUDES,
     "gravity_g": Range(*EARTH_RANGES["gravity"], "g"),
-    "gravity_ms2": Range(0.9 * STANDARD_GRAVITY, 1.1 * STANDARD_GRAVITY, "m/s²"),
     "field_nt": Range(*EARTH_RANGES["field"], "nT"),
     "dip_deg": REFERENCES["dip"].values,
     "declination_deg": ROTATION,
@@ -254,7 +253,9 @@ def _sources(
         for name in MEASURABLE
     }
     sources["sd_gravity"] = "stated" if "gravity" in measured else GRAVITY_SD_SOURCE
-    sources["sd_field_dip_declination"] = OWSG
+    sources["sd_field_dip_declination"] = (
+        OWSG if not GEOMAGNETIC & measured.keys() else f"{OWSG}; of measured values as stated"
+    )
     return sources | ({"convergence": grid.name} if grid else {})
 
 
@@ -264,10 +265,11 @@ def _findings(
 ) -> list[Finding]:  # fmt: skip
     """What the reader should know of a reference."""
     findings = []
-    exact = [f"`{MEASURABLE[n]}`" for n in MEASURABLE if n in measured and not uncertainties.get(n)]
-    if exact:
-        text = f"{', '.join(exact)}: measured without a standard uncertainty, and taken as exact. State it."
-        findings.append(Finding(id="exact-reference", text=text))
+    for name in measured:
+        if not uncertainties.get(name):
+            key = MEASURABLE[name]
+            text = f"`{key}` has no standard uncertainty and is taken as exact. State `sd_{key}`."
+            findings.append(Finding(id="exact-reference", text=text))
     horizontal = values["field_nt"] * math.cos(math.radians(values["dip_deg"]))
     if horizontal < LEAST_HORIZONTAL:
         text = (
@@ -275,9 +277,9 @@ def _findings(
             "a magnetic pole."
         )
         findings.append(Finding(id="magnetic-pole", text=text))
-    if place["altitude_m"] < 0 and "gravity" not in measured:
+    if place["altitude_m"] < LOWEST_LAND and "gravity" not in measured:
         text = (
-            "below the ellipsoid gravity does not follow the free-air gradient of normal gravity: its "
+            "below ground gravity does not follow the free-air gradient of normal gravity: its "
             "uncertainty is enlarged. Measure gravity, or use the altitude of the ground."
         )
         findings.append(Finding(id="gravity-below-ground", text=text))
@@ -325,5 +327,10 @@ def load_reference(path: str | os.PathLike[str]) -> tuple[EarthReference, str]:
             f"{file.name} is not a reference: {error}. Use a file that mwdcal reference wrote."
         ) from None
     numbers = {key: getattr(reference, key) for key in RANGES_OF_REFERENCE}
+    if not math.isclose(reference.gravity_ms2, reference.gravity_g * STANDARD_GRAVITY):
+        raise InputError(
+            f"{file.name}: 'gravity_ms2' must be 'gravity_g' times {STANDARD_GRAVITY}; got "
+            f"{reference.gravity_ms2:g} and {reference.gravity_g:g}. Use the file as mwdcal wrote it."
+        )
     check_ranges({key: value for key, value in numbers.items() if value is not None}, file.name)
     return reference, hashlib.sha256(data).hexdigest()

@@ -23,7 +23,7 @@ from mwdcal.errors import InputError
 from mwdcal.estimation.uncertainty import TANGENT_STEP, analyse, tangent
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array, Bools, diagonal
-from mwdcal.survey.references import PLACE_SD
+from mwdcal.survey.place.references import PLACE_SD
 from mwdcal.survey.well import UNKNOWN_GRAVITY, unknown_gravity
 
 OFFSET_NAMES = ("cross-axial x", "cross-axial y", "axial")

@@ -14,7 +14,7 @@ from mwdcal.errors import FitError
 from mwdcal.estimation.uncertainty import station_misfit
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array, Bools, centred
-from mwdcal.survey.interference_estimate import (
+from mwdcal.survey.multistation.interference_estimate import (
     USUAL_SD,
     Assumed,
     Estimate,
@@ -23,7 +23,7 @@ from mwdcal.survey.interference_estimate import (
     surveys,
     varied,
 )
-from mwdcal.survey.separability import missing
+from mwdcal.survey.multistation.separability import missing
 
 FEWEST_SURVEYS = 2
 """Surveys below which nothing can be said of several stations."""
