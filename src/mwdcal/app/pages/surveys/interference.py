@@ -9,6 +9,7 @@ import numpy as np
 
 from mwdcal import __version__
 from mwdcal.app.pages.page import banner, environment
+from mwdcal.app.pages.surveys.survey_figures import LARGEST_DRAWN_SD
 from mwdcal.app.screens.surveys.interference import (
     CORRECTED_TITLES,
     DIRECTION_TITLES,
@@ -125,6 +126,8 @@ def draw_azimuths(summary: MultiStationAnalysis) -> Figure:
     )
     depth, title = along_hole(rows)
     change, sd = _column(rows, "azimuth_change_deg"), _column(rows, "sd_azimuth_after_deg")
+    certain = sd < LARGEST_DRAWN_SD
+    change = np.where(certain, change, np.nan)
     first = panels[0]
     first.fill_betweenx(
         depth, change - 2 * sd, change + 2 * sd, color=plots.BAND, lw=0, label="±2σ after"
@@ -135,7 +138,8 @@ def draw_azimuths(summary: MultiStationAnalysis) -> Figure:
     first.set(xlabel="azimuth after less before, °", ylabel=title)
     names = {"inclination_deg": "inclination", "azimuth_after_deg": "azimuth after"}
     for (name, word), (colour, marker, line) in zip(names.items(), plots.SERIES[1:], strict=False):
-        panels[1].plot(_column(rows, name), depth, ls=line, marker=marker, color=colour, label=word)
+        shown = np.where(certain | (name == "inclination_deg"), _column(rows, name), np.nan)
+        panels[1].plot(shown, depth, ls=line, marker=marker, color=colour, label=word)
     panels[1].set(xlabel="inclination, azimuth, °")
     _finish(figure, panels, depth)
     return figure
