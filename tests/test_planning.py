@@ -17,7 +17,7 @@ from mwdcal.files.profiles import built_in, load_profile
 from mwdcal.geometry.vectors import reference_vectors
 from mwdcal.planning.expected import expected, nominal_run, planned_fit
 from mwdcal.planning.moves import Stand, move_seconds, session_seconds, shortest_order
-from mwdcal.planning.optimal import Information, best, efficiency
+from mwdcal.planning.optimal import Design, Information, best
 from mwdcal.planning.plans import load_plan
 from simulation import DEG, attitude
 
@@ -157,7 +157,7 @@ def test_the_efficiency_is_of_the_better_stations_larger():
     information, _ = regression([0, 1, 2], np.linspace(-1, 1, 21))
     even = np.isin(np.arange(21), [0, 5, 10, 15, 20])
     near = np.isin(np.arange(21), [8, 9, 10, 11, 12])
-    assert 0 < efficiency(information, near) < efficiency(information, even) < 1
+    assert 0 < Design(information, near).efficiency < Design(information, even).efficiency < 1
 
 
 @pytest.mark.parametrize(

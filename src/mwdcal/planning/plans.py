@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import product
+from math import prod
 from pathlib import Path
 
 import msgspec
 import numpy as np
 
-from mwdcal.calibration.readings import SOAK_GAP
+from mwdcal.calibration.readings import CONSTANTS, SOAK_GAP
 from mwdcal.errors import InputError
 from mwdcal.estimation.evidence import ANGLES
 from mwdcal.files.contract import RAW, REFERENCES
@@ -41,6 +42,13 @@ class PlannedStations(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
     toolface_deg: Values = 0.0
 
     @property
+    def count(self) -> int:
+        """Number of stations, without a list of them."""
+        return prod(
+            len(_listed(v)) for v in (self.inclination_deg, self.azimuth_deg, self.toolface_deg)
+        )
+
+    @property
     def attitudes(self) -> list[tuple[float, ...]]:
         """Inclination, azimuth and toolface of every station."""
         every = (self.inclination_deg, self.azimuth_deg, self.toolface_deg)
@@ -64,9 +72,9 @@ class PlanFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     def table(self, source: str) -> Table:
         """The run file of the plan, without readings; refuses one of no stations or too many."""
         soaks = _listed(self.temperature_c)
-        attitudes = [each for some in self.stations for each in some.attitudes]
-        count = len(attitudes) * len(soaks)
+        count = sum(some.count for some in self.stations) * len(soaks)
         check_count(count, source)
+        attitudes = [each for some in self.stations for each in some.attitudes]
         columns = dict(zip(ANGLES, np.tile(np.transpose(attitudes), len(soaks)), strict=True))
         place = {"gravity": self.gravity_g, "field": self.field_nt, "dip": self.dip_deg}
         columns |= {n: np.full(count, float(v)) for n, v in place.items() if v is not None}
@@ -148,15 +156,19 @@ def taken(plan: Table, places: Ints) -> Table:
 def at_temperatures(plan: Table, other: Table) -> Table:
     """The attitudes of a plan at every soak of another, and at the place of that one."""
     soaks = soak_temperatures(other)
-    everything = np.tile(np.arange(plan.count), max(len(soaks), 1))
-    result = taken(plan, everything)
-    place = {
-        name: np.full(result.count, other.columns[name][0])
-        for name in (REFERENCES[n].column for n in ("gravity", "field", "dip"))
-        if name in other.columns
-    }
+    result = taken(plan, np.tile(np.arange(plan.count), max(len(soaks), 1)))
     warmth = {"temperature_c": np.repeat(soaks, plan.count)} if len(soaks) else {}
-    return replace(result, columns={**result.columns, **warmth, **place})
+    return at_place(replace(result, columns={**result.columns, **warmth}), other)
+
+
+def at_place(plan: Table, other: Table) -> Table:
+    """A plan with the gravity, field and dip that another states first, where that states any."""
+    place = {}
+    for name in (REFERENCES[constant].column for constant in CONSTANTS):
+        stated = np.asarray(other.columns.get(name, ()), float)
+        for value in stated[~np.isnan(stated)][:1]:
+            place[name] = np.full(plan.count, value)
+    return replace(plan, columns={**plan.columns, **place})
 
 
 def soak_temperatures(plan: Table) -> Array:

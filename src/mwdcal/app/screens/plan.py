@@ -82,6 +82,21 @@ def wanted_accuracy(words: Sequence[str]) -> dict[str, float]:
     return wanted
 
 
+def reach(words: Sequence[str]) -> dict[str, tuple[float, float]]:
+    """What a stand reaches, such as inclination=0:120, as the least and the largest setting by angle, degrees."""
+    ends = {}
+    for word in words:
+        name, _, limits = word.partition("=")
+        low, _, high = limits.partition(":")
+        try:
+            ends[name] = float(low), float(high)
+        except ValueError:
+            raise InputError(
+                f"`reach` must be such as inclination=0:120, in degrees; got {word!r}."
+            ) from None
+    return ends
+
+
 def facts(each: Planned) -> PlanSummary:
     """What is said of a plan."""
     return PlanSummary(**_fields(each))
