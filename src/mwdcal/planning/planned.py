@@ -40,7 +40,7 @@ WORKING_INCLINATIONS = np.radians([5.0, 30.0, 60.0, 90.0, 120.0])
 FEWEST_PLANNED = 8
 """Stations with which the search for the smallest plan begins."""
 MOST_SEARCHED = 1_000_000
-"""Product of stations and candidates in a search: some minutes."""
+"""Product of stations and candidates in a search: a minute."""
 OUT_NAMED = 5
 """Stations out of reach that are named."""
 CRITERIA = ("D", "A", "I")
@@ -119,6 +119,7 @@ def smallest_plan(
     candidates together do not give it.
     """
     search = Search.of(candidates, profile, options, criterion, stand, measured)
+    _check_determined(search.calibration, accuracy_deg)
     if not _reaches(search.calibration, accuracy_deg):
         raise InputError(
             f"all {search.most} candidates together do not give the wanted accuracy. Add candidates, "
@@ -206,14 +207,20 @@ class Search:
     def _of_angles(self) -> Array:
         """Mean variance of the angles over the working range, each in units of what all candidates give."""
         grid = np.meshgrid(WORKING_INCLINATIONS, TWELFTHS, TWELFTHS, indexing="ij")
-        attitude = [axis.ravel() for axis in grid]
+        inclination, azimuth, toolface = (axis.ravel() for axis in grid)
         whole = np.zeros((self.turn.shape[1],) * 2)
-        for temperature in self.calibration.temperature_c or (None,):
-            readings = readings_at(self.calibration, *attitude, temperature)
+        for temperature in self._temperatures():
+            readings = readings_at(self.calibration, inclination, azimuth, toolface, temperature)
             for name in angles(self.calibration):
                 moved = self.calibration.sensitivity(name, readings) @ self.turn
                 whole += moved.mT @ moved / np.sum(moved**2)
         return whole
+
+    def _temperatures(self) -> list[float] | list[None]:
+        """Over the calibrated range, more than its temperature terms could pass through."""
+        low, high = self.calibration.temperature_c or (0.0, 0.0)
+        order = max(self.choice.options.orders)
+        return np.linspace(low, high, order + 2).tolist() if order else [None]
 
     def best(self, count: int) -> Design:
         """The best so many stations beside those measured."""
@@ -231,7 +238,8 @@ class Search:
 
     def given(self, design: Design) -> Calibration:
         """The calibration that chosen stations and those measured give."""
-        return expected(taken(self.plan, design.chosen), self.profile, self.options)
+        options = replace(self.options or Options(), order=self.choice.options.order)
+        return expected(taken(self.plan, design.chosen), self.profile, options)
 
     def planned(self, design: Design) -> Planned:
         """The chosen stations, but those measured, in an order of short moves."""
@@ -252,9 +260,10 @@ def _check_reached(plan: Table, stand: Stand) -> None:
         if not reached.all():
             low, high = stand.reach[name]
             names = labels(plan, "station") or [str(k + 1) for k in range(plan.count)]
+            out = listed([names[k] for k in np.flatnonzero(~reached)], OUT_NAMED)
             raise InputError(
-                f"{plan.source}: {name} outside {low:g}:{high:g}°, which the stand reaches, at station "
-                f"{listed([names[k] for k in np.flatnonzero(~reached)], OUT_NAMED)}. Leave them out, or widen `reach`."
+                f"{plan.source}: the stand reaches {name} {low:g}:{high:g}°, and station {out} lie outside. Leave "
+                "them out, or widen `reach`."
             )
 
 
@@ -270,12 +279,20 @@ def _reached(candidates: Table, stand: Stand) -> Table:
     return candidates if inside.all() else taken(candidates, np.flatnonzero(inside))
 
 
+def _check_determined(calibration: Calibration, accuracy_deg: Mapping[str, float]) -> None:
+    """Refuse to want the accuracy of an angle that cannot have any."""
+    sd = accuracy_at(calibration, WORKING_INCLINATIONS.tolist())
+    for name in accuracy_deg:
+        if name not in sd:
+            raise InputError(
+                f"the accuracy of {name} cannot be wanted: the tool gives {', '.join(sd)}."
+            )
+        if np.isnan(sd[name]).any():
+            free = calibration.undetermined()[0].text
+            raise InputError(f"the accuracy of {name} cannot be wanted: {free}.")
+
+
 def _reaches(calibration: Calibration, accuracy_deg: Mapping[str, float]) -> bool:
     """Whether every wanted accuracy holds at all working inclinations."""
     sd = accuracy_at(calibration, WORKING_INCLINATIONS.tolist())
-    unknown = [name for name in accuracy_deg if name not in sd]
-    if unknown:
-        raise InputError(
-            f"the accuracy of {unknown[0]} cannot be wanted: the tool gives {', '.join(sd)}."
-        )
     return all(np.degrees(sd[name]).max() <= limit for name, limit in accuracy_deg.items())

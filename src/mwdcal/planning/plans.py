@@ -13,7 +13,7 @@ import numpy as np
 from mwdcal.calibration.readings import CONSTANTS, SOAK_GAP
 from mwdcal.errors import InputError
 from mwdcal.estimation.evidence import ANGLES
-from mwdcal.files.contract import RAW, REFERENCES
+from mwdcal.files.contract import CHANNELS, RAW, REFERENCES
 from mwdcal.files.formats import table as tables
 from mwdcal.files.formats.columns import LABELS, Column
 from mwdcal.files.formats.table import Table, labels, numbers
@@ -123,6 +123,23 @@ def load_plan(name_or_path: str) -> Table:
         return replace(table, columns=cells)
     plan, _ = decoded_toml(name_or_path, PlanFile, "plans", "plan", "Plans")
     return plan.table(path.name)
+
+
+def load_measured(path: str) -> Table:
+    """The stations of a run that is measured already, as a plan.
+
+    Raises:
+        InputError: it cannot be read, or holds one triad alone.
+    """
+    table = tables.read(Path(path))
+    for triad, names in CHANNELS.items():
+        missing = [name for name in names if name not in table.columns]
+        if missing:
+            raise InputError(
+                f"{table.source}: no column {missing[0]}. The stations of a run without {triad} cannot be added to a "
+                "plan for both triads; plan without `measured`."
+            )
+    return load_plan(path)
 
 
 def joined(first: Table, second: Table) -> Table:

@@ -96,7 +96,7 @@ def command(
     from mwdcal.files.formats import atomic, table
     from mwdcal.planning import planned
     from mwdcal.planning.moves import Stand
-    from mwdcal.planning.plans import load_plan, run_sheet
+    from mwdcal.planning.plans import load_measured, load_plan, run_sheet
 
     options.check_outputs([output], [tool, measured, *plans], page=html)
     if len(plans) > 1 and (accuracy or stations or measured):
@@ -106,7 +106,7 @@ def command(
     chosen = options_of(typed, prior)
     stand = Stand(speed, settle, soak, screen.reach(reach))
     tables = [load_plan(name) for name in plans]
-    done = load_plan(str(measured)) if measured else None
+    done = load_measured(str(measured)) if measured else None
     search = profile, chosen, criterion, stand, done
     candidates = tables[0] if tables else None
     with progress.bar("planning") as show:
