@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 
 from mwdcal.calibration.automatic.auto import Choice, choose
@@ -11,7 +12,7 @@ from mwdcal.calibration.calibrate import recorded
 from mwdcal.calibration.estimate import Fit, fit
 from mwdcal.calibration.options import AUTO, Options
 from mwdcal.calibration.readings import HIGHEST, LEAST_TEMPERATURE_SPAN, SOAK_GAP, Readings
-from mwdcal.calibration.record import Calibration
+from mwdcal.calibration.record import Calibration, Undetermined
 from mwdcal.errors import FitError, InputError
 from mwdcal.estimation.evidence import ANGLES, EARTH
 from mwdcal.files.contract import CHANNELS, REFERENCES
@@ -116,3 +117,15 @@ def expected(plan: Table, profile: Profile, options: Options | None = None) -> C
         FitError: no calibration can come of the plan; the message says what to add.
     """
     return recorded(*planned_fit(plan, profile, options))
+
+
+def left_undetermined(calibration: Calibration) -> list[Undetermined]:
+    """What a plan leaves undetermined, with a remedy: it states every reference, and not every method uses them."""
+    entries = calibration.undetermined()
+    if calibration.method == "joint":
+        return entries
+    advice = f"Method {calibration.method} does not use the reference that would fix it; joint does"
+    return [
+        msgspec.structs.replace(each, text=f"{each.text.partition('. ')[0]}. {advice}")
+        for each in entries
+    ]

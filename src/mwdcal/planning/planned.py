@@ -21,7 +21,7 @@ from mwdcal.errors import FitError, InputError
 from mwdcal.estimation.evidence import ANGLES
 from mwdcal.files.formats.table import Table, labels
 from mwdcal.geometry.vectors import Array
-from mwdcal.planning.expected import expected, planned_fit
+from mwdcal.planning.expected import expected, left_undetermined, planned_fit
 from mwdcal.planning.moves import USUAL_STAND, Stand, session_seconds, shortest_order
 from mwdcal.planning.optimal import Design, Information, best
 from mwdcal.planning.plans import (
@@ -288,7 +288,7 @@ def _check_determined(calibration: Calibration, accuracy_deg: Mapping[str, float
                 f"the accuracy of {name} cannot be wanted: the tool gives {', '.join(sd)}."
             )
         if np.isnan(sd[name]).any():
-            free = calibration.undetermined()[0].text
+            free = left_undetermined(calibration)[0].text
             raise InputError(f"the accuracy of {name} cannot be wanted: {free}.")
 
 

@@ -13,7 +13,7 @@ from mwdcal.app.screens.plan import PLACE, accuracy_rows, comparison_rows, facts
 from mwdcal.app.text import plural, quantity
 from mwdcal.calibration.prediction import accuracy_at
 from mwdcal.geometry.vectors import Array, Ints, reference_vectors
-from mwdcal.planning.expected import planned_earth
+from mwdcal.planning.expected import left_undetermined, planned_earth
 from mwdcal.planning.planned import Planned
 from mwdcal.planning.plans import attitudes, soak_numbers
 from mwdcal.use import plots
@@ -36,7 +36,7 @@ def render(plans: Sequence[Planned]) -> str:
         profile=first.calibration.profile.name,
         summary=summaries[0],
         banner=_banner(first),
-        findings=first.calibration.undetermined(),
+        findings=left_undetermined(first.calibration),
         simulated=True,
         titles=station_rows(first.plan)[0],
         rows=zip(station_rows(first.plan)[1], np.diff(soaks, prepend=soaks[:1]) != 0, strict=True),

@@ -18,6 +18,7 @@ from mwdcal.calibration.readings import SIMULATED
 from mwdcal.calibration.record import Calibration, Finding, TriadCalibration, Undetermined
 from mwdcal.errors import InputError
 from mwdcal.files.formats.table import Table
+from mwdcal.planning.expected import left_undetermined
 from mwdcal.planning.planned import WORKING_INCLINATIONS, Planned
 
 PLACE = "1σ, calibration alone, at 45° inclination"
@@ -106,7 +107,7 @@ def _fields(each: Planned) -> dict[str, Any]:
     """The fields of a `PlanSummary`."""
     calibration = each.calibration
     by_triad = {triad.name: _triad(triad) for triad in calibration.triads}
-    free = {entry.id: entry for entry in calibration.undetermined()}
+    free = {entry.id: entry for entry in left_undetermined(calibration)}
     return {
         "plan": each.plan.source,
         "stations": each.plan.count,
@@ -144,7 +145,7 @@ def _by_inclination(calibration: Calibration) -> dict[str, list[float | None]]:
 
 def findings(plans: Sequence[Planned]) -> list[Finding]:
     """What the plans leave undetermined."""
-    entries = [(each, free) for each in plans for free in each.calibration.undetermined()]
+    entries = [(each, free) for each in plans for free in left_undetermined(each.calibration)]
     return [Finding(id=free.id, text=f"{each.plan.source}: {free.text}") for each, free in entries]
 
 
