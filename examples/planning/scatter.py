@@ -47,7 +47,7 @@ STANDS = {
 """Stands by name: without errors; with errors of each setting; with errors that all stations share, too."""
 TOOLS, MANY, AT_ONCE = 2_000, 20_000, 250
 """Calibrations of each plan, and where that is too few to tell; in one fit."""
-LIMIT = 0.05
+LIMIT = 0.045
 """Departure from the prediction at which `MANY` calibrations have to decide."""
 SEED = 20261122
 
