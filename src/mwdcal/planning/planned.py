@@ -37,6 +37,8 @@ from mwdcal.sensor.profile import Profile
 
 WORKING_INCLINATIONS = np.radians([5.0, 30.0, 60.0, 90.0, 120.0])
 """Inclinations over which an I-optimal plan makes the angles accurate."""
+WORKING_TEMPERATURES = 7
+"""Temperatures, evenly from the coldest to the hottest soak, at which a wanted accuracy holds."""
 FEWEST_PLANNED = 8
 """Stations with which the search for the smallest plan begins."""
 MOST_SEARCHED = 1_000_000
@@ -115,8 +117,8 @@ def smallest_plan(
 ) -> Planned:
     """The best plan of the fewest stations that gives wanted accuracies, 1σ in degrees by angle.
 
-    An accuracy holds at every one of `WORKING_INCLINATIONS`. Raises as `judged`, and `InputError` where all
-    candidates together do not give it.
+    An accuracy holds at every one of `WORKING_INCLINATIONS`, from the coldest soak to the hottest. Raises as
+    `judged`, and `InputError` where all candidates together do not give it.
     """
     search = Search.of(candidates, profile, options, criterion, stand, measured)
     _check_determined(search.calibration, accuracy_deg)
@@ -293,6 +295,11 @@ def _check_determined(calibration: Calibration, accuracy_deg: Mapping[str, float
 
 
 def _reaches(calibration: Calibration, accuracy_deg: Mapping[str, float]) -> bool:
-    """Whether every wanted accuracy holds at all working inclinations."""
-    sd = accuracy_at(calibration, WORKING_INCLINATIONS.tolist())
-    return all(np.degrees(sd[name]).max() <= limit for name, limit in accuracy_deg.items())
+    """Whether every wanted accuracy holds at all working inclinations and temperatures."""
+    span = calibration.temperature_c
+    temperatures = np.linspace(*span, WORKING_TEMPERATURES).tolist() if span else [None]
+    for at in temperatures:
+        sd = accuracy_at(calibration, WORKING_INCLINATIONS.tolist(), temperature=at)
+        if not all(np.degrees(sd[name]).max() <= most for name, most in accuracy_deg.items()):
+            return False
+    return True
