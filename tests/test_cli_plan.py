@@ -12,6 +12,9 @@ from simulation import DEG, Tool
 
 ATTITUDE = ("ref_inclination_deg", "ref_azimuth_deg", "ref_toolface_deg")
 ONE_ATTITUDE = "name = 'one'\n[[stations]]\ninclination_deg = [45, 45, 45, 45, 45, 45]\n"
+MILLION = "name = 'million'\n[[stations]]\n" + "".join(
+    f"{angle}_deg = {list(range(100))}\n" for angle in ("inclination", "azimuth", "toolface")
+)
 
 
 def filled(sheet, seed):
@@ -93,6 +96,22 @@ def test_the_fewest_stations_for_an_accuracy():
     assert max(fewer["accuracy_by_inclination_deg"]["azimuth"]) > 0.04
 
 
+def test_a_search_keeps_to_what_the_stand_reaches(tmp_path):
+    sheet = tmp_path / "plan.csv"
+    reach = ("--reach", "inclination=0:90", "--reach", "azimuth=0:0")
+    limited = mwdcal(
+        "plan", "--stations", 12, *reach, "--tool", "servo", "-o", sheet, "--json"
+    ).json
+    with sheet.open(encoding="utf-8") as stream:
+        rows = list(csv.DictReader(line for line in stream if not line.startswith("#")))
+    assert len(rows) == 12
+    assert {float(row["ref_azimuth_deg"]) for row in rows} == {0.0}
+    assert max(float(row["ref_inclination_deg"]) for row in rows) <= 90
+    free = mwdcal("plan", "--stations", 12, "--tool", "servo", "--json").json
+    for angle, sd in limited["accuracy_by_inclination_deg"].items():
+        assert max(sd) > max(free["accuracy_by_inclination_deg"][angle])
+
+
 def test_the_next_stations_of_a_run_are_better_than_others(tmp_path):
     run = tmp_path / "run.csv"
     mwdcal("plan", "--plan", "six-state", "--tool", "servo", "-o", run)
@@ -111,7 +130,22 @@ def test_the_next_stations_of_a_run_are_better_than_others(tmp_path):
     ("arguments", "code", "words"),
     [
         (("--plan", "nine-state"), 2, "twelve-state"),
-        (("--plan", "one.toml"), 3, "does not move"),
+        (("--plan", "one.toml"), 3, "would read the same at all 6 stations"),
+        (("--plan", "empty.toml"), 2, "this one has 0"),
+        (("--plan", "million.toml"), 2, "this one has 1000000"),
+        (("--plan", "million.toml", "--stations", 24), 2, "this one has 1000000"),
+        (
+            ("--plan", "moosavi-12", "--reach", "inclination=0:100"),
+            2,
+            "station 37, 38, 39, 40, 41 and 7 more lie",
+        ),
+        (("--plan", "moosavi-12", "--reach", "azimuth=0:0"), 2, "the stand reaches azimuth 0:0°"),
+        (("--stations", 12, "--reach", "inclination=7:8"), 2, "no candidate is within"),
+        (("--stations", 200, "--reach", "azimuth=0:0"), 2, "the 84 candidates"),
+        (("--reach", "inclination=120"), 2, "such as inclination=0:120"),
+        (("--reach", "roll=0:1"), 2, "--reach must be of inclination"),
+        (("--measured", "accelerometer.csv"), 2, "no column mx"),
+        (("--accuracy", "inclination=1", "--method", "scalar"), 2, "undetermined"),
         (("--stations", 505), 2, "between 1 and the 504 candidates"),
         (("--stations", 3), 3, "stations"),
         (("--stations", 12, "--plan", "six-state", "--plan", "moosavi-12"), 2, "Name it alone"),
@@ -125,6 +159,9 @@ def test_the_next_stations_of_a_run_are_better_than_others(tmp_path):
 def test_what_cannot_be_planned_ends_in_one_sentence(tmp_path, monkeypatch, arguments, code, words):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "one.toml").write_text(ONE_ATTITUDE)
+    (tmp_path / "empty.toml").write_text("name = 'empty'\nstations = []\n")
+    (tmp_path / "million.toml").write_text(MILLION)
+    (tmp_path / "accelerometer.csv").write_text("ref_inclination_deg,ax,ay,az\n10,0,0,0\n")
     message = refused(mwdcal("plan", *arguments, "--tool", "servo", "-o", "plan.csv"), code)
     assert words in message
     assert not (tmp_path / "plan.csv").exists()

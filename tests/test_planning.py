@@ -8,18 +8,21 @@ from itertools import combinations, pairwise, permutations
 import numpy as np
 import pytest
 from msgspec.structs import replace as with_changes
+from scipy.stats import chi2
 
 from mwdcal.calibration import results
 from mwdcal.calibration.estimate import fit
 from mwdcal.calibration.prediction import accuracy_at, readings_at
-from mwdcal.errors import InputError
+from mwdcal.calibration.readings import TRIADS
+from mwdcal.errors import FitError, InputError
 from mwdcal.files.profiles import built_in, load_profile
 from mwdcal.geometry.vectors import reference_vectors
+from mwdcal.planning import planned
 from mwdcal.planning.expected import expected, nominal_run, planned_earth, planned_fit
 from mwdcal.planning.moves import Stand, move_seconds, session_seconds, shortest_order
-from mwdcal.planning.optimal import Information, best, efficiency
+from mwdcal.planning.optimal import Design, Information, best
 from mwdcal.planning.planned import WORKING_INCLINATIONS, best_plan, judged, smallest_plan
-from mwdcal.planning.plans import load_plan, run_sheet
+from mwdcal.planning.plans import load_plan, run_sheet, taken
 from simulation import DEG, attitude
 
 SERVO = load_profile("servo")[0]
@@ -62,37 +65,58 @@ def test_the_laboratory_turns_every_axis_of_both_triads_to_its_extremes():
 
 
 @pytest.mark.parametrize(
-    ("name", "profile"),
+    ("name", "profile", "count"),
     [
-        pytest.param(name, profile, id=f"{name} {kind}")
-        for name in ("six-state", "twelve-state", "laboratory-thermal", "moosavi-12", "moosavi-30")
-        for kind, profile in (("exact", EXACT), ("uncertain", SERVO))
+        pytest.param(name, profile, count, id=f"{name} {kind}")
+        for name, profile, kind, count in (
+            ("six-state", EXACT, "exact", 1000),
+            ("laboratory-thermal", EXACT, "exact", 1000),
+            ("moosavi-30", EXACT, "exact", 1000),
+            ("twelve-state", SERVO, "uncertain", 500),
+            ("moosavi-12", SERVO, "uncertain", 500),
+            ("laboratory-thermal", SERVO, "uncertain", 200),
+        )
     ],
 )
-def test_expected_uncertainties_are_the_scatter_of_simulated_calibrations(name, profile):
-    choice, planned = planned_fit(load_plan(name), profile)
-    readings, count = choice.readings, 2000 if planned.problem.evidence.include.size < 100 else 500
+def test_expected_covariance_is_that_of_simulated_calibrations(name, profile, count):
+    """Errors of all parameters with the expected covariance taken out: χ², in all and along every direction.
+
+    `examples/planning/scatter.py` makes 2,000 to 20,000 of every plan.
+    """
+    choice, result = planned_fit(load_plan(name), profile)
+    readings = choice.readings
     rng = np.random.default_rng(7)
     angles = [
         readings.known[name] + readings.uncertainty(name) * rng.normal(size=(count, readings.count))
         for name in ANGLES
     ]
     field, dip = (readings.known[name][0] for name in ("field", "dip"))
-    fields = attitude(*angles)(1.0, field, dip)
     noisy = [
-        field + readings.sd[kind] * rng.normal(size=field.shape)
-        for kind, field in zip(("accelerometer", "magnetometer"), fields, strict=True)
+        vectors + readings.sd[kind] * rng.normal(size=vectors.shape)
+        for kind, vectors in zip(TRIADS, attitude(*angles)(1.0, field, dip), strict=True)
     ]
     many = replace(readings, accelerometer=noisy[0], magnetometer=noisy[1])
     fitted = fit(many, choice.options)
     reference = choice.profile.reference_temperature_c
-    values = np.einsum("bij,bj->bi", results.to_file(fitted, reference), fitted.state.params)
-    stated = np.array(
-        [sd for t in expected(load_plan(name), profile).triads for sd in t.standard_uncertainties]
+    values, nominal = (
+        np.einsum("bij,bj->bi", results.to_file(each, reference), each.state.params)
+        for each in (fitted, result)
     )
-    ratio = values.std(0, ddof=1) / stated
-    # χ of `count` - 1 degrees of freedom: 1σ is 1 / √(2 count); the largest of 60
-    assert np.abs(ratio - 1).max() < 4.5 / np.sqrt(2 * count), ratio
+    calibration = expected(load_plan(name), profile)
+    covariance, size = calibration.parameter_covariance, values.shape[-1]
+    sd = np.sqrt(np.diag(covariance))
+    root = np.linalg.cholesky(covariance / np.outer(sd, sd))
+    errors = (values - nominal) / sd
+    # χ of `count` degrees of freedom: 1σ is 1 / √(2 count); the largest of 60
+    assert np.abs(np.sqrt(np.mean(errors**2, 0)) - 1).max() < 4.5 / np.sqrt(2 * count)
+    white = np.linalg.solve(root, errors.T)
+    low, high = chi2.ppf([1e-4, 1 - 1e-4], count * size)
+    assert low < np.sum(white**2) < high
+    ends = np.linalg.svd(white, compute_uv=False)[
+        [-1, 0]
+    ]  # within √N ± (√k + t), but for 2 exp(-t²/2)
+    assert np.sqrt(count) - np.sqrt(size) - 4 < ends[0]
+    assert ends[1] < np.sqrt(count) + np.sqrt(size) + 4
 
 
 def test_twelve_states_halve_the_variance_of_six():
@@ -158,7 +182,7 @@ def test_the_efficiency_is_of_the_better_stations_larger():
     information, _ = regression([0, 1, 2], np.linspace(-1, 1, 21))
     even = np.isin(np.arange(21), [0, 5, 10, 15, 20])
     near = np.isin(np.arange(21), [8, 9, 10, 11, 12])
-    assert 0 < efficiency(information, near) < efficiency(information, even) < 1
+    assert 0 < Design(information, near).efficiency < Design(information, even).efficiency < 1
 
 
 @pytest.mark.parametrize(
@@ -166,12 +190,12 @@ def test_the_efficiency_is_of_the_better_stations_larger():
 )
 def test_planned_information_is_that_of_the_fit(common):
     profile = with_changes(SERVO, stand=with_changes(SERVO.stand, **common))
-    _, planned = planned_fit(load_plan("moosavi-12"), profile)
-    information, turn = Information.of_fit(planned)
+    _, result = planned_fit(load_plan("moosavi-12"), profile)
+    information, turn = Information.of_fit(result)
     assert information.size == turn.shape[1] == 24
     assert (information.rows.shape[-1] > 24) is bool(common)
     whole = np.linalg.inv(information.of(np.ones(information.count)))[:24, :24]
-    covariance = planned.analysis.covariance[0]
+    covariance = result.analysis.covariance[0]
     sd = np.sqrt(np.diag(covariance))
     size = np.outer(sd, sd)
     np.testing.assert_allclose(turn @ whole @ turn.T / size, covariance / size, atol=1e-6)
@@ -185,6 +209,32 @@ def test_seconds_of_a_session():
     # 90° at 2°/s, then 20° (azimuth the short way: 10°), three readings after 10 s each, one soak
     assert session_seconds(stations, np.zeros(3, int), STAND) == 45 + 10 + 30 + 3600
     assert session_seconds(stations, np.array([0, 0, 1]), STAND) == 45 + 10 + 30 + 7200
+
+
+def test_an_axis_with_ends_goes_back_the_long_way():
+    stations = np.array([[90.0, 350, 0], [90, 10, 0]])
+    ended = replace(STAND, reach={"azimuth": (0.0, 360.0)})
+    assert session_seconds(stations, np.zeros(2, int), STAND) == 10 + 20 / 2 + 10 + 3600
+    assert session_seconds(stations, np.zeros(2, int), ended) == 10 + 340 / 2 + 10 + 3600
+    across = replace(STAND, reach={"azimuth": (-180.0, 180.0)})
+    assert session_seconds(stations, np.zeros(2, int), across) == 10 + 20 / 2 + 10 + 3600
+
+
+def test_what_a_stand_reaches():
+    stand = Stand(reach={"inclination": (0.0, 120.0), "azimuth": (-90.0, 90.0), "toolface": (0, 0)})
+    stations = np.array([[0.0, 0, 0], [120, 270, 360], [121, 90, 0], [90, 180, 0], [90, 0, 1]])
+    assert stand.within(stations).tolist() == [
+        [True, True, True], [True, True, True], [False, True, True], [True, False, True], [True, True, False],
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "reach", [{"roll": (0, 1)}, {"inclination": (-10, 90)}, {"azimuth": (90, 0)}, {"toolface": (-300, 100)},
+              {"azimuth": (0, np.nan)}], ids=str,
+)  # fmt: skip
+def test_a_stand_reaches_from_the_least_setting_to_the_largest(reach):
+    with pytest.raises(InputError, match="from the least setting to the largest"):
+        Stand(reach=reach)
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -223,6 +273,11 @@ def test_soaks_keep_their_order():
             f"azimuth_deg = {list(range(300))}\n",
             "this one has 54000",
         ),
+        (
+            f"name = 'x'\n[[stations]]\ninclination_deg = {[0] * 1000}\nazimuth_deg = {[0] * 1000}\n"
+            f"toolface_deg = {[0] * 1000}\n",
+            "this one has 1000000000",
+        ),
     ],
 )
 def test_bad_plans_end_in_one_sentence(tmp_path, text, words):
@@ -230,6 +285,56 @@ def test_bad_plans_end_in_one_sentence(tmp_path, text, words):
     path.write_text(text)
     with pytest.raises(InputError, match=words):
         nominal_run(load_plan(str(path)), SERVO)
+
+
+def test_stations_of_one_attitude_are_no_plan():
+    plan = load_plan("six-state")
+    one = taken(plan, np.zeros(24, int))
+    with pytest.raises(FitError, match=r"would read the same at all 24 stations.*Add stations"):
+        expected(one, SERVO)
+
+
+def test_a_search_that_would_take_hours_is_refused():
+    whole = load_plan("candidates")
+    many = taken(whole, np.arange(1001) % whole.count)
+    with pytest.raises(InputError, match="must not exceed 1000000"):
+        best_plan(many, 1000, SERVO, criterion="D")
+
+
+HOT = """
+name = "hot"
+temperature_c = [20, 60, 100, 140]
+[[stations]]
+inclination_deg = [0, 90, 180]
+azimuth_deg = [0, 90, 180, 270]
+toolface_deg = [0, 90, 180, 270]
+"""
+
+
+@pytest.mark.parametrize("criterion", ["D", "A", "I"])
+def test_the_best_stations_carry_the_temperature_terms_of_all_candidates(tmp_path, criterion):
+    (tmp_path / "hot.toml").write_text(HOT)
+    result = best_plan(load_plan(str(tmp_path / "hot.toml")), 24, SERVO, None, criterion)
+    triad = result.calibration.accelerometer
+    assert (triad.order, triad.rank, triad.size) == (3, 30, 30)
+    assert set(result.plan.columns["temperature_c"]) == {20, 60, 100, 140}
+
+
+def test_the_next_stations_are_at_the_place_and_the_temperatures_of_the_run():
+    run = load_plan("six-state")
+    warm = {"temperature_c": np.full(6, 80.0), "ref_dip_deg": np.full(6, -70.0)}
+    measured = replace(run, columns={**run.columns, **warm})
+    more = best_plan(None, 3, SERVO, None, "I", measured=measured).plan.columns
+    assert more["ref_dip_deg"].tolist() == [-70] * 3
+    assert more["temperature_c"].tolist() == [80] * 3
+
+
+def test_a_search_computes_the_information_once(monkeypatch):
+    fits = []
+    counted = planned.planned_fit
+    monkeypatch.setattr(planned, "planned_fit", lambda *a: fits.append(a) or counted(*a))
+    smallest_plan(None, {"inclination": 0.02}, SERVO)
+    assert len(fits) == 1
 
 
 def test_a_plan_needs_the_noise():
@@ -347,9 +452,9 @@ def test_why_24_stations_cannot_beat_the_48_of_the_textbook():
     low = [np.radians(5.0)]
     textbook = accuracy_at(expected(load_plan("moosavi-12"), SERVO), low)["azimuth"][0]
     candidates = load_plan("candidates")
-    choice, planned = planned_fit(candidates, SERVO)
-    information, turn = Information.of_fit(planned)
-    to_file = results.to_file(planned, choice.profile.reference_temperature_c)[0]
+    choice, result = planned_fit(candidates, SERVO)
+    information, turn = Information.of_fit(result)
+    to_file = results.to_file(result, choice.profile.reference_temperature_c)[0]
     made = expected(candidates, SERVO)
     faces, azimuths = np.meshgrid(np.arange(12) * 30 * DEG, np.arange(12) * 30 * DEG)
     at = readings_at(made, low[0], azimuths.ravel(), faces.ravel())
@@ -359,7 +464,11 @@ def test_why_24_stations_cannot_beat_the_48_of_the_textbook():
     for _ in range(200):
         covariance = np.linalg.inv(information.of(weights))
         slopes = np.einsum(
-            "nmi,ij,nmj->n", information.rows, covariance @ wanted @ covariance, information.rows
+            "nmi,ij,nmj->n",
+            information.rows,
+            covariance @ wanted @ covariance,
+            information.rows,
+            optimize=True,
         )
         value = np.trace(wanted @ covariance)
         bound = max(bound, value - (24 * slopes.max() - weights @ slopes))

@@ -150,6 +150,7 @@ def files(tmp_path_factory):
 def work(files, tmp_path, monkeypatch):
     """A copy of the files to run in; nothing is said of how far a command is."""
     monkeypatch.setattr(progress.slowly, "__defaults__", (600.0,))
+    monkeypatch.setattr(progress, "PATIENCE", 600.0)
     monkeypatch.chdir(shutil.copytree(files, tmp_path / "work"))
 
 

@@ -26,7 +26,7 @@ from mwdcal.planning.effects import (
     load_effects,
 )
 from mwdcal.planning.plans import load_plan
-from mwdcal.planning.session import Session
+from mwdcal.planning.session import Session, tool_facts
 from mwdcal.planning.simulate import drawn, simulated
 from mwdcal.sensor.models import factor_parts
 from mwdcal.sensor.profile import StandProfile
@@ -125,6 +125,63 @@ def test_readings_are_those_of_the_factors():
         np.testing.assert_allclose(
             getattr(got, name), wanted, rtol=0, atol=1e-12 * np.abs(wanted).max()
         )
+
+
+CURVED = with_changes(
+    EXACT,
+    accelerometer=with_changes(EXACT.accelerometer, nonlinearity=0.002, axes=("-x", "+z", "+y")),
+)
+
+
+def test_a_declared_nonlinearity_bends_each_axis():
+    seen = stations([90, 90], 0, [90, 270])  # gravity along -x and +x of the tool
+    tool = replace(nominal(1), curves=(np.array([[[3e-3, 4e-3], [0, 0], [0, 0]]]), None))
+    read = simulated(tool, seen, np.random.default_rng(0)).readings
+    expected = [-1 + 3e-3 - 4e-3, 1 + 3e-3 + 4e-3]
+    np.testing.assert_allclose(np.sort(read.accelerometer[0, :, 0]), expected, atol=1e-15)
+    straight = simulated(nominal(1), seen, np.random.default_rng(0)).readings
+    np.testing.assert_array_equal(read.magnetometer, straight.magnetometer)
+
+
+def test_own_axis_terms_are_drawn_as_large_as_their_prior_takes_them():
+    """A fit with the declared terms leaves the noise alone; one without does not."""
+    session, rng = Session.of(load_plan("acceptance-104"), CURVED), np.random.default_rng(5)
+    truth = drawn(rng, CURVED, 0, (40,))
+    assert np.std(truth.curves[0]) == pytest.approx(0.002, rel=0.15)
+    assert truth.curves[1] is None
+    readings = session.measured(truth, rng).readings
+    with_terms, without = (
+        fit(readings, Options(order=0, nonlinearity=terms)).analysis.variance_factor[:, 0]
+        for terms in ({"accelerometer": 0.002}, {})
+    )
+    assert with_terms.mean() == pytest.approx(1, abs=0.05)
+    assert without.mean() > 5
+
+
+def test_the_truth_file_has_the_nonlinearity_of_the_channels(tmp_path):
+    profile = tmp_path / "curved.toml"
+    triads = "[accelerometer]\nscale = 3.0\nnoise = 3e-4\nnonlinearity = 0.002\n[magnetometer]\nnoise = 15.0\n"
+    profile.write_text(f"name = 'curved'\n{triads}", encoding="utf-8")
+    truth = tmp_path / "truth.json"
+    command("simulate", "--tool", profile, "-o", tmp_path / "run.csv", "--truth", truth)
+    document = json.loads(truth.read_text(encoding="utf-8"))
+    assert np.shape(document["accelerometer"]["nonlinearity"]) == (3, 2)
+    assert "nonlinearity" not in document["magnetometer"]
+
+
+def test_a_channel_against_its_axis_has_the_square_of_the_other_sign():
+    """What a channel reads, from the curve stated for it, is what the tool's axis gives it."""
+    tool = replace(drawn(np.random.default_rng(1), CURVED, 0), magnetometer=None)
+    curve = np.array(tool_facts(tool, CURVED)["accelerometer"]["nonlinearity"])
+    straight = replace(tool, curves=())
+    vectors, warm = (np.random.default_rng(2).normal(size=(5, 3)),) * 2, np.full(5, 25.0)
+    bent, plain = (
+        each.readings(vectors, warm)["accelerometer"] @ CURVED.accelerometer.permutation
+        for each in (tool, straight)
+    )
+    np.testing.assert_allclose(
+        bent, plain + curve[:, 0] * plain**2 + curve[:, 1] * plain**3, atol=1e-12
+    )
 
 
 def test_ten_thousand_tools_in_one_call():

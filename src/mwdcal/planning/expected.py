@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 
 from mwdcal.calibration.automatic.auto import Choice, choose
@@ -11,8 +12,8 @@ from mwdcal.calibration.calibrate import recorded
 from mwdcal.calibration.estimate import Fit, fit
 from mwdcal.calibration.options import AUTO, Options
 from mwdcal.calibration.readings import HIGHEST, LEAST_TEMPERATURE_SPAN, SOAK_GAP, Readings
-from mwdcal.calibration.record import Calibration
-from mwdcal.errors import InputError
+from mwdcal.calibration.record import Calibration, Undetermined
+from mwdcal.errors import FitError, InputError
 from mwdcal.estimation.evidence import ANGLES, EARTH
 from mwdcal.files.contract import CHANNELS, REFERENCES
 from mwdcal.files.formats.table import Table
@@ -20,6 +21,9 @@ from mwdcal.files.runs import check_references, from_readings, to_readings
 from mwdcal.geometry.vectors import Array, reference_vectors
 from mwdcal.planning.simulate import Earth
 from mwdcal.sensor.profile import Profile
+
+STILL = 1e-6
+"""A channel that moves by no more than this share of gravity or field over a plan does not move."""
 
 
 def nominal_run(plan: Table, profile: Profile) -> tuple[Readings, Profile]:
@@ -83,6 +87,7 @@ def planned_fit(
     """
     options = options or Options()
     readings, scaled = nominal_run(plan, profile)
+    _check_moves(readings)
     if options.order == AUTO:
         soaks = readings.temperature
         options = replace(options, order=0 if soaks is None else highest_order(soaks))
@@ -92,6 +97,17 @@ def planned_fit(
     result = fit(choice.readings, choice.options)
     one = np.ones_like(result.analysis.variance_factor)
     return choice, replace(result, analysis=replace(result.analysis, variance_factor=one))
+
+
+def _check_moves(readings: Readings) -> None:
+    """Refuse a plan at all of whose stations a channel reads the same."""
+    for triad, strength in zip(readings.triads, EARTH, strict=False):
+        moved = np.ptp(getattr(readings, triad), axis=0) / readings.known[strength].max()
+        for axis in (axis for axis, share in zip("xyz", moved, strict=True) if share < STILL):
+            raise FitError(
+                f"{readings.source}: the {triad} on tool axis {axis} would read the same at all {readings.count} "
+                "stations, and nothing could be learnt of it. Add stations at other inclinations and toolfaces."
+            )
 
 
 def expected(plan: Table, profile: Profile, options: Options | None = None) -> Calibration:
@@ -105,3 +121,15 @@ def expected(plan: Table, profile: Profile, options: Options | None = None) -> C
         FitError: no calibration can come of the plan; the message says what to add.
     """
     return recorded(*planned_fit(plan, profile, options))
+
+
+def left_undetermined(calibration: Calibration) -> list[Undetermined]:
+    """What a plan leaves undetermined, with a remedy: it states every reference, and not every method uses them."""
+    entries = calibration.undetermined()
+    if calibration.method == "joint":
+        return entries
+    advice = f"Method {calibration.method} does not use the reference that would fix it; joint does"
+    return [
+        msgspec.structs.replace(each, text=f"{each.text.partition('. ')[0]}. {advice}")
+        for each in entries
+    ]

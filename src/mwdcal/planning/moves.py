@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from mwdcal.errors import InputError
-from mwdcal.geometry.vectors import Array, Ints
+from mwdcal.estimation.evidence import ANGLES
+from mwdcal.geometry.vectors import Array, Bools, Ints
 
 MOST_ORDERED = 2_000
 """Stations of one soak that are put in order; a longer plan keeps its own."""
+WITHIN = 1e-6
+"""A setting so little beyond what the stand reaches is within it, degrees."""
 
 
 @dataclass(frozen=True)
@@ -18,15 +22,17 @@ class Stand:
     """How fast a stand is: its axes move at the same time.
 
     `degrees_per_second` of an axis, `settle_seconds` between the end of a move and the reading,
-    `soak_minutes` until the tool has the temperature of the next soak.
+    `soak_minutes` until the tool has the temperature of the next soak. `reach`: the least and the largest
+    setting by angle, degrees; azimuth and toolface without one turn round and round.
     """
 
     degrees_per_second: float = 5.0
     settle_seconds: float = 30.0
     soak_minutes: float = 90.0
+    reach: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Refuse a stand that does not move, and times below zero.
+        """Refuse a stand that does not move or reaches nothing, and times below zero.
 
         Raises `InputError`.
         """
@@ -37,6 +43,28 @@ class Stand:
         for name, value in (("settle", self.settle_seconds), ("soak", self.soak_minutes)):
             if not 0 <= value < np.inf:
                 raise InputError(f"`{name}` must be a time of 0 or more; got {value:g}.")
+        for name, (low, high) in self.reach.items():
+            least, most = (0, 180) if name == ANGLES[0] else (-360, 360)
+            if name not in ANGLES or not (least <= low <= high <= most and high - low <= 360):
+                raise InputError(
+                    f"`reach` must be of {', '.join(ANGLES)}, such as inclination=0:120, from the least setting to "
+                    f"the largest; got {name}={low:g}:{high:g}."
+                )
+
+    def settings(self, attitude: Array) -> Array:
+        """Settings (n, 3) of attitudes (n, 3), degrees: whole turns added to be above the least."""
+        settings = attitude.copy()
+        for place, name in enumerate(ANGLES):
+            if name in self.reach and place:
+                low = self.reach[name][0] - WITHIN
+                settings[:, place] = low + (attitude[:, place] - low) % 360
+        return settings
+
+    def within(self, attitude: Array) -> Bools:
+        """Which angles (n, 3) of attitudes (n, 3), degrees, the stand reaches."""
+        low, high = np.transpose([self.reach.get(name, (-np.inf, np.inf)) for name in ANGLES])
+        settings = self.settings(attitude)
+        return np.asarray((settings >= low - WITHIN) & (settings <= high + WITHIN))
 
 
 USUAL_STAND = Stand()
@@ -44,9 +72,15 @@ USUAL_STAND = Stand()
 
 
 def move_seconds(attitude: Array, stand: Stand) -> Array:
-    """Seconds (n, n) from each station to each other, of attitudes (n, 3) in degrees."""
-    difference = np.abs(attitude[:, None] - attitude)
-    difference[..., 1:] = np.minimum(difference[..., 1:] % 360, -difference[..., 1:] % 360)
+    """Seconds (n, n) from each station to each other, of attitudes (n, 3) in degrees.
+
+    Azimuth and toolface go the shorter way round, but for one whose reach has ends.
+    """
+    settings = stand.settings(attitude)
+    difference = np.abs(settings[:, None] - settings)
+    round_and_round = [name != ANGLES[0] and name not in stand.reach for name in ANGLES]
+    shorter = np.minimum(difference % 360, -difference % 360)
+    difference = np.where(round_and_round, shorter, difference)
     return np.asarray(difference.max(-1) / stand.degrees_per_second + stand.settle_seconds)
 
 

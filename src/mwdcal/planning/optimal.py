@@ -11,6 +11,7 @@ bound; D. M. Titterington, "Algorithms for computing D-optimal designs" (1976), 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -70,15 +71,36 @@ class Information:
 
 @dataclass(frozen=True)
 class Design:
-    """Chosen candidates, and how good they are.
+    """Chosen candidates, `members` (n,) of all, and how good they are."""
 
-    `chosen` (N,): their places among the candidates, in the order of these. `efficiency`: at least this
-    share of the best possible D-value per parameter, det(information)^(1/r), that N stations at the
-    candidates can have.
-    """
+    information: Information
+    members: Bools
 
-    chosen: Ints
-    efficiency: float
+    @property
+    def chosen(self) -> Ints:
+        """Their places (N,) among the candidates, in the order of these."""
+        return np.flatnonzero(self.members)
+
+    @cached_property
+    def efficiency(self) -> float:
+        """Share of the best D-value, per parameter, that as many stations at the candidates can have, at least.
+
+        Definition: of det(information)^(1/r). Method: weights of the candidates approach the best ones, and what
+        any others could still gain over them is bounded by the steepest slope (Kiefer and Wolfowitz).
+        """
+        information, count = self.information, np.count_nonzero(self.members)
+        reached = _log_det(information, self.members.astype(np.float64))
+        weights = np.full(information.count, count / information.count)
+        size, bound = information.size, np.inf
+        for _ in range(WEIGHT_STEPS):
+            slopes = _slopes(information, weights)
+            mean = float(weights @ slopes) / count
+            gain = count * (float(slopes.max()) - mean)
+            bound = min(bound, _log_det(information, weights) + gain)
+            if gain < CLOSE * size:
+                break
+            weights = weights * slopes / mean
+        return float(np.exp(min(reached - bound, 0.0) / size))
 
 
 def best(
@@ -95,7 +117,7 @@ def best(
     chosen = _added(information, count, wanted, kept)
     while _exchange(information, chosen, wanted, kept):
         pass
-    return Design(np.flatnonzero(chosen), efficiency(information, chosen))
+    return Design(information, chosen)
 
 
 def _added(information: Information, count: int, wanted: Array | None, kept: Bools) -> Bools:
@@ -153,26 +175,6 @@ def _log_gain(rows: Array, whole: Array) -> Array:
         return np.zeros(len(rows))
     inner = np.eye(rows.shape[1]) + rows @ inverse(whole) @ rows.mT
     return np.asarray(np.linalg.slogdet(inner)[1])
-
-
-def efficiency(information: Information, chosen: Bools) -> float:
-    """Share of the best D-value, per parameter, that as many stations at the candidates could have, at least.
-
-    Method: weights of the candidates approach the best ones, and what any others could still gain over
-    them is bounded by the steepest slope (Kiefer and Wolfowitz).
-    """
-    count, size = np.count_nonzero(chosen), information.size
-    reached = _log_det(information, chosen.astype(np.float64))
-    weights = np.full(information.count, count / information.count)
-    bound = np.inf
-    for _ in range(WEIGHT_STEPS):
-        slopes = _slopes(information, weights)
-        mean = float(weights @ slopes) / count
-        bound = min(bound, _log_det(information, weights) + count * (float(slopes.max()) - mean))
-        if count * (slopes.max() - mean) < CLOSE * size:
-            break
-        weights = weights * slopes / mean
-    return float(np.exp(min(reached - bound, 0.0) / size))
 
 
 def _log_det(information: Information, weights: Array) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import product
+from math import prod
 from pathlib import Path
 
 import msgspec
@@ -13,7 +14,7 @@ import numpy as np
 from mwdcal.calibration.readings import CONSTANTS, SOAK_GAP
 from mwdcal.errors import InputError
 from mwdcal.estimation.evidence import ANGLES
-from mwdcal.files.contract import COLUMNS, RAW, REFERENCES, check_near_misses
+from mwdcal.files.contract import CHANNELS, COLUMNS, RAW, REFERENCES, check_near_misses
 from mwdcal.files.formats import table as tables
 from mwdcal.files.formats.columns import LABELS, Column
 from mwdcal.files.formats.table import Table, labels, numbers
@@ -43,6 +44,13 @@ class PlannedStations(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
     toolface_deg: Values = 0.0
 
     @property
+    def count(self) -> int:
+        """Number of stations, without a list of them."""
+        return prod(
+            len(_listed(v)) for v in (self.inclination_deg, self.azimuth_deg, self.toolface_deg)
+        )
+
+    @property
     def attitudes(self) -> list[tuple[float, ...]]:
         """Inclination, azimuth and toolface of every station."""
         every = (self.inclination_deg, self.azimuth_deg, self.toolface_deg)
@@ -66,9 +74,9 @@ class PlanFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     def table(self, source: str) -> Table:
         """The run file of the plan, without readings; refuses one of no stations or too many."""
         soaks = _listed(self.temperature_c)
-        attitudes = [each for some in self.stations for each in some.attitudes]
-        count = len(attitudes) * len(soaks)
+        count = sum(some.count for some in self.stations) * len(soaks)
         check_count(count, source)
+        attitudes = [each for some in self.stations for each in some.attitudes]
         place = {"gravity": self.gravity_g, "field": self.field_nt, "dip": self.dip_deg}
         _check_finite([*soaks, *np.ravel(attitudes), *filter(None, place.values())], source)
         columns = dict(zip(ANGLES, np.tile(np.transpose(attitudes), len(soaks)), strict=True))
@@ -134,6 +142,23 @@ def _blank(cells: Column) -> bool:
     return isinstance(cells, np.ndarray) and bool(np.isnan(cells).all())
 
 
+def load_measured(path: str) -> Table:
+    """The stations of a run that is measured already, as a plan.
+
+    Raises:
+        InputError: it cannot be read, or holds one triad alone.
+    """
+    table = tables.read(Path(path))
+    for triad, names in CHANNELS.items():
+        missing = [name for name in names if name not in table.columns]
+        if missing:
+            raise InputError(
+                f"{table.source}: no column {missing[0]}. The stations of a run without {triad} cannot be added to a "
+                "plan for both triads; plan without `measured`."
+            )
+    return load_plan(path)
+
+
 def joined(first: Table, second: Table) -> Table:
     """The stations of two plans, one after the other; what one does not state is blank there.
 
@@ -170,15 +195,19 @@ def taken(plan: Table, places: Ints) -> Table:
 def at_temperatures(plan: Table, other: Table) -> Table:
     """The attitudes of a plan at every soak of another, and at the place of that one."""
     soaks = soak_temperatures(other)
-    everything = np.tile(np.arange(plan.count), max(len(soaks), 1))
-    result = taken(plan, everything)
-    place = {
-        name: np.full(result.count, other.columns[name][0])
-        for name in (REFERENCES[n].column for n in ("gravity", "field", "dip"))
-        if name in other.columns
-    }
+    result = taken(plan, np.tile(np.arange(plan.count), max(len(soaks), 1)))
     warmth = {"temperature_c": np.repeat(soaks, plan.count)} if len(soaks) else {}
-    return replace(result, columns={**result.columns, **warmth, **place})
+    return at_place(replace(result, columns={**result.columns, **warmth}), other)
+
+
+def at_place(plan: Table, other: Table) -> Table:
+    """A plan with the gravity, field and dip that another states first, where that states any."""
+    place = {}
+    for name in (REFERENCES[constant].column for constant in CONSTANTS):
+        stated = np.asarray(other.columns.get(name, ()), float)
+        for value in stated[~np.isnan(stated)][:1]:
+            place[name] = np.full(plan.count, value)
+    return replace(plan, columns={**plan.columns, **place})
 
 
 def soak_temperatures(plan: Table) -> Array:

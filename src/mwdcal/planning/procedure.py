@@ -26,7 +26,7 @@ from mwdcal.files.formats.table import Table
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import AnyArray, Array, Bools, reference_vectors
 from mwdcal.planning.effects import Effects
-from mwdcal.planning.expected import planned_fit
+from mwdcal.planning.expected import left_undetermined, planned_fit
 from mwdcal.planning.planned import WORKING_INCLINATIONS
 from mwdcal.planning.session import Session
 from mwdcal.planning.simulate import Truth, drawn
@@ -100,11 +100,8 @@ class Procedure:
         """
         choice, result = planned_fit(plan, profile, options)
         calibration = recorded(choice, result)
-        if free := calibration.undetermined():
-            raise FitError(
-                f"{plan.source} leaves a direction undetermined: {free[0].text}. Add what determines it, or choose "
-                "another `method`."
-            )
+        if free := left_undetermined(calibration):
+            raise FitError(f"{plan.source} leaves a direction undetermined: {free[0].text}.")
         place = {REFERENCES[name].column for name in CONSTANTS} & {*plan.columns}
         there = {
             name: np.full(test.count, plan.columns[name][0]) for name in place - {*test.columns}

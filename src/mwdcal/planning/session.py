@@ -163,6 +163,9 @@ def tool_facts(
         values = {
             name: _factors(params, profile, name) for name, (_, params) in tool.triads.items()
         }
+        for name, curve in zip(values, tool.curves, strict=False):
+            if curve is not None:
+                values[name]["nonlinearity"] = _channel_curve(curve, profile, name)
     else:
         linear = any(t.order and t.model != "factors" for t in calibration.triads)
         notation = "affine" if linear else "factors"
@@ -175,3 +178,9 @@ def tool_facts(
 def _factors(params: Array, profile: Profile, triad: str) -> dict[str, Array]:
     sensor = getattr(profile, triad)
     return channel_factors(params, sensor.permutation, np.full(3, sensor.scale or 1.0))
+
+
+def _channel_curve(curve: Array, profile: Profile, triad: str) -> Array:
+    """Own-axis errors (3, 2) of channels, of those along the tool axes: a square turns its sign with the axis."""
+    turn = getattr(profile, triad).permutation.mT
+    return np.stack([turn @ curve[:, 0], np.abs(turn) @ curve[:, 1]], -1)

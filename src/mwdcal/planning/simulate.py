@@ -91,7 +91,9 @@ def grid(
 class Truth:
     """Tools of two triads, parameters (..., k) each, and the earth they stand on.
 
-    The parameters are factors (30 at order 3) unless `forms` gives the models of the triads.
+    The parameters are factors (30 at order 3) unless `forms` gives the models of the triads. `curves` (..., 3, 2) of
+    each triad, or None: own-axis quadratic and cubic error along each axis where gravity or field is all on it, as
+    shares of them.
     """
 
     accelerometer: Array
@@ -102,6 +104,7 @@ class Truth:
     field: float = 48_000.0
     dip: float = np.radians(63.0)
     forms: tuple[Model, ...] = ()
+    curves: tuple[Array | None, ...] = ()
 
     @property
     def model(self) -> Factors:
@@ -118,10 +121,18 @@ class Truth:
     def readings(self, vectors: tuple[Array, Array], temperature: Array) -> dict[str, Array]:
         """Readings (..., n, 3) of each triad without noise, nominal units: the model, inverted."""
         pairs = zip(self.triads.items(), vectors, strict=False)
-        return {
+        result = {
             name: raw_reading(model, params, vector, temperature, *() if model.curved else (1,))
             for (name, (model, params)), vector in pairs
         }
+        for name, curve, strength in zip(
+            result, self.curves, (self.gravity, self.field), strict=False
+        ):
+            if curve is not None:
+                share = result[name] / strength
+                square, cube = np.moveaxis(curve[..., None, :, :], -1, 0)
+                result[name] = result[name] + strength * (square + cube * share) * share**2
+        return result
 
 
 def servo(rng: np.random.Generator) -> Truth:
@@ -134,8 +145,8 @@ def drawn(
 ) -> Truth:
     """Tools within the tolerances of a profile's datasheets; what these do not state is as of `SERVO`.
 
-    Every tolerance is the standard deviation of a uniform distribution, about nominal. The same numbers are
-    drawn at every order.
+    Every tolerance is the standard deviation of a uniform distribution, about nominal, and so is a declared
+    nonlinearity. The same numbers are drawn at every order.
     """
     unit = rng.uniform(-ROOT3, ROOT3, (*lead, len(TRIADS), 30))
     first, second = (
@@ -144,7 +155,10 @@ def drawn(
         )
         for k, name in enumerate(TRIADS)
     )
-    return Truth(first, second, order=order, reference=profile.reference_temperature_c)
+    declared = [getattr(profile, name).nonlinearity for name in TRIADS]
+    curves = [sd and sd * rng.uniform(-ROOT3, ROOT3, (*lead, 3, 2)) for sd in declared]
+    reference = profile.reference_temperature_c
+    return Truth(first, second, order=order, reference=reference, curves=tuple(curves))
 
 
 def _factors(unit: Array, sheet: Datasheet, usual: Datasheet, order: int) -> Array:

@@ -12,10 +12,9 @@ from mwdcal.app.pages.page import banner, environment
 from mwdcal.app.screens.plan import PLACE, accuracy_rows, comparison_rows, facts, station_rows
 from mwdcal.app.text import plural, quantity
 from mwdcal.calibration.prediction import accuracy_at
-from mwdcal.calibration.readings import TRIADS
 from mwdcal.files.contract import REFERENCES
 from mwdcal.geometry.vectors import Array, Ints, reference_vectors
-from mwdcal.planning.expected import planned_earth
+from mwdcal.planning.expected import left_undetermined, planned_earth
 from mwdcal.planning.planned import Planned
 from mwdcal.planning.plans import attitudes, soak_numbers
 from mwdcal.use import plots
@@ -38,7 +37,7 @@ def render(plans: Sequence[Planned]) -> str:
         profile=first.calibration.profile.name,
         summary=summaries[0],
         banner=_banner(first),
-        findings=first.calibration.undetermined(),
+        findings=left_undetermined(first.calibration),
         simulated=True,
         place=_place(first),
         titles=station_rows(first.plan)[0],
@@ -46,7 +45,7 @@ def render(plans: Sequence[Planned]) -> str:
         compared=comparison_rows(summaries),
         plans=[each.plan for each in summaries],
         accuracy=accuracy_rows(summaries[0]),
-        coverage=draw_coverage(first),
+        coverage=draw_coverage(plans),
         curves=draw_accuracy(plans),
         version=__version__,
     )
@@ -78,31 +77,37 @@ def _banner(planned: Planned) -> dict[str, str]:
 
 
 @plots.style()
-def draw_coverage(planned: Planned) -> Figure:
-    """The directions of gravity and of the field in the tool at each station, by soak."""
+def draw_coverage(plans: Sequence[Planned]) -> Figure:
+    """The directions of gravity and of the field in the tool at each station, by soak, a row for each plan."""
     label = "Directions of gravity and field in the axes of the tool"
-    figure, [panels] = plots.new_figure(label, 2.4, columns=2, sharey=True)
-    degrees, soaks = attitudes(planned.plan), soak_numbers(planned.plan)
-    both = reference_vectors(*np.radians(degrees).T, *planned_earth(planned.plan))
-    for axes, triad, vectors in zip(panels, TRIADS, both, strict=True):
-        _directions(axes, vectors, soaks)
-        name = {"accelerometer": "gravity", "magnetometer": "magnetic field"}[triad]
-        axes.set(title=f"{name} ({triad})", xlabel="direction about the tool axis, from x to y, °")
-    panels[0].set_ylabel("above the x-y plane, to z, °")
+    count = len(plans)
+    figure, panels = plots.new_figure(
+        label, 0.6 + 1.8 * count, rows=count, columns=2, sharex=True, sharey=True
+    )
+    for row, planned in zip(panels, plans, strict=True):
+        degrees, soaks = attitudes(planned.plan), soak_numbers(planned.plan)
+        both = reference_vectors(*np.radians(degrees).mT, *planned_earth(planned.plan))
+        for axes, what, vectors in zip(row, ("gravity", "magnetic field"), both, strict=True):
+            _directions(axes, vectors, soaks)
+            name = f"{planned.plan.source[:30]}: " if count > 1 else ""
+            axes.set_title(name + what)
+        row[0].set_ylabel("above x-y plane, °")
+    for axes in panels[-1]:
+        axes.set_xlabel("direction about the tool axis, from x to y, °")
     return figure
 
 
 def _directions(axes: Axes, vectors: Array, soaks: Ints) -> None:
-    """Longitude and latitude of vectors (n, 3) in the tool's axes."""
+    """Vectors (n, 3) in the tool's axes on a map of the sphere that is true to area: longitude and sine of latitude."""
     longitude = np.degrees(np.arctan2(vectors[:, 1], vectors[:, 0]))
-    latitude = np.degrees(np.arctan2(vectors[:, 2], np.hypot(vectors[:, 0], vectors[:, 1])))
+    height = vectors[:, 2] / np.linalg.norm(vectors, axis=-1)
     for number in np.unique(soaks).tolist():
         some = soaks == number
         marker = SOAK_MARKERS[number % len(SOAK_MARKERS)]
-        axes.plot(longitude[some], latitude[some], marker, mfc="none", color=plots.AFTER, alpha=0.8)
-    axes.set(
-        xlim=(-185, 185), ylim=(-95, 95), xticks=range(-180, 181, 90), yticks=range(-90, 91, 45)
-    )
+        axes.plot(longitude[some], height[some], marker, mfc="none", color=plots.AFTER, alpha=0.8)
+    axes.set(xlim=(-185, 185), ylim=(-1.08, 1.08), xticks=range(-180, 181, 90))
+    latitudes = np.arange(-90, 91, 30)
+    axes.set_yticks(np.sin(np.radians(latitudes)), [str(each) for each in latitudes])
 
 
 @plots.style()

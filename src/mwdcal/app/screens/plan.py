@@ -18,6 +18,7 @@ from mwdcal.calibration.readings import SIMULATED
 from mwdcal.calibration.record import Calibration, Finding, TriadCalibration, Undetermined
 from mwdcal.errors import InputError
 from mwdcal.files.formats.table import Table
+from mwdcal.planning.expected import left_undetermined
 from mwdcal.planning.planned import WORKING_INCLINATIONS, Planned
 
 PLACE = "1σ, calibration alone, at 45° inclination"
@@ -82,6 +83,21 @@ def wanted_accuracy(words: Sequence[str]) -> dict[str, float]:
     return wanted
 
 
+def reach(words: Sequence[str]) -> dict[str, tuple[float, float]]:
+    """What a stand reaches, such as inclination=0:120, as the least and the largest setting by angle, degrees."""
+    ends = {}
+    for word in words:
+        name, _, limits = word.partition("=")
+        low, _, high = limits.partition(":")
+        try:
+            ends[name] = float(low), float(high)
+        except ValueError:
+            raise InputError(
+                f"`reach` must be such as inclination=0:120, in degrees; got {word!r}."
+            ) from None
+    return ends
+
+
 def facts(each: Planned) -> PlanSummary:
     """What is said of a plan."""
     return PlanSummary(**_fields(each))
@@ -91,7 +107,7 @@ def _fields(each: Planned) -> dict[str, Any]:
     """The fields of a `PlanSummary`."""
     calibration = each.calibration
     by_triad = {triad.name: _triad(triad) for triad in calibration.triads}
-    free = {entry.id: entry for entry in calibration.undetermined()}
+    free = {entry.id: entry for entry in left_undetermined(calibration)}
     return {
         "plan": each.plan.source,
         "stations": each.plan.count,
@@ -129,7 +145,7 @@ def _by_inclination(calibration: Calibration) -> dict[str, list[float | None]]:
 
 def findings(plans: Sequence[Planned]) -> list[Finding]:
     """What the plans leave undetermined."""
-    entries = [(each, free) for each in plans for free in each.calibration.undetermined()]
+    entries = [(each, free) for each in plans for free in left_undetermined(each.calibration)]
     return [Finding(id=free.id, text=f"{each.plan.source}: {free.text}") for each, free in entries]
 
 

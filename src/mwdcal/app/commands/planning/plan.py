@@ -39,6 +39,13 @@ from mwdcal.errors import InputError
     metavar="RUN",
     help="A run that is measured already: the best stations to add to it.",
 )
+@click.option(
+    "--reach",
+    metavar="ANGLE=LOW:HIGH",
+    multiple=True,
+    help="What the stand reaches, such as inclination=0:120 or azimuth=0:0, degrees; may be repeated. Default: "
+    "every attitude.",
+)
 @options.preset(
     "--criterion",
     type=click.Choice(["D", "A", "I"]),
@@ -71,8 +78,8 @@ from mwdcal.errors import InputError
 @options.JSON
 def command(
     plans: tuple[str, ...], stations: int | None, accuracy: tuple[str, ...], measured: Path | None,
-    criterion: str, speed: float, settle: float, soak: float, tool: str | None, output: Path | None,
-    html: Path | None, as_json: bool, **typed: Unpack[options.Typed],
+    reach: tuple[str, ...], criterion: str, speed: float, settle: float, soak: float, tool: str | None,
+    output: Path | None, html: Path | None, as_json: bool, **typed: Unpack[options.Typed],
 ) -> None:  # fmt: skip
     """What a calibration from planned stations will give: uncertainty, rank, accuracy, hours at the stand.
 
@@ -82,34 +89,37 @@ def command(
     Example: mwdcal plan --stations 24 --tool servo -o plan.csv --html sheet.html
     Exit: 0 planned, 2 input cannot be read, 3 the stations cannot give a calibration.
     """
+    from mwdcal.app import progress
     from mwdcal.app.choices import options_of, prior_of
     from mwdcal.app.screens import plan as screen
     from mwdcal.files import profiles
     from mwdcal.files.formats import atomic, table
     from mwdcal.planning import planned
     from mwdcal.planning.moves import Stand
-    from mwdcal.planning.plans import load_plan, run_sheet
+    from mwdcal.planning.plans import load_measured, load_plan, run_sheet
 
     options.check_outputs([output], [tool, measured, *plans], page=html)
+    if len(plans) > 1 and (accuracy or stations or measured):
+        raise InputError("`plan`: one plan holds the candidates to choose from. Name it alone.")
     prior, _ = prior_of(typed["prior"])
     profile, digest = profiles.load_profile(tool)
     chosen = options_of(typed, prior)
-    stand = Stand(speed, settle, soak)
+    stand = Stand(speed, settle, soak, screen.reach(reach))
     tables = [load_plan(name) for name in plans]
-    done = load_plan(str(measured)) if measured else None
-    if accuracy or stations or done:
-        if len(tables) > 1:
-            raise InputError("`plan`: one plan holds the candidates to choose from. Name it alone.")
-        candidates = tables[0] if tables else load_plan("candidates")
-        search = profile, chosen, criterion, stand
+    done = load_measured(str(measured)) if measured else None
+    search = profile, chosen, criterion, stand, done
+    candidates = tables[0] if tables else None
+    with progress.bar("planning") as show:
         if accuracy:
             wanted = screen.wanted_accuracy(accuracy)
             result = [planned.smallest_plan(candidates, wanted, *search)]
+        elif stations or done:
+            result = [planned.best_plan(candidates, stations or 1, *search)]
         else:
-            result = [planned.best_plan(candidates, stations or 1, *search, done)]
-    else:
-        tables = tables or [load_plan("twenty-four-state")]
-        result = [planned.judged(each, profile, chosen, stand) for each in tables]
+            result = []
+            for each in tables or [load_plan("twenty-four-state")]:
+                result.append(planned.judged(each, profile, chosen, stand))
+                show(len(result), len(tables))
     shown = screen.document if as_json else screen.screen
     digests = {"profile": digest, "measured": done.digest if done else ""}
     text = shown(result, digests, output, html)
