@@ -10,6 +10,7 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
+from msgspec.structs import replace as replace_struct
 from scipy.stats import chi2
 
 import mwdcal
@@ -302,6 +303,22 @@ def test_reference_file_gives_norths_and_limits(example, tmp_path):
     assert document["not_judged"] == 0
     assert document["north"] == "grid"
     assert document["reference_sha256"]
+
+
+def test_references_of_the_laboratory_do_not_count_in_a_well(example, tmp_path):
+    """The stand's uncertainty of field and dip is that of the laboratory: limits are those of the model."""
+    calibration = mwdcal.load(example)
+    stand = replace_struct(calibration.profile.stand, field_nt=1.0, dip_deg=0.001, gravity_g=1e-6)
+    narrow = replace_struct(calibration, profile=replace_struct(calibration.profile, stand=stand))
+    path = tmp_path / "narrow.json"
+    mwdcal.save(narrow, path)
+    (tmp_path / "b").mkdir()
+    first, _ = surveyed_file(example, tmp_path, {})
+    second, _ = surveyed_file(path, tmp_path / "b", {})
+    shifted = {"ref_field_nt": ["48700"] * 36}
+    assert first["accepted"] == second["accepted"]
+    one, other = (surveyed_file(c, tmp_path, shifted)[0]["accepted"] for c in (example, path))
+    assert one == other
 
 
 def test_without_reference_nothing_is_accepted(example, tmp_path):

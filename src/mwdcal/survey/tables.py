@@ -8,6 +8,7 @@ from dataclasses import replace
 from math import radians
 
 import numpy as np
+from msgspec.structs import replace as replace_struct
 
 from mwdcal.calibration.readings import CONSTANTS, Readings, is_simulated
 from mwdcal.calibration.record import Calibration
@@ -17,6 +18,7 @@ from mwdcal.files.contract import REFERENCES, check_columns, stated_norths
 from mwdcal.files.formats.table import Table, cell_error, numbers
 from mwdcal.files.runs import renamed, to_readings
 from mwdcal.geometry.vectors import Array
+from mwdcal.sensor.profile import StandProfile
 from mwdcal.survey.place.references import MEASURABLE, EarthReference
 from mwdcal.survey.well import North, Well
 
@@ -34,6 +36,7 @@ def survey_readings(
 ) -> tuple[Readings, Array | None, North]:
     """The readings of a table, measured depths (n,) if it has them, and the norths that azimuths may count from.
 
+    Uncertainties of the laboratory's stand and references do not count in a well.
     What the table states of gravity, field, dip, declination and convergence stands before the `reference`.
 
     Raises:
@@ -43,7 +46,8 @@ def survey_readings(
     check_columns(list(table.columns), table.source)
     if calibration.thermal:
         synonyms.check_evidence(list(table.columns), table.source, ("temperature_c",))
-    readings, _ = to_readings(table, calibration.profile)
+    in_a_well = replace_struct(calibration.profile, stand=StandProfile())
+    readings, _ = to_readings(table, in_a_well)
     if reference is not None:
         readings = _referenced(readings, reference)
     return readings, _depths(table), _norths(table, reference)
