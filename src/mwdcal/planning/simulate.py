@@ -24,26 +24,10 @@ from mwdcal.geometry.vectors import (
 )
 from mwdcal.planning.effects import Effects, approach, response, wandering
 from mwdcal.planning.plans import ROOM_TEMPERATURE
+from mwdcal.sensor.datasheets import ROOT3, tolerance
 from mwdcal.sensor.models import Basis, Factors, Model
-from mwdcal.sensor.profile import COMMON, Datasheet, Profile
+from mwdcal.sensor.profile import COMMON, Profile
 
-ROOT3 = np.sqrt(3.0)
-"""Half the width of a uniform distribution, in its standard deviations."""
-SERVO = {
-    "accelerometer": Datasheet(
-        scale=0.05 / ROOT3, bias=0.010 / ROOT3, misalignment_deg=np.degrees(2e-3) / ROOT3,
-        scale_per_c=180e-6 / ROOT3, bias_per_c=100e-6 / ROOT3,
-    ),
-    "magnetometer": Datasheet(
-        scale=0.02 / ROOT3, bias=500.0 / ROOT3, misalignment_deg=np.degrees(4e-3) / ROOT3,
-        scale_per_c=100e-6 / ROOT3, bias_per_c=2.0 / ROOT3,
-    ),
-}  # fmt: skip
-"""A servo instrument within the limits of Moosavi's Table 1, 1σ of uniform distributions.
-
-Scale ± 5 %, bias ± 10 mg, axis alignment ± 2 mrad, scale drift ± 180 ppm/°C, bias drift ± 100 µg/°C.
-The magnetometer: scale ± 2 %, hard iron ± 1 % of 50 µT, alignment ± 4 mrad.
-"""
 DRIFT_POWERS = np.array([1.0, 1e-3, 1e-6])
 """Powers of a drift over temperature: the square and the cube are a tenth and a hundredth of it over 100 °C."""
 
@@ -139,29 +123,21 @@ def drawn(
     """
     unit = rng.uniform(-ROOT3, ROOT3, (*lead, len(TRIADS), 30))
     first, second = (
-        _factors(
-            unit[..., k, :], getattr(profile, name).datasheet or SERVO[name], SERVO[name], order
-        )
-        for k, name in enumerate(TRIADS)
+        _factors(unit[..., k, :], profile, name, order) for k, name in enumerate(TRIADS)
     )
     return Truth(first, second, order=order, reference=profile.reference_temperature_c)
 
 
-def _factors(unit: Array, sheet: Datasheet, usual: Datasheet, order: int) -> Array:
-    """Factors (..., k) within tolerances, of numbers (..., 30) of standard deviation 1."""
-
-    def tolerance(name: str) -> float:
-        stated = getattr(sheet, name)
-        return float(getattr(usual, name) if stated is None else stated)
-
+def _factors(unit: Array, profile: Profile, triad: str, order: int) -> Array:
+    """Factors (..., k) of a triad within tolerances, of numbers (..., 30) of standard deviation 1."""
     parts = []
     for start, middle, name in ((0, 1.0, "scale"), (12, 0.0, "bias")):
-        steady = middle + tolerance(name) * unit[..., start : start + 3, None]
+        steady = middle + tolerance(profile, triad, name) * unit[..., start : start + 3, None]
         drift = unit[..., start + 3 : start + 12].reshape(*unit.shape[:-1], 3, 3)
-        powers = tolerance(f"{name}_per_c") * drift * DRIFT_POWERS
+        powers = tolerance(profile, triad, f"{name}_per_c") * drift * DRIFT_POWERS
         parts.append(np.concatenate([steady, powers], -1)[..., : order + 1])
     linear = [part.reshape(*unit.shape[:-1], -1) for part in parts]
-    turns = np.radians(tolerance("misalignment_deg")) * unit[..., 24:]
+    turns = np.radians(tolerance(profile, triad, "misalignment_deg")) * unit[..., 24:]
     return np.concatenate([*linear, turns], -1)
 
 

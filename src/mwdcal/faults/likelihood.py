@@ -1,0 +1,276 @@
+"""How well each fault explains readings: the joint estimator with the calibration as prior, and faults as columns.
+
+Members B of a batch lead the axes. Everything that is not known has a proper prior, so that the density of the
+readings under each fault is one Gaussian integral about the best explanation (Laplace), and comparable.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mwdcal.calibration.evidence import evidence_of
+from mwdcal.calibration.readings import Readings
+from mwdcal.calibration.record import Calibration
+from mwdcal.estimation.batch import batch_of_one, mapped, take
+from mwdcal.estimation.problem import Prior, Problem, State, Triad
+from mwdcal.estimation.start import oriented
+from mwdcal.faults.physics import SIZE, columns
+from mwdcal.geometry.vectors import Array, Ints, inverse
+
+FREE_SIZE = 0.3
+"""Standard uncertainty of a direction that the calibration has left free: it turns or stretches by as much."""
+LEAST_SD = 1e-7
+"""Smallest noise of a reading that counts, as a share of the field."""
+LEFT_OUT = 1e6
+"""Factor on the noise of a channel that is taken to be dead: its readings then say nothing of anything else."""
+STEPS = 6
+"""Gauss-Newton steps: departures are a few per cent of the field, and each step gains two digits or more."""
+
+
+@dataclass(frozen=True)
+class Suspect:
+    """Tools that may be at fault: their readings as a problem, and what their calibrations leave uncertain.
+
+    `expected` (B, p) are the parameters and `root` (B, p, k) a root of their covariance; `warmth` (B, n) is T
+    less its reference.
+    """
+
+    problem: Problem
+    expected: Array
+    root: Array
+    warmth: Array
+
+    @classmethod
+    def of(cls, calibration: Calibration, readings: Readings) -> Suspect:
+        """A batch of one; `readings` have the triads of the calibration, or the accelerometer alone."""
+        temperature = readings.temperature
+        if temperature is None:
+            temperature = np.full(readings.count, calibration.reference_temperature)
+        triads = []
+        for triad in calibration.triads[: len(readings.triads)]:
+            raw = getattr(readings, triad.name)
+            sd = np.broadcast_to(readings.sd.get(triad.name, triad.noise), raw.shape)
+            floor = LEAST_SD * np.sqrt(np.mean(raw**2) + 1e-12)
+            model = batch_of_one(triad.functions(calibration.reference_temperature))
+            triads.append(Triad(model, raw[None], np.maximum(sd, floor)[None]))
+        count = sum(triad.model.size for triad in triads)
+        evidence = evidence_of(readings, np.ones(readings.count))
+        nothing = Prior(np.zeros((1, count, count)), np.zeros((1, count)))
+        problem = Problem(tuple(triads), temperature[None], evidence, nothing)
+        return cls(
+            problem,
+            calibration.parameters[None, :count],
+            _root(calibration)[None, :count],
+            (temperature - calibration.reference_temperature)[None],
+        )
+
+    def without(self, dead: Array) -> Suspect:
+        """The same with readings left out where `dead` (B, n, m)."""
+        triads, start = [], 0
+        for triad in self.problem.triads:
+            broken = dead[..., start : start + 3]
+            triads.append(replace(triad, sd=np.where(broken, LEFT_OUT * triad.sd, triad.sd)))
+            start += 3
+        return replace(self, problem=replace(self.problem, triads=tuple(triads)))
+
+    def start(self, readable: Array | None = None) -> State:
+        """Where the calibration sees the tools; `readable` (B, n, m) are readings to take for that instead."""
+        evidence, (batch, count) = self.problem.evidence, self.problem.temperature.shape
+        constants = [constant.value for constant in evidence.constants]
+        empty = State(
+            self.expected,
+            np.broadcast_to(np.eye(3), (batch, count, 3, 3)),
+            np.stack(constants, -1) if constants else np.zeros((batch, 0)),
+            np.zeros((batch, count, 0)),
+        )
+        problem = self.problem if readable is None else with_raw(self.problem, readable)
+        return oriented(problem, empty)
+
+
+def _root(calibration: Calibration) -> Array:
+    """Root (p, k) of the covariance of all parameters, free directions of `FREE_SIZE` in it."""
+    covariance = calibration.parameter_covariance
+    scale = np.sqrt(np.diag(covariance))
+    scale = np.where(scale > 0, scale, 1.0)
+    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
+    known = scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
+    return np.concatenate([known, FREE_SIZE * calibration.free_directions.transpose()], -1)
+
+
+def raw_of(problem: Problem) -> Array:
+    """Readings (B, n, m) of all triads."""
+    return np.concatenate([triad.raw for triad in problem.triads], -1)
+
+
+def with_raw(problem: Problem, raw: Array) -> Problem:
+    """The problem with other readings (B, n, m)."""
+    parts = np.split(raw, len(problem.triads), -1)
+    triads = [replace(t, raw=part) for t, part in zip(problem.triads, parts, strict=True)]
+    return replace(problem, triads=tuple(triads))
+
+
+def joined(suspects: list[Suspect]) -> Suspect:
+    """One batch of several, whose problems differ in numbers alone."""
+    whole: Suspect = mapped(lambda *arrays: np.concatenate(arrays), *suspects)
+    return whole
+
+
+def departures_seen(suspect: Suspect, state: State) -> Array:
+    """Change (B, n, m, SIZE) of the readings by each departure, at the vectors and attitudes of a state."""
+    problem = suspect.problem
+    vectors = np.concatenate(problem.targets(state), -1)
+    raw = raw_of(problem)
+    count = raw.shape[-1]
+    gain = np.broadcast_to(np.eye(3), state.attitude.shape)
+    if count == 6:
+        triad, where = problem.triads[1], problem.slices()[1]
+        gain = inverse(triad.model.slope(state.params[:, where], triad.raw, problem.temperature))
+    whole = np.zeros((*raw.shape[:-1], 6))
+    whole[..., :count] = raw
+    return columns(whole, vectors, state.attitude, suspect.warmth, gain)[..., :count, :]
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """The best explanation of readings by a fault: `evidence` (B,), log density; its sizes (B, k).
+
+    `covariance` (B, k, k) of the sizes; `information` (B, SIZE, SIZE) and `gradient` (B, SIZE) of all departures
+    beside those explained, calibration and attitudes being uncertain.
+    """
+
+    evidence: Array
+    sizes: Array
+    covariance: Array
+    information: Array
+    gradient: Array
+    state: State
+
+
+@np.errstate(invalid="ignore", divide="ignore", over="ignore")
+def explained(suspect: Suspect, mixing: Array, state: State) -> Explanation:
+    """The best explanation of the readings by departures `mixing` (B, SIZE, k) times sizes of unit variance.
+
+    `state` is where the search begins. Columns of zeros are sizes that nothing has.
+    """
+    problem, raw = suspect.problem, raw_of(suspect.problem)
+    scores = np.zeros((len(raw), suspect.root.shape[-1]))
+    sizes = np.zeros((len(raw), mixing.shape[-1]))
+    for _ in range(STEPS):
+        seen = departures_seen(suspect, state)
+        mixed = seen @ mixing[:, None]
+        sound = raw - np.einsum("bnmk,bk->bnm", mixed, sizes)
+        system = _System.at(suspect, with_raw(problem, sound), state, mixed, scores, sizes)
+        step = -np.einsum("bij,bj->bi", system.covariance, system.gradient)
+        state = system.moved(state, step, suspect.root)
+        scores = scores + step[:, : scores.shape[1]]
+        sizes = sizes + step[:, step.shape[1] - sizes.shape[1] :]
+    seen = departures_seen(suspect, state)
+    mixed = seen @ mixing[:, None]
+    sound = raw - np.einsum("bnmk,bk->bnm", mixed, sizes)
+    system = _System.at(suspect, with_raw(problem, sound), state, mixed, scores, sizes)
+    k = mixing.shape[-1]
+    first = system.covariance.shape[-1] - k
+    information, gradient = system.beside(seen)
+    return Explanation(
+        np.nan_to_num(system.evidence(), nan=-np.inf),
+        sizes,
+        system.covariance[:, first:, first:],
+        information,
+        gradient,
+        state,
+    )
+
+
+@dataclass(frozen=True)
+class _System:
+    """Normal equations of all unknowns: scores of the calibration, shared unknowns, sizes of the fault."""
+
+    problem: Problem
+    linear: object
+    design: Array
+    precision: Array
+    pull: Array
+    covariance: Array
+    gradient: Array
+    logarithm: Array
+
+    @classmethod
+    def at(
+        cls, suspect: Suspect, problem: Problem, state: State, mixed: Array, scores: Array,
+        sizes: Array,
+    ) -> _System:  # fmt: skip
+        linear = problem.linear(state)
+        p, (k, s) = linear.size, (scores.shape[-1], sizes.shape[-1])
+        noise = np.concatenate([triad.sd for triad in problem.triads], -1)
+        design = np.concatenate(
+            [linear.design[..., :p] @ suspect.root[:, None], linear.shared, -mixed / noise[..., None]],
+            -1,
+        )  # fmt: skip
+        shared = linear.prior[:, p:, p:]
+        precision = np.zeros((len(scores), design.shape[-1], design.shape[-1]))
+        precision[...] = np.eye(design.shape[-1])
+        inner = slice(k, k + shared.shape[-1])
+        precision[:, inner, inner] = shared
+        pull = np.concatenate([scores, linear.pull[:, p:], sizes], -1)
+        weighed = linear.weigh(design)
+        information = np.einsum("bnmi,bnmj->bij", design, weighed, optimize=True) + precision
+        gradient = np.einsum("bnmi,bnm->bi", weighed, linear.residual)
+        gradient = gradient + np.einsum("bij,bj->bi", precision, pull)
+        scale = np.sqrt(np.einsum("bii->bi", information))
+        inner_inverse = inverse(information / (scale[:, :, None] * scale[:, None, :]))
+        covariance = inner_inverse / (scale[:, :, None] * scale[:, None, :])
+        logarithm = np.linalg.slogdet(information)[1] - np.linalg.slogdet(shared)[1]
+        return cls(problem, linear, design, precision, pull, covariance, gradient, logarithm)
+
+    def moved(self, state: State, step: Array, root: Array) -> State:
+        """The state after a step; what the fault then explains is no longer in the residual."""
+        k, s = root.shape[-1], self.linear.shared.shape[-1]
+        fault = np.einsum("bnmk,bk->bnm", self.design[..., k + s :], step[:, k + s :])
+        linear = replace(self.linear, residual=self.linear.residual + fault)
+        params = np.einsum("bpk,bk->bp", root, step[:, :k])
+        return self.problem.move(state, linear, np.concatenate([params, step[:, k : k + s]], -1))
+
+    def evidence(self) -> Array:
+        """Logarithm (B,) of the density of the readings, but for a constant."""
+        linear = self.linear
+        residual = linear.residual
+        weighed = linear.weigh(residual[..., None])[..., 0]
+        square = np.sum(residual * weighed, (-1, -2))
+        square = square + np.einsum("bi,bij,bj->b", self.pull, self.precision, self.pull)
+        square = square - np.einsum("bi,bij,bj->b", self.gradient, self.covariance, self.gradient)
+        private = -np.linalg.slogdet(linear.core)[1].sum(-1)
+        return np.asarray(-0.5 * (square + self.logarithm + private))
+
+    def beside(self, seen: Array) -> tuple[Array, Array]:
+        """Information (B, SIZE, SIZE) and gradient (B, SIZE) of departures `seen` (B, n, m, SIZE).
+
+        Of the logarithm of the density by each departure, all that the system has being integrated out.
+        """
+        noise = np.concatenate([triad.sd for triad in self.problem.triads], -1)
+        added = -seen / noise[..., None]
+        weighed = self.linear.weigh(added)
+        cross = np.einsum("bnmi,bnmj->bij", weighed, self.design, optimize=True)
+        whole = np.einsum("bnmi,bnmj->bij", added, weighed, optimize=True)
+        pulled = np.einsum("bnmi,bnm->bi", weighed, self.linear.residual)
+        information = whole - cross @ self.covariance @ cross.mT
+        gradient = np.einsum("bij,bjk,bk->bi", cross, self.covariance, self.gradient) - pulled
+        return (information + information.mT) / 2, gradient
+
+
+def ratios(information: Array, gradient: Array, mixing: Array) -> Array:
+    """Log evidence (...,) of a fault over none, linearised: `information` (…, SIZE, SIZE), `mixing` (…, SIZE, k).
+
+    Definition: bᵀ(I + A)⁻¹b / 2 - log det(I + A) / 2, A and b being those of its sizes.
+    """
+    inner = mixing.mT @ information @ mixing
+    along = np.einsum("...ik,...i->...k", mixing, gradient)
+    whole = np.eye(inner.shape[-1]) + inner
+    solved = np.linalg.solve(whole, along[..., None])[..., 0]
+    return np.asarray(0.5 * (np.sum(along * solved, -1) - np.linalg.slogdet(whole)[1]))
+
+
+def repeated(suspect: Suspect, index: Ints) -> Suspect:
+    """The members at `index`, as often as they stand there."""
+    return take(suspect, index)
