@@ -16,7 +16,7 @@ from mwdcal.calibration.record import Calibration
 from mwdcal.estimation.batch import batch_of_one, mapped, take
 from mwdcal.estimation.problem import Prior, Problem, State, Triad
 from mwdcal.estimation.start import oriented
-from mwdcal.faults.physics import SIZE, columns
+from mwdcal.faults.physics import columns
 from mwdcal.geometry.vectors import Array, Ints, inverse
 
 FREE_SIZE = 0.3
@@ -25,7 +25,7 @@ LEAST_SD = 1e-7
 """Smallest noise of a reading that counts, as a share of the field."""
 LEFT_OUT = 1e6
 """Factor on the noise of a channel that is taken to be dead: its readings then say nothing of anything else."""
-STEPS = 6
+STEPS = 5
 """Gauss-Newton steps: departures are a few per cent of the field, and each step gains two digits or more."""
 
 
@@ -149,16 +149,20 @@ class Explanation:
 
 
 @np.errstate(invalid="ignore", divide="ignore", over="ignore")
-def explained(suspect: Suspect, mixing: Array, state: State) -> Explanation:
+def explained(
+    suspect: Suspect, mixing: Array, state: State, seen_at: Array | float = 1.0
+) -> Explanation:
     """The best explanation of the readings by departures `mixing` (B, SIZE, k) times sizes of unit variance.
 
-    `state` is where the search begins. Columns of zeros are sizes that nothing has.
+    `state` is where the search begins. Columns of zeros are sizes that nothing has. `seen_at` (n, SIZE) is 0 for
+    departures that a station is without.
     """
     problem, raw = suspect.problem, raw_of(suspect.problem)
     scores = np.zeros((len(raw), suspect.root.shape[-1]))
     sizes = np.zeros((len(raw), mixing.shape[-1]))
+    seen_at_rows = np.asarray(seen_at)[..., None, :] if np.ndim(seen_at) else seen_at
     for _ in range(STEPS):
-        seen = departures_seen(suspect, state)
+        seen = departures_seen(suspect, state) * seen_at_rows
         mixed = seen @ mixing[:, None]
         sound = raw - np.einsum("bnmk,bk->bnm", mixed, sizes)
         system = _System.at(suspect, with_raw(problem, sound), state, mixed, scores, sizes)
@@ -166,7 +170,7 @@ def explained(suspect: Suspect, mixing: Array, state: State) -> Explanation:
         state = system.moved(state, step, suspect.root)
         scores = scores + step[:, : scores.shape[1]]
         sizes = sizes + step[:, step.shape[1] - sizes.shape[1] :]
-    seen = departures_seen(suspect, state)
+    seen = departures_seen(suspect, state) * seen_at_rows
     mixed = seen @ mixing[:, None]
     sound = raw - np.einsum("bnmk,bk->bnm", mixed, sizes)
     system = _System.at(suspect, with_raw(problem, sound), state, mixed, scores, sizes)
@@ -202,7 +206,7 @@ class _System:
         sizes: Array,
     ) -> _System:  # fmt: skip
         linear = problem.linear(state)
-        p, (k, s) = linear.size, (scores.shape[-1], sizes.shape[-1])
+        p, k = linear.size, scores.shape[-1]
         noise = np.concatenate([triad.sd for triad in problem.triads], -1)
         design = np.concatenate(
             [linear.design[..., :p] @ suspect.root[:, None], linear.shared, -mixed / noise[..., None]],
@@ -267,7 +271,7 @@ def ratios(information: Array, gradient: Array, mixing: Array) -> Array:
     inner = mixing.mT @ information @ mixing
     along = np.einsum("...ik,...i->...k", mixing, gradient)
     whole = np.eye(inner.shape[-1]) + inner
-    solved = np.linalg.solve(whole, along[..., None])[..., 0]
+    solved = np.einsum("...k,...kj->...j", along, np.linalg.inv(whole))
     return np.asarray(0.5 * (np.sum(along * solved, -1) - np.linalg.slogdet(whole)[1]))
 
 

@@ -6,6 +6,7 @@ g, nT, radians, °C.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import accumulate, pairwise
 from typing import NamedTuple
@@ -161,14 +162,24 @@ class Damage:
         """Departures (..., 1, k) of one kind."""
         return np.asarray(self.departures[..., None, PLACES[name]])
 
+    def described(self) -> dict[str, list[float]]:
+        """What has happened to one tool, by kind of departure: those that have; and dead channels (6,)."""
+        kinds = {name: self.departures[where].tolist() for name, where in PLACES.items()}
+        dead = {"dead": self.dead.astype(float).tolist()} if self.dead.any() else {}
+        return {name: values for name, values in kinds.items() if any(values)} | dead
+
 
 def drawn_damage(
-    rng: np.random.Generator, fault: Fault, size: float = 1.0, lead: tuple[int, ...] = ()
+    rng: np.random.Generator, forms: Sequence[Fault], size: float = 1.0, lead: tuple[int, ...] = ()
 ) -> Damage:
-    """A fault of `size` times the usual one: each of its sizes drawn within `SPREAD` of that, of either sign."""
-    count = fault.mixing.shape[1]
-    drawn = rng.uniform(*SPREAD, (*lead, count)) * rng.choice([-1.0, 1.0], (*lead, count))
-    departures = size * drawn @ fault.mixing.transpose()
+    """One of the `forms` for each tool, of `size` times the usual one: sizes uniform within `SPREAD`, of either sign."""
+    departures = np.zeros((*lead, SIZE))
+    chosen = rng.integers(len(forms), size=lead)
+    for place, form in enumerate(forms):
+        shape = *lead, form.mixing.shape[1]
+        drawn = rng.uniform(*SPREAD, shape) * rng.choice([-1.0, 1.0], shape)
+        mine = np.asarray(chosen == place)[..., None]
+        departures += np.where(mine, size * drawn @ form.mixing.transpose(), 0.0)
     nothing = np.zeros((*lead, 6))
     return Damage(departures, nothing > 0, nothing)
 

@@ -123,6 +123,7 @@ def session_facts(
         "stand": stand,
         "earth": {"gravity_g": earth["gravity"], "field_nt": earth["field"], "dip_deg": float(dip)},
         "turn_on": {name: value.tolist() for name, value in result.turn_on.items()},
+        "fault": {} if result.damage is None else result.damage.described(),
     }
 
 

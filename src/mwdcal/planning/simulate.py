@@ -14,6 +14,7 @@ import numpy as np
 from mwdcal.calibration.prediction import raw_reading
 from mwdcal.calibration.readings import CONSTANTS, TRIADS, Readings
 from mwdcal.estimation.evidence import ANGLES
+from mwdcal.faults.physics import Damage, changed_field, changed_readings
 from mwdcal.geometry.vectors import (
     Array,
     earth_field,
@@ -178,13 +179,15 @@ def run(
 class Simulation:
     """Readings of tools (..., n, 3), and what is true of their sessions.
 
-    `angles` by name and `temperature` of the sensors (..., n), radians and °C; `turn_on` (..., 3) by triad.
+    `angles` by name and `temperature` of the sensors (..., n), radians and °C; `turn_on` (..., 3) by triad;
+    `damage` of a tool at fault.
     """
 
     readings: Readings
     angles: dict[str, Array]
     temperature: Array
     turn_on: dict[str, Array]
+    damage: Damage | None = None
 
 
 def common_errors(
@@ -229,10 +232,11 @@ def simulated(
         + session.uncertainty(name) * rng.normal(size=(*lead, count))
         for name in ANGLES
     }
-    vectors = _vectors(session, angles, rng, effects, common, times)
+    damage = effects.fault.damage(rng, session.profile or Profile(name="servo"), lead)
+    vectors = _vectors(session, angles, rng, effects, common, times, damage)
     warmth, recorded = _temperatures(session, effects, times)
     readings, turn_on = {}, {}
-    for name, exact in truth.readings(vectors, warmth).items():
+    for name, exact in _read(truth, vectors, warmth, damage).items():
         sensor = getattr(effects, name)
         whole = exact
         if sensor.turn_on:
@@ -251,7 +255,7 @@ def simulated(
         station=session.station,
         metadata={**session.metadata, "simulated": True},
     )
-    return Simulation(result, angles, warmth, turn_on)
+    return Simulation(result, angles, warmth, turn_on, damage)
 
 
 def _settings(session: Readings, name: str, effects: Effects, common: Mapping[str, Array]) -> Array:
@@ -264,9 +268,9 @@ def _settings(session: Readings, name: str, effects: Effects, common: Mapping[st
 
 def _vectors(
     session: Readings, angles: Mapping[str, Array], rng: np.random.Generator, effects: Effects,
-    common: Mapping[str, Array], minutes: Array,
+    common: Mapping[str, Array], minutes: Array, damage: Damage | None,
 ) -> tuple[Array, Array]:  # fmt: skip
-    """Gravity and field (..., n, 3) in the frames of the tools."""
+    """Gravity and field (..., n, 3) in the frames of the tools, at their sensors."""
     gravity, field, dip = (
         session.known[name] + np.asarray(common.get(name, 0.0))[..., None] for name in CONSTANTS
     )
@@ -281,7 +285,20 @@ def _vectors(
         size = effects.earth.variation_nt, effects.earth.variation_minutes
         earth[1] = earth[1] + wandering(rng, attitude.shape[:-1], minutes, *size)
     g, b = (np.einsum("...ij,...j->...i", attitude, vector) for vector in earth)
-    return g, b
+    return g, b if damage is None else changed_field(damage, b, attitude)
+
+
+def _read(
+    truth: Truth, vectors: tuple[Array, Array], temperature: Array, damage: Damage | None
+) -> dict[str, Array]:
+    """Readings (..., n, 3) of each triad without noise, of tools that may be at fault."""
+    sound = truth.readings(vectors, temperature)
+    if damage is None:
+        return sound
+    whole = [sound.get(name, 0 * vector) for name, vector in zip(TRIADS, vectors, strict=True)]
+    raw, both = (np.concatenate(pair, -1) for pair in (whole, vectors))
+    changed = changed_readings(damage, raw, both, temperature, truth.reference)
+    return {name: changed[..., 3 * i : 3 * i + 3] for i, name in enumerate(sound)}
 
 
 def _temperatures(

@@ -1,0 +1,120 @@
+"""How much readings speak for each fault: evidence over none, shares, and the chance of as much from a sound tool."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from mwdcal.faults.dead import DeadChannels, dead_channels
+from mwdcal.faults.likelihood import Explanation, Suspect, explained, ratios, repeated
+from mwdcal.faults.physics import FAULTS, NONE, SIZE, Fault
+from mwdcal.geometry.vectors import Array
+
+FALSE_ALARMS = 0.01
+"""Probability that a fault is named where there is none."""
+DEAD_SHARE = 0.05
+"""Share of it that goes to dead channels, whose evidence has a bound and needs no simulation."""
+DRAWS = 9_999
+"""Simulated changes without a fault, by which the evidence is judged."""
+LIKELY = 0.05
+"""A fault with a larger share of the likelihood than this is not excluded."""
+DISTINCT = float(np.log(1 / LIKELY))
+"""Logarithm of the evidence ratio that tells two faults apart."""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What readings of one tool say of all faults; `forms` are the ways in which faults show.
+
+    `best` has them as a batch, with "none" at its head; `dead` are dead channels.
+    """
+
+    suspect: Suspect
+    forms: list[Fault]
+    best: Explanation
+    dead: DeadChannels
+
+    @classmethod
+    def of(cls, suspect: Suspect, forms: list[Fault]) -> Evidence:
+        """Of a batch of one."""
+        mixing = padded(forms)
+        tools = repeated(suspect, np.zeros(len(mixing), int))
+        return cls(suspect, forms, explained(tools, mixing, tools.start()), dead_channels(suspect))
+
+    @property
+    def information(self) -> Array:
+        """Information (SIZE, SIZE) of all departures of a sound tool."""
+        return self.best.information[0]
+
+    @cached_property
+    def by_form(self) -> Array:
+        """Log evidence (F,) of each form over none."""
+        return np.asarray(self.best.evidence[1:] - self.best.evidence[0])
+
+    @cached_property
+    def dead_ratios(self) -> Array:
+        """Log evidence (C,) of each dead channel over none."""
+        return np.asarray(self.dead.evidence - self.best.evidence[0])
+
+    @cached_property
+    def by_fault(self) -> dict[str, float]:
+        """Log evidence of each fault over none: the mean over its forms."""
+        result = dict.fromkeys((NONE, *FAULTS), 0.0) | over_forms(self.forms, self.by_form)
+        return result | {"dead-channel": float(log_mean(self.dead_ratios))}
+
+    def likelihoods(self) -> dict[str, float]:
+        """Share of each fault, all being as likely beforehand."""
+        values = np.array(list(self.by_fault.values()))
+        shares = np.exp(values - values.max())
+        return dict(zip(self.by_fault, (shares / shares.sum()).tolist(), strict=True))
+
+    def probability(self, freedom: float, draws: int = DRAWS) -> float:
+        """Bound on the chance of so much evidence for any fault, from a sound tool.
+
+        Definition: a Monte Carlo test. Without a fault the gradient by all departures is Gaussian with their
+        information as covariance, so that the evidence of all faults can be drawn together; it is inflated by
+        Student's factor of `freedom` degrees of freedom behind the noise. An evidence ratio has the mean 1
+        under none, so that for dead channels Markov's inequality bounds it.
+        """
+        observed = log_mean(_linear(self.forms, self.information, self.best.gradient[0]))
+        rng = np.random.default_rng(0)
+        values, vectors = np.linalg.eigh(self.information)
+        root = vectors * np.sqrt(np.maximum(values, 0.0))
+        sound = rng.normal(size=(draws, SIZE)) @ root.transpose()
+        if np.isfinite(freedom):
+            sound *= np.sqrt(freedom / rng.chisquare(freedom, draws))[:, None]
+        beyond = log_mean(_linear(self.forms, self.information, sound)) >= observed
+        by_chance = (1 + np.count_nonzero(beyond)) / (draws + 1)
+        dead = np.exp(min(0.0, -self.by_fault["dead-channel"]))
+        return float(min(1.0, by_chance / (1 - DEAD_SHARE), dead / DEAD_SHARE))
+
+
+def padded(forms: list[Fault]) -> Array:
+    """Departures (1 + F, SIZE, k) of none and of each form, columns of zeros where it has fewer than k sizes."""
+    whole = np.zeros((1 + len(forms), SIZE, max(form.mixing.shape[1] for form in forms)))
+    for place, form in enumerate(forms, 1):
+        whole[place, :, : form.mixing.shape[1]] = form.mixing
+    return whole
+
+
+def _linear(forms: list[Fault], information: Array, gradient: Array) -> Array:
+    """Log evidence (..., faults) of faults over none, linearised at none, of gradients (..., SIZE)."""
+    each = np.stack([ratios(information, gradient, form.mixing) for form in forms], -1)
+    return np.stack(list(over_forms(forms, each).values()), -1)
+
+
+def over_forms(forms: list[Fault], each: Array) -> dict[str, Array]:
+    """Log evidence (...) of each fault, of those (..., F) of its forms, each as likely beforehand."""
+    kinds = dict.fromkeys(form.kind for form in forms)
+    places = {kind: [i for i, form in enumerate(forms) if form.kind == kind] for kind in kinds}
+    return {kind: log_mean(each[..., where]) for kind, where in places.items()}
+
+
+def log_mean(values: Array) -> Array:
+    """Logarithm (...,) of the mean of exp(values (..., k))."""
+    most = values.max(-1, keepdims=True)
+    most = np.where(np.isfinite(most), most, 0.0)
+    with np.errstate(divide="ignore"):
+        return np.asarray(np.log(np.mean(np.exp(values - most), -1)) + most[..., 0])
