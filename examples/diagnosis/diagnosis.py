@@ -81,7 +81,14 @@ def case(task: tuple[int, str, str]) -> tuple[str, str, str, float, str, list[fl
         known = {name: readings.known[name] for name in EARTH_SD}
         readings = replace(readings, known=known)
     named = diagnose(calibration, readings, draws=DRAWS)
-    return kind, scene, named.fault, named.probability, named.channel or "", *scores(named, result, kind, scene)
+    return (
+        kind,
+        scene,
+        named.fault,
+        named.probability,
+        named.channel or "",
+        *scores(named, result, kind, scene),
+    )
 
 
 def scores(named, result, kind: str, scene: str) -> tuple[list[float], list[float]]:
@@ -131,7 +138,9 @@ def tool(number: int):
     session = Session.of(load_plan("laboratory-thermal"), PROFILE)
     truth = drawn(rng, PROFILE, 1)
     readings = session.measured(truth, rng).readings
-    return calibrate(replace(readings, profile=PROFILE), PROFILE, Options(order=1, nonlinearity="none")), truth
+    return calibrate(
+        replace(readings, profile=PROFILE), PROFILE, Options(order=1, nonlinearity="none")
+    ), truth
 
 
 def cases_of(number: int) -> list:
@@ -144,7 +153,11 @@ def cases_of(number: int) -> list:
 def studied(count: int, first: int = 0) -> list:
     """All cases of many tools, by all cores."""
     with multiprocessing.Pool() as pool:
-        return [c for many in pool.imap(cases_of, range(first, first + count), chunksize=4) for c in many]
+        return [
+            c
+            for many in pool.imap(cases_of, range(first, first + count), chunksize=4)
+            for c in many
+        ]
 
 
 def page(results: list, count: int) -> str:
@@ -163,7 +176,10 @@ def confusion(results: list, scene: str) -> Iterable[str]:
     for kind in KINDS:
         named = [r[2] for r in results if r[0] == kind and r[1] == scene]
         shares = [100 * named.count(other) / len(named) for other in KINDS]
-        cells = [f"**{s:.1f}**" if other == kind else f"{s:.1f}" for other, s in zip(KINDS, shares, strict=True)]
+        cells = [
+            f"**{s:.1f}**" if other == kind else f"{s:.1f}"
+            for other, s in zip(KINDS, shares, strict=True)
+        ]
         low, high = binomtest(named.count(kind), len(named)).proportion_ci(method="wilson")
         yield f"| {kind} | " + " | ".join(cells) + f" | {100 * low:.1f}…{100 * high:.1f} |"
 
@@ -196,7 +212,9 @@ def main() -> None:
     """Write the page, or print it."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--count", type=int, default=1000)
-    parser.add_argument("--output", type=Path, default=Path(__file__).parents[2] / "docs" / "diagnosis.md")
+    parser.add_argument(
+        "--output", type=Path, default=Path(__file__).parents[2] / "docs" / "diagnosis.md"
+    )
     options = parser.parse_args()
     options.output.write_text(page(studied(options.count), options.count), "utf-8")
 

@@ -106,7 +106,7 @@ def _departures(evidence: Evidence, fault: str) -> Array:
     where = [i for i, form in enumerate(evidence.forms) if form.kind == fault]
     best = max(where, key=lambda i: evidence.by_form[i])
     mixing = evidence.forms[best].mixing
-    return np.asarray(mixing @ evidence.best.sizes[best + 1, : mixing.shape[1]])
+    return np.asarray(mixing @ evidence.best.sizes[best, : mixing.shape[1]])
 
 
 def _margins(evidence: Evidence, each: Array, fault: str) -> dict[str, float]:
@@ -129,7 +129,7 @@ def _best(
 
 def _offers(calibration: Calibration, readings: Readings, evidence: Evidence) -> dict[str, Array]:
     """Information (SIZE, SIZE) of the departures by the readings and each further roll, by its description."""
-    state, problem = evidence.best.state, evidence.suspect.problem
+    state, problem = evidence.none.state, evidence.suspect.problem
     axis = state.attitude[0, :, 2, :].mean(0)
     here = float(np.arctan2(np.hypot(axis[0], axis[1]), axis[2]))
     azimuth = float(np.arctan2(axis[1], axis[0]))
@@ -157,11 +157,11 @@ def _informed(calibration: Calibration, readings: Readings, offer: Further) -> A
     """Information (SIZE, SIZE) of the departures by the readings and a further roll."""
     longer = _extended(calibration, readings, offer)
     suspect = Suspect.of(calibration, longer)
-    held = np.ones((longer.count, SIZE))
+    held = np.ones((longer.count, 1, SIZE))
     for name in offer.without:
-        held[readings.count :, PLACES[name]] = 0.0
+        held[readings.count :, :, PLACES[name]] = 0.0
     nothing = np.zeros((1, SIZE, 0))
-    return np.asarray(explained(suspect, nothing, suspect.start(), held).information[0])
+    return np.asarray(explained(suspect, nothing, suspect.start(), held=held).information[0])
 
 
 def _extended(calibration: Calibration, readings: Readings, offer: Further) -> Readings:

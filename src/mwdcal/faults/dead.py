@@ -11,7 +11,6 @@ from mwdcal.faults.likelihood import Suspect, explained, raw_of, repeated
 from mwdcal.faults.physics import SIZE
 from mwdcal.geometry.vectors import Array, Bools, Ints
 
-
 UNSTEADY = 100.0
 """Negative log density of readings, over the root of their number, at which they are no constant."""
 MOST_ONSETS = 12

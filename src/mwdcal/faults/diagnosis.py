@@ -14,7 +14,6 @@ from mwdcal.faults.physics import FAULTS, NONE, Fault, Term, faults
 from mwdcal.faults.weighing import DRAWS, FALSE_ALARMS, Evidence
 from mwdcal.files.contract import CHANNELS
 
-
 BLIND = 0.9
 """A size of which the readings leave so much of the uncertainty that it had beforehand is not stated."""
 
@@ -128,10 +127,10 @@ def _named(calibration: Calibration, evidence: Evidence, fault: str) -> dict[str
 def _sizes(calibration: Calibration, evidence: Evidence, place: int) -> list[Moved]:
     """The sizes of a form that the readings show, the one that stands out most first."""
     form, best = evidence.forms[place], evidence.best
-    sd = np.sqrt(np.einsum("kk->k", best.covariance[place + 1]))
+    sd = np.sqrt(np.einsum("kk->k", best.covariance[place]))
     rows = []
     for term, value, spread, usual in zip(
-        form.terms, best.sizes[place + 1], sd, form.usual, strict=False
+        form.terms, best.sizes[place], sd, form.usual, strict=False
     ):
         if spread > BLIND:
             continue

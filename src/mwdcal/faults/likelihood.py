@@ -15,9 +15,10 @@ from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import Calibration
 from mwdcal.estimation.batch import batch_of_one, mapped, take
 from mwdcal.estimation.problem import Prior, Problem, State, Triad
+from mwdcal.estimation.solvers import Linear
 from mwdcal.estimation.start import oriented
 from mwdcal.faults.physics import columns
-from mwdcal.geometry.vectors import Array, Ints, inverse
+from mwdcal.geometry.vectors import Array, Ints, diagonal, inverse, outer
 
 FREE_SIZE = 0.3
 """Standard uncertainty of a direction that the calibration has left free: it turns or stretches by as much."""
@@ -25,7 +26,7 @@ LEAST_SD = 1e-7
 """Smallest noise of a reading that counts, as a share of the field."""
 LEFT_OUT = 1e6
 """Factor on the noise of a channel that is taken to be dead: its readings then say nothing of anything else."""
-STEPS = 5
+STEPS, STEPS_FROM_NEAR = 5, 2
 """Gauss-Newton steps: departures are a few per cent of the field, and each step gains two digits or more."""
 
 
@@ -137,7 +138,7 @@ class Explanation:
     """The best explanation of readings by a fault: `evidence` (B,), log density; its sizes (B, k).
 
     `covariance` (B, k, k) of the sizes; `information` (B, SIZE, SIZE) and `gradient` (B, SIZE) of all departures
-    beside those explained, calibration and attitudes being uncertain.
+    beside those explained, calibration and attitudes being uncertain; `scores` (B, k) of the calibration.
     """
 
     evidence: Array
@@ -146,45 +147,36 @@ class Explanation:
     information: Array
     gradient: Array
     state: State
+    scores: Array
 
 
 @np.errstate(invalid="ignore", divide="ignore", over="ignore")
 def explained(
-    suspect: Suspect, mixing: Array, state: State, seen_at: Array | float = 1.0
+    suspect: Suspect,
+    mixing: Array,
+    state: State,
+    near: Explanation | None = None,
+    held: Array | float = 1.0,
 ) -> Explanation:
     """The best explanation of the readings by departures `mixing` (B, SIZE, k) times sizes of unit variance.
 
-    `state` is where the search begins. Columns of zeros are sizes that nothing has. `seen_at` (n, SIZE) is 0 for
-    departures that a station is without.
+    `state` is where the search begins, or else it begins `near` that of sound tools, which takes fewer steps.
+    Columns of zeros are sizes that nothing has. `held` (n, 1, SIZE) is 0 for departures that a station is without.
     """
-    problem, raw = suspect.problem, raw_of(suspect.problem)
-    scores = np.zeros((len(raw), suspect.root.shape[-1]))
-    sizes = np.zeros((len(raw), mixing.shape[-1]))
-    seen_at_rows = np.asarray(seen_at)[..., None, :] if np.ndim(seen_at) else seen_at
-    for _ in range(STEPS):
-        seen = departures_seen(suspect, state) * seen_at_rows
-        mixed = seen @ mixing[:, None]
-        sound = raw - np.einsum("bnmk,bk->bnm", mixed, sizes)
-        system = _System.at(suspect, with_raw(problem, sound), state, mixed, scores, sizes)
+    scores = np.zeros((len(mixing), suspect.root.shape[-1])) if near is None else near.scores
+    sizes = np.zeros((len(mixing), mixing.shape[-1]))
+    for _ in range(STEPS if near is None else STEPS_FROM_NEAR):
+        system = _System.at(suspect, mixing, state, scores, sizes, held)
         step = -np.einsum("bij,bj->bi", system.covariance, system.gradient)
         state = system.moved(state, step, suspect.root)
         scores = scores + step[:, : scores.shape[1]]
         sizes = sizes + step[:, step.shape[1] - sizes.shape[1] :]
-    seen = departures_seen(suspect, state) * seen_at_rows
-    mixed = seen @ mixing[:, None]
-    sound = raw - np.einsum("bnmk,bk->bnm", mixed, sizes)
-    system = _System.at(suspect, with_raw(problem, sound), state, mixed, scores, sizes)
-    k = mixing.shape[-1]
-    first = system.covariance.shape[-1] - k
-    information, gradient = system.beside(seen)
-    return Explanation(
-        np.nan_to_num(system.evidence(), nan=-np.inf),
-        sizes,
-        system.covariance[:, first:, first:],
-        information,
-        gradient,
-        state,
-    )
+    system = _System.at(suspect, mixing, state, scores, sizes, held)
+    first = system.covariance.shape[-1] - sizes.shape[-1]
+    information, gradient = system.beside()
+    evidence = np.nan_to_num(system.evidence(), nan=-np.inf)
+    spread = system.covariance[:, first:, first:]
+    return Explanation(evidence, sizes, spread, information, gradient, state, scores)
 
 
 @dataclass(frozen=True)
@@ -192,7 +184,8 @@ class _System:
     """Normal equations of all unknowns: scores of the calibration, shared unknowns, sizes of the fault."""
 
     problem: Problem
-    linear: object
+    linear: Linear
+    seen: Array
     design: Array
     precision: Array
     pull: Array
@@ -202,31 +195,33 @@ class _System:
 
     @classmethod
     def at(
-        cls, suspect: Suspect, problem: Problem, state: State, mixed: Array, scores: Array,
-        sizes: Array,
+        cls, suspect: Suspect, mixing: Array, state: State, scores: Array, sizes: Array,
+        held: Array | float,
     ) -> _System:  # fmt: skip
+        """At a state, of the readings less what the fault does to them there."""
+        seen = departures_seen(suspect, state) * held
+        mixed = seen @ mixing[:, None]
+        sound = raw_of(suspect.problem) - np.einsum("bnmk,bk->bnm", mixed, sizes)
+        problem = with_raw(suspect.problem, sound)
         linear = problem.linear(state)
+        noise = np.concatenate([triad.sd for triad in problem.triads], -1)[..., None]
+        seen, mixed = -seen / noise, -mixed / noise
         p, k = linear.size, scores.shape[-1]
-        noise = np.concatenate([triad.sd for triad in problem.triads], -1)
-        design = np.concatenate(
-            [linear.design[..., :p] @ suspect.root[:, None], linear.shared, -mixed / noise[..., None]],
-            -1,
-        )  # fmt: skip
+        known = linear.design[..., :p] @ suspect.root[:, None]
+        design = np.concatenate([known, linear.shared, mixed], -1)
         shared = linear.prior[:, p:, p:]
-        precision = np.zeros((len(scores), design.shape[-1], design.shape[-1]))
-        precision[...] = np.eye(design.shape[-1])
-        inner = slice(k, k + shared.shape[-1])
+        precision = np.broadcast_to(np.eye(design.shape[-1]), (len(scores), *design.shape[-1:] * 2))
+        precision, inner = precision.copy(), slice(k, k + shared.shape[-1])
         precision[:, inner, inner] = shared
         pull = np.concatenate([scores, linear.pull[:, p:], sizes], -1)
-        weighed = linear.weigh(design)
-        information = np.einsum("bnmi,bnmj->bij", design, weighed, optimize=True) + precision
-        gradient = np.einsum("bnmi,bnm->bi", weighed, linear.residual)
+        weighed = _rows(linear.weigh(design))
+        information = weighed.mT @ _rows(design) + precision
+        gradient = (weighed.mT @ _rows(linear.residual[..., None]))[..., 0]
         gradient = gradient + np.einsum("bij,bj->bi", precision, pull)
-        scale = np.sqrt(np.einsum("bii->bi", information))
-        inner_inverse = inverse(information / (scale[:, :, None] * scale[:, None, :]))
-        covariance = inner_inverse / (scale[:, :, None] * scale[:, None, :])
+        scales = outer(np.sqrt(diagonal(information)))
+        covariance = inverse(information / scales) / scales
         logarithm = np.linalg.slogdet(information)[1] - np.linalg.slogdet(shared)[1]
-        return cls(problem, linear, design, precision, pull, covariance, gradient, logarithm)
+        return cls(problem, linear, seen, design, precision, pull, covariance, gradient, logarithm)
 
     def moved(self, state: State, step: Array, root: Array) -> State:
         """The state after a step; what the fault then explains is no longer in the residual."""
@@ -247,20 +242,23 @@ class _System:
         private = -np.linalg.slogdet(linear.core)[1].sum(-1)
         return np.asarray(-0.5 * (square + self.logarithm + private))
 
-    def beside(self, seen: Array) -> tuple[Array, Array]:
-        """Information (B, SIZE, SIZE) and gradient (B, SIZE) of departures `seen` (B, n, m, SIZE).
+    def beside(self) -> tuple[Array, Array]:
+        """Information (B, SIZE, SIZE) and gradient (B, SIZE) of all departures.
 
         Of the logarithm of the density by each departure, all that the system has being integrated out.
         """
-        noise = np.concatenate([triad.sd for triad in self.problem.triads], -1)
-        added = -seen / noise[..., None]
-        weighed = self.linear.weigh(added)
-        cross = np.einsum("bnmi,bnmj->bij", weighed, self.design, optimize=True)
-        whole = np.einsum("bnmi,bnmj->bij", added, weighed, optimize=True)
-        pulled = np.einsum("bnmi,bnm->bi", weighed, self.linear.residual)
-        information = whole - cross @ self.covariance @ cross.mT
-        gradient = np.einsum("bij,bjk,bk->bi", cross, self.covariance, self.gradient) - pulled
+        weighed = _rows(self.linear.weigh(self.seen))
+        cross = weighed.mT @ _rows(self.design)
+        pulled = (weighed.mT @ _rows(self.linear.residual[..., None]))[..., 0]
+        inner = cross @ self.covariance
+        information = weighed.mT @ _rows(self.seen) - inner @ cross.mT
+        gradient = np.einsum("bij,bj->bi", inner, self.gradient) - pulled
         return (information + information.mT) / 2, gradient
+
+
+def _rows(columns: Array) -> Array:
+    """Columns (B, n, m, k) with all readings of all stations in one row of each: (B, n m, k)."""
+    return columns.reshape(len(columns), -1, columns.shape[-1])
 
 
 def ratios(information: Array, gradient: Array, mixing: Array) -> Array:

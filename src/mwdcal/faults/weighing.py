@@ -7,6 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
+from mwdcal.estimation.batch import take
 from mwdcal.faults.dead import DeadChannels, dead_channels
 from mwdcal.faults.likelihood import Explanation, Suspect, explained, ratios, repeated
 from mwdcal.faults.physics import FAULTS, NONE, SIZE, Fault
@@ -28,11 +29,12 @@ DISTINCT = float(np.log(1 / LIKELY))
 class Evidence:
     """What readings of one tool say of all faults; `forms` are the ways in which faults show.
 
-    `best` has them as a batch, with "none" at its head; `dead` are dead channels.
+    `none` explains the readings without a fault, `best` by each form, as a batch; `dead` are dead channels.
     """
 
     suspect: Suspect
     forms: list[Fault]
+    none: Explanation
     best: Explanation
     dead: DeadChannels
 
@@ -40,23 +42,26 @@ class Evidence:
     def of(cls, suspect: Suspect, forms: list[Fault]) -> Evidence:
         """Of a batch of one."""
         mixing = padded(forms)
-        tools = repeated(suspect, np.zeros(len(mixing), int))
-        return cls(suspect, forms, explained(tools, mixing, tools.start()), dead_channels(suspect))
+        none = explained(suspect, mixing[:1], suspect.start())
+        each = np.zeros(len(forms), int)
+        near = take(none, each)
+        best = explained(repeated(suspect, each), mixing[1:], near.state, near)
+        return cls(suspect, forms, none, best, dead_channels(suspect))
 
     @property
     def information(self) -> Array:
         """Information (SIZE, SIZE) of all departures of a sound tool."""
-        return self.best.information[0]
+        return self.none.information[0]
 
     @cached_property
     def by_form(self) -> Array:
         """Log evidence (F,) of each form over none."""
-        return np.asarray(self.best.evidence[1:] - self.best.evidence[0])
+        return np.asarray(self.best.evidence - self.none.evidence)
 
     @cached_property
     def dead_ratios(self) -> Array:
         """Log evidence (C,) of each dead channel over none."""
-        return np.asarray(self.dead.evidence - self.best.evidence[0])
+        return np.asarray(self.dead.evidence - self.none.evidence)
 
     @cached_property
     def by_fault(self) -> dict[str, float]:
@@ -78,7 +83,7 @@ class Evidence:
         Student's factor of `freedom` degrees of freedom behind the noise. An evidence ratio has the mean 1
         under none, so that for dead channels Markov's inequality bounds it.
         """
-        observed = log_mean(_linear(self.forms, self.information, self.best.gradient[0]))
+        observed = log_mean(_linear(self.forms, self.information, self.none.gradient[0]))
         rng = np.random.default_rng(0)
         values, vectors = np.linalg.eigh(self.information)
         root = vectors * np.sqrt(np.maximum(values, 0.0))
