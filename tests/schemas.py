@@ -24,6 +24,7 @@ from mwdcal.app.screens import (
     stations,
 )
 from mwdcal.calibration.record import SCHEMA_VERSION, Calibration
+from mwdcal.faults.diagnosis import Diagnosis
 from mwdcal.use.verification import Verdict
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
@@ -32,6 +33,7 @@ CONTENTS: dict[str, type] = {
     "calibrate": calibration.CalibrationSummary,
     "compare": comparison.ComparisonSummary,
     "convert": conversion.ConversionSummary,
+    "diagnose": Diagnosis,
     "example": ExampleDocument,
     "fleet": fleet.FleetDocument,
     "noise": noise.NoiseSummary,

@@ -32,14 +32,14 @@ from mwdcal.planning.simulate import StationPlan, drawn, grid, simulated
 
 KINDS = (NONE, *FAULTS)
 SCENES = {
-    "roll": "a roll test on the stand, 24 stations at 25 °C, with references",
-    "two soaks": "the same at 25 °C and at 100 °C, 48 stations",
+    "roll": "a roll test on the stand, 12 stations at 25 °C, with references",
+    "two soaks": "the same at 25 °C and at 100 °C, 24 stations",
     "surveys": "12 surveys in a well, at 50 °C to 105 °C, without references for the attitude",
 }
 PROFILE = load_profile("servo")[0]
 EARTH_SD = {"gravity": 1e-4, "field": 20.0, "dip": np.radians(0.03)}
 """Uncertainty of the references of surveys: in-field referencing (OWSG, IFR)."""
-DRAWS = 1_999
+DRAWS = 999
 SEED = 20261123
 
 
@@ -50,7 +50,7 @@ def later(scene: str, rng: np.random.Generator) -> Readings:
         angles = np.radians(np.linspace(8, 88, count)), rng.uniform(0, 2 * np.pi, (2, count))
         plan = StationPlan(angles[0], *angles[1], np.linspace(50.0, 105.0, count))
     else:
-        plan = grid([5, 45, 90], 8, [0, 120, 240], [25.0] if scene == "roll" else [25.0, 100.0])
+        plan = grid([5, 45, 90], 4, [0, 120, 240], [25.0] if scene == "roll" else [25.0, 100.0])
     model = Session.of(load_plan("roll-test"), PROFILE).readings
     sd = {name: np.broadcast_to(value.ravel()[0], (plan.count, 3) if name.endswith("meter") else plan.count)
           for name, value in ((n, np.asarray(v)) for n, v in model.sd.items())}  # fmt: skip
@@ -112,9 +112,9 @@ def strengthened(north: float, east: float) -> float:
 
 
 def _places(name: str) -> slice:
-    from mwdcal.faults.physics import PLACES
+    from mwdcal.faults.physics import DEPARTURES
 
-    return PLACES[name]
+    return DEPARTURES[name]
 
 
 def located(row, kind: str) -> tuple[str, float, int]:
@@ -204,8 +204,8 @@ Written by `make diagnosis`. SIMULATED DATA: {count} tools for each row, each wi
 reads any constant, in half of the cases with more than one temperature only above 80 °C. Rows: what the tool has;
 columns: what `diagnose` names, per cent.
 """
-SIZES = """Of the faults that are named rightly: how often the true size lies within the stated uncertainty (68.3 % and 95 % if
-it is right)."""
+SIZES = """Of the faults that are named rightly: how often the true size lies within the stated uncertainty (68.3 % and
+95 % if it is right)."""
 
 
 def main() -> None:

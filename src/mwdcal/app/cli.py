@@ -23,7 +23,7 @@ INTERNAL = 70
 COMPLETION = "_MWDCAL_COMPLETE"
 """Variable with which a shell asks for completions, which are bytes."""
 COMMANDS = (
-    *("apply", "calibrate", "compare", "completion", "convert", "example"),
+    *("apply", "calibrate", "compare", "completion", "convert", "planning.diagnose", "example"),
     *("fleet", "noise", "planning.plan", "profile", "planning.simulate", "stations", "verify"),
 )
 """Modules of `mwdcal.app.commands` with a command of their name."""

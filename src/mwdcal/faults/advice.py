@@ -14,8 +14,8 @@ from mwdcal.calibration.readings import CONSTANTS, Readings
 from mwdcal.calibration.record import Calibration
 from mwdcal.estimation.evidence import ANGLES
 from mwdcal.faults.likelihood import Suspect, explained
-from mwdcal.faults.physics import NONE, PLACES, SIZE
-from mwdcal.faults.weighing import DISTINCT, LIKELY, Evidence, over_forms
+from mwdcal.faults.physics import DEPARTURES, NONE, SIZE
+from mwdcal.faults.weighing import DISTINCT, LIKELY, FaultEvidence, over_forms
 from mwdcal.geometry.vectors import Array, reference_vectors
 
 QUARTERS = np.arange(4) * np.pi / 2
@@ -44,7 +44,7 @@ class Further(NamedTuple):
     without: tuple[str, ...] = ()
 
 
-def expected_ratios(evidence: Evidence, information: Array, departures: Array) -> Array:
+def expected_ratios(evidence: FaultEvidence, information: Array, departures: Array) -> Array:
     """Log evidence (F,) over none that each form gains on average, the tool having `departures` (SIZE,)."""
     mean = information @ departures
     result = []
@@ -57,7 +57,7 @@ def expected_ratios(evidence: Evidence, information: Array, departures: Array) -
     return np.array(result)
 
 
-def unseen(evidence: Evidence) -> list[str]:
+def unseen(evidence: FaultEvidence) -> list[str]:
     """Faults that readings would not show, on average over faults of the usual size in their best form.
 
     Definition: the log evidence for the fault is tr(A) / 2 - log det(I + A) / 2 on average, A being the
@@ -76,7 +76,7 @@ def unseen(evidence: Evidence) -> list[str]:
 
 
 def apart(
-    calibration: Calibration, readings: Readings, evidence: Evidence, fault: str,
+    calibration: Calibration, readings: Readings, evidence: FaultEvidence, fault: str,
     shares: Mapping[str, float],
 ) -> tuple[list[str], list[NextReading]]:  # fmt: skip
     """Faults that cannot be told from the one named, and for each the further reading that would tell."""
@@ -101,15 +101,13 @@ def apart(
     return rivals, [_best(name, margins, later) for name in rivals if name in margins]
 
 
-def _departures(evidence: Evidence, fault: str) -> Array:
+def _departures(evidence: FaultEvidence, fault: str) -> Array:
     """Departures (SIZE,) of the best form of a fault, of the sizes that were estimated."""
-    where = [i for i, form in enumerate(evidence.forms) if form.kind == fault]
-    best = max(where, key=lambda i: evidence.by_form[i])
-    mixing = evidence.forms[best].mixing
-    return np.asarray(mixing @ evidence.best.sizes[best, : mixing.shape[1]])
+    form, sizes, _ = evidence.sizes(fault)
+    return np.asarray(form.mixing @ sizes)
 
 
-def _margins(evidence: Evidence, each: Array, fault: str) -> dict[str, float]:
+def _margins(evidence: FaultEvidence, each: Array, fault: str) -> dict[str, float]:
     """By how much the log evidence of a fault is expected to exceed that of each other."""
     kinds = over_forms(evidence.forms, each)
     return {name: float(kinds[fault] - value) for name, value in kinds.items() if name != fault}
@@ -127,7 +125,9 @@ def _best(
     return NextReading(fault=rival, reading=text, evidence=gained)
 
 
-def _offers(calibration: Calibration, readings: Readings, evidence: Evidence) -> dict[str, Array]:
+def _offers(
+    calibration: Calibration, readings: Readings, evidence: FaultEvidence
+) -> dict[str, Array]:
     """Information (SIZE, SIZE) of the departures by the readings and each further roll, by its description."""
     state, problem = evidence.none.state, evidence.suspect.problem
     axis = state.attitude[0, :, 2, :].mean(0)
@@ -159,65 +159,52 @@ def _informed(calibration: Calibration, readings: Readings, offer: Further) -> A
     suspect = Suspect.of(calibration, longer)
     held = np.ones((longer.count, 1, SIZE))
     for name in offer.without:
-        held[readings.count :, :, PLACES[name]] = 0.0
+        held[readings.count :, :, DEPARTURES[name]] = 0.0
     nothing = np.zeros((1, SIZE, 0))
     return np.asarray(explained(suspect, nothing, suspect.start(), held=held).information[0])
 
 
 def _extended(calibration: Calibration, readings: Readings, offer: Further) -> Readings:
-    """The readings, and those of a sound tool in a further roll of known attitudes."""
+    """The readings, and those of a sound tool in a further roll of known attitudes at the same place."""
     known = {name: readings.reference(name) for name in (*ANGLES, *CONSTANTS)}
-    field, dip = (
-        np.nanmean(known[name]) if np.isfinite(known[name]).any() else np.nan
-        for name in ("field", "dip")
-    )
-    earth = calibration.earth
-    gravity = float(np.mean(known["gravity"]))
-    seen_dip = np.radians(earth.get("dip_deg", 0.0)) if np.isnan(dip) else dip
-    angles = np.broadcast_arrays(offer.inclination, offer.azimuth, QUARTERS)
-    vectors = reference_vectors(*angles, gravity, field, seen_dip)
-    usual = (
-        calibration.reference_temperature
-        if readings.temperature is None
-        else readings.temperature.mean()
-    )
-    warmth = np.full(4, usual if offer.temperature is None else offer.temperature)
-    result, sd = {}, {}
-    for triad, vector in zip(calibration.triads[: len(readings.triads)], vectors, strict=False):
-        model = triad.functions(calibration.reference_temperature)
-        raw = raw_reading(model, np.array(triad.parameters), vector, warmth)
-        before = getattr(readings, triad.name)
-        stated = np.broadcast_to(readings.sd.get(triad.name, triad.noise), before.shape)
-        result[triad.name] = np.concatenate([before, raw])
-        sd[triad.name] = np.concatenate([stated, np.tile(stated.mean(0), (4, 1))])
-    blank = np.full(4, np.nan)
-    more = {
-        **dict(zip(ANGLES, angles, strict=True)),
-        "gravity": blank + gravity,
-        "field": blank + field,
-        "dip": blank + dip,
+    here = {
+        n: np.mean(known[n][np.isfinite(known[n])] if np.isfinite(known[n]).any() else np.nan)
+        for n in CONSTANTS
     }
-    for name in (*ANGLES, *CONSTANTS):
-        spread = readings.uncertainty(name)
-        largest = spread.max()
-        sd[name] = np.append(
-            spread, np.full(4, max(largest, SETTING) if name in ANGLES else largest)
-        )
-        known[name] = np.append(known[name], more[name])
-    others = {
-        name: np.full(readings.count + 4, np.max(value))
-        for name, value in readings.sd.items()
-        if name not in sd
-    }
+    turns = np.broadcast_arrays(offer.inclination, offer.azimuth, QUARTERS)
+    more = dict(zip(ANGLES, turns, strict=True)) | {n: np.full(4, here[n]) for n in CONSTANTS}
+    warmth, usual = readings.temperature, calibration.reference_temperature
+    if warmth is not None:
+        usual = float(np.mean(warmth)) if offer.temperature is None else offer.temperature
+        warmth = np.append(warmth, np.full(4, usual))
+    dip = (
+        np.radians(calibration.earth.get("dip_deg", 0.0)) if np.isnan(here["dip"]) else here["dip"]
+    )
+    vectors = reference_vectors(*turns, here["gravity"], here["field"], dip)
+    raw, sd = _rolled(calibration, readings, vectors, np.full(4, usual))
+    for name in readings.sd.keys() - sd.keys() | set(ANGLES):
+        stated = readings.uncertainty(name)
+        least = SETTING if name in ANGLES else 0.0
+        sd[name] = np.append(stated, np.full(4, max(stated.max(), least)))
     return replace(
-        readings,
-        **result,
-        temperature=None
-        if readings.temperature is None
-        else np.append(readings.temperature, warmth),
-        known=known,
-        sd=sd | others,
+        readings, **raw, temperature=warmth, sd=sd, station=(), digest=(),
+        known={name: np.append(known[name], more[name]) for name in known},
         group=np.append(readings.groups, np.full(4, -1)),
-        station=(),
-        digest=(),
-    )
+    )  # fmt: skip
+
+
+def _rolled(
+    calibration: Calibration, readings: Readings, vectors: tuple[Array, Array], warmth: Array
+) -> tuple[dict[str, Array], dict[str, Array]]:
+    """Readings and their noise (n + 4, 3) by triad, those of a sound tool at `vectors` (4, 3) after the others."""
+    raw, sd = {}, {}
+    for triad, vector in zip(calibration.triads[: len(readings.triads)], vectors, strict=False):
+        model, before = (
+            triad.functions(calibration.reference_temperature),
+            getattr(readings, triad.name),
+        )
+        added = raw_reading(model, np.array(triad.parameters), vector, warmth)
+        stated = np.broadcast_to(readings.sd.get(triad.name, triad.noise), before.shape)
+        raw[triad.name] = np.concatenate([before, added])
+        sd[triad.name] = np.concatenate([stated, np.tile(stated.mean(0), (4, 1))])
+    return raw, sd

@@ -11,8 +11,9 @@ from mwdcal.faults import advice, preparation
 from mwdcal.faults.advice import NextReading
 from mwdcal.faults.likelihood import Suspect
 from mwdcal.faults.physics import FAULTS, NONE, Fault, Term, faults
-from mwdcal.faults.weighing import DRAWS, FALSE_ALARMS, Evidence
+from mwdcal.faults.weighing import DRAWS, FALSE_ALARMS, FaultEvidence
 from mwdcal.files.contract import CHANNELS
+from mwdcal.geometry.vectors import Array
 
 BLIND = 0.9
 """A size of which the readings leave so much of the uncertainty that it had beforehand is not stated."""
@@ -71,7 +72,7 @@ def diagnose(calibration: Calibration, readings: Readings, *, draws: int = DRAWS
         for form in faults(calibration.profile, unit)
         if prepared.magnetometer is not None or not _magnetic(form)
     ]
-    evidence = Evidence.of(Suspect.of(calibration, prepared), forms)
+    evidence = FaultEvidence.of(Suspect.of(calibration, prepared), forms)
     probability = evidence.probability(preparation.freedom(calibration, prepared), draws)
     shares = evidence.likelihoods()
     fault = max(FAULTS, key=lambda name: shares[name]) if probability <= FALSE_ALARMS else NONE
@@ -99,7 +100,7 @@ def _magnetic(form: Fault) -> bool:
     return form.channel >= 3 or form.channel == -2
 
 
-def _named(calibration: Calibration, evidence: Evidence, fault: str) -> dict[str, object]:
+def _named(calibration: Calibration, evidence: FaultEvidence, fault: str) -> dict[str, object]:
     """Channel, sizes and onset of the best form of a fault."""
     if fault == NONE:
         nothing = dict.fromkeys(("channel", "parameter", "size", "size_uncertainty", "unit"))
@@ -108,38 +109,29 @@ def _named(calibration: Calibration, evidence: Evidence, fault: str) -> dict[str
         channel, moved, onset = _dead(calibration, evidence)
         extra = {"above_c": None if np.isinf(onset) else onset}
     else:
-        where = [i for i, form in enumerate(evidence.forms) if form.kind == fault]
-        best = max(where, key=lambda i: evidence.by_form[i])
-        channel = channel_name(calibration, evidence.forms[best].channel)
-        moved, extra = _sizes(calibration, evidence, best), {}
-    first = moved[0]
-    return {
-        "channel": channel or (first.channel if fault == "dead-channel" else None),
-        "parameter": first.parameter,
-        "size": first.size,
-        "size_uncertainty": first.uncertainty,
-        "unit": first.unit,
-        "parameters": moved,
-        **extra,
-    }
+        form, sizes, covariance = evidence.sizes(fault)
+        channel = channel_name(calibration, form.channel)
+        moved, extra = _moved(calibration, form, sizes, covariance), {}
+    sized = {"parameters": moved, "channel": channel, **extra}
+    for first in moved[:1]:
+        names = {"size_uncertainty": first.uncertainty, "unit": first.unit}
+        sized |= {"parameter": first.parameter, "size": first.size, **names}
+    return dict.fromkeys(("parameter", "size", "size_uncertainty", "unit")) | sized
 
 
-def _sizes(calibration: Calibration, evidence: Evidence, place: int) -> list[Moved]:
+def _moved(calibration: Calibration, form: Fault, sizes: Array, covariance: Array) -> list[Moved]:
     """The sizes of a form that the readings show, the one that stands out most first."""
-    form, best = evidence.forms[place], evidence.best
-    sd = np.sqrt(np.einsum("kk->k", best.covariance[place]))
     rows = []
-    for term, value, spread, usual in zip(
-        form.terms, best.sizes[place], sd, form.usual, strict=False
+    for term, value, variance, usual in zip(
+        form.terms, sizes, covariance.diagonal(), form.usual, strict=True
     ):
+        spread = float(np.sqrt(variance))
         if spread > BLIND:
             continue
-        name = channel_name(calibration, term.channel)
-        sign = _polarity(calibration, term)
         row = Moved(
             parameter=term.name,
-            channel=name,
-            size=float(sign * value * usual),
+            channel=channel_name(calibration, term.channel),
+            size=float(_polarity(calibration, term) * value * usual),
             uncertainty=float(spread * usual),
             unit=term.unit,
         )
@@ -147,7 +139,9 @@ def _sizes(calibration: Calibration, evidence: Evidence, place: int) -> list[Mov
     return [row for _, row in sorted(rows, key=lambda pair: -pair[0])]
 
 
-def _dead(calibration: Calibration, evidence: Evidence) -> tuple[str | None, list[Moved], float]:
+def _dead(
+    calibration: Calibration, evidence: FaultEvidence
+) -> tuple[str | None, list[Moved], float]:
     """Channel, constant and onset of the best dead channel."""
     dead, best = evidence.dead, int(np.argmax(evidence.dead_ratios))
     place = int(dead.channel[best])

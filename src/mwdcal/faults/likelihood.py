@@ -24,7 +24,7 @@ FREE_SIZE = 0.3
 """Standard uncertainty of a direction that the calibration has left free: it turns or stretches by as much."""
 LEAST_SD = 1e-7
 """Smallest noise of a reading that counts, as a share of the field."""
-LEFT_OUT = 1e6
+IGNORED = 1e6
 """Factor on the noise of a channel that is taken to be dead: its readings then say nothing of anything else."""
 STEPS, STEPS_FROM_NEAR = 5, 2
 """Gauss-Newton steps: departures are a few per cent of the field, and each step gains two digits or more."""
@@ -72,7 +72,7 @@ class Suspect:
         triads, start = [], 0
         for triad in self.problem.triads:
             broken = dead[..., start : start + 3]
-            triads.append(replace(triad, sd=np.where(broken, LEFT_OUT * triad.sd, triad.sd)))
+            triads.append(replace(triad, sd=np.where(broken, IGNORED * triad.sd, triad.sd)))
             start += 3
         return replace(self, problem=replace(self.problem, triads=tuple(triads)))
 

@@ -20,11 +20,11 @@ from mwdcal.sensor.profile import Profile
 
 FAULTS = ("impact", "dead-channel", "heat", "magnetised", "casing", "turn-on")
 NONE = "none"
-AXES = "xyz"
+AXIS_NAMES = "xyz"
 _COUNTS = {
     "bias": 6, "turn": 12, "drift-bias": 6, "drift-scale": 6, "iron": 3, "disturbance": 3, "turn-on": 6,
 }  # fmt: skip
-PLACES = {
+DEPARTURES = {
     name: slice(*ends)
     for name, ends in zip(_COUNTS, pairwise(accumulate(_COUNTS.values(), initial=0)), strict=True)
 }
@@ -40,7 +40,7 @@ DISTURBANCE = 1_000.0
 """Field of casing or steel nearby along each axis of the Earth, nT: 2 % of it."""
 TURN_ON = (4.08e-4, 70.0)
 """Bias that switching on may leave, g and nT: what the OWSG error model allows a sensor, ABXY and MBXY."""
-SPREAD = (0.5, 1.5)
+SIZE_RANGE = (0.5, 1.5)
 """Sizes of simulated faults are uniform between these multiples of the usual one, of either sign."""
 
 
@@ -113,8 +113,8 @@ def _turned(profile: Profile, triad: int) -> Fault:
     for about in range(3):
         first, second = (3 * triad + (about + step) % 3 for step in (1, 2))
         for pair, sign in (((first, second), 1.0), ((second, first), -1.0)):
-            mixing[PLACES["turn"].start + ACROSS.index(pair), about] = sign * size
-    terms = tuple(Term(f"turn about {axis}", "°", np.degrees(1.0)) for axis in AXES)
+            mixing[DEPARTURES["turn"].start + ACROSS.index(pair), about] = sign * size
+    terms = tuple(Term(f"turn about {axis}", "°", np.degrees(1.0)) for axis in AXIS_NAMES)
     return Fault("impact", -1 - triad, mixing, terms, np.full(3, np.degrees(size)))
 
 
@@ -125,7 +125,7 @@ def _fault(
     mixing = np.zeros((SIZE, len(departures)))
     terms = []
     for column, (name, place, size) in enumerate(departures):
-        mixing[PLACES[name].start + place, column] = size
+        mixing[DEPARTURES[name].start + place, column] = size
         terms.append(_term(name, place, field_unit))
     sizes = [size * term.factor for (_, _, size), term in zip(departures, terms, strict=True)]
     return Fault(kind, channel, mixing, tuple(terms), np.array(sizes))
@@ -135,9 +135,9 @@ def _term(name: str, place: int, field_unit: float) -> Term:
     """Name and unit of one elementary departure."""
     if name == "turn":
         channel, towards = ACROSS[place]
-        return Term(f"axis turned towards {AXES[towards % 3]}", "°", np.degrees(1.0), channel)
+        return Term(f"axis turned towards {AXIS_NAMES[towards % 3]}", "°", np.degrees(1.0), channel)
     if name in ("iron", "disturbance"):
-        axis = AXES[place] if name == "iron" else ("north", "east", "down")[place]
+        axis = AXIS_NAMES[place] if name == "iron" else ("north", "east", "down")[place]
         return Term(f"field {'along ' if name == 'iron' else ''}{axis}", "nT", 1 / field_unit)
     if name == "drift-scale":
         return Term("scale drift", "ppm/°C", 1e6, place)
@@ -160,11 +160,11 @@ class Damage:
 
     def part(self, name: str) -> Array:
         """Departures (..., 1, k) of one kind."""
-        return np.asarray(self.departures[..., None, PLACES[name]])
+        return np.asarray(self.departures[..., None, DEPARTURES[name]])
 
     def described(self) -> dict[str, list[float]]:
         """What has happened to one tool, by kind of departure: those that have; and dead channels (6,)."""
-        kinds = {name: self.departures[where].tolist() for name, where in PLACES.items()}
+        kinds = {name: self.departures[where].tolist() for name, where in DEPARTURES.items()}
         dead = {"dead": self.dead.astype(float).tolist()} if self.dead.any() else {}
         return {name: values for name, values in kinds.items() if any(values)} | dead
 
@@ -172,12 +172,12 @@ class Damage:
 def drawn_damage(
     rng: np.random.Generator, forms: Sequence[Fault], size: float = 1.0, lead: tuple[int, ...] = ()
 ) -> Damage:
-    """One of the `forms` for each tool, of `size` times the usual one: sizes uniform within `SPREAD`, of either sign."""
+    """One of the `forms` for each tool, of `size` times the usual one: uniform within `SIZE_RANGE`, of either sign."""
     departures = np.zeros((*lead, SIZE))
     chosen = rng.integers(len(forms), size=lead)
     for place, form in enumerate(forms):
         shape = *lead, form.mixing.shape[1]
-        drawn = rng.uniform(*SPREAD, shape) * rng.choice([-1.0, 1.0], shape)
+        drawn = rng.uniform(*SIZE_RANGE, shape) * rng.choice([-1.0, 1.0], shape)
         mine = np.asarray(chosen == place)[..., None]
         departures += np.where(mine, size * drawn @ form.mixing.transpose(), 0.0)
     nothing = np.zeros((*lead, 6))
@@ -198,8 +198,9 @@ def changed_readings(
 ) -> Array:
     """What channels (..., n, 6) read instead of `raw`, in nominal units, at `vectors` (..., n, 6).
 
-    Definition: "bias" and "turn-on" add; "drift-…" add to bias and scale in proportion to T - `reference`; by "turn" an axis comes to lie along its old direction plus this share of another one, as a
-    unit vector, and reads the component there. Dead channels read what `damage` says.
+    Definition: "bias" and "turn-on" add; "drift-…" add to bias and scale in proportion to T - `reference`; by
+    "turn" an axis comes to lie along its old direction plus this share of another one, as a unit vector, and
+    reads the component there. Dead channels read what `damage` says.
     """
     warm = (temperature - reference)[..., None]
     result = (1 + damage.part("drift-scale") * warm) * raw + damage.part("drift-bias") * warm
@@ -227,9 +228,9 @@ def columns(raw: Array, vectors: Array, attitude: Array, warmth: Array, gain: Ar
         ("drift-bias", np.broadcast_to(warmth[..., None], raw.shape)),
         ("drift-scale", raw * warmth[..., None]),
     ):
-        result[..., every, PLACES[name].start + every] = change
+        result[..., every, DEPARTURES[name].start + every] = change
     for place, (channel, towards) in enumerate(ACROSS):
-        result[..., channel, PLACES["turn"].start + place] = vectors[..., towards]
-    result[..., 3:, PLACES["iron"]] = gain
-    result[..., 3:, PLACES["disturbance"]] = gain @ attitude
+        result[..., channel, DEPARTURES["turn"].start + place] = vectors[..., towards]
+    result[..., 3:, DEPARTURES["iron"]] = gain
+    result[..., 3:, DEPARTURES["disturbance"]] = gain @ attitude
     return result

@@ -81,7 +81,7 @@ def _with_field(calibration: Calibration, readings: Readings, findings: list[Fin
     field, sd = readings.reference("field"), readings.uncertainty("field")
     if calibration.relative:
         field = np.full(field.shape, np.nan)
-        text = "the magnetometer is calibrated to field = 1: field strengths are relative, and sizes in nT those of 50,000 nT."
+        text = "the magnetometer is calibrated to field = 1: sizes in nT are as if that were 50,000 nT."
         findings.append(_finding("relative-field", text))
     blank = np.isnan(field)
     if blank.all():

@@ -7,11 +7,11 @@ from functools import cached_property
 
 import numpy as np
 
-from mwdcal.estimation.batch import take
+from mwdcal.estimation.batch import put, take
 from mwdcal.faults.dead import DeadChannels, dead_channels
 from mwdcal.faults.likelihood import Explanation, Suspect, explained, ratios, repeated
 from mwdcal.faults.physics import FAULTS, NONE, SIZE, Fault
-from mwdcal.geometry.vectors import Array
+from mwdcal.geometry.vectors import Array, Ints
 
 FALSE_ALARMS = 0.01
 """Probability that a fault is named where there is none."""
@@ -19,6 +19,8 @@ DEAD_SHARE = 0.05
 """Share of it that goes to dead channels, whose evidence has a bound and needs no simulation."""
 DRAWS = 9_999
 """Simulated changes without a fault, by which the evidence is judged."""
+WITHIN, SHARE_WITHIN = 50.0, 0.2
+"""Log evidence, and share of the best one, by which the linearised evidence of a form may be behind to be refined."""
 LIKELY = 0.05
 """A fault with a larger share of the likelihood than this is not excluded."""
 DISTINCT = float(np.log(1 / LIKELY))
@@ -26,37 +28,47 @@ DISTINCT = float(np.log(1 / LIKELY))
 
 
 @dataclass(frozen=True)
-class Evidence:
+class FaultEvidence:
     """What readings of one tool say of all faults; `forms` are the ways in which faults show.
 
-    `none` explains the readings without a fault, `best` by each form, as a batch; `dead` are dead channels.
+    `none` explains the readings without a fault, `best` by each form that is not far behind, those at `likely`,
+    as a batch; `dead` are dead channels. `by_form` (F,) is the log evidence of each form over none.
     """
 
     suspect: Suspect
     forms: list[Fault]
     none: Explanation
+    by_form: Array
+    likely: Ints
     best: Explanation
     dead: DeadChannels
 
     @classmethod
-    def of(cls, suspect: Suspect, forms: list[Fault]) -> Evidence:
+    def of(cls, suspect: Suspect, forms: list[Fault]) -> FaultEvidence:
         """Of a batch of one."""
-        mixing = padded(forms)
-        none = explained(suspect, mixing[:1], suspect.start())
-        each = np.zeros(len(forms), int)
-        near = take(none, each)
-        best = explained(repeated(suspect, each), mixing[1:], near.state, near)
-        return cls(suspect, forms, none, best, dead_channels(suspect))
+        none = explained(suspect, np.zeros((1, SIZE, 0)), suspect.start())
+        roughly = by_form(forms, none.information[0], none.gradient[0])
+        likely = np.flatnonzero(
+            roughly >= roughly.max() - WITHIN - SHARE_WITHIN * abs(roughly.max())
+        )
+        near = take(none, 0 * likely)
+        mixing = padded([forms[i] for i in likely])
+        best = explained(repeated(suspect, 0 * likely), mixing, near.state, near)
+        exactly = put(roughly, likely, best.evidence - none.evidence)
+        return cls(suspect, forms, none, exactly, likely, best, dead_channels(suspect))
 
     @property
     def information(self) -> Array:
         """Information (SIZE, SIZE) of all departures of a sound tool."""
         return self.none.information[0]
 
-    @cached_property
-    def by_form(self) -> Array:
-        """Log evidence (F,) of each form over none."""
-        return np.asarray(self.best.evidence - self.none.evidence)
+    def sizes(self, kind: str) -> tuple[Fault, Array, Array]:
+        """The best form of a fault, its sizes (k,) and their covariance (k, k), in units of the usual ones."""
+        where = [i for i, form in enumerate(self.forms) if form.kind == kind]
+        best = max(where, key=lambda i: self.by_form[i])
+        place, count = int(np.searchsorted(self.likely, best)), self.forms[best].mixing.shape[1]
+        covariance = self.best.covariance[place, :count, :count]
+        return self.forms[best], self.best.sizes[place, :count], covariance
 
     @cached_property
     def dead_ratios(self) -> Array:
@@ -97,17 +109,22 @@ class Evidence:
 
 
 def padded(forms: list[Fault]) -> Array:
-    """Departures (1 + F, SIZE, k) of none and of each form, columns of zeros where it has fewer than k sizes."""
-    whole = np.zeros((1 + len(forms), SIZE, max(form.mixing.shape[1] for form in forms)))
-    for place, form in enumerate(forms, 1):
+    """Departures (F, SIZE, k) of each form, columns of zeros where it has fewer than k sizes."""
+    whole = np.zeros((len(forms), SIZE, max(form.mixing.shape[1] for form in forms)))
+    for place, form in enumerate(forms):
         whole[place, :, : form.mixing.shape[1]] = form.mixing
     return whole
 
 
 def _linear(forms: list[Fault], information: Array, gradient: Array) -> Array:
     """Log evidence (..., faults) of faults over none, linearised at none, of gradients (..., SIZE)."""
-    each = np.stack([ratios(information, gradient, form.mixing) for form in forms], -1)
+    each = by_form(forms, information, gradient)
     return np.stack(list(over_forms(forms, each).values()), -1)
+
+
+def by_form(forms: list[Fault], information: Array, gradient: Array) -> Array:
+    """Log evidence (..., F) of each form over none, linearised at none, of gradients (..., SIZE)."""
+    return np.stack([ratios(information, gradient, form.mixing) for form in forms], -1)
 
 
 def over_forms(forms: list[Fault], each: Array) -> dict[str, Array]:

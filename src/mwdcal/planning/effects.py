@@ -145,6 +145,7 @@ def load_effects(name_or_path: str) -> tuple[Effects, str]:
         for key, value in values.items():
             if isinstance(value, float):
                 _check(f"{name_or_path}, key '{section}.{key}'", key, value)
+    _check_channel(f"{name_or_path}, key 'fault.channel'", effects.fault)
     return effects, digest
 
 
@@ -157,6 +158,14 @@ def _check(where: str, key: str, value: float) -> None:
         raise InputError(
             f"{where}: must be {word} and at most {LARGEST_EFFECT:g}; got {value}. Correct it, or leave it out."
         )
+
+
+def _check_channel(where: str, fault: FaultEffect) -> None:
+    """Refuse a channel that the fault does not have."""
+    on_one = fault.kind == "dead-channel" and fault.channel not in TRIADS
+    if fault.channel and not on_one and fault.kind != "impact":
+        whole = "one channel, such as ax" if fault.kind == "dead-channel" else "left out"
+        raise InputError(f"{where}: of '{fault.kind}' it must be {whole}; got '{fault.channel}'.")
 
 
 def wandering(
