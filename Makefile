@@ -3,7 +3,7 @@
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: papers measured verification mutations help demo test test-quick test-oldest test-versions \
+.PHONY: papers measured verification diagnosis mutations help demo test test-quick test-oldest test-versions \
 	fuzz kills check bench docs clean
 
 PYTHON ?= python3
@@ -103,6 +103,9 @@ papers: $(INSTALLED) ## recompute the papers and rewrite their pages and figures
 
 verification: $(INSTALLED) ## count wrong verdicts of simulated roll tests and rewrite docs/verification.md (two minutes)
 	@$(CLOCK); $(ONE_THREAD) $(BIN)/python examples/verification/verification.py
+
+diagnosis: $(INSTALLED) ## name faults of simulated tools and rewrite docs/diagnosis.md (half an hour; COUNT=100)
+	@$(CLOCK); $(ONE_THREAD) $(BIN)/python examples/diagnosis/diagnosis.py --count $(or $(COUNT),1000)
 
 docs: $(INSTALLED) ## build the documentation into build/docs, and the manual page docs/mwdcal.1
 	@$(CLOCK); $(SPHINX) -b html docs build/docs; $(SPHINX) -b man docs build/man; \

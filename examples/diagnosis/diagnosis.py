@@ -1,6 +1,6 @@
 """How often `diagnose` names the right fault: simulated tools with each fault, and without.
 
-    make diagnosis        (writes docs/diagnosis.md; ten minutes)
+    make diagnosis        (writes docs/diagnosis.md; half an hour)
 
 Every case has a tool, a calibration and later readings of its own. Faults are simulated by their physics
 (`mwdcal.faults.physics`: exact, not to first order), of the sizes that `mwdcal simulate` draws. All data are

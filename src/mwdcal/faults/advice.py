@@ -14,7 +14,7 @@ from mwdcal.calibration.readings import CONSTANTS, Readings
 from mwdcal.calibration.record import Calibration
 from mwdcal.estimation.evidence import ANGLES
 from mwdcal.faults.likelihood import Suspect, explained
-from mwdcal.faults.physics import DEPARTURES, NONE, SIZE
+from mwdcal.faults.physics import DEAD, DEPARTURES, FAULTS, NONE, SIZE
 from mwdcal.faults.weighing import DISTINCT, LIKELY, FaultEvidence, over_forms
 from mwdcal.geometry.vectors import Array, reference_vectors
 
@@ -72,7 +72,8 @@ def unseen(evidence: FaultEvidence) -> list[str]:
         kind: max(g for g, form in zip(gains, evidence.forms, strict=True) if form.kind == kind)
         for kind in kinds
     }
-    return [kind for kind, gain in best.items() if gain < DISTINCT]
+    seen = {kind for kind, gain in best.items() if gain >= DISTINCT}
+    return [kind for kind in FAULTS if kind not in seen and kind != DEAD]
 
 
 def apart(
@@ -85,7 +86,7 @@ def apart(
     rivals = [
         name for name, share in shares.items() if name not in (fault, NONE) and share > LIKELY
     ]
-    if fault == "dead-channel":
+    if fault == DEAD:
         return rivals, []
     departures = _departures(evidence, fault)
     expected = expected_ratios(evidence, evidence.information, departures)

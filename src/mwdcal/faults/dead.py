@@ -22,13 +22,14 @@ class DeadChannels:
     """Every channel at every onset, as a batch of explanations (C,).
 
     `channel` (C,) counts components of both triads; `onset` (C,) is the coldest temperature at which it is dead,
-    -inf where it always is. `evidence` (C,) is the log density of the readings; `value` and `sd` (C,) are of
-    the constant.
+    -inf where it always is. `evidence` (C,) is the log density of the readings, `misfit` (C,) χ² of the others;
+    `value` and `sd` (C,) are of the constant.
     """
 
     channel: Ints
     onset: Array
     evidence: Array
+    misfit: Array
     value: Array
     sd: Array
 
@@ -49,14 +50,14 @@ def dead_channels(suspect: Suspect) -> DeadChannels:
     )
     density, value, spread = _constant(raw, sd, broken, _strengths(suspect))
     steady = np.flatnonzero(density > -UNSTEADY * np.sqrt(broken.sum((-1, -2))))
-    evidence = np.full(len(channel), -np.inf)
+    evidence, misfit = np.full((2, len(channel)), -np.inf)
     if steady.size:
         tools = repeated(suspect, np.zeros(len(steady), int))
         sound = tools.without(broken[steady])
         state = sound.start(_readable(tools, broken[steady]))
-        live = explained(sound, np.zeros((len(steady), SIZE, 0)), state).evidence
-        evidence[steady] = live + density[steady]
-    return DeadChannels(channel, onset, evidence, value, spread)
+        live = explained(sound, np.zeros((len(steady), SIZE, 0)), state)
+        evidence[steady], misfit[steady] = live.evidence + density[steady], live.misfit
+    return DeadChannels(channel, onset, evidence, misfit, value, spread)
 
 
 def _onsets(temperature: Array) -> Array:

@@ -9,9 +9,9 @@ from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.faults import advice, preparation
 from mwdcal.faults.advice import NextReading
-from mwdcal.faults.likelihood import Suspect
-from mwdcal.faults.physics import FAULTS, NONE, Fault, Term, faults
-from mwdcal.faults.weighing import DRAWS, FALSE_ALARMS, FaultEvidence
+from mwdcal.faults.likelihood import Suspect, raw_of
+from mwdcal.faults.physics import DEAD, FAULTS, NONE, Fault, Term, faults
+from mwdcal.faults.weighing import DRAWS, FALSE_ALARMS, UNEXPLAINED, FaultEvidence
 from mwdcal.files.contract import CHANNELS
 from mwdcal.geometry.vectors import Array
 
@@ -76,6 +76,7 @@ def diagnose(calibration: Calibration, readings: Readings, *, draws: int = DRAWS
     probability = evidence.probability(preparation.freedom(calibration, prepared), draws)
     shares = evidence.likelihoods()
     fault = max(FAULTS, key=lambda name: shares[name]) if probability <= FALSE_ALARMS else NONE
+    findings += _unexplained(evidence, fault, preparation.freedom(calibration, prepared))
     named = _named(calibration, evidence, fault)
     confounded, remedies = advice.apart(calibration, prepared, evidence, fault, shares)
     return Diagnosis(
@@ -93,6 +94,22 @@ def diagnose(calibration: Calibration, readings: Readings, *, draws: int = DRAWS
     )
 
 
+def _unexplained(evidence: FaultEvidence, fault: str, freedom: float) -> list[Finding]:
+    """A finding if even the best explanation leaves more than the noise does."""
+    from scipy.special import chdtrc, fdtrc
+
+    misfit, count = evidence.misfit(fault), raw_of(evidence.suspect.problem).size
+    known = np.isinf(freedom)
+    chance = chdtrc(count, misfit) if known else fdtrc(count, freedom, misfit / count)
+    if not chance < UNEXPLAINED:
+        return []
+    text = (
+        f"no single fault explains these readings: the best leaves {misfit / count:.3g} times the variance of the "
+        "noise. Check that they are of this tool, in its units, with the right references and none that moved."
+    )
+    return [Finding(id="unexplained", text=text)]
+
+
 def _magnetic(form: Fault) -> bool:
     """Whether a form needs a magnetometer to show at all."""
     if form.channel is None:
@@ -105,7 +122,7 @@ def _named(calibration: Calibration, evidence: FaultEvidence, fault: str) -> dic
     if fault == NONE:
         nothing = dict.fromkeys(("channel", "parameter", "size", "size_uncertainty", "unit"))
         return {**nothing, "parameters": []}
-    if fault == "dead-channel":
+    if fault == DEAD:
         channel, moved, onset = _dead(calibration, evidence)
         extra = {"above_c": None if np.isinf(onset) else onset}
     else:

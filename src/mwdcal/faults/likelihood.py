@@ -138,7 +138,8 @@ class Explanation:
     """The best explanation of readings by a fault: `evidence` (B,), log density; its sizes (B, k).
 
     `covariance` (B, k, k) of the sizes; `information` (B, SIZE, SIZE) and `gradient` (B, SIZE) of all departures
-    beside those explained, calibration and attitudes being uncertain; `scores` (B, k) of the calibration.
+    beside those explained, calibration and attitudes being uncertain; `scores` (B, k) of the calibration;
+    `misfit` (B,) is χ², of at most as many degrees of freedom as there are readings.
     """
 
     evidence: Array
@@ -148,6 +149,7 @@ class Explanation:
     gradient: Array
     state: State
     scores: Array
+    misfit: Array
 
 
 @np.errstate(invalid="ignore", divide="ignore", over="ignore")
@@ -176,7 +178,9 @@ def explained(
     information, gradient = system.beside()
     evidence = np.nan_to_num(system.evidence(), nan=-np.inf)
     spread = system.covariance[:, first:, first:]
-    return Explanation(evidence, sizes, spread, information, gradient, state, scores)
+    return Explanation(
+        evidence, sizes, spread, information, gradient, state, scores, system.misfit()
+    )
 
 
 @dataclass(frozen=True)
@@ -233,14 +237,18 @@ class _System:
 
     def evidence(self) -> Array:
         """Logarithm (B,) of the density of the readings, but for a constant."""
+        private = -np.linalg.slogdet(self.linear.core)[1].sum(-1)
+        return np.asarray(-0.5 * (self.misfit() + self.logarithm + private))
+
+    def misfit(self) -> Array:
+        """χ² (B,) of the readings and all priors, at the best values of everything."""
         linear = self.linear
         residual = linear.residual
         weighed = linear.weigh(residual[..., None])[..., 0]
         square = np.sum(residual * weighed, (-1, -2))
         square = square + np.einsum("bi,bij,bj->b", self.pull, self.precision, self.pull)
-        square = square - np.einsum("bi,bij,bj->b", self.gradient, self.covariance, self.gradient)
-        private = -np.linalg.slogdet(linear.core)[1].sum(-1)
-        return np.asarray(-0.5 * (square + self.logarithm + private))
+        left = np.einsum("bi,bij,bj->b", self.gradient, self.covariance, self.gradient)
+        return np.asarray(square - left)
 
     def beside(self) -> tuple[Array, Array]:
         """Information (B, SIZE, SIZE) and gradient (B, SIZE) of all departures.

@@ -18,7 +18,8 @@ from mwdcal.geometry.vectors import Array, Bools
 from mwdcal.sensor.datasheets import tolerance
 from mwdcal.sensor.profile import Profile
 
-FAULTS = ("impact", "dead-channel", "heat", "magnetised", "casing", "turn-on")
+DEAD = "dead-channel"
+FAULTS = ("impact", DEAD, "heat", "magnetised", "casing", "turn-on")
 NONE = "none"
 AXIS_NAMES = "xyz"
 _COUNTS = {

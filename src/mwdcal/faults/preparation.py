@@ -23,6 +23,7 @@ def prepared(calibration: Calibration, readings: Readings) -> tuple[Readings, li
         InputError: readings of another tool or of the fit itself, or none that can be used.
     """
     _check(calibration, readings)
+    calibration.fields(readings)  # refuses readings that lack what the calibration needs
     findings = []
     if readings.magnetometer is not None and not calibration.has_field:
         readings = replace(readings, magnetometer=None)

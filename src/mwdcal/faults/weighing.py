@@ -10,7 +10,7 @@ import numpy as np
 from mwdcal.estimation.batch import put, take
 from mwdcal.faults.dead import DeadChannels, dead_channels
 from mwdcal.faults.likelihood import Explanation, Suspect, explained, ratios, repeated
-from mwdcal.faults.physics import FAULTS, NONE, SIZE, Fault
+from mwdcal.faults.physics import DEAD, FAULTS, NONE, SIZE, Fault
 from mwdcal.geometry.vectors import Array, Ints
 
 FALSE_ALARMS = 0.01
@@ -21,6 +21,8 @@ DRAWS = 9_999
 """Simulated changes without a fault, by which the evidence is judged."""
 WITHIN, SHARE_WITHIN = 50.0, 0.2
 """Log evidence, and share of the best one, by which the linearised evidence of a form may be behind to be refined."""
+UNEXPLAINED = 1e-4
+"""Probability of the misfit of the best explanation below which it explains too little."""
 LIKELY = 0.05
 """A fault with a larger share of the likelihood than this is not excluded."""
 DISTINCT = float(np.log(1 / LIKELY))
@@ -62,13 +64,26 @@ class FaultEvidence:
         """Information (SIZE, SIZE) of all departures of a sound tool."""
         return self.none.information[0]
 
+    def misfit(self, kind: str) -> float:
+        """χ² of the readings as a fault, or none, explains them best."""
+        if kind == DEAD:
+            return float(self.dead.misfit[np.argmax(self.dead.evidence)])
+        if kind == NONE:
+            return float(self.none.misfit[0])
+        return float(self.best.misfit[self._best(kind)])
+
+    def _best(self, kind: str) -> int:
+        """The place of the best form of a fault among those at `likely`."""
+        where = [i for i, form in enumerate(self.forms) if form.kind == kind]
+        return int(np.searchsorted(self.likely, max(where, key=lambda i: self.by_form[i])))
+
     def sizes(self, kind: str) -> tuple[Fault, Array, Array]:
         """The best form of a fault, its sizes (k,) and their covariance (k, k), in units of the usual ones."""
-        where = [i for i, form in enumerate(self.forms) if form.kind == kind]
-        best = max(where, key=lambda i: self.by_form[i])
-        place, count = int(np.searchsorted(self.likely, best)), self.forms[best].mixing.shape[1]
+        place = self._best(kind)
+        form = self.forms[self.likely[place]]
+        count = form.mixing.shape[1]
         covariance = self.best.covariance[place, :count, :count]
-        return self.forms[best], self.best.sizes[place, :count], covariance
+        return form, self.best.sizes[place, :count], covariance
 
     @cached_property
     def dead_ratios(self) -> Array:
@@ -79,7 +94,7 @@ class FaultEvidence:
     def by_fault(self) -> dict[str, float]:
         """Log evidence of each fault over none: the mean over its forms."""
         result = dict.fromkeys((NONE, *FAULTS), 0.0) | over_forms(self.forms, self.by_form)
-        return result | {"dead-channel": float(log_mean(self.dead_ratios))}
+        return result | {DEAD: float(log_mean(self.dead_ratios))}
 
     def likelihoods(self) -> dict[str, float]:
         """Share of each fault, all being as likely beforehand."""
@@ -104,7 +119,7 @@ class FaultEvidence:
             sound *= np.sqrt(freedom / rng.chisquare(freedom, draws))[:, None]
         beyond = log_mean(_linear(self.forms, self.information, sound)) >= observed
         by_chance = (1 + np.count_nonzero(beyond)) / (draws + 1)
-        dead = np.exp(min(0.0, -self.by_fault["dead-channel"]))
+        dead = np.exp(min(0.0, -self.by_fault[DEAD]))
         return float(min(1.0, by_chance / (1 - DEAD_SHARE), dead / DEAD_SHARE))
 
 

@@ -47,6 +47,7 @@ class Session:
             InputError: the plan does not state an attitude, or the profile not the noise of a triad.
         """
         readings, scaled = nominal_run(plan, profile)
+        readings = replace(readings, profile=scaled)
         return cls(plan, scaled, readings, station_minutes(plan), effects or Effects())
 
     @property
