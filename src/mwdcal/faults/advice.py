@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 
 from mwdcal.calibration.prediction import raw_reading
-from mwdcal.calibration.readings import CONSTANTS, Readings
+from mwdcal.calibration.readings import CONSTANTS, TRIADS, Readings
 from mwdcal.calibration.record import Calibration
 from mwdcal.estimation.evidence import ANGLES
 from mwdcal.faults.likelihood import Suspect, explained
@@ -181,14 +181,16 @@ def _extended(calibration: Calibration, readings: Readings, offer: Further) -> R
     dip = (
         np.radians(calibration.earth.get("dip_deg", 0.0)) if np.isnan(here["dip"]) else here["dip"]
     )
-    vectors = reference_vectors(*turns, here["gravity"], here["field"], dip)
+    inclination, azimuth, toolface = turns
+    vectors = reference_vectors(inclination, azimuth, toolface, here["gravity"], here["field"], dip)
     raw, sd = _rolled(calibration, readings, vectors, np.full(4, usual))
     for name in readings.sd.keys() - sd.keys() | set(ANGLES):
         stated = readings.uncertainty(name)
         least = SETTING if name in ANGLES else 0.0
         sd[name] = np.append(stated, np.full(4, max(stated.max(), least)))
     return replace(
-        readings, **raw, temperature=warmth, sd=sd, station=(), digest=(),
+        readings, accelerometer=raw[TRIADS[0]], magnetometer=raw.get(TRIADS[1]), temperature=warmth,
+        sd=sd, station=(), digest=(),
         known={name: np.append(known[name], more[name]) for name in known},
         group=np.append(readings.groups, np.full(4, -1)),
     )  # fmt: skip

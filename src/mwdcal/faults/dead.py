@@ -119,4 +119,4 @@ def _readable(tools: Suspect, broken: Bools) -> Array:
 def _dip_error(raw: Array, known: dict[str, Array]) -> Array:
     """How far (C, n) g·b is from what strengths and dip say."""
     expected = known["gravity"] * known["field"] * np.sin(np.nan_to_num(known["dip"], nan=1.0))
-    return np.abs(np.sum(raw[..., :3] * raw[..., 3:], -1) - expected)
+    return np.asarray(np.abs(np.sum(raw[..., :3] * raw[..., 3:], -1) - expected))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import msgspec
 import numpy as np
 
@@ -10,7 +12,7 @@ from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.faults import advice, preparation
 from mwdcal.faults.advice import NextReading
 from mwdcal.faults.likelihood import Suspect, raw_of
-from mwdcal.faults.physics import DEAD, FAULTS, NONE, Fault, Term, faults
+from mwdcal.faults.physics import DEAD, FAULTS, NONE, FaultForm, FaultTerm, faults
 from mwdcal.faults.weighing import DRAWS, FALSE_ALARMS, UNEXPLAINED, FaultEvidence
 from mwdcal.files.contract import CHANNELS
 from mwdcal.geometry.vectors import Array
@@ -110,14 +112,14 @@ def _unexplained(evidence: FaultEvidence, fault: str, freedom: float) -> list[Fi
     return [Finding(id="unexplained", text=text)]
 
 
-def _magnetic(form: Fault) -> bool:
+def _magnetic(form: FaultForm) -> bool:
     """Whether a form needs a magnetometer to show at all."""
     if form.channel is None:
         return form.kind in ("magnetised", "casing")
     return form.channel >= 3 or form.channel == -2
 
 
-def _named(calibration: Calibration, evidence: FaultEvidence, fault: str) -> dict[str, object]:
+def _named(calibration: Calibration, evidence: FaultEvidence, fault: str) -> dict[str, Any]:
     """Channel, sizes and onset of the best form of a fault."""
     if fault == NONE:
         nothing = dict.fromkeys(("channel", "parameter", "size", "size_uncertainty", "unit"))
@@ -128,15 +130,17 @@ def _named(calibration: Calibration, evidence: FaultEvidence, fault: str) -> dic
     else:
         form, sizes, covariance = evidence.sizes(fault)
         channel = channel_name(calibration, form.channel)
-        moved, extra = _moved(calibration, form, sizes, covariance), {}
-    sized = {"parameters": moved, "channel": channel, **extra}
+        moved, extra = _moved(calibration, form, sizes, covariance), {"above_c": None}
+    sized: dict[str, Any] = {"parameters": moved, "channel": channel, **extra}
     for first in moved[:1]:
         names = {"size_uncertainty": first.uncertainty, "unit": first.unit}
         sized |= {"parameter": first.parameter, "size": first.size, **names}
     return dict.fromkeys(("parameter", "size", "size_uncertainty", "unit")) | sized
 
 
-def _moved(calibration: Calibration, form: Fault, sizes: Array, covariance: Array) -> list[Moved]:
+def _moved(
+    calibration: Calibration, form: FaultForm, sizes: Array, covariance: Array
+) -> list[Moved]:
     """The sizes of a form that the readings show, the one that stands out most first."""
     rows = []
     for term, value, variance, usual in zip(
@@ -162,7 +166,7 @@ def _dead(
     """Channel, constant and onset of the best dead channel."""
     dead, best = evidence.dead, int(np.argmax(evidence.dead_ratios))
     place = int(dead.channel[best])
-    term = Term("constant", "g" if place < 3 else calibration.field_unit, 1.0, place)
+    term = FaultTerm("constant", "g" if place < 3 else calibration.field_unit, 1.0, place)
     value = _polarity(calibration, term) * dead.value[best]
     name = channel_name(calibration, place)
     moved = Moved(
@@ -183,7 +187,7 @@ def channel_name(calibration: Calibration, component: int | None) -> str | None:
     return CHANNELS[triad][int(np.argmax(np.abs(permutation[component % 3])))]
 
 
-def _polarity(calibration: Calibration, term: Term) -> float:
+def _polarity(calibration: Calibration, term: FaultTerm) -> float:
     """Sign of a channel along its tool axis, for sizes that change with it."""
     if term.channel is None or not term.name.startswith(("bias", "constant")):
         return 1.0

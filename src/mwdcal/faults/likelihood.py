@@ -122,7 +122,7 @@ def departures_seen(suspect: Suspect, state: State) -> Array:
     """Change (B, n, m, SIZE) of the readings by each departure, at the vectors and attitudes of a state."""
     problem = suspect.problem
     vectors = np.concatenate(problem.targets(state), -1)
-    raw = raw_of(problem)
+    raw = raw_of(problem) - np.concatenate([p.misfit for p in problem.predictions(state)], -1)
     count = raw.shape[-1]
     gain = np.broadcast_to(np.eye(3), state.attitude.shape)
     if count == 6:

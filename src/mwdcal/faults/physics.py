@@ -45,7 +45,7 @@ SIZE_RANGE = (0.5, 1.5)
 """Sizes of simulated faults are uniform between these multiples of the usual one, of either sign."""
 
 
-class Term(NamedTuple):
+class FaultTerm(NamedTuple):
     """One size that a fault has: its name, unit, what one of our units is in it, and the channel, if it has one.
 
     `channel` counts components of both triads from 0.
@@ -58,22 +58,22 @@ class Term(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Fault:
+class FaultForm:
     """One way in which a kind of fault shows: on a channel, a triad, or the whole tool.
 
     `mixing` (SIZE, k) are the departures that its k sizes cause, each size in units of the usual one, which
-    `usual` (k,) are in the units of `terms`. `channel` counts as of a `Term`; -1 and -2 are whole triads, None is
+    `usual` (k,) are in the units of `terms`. `channel` counts as of a `FaultTerm`; -1 and -2 are whole triads, None is
     the tool.
     """
 
     kind: str
     channel: int | None
     mixing: Array
-    terms: tuple[Term, ...]
+    terms: tuple[FaultTerm, ...]
     usual: Array
 
 
-def faults(profile: Profile, field_unit: float = 1.0) -> list[Fault]:
+def faults(profile: Profile, field_unit: float = 1.0) -> list[FaultForm]:
     """All ways in which faults show, dead channels apart, of the sizes of a profile's datasheet.
 
     `field_unit`: what 1 nT is in the unit of the magnetometer.
@@ -97,7 +97,7 @@ def _drift(profile: Profile, name: str, channel: int) -> float:
     return tolerance(profile, TRIADS[channel // 3], f"{name}_per_c")
 
 
-def _impact(profile: Profile, channel: int, unit: Array) -> Fault:
+def _impact(profile: Profile, channel: int, unit: Array) -> FaultForm:
     """A blow that moves the bias of one sensor and turns its axis."""
     triad = TRIADS[channel // 3]
     bias = tolerance(profile, triad, "bias") * unit[channel]
@@ -107,7 +107,7 @@ def _impact(profile: Profile, channel: int, unit: Array) -> Fault:
     return _fault("impact", channel, departures, unit[-1])
 
 
-def _turned(profile: Profile, triad: int) -> Fault:
+def _turned(profile: Profile, triad: int) -> FaultForm:
     """A blow that turns a whole triad in its housing."""
     size = np.radians(tolerance(profile, TRIADS[triad], "misalignment_deg"))
     mixing = np.zeros((SIZE, 3))
@@ -115,13 +115,13 @@ def _turned(profile: Profile, triad: int) -> Fault:
         first, second = (3 * triad + (about + step) % 3 for step in (1, 2))
         for pair, sign in (((first, second), 1.0), ((second, first), -1.0)):
             mixing[DEPARTURES["turn"].start + ACROSS.index(pair), about] = sign * size
-    terms = tuple(Term(f"turn about {axis}", "°", np.degrees(1.0)) for axis in AXIS_NAMES)
-    return Fault("impact", -1 - triad, mixing, terms, np.full(3, np.degrees(size)))
+    terms = tuple(FaultTerm(f"turn about {axis}", "°", np.degrees(1.0)) for axis in AXIS_NAMES)
+    return FaultForm("impact", -1 - triad, mixing, terms, np.full(3, np.degrees(size)))
 
 
 def _fault(
     kind: str, channel: int | None, departures: list[tuple[str, int, float]], field_unit: float
-) -> Fault:
+) -> FaultForm:
     """A fault of elementary departures: kind, place within it and usual size of each."""
     mixing = np.zeros((SIZE, len(departures)))
     terms = []
@@ -129,22 +129,24 @@ def _fault(
         mixing[DEPARTURES[name].start + place, column] = size
         terms.append(_term(name, place, field_unit))
     sizes = [size * term.factor for (_, _, size), term in zip(departures, terms, strict=True)]
-    return Fault(kind, channel, mixing, tuple(terms), np.array(sizes))
+    return FaultForm(kind, channel, mixing, tuple(terms), np.array(sizes))
 
 
-def _term(name: str, place: int, field_unit: float) -> Term:
+def _term(name: str, place: int, field_unit: float) -> FaultTerm:
     """Name and unit of one elementary departure."""
     if name == "turn":
         channel, towards = ACROSS[place]
-        return Term(f"axis turned towards {AXIS_NAMES[towards % 3]}", "°", np.degrees(1.0), channel)
+        return FaultTerm(
+            f"axis turned towards {AXIS_NAMES[towards % 3]}", "°", np.degrees(1.0), channel
+        )
     if name in ("iron", "disturbance"):
         axis = AXIS_NAMES[place] if name == "iron" else ("north", "east", "down")[place]
-        return Term(f"field {'along ' if name == 'iron' else ''}{axis}", "nT", 1 / field_unit)
+        return FaultTerm(f"field {'along ' if name == 'iron' else ''}{axis}", "nT", 1 / field_unit)
     if name == "drift-scale":
-        return Term("scale drift", "ppm/°C", 1e6, place)
+        return FaultTerm("scale drift", "ppm/°C", 1e6, place)
     unit, factor = ("mg", 1e3) if place < 3 else ("nT", 1 / field_unit)
     rate = "/°C" if name == "drift-bias" else ""
-    return Term("bias drift" if rate else "bias", unit + rate, factor, place)
+    return FaultTerm("bias drift" if rate else "bias", unit + rate, factor, place)
 
 
 @dataclass(frozen=True)
@@ -171,7 +173,10 @@ class Damage:
 
 
 def drawn_damage(
-    rng: np.random.Generator, forms: Sequence[Fault], size: float = 1.0, lead: tuple[int, ...] = ()
+    rng: np.random.Generator,
+    forms: Sequence[FaultForm],
+    size: float = 1.0,
+    lead: tuple[int, ...] = (),
 ) -> Damage:
     """One of the `forms` for each tool, of `size` times the usual one: uniform within `SIZE_RANGE`, of either sign."""
     departures = np.zeros((*lead, SIZE))

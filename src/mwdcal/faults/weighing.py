@@ -10,7 +10,7 @@ import numpy as np
 from mwdcal.estimation.batch import put, take
 from mwdcal.faults.dead import DeadChannels, dead_channels
 from mwdcal.faults.likelihood import Explanation, Suspect, explained, ratios, repeated
-from mwdcal.faults.physics import DEAD, FAULTS, NONE, SIZE, Fault
+from mwdcal.faults.physics import DEAD, FAULTS, NONE, SIZE, FaultForm
 from mwdcal.geometry.vectors import Array, Ints
 
 FALSE_ALARMS = 0.01
@@ -38,7 +38,7 @@ class FaultEvidence:
     """
 
     suspect: Suspect
-    forms: list[Fault]
+    forms: list[FaultForm]
     none: Explanation
     by_form: Array
     likely: Ints
@@ -46,7 +46,7 @@ class FaultEvidence:
     dead: DeadChannels
 
     @classmethod
-    def of(cls, suspect: Suspect, forms: list[Fault]) -> FaultEvidence:
+    def of(cls, suspect: Suspect, forms: list[FaultForm]) -> FaultEvidence:
         """Of a batch of one."""
         none = explained(suspect, np.zeros((1, SIZE, 0)), suspect.start())
         roughly = by_form(forms, none.information[0], none.gradient[0])
@@ -56,13 +56,14 @@ class FaultEvidence:
         near = take(none, 0 * likely)
         mixing = padded([forms[i] for i in likely])
         best = explained(repeated(suspect, 0 * likely), mixing, near.state, near)
-        exactly = put(roughly, likely, best.evidence - none.evidence)
+        exactly = np.asarray(best.evidence - none.evidence)
+        exactly = put(np.minimum(roughly, exactly.max() - WITHIN), likely, exactly)
         return cls(suspect, forms, none, exactly, likely, best, dead_channels(suspect))
 
     @property
     def information(self) -> Array:
         """Information (SIZE, SIZE) of all departures of a sound tool."""
-        return self.none.information[0]
+        return np.asarray(self.none.information[0])
 
     def misfit(self, kind: str) -> float:
         """χ² of the readings as a fault, or none, explains them best."""
@@ -77,7 +78,7 @@ class FaultEvidence:
         where = [i for i, form in enumerate(self.forms) if form.kind == kind]
         return int(np.searchsorted(self.likely, max(where, key=lambda i: self.by_form[i])))
 
-    def sizes(self, kind: str) -> tuple[Fault, Array, Array]:
+    def sizes(self, kind: str) -> tuple[FaultForm, Array, Array]:
         """The best form of a fault, its sizes (k,) and their covariance (k, k), in units of the usual ones."""
         place = self._best(kind)
         form = self.forms[self.likely[place]]
@@ -93,8 +94,8 @@ class FaultEvidence:
     @cached_property
     def by_fault(self) -> dict[str, float]:
         """Log evidence of each fault over none: the mean over its forms."""
-        result = dict.fromkeys((NONE, *FAULTS), 0.0) | over_forms(self.forms, self.by_form)
-        return result | {DEAD: float(log_mean(self.dead_ratios))}
+        others = over_forms(self.forms, self.by_form) | {DEAD: log_mean(self.dead_ratios)}
+        return {name: float(others.get(name, 0.0)) for name in (NONE, *FAULTS)}
 
     def likelihoods(self) -> dict[str, float]:
         """Share of each fault, all being as likely beforehand."""
@@ -123,7 +124,7 @@ class FaultEvidence:
         return float(min(1.0, by_chance / (1 - DEAD_SHARE), dead / DEAD_SHARE))
 
 
-def padded(forms: list[Fault]) -> Array:
+def padded(forms: list[FaultForm]) -> Array:
     """Departures (F, SIZE, k) of each form, columns of zeros where it has fewer than k sizes."""
     whole = np.zeros((len(forms), SIZE, max(form.mixing.shape[1] for form in forms)))
     for place, form in enumerate(forms):
@@ -131,18 +132,18 @@ def padded(forms: list[Fault]) -> Array:
     return whole
 
 
-def _linear(forms: list[Fault], information: Array, gradient: Array) -> Array:
+def _linear(forms: list[FaultForm], information: Array, gradient: Array) -> Array:
     """Log evidence (..., faults) of faults over none, linearised at none, of gradients (..., SIZE)."""
     each = by_form(forms, information, gradient)
     return np.stack(list(over_forms(forms, each).values()), -1)
 
 
-def by_form(forms: list[Fault], information: Array, gradient: Array) -> Array:
+def by_form(forms: list[FaultForm], information: Array, gradient: Array) -> Array:
     """Log evidence (..., F) of each form over none, linearised at none, of gradients (..., SIZE)."""
     return np.stack([ratios(information, gradient, form.mixing) for form in forms], -1)
 
 
-def over_forms(forms: list[Fault], each: Array) -> dict[str, Array]:
+def over_forms(forms: list[FaultForm], each: Array) -> dict[str, Array]:
     """Log evidence (...) of each fault, of those (..., F) of its forms, each as likely beforehand."""
     kinds = dict.fromkeys(form.kind for form in forms)
     places = {kind: [i for i, form in enumerate(forms) if form.kind == kind] for kind in kinds}

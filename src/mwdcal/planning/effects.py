@@ -94,7 +94,7 @@ class FaultEffect(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     """
 
     kind: Literal["none", "impact", "dead-channel", "heat", "magnetised", "casing", "turn-on"] = (
-        NONE
+        "none"
     )
     channel: Literal["", "ax", "ay", "az", "mx", "my", "mz", "accelerometer", "magnetometer"] = ""
     size: float = 1.0
