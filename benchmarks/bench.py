@@ -35,11 +35,21 @@ TEXTS = Path(__file__).with_name("benchmarks.md")
 """The page without its figures: a paragraph per group under its heading."""
 PACKAGES = (
     "mwdcal", "numpy", "scipy", "numba", "pyarrow", "pyswarms", "AllanTools",
-    "circuitpython-mag-cal", "imucal", "pandas",
+    "circuitpython-mag-cal", "imucal", "pandas", "welleng",
 )  # fmt: skip
-ORDER = ("fleet", "apply", "fits", "procedures", "swarms", "peers", "allan", "commands")
+ORDER = ("fleet", "apply", "fits", "procedures", "surveys", "swarms", "peers", "allan", "commands")
 """Order of the runs: the memory of a fleet is that of the largest process so far."""
-PLOTTED = ("fits", "procedures", "swarms", "peers", "allan", "fleet", "apply", "commands")
+PLOTTED = (
+    "fits",
+    "procedures",
+    "surveys",
+    "swarms",
+    "peers",
+    "allan",
+    "fleet",
+    "apply",
+    "commands",
+)
 GOALS = {
     "fleet": (
         ("fleet, 20000 tools x 48 stations x 24 parameters, 4 cores, least-squares", 100.0, 500.0),

@@ -26,6 +26,7 @@ import warnings
 from collections import Counter
 from pathlib import Path
 from typing import Any
+from xml.sax.saxutils import escape
 
 import click
 import numpy as np
@@ -310,12 +311,46 @@ def workbook_table(r: random.Random, t: Columns, path: Path) -> None:
     book.save(path)
 
 
+def log_table(r: random.Random, t: Columns, path: Path) -> None:
+    """As LAS: the columns as curves, blanks as the header's NULL."""
+    lines = ["~V", " VERS. 2.0 :", " WRAP. NO :", "~W", " NULL. -999.25 :", "~C", " DEPT.M :"]
+    lines += [f" {name}.{r.choice(('', 'G', 'NT', 'DEGC'))} : x" for name in t.columns]
+    lines += [f"~O{chr(10)}# {line}" for line in t.metadata if r.random() < 0.3]
+    rows = zip(*([x.strip() or "-999.25" for x in v] for v in t.columns.values()), strict=True)
+    lines += ["~A", *(f"{30 * k} {' '.join(row)}" for k, row in enumerate(rows))]
+    path.write_text("\n".join(lines), "utf-8", "surrogatepass")
+
+
+def trajectory_table(r: random.Random, t: Columns, path: Path) -> None:
+    """As WITSML: raw channels as the elements of their triads, other columns as elements of their name."""
+    words = {
+        "a": ("grav", r.choice(("gn", "mgn", "m/s2"))),
+        "m": ("mag", r.choice(("nT", "uT", "V"))),
+    }
+    axes = {"x": "Tran1", "y": "Tran2", "z": "Axial"}
+    lines = ['<trajectorys xmlns="http://www.witsml.org/schemas/1series"><trajectory>']
+    for k in range(t.count):
+        cells = {name: escape(values[k]) for name, values in t.columns.items()}
+        raw = [
+            f'<{words[n[0]][0]}{axes[n[1]]}Raw uom="{words[n[0]][1]}">{cells[n]}</{words[n[0]][0]}{axes[n[1]]}Raw>'
+            for n in cli_support.RAW
+            if n in cells
+        ]
+        others = [f"<{n}>{x}</{n}>" for n, x in cells.items() if n not in cli_support.RAW]
+        parts = f'<md uom="m">{30 * k}</md><rawData>{"".join(raw)}</rawData>{"".join(others)}'
+        lines.append(f'<trajectoryStation uid="{k}">{parts}</trajectoryStation>')
+    lines.append("</trajectory></trajectorys>")
+    path.write_text("\n".join(lines), "utf-8", "replace")
+
+
 WRITERS = {
     ".csv": text_table,
     ".tsv": text_table,
     ".txt": text_table,
     ".parquet": parquet_table,
     ".xlsx": workbook_table,
+    ".las": log_table,
+    ".xml": trajectory_table,
 }
 
 
@@ -421,6 +456,10 @@ WORDS = {
     "repeat": ("1", "3", "20", "0"),
     "workers": ("1",),
     "word_bits": ("32", "24", "16", "11"),
+    "day": (*("2026-07-01",) * 6, "2025-01-01", "1950-06-30", "2024-02-30", "1.7.2026"),
+    "crs": ("EPSG:23031", "EPSG:4326", "EPSG:2048", "EPSG:1"),
+    "field_nt": ("48000", "51000.5", "48"),
+    "gravity_g": ("1.0013", "9.81"),
 }
 """Values of options that are not read off the command line itself."""
 USUAL = {
@@ -448,12 +487,16 @@ RARE = {"compare": 0.05, "noise": 0.15}
 """How often a command that takes long is run, against the others."""
 
 
+TABLE_SUFFIXES = (*(".csv",) * 4, ".tsv", ".parquet", ".xlsx", ".las", ".xml")
+"""Of runs and logs, the usual one more often."""
+
+
 def files(r: random.Random, kind: str, sound: dict[str, list[Any]], stem: Path) -> Path:
     """A file of a kind, damaged or not."""
     sample = r.choice(sound[kind])
     if kind in ("run", "log"):
         plain = (".txt",) if kind == "log" else ()
-        path = table_file(r, sample, stem, (*(".csv",) * 4, ".tsv", ".parquet", ".xlsx", *plain))
+        path = table_file(r, sample, stem, TABLE_SUFFIXES + plain)
     elif kind == "fleet":
         path = table_file(r, sample, stem, (".parquet", ".parquet", ".csv", ".xlsx"))
         if r.random() < 0.2:
@@ -483,7 +526,7 @@ def value(r: random.Random, p: click.Parameter, sound: dict[str, list[Any]], fol
     name = str(p.name)
     metavar = str(getattr(p, "metavar", "") or "")
     if name in OUTPUTS:
-        suffixes = re.findall(r"\.\w+", metavar) or [".csv", ".tsv", ".parquet", ".xlsx"]
+        suffixes = re.findall(r"\.\w+", metavar) or sorted({*TABLE_SUFFIXES})
         return str(folder / f"out-{name}{r.choice(suffixes)}")
     if name in SAMPLES and (name not in WORDS or r.random() < 0.3):
         return str(files(r, SAMPLES[name], sound, folder / f"in-{name}"))

@@ -11,7 +11,7 @@ import msgspec
 
 import mwdcal
 from mwdcal.app import correction
-from mwdcal.app.envelope import DOCUMENT_VERSION, INPUTS, Envelope, ExampleDocument
+from mwdcal.app.envelope import INPUTS, Envelope, ExampleDocument
 from mwdcal.app.screens import (
     calibration,
     comparison,
@@ -23,7 +23,8 @@ from mwdcal.app.screens import (
     simulation,
     stations,
 )
-from mwdcal.calibration.record import SCHEMA_VERSION, Calibration
+from mwdcal.app.screens.surveys import reference, survey
+from mwdcal.calibration.record import DOCUMENT_VERSION, SCHEMA_VERSION, Calibration
 from mwdcal.faults.diagnosis import Diagnosis
 from mwdcal.use.verification import Verdict
 
@@ -39,8 +40,10 @@ CONTENTS: dict[str, type] = {
     "noise": noise.NoiseSummary,
     "plan": plan.PlanDocument,
     "profile": proposal.ProposalSummary,
+    "reference": reference.ReferenceSummary,
     "simulate": simulation.SimulationSummary,
     "stations": stations.StationsSummary,
+    "survey": survey.SurveySummary,
     "verify": Verdict,
 }
 """What follows the envelope in the document of each command."""

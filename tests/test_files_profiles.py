@@ -26,7 +26,9 @@ def refusal(folder, text):
 
 
 def test_the_built_in_profiles():
-    names = ["distox", "generic", "moosavi-servo", "sap5", "sap6", "servo"]
+    conventions = ["halliburton", "inverted-xy", "schlumberger", "standard", "tensor"]
+    names = [f"convention-{name}" for name in conventions]
+    names += ["distox", "generic", "moosavi-servo", "sap5", "sap6", "servo"]
     assert built_in("profiles") == names
     for name in names:
         profile, digest = load_profile(name)
@@ -55,7 +57,7 @@ def test_a_left_handed_instrument_is_a_real_one(tmp_path):
 @pytest.mark.parametrize(
     ("name", "part"),
     [
-        ("servoo", "built-in name (distox, generic, moosavi-servo, sap5, sap6, servo)"),
+        ("servoo", "distox, generic, moosavi-servo, sap5, sap6, servo)"),
         ("servoo", "Did you mean 'servo'"),
         ("nowhere/tool.toml", "or the path of a TOML file; got 'nowhere/tool.toml'"),
         ("", "is not a tool profile"),

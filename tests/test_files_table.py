@@ -234,7 +234,11 @@ def test_a_missing_extra_is_named(tmp_path, monkeypatch, module, suffix):
         ({}, "a.csv", "expected the column names"),
         ({"ax": ["1\n2"]}, "a.csv", "must be one line"),
         ({"ax": ["1\0"]}, "a.xlsx", "must be plain text"),
-        ({"ax": ["1"]}, "a.json", "must be one of .csv, .tsv, .parquet, .xlsx; got '.json'"),
+        (
+            {"ax": ["1"]},
+            "a.json",
+            "must be one of .csv, .tsv, .parquet, .xlsx, .xml, .las; got '.json'",
+        ),
         ({"ax": ["1"]}, "a", "got 'none'"),
     ],
 )

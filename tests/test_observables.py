@@ -23,7 +23,7 @@ def complex_value(name, x):
     across = np.sqrt(g[..., 0] ** 2 + g[..., 1] ** 2)
     east = (g[..., 0] * b[..., 1] - g[..., 1] * b[..., 0]) * size(g)
     north = b[..., 2] * across**2 - g[..., 2] * (g[..., 0] * b[..., 0] + g[..., 1] * b[..., 1])
-    return {
+    values = {
         "inclination": lambda: atan2(across, g[..., 2]),
         "toolface": lambda: atan2(-g[..., 0], -g[..., 1]),
         "azimuth": lambda: atan2(east, north),
@@ -31,13 +31,19 @@ def complex_value(name, x):
         "gravity": lambda: size(g),
         "field": lambda: size(b),
         "dip": lambda: atan2(dot(g, b), size(cross)),
-    }[name]()
+        "north_toolface": lambda: values["azimuth"]() + values["toolface"](),
+    }
+    return values[name]()
+
+
+ANGLES_AND_STRENGTHS = (
+    *("inclination", "toolface", "azimuth", "magnetic_toolface", "north_toolface"),
+    *("gravity", "field", "dip"),
+)
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-@pytest.mark.parametrize(
-    "name", ["inclination", "toolface", "azimuth", "magnetic_toolface", "gravity", "field", "dip"]
-)
+@pytest.mark.parametrize("name", ANGLES_AND_STRENGTHS)
 def test_gradients_by_complex_step(name, shape):
     rng = np.random.default_rng(4)
     inc = np.where(rng.uniform(size=shape) < 0.3, 1e-4, rng.uniform(0.02, 3.1, shape))
@@ -93,3 +99,23 @@ def test_iscwsa_weighting_functions_are_gradient_times_model():
                 np.testing.assert_allclose(
                     value / scale, want / scale, rtol=0, atol=1e-12, err_msg=term
                 )
+
+
+def test_north_toolface_is_azimuth_plus_toolface_and_the_magnetic_toolface_at_vertical():
+    rng = np.random.default_rng(6)
+    azi, tool = rng.uniform(0, 2 * np.pi, (2, 300))
+    for inc in (0.0, 1e-13, 1e-9, 1e-3, 0.5, np.pi / 2, 3.0):
+        g, b = reference_vectors(np.full(300, inc), azi, tool, 9.8, 50_000.0, 1.2)
+        value, slope = (
+            getattr(OBSERVABLES["north_toolface"], what)(g, b) for what in ("value", "gradient")
+        )
+        off = OBSERVABLES["north_toolface"].difference(value, azi + tool)
+        np.testing.assert_allclose(off, 0, atol=1e-13 / max(1 + np.cos(inc), 0.01))
+        assert np.isfinite(slope).all()
+        if inc == 0:
+            np.testing.assert_allclose(
+                value, OBSERVABLES["magnetic_toolface"].value(g, b), atol=1e-15
+            )
+    down = reference_vectors(np.pi, 0.3, 0.4, 1.0, 1.0, 0.5)
+    exactly = np.array([0.0, 0.0, -1.0]), down[1]
+    assert np.isnan(OBSERVABLES["north_toolface"].value(*exactly))

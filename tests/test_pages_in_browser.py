@@ -52,6 +52,8 @@ SAMPLES = {
     "noise-moving": ("noise", EXAMPLE / "log.csv", *TOOL),
     "stations": ("stations", EXAMPLE / "log.csv", "-o", "new.csv"),
     "plan": ("plan", *TOOL, "--plan", "laboratory-thermal", "--plan", "moosavi-12"),
+    "survey": ("survey", "tool.json", EXAMPLE / "well.csv", "-o", "new.csv"),
+    "survey-rejected": ("survey", "tool.json", "iron.csv", "-o", "new.csv"),
 }
 """Commands that also write a page, by the name of the sample."""
 
@@ -104,6 +106,9 @@ def folder(tmp_path_factory):
     ran = mwdcal("calibrate", EXAMPLE / "run.csv", *TOOL, "-o", folder / "tool.json")
     assert ran.code == 0, ran
     fleet(folder / "fleet.parquet")
+    iron = read_csv(EXAMPLE / "well.csv")
+    iron["mz"] = [f"{float(v) + 0.06:.6f}" for v in iron["mz"]]
+    write_csv(folder / "iron.csv", iron, 'simulated = "yes"')
     return folder
 
 

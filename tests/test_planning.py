@@ -15,10 +15,11 @@ from mwdcal.calibration.prediction import accuracy_at, readings_at
 from mwdcal.errors import InputError
 from mwdcal.files.profiles import built_in, load_profile
 from mwdcal.geometry.vectors import reference_vectors
-from mwdcal.planning.expected import expected, nominal_run, planned_fit
+from mwdcal.planning.expected import expected, nominal_run, planned_earth, planned_fit
 from mwdcal.planning.moves import Stand, move_seconds, session_seconds, shortest_order
 from mwdcal.planning.optimal import Information, best, efficiency
-from mwdcal.planning.plans import load_plan
+from mwdcal.planning.planned import WORKING_INCLINATIONS, best_plan, judged, smallest_plan
+from mwdcal.planning.plans import load_plan, run_sheet
 from simulation import DEG, attitude
 
 SERVO = load_profile("servo")[0]
@@ -214,6 +215,9 @@ def test_soaks_keep_their_order():
         ("name = 'x'\n[[stations]]\nazimuth_deg = 1", "inclination_deg"),
         ("name = 'x'\n[[stations]]\ninclination_deg = 1\nroll = 2", "roll"),
         ("name =", "is not a plan"),
+        ("name = 'x'\ntemperature_c = nan\n[[stations]]\ninclination_deg = 1", "must be finite"),
+        ("name = 'x'\ngravity_g = nan\n[[stations]]\ninclination_deg = 1", "must be finite"),
+        ("name = 'x'\n[[stations]]\ninclination_deg = [1, inf]", "must be finite"),
         (
             f"name = 'x'\n[[stations]]\ninclination_deg = {list(range(180))}\n"
             f"azimuth_deg = {list(range(300))}\n",
@@ -260,6 +264,78 @@ def test_a_plan_states_every_attitude(tmp_path):
     path.write_text("ref_inclination_deg,ref_azimuth_deg,ref_toolface_deg\n90,0,0\n45,,30\n")
     with pytest.raises(InputError, match="station 2 has no ref_azimuth_deg"):
         nominal_run(load_plan(str(path)), SERVO)
+
+
+ATTITUDES = (
+    "0,0,0", "180,0,0", "90,0,0", "90,0,90", "90,0,180", "90,0,270", "60,120,40", "120,240,200",
+)  # fmt: skip
+
+
+def written_plan(path, names="", cells=("",)):
+    """A run file of `ATTITUDES` with further columns, whose cells come in turn."""
+    head = "ref_inclination_deg,ref_azimuth_deg,ref_toolface_deg" + names
+    rows = [each + cells[k % len(cells)] for k, each in enumerate(ATTITUDES)]
+    path.write_text("\n".join([head, *rows, ""]))
+    return load_plan(str(path))
+
+
+@pytest.mark.parametrize(
+    ("names", "cell"),
+    [("", ""), (",temperature_c", ","), (",ref_gravity_g,ref_field_nt,ref_dip_deg", ",,,")],
+)
+def test_a_plan_without_temperatures_or_place_is_one_at_the_usual(tmp_path, names, cell):
+    """The candidates have temperatures, the plan none: its efficiency among them is the same."""
+    usual = ",temperature_c,ref_gravity_g,ref_field_nt,ref_dip_deg"
+    whole = judged(written_plan(tmp_path / "whole.csv", usual, (",25,1,48000,63",)), SERVO)
+    bare = judged(written_plan(tmp_path / "bare.csv", names, (cell,)), SERVO)
+    assert bare.efficiency == pytest.approx(whole.efficiency, rel=1e-9)
+    np.testing.assert_allclose(
+        bare.calibration.parameter_covariance, whole.calibration.parameter_covariance, rtol=1e-6,
+        atol=1e-22,
+    )  # fmt: skip
+
+
+def test_a_run_without_temperatures_has_next_stations(tmp_path):
+    done = written_plan(tmp_path / "run.csv")
+    assert best_plan(load_plan("candidates"), 2, SERVO, measured=done).plan.count == 2
+
+
+def test_blank_cells_of_the_place_take_the_mean_of_the_others(tmp_path):
+    cells = (",0.99,52000,-70", ",,,", ",0.992,54000,-72", ",,,")
+    plan = written_plan(tmp_path / "p.csv", ",ref_gravity_g,ref_field_nt,ref_dip_deg", cells)
+    place = [values[1] for values in planned_earth(plan)]
+    np.testing.assert_allclose(place, [0.991, 53_000, -71 * DEG])
+
+
+def test_a_sheet_asks_for_the_place(tmp_path):
+    """Without field and dip `calibrate` would give another accuracy than the plan has stated."""
+    bare = run_sheet(load_plan("six-state")).columns
+    assert all(np.isnan(bare[f"ref_{name}"]).all() for name in ("gravity_g", "field_nt", "dip_deg"))
+    stated = run_sheet(load_plan("laboratory-thermal")).columns
+    assert set(stated["ref_dip_deg"]) == {70.5}
+
+
+@pytest.mark.parametrize("name", ["Temp", "Temperature_C", "DIP", "ref_Field_nT"])
+def test_columns_under_other_names_are_not_left_out_of_a_plan(tmp_path, name):
+    """As of a run: a plan at two temperatures is not taken for one at none."""
+    with pytest.raises(InputError, match=name):
+        written_plan(tmp_path / "plan.csv", f",{name}", (",20", ",90"))
+
+
+def test_the_fewest_stations_carry_the_temperature_terms_of_all_candidates(tmp_path):
+    """And the accuracy holds between the soaks and at their ends, not at the reference temperature alone."""
+    path = tmp_path / "warm.toml"
+    path.write_text(
+        "name = 'warm'\ntemperature_c = [20, 90, 160]\n[[stations]]\ninclination_deg = [5, 90, 175]\n"
+        "azimuth_deg = [0, 120, 240]\ntoolface_deg = [0, 120, 240]\n"
+    )
+    wanted = {"azimuth": 0.25}
+    result = smallest_plan(load_plan(str(path)), wanted, SERVO)
+    assert [triad.order for triad in result.calibration.triads] == [2, 2]
+    for temperature in np.linspace(20, 160, 15):
+        each = accuracy_at(result.calibration, WORKING_INCLINATIONS, temperature=temperature)
+        # the temperatures that are looked at lie 23 °C apart
+        assert np.degrees(each["azimuth"]).max() < 1.02 * wanted["azimuth"]
 
 
 def test_why_24_stations_cannot_beat_the_48_of_the_textbook():

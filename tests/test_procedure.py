@@ -243,6 +243,19 @@ def test_the_same_result_whatever_the_number_of_processes(tmp_path):
     assert files[0] == files[1]
 
 
+def test_a_tool_without_magnetometer_is_judged_by_what_it_has():
+    """As `verify` judges it: a limit of azimuth neither passes nor fails it."""
+    tool = replace(drawn(np.random.default_rng(1), SERVO, 0), magnetometer=None)
+    limits = Limits(name="both", spread=Bounds(inclination_deg=1.0, azimuth_deg=1.0))
+    wanted = Procedure.of(
+        load_plan("twelve-state"), load_plan("roll-test"), SERVO, Options(), limits, 1, tool=tool
+    )
+    assert [each.name for each in wanted.judged] == ["inclination"]
+    columns = wanted.repeated((0, 20))
+    assert columns["passed"].all()
+    assert columns["good"].all()
+
+
 def test_another_seed_gives_other_tools(tmp_path):
     first, second = (
         repeat(tmp_path, str(seed), "--seed", seed, "--workers", 1)[1] for seed in (1, 2)

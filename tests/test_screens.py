@@ -22,6 +22,7 @@ from mwdcal.app import cli, progress, text
 
 STORED = Path(__file__).parent / "screens"
 WIDTHS = (80, 120)
+PLACE = ("--latitude", "60", "--longitude", "3.5", "--altitude-m", "40", "--date", "2026-07-01")
 SCREENS = {
     "example": ("example", "new"),
     "calibrate": ("calibrate", "demo/run.csv", "--tool", "demo/tool.toml", "-o", "made.json"),
@@ -43,10 +44,14 @@ SCREENS = {
     "plan": ("plan", "--tool", "demo/tool.toml", "--plan", "six-state", "--plan", "moosavi-30"),
     "plan-best": ("plan", "--tool", "demo/tool.toml", "--stations", "8"),
     "profile": ("profile", "demo/export.csv", "-o", "made.toml"),
+    "reference": ("reference", *PLACE, "--crs", "EPSG:23031", "--field-nt", "50500"),
+    "reference-fill": ("reference", *PLACE, "--model", "igrf14", "--fill", "blank.csv", "-o",
+                       "made.csv"),
     "simulate": ("simulate", "--plan", "six-state", "--effects", "stand.toml", "-o", "made.csv"),
     "simulate-repeat": ("simulate", "--plan", "six-state", "--repeat", "20", "--limits", "tight.toml",
                         "--workers", "1", "-o", "made.parquet"),
     "stations": ("stations", "demo/log.csv", "-o", "stations.csv"),
+    "survey": ("survey", "tool.json", "demo/well.csv", "-o", "made.csv"),
     "misused": ("calibrate", "demo/run.csv"),
 }  # fmt: skip
 """Commands and what they run on."""
@@ -110,8 +115,13 @@ def prepared(folder):
     def hot(columns):
         columns["temperature_c"][3] = "80.0"
 
+    def without_references(columns):
+        del columns["ref_gravity_g"]
+        columns["ref_field_nt"][1:] = [""] * 47
+
     changed(demo / "run.csv", folder / "moved.csv", moved)
     changed(demo / "run.csv", folder / "few.csv", some(3))
+    changed(demo / "run.csv", folder / "blank.csv", without_references)
     changed(demo / "rolltest.csv", folder / "part.csv", some(4))
     changed(demo / "rolltest.csv", folder / "knocked.csv", knocked)
     changed(demo / "surveys.csv", folder / "hot.csv", hot)
@@ -154,7 +164,8 @@ def screen(width, *arguments, **variables):
     code, out, err = seen(width, *arguments, **variables)
     shown = f"exit {code}\n--- stdout\n{out}--- stderr\n{err}"
     shown = re.sub(r"[\d.]+ s, [\d.]+ tools/s", "? s, ? tools/s", shown)
-    for varying in ("[0-9a-f]{64}", r"(?<=mwdcal )\d[\w.]+"):
+    libraries = (rf"(?<={name} )\d[\w.]+" for name in ("mwdcal", "pygeomag", "ppigrf", "pyproj"))
+    for varying in ("[0-9a-f]{64}", *libraries):
         shown = re.sub(varying, lambda part: "?" * len(part[0]), shown)
     times = re.compile(r"^(time of one fit, s)(.*)$", re.MULTILINE)
     return times.sub(lambda line: line[1] + re.sub(r"\d", "0", line[2]), shown)

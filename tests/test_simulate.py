@@ -437,6 +437,20 @@ def test_plans_give_a_truth_of_the_order_that_their_soaks_carry(tmp_path):
         assert np.shape(written["accelerometer"]["SF"]) == (3, order + 1)
 
 
+@pytest.mark.parametrize("extra", ["", ",temperature_c", ",ref_gravity_g,ref_field_nt,ref_dip_deg"])
+def test_a_plan_without_temperatures_or_place_is_carried_out(tmp_path, extra):
+    plan, run = tmp_path / "plan.csv", tmp_path / "run.csv"
+    blank = "," * extra.count(",")
+    rows = [f"{i},{a},{t}{blank}" for i, a, t in ((0, 0, 0), (90, 40, 30), (120, 80, 200))]
+    plan.write_text(
+        "\n".join([f"ref_inclination_deg,ref_azimuth_deg,ref_toolface_deg{extra}", *rows])
+    )
+    document = command("simulate", "--plan", plan, "-o", run, "--json").json
+    assert document["earth"] == {"gravity_g": 1.0, "field_nt": 48_000.0, "dip_deg": 63.0}
+    assert document["order"] == 0
+    assert mwdcal.read_run(run).count == 3
+
+
 def test_built_in_effects_are_none():
     assert built_in("effects") == ["none"]
     assert load_effects("none")[0] == Effects()

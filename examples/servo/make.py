@@ -5,6 +5,7 @@ Writes beside this script what `mwdcal example` hands out, and truth.json. Same 
 run.csv       48 stations
 rolltest.csv  12 toolfaces at 45°, taken separately
 surveys.csv   readings without references, to be corrected
+well.csv      surveys of a well, with measured depths
 export.csv    the stations of run.csv as a German spreadsheet program would export them
 log.csv       a continuous log in which the tool rests six times
 static.csv    a continuous log of the tool at rest
@@ -32,6 +33,8 @@ IDENTITY_LINES = [f"# {k} = {json.dumps(v, ensure_ascii=False)}\n" for k, v in I
 POWERS = np.array([1.0, 1e-3, 1e-6])
 """Of a drift, shares of the powers 1 to 3 of temperature, per °C."""
 RAW = ("ax", "ay", "az", "mx", "my", "mz")
+DEPTHS = list(range(0, 1080, 30))
+"""Measured depths of the surveys of a well, m."""
 SAMPLING_HZ = 10
 SAMPLE_NOISE = 1e-3
 """Of one sample of a log, V."""
@@ -89,6 +92,24 @@ def log(name: str, level, rng) -> None:
             )
 
 
+def well(tool, rng, profile) -> None:
+    """Surveys every 30 m of a hole that builds to 70° and turns to the east, with the Earth's field and declination."""
+    inclinations = [min(max(0.08 * (depth - 120), 0.5), 70.0) for depth in DEPTHS]
+    azimuths = [20 + 0.06 * max(depth - 600, 0) for depth in DEPTHS]
+    rolled = mwdcal.simulate(inclinations, 5, azimuths, [25.1], tool=tool, seed=rng)
+    place = np.arange(len(DEPTHS))
+    run = rolled.select(np.isin(np.arange(rolled.count), 5 * place + (2 * place) % 5))
+    known = {name: run.known[name] for name in ("gravity", "field", "dip")}
+    identity = {**IDENTITY, "declination_deg": 2.4}
+    labels = tuple(str(i + 1) for i in place)
+    run = replace(run, known=known, sd={}, station=labels, metadata=identity)
+    mwdcal.save(run, HERE / "well.csv", profile, decimals=6)
+    depths = iter(["md_m", *map(str, DEPTHS)])
+    lines = (HERE / "well.csv").read_text("utf-8").splitlines()
+    lines = [line if line.startswith("#") else f"{next(depths)},{line}" for line in lines]
+    (HERE / "well.csv").write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")
+
+
 def main() -> None:
     """Simulate the runs and logs and write them."""
     rng = np.random.default_rng(SEED)
@@ -128,6 +149,7 @@ def main() -> None:
     moving = [np.interp(time, seconds, np.repeat(channel, 2)) for channel in rests.T]
     log("log.csv", np.stack(moving, -1), rng)
     log("static.csv", np.tile(rests[0], (120 * SAMPLING_HZ, 1)), rng)
+    well(tool, rng, profile)
     document = {
         "simulated": True,
         "seed": SEED,

@@ -23,8 +23,22 @@ INTERNAL = 70
 COMPLETION = "_MWDCAL_COMPLETE"
 """Variable with which a shell asks for completions, which are bytes."""
 COMMANDS = (
-    *("apply", "calibrate", "compare", "completion", "convert", "planning.diagnose", "example"),
-    *("fleet", "noise", "planning.plan", "profile", "planning.simulate", "stations", "verify"),
+    "apply",
+    "calibrate",
+    "compare",
+    "completion",
+    "convert",
+    "planning.diagnose",
+    "example",
+    "fleet",
+    "noise",
+    "planning.plan",
+    "profile",
+    "surveys.reference",
+    "planning.simulate",
+    "stations",
+    "surveys.survey",
+    "verify",
 )
 """Modules of `mwdcal.app.commands` with a command of their name."""
 

@@ -17,18 +17,20 @@ from mwdcal.files import carried, streams
 from mwdcal.files.contract import CHANNELS, check_columns
 from mwdcal.files.formats import table as tables
 from mwdcal.files.formats.columns import as_text
-from mwdcal.files.formats.table import Table
+from mwdcal.files.formats.table import EXCHANGED, Table
 from mwdcal.files.runs import is_export, read_export, renamed, to_readings
 from mwdcal.geometry.observables import EXTRAPOLATED
 from mwdcal.sensor.profile import Profile
 from mwdcal.use.correction import RowCounts, counted
 
 LARGEST_TEXT = 8_000_000
-"""Bytes of text that becomes a workbook: memory is some fifty times as much."""
+"""Bytes of text that becomes a workbook, WITSML or LAS: memory is some fifty times as much."""
 WHOLE_ROWS = 100_000
-"""Rows of a Parquet table that becomes a workbook."""
+"""Rows of a Parquet table that becomes a workbook, WITSML or LAS."""
 TEXT = (".csv", ".tsv")
 """Suffixes of text tables."""
+WHOLE = (".xlsx", *EXCHANGED)
+"""Suffixes of tables that are written as a whole."""
 
 
 class Applied(msgspec.Struct, frozen=True, kw_only=True):
@@ -63,7 +65,7 @@ def apply_to_any(
             calibration, readings, output, outside, advance, missing=missing, decimal=decimal
         )
         return *streamed, ""
-    if readings.suffix.lower() in TEXT and (exported or output.suffix.lower() == ".xlsx"):
+    if readings.suffix.lower() in TEXT and (exported or output.suffix.lower() in WHOLE):
         _check_size(readings)
     source = read_export(readings, profile, decimal=decimal, rows=WHOLE_ROWS)
     result, tally, findings = apply_to_table(calibration, source, outside, missing)
@@ -81,7 +83,7 @@ def _is_exported(readings: Path, profile: Profile, decimal: str) -> bool:
     """Whether a table is written, or names its columns, as the profile says and not as documented."""
     if isinstance(profile.columns, msgspec.UnsetType):
         return False
-    if readings.suffix.lower() == ".xlsx":
+    if readings.suffix.lower() in WHOLE:
         return True
     opened = streams.open_parquet if readings.suffix.lower() == ".parquet" else streams.open_text
     try:
@@ -96,8 +98,8 @@ def _check_size(readings: Path) -> None:
     size = readings.stat().st_size if readings.is_file() else 0
     if size > LARGEST_TEXT:
         raise InputError(
-            f"{readings.name}: an export, or a text table that becomes a workbook, must have at most {LARGEST_TEXT} "
-            f"bytes; got {size}. Split it, or write CSV."
+            f"{readings.name}: an export, or a text table that becomes XLSX, WITSML or LAS, must have at most "
+            f"{LARGEST_TEXT} bytes; got {size}. Split it, or write CSV."
         )
 
 

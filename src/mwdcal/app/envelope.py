@@ -8,10 +8,8 @@ from typing import Any
 import msgspec
 
 from mwdcal.calibration.readings import is_simulated, serial_of
-from mwdcal.calibration.record import SOFTWARE
+from mwdcal.calibration.record import DOCUMENT_VERSION, SOFTWARE
 
-DOCUMENT_VERSION = 1
-"""Version of the documents: higher when a key goes, or changes its meaning."""
 INPUTS = {
     "apply": ("calibration", "readings"),
     "calibrate": ("run", "profile", "prior"),
@@ -23,8 +21,10 @@ INPUTS = {
     "noise": ("log", "profile"),
     "plan": ("profile", "measured"),
     "profile": ("run",),
+    "reference": ("run",),
     "simulate": ("plan", "profile", "calibration", "effects", "rolltest", "limits"),
     "stations": ("log",),
+    "survey": ("calibration", "readings", "reference", "limits"),
     "verify": ("calibration", "run", "limits"),
 }
 """The files behind the document of each command, whose digests are its keys `…_sha256`."""

@@ -25,13 +25,15 @@ from mwdcal.sensor.models import Basis, Factors, Model, Polynomial
 from mwdcal.sensor.profile import Profile
 
 SCHEMA_VERSION = 1
+DOCUMENT_VERSION = 1
+"""Version of what commands print for machines: higher when a key goes, or changes its meaning."""
 SOFTWARE = f"mwdcal {__version__}"
 """Name and version of the program."""
 DIGITS = 12
 """Significant digits of every number in a calibration file."""
 MARGIN = 1.0
 """Degrees Celsius by which a temperature may lie outside the calibrated range, as it is read."""
-MAGNETIC = ("azimuth", "field", "dip", "magnetic_toolface", "bx", "by", "bz")
+MAGNETIC = ("azimuth", "field", "dip", "magnetic_toolface", "north_toolface", "bx", "by", "bz")
 """Observables that need a magnetometer."""
 LARGEST_ANGLE_SD = 0.5
 """Largest standard uncertainty of a direction that is stated, rad: a fifth too small already, as the
@@ -460,12 +462,12 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
                     f"`names` must be observables ({', '.join(OBSERVABLES)}); got {name!r}. "
                     "Correct the name."
                 )
-        rows = np.stack([self.sensitivity(name, readings) for name in names], -2)
-        total = np.einsum("...ai,ij,...bj->...ab", rows, self.parameter_covariance, rows)
+        rows = np.stack([self._gradient(name, readings) for name in names], -2)
+        moved = self.jacobian(readings)
+        vectors = moved @ self.parameter_covariance @ moved.mT
         if noise:
-            rows = np.stack([self._gradient(name, readings) for name in names], -2)
-            reading = self.noise_covariance(readings)
-            total = total + np.einsum("...ai,...ij,...bj->...ab", rows, reading, rows)
+            vectors = vectors + self.noise_covariance(readings)
+        total = np.einsum("...ai,...ij,...bj->...ab", rows, vectors, rows)
         lacking = () if self.has_field else MAGNETIC
         blank = np.stack([self.rests_on_free(n, readings) | (n in lacking) for n in names], -1)
         turns = np.array([OBSERVABLES[n].period > 0 for n in names])

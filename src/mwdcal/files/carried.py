@@ -9,13 +9,15 @@ from mwdcal.files.contract import RANGES
 from mwdcal.files.formats.columns import Column, plain_names, shown
 from mwdcal.files.formats.text import is_formula
 
+_RENAMING = (".csv", ".tsv", ".xlsx")
+"""Suffixes of formats in which the name of a column is one line of a table."""
 NAMED = 10
 """Most columns that a finding names."""
 
 
 def copied(names: Sequence[str], formulas: Collection[str], suffix: str) -> list[Finding]:
     """Columns that a table of this format has under another name, and those with formulas."""
-    plain = names if suffix == ".parquet" else plain_names(names)
+    plain = plain_names(names) if suffix in _RENAMING else names
     renamed = [
         f"{shown(old)} is {shown(new)}" for old, new in zip(names, plain, strict=True) if old != new
     ]

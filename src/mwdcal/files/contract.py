@@ -180,13 +180,10 @@ def magnetic_offset(metadata: Mapping[str, object], source: str) -> float:
     >>> magnetic_offset({"azimuth_reference": "true", "declination_deg": 3.0}, "run.csv")
     3.0
     """
-    check_near_misses(list(metadata), AZIMUTH_KEYS, f"{source}: metadata")
+    stated = stated_norths(metadata, source)
     kind = metadata.get("azimuth_reference", "magnetic")
     if kind is True:  # the bare word `true` in a metadata line
         kind = "true"
-    stated = {
-        key: _degrees(metadata[key], key, source) for key in AZIMUTH_KEYS[1:] if key in metadata
-    }
     if not isinstance(kind, str) or kind not in _NORTHS:
         raise InputError(
             f"{source}, metadata 'azimuth_reference': must be one of "
@@ -199,6 +196,18 @@ def magnetic_offset(metadata: Mapping[str, object], source: str) -> float:
                 f"`# {key} = …`, or give magnetic azimuths."
             )
     return sum((sign * stated[key] for key, sign in _NORTHS[kind].items()), 0.0)
+
+
+def stated_norths(metadata: Mapping[str, object], source: str) -> dict[str, float]:
+    """Declination and convergence that metadata state, degrees.
+
+    >>> stated_norths({"declination_deg": 3.0}, "run.csv")
+    {'declination_deg': 3.0}
+    """
+    check_near_misses(list(metadata), AZIMUTH_KEYS, f"{source}: metadata")
+    return {
+        key: _degrees(metadata[key], key, source) for key in AZIMUTH_KEYS[1:] if key in metadata
+    }
 
 
 def _degrees(value: object, key: str, source: str) -> float:

@@ -42,7 +42,7 @@ READ = (TIME, *RANGES)
 
 _PIECE = 16_000_000
 _LONGEST_ROW = 1_000_000
-_TYPED = (".parquet", ".xlsx")
+_TYPED = (".parquet", ".xlsx", *tables.EXCHANGED)
 _ODD = re.compile(r"nan|inf|[\"\r]", re.IGNORECASE)
 _CLOCK = re.compile(r"\d{4}-\d{1,2}-\d{1,2}|\d{1,2}:\d{2}|\d{1,2}[./]\d{1,2}[./]\d{4}")
 _BINARY = re.compile(rb"[\x00-\x08\x0e-\x1f]")

@@ -98,8 +98,10 @@ NOTICED = {
     "temperature_c": "°C",
 }
 """Columns that must not be overlooked, with their units."""
-OURS = ("time_s", "start_s", "end_s", "samples", "drifting", "serial")
+OURS = ("time_s", "start_s", "end_s", "samples", "drifting", "serial", "md_m")
 """Columns beyond the contract that mwdcal itself reads or writes in run files."""
+_COPIED = ("drift_", "witsml ")
+"""What columns begin with that mwdcal writes of a log, and that a WITSML file has beyond a run's."""
 _CASED = {"nT": " nt ", "uT": " ut ", "mT": " millit ", "mG": " milligauss ", "mg": " millig "}
 
 
@@ -179,7 +181,7 @@ def _without_unit(words: list[str]) -> tuple[list[str], str]:
 
 def unused(names: Sequence[str], used: Collection[str]) -> tuple[str, ...]:
     """Columns that are not used, each with what it resembles; those that resemble something first."""
-    others = [n for n in names if n not in (*used, *OURS) and not n.startswith("drift_")]
+    others = [n for n in names if n not in (*used, *OURS) and not n.startswith(_COPIED)]
     alike = {name: resembled(name) for name in others}
     notes = {name: f" (resembles '{each.column}')" for name, each in alike.items() if each}
     notes |= dict.fromkeys(_results(names), " (a result of mwdcal apply)")

@@ -61,6 +61,26 @@ def magnetic_toolface(g: Array, b: Array) -> Array:
     return wrap(np.arctan2(b[..., 0], b[..., 1]))
 
 
+def _north_parts(g: Array, b: Array) -> tuple[Array, Array, Array]:
+    """Gravity's direction u, the field t in a tool turned upright by the shortest way, and what is taken off it.
+
+    Definition: t = b - s u across the tool axis, s = (u·b + b_z) / (1 + u_z).
+    """
+    upright = np.where(is_vertical(g) & (g[..., 2] < 0), np.nan, 1.0)[..., None]
+    down = _unit(g) * upright
+    share = (np.sum(down * b, -1) + b[..., 2]) / (1 + down[..., 2])
+    return down, b - share[..., None] * down, share
+
+
+def north_toolface(g: Array, b: Array) -> Array:
+    """Angle from magnetic north to the toolface scribe, 0…2π: azimuth + toolface, which exists at vertical.
+
+    Singular: NaN at 180° inclination, where azimuth - toolface matters instead.
+    """
+    _, turned, _ = _north_parts(g, b)
+    return wrap(np.arctan2(turned[..., 0], turned[..., 1]))
+
+
 def _azimuth_parts(g: Array, b: Array) -> tuple[Array, Array]:
     strength = np.linalg.norm(g, axis=-1)
     east = (g[..., 0] * b[..., 1] - g[..., 1] * b[..., 0]) * strength
@@ -133,6 +153,16 @@ def _azimuth_gradient(g: Array, b: Array) -> Array:
     return np.asarray(numerator / square[..., None])
 
 
+def _north_toolface_gradient(g: Array, b: Array) -> Array:
+    down, turned, share = _north_parts(g, b)
+    across = _turning(turned)
+    axis = np.array([0.0, 0.0, 1.0])
+    part = (np.sum(across * down, -1) / (1 + down[..., 2]))[..., None]
+    of_down = -share[..., None] * (across - part * axis) - part * b
+    of_down = of_down - np.sum(of_down * down, -1, keepdims=True) * down
+    return _six(of_down / np.linalg.norm(g, axis=-1, keepdims=True), across - part * (down + axis))
+
+
 def _dip_gradient(g: Array, b: Array) -> Array:
     strength = np.linalg.norm(g, axis=-1, keepdims=True)
     total = np.linalg.norm(b, axis=-1, keepdims=True)
@@ -175,6 +205,7 @@ OBSERVABLES: dict[str, Observable] = {
     "magnetic_toolface": Observable(
         magnetic_toolface, lambda g, b: _six(np.zeros_like(g), _turning(b)), 2 * np.pi, "rad"
     ),
+    "north_toolface": Observable(north_toolface, _north_toolface_gradient, 2 * np.pi, "rad"),
     "gravity": Observable(gravity, lambda g, b: _six(_unit(g), np.zeros_like(b)), 0.0, "g"),
     "field": Observable(field, lambda g, b: _six(np.zeros_like(g), _unit(b)), 0.0, "nT"),
     "dip": Observable(dip, _dip_gradient, 0.0, "rad"),

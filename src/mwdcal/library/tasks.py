@@ -57,7 +57,7 @@ def load_profile(name: Path = "generic") -> Profile:
 def read_run(
     source: Tabular, profile: Path | Profile = "generic", *, decimal: str = "."
 ) -> Readings:
-    """The readings of a run: of a CSV, TSV, Parquet or XLSX file, or of columns with the same names.
+    """The readings of a run: of a CSV, TSV, Parquet, XLSX, WITSML or LAS file, or of columns with the same names.
 
     `profile` says which tool axis each raw channel measures and in which unit; it goes with the
     readings to `calibrate`. Readings to be corrected or verified are read with the profile of their

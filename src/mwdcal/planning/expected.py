@@ -53,12 +53,16 @@ def nominal_run(plan: Table, profile: Profile) -> tuple[Readings, Profile]:
 
 
 def planned_earth(plan: Table) -> list[Array]:
-    """Gravity, g, field, nT, and dip, radians, at each station (n,) of a plan."""
+    """Gravity, g, field, nT, and dip, radians, at each station (n,) of a plan; blank cells take the mean."""
     earth = []
     for name, usual in Earth()._asdict().items():
         reference = REFERENCES[name]
         given = np.asarray(plan.columns.get(reference.column, np.full(plan.count, np.nan)), float)
-        earth.append(np.where(np.isnan(given), usual, given * reference.factor))
+        blank = np.isnan(given)
+        stated = given[~blank] * reference.factor
+        earth.append(
+            np.where(blank, stated.mean() if stated.size else usual, given * reference.factor)
+        )
     return earth
 
 

@@ -26,6 +26,8 @@ from mwdcal.sensor.profile import Profile
 
 WORKING_INCLINATIONS = np.radians([5.0, 30.0, 60.0, 90.0, 120.0])
 """Inclinations over which an I-optimal plan makes the angles accurate."""
+WORKING_TEMPERATURES = 7
+"""Temperatures, evenly from the coldest to the hottest soak, at which a wanted accuracy holds."""
 FEWEST_PLANNED = 8
 """Stations with which the search for the smallest plan begins."""
 CRITERIA = ("D", "A", "I")
@@ -61,7 +63,7 @@ def judged(
     """
     calibration = expected(plan, profile, options)
     whole = joined(plan, at_temperatures(candidates or load_plan("candidates"), plan))
-    information, _, _ = _information(whole, profile, options)
+    information, *_ = _information(whole, profile, options)
     share = efficiency(information, np.arange(whole.count) < plan.count)
     return Planned(
         plan, calibration, share, session_seconds(attitudes(plan), soak_numbers(plan), stand)
@@ -79,7 +81,8 @@ def best_plan(
 ) -> Planned:
     """The best stations out of candidates, `count` of them beside those already `measured`.
 
-    They come in an order of short moves. Raises as `judged`.
+    They come in an order of short moves; the order of temperature terms is that of all candidates. Raises as
+    `judged`.
     """
     if criterion not in CRITERIA:
         raise InputError(f"`criterion` must be one of {', '.join(CRITERIA)}; got {criterion!r}.")
@@ -89,7 +92,7 @@ def best_plan(
         raise InputError(
             f"`stations` must be between 1 and the {candidates.count} candidates; got {count}."
         )
-    information, turn, calibration = _information(whole, profile, options)
+    information, turn, calibration, fixed = _information(whole, profile, options)
     wanted = _wanted(criterion, turn, calibration)
     kept = np.arange(whole.count) < before
     design = best(information, before + count, wanted, kept)
@@ -99,7 +102,7 @@ def best_plan(
     new = new[shortest_order(attitudes(chosen), soak_numbers(chosen), stand)]
     plan = replace(taken(whole, new), source=f"{count} of {candidates.source}")
     everything = taken(whole, np.concatenate([np.arange(before), new]))
-    given = expected(everything, profile, options)
+    given = expected(everything, profile, fixed)
     return Planned(
         plan, given, design.efficiency, session_seconds(attitudes(plan), soak_numbers(plan), stand)
     )
@@ -115,8 +118,8 @@ def smallest_plan(
 ) -> Planned:
     """The best plan of the fewest stations that gives wanted accuracies, 1σ in degrees by angle.
 
-    An accuracy holds at every one of `WORKING_INCLINATIONS`. Raises as `judged`, and `InputError` where all
-    candidates together do not give it.
+    An accuracy holds at every one of `WORKING_INCLINATIONS`, from the coldest soak to the hottest. Raises as
+    `judged`, and `InputError` where all candidates together do not give it.
     """
     if not _reached(expected(candidates, profile, options), accuracy_deg):
         raise InputError(
@@ -145,8 +148,13 @@ def smallest_plan(
 
 
 def _reached(calibration: Calibration, accuracy_deg: Mapping[str, float]) -> bool:
-    """Whether every wanted accuracy holds at all working inclinations."""
-    sd = accuracy_at(calibration, WORKING_INCLINATIONS.tolist())
+    """Whether every wanted accuracy holds at all working inclinations and temperatures."""
+    span = calibration.temperature_c
+    temperatures = np.linspace(*span, WORKING_TEMPERATURES).tolist() if span else [None]
+    each = [
+        accuracy_at(calibration, WORKING_INCLINATIONS.tolist(), temperature=t) for t in temperatures
+    ]
+    sd = {name: np.stack([one[name] for one in each]) for name in each[0]}
     unknown = [name for name in accuracy_deg if name not in sd]
     if unknown:
         raise InputError(
@@ -157,12 +165,12 @@ def _reached(calibration: Calibration, accuracy_deg: Mapping[str, float]) -> boo
 
 def _information(
     plan: Table, profile: Profile, options: Options | None
-) -> tuple[Information, Array, Calibration]:
-    """Of every station of a plan, the directions it is in, and the calibration that all give."""
+) -> tuple[Information, Array, Calibration, Options]:
+    """Of every station of a plan, the directions it is in, the calibration that all give, and how it is fitted."""
     choice, result = planned_fit(plan, profile, options)
     information, turn = Information.of_fit(result)
     to_file = results.to_file(result, choice.profile.reference_temperature_c)[0]
-    return information, to_file @ turn, recorded(choice, result)
+    return information, to_file @ turn, recorded(choice, result), choice.options
 
 
 def _wanted(criterion: str, turn: Array, calibration: Calibration) -> Array | None:

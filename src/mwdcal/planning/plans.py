@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -9,14 +10,15 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from mwdcal.calibration.readings import SOAK_GAP
+from mwdcal.calibration.readings import CONSTANTS, SOAK_GAP
 from mwdcal.errors import InputError
 from mwdcal.estimation.evidence import ANGLES
-from mwdcal.files.contract import RAW, REFERENCES
+from mwdcal.files.contract import COLUMNS, RAW, REFERENCES, check_near_misses
 from mwdcal.files.formats import table as tables
 from mwdcal.files.formats.columns import LABELS, Column
 from mwdcal.files.formats.table import Table, labels, numbers
 from mwdcal.files.profiles import decoded_toml
+from mwdcal.files.synonyms import check_evidence
 from mwdcal.geometry.vectors import Array, Ints
 
 Values = float | list[float]
@@ -67,8 +69,9 @@ class PlanFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         attitudes = [each for some in self.stations for each in some.attitudes]
         count = len(attitudes) * len(soaks)
         check_count(count, source)
-        columns = dict(zip(ANGLES, np.tile(np.transpose(attitudes), len(soaks)), strict=True))
         place = {"gravity": self.gravity_g, "field": self.field_nt, "dip": self.dip_deg}
+        _check_finite([*soaks, *np.ravel(attitudes), *filter(None, place.values())], source)
+        columns = dict(zip(ANGLES, np.tile(np.transpose(attitudes), len(soaks)), strict=True))
         columns |= {n: np.full(count, float(v)) for n, v in place.items() if v is not None}
         return Table(
             {
@@ -86,6 +89,13 @@ def _listed(values: Values) -> list[float]:
     return values if isinstance(values, list) else [values]
 
 
+def _check_finite(values: Sequence[float], source: str) -> None:
+    if not np.isfinite(values).all():
+        raise InputError(
+            f"{source}: every number must be finite. Correct 'nan' and 'inf', or leave the key out."
+        )
+
+
 def check_count(count: int, source: str) -> None:
     """Refuse a plan of no stations, or of too many."""
     if not 1 <= count <= MOST_PLANNED:
@@ -99,7 +109,7 @@ def load_plan(name_or_path: str) -> Table:
     """A plan as a run file without readings: built in by name, a TOML file, or a run file.
 
     Of a run file attitudes and temperatures count, and what is stated of their uncertainty; its
-    readings are left out.
+    readings and columns without a figure are left out.
 
     Raises:
         InputError: no such plan, or a file that is not one.
@@ -108,18 +118,30 @@ def load_plan(name_or_path: str) -> Table:
     if path.suffix.lower() in tables.SUFFIXES:
         table = tables.read(path)
         check_count(table.count, table.source)
+        check_near_misses(list(table.columns), COLUMNS, f"{table.source}: column")
+        check_evidence(list(table.columns), table.source)
         kept = [name for name in table.columns if name in PLANNED]
         cells: dict[str, Column] = {
             name: labels(table, name) if name in LABELS else numbers(table, name) for name in kept
         }
-        return replace(table, columns=cells)
+        return replace(table, columns={k: v for k, v in cells.items() if not _blank(v)})
     plan, _ = decoded_toml(name_or_path, PlanFile, "plans", "plan", "Plans")
     return plan.table(path.name)
 
 
+def _blank(cells: Column) -> bool:
+    """Whether a column states nothing, as if it were not there."""
+    return isinstance(cells, np.ndarray) and bool(np.isnan(cells).all())
+
+
 def joined(first: Table, second: Table) -> Table:
-    """The stations of two plans, one after the other; what one does not state is blank there."""
+    """The stations of two plans, one after the other; what one does not state is blank there.
+
+    Without temperatures in the first there are none.
+    """
     names = dict.fromkeys([*first.columns, *second.columns])
+    if "temperature_c" not in first.columns:
+        names.pop("temperature_c", None)
     columns = {name: _both(first, second, name) for name in names}
     return replace(first, columns=columns, lines=range(1, first.count + second.count + 1))
 
@@ -182,9 +204,12 @@ def attitudes(plan: Table) -> Array:
 
 
 def run_sheet(plan: Table) -> Table:
-    """The run file of a plan to be filled in: its columns, and blank ones for the readings."""
-    blank = {name: np.full(plan.count, np.nan) for name in RAW}
+    """The run file of a plan to be filled in: its columns, and blank ones for readings and place."""
     head = {
         name: cells for name, cells in plan.columns.items() if name in ("station", "temperature_c")
     }
-    return replace(plan, columns={**head, **blank, **plan.columns})
+    place = [REFERENCES[name].column for name in CONSTANTS]
+    order = dict.fromkeys([*head, *RAW, *plan.columns, *place])
+    return replace(
+        plan, columns={n: plan.columns.get(n, np.full(plan.count, np.nan)) for n in order}
+    )

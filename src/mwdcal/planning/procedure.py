@@ -110,6 +110,8 @@ class Procedure:
             name: np.full(test.count, plan.columns[name][0]) for name in place - {*test.columns}
         }
         testing = Session.of(replace(test, columns={**test.columns, **there}), profile, effects)
+        if tool and tool.magnetometer is None:  # no limit of azimuth, field or dip then
+            testing = replace(testing, readings=replace(testing.readings, magnetometer=None))
         most = max(choice.options.orders) if order is None else order
         return cls(
             Session.of(plan, profile, effects), testing, choice.options, limits, calibration, seed,

@@ -74,8 +74,10 @@ def station_minutes(plan: Table, stand: Stand | None = None) -> Array:
     """When each station (n,) is read: moves, and a soak at each change of temperature."""
     stand, attitude, soak = stand or Stand(), attitudes(plan), soak_numbers(plan)
     steps = [move_seconds(attitude[i : i + 2], stand)[0, 1] / 60 for i in range(plan.count - 1)]
-    first = soak_temperatures(plan)[soak[:1]]
-    changed = np.concatenate([first != ROOM_TEMPERATURE or [False], np.diff(soak) != 0])
+    first = (
+        soak_temperatures(plan)[soak[:1]] if "temperature_c" in plan.columns else ROOM_TEMPERATURE
+    )
+    changed = np.append(first != ROOM_TEMPERATURE, np.diff(soak) != 0)
     settled = [stand.settle_seconds / 60, *steps]
     return np.asarray(np.cumsum(settled + stand.soak_minutes * changed))
 

@@ -27,8 +27,10 @@ MOST_OFF = 0.5
 ALIKE = {"gravity": 1.5, "field": 6.0}
 """Greatest over least strength up to which one unit may explain all rows."""
 JUDGED_STRENGTHS = ("gravity", "field")
+STANDARD_GRAVITY = 9.80665
+"""1 g, m/s²."""
 STRENGTH_UNITS: dict[str, dict[str, float]] = {
-    "gravity": {"g": 1.0, "m/s²": 9.80665, "mg": 1000.0},
+    "gravity": {"g": 1.0, "m/s²": STANDARD_GRAVITY, "mg": 1000.0},
     "field": {"nT": 1.0, "µT": 1e-3, "mT": 1e-6, "gauss": 1e-5, "mG": 1e-2},
 }
 """Units in which readings come, per g or nT."""

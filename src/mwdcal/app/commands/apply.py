@@ -16,13 +16,7 @@ from mwdcal.errors import InputError
 @options.CALIBRATION
 @options.argument("readings")
 @options.output(metavar="OUT", help="Table to write; format by suffix.")
-@options.preset(
-    "--outside",
-    default="blank",
-    metavar="blank|refuse|extrapolate",
-    help="Results of rows more than 1 °C (without temperature terms: 5 °C) outside the calibrated "
-    "temperatures: none; refuse the file; or extrapolated, and marked in a column 'extrapolated'.",
-)
+@options.WHERE_OUTSIDE
 @options.preset(
     "--missing",
     type=click.Choice(["refuse", "blank"]),
@@ -35,7 +29,7 @@ def command(
     calibration: Path, readings: Path, output: Path, outside: str, missing: str, decimal: str,
     as_json: bool,
 ) -> None:  # fmt: skip
-    """Correct READINGS (CSV, TSV, Parquet or XLSX) with the CALIBRATION of their tool.
+    """Correct READINGS (CSV, TSV, Parquet, XLSX, WITSML or LAS) with the CALIBRATION of their tool.
 
     Writes the columns of READINGS as they are and, beside them: gravity and field along the tool
     axes, inclination, azimuth (magnetic), toolface, dip and strengths.

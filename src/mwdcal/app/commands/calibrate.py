@@ -31,7 +31,7 @@ def command(
     run: Path, output: Path, tool: str | None, exclude: tuple[str, ...],
     report: Path | None, decimal: str, as_json: bool, **typed: Unpack[options.Typed],
 ) -> None:  # fmt: skip
-    """Fit the sensor model to a calibration RUN (CSV, TSV, Parquet or XLSX).
+    """Fit the sensor model to a calibration RUN (CSV, TSV, Parquet, XLSX, WITSML or LAS).
 
     \b
     Example: mwdcal calibrate run.csv --tool servo -o tool.json --report tool.html

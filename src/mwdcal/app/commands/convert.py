@@ -20,8 +20,9 @@ from mwdcal.errors import InputError
 @click.option(
     "--to",
     "form",
-    type=click.Choice(["c-header", "fixed-point"]),
-    help="C sources with test vectors, in double precision or in whole numbers.",
+    type=click.Choice(["c-header", "fixed-point", "tool-model"]),
+    help="C sources with test vectors, in double precision or in whole numbers; or the sensor terms of the calibration "
+    "as a tool model for error-model programs.",
 )
 @click.option(
     "--word-bits",
@@ -38,7 +39,7 @@ from mwdcal.errors import InputError
 @options.output(
     metavar="OUT.json|DIR",
     required=False,
-    help="Write JSON here instead of printing; with --to the folder of the sources.",
+    help="Write JSON here instead of printing; with --to the folder of the sources, or the tool model.",
 )
 @options.JSON
 def command(
@@ -53,9 +54,12 @@ def command(
     Example: mwdcal convert tool.json --notation forward --temperature course
     Example: mwdcal convert tool.json --to c-header -o firmware
     Example: mwdcal convert tool.json --to fixed-point --word-bits 24 -o firmware
+    Example: mwdcal convert tool.json --to tool-model -o model.json
     """
     _check_choice(notation, form, word_bits, temperature, output)
-    if form and output:
+    if form == "tool-model" and output:
+        _write_model(calibration, temperature, output, as_json)
+    elif form and output:
         _write_sources(calibration, form, word_bits, output, as_json)
     elif notation:
         _convert(calibration, notation, temperature, output, as_json)
@@ -69,8 +73,8 @@ def _check_choice(
     if (notation is None) == (form is None):
         raise InputError("`notation` or `form` must be given, and not both. Choose one.")
     if form and output is None:
-        raise InputError("`form` needs the folder to write to. Add `output` DIR.")
-    if form and temperature is not None:
+        raise InputError("`form` needs the folder or file to write to. Add `output`.")
+    if form and form != "tool-model" and temperature is not None:
         raise InputError(
             "`temperature` goes with `notation`: sources hold for all temperatures. Omit it."
         )
@@ -109,6 +113,25 @@ def _write_sources(
     document = conversion.export_document(exported, folder)
     print_result(
         document if as_json else conversion.export_screen(exported, folder), exported.findings
+    )
+
+
+def _write_model(calibration: Path, temperature: str | None, output: Path, as_json: bool) -> None:
+    """Write the sensor terms of a calibration as a tool model, and print them."""
+    from mwdcal.app.screens import conversion
+    from mwdcal.survey.tool_model import sensor_terms, write_tool_model
+
+    options.check_outputs([output], [calibration])
+    at = _temperature(temperature)
+    if isinstance(at, str):
+        raise InputError(f"`temperature` of a tool model must be a number in °C; got {at!r}.")
+    converted = conversion.loaded(calibration, at)
+    terms = sensor_terms(converted.calibration, at)
+    write_tool_model(output, converted.calibration, temperature=at)
+    document = conversion.terms_document(converted, terms, output)
+    print_result(
+        document if as_json else conversion.terms_screen(converted, terms, output),
+        converted.findings,
     )
 
 

@@ -18,6 +18,7 @@ CONTENTS = {
     "tool.toml": "its tool profile",
     "rolltest.csv": "a roll test of the same tool",
     "surveys.csv": "readings to correct",
+    "well.csv": "surveys of a well, with measured depths",
     "export.csv": "the run as a German spreadsheet program exports it",
     "log.csv": "a continuous log in which the tool rests six times",
     "static.csv": "a log of the tool at rest",

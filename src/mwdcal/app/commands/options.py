@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path
@@ -20,6 +21,18 @@ FILE = click.Path(path_type=Path)
 PICTURES = (".png", ".svg")
 """Suffixes of pictures."""
 
+
+class PointedNumber(click.types.FloatParamType):
+    """A number with a decimal point."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """The number, or what is wrong with the word."""
+        if isinstance(value, str) and re.fullmatch(r"[+-]?\d*,\d+", value.strip()):
+            self.fail(f"{value!r} has a decimal comma. Write it with a decimal point.", param, ctx)
+        return super().convert(value, param, ctx)
+
+
+NUMBER = PointedNumber()
 command = partial(click.command, cls=Command)
 argument = partial(click.argument, type=FILE)
 output = partial(click.option, "-o", "--output", type=FILE, required=True)
@@ -38,6 +51,13 @@ preset = partial(click.option, show_default=True)
 CALIBRATION = argument("calibration")
 RUN = argument("run")
 LOG = argument("log")
+WHERE_OUTSIDE = preset(
+    "--outside",
+    default="blank",
+    metavar="blank|refuse|extrapolate",
+    help="Results of rows more than 1 °C (without temperature terms: 5 °C) outside the calibrated "
+    "temperatures: none; refuse the file; or extrapolated, and marked as such.",
+)
 DECIMAL = preset(
     "--decimal", default=".", metavar="SIGN", help="Decimal sign of numbers in text files."
 )
@@ -53,7 +73,7 @@ COLUMN_NAMES = click.option(
 
 def number(name: str, metavar: str, text: str, *variable: str) -> Decorator:
     """An option with a number; `variable` where it is not named as the option."""
-    return click.option(name, *variable, type=float, metavar=metavar, help=text)
+    return click.option(name, *variable, type=NUMBER, metavar=metavar, help=text)
 
 
 SAMPLING_HZ = number("--sampling-hz", "HZ", "Rate of the log; wins over its column time_s.")

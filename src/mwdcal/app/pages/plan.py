@@ -13,6 +13,7 @@ from mwdcal.app.screens.plan import PLACE, accuracy_rows, comparison_rows, facts
 from mwdcal.app.text import plural, quantity
 from mwdcal.calibration.prediction import accuracy_at
 from mwdcal.calibration.readings import TRIADS
+from mwdcal.files.contract import REFERENCES
 from mwdcal.geometry.vectors import Array, Ints, reference_vectors
 from mwdcal.planning.expected import planned_earth
 from mwdcal.planning.planned import Planned
@@ -39,6 +40,7 @@ def render(plans: Sequence[Planned]) -> str:
         banner=_banner(first),
         findings=first.calibration.undetermined(),
         simulated=True,
+        place=_place(first),
         titles=station_rows(first.plan)[0],
         rows=zip(station_rows(first.plan)[1], np.diff(soaks, prepend=soaks[:1]) != 0, strict=True),
         compared=comparison_rows(summaries),
@@ -48,6 +50,15 @@ def render(plans: Sequence[Planned]) -> str:
         curves=draw_accuracy(plans),
         version=__version__,
     )
+
+
+def _place(planned: Planned) -> list[tuple[str, str]]:
+    """Gravity, field and dip of the place with their units; blank where the plan does not state them."""
+    rows = []
+    for name, word in (("gravity", "Gravity, g"), ("field", "Field, nT"), ("dip", "Dip, °")):
+        values = np.unique(np.asarray(planned.plan.columns.get(REFERENCES[name].column, ()), float))
+        rows.append((word, f"{values[0]:.12g}" if len(values) == 1 else ""))
+    return rows
 
 
 def _banner(planned: Planned) -> dict[str, str]:

@@ -9,8 +9,9 @@ import msgspec
 import numpy as np
 
 from mwdcal.app.envelope import enveloped
-from mwdcal.app.screens.numbers import HELD, UNDETERMINED
+from mwdcal.app.screens.numbers import HELD, UNDETERMINED, number, written
 from mwdcal.app.text import one_line, raised, table
+from mwdcal.calibration.prediction import middle_temperature
 from mwdcal.calibration.readings import Readings, simulated
 from mwdcal.calibration.record import SOFTWARE, Calibration, Finding
 from mwdcal.files import documents
@@ -19,6 +20,7 @@ from mwdcal.firmware.export import DEFAULT_BITS, FirmwareSources, export
 from mwdcal.firmware.statements import stated_errors
 from mwdcal.firmware.working_range import SHARE_OF
 from mwdcal.sensor.profile import Axis
+from mwdcal.survey.tool_model import SensorTerm
 from mwdcal.use.notation import COURSE, Notation, convert, powers
 
 UNRECORDED = (
@@ -94,6 +96,7 @@ class ConversionSummary(msgspec.Struct, frozen=True, kw_only=True):
     powers_of_two: dict[str, Any] | msgspec.UnsetType = msgspec.UNSET
     temperature_range_c: tuple[float, float] | msgspec.UnsetType | None = msgspec.UNSET
     strongest: dict[str, Any] | msgspec.UnsetType = msgspec.UNSET
+    terms: list[SensorTerm] | msgspec.UnsetType = msgspec.UNSET
 
 
 def convert_file(path: Path, notation: str, temperature: float | str | None) -> Converted:
@@ -103,6 +106,43 @@ def convert_file(path: Path, notation: str, temperature: float | str | None) -> 
     findings = temperature_findings(calibration, notation, temperature)
     findings += calibration.change_findings()
     return Converted(path, sha256, calibration, notation, temperature, triads, findings)
+
+
+def loaded(path: Path, temperature: float | None) -> Converted:
+    """A calibration file at a temperature, without values in any notation."""
+    calibration, sha256 = documents.load(path)
+    findings = [] if temperature is None else temperature_findings(calibration, "", temperature)
+    findings += calibration.change_findings()
+    return Converted(path, sha256, calibration, "", temperature, {}, findings)
+
+
+def terms_document(converted: Converted, terms: list[SensorTerm], output: Path) -> dict[str, Any]:
+    """The sensor terms for machines."""
+    at = converted.temperature
+    content = ConversionSummary(
+        **_identity(converted),
+        to="tool-model",
+        temperature_c=middle_temperature(converted.calibration) if at is None else at,
+        files=[str(output)],
+        terms=terms,
+    )
+    return _enveloped(converted, content)
+
+
+def terms_screen(converted: Converted, terms: list[SensorTerm], output: Path) -> str:
+    """The sensor terms for people."""
+    rows = [
+        [
+            term.name,
+            *(number(value) for value in (term.value, term.owsg)),
+            term.unit,
+            UNDETERMINED if term.ratio is None else number(term.ratio, 2),
+        ]
+        for term in terms
+    ]
+    heading = "\n".join(one_line("   ".join(line)) for line in _heading(converted))
+    shown = table(rows, ["term", "1σ", "OWSG MWD", "unit", "ratio"])
+    return f"{heading}\n\n{shown}\n{written(**{'tool model': output})}"
 
 
 def temperature_findings(

@@ -1,1 +1,1 @@
-"""Formats of other programs: WITSML, LAS, axis conventions of tool makers."""
+"""Formats of other programs: WITSML trajectories and LAS logs."""

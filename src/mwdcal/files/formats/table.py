@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from mwdcal.errors import InputError, reason
+from mwdcal.files.exchange import las, witsml
 from mwdcal.files.formats import atomic, dialect, parquet, text, workbook
 from mwdcal.files.formats.columns import (
     LABELS,
@@ -27,8 +28,12 @@ from mwdcal.files.formats.columns import shown as shown
 from mwdcal.geometry.vectors import Array
 from mwdcal.sensor.profile import TableFormat
 
-_FORMATS: dict[str, Any] = {".csv": text, ".tsv": text, ".parquet": parquet, ".xlsx": workbook}
-SUFFIXES = tuple(_FORMATS)
+_TABLES: dict[str, Any] = {".csv": text, ".tsv": text, ".parquet": parquet, ".xlsx": workbook}
+_FORMATS: dict[str, Any] = {**_TABLES, ".xml": witsml, ".las": las}
+SUFFIXES = tuple(_TABLES)
+"""Of tables as documented; those of other programs are `EXCHANGED`."""
+EXCHANGED = (".xml", ".las")
+"""Suffixes of WITSML and LAS, whose columns are taken from the format's own names."""
 
 _LARGEST_FILES = {".parquet": 2_000_000_000}
 _LARGEST_TEXT = 50_000_000
@@ -68,7 +73,7 @@ def read(
     rows: int = 0,
     export: TableFormat | None = None,
 ) -> Table:
-    """The table in a .csv, .tsv, .parquet or .xlsx file.
+    """The table in a .csv, .tsv, .parquet, .xlsx, .xml (WITSML) or .las file.
 
     `decimal` is the decimal sign of text cells, '.' or ','. `rows`: the most that a Parquet table may
     have; text and workbooks have limits of their own. `export`: how another program has written it.
@@ -118,6 +123,9 @@ def rendered(
         delimiter = "\t" if file.suffix.lower() == ".tsv" else ","
         return text.render(pointed(table), table.metadata, delimiter)
     content = form.render(_typed(table), table.metadata, file.name)
+    if file.suffix.lower() in EXCHANGED:  # what could not be read again
+        advice = "Write Parquet."
+        at_most(len(content), _LARGEST_TEXT, file.name, "the file", "bytes", advice)
     return content
 
 
@@ -154,8 +162,8 @@ def recognised(path: str | os.PathLike[str]) -> dialect.Export:
         rows = dict(workbook.read_rows(data, file.name))
         cells = [[as_text(c) for c in rows.get(n, ())] for n in range(1, max(rows, default=0) + 1)]
         return dialect.recognised_rows(cells, TableFormat(), file.name)
-    if suffix == ".parquet":
-        names = [*parquet.parse(data, file.name, most=0).columns]
+    if _FORMATS[suffix] is not text:
+        names = [*_FORMATS[suffix].parse(data, file.name).columns]
         return dialect.Export(TableFormat(), names, [""] * len(names))
     text.refuse_foreign(data, file.name, allowed=text.UTF_16)
     return dialect.recognised_text(data, file.name)
@@ -178,7 +186,7 @@ def _suffix(path: Path) -> str:
     suffix = path.suffix.lower()
     if suffix not in _FORMATS:
         raise InputError(
-            f"'{path}': the suffix must be one of {', '.join(SUFFIXES)}; got "
+            f"'{path}': the suffix must be one of {', '.join(_FORMATS)}; got "
             f"'{suffix or 'none'}'. Convert or rename the file."
         )
     return suffix

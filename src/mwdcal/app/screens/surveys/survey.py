@@ -1,0 +1,209 @@
+"""The surveys of a well, on the screen and for machines."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import msgspec
+import numpy as np
+
+from mwdcal.app.screens.numbers import fixed, written
+from mwdcal.app.text import one_line, plural, table
+from mwdcal.calibration.readings import simulated
+from mwdcal.calibration.record import Finding
+from mwdcal.survey.acceptance import SurveyLimits
+from mwdcal.survey.multistation.interference import InterferenceSize, MultiStationAnalysis
+from mwdcal.survey.well import North, Well
+
+MOST_SURVEYS = 30
+"""Surveys of a table on screen."""
+OUTCOMES = {"true": "accepted", "false": "REJECTED", "": "not judged"}
+"""What the column `accepted` says, in words."""
+
+
+class EndOfPath(msgspec.Struct, frozen=True, kw_only=True):
+    """The last station on the well path: metres from where the path starts, with standard uncertainties."""
+
+    station: str
+    md_m: float
+    north_m: float
+    east_m: float
+    tvd_m: float
+    sd_north_m: float | None
+    sd_east_m: float | None
+    sd_tvd_m: float | None
+    covariance_m2: list[list[float | None]]
+
+
+class SurveySummary(msgspec.Struct, frozen=True, kw_only=True):
+    """What `survey` prints: stations counted by outcome, what they were judged by, where the path ends.
+
+    `msa` is the multi-station analysis, if one was asked for; `interference` and `separable` are of it.
+    """
+
+    rows: int
+    accepted: int
+    rejected: int
+    not_judged: int
+    blank: int
+    north: str
+    declination_deg: float | None
+    convergence_deg: float | None
+    limits: str
+    source: str
+    end: EndOfPath | None
+    findings: list[Finding]
+    output: str
+    html: str
+    interference: InterferenceSize | None = None
+    separable: bool | None = None
+    msa: MultiStationAnalysis | None = None
+
+
+def refusal(msa: MultiStationAnalysis, limits: SurveyLimits, north: North) -> SurveySummary:
+    """What a multi-station analysis says that cannot be used: no survey is judged, nothing is written."""
+    rows = len(msa.station_rows)
+    return SurveySummary(
+        rows=rows,
+        accepted=0,
+        rejected=0,
+        not_judged=rows,
+        blank=rows,
+        north=north.name,
+        declination_deg=_degrees(north.declination),
+        convergence_deg=_degrees(north.convergence),
+        limits=limits.name,
+        source=limits.source,
+        end=None,
+        findings=msa.findings,
+        output="",
+        html="",
+        interference=msa.interference,
+        separable=msa.separable,
+        msa=msa,
+    )
+
+
+def summary(
+    well: Well, output: str, html: str, msa: MultiStationAnalysis | None = None
+) -> SurveySummary:
+    """The result for machines."""
+    judged, accepted = well.judgement.judged, well.judgement.accepted
+    north = well.north
+    return SurveySummary(
+        rows=len(judged),
+        accepted=int(accepted.sum()),
+        rejected=int((judged & ~accepted).sum()),
+        not_judged=int((~judged).sum()),
+        blank=int(np.isnan(well.surveys.value[:, 0]).sum()),
+        north=north.name,
+        declination_deg=_degrees(north.declination),
+        convergence_deg=_degrees(north.convergence),
+        limits=well.limits.name,
+        source=well.limits.source,
+        end=end_of_path(well),
+        findings=well.findings,
+        output=output,
+        html=html,
+        interference=msa.interference if msa else None,
+        separable=msa.separable if msa else None,
+        msa=msa,
+    )
+
+
+def _degrees(angle: float | None) -> float | None:
+    return None if angle is None else float(np.degrees(angle))
+
+
+def end_of_path(well: Well) -> EndOfPath | None:
+    """The last station with a position."""
+    if well.position is None or np.isnan(well.position.place[:, 0]).all():
+        return None
+    last = int(np.flatnonzero(~np.isnan(well.position.place[:, 0]))[-1])
+    north, east, tvd = well.position.place[last].tolist()
+    sd_north, sd_east, sd_tvd = map(_stated, well.position.sd[last].tolist())
+    return EndOfPath(
+        station=well.readings.labels[last],
+        md_m=float(well.position.md[last]),
+        north_m=north,
+        east_m=east,
+        tvd_m=tvd,
+        sd_north_m=sd_north,
+        sd_east_m=sd_east,
+        sd_tvd_m=sd_tvd,
+        covariance_m2=[[*map(_stated, row)] for row in well.position.covariance[last].tolist()],
+    )
+
+
+def _stated(value: float) -> float | None:
+    return None if np.isnan(value) else value
+
+
+def screen(well: Well, facts: SurveySummary, *metadata: Mapping[str, object]) -> str:
+    """The surveys for people; `metadata` of calibration and readings."""
+    counts = [f"{facts.accepted} accepted", f"{facts.rejected} rejected"]
+    if facts.not_judged:
+        counts.append(f"{facts.not_judged} not judged")
+    heading = [well.readings.source, plural(facts.rows, "survey"), *counts, *simulated(*metadata)]
+    source = f" ({facts.source})" if facts.source else ""
+    lines = [
+        "   ".join(heading),
+        f"azimuths from {facts.north} north   limits {facts.limits}{source}",
+    ]
+    if facts.end:
+        lines.append(end_in_words(facts.end, facts.north))
+    return "\n".join(
+        [
+            *map(one_line, lines),
+            "",
+            survey_table(well),
+            written(table=facts.output, page=facts.html),
+        ]
+    )
+
+
+def end_in_words(end: EndOfPath, north: str) -> str:
+    """Where the path ends, with standard uncertainties."""
+    parts = [
+        f"{title} {fixed(value, 2)} m (1σ {'not stated' if sd is None else fixed(sd, 2)})"
+        for title, value, sd in (
+            ("north", end.north_m, end.sd_north_m),
+            ("east", end.east_m, end.sd_east_m),
+            ("TVD", end.tvd_m, end.sd_tvd_m),
+        )
+    ]
+    return f"at {fixed(end.md_m, 2)} m MD, from {north} north: {', '.join(parts)}"
+
+
+def survey_table(well: Well, most: int = MOST_SURVEYS) -> str:
+    """The first surveys, each angle with its standard uncertainty."""
+    header, rows = survey_rows(well, most)
+    more = len(well.readings.labels) - len(rows)
+    return table(rows, header) + (f"\n… and {more} more" if more > 0 else "")
+
+
+def survey_rows(well: Well, most: int) -> tuple[list[str], list[list[str]]]:
+    """Header and cells of the first surveys."""
+    columns = well.columns()
+    azimuth = f"azimuth_{well.north.name}_deg"
+    angles = ["inclination_deg", azimuth, "toolface_deg"]
+    shown = {
+        "inclination_deg": "inc °", azimuth: f"azi {well.north.name} °", "toolface_deg": "toolface °",
+        "gravity_g": "|g| g", "field_nt": "|b| nT", "dip_deg": "dip °",
+    }  # fmt: skip
+    digits = {"gravity_g": 5, "field_nt": 0, "dip_deg": 2}
+    header = ["station", *(["md m"] if well.position else [])]
+    for name, title in shown.items():
+        header += [title, "1σ"] if name in angles else [title]
+    modelled, rows = well.limits.probability is not None, []
+    for i, label in enumerate(well.readings.labels[:most]):
+        row = [label, *([fixed(well.position.md[i], 2)] if well.position else [])]
+        for name in shown:
+            row.append(fixed(columns[name][i], digits.get(name, 2)))
+            if name in angles:
+                row.append(fixed(columns[f"sd_{name}"][i], 2))
+        kind = str(columns["toolface_kind"][i])
+        distance = well.judgement.distance[i]
+        model = [fixed(distance, 1) if well.judgement.judged[i] else "–"] if modelled else []
+        rows.append([*row, kind, *model, OUTCOMES[str(columns["accepted"][i])]])
+    return [*header, "from", *(["distance"] if modelled else []), ""], rows

@@ -1,0 +1,230 @@
+"""Whether a survey may be used: |g|, |b| and dip against the Earth's at its place.
+
+Fixed limits on each departure, or an error model: the departures against what sensors, calibration,
+drill string and references explain, taken together as a Mahalanobis distance.
+
+Reference: S. Ekseth et al., "The reliability problem related to directional survey data", SPE 103734 (2006).
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+
+from mwdcal.calibration.readings import Readings
+from mwdcal.errors import InputError
+from mwdcal.files.profiles import decoded_toml
+from mwdcal.geometry.observables import OBSERVABLES
+from mwdcal.geometry.vectors import Array, Bools, diagonal
+from mwdcal.survey.stations import STRENGTHS, SURVEYED, Surveys
+from mwdcal.use.strengths import STANDARD_GRAVITY
+
+STRENGTH_NAMES = SURVEYED[STRENGTHS]
+SURVEY_UNITS = {
+    "gravity": ("mg", 1e3, 2),
+    "field": ("nT", 1.0, 0),
+    "dip": ("°", float(np.degrees(1.0)), 2),
+}
+"""Unit in which a departure is shown, its factor, and decimals."""
+
+
+class SensorTerms(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What sensors may be off beside the calibration's own uncertainty, 1σ of each axis."""
+
+    accelerometer_bias_ms2: float = 0.0
+    accelerometer_scale: float = 0.0
+    magnetometer_bias_nt: float = 0.0
+    magnetometer_scale: float = 0.0
+    axial_interference_nt: float = 0.0
+
+    def covariance(self, g: Array, b: Array) -> Array:
+        """Covariance (..., 6) on the diagonal, of both vectors (..., 3): g² and nT²."""
+        gravity = self.accelerometer_bias_ms2 / STANDARD_GRAVITY
+        variance = np.concatenate(
+            [
+                gravity**2 + (self.accelerometer_scale * g) ** 2,
+                self.magnetometer_bias_nt**2 + (self.magnetometer_scale * b) ** 2,
+            ],
+            -1,
+        )
+        variance[..., 5] += self.axial_interference_nt**2
+        return variance
+
+
+class ReferenceTerms(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Standard uncertainties of the references where they state none."""
+
+    gravity_ms2: float = 0.0
+    field_nt: float = 0.0
+    dip_deg: float = 0.0
+
+    def sd(self, name: str) -> float:
+        """That of gravity, field or dip in g, nT or radians."""
+        return {
+            "gravity": self.gravity_ms2 / STANDARD_GRAVITY,
+            "field": self.field_nt,
+            "dip": float(np.radians(self.dip_deg)),
+        }[name]
+
+
+class SurveyLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Limits of surveys and where they come from.
+
+    `gravity_g`, `field_nt`, `dip_deg`: fixed limits on the departures. `probability`: of the error model, that a
+    survey within it is accepted.
+    """
+
+    name: str
+    source: str = ""
+    gravity_g: float | None = None
+    field_nt: float | None = None
+    dip_deg: float | None = None
+    probability: float | None = None
+    sensor: SensorTerms = SensorTerms()
+    reference: ReferenceTerms = ReferenceTerms()
+
+    def fixed(self, name: str) -> float | None:
+        """The fixed limit of gravity, field or dip in g, nT or radians."""
+        if name == "dip":
+            return None if self.dip_deg is None else float(np.radians(self.dip_deg))
+        return self.gravity_g if name == "gravity" else self.field_nt
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """Departures of |g|, |b| and dip (n, 3) from the references, g, nT, radians; NaN where not judged.
+
+    `bound` (n, 3): what each may be by itself: the fixed limit, else that of the error model, infinite where
+    neither is. `distance` (n,) of the three together and the `largest` that is accepted (n,), infinite without
+    an error model. `accepted` (n,): judged, and within all limits.
+    """
+
+    departure: Array
+    bound: Array
+    distance: Array
+    largest: Array
+    accepted: Bools
+
+    @property
+    def judged(self) -> Bools:
+        """Stations (n,) of which anything is judged."""
+        return np.asarray((~np.isnan(self.departure)).any(-1))
+
+    def findings(self) -> list[str]:
+        """What is wrong with each station; empty where nothing is."""
+        pairs = zip(self.judged.tolist(), self.accepted.tolist(), strict=True)
+        return [
+            "" if accepted else self._finding(i) if judged else "not judged: no reference"
+            for i, (judged, accepted) in enumerate(pairs)
+        ]
+
+    def _finding(self, i: int) -> str:
+        off, most = self.departure[i], self.bound[i]
+        parts = [
+            f"{name} {off[k] * factor:+.{digits}f} {unit} (at most {most[k] * factor:.{digits}f})"
+            for k, (name, (unit, factor, digits)) in enumerate(SURVEY_UNITS.items())
+            if abs(off[k]) > most[k]
+        ]
+        if self.distance[i] > self.largest[i]:
+            parts.append(f"distance {self.distance[i]:.2f} (at most {self.largest[i]:.2f})")
+        return ", ".join(parts)
+
+
+def load_survey_limits(
+    name_or_path: str | os.PathLike[str] = "owsg-mwd",
+) -> tuple[SurveyLimits, str]:
+    """Limits of surveys and the SHA-256 of their bytes: built in by name, or a TOML file by path.
+
+    Raises:
+        InputError: no such limits, a limit that is not positive, or none at all.
+    """
+    name = os.fspath(name_or_path)
+    limits, digest = decoded_toml(
+        name, SurveyLimits, "survey_limits", "limits profile of surveys", "Surveys"
+    )
+    stated = {
+        key: getattr(limits, key) for key in ("gravity_g", "field_nt", "dip_deg", "probability")
+    }
+    given = {key: value for key, value in stated.items() if value is not None}
+    if not given:
+        raise InputError(
+            f"{name} sets no limit: give probability, or gravity_g, field_nt, dip_deg."
+        )
+    for key, value in given.items():
+        if not 0 < value < (1.0 if key == "probability" else float("inf")):
+            below = " and below 1" if key == "probability" else ""
+            raise InputError(f"{name}: {key} must be above 0{below}; got {value}.")
+    for part in (limits.sensor, limits.reference):
+        for key, value in msgspec.structs.asdict(part).items():
+            if not 0 <= value < float("inf"):
+                raise InputError(f"{name}: {key} must be at least 0; got {value}.")
+    return limits, digest
+
+
+def judged(
+    surveys: Surveys, vectors: tuple[Array, Array], readings: Readings, limits: SurveyLimits
+) -> Judgement:
+    """Surveys against the references of their readings; `vectors` (n, 3) each as corrected.
+
+    A quantity without a reference, or that the calibration leaves undetermined, is not judged.
+    """
+    reference = np.stack(
+        [np.broadcast_to(readings.known.get(n, np.nan), readings.count) for n in STRENGTH_NAMES], -1
+    )
+    departure = surveys.value[:, STRENGTHS] - reference
+    covariance = _covariance(surveys, vectors, readings, limits)
+    missing = np.isnan(departure) | np.isnan(diagonal(covariance))
+    departure = np.where(missing, np.nan, departure)
+    fixed = np.array(
+        [np.inf if (most := limits.fixed(n)) is None else most for n in STRENGTH_NAMES]
+    )
+    together = distance(departure, covariance)
+    largest = np.full(together.shape, np.inf)
+    bound = np.broadcast_to(fixed, departure.shape)
+    if limits.probability is not None:
+        from scipy.special import chdtri
+
+        beyond = 1 - limits.probability
+        largest = np.sqrt(chdtri(np.maximum((~missing).sum(-1), 1), beyond))
+        alone = np.sqrt(diagonal(covariance) * chdtri(1, beyond))
+        bound = np.where(np.isfinite(fixed), fixed, alone)
+    over = np.abs(departure) > fixed
+    accepted = ~missing.all(-1) & ~over.any(-1) & (together <= largest)
+    return Judgement(departure, bound, together, largest, np.asarray(accepted))
+
+
+def distance(departure: Array, covariance: Array) -> Array:
+    """Mahalanobis distance (...) of departures (..., k) with a covariance (..., k, k); NaN ones are left out."""
+    missing = np.isnan(departure) | np.isnan(diagonal(covariance))
+    blank = missing[..., :, None] | missing[..., None, :]
+    whole = np.where(blank, np.eye(departure.shape[-1]), covariance)
+    sd = np.sqrt(diagonal(whole))
+    scaled = np.where(missing, 0.0, departure) / sd
+    correlation = whole / (sd[..., :, None] * sd[..., None, :])
+    solved = np.linalg.solve(correlation, scaled[..., None])[..., 0]
+    return np.asarray(np.sqrt(np.maximum(np.sum(scaled * solved, -1), 0.0)))
+
+
+def _covariance(
+    surveys: Surveys, vectors: tuple[Array, Array], readings: Readings, limits: SurveyLimits
+) -> Array:
+    """Covariance (n, 3, 3) of the departures: calibration, noise, sensors and references."""
+    gradient = np.stack([OBSERVABLES[name].gradient(*vectors) for name in STRENGTH_NAMES], -2)
+    gradient = np.where(np.isnan(gradient), 0.0, gradient)
+    variance = np.nan_to_num(limits.sensor.covariance(*vectors))
+    sensors = (gradient * variance[:, None, :]) @ gradient.mT
+    sd = np.stack([_reference_sd(readings, limits, name) for name in STRENGTH_NAMES], -1)
+    return np.asarray(
+        surveys.covariance[:, STRENGTHS, STRENGTHS]
+        + sensors
+        + sd[:, :, None] ** 2 * np.eye(len(STRENGTH_NAMES))
+    )
+
+
+def _reference_sd(readings: Readings, limits: SurveyLimits, name: str) -> Array:
+    """Standard uncertainty (n,) of a reference: as stated, else that of the limits."""
+    stated = readings.uncertainty(name)
+    return np.where(stated > 0, stated, limits.reference.sd(name))

@@ -1,0 +1,1 @@
+"""Multi-station analysis: interference of the drill string from the surveys themselves."""

@@ -1,0 +1,1 @@
+"""The Earth at the place and date of a survey: gravity, magnetic field, norths, and their uncertainties."""

@@ -1,0 +1,330 @@
+"""What a survey is judged and turned by at a place and date: gravity, field, dip, declination, convergence.
+
+Values come from models of the Earth, or were measured there; a measured value always stands before a
+modelled one. Each has a standard uncertainty, and says where both come from.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import os
+from collections.abc import Mapping
+from datetime import date
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+
+from mwdcal.calibration.readings import EARTH_RANGES
+from mwdcal.calibration.record import DOCUMENT_VERSION, Finding
+from mwdcal.errors import InputError, reason
+from mwdcal.files.contract import AZIMUTH_KEYS, REFERENCES, ROTATION, Range, magnetic_offset
+from mwdcal.survey.place import earth
+from mwdcal.use.strengths import STANDARD_GRAVITY
+
+MEASURABLE = {
+    "gravity": "gravity_g",
+    "field": "field_nt",
+    "dip": "dip_deg",
+    "declination": "declination_deg",
+}
+"""Values that may be measured, and their keys with the unit."""
+GRAVITY_ANOMALY = 4.2e-4
+"""Spread of real gravity about normal gravity, m/s²: √1795 mGal (Tscherning and Rapp 1974)."""
+GRADIENT_IN_ROCK = 2.24e-6
+"""By which gravity falls behind the free-air gradient below ground, m/s² per m: 4πGρ of 2670 kg/m³."""
+GRAVITY_SD_SOURCE = "gravity anomalies (Tscherning and Rapp 1974), gradient in rock of 2670 kg/m³"
+"""Source of the uncertainty of normal gravity."""
+
+
+class FieldSd(NamedTuple):
+    """Standard uncertainties of the main field as a reference; declination also by the horizontal field."""
+
+    field_nt: float
+    dip_deg: float
+    declination_deg: float
+    horizontal_deg_nt: float
+
+
+OWSG = "OWSG set A Rev 5.1"
+"""Source of the uncertainties of the main field."""
+PLACE_SD = FieldSd(*(math.hypot(*terms) for terms in (
+    (61.0, 88.0, 73.0, 13.0), (0.09, 0.14, 0.11, 0.03), (0.16, 0.24, 0.21, 0.05), (2350.0, 3359.0, 2840.0, 356.0)
+)))  # fmt: skip
+"""The same for all stations of a well: MFI, MDI, DEC and DBH, each of -U, -OS, -OH and -OI."""
+MOMENT_SD = FieldSd(60.0, 0.08, 0.10, 3000.0)
+"""Of each station its own: MFIR, MDIR, DECR and DBHR."""
+GEOMAGNETIC = {"field", "dip", "declination"}
+LOWEST_LAND = -500.0
+"""Altitude below which there is no open ground, m."""
+LEAST_HORIZONTAL = 6000.0
+"""Horizontal field below which magnetic azimuths need caution by the World Magnetic Model, nT."""
+ALTITUDES = Range(-15_000.0, 100_000.0, "m")
+_REFERENCE_BYTES = 1_000_000
+_SD = {name: REFERENCES.get(name, REFERENCES["dip"]).uncertainty for name in MEASURABLE}
+RANGES_OF_REFERENCE = {
+    "latitude_deg": Range(-90.0, 90.0, "°"),
+    "longitude_deg": Range(-180.0, 360.0, "°"),
+    "altitude_m": ALTITUDES,
+    "gravity_g": Range(*EARTH_RANGES["gravity"], "g"),
+    "field_nt": Range(*EARTH_RANGES["field"], "nT"),
+    "dip_deg": REFERENCES["dip"].values,
+    "declination_deg": ROTATION,
+    "convergence_deg": ROTATION,
+    **{f"sd_{key}": _SD[name] for name, key in MEASURABLE.items()},
+    **{f"sd_random_{MEASURABLE[name]}": _SD[name] for name in sorted(GEOMAGNETIC)},
+}
+"""Accepted values."""
+_REMEDIES = {
+    "latitude_deg": "North is positive.",
+    "longitude_deg": "East is positive.",
+    "altitude_m": "Give it in metres above the ellipsoid.",
+    "gravity_g": f"Give it in g of {STANDARD_GRAVITY} m/s².",
+    "field_nt": "Give it in nT.",
+    "dip_deg": "Down is positive.",
+    "declination_deg": "East is positive.",
+}
+
+
+class EarthReference(msgspec.Struct, frozen=True, kw_only=True):
+    """Gravity and field at a place and date, and what turns magnetic azimuths into true and grid ones.
+
+    True azimuth = magnetic + declination; grid azimuth = true - convergence; both east positive. Dip is
+    positive down. 1 g is 9.80665 m/s².
+
+    Attributes:
+        latitude_deg: geodetic, WGS84; north positive.
+        longitude_deg: east positive.
+        altitude_m: metres above the ellipsoid, negative below.
+        date: day for which the field holds.
+        convergence_deg: of the grid `crs`; None where no grid was named.
+        model: word of the field model; None where field, dip and declination were all measured.
+        epoch: decimal year from which its coefficients are carried forward.
+        valid_to: decimal year up to which it holds.
+        coefficients: file and version of its coefficients.
+        sd_gravity_g: standard uncertainty; this and those of field, dip and declination are of errors
+            that all stations of a well share.
+        sd_random_field_nt: standard uncertainty of what changes from station to station, as the
+            field varies with time; as are those of dip and declination.
+        measured: values that were measured at the place, of `MEASURABLE`.
+        sources: where values and uncertainties come from.
+        findings: what the reader should know.
+    """
+
+    latitude_deg: float
+    longitude_deg: float
+    altitude_m: float
+    date: date
+    gravity_g: float
+    gravity_ms2: float
+    field_nt: float
+    dip_deg: float
+    declination_deg: float
+    convergence_deg: float | None = None
+    crs: str | None = None
+    model: str | None = None
+    epoch: float | None = None
+    valid_to: float | None = None
+    coefficients: str | None = None
+    coefficients_sha256: str | None = None
+    sd_gravity_g: float = 0.0
+    sd_field_nt: float = 0.0
+    sd_dip_deg: float = 0.0
+    sd_declination_deg: float = 0.0
+    sd_random_field_nt: float = 0.0
+    sd_random_dip_deg: float = 0.0
+    sd_random_declination_deg: float = 0.0
+    measured: list[str] = []
+    sources: dict[str, str] = {}
+    findings: list[Finding] = []
+
+    @property
+    def norths(self) -> tuple[str, ...]:
+        """The norths that azimuths can be counted from."""
+        return ("magnetic", "true", *(["grid"] if self.convergence_deg is not None else []))
+
+    def offset_deg(self, north: str) -> float:
+        """What is added to a magnetic azimuth to count it from a north, degrees."""
+        stated = (north, self.declination_deg, self.convergence_deg)
+        metadata = {k: v for k, v in zip(AZIMUTH_KEYS, stated, strict=True) if v is not None}
+        return magnetic_offset(metadata, "reference")
+
+
+def reference_at(
+    latitude_deg: float,
+    longitude_deg: float,
+    altitude_m: float,
+    day: date,
+    *,
+    model: str = "wmm2025",
+    crs: str | None = None,
+    measured: Mapping[str, float] | None = None,
+    uncertainties: Mapping[str, float] | None = None,
+) -> EarthReference:
+    """The reference of a place and date.
+
+    `measured` values by name of `MEASURABLE`, in the units of their keys, stand before those of the models,
+    with their standard `uncertainties`, zero where none is stated. The field model is not consulted where
+    field, dip and declination were all measured.
+    """
+    measured, uncertainties = measured or {}, uncertainties or {}
+    place: dict[str, Any] = {
+        "latitude_deg": float(latitude_deg),
+        "longitude_deg": float(longitude_deg),
+        "altitude_m": float(altitude_m),
+    }
+    given = {MEASURABLE[name]: value for name, value in measured.items()}
+    stated = {f"sd_{MEASURABLE[name]}": value for name, value in uncertainties.items()}
+    check_ranges({**place, **given, **stated})
+    for name in sorted(uncertainties.keys() - measured.keys()):
+        key = MEASURABLE[name]
+        raise InputError(
+            f"`sd_{key}` is of a measured value. Add `{key}`, or leave out `sd_{key}`."
+        )
+    modelled, described = _modelled(place, day, model, measured)
+    values: dict[str, Any] = {**modelled, **given}
+    spread: dict[str, Any] = _uncertainties(values, altitude_m)
+    spread |= {f"sd_{MEASURABLE[name]}": uncertainties.get(name, 0.0) for name in measured}
+    grid = earth.grid_convergence(crs, latitude_deg, longitude_deg) if crs else None
+    return EarthReference(
+        **place,
+        date=day,
+        **values,
+        gravity_ms2=values["gravity_g"] * STANDARD_GRAVITY,
+        **spread,
+        **described,
+        convergence_deg=grid.convergence_deg if grid else None,
+        crs=crs or None,
+        measured=[name for name in MEASURABLE if name in measured],
+        sources=_sources(described.get("coefficients"), measured, grid),
+        findings=_findings(values, altitude_m, measured, uncertainties, grid),
+    )
+
+
+def _modelled(
+    place: Mapping[str, float], day: date, model: str, measured: Mapping[str, float]
+) -> tuple[dict[str, float], dict[str, Any]]:
+    """Values of the models that the measured ones leave to them, by key, and what the field model is."""
+    gravity = float(earth.normal_gravity(place["latitude_deg"], place["altitude_m"]))
+    values = {"gravity_g": gravity / STANDARD_GRAVITY}
+    if measured.keys() >= GEOMAGNETIC:
+        return values, {}
+    year = earth.decimal_year(day)
+    coefficients = earth.field_model(model, year)
+    field = earth.main_field(coefficients, **place, year=year)
+    described = {
+        "model": model,
+        "epoch": coefficients.epoch,
+        "valid_to": coefficients.valid_to,
+        "coefficients": coefficients.coefficients,
+        "coefficients_sha256": coefficients.sha256,
+    }
+    return {**values, **field._asdict()}, described
+
+
+def _uncertainties(values: Mapping[str, float], altitude_m: float) -> dict[str, float]:
+    """Standard uncertainties of modelled values, and of what changes from station to station."""
+    below = max(-altitude_m, 0.0)
+    gravity = math.hypot(GRAVITY_ANOMALY, GRADIENT_IN_ROCK * below) / STANDARD_GRAVITY
+    horizontal = values["field_nt"] * math.cos(math.radians(values["dip_deg"]))
+    spread = {"sd_gravity_g": gravity}
+    for prefix, sd in (("sd_", PLACE_SD), ("sd_random_", MOMENT_SD)):
+        declination = math.hypot(sd.declination_deg, sd.horizontal_deg_nt / max(horizontal, 1.0))
+        spread |= {
+            f"{prefix}field_nt": sd.field_nt,
+            f"{prefix}dip_deg": sd.dip_deg,
+            f"{prefix}declination_deg": min(declination, _SD["declination"].high),
+        }
+    return spread
+
+
+def _sources(
+    coefficients: str | None, measured: Mapping[str, float], grid: earth.Grid | None
+) -> dict[str, str]:
+    """Where each value comes from, and the uncertainties of those that were not measured."""
+    sources = dict.fromkeys(MEASURABLE, str(coefficients))
+    sources["gravity"] = "WGS84 normal gravity (NIMA TR8350.2)"
+    sources |= dict.fromkeys(measured, "measured")
+    sources["sd_gravity"] = "stated" if "gravity" in measured else GRAVITY_SD_SOURCE
+    sources["sd_field_dip_declination"] = (
+        OWSG if not GEOMAGNETIC & measured.keys() else f"{OWSG}; of measured values as stated"
+    )
+    return sources | ({"convergence": grid.name} if grid else {})
+
+
+def _findings(
+    values: Mapping[str, float], altitude_m: float, measured: Mapping[str, float],
+    uncertainties: Mapping[str, float], grid: earth.Grid | None,
+) -> list[Finding]:  # fmt: skip
+    """What the reader should know of a reference."""
+    findings = []
+    for name in measured:
+        if not uncertainties.get(name):
+            key = MEASURABLE[name]
+            text = f"`{key}` has no standard uncertainty and is taken as exact. State `sd_{key}`."
+            findings.append(Finding(id="exact-reference", text=text))
+    horizontal = values["field_nt"] * math.cos(math.radians(values["dip_deg"]))
+    if horizontal < LEAST_HORIZONTAL:
+        text = (
+            f"the horizontal field is {horizontal:.0f} nT: magnetic azimuths are unreliable so close to "
+            "a magnetic pole."
+        )
+        findings.append(Finding(id="magnetic-pole", text=text))
+    if altitude_m < LOWEST_LAND and "gravity" not in measured:
+        text = (
+            "below ground gravity does not follow the free-air gradient of normal gravity: its "
+            "uncertainty is enlarged. Measure gravity, or use the altitude of the ground."
+        )
+        findings.append(Finding(id="gravity-below-ground", text=text))
+    if grid and not grid.covered:
+        text = f"the place is outside the area of use of {grid.name}. Check `crs` and the zone."
+        findings.append(Finding(id="outside-grid", text=text))
+    return findings
+
+
+def check_ranges(values: Mapping[str, float], source: str = "") -> None:
+    """Refuse a value that no place on Earth has; `source` is the file that states it."""
+    for key, value in values.items():
+        limits = RANGES_OF_REFERENCE[key]
+        if not limits.low <= value <= limits.high:
+            named = f"{source}: '{key}'" if source else f"`{key}`"
+            raise InputError(f"{named} must be {limits}; got {value:g}. {_remedy(key, values)}")
+
+
+def _remedy(key: str, values: Mapping[str, float]) -> str:
+    if key == "latitude_deg" and abs(values.get("longitude_deg", math.inf)) <= 90.0:
+        return "Are latitude and longitude swapped?"
+    return _REMEDIES.get(key, "State a standard uncertainty (1σ).")
+
+
+def load_reference(path: str | os.PathLike[str]) -> tuple[EarthReference, str]:
+    """A reference that `mwdcal reference` wrote, and the SHA-256 of its file."""
+    file = Path(path)
+    try:
+        with file.open("rb") as stream:
+            data = stream.read(_REFERENCE_BYTES + 1)
+    except (OSError, ValueError) as error:
+        raise InputError(f"{file}: cannot be read ({reason(error)}). Check the path.") from None
+    try:
+        head = msgspec.json.decode(data, type=dict[str, Any])
+        if len(data) > _REFERENCE_BYTES or head.get("command") != "reference":
+            raise msgspec.ValidationError("it is not of that command")
+        if head.get("schema_version") != DOCUMENT_VERSION:
+            version = (
+                f"'schema_version' must be {DOCUMENT_VERSION}; got {head.get('schema_version')!r}"
+            )
+            raise msgspec.ValidationError(version)
+        reference = msgspec.json.decode(data, type=EarthReference)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise InputError(
+            f"{file.name} is not a reference: {error}. Use a file that mwdcal reference wrote."
+        ) from None
+    numbers = {key: getattr(reference, key) for key in RANGES_OF_REFERENCE}
+    if not math.isclose(reference.gravity_ms2, reference.gravity_g * STANDARD_GRAVITY):
+        raise InputError(
+            f"{file.name}: 'gravity_ms2' must be 'gravity_g' times {STANDARD_GRAVITY}; got "
+            f"{reference.gravity_ms2:g} and {reference.gravity_g:g}. Use the file as mwdcal wrote it."
+        )
+    check_ranges({key: value for key, value in numbers.items() if value is not None}, file.name)
+    return reference, hashlib.sha256(data).hexdigest()

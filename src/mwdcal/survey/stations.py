@@ -1,0 +1,108 @@
+"""Surveys: angles and strengths of calibrated readings in a well, each with its standard uncertainty.
+
+The uncertainty is that of the calibration and of the noise of one reading; of true and grid azimuths also
+that of the declination. Interference of the drill string and what has changed since the calibration are not
+part of it: `mwdcal.survey.acceptance` judges them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from mwdcal.calibration.readings import Readings
+from mwdcal.calibration.record import Calibration
+from mwdcal.errors import InputError
+from mwdcal.geometry.observables import OBSERVABLES
+from mwdcal.geometry.vectors import Array, Bools, diagonal, wrap
+
+SURVEYED = ("inclination", "azimuth", "toolface", "north_toolface", "gravity", "field", "dip")
+"""Observables of a survey, in the order of `Surveys.covariance`."""
+STRENGTHS = slice(4, 7)
+"""Where |g|, |b| and dip lie in it."""
+TOOLFACE_SWITCH = (np.radians(3.0), np.radians(5.0))
+"""Inclinations below which the toolface counts from magnetic north, and above which from the high side."""
+STATIONS_AT_ONCE = 1 << 12
+"""Stations whose covariances are computed at once, so that memory does not grow with their number."""
+
+
+@dataclass(frozen=True)
+class Surveys:
+    """Observables (n, 7) in the order of `SURVEYED`: radians, g, nT; their covariance (n, 7, 7).
+
+    NaN: not there, such as azimuth and toolface at vertical, or without a stated uncertainty.
+    `magnetic` (n,): the toolface counts from magnetic north.
+    """
+
+    value: Array
+    covariance: Array
+    magnetic: Bools
+
+    def of(self, name: str) -> tuple[Array, Array]:
+        """An observable (n,) and its standard uncertainty; `toolface` is the one that counts."""
+        place = SURVEYED.index(name)
+        value, sd = self.value[:, place], self._sd(place)
+        if name != "toolface":
+            return value, sd
+        north = SURVEYED.index("north_toolface")
+        return (
+            np.where(self.magnetic, self.value[:, north], value),
+            np.where(self.magnetic, self._sd(north), sd),
+        )
+
+    def _sd(self, place: int) -> Array:
+        return np.asarray(np.sqrt(np.maximum(diagonal(self.covariance)[:, place], 0.0)))
+
+
+def surveyed(
+    calibration: Calibration,
+    readings: Readings,
+    switch: tuple[float, float] = TOOLFACE_SWITCH,
+) -> Surveys:
+    """Surveys from readings, in the order in which they were taken.
+
+    Shapes: `readings` of n stations without leading axes. Units: `switch` in radians.
+    Singular: at vertical azimuth and toolface are NaN, the toolface from magnetic north is not.
+
+    Raises:
+        InputError: a switch that does not open above where it closes; temperatures are missing that the calibration
+            needs.
+    """
+    low, high = switch
+    if not 0 <= low <= high <= np.pi / 2:
+        raise InputError(
+            f"`switch` must be two inclinations between 0 and 90°, the lower one first; got {np.degrees(low):g}° and "
+            f"{np.degrees(high):g}°."
+        )
+    values, covariances = [], []
+    for part in blocks(readings):
+        g, b = calibration.fields(part)
+        values.append(np.stack([OBSERVABLES[name].value(g, b) for name in SURVEYED], -1))
+        covariances.append(calibration.covariance(SURVEYED, part, noise=True))
+    value = np.concatenate(values)
+    magnetic = switched(value[:, 0], low, high) & calibration.has_field
+    return Surveys(value, np.concatenate(covariances), magnetic)
+
+
+def blocks(readings: Readings) -> Iterator[Readings]:
+    """The readings in parts of `STATIONS_AT_ONCE`."""
+    places = np.arange(readings.count)
+    for start in range(0, readings.count, STATIONS_AT_ONCE):
+        yield readings.select((places >= start) & (places < start + STATIONS_AT_ONCE))
+
+
+def switched(inclination: Array, low: float, high: float) -> Bools:
+    """Stations (n,) whose toolface is magnetic: from below `low` until above `high`, in their order.
+
+    A first station between the two is taken as gravity toolface.
+    """
+    decided = np.where(inclination < low, 1, np.where(inclination > high, 0, -1))
+    last = np.maximum.accumulate(np.where(decided >= 0, np.arange(len(decided)), -1))
+    return np.asarray((last >= 0) & (decided[np.maximum(last, 0)] == 1))
+
+
+def from_true_north(azimuth: Array, declination: float) -> Array:
+    """True azimuth (n,) of a magnetic one, radians, 0…2π; `declination` positive to the east."""
+    return wrap(azimuth + declination)

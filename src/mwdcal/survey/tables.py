@@ -1,0 +1,140 @@
+"""Surveys from a table of readings, and the table with the results beside its columns."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import replace
+from math import radians
+
+import numpy as np
+
+from mwdcal.calibration.readings import CONSTANTS, Readings, is_simulated
+from mwdcal.calibration.record import Calibration
+from mwdcal.errors import InputError
+from mwdcal.files import synonyms
+from mwdcal.files.contract import REFERENCES, check_columns, stated_norths
+from mwdcal.files.formats.table import Table, cell_error, numbers
+from mwdcal.files.runs import renamed, to_readings
+from mwdcal.geometry.vectors import Array
+from mwdcal.survey.place.references import MEASURABLE, EarthReference
+from mwdcal.survey.well import North, Well
+
+MEASURED_DEPTH = "md_m"
+"""The column of measured depths, m."""
+LARGEST_DEPTH = 20_000.0
+"""No hole is longer, m."""
+_DEPTH_NAMES = re.compile(
+    r"(md|(measured|bit|survey)?[ _]?depth)[ _]*[\[(]?(m|ft|feet|met(re|er)s?)?[\])]?"
+)
+
+
+def survey_readings(
+    table: Table, calibration: Calibration, reference: EarthReference | None = None
+) -> tuple[Readings, Array | None, North]:
+    """The readings of a table, measured depths (n,) if it has them, and the norths that azimuths may count from.
+
+    What the table states of gravity, field, dip, declination and convergence stands before the `reference`.
+
+    Raises:
+        InputError: a table that cannot be read, depths under another name or in another unit.
+    """
+    table = renamed(table, calibration.profile)
+    check_columns(list(table.columns), table.source)
+    if calibration.thermal:
+        synonyms.check_evidence(list(table.columns), table.source, ("temperature_c",))
+    readings, _ = to_readings(table, calibration.profile)
+    if reference is not None:
+        readings = _referenced(readings, reference)
+    return readings, _depths(table), _norths(table, reference)
+
+
+def _referenced(readings: Readings, reference: EarthReference) -> Readings:
+    """The readings with gravity, field and dip of the place where the table states none.
+
+    Their uncertainty is of one station: what all share, and what changes from one to the next.
+    """
+    known, sd = dict(readings.known), dict(readings.sd)
+    for name in CONSTANTS:
+        key, factor = MEASURABLE[name], REFERENCES[name].factor
+        shared, alone = (getattr(reference, f"{p}{key}", 0.0) for p in ("sd_", "sd_random_"))
+        stated = np.broadcast_to(known.get(name, np.nan), readings.count)
+        blank = np.isnan(stated)
+        known[name] = np.where(blank, getattr(reference, key) * factor, stated)
+        sd[name] = np.where(blank, np.hypot(shared, alone) * factor, readings.uncertainty(name))
+    return replace(readings, known=known, sd=sd)
+
+
+def _depths(table: Table) -> Array | None:
+    if MEASURED_DEPTH not in table.columns:
+        for name in table.columns:
+            if _DEPTH_NAMES.fullmatch(name.strip().lower()):
+                raise InputError(
+                    f"{table.source}: column '{name}': measured depths must be in metres, in a column "
+                    f"'{MEASURED_DEPTH}'. Rename it, and convert feet (× 0.3048)."
+                )
+        return None
+    column = table.columns[MEASURED_DEPTH]
+    depths = numbers(table, MEASURED_DEPTH) if isinstance(column, list) else column
+    wrong = np.flatnonzero((depths < 0) | (depths > LARGEST_DEPTH))
+    if wrong.size:
+        problem = f"must be between 0 and {LARGEST_DEPTH:g} m; got {depths[wrong[0]]:g}."
+        raise cell_error(table, MEASURED_DEPTH, int(wrong[0]), problem)
+    return None if np.isnan(depths).all() else depths
+
+
+def _norths(table: Table, reference: EarthReference | None) -> North:
+    """What metadata and reference say of declination and convergence."""
+    stated = stated_norths(table.metadata, table.source)
+    convergence = stated.get("convergence_deg", reference.convergence_deg if reference else None)
+    sd, noise = 0.0, 0.0
+    if "declination_deg" in stated or reference is None:
+        declination = stated.get("declination_deg")
+    else:
+        declination = reference.declination_deg
+        sd, noise = reference.sd_declination_deg, reference.sd_random_declination_deg
+    north = (None if angle is None else radians(angle) for angle in (declination, convergence))
+    return North(next(north), radians(sd), next(north), radians(noise))
+
+
+def surveyed_table(table: Table, well: Well) -> Table:
+    """The table with the results beside its columns.
+
+    Raises:
+        InputError: a column has the name of a result already.
+    """
+    results = well.columns()
+    taken = [name for name in results if name in table.columns]
+    if taken:
+        raise InputError(
+            f"{table.source}: the column '{taken[0]}' is there already, and would be lost under the result of that "
+            "name. Rename it."
+        )
+    columns = {
+        name: values if values.dtype.kind == "f" else [str(cell) for cell in values]
+        for name, values in results.items()
+    }
+    metadata = {**table.metadata, **described(well)}
+    return replace(table, columns={**table.columns, **columns}, metadata=metadata)
+
+
+def described(well: Well) -> Mapping[str, object]:
+    """What a table of surveys says of the calibration, north and limits it rests on."""
+    calibration, north = well.calibration, well.north
+    stated: dict[str, object] = {
+        "calibration_run": calibration.run,
+        "calibration_time": calibration.time,
+        "survey_limits": well.limits.name,
+        "north": north.name,
+    }
+    for key, angle in (
+        ("declination_deg", north.declination),
+        ("convergence_deg", north.convergence),
+    ):
+        if angle is not None:
+            stated[key] = float(np.degrees(angle))
+    if is_simulated(calibration.tool) or is_simulated(well.readings.metadata):
+        stated["simulated"] = True
+    if well.findings:
+        stated["findings"] = [finding.text for finding in well.findings]
+    return stated

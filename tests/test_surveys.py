@@ -1,0 +1,478 @@
+"""Surveys with their uncertainty, the toolface switch, and acceptance by fixed limits and by an error model."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from functools import cache
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+import mwdcal
+from cli_support import EXAMPLE, read_csv, refused, write_csv
+from cli_support import mwdcal as cli
+from mwdcal.calibration.readings import Readings
+from mwdcal.errors import InputError
+from mwdcal.geometry.observables import OBSERVABLES
+from mwdcal.geometry.vectors import centred, diagonal, reference_vectors
+from mwdcal.planning.simulate import Earth, Truth, grid, run, servo
+from mwdcal.survey.acceptance import (
+    STRENGTH_NAMES,
+    Judgement,
+    SurveyLimits,
+    distance,
+    judged,
+    load_survey_limits,
+)
+from mwdcal.survey.path import well_path
+from mwdcal.survey.stations import STRENGTHS, SURVEYED, surveyed, switched
+
+EARTH = Earth()
+NOISE = (1e-4, 15.0)
+
+
+@cache
+def laboratory(seed=0):
+    """A tool and its calibration."""
+    rng = np.random.default_rng(seed)
+    tool = servo(rng)
+    plan = grid([0, 45, 90, 135], 12, [0, 90, 180, 270], [30.0])
+    return tool, mwdcal.calibrate(run(tool, plan, rng, NOISE, (1e-4, 1e-4, 1e-4)))
+
+
+def readings(tool, inclination, azimuth, toolface, rng=None, shift=0.0):
+    """What the tool reads in a well, with references; `shift` (3,) is a field of the drill string."""
+    angles = np.broadcast_arrays(*map(np.atleast_1d, (inclination, azimuth, toolface)))
+    count = angles[0].size
+    g, b = reference_vectors(*angles, EARTH.gravity, EARTH.field, EARTH.dip)
+    warmth = np.full(count, 30.0)
+    raw = tool.readings((g, b + shift), warmth)
+    if rng is not None:
+        raw = {
+            name: value + size * rng.normal(size=value.shape)
+            for (name, value), size in zip(raw.items(), NOISE, strict=True)
+        }
+    known = {name: np.full(count, getattr(EARTH, name)) for name in ("gravity", "field", "dip")}
+    return Readings(raw["accelerometer"], raw["magnetometer"], warmth, known)
+
+
+def test_uncertainty_covers_the_errors_of_surveys():
+    """Errors over 150 calibrations, 12 surveys each, in units of the stated covariance: chi-square, χ²/k = 1."""
+    total, count = 0.0, 0
+    names = ["inclination", "azimuth", "north_toolface", "gravity", "field", "dip"]
+    places = [SURVEYED.index(name) for name in names]
+    inc, azi, roll = np.radians([[4.0, 30, 88, 120], [20, 140, 260, 330], [10, 100, 200, 300]])
+    for seed in range(150):
+        tool, calibration = laboratory(seed)
+        surveys = surveyed(calibration, readings(tool, inc, azi, roll, np.random.default_rng(seed)))
+        vectors = reference_vectors(inc, azi, roll, EARTH.gravity, EARTH.field, EARTH.dip)
+        true = np.stack([OBSERVABLES[name].value(*vectors) for name in names], -1)
+        error = centred(surveys.value[:, places] - true)
+        error[:, 3:5] = (surveys.value[:, places] - true)[:, 3:5]
+        sd = np.sqrt(diagonal(surveys.covariance)[:, places])
+        total += float(np.sum((error / sd) ** 2))
+        count += error.size
+    # errors of one calibration are alike: the sum scatters by no more than that of 150 × 6 independent ones
+    assert total / count == pytest.approx(1.0, abs=4 * np.sqrt(2 / 900))
+
+
+def test_azimuth_does_not_depend_on_the_toolface():
+    roll = np.radians(np.arange(0, 360, 7.0))
+    for inc in np.radians([1.0, 5, 45, 90, 135, 179]):
+        g, b = reference_vectors(np.full(roll.shape, inc), 1.234, roll, 1.0, 48_000.0, 1.1)
+        off = centred(OBSERVABLES["azimuth"].value(g, b) - 1.234)
+        assert np.abs(off).max() < 1e-12 / np.sin(inc)
+
+
+def test_the_magnetic_toolface_takes_over_without_a_jump():
+    """From 8° to vertical and back: azimuth + gravity toolface goes on as the toolface from north."""
+    tool, calibration = laboratory()
+    inc = np.radians(np.concatenate([np.arange(8.1, 0, -0.25), [0.0], np.arange(0.1, 8.2, 0.25)]))
+    surveys = surveyed(calibration, readings(tool, inc, np.radians(70), np.radians(40)))
+    toolface, sd = surveys.of("toolface")
+    kind = surveys.magnetic
+    down = slice(0, np.argmin(inc))
+    np.testing.assert_array_equal(kind[down], inc[down] < np.radians(3))
+    up = slice(np.argmin(inc), None)
+    np.testing.assert_array_equal(kind[up], inc[up] <= np.radians(5))
+    expected = np.where(kind, np.radians(110), np.radians(40))
+    assert np.abs(centred(toolface - expected)).max() < 0.01
+    switch = np.flatnonzero(np.diff(kind.astype(int)))
+    azimuth = surveys.of("azimuth")[0]
+    gravity = surveys.value[:, SURVEYED.index("toolface")]
+    for i in switch:  # the same stations by either
+        for k in (i, i + 1):
+            north = surveys.value[k, SURVEYED.index("north_toolface")]
+            assert abs(centred(azimuth[k] + gravity[k] - north)) < 1e-12
+    assert np.isfinite(toolface).all()
+    assert np.isfinite(sd).all()
+    assert sd[kind].max() < 1.5 * sd[np.abs(inc - np.radians(8.1)) < 1e-9].max()
+
+
+def test_switch_keeps_its_state_between_its_ends():
+    inc = np.array([4.0, 2.9, 4.0, 5.1, 4.0, 3.1, 2.0, 4.9])
+    expected = [False, True, True, False, False, False, True, True]
+    assert switched(inc, 3.0, 5.0).tolist() == expected
+
+
+def test_bad_switch_is_refused():
+    tool, calibration = laboratory()
+    with pytest.raises(InputError, match="`switch` must be"):
+        surveyed(calibration, readings(tool, 1.0, 0.0, 0.0), (0.2, 0.1))
+
+
+def test_distance_of_the_published_case():
+    """MagVAR's public interface, 2026-09-13: 29.4217° N, I 45°, A 45° true, declination 4.24°: 0.9495."""
+    limits, _ = load_survey_limits("owsg-mwd")
+    roll = np.radians(np.arange(0, 360, 5.0))
+    inc, azi = np.radians([45.0, 45 - 4.24])
+    g, b = reference_vectors(inc, azi, roll, 9.800 / 9.80665, 46_644.9, np.radians(58.04))
+    slope = np.stack([OBSERVABLES[name].gradient(g, b) for name in STRENGTH_NAMES], -2)
+    sensors = ((slope * limits.sensor.covariance(g, b)[:, None]) @ slope.mT).mean(0)
+    references = np.diag([limits.reference.sd(name) ** 2 for name in STRENGTH_NAMES])
+    off = np.array([0.003 / 9.80665, 46_475.6 - 46_644.9, np.radians(57.96 - 58.04)])
+    assert distance(off, sensors + references) == pytest.approx(0.9495, rel=0.02)
+
+
+def test_error_model_accepts_at_its_probability():
+    """Sensor errors, noise and references drawn as stated: 99.73 % of 20,000 surveys are accepted."""
+    limits = SurveyLimits(
+        name="x",
+        probability=0.9973,
+        sensor=load_survey_limits()[0].sensor,
+        reference=load_survey_limits()[0].reference,
+    )
+    tool, calibration = laboratory()
+    rng = np.random.default_rng(2)
+    count = 20_000
+    inc, azi, roll = rng.uniform(0.1, 2.0, count), *rng.uniform(0, 6.28, (2, count))
+    exact = reference_vectors(inc, azi, roll, EARTH.gravity, EARTH.field, EARTH.dip)
+    variance = limits.sensor.covariance(*exact)
+    off = np.sqrt(variance) * rng.normal(size=variance.shape)
+    warmth = np.full(count, 30.0)
+    raw = tool.readings((exact[0] + off[:, :3], exact[1] + off[:, 3:]), warmth)
+    known = {
+        name: getattr(EARTH, name) + limits.reference.sd(name) * rng.normal(size=count)
+        for name in STRENGTH_NAMES
+    }
+    read = Readings(
+        raw["accelerometer"] + NOISE[0] * rng.normal(size=(count, 3)),
+        raw["magnetometer"] + NOISE[1] * rng.normal(size=(count, 3)),
+        warmth,
+        known,
+    )
+    result = judged(surveyed(calibration, read), calibration.fields(read), read, limits)
+    rejected = np.mean(~result.accepted)
+    assert rejected == pytest.approx(0.0027, abs=4 * np.sqrt(0.0027 / count) + 0.0005)
+    assert np.median(result.distance) == pytest.approx(np.sqrt(chi2.median(3)), rel=0.03)
+
+
+def test_axial_interference_is_rejected_and_named():
+    tool, calibration = laboratory()
+    read = readings(tool, np.radians([10, 40]), np.radians([20, 300]), 1.0, shift=[0, 0, 1500.0])
+    limits, _ = load_survey_limits()
+    result = judged(surveyed(calibration, read), calibration.fields(read), read, limits)
+    assert not result.accepted.any()
+    assert all("distance" in text and "field" in text for text in result.findings())
+
+
+def test_fixed_limits_hold_one_by_one():
+    limits, _ = load_survey_limits("iscwsa-fixed")
+    tool, calibration = laboratory()
+    read = readings(tool, 0.8, 0.5, np.radians([0.0, 120, 240]))
+    known = {**read.known, "dip": read.known["dip"] + np.radians([0.0, 0.3, -0.1])}
+    known["field"] = known["field"] + np.array([0.0, 0, 400])
+    read = replace(read, known=known)
+    result = judged(surveyed(calibration, read), calibration.fields(read), read, limits)
+    assert result.accepted.tolist() == [True, False, False]
+    first, second, third = result.findings()
+    assert first == ""
+    assert second.startswith("dip -0.3")
+    assert "at most 0.25" in second
+    assert float(third.split()[1]) == pytest.approx(-400, abs=10)
+
+
+def test_nothing_is_accepted_without_a_reference():
+    tool, calibration = laboratory()
+    read = replace(readings(tool, 0.8, 0.5, 0.1), known={})
+    result = judged(
+        surveyed(calibration, read), calibration.fields(read), read, load_survey_limits()[0]
+    )
+    assert isinstance(result, Judgement)
+    assert not result.accepted.any()
+    assert not result.judged.any()
+    assert result.findings() == ["not judged: no reference"]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('name = "x"', "sets no limit"),
+        ('name = "x"\nprobability = 1.0', "probability must be above 0 and below 1"),
+        ('name = "x"\nfield_nt = -3.0', "field_nt must be above 0"),
+        ('name = "x"\nfield_nt = nan', "field_nt must be above 0"),
+        ('name = "x"\nfield_nt = 1.0\n[sensor]\nmagnetometer_bias_nt = -1.0', "at least 0"),
+        ('name = "x"\nfeild_nt = 1.0', "limits profile of surveys"),
+    ],
+)
+def test_limits_that_are_none(tmp_path, text, message):
+    path = tmp_path / "limits.toml"
+    path.write_text(text)
+    with pytest.raises(InputError, match=message):
+        load_survey_limits(path)
+
+
+def test_strengths_lie_where_they_are_said_to():
+    assert SURVEYED[STRENGTHS] == ("gravity", "field", "dip")
+
+
+# ------------------------------------------------------------------ the command
+
+
+@pytest.fixture(scope="module")
+def example(tmp_path_factory):
+    """The calibration of the bundled example."""
+    folder = tmp_path_factory.mktemp("well")
+    fit = ("calibrate", EXAMPLE / "run.csv", "--tool", EXAMPLE / "tool.toml")
+    assert cli(*fit, "-o", folder / "tool.json").code == 0
+    return folder / "tool.json"
+
+
+def surveyed_file(example, folder, columns=None, *options, metadata=()):
+    """The table that `survey` makes of the example's well, changed; and the document it prints."""
+    source = EXAMPLE / "well.csv"
+    if columns is not None:
+        stated = ("simulated = true", *metadata)
+        source = write_csv(folder / "in.csv", {**read_csv(source), **columns}, *stated)
+    out = folder / "out.csv"
+    ran = cli("survey", example, source, "-o", out, "--json", *options)
+    assert ran.code == 0, ran
+    return read_csv(out), ran.json
+
+
+def test_columns_of_a_well(example, tmp_path):
+    columns, document = surveyed_file(example, tmp_path)
+    given = read_csv(EXAMPLE / "well.csv")
+    assert [*columns][: len(given)] == [*given]
+    values = {k: np.array(v, float) for k, v in columns.items() if k.endswith(("_deg", "_m"))}
+    depth = np.array(given["md_m"], float)
+    inclination = np.minimum(np.maximum(0.08 * (depth - 120), 0.5), 70)
+    azimuth = 20 + 0.06 * np.maximum(depth - 600, 0) + 2.4
+    for name, true in {"inclination": inclination, "azimuth_true": azimuth}.items():
+        off = (values[f"{name}_deg"] - true + 180) % 360 - 180
+        assert np.abs(off / values[f"sd_{name}_deg"]).max() < 4
+    assert (values["azimuth_true_deg"] - values["azimuth_magnetic_deg"]) % 360 == pytest.approx(2.4)
+    assert "azimuth_grid_deg" not in columns
+    assert set(columns["accepted"]) == {"true"}
+    assert set(columns["toolface_kind"]) == {"gravity", "magnetic"}
+    assert document["accepted"] == document["rows"] == 36
+    assert document["north"] == "true"
+    assert document["simulated"] is True
+    reference = well_path(depth, np.radians(inclination), np.radians(azimuth))
+    for k, name in enumerate(("north_m", "east_m", "tvd_m")):
+        assert values[name] == pytest.approx(reference[:, k], abs=5 * values[f"sd_{name}"].max())
+        assert document["end"][name] == pytest.approx(float(columns[name][-1]), abs=1e-6)
+
+
+def test_reference_file_gives_norths_and_limits(example, tmp_path):
+    place = tmp_path / "here.json"
+    made = cli(
+        *("reference", "--latitude", "60", "--longitude", "3.5", "--altitude-m", "0"),
+        *("--date", "2026-06-01", "--crs", "EPSG:23031", "--field-nt", "48000"),
+        *("--dip-deg", "63", "--gravity-g", "1", "--json"),
+    )
+    assert made.code == 0, made
+    place.write_text(made.out)
+    blank = dict.fromkeys(("ref_gravity_g", "ref_field_nt", "ref_dip_deg"), [""] * 36)
+    columns, document = surveyed_file(example, tmp_path, blank, "--reference", place)
+    stated = made.json
+    true, grid, magnetic = (
+        np.array(columns[f"azimuth_{name}_deg"], float) for name in ("true", "grid", "magnetic")
+    )
+    assert (true - magnetic) % 360 == pytest.approx(stated["declination_deg"] % 360)
+    assert (true - grid) % 360 == pytest.approx(stated["convergence_deg"] % 360)
+    sd = np.array(columns["sd_azimuth_grid_deg"], float)
+    alone = np.array(columns["sd_azimuth_magnetic_deg"], float)
+    shared = np.hypot(stated["sd_declination_deg"], stated["sd_random_declination_deg"])
+    assert sd == pytest.approx(np.hypot(alone, shared))
+    assert document["not_judged"] == 0
+    assert document["north"] == "grid"
+    assert document["reference_sha256"]
+
+
+def test_without_reference_nothing_is_accepted(example, tmp_path):
+    blank = dict.fromkeys(("ref_gravity_g", "ref_field_nt", "ref_dip_deg"), [""] * 36)
+    columns, document = surveyed_file(example, tmp_path, blank)
+    assert set(columns["accepted"]) == {""}
+    assert document["not_judged"] == 36
+    assert "not-judged" in {finding["id"] for finding in document["findings"]}
+    assert document["north"] == "magnetic"
+    assert "azimuth_true_deg" not in columns
+
+
+def test_hot_stations_have_no_result_and_no_position(example, tmp_path):
+    warm = ["25.1"] * 36
+    warm[5] = "90"
+    columns, document = surveyed_file(example, tmp_path, {"temperature_c": warm})
+    assert columns["inclination_deg"][5] == columns["tvd_m"][5] == columns["accepted"][5] == ""
+    assert columns["tvd_m"][6] != ""
+    assert document["blank"] == 1
+    assert {"outside-temperature", "left-out"} <= {f["id"] for f in document["findings"]}
+    columns, _ = surveyed_file(
+        example, tmp_path, {"temperature_c": warm}, "--outside", "extrapolate"
+    )
+    assert columns["inclination_deg"][5] != ""
+    assert columns["sd_inclination_deg"][5] == ""
+
+
+def test_tie_in_moves_the_path(example, tmp_path):
+    first, _ = surveyed_file(example, tmp_path)
+    moved, document = surveyed_file(example, tmp_path, None, "--tie-in", "100,-20,1000")
+    for name, shift in (("north_m", 100), ("east_m", -20), ("tvd_m", 1000)):
+        gap = np.array(moved[name], float) - np.array(first[name], float)
+        assert gap == pytest.approx(shift)
+    assert "path-from-first" not in {f["id"] for f in document["findings"]}
+
+
+@pytest.mark.parametrize(
+    ("columns", "options", "message"),
+    [
+        ({"md_m": [str(1000 - i) for i in range(36)]}, (), "must increase"),
+        ({"md_m": ["-5", *map(str, range(35))]}, (), "between 0 and 20000"),
+        ({"accepted": ["x"] * 36}, (), "'accepted' is there already"),
+        ({"MD (ft)": ["1"] * 36}, (), "column 'md_m' twice|measured depths must be in metres"),
+        ({}, ("--switch", "5"), "--switch"),
+        ({}, ("--switch", "6,5"), "--switch"),
+        ({}, ("--tie-in", "1,2"), "--tie-in"),
+        ({}, ("--limits", "nothing"), "nothing"),
+        ({}, ("--outside", "hide"), "--outside"),
+    ],
+)
+def test_bad_input_of_a_well(example, tmp_path, columns, options, message):
+    given = read_csv(EXAMPLE / "well.csv")
+    if "MD (ft)" in columns:
+        del given["md_m"]
+    source = write_csv(tmp_path / "in.csv", {**given, **columns}, "simulated = true")
+    ran = cli("survey", example, source, "-o", tmp_path / "out.csv", *options)
+    assert re.search(message, refused(ran, 2))
+    assert not (tmp_path / "out.csv").exists()
+
+
+def test_long_well_is_like_its_parts(example, tmp_path):
+    """Results do not depend on how many stations are worked on at once."""
+    from mwdcal.survey import position, stations
+
+    whole, _ = surveyed_file(example, tmp_path)
+    with (
+        patch.object(stations, "STATIONS_AT_ONCE", 7),
+        patch.object(position, "STATIONS_AT_ONCE", 5),
+    ):
+        parts, _ = surveyed_file(example, tmp_path)
+    for name in whole:
+        if name.endswith(("_deg", "_m", "_nt", "_g")):
+            one, other = (np.array(t[name], float) for t in (whole, parts))
+            np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12)
+
+
+# ------------------------------------------------------------------ multi-station analysis
+
+
+def with_iron(folder, axial, inclination=None, azimuth=None):
+    """The example's well, or 30 surveys at one attitude, with axial interference; nominal nT by the profile."""
+    columns = read_csv(EXAMPLE / "well.csv")
+    if inclination is not None:
+        roll = np.radians(np.arange(30) * 77.0)
+        g, b = reference_vectors(inclination, azimuth, roll, 1.0, 48_000.0, np.radians(63))
+        truth = json.loads((EXAMPLE / "truth.json").read_text("utf-8"))
+        tool = Truth(np.array(truth["accelerometer"]), np.array(truth["magnetometer"]))
+        raw = tool.readings((g, b + np.array([0, 0, axial])), np.full(30, 25.1))
+        noise = np.random.default_rng(5).normal(size=(6, 30))
+        columns = {name: values[:30] for name, values in columns.items()}
+        for k, name in enumerate(("ax", "ay", "az")):
+            columns[name] = raw["accelerometer"][:, k] * 3.0 + 3e-4 * noise[k]
+        for k, name in enumerate(("mx", "my", "mz")):
+            columns[name] = raw["magnetometer"][:, k] * 5e-5 + 7.5e-4 * noise[3 + k]
+    else:
+        columns["mz"] = [f"{float(value) + 5e-5 * axial:.6f}" for value in columns["mz"]]
+    columns |= {"sd_ref_field_nt": ["130"] * len(columns["ax"])}
+    columns |= {"sd_ref_dip_deg": ["0.2"] * len(columns["ax"])}
+    return write_csv(folder / "iron.csv", columns, "simulated = true")
+
+
+def test_msa_takes_axial_interference_off(example, tmp_path):
+    source, out = with_iron(tmp_path, 1500), tmp_path / "out.csv"
+    plain = cli("survey", example, source, "-o", out, "--json").json
+    assert plain["rejected"] > 20
+    assert plain["interference"] is plain["separable"] is None
+    ran = cli(
+        "survey", example, source, "-o", out, "--msa", "--json", "--msa-html", tmp_path / "m.html"
+    )
+    assert ran.code == 0, ran
+    size = ran.json["interference"]
+    # 1500 nT on the sensor, whose scale is within 2 % of nominal
+    assert size["axial_nt"] == pytest.approx(1500, abs=3 * size["sd_axial_nt"] + 30)
+    assert ran.json["separable"] is True
+    assert ran.json["rejected"] == 0
+    columns = read_csv(out)
+    depth = np.array(columns["md_m"], float)
+    true = 20 + 0.06 * np.maximum(depth - 600, 0)
+    off = (np.array(columns["azimuth_magnetic_deg"], float) - true + 180) % 360 - 180
+    sd = np.array(columns["sd_azimuth_magnetic_deg"], float)
+    assert np.abs(off / sd).max() < 4
+    assert "SIMULATED" in (tmp_path / "m.html").read_text("utf-8")
+
+
+def test_msa_near_horizontal_east_west_is_refused(example, tmp_path):
+    source, out = with_iron(tmp_path, 1500, np.radians(89), np.radians(90)), tmp_path / "out.csv"
+    ran = cli("survey", example, source, "-o", out, "--msa")
+    assert "do not separate interference from azimuth" in refused(ran, 3)
+    assert not out.exists()
+    ran = cli("survey", example, source, "-o", out, "--msa", "--json")
+    assert ran.code == 3
+    assert ran.json["separable"] is False
+    assert ran.json["msa"]["missing"]
+    assert not out.exists()
+    north = with_iron(tmp_path, 1500, np.radians(60), np.radians(10))
+    assert cli("survey", example, north, "-o", out, "--msa", "--json").json["separable"] is True
+
+
+def test_page_of_the_analysis_goes_with_it(example, tmp_path):
+    ran = cli(
+        "survey",
+        example,
+        EXAMPLE / "well.csv",
+        "-o",
+        tmp_path / "o.csv",
+        "--msa-html",
+        tmp_path / "m.html",
+    )
+    assert "--msa" in refused(ran, 2)
+
+
+# ------------------------------------------------------------------ sensor terms
+
+
+def test_tool_model_of_a_calibration(example, tmp_path):
+    ran = cli("convert", example, "--to", "tool-model", "-o", tmp_path / "m.json", "--json")
+    assert ran.code == 0, ran
+    terms = {term["name"]: term for term in ran.json["terms"]}
+    model = json.loads((tmp_path / "m.json").read_text("utf-8"))
+    values = {term["name"]: term["value"] for term in model["terms"]}
+    assert values["ABZ"] == pytest.approx(terms["ABZ"]["value"])
+    assert terms["MBZ"]["ratio"] == pytest.approx(terms["MBZ"]["value"] / 70)
+    assert "ABXY" in cli("convert", example, "--to", "tool-model", "-o", tmp_path / "m.json").out
+    bad = cli(
+        "convert",
+        example,
+        "--to",
+        "tool-model",
+        "-o",
+        tmp_path / "m.json",
+        "--temperature",
+        "course",
+    )
+    assert "--temperature" in refused(bad, 2)
