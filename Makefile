@@ -3,8 +3,8 @@
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: papers measured verification scatter mutations help demo test test-quick test-oldest test-versions \
-	fuzz kills check bench docs clean
+.PHONY: papers measured verification scatter diagnosis mutations help demo test test-quick test-oldest \
+	test-versions fuzz kills check bench docs clean
 
 PYTHON ?= python3
 PYTHONS ?= python3.12 python3.13
@@ -106,6 +106,9 @@ verification: $(INSTALLED) ## count wrong verdicts of simulated roll tests and r
 
 scatter: $(INSTALLED) ## compare what plans state with simulated calibrations and rewrite docs/scatter.md (a quarter of an hour)
 	@$(CLOCK); $(ONE_THREAD) $(BIN)/python examples/planning/scatter.py
+
+diagnosis: $(INSTALLED) ## name faults of simulated tools and rewrite docs/diagnosis.md (half an hour; COUNT=100)
+	@$(CLOCK); $(ONE_THREAD) $(BIN)/python examples/diagnosis/diagnosis.py --count $(or $(COUNT),1000)
 
 docs: $(INSTALLED) ## build the documentation into build/docs, and the manual page docs/mwdcal.1
 	@$(CLOCK); $(SPHINX) -b html docs build/docs; $(SPHINX) -b man docs build/man; \

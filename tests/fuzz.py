@@ -629,7 +629,7 @@ def promises(line: list[str], ran: cli_support.Ran, folder: Path, before: set[Pa
     shown = {
         p for p in named if p.name.startswith(("out-plot", "out-report"))
     }  # of a refused log too
-    if ran.code not in ({0, 1, 2, 3} if line[0] == "verify" else {0, 2, 3}):
+    if ran.code not in ({0, 1, 2, 3} if line[0] in ("diagnose", "verify") else {0, 2, 3}):
         broken.append(f"exit {ran.code}")
     if written - named:
         broken.append(f"left behind: {sorted(p.name for p in written - named)}")

@@ -25,6 +25,7 @@ from mwdcal.app.screens import (
 )
 from mwdcal.app.screens.surveys import reference, survey
 from mwdcal.calibration.record import DOCUMENT_VERSION, SCHEMA_VERSION, Calibration
+from mwdcal.faults.diagnosis import Diagnosis
 from mwdcal.use.verification import Verdict
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
@@ -33,6 +34,7 @@ CONTENTS: dict[str, type] = {
     "calibrate": calibration.CalibrationSummary,
     "compare": comparison.ComparisonSummary,
     "convert": conversion.ConversionSummary,
+    "diagnose": Diagnosis,
     "example": ExampleDocument,
     "fleet": fleet.FleetDocument,
     "noise": noise.NoiseSummary,

@@ -36,6 +36,8 @@ SCREENS = {
     "compare": ("compare", "demo/run.csv", "--tool", "demo/tool.toml"),
     "compare-parameters": ("compare", "demo/run.csv", "--tool", "demo/tool.toml", "--parameters"),
     "convert": ("convert", "tool.json", "--notation", "forward", "--temperature", "90"),
+    "diagnose": ("diagnose", "tool.json", "demo/rolltest.csv"),
+    "diagnose-named": ("diagnose", "tool.json", "knocked.csv"),
     "fleet": ("fleet", "fleet.parquet", "--tool", "demo/tool.toml", "-o", "made.parquet",
               "--workers", "1"),
     "noise": ("noise", "demo/static.csv", "--tool", "demo/tool.toml"),
@@ -104,6 +106,9 @@ def prepared(folder):
         columns["az"][6] = f"{float(columns['az'][6]) + 0.0039:.6f}"
         columns["remark"] = ["as it came"] * 48
 
+    def knocked(columns):
+        columns["ay"] = [f"{float(value) + 0.015:.6f}" for value in columns["ay"]]
+
     def some(count):
         return lambda columns: columns.update({k: v[:count] for k, v in columns.items()})
 
@@ -118,6 +123,7 @@ def prepared(folder):
     changed(demo / "run.csv", folder / "few.csv", some(3))
     changed(demo / "run.csv", folder / "blank.csv", without_references)
     changed(demo / "rolltest.csv", folder / "part.csv", some(4))
+    changed(demo / "rolltest.csv", folder / "knocked.csv", knocked)
     changed(demo / "surveys.csv", folder / "hot.csv", hot)
     write_csv(folder / "soaks.csv", servo_run(temperatures=(0.0, 40.0, 80.0)))
     limits = 'name = "tight"\n[error]\ninclination_deg = 0.001\nazimuth_deg = 2\n'

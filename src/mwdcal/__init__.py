@@ -38,6 +38,7 @@ __all__ = [  # noqa: F405 - imported when first used: `import mwdcal` loads no N
     "apply",
     "calibrate",
     "compare",
+    "diagnose",
     "load",
     "load_profile",
     "noise",

@@ -28,6 +28,7 @@ COMMANDS = (
     "compare",
     "completion",
     "convert",
+    "planning.diagnose",
     "example",
     "fleet",
     "noise",

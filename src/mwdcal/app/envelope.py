@@ -15,6 +15,7 @@ INPUTS = {
     "calibrate": ("run", "profile", "prior"),
     "compare": ("run", "profile"),
     "convert": ("calibration", "run"),
+    "diagnose": ("calibration", "readings"),
     "example": (),
     "fleet": ("runs", "profile"),
     "noise": ("log", "profile"),

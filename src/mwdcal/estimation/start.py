@@ -56,7 +56,7 @@ def start(problem: Problem) -> State:
         free = _triad_start(problem, empty, index)
         whole = known.all(-1, keepdims=True)
         params.append(np.where(whole, problem.prior.expected[:, where], free))
-    return _attitudes(problem, replace(empty, params=np.concatenate(params, -1)))
+    return oriented(problem, replace(empty, params=np.concatenate(params, -1)))
 
 
 def _triad_start(problem: Problem, state: State, index: int) -> Array:
@@ -162,8 +162,8 @@ def _unknown_dip(attitude: Array, field: Array, terms: Array, weight: Array, gra
     return np.asarray(np.arctan2(sign * down, sign * north))
 
 
-def _attitudes(problem: Problem, state: State) -> State:
-    """Fill unknown angles from the start's own fields, share directions, find unknown turns."""
+def oriented(problem: Problem, state: State) -> State:
+    """A state with attitudes: unknown angles of its own fields, shared directions, the best unknown turns."""
     evidence = problem.evidence
     fields = problem.fields(state)[: len(problem.triads)]
     g = fields[0]

@@ -16,6 +16,8 @@ from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.comparison.compare import Comparison
 from mwdcal.comparison.compare import compare as compare_methods
 from mwdcal.errors import InputError
+from mwdcal.faults.diagnosis import Diagnosis
+from mwdcal.faults.diagnosis import diagnose as explain
 from mwdcal.files import documents, logs, profiles, runs
 from mwdcal.files.formats import table as tables
 from mwdcal.files.formats.columns import LABELS, Column
@@ -243,6 +245,19 @@ def verify(
     return judge(
         calibration, rolltest, limits if isinstance(limits, Limits) else load_limits(limits)[0]
     )
+
+
+def diagnose(calibration: Calibration, later: Readings) -> Diagnosis:
+    """Say which fault explains later readings of a calibrated tool best: `.fault` is "none" where none is needed.
+
+    Definition: faults are compared by the density of the readings, all that is uncertain being integrated out;
+    one is named where a sound tool gives as much evidence with a probability of at most 1 %.
+
+    Raises:
+        InputError: readings of another tool or of the fit itself, or none that can be used.
+    """
+    _check_readings(later, "later")
+    return explain(calibration, later)
 
 
 @dataclass(frozen=True)

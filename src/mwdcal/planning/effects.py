@@ -6,13 +6,17 @@ Sizes of everything that is drawn are standard deviations. All effects are zero 
 from __future__ import annotations
 
 import math
+from typing import Literal
 
 import msgspec
 import numpy as np
 
+from mwdcal.calibration.readings import TRIADS
 from mwdcal.errors import InputError
+from mwdcal.faults.physics import NONE, SIZE, Damage, drawn_damage, faults
 from mwdcal.files.profiles import decoded_toml
 from mwdcal.geometry.vectors import Array, centred
+from mwdcal.sensor.profile import Profile
 
 LARGEST_EFFECT = 1e6
 """No size of an effect is larger, in its unit."""
@@ -81,6 +85,48 @@ class EarthEffects(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     variation_minutes: float = 60.0
 
 
+class FaultEffect(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A fault that the tool has: what it does is that of `mwdcal.faults.physics`, drawn for each tool.
+
+    `channel` is that of an impact ("ax" …, or a triad) or of a dead channel; "" is drawn. `size` in multiples
+    of the usual one, which the tool's datasheet gives. A dead channel reads `reading`, g or nT along the tool axis,
+    at temperatures above `above_c`, if there is one.
+    """
+
+    kind: Literal["none", "impact", "dead-channel", "heat", "magnetised", "casing", "turn-on"] = (
+        "none"
+    )
+    channel: Literal["", "ax", "ay", "az", "mx", "my", "mz", "accelerometer", "magnetometer"] = ""
+    size: float = 1.0
+    reading: float = 0.0
+    above_c: float | None = None
+
+    def damage(
+        self, rng: np.random.Generator, profile: Profile, lead: tuple[int, ...]
+    ) -> Damage | None:
+        """What the fault has done to tools (...,); None without one."""
+        if self.kind == NONE:
+            return None
+        if self.kind == "dead-channel":
+            drawn = rng.integers(6, size=lead) if not self.channel else self._place(profile)
+            dead = np.arange(6) == np.broadcast_to(drawn, lead)[..., None]
+            reading = np.full((*lead, 6), self.reading)
+            above = -np.inf if self.above_c is None else self.above_c
+            return Damage(np.zeros((*lead, SIZE)), dead, reading, above)
+        forms = [form for form in faults(profile) if form.kind == self.kind]
+        if self.channel:
+            forms = [form for form in forms if form.channel in (None, self._place(profile))]
+        return drawn_damage(rng, forms, self.size, lead)
+
+    def _place(self, profile: Profile) -> int:
+        """The component of both triads that the channel measures; of a triad -1 or -2."""
+        if self.channel in TRIADS:
+            return -1 - TRIADS.index(self.channel)
+        triad = "am".index(self.channel[0])
+        permutation = getattr(profile, TRIADS[triad]).permutation
+        return 3 * triad + int(np.argmax(np.abs(permutation[:, "xyz".index(self.channel[1])])))
+
+
 class Effects(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """All effects of a session."""
 
@@ -89,6 +135,7 @@ class Effects(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     stand: StandEffects = StandEffects()
     temperature: TemperatureEffects = TemperatureEffects()
     earth: EarthEffects = EarthEffects()
+    fault: FaultEffect = FaultEffect()
 
 
 def load_effects(name_or_path: str) -> tuple[Effects, str]:
@@ -96,20 +143,29 @@ def load_effects(name_or_path: str) -> tuple[Effects, str]:
     effects, digest = decoded_toml(name_or_path, Effects, "effects", "file of effects", "Planning")
     for section, values in msgspec.to_builtins(effects).items():
         for key, value in values.items():
-            if value is not None:
+            if isinstance(value, float):
                 _check(f"{name_or_path}, key '{section}.{key}'", key, value)
+    _check_channel(f"{name_or_path}, key 'fault.channel'", effects.fault)
     return effects, digest
 
 
 def _check(where: str, key: str, value: float) -> None:
     """Refuse a size that no effect has."""
     positive = key in ("instability_minutes", "variation_minutes", "saturation")
-    low = -LARGEST_EFFECT if key == "drift_c_per_hour" else 0.0
+    low = -LARGEST_EFFECT if key in ("drift_c_per_hour", "reading", "above_c") else 0.0
     if not low <= value <= LARGEST_EFFECT or (positive and value == 0):
         word = "above 0" if positive else f"at least {low:g}"
         raise InputError(
             f"{where}: must be {word} and at most {LARGEST_EFFECT:g}; got {value}. Correct it, or leave it out."
         )
+
+
+def _check_channel(where: str, fault: FaultEffect) -> None:
+    """Refuse a channel that the fault does not have."""
+    on_one = fault.kind == "dead-channel" and fault.channel not in TRIADS
+    if fault.channel and not on_one and fault.kind != "impact":
+        whole = "one channel, such as ax" if fault.kind == "dead-channel" else "left out"
+        raise InputError(f"{where}: of '{fault.kind}' it must be {whole}; got '{fault.channel}'.")
 
 
 def wandering(

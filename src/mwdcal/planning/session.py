@@ -47,6 +47,7 @@ class Session:
             InputError: the plan does not state an attitude, or the profile not the noise of a triad.
         """
         readings, scaled = nominal_run(plan, profile)
+        readings = replace(readings, profile=scaled)
         return cls(plan, scaled, readings, station_minutes(plan), effects or Effects())
 
     @property
@@ -125,6 +126,7 @@ def session_facts(
         "stand": stand,
         "earth": {"gravity_g": earth["gravity"], "field_nt": earth["field"], "dip_deg": float(dip)},
         "turn_on": {name: value.tolist() for name, value in result.turn_on.items()},
+        "fault": {} if result.damage is None else result.damage.described(),
     }
 
 

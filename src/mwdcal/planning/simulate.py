@@ -14,6 +14,7 @@ import numpy as np
 from mwdcal.calibration.prediction import raw_reading
 from mwdcal.calibration.readings import CONSTANTS, TRIADS, Readings
 from mwdcal.estimation.evidence import ANGLES
+from mwdcal.faults.physics import Damage, changed_field, changed_readings
 from mwdcal.geometry.vectors import (
     Array,
     earth_field,
@@ -24,26 +25,10 @@ from mwdcal.geometry.vectors import (
 )
 from mwdcal.planning.effects import Effects, approach, response, wandering
 from mwdcal.planning.plans import ROOM_TEMPERATURE
+from mwdcal.sensor.datasheets import ROOT3, tolerance
 from mwdcal.sensor.models import Basis, Factors, Model
-from mwdcal.sensor.profile import COMMON, Datasheet, Profile
+from mwdcal.sensor.profile import COMMON, Profile
 
-ROOT3 = np.sqrt(3.0)
-"""Half the width of a uniform distribution, in its standard deviations."""
-SERVO = {
-    "accelerometer": Datasheet(
-        scale=0.05 / ROOT3, bias=0.010 / ROOT3, misalignment_deg=np.degrees(2e-3) / ROOT3,
-        scale_per_c=180e-6 / ROOT3, bias_per_c=100e-6 / ROOT3,
-    ),
-    "magnetometer": Datasheet(
-        scale=0.02 / ROOT3, bias=500.0 / ROOT3, misalignment_deg=np.degrees(4e-3) / ROOT3,
-        scale_per_c=100e-6 / ROOT3, bias_per_c=2.0 / ROOT3,
-    ),
-}  # fmt: skip
-"""A servo instrument within the limits of Moosavi's Table 1, 1σ of uniform distributions.
-
-Scale ± 5 %, bias ± 10 mg, axis alignment ± 2 mrad, scale drift ± 180 ppm/°C, bias drift ± 100 µg/°C.
-The magnetometer: scale ± 2 %, hard iron ± 1 % of 50 µT, alignment ± 4 mrad.
-"""
 DRIFT_POWERS = np.array([1.0, 1e-3, 1e-6])
 """Powers of a drift over temperature: the square and the cube are a tenth and a hundredth of it over 100 °C."""
 
@@ -150,10 +135,7 @@ def drawn(
     """
     unit = rng.uniform(-ROOT3, ROOT3, (*lead, len(TRIADS), 30))
     first, second = (
-        _factors(
-            unit[..., k, :], getattr(profile, name).datasheet or SERVO[name], SERVO[name], order
-        )
-        for k, name in enumerate(TRIADS)
+        _factors(unit[..., k, :], profile, name, order) for k, name in enumerate(TRIADS)
     )
     declared = [getattr(profile, name).nonlinearity for name in TRIADS]
     curves = [sd and sd * rng.uniform(-ROOT3, ROOT3, (*lead, 3, 2)) for sd in declared]
@@ -161,21 +143,16 @@ def drawn(
     return Truth(first, second, order=order, reference=reference, curves=tuple(curves))
 
 
-def _factors(unit: Array, sheet: Datasheet, usual: Datasheet, order: int) -> Array:
-    """Factors (..., k) within tolerances, of numbers (..., 30) of standard deviation 1."""
-
-    def tolerance(name: str) -> float:
-        stated = getattr(sheet, name)
-        return float(getattr(usual, name) if stated is None else stated)
-
+def _factors(unit: Array, profile: Profile, triad: str, order: int) -> Array:
+    """Factors (..., k) of a triad within tolerances, of numbers (..., 30) of standard deviation 1."""
     parts = []
     for start, middle, name in ((0, 1.0, "scale"), (12, 0.0, "bias")):
-        steady = middle + tolerance(name) * unit[..., start : start + 3, None]
+        steady = middle + tolerance(profile, triad, name) * unit[..., start : start + 3, None]
         drift = unit[..., start + 3 : start + 12].reshape(*unit.shape[:-1], 3, 3)
-        powers = tolerance(f"{name}_per_c") * drift * DRIFT_POWERS
+        powers = tolerance(profile, triad, f"{name}_per_c") * drift * DRIFT_POWERS
         parts.append(np.concatenate([steady, powers], -1)[..., : order + 1])
     linear = [part.reshape(*unit.shape[:-1], -1) for part in parts]
-    turns = np.radians(tolerance("misalignment_deg")) * unit[..., 24:]
+    turns = np.radians(tolerance(profile, triad, "misalignment_deg")) * unit[..., 24:]
     return np.concatenate([*linear, turns], -1)
 
 
@@ -216,13 +193,15 @@ def run(
 class Simulation:
     """Readings of tools (..., n, 3), and what is true of their sessions.
 
-    `angles` by name and `temperature` of the sensors (..., n), radians and °C; `turn_on` (..., 3) by triad.
+    `angles` by name and `temperature` of the sensors (..., n), radians and °C; `turn_on` (..., 3) by triad;
+    `damage` of a tool at fault.
     """
 
     readings: Readings
     angles: dict[str, Array]
     temperature: Array
     turn_on: dict[str, Array]
+    damage: Damage | None = None
 
 
 def common_errors(
@@ -267,10 +246,11 @@ def simulated(
         + session.uncertainty(name) * rng.normal(size=(*lead, count))
         for name in ANGLES
     }
-    vectors = _vectors(session, angles, rng, effects, common, times)
+    damage = effects.fault.damage(rng, session.profile or Profile(name="servo"), lead)
+    vectors = _vectors(session, angles, rng, effects, common, times, damage)
     warmth, recorded = _temperatures(session, effects, times)
     readings, turn_on = {}, {}
-    for name, exact in truth.readings(vectors, warmth).items():
+    for name, exact in _read(truth, vectors, warmth, damage).items():
         sensor = getattr(effects, name)
         whole = exact
         if sensor.turn_on:
@@ -289,7 +269,7 @@ def simulated(
         station=session.station,
         metadata={**session.metadata, "simulated": True},
     )
-    return Simulation(result, angles, warmth, turn_on)
+    return Simulation(result, angles, warmth, turn_on, damage)
 
 
 def _settings(session: Readings, name: str, effects: Effects, common: Mapping[str, Array]) -> Array:
@@ -302,9 +282,9 @@ def _settings(session: Readings, name: str, effects: Effects, common: Mapping[st
 
 def _vectors(
     session: Readings, angles: Mapping[str, Array], rng: np.random.Generator, effects: Effects,
-    common: Mapping[str, Array], minutes: Array,
+    common: Mapping[str, Array], minutes: Array, damage: Damage | None,
 ) -> tuple[Array, Array]:  # fmt: skip
-    """Gravity and field (..., n, 3) in the frames of the tools."""
+    """Gravity and field (..., n, 3) in the frames of the tools, at their sensors."""
     gravity, field, dip = (
         session.known[name] + np.asarray(common.get(name, 0.0))[..., None] for name in CONSTANTS
     )
@@ -319,7 +299,20 @@ def _vectors(
         size = effects.earth.variation_nt, effects.earth.variation_minutes
         earth[1] = earth[1] + wandering(rng, attitude.shape[:-1], minutes, *size)
     g, b = (np.einsum("...ij,...j->...i", attitude, vector) for vector in earth)
-    return g, b
+    return g, b if damage is None else changed_field(damage, b, attitude)
+
+
+def _read(
+    truth: Truth, vectors: tuple[Array, Array], temperature: Array, damage: Damage | None
+) -> dict[str, Array]:
+    """Readings (..., n, 3) of each triad without noise, of tools that may be at fault."""
+    sound = truth.readings(vectors, temperature)
+    if damage is None:
+        return sound
+    whole = [sound.get(name, 0 * vector) for name, vector in zip(TRIADS, vectors, strict=True)]
+    raw, both = (np.concatenate(pair, -1) for pair in (whole, vectors))
+    changed = changed_readings(damage, raw, both, temperature, truth.reference)
+    return {name: changed[..., 3 * i : 3 * i + 3] for i, name in enumerate(sound)}
 
 
 def _temperatures(

@@ -41,7 +41,8 @@ class SimulationSummary(msgspec.Struct, frozen=True, kw_only=True):
 
     Parameters by triad in raw units, as `convert` prints them in this `notation`: factors (SF, B, m), or affine (M, b)
     for a calibration that is linear in its parameters above order 0. `stand`: errors common to the session, such
-    that reading = value + zero. `turn_on`: bias of the channels along the tool axes, g or nT. Of many repetitions
+    that reading = value + zero. `turn_on`: bias of the channels along the tool axes, g or nT. `fault`: departures of
+    a tool at fault, by kind. Of many repetitions
     `repetition` has what they show, and what is true of a single run is empty.
     """
 
@@ -56,6 +57,7 @@ class SimulationSummary(msgspec.Struct, frozen=True, kw_only=True):
     earth: dict[str, float] = {}
     stand: dict[str, float] = {}
     turn_on: dict[str, list[float]] = {}
+    fault: dict[str, list[float]] = {}
     effects: Effects
     stations: list[TrueAttitude] = []
     repetition: Repetition | None = None

@@ -1,0 +1,47 @@
+"""`mwdcal diagnose`: what has happened to a calibrated tool, by later readings."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from mwdcal.app.commands import options
+from mwdcal.app.messages import findings_as_typed, print_result
+
+
+@options.command()
+@options.CALIBRATION
+@options.argument("readings")
+@options.DECIMAL
+@options.JSON
+def command(calibration: Path, readings: Path, decimal: str, as_json: bool) -> None:
+    """Say which fault, if any, later READINGS of the tool of a CALIBRATION show.
+
+    READINGS are a roll test or surveys, a run file with the references that are known, or none.
+
+    \b
+    Example: mwdcal diagnose tool.json rolltest.csv
+    Exit: 0 still fine, 1 a fault is named, 2 input cannot be read or is of the fit itself.
+    """
+    from msgspec.structs import replace
+
+    from mwdcal.app.envelope import enveloped
+    from mwdcal.app.screens.diagnosis import screen
+    from mwdcal.calibration.diagnosis.findings import unused_columns
+    from mwdcal.faults.diagnosis import diagnose
+    from mwdcal.faults.physics import NONE
+    from mwdcal.files import documents, runs
+
+    options.check_outputs([], [calibration, readings])
+    fitted, digest = documents.load(calibration)
+    later, _ = runs.read_run(readings, fitted.profile, decimal=decimal)
+    result = diagnose(fitted, later)
+    findings = findings_as_typed(
+        [*fitted.change_findings(), *result.findings, *unused_columns(later.unused)]
+    )
+    result = replace(result, findings=findings)
+    stated = fitted.tool, later.metadata
+    digests = {"calibration": digest, "readings": later.run_sha256}
+    document = enveloped("diagnose", result, *stated, **digests)
+    print_result(document if as_json else screen(result, *stated), findings)
+    sys.exit(0 if result.fault == NONE else 1)

@@ -1,0 +1,377 @@
+"""Faults: their physics against finite differences, the evidence against a dense normal density, names and rates."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.stats import binom, multivariate_normal
+
+import mwdcal
+from cli_support import SERVO_NOISE, read_csv, refused, servo_run, write_csv
+from cli_support import mwdcal as command
+from mwdcal.calibration.options import Options
+from mwdcal.calibration.prediction import raw_reading
+from mwdcal.faults import physics
+from mwdcal.faults.diagnosis import diagnose
+from mwdcal.faults.likelihood import Suspect, explained, raw_of, repeated
+from mwdcal.faults.physics import DEPARTURES, FAULTS, NONE, SIZE, Damage
+from mwdcal.faults.weighing import padded
+from mwdcal.geometry.vectors import reference_vectors, tool_from_earth
+from mwdcal.planning import simulate
+from mwdcal.planning.effects import Effects, FaultEffect, load_effects
+from mwdcal.sensor.profile import Profile
+from simulation import Tool
+
+PLAN = simulate.grid([5, 45, 90, 135], 6, [0, 90, 180, 270], [20.0, 90.0])
+ROLL = simulate.grid([5, 45, 90], 4, [0, 120, 240], [90.0])
+NOISE = {
+    "accelerometer": np.full((ROLL.count, 3), 1e-4),
+    "magnetometer": np.full((ROLL.count, 3), 15.0),
+}
+ANGLES = ROLL.inclination, ROLL.azimuth, ROLL.toolface
+DIP = np.radians(63.0)
+
+
+@cache
+def tool(number):
+    """A tool and its calibration, of a run of its own with the noise declared."""
+    rng = np.random.default_rng([77, number])
+    truth = simulate.drawn(rng, Profile(name="servo"), order=1)
+    run = simulate.run(truth, PLAN, rng)
+    sd = {name: np.resize(value[0], (PLAN.count, 3)) for name, value in NOISE.items()}
+    return mwdcal.calibrate(
+        replace(run, sd=sd), options=Options(order=1, nonlinearity="none")
+    ), truth
+
+
+def later(number, seed=0, known=None, **fault):
+    """A roll test of a tool that may be at fault."""
+    _, truth = tool(number)
+    references = dict(zip(("inclination", "azimuth", "toolface"), ANGLES, strict=True))
+    references |= {"gravity": np.ones(ROLL.count), "field": np.full(ROLL.count, truth.field)}
+    references |= {"dip": np.full(ROLL.count, truth.dip)}
+    blank = np.zeros((ROLL.count, 3))
+    session = mwdcal.Readings(blank, blank, ROLL.temperature, references, NOISE)
+    rng, effects = np.random.default_rng([78, number, seed]), Effects(fault=FaultEffect(**fault))
+    result = simulate.simulated(truth, session, rng, effects)
+    kept = references if known is None else {name: references[name] for name in known}
+    return replace(result.readings, known=kept), result.damage
+
+
+# Physics
+
+
+def read(departures, raw, vectors, attitude, temperature):
+    """Readings of a tool of unit gains, with departures."""
+    damage = Damage(departures, np.zeros(6, bool), np.zeros(6))
+    field = physics.changed_field(damage, vectors[:, 3:], attitude)
+    whole = np.concatenate([vectors[:, :3], field], -1)
+    return physics.changed_readings(damage, raw + whole - vectors, whole, temperature, 30.0)
+
+
+def test_columns_are_derivatives_of_the_physics():
+    vectors = np.concatenate(reference_vectors(*ANGLES, 1.0, 48_000.0, DIP), -1)
+    attitude, raw = tool_from_earth(*ANGLES), 1.01 * vectors
+    warmth, gain = ROLL.temperature - 30.0, np.broadcast_to(np.eye(3), attitude.shape)
+    columns = physics.columns(raw, vectors, attitude, warmth, gain)
+    for place in range(SIZE):
+        step = 1e-6 * np.eye(SIZE)[place]
+        up, down = (read(s * step, raw, vectors, attitude, ROLL.temperature) for s in (1, -1))
+        np.testing.assert_allclose((up - down) / 2e-6, columns[..., place], atol=2e-4, rtol=1e-6)
+
+
+def test_what_turns_with_the_tool_and_what_stays_in_the_earth():
+    attitude = tool_from_earth(*ANGLES)
+    field = reference_vectors(*ANGLES, 1.0, 48_000.0, DIP)[1]
+    departures = np.zeros(SIZE)
+    departures[DEPARTURES["disturbance"]] = 300.0, -200.0, 100.0
+    damage = Damage(departures, np.zeros(6, bool), np.zeros(6))
+    strength = np.linalg.norm(physics.changed_field(damage, field, attitude), axis=-1)
+    level, down = 48_000 * np.cos(DIP) + 300, 48_000 * np.sin(DIP) + 100
+    np.testing.assert_allclose(strength, np.sqrt(level**2 + 200**2 + down**2))
+    departures[:] = 0.0
+    departures[DEPARTURES["iron"]] = 10.0, 20.0, 200.0
+    changed = physics.changed_field(Damage(departures, *[np.zeros(6)] * 2), field, attitude) - field
+    np.testing.assert_allclose(changed, np.tile([10.0, 20.0, 200.0], (ROLL.count, 1)), atol=1e-9)
+
+
+def test_a_turned_axis_keeps_its_gain():
+    """Turned by 3 and 4 units a unit vector points along (1, 3, 4) / √26."""
+    departures = np.zeros(SIZE)
+    departures[DEPARTURES["turn"]][:2] = 3.0, 4.0
+    damage = Damage(departures, np.zeros(6, bool), np.zeros(6))
+    vectors = np.eye(3, 6)
+    read = physics.changed_readings(damage, vectors, vectors, np.full(3, 30.0), 30.0)
+    np.testing.assert_allclose(read[:, 0], np.array([1.0, 3.0, 4.0]) / np.sqrt(26))
+
+
+def test_a_channel_dies_of_heat():
+    damage = Damage(np.zeros(SIZE), np.arange(6) == 2, np.full(6, 0.3), above=80.0)
+    raw = np.ones((2, 6))
+    read = physics.changed_readings(damage, raw, raw, np.array([79.0, 81.0]), 30.0)
+    np.testing.assert_allclose(read, [[1] * 6, [1, 1, 0.3, 1, 1, 1]])
+
+
+# Evidence
+
+
+def test_the_evidence_is_that_of_a_normal_density():
+    """With exact attitudes the readings are normal: their covariance by finite differences, dense."""
+    calibration, _ = tool(0)
+    readings, _ = later(0, kind="turn-on", size=0.3)
+    suspect = Suspect.of(calibration, readings)
+    forms = physics.faults(calibration.profile)
+    each = repeated(suspect, np.zeros(len(forms), int))
+    none = explained(suspect, np.zeros((1, SIZE, 0)), suspect.start())
+    best = explained(each, padded(forms), each.start())
+    vectors = reference_vectors(*ANGLES, 1.0, 48_000.0, DIP)
+    ends = np.cumsum([0, *(len(t.parameters) for t in calibration.triads)])
+
+    def forward(params):
+        parts = [
+            raw_reading(t.functions(30.0), params[a:b], v, ROLL.temperature)
+            for t, v, a, b in zip(calibration.triads, vectors, ends, ends[1:], strict=False)
+        ]
+        return np.concatenate(parts, -1)
+
+    params = calibration.parameters
+    sd = np.sqrt(np.diag(calibration.parameter_covariance))
+    slopes = [(forward(params + s) - forward(params - s)).ravel() / 2 for s in np.diag(sd)]
+    jacobian = np.stack(slopes, -1) / sd
+    mean = forward(params)
+    noise = np.concatenate([NOISE["accelerometer"], NOISE["magnetometer"]], -1).ravel() ** 2
+    sound = np.diag(noise) + jacobian @ calibration.parameter_covariance @ jacobian.T
+    scale = np.sqrt(noise)
+    difference = (raw_of(suspect.problem)[0] - mean).ravel() / scale
+
+    def density(covariance):
+        return multivariate_normal(cov=covariance / np.outer(scale, scale)).logpdf(difference)
+
+    attitude = tool_from_earth(*ANGLES)
+    gain = np.linalg.inv(calibration.magnetometer.functions(30.0).slope(
+        np.array(calibration.magnetometer.parameters), mean[:, 3:], ROLL.temperature))  # fmt: skip
+    seen = physics.columns(mean, np.concatenate(vectors, -1), attitude, ROLL.temperature - 30, gain)
+    for form, evidence in zip(forms, best.evidence - none.evidence, strict=True):
+        change = (seen @ form.mixing).reshape(-1, form.mixing.shape[1])
+        expected = density(sound + change @ change.T) - density(sound)
+        assert evidence == pytest.approx(expected, abs=0.02, rel=2e-3), form
+
+
+def test_a_sound_tool_gives_an_alarm_no_more_often_than_stated():
+    """Of 30 chances the smallest tenth holds no more than its binomial share, and 1 % alarms hardly any."""
+    chances = [
+        diagnose(tool(n)[0], later(n, s)[0], draws=199).probability
+        for n in range(6)
+        for s in range(5)
+    ]
+    assert np.count_nonzero(np.array(chances) <= 0.1) <= binom.ppf(0.999, 30, 0.1)
+    assert np.count_nonzero(np.array(chances) <= 0.01) <= binom.ppf(0.999, 30, 0.01)
+    assert 0.3 < np.mean(chances) < 0.5 + 5 * 0.29 / np.sqrt(30)
+
+
+@pytest.mark.parametrize("kind", FAULTS)
+def test_faults_of_the_usual_size_are_named(kind):
+    named, scores = [], []
+    for number in range(6):
+        readings, damage = later(number, kind=kind, reading=0.2)
+        result = diagnose(tool(number)[0], readings, draws=199)
+        named.append(result.fault)
+        if kind in ("magnetised", "casing") and result.fault == kind:
+            where = "iron" if kind == "magnetised" else "disturbance"
+            names = ["x", "y", "z"] if kind == "magnetised" else ["north", "east", "down"]
+            for row in result.parameters:
+                true = damage.part(where)[0, names.index(row.parameter.split()[-1])]
+                scores.append((row.size - true) / row.uncertainty)
+    assert named.count(kind) >= 5
+    assert np.sum(np.square(scores)) < 45  # of 18: chance 4e-4
+
+
+@pytest.mark.parametrize("channel", ["ax", "az", "my"])
+def test_an_impact_names_its_channel_and_size(channel):
+    calibration, _ = tool(1)
+    readings, damage = later(1, kind="impact", channel=channel)
+    result = diagnose(calibration, readings)
+    assert (result.fault, result.channel) == ("impact", channel)
+    place = ("ax", "ay", "az", "mx", "my", "mz").index(channel)
+    bias = next(row for row in result.parameters if row.parameter == "bias")
+    true = damage.part("bias")[0, place] * (1e3 if place < 3 else 1.0)
+    assert abs(bias.size - true) < 4 * bias.uncertainty
+    assert bias.unit == ("mg" if place < 3 else "nT")
+
+
+def test_a_dead_channel_is_named_without_references_too():
+    for known in (None, ("field", "dip")):
+        readings, _ = later(2, known=known, kind="dead-channel", channel="my", reading=12_345.0)
+        result = diagnose(tool(2)[0], readings)
+        assert (result.fault, result.channel, result.unit) == ("dead-channel", "my", "nT")
+        assert result.size == pytest.approx(12_345.0, abs=5 * result.size_uncertainty)
+
+
+def test_iron_and_a_bias_of_the_axial_channel_are_alike_in_principle():
+    """A field along the tool axis is a bias of mz at any attitude: their columns have one direction."""
+    calibration, truth = tool(3)
+    readings, _ = later(3)
+    gain = np.linalg.inv(truth.triads["magnetometer"][0].slope(truth.magnetometer, readings.magnetometer,
+                                                                ROLL.temperature))  # fmt: skip
+    moved = readings.magnetometer + gain @ np.array([0.0, 0.0, 200.0])
+    result = diagnose(calibration, replace(readings, magnetometer=moved))
+    assert result.fault == "magnetised"
+    assert result.confounded_with == ["impact"]
+    assert "collar" in result.tell_apart[0].reading
+    assert result.size == pytest.approx(200.0, abs=4 * result.size_uncertainty)
+
+
+# Readings that say little
+
+
+def test_one_station_without_references_names_nothing():
+    readings, _ = later(4, known=())
+    one = readings.select(np.arange(ROLL.count) == 0)
+    result = diagnose(tool(4)[0], one)
+    assert result.fault == NONE
+    assert {"magnetised", "casing"} <= {*result.unseen}
+    assert result.likelihoods[NONE] < 0.5
+
+
+def test_an_accelerometer_alone_and_no_temperature():
+    readings, _ = later(4, kind="impact", channel="ax")
+    result = diagnose(tool(4)[0], replace(readings, magnetometer=None))
+    assert (result.fault, result.channel) == ("impact", "ax")
+    assert "no-magnetometer" in {finding.id for finding in result.findings}
+    assert result.likelihoods["casing"] == result.likelihoods[NONE]
+    with pytest.raises(mwdcal.InputError, match="temperature_c"):
+        diagnose(tool(4)[0], replace(readings, temperature=None))
+
+
+def test_a_relative_field():
+    _, truth = tool(5)
+    run = simulate.run(truth, PLAN, np.random.default_rng(1))
+    known = {name: value for name, value in run.known.items() if name != "field"}
+    calibration = mwdcal.calibrate(
+        replace(run, known=known), options=Options(order=1, nonlinearity="none")
+    )
+    for fault in ("none", "casing"):
+        result = diagnose(calibration, later(5, kind=fault)[0])
+        assert result.fault == fault
+        assert "relative-field" in {finding.id for finding in result.findings}
+
+
+def test_readings_of_another_unit_do_not_look_fine():
+    readings, _ = later(4)
+    result = diagnose(tool(4)[0], replace(readings, magnetometer=readings.magnetometer / 1000))
+    assert result.fault != NONE
+    assert "unexplained" in {finding.id for finding in result.findings}
+
+
+# The command
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("diagnose")
+    assert command("example", folder / "demo").code == 0
+    demo = folder / "demo"
+    fit = ("calibrate", demo / "run.csv", "--tool", demo / "tool.toml", "-o", folder / "tool.json")
+    assert command(*fit).code == 0
+    return folder
+
+
+def test_the_command_says_still_fine(files):
+    ran = command("diagnose", files / "tool.json", files / "demo" / "rolltest.csv")
+    assert ran.code == 0
+    assert ran.out.startswith("still fine: ")
+    assert "SIMULATED" in ran.out
+
+
+def test_the_command_names_a_fault_in_raw_units(files, tmp_path):
+    columns = read_csv(files / "demo" / "rolltest.csv")
+    columns["ay"] = [float(value) + 0.03 for value in columns["ay"]]  # 10 mg at 3 V/g
+    write_csv(tmp_path / "knocked.csv", columns)
+    ran = command("diagnose", files / "tool.json", tmp_path / "knocked.csv", "--json")
+    assert ran.code == 1
+    assert (ran.json["fault"], ran.json["channel"], ran.json["unit"]) == ("impact", "ay", "mg")
+    assert abs(ran.json["size"] - 10) < 4 * ran.json["size_uncertainty"]
+    assert sum(ran.json["likelihoods"].values()) == pytest.approx(1)
+    assert command("diagnose", files / "tool.json", tmp_path / "knocked.csv").out.startswith(
+        "impact on channel ay: bias moved by "
+    )
+
+
+def test_the_command_refuses_what_says_nothing(files, tmp_path):
+    demo = files / "demo"
+    assert "own fit" in refused(command("diagnose", files / "tool.json", demo / "run.csv"), 2)
+    columns = read_csv(demo / "rolltest.csv")
+    write_csv(tmp_path / "other.csv", columns, 'serial = "another"')
+    assert "tool another" in refused(
+        command("diagnose", files / "tool.json", tmp_path / "other.csv"), 2
+    )
+
+
+def test_channels_have_their_own_names_and_signs(tmp_path):
+    """A tool whose ay measures -x: a step of +6 mg of that channel is one, whatever its axis."""
+    (tmp_path / "odd.toml").write_text(
+        'name = "odd"\n[accelerometer]\naxes = ["+z", "-x", "+y"]\nscale = 1.0\nnoise = 1e-4\n'
+        '[magnetometer]\naxes = ["+x", "+y", "+z"]\nscale = 1.0\nnoise = 15.0\n', "utf-8")  # fmt: skip
+    (tmp_path / "plan.toml").write_text(
+        'name = "p"\n[[stations]]\ninclination_deg = [5, 45, 90, 135]\ntoolface_deg = [0, 90, 180, 270]\n', "utf-8"
+    )  # fmt: skip
+    (tmp_path / "fault.toml").write_text('[fault]\nkind = "impact"\nchannel = "ay"\n', "utf-8")
+    run = (
+        "simulate",
+        "--plan",
+        tmp_path / "plan.toml",
+        "--tool",
+        tmp_path / "odd.toml",
+        "--order",
+        "0",
+    )
+    assert command(*run, "--seed", "1", "-o", tmp_path / "run.csv").code == 0
+    fit = (
+        "calibrate",
+        tmp_path / "run.csv",
+        "--tool",
+        tmp_path / "odd.toml",
+        "-o",
+        tmp_path / "cal.json",
+    )
+    assert command(*fit, "--order", "0").code == 0
+    again = (
+        "simulate",
+        "--plan",
+        tmp_path / "plan.toml",
+        "--calibration",
+        tmp_path / "cal.json",
+        "--seed",
+        "2",
+    )
+    effects = ("--effects", tmp_path / "fault.toml", "-o", tmp_path / "later.csv", "--json")
+    truth = command(*again, *effects).json
+    ran = command("diagnose", tmp_path / "cal.json", tmp_path / "later.csv", "--json")
+    assert (ran.code, ran.json["fault"], ran.json["channel"]) == (1, "impact", "ay")
+    bias = next(row for row in ran.json["parameters"] if row["parameter"] == "bias")
+    assert abs(bias["size"] + 1e3 * truth["fault"]["bias"][0]) < 4 * bias["uncertainty"]
+
+
+@pytest.mark.parametrize(
+    "text", ['kind = "heat"\nchannel = "ax"', 'kind = "dead-channel"\nchannel = "accelerometer"']
+)
+def test_effects_refuse_a_channel_that_the_fault_lacks(text, tmp_path):
+    (tmp_path / "odd.toml").write_text(f"[fault]\n{text}\n", "utf-8")
+    with pytest.raises(mwdcal.InputError, match="fault.channel"):
+        load_effects(str(tmp_path / "odd.toml"))
+
+
+def test_a_run_of_the_tests_own_model_is_still_fine(tmp_path):
+    """Readings by the formulas of the tests, not of the package; those of another tool are not explained."""
+    sound = Tool.random(1, noise=SERVO_NOISE)
+    write_csv(tmp_path / "run.csv", servo_run(1, tool=sound))
+    write_csv(tmp_path / "later.csv", servo_run(2, (30, 80), 6, tool=sound))
+    fit = ("calibrate", tmp_path / "run.csv", "--tool", "servo", "-o", tmp_path / "cal.json")
+    assert command(*fit).code == 0
+    ran = command("diagnose", tmp_path / "cal.json", tmp_path / "later.csv")
+    assert (ran.code, ran.err) == (0, "")
+    write_csv(tmp_path / "other.csv", servo_run(2, (30, 80), 6))
+    ran = command("diagnose", tmp_path / "cal.json", tmp_path / "other.csv")
+    assert ran.code == 1
+    assert "no single fault explains" in ran.err
