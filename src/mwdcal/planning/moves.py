@@ -13,7 +13,7 @@ from mwdcal.geometry.vectors import Array, Bools, Ints
 
 MOST_ORDERED = 2_000
 """Stations of one soak that are put in order; a longer plan keeps its own."""
-WITHIN = 1e-6
+AT_ENDS_WITHIN = 1e-6
 """A setting so little beyond what the stand reaches is within it, degrees."""
 
 
@@ -56,7 +56,7 @@ class Stand:
         settings = attitude.copy()
         for place, name in enumerate(ANGLES):
             if name in self.reach and place:
-                low = self.reach[name][0] - WITHIN
+                low = self.reach[name][0] - AT_ENDS_WITHIN
                 settings[:, place] = low + (attitude[:, place] - low) % 360
         return settings
 
@@ -64,7 +64,7 @@ class Stand:
         """Which angles (n, 3) of attitudes (n, 3), degrees, the stand reaches."""
         low, high = np.transpose([self.reach.get(name, (-np.inf, np.inf)) for name in ANGLES])
         settings = self.settings(attitude)
-        return np.asarray((settings >= low - WITHIN) & (settings <= high + WITHIN))
+        return np.asarray((settings >= low - AT_ENDS_WITHIN) & (settings <= high + AT_ENDS_WITHIN))
 
 
 USUAL_STAND = Stand()
