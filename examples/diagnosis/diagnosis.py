@@ -164,7 +164,7 @@ def page(results: list, count: int) -> str:
     """The page of documentation."""
     lines = [HEAD.format(count=count)]
     for scene, words in SCENES.items():
-        lines += [f"### {words[0].upper()}{words[1:]}", "", *confusion(results, scene), ""]
+        lines += [f"## {words[0].upper()}{words[1:]}", "", *confusion(results, scene), ""]
     lines += ["## Sizes", "", SIZES, "", *coverage(results)]
     return "\n".join(lines) + "\n"
 
