@@ -329,6 +329,7 @@ def test_a_quiet_completion_prints_nothing():
 
 
 if __name__ == "__main__":
+    progress.PATIENCE = 600.0
     progress.slowly.__defaults__ = (600.0,)
     with tempfile.TemporaryDirectory() as place:
         prepared(Path(place))
