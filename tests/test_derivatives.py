@@ -184,6 +184,8 @@ def test_every_observable_through_the_model(kind, order, parameters, lead):
             -1,
         )
         there = ~VERTICAL if name in ("toolface", "azimuth") else VERTICAL | True
+        if name == "north_toolface":  # not upside down
+            there = np.arange(len(VERTICAL)) != 1
         with np.errstate(all="ignore"):
             expected = complex_steps(lambda p, n=name: written(n, p), whole)
         assert np.isnan(observable.value(*fields)[..., ~there]).all()

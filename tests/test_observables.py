@@ -31,9 +31,19 @@ def complex_value(name, x):
         "gravity": lambda: size(g),
         "field": lambda: size(b),
         "dip": lambda: atan2(dot(g, b), size(cross)),
-        "north_toolface": lambda: values["azimuth"]() + values["toolface"](),
+        "north_toolface": lambda: atan2(*upright(g / size(g)[..., None], b)),
     }
     return values[name]()
+
+
+def upright(down, b):
+    """x and y of b in a tool turned so that unit vector `down` is its z axis, the shortest way (Rodrigues)."""
+    axis = np.stack([down[..., 1], -down[..., 0], 0 * down[..., 0]], -1)
+    once = np.cross(axis, b)
+    lean, less = 1 + down[..., 2:], 1 - down[..., 2:]
+    lean = np.where(lean.real < 1, np.sum(down[..., :2] ** 2, -1, keepdims=True) / less, lean)
+    turned = b + once + np.cross(axis, once) / lean
+    return turned[..., 0], turned[..., 1]
 
 
 ANGLES_AND_STRENGTHS = (

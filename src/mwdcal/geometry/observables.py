@@ -61,15 +61,17 @@ def magnetic_toolface(g: Array, b: Array) -> Array:
     return wrap(np.arctan2(b[..., 0], b[..., 1]))
 
 
-def _north_parts(g: Array, b: Array) -> tuple[Array, Array, Array]:
-    """Gravity's direction u, the field t in a tool turned upright by the shortest way, and what is taken off it.
+def _north_parts(g: Array, b: Array) -> tuple[Array, Array, Array, Array]:
+    """Gravity's direction u, 1 + u_z, the field t in a tool turned upright by the shortest way, and s.
 
-    Definition: t = b - s u across the tool axis, s = (u·b + b_z) / (1 + u_z).
+    Definition: t = b - s u across the tool axis, s = (u·b + b_z) / (1 + u_z); without cancellation upside down.
     """
     upright = np.where(is_vertical(g) & (g[..., 2] < 0), np.nan, 1.0)[..., None]
     down = _unit(g) * upright
-    share = (np.sum(down * b, -1) + b[..., 2]) / (1 + down[..., 2])
-    return down, b - share[..., None] * down, share
+    x, y, z = np.moveaxis(down, -1, 0)
+    lean = np.where(z < 0, (x**2 + y**2) / (1 - np.minimum(z, 0.0)), 1 + z)
+    share = (x * b[..., 0] + y * b[..., 1]) / lean + b[..., 2]
+    return down, lean, b - share[..., None] * down, share
 
 
 def north_toolface(g: Array, b: Array) -> Array:
@@ -77,7 +79,7 @@ def north_toolface(g: Array, b: Array) -> Array:
 
     Singular: NaN at 180° inclination, where azimuth - toolface matters instead.
     """
-    _, turned, _ = _north_parts(g, b)
+    _, _, turned, _ = _north_parts(g, b)
     return wrap(np.arctan2(turned[..., 0], turned[..., 1]))
 
 
@@ -154,10 +156,10 @@ def _azimuth_gradient(g: Array, b: Array) -> Array:
 
 
 def _north_toolface_gradient(g: Array, b: Array) -> Array:
-    down, turned, share = _north_parts(g, b)
+    down, lean, turned, share = _north_parts(g, b)
     across = _turning(turned)
     axis = np.array([0.0, 0.0, 1.0])
-    part = (np.sum(across * down, -1) / (1 + down[..., 2]))[..., None]
+    part = (np.sum(across * down, -1) / lean)[..., None]
     of_down = -share[..., None] * (across - part * axis) - part * b
     of_down = of_down - np.sum(of_down * down, -1, keepdims=True) * down
     return _six(of_down / np.linalg.norm(g, axis=-1, keepdims=True), across - part * (down + axis))
