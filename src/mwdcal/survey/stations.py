@@ -82,7 +82,8 @@ def surveyed(
         values.append(np.stack([OBSERVABLES[name].value(g, b) for name in SURVEYED], -1))
         covariances.append(calibration.covariance(SURVEYED, part, noise=True))
     value = np.concatenate(values)
-    magnetic = switched(value[:, 0], low, high) & calibration.has_field
+    there = calibration.has_field and readings.magnetometer is not None
+    magnetic = switched(value[:, 0], low, high) & there
     return Surveys(value, np.concatenate(covariances), magnetic)
 
 

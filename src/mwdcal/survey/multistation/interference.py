@@ -14,6 +14,7 @@ from mwdcal.errors import FitError
 from mwdcal.estimation.uncertainty import station_misfit
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array, Bools, centred
+from mwdcal.survey.acceptance import SURVEY_UNITS
 from mwdcal.survey.multistation.interference_estimate import (
     USUAL_SD,
     Assumed,
@@ -31,6 +32,8 @@ LEAST_SEEN = 2.0
 """Interference below this many standard uncertainties in every direction is none that was seen."""
 FEWEST_AT_END = 2
 """Doubtful surveys in a row at the end that point at something near the hole."""
+FARTHEST_REFERENCE = 3.0
+"""Standard uncertainties beyond which what the surveys say of a reference contradicts it."""
 BEYOND_ASSUMED = 3.0
 """Interference of more than this many times what was assumed says that too little was assumed."""
 
@@ -352,7 +355,24 @@ def _findings(
             f"assumed ({USUAL_SD['field']:.0f} nT, {np.degrees(USUAL_SD['dip']):.1g}°). State sd_ref_field_nt and "
             "sd_ref_dip_deg."
         )
+    texts |= _doubtful_references(whole)
     return [Finding(id=key, text=text) for key, text in texts.items()] + _doubtful(whole, rows)
+
+
+def _doubtful_references(whole: Estimate) -> dict[str, str]:
+    """References that the surveys put farther off than their uncertainty allows, by id, in sentences."""
+    off, stated = whole.result.state.constants[0].tolist(), whole.result.problem.evidence.constants
+    texts = {}
+    for size, constant in zip(off, stated, strict=True):
+        sigmas = abs(size) / float(constant.sd[0])
+        if constant.name in SURVEY_UNITS and sigmas > FARTHEST_REFERENCE:
+            unit, factor, digits = SURVEY_UNITS[constant.name]
+            texts[f"reference-{constant.name}-doubtful"] = (
+                f"by the surveys {constant.name} is {size * factor:+.{digits}f} {unit} from its reference, "
+                f"{sigmas:.1f} times the standard uncertainty of that: check place, date and datum. No stated uncertainty "
+                "covers it."
+            )
+    return texts
 
 
 def _doubtful(whole: Estimate, rows: list[InterferenceStation]) -> list[Finding]:
