@@ -551,6 +551,20 @@ def test_msa_takes_axial_interference_off(example, tmp_path):
     assert "SIMULATED" in (tmp_path / "m.html").read_text("utf-8")
 
 
+def test_results_say_whether_interference_was_taken_off(example, tmp_path):
+    source, out, page = with_iron(tmp_path, 1500), tmp_path / "out.csv", tmp_path / "s.html"
+    for options, corrected in (((), False), (("--msa",), True)):
+        ran = cli("survey", example, source, "-o", out, "--html", page, "--json", *options)
+        ids = {finding["id"] for finding in ran.json["findings"]}
+        shown = " ".join(page.read_text("utf-8").split())
+        assert ("interference-corrected" in ids) is corrected
+        assert ("corrected for interference" in out.read_text("utf-8")) is corrected
+        assert ("Interference of the drill string is not part of it" in shown) is not corrected
+        assert "judged by all three together" in shown
+    cli("survey", example, source, "-o", out, "--html", page, "--limits", "fixed")
+    assert "judged by all three together" not in " ".join(page.read_text("utf-8").split())
+
+
 def test_msa_near_horizontal_east_west_is_refused(example, tmp_path):
     source, out = with_iron(tmp_path, 1500, np.radians(89), np.radians(90)), tmp_path / "out.csv"
     ran = cli("survey", example, source, "-o", out, "--msa")

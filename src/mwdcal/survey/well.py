@@ -28,14 +28,16 @@ WELL_FINDINGS = {
     "laboratory-gravity": "the calibration's gravity is 1 g, as where its run states none: |g| is then in units of the "
     "laboratory's gravity, and judged with 1.5 mg more of uncertainty. Calibrate with ref_gravity_g.",
     "magnetic-north": "no declination: azimuths and the well path count from magnetic north.",
-    "path-from-first": "the well path starts at the first station, at north 0, east 0 and TVD 0. `tie-in` gives its "
+    "path-from-first": "the well path starts at the first station, at north 0, east 0 and TVD 0. `tie_in` gives its "
     "position.",
     "path-from-later": "the well path starts at station {start}: those before it have no result or no measured depth. "
-    "`tie-in` gives the position of station {start}.",
+    "`tie_in` gives the position of station {start}.",
     "left-out": "left out of the well path, without a result or a measured depth: {count} of {rows} stations.",
     "no-path": "no well path: no station has both a measured depth and a direction with azimuth.",
 }
 """What the findings about a well say, in their order."""
+CORRECTED = "interference-corrected"
+"""The finding of a calibration from which multi-station analysis has taken interference."""
 UNKNOWN_GRAVITY = 0.0015
 """Standard uncertainty of |g| in units of a laboratory's gravity that was taken as 1 g: that is anything from
 9.780 to 9.832 m/s²."""
@@ -114,6 +116,11 @@ class Well:
     position: Position | None
     findings: list[Finding]
     extrapolated: Bools | None = None
+
+    @property
+    def corrected(self) -> list[Finding]:
+        """The finding that interference of the drill string was taken off."""
+        return [finding for finding in self.calibration.findings if finding.id == CORRECTED]
 
     @property
     def blank(self) -> Bools:
@@ -300,7 +307,7 @@ def _findings(result: Well, from_first: bool) -> list[Finding]:
         "names": " and ".join(n for n, lacks in zip(STRENGTH_NAMES, absent, strict=True) if lacks),
         "partly": int(partly.sum()), "unjudged": int(unjudged.sum()), "count": int((~on_path).sum()),
     }  # fmt: skip
-    return [
+    return result.corrected + [
         Finding(id=name, text=text.format(**words))
         for name, text in WELL_FINDINGS.items()
         if applies[name]

@@ -25,6 +25,7 @@ from mwdcal.survey.multistation.interference_estimate import (
     varied,
 )
 from mwdcal.survey.multistation.separability import missing
+from mwdcal.survey.well import CORRECTED
 
 FEWEST_SURVEYS = 2
 """Surveys below which nothing can be said of several stations."""
@@ -215,7 +216,7 @@ def corrected_calibration(calibration: Calibration, whole: Estimate) -> Calibrat
         simulated=calibration.simulated or is_simulated(metadata),
         covariance_rows=covariance.tolist(),
         inherited=[*calibration.inherited, *whole.readings.digest],
-        findings=[*calibration.findings, Finding(id="interference-corrected", text=text)],
+        findings=[*calibration.findings, Finding(id=CORRECTED, text=text)],
     )
     return sealed(rounded(record))
 
@@ -369,8 +370,8 @@ def _doubtful_references(whole: Estimate) -> dict[str, str]:
             unit, factor, digits = SURVEY_UNITS[constant.name]
             texts[f"reference-{constant.name}-doubtful"] = (
                 f"by the surveys {constant.name} is {size * factor:+.{digits}f} {unit} from its reference, "
-                f"{sigmas:.1f} times the standard uncertainty of that: check place, date and datum. No stated uncertainty "
-                "covers it."
+                f"{sigmas:.1f} times the standard uncertainty of that: check place, date and datum. No stated "
+                "uncertainty covers it."
             )
     return texts
 

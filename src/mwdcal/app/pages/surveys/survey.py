@@ -28,6 +28,8 @@ def render(well: Well, findings: list[Finding], sha256: Mapping[str, str]) -> st
         .get_template("survey.html")
         .render(
             facts=facts,
+            modelled=well.limits.probability is not None,
+            corrected=bool(well.corrected),
             readings=well.readings.source,
             serial=next(filter(None, map(serial_of, stated)), None),
             simulated=any(map(is_simulated, stated)),
