@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 
+from mwdcal.calibration import results
 from mwdcal.calibration.readings import Readings, is_simulated
 from mwdcal.calibration.record import Calibration, Finding, rounded, sealed, stated
 from mwdcal.calibration.residuals import RESHOOT
@@ -361,12 +362,17 @@ def _findings(
 
 
 def _doubtful_references(whole: Estimate) -> dict[str, str]:
-    """References that the surveys put farther off than their uncertainty allows, by id, in sentences."""
-    off, stated = whole.result.state.constants[0].tolist(), whole.result.problem.evidence.constants
-    texts = {}
-    for size, constant in zip(off, stated, strict=True):
+    """References that the surveys put farther off than their uncertainty allows, by id, in sentences.
+
+    With what the estimate itself may be off by, the noise being what the surveys have.
+    """
+    result, texts = whole.result, {}
+    noisy = np.diag(result.analysis.constants[0]) * results.variance_scales(result)[0].max()
+    stated = result.problem.evidence.constants
+    for size, variance, constant in zip(result.state.constants[0], noisy, stated, strict=True):
         sigmas = abs(size) / float(constant.sd[0])
-        if constant.name in SURVEY_UNITS and sigmas > FARTHEST_REFERENCE:
+        likely = FARTHEST_REFERENCE * np.hypot(constant.sd[0], np.sqrt(max(variance, 0.0)))
+        if constant.name in SURVEY_UNITS and abs(size) > likely:
             unit, factor, digits = SURVEY_UNITS[constant.name]
             texts[f"reference-{constant.name}-doubtful"] = (
                 f"by the surveys {constant.name} is {size * factor:+.{digits}f} {unit} from its reference, "
