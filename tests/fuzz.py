@@ -62,11 +62,15 @@ SAMPLES = {
     "rolltest": "plan",
     "plans": "plan",
     "measured": "run",
+    "reference": "reference",
 }
 """The kind of file that each argument or option takes, by its name."""
-OUTPUTS = ("output", "report", "plot", "folder", "calibrations", "truth", "html")
+OUTPUTS = ("output", "report", "plot", "folder", "calibrations", "truth", "html", "msa_html")
 """Arguments and options that name what to write."""
 LIMITS = 'name = "lab"\n[spread]\ninclination_deg = 0.2\nazimuth_deg = 1.5\n'
+SURVEY_LIMITS = (
+    'name = "lab"\nprobability = 0.9973\nfield_nt = 900.0\n[sensor]\nmagnetometer_bias_nt = 70.0\n'
+)
 PLAN = 'name = "lab"\ntemperature_c = [25, 60]\n[[stations]]\ninclination_deg = [5, 60, 120]\ntoolface_deg = [0, 90]\n'
 EFFECTS = "[accelerometer]\nturn_on = 2e-4\n[stand]\ntilt_deg = 0.1\n[earth]\nvariation_nt = 20.0\n"
 CALIBRATIONS = (
@@ -106,6 +110,7 @@ def runs() -> dict[str, dict[str, Any]]:
         "servo.csv": servo,
         "rolls.csv": roll_run(2),
         "warm.csv": servo_run(3, (10, 60, 110), 6, (25.0, 80.0, 130.0)),
+        "well.csv": dict(cli_support.read_csv(EXAMPLE / "well.csv")),
         "gravity.csv": {k: v for k, v in servo.items() if not k.startswith("m")},
         "bent.csv": {**servo, **{a: servo[a] + 1e-4 * servo[a] ** 3 for a in ("ax", "ay", "az")}},
     }
@@ -130,13 +135,29 @@ def samples(folder: Path) -> dict[str, list[Any]]:
     runs_of_many = write_csv(folder / "fleet.csv", fleet, "simulated = true")
     ran = cli_support.mwdcal("fleet", runs_of_many, "-o", table, "--tool", "servo", "--workers", 1)
     assert ran.code == 0, ran
+    place = cli_support.mwdcal(
+        *(
+            "reference",
+            "--latitude",
+            60,
+            "--longitude",
+            3.5,
+            "--altitude-m",
+            0,
+            "--date",
+            "2026-06-01",
+        ),
+        *("--crs", "EPSG:23031", "--json"),
+    )
+    assert place.code == 0, place
     return {
         "run": list(tables.values()),
         "log": [log(4, 4.0, (20, 80, 120)), log(5, 20.0, (20,))],
         "fleet": [fleet],
         "calibration": [*calibrations, table.read_bytes()],
         "profile": [(EXAMPLE / "tool.toml").read_text("utf-8")],
-        "limits": [LIMITS],
+        "limits": [LIMITS, SURVEY_LIMITS],
+        "reference": [place.out],
         "effects": [EFFECTS],
         "plan": [PLAN],
     }

@@ -19,7 +19,7 @@ from cli_support import mwdcal as cli
 from mwdcal.calibration.readings import Readings
 from mwdcal.errors import InputError
 from mwdcal.geometry.observables import OBSERVABLES
-from mwdcal.geometry.vectors import centred, diagonal, reference_vectors
+from mwdcal.geometry.vectors import centred, reference_vectors
 from mwdcal.planning.simulate import Earth, Truth, grid, run, servo
 from mwdcal.survey.acceptance import (
     STRENGTH_NAMES,
@@ -74,7 +74,7 @@ def test_uncertainty_covers_the_errors_of_surveys():
         true = np.stack([OBSERVABLES[name].value(*vectors) for name in names], -1)
         error = centred(surveys.value[:, places] - true)
         error[:, 3:5] = (surveys.value[:, places] - true)[:, 3:5]
-        sd = np.sqrt(diagonal(surveys.covariance)[:, places])
+        sd = surveys.sd[:, places]
         total += float(np.sum((error / sd) ** 2))
         count += error.size
     # errors of one calibration are alike: the sum scatters by no more than that of 150 × 6 independent ones

@@ -523,6 +523,8 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
     def rests_on_free(self, name: str, readings: Readings) -> Bools:
         """Where (…, n) an observable moves with a direction that no evidence determines."""
         shape = readings.accelerometer.shape[:-1]
+        if not self.free:
+            return np.zeros(shape, bool)
         g, b = self.fields(readings)
         moved = np.einsum("...nip,kp->...nki", self.jacobian(readings), self.free_directions)
         gradient = np.nan_to_num(OBSERVABLES[name].gradient(g, b))

@@ -218,9 +218,7 @@ def _covariance(
     sensors = (gradient * variance[:, None, :]) @ gradient.mT
     sd = np.stack([_reference_sd(readings, limits, name) for name in STRENGTH_NAMES], -1)
     return np.asarray(
-        surveys.covariance[:, STRENGTHS, STRENGTHS]
-        + sensors
-        + sd[:, :, None] ** 2 * np.eye(len(STRENGTH_NAMES))
+        surveys.strengths + sensors + sd[:, :, None] ** 2 * np.eye(len(STRENGTH_NAMES))
     )
 
 

@@ -7,7 +7,7 @@ part of it: `mwdcal.survey.acceptance` judges them.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,7 +19,7 @@ from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array, Bools, diagonal, wrap
 
 SURVEYED = ("inclination", "azimuth", "toolface", "north_toolface", "gravity", "field", "dip")
-"""Observables of a survey, in the order of `Surveys.covariance`."""
+"""Observables of a survey, in the order of `Surveys.value`."""
 STRENGTHS = slice(4, 7)
 """Where |g|, |b| and dip lie in it."""
 TOOLFACE_SWITCH = (np.radians(3.0), np.radians(5.0))
@@ -30,40 +30,39 @@ STATIONS_AT_ONCE = 1 << 12
 
 @dataclass(frozen=True)
 class Surveys:
-    """Observables (n, 7) in the order of `SURVEYED`: radians, g, nT; their covariance (n, 7, 7).
+    """Observables (n, 7) in the order of `SURVEYED`, radians, g, nT, and their standard uncertainties (n, 7).
 
     NaN: not there, such as azimuth and toolface at vertical, or without a stated uncertainty.
-    `magnetic` (n,): the toolface counts from magnetic north.
+    `strengths` (n, 3, 3): covariance of |g|, |b| and dip. `magnetic` (n,): the toolface counts from magnetic north.
     """
 
     value: Array
-    covariance: Array
+    sd: Array
+    strengths: Array
     magnetic: Bools
 
     def of(self, name: str) -> tuple[Array, Array]:
         """An observable (n,) and its standard uncertainty; `toolface` is the one that counts."""
-        place = SURVEYED.index(name)
-        value, sd = self.value[:, place], self._sd(place)
+        place, north = SURVEYED.index(name), SURVEYED.index("north_toolface")
+        value, sd = self.value[:, place], self.sd[:, place]
         if name != "toolface":
             return value, sd
-        north = SURVEYED.index("north_toolface")
         return (
             np.where(self.magnetic, self.value[:, north], value),
-            np.where(self.magnetic, self._sd(north), sd),
+            np.where(self.magnetic, self.sd[:, north], sd),
         )
-
-    def _sd(self, place: int) -> Array:
-        return np.asarray(np.sqrt(np.maximum(diagonal(self.covariance)[:, place], 0.0)))
 
 
 def surveyed(
     calibration: Calibration,
     readings: Readings,
     switch: tuple[float, float] = TOOLFACE_SWITCH,
+    advance: Callable[[int, int], None] = lambda done, total: None,
 ) -> Surveys:
     """Surveys from readings, in the order in which they were taken.
 
-    Shapes: `readings` of n stations without leading axes. Units: `switch` in radians.
+    Shapes: `readings` of n stations without leading axes. Units: `switch` in radians. `advance` gets how many are
+    done, and of how many.
     Singular: at vertical azimuth and toolface are NaN, the toolface from magnetic north is not.
 
     Raises:
@@ -76,15 +75,20 @@ def surveyed(
             f"`switch` must be two inclinations between 0 and 90°, the lower one first; got {np.degrees(low):g}° and "
             f"{np.degrees(high):g}°."
         )
-    values, covariances = [], []
+    value = np.empty((readings.count, len(SURVEYED)))
+    sd, strengths, done = np.empty_like(value), np.empty((readings.count, 3, 3)), 0
     for part in blocks(readings):
+        rows = slice(done, done + part.count)
         g, b = calibration.fields(part)
-        values.append(np.stack([OBSERVABLES[name].value(g, b) for name in SURVEYED], -1))
-        covariances.append(calibration.covariance(SURVEYED, part, noise=True))
-    value = np.concatenate(values)
+        value[rows] = np.stack([OBSERVABLES[name].value(g, b) for name in SURVEYED], -1)
+        covariance = calibration.covariance(SURVEYED, part, noise=True)
+        sd[rows] = np.sqrt(np.maximum(diagonal(covariance), 0.0))
+        strengths[rows] = covariance[:, STRENGTHS, STRENGTHS]
+        done = rows.stop
+        advance(done, readings.count)
     there = calibration.has_field and readings.magnetometer is not None
     magnetic = switched(value[:, 0], low, high) & there
-    return Surveys(value, np.concatenate(covariances), magnetic)
+    return Surveys(value, sd, strengths, magnetic)
 
 
 def blocks(readings: Readings) -> Iterator[Readings]:

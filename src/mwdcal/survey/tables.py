@@ -112,7 +112,7 @@ def surveyed_table(table: Table, well: Well) -> Table:
     Raises:
         InputError: a column has the name of a result already.
     """
-    results = well.columns()
+    results = well.columns
     taken = [name for name in results if name in table.columns]
     if taken:
         raise InputError(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -13,7 +14,7 @@ from mwdcal.geometry.observables import EXTRAPOLATED, RESULTS, VECTORS
 from mwdcal.geometry.vectors import AnyArray, Array, Bools, diagonal, wrap
 from mwdcal.survey.acceptance import STRENGTH_NAMES, Judgement, SurveyLimits, judged
 from mwdcal.survey.position import calibrated_path
-from mwdcal.survey.stations import STRENGTHS, TOOLFACE_SWITCH, Surveys, surveyed
+from mwdcal.survey.stations import TOOLFACE_SWITCH, Surveys, surveyed
 from mwdcal.use.correction import counted
 
 AXES_OF_EARTH = ("north", "east", "tvd")
@@ -135,8 +136,8 @@ class Well:
     @property
     def lacking(self) -> Bools:
         """What (n, 3) of |g|, |b| and dip is not judged although the survey has it: its reference lacks."""
-        covariance = diagonal(self.surveys.covariance)[:, STRENGTHS]
-        lacking = np.isnan(self.judgement.departure) & ~np.isnan(covariance)
+        stated = ~np.isnan(diagonal(self.surveys.strengths))
+        lacking = np.isnan(self.judgement.departure) & stated
         return np.asarray(lacking & np.array([True, not self.calibration.relative, True]))
 
     @cached_property
@@ -150,6 +151,7 @@ class Well:
             for remark, blank, unstated in remarks
         ]
 
+    @cached_property
     def columns(self) -> dict[str, AnyArray]:
         """Results by column, in the units of files; only azimuths whose north is known."""
         norths = {"magnetic": 0.0}
@@ -197,11 +199,13 @@ def well(
     tie_in: tuple[float, float, float] | None = None,
     switch: tuple[float, float] = TOOLFACE_SWITCH,
     outside: str = "blank",
+    advance: Callable[[int, int], None] = lambda done, total: None,
 ) -> Well:
     """The surveys of a well from readings in their order, references with these; `md` (n,) measured depths, m.
 
     Units: `tie_in` north, east and TVD of the first station, m; `switch` as of `surveyed`. `outside` the calibrated
     temperatures as of `correction.correct`: blank results, refuse, or extrapolate without stated uncertainty.
+    `advance` as of `surveyed`.
 
     Raises:
         InputError: readings that do not belong to the calibration, or depths that do not increase.
@@ -209,7 +213,7 @@ def well(
     north = north or North()
     columns, _, findings = counted(calibration, readings, outside)
     beyond, blank = calibration.outside(readings), np.isnan(columns[RESULTS[0]])
-    surveys = _without(surveyed(calibration, readings, switch), blank, beyond)
+    surveys = _without(surveyed(calibration, readings, switch, advance), blank, beyond)
     g, b = (np.stack([columns[name] for name in VECTORS[i : i + 3]], -1) for i in (0, 3))
     judgement = judged(surveys, *_to_judge(calibration, readings, (g, b)), limits)
     start = (0.0, 0.0, 0.0) if tie_in is None else tie_in
@@ -227,7 +231,8 @@ def _without(surveys: Surveys, blank: Bools, beyond: Bools) -> Surveys:
     """Surveys without values where they are `blank`, and without uncertainties `beyond` the temperatures."""
     return Surveys(
         np.where(blank[:, None], np.nan, surveys.value),
-        np.where((blank | beyond)[:, None, None], np.nan, surveys.covariance),
+        np.where((blank | beyond)[:, None], np.nan, surveys.sd),
+        np.where((blank | beyond)[:, None, None], np.nan, surveys.strengths),
         surveys.magnetic & ~blank,
     )
 

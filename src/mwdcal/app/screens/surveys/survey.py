@@ -189,7 +189,7 @@ def survey_table(well: Well, most: int = MOST_SURVEYS) -> str:
 
 def survey_rows(well: Well, most: int) -> tuple[list[str], list[list[str]]]:
     """Header and cells of the first surveys."""
-    columns = well.columns()
+    columns = well.columns
     azimuth = f"azimuth_{well.north.name}_deg"
     angles, relative = ["inclination_deg", azimuth, "toolface_deg"], well.calibration.relative
     shown = {
