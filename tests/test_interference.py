@@ -202,6 +202,41 @@ def test_other_laboratories() -> None:
     )  # references are exact here, and stated as uncertain
 
 
+@cache
+def without_toolface() -> Calibration:
+    """A laboratory that knows no toolface: the common rotation about the tool axis stays open."""
+    made = make(0)
+    known = {name: value for name, value in made.known.items() if name != "toolface"}
+    return calibrate(replace(made, known=known), PROFILE, Options(order=0, nonlinearity=()))
+
+
+def test_an_open_toolface_zero_does_not_stand_in_the_way() -> None:
+    """No azimuth rests on it."""
+    calibration = without_toolface()
+    assert len(calibration.free) == 1
+    result = interference(calibration, well())
+    assert result.summary.separable
+    rows = result.summary.station_rows
+    errors = np.array([row.azimuth_after_deg for row in rows]) - np.degrees(DEVIATED.azimuth)
+    sd = np.array([row.sd_azimuth_after_deg for row in rows])
+    assert np.sqrt(np.mean(np.square(errors / sd))) < 2
+
+
+def test_a_wrong_reference_is_named() -> None:
+    """600 nT, or 1°, where 130 nT and 0.2° are stated, as for another place or date: from surveys at many attitudes."""
+    readings = well(seed=8)
+    off = {"field": 600.0, "dip": 1 * DEG}
+    for name, size in off.items():
+        known = {**readings.known, name: readings.known[name] - size}
+        found = interference(laboratory(), replace(readings, known=known)).summary.findings
+        [text] = [f.text for f in found if f.id == f"reference-{name}-doubtful"]
+        [stated] = re.findall(r"is \+([0-9.]+)", text)
+        assert float(stated) == pytest.approx({"field": 600, "dip": 1.0}[name], rel=0.5)
+    for seed in range(5):
+        found = interference(laboratory(), well(seed=seed)).summary.findings
+        assert not [f for f in found if f.id.startswith("reference-")]
+
+
 def test_a_gross_error_is_named_and_counts_little() -> None:
     readings = well()
     bad = replace(readings, magnetometer=readings.magnetometer.copy())

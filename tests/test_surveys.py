@@ -344,6 +344,102 @@ def test_hot_stations_have_no_result_and_no_position(example, tmp_path):
     )
     assert columns["inclination_deg"][5] != ""
     assert columns["sd_inclination_deg"][5] == ""
+    assert columns["extrapolated"] == ["false"] * 5 + ["true"] + ["false"] * 30
+    assert columns["tvd_m"][5] != ""
+    # a direction without a stated accuracy leaves none to the positions from there on
+    assert [cell == "" for cell in columns["sd_tvd_m"]] == [False] * 5 + [True] * 31
+    assert columns["finding"][5] == "not judged: no statement of accuracy"
+
+
+def test_a_station_without_result_does_not_lack_a_reference(example, tmp_path):
+    warm = ["25.1"] * 36
+    warm[5] = "90"
+    columns, document = surveyed_file(example, tmp_path, {"temperature_c": warm})
+    assert columns["finding"][5] == "no result"
+    texts = {finding["id"]: finding["text"] for finding in document["findings"]}
+    assert "not-judged" not in texts
+    assert texts["left-out"].endswith("1 of 36 stations.")
+
+
+@pytest.mark.parametrize("options", [(), ("--tie-in", "100,-20,1000")])
+@pytest.mark.parametrize(
+    ("column", "cells"),
+    [("temperature_c", ["90", *["25.1"] * 35]), ("md_m", ["", *map(str, range(1000, 1350, 10))])],
+)
+def test_a_path_that_cannot_begin_at_the_first_station_says_so(
+    example, tmp_path, column, cells, options
+):
+    """Else the tie-in, or zero, would silently be the position of another station."""
+    columns, document = surveyed_file(example, tmp_path, {column: cells}, *options)
+    assert columns["tvd_m"][0] == ""
+    [text] = [f["text"] for f in document["findings"] if f["id"] == "path-from-later"]
+    assert f"starts at station {columns['station'][1]}:" in text
+    assert any(f["id"] == "path-from-first" for f in document["findings"]) is not bool(options)
+
+
+def test_what_is_not_judged_is_named(example, tmp_path):
+    blank = dict.fromkeys(("ref_field_nt", "ref_dip_deg"), [""] * 36)
+    columns, document = surveyed_file(example, tmp_path, blank)
+    assert set(columns["accepted"]) == {"true"}
+    [text] = [f["text"] for f in document["findings"] if f["id"] == "partly-judged"]
+    assert text.startswith("field and dip of 36 of 36 surveys are not judged")
+    one = ["48000"] * 36
+    one[3] = ""
+    _, document = surveyed_file(example, tmp_path, {"ref_field_nt": one})
+    [text] = [f["text"] for f in document["findings"] if f["id"] == "partly-judged"]
+    assert text.startswith("field of 1 of 36 surveys")
+    _, document = surveyed_file(example, tmp_path)
+    assert "partly-judged" not in {f["id"] for f in document["findings"]}
+
+
+def test_unused_columns_are_listed(example, tmp_path):
+    _, document = surveyed_file(example, tmp_path, {"Inc": ["1"] * 36})
+    [text] = [f["text"] for f in document["findings"] if f["id"] == "unused-columns"]
+    assert "Inc" in text
+    assert "md_m" not in text
+
+
+@pytest.fixture(scope="module")
+def relative(tmp_path_factory):
+    """The example's tool, calibrated without the strength of the field."""
+    folder = tmp_path_factory.mktemp("relative")
+    run = read_csv(EXAMPLE / "run.csv")
+    run = {name: cells for name, cells in run.items() if "ref_field" not in name}
+    source = write_csv(folder / "run.csv", run, "simulated = true")
+    made = cli("calibrate", source, "--tool", "servo", "-o", folder / "tool.json")
+    assert made.code == 0, made
+    return folder / "tool.json"
+
+
+def test_a_relative_magnetometer_is_judged_by_dip_alone(example, relative, tmp_path):
+    """|b| in units of the laboratory's field is no nT; dip has the limits that it has in nT."""
+    (tmp_path / "absolute").mkdir()
+    _, document = surveyed_file(relative, tmp_path)
+    assert document["accepted"] == 36
+    assert "partly-judged" not in {f["id"] for f in document["findings"]}
+    dip = np.array(read_csv(EXAMPLE / "well.csv")["ref_dip_deg"], float)
+    for off, accepted in ((0.1, 36), (2.0, 0)):
+        shifted = {"ref_dip_deg": (dip + off).astype(str).tolist()}
+        by_ratio, first = surveyed_file(relative, tmp_path, shifted)
+        _, second = surveyed_file(example, tmp_path / "absolute", shifted)
+        assert first["accepted"] == second["accepted"] == accepted
+        assert not any("nT" in finding for finding in by_ratio["finding"])
+    blank = {"ref_field_nt": [""] * 36}
+    _, document = surveyed_file(relative, tmp_path, blank)
+    [text] = [f["text"] for f in document["findings"] if f["id"] == "partly-judged"]
+    assert text.startswith("dip of 36 of 36")
+
+
+def test_without_magnetic_readings_the_toolface_is_the_gravity_one(example, tmp_path):
+    given = read_csv(EXAMPLE / "well.csv")
+    bare = {name: cells for name, cells in given.items() if name not in ("mx", "my", "mz")}
+    source, out = write_csv(tmp_path / "in.csv", bare, "simulated = true"), tmp_path / "out.csv"
+    ran = cli("survey", example, source, "-o", out, "--json")
+    assert ran.code == 0, ran
+    columns = read_csv(out)
+    assert set(columns["toolface_kind"]) == {"gravity"}
+    assert "" not in columns["toolface_deg"]
+    assert "no-path" in {finding["id"] for finding in ran.json["findings"]}
 
 
 def test_tie_in_moves_the_path(example, tmp_path):
@@ -359,6 +455,18 @@ def test_tie_in_moves_the_path(example, tmp_path):
     ("columns", "options", "message"),
     [
         ({"md_m": [str(1000 - i) for i in range(36)]}, (), "must increase"),
+        (
+            {"md_m": ["7", "8", "8", *map(str, range(9, 42))]},
+            (),
+            "line 5, column 'md_m': must increase",
+        ),
+        (
+            {"md_m": ["7", "", "6", *map(str, range(9, 42))]},
+            (),
+            "line 5, column 'md_m': must increase",
+        ),
+        ({"DEPT": ["1"] * 36}, (), "measured depths must be in metres"),
+        ({"Hole Depth (ft)": ["1"] * 36}, (), "measured depths must be in metres"),
         ({"md_m": ["-5", *map(str, range(35))]}, (), "between 0 and 20000"),
         ({"accepted": ["x"] * 36}, (), "'accepted' is there already"),
         ({"MD (ft)": ["1"] * 36}, (), "column 'md_m' twice|measured depths must be in metres"),
@@ -371,7 +479,7 @@ def test_tie_in_moves_the_path(example, tmp_path):
 )
 def test_bad_input_of_a_well(example, tmp_path, columns, options, message):
     given = read_csv(EXAMPLE / "well.csv")
-    if "MD (ft)" in columns:
+    if {"MD (ft)", "DEPT", "Hole Depth (ft)"} & {*columns}:
         del given["md_m"]
     source = write_csv(tmp_path / "in.csv", {**given, **columns}, "simulated = true")
     ran = cli("survey", example, source, "-o", tmp_path / "out.csv", *options)
@@ -441,6 +549,20 @@ def test_msa_takes_axial_interference_off(example, tmp_path):
     sd = np.array(columns["sd_azimuth_magnetic_deg"], float)
     assert np.abs(off / sd).max() < 4
     assert "SIMULATED" in (tmp_path / "m.html").read_text("utf-8")
+
+
+def test_results_say_whether_interference_was_taken_off(example, tmp_path):
+    source, out, page = with_iron(tmp_path, 1500), tmp_path / "out.csv", tmp_path / "s.html"
+    for options, corrected in (((), False), (("--msa",), True)):
+        ran = cli("survey", example, source, "-o", out, "--html", page, "--json", *options)
+        ids = {finding["id"] for finding in ran.json["findings"]}
+        shown = " ".join(page.read_text("utf-8").split())
+        assert ("interference-corrected" in ids) is corrected
+        assert ("corrected for interference" in out.read_text("utf-8")) is corrected
+        assert ("Interference of the drill string is not part of it" in shown) is not corrected
+        assert "judged by all three together" in shown
+    cli("survey", example, source, "-o", out, "--html", page, "--limits", "fixed")
+    assert "judged by all three together" not in " ".join(page.read_text("utf-8").split())
 
 
 def test_msa_near_horizontal_east_west_is_refused(example, tmp_path):

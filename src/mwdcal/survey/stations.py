@@ -86,7 +86,8 @@ def surveyed(
         strengths[rows] = covariance[:, STRENGTHS, STRENGTHS]
         done = rows.stop
         advance(done, readings.count)
-    magnetic = switched(value[:, 0], low, high) & calibration.has_field
+    there = calibration.has_field and readings.magnetometer is not None
+    magnetic = switched(value[:, 0], low, high) & there
     return Surveys(value, sd, strengths, magnetic)
 
 

@@ -27,7 +27,7 @@ MEASURED_DEPTH = "md_m"
 LARGEST_DEPTH = 20_000.0
 """No hole is longer, m."""
 _DEPTH_NAMES = re.compile(
-    r"(md|(measured|bit|survey)?[ _]?depth)[ _]*[\[(]?(m|ft|feet|met(re|er)s?)?[\])]?"
+    r"(md|dept|((measured|bit|survey|hole|along[ _-]?hole)[ _]?)?depth)[ _]*[\[(]?(m|ft|feet|met(re|er)s?)?[\])]?"
 )
 
 
@@ -84,7 +84,12 @@ def _depths(table: Table) -> Array | None:
     if wrong.size:
         problem = f"must be between 0 and {LARGEST_DEPTH:g} m; got {depths[wrong[0]]:g}."
         raise cell_error(table, MEASURED_DEPTH, int(wrong[0]), problem)
-    return None if np.isnan(depths).all() else depths
+    there = np.flatnonzero(~np.isnan(depths))
+    back = there[1:][np.diff(depths[there]) <= 0]
+    if back.size:
+        problem = f"must increase from station to station; got {depths[back[0]]:g}. Sort; leave repeated surveys out."
+        raise cell_error(table, MEASURED_DEPTH, int(back[0]), problem)
+    return depths if there.size else None
 
 
 def _norths(table: Table, reference: EarthReference | None) -> North:

@@ -10,9 +10,9 @@ import numpy as np
 
 from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import Calibration, Finding
-from mwdcal.geometry.observables import RESULTS, VECTORS
-from mwdcal.geometry.vectors import AnyArray, Array, Bools, wrap
-from mwdcal.survey.acceptance import Judgement, SurveyLimits, judged
+from mwdcal.geometry.observables import EXTRAPOLATED, RESULTS, VECTORS
+from mwdcal.geometry.vectors import AnyArray, Array, Bools, diagonal, wrap
+from mwdcal.survey.acceptance import STRENGTH_NAMES, Judgement, SurveyLimits, judged
 from mwdcal.survey.position import calibrated_path
 from mwdcal.survey.stations import TOOLFACE_SWITCH, Surveys, surveyed
 from mwdcal.use.correction import counted
@@ -22,16 +22,23 @@ WELL_FINDINGS = {
     "rejected": "{rejected} of {judged} surveys lie outside the limits '{limits}' (first: station {first}: {why}).",
     "rejected-on-path": "surveys outside the limits are part of the well path. Leave them out of the table, or "
     "survey again.",
-    "not-judged": "{count} of {rows} surveys are not judged: no reference for |g|, |b| or dip. Give `reference`, or "
+    "not-judged": "{unjudged} of {rows} surveys are not judged: no reference for |g|, |b| or dip. Give `reference`, or "
     "columns ref_gravity_g, ref_field_nt, ref_dip_deg.",
+    "partly-judged": "{names} of {partly} of {rows} surveys are not judged: no reference. `accepted` says nothing "
+    "about them.",
     "laboratory-gravity": "the calibration's gravity is 1 g, as where its run states none: |g| is then in units of the "
     "laboratory's gravity, and judged with 1.5 mg more of uncertainty. Calibrate with ref_gravity_g.",
     "magnetic-north": "no declination: azimuths and the well path count from magnetic north.",
-    "path-from-first": "the well path starts at the first station, at north 0, east 0 and TVD 0. `tie-in` gives its "
+    "path-from-first": "the well path starts at the first station, at north 0, east 0 and TVD 0. `tie_in` gives its "
     "position.",
-    "left-out": "{count} stations without a result are left out of the well path.",
+    "path-from-later": "the well path starts at station {start}: those before it have no result or no measured depth. "
+    "`tie_in` gives the position of station {start}.",
+    "left-out": "left out of the well path, without a result or a measured depth: {count} of {rows} stations.",
+    "no-path": "no well path: no station has both a measured depth and a direction with azimuth.",
 }
 """What the findings about a well say, in their order."""
+CORRECTED = "interference-corrected"
+"""The finding of a calibration from which multi-station analysis has taken interference."""
 UNKNOWN_GRAVITY = 0.0015
 """Standard uncertainty of |g| in units of a laboratory's gravity that was taken as 1 g: that is anything from
 9.780 to 9.832 m/s²."""
@@ -77,6 +84,16 @@ class Position:
     covariance: Array
 
     @property
+    def on_path(self) -> Bools:
+        """Stations (n,) with a position."""
+        return ~np.isnan(self.place[:, 0])
+
+    def without_accuracy(self, beyond: Bools) -> Position:
+        """The same, with no covariance from the first station on the path on that is `beyond` (n,)."""
+        lost = np.logical_or.accumulate(beyond & self.on_path)
+        return replace(self, covariance=np.where(lost[:, None, None], np.nan, self.covariance))
+
+    @property
     def sd(self) -> Array:
         """Standard uncertainties (n, 3)."""
         return np.asarray(np.sqrt(np.maximum(np.diagonal(self.covariance, axis1=1, axis2=2), 0.0)))
@@ -86,8 +103,8 @@ class Position:
 class Well:
     """Surveys of a well in the order of their table.
 
-    `corrected`: vectors and scalars as `correction.correct` gives them; `blank` (n,): stations without results,
-    and `extrapolated` ones, without a statement of accuracy. `position`: None without measured depths.
+    `vectors` (n, 3) each as corrected; `extrapolated` (n,): stations without a statement of accuracy, None where
+    none may be. `position`: None without measured depths.
     """
 
     calibration: Calibration
@@ -99,11 +116,40 @@ class Well:
     vectors: tuple[Array, Array]
     position: Position | None
     findings: list[Finding]
+    extrapolated: Bools | None = None
+
+    @property
+    def corrected(self) -> list[Finding]:
+        """The finding that interference of the drill string was taken off."""
+        return [finding for finding in self.calibration.findings if finding.id == CORRECTED]
+
+    @property
+    def blank(self) -> Bools:
+        """Stations (n,) without a result."""
+        return np.isnan(self.surveys.value[:, 0])
+
+    @property
+    def unstated(self) -> Bools:
+        """Stations (n,) of whose |g|, and so of nothing, an uncertainty is stated."""
+        return np.isnan(self.surveys.of("gravity")[1])
+
+    @property
+    def lacking(self) -> Bools:
+        """What (n, 3) of |g|, |b| and dip is not judged although the survey has it: its reference lacks."""
+        stated = ~np.isnan(diagonal(self.surveys.strengths))
+        lacking = np.isnan(self.judgement.departure) & stated
+        return np.asarray(lacking & np.array([True, not self.calibration.relative, True]))
 
     @cached_property
     def remarks(self) -> list[str]:
         """What is wrong with each station."""
-        return self.judgement.findings()
+        remarks = zip(
+            self.judgement.findings(), self.blank.tolist(), self.unstated.tolist(), strict=True
+        )
+        return [
+            "no result" if blank else "not judged: no statement of accuracy" if unstated else remark
+            for remark, blank, unstated in remarks
+        ]
 
     @cached_property
     def columns(self) -> dict[str, AnyArray]:
@@ -133,6 +179,8 @@ class Well:
             self.judgement.judged, np.where(self.judgement.accepted, "true", "false"), ""
         )
         columns["finding"] = np.array(self.remarks, dtype=object)
+        if self.extrapolated is not None:
+            columns[EXTRAPOLATED] = np.where(self.extrapolated, "true", "false")
         if self.position is not None:
             for k, name in enumerate(AXES_OF_EARTH):
                 columns |= {
@@ -167,12 +215,15 @@ def well(
     beyond, blank = calibration.outside(readings), np.isnan(columns[RESULTS[0]])
     surveys = _without(surveyed(calibration, readings, switch, advance), blank, beyond)
     g, b = (np.stack([columns[name] for name in VECTORS[i : i + 3]], -1) for i in (0, 3))
-    judgement = judged(surveys, (g, b), _scaled(calibration, readings), limits)
+    judgement = judged(surveys, *_to_judge(calibration, readings, (g, b)), limits)
     start = (0.0, 0.0, 0.0) if tie_in is None else tie_in
     position = None if md is None else _positions(calibration, readings, md, north, blank, start)
+    if position is not None:
+        position = position.without_accuracy(beyond)
     result = Well(
-        calibration, readings, surveys, judgement, limits, north, (g, b), position, findings
-    )
+        calibration, readings, surveys, judgement, limits, north, (g, b), position, findings,
+        extrapolated=columns.get(EXTRAPOLATED),
+    )  # fmt: skip
     return replace(result, findings=findings + _findings(result, tie_in is None))
 
 
@@ -186,12 +237,22 @@ def _without(surveys: Surveys, blank: Bools, beyond: Bools) -> Surveys:
     )
 
 
-def _scaled(calibration: Calibration, readings: Readings) -> Readings:
-    """The readings, with what |g| may depart from its reference because the laboratory's gravity is not known."""
-    if not unknown_gravity(calibration):
-        return readings
-    sd = np.hypot(readings.uncertainty("gravity"), UNKNOWN_GRAVITY)
-    return replace(readings, sd={**readings.sd, "gravity": sd})
+def _to_judge(
+    calibration: Calibration, readings: Readings, vectors: tuple[Array, Array]
+) -> tuple[tuple[Array, Array], Readings]:
+    """Vectors in g and nT, and the readings with the references they are judged by.
+
+    |g| may depart from its reference because the laboratory's gravity is not known. A magnetometer calibrated to a
+    field of one says nothing of |b|, and of dip where no reference says how large the sensors' nT are in it.
+    """
+    (g, b), known, sd = vectors, dict(readings.known), dict(readings.sd)
+    if unknown_gravity(calibration):
+        sd["gravity"] = np.hypot(readings.uncertainty("gravity"), UNKNOWN_GRAVITY)
+    if calibration.relative:
+        field = readings.reference("field")
+        b = b * field[:, None]
+        known |= {"field": np.full(len(b), np.nan), "dip": readings.reference("dip") + 0 * field}
+    return (g, b), replace(readings, known=known, sd=sd)
 
 
 def unknown_gravity(calibration: Calibration) -> bool:
@@ -226,33 +287,36 @@ def _findings(result: Well, from_first: bool) -> list[Finding]:
     """Findings about a well."""
     judgement, position = result.judgement, result.position
     rejected = judgement.judged & ~judgement.accepted
-    first = int(np.argmax(rejected))
-    on_path = np.zeros(len(rejected), bool) if position is None else ~np.isnan(position.place[:, 0])
-    there = bool(on_path.any())
+    unjudged = ~judgement.judged & ~result.blank & ~result.unstated
+    partly = judgement.judged & result.lacking.any(-1)
+    on_path = np.zeros(len(rejected), bool) if position is None else position.on_path
+    there, start = bool(on_path.any()), int(np.argmax(on_path))
     applies = {
         "rejected": rejected.any(),
         "rejected-on-path": (rejected & on_path).any(),
-        "not-judged": not judgement.judged.all(),
+        "not-judged": unjudged.any(),
+        "partly-judged": partly.any(),
         "laboratory-gravity": unknown_gravity(result.calibration)
         and not np.isnan(judgement.departure[:, 0]).all(),
         "magnetic-north": result.north.declination is None and result.calibration.has_field,
-        "path-from-first": there and from_first and position is not None and position.md[0] > 0,
+        "path-from-first": there and from_first and position is not None and position.md[start] > 0,
+        "path-from-later": start > 0,
         "left-out": there and not on_path.all(),
+        "no-path": position is not None and not there,
     }
+    first, labels = int(np.argmax(rejected)), result.readings.labels
+    absent = np.asarray(result.lacking[partly].any(0)).tolist()
     words = {
         "rejected": int(rejected.sum()), "judged": int(judgement.judged.sum()), "limits": result.limits.name,
-        "rows": len(rejected), "first": result.readings.labels[first], "why": result.remarks[first],
-        "count": int((~on_path).sum() if there else 0),
+        "rows": len(rejected), "first": labels[first], "why": result.remarks[first], "start": labels[start],
+        "names": " and ".join(n for n, lacks in zip(STRENGTH_NAMES, absent, strict=True) if lacks),
+        "partly": int(partly.sum()), "unjudged": int(unjudged.sum()), "count": int((~on_path).sum()),
     }  # fmt: skip
-    return [
-        Finding(id=name, text=text.format(**words | _not_judged(name, judgement)))
+    return result.corrected + [
+        Finding(id=name, text=text.format(**words))
         for name, text in WELL_FINDINGS.items()
         if applies[name]
     ]
-
-
-def _not_judged(name: str, judgement: Judgement) -> dict[str, int]:
-    return {"count": int((~judgement.judged).sum())} if name == "not-judged" else {}
 
 
 def _angle(name: str, value: Array, sd: Array) -> dict[str, AnyArray]:

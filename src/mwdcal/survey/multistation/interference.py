@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 
+from mwdcal.calibration import results
 from mwdcal.calibration.readings import Readings, is_simulated
 from mwdcal.calibration.record import Calibration, Finding, rounded, sealed, stated
 from mwdcal.calibration.residuals import RESHOOT
@@ -14,6 +15,7 @@ from mwdcal.errors import FitError
 from mwdcal.estimation.uncertainty import station_misfit
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array, Bools, centred
+from mwdcal.survey.acceptance import SURVEY_UNITS
 from mwdcal.survey.multistation.interference_estimate import (
     USUAL_SD,
     Assumed,
@@ -24,6 +26,7 @@ from mwdcal.survey.multistation.interference_estimate import (
     varied,
 )
 from mwdcal.survey.multistation.separability import missing
+from mwdcal.survey.well import CORRECTED
 
 FEWEST_SURVEYS = 2
 """Surveys below which nothing can be said of several stations."""
@@ -31,6 +34,8 @@ LEAST_SEEN = 2.0
 """Interference below this many standard uncertainties in every direction is none that was seen."""
 FEWEST_AT_END = 2
 """Doubtful surveys in a row at the end that point at something near the hole."""
+FARTHEST_REFERENCE = 3.0
+"""Standard uncertainties beyond which what the surveys say of a reference contradicts it."""
 BEYOND_ASSUMED = 3.0
 """Interference of more than this many times what was assumed says that too little was assumed."""
 
@@ -212,7 +217,7 @@ def corrected_calibration(calibration: Calibration, whole: Estimate) -> Calibrat
         simulated=calibration.simulated or is_simulated(metadata),
         covariance_rows=covariance.tolist(),
         inherited=[*calibration.inherited, *whole.readings.digest],
-        findings=[*calibration.findings, Finding(id="interference-corrected", text=text)],
+        findings=[*calibration.findings, Finding(id=CORRECTED, text=text)],
     )
     return sealed(rounded(record))
 
@@ -352,7 +357,29 @@ def _findings(
             f"assumed ({USUAL_SD['field']:.0f} nT, {np.degrees(USUAL_SD['dip']):.1g}°). State sd_ref_field_nt and "
             "sd_ref_dip_deg."
         )
+    texts |= _doubtful_references(whole)
     return [Finding(id=key, text=text) for key, text in texts.items()] + _doubtful(whole, rows)
+
+
+def _doubtful_references(whole: Estimate) -> dict[str, str]:
+    """References that the surveys put farther off than their uncertainty allows, by id, in sentences.
+
+    With what the estimate itself may be off by, the noise being what the surveys have.
+    """
+    result, texts = whole.result, {}
+    noisy = np.diag(result.analysis.constants[0]) * results.variance_scales(result)[0].max()
+    stated = result.problem.evidence.constants
+    for size, variance, constant in zip(result.state.constants[0], noisy, stated, strict=True):
+        sigmas = abs(size) / float(constant.sd[0])
+        likely = FARTHEST_REFERENCE * np.hypot(constant.sd[0], np.sqrt(max(variance, 0.0)))
+        if constant.name in SURVEY_UNITS and abs(size) > likely:
+            unit, factor, digits = SURVEY_UNITS[constant.name]
+            texts[f"reference-{constant.name}-doubtful"] = (
+                f"by the surveys {constant.name} is {size * factor:+.{digits}f} {unit} from its reference, "
+                f"{sigmas:.1f} times the standard uncertainty of that: check place, date and datum. No stated "
+                "uncertainty covers it."
+            )
+    return texts
 
 
 def _doubtful(whole: Estimate, rows: list[InterferenceStation]) -> list[Finding]:

@@ -85,7 +85,8 @@ class Estimate:
     `parameters` (B, k) and `covariance` (B, k, k) are those of the corrected calibration; `size` (B, d) and
     `spread` (B, d, d) the interference by `Assumed.names` with its covariance. If field and dip also depart
     from station to station, its covariance is `cautious_spread`, and `azimuth_sd` (B, n) the 1σ that it leaves
-    in the azimuths, rad. `bound` and `released` are the laboratory's knowledge without and with interference.
+    in the azimuths, rad. `open_azimuth` (B,): one rests on what neither laboratory nor surveys determine. `bound`
+    and `released` are the laboratory's knowledge without and with interference.
     """
 
     readings: Readings
@@ -97,6 +98,7 @@ class Estimate:
     spread: Array
     cautious_spread: Array
     azimuth_sd: Array
+    open_azimuth: Bools
     bound: Knowledge
     released: Knowledge
 
@@ -114,7 +116,7 @@ class Estimate:
     @property
     def separable(self) -> Array:
         """Whether (B,) the azimuth of every station is of use after the correction."""
-        whole = self.result.analysis.determined.keep.all(-1) & varied(self.readings)
+        whole = ~self.open_azimuth & varied(self.readings)
         limit = np.radians(self.assumed.largest_azimuth_sd_deg)
         return np.asarray(whole & (self.azimuth_sd.max(-1) <= limit))
 
@@ -159,6 +161,7 @@ def estimate(
         spread=spread,
         cautious_spread=cautious,
         azimuth_sd=np.sqrt(np.einsum("bni,bij,bnj->bn", moved, cautious, moved)),
+        open_azimuth=_open_azimuth(calibration, readings, result),
         bound=known,
         released=released,
     )
@@ -205,6 +208,13 @@ def varied(readings: Readings) -> Bools:
         unit = np.asarray(value) / np.linalg.norm(np.asarray(value), axis=-1, keepdims=True)
         turned.append(np.linalg.norm(unit - unit[..., :1, :], axis=-1).max(-1))
     return np.asarray(np.maximum(*turned) > LEAST_VARIATION)
+
+
+def _open_azimuth(calibration: Calibration, readings: Readings, result: Fit) -> Bools:
+    """Whether (B,) an azimuth rests on a direction that nothing determines; the zero of toolface is none."""
+    undetermined = (~result.analysis.determined.keep).sum(-1)
+    resting = calibration.rests_on_free("azimuth", readings).any(-1)
+    return np.asarray((undetermined > len(calibration.free)) | ((undetermined > 0) & resting))
 
 
 def _options(calibration: Calibration, assumed: Assumed) -> Options:

@@ -169,7 +169,7 @@ def _analysed(
     if not analysis.summary.separable:
         atomic.write_all(pages)
         if as_json:
-            refused = refusal(analysis.summary, scene.limits, scene.north)
+            refused = refusal(analysis.summary, scene.limits, scene.north, scene.readings.count)
             print_result(enveloped("survey", refused, *scene.stated, **scene.digests), [])
         analysis.check()
     return analysis, pages
@@ -186,14 +186,16 @@ def _print(
     from mwdcal.app.envelope import enveloped
     from mwdcal.app.screens.surveys import interference as screens_of_msa
     from mwdcal.app.screens.surveys import survey as screens
+    from mwdcal.calibration.diagnosis.findings import unused_columns
 
     msa = analysis.summary if analysis else None
-    summary = screens.summary(result, *files, msa)
+    unused = unused_columns(scene.readings.unused)
+    summary = screens.summary(result, *files, msa, unused)
     document = enveloped("survey", summary, *scene.stated, **scene.digests)
     shown = screens.screen(result, summary, *scene.stated)
     if analysis:
         shown = f"{screens_of_msa.screen(analysis, *scene.stated)}\n\n{shown}"
-    findings = findings_as_typed([*(msa.findings if msa else []), *result.findings])
+    findings = findings_as_typed([*(msa.findings if msa else []), *summary.findings])
     print_result(document if as_json else shown, findings)
 
 

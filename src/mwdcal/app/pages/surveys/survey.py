@@ -28,6 +28,8 @@ def render(well: Well, findings: list[Finding], sha256: Mapping[str, str]) -> st
         .get_template("survey.html")
         .render(
             facts=facts,
+            modelled=well.limits.probability is not None,
+            corrected=bool(well.corrected),
             readings=well.readings.source,
             serial=next(filter(None, map(serial_of, stated)), None),
             simulated=any(map(is_simulated, stated)),
@@ -58,4 +60,6 @@ def _banner(facts: SurveySummary) -> dict[str, str]:
         return banner("bad", "Rejected", headline, f"{facts.rejected} outside. {north}")
     if facts.not_judged or facts.blank:
         return banner("attention", "Attention", headline, f"{facts.not_judged} not judged. {north}")
+    if any(finding.id == "partly-judged" for finding in facts.findings):
+        return banner("attention", "Attention", headline, f"Judged in part. {north}")
     return banner("good", "Accepted", headline, north)

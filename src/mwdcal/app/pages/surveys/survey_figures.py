@@ -70,9 +70,7 @@ def _track(axes: Axes, well: Well, depth: Array, k: int, factor: float) -> None:
     value, bound = judgement.departure[:, k] * factor, judgement.bound[:, k] * factor
     there = ~np.isnan(value) & ~np.isnan(depth)
     if not there.any():
-        axes.annotate(
-            "no reference", (0.5, 0.5), xycoords="axes fraction", ha="center", color=BEFORE
-        )
+        axes.annotate("not judged", (0.5, 0.5), xycoords="axes fraction", ha="center", color=BEFORE)
         axes.set_xticks([])
         return
     limited = there & np.isfinite(bound)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import msgspec
 import numpy as np
@@ -60,9 +60,10 @@ class SurveySummary(msgspec.Struct, frozen=True, kw_only=True):
     msa: MultiStationAnalysis | None = None
 
 
-def refusal(msa: MultiStationAnalysis, limits: SurveyLimits, north: North) -> SurveySummary:
-    """What a multi-station analysis says that cannot be used: no survey is judged, nothing is written."""
-    rows = len(msa.station_rows)
+def refusal(
+    msa: MultiStationAnalysis, limits: SurveyLimits, north: North, rows: int
+) -> SurveySummary:
+    """What a multi-station analysis says that cannot be used: none of the `rows` is judged, nothing is written."""
     return SurveySummary(
         rows=rows,
         accepted=0,
@@ -85,9 +86,13 @@ def refusal(msa: MultiStationAnalysis, limits: SurveyLimits, north: North) -> Su
 
 
 def summary(
-    well: Well, output: str, html: str, msa: MultiStationAnalysis | None = None
+    well: Well,
+    output: str,
+    html: str,
+    msa: MultiStationAnalysis | None = None,
+    about_file: Sequence[Finding] = (),
 ) -> SurveySummary:
-    """The result for machines."""
+    """The result for machines; findings `about_file` come after those about the well."""
     judged, accepted = well.judgement.judged, well.judgement.accepted
     north = well.north
     return SurveySummary(
@@ -95,14 +100,14 @@ def summary(
         accepted=int(accepted.sum()),
         rejected=int((judged & ~accepted).sum()),
         not_judged=int((~judged).sum()),
-        blank=int(np.isnan(well.surveys.value[:, 0]).sum()),
+        blank=int(well.blank.sum()),
         north=north.name,
         declination_deg=_degrees(north.declination),
         convergence_deg=_degrees(north.convergence),
         limits=well.limits.name,
         source=well.limits.source,
         end=end_of_path(well),
-        findings=well.findings,
+        findings=[*well.findings, *about_file],
         output=output,
         html=html,
         interference=msa.interference if msa else None,
@@ -186,12 +191,12 @@ def survey_rows(well: Well, most: int) -> tuple[list[str], list[list[str]]]:
     """Header and cells of the first surveys."""
     columns = well.columns
     azimuth = f"azimuth_{well.north.name}_deg"
-    angles = ["inclination_deg", azimuth, "toolface_deg"]
+    angles, relative = ["inclination_deg", azimuth, "toolface_deg"], well.calibration.relative
     shown = {
         "inclination_deg": "inc °", azimuth: f"azi {well.north.name} °", "toolface_deg": "toolface °",
-        "gravity_g": "|g| g", "field_nt": "|b| nT", "dip_deg": "dip °",
+        "gravity_g": "|g| g", "field_nt": "|b| (relative)" if relative else "|b| nT", "dip_deg": "dip °",
     }  # fmt: skip
-    digits = {"gravity_g": 5, "field_nt": 0, "dip_deg": 2}
+    digits = {"gravity_g": 5, "field_nt": 5 if relative else 0, "dip_deg": 2}
     header = ["station", *(["md m"] if well.position else [])]
     for name, title in shown.items():
         header += [title, "1σ"] if name in angles else [title]
