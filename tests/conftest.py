@@ -6,6 +6,8 @@ A job in the background ignores Ctrl-C, and so would the commands that the tests
 import os
 import signal
 
+import pytest
+
 for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(name, "1")
 
@@ -15,3 +17,10 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 def pytest_configure(config):
     config.addinivalue_line("markers", "slow: takes seconds; `make test-quick` leaves it out")
+
+
+@pytest.fixture
+def without_pictures(monkeypatch):
+    """Pages with empty pictures: drawing takes most of the time of a page that is read for its text."""
+    drawing = "mwdcal.app.pages.pictures.picture"
+    monkeypatch.setattr(drawing, lambda figure, suffix: b"<svg></svg>")
