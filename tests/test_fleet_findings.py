@@ -11,6 +11,7 @@ from mwdcal.calibration.residuals import tail
 from test_fleet import alone, calibrated, check_same, servo_run, short_run, write_fleet
 
 pq = pytest.importorskip("pyarrow.parquet")
+pytestmark = pytest.mark.usefixtures("without_pictures")
 
 
 def spoiled(seed, station=7, by=0.05, **changes):
