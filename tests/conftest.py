@@ -17,6 +17,18 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 def pytest_configure(config):
     config.addinivalue_line("markers", "slow: takes seconds; `make test-quick` leaves it out")
+    config.addinivalue_line(
+        "markers", "study: the large version of a test that always runs; `make test-studies`"
+    )
+
+
+def pytest_collection_modifyitems(config, items):
+    """Leaves the studies out, unless `-m` names them."""
+    if "study" not in config.option.markexpr:
+        config.hook.pytest_deselected(
+            items=[each for each in items if each.get_closest_marker("study")]
+        )
+        items[:] = [each for each in items if not each.get_closest_marker("study")]
 
 
 @pytest.fixture
