@@ -4,7 +4,10 @@ A job in the background ignores Ctrl-C, and so would the commands that the tests
 """
 
 import os
+import pickle
 import signal
+from functools import wraps
+from inspect import isfunction
 
 import pytest
 
@@ -31,8 +34,80 @@ def pytest_collection_modifyitems(config, items):
         items[:] = [each for each in items if not each.get_closest_marker("study")]
 
 
+@pytest.fixture(autouse=True, scope="session")
+def templates_compiled_once():
+    """Not once for each page, as in a command: what is compiled depends on the text alone."""
+    try:
+        from jinja2 import Environment
+    except ImportError:
+        yield
+        return
+    compiled, from_text = {}, Environment.compile
+
+    def once(self, *given, **named):
+        key = (given, *named.items())
+        if key not in compiled:
+            compiled[key] = from_text(self, *given, **named)
+        return compiled[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Environment, "compile", once)
+        yield
+
+
 @pytest.fixture
 def without_pictures(monkeypatch):
     """Pages with empty pictures: drawing takes most of the time of a page that is read for its text."""
-    drawing = "mwdcal.app.pages.pictures.picture"
-    monkeypatch.setattr(drawing, lambda figure, suffix: b"<svg></svg>")
+    from markupsafe import Markup
+
+    from mwdcal.app.pages import pictures
+    from mwdcal.use.plots import Plots
+
+    for name, method in vars(Plots).items():
+        if isfunction(method) and not name.startswith("_"):
+            monkeypatch.setattr(Plots, name, lambda *given: "")
+    monkeypatch.setattr(pictures, "picture", lambda figure, suffix: b"<svg></svg>")
+    monkeypatch.setattr(pictures, "svg", lambda figure, key: Markup("<svg></svg>"))
+
+
+def remembered(function, results):
+    """The function, which computes once for equal arguments, and says of its progress the same again."""
+
+    @wraps(function)
+    def once(*given, **named):
+        speakers = {name: named.pop(name) for name in ("progress", "say") if name in named}
+        key = function.__qualname__, pickle.dumps((given, named))
+        if key not in results:
+            said = []
+            listeners = dict.fromkeys(speakers, said.append)
+            results[key] = function(*given, **named, **listeners), said
+        result, said = results[key]
+        for speaker in speakers.values():
+            for each in said:
+                speaker(each)
+        return result
+
+    return once
+
+
+@pytest.fixture(scope="module")
+def results():
+    """Of what takes long, by its arguments."""
+    return {}
+
+
+@pytest.fixture
+def computed_once(results, monkeypatch):
+    """What takes most of the time of a command is computed once for all tests of what it shows."""
+    from mwdcal.comparison import compare
+    from mwdcal.logs import noise
+    from mwdcal.planning import planned
+
+    long = (
+        (planned, "judged"),
+        (planned, "best_plan"),
+        (compare, "compare"),
+        (noise, "find_noise"),
+    )
+    for module, name in long:
+        monkeypatch.setattr(module, name, remembered(getattr(module, name), results))

@@ -158,15 +158,15 @@ def temperatures(odd=0, of=1):
     ("tool", "options", "odd"),
     [
         ("servo", (), (0, 1)),
-        ("quiet", ("--model", "polynomial"), (0, 2)),
-        ("generic", ("--method", "scalar"), (1, 2)),
-        ("servo", ("--method", "newton"), (0, 2)),
-        ("servo", ("--prior", "datasheet", "--parameters", 9), (1, 2)),
+        ("quiet", ("--model", "polynomial"), (0, 3)),
+        ("generic", ("--method", "scalar"), (1, 3)),
+        ("servo", ("--method", "newton"), (2, 3)),
+        ("servo", ("--prior", "datasheet", "--parameters", 9), (0, 3)),
     ],
     ids=str,
 )
 def test_orders_are_chosen_as_for_each_tool_alone(tmp_path, tool, options, odd):
-    """Every kind of tool with the default and with two other ways."""
+    """Every kind of tool with the default and with another way."""
     rows, alone = both(tmp_path, temperatures(*odd), "--order", "auto", *options, tool=tool)
     check_all(rows, alone)
     chosen = {(r["accelerometer_order"], r["magnetometer_order"]) for r in rows.values()}

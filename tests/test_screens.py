@@ -5,14 +5,12 @@
 
 import io
 import os
-import pickle
 import re
 import shutil
 import sys
 import tempfile
 from collections import Counter
 from contextlib import redirect_stderr, redirect_stdout
-from functools import wraps
 from pathlib import Path
 from unittest.mock import patch
 
@@ -21,9 +19,6 @@ import pytest
 
 from cli_support import mwdcal, read_csv, servo_run, write_csv
 from mwdcal.app import cli, progress, text
-from mwdcal.comparison import compare as comparison
-from mwdcal.logs import noise
-from mwdcal.planning import planned
 
 STORED = Path(__file__).parent / "screens"
 WIDTHS = (80, 120)
@@ -60,8 +55,6 @@ SCREENS = {
     "misused": ("calibrate", "demo/run.csv"),
 }  # fmt: skip
 """Commands and what they run on."""
-LONG = ((planned, "judged"), (planned, "best_plan"), (comparison, "compare"), (noise, "find_noise"))
-"""What takes most of the time of a screen."""
 WITHOUT_A_SCREEN = {"completion"}
 """Commands whose result is a script."""
 
@@ -159,37 +152,9 @@ def files(tmp_path_factory):
     return folder
 
 
-def remembered(function, results):
-    """The function, which computes once for equal arguments, and says of its progress the same again."""
-
-    @wraps(function)
-    def once(*given, **named):
-        speakers = {name: named.pop(name) for name in ("progress", "say") if name in named}
-        key = function.__qualname__, pickle.dumps((given, named))
-        if key not in results:
-            said = []
-            listeners = dict.fromkeys(speakers, said.append)
-            results[key] = function(*given, **named, **listeners), said
-        result, said = results[key]
-        for speaker in speakers.values():
-            for each in said:
-                speaker(each)
-        return result
-
-    return once
-
-
-@pytest.fixture(scope="module")
-def results():
-    """Of what takes long, by its arguments: every screen is shown at many widths and in many ways."""
-    return {}
-
-
 @pytest.fixture
-def work(files, results, tmp_path, monkeypatch):
+def work(files, computed_once, tmp_path, monkeypatch):
     """A copy of the files to run in; nothing is said of how far a command is."""
-    for module, name in LONG:
-        monkeypatch.setattr(module, name, remembered(getattr(module, name), results))
     monkeypatch.setattr(progress.slowly, "__defaults__", (600.0,))
     monkeypatch.setattr(progress, "PATIENCE", 600.0)
     monkeypatch.chdir(shutil.copytree(files, tmp_path / "work"))
