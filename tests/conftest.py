@@ -3,6 +3,7 @@
 A job in the background ignores Ctrl-C, and so would the commands that the tests start.
 """
 
+import gc
 import os
 import pickle
 import signal
@@ -32,6 +33,12 @@ def pytest_collection_modifyitems(config, items):
             items=[each for each in items if each.get_closest_marker("study")]
         )
         items[:] = [each for each in items if not each.get_closest_marker("study")]
+
+
+def pytest_collection_finish():
+    """The thousands of tests stay to the end: looking for garbage does not go over them each time."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(autouse=True, scope="session")
