@@ -3,7 +3,7 @@
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: papers measured verification scatter diagnosis mutations help demo test test-quick test-oldest \
+.PHONY: papers measured verification scatter diagnosis mutations help demo test test-quick test-studies test-oldest \
 	test-versions fuzz kills check bench docs clean
 
 PYTHON ?= python3
@@ -46,10 +46,14 @@ demo: $(INSTALLED) ## calibrate the example tool, verify it, write its report
 	echo "report: build/demo/tool.html"
 
 test: $(INSTALLED) ## run the tests on all cores
-	@$(CLOCK); $(ONE_THREAD) $(BIN)/python -m pytest -q -rs --durations=25 --durations-min=5 -n auto
+	@$(CLOCK); $(ONE_THREAD) $(BIN)/python -m pytest -q -rs --durations=25 --durations-min=5 \
+		-n auto --dist worksteal
 
 test-quick: $(INSTALLED) ## run the most telling tests (under a minute)
 	@$(CLOCK); $(ONE_THREAD) $(BIN)/python $(QUICK)
+
+test-studies: $(INSTALLED) ## run the large versions of tests that are made small in the others (two minutes)
+	@$(CLOCK); $(ONE_THREAD) $(BIN)/python -m pytest -q -rs -n auto -m study
 
 # What the quick tests need besides the package and its extras.
 TESTED_WITH := pytest pytest-xdist hypothesis jsonschema allantools pandas polars

@@ -21,6 +21,7 @@ from mwdcal.app import cli, progress, text
 
 SOURCE = Path(cli.__file__).parents[1]
 ENCODINGS = ("cp1252", "cp850", "latin-1", "ascii")
+pytestmark = pytest.mark.usefixtures("computed_once")
 posix = pytest.mark.skipif(os.name == "nt", reason="POSIX names, pipes and descriptors")
 
 

@@ -368,6 +368,7 @@ def test_the_page_is_whole_and_needs_nothing_else(whole):
     assert page == render(whole, "<tool>", "ab" * 32)
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_the_page_says_what_is_simulated_and_what_is_refused():
     page = render(heated())
     assert "SIMULATED DATA" in page
@@ -487,6 +488,7 @@ def test_parameters_beyond_the_axis_have_an_arrow_and_the_largest_its_value(whol
     assert separate(figure) == []
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_the_page_has_serial_and_dates_as_text(whole):
     stated = {"serial": "<b>S</b>", "date": "2026-03-04"}
     page = render(whole, metadata=stated, time="2026-11-22 17:00 UTC")
@@ -497,6 +499,7 @@ def test_the_page_has_serial_and_dates_as_text(whole):
     assert not re.search(r"measured \d", render(whole))
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_a_relative_field_has_no_nanotesla_on_the_page():
     found = compare(make(1, unknown=("field",)), PROFILE)
     page = render(found)
@@ -530,6 +533,7 @@ def test_uncertainty_in_parentheses(pair, text):
     assert command._joined(*pair) == text
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_command_prints_the_same_as_its_json(tmp_path):
     report = tmp_path / "methods.html"
     screen = mwdcal("compare", EXAMPLE, "--tool", "servo", "--report", report)

@@ -345,6 +345,7 @@ def test_the_row_is_its_worst_set():
         assert row.passed == all(each.passed for each in row.sets)
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_stations_over_a_limit_are_marked():
     result = verdict("sets", 0.001)
     limits = {row.name: row.limit / (1 + row.name.startswith("spread")) for row in result.rows}
@@ -412,6 +413,7 @@ def test_a_relative_calibration_draws_everything_but_the_field():
     Page().feed(render(sound("field"), result))
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_a_verdict_without_values_has_no_picture():
     only = Limits(name="field", error=Bounds(field_nt=300.0))
     result = verify(sound("field"), readings(ONE, 3), only)
@@ -434,6 +436,7 @@ def test_a_set_that_was_not_rolled_is_drawn_and_fails():
     assert "not stated" in result.plot.toolface().axes[0].get_title("right")
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_signatures_are_on_the_first_printed_page():
     """In print they follow banner and facts, before findings of any length."""
     page = render(sound(), verdict("one"))
@@ -443,6 +446,7 @@ def test_signatures_are_on_the_first_printed_page():
     assert "#outcome > .sign { order: -2" in printed
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_a_simulated_roll_test_is_labelled_as_one():
     real = msgspec.structs.replace(sound(), tool={"serial": "MWD-7"}, simulated=False)
     result = verdict("one")

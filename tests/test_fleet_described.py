@@ -19,6 +19,7 @@ from test_fleet_options import bent, drifting
 from test_fleet_page import table_of, worst_tools
 
 pq = pytest.importorskip("pyarrow.parquet")
+pytestmark = pytest.mark.usefixtures("without_pictures")
 
 from mwdcal.app.pages import fleet_figures, fleet_report  # noqa: E402
 from mwdcal.calibration.diagnosis.findings import REMARKS  # noqa: E402

@@ -7,6 +7,7 @@ reader could not read.
 import io
 import re
 import shutil
+from functools import cached_property
 from importlib.resources import files
 from itertools import product
 from pathlib import Path
@@ -120,10 +121,21 @@ def browser():
         chromium.close()
 
 
-def blank(sheet):
-    """Whether nothing is on it but the foot."""
-    text, drawn = sheet
-    return drawn < 1500 and len(text) < 150
+class Sheet:
+    """A printed page."""
+
+    def __init__(self, page):
+        self.page = page
+
+    @cached_property
+    def text(self):
+        """Blanks may be as they like; a page of pictures takes seconds to read."""
+        return " ".join(self.page.extract_text().split())
+
+    @property
+    def blank(self):
+        """Whether nothing is on it but the foot: little is drawn, and few words."""
+        return len(self.page.get_contents().get_data()) < 1500 and len(self.text) < 150
 
 
 class Seen:
@@ -171,12 +183,9 @@ class Seen:
         )
 
     def paper(self):
-        """The text of each printed page, with blanks as they may be, and how much is drawn on it."""
+        """The printed pages."""
         printed = pypdf.PdfReader(io.BytesIO(self.page.pdf(prefer_css_page_size=True)))
-        return [
-            (" ".join(page.extract_text().split()), len(page.get_contents().get_data()))
-            for page in printed.pages
-        ]
+        return [Sheet(page) for page in printed.pages]
 
     def paper_faults(self):
         """What is missing on the first sheet, and sheets with nothing on them."""
@@ -185,10 +194,10 @@ class Seen:
         if self.page.locator("#signatures").count():
             first += ["Calibrated by", "Approved by", "name", "signature", "date"]
         paper = self.paper()
-        faults = [f"not on the first sheet: {words}" for words in first if words not in paper[0][0]]
-        faults += [
-            f"blank: sheet {number}" for number, sheet in enumerate(paper, 1) if blank(sheet)
+        faults = [
+            f"not on the first sheet: {words}" for words in first if words not in paper[0].text
         ]
+        faults += [f"blank: sheet {number}" for number, sheet in enumerate(paper, 1) if sheet.blank]
         return faults + [f"{len(paper)} sheets"] * (len(paper) > MOST_SHEETS)
 
     def light(self, selector):
@@ -343,14 +352,14 @@ def test_a_page_may_ask_for_nothing_and_run_nothing_but_its_script(planted, cont
 
 def test_a_blank_sheet_is_found(planted):
     seen = planted("<p>one</p><div class='page'></div><p class='page'>" + "words " * 60 + "</p>")
-    assert [blank(sheet) for sheet in seen.paper()] == [True, True, False]
+    assert [sheet.blank for sheet in seen.paper()] == [True, True, False]
 
 
 def test_heads_are_repeated_on_paper(planted):
     rows = [(f"P{number}", str(number)) for number in range(120)]
     paper = planted(table_of(rows)).paper()
     assert len(paper) > 2
-    assert all("label" in text and "first" in text for text, _ in paper)
+    assert all("label" in sheet.text and "first" in sheet.text for sheet in paper)
 
 
 # ------------------------------------------------------------------ a closer look

@@ -17,6 +17,7 @@ from test_stations import multi_rate
 
 jsonschema = pytest.importorskip("jsonschema")
 pq = pytest.importorskip("pyarrow.parquet")
+pytestmark = pytest.mark.usefixtures("without_pictures")
 
 IDENTITY = ("serial = 'MWD-7'", "simulated = true")
 HEAD = ("schema_version", "command", "software", "serial", "simulated")

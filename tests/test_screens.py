@@ -153,7 +153,7 @@ def files(tmp_path_factory):
 
 
 @pytest.fixture
-def work(files, tmp_path, monkeypatch):
+def work(files, computed_once, tmp_path, monkeypatch):
     """A copy of the files to run in; nothing is said of how far a command is."""
     monkeypatch.setattr(progress.slowly, "__defaults__", (600.0,))
     monkeypatch.setattr(progress, "PATIENCE", 600.0)
