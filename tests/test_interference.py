@@ -89,6 +89,19 @@ def test_interference_is_within_its_uncertainty_over_500_wells() -> None:
     assert np.mean(square) == pytest.approx(3.0, abs=4 * np.sqrt(6 / SEEDS))  # χ² of three
 
 
+def test_statistics_hold_where_field_and_dip_also_differ_from_station_to_station() -> None:
+    readings = surveyed(laboratory(), DEVIATED, 200, seed=21, moments=1.0)
+    whole = estimate(laboratory(), readings, PLAIN)
+    departure = whole.size - np.array(IRON)
+    square = np.einsum("wi,wij,wj->w", departure, np.linalg.inv(whole.spread), departure)
+    # the larger of field and dip counts in every direction: a little too cautious, never too bold
+    assert 2.0 < np.mean(square) < 3.0 + 4 * np.sqrt(6 / 200)
+    azimuth, covariance, _ = azimuths(laboratory(), whole)
+    error = centred(azimuth - DEVIATED.azimuth).mean(-1)
+    inside = np.abs(error) < 1.96 * np.sqrt(covariance.mean((-1, -2)))
+    assert 0.92 < np.mean(inside) <= 1.0
+
+
 def test_uncorrected_surveys_raise_the_alarm_in_every_well() -> None:
     """Fixed limits of 300 nT and 0.3° at some survey, and azimuths off by degrees."""
     readings, _ = deviated()

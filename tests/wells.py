@@ -12,6 +12,8 @@ from simulation import DEG, attitude
 
 FIELD, DIP = 50_000.0, 65 * DEG
 SD_FIELD, SD_DIP = 130.0, 0.2 * DEG
+SD_MOMENT = (60.0, 0.08 * DEG)
+"""Of field, nT, and dip at each station its own (OWSG, MFIR and MDIR)."""
 NOISE = (1e-4, 15.0)
 IRON = (80.0, -60.0, 1500.0)
 """Interference along x, y, z: 100 nT across the tool, 1,500 nT along it."""
@@ -73,18 +75,23 @@ def surveyed(
     iron=IRON,
     references=1.0,
     scale=0.0,
+    moments=0.0,
 ) -> Readings:
     """Surveys (wells, n) by tools whose calibration is off, in a field that is off its references.
 
     `references` multiplies the errors of these, of standard deviations that the surveys state. The readings are
-    those of a triad field = A reading + c at one temperature.
+    those of a triad field = A reading + c at one temperature. `moments`: by how much of `SD_MOMENT` field and dip
+    also differ from station to station.
     """
     rng = np.random.default_rng(seed)
     tools = drawn_tools(calibration, rng, wells).reshape(wells, 2, 12)
     matrix, offset = tools[..., :9].reshape(wells, 2, 3, 3), tools[..., 9:]
     vectors = attitude(where.inclination, where.azimuth, where.toolface)
     off = references * rng.normal(size=(wells, 2)) * (SD_FIELD, SD_DIP)
-    fields = [vectors(1.0, FIELD + f, DIP + d) for f, d in off]
+    off = np.repeat(off[:, None], len(where), 1)
+    if moments:
+        off = off + moments * rng.normal(size=off.shape) * SD_MOMENT
+    fields = [vectors(1.0, FIELD + each[:, :1], DIP + each[:, 1]) for each in off]
     g, b = (np.stack(each) for each in zip(*fields, strict=True))
     seen = [g, b * (1 + np.asarray(scale)) + np.asarray(iron)]
     raw = [
@@ -98,6 +105,9 @@ def surveyed(
         "accelerometer": np.full((count, 3), NOISE[0]), "magnetometer": np.full((count, 3), NOISE[1]),
         "field": np.full(count, SD_FIELD), "dip": np.full(count, SD_DIP),
     }  # fmt: skip
+    if moments:
+        sizes = zip(("field", "dip"), SD_MOMENT, strict=True)
+        sd |= {f"random-{name}": np.full(count, moments * size) for name, size in sizes}
     labels = tuple(f"S{i + 1}" for i in range(count))
     metadata = {"simulated": True}
     return Readings(*raw, None, known, sd, station=labels, metadata=metadata, source="well.csv")

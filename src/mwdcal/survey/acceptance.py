@@ -19,7 +19,7 @@ from mwdcal.errors import InputError
 from mwdcal.files.profiles import decoded_toml
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array, Bools, diagonal
-from mwdcal.survey.stations import STRENGTHS, SURVEYED, Surveys
+from mwdcal.survey.stations import RANDOM, STRENGTHS, SURVEYED, Surveys
 from mwdcal.use.strengths import STANDARD_GRAVITY
 
 STRENGTH_NAMES = SURVEYED[STRENGTHS]
@@ -225,4 +225,5 @@ def _covariance(
 def _reference_sd(readings: Readings, limits: SurveyLimits, name: str) -> Array:
     """Standard uncertainty (n,) of a reference: as stated, else that of the limits."""
     stated = readings.uncertainty(name)
-    return np.where(stated > 0, stated, limits.reference.sd(name))
+    shared = np.where(stated > 0, stated, limits.reference.sd(name))
+    return np.hypot(shared, readings.uncertainty(RANDOM + name))

@@ -24,6 +24,8 @@ STRENGTHS = slice(4, 7)
 """Where |g|, |b| and dip lie in it."""
 TOOLFACE_SWITCH = (np.radians(3.0), np.radians(5.0))
 """Inclinations below which the toolface counts from magnetic north, and above which from the high side."""
+RANDOM = "random-"
+"""Start of the names, in `Readings.sd`, of what a reference is uncertain by anew at every station: "random-field"."""
 STATIONS_AT_ONCE = 1 << 12
 """Stations whose covariances are computed at once, so that memory does not grow with their number."""
 

@@ -20,6 +20,7 @@ from mwdcal.files.runs import renamed, to_readings
 from mwdcal.geometry.vectors import Array
 from mwdcal.sensor.profile import StandProfile
 from mwdcal.survey.place.references import MEASURABLE, EarthReference
+from mwdcal.survey.stations import RANDOM
 from mwdcal.survey.well import North, Well
 
 MEASURED_DEPTH = "md_m"
@@ -56,7 +57,7 @@ def survey_readings(
 def _referenced(readings: Readings, reference: EarthReference) -> Readings:
     """The readings with gravity, field and dip of the place where the table states none.
 
-    Their uncertainty is of one station: what all share, and what changes from one to the next.
+    Their uncertainty that all stations share stands under the name, and what is new at each under `RANDOM`.
     """
     known, sd = dict(readings.known), dict(readings.sd)
     for name in CONSTANTS:
@@ -65,7 +66,8 @@ def _referenced(readings: Readings, reference: EarthReference) -> Readings:
         stated = np.broadcast_to(known.get(name, np.nan), readings.count)
         blank = np.isnan(stated)
         known[name] = np.where(blank, getattr(reference, key) * factor, stated)
-        sd[name] = np.where(blank, np.hypot(shared, alone) * factor, readings.uncertainty(name))
+        sd[name] = np.where(blank, shared * factor, readings.uncertainty(name))
+        sd[RANDOM + name] = np.where(blank, alone * factor, 0.0)
     return replace(readings, known=known, sd=sd)
 
 

@@ -24,6 +24,7 @@ from mwdcal.estimation.uncertainty import TANGENT_STEP, analyse, tangent
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array, Bools, diagonal
 from mwdcal.survey.place.references import PLACE_SD
+from mwdcal.survey.stations import RANDOM
 from mwdcal.survey.well import UNKNOWN_GRAVITY, unknown_gravity
 
 OFFSET_NAMES = ("cross-axial x", "cross-axial y", "axial")
@@ -170,6 +171,7 @@ def estimate(
 def surveys(calibration: Calibration, readings: Readings) -> Readings:
     """The readings as stations of unknown attitude, with the noise of the calibration where none is stated.
 
+    What is new of field and dip at every station counts as noise of the magnetometer, by the larger of the two.
     Raises `InputError` for a calibration or readings without a magnetometer, or without a reference.
     """
     if not calibration.has_field or readings.magnetometer is None:
@@ -192,6 +194,9 @@ def surveys(calibration: Calibration, readings: Readings) -> Readings:
     sd = {
         t.name: np.broadcast_to(readings.sd.get(t.name, t.noise), shape) for t in calibration.triads
     }
+    random = [readings.uncertainty(RANDOM + name) for name in ("field", "dip")]
+    moved = np.maximum(random[0], readings.reference("field") * random[1])
+    sd["magnetometer"] = np.hypot(sd["magnetometer"], moved[..., None])
     for name in CONSTANTS:
         stated = readings.uncertainty(name)
         sd[name] = np.where(stated > 0, stated, USUAL_SD[name])
