@@ -277,7 +277,7 @@ def test_a_command_that_waits_for_a_pipe_can_be_terminated(tmp_path):
     child.send_signal(signal.SIGTERM)
     _, err = child.communicate(timeout=30)
     assert child.returncode in (2, 128 + signal.SIGTERM)
-    assert err.startswith("mwdcal: ")
+    assert err.lstrip().startswith("mwdcal: ")
     assert "Traceback" not in err
 
 
