@@ -50,7 +50,7 @@ test: $(INSTALLED) ## run the tests on all cores
 		-n auto --dist worksteal
 
 test-quick: $(INSTALLED) ## run the most telling tests (under a minute)
-	@$(CLOCK); $(ONE_THREAD) $(BIN)/python $(QUICK)
+	@$(CLOCK); $(ONE_THREAD) $(BIN)/python $(QUICK_RUN)
 
 test-studies: $(INSTALLED) ## run the large versions of tests that are made small in the others (two minutes)
 	@$(CLOCK); $(ONE_THREAD) $(BIN)/python -m pytest -q -rs -n auto -m study
@@ -58,20 +58,20 @@ test-studies: $(INSTALLED) ## run the large versions of tests that are made smal
 # What the quick tests need besides the package and its extras.
 TESTED_WITH := pytest pytest-xdist hypothesis jsonschema allantools pandas polars
 INSTALL := -m pip install --quiet --disable-pip-version-check
-QUICK := -m pytest -q -n auto -m "not slow" $(QUICK_TESTS:%=tests/test_%.py)
+QUICK_RUN := -m pytest -q -n auto -m "not slow" $(QUICK_TESTS:%=tests/test_%.py)
 
 test-oldest: $(INSTALLED) ## run the quick tests with the lowest versions that pyproject.toml allows
 	@$(CLOCK); mkdir -p build; $(BIN)/python tests/oldest_versions.py > build/oldest.txt; \
 	$(PYTHON) -m venv build/oldest; \
 	build/oldest/bin/python $(INSTALL) -c build/oldest.txt -e '.[all]' $(TESTED_WITH); \
-	$(ONE_THREAD) build/oldest/bin/python $(QUICK) -W ignore::DeprecationWarning
+	$(ONE_THREAD) build/oldest/bin/python $(QUICK_RUN) -W ignore::DeprecationWarning
 
 test-versions: ## run the quick tests with other interpreters (PYTHONS="python3.12 python3.13")
 	@$(CLOCK); for python in $(PYTHONS); do \
 		$$python --version >/dev/null 2>&1 || { echo "skipped: $$python is not installed"; continue; }; \
 		place=build/$$(basename $$python); $$python -m venv $$place; \
 		$$place/bin/python $(INSTALL) -c constraints.txt -e '.[all]' $(TESTED_WITH); \
-		$$place/bin/python --version; $(ONE_THREAD) $$place/bin/python $(QUICK); \
+		$$place/bin/python --version; $(ONE_THREAD) $$place/bin/python $(QUICK_RUN); \
 	done
 
 fuzz: $(INSTALLED) ## run random commands on damaged files (SEEDS=0:100000 MINUTES=10), findings into build/fuzz
