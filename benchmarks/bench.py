@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import os
 import platform
+import re
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -234,6 +235,24 @@ def page(groups: dict[str, Group], quick: bool) -> str:
     return text
 
 
+def renewed(text: str, groups: dict[str, Group]) -> str:
+    """A page with the sections of some groups measured anew, by themselves: with their own machine and date."""
+    parts = re.split(r"(?m)^(?=## )", text)
+    for section in re.split(r"(?m)^(?=## )", TEXTS.read_text("utf-8")):
+        for name, group in groups.items():
+            if "{" + name + "}" in section:
+                shown = group.missing or group_table(group.rows)
+                about = f"Measured by itself: {datetime.now(UTC).date()}, {machine()}."
+                filled = section.replace("{" + name + "}", f"{shown}\n\n{about}")
+                heading = section.partition("\n")[0]
+                kept = [part for part in parts if part.partition("\n")[0] != heading]
+                place = next(
+                    i for i, part in enumerate(kept) if part.startswith("## Particle swarm")
+                )
+                parts = [*kept[:place], filled, *kept[place:]]
+    return "".join(parts)
+
+
 def plot(groups: dict[str, Group], path: Path) -> None:
     """All ratios of time on one logarithmic axis, the groups apart."""
     import matplotlib as mpl
@@ -284,11 +303,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--output", type=Path, default=ROOT / "docs")
+    parser.add_argument("--only", help="groups with commas, whose sections of the page are renewed")
     asked = parser.parse_args()
     if os.environ.get("OMP_NUM_THREADS") != "1":
         sys.exit("set OMP_NUM_THREADS=1 and OPENBLAS_NUM_THREADS=1, or use `make bench`")
     if asked.quick:
         measuring.BUDGET["seconds"] = 0.5
+    if asked.only:
+        groups = {name: measured(name, asked.quick) for name in asked.only.split(",")}
+        there = asked.output / "benchmarks.md"
+        there.write_text(renewed(there.read_text("utf-8"), groups), "utf-8")
+        return
     groups = {name: measured(name, asked.quick) for name in ORDER}
     asked.output.mkdir(parents=True, exist_ok=True)
     (asked.output / "benchmarks.md").write_text(page(groups, asked.quick), "utf-8")
