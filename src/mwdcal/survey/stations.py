@@ -16,7 +16,7 @@ from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import Calibration
 from mwdcal.errors import InputError
 from mwdcal.geometry.observables import OBSERVABLES
-from mwdcal.geometry.vectors import Array, Bools, diagonal, wrap
+from mwdcal.geometry.vectors import Array, Bools, diagonal
 
 SURVEYED = ("inclination", "azimuth", "toolface", "north_toolface", "gravity", "field", "dip")
 """Observables of a survey, in the order of `Surveys.value`."""
@@ -108,8 +108,3 @@ def switched(inclination: Array, low: float, high: float) -> Bools:
     decided = np.where(inclination < low, 1, np.where(inclination > high, 0, -1))
     last = np.maximum.accumulate(np.where(decided >= 0, np.arange(len(decided)), -1))
     return np.asarray((last >= 0) & (decided[np.maximum(last, 0)] == 1))
-
-
-def from_true_north(azimuth: Array, declination: float) -> Array:
-    """True azimuth (n,) of a magnetic one, radians, 0…2π; `declination` positive to the east."""
-    return wrap(azimuth + declination)

@@ -10,7 +10,7 @@ import numpy as np
 from mwdcal.app.screens.numbers import fixed, written
 from mwdcal.app.text import one_line, plural, table
 from mwdcal.calibration.readings import simulated
-from mwdcal.calibration.record import Finding
+from mwdcal.calibration.record import Finding, stated
 from mwdcal.survey.acceptance import SurveyLimits
 from mwdcal.survey.multistation.interference import InterferenceSize, MultiStationAnalysis
 from mwdcal.survey.well import North, Well
@@ -126,7 +126,7 @@ def end_of_path(well: Well) -> EndOfPath | None:
         return None
     last = int(np.flatnonzero(~np.isnan(well.position.place[:, 0]))[-1])
     north, east, tvd = well.position.place[last].tolist()
-    sd_north, sd_east, sd_tvd = map(_stated, well.position.sd[last].tolist())
+    sd_north, sd_east, sd_tvd = map(stated, well.position.sd[last].tolist())
     return EndOfPath(
         station=well.readings.labels[last],
         md_m=float(well.position.md[last]),
@@ -136,12 +136,8 @@ def end_of_path(well: Well) -> EndOfPath | None:
         sd_north_m=sd_north,
         sd_east_m=sd_east,
         sd_tvd_m=sd_tvd,
-        covariance_m2=[[*map(_stated, row)] for row in well.position.covariance[last].tolist()],
+        covariance_m2=[[*map(stated, row)] for row in well.position.covariance[last].tolist()],
     )
-
-
-def _stated(value: float) -> float | None:
-    return None if np.isnan(value) else value
 
 
 def screen(well: Well, facts: SurveySummary, *metadata: Mapping[str, object]) -> str:
