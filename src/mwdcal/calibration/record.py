@@ -601,8 +601,12 @@ def content_sha256(calibration: Calibration) -> str:
 def document_sha256(fields: Mapping[str, Any]) -> str:
     """The `content_sha256` of a calibration file, whose fields are these."""
     kept = {name: value for name, value in fields.items() if name not in ("time", "sha256")}
-    text = json.dumps(kept, sort_keys=True, separators=(",", ":"))
-    return hashlib.sha256(text.encode()).hexdigest()
+    return hashlib.sha256(canonical(kept)).hexdigest()
+
+
+def canonical(fields: Mapping[str, Any]) -> bytes:
+    """The one form in which fields are hashed and signed: compact JSON in ASCII with sorted keys."""
+    return json.dumps(fields, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
 
 
 def sealed(calibration: Calibration) -> Calibration:

@@ -7,6 +7,7 @@ turns fitted parameters back into the instrument's own channels.
 
 from __future__ import annotations
 
+from datetime import date
 from typing import Literal
 
 import msgspec
@@ -125,9 +126,26 @@ class ColumnSource(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     unit: str = ""
 
 
+class MeasurementStandard(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What the references of a calibration are traceable to: a stand, a magnetometer, a gravity survey.
+
+    `certificate` is the number of its own calibration certificate, of `issued`, by `issuer`; `due` the
+    day from which it no longer holds.
+    """
+
+    quantity: Literal["stand", "gravity", "field", "dip", "temperature"]
+    name: str
+    serial: str = ""
+    certificate: str = ""
+    issuer: str = ""
+    issued: date | None = None
+    due: date | None = None
+
+
 class Profile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """A tool as its maker describes it: see `docs/files.md` for the TOML form.
 
+    `standards` are what the references of its calibrations are traceable to.
     `table` and `columns` say how its tables are written, and which of their columns is which of the
     run file's; without them tables are run files as documented.
     """
@@ -137,5 +155,6 @@ class Profile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     accelerometer: TriadProfile = TriadProfile()
     magnetometer: TriadProfile = TriadProfile()
     stand: StandProfile = StandProfile()
+    standards: tuple[MeasurementStandard, ...] | msgspec.UnsetType = msgspec.UNSET
     table: TableFormat | msgspec.UnsetType = msgspec.UNSET
     columns: dict[str, ColumnSource] | msgspec.UnsetType = msgspec.UNSET

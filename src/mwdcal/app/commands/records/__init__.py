@@ -1,0 +1,1 @@
+"""Commands for certificates and for the registry of tools."""

@@ -1,0 +1,1 @@
+"""Certificates as pages and PDF, and pages of the registry."""

@@ -1,0 +1,209 @@
+"""`Certificate`: everything that a calibration certificate states, once, for every form that it takes.
+
+PDF, page, JSON and XML are made from this record alone, pictures apart. The fields follow
+ISO/IEC 17025:2017, 7.8.2 (all reports), 7.8.4 (calibration certificates) and 7.8.6 (statements of conformity).
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import msgspec
+
+from mwdcal.calibration.record import Finding
+
+CERTIFICATE_VERSION = 1
+"""Version of the certificate's JSON: higher when a key goes, or changes its meaning."""
+
+
+class Party(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A laboratory or a customer: name, lines of the address, and what else identifies it."""
+
+    name: str
+    address: list[str] = []
+    contact: str = ""
+    accreditation: str = ""
+
+
+class Person(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Who measured, or who authorised the certificate."""
+
+    name: str
+    function: str = ""
+
+
+class Item(msgspec.Struct, frozen=True, kw_only=True):
+    """The tool that was calibrated."""
+
+    type: str
+    serial: str
+    manufacturer: str = ""
+    identification: dict[str, str] = {}
+    condition: str = ""
+    received: str = ""
+
+
+class Quantity(msgspec.Struct, frozen=True, kw_only=True):
+    """A value with its unit and uncertainty; None where it is undetermined, or nothing is stated.
+
+    `expanded_uncertainty` is `coverage_factor` times `standard_uncertainty` and covers the value
+    with the probability `coverage_probability`. `at`: where it holds, such as an attitude.
+    """
+
+    id: str
+    name: str
+    unit: str
+    value: float | None
+    standard_uncertainty: float | None = None
+    expanded_uncertainty: float | None = None
+    coverage_factor: float | None = None
+    coverage_probability: float | None = None
+    at: str = ""
+
+
+class ResultTable(msgspec.Struct, frozen=True, kw_only=True):
+    """Results that belong together, such as the parameters of a triad."""
+
+    id: str
+    title: str
+    note: str = ""
+    quantities: list[Quantity]
+
+
+class BudgetLine(msgspec.Struct, frozen=True, kw_only=True):
+    """What one source adds to the standard uncertainty of each angle, in degrees; None: undetermined.
+
+    `kind`: "A" by statistics of the readings, "B" otherwise (JCGM 100, 4.2 and 4.3).
+    """
+
+    id: str
+    source: str
+    kind: Literal["A", "B"]
+    basis: str
+    inclination_deg: float | None
+    toolface_deg: float | None
+    azimuth_deg: float | None = None
+
+
+class Budget(msgspec.Struct, frozen=True, kw_only=True):
+    """The uncertainty budget of the angles at one attitude: lines, their sum of squares, and its expansion."""
+
+    at: str
+    lines: list[BudgetLine]
+    combined: BudgetLine
+    expanded: BudgetLine
+    coverage_factor: float
+    coverage_probability: float
+
+
+class TracedStandard(msgspec.Struct, frozen=True, kw_only=True):
+    """A measurement standard that the results are traceable to, and its own certificate."""
+
+    quantity: str
+    name: str
+    serial: str = ""
+    certificate: str = ""
+    issuer: str = ""
+    date: str = ""
+    due: str = ""
+    overdue: bool = False
+    standard_uncertainty: str = ""
+
+
+class LimitDecision(msgspec.Struct, frozen=True, kw_only=True):
+    """A limit of a roll test and the decision on it.
+
+    `acceptance_limit`: what the value must not exceed, the limit less the guard band.
+    `probability_within`: that the true value is within the limit, given value and uncertainty; None where
+    the uncertainty is not stated. `risk`: of the wrong decision that was taken, from it.
+    """
+
+    quantity: Quantity
+    limit: float
+    acceptance_limit: float | None
+    passed: bool
+    probability_within: float | None
+    risk: float | None
+    note: str = ""
+
+
+class ConformityTest(msgspec.Struct, frozen=True, kw_only=True):
+    """A roll test as the certificate shows it: as found, or as left."""
+
+    when: Literal["as found", "as left"]
+    passed: bool
+    date: str = ""
+    run: str
+    stations: int
+    limits: str
+    source: str
+    rule: Literal["simple", "guarded"]
+    rule_text: str
+    calibration_sha256: str
+    decisions: list[LimitDecision]
+    findings: list[Finding] = []
+
+
+class Method(msgspec.Struct, frozen=True, kw_only=True):
+    """How the tool was calibrated: procedure, estimator and model, and what they rest on."""
+
+    name: str
+    text: str
+    software: str
+    model: str
+    stations: int
+    references: list[str] = []
+    deviations: list[str] = []
+
+
+class SourceFile(msgspec.Struct, frozen=True, kw_only=True):
+    """A file that the certificate rests on: what it is, its path from the certificate's folder, its SHA-256."""
+
+    id: str
+    name: str
+    sha256: str
+
+
+class Signature(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A signature over the canonical JSON of the document without this field.
+
+    `key` is the SHA-256 of the raw public key, hexadecimal, its first 16 digits; `time` (UTC) is part
+    of what is signed; `value` in base64.
+    """
+
+    algorithm: Literal["Ed25519"] = "Ed25519"
+    key: str
+    time: str
+    value: str
+
+
+class Certificate(msgspec.Struct, frozen=True, kw_only=True):
+    """A calibration certificate. Dates are ISO 8601; angles in degrees, strengths in g and nT."""
+
+    schema_version: int = CERTIFICATE_VERSION
+    command: str = "certificate"
+    software: str
+    serial: str | None
+    simulated: bool
+    number: str
+    title: str = "Calibration certificate"
+    issued: str
+    laboratory: Party | None = None
+    place: str = ""
+    customer: Party | None = None
+    item: Item
+    calibrated: str
+    next_due: str = ""
+    method: Method
+    conditions: list[Quantity]
+    results: list[ResultTable]
+    budget: Budget
+    traceability: list[TracedStandard]
+    as_found: ConformityTest | None = None
+    as_left: ConformityTest | None = None
+    measured_by: Person | None = None
+    authorised_by: Person | None = None
+    statements: list[str]
+    findings: list[Finding]
+    files: list[SourceFile]
+    signature: Signature | msgspec.UnsetType = msgspec.UNSET

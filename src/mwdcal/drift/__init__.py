@@ -1,0 +1,1 @@
+"""How a tool changes from calibration to calibration, and when the next one is due."""
