@@ -58,6 +58,11 @@ def load(path: str | os.PathLike[str]) -> tuple[Calibration, str]:
     data, name, digest = (
         members.read(path) if file.suffix.lower() == members.SUFFIX else _whole_file(file)
     )
+    return decoded(data, name), digest
+
+
+def decoded(data: bytes, name: str) -> Calibration:
+    """The calibration in the bytes of a file of that name, or what is wrong with it."""
     try:
         calibration = _decoded(data, name)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
@@ -66,7 +71,7 @@ def load(path: str | os.PathLike[str]) -> tuple[Calibration, str]:
         ) from None
     check(calibration, name, _AS_WRITTEN)
     check_profile(calibration.profile, name)
-    return calibration, digest
+    return calibration
 
 
 def _whole_file(path: Path) -> members.Member:
