@@ -1,180 +1,161 @@
-"""What a file is that the registry takes: its kind, tool, date and what it rests on, from its bytes."""
+"""What a file is to a registry: the records that are made of it, by its content."""
 
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import suppress
-from datetime import date
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import msgspec
 
-from mwdcal.calibration.readings import is_simulated, serial_of
-from mwdcal.calibration.record import Calibration
-from mwdcal.errors import FitError, InputError
+from mwdcal.calibration.record import canonical
+from mwdcal.errors import InputError, reason
 from mwdcal.files import documents
 from mwdcal.files.contract import CHANNELS
-from mwdcal.files.formats import dialect
+from mwdcal.files.formats import members, parquet
 from mwdcal.files.formats import table as tables
-from mwdcal.files.formats.columns import shown
-from mwdcal.files.formats.table import Table
-from mwdcal.files.runs import serials
+from mwdcal.files.profiles import decoded_profile
+from mwdcal.registry.store import LARGEST_OBJECT, Entry
+from mwdcal.sensor.profile import MeasurementStandard
 
 TABLES = (*tables.SUFFIXES, *tables.EXCHANGED)
-"""Suffixes of files of runs, whose columns decide."""
-UNKNOWN = (
-    "it is none of the files that a registry keeps: calibrations, verifications and certificates of mwdcal, runs, "
-    "profiles, limits, laboratories and public keys"
+"""Suffixes of files with tables."""
+COMMANDS_KEPT = {"calibrate": "calibration", "verify": "verification", "certificate": "certificate"}
+"""Kinds of documents by the command that writes them."""
+LABORATORY_KEYS = ("laboratory", "customer", "measured_by", "authorised_by", "number")
+"""Of which a laboratory file has one at least."""
+PEOPLE = LABORATORY_KEYS[2:4]
+_BOM = b"\xef\xbb\xbf"
+_PEM = b"-----BEGIN "
+_UNKNOWN = (
+    "a registry keeps calibrations, verifications and certificates of mwdcal, runs, tool profiles, limits, "
+    "laboratories and public keys, and it is none of them. Leave it out."
 )
 
 
-class Content(NamedTuple):
-    """A file as the registry keeps it: its bytes as they are, and what they say of themselves.
+class UnlikeRunError(InputError):
+    """A table that is a run only if some calibration was made of it: `entry`."""
 
-    `date` is the day of the measurement, ISO 8601, empty where the file states none; `links` are the SHA-256 of
-    the files that it rests on, by what they are to it.
-    """
-
-    kind: str
-    data: bytes
-    name: str
-    serial: str = ""
-    date: str = ""
-    simulated: bool = False
-    links: Mapping[str, str] = {}
-    title: str = ""
+    def __init__(self, message: str, entry: Entry) -> None:
+        super().__init__(f"{message} Add it together with a calibration that was made of it.")
+        self.entry = entry
 
 
-class _Verification(msgspec.Struct):
-    """What the registry reads of the document of a roll test."""
-
-    serial: str | None
-    simulated: bool
-    passed: bool
-    limits: str
-    rows: list[dict[str, Any]]
-    calibration_sha256: str | None
-    run_sha256: str | None
-    limits_sha256: str | None
+def is_fleet(file: Path) -> bool:
+    """Whether a file is a table of calibrations, as `mwdcal fleet` writes it."""
+    if file.suffix.lower() != members.SUFFIX:
+        return False
+    return members.RECORD in parquet.opened(file, file.name)[1].names
 
 
-class _Item(msgspec.Struct):
-    serial: str
+def of_fleet(file: Path, group: int) -> Iterator[Entry]:
+    """The calibrations in a row group of a fleet's table, each as the file that `mwdcal fleet` writes of it."""
+    for serial, record in members.records(file, [group]):
+        yield Entry("calibration", documents.laid_out(record), f"{serial}.json")
 
 
-class _File(msgspec.Struct):
-    id: str
-    sha256: str
+def content(file: Path) -> bytes:
+    """The bytes of a file, of at most `LARGEST_OBJECT`."""
+    tables.check_file(file)
+    try:
+        size = file.stat().st_size
+        if size <= LARGEST_OBJECT:
+            return file.read_bytes()
+    except OSError as error:
+        raise InputError(f"{file}: cannot be read ({reason(error)}). Check its rights.") from None
+    raise InputError(
+        f"{file.name}: a registry takes files of at most {LARGEST_OBJECT:,} bytes; got {size:,}."
+    )
 
 
-class _Certificate(msgspec.Struct):
-    """What the registry reads of a certificate."""
+def of_bytes(data: bytes, name: str) -> list[Entry]:
+    """The records that a file is, and what it names: people and standards.
 
-    number: str
-    issued: str
-    simulated: bool
-    item: _Item
-    files: list[_File]
-
-
-def content(data: bytes, name: str) -> Content:
-    """What the bytes of a file are; its name counts only for tables, whose format is in the suffix.
+    The name of the file counts for tables, whose format is its suffix.
 
     Raises:
+        UnlikeRunError: a table that may be a run whose columns have names of their own.
         InputError: it is nothing that a registry keeps, or damaged.
     """
-    head = data[:64].lstrip(b"\xef\xbb\xbf \t\r\n")
-    if head.startswith(b"{"):
-        return _document(data, name)
-    if b"PRIVATE KEY" in data[:200]:
-        raise InputError(
-            f"{name} is a private key, which is kept by its owner alone. Add the public one."
-        )
-    if b"-----BEGIN PUBLIC KEY-----" in data[:200]:
-        return Content("public-key", data, name)
+    text = data.removeprefix(_BOM).lstrip()
+    if text.startswith(_PEM):
+        return [_key(text, data, name)]
+    if text.startswith(b"{"):
+        return [Entry(_json_kind(data, name), data, name)]
     if Path(name).suffix.lower() in TABLES:
-        return _run(data, name)
-    return _toml(data, name)
+        return [_run(data, name)]
+    return _of_toml(data, name)
 
 
-# ------------------------------------------------------------------ JSON
+def checked(entry: Entry) -> Entry:
+    """The entry, if it is a calibration one that every command accepts."""
+    if entry.kind == "calibration":
+        documents.decoded(entry.data, entry.name)
+    return entry
 
 
-def _document(data: bytes, name: str) -> Content:
-    """A JSON document of mwdcal."""
-    try:
-        command = msgspec.json.decode(data, type=dict[str, Any]).get("command")
-        read = _DOCUMENTS.get(str(command))
-        if read is None:
-            raise InputError(f"{name}: {UNKNOWN}. Leave it out.")
-        return read(data, name)
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+def _key(text: bytes, data: bytes, name: str) -> Entry:
+    if b"PRIVATE" in text[:64]:
         raise InputError(
-            f"{name} is not a document of mwdcal as it was written: {error}. Write it again."
-        ) from None
+            f"{name}: a private key is for its owner alone; a registry keeps the public one. Add that."
+        )
+    return Entry("public-key", data, name)
 
 
-def calibration(data: bytes, name: str) -> Content:
-    """A calibration file; also what `mwdcal calibrate` prints, which is none, is refused here."""
-    record = documents.decoded(data, name)
-    return Content(
-        "calibration",
-        data,
-        name,
-        serial_of(record.tool) or "",
-        measured(record),
-        is_simulated(record.tool),
-        _known(
-            run=record.run_sha256, profile=record.profile_sha256, prior=record.prior_sha256 or ""
-        ),
-        record.profile.name,
+def _json_kind(data: bytes, name: str) -> str:
+    """The kind of a JSON document."""
+    try:
+        fields = msgspec.json.decode(data, type=dict[str, Any])
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise InputError(f"{name}: it is damaged ({error}). Write it again.") from None
+    kinds = {"quantity": "standard", "function": "person"}
+    kind = COMMANDS_KEPT.get(str(fields.get("command"))) or next(
+        (kind for key, kind in kinds.items() if key in fields), ""
     )
+    if not kind:
+        raise InputError(f"{name}: {_UNKNOWN}")
+    return kind
 
 
-def measured(record: Calibration) -> str:
-    """The day of the measurement: as the run states it, else the day on which it was calibrated."""
-    return _day(record.tool.get("date")) or _day(record.time)
+def _run(data: bytes, name: str) -> Entry:
+    """A table of readings."""
+    entry = Entry("run", data, name)
+    try:
+        missing = {*CHANNELS["accelerometer"]} - {*tables.parsed(data, name).columns}
+    except InputError as error:
+        raise UnlikeRunError(str(error), entry) from None
+    if missing:
+        raise UnlikeRunError(f"{name}: the columns of a run are missing ({', '.join(sorted(missing))}).", entry)
+    return entry
 
 
-def _verification(data: bytes, name: str) -> Content:
-    """What `mwdcal verify` prints with `--json`."""
-    record = msgspec.json.decode(data, type=_Verification)
-    links = _known(
-        calibration=record.calibration_sha256, run=record.run_sha256, limits=record.limits_sha256
-    )
-    verdict = "passed" if record.passed else "failed"
-    return Content(
-        "verification", data, name, record.serial or "", "", record.simulated, links,
-        f"{record.limits}: {verdict}",
-    )  # fmt: skip
+def _of_toml(data: bytes, name: str) -> list[Entry]:
+    """A tool profile, limits or a laboratory, with the people and standards that it names."""
+    try:
+        fields = tomllib.loads(data.removeprefix(_BOM).decode())
+    except (ValueError, RecursionError):
+        raise InputError(f"{name}: {_UNKNOWN}") from None
+    try:
+        kind = _toml_kind(fields, data, name)
+        people = [fields[key] for key in PEOPLE if key in fields]
+        standards = msgspec.convert(fields.get("standards", []), list[MeasurementStandard])
+    except (msgspec.ValidationError, TypeError) as error:
+        raise InputError(f"{name}: {error}. Correct the file.") from None
+    derived = [("person", {"function": "", **each}) for each in people]
+    derived += [("standard", msgspec.to_builtins(each)) for each in standards]
+    return [
+        Entry(kind, data, name),
+        *(Entry(kind, canonical(about), f"{about['name']}.json") for kind, about in derived),
+    ]
 
 
-def _certificate(data: bytes, name: str) -> Content:
-    """A certificate as JSON, signed or not."""
-    record = msgspec.json.decode(data, type=_Certificate)
-    links = {each.id: each.sha256 for each in record.files}
-    return Content(
-        "certificate", data, name, record.item.serial, _day(record.issued), record.simulated,
-        links, record.number,
-    )  # fmt: skip
-
-
-_DOCUMENTS: dict[str, Callable[[bytes, str], Content]] = {
-    "calibrate": calibration,
-    "verify": _verification,
-    "certificate": _certificate,
-}
-
-
-def _known(**links: str | None) -> dict[str, str]:
-    """The links that are stated."""
-    return {name: digest for name, digest in links.items() if digest}
-
-
-def _day(stated: object) -> str:
-    """The day in a date or time as ISO 8601 has it; empty where it is none."""
-    with suppress(ValueError):
-        return date.fromisoformat(str(stated)[:10]).isoformat()
-    return ""
+def _toml_kind(fields: Mapping[str, Any], data: bytes, name: str) -> str:
+    if {"spread", "error"} & {*fields}:
+        return "limits"
+    if {*LABORATORY_KEYS} & {*fields}:
+        return "laboratory"
+    if {"accelerometer", "magnetometer"} & {*fields}:
+        decoded_profile(data.removeprefix(_BOM), name)
+        return "profile"
+    raise InputError(f"{name}: {_UNKNOWN}")

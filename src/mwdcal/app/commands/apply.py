@@ -46,7 +46,7 @@ def command(
     from mwdcal.files.runs import BlankReadingError
 
     options.check_outputs([output], [calibration, readings])
-    fitted, digest = documents.load(calibration)
+    fitted, digest = load_calibration(calibration)
     try:
         with bar("correcting") as advance:
             tally, findings, readings_digest = apply_to_any(

@@ -35,7 +35,7 @@ def command(
     from mwdcal.use.verification import verify
 
     options.check_outputs([], [calibration, run, limits], page=report)
-    fitted, digest = documents.load(calibration)
+    fitted, digest = load_calibration(calibration)
     readings, _ = runs.read_run(run, fitted.profile, decimal=decimal)
     bounds, limits_digest = load_limits(limits)
     result = verify(fitted, readings, bounds)

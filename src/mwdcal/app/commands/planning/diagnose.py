@@ -33,7 +33,7 @@ def command(calibration: Path, readings: Path, decimal: str, as_json: bool) -> N
     from mwdcal.files import documents, runs
 
     options.check_outputs([], [calibration, readings])
-    fitted, digest = documents.load(calibration)
+    fitted, digest = load_calibration(calibration)
     later, _ = runs.read_run(readings, fitted.profile, decimal=decimal)
     result = diagnose(fitted, later)
     findings = findings_as_typed(

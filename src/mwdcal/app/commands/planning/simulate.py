@@ -153,7 +153,7 @@ def _scene(
     physics, digest = load_effects(effects or "none")
     digests = {"plan": table.digest, "effects": digest if effects else ""}
     if calibration:
-        record, digests["calibration"] = documents.load(calibration)
+        record, digests["calibration"] = load_calibration(calibration)
         true, profile = calibrated_tool(record)
         return _Scene(table, profile, physics, chosen, digests, record, true)
     profile, digests["profile"] = profiles.load_profile(tool or "servo")

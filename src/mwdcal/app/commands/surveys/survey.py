@@ -140,7 +140,7 @@ def _read(
     from mwdcal.survey.place.references import load_reference
     from mwdcal.survey.tables import survey_readings
 
-    fitted, digest = documents.load(calibration)
+    fitted, digest = load_calibration(calibration)
     bounds, limits_digest = load_survey_limits(limits)
     source = read_export(readings, fitted.profile, decimal=decimal, rows=MOST_ROWS)
     place, place_digest = load_reference(reference) if reference else (None, "")
