@@ -11,7 +11,7 @@ import msgspec
 
 from mwdcal.calibration.record import canonical
 from mwdcal.errors import InputError, reason
-from mwdcal.files import documents
+from mwdcal.files import documents, runs
 from mwdcal.files.contract import CHANNELS
 from mwdcal.files.formats import members, parquet
 from mwdcal.files.formats import table as tables
@@ -119,14 +119,16 @@ def _json_kind(data: bytes, name: str) -> str:
 
 
 def _run(data: bytes, name: str) -> Entry:
-    """A table of readings."""
-    entry = Entry("run", data, name)
+    """A table of readings, and whose they are where it says so."""
     try:
-        missing = {*CHANNELS["accelerometer"]} - {*tables.parsed(data, name).columns}
+        table = tables.parsed(data, name)
     except InputError as error:
-        raise UnlikeRunError(str(error), entry) from None
-    if missing:
-        raise UnlikeRunError(f"{name}: the columns of a run are missing ({', '.join(sorted(missing))}).", entry)
+        raise UnlikeRunError(str(error), Entry("run", data, name)) from None
+    serials = runs.serials(table.metadata, tables.labels(table, "serial"))
+    entry = Entry("run", data, name, serials[0] if len(serials) == 1 else None)
+    if missing := {*CHANNELS["accelerometer"]} - {*table.columns}:
+        columns = ", ".join(sorted(missing))
+        raise UnlikeRunError(f"{name}: the columns of a run are missing ({columns}).", entry)
     return entry
 
 

@@ -14,7 +14,8 @@ from mwdcal.errors import InputError, reason
 from mwdcal.files.formats.folders import file_name, whole
 from mwdcal.registry.database import chain
 from mwdcal.registry.database.models import history, objects, records, withdrawals
-from mwdcal.registry.store import Registry, content_address, unpacked
+from mwdcal.registry.facts import content_address
+from mwdcal.registry.store import Registry, unpacked
 
 MANIFEST = "manifest.json"
 """Name of the file of an export that names all others."""
@@ -141,5 +142,7 @@ def read_manifest(folder: Path) -> Manifest | None:
         raise InputError(f"{path}: it is damaged ({error}). Export again.") from None
     for file in manifest.files:
         if not (folder / file.path).resolve().is_relative_to(folder.resolve()):
-            raise InputError(f"{path}: it names {file.path!r}, outside of its folder. Export again.")
+            raise InputError(
+                f"{path}: it names {file.path!r}, outside of its folder. Export again."
+            )
     return manifest

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import pickle
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import msgspec
 from msgspec.structs import replace
@@ -17,15 +18,15 @@ from mwdcal.files.formats import members
 from mwdcal.files.formats.folders import visible_files
 from mwdcal.registry import contents
 from mwdcal.registry.exports import read_manifest
+from mwdcal.registry.facts import content_address
 from mwdcal.registry.queries import records_page
-from mwdcal.registry.store import Entry, Registry, content_address, draft
+from mwdcal.registry.store import Draft, Entry, Registry, draft
 
 FILES_AT_ONCE = 50
 """Files of a portion."""
 RECORDS_AT_ONCE = 1000
 """Records that are added in one transaction."""
 COUNTS = ("new", "known", "refused")
-Draft = dict[str, Any]
 
 
 class Source(NamedTuple):
@@ -145,7 +146,11 @@ def _entries(source: Source) -> Iterable[Entry]:
 
 
 class Adding:
-    """Files on their way into a registry, some hundred records in a transaction; see `results`."""
+    """Files on their way into a registry, some hundred records in a transaction.
+
+    `results` say what became of each file, `new` how many records of each kind are new, `simulated` whether one of
+    the files rests on simulated data.
+    """
 
     def __init__(self, registry: Registry, actor: str) -> None:
         self._registry, self._actor = registry, actor
@@ -153,6 +158,8 @@ class Adding:
         self._doubtful: list[Prepared] = []
         self._runs: set[str] = set()
         self._files: dict[Path, FileResult] = {}
+        self.new: Counter[str] = Counter()
+        self.simulated = False
 
     @property
     def results(self) -> list[FileResult]:
@@ -168,6 +175,7 @@ class Adding:
             self._count(each.source, refused=1, message=message)
         for one in each.drafts:
             self._waiting.append((each.source, one))
+            self.simulated = self.simulated or bool(one["simulated"])
             if one["run"]:
                 self._runs.add(one["run"])
             if len(self._waiting) == RECORDS_AT_ONCE:
@@ -194,6 +202,7 @@ class Adding:
             self._waiting, self._registry.insert(drafts, self._actor), strict=True
         ):
             self._count(source, added.kind, new=int(added.new), known=int(not added.new))
+            self.new[added.kind] += added.new
             if added.new and source.reason:
                 self._registry.withdraw(added.number, source.reason, self._actor)
         self._waiting = []

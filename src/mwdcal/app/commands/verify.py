@@ -27,10 +27,11 @@ def command(
     """
     from msgspec.structs import replace
 
+    from mwdcal.app.choices import load_calibration
     from mwdcal.app.envelope import enveloped
     from mwdcal.app.screens.verification import screen
     from mwdcal.calibration.diagnosis.findings import unused_columns
-    from mwdcal.files import documents, runs
+    from mwdcal.files import runs
     from mwdcal.files.limits import load_limits
     from mwdcal.use.verification import verify
 

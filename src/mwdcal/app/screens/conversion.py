@@ -8,13 +8,13 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
+from mwdcal.app.choices import load_calibration
 from mwdcal.app.envelope import enveloped
 from mwdcal.app.screens.numbers import HELD, UNDETERMINED, number, written
 from mwdcal.app.text import one_line, raised, table
 from mwdcal.calibration.prediction import middle_temperature
 from mwdcal.calibration.readings import Readings, simulated
 from mwdcal.calibration.record import SOFTWARE, Calibration, Finding
-from mwdcal.files import documents
 from mwdcal.files.formats import members
 from mwdcal.firmware.export import DEFAULT_BITS, FirmwareSources, export
 from mwdcal.firmware.statements import stated_errors

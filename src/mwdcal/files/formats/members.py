@@ -1,4 +1,4 @@
-"""One tool out of many: `cals.parquet#SERIAL` out of the table of a fleet, `registry.sqlite#SERIAL` out of a registry."""
+"""One tool out of many, as `cals.parquet#SERIAL` names it in the table of a fleet."""
 
 from __future__ import annotations
 

@@ -25,12 +25,13 @@ def command(calibration: Path, readings: Path, decimal: str, as_json: bool) -> N
     """
     from msgspec.structs import replace
 
+    from mwdcal.app.choices import load_calibration
     from mwdcal.app.envelope import enveloped
     from mwdcal.app.screens.diagnosis import screen
     from mwdcal.calibration.diagnosis.findings import unused_columns
     from mwdcal.faults.diagnosis import diagnose
     from mwdcal.faults.physics import NONE
-    from mwdcal.files import documents, runs
+    from mwdcal.files import runs
 
     options.check_outputs([], [calibration, readings])
     fitted, digest = load_calibration(calibration)

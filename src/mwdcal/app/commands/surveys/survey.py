@@ -134,7 +134,7 @@ def _read(
     calibration: Path, readings: Path, reference: Path | None, limits: str, decimal: str
 ) -> _WellInputs:
     """The files read."""
-    from mwdcal.files import documents
+    from mwdcal.app.choices import load_calibration
     from mwdcal.files.runs import MOST_ROWS, read_export
     from mwdcal.survey.acceptance import load_survey_limits
     from mwdcal.survey.place.references import load_reference
