@@ -20,7 +20,7 @@ from mwdcal.calibration.prediction import (
     typical_accuracy,
 )
 from mwdcal.calibration.record import BudgetRow, Calibration, stated
-from mwdcal.calibration.results import NOISE, ORDER, PRIOR, SETTINGS
+from mwdcal.calibration.results import NOISE, ORDER, PRIOR, REPEATABILITY, SETTINGS
 from mwdcal.certificate.decisions import PROBABILITY, student_factor
 from mwdcal.certificate.document import Budget, BudgetLine
 from mwdcal.geometry.vectors import Array
@@ -179,6 +179,8 @@ def _basis(calibration: Calibration, source: str) -> str:
     """Where the size of a source is known from."""
     if source == NOISE:
         return "; ".join(f"{t.name}: {t.noise_source}{_scaled(t)}" for t in calibration.triads)
+    if source == REPEATABILITY:
+        return "declared in the tool profile; scaled by the residuals"
     if source == SETTINGS:
         return f"declared for the stand{settings_in_words(calibration)}; scaled by the residuals"
     if source == ORDER:

@@ -17,7 +17,7 @@ from msgspec.structs import replace
 from mwdcal.calibration.readings import is_simulated
 from mwdcal.calibration.record import SOFTWARE, Calibration, Finding, canonical, rounded
 from mwdcal.certificate.budget import assumed_exact, budget
-from mwdcal.certificate.decisions import conformity
+from mwdcal.certificate.decisions import When, conformity
 from mwdcal.certificate.document import (
     Certificate,
     ConformityTest,
@@ -31,16 +31,19 @@ from mwdcal.certificate.laboratory import Laboratory
 from mwdcal.certificate.methods import method
 from mwdcal.certificate.tables import conditions, result_tables
 from mwdcal.certificate.traceability import references_in_use, traced
+from mwdcal.errors import InputError
 from mwdcal.files.documents import Verification
 
 DIGEST_DIGITS = 12
 """Hexadecimal digits of the contents' SHA-256 in a certificate number."""
 NUMBER_PATTERN = "{serial}-{date}-{digest}"
 """How a certificate number is made, unless the laboratory has a pattern of its own."""
+LONGEST_NUMBER = 64
+"""Characters of a certificate number."""
 NOT_TESTED = "Conformity was not tested: no roll test after the calibration was supplied."
 DATE_OF_FIT = (
-    "the run states no date: the day on which it was computed stands for the date of the calibration. State 'date' "
-    "in the run."
+    "the run states no date: the day on which the calibration was computed stands for that of the "
+    "measurements."
 )
 NO_AS_FOUND = "No roll test before the adjustment (as found) was supplied."
 STATEMENTS = (
@@ -56,7 +59,8 @@ class Order(msgspec.Struct, frozen=True, kw_only=True):
     """What is particular to one certificate, beside its calibration and the laboratory.
 
     `customer`, `condition` and `received` stand before those of the laboratory file; `number` before its
-    pattern. `as_left` and `as_found` are roll tests with this and with the previous calibration.
+    pattern. `verification` (as left) and `as_found` are roll tests with this and with the previous calibration;
+    `calibration_sha256` is of the file of this one.
     """
 
     issued: date
@@ -64,8 +68,9 @@ class Order(msgspec.Struct, frozen=True, kw_only=True):
     customer: str = ""
     condition: str = ""
     received: date | None = None
-    as_left: Verification | None = None
+    verification: Verification | None = None
     as_found: Verification | None = None
+    calibration_sha256: str
     files: tuple[SourceFile, ...] = ()
 
 
@@ -78,6 +83,8 @@ def certificate(
     """
     stated = laboratory or Laboratory()
     day, day_stated = calibrated_on(calibration)
+    if day_stated:
+        _check_days(day, order, stated)
     tests, changed = _tests(calibration, order, stated)
     standards = traced(calibration, stated, day)
     contents = Certificate(
@@ -115,7 +122,9 @@ def certificate(
         *calibration.findings,
     ]
     whole = rounded(replace(contents, findings=findings))
-    return replace(whole, number=order.number or _number(whole, stated.number or NUMBER_PATTERN))
+    number = order.number or _number(whole, stated.number or NUMBER_PATTERN)
+    _check_number(number)
+    return replace(whole, number=number)
 
 
 def calibrated_on(calibration: Calibration) -> tuple[date, bool]:
@@ -126,26 +135,70 @@ def calibrated_on(calibration: Calibration) -> tuple[date, bool]:
         return date.fromisoformat(calibration.time[:10]), False
 
 
+def _check_days(day: date, order: Order, laboratory: Laboratory) -> None:
+    """Refuse a certificate from before the calibration, and a tool that was received after it."""
+    received = order.received or laboratory.item.received
+    if order.issued < day:
+        raise InputError(
+            f"`date` must not be before the day of the calibration, {day}; got {order.issued}. Correct one of them."
+        )
+    if received and received > day:
+        raise InputError(
+            f"`received` must not be after the day of the calibration, {day}; got {received}. Correct one of them."
+        )
+
+
+def _check_number(number: str) -> None:
+    """Refuse a number that cannot stand on one line of every page."""
+    if not number.strip() or len(number) > LONGEST_NUMBER or not number.isprintable():
+        raise InputError(
+            f"`number` must be 1 to {LONGEST_NUMBER} printable characters; got {number[:80]!r}. Choose another."
+        )
+
+
 def _tests(
     calibration: Calibration, order: Order, laboratory: Laboratory
 ) -> tuple[dict[str, ConformityTest], list[Finding]]:
     """The roll tests by when they were made, and findings about their decisions."""
-    tests, findings = {}, []
-    if order.as_found:
-        tests["as found"], about = conformity(
-            "as found", order.as_found, calibration, laboratory.decision
-        )
-        findings += about
-    if order.as_left:
-        tests["as left"], about = conformity(
-            "as left", order.as_left, calibration, laboratory.decision
-        )
-        findings += about
+    tests: dict[str, ConformityTest] = {}
+    findings: list[Finding] = []
+    given: dict[When, Verification | None] = {
+        "as found": order.as_found,
+        "as left": order.verification,
+    }
+    for when, document in given.items():
+        if document is not None:
+            _check_test(document, calibration, order)
+            tests[when], about = conformity(when, document, calibration, laboratory.decision)
+            findings += about
     return tests, findings
 
 
+def _check_test(document: Verification, calibration: Calibration, order: Order) -> None:
+    """Refuse a roll test of another tool, or with the wrong one of the two calibrations."""
+    as_left = document is order.verification
+    argument = "`verification`" if as_left else "`as_found`"
+    serial = calibration.tool.get("serial")
+    if serial and document.serial and document.serial != serial:
+        raise InputError(
+            f"{argument} is of tool {document.serial}, the calibration of tool {serial}. Name a roll test of the "
+            "same tool."
+        )
+    if as_left and document.calibration_sha256 != order.calibration_sha256:
+        other, this = (each.calibration_sha256[:16] for each in (document, order))
+        raise InputError(
+            f"{argument} is a test of another calibration (SHA-256 {other}…): it must be of this one ({this}…). "
+            "Verify this calibration, and save what is printed as JSON."
+        )
+    if not as_left and document.calibration_sha256 == order.calibration_sha256:
+        raise InputError(
+            f"{argument} is a test of this very calibration: it must be of the one that was in the tool before. "
+            "Verify that one by readings from before the adjustment, or leave it out."
+        )
+
+
 def _simulated(calibration: Calibration, order: Order) -> bool:
-    documents = [each for each in (order.as_found, order.as_left) if each]
+    documents = [each for each in (order.as_found, order.verification) if each]
     marked = calibration.simulated or is_simulated(calibration.tool)
     return marked or any(each.simulated for each in documents)
 
@@ -203,17 +256,17 @@ def _not_stated(contents: Certificate, calibration: Calibration) -> Iterator[Fin
         "customer": contents.customer is None,
         "serial of the item": not contents.item.serial,
         "condition of the item": not contents.item.condition,
-        "date of receipt": not contents.item.received,
         "measured by": contents.measured_by is None,
         "authorised by": contents.authorised_by is None,
         **{
-            f"traceability of the {quantity}": quantity not in traceable
+            f"traceability of {'' if quantity == 'gravity' else 'the '}{quantity}": quantity
+            not in traceable
             for quantity in references_in_use(calibration)
         },
     }
     names = [name for name, missing in lacking.items() if missing]
     if names:
-        text = f"not stated: {', '.join(names)}. Add them to the `laboratory` file or to the run."
+        text = f"not stated: {', '.join(names)}."
         yield Finding(id="not-stated", text=text)
 
 

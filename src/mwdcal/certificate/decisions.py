@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, TypeAlias
 
 from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.certificate.document import ConformityTest, LimitDecision, Quantity
@@ -17,6 +17,11 @@ from mwdcal.files.documents import Verification
 from mwdcal.geometry.vectors import Array, ArrayLike
 from mwdcal.use.verification import COVERAGE, RULES, SPREAD_OF, VerdictRow
 
+When: TypeAlias = Literal["as found", "as left"]
+"""When a roll test was made: before or after the adjustment."""
+GUARDED_RISK = "the probability that a tool which passes is outside the limit is at most 2.3 %"
+SIMPLE_RISK = "the probability of a wrong decision reaches 50 % where the value is at its limit"
+"""Largest risks of the rules of a verification: one-sided, beyond two standard uncertainties, and at the limit."""
 PROBABILITY = 0.95
 """Coverage probability of every expanded uncertainty of a certificate."""
 
@@ -110,12 +115,12 @@ def rule_of(
         text += f"; {choice.risk}" if choice.risk else ""
         return Rule("guarded", text, choice.guard_factor * k, k)
     if verification.rule == RULES["guarded"]:
-        return Rule("guarded", verification.rule, COVERAGE, k)
-    return Rule("simple", verification.rule, 0.0, k)
+        return Rule("guarded", f"{verification.rule}; {GUARDED_RISK}", COVERAGE, k)
+    return Rule("simple", f"{verification.rule}; {SIMPLE_RISK}", 0.0, k)
 
 
 def conformity(
-    when: Literal["as found", "as left"],
+    when: When,
     verification: Verification,
     calibration: Calibration,
     choice: DecisionRule | None,
