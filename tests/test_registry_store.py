@@ -3,7 +3,8 @@
 import pytest
 
 from mwdcal.registry import checking, copies, queries
-from mwdcal.registry.store import Entry, create, open_registry
+from mwdcal.registry.setup import create
+from mwdcal.registry.store import Entry, open_registry
 from registry_support import calibration, empty_database
 
 

@@ -12,7 +12,7 @@ import sqlalchemy as sa
 from mwdcal.errors import FitError
 from mwdcal.files.formats import atomic
 from mwdcal.registry.checking import check
-from mwdcal.registry.database import chain, schema
+from mwdcal.registry.database import chain, migrating
 from mwdcal.registry.database.connections import ROWS_AT_ONCE, connect
 from mwdcal.registry.database.models import metadata
 from mwdcal.registry.store import Registry, open_registry, person
@@ -27,7 +27,7 @@ def backup(registry: Registry, path: str | os.PathLike[str]) -> str:
         target = connect(stream.name, new=True, shared=False)
         try:
             with registry.reading() as source, target.writing() as sink:
-                schema.create_tables(sink, str(path))
+                migrating.create_tables(sink, str(path))
                 _copy(source, sink)
                 _, head = chain.head(sink)
         finally:
@@ -49,7 +49,7 @@ def restore(path: str | os.PathLike[str], database: str | os.PathLike[str], acto
         with open_registry(path) as source:
             _refuse_altered(source)
             with source.reading() as rows, target.writing() as sink:
-                schema.create_tables(sink, target.name)
+                migrating.create_tables(sink, target.name)
                 _copy(rows, sink)
                 _, head = chain.head(sink)
                 chain.append_one(sink, who, "restore", "registry", head)

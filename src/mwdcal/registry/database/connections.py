@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import sqlalchemy as sa
 
@@ -67,7 +68,6 @@ class Database:
             with connection.begin():
                 if self.file is None:
                     connection.execute(sa.text(f"SELECT pg_advisory_xact_lock({_LOCK})"))
-                    _wait_for_the_disk(connection)
                 yield connection
 
 
@@ -77,10 +77,13 @@ def _log_ahead(connection: sa.Connection) -> None:
         connection.connection.cursor().execute("PRAGMA journal_mode=WAL")
 
 
-def _wait_for_the_disk(connection: sa.Connection) -> None:
-    """Let COMMIT return only when the write is durable, where the server is set not to."""
-    if connection.scalar(sa.text("SHOW synchronous_commit")) == "off":
-        connection.execute(sa.text("SET LOCAL synchronous_commit = on"))
+def _wait_for_the_disk(connection: Any, _record: object) -> None:
+    """Let COMMIT return only when the write is durable, where the server is set not to wait."""
+    with connection.cursor() as cursor:
+        cursor.execute("SHOW synchronous_commit")
+        if cursor.fetchone()[0] == "off":
+            cursor.execute("SET synchronous_commit = on")
+    connection.commit()
 
 
 def is_url(database: str | os.PathLike[str]) -> bool:
@@ -106,6 +109,7 @@ def connect(database: str | os.PathLike[str], new: bool = False, shared: bool = 
             "pip install 'mwdcal[postgresql]'"
         )
     engine = sa.create_engine(url.set(drivername="postgresql+psycopg"), hide_parameters=True)
+    sa.event.listen(engine, "connect", _wait_for_the_disk)
     return Database(name, engine)
 
 
@@ -160,7 +164,9 @@ def explained(database: Database) -> Iterator[None]:
     """Turn what the database refuses into one sentence without passwords."""
     try:
         yield
-    except (sa.exc.DBAPIError, sqlite3.Error) as error:
+    except (UnicodeError, OverflowError):
+        raise InputError(f"{database.name}: it is damaged. Restore it from a backup.") from None
+    except (sa.exc.SQLAlchemyError, sqlite3.Error) as error:
         raise InputError(f"{database.name}: {sentence(error, database)}") from None
 
 
