@@ -52,22 +52,28 @@ def prior_of(word: str | None) -> tuple[Prior, str]:
     """
     if not word:
         return None, ""
-    return (DATASHEET, "") if word == DATASHEET else load_calibration(Path(word))
+    return (DATASHEET, "") if word == DATASHEET else calibration_of(Path(word))
 
 
-def load_calibration(path: Path) -> tuple[Calibration, str]:
-    """A calibration file, or one tool in the table of a fleet or in a registry; and its SHA-256.
+def calibration_of(path: Path) -> tuple[Calibration, str]:
+    """The calibration in a file, and its SHA-256: see `calibration_file`."""
+    file = calibration_file(path)
+    return documents.decoded(file), file.digest
+
+
+def calibration_file(path: Path) -> members.Member:
+    """A calibration file, or one tool in the table of a fleet or in a registry; its name and SHA-256.
 
     `registry.sqlite#SERIAL` is the latest calibration of that tool.
     """
     file, serial = members.split(path)
     if not members.is_database(file):
-        return documents.load(path)
-    from mwdcal.registry.lookup import calibration
+        return documents.contents(path)
+    from mwdcal.registry.lookup import latest_file
     from mwdcal.registry.store import open_registry
 
     with open_registry(file) as registry:
-        return calibration(registry, serial)
+        return latest_file(registry, serial)
 
 
 def order_of(word: str) -> int | Literal["auto"]:

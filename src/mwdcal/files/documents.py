@@ -75,23 +75,26 @@ def load(path: str | os.PathLike[str]) -> tuple[Calibration, str]:
 
     `cals.parquet#SERIAL` is the calibration of one tool in the table of a fleet; the SHA-256 is that of the table.
     """
+    file = contents(path)
+    return decoded(file), file.digest
+
+
+def contents(path: str | os.PathLike[str]) -> members.Member:
+    """The bytes that `decoded` takes, the name of their file, and its SHA-256."""
     file, _ = members.split(path)
-    data, name, digest = (
-        members.read(path) if file.suffix.lower() == members.SUFFIX else _whole_file(file)
-    )
-    return decoded(data, name), digest
+    return members.read(path) if file.suffix.lower() == members.SUFFIX else _whole_file(file)
 
 
-def decoded(data: bytes, name: str) -> Calibration:
-    """The calibration in the bytes of a file of that name, or what is wrong with it."""
+def decoded(file: members.Member) -> Calibration:
+    """The calibration in a file, or what is wrong with it."""
     try:
-        calibration = _decoded(data, name)
+        calibration = _decoded(file.record, file.name)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise InputError(
-            f"{name} is not a calibration file: {error}. Use a file that mwdcal calibrate wrote."
+            f"{file.name} is not a calibration file: {error}. Use a file that mwdcal calibrate wrote."
         ) from None
-    check(calibration, name, _AS_WRITTEN)
-    check_profile(calibration.profile, name)
+    check(calibration, file.name, _AS_WRITTEN)
+    check_profile(calibration.profile, file.name)
     return calibration
 
 

@@ -38,7 +38,7 @@ def command(
     Example: mwdcal apply tool.json surveys.csv -o corrected.csv
     Exit: 0 written, 2 input cannot be read, or does not belong to the calibration.
     """
-    from mwdcal.app.choices import load_calibration
+    from mwdcal.app.choices import calibration_of
     from mwdcal.app.correction import Applied, apply_to_any
     from mwdcal.app.envelope import enveloped
     from mwdcal.app.progress import bar
@@ -46,7 +46,7 @@ def command(
     from mwdcal.files.runs import BlankReadingError
 
     options.check_outputs([output], [calibration, readings])
-    fitted, digest = load_calibration(calibration)
+    fitted, digest = calibration_of(calibration)
     try:
         with bar("correcting") as advance:
             tally, findings, readings_digest = apply_to_any(

@@ -177,7 +177,7 @@ def _named_registry(context: click.Context, option: click.Parameter, typed: str 
     group = context.parent.params.get(option.name) if context.parent and option.name else None
     named = typed or group
     if not named and not context.resilient_parsing:
-        raise InputError(f"`database` must name the registry; got none. Or set {REGISTRY}.")
+        raise InputError(f"--database must name the registry; got none. Or set ${REGISTRY}.")
     return named or ""
 
 

@@ -27,7 +27,7 @@ def command(
     """
     from msgspec.structs import replace
 
-    from mwdcal.app.choices import load_calibration
+    from mwdcal.app.choices import calibration_of
     from mwdcal.app.envelope import enveloped
     from mwdcal.app.screens.verification import screen
     from mwdcal.calibration.diagnosis.findings import unused_columns
@@ -36,7 +36,7 @@ def command(
     from mwdcal.use.verification import verify
 
     options.check_outputs([], [calibration, run, limits], page=report)
-    fitted, digest = load_calibration(calibration)
+    fitted, digest = calibration_of(calibration)
     readings, _ = runs.read_run(run, fitted.profile, decimal=decimal)
     bounds, limits_digest = load_limits(limits)
     result = verify(fitted, readings, bounds)
