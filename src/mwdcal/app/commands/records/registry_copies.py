@@ -35,7 +35,7 @@ def export(folder: Path, database: str, as_json: bool) -> None:
     result = screen.RegistryExported(
         folder=str(folder), files=len(manifest.files), events=manifest.events, head=manifest.head
     )
-    text = f"wrote {plural(result.files, 'document')} to {folder}   newest event {result.head[:16]}"
+    text = f"wrote {plural(result.files, 'document')} to {folder}   newest event {result.head}"
     about = {"simulated": manifest.simulated}
     print_result(screen.document("registry export", result, about) if as_json else one_line(text))
 

@@ -28,7 +28,7 @@ def init(database: str, actor: str, as_json: bool) -> None:
     create(database, actor)
     with open_registry(database) as registry:
         result = screen.RegistryCreated(registry=registry.name, head=registry.head()[1])
-    created = f"created the registry {result.registry}   its newest event {result.head[:16]}"
+    created = f"created the registry {result.registry}   newest event {result.head}"
     print_result(screen.document("registry init", result) if as_json else created)
 
 
@@ -54,7 +54,7 @@ def upgrade(database: str, actor: str, target: str | None, as_json: bool) -> Non
     else:
         before, after = setup.upgrade(database, actor)
     result = screen.RegistryUpgraded(before=before, after=after)
-    words = f"schema {before} → {after}" if before != after else f"schema {after}, as it should be"
+    words = f"schema {before} → {after}" if before != after else f"schema {after}   nothing to do"
     print_result(screen.document("registry upgrade", result) if as_json else words)
 
 
