@@ -78,6 +78,7 @@ def check(database: str, head: str | None, as_json: bool) -> None:
     """
     from mwdcal.app.progress import bar
     from mwdcal.app.screens.records import registry as screen
+    from mwdcal.calibration.record import Finding
     from mwdcal.registry import checking
     from mwdcal.registry.store import open_registry
 
@@ -86,5 +87,6 @@ def check(database: str, head: str | None, as_json: bool) -> None:
             discrepancies = checking.check(registry, head, advance)
         result = screen.checked(registry, discrepancies)
     shown = screen.document("registry check", result) if as_json else screen.check_text(result)
-    print_result(shown)
+    findings = [Finding(id=each.id, text=f"{each.text}.") for each in result.discrepancies]
+    print_result(shown, findings)
     sys.exit(0 if result.sound else 1)

@@ -182,9 +182,8 @@ def check_text(result: RegistryChecked) -> str:
     """The outcome of a check for people."""
     if result.sound:
         return one_line(f"PASS   {result.registry}: sound") + _newest(result.events, result.head)
-    lines = [f"FAIL   {result.registry}: {plural(len(result.discrepancies), 'discrepancy')}"]
-    lines += [f"! {each.text}" for each in result.discrepancies]
-    return "\n".join(map(one_line, lines))
+    count = len(result.discrepancies)
+    return one_line(f"FAIL   {result.registry}: altered in {plural(count, 'place')}")
 
 
 def list_text(listing: Listing) -> str:
