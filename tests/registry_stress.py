@@ -77,7 +77,7 @@ def stressed(
     number = writers
     for kill in range(kills):
         time.sleep(max(0.0, begun + (kill + rng.random()) * seconds / (kills + 1) - time.time()))
-        served = backends(database) if kill % 10 == 9 else []
+        served = backends(database) if kill % 25 == 12 else []
         if served:
             with contextlib.suppress(ProcessLookupError):  # it has just ended
                 os.kill(rng.choice(served), signal.SIGKILL)

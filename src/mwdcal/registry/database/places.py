@@ -8,7 +8,7 @@ import os
 from pathlib import Path
 
 _NETWORK = frozenset(
-    (
+    [
         "nfs",
         "nfs4",
         "cifs",
@@ -16,12 +16,18 @@ _NETWORK = frozenset(
         "smb2",
         "smb3",
         "smbfs",
+        "ncpfs",
         "afs",
         "ceph",
         "glusterfs",
+        "lustre",
+        "beegfs",
+        "davfs",
+        "fuse.davfs2",
         "fuse.sshfs",
-    )
-    + ("fuse.rclone", "fuse.s3fs", "davfs", "fuse.davfs2", "ncpfs", "lustre", "beegfs")
+        "fuse.rclone",
+        "fuse.s3fs",
+    ]
 )
 """File systems that several machines may write to, by Linux's names."""
 _REMOTE_DRIVE = 4
