@@ -5,29 +5,12 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import os
+import re
 from pathlib import Path
 
-_NETWORK = frozenset(
-    [
-        "nfs",
-        "nfs4",
-        "cifs",
-        "smb",
-        "smb2",
-        "smb3",
-        "smbfs",
-        "ncpfs",
-        "afs",
-        "ceph",
-        "glusterfs",
-        "lustre",
-        "beegfs",
-        "davfs",
-        "fuse.davfs2",
-        "fuse.sshfs",
-        "fuse.rclone",
-        "fuse.s3fs",
-    ]
+_NETWORK = re.compile(
+    "nfs4?|cifs|smb[23]?|smbfs|ncpfs|afs|ceph|glusterfs|lustre|beegfs|davfs|"
+    r"fuse\.(davfs2|sshfs|rclone|s3fs)"
 )
 """File systems that several machines may write to, by Linux's names."""
 _REMOTE_DRIVE = 4
@@ -40,7 +23,8 @@ def on_network(path: Path) -> bool:
         place = path.resolve()
         if os.name == "nt":
             return _remote_drive(place)
-        return file_system(place, _MOUNTS.read_text("utf-8", "replace")) in _NETWORK
+        kind = file_system(place, _MOUNTS.read_text("utf-8", "replace"))
+        return _NETWORK.fullmatch(kind) is not None
     return False
 
 
