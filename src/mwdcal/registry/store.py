@@ -21,6 +21,8 @@ from mwdcal.registry.facts import FACTS_VERSION, LONGEST_NAME, content_address, 
 
 LARGEST_OBJECT = 500_000_000
 """Bytes of the largest file that a registry takes."""
+Draft = dict[str, Any]
+"""What is inserted of an entry: see `draft`."""
 
 
 class Entry(NamedTuple):
@@ -82,8 +84,13 @@ class Registry:
             InputError: a file is not of its kind, its serial is another than the entry's, or the
                 database refuses.
         """
+        return self.insert([draft(entry) for entry in entries], actor, when)
+
+    def insert(
+        self, drafts: Sequence[Draft], actor: str, when: datetime | None = None
+    ) -> list[Added]:
+        """The same with the drafts of entries, which other processes may have made."""
         who, time = person(actor), chain.instant(when)
-        drafts = [_draft(entry) for entry in entries]
         with self.writing() as connection:
             return _insert(connection, drafts, who, time)
 
@@ -160,7 +167,7 @@ def unpacked(data: bytes, size: int) -> bytes:
     return content
 
 
-def _draft(entry: Entry) -> dict[str, Any]:
+def draft(entry: Entry) -> Draft:
     """The rows of an entry, without their number: columns of a record, and `object`."""
     if len(entry.data) > LARGEST_OBJECT:
         raise InputError(
@@ -194,9 +201,7 @@ def record_digest(record: Mapping[str, Any], stored: Mapping[str, Any] | None) -
     return chain.digest({**record, "object": packed})
 
 
-def _insert(
-    connection: sa.Connection, drafts: Sequence[dict[str, Any]], who: str, time: str
-) -> list[Added]:
+def _insert(connection: sa.Connection, drafts: Sequence[Draft], who: str, time: str) -> list[Added]:
     """Insert what is new, with its events; what became of each."""
     known = _known(connection, [draft["sha256"] for draft in drafts])
     stored = {sha256 for sha256, _ in known}
