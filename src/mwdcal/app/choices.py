@@ -15,6 +15,7 @@ from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.certificate.signature import FINDING_OF_STATE, SignatureCheck, check
 from mwdcal.certificate.trusted_keys import trusted
 from mwdcal.files import documents, profiles, runs
+from mwdcal.files.formats import members
 from mwdcal.sensor.profile import Profile
 
 
@@ -37,7 +38,7 @@ def load_calibration(path: Path, keys: Sequence[Path]) -> LoadedCalibration:
     Where there are keys, an unsigned calibration is a finding too.
     """
     trust = trusted(keys)
-    file = documents.contents(path)
+    file = calibration_file(path)
     calibration, checked = documents.decoded(file), check(file.record, trust)
     findings = [Finding(id=FINDING_OF_STATE[checked.state], text=checked.text)]
     sound = checked.state == "intact" or (checked.state == "unsigned" and not keys)
@@ -79,7 +80,28 @@ def prior_of(word: str | None) -> tuple[Prior, str]:
     """
     if not word:
         return None, ""
-    return (DATASHEET, "") if word == DATASHEET else documents.load(Path(word))
+    return (DATASHEET, "") if word == DATASHEET else calibration_of(Path(word))
+
+
+def calibration_of(path: Path) -> tuple[Calibration, str]:
+    """The calibration in a file, and its SHA-256: see `calibration_file`."""
+    file = calibration_file(path)
+    return documents.decoded(file), file.digest
+
+
+def calibration_file(path: Path) -> members.Member:
+    """A calibration file, or one tool in the table of a fleet or in a registry; its name and SHA-256.
+
+    `registry.sqlite#SERIAL` is the latest calibration of that tool.
+    """
+    file, serial = members.split(path)
+    if not members.is_database(file):
+        return documents.contents(path)
+    from mwdcal.registry.lookup import latest_file
+    from mwdcal.registry.store import open_registry
+
+    with open_registry(file) as registry:
+        return latest_file(registry, serial)
 
 
 def order_of(word: str) -> int | Literal["auto"]:

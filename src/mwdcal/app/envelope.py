@@ -15,6 +15,7 @@ from mwdcal.certificate.signature import SignatureCheck
 INPUTS = {
     "apply": ("calibration", "readings"),
     "calibrate": ("run", "profile", "prior"),
+    "certificate": (),
     **{f"certificate key {name}": () for name in ("create", "list", "retire", "revoke", "trust")},
     "certificate sign": ("document",),
     "certificate verify": ("document",),
@@ -27,12 +28,26 @@ INPUTS = {
     "plan": ("profile", "measured"),
     "profile": ("run",),
     "reference": ("run",),
+    "registry add": (),
+    "registry backup": (),
+    "registry check": (),
+    "registry export": (),
+    "registry get": (),
+    "registry history": (),
+    "registry init": (),
+    "registry list": (),
+    "registry restore": (),
+    "registry upgrade": (),
+    "registry withdraw": (),
     "simulate": ("plan", "profile", "calibration", "effects", "rolltest", "limits"),
     "stations": ("log",),
     "survey": ("calibration", "readings", "reference", "limits"),
     "verify": ("calibration", "run", "limits"),
 }
-"""The files behind the document of each command, whose digests are its keys `…_sha256`."""
+"""The files behind the document of each command, whose digests are its keys `…_sha256`.
+
+A certificate is its own document, and lists them under `files`.
+"""
 
 
 class Envelope(msgspec.Struct, frozen=True, kw_only=True):

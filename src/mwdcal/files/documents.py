@@ -29,7 +29,10 @@ _UNREADABLE = "No command would read such a file: calibrate again, or correct th
 
 
 class Verification(Verdict, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The document that `mwdcal verify` prints as JSON: a verdict, and what it rests on."""
+    """The document that `mwdcal verify` prints as JSON: a verdict, and what it rests on.
+
+    `calibration_signature` is what it said of the signature of the calibration, `signature` its own.
+    """
 
     schema_version: int
     command: str
