@@ -10,6 +10,7 @@ processes that serve writers are killed as well, by which the server stops and r
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import multiprocessing
 import os
@@ -76,10 +77,11 @@ def stressed(
     number = writers
     for kill in range(kills):
         time.sleep(max(0.0, begun + (kill + rng.random()) * seconds / (kills + 1) - time.time()))
-        served = backends(database) if kill % 10 == 9 else []
+        served = backends(database) if kill % 25 == 12 else []
         if served:
-            events["server processes killed"] += 1
-            os.kill(rng.choice(served), signal.SIGKILL)
+            with contextlib.suppress(ProcessLookupError):  # it has just ended
+                os.kill(rng.choice(served), signal.SIGKILL)
+                events["server processes killed"] += 1
             continue
         at = rng.randrange(writers)
         if running[at].is_alive():

@@ -4,7 +4,7 @@ import json
 import random
 import shutil
 import sqlite3
-from contextlib import closing
+from contextlib import closing, contextmanager, suppress
 
 import pytest
 
@@ -143,25 +143,27 @@ def swap_rows(connection, table, rng):
 CHANGES = (change_value, change_value, change_value, delete_row, insert_row, swap_rows)
 
 
+@contextmanager
+def without_triggers(connection):
+    """A transaction in which nothing keeps tables from being changed; the triggers are there again afterwards."""
+    query = "SELECT name, sql FROM sqlite_master WHERE type = 'trigger'"
+    triggers = connection.execute(query).fetchall()
+    connection.execute("BEGIN")
+    for name, _ in triggers:
+        connection.execute(f"DROP TRIGGER {name}")
+    yield
+    for _, statement in triggers:
+        connection.execute(statement)
+    connection.commit()
+
+
 def tampered(path, rng):
-    """Change something past the triggers, which are put back afterwards; what was done."""
-    with closing(sqlite3.connect(path)) as connection:
-        triggers = connection.execute(
-            "SELECT name, sql FROM sqlite_master WHERE type = 'trigger'"
-        ).fetchall()
-        while True:
-            table, change = rng.choice(TABLES), rng.choice(CHANGES)
-            connection.execute("BEGIN")
-            for name, _ in triggers:
-                connection.execute(f"DROP TRIGGER {name}")
-            try:
+    """Change something past the triggers; what was done."""
+    while True:
+        table, change = rng.choice(TABLES), rng.choice(CHANGES)
+        with closing(sqlite3.connect(path)) as connection, suppress(sqlite3.IntegrityError):
+            with without_triggers(connection):
                 change(connection, table, rng)
-            except sqlite3.IntegrityError:
-                connection.rollback()
-                continue
-            for _, statement in triggers:
-                connection.execute(statement)
-            connection.commit()
             return change.__name__, table
 
 
@@ -207,3 +209,48 @@ def test_changed_bytes_of_the_file_are_reported(original, tmp_path):
 @pytest.mark.study
 def test_changed_bytes_of_the_file_are_reported_in_each_of_a_thousand_trials(original, tmp_path):
     assert unnoticed_bytes(original, tmp_path, range(1000, 2000)) == []
+
+
+def test_removed_events_show_by_the_head_that_was_known(original, tmp_path):
+    path = tmp_path / "changed.registry"
+    with open_registry(original) as registry:
+        head = registry.head()[1]
+    shutil.copyfile(original, path)
+    with closing(sqlite3.connect(path)) as connection, without_triggers(connection):
+        for table in ("history", "withdrawals"):
+            connection.execute(f"DELETE FROM {table} WHERE number = 16")
+        one_more = "records = records + 1, calibrations = calibrations + 1"
+        connection.execute(f"UPDATE tools SET {one_more} WHERE serial = 'A-1'")
+    assert verdict(path) == set()  # the rows fit together: nothing in them tells
+    assert verdict(path, head) == {"head"}
+    assert verdict(original, head) == set()
+
+
+@pytest.mark.parametrize(
+    "statement",
+    [
+        "DROP INDEX records_serial",
+        "DROP TRIGGER history_no_update",
+        "DROP TRIGGER objects_no_delete",
+        "DROP TABLE tools",
+        "CREATE TABLE more (number INTEGER)",
+        "CREATE TRIGGER sly AFTER INSERT ON records BEGIN DELETE FROM tools; END",
+        "ALTER TABLE history ADD COLUMN more TEXT",
+    ],
+)
+def test_a_changed_schema_is_reported(original, tmp_path, statement):
+    path = tmp_path / "changed.registry"
+    shutil.copyfile(original, path)
+    with closing(sqlite3.connect(path)) as connection:
+        connection.execute(statement)
+    assert verdict(path) & {"schema", "unreadable"}
+
+
+@pytest.mark.parametrize("table", ["objects", "records", "withdrawals", "history"])
+def test_triggers_refuse_changes(original, tmp_path, table):
+    path = tmp_path / "changed.registry"
+    shutil.copyfile(original, path)
+    with closing(sqlite3.connect(path)) as connection:
+        for statement in (f"UPDATE {table} SET number = 99", f"DELETE FROM {table}"):
+            with pytest.raises(sqlite3.IntegrityError, match="only grows"):
+                connection.execute(statement)

@@ -14,7 +14,7 @@ import sqlalchemy as sa
 
 from mwdcal.errors import InputError
 from mwdcal.registry.database import chain, migrating
-from mwdcal.registry.database.connections import ROWS_AT_ONCE
+from mwdcal.registry.database.connections import OBJECTS_AT_ONCE, ROWS_AT_ONCE
 from mwdcal.registry.database.models import history, objects, records, tools, withdrawals
 from mwdcal.registry.database.tools import TOOL_KINDS, rows_of
 from mwdcal.registry.facts import FACTS_VERSION, content_address, facts
@@ -109,7 +109,7 @@ def _events(connection: sa.Connection, progress: Progress) -> Iterator[Discrepan
     rows = [
         _Rows(connection, records),
         _Rows(connection, withdrawals),
-        _Rows(connection, objects, 4),
+        _Rows(connection, objects, OBJECTS_AT_ONCE),
     ]
     before = (0, chain.GENESIS)
     options = {"stream_results": True, "yield_per": ROWS_AT_ONCE}

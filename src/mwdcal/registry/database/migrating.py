@@ -82,6 +82,8 @@ def change(database: Database, target: str, actor: str) -> tuple[str, str]:
         raise InputError(
             f"`target` must be one of the schema's versions {', '.join(steps)}; got {target!r}. Choose one."
         )
+    with database.reading() as connection:
+        known_version(connection, database.name)  # nothing is written to what is not a registry
     with database.writing() as connection:
         current = known_version(connection, database.name)
         if current != target:

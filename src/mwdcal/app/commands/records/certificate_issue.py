@@ -81,6 +81,7 @@ def command(
     """
     from msgspec import to_builtins
 
+    from mwdcal.app.choices import calibration_of
     from mwdcal.app.screens.records.certificate_issue import screen
     from mwdcal.certificate.contents import Order, certificate
     from mwdcal.certificate.laboratory import load_laboratory
@@ -91,7 +92,7 @@ def command(
     paths = {"calibration": calibration, "verification": verification, "as-found": as_found}
     paths["laboratory"] = laboratory
     options.check_outputs(output, paths.values())
-    fitted, digest = documents.load(calibration)
+    fitted, digest = calibration_of(calibration)
     as_left, left_digest = _read(documents.load_verification, verification)
     before, before_digest = _read(documents.load_verification, as_found)
     stated, laboratory_digest = _read(load_laboratory, laboratory)
