@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import sqlalchemy as sa
 
+from mwdcal.registry.database.chain import head
 from mwdcal.registry.database.models import history, objects, records, tools, withdrawals
 from mwdcal.registry.store import Registry, unpacked
 
@@ -177,7 +178,10 @@ def due(registry: Registry, before: str, offset: int = 0, limit: int = 50) -> Pa
 
 def events(registry: Registry, offset: int = 0, limit: int = 50) -> Page:
     """Events of the history, newest first; columns: those of `history`."""
-    return _page(registry, sa.select(history), [history.c.number.desc()], offset, limit)
+    newest = sa.select(history).order_by(history.c.number.desc()).offset(offset).limit(limit)
+    with registry.reading() as connection:
+        rows: list[Row] = [dict(row) for row in connection.execute(newest).mappings()]
+        return Page(head(connection)[0], rows)
 
 
 def counts(registry: Registry) -> dict[str, int]:
