@@ -8,10 +8,13 @@ import shutil
 import pytest
 
 from cli_support import EXAMPLE, ROOT, mwdcal, refused
+from registry_support import empty_database
 
 pq = pytest.importorskip("pyarrow.parquet")
 pa = pytest.importorskip("pyarrow")
 pytest.importorskip("sqlalchemy")
+
+from test_schemas import checked  # noqa: E402
 
 LABORATORY = ROOT / "examples" / "registry" / "laboratory.py"
 LAB = """place = "Hall 2"
@@ -75,8 +78,9 @@ def filled(example):
 
 
 def registry(path, *arguments, code=0):
+    """The document of a subcommand, valid by its published schema."""
     ran = run("registry", "--database", path, *arguments, "--json", code=code)
-    return ran.json
+    return checked(f"registry {arguments[0]}", ran.json)
 
 
 def sha256(path):
@@ -310,6 +314,27 @@ def test_the_registry_is_named_by_option_group_or_environment(filled, tmp_path, 
     assert run("registry", "list").out != lists[0]
     monkeypatch.delenv("MWDCAL_REGISTRY")
     assert "--database must name the registry" in refused(mwdcal("registry", "list"), 2)
+
+
+def test_the_commands_work_on_postgresql_and_tell_no_password(
+    example, filled, postgresql, tmp_path
+):
+    url = empty_database(postgresql)
+    registry(url, "init")
+    added = registry(url, "add", example, "--workers", 1)
+    assert sum(added["new"].values()) + 1 == added["events"]
+    assert registry(url, "list")["tools"] == registry(filled, "list")["tools"]
+    registry(url, "get", "SIM-0001", "-o", tmp_path / "got.json")
+    assert (tmp_path / "got.json").read_bytes() == (
+        example.parent / "tools" / "SIM-0001.json"
+    ).read_bytes()
+    registry(url, "export", tmp_path / "out")
+    backup = registry(url, "backup", tmp_path / "b.sqlite")
+    assert registry(tmp_path / "b.sqlite", "check", "--head", backup["head"])["sound"]
+    secret = url.replace("://postgres", "://user:s3cret", 1)
+    ran = mwdcal("registry", "--database", secret, "list")
+    assert ran.code == 2
+    assert "s3cret" not in ran.out + ran.err + str(added)
 
 
 def test_an_altered_registry_is_found_and_a_text_of_others_stays_a_text(filled, tmp_path):
