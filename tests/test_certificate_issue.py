@@ -270,3 +270,17 @@ def test_every_line_of_the_page_runs(tmp_path, monkeypatch):
     assert {"C.json", "C.html", "short.json"} <= {path.name for path in tmp_path.iterdir()}
     document = json.loads((tmp_path / "short.json").read_text("utf-8"))
     assert (document["number"], document["issued"]) == ("EX-1", "2036-04-01")
+
+
+def test_a_calibration_that_is_not_signed_by_a_trusted_key_is_a_finding(here, tmp_path):
+    pytest.importorskip("cryptography")
+    made = mwdcal("certificate", "key", "create", "-o", tmp_path / "lab.key")
+    assert made.code == 0, made
+    (public,) = tmp_path.glob("*.pub")
+    line = ("certificate", "new.json", *DATES, "--json")
+
+    def findings(*keys):
+        return " ".join(finding["text"] for finding in mwdcal(*line, *keys).json["findings"])
+
+    assert "unsigned" not in findings()
+    assert "unsigned" in findings("--key", public)

@@ -34,7 +34,7 @@ UNDECLARED = {
 """Common errors that leave residuals, and the key of `[stand]` that declares each."""
 SCALED = (NOISE, REPEATABILITY, SETTINGS)
 """Sources whose variance is scaled by that of the residuals."""
-AXES = 3
+AXES_OF_A_TERM = 3
 """Axes on which a term beyond the order is seen: as many degrees of freedom has its size."""
 INVISIBLE = "no residual tests it"
 VISIBLE = "a large error of it would show in the residuals"
@@ -96,7 +96,7 @@ def coverage_factors(calibration: Calibration) -> dict[str, float]:
     for name in angles(calibration):
         parts = {row.source: getattr(row, f"{name}_deg") or 0.0 for row in calibration.budget}
         scaled = sum(parts.get(source, 0.0) ** 2 for source in SCALED)
-        spread = scaled**2 / fewest + parts.get(ORDER, 0.0) ** 4 / AXES
+        spread = scaled**2 / fewest + parts.get(ORDER, 0.0) ** 4 / AXES_OF_A_TERM
         total = sum(part**2 for part in parts.values())
         effective = min(total**2 / spread, fewest) if spread else fewest
         factors[name] = float(student_factor(effective))

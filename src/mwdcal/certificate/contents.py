@@ -62,7 +62,8 @@ class Order(msgspec.Struct, frozen=True, kw_only=True):
 
     `customer`, `condition` and `received` stand before those of the laboratory file; `number` before its
     pattern. `verification` (as left) and `as_found` are roll tests with this and with the previous calibration;
-    `calibration_sha256` is of the file of this one.
+    `calibration_sha256` is of the file of this one. `findings` are about the files themselves, such as their
+    signatures.
     """
 
     issued: date
@@ -74,6 +75,7 @@ class Order(msgspec.Struct, frozen=True, kw_only=True):
     as_found: Verification | None = None
     calibration_sha256: str
     files: tuple[SourceFile, ...] = ()
+    findings: tuple[Finding, ...] = ()
 
 
 def certificate(
@@ -114,7 +116,13 @@ def certificate(
         files=list(order.files),
     )
     unstated_day = [] if day_stated else [Finding(id="date-not-stated", text=DATE_OF_FIT)]
-    findings = [*_findings(contents, calibration), *unstated_day, *changed, *calibration.findings]
+    findings = [
+        *order.findings,
+        *_findings(contents, calibration),
+        *unstated_day,
+        *changed,
+        *calibration.findings,
+    ]
     whole = rounded(replace(contents, findings=findings))
     number = order.number or _number(whole, stated.number or NUMBER_PATTERN)
     _check_number(number)
