@@ -22,7 +22,14 @@ from mwdcal.certificate.dcc.elements import (
     title,
     words,
 )
-from mwdcal.certificate.document import Certificate, ConformityTest, Item, Party, Person
+from mwdcal.certificate.document import (
+    Certificate,
+    ConformityTest,
+    Item,
+    Party,
+    Person,
+    TracedStandard,
+)
 from mwdcal.errors import InputError
 
 UNKNOWN_COUNTRY = "ZZ"
@@ -60,7 +67,8 @@ def administrative_data(certificate: Certificate) -> ET.Element:
 
 def software(name_and_version: str) -> ET.Element:
     """A program by its name and version, "mwdcal 1.2"."""
-    name, _, version = name_and_version.strip().rpartition(" ")
+    before, _, last = name_and_version.strip().rpartition(" ")
+    name, version = (before, last) if before else (last, "")
     release = leaf("release", version, UNSTATED)
     return node("software", title(name), release, leaf("type", "application"))
 
@@ -121,17 +129,10 @@ def _country(party: Party) -> str:
 
 
 def _where(certificate: Certificate) -> str:
-    """The place in the words of the schema; a place of its own is stated in full besides."""
-    if not certificate.place.strip():
-        return "laboratory"
-    parties = {"laboratory": certificate.laboratory, "customer": certificate.customer}
-    here = (who for who, party in parties.items() if party and _is_at(certificate.place, party))
-    return next(here, "other")
-
-
-def _is_at(place: str, party: Party) -> bool:
-    lines = [party.name, *party.address]
-    return place.strip().casefold() in {line.strip().casefold() for line in lines}
+    """The place in the words of the schema: the laboratory, unless it is that of the customer."""
+    customer = certificate.customer or Party(name="")
+    lines = {line.strip().casefold() for line in (customer.name, *customer.address)} - {""}
+    return "customer" if certificate.place.strip().casefold() in lines else "laboratory"
 
 
 def _item(item: Item) -> ET.Element:
@@ -217,17 +218,23 @@ def _place(certificate: Certificate) -> Iterator[ET.Element]:
 
 
 def _traceability(certificate: Certificate) -> Iterator[ET.Element]:
-    if certificate.traceability:
+    """The certificates by which the results are traceable; nothing where no standard has one."""
+    standards = [each for each in certificate.traceability if each.certificate.strip()]
+    if standards:
+        lines = (f"{each.quantity}: {each.name}, {_source(each)}" for each in standards)
         yield _statement(
             "traceability",
             title("Metrological traceability"),
-            *(leaf("reference", standard.certificate) for standard in certificate.traceability),
-            words(
-                "declaration",
-                "The results are traceable to the standards among the measuring equipment.",
-            ),
+            *(leaf("reference", each.certificate) for each in standards),
+            words("declaration", "\n".join(["Traceable by these certificates.", *lines])),
             basic="metrologicallyTraceableToSI",
         )
+
+
+def _source(standard: TracedStandard) -> str:
+    """The certificate of a standard: number, issuer, and whether it is overdue."""
+    issuer = f" of {standard.issuer}" if standard.issuer.strip() else ""
+    return f"certificate {standard.certificate}{issuer}" + (", overdue" if standard.overdue else "")
 
 
 def _decision_rule(test: ConformityTest) -> ET.Element:

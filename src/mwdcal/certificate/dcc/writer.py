@@ -11,10 +11,7 @@ import base64
 from collections.abc import Iterable, Iterator
 from xml.etree import ElementTree as ET
 
-import msgspec
-
 from mwdcal.calibration.readings import SIMULATED
-from mwdcal.calibration.record import canonical
 from mwdcal.certificate.dcc.administrative import (
     administrative_data,
     conformity,
@@ -44,6 +41,7 @@ from mwdcal.certificate.document import (
     Quantity,
     ResultTable,
     TracedStandard,
+    encode,
 )
 
 DCC_VERSION = "3.3.0"
@@ -84,8 +82,8 @@ def to_xml(certificate: Certificate) -> bytes:
 
 
 def _document(certificate: Certificate) -> ET.Element:
-    """The certificate's JSON, in the one form in which it is signed."""
-    data = base64.b64encode(canonical(msgspec.to_builtins(certificate))).decode()
+    """The certificate's JSON file."""
+    data = base64.b64encode(encode(certificate)).decode()
     return node(
         "document",
         title("The certificate as JSON of mwdcal"),
@@ -180,7 +178,8 @@ def _equipment(standard: TracedStandard) -> ET.Element:
 
 
 def _condition(quantity: Quantity) -> ET.Element:
-    basic = ("temperature",) if quantity.unit.strip() == "°C" else ()
+    kinds = {"temperature": quantity.unit == "°C", "humidityRelative": "humidity" in quantity.name}
+    basic = (kind for kind, applies in kinds.items() if applies)
     return node(
         "influenceCondition",
         title(quantity.name),
