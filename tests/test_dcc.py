@@ -275,21 +275,31 @@ def bare():
     )
 
 
+def within(place, each):
+    """A quantity as clients give it: they know it by its label alone."""
+    return replace(each, id=f"{place}/{each.id}")
+
+
 def decisions(certificate):
-    tests = filter(None, (certificate.as_found, certificate.as_left))
-    return [each for test in tests for each in test.decisions]
+    found, left = certificate.as_found, certificate.as_left
+    tests = {"as-found": found.decisions, "as-left": left.decisions}
+    return [
+        replace(each, quantity=within(place, each.quantity))
+        for place, of_test in tests.items()
+        for each in of_test
+    ]
 
 
 def budget_values(budget):
     for line in (*budget.lines, budget.combined, budget.expanded):
         for name in ("inclination", "toolface", "azimuth"):
             value = getattr(line, f"{name}_deg")
-            yield Quantity(id=f"{line.id}-{name}", name=name, unit="°", value=value)
+            yield Quantity(id=f"budget/{line.id}/{name}", name=name, unit="°", value=value)
 
 
 def calibration_results(certificate):
     """All quantities among the results, in their order."""
-    tables = [each for table in certificate.results for each in table.quantities]
+    tables = [within(table.id, each) for table in certificate.results for each in table.quantities]
     tested = [each.quantity for each in decisions(certificate)]
     return [*tables, *budget_values(certificate.budget), *tested]
 
@@ -297,7 +307,7 @@ def calibration_results(certificate):
 def all_quantities(certificate):
     """Results, conditions, and the limits and probabilities beside the decisions."""
     yield from calibration_results(certificate)
-    yield from certificate.conditions
+    yield from (within("condition", each) for each in certificate.conditions)
     for each in decisions(certificate):
         unit = each.quantity.unit
         numbers = {
@@ -307,7 +317,7 @@ def all_quantities(certificate):
             "risk": ("1", each.risk),
         }
         for name, (of, value) in numbers.items():
-            yield Quantity(id=name, name=name, unit=of, value=value)
+            yield Quantity(id=f"{each.quantity.id}/{name}", name=name, unit=of, value=value)
 
 
 def coverage(each):
@@ -585,4 +595,12 @@ def test_what_is_undetermined_has_text_and_no_number():
     assert [each.findtext("dcc:name/dcc:content", None, NAMESPACES) for each in texts] == open_ones
     assert all("Undetermined" in "".join(each.itertext()) for each in texts)
     labels = {each.text for each in root.iter(f"{{{NAMESPACES['si']}}}label")}
-    assert labels.isdisjoint({"toolface-zero", "rotation-x", "dip-inclination", "toolface"})
+    none = {"accelerometer/toolface-zero", "free/rotation-x", "budget/dip/inclination"}
+    assert labels.isdisjoint({*none, "condition/dip", "as-found/toolface"})
+    assert {"accelerometer/bias-x", "as-found/toolface/limit", "condition/gravity"} <= labels
+
+
+def test_labels_are_unique(issued):
+    root = ElementTree.fromstring(issued[1])
+    labels = [each.text for each in root.iter(f"{{{NAMESPACES['si']}}}label")]
+    assert len(labels) == len(set(labels)) > 100

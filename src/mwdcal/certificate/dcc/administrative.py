@@ -18,8 +18,8 @@ from mwdcal.certificate.dcc.elements import (
     day,
     leaf,
     node,
-    ref_type,
     title,
+    typed,
     words,
 )
 from mwdcal.certificate.document import (
@@ -73,18 +73,24 @@ def software(name_and_version: str) -> ET.Element:
     return node("software", title(name), release, leaf("type", "application"))
 
 
-def identification(issuer: str, value: str, name: str, *basic: str, fallback: str = "") -> Child:
+def identification(
+    issuer: str, value: str, name: str, basic: str = "", fallback: str = ""
+) -> Child:
     """A number by which something is known, and who gave it; none where it is blank."""
     stated = leaf("value", value, fallback)
     if stated is None:
         return None
-    kind = ref_type("", *basic) or None
-    return node("identification", leaf("issuer", issuer), stated, title(name), refType=kind)
+    return typed("identification", "", leaf("issuer", issuer), stated, title(name), basic=basic)
+
+
+def when_id(test: ConformityTest) -> str:
+    """The id of a test: as-found or as-left."""
+    return test.when.replace(" ", "-")
 
 
 def rule_id(test: ConformityTest) -> str:
     """The id of the statement with the decision rule of a test."""
-    return f"decision-rule-{test.when.replace(' ', '-')}"
+    return f"decision-rule-{when_id(test)}"
 
 
 def tests(certificate: Certificate) -> list[ConformityTest]:
@@ -180,10 +186,12 @@ def _persons(certificate: Certificate) -> Iterator[ET.Element]:
 def _statements(certificate: Certificate) -> Iterator[ET.Element]:
     """What applies to the whole calibration: simulation, traceability, conformity, and the certificate's own words."""
     if certificate.simulated:
-        yield _statement("simulated", words("declaration", f"{SIMULATED}: no tool was measured."))
+        yield typed(
+            "statement", "simulated", words("declaration", f"{SIMULATED}: no tool was measured.")
+        )
     for text in certificate.statements:
         if (declaration := words("declaration", text)) is not None:
-            yield _statement("statement", declaration)
+            yield typed("statement", "statement", declaration)
     yield from _signature(certificate)
     yield from _place(certificate)
     yield from _traceability(certificate)
@@ -191,30 +199,28 @@ def _statements(certificate: Certificate) -> Iterator[ET.Element]:
         yield _decision_rule(test)
         yield _conformity(test)
     if day(certificate.next_due):
-        yield _statement(
-            "next-due", title("Next calibration due"), leaf("date", day(certificate.next_due))
+        yield typed(
+            "statement",
+            "next-due",
+            title("Next calibration due"),
+            leaf("date", day(certificate.next_due)),
         )
     for finding in certificate.findings:
         if (declaration := words("declaration", finding.text)) is not None:
-            yield _statement(finding.id, declaration)
-
-
-def _statement(name: str, *children: Child, basic: str = "", **attributes: str) -> ET.Element:
-    types = ref_type(name, *([basic] if basic else []))
-    return node("statement", *children, refType=types or None, **attributes)
+            yield typed("statement", finding.id, declaration)
 
 
 def _signature(certificate: Certificate) -> Iterator[ET.Element]:
     if certificate.signature is not msgspec.UNSET:
         signed = certificate.signature
         text = f"The JSON in this document is signed: {signed.algorithm}, key {signed.key}, {signed.time}."
-        yield _statement("signature", words("declaration", text))
+        yield typed("statement", "signature", words("declaration", text))
 
 
 def _place(certificate: Certificate) -> Iterator[ET.Element]:
     if (place := words("further", certificate.place)) is not None:
         location = node("location", place)
-        yield _statement("place", title("Place of the calibration"), location)
+        yield typed("statement", "place", title("Place of the calibration"), location)
 
 
 def _traceability(certificate: Certificate) -> Iterator[ET.Element]:
@@ -222,7 +228,8 @@ def _traceability(certificate: Certificate) -> Iterator[ET.Element]:
     standards = [each for each in certificate.traceability if each.certificate.strip()]
     if standards:
         lines = (f"{each.quantity}: {each.name}, {_source(each)}" for each in standards)
-        yield _statement(
+        yield typed(
+            "statement",
             "traceability",
             title("Metrological traceability"),
             *(leaf("reference", each.certificate) for each in standards),
@@ -238,7 +245,8 @@ def _source(standard: TracedStandard) -> str:
 
 
 def _decision_rule(test: ConformityTest) -> ET.Element:
-    return _statement(
+    return typed(
+        "statement",
         f"{test.rule}-acceptance",
         title(f"Decision rule, {test.when}"),
         leaf("reference", test.limits),
@@ -250,7 +258,8 @@ def _decision_rule(test: ConformityTest) -> ET.Element:
 
 
 def _conformity(test: ConformityTest) -> ET.Element:
-    return _statement(
+    return typed(
+        "statement",
         test.when,
         title(f"Conformity, {test.when}"),
         leaf("norm", "ISO/IEC 17025:2017, 7.8.6"),
