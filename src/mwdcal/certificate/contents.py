@@ -28,7 +28,7 @@ from mwdcal.certificate.document import (
     SourceFile,
     TracedStandard,
 )
-from mwdcal.certificate.laboratory import Laboratory
+from mwdcal.certificate.laboratory import Laboratory, filled_pattern
 from mwdcal.certificate.methods import method
 from mwdcal.certificate.repeatability import repeatability
 from mwdcal.certificate.tables import conditions, result_tables
@@ -305,7 +305,8 @@ def _number(contents: Certificate, pattern: str) -> str:
     """The number of a certificate, from what it says."""
     digest = hashlib.sha256(canonical(msgspec.to_builtins(contents))).hexdigest()
     serial = re.sub(r"[^A-Za-z0-9._]+", "-", contents.item.serial).strip("-")[:40]
-    return pattern.format(
+    return filled_pattern(
+        pattern,
         serial=serial or "tool",
         date=contents.issued.replace("-", ""),
         year=contents.issued[:4],
