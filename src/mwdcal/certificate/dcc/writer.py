@@ -8,7 +8,7 @@ Reference: PTB, DCC 3.3.0 (https://ptb.de/dcc/v3.3.0/), D-SI 2.2.
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from xml.etree import ElementTree as ET
 
 from msgspec.structs import replace
@@ -258,21 +258,35 @@ def _table(table: ResultTable) -> ET.Element:
 
 
 def _budget(budget: Budget) -> ET.Element:
-    """A list for each source, of what it adds to the uncertainty of each angle; then their sum, and expanded."""
-    lines = [*budget.lines, budget.combined, budget.expanded]
-    data = [child for line in lines for child in _budget_line(line)]
-    return _result("Uncertainty budget", budget.at, "uncertainty-budget", data)
+    """A list for each source, of what it adds to the uncertainty of each angle; then their sum, and expanded.
+
+    An angle of which no source says anything, as without a magnetometer, is undetermined in the sum alone.
+    """
+    known = [
+        angle for angle in _ANGLES if any(_sd(line, angle) is not None for line in budget.lines)
+    ]
+    data = [child for line in budget.lines for child in _budget_line(line, known)]
+    sums = [
+        child
+        for line in (budget.combined, budget.expanded)
+        for child in _budget_line(line, _ANGLES)
+    ]
+    return _result("Uncertainty budget", budget.at, "uncertainty-budget", [*data, *sums])
 
 
-def _budget_line(line: BudgetLine) -> Iterator[Child]:
-    angles = (
-        Quantity(
-            id=f"budget/{line.id}/{name}", name=name, unit="°", value=getattr(line, f"{name}_deg")
-        )
-        for name in _ANGLES
+def _sd(line: BudgetLine, angle: str) -> float | None:
+    """What a line of the budget adds to an angle, degrees."""
+    value: float | None = getattr(line, f"{angle}_deg")
+    return value
+
+
+def _budget_line(line: BudgetLine, angles: Iterable[str]) -> list[Child]:
+    quantities = (
+        Quantity(id=f"budget/{line.id}/{angle}", name=angle, unit="°", value=_sd(line, angle))
+        for angle in angles
     )
     basis = words("description", f"Type {line.kind}. {line.basis}")
-    yield from _data(angles, title(line.source), basis, basic="")
+    return _data(quantities, title(line.source), basis, basic="")
 
 
 def _roll_test(test: ConformityTest, simulated: bool) -> ET.Element:
