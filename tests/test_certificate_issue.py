@@ -2,11 +2,13 @@
 
 import hashlib
 import json
+import re
+import shlex
 
 import msgspec
 import pytest
 
-from cli_support import EXAMPLE, mwdcal, refused
+from cli_support import EXAMPLE, ROOT, mwdcal, refused
 from mwdcal.app.commands.records import certificate_issue
 from mwdcal.certificate.document import Certificate
 from mwdcal.certificate.laboratory import load_laboratory
@@ -252,3 +254,19 @@ def test_a_pattern_makes_the_number(here, tmp_path):
 
 def test_the_digest_is_that_of_the_file():
     assert load_laboratory(EXAMPLE / "laboratory.toml")[1] == sha256(EXAMPLE / "laboratory.toml")
+
+
+def test_every_line_of_the_page_runs(tmp_path, monkeypatch):
+    pytest.importorskip("matplotlib")
+    text = (ROOT / "docs" / "certificate.md").read_text("utf-8")
+    lines = re.findall(r"^mwdcal (.*)", re.search(r"^```\n(.*?)^```", text, re.S | re.M)[1], re.M)
+    monkeypatch.chdir(tmp_path)
+    for line in lines:
+        typed, _, target = line.partition(" > ")
+        ran = mwdcal(*shlex.split(typed))
+        assert ran.code == 0, (line, ran)
+        if target:
+            (tmp_path / target).write_text(ran.out, "utf-8")
+    assert {"C.json", "C.html", "short.json"} <= {path.name for path in tmp_path.iterdir()}
+    document = json.loads((tmp_path / "short.json").read_text("utf-8"))
+    assert (document["number"], document["issued"]) == ("EX-1", "2036-04-01")
