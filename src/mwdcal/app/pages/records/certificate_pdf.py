@@ -18,8 +18,8 @@ from mwdcal.app.pages.pictures import picture, require
 from mwdcal.app.pages.records.certificate_blocks import mapped_texts
 from mwdcal.app.pages.records.certificate_pictures import Picture
 from mwdcal.app.pages.records.certificate_text import certificate_text
-from mwdcal.calibration.record import canonical
 from mwdcal.certificate.document import Certificate
+from mwdcal.files.documents import laid_out
 
 STANDARD: Literal["a-3a"] = "a-3a"
 """Of PDF: for archives, tagged for readers of screens, with files attached."""
@@ -54,7 +54,7 @@ def render_pdf(certificate: Certificate, pictures: Sequence[Picture] = ()) -> by
         _timestamp(certificate),
         text=_json(shown),
         pictures=_json({each.id: picture(each.figure, ".svg").decode() for each in pictures}),
-        certificate=canonical(msgspec.to_builtins(certificate)).decode(),
+        certificate=laid_out(msgspec.json.encode(certificate)).decode(),
     )
 
 
