@@ -13,10 +13,10 @@ from mwdcal.app.pages.records.certificate_blocks import (
     Cell,
     CertificateText,
     Column,
+    DecisionBox,
     FactList,
     FactsBlock,
     Mark,
-    Outcome,
     OutcomesBlock,
     PictureBlock,
     Section,
@@ -231,7 +231,7 @@ def _conformity(certificate: Certificate) -> Iterator[Block]:
         yield TextBlock(findings, "Findings of the roll tests", bullets=True)
 
 
-def _outcome(test: ConformityTest) -> Outcome:
+def _outcome(test: ConformityTest) -> DecisionBox:
     missed = [each.quantity.name for each in test.decisions if not each.passed]
     count = plural(len(test.decisions), "limit")
     level: Mark = "good" if test.passed else "bad"
@@ -239,7 +239,7 @@ def _outcome(test: ConformityTest) -> Outcome:
     if not test.passed and not missed:
         headline = "Fail"
     after = f"Not met: {', '.join(missed)}. " if missed else ""
-    return Outcome(level, test.when, headline, f"{after}Decision rule: {test.rule}.")
+    return DecisionBox(level, test.when, headline, f"{after}Decision rule: {test.rule}.")
 
 
 def _test_facts(tests: Sequence[ConformityTest]) -> TableBlock:
