@@ -9,6 +9,7 @@ import secrets
 import shutil
 import tempfile
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 import sqlalchemy as sa
@@ -63,3 +64,10 @@ def empty_database(server: str) -> str:
         connection.execute(sa.text(f"CREATE DATABASE {name}"))
     engine.dispose()
     return url.set(database=name, drivername="postgresql").render_as_string(hide_password=False)
+
+
+def registry_database(request: pytest.FixtureRequest, tmp_path: Path) -> Path | str:
+    """An empty database of the kind that the fixture's parameter names: to be made a fixture of."""
+    if request.param == "sqlite":
+        return tmp_path / "tools.registry"
+    return empty_database(request.getfixturevalue("postgresql"))

@@ -78,7 +78,7 @@ def load_profile(name_or_path: str | None = None) -> tuple[Profile, str]:
     """
     name = "generic" if name_or_path is None else name_or_path
     data, digest = read_toml(name, "profiles", "tool profile")
-    return _profile(data, Path(name).name), digest
+    return decoded_profile(data, Path(name).name), digest
 
 
 def built_in(folder: str) -> list[str]:
@@ -150,8 +150,8 @@ def decoded_toml(
         ) from None
 
 
-def _profile(data: bytes, source: str) -> Profile:
-    """The checked profile in the bytes of a TOML file."""
+def decoded_profile(data: bytes, source: str) -> Profile:
+    """The checked profile in the bytes of a TOML file, without a byte order mark."""
     try:
         profile = msgspec.toml.decode(data, type=Profile)
     except msgspec.ValidationError as error:

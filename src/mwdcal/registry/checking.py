@@ -6,7 +6,6 @@ Everything is read once, in order of its number, with a few hundred rows in memo
 from __future__ import annotations
 
 import math
-import zlib
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
 
@@ -14,8 +13,8 @@ import msgspec
 import sqlalchemy as sa
 
 from mwdcal.errors import InputError
-from mwdcal.registry.database import chain, schema
-from mwdcal.registry.database.connections import ROWS_AT_ONCE
+from mwdcal.registry.database import chain, migrating
+from mwdcal.registry.database.connections import OBJECTS_AT_ONCE, ROWS_AT_ONCE
 from mwdcal.registry.database.models import history, objects, records, tools, withdrawals
 from mwdcal.registry.database.tools import TOOL_KINDS, rows_of
 from mwdcal.registry.facts import FACTS_VERSION, content_address, facts
@@ -64,7 +63,7 @@ def check(
 
 
 def _all(connection: sa.Connection, head: str | None, progress: Progress) -> Iterator[Discrepancy]:
-    for text in schema.differences(connection):
+    for text in migrating.differences(connection):
         yield Discrepancy("schema", text)
     yield from _events(connection, progress)
     yield from _tools(connection)
@@ -110,7 +109,7 @@ def _events(connection: sa.Connection, progress: Progress) -> Iterator[Discrepan
     rows = [
         _Rows(connection, records),
         _Rows(connection, withdrawals),
-        _Rows(connection, objects, 4),
+        _Rows(connection, objects, OBJECTS_AT_ONCE),
     ]
     before = (0, chain.GENESIS)
     options = {"stream_results": True, "yield_per": ROWS_AT_ONCE}
@@ -209,10 +208,9 @@ def _bytes_of(record: Row, stored: Row | None) -> bytes | None:
         return None
     try:
         data = unpacked(stored["data"], stored["size"])
-    except (zlib.error, TypeError, ValueError, OverflowError):
+    except InputError:
         return None
-    sound = len(data) == stored["size"] and content_address(data) == stored["sha256"]
-    return data if sound else None
+    return data if content_address(data) == stored["sha256"] else None
 
 
 def _other_facts(record: Row, data: bytes) -> list[str]:

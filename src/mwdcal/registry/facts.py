@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import base64
 import hashlib
 import json
 import math
+import re
 import tomllib
 from collections.abc import Callable, Mapping
-from datetime import UTC, datetime
+from datetime import UTC, date, datetime
 from typing import Any
 
 import msgspec
 
+from mwdcal.calibration.readings import is_simulated
 from mwdcal.errors import InputError
 from mwdcal.files import metadata
 
@@ -19,6 +22,10 @@ FACTS_VERSION = 1
 """Version of the functions below: higher when one of them reads the same bytes otherwise."""
 LONGEST_NAME = 200
 """Characters of the longest serial, name or number that a registry takes."""
+_OWNER = re.compile(rb"^Owner: ([^\r\n]*)", re.MULTILINE)
+_PEM_KEY = re.compile(rb"-----BEGIN PUBLIC KEY-----\s(.*?)-----END PUBLIC KEY-----", re.DOTALL)
+_RAW_KEY = 32
+"""Bytes of a public key of Ed25519, the last ones of its SubjectPublicKeyInfo."""
 _METADATA_LINES = 200
 """Lines of a text table in which metadata are looked for."""
 
@@ -27,7 +34,7 @@ class Facts(msgspec.Struct, frozen=True, kw_only=True):
     """What is indexed of a document; None where it does not say.
 
     `type`: of the tool, or the quantity of a standard. `label`: what people call it, such as a
-    certificate's number. `time`: of the calibration, or of issue, ISO 8601 in UTC. `run`,
+    certificate's number. `time`: of the measurement, or of issue, ISO 8601 in UTC. `run`,
     `calibration`, `previous`: SHA-256 of the run and the calibration that it rests on, and of the
     calibration that was its prior. Angles: 1σ accuracy to expect, degrees. `next_due`: a date.
     `status`: `passed` or `failed`. `simulated`: 1 where it rests on simulated data.
@@ -103,6 +110,14 @@ def _instant(value: object) -> str | None:
     return moment.astimezone(UTC).isoformat(timespec="seconds")
 
 
+def _measured(stated: object) -> str | None:
+    """The day of a measurement as a run states it; None where that is no date."""
+    try:
+        return date.fromisoformat(str(stated)[: len("2026-01-31")]).isoformat()
+    except ValueError:
+        return None
+
+
 def _norm(rows: list[Mapping[str, Any]], key: str) -> float | None:
     """The root of the sum of squares of a column of the budget; None where a part is undetermined."""
     parts = [row.get(key) for row in rows]
@@ -116,7 +131,7 @@ def _calibration(data: bytes, name: str) -> Facts:
     return Facts(
         serial=_text(fields.get("serial") or tool.get("serial")),
         type=_text(fields["profile"].get("name")),
-        time=_instant(fields["time"]),
+        time=_measured(tool.get("date")) or _instant(fields["time"]),
         run=_text(fields.get("run_sha256")),
         previous=_text(fields.get("prior_sha256")),
         inclination_deg=_norm(budget, "inclination_deg"),
@@ -200,7 +215,30 @@ def _run(data: bytes, name: str) -> Facts:
             values |= metadata.parse([(number, line)], name)
         except InputError:
             continue  # a remark of another program
-    return Facts(serial=_text(values.get("serial")), simulated=int(bool(values.get("simulated"))))
+    return Facts(
+        serial=_text(values.get("serial")),
+        time=_measured(values.get("date")),
+        simulated=int(is_simulated(values)),
+    )
+
+
+def _limits(data: bytes, name: str) -> Facts:
+    return Facts(label=_text(tomllib.loads(data.decode("utf-8-sig")).get("name")))
+
+
+def _laboratory(data: bytes, name: str) -> Facts:
+    fields = tomllib.loads(data.decode("utf-8-sig"))
+    return Facts(label=_text(fields.get("laboratory", {}).get("name")))
+
+
+def _public_key(data: bytes, name: str) -> Facts:
+    """Owner and key, as its signatures name it, of a PEM file; both as `certificate key create` writes them."""
+    owner, block = _OWNER.search(data), _PEM_KEY.search(data)
+    if block is None:
+        raise ValueError("no public key in PEM form")
+    raw = base64.b64decode(b"".join(block[1].split()), validate=True)[-_RAW_KEY:]
+    stated = owner[1].decode("utf-8", "replace").strip() if owner else ""
+    return Facts(label=_text(stated), type=hashlib.sha256(raw).hexdigest()[:16])
 
 
 RECORD_KINDS: dict[str, Callable[[bytes, str], Facts]] = {
@@ -212,6 +250,9 @@ RECORD_KINDS: dict[str, Callable[[bytes, str], Facts]] = {
     "certificate": _certificate,
     "standard": _standard,
     "person": _person,
+    "limits": _limits,
+    "laboratory": _laboratory,
+    "public-key": _public_key,
 }
 """Kinds of records, and what reads the facts of each."""
 

@@ -62,7 +62,7 @@ def _page(
         return Page(total, [dict(row) for row in rows])
 
 
-def _with_events() -> sa.Select[Any]:
+def with_events() -> sa.Select[Any]:
     """Records with who added them when (`added`, `actor`), and why they were withdrawn, if they were."""
     return (
         sa.select(
@@ -82,7 +82,7 @@ def past(registry: Registry, serial: str, offset: int = 0, limit: int = 200) -> 
 
     Columns: those of `records`, with `added` (time), `actor`, `withdrawn` (number of that event) and `reason`.
     """
-    query = _with_events().where(records.c.serial == serial)
+    query = with_events().where(records.c.serial == serial)
     return _page(registry, query, [records.c.number], offset, limit)
 
 
@@ -95,7 +95,7 @@ def records_page(
     limit: int = 50,
 ) -> Page:
     """Records of a kind whose columns equal `where`, in order of the time they state; columns as of `past`."""
-    query = _with_events().where(records.c.kind == kind)
+    query = with_events().where(records.c.kind == kind)
     for name, value in (where or {}).items():
         query = query.where(records.c[name] == value)
     keys = [records.c.time, records.c.number]
@@ -105,9 +105,7 @@ def records_page(
 def record(registry: Registry, number: int) -> Row | None:
     """The record of a number, with the columns of `past`; None where there is none."""
     with registry.reading() as connection:
-        row = (
-            connection.execute(_with_events().where(records.c.number == number)).mappings().first()
-        )
+        row = connection.execute(with_events().where(records.c.number == number)).mappings().first()
         return dict(row) if row else None
 
 

@@ -21,6 +21,8 @@ from mwdcal.registry.facts import FACTS_VERSION, LONGEST_NAME, content_address, 
 
 LARGEST_OBJECT = 500_000_000
 """Bytes of the largest file that a registry takes."""
+Draft = dict[str, Any]
+"""What is inserted of an entry: see `draft`."""
 
 
 class Entry(NamedTuple):
@@ -60,14 +62,14 @@ class Registry:
     def reading(self) -> Iterator[sa.Connection]:
         """A transaction that sees one state of the registry."""
         with self.database.reading() as connection:
-            schema.check_revision(connection, self.name)
+            schema.check_version(connection, self.name)
             yield connection
 
     @contextlib.contextmanager
     def writing(self) -> Iterator[sa.Connection]:
         """A transaction of the only writer, durable when the block ends."""
         with self.database.writing() as connection:
-            schema.check_revision(connection, self.name)
+            schema.check_version(connection, self.name)
             yield connection
 
     def add(
@@ -82,8 +84,13 @@ class Registry:
             InputError: a file is not of its kind, its serial is another than the entry's, or the
                 database refuses.
         """
+        return self.insert([draft(entry) for entry in entries], actor, when)
+
+    def insert(
+        self, drafts: Sequence[Draft], actor: str, when: datetime | None = None
+    ) -> list[Added]:
+        """The same with the drafts of entries, which other processes may have made."""
         who, time = person(actor), chain.instant(when)
-        drafts = [_draft(entry) for entry in entries]
         with self.writing() as connection:
             return _insert(connection, drafts, who, time)
 
@@ -105,11 +112,11 @@ class Registry:
             before = sa.select(withdrawals.c.number).where(withdrawals.c.record == number)
             if connection.scalar(before) is not None:
                 raise InputError(f"{self.name}: record {number} is withdrawn already.")
-            row = {"number": chain.head(connection)[0] + 1, "record": number, "reason": why}
+            newest, previous = chain.head(connection)
+            row = {"number": newest + 1, "record": number, "reason": why}
             connection.execute(sa.insert(withdrawals), row)
-            chain.append(
-                connection, [_event(row, record._mapping, who, time, "withdraw", chain.digest(row))]
-            )
+            event = _event(row, record._mapping, who, time, "withdraw", chain.digest(row))
+            chain.append(connection, previous, [event])
             _refresh_tools(connection, [record._mapping])
 
     def content(self, sha256: str) -> bytes:
@@ -146,16 +153,21 @@ def unpacked(data: bytes, size: int) -> bytes:
     """An object's bytes from those stored; at most one more than `size` of them.
 
     Raises:
-        zlib.error: they are damaged.
+        InputError: they are damaged.
     """
     unpacker = zlib.decompressobj()
-    content = unpacker.decompress(data, size + 1)
-    if not unpacker.eof or unpacker.unused_data:
-        raise zlib.error("the stored bytes are incomplete, or there are too many")
+    try:
+        content = unpacker.decompress(data, size + 1)
+    except (zlib.error, TypeError, ValueError, OverflowError):
+        content = b""
+    if len(content) != size or not unpacker.eof or unpacker.unused_data:
+        raise InputError(
+            "a file in the registry is damaged. Check the registry, and restore it from a backup."
+        )
     return content
 
 
-def _draft(entry: Entry) -> dict[str, Any]:
+def draft(entry: Entry) -> Draft:
     """The rows of an entry, without their number: columns of a record, and `object`."""
     if len(entry.data) > LARGEST_OBJECT:
         raise InputError(
@@ -189,13 +201,11 @@ def record_digest(record: Mapping[str, Any], stored: Mapping[str, Any] | None) -
     return chain.digest({**record, "object": packed})
 
 
-def _insert(
-    connection: sa.Connection, drafts: Sequence[dict[str, Any]], who: str, time: str
-) -> list[Added]:
+def _insert(connection: sa.Connection, drafts: Sequence[Draft], who: str, time: str) -> list[Added]:
     """Insert what is new, with its events; what became of each."""
     known = _known(connection, [draft["sha256"] for draft in drafts])
     stored = {sha256 for sha256, _ in known}
-    number, _ = chain.head(connection)
+    number, previous = chain.head(connection)
     rows, packed, events, result = [], [], [], []
     for draft in drafts:
         row = {name: value for name, value in draft.items() if name != "object"}
@@ -216,7 +226,7 @@ def _insert(
     for table, values in ((objects, packed), (records, rows)):
         if values:
             connection.execute(sa.insert(table), values)
-    chain.append(connection, events)
+    chain.append(connection, previous, events)
     _refresh_tools(connection, rows)
     return result
 
@@ -253,45 +263,20 @@ def _refresh_tools(connection: sa.Connection, rows: Iterable[Any]) -> None:
     )
 
 
-def create(database: str | os.PathLike[str], actor: str) -> None:
-    """Create a registry in a new file, or in an empty database by its URL.
-
-    Raises:
-        InputError: it exists already, or cannot be created.
-    """
-    who, target = person(actor), connect(database, new=True)
-    try:
-        schema.initialise(target, who)
-    finally:
-        target.engine.dispose()
-
-
 @contextlib.contextmanager
-def open_registry(database: str | os.PathLike[str]) -> Iterator[Registry]:
+def open_registry(database: str | os.PathLike[str], shared: bool = True) -> Iterator[Registry]:
     """A registry by the path of its file or its URL, closed when the block ends.
+
+    Not `shared`: a file that nobody writes to, as a backup, which may be on a network drive.
 
     Raises:
         InputError: there is none, it is not a registry, or its schema is older or newer than this program's.
     """
-    target = connect(database)
-    registry = Registry(target)
+    target = connect(database, shared=shared)
     try:
-        with registry.reading():
-            pass
-        yield registry
+        with target.reading() as connection:
+            schema.known_version(connection, target.name)
+            schema.check_version(connection, target.name)
+        yield Registry(target)
     finally:
         target.engine.dispose()
-
-
-def upgrade(database: str | os.PathLike[str], actor: str) -> tuple[str, str]:
-    """Bring the schema of a registry to this program's version; from which to which."""
-    return move_to(database, schema.revisions()[-1], actor)
-
-
-def move_to(database: str | os.PathLike[str], target: str, actor: str) -> tuple[str, str]:
-    """Bring the schema of a registry to a version, up or down; from which to which."""
-    who, place = person(actor), connect(database)
-    try:
-        return schema.change(place, target, who)
-    finally:
-        place.engine.dispose()

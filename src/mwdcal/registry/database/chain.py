@@ -43,9 +43,8 @@ def head(connection: sa.Connection) -> tuple[int, str]:
     return (row.number, row.hash) if row else (0, GENESIS)
 
 
-def append(connection: sa.Connection, events: Iterable[Mapping[str, Any]]) -> None:
-    """Append events, whose numbers must follow the newest, to the history."""
-    _, previous = head(connection)
+def append(connection: sa.Connection, previous: str, events: Iterable[Mapping[str, Any]]) -> None:
+    """Append events, whose numbers must follow the newest, of hash `previous`, to the history."""
     rows = []
     for event in events:
         row = {"sha256": None, "row_sha256": None, **event, "previous": previous}
@@ -64,7 +63,8 @@ def append_one(
     connection: sa.Connection, actor: str, action: str, kind: str, subject: str, **more: Any
 ) -> int:
     """Append one event now; its number."""
-    number = head(connection)[0] + 1
+    newest, previous = head(connection)
+    number = newest + 1
     event = {"number": number, "time": instant(), "actor": actor, "action": action, "kind": kind}
-    append(connection, [{**event, "subject": subject, **more}])
+    append(connection, previous, [{**event, "subject": subject, **more}])
     return number

@@ -11,13 +11,17 @@ from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import sqlalchemy as sa
 
 from mwdcal.errors import InputError
+from mwdcal.registry.database.places import on_network
 
 ROWS_AT_ONCE = 100
 """Rows of a table that are in memory at once."""
+OBJECTS_AT_ONCE = 8
+"""Files of a registry that are in memory at once."""
 LONGEST_WAIT = 60.0
 """Seconds for which a writer waits for its turn."""
 _LOCK = 0x6D776463616C
@@ -40,7 +44,8 @@ _WHAT_TO_DO = {
 class Database:
     """A database by the name that messages have for it, without password; `file` is that of SQLite.
 
-    `shared`: several programs will use it at once, for which SQLite keeps a second file beside it.
+    `shared`: several programs may use it at once, for which SQLite keeps a log beside it; otherwise
+    it is a file that only this program writes, as a backup that is not finished.
     """
 
     name: str
@@ -61,26 +66,33 @@ class Database:
     def writing(self) -> Iterator[sa.Connection]:
         """A transaction of the only writer: on the disk when the block ends, or without effect."""
         with explained(self), self.engine.connect() as plain:
-            if self.file and self.shared:
-                _log_ahead(plain)
+            if self.file:
+                _set_journal(plain, self.shared)
             connection = plain.execution_options(mwdcal_writing=True)
             with connection.begin():
                 if self.file is None:
                     connection.execute(sa.text(f"SELECT pg_advisory_xact_lock({_LOCK})"))
-                    _wait_for_the_disk(connection)
                 yield connection
 
 
-def _log_ahead(connection: sa.Connection) -> None:
-    """Have SQLite write ahead into a log, so that readers and the writer do not wait for each other."""
-    with contextlib.suppress(sqlite3.Error):  # not on every disk; then they wait
-        connection.connection.cursor().execute("PRAGMA journal_mode=WAL")
+def _set_journal(connection: sa.Connection, shared: bool) -> None:
+    """Have SQLite write ahead into a log, so that readers and the writer do not wait for each other.
+
+    A file that nobody else uses, and that is thrown away where its writer fails, needs no journal.
+    """
+    modes = ("journal_mode=WAL",) if shared else ("journal_mode=OFF", "synchronous=OFF")
+    with contextlib.suppress(sqlite3.Error):  # no log on every disk; then they wait
+        for mode in modes:
+            connection.connection.cursor().execute(f"PRAGMA {mode}")
 
 
-def _wait_for_the_disk(connection: sa.Connection) -> None:
-    """Let COMMIT return only when the write is durable, where the server is set not to."""
-    if connection.scalar(sa.text("SHOW synchronous_commit")) == "off":
-        connection.execute(sa.text("SET LOCAL synchronous_commit = on"))
+def _wait_for_the_disk(connection: Any, _record: object) -> None:
+    """Let COMMIT return only when the write is durable, where the server is set not to wait."""
+    with connection.cursor() as cursor:
+        cursor.execute("SHOW synchronous_commit")
+        if cursor.fetchone()[0] == "off":
+            cursor.execute("SET synchronous_commit = on")
+    connection.commit()
 
 
 def is_url(database: str | os.PathLike[str]) -> bool:
@@ -106,6 +118,7 @@ def connect(database: str | os.PathLike[str], new: bool = False, shared: bool = 
             "pip install 'mwdcal[postgresql]'"
         )
     engine = sa.create_engine(url.set(drivername="postgresql+psycopg"), hide_parameters=True)
+    sa.event.listen(engine, "connect", _wait_for_the_disk)
     return Database(name, engine)
 
 
@@ -128,6 +141,11 @@ def _sqlite(path: Path, new: bool, shared: bool) -> Database:
         raise InputError(f"{path}: its folder does not exist. Create it, or name another.")
     if not new and not path.is_file():
         raise InputError(f"{path}: no such file. Check the path, or create the registry.")
+    if shared and on_network(path):
+        raise InputError(
+            f"{path}: it is on a network drive, where SQLite cannot keep the writers of several machines "
+            "apart. Put the registry on a local disk, or into PostgreSQL."
+        )
     engine = sa.create_engine(
         "sqlite://", creator=partial(_opened, path, new), poolclass=sa.QueuePool
     )
@@ -160,12 +178,14 @@ def explained(database: Database) -> Iterator[None]:
     """Turn what the database refuses into one sentence without passwords."""
     try:
         yield
-    except (sa.exc.DBAPIError, sqlite3.Error) as error:
+    except (UnicodeError, OverflowError):
+        raise InputError(f"{database.name}: it is damaged. Restore it from a backup.") from None
+    except (sa.exc.SQLAlchemyError, sqlite3.Error) as error:
         raise InputError(f"{database.name}: {sentence(error, database)}") from None
 
 
 def sentence(error: Exception, database: Database) -> str:
-    """What a database refused, and what to do about it."""
+    """What a database refused, without passwords, and what to do about it."""
     lines = str(getattr(error, "orig", None) or error).strip().splitlines()
     text = lines[0].strip() if lines else type(error).__name__
     password = database.engine.url.password

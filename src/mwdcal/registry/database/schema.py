@@ -1,186 +1,48 @@
-"""The schema of a registry: its versions, and the steps between them, up and down."""
+"""The version of a registry's schema, and whether this program can work with it."""
 
 from __future__ import annotations
 
-from functools import cache
-from importlib.resources import files
-from typing import Any
-from uuid import uuid4
+import re
 
 import sqlalchemy as sa
-from alembic.autogenerate import compare_metadata
-from alembic.config import Config
-from alembic.runtime.environment import EnvironmentContext
-from alembic.runtime.migration import MigrationContext
-from alembic.script import ScriptDirectory
 
 from mwdcal.errors import InputError
-from mwdcal.registry.database.chain import append_one
-from mwdcal.registry.database.connections import Database
-from mwdcal.registry.database.guards import FUNCTION_BODY, trigger_names
-from mwdcal.registry.database.models import GUARDED, metadata
 
-_UPGRADE = "Upgrade it with mwdcal registry upgrade, after a backup."
-
-
-def scripts() -> ScriptDirectory:
-    """The migrations, which are part of the package."""
-    folder = str(files(__package__) / "migrations")
-    return ScriptDirectory(folder, version_locations=[folder])
+SCHEMA_VERSION_OF_REGISTRY = "0002"
+"""The newest migration: the schema that this program works with."""
+VERSION_TABLE = "alembic_version"
+"""Where Alembic keeps the version."""
+_STATED_VERSION = sa.text(f"SELECT version_num FROM {VERSION_TABLE}")
 
 
-def revisions() -> list[str]:
-    """All versions of the schema, oldest first."""
-    return [step.revision for step in scripts().walk_revisions()][::-1]
+def stated_version(connection: sa.Connection) -> str:
+    """The version that a registry states; empty where it does not state one."""
+    rows = connection.scalars(_STATED_VERSION).all()
+    return str(rows[0]) if len(rows) == 1 else ""
 
 
-def revision(connection: sa.Connection) -> str | None:
-    """The version of the schema in a database; None where there is none."""
-    heads = MigrationContext.configure(connection).get_current_heads()
-    return heads[0] if len(heads) == 1 else None
-
-
-def migrate(connection: sa.Connection, target: str) -> None:
-    """Bring the schema to a version, up or down, within the transaction of the connection."""
-    directory, current = scripts(), revision(connection)
-    steps = revisions()
-    up = current is None or (target != "base" and steps.index(target) >= steps.index(current))
-
-    def plan(at: Any, _context: MigrationContext) -> Any:
-        if up:
-            return directory._upgrade_revs(target, at)
-        return directory._downgrade_revs(target, at)
-
-    with EnvironmentContext(Config(), directory, fn=plan, destination_rev=target) as environment:
-        environment.configure(connection=connection, target_metadata=metadata)
-        environment.run_migrations()
-
-
-def initialise(database: Database, actor: str) -> None:
-    """Create the tables in an empty database, and begin the history.
+def known_version(connection: sa.Connection, name: str) -> str:
+    """The version of the schema in a database, the newest or an older one.
 
     Raises:
-        InputError: there are tables already.
-    """
-    with database.writing() as connection:
-        create_tables(connection, database.name)
-        append_one(connection, actor, "create", "registry", uuid4().hex)
-
-
-def create_tables(connection: sa.Connection, name: str) -> None:
-    """Create the tables at the newest version; refuses a database that has tables of a registry, or a file with any."""
-    tables = set(sa.inspect(connection).get_table_names())
-    ours = {*metadata.tables, "alembic_version"}
-    if tables if connection.dialect.name == "sqlite" else tables & ours:
-        raise InputError(f"{name}: it exists and is not empty. Name another, or use this one.")
-    migrate(connection, revisions()[-1])
-
-
-def change(database: Database, target: str, actor: str) -> tuple[str, str]:
-    """Bring the schema to a version, up or down, and note it in the history; from which to which."""
-    steps = revisions()
-    if target not in steps:
-        raise InputError(
-            f"`target` must be one of the schema's versions {', '.join(steps)}; got {target!r}. Choose one."
-        )
-    with database.writing() as connection:
-        current = known_revision(connection, database.name)
-        if current != target:
-            migrate(connection, target)
-            action = "upgrade" if steps.index(target) > steps.index(current) else "downgrade"
-            append_one(connection, actor, action, "schema", target)
-    return current, target
-
-
-def known_revision(connection: sa.Connection, name: str) -> str:
-    """The version of the schema in a database, one of `revisions`.
-
-    Raises:
-        InputError: it is no registry, or one of a newer program.
+        InputError: it is not a registry, or one of a newer program.
     """
     tables = set(sa.inspect(connection).get_table_names())
-    current = revision(connection) if "alembic_version" in tables else None
-    if current is None or "history" not in tables:
+    version = stated_version(connection) if {VERSION_TABLE, "history"} <= tables else ""
+    if not re.fullmatch(r"\d{4}", version):
         raise InputError(f"{name}: it is not a registry. Name one that mwdcal made, or create it.")
-    if current not in revisions():
+    if version > SCHEMA_VERSION_OF_REGISTRY:
         raise InputError(
-            f"{name}: a newer version of mwdcal made it (schema {current!r}). Use that version."
+            f"{name}: a newer version of mwdcal made it (schema {version}). Use that version."
         )
-    return current
+    return version
 
 
-def check_revision(connection: sa.Connection, name: str) -> None:
-    """Refuse a database whose schema is not the newest."""
-    current, newest = known_revision(connection, name), revisions()[-1]
-    if current != newest:
+def check_version(connection: sa.Connection, name: str) -> None:
+    """Refuse a registry whose schema is not the newest."""
+    version = stated_version(connection)
+    if version != SCHEMA_VERSION_OF_REGISTRY:
         raise InputError(
-            f"{name}: its schema {current} is older than this program's, {newest}. {_UPGRADE}"
+            f"{name}: its schema is {version or 'not stated'}, and this program works with "
+            f"{SCHEMA_VERSION_OF_REGISTRY}. Upgrade it with mwdcal registry upgrade, after a backup."
         )
-
-
-def differences(connection: sa.Connection) -> list[str]:
-    """What is wrong with the tables, indexes and triggers of a database, one sentence each."""
-    if connection.dialect.name == "sqlite":
-        wrong = [
-            row for row in connection.scalars(sa.text("PRAGMA integrity_check")) if row != "ok"
-        ]
-        return [f"SQLite finds: {text}" for text in wrong[:5]] + _sqlite_differences(connection)
-    return _postgresql_differences(connection)
-
-
-def _sqlite_differences(connection: sa.Connection) -> list[str]:
-    present, expected = _catalogue(connection), _expected_catalogue()
-    names = sorted({*present, *expected})
-    return [
-        f"{kind} '{name}' of the schema is "
-        + ("missing" if (kind, name) not in present else "not as mwdcal makes it")
-        for kind, name in names
-        if present.get((kind, name)) != expected.get((kind, name))
-    ]
-
-
-def _catalogue(connection: sa.Connection) -> dict[tuple[str, str], tuple[str, str | None]]:
-    """The statement that made each table, index and trigger; SQLite's own statistics apart."""
-    query = "SELECT type, name, tbl_name, sql FROM sqlite_master WHERE name NOT LIKE 'sqlite~_stat%' ESCAPE '~'"
-    return {
-        (row.type, row.name): (row.tbl_name, row.sql) for row in connection.execute(sa.text(query))
-    }
-
-
-@cache
-def _expected_catalogue() -> dict[tuple[str, str], tuple[str, str | None]]:
-    """The catalogue of a new registry."""
-    engine = sa.create_engine("sqlite://")
-    with engine.begin() as connection:
-        migrate(connection, revisions()[-1])
-        result = _catalogue(connection)
-    engine.dispose()
-    return result
-
-
-def _postgresql_differences(connection: sa.Connection) -> list[str]:
-    """Differences of tables and indexes as Alembic finds them, and triggers that are missing or off."""
-    ours = {*metadata.tables, "alembic_version"}
-    options = {"include_name": lambda name, kind, parents: kind != "table" or name in ours}
-    context = MigrationContext.configure(connection, opts=options)
-    wrong = [
-        f"the schema is not as mwdcal makes it: {_words(d)}"
-        for d in compare_metadata(context, metadata)
-    ]
-    query = sa.text(
-        "SELECT tgname, tgenabled, prosrc FROM pg_trigger JOIN pg_proc ON pg_proc.oid = tgfoid "
-        "WHERE NOT tgisinternal AND tgrelid IN (SELECT to_regclass(name) FROM unnest(CAST(:tables AS text[])) AS name)"
-    )
-    present = {row.tgname: row for row in connection.execute(query, {"tables": sorted(ours)})}
-    for name in {*present, *trigger_names("postgresql", [t.name for t in GUARDED])}:
-        row = present.get(name)
-        if row is None or row.tgenabled != "O" or row.prosrc.strip() != FUNCTION_BODY:
-            wrong.append(f"trigger '{name}' of the schema is missing or not as mwdcal makes it")
-    return sorted(wrong)
-
-
-def _words(difference: Any) -> str:
-    """A difference that Alembic reports, in short."""
-    first = difference[0] if isinstance(difference, list) else difference
-    named = [getattr(part, "name", part) for part in first[1:] if part is not None]
-    return " ".join([str(first[0]).replace("_", " "), *(str(n) for n in named[:2])])

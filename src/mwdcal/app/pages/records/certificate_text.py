@@ -13,7 +13,6 @@ from mwdcal.app.pages.records.certificate_blocks import (
     Cell,
     CertificateText,
     Column,
-    DecisionBox,
     FactList,
     FactsBlock,
     Mark,
@@ -23,6 +22,7 @@ from mwdcal.app.pages.records.certificate_blocks import (
     Signatory,
     SignaturesBlock,
     TableBlock,
+    TestOutcome,
     TextBlock,
     mapped_texts,
 )
@@ -35,7 +35,7 @@ from mwdcal.app.screens.numbers import (
     number,
     unit,
 )
-from mwdcal.app.text import chance, harmless, plural
+from mwdcal.app.text import NOT_STATED, chance, harmless, plural
 from mwdcal.certificate.document import (
     Budget,
     BudgetLine,
@@ -52,8 +52,6 @@ from mwdcal.certificate.document import (
 if TYPE_CHECKING:
     from mwdcal.app.pages.records.certificate_pictures import Picture
 
-NOT_STATED = "not stated"
-"""In place of what a certificate must have room for, and does not say."""
 SIMULATED_DATA = "SIMULATED DATA"
 EXACT_DIGITS = 6
 """Significant digits of a number without uncertainty, at most."""
@@ -61,7 +59,7 @@ RESULT_DIGITS = 3
 """Significant digits of a result without uncertainty, such as the mean of errors."""
 NEARLY_CERTAIN = 1e-6
 """A probability nearer to one than this is given as a bound."""
-_BLANK = Cell([NOT_STATED], "free")
+_NOT_STATED_CELL = Cell([NOT_STATED], "free")
 
 
 def certificate_text(certificate: Certificate, pictures: Sequence[Picture] = ()) -> CertificateText:
@@ -231,7 +229,7 @@ def _conformity(certificate: Certificate) -> Iterator[Block]:
         yield TextBlock(findings, "Findings of the roll tests", bullets=True)
 
 
-def _outcome(test: ConformityTest) -> DecisionBox:
+def _outcome(test: ConformityTest) -> TestOutcome:
     missed = [each.quantity.name for each in test.decisions if not each.passed]
     count = plural(len(test.decisions), "limit")
     level: Mark = "good" if test.passed else "bad"
@@ -239,7 +237,7 @@ def _outcome(test: ConformityTest) -> DecisionBox:
     if not test.passed and not missed:
         headline = "Fail"
     after = f"Not met: {', '.join(missed)}. " if missed else ""
-    return DecisionBox(level, test.when, headline, f"{after}Decision rule: {test.rule}.")
+    return TestOutcome(level, test.when, headline, f"{after}Decision rule: {test.rule}.")
 
 
 def _test_facts(tests: Sequence[ConformityTest]) -> TableBlock:
@@ -432,7 +430,9 @@ def _traceability(standards: Sequence[TracedStandard]) -> Block:
             [
                 Cell([each.quantity]),
                 Cell([each.name, *filter(None, [serial])]),
-                Cell([*filter(None, [each.certificate, by])]) if each.certificate or by else _BLANK,
+                Cell([*filter(None, [each.certificate, by])])
+                if each.certificate or by
+                else _NOT_STATED_CELL,
                 _cell(each.date or NOT_STATED),
                 due or _cell(each.due or NOT_STATED),
                 _cell(each.standard_uncertainty or NOT_STATED),

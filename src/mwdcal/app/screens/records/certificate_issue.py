@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from mwdcal.app.screens.numbers import measured, number, unit, written
-from mwdcal.app.text import chance, one_line, table
+from mwdcal.app.text import NOT_STATED, chance, one_line, table
 from mwdcal.app.text import quantity as in_unit
 from mwdcal.calibration.readings import SIMULATED
 from mwdcal.certificate.document import (
@@ -18,7 +18,6 @@ from mwdcal.certificate.document import (
     Quantity,
 )
 
-NOT_STATED = "not stated"
 ASSUMED_EXACT = "exact"
 """In place of the share of a source that is assumed exact."""
 
