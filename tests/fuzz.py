@@ -62,12 +62,17 @@ SAMPLES = {
     "plans": "plan",
     "measured": "run",
     "reference": "reference",
+    "key": "key",
+    "keys": "key",
+    "public": "key",
+    "document": "signed",
+    "files": "run",
     "verification": "verification",
     "as_found": "verification",
     "laboratory": "laboratory",
 }
 """The kind of file that each argument or option takes, by its name."""
-DOCUMENTS = ("calibration", "verification")
+DOCUMENTS = ("calibration", "verification", "signed")
 """Kinds of files that are JSON."""
 OUTPUTS = ("output", "report", "plot", "folder", "calibrations", "truth", "html", "msa_html")
 """Arguments and options that name what to write."""
@@ -166,6 +171,7 @@ def samples(folder: Path) -> dict[str, list[Any]]:
         "profile": [(EXAMPLE / "tool.toml").read_text("utf-8")],
         "limits": [LIMITS, SURVEY_LIMITS],
         "reference": [place.out],
+        **signed(folder, calibrations[0]),
         "effects": [EFFECTS],
         "verification": tests,
         "laboratory": [(EXAMPLE / "laboratory.toml").read_text("utf-8")],
@@ -410,6 +416,29 @@ def leaves(node: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
     return [p for key, value in pairs for p in ((*path, key), *leaves(value, (*path, key)))]
 
 
+def signed(folder: Path, calibration: str) -> dict[str, list[str]]:
+    """Keys, and documents that are signed or not."""
+    key, listed = folder / "lab.key", folder / "keys.json"
+    certificate = {
+        "schema_version": 1,
+        "command": "certificate",
+        "serial": "T-1",
+        "simulated": True,
+    }
+    certificate["files"] = [{"id": "run", "name": "in-files.csv", "sha256": "0" * 64}]
+    unsigned, document = json.dumps(certificate), folder / "signed.json"
+    document.write_text(unsigned, "utf-8")
+    for typed in (
+        ("key", "create", "-o", key, "--owner", "<b>L\u00e4b</b>"),
+        ("key", "trust", listed, f"{key}.pub"),
+        ("sign", document, "--key", key),
+    ):
+        ran = cli_support.mwdcal("certificate", *typed)
+        assert ran.code == 0, ran
+    keys = [path.read_text("utf-8") for path in (key, Path(f"{key}.pub"), listed)]
+    return {"key": keys, "signed": [calibration, unsigned, document.read_text("utf-8")]}
+
+
 def document_file(r: random.Random, sample: str, stem: Path) -> Path:
     """A calibration with some members changed."""
     document = json.loads(sample)
@@ -538,6 +567,7 @@ def files(r: random.Random, kind: str, sound: dict[str, list[Any]], stem: Path) 
         return Path(f"{path}#{r.choice(('T0', 'T1', 'T2', 'T9', '', '#', ' T0', '../T0'))}")
     else:
         path = (document_file if kind in DOCUMENTS else toml_file)(r, sample, stem)
+        path.chmod(0o600)  # as that of a private key must be
     damaged(r, path)
     return path
 

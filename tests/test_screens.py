@@ -3,7 +3,9 @@
 `python tests/test_screens.py` rewrites the stored ones in `tests/screens`.
 """
 
+import hashlib
 import io
+import json
 import os
 import re
 import shutil
@@ -19,6 +21,7 @@ import pytest
 
 from cli_support import called, commands, mwdcal, read_csv, servo_run, write_csv
 from mwdcal.app import cli, progress, text
+from mwdcal.certificate import keys, signature
 
 STORED = Path(__file__).parent / "screens"
 WIDTHS = (80, 120)
@@ -56,11 +59,20 @@ SCREENS = {
                         "--workers", "1", "-o", "made.parquet"),
     "stations": ("stations", "demo/log.csv", "-o", "stations.csv"),
     "survey": ("survey", "tool.json", "demo/well.csv", "-o", "made.csv"),
+    "certificate-sign": ("certificate", "sign", "certificate.json", "--key", "lab.key", "-o", "made.json"),
+    "certificate-verify": ("certificate", "verify", "signed.json", "--key", "lab.key.pub"),
+    "certificate-altered": ("certificate", "verify", "altered.json", "--key", "lab.key.pub"),
+    "key-list": ("certificate", "key", "list", "keys.json"),
+    "key-retire": ("certificate", "key", "retire", "old.json", "139e", "--at", "2027-01-01"),
+    "verify-signed": ("verify", "signed-tool.json", "demo/rolltest.csv", "--key", "keys.json"),
     "misused": ("calibrate", "demo/run.csv"),
 }  # fmt: skip
 """Commands and what they run on."""
-WITHOUT_A_SCREEN = {"completion", "certificate"}
-"""Commands whose result is a script."""
+WITHOUT_A_SCREEN = {
+    "completion",
+    *(f"certificate key {name}" for name in ("create", "trust", "revoke")),
+}
+"""Commands whose result is a script, or a key or time that is new each time; those of keys show a list of them."""
 
 
 class Terminal(io.TextIOWrapper):
@@ -140,6 +152,57 @@ def prepared(folder):
         test = mwdcal("verify", folder / "dated.json", demo / "rolltest.csv", "--json", *limits)
         (folder / name).write_text(test.out, "utf-8")
     fleet(folder)
+    signatures(folder)
+
+
+def signatures(folder):
+    """Documents signed with a key that is the same each time, one of them altered; a list of keys."""
+    pytest.importorskip("cryptography")
+    write_key(folder / "lab.key", "Calibration laboratory")
+    document = {
+        "schema_version": 1,
+        "command": "certificate",
+        "serial": "SIM-0001",
+        "simulated": True,
+    }
+    files = [("calibration", "tool.json"), ("run", "demo/run.csv"), ("verification", "lost.json")]
+    listed = [
+        {
+            "id": name,
+            "name": path,
+            "sha256": hashlib.sha256((folder / path).read_bytes()).hexdigest(),
+        }
+        for name, path in files[:1]
+    ] + [{"id": name, "name": path, "sha256": "0" * 64} for name, path in files[1:]]
+    (folder / "certificate.json").write_text(json.dumps({**document, "files": listed}), "utf-8")
+    with patch.object(signature, "now", lambda: "2026-07-01T12:00:00+00:00"):
+        for name, target in (("certificate", "signed"), ("tool", "signed-tool")):
+            typed = (
+                folder / f"{name}.json",
+                "--key",
+                folder / "lab.key",
+                "-o",
+                folder / f"{target}.json",
+            )
+            assert mwdcal("certificate", "sign", *typed).code == 0
+    altered = (folder / "signed.json").read_bytes().replace(b"SIM-0001", b"SIM-0002")
+    (folder / "altered.json").write_bytes(altered)
+    for name in ("keys.json", "old.json"):
+        typed = (folder / name, folder / "lab.key.pub")
+        assert mwdcal("certificate", "key", "trust", *typed).code == 0
+
+
+def write_key(path, owner):
+    """A key that is the same each time."""
+    curve = pytest.importorskip(
+        "cryptography.hazmat.primitives.asymmetric.ed25519"
+    ).Ed25519PrivateKey
+    private = curve.from_private_bytes(bytes(32))
+    with (
+        patch.object(curve, "generate", lambda: private),
+        patch.object(keys, "now", lambda: "2026-01-01T00:00:00+00:00"),
+    ):
+        keys.create(path, owner, "")
 
 
 def dated(demo, folder):
