@@ -57,24 +57,42 @@ def _page(
     registry: Registry, query: sa.Select[Any], order: list[Any], offset: int, limit: int
 ) -> Page:
     with registry.reading() as connection:
-        total = connection.scalar(sa.select(sa.func.count()).select_from(query.subquery())) or 0
         rows = connection.execute(query.order_by(*order).offset(offset).limit(limit)).mappings()
-        return Page(total, [dict(row) for row in rows])
+        return Page(_count(connection, query), [dict(row) for row in rows])
 
 
-def with_events() -> sa.Select[Any]:
+def _count(connection: sa.Connection, query: sa.Select[Any]) -> int:
+    return connection.scalar(sa.select(sa.func.count()).select_from(query.subquery())) or 0
+
+
+def with_events(of: sa.FromClause = records) -> sa.Select[Any]:
     """Records with who added them when (`added`, `actor`), and why they were withdrawn, if they were."""
     return (
         sa.select(
-            records,
+            of,
             history.c.time.label("added"),
             history.c.actor,
             withdrawals.c.number.label("withdrawn"),
             withdrawals.c.reason,
         )
-        .join(history, history.c.number == records.c.number)
-        .outerjoin(withdrawals, withdrawals.c.record == records.c.number)
+        .join(history, history.c.number == of.c.number)
+        .outerjoin(withdrawals, withdrawals.c.record == of.c.number)
     )
+
+
+def _records_page(
+    registry: Registry, query: sa.Select[Any], descending: bool, offset: int, limit: int
+) -> Page:
+    """A part of some records in order of time and number, each with its events, which are joined to the part alone."""
+
+    def order(table: sa.FromClause) -> list[sa.ColumnElement[Any]]:
+        keys = [table.c.time, table.c.number]
+        return [key.desc() if descending else key for key in keys]
+
+    part = query.order_by(*order(records)).offset(offset).limit(limit).subquery()
+    with registry.reading() as connection:
+        rows = connection.execute(with_events(part).order_by(*order(part))).mappings().all()
+        return Page(_count(connection, query), [dict(row) for row in rows])
 
 
 def past(registry: Registry, serial: str, offset: int = 0, limit: int = 200) -> Page:
@@ -95,11 +113,10 @@ def records_page(
     limit: int = 50,
 ) -> Page:
     """Records of a kind whose columns equal `where`, in order of the time they state; columns as of `past`."""
-    query = with_events().where(records.c.kind == kind)
+    query = sa.select(records).where(records.c.kind == kind)
     for name, value in (where or {}).items():
         query = query.where(records.c[name] == value)
-    keys = [records.c.time, records.c.number]
-    return _page(registry, query, [k.desc() if newest_first else k for k in keys], offset, limit)
+    return _records_page(registry, query, newest_first, offset, limit)
 
 
 def record(registry: Registry, number: int) -> Row | None:

@@ -53,6 +53,7 @@ records = sa.Table(
     sa.Index("records_serial", "serial", "kind", "time"),
     sa.Index("records_time", "kind", "time"),
     sa.Index("records_calibration", "calibration"),
+    sa.Index("records_run", "run"),
 )
 
 withdrawals = sa.Table(

@@ -63,6 +63,7 @@ def _create_objects_and_records() -> None:
     op.create_index("records_serial", "records", ["serial", "kind", "time"])
     op.create_index("records_time", "records", ["kind", "time"])
     op.create_index("records_calibration", "records", ["calibration"])
+    op.create_index("records_run", "records", ["run"])
 
 
 def downgrade() -> None:
