@@ -172,10 +172,13 @@ def due(registry: Registry, before: str, offset: int = 0, limit: int = 50) -> Pa
         .outerjoin(withdrawals, withdrawals.c.record == at.number)
         .where(at.kind == "standard", at.next_due < before, withdrawals.c.number.is_(None))
     )
-    both = sa.union_all(of_tools, of_standards).subquery()
-    return _page(
-        registry, sa.select(both), [both.c.next_due, both.c.kind, both.c.serial], offset, limit
-    )
+    part = of_tools.order_by(tools.c.next_due, tools.c.serial).limit(offset + limit).subquery()
+    both = sa.union_all(sa.select(part), of_standards).subquery()
+    order = both.c.next_due, both.c.kind, both.c.serial
+    with registry.reading() as connection:
+        rows = connection.execute(sa.select(both).order_by(*order).offset(offset).limit(limit))
+        total = _count(connection, of_tools) + _count(connection, of_standards)
+        return Page(total, [dict(row) for row in rows.mappings()])
 
 
 def events(registry: Registry, offset: int = 0, limit: int = 50) -> Page:
