@@ -311,7 +311,11 @@ def test_the_fit_is_not_contradicted_by_its_own_noise():
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("count", "white", "walk"),
-    [(200, 1, 0.3), (1024, 1, 0.3), (COUNT, 1, 0.1)],
+    [
+        (200, 1, 0.3),
+        (1024, 1, 0.3),
+        pytest.param(COUNT, 1, 0.1, marks=pytest.mark.study),
+    ],
 )
 def test_short_averages_are_left_out_as_seldom_as_stated(count, white, walk):
     """1 in 1000 stated, 10 in 1000 before: variances of few degrees of freedom are skew.
@@ -352,7 +356,9 @@ def test_correlated_noise_is_no_quantisation():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("drift", [0, 1e-5, 2e-5, 1e-4])
+@pytest.mark.parametrize(
+    "drift", [0, 2e-5, *(pytest.param(each, marks=pytest.mark.study) for each in (1e-5, 1e-4))]
+)
 def test_the_interval_of_one_station_holds_at_any_drift(drift):
     """N 1e-3 raw·√s, K 1e-4 raw/√s at 5 Hz, station of 30 s: 61 % at 2e-5 raw/s before.
 

@@ -15,6 +15,7 @@ from mwdcal.certificate.signature import SignatureCheck
 INPUTS = {
     "apply": ("calibration", "readings"),
     "calibrate": ("run", "profile", "prior"),
+    "certificate": (),
     **{f"certificate key {name}": () for name in ("create", "list", "retire", "revoke", "trust")},
     "certificate sign": ("document",),
     "certificate verify": ("document",),
@@ -43,7 +44,10 @@ INPUTS = {
     "survey": ("calibration", "readings", "reference", "limits"),
     "verify": ("calibration", "run", "limits"),
 }
-"""The files behind the document of each command, whose digests are its keys `…_sha256`."""
+"""The files behind the document of each command, whose digests are its keys `…_sha256`.
+
+A certificate is its own document, and lists them under `files`.
+"""
 
 
 class Envelope(msgspec.Struct, frozen=True, kw_only=True):

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from mwdcal.app.screens.numbers import measured, number, unit, written
-from mwdcal.app.text import chance, one_line, table
+from mwdcal.app.text import NOT_STATED, chance, one_line, table
 from mwdcal.app.text import quantity as in_unit
 from mwdcal.calibration.readings import SIMULATED
 from mwdcal.certificate.document import (
@@ -18,8 +18,7 @@ from mwdcal.certificate.document import (
     Quantity,
 )
 
-NOT_STATED = "not stated"
-EXACT = "exact"
+ASSUMED_EXACT = "exact"
 """In place of the share of a source that is assumed exact."""
 
 
@@ -100,5 +99,5 @@ def _source(line: BudgetLine) -> list[str]:
 def _share(line: BudgetLine, value: float | None) -> str:
     """What a source adds to the uncertainty of an angle."""
     if line.basis.startswith("assumed exact"):
-        return EXACT
+        return ASSUMED_EXACT
     return "–" if value is None else f"{number(value, 2)}°"
