@@ -8,10 +8,12 @@ import io
 import json
 import subprocess
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import click
 import numpy as np
 
 from mwdcal.app import cli
@@ -41,6 +43,23 @@ class Ran:
     def messages(self) -> list[str]:
         """The messages that end a command: ours, or those of the option parser."""
         return [s for s in self.err.splitlines() if s.startswith(("mwdcal: ", "Error: "))]
+
+
+def commands(group: click.Group = cli.cli, *before: str) -> dict[str, click.Command]:
+    """Every command that runs something, by the words that call it; a default by those of its group."""
+    found: dict[str, click.Command] = {}
+    for name in sorted(group.commands):
+        command = group.commands[name]
+        words = before if name == getattr(group, "default", None) else (*before, name)
+        inner = isinstance(command, click.Group)
+        found |= commands(command, *words) if inner else {" ".join(words): command}
+    return found
+
+
+def called(typed: Sequence[object]) -> str:
+    """The name in `commands` of what a command line calls."""
+    names = (" ".join(map(str, typed[:count])) for count in (3, 2, 1))
+    return next(name for name in names if name in commands())
 
 
 def mwdcal(*arguments: object) -> Ran:

@@ -8,11 +8,14 @@ import sys
 import click
 import numpy as np
 import pytest
+from click.shell_completion import ShellComplete
+from click.testing import CliRunner
 
 from cli_support import (
     EXAMPLE,
     SCALE,
     calibrated,
+    commands,
     mwdcal,
     numbers,
     process,
@@ -22,13 +25,13 @@ from cli_support import (
     write_csv,
 )
 from mwdcal.app.cli import cli
-from mwdcal.app.commands import options
+from mwdcal.app.commands import Group, options
 from mwdcal.errors import InputError
 from mwdcal.files import documents
 from mwdcal.use.correction import OUTSIDE
 from schemas import of_calibration_files
 
-COMMANDS = sorted(cli.commands)
+COMMANDS = sorted({*commands(), *cli.commands})
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +55,7 @@ def every_command(calibration, roll, folder):
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_has_help_with_an_example(command):
     for option in ("-h", "--help"):
-        ran = mwdcal(command, option)
+        ran = mwdcal(*command.split(), option)
         assert ran.code == 0
         assert ran.err == ""
         assert f"mwdcal {command} " in ran.out.split("Example", 1)[1]
@@ -522,3 +525,54 @@ def test_a_command_imports_no_other_command():
     command = [sys.executable, "-c", script]
     done = subprocess.run(command, capture_output=True, encoding="utf-8", check=True)
     assert done.stderr.strip() == "['verify'] False"
+
+
+# Commands with subcommands
+
+
+def echoing(name):
+    parameters = [click.Argument(["words"], nargs=-1), click.Option(["-o"])]
+    return click.Command(name, params=parameters, callback=lambda words, o: click.echo(name))
+
+
+@click.group(cls=Group, default="issue", commands={n: echoing(n) for n in ("issue", "sign")})
+def grouped():
+    """A group whose default is `issue`."""
+
+
+@pytest.mark.parametrize(
+    ("typed", "called"),
+    [
+        ("cal.json -o c.pdf", "issue"),
+        ("-o c.pdf cal.json", "issue"),
+        ("issue sign", "issue"),
+        ("./sign", "issue"),
+        ("", "issue"),
+        ("sign cal.json", "sign"),
+    ],
+)
+def test_a_first_word_that_is_no_subcommand_belongs_to_the_default(typed, called):
+    assert CliRunner().invoke(grouped, typed).output == f"{called}\n"
+
+
+def test_a_misspelt_subcommand_is_no_file_of_the_default(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    ran = CliRunner().invoke(grouped, "sing")
+    assert ran.exit_code == 2
+    assert "Did you mean sign" in ran.output
+    (tmp_path / "sing").touch()
+    assert CliRunner().invoke(grouped, "sing").output == "issue\n"
+
+
+@pytest.mark.parametrize(
+    ("typed", "offered"),
+    [
+        ("certificate ", ["issue", ""]),
+        ("certificate --o", ["--output"]),
+        ("certificate c.json --o", ["--output"]),
+    ],
+)
+def test_completion_in_a_group_offers_its_commands_and_what_the_default_takes(typed, offered):
+    *words, incomplete = typed.split(" ")
+    items = ShellComplete(cli, {}, "mwdcal", "").get_completions(words, incomplete)
+    assert {*offered} <= {item.value for item in items}

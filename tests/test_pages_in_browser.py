@@ -15,8 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cli_support import EXAMPLE, mwdcal, read_csv, servo_run, write_csv
-from mwdcal.app import cli
+from cli_support import EXAMPLE, called, commands, mwdcal, read_csv, servo_run, write_csv
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 axe = pytest.importorskip("axe_playwright_python", reason="axe-core is not installed")
@@ -63,16 +62,16 @@ def with_a_page():
     """Commands that can write a page."""
     return {
         name
-        for name, command in cli.cli.commands.items()
+        for name, command in commands().items()
         if any({"--report", "--html"} & {*option.opts} for option in command.params)
     }
 
 
-PAGES = [name for name, typed in SAMPLES.items() if typed[0] in with_a_page()]
+PAGES = [name for name, typed in SAMPLES.items() if called(typed) in with_a_page()]
 
 
 def test_every_command_with_a_page_has_a_sample():
-    missing = with_a_page() - {typed[0] for typed in SAMPLES.values()}
+    missing = with_a_page() - {called(typed) for typed in SAMPLES.values()}
     assert not missing, f"add a sample of {', '.join(missing)} to SAMPLES, so that its page is seen"
 
 
@@ -229,7 +228,7 @@ def written(folder, monkeypatch):
         path = folder / f"{name}.html"
         if not path.exists():
             option = {"--report", "--html"} & {
-                opt for param in cli.cli.commands[SAMPLES[name][0]].params for opt in param.opts
+                opt for param in commands()[called(SAMPLES[name])].params for opt in param.opts
             }
             ran = mwdcal(*SAMPLES[name], *option, path)
             assert path.exists(), ran

@@ -6,8 +6,7 @@ import json
 import numpy as np
 import pytest
 
-from cli_support import EXAMPLE, calibrated, mwdcal, servo_run, write_csv
-from mwdcal.app.cli import cli
+from cli_support import EXAMPLE, calibrated, commands, mwdcal, servo_run, write_csv
 from mwdcal.app.envelope import INPUTS
 from mwdcal.files import documents
 from schemas import CONTENTS, of_command
@@ -80,8 +79,8 @@ RUN = pytest.mark.parametrize("make", RUNS.values(), ids=RUNS)
 def test_every_command_with_json_has_a_schema():
     with_json = {
         name
-        for name in cli.commands
-        if any(parameter.name == "as_json" for parameter in cli.commands[name].params)
+        for name, command in commands().items()
+        if any(parameter.name == "as_json" for parameter in command.params)
     }
     assert with_json == set(CONTENTS) == set(INPUTS)
 

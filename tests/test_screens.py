@@ -17,7 +17,7 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 
-from cli_support import mwdcal, read_csv, servo_run, write_csv
+from cli_support import called, commands, mwdcal, read_csv, servo_run, write_csv
 from mwdcal.app import cli, progress, text
 
 STORED = Path(__file__).parent / "screens"
@@ -33,6 +33,10 @@ SCREENS = {
     "verify-failed": ("verify", "tool.json", "demo/rolltest.csv", "--limits", "tight.toml"),
     "verify-not-rolled": ("verify", "tool.json", "part.csv"),
     "apply": ("apply", "tool.json", "hot.csv", "-o", "made.csv"),
+    "certificate": ("certificate", "dated.json", "--verification", "v.json", "--laboratory",
+                    "demo/laboratory.toml", "--date", "2026-04-01", "--number", "EX-1", "-o", "C.json"),
+    "certificate-failed": ("certificate", "dated.json", "--verification", "failed.json", "--date",
+                           "2026-04-01", "--number", "EX-2"),
     "compare": ("compare", "demo/run.csv", "--tool", "demo/tool.toml"),
     "compare-parameters": ("compare", "demo/run.csv", "--tool", "demo/tool.toml", "--parameters"),
     "convert": ("convert", "tool.json", "--notation", "forward", "--temperature", "90"),
@@ -55,7 +59,7 @@ SCREENS = {
     "misused": ("calibrate", "demo/run.csv"),
 }  # fmt: skip
 """Commands and what they run on."""
-WITHOUT_A_SCREEN = {"completion"}
+WITHOUT_A_SCREEN = {"completion", "certificate"}
 """Commands whose result is a script."""
 
 
@@ -126,12 +130,24 @@ def prepared(folder):
     changed(demo / "rolltest.csv", folder / "knocked.csv", knocked)
     changed(demo / "surveys.csv", folder / "hot.csv", hot)
     write_csv(folder / "soaks.csv", servo_run(temperatures=(0.0, 40.0, 80.0)))
+    dated(demo, folder)
     limits = 'name = "tight"\n[error]\ninclination_deg = 0.001\nazimuth_deg = 2\n'
     (folder / "tight.toml").write_text(limits, "utf-8")
     (folder / "stand.toml").write_text(
         "[stand]\nazimuth_zero_deg = 0.1\ntilt_deg = 0.05\n", "utf-8"
     )
+    for name, *limits in (("v.json",), ("failed.json", "--limits", folder / "tight.toml")):
+        test = mwdcal("verify", folder / "dated.json", demo / "rolltest.csv", "--json", *limits)
+        (folder / name).write_text(test.out, "utf-8")
     fleet(folder)
+
+
+def dated(demo, folder):
+    """The calibration of the run with a date, which a certificate shows."""
+    run = "# date = 2026-03-15\n" + (demo / "run.csv").read_text("utf-8")
+    (folder / "dated.csv").write_text(run, "utf-8")
+    line = ("calibrate", folder / "dated.csv", "--tool", demo / "tool.toml", "-o")
+    assert mwdcal(*line, folder / "dated.json").code == 0
 
 
 def fleet(folder):
@@ -187,9 +203,8 @@ def words(shown):
 
 
 def test_every_command_has_a_screen():
-    assert {arguments[0] for arguments in SCREENS.values()} | WITHOUT_A_SCREEN == {
-        *cli.cli.commands
-    }
+    shown = {called(arguments) for arguments in SCREENS.values()}
+    assert shown | WITHOUT_A_SCREEN == {*commands()}
 
 
 @pytest.mark.parametrize("name", SCREENS)
@@ -218,9 +233,9 @@ def test_lines_are_folded_in_the_characters_that_are_shown(work, encoding):
         assert max(map(len, (out + err).splitlines())) <= 80
 
 
-@pytest.mark.parametrize("name", sorted(cli.cli.commands))
+@pytest.mark.parametrize("name", sorted({*commands(), *cli.cli.commands}))
 def test_help_fits_80_columns(name):
-    code, out, _ = seen(80, name, "--help")
+    code, out, _ = seen(80, *name.split(), "--help")
     assert code == 0
     assert max(map(len, out.splitlines())) <= 80
 

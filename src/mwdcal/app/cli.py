@@ -6,14 +6,12 @@ import contextlib
 import io
 import os
 import sys
-from collections import UserDict
-from importlib import import_module
-from typing import Any
 
 import click
 
 from mwdcal import __version__
 from mwdcal.app import interruption
+from mwdcal.app.commands import Commands
 from mwdcal.app.messages import say, screens
 from mwdcal.app.text import harmless, laid_out
 from mwdcal.errors import MwdcalError, reason
@@ -25,6 +23,7 @@ COMPLETION = "_MWDCAL_COMPLETE"
 COMMANDS = (
     "apply",
     "calibrate",
+    "records.certificate",
     "compare",
     "completion",
     "convert",
@@ -35,21 +34,13 @@ COMMANDS = (
     "planning.plan",
     "profile",
     "surveys.reference",
+    "records.registry",
     "planning.simulate",
     "stations",
     "surveys.survey",
     "verify",
 )
 """Modules of `mwdcal.app.commands` with a command of their name."""
-
-
-class Commands(UserDict[str, Any]):
-    """The commands by name; kept are their modules, and each is imported when it is asked for."""
-
-    def __getitem__(self, name: str) -> Any:
-        """The command of the module of that name."""
-        module = super().__getitem__(name)
-        return import_module(f"mwdcal.app.commands.{module}").command
 
 
 @click.group(
