@@ -8,15 +8,11 @@ from typing import Any
 import msgspec
 
 from mwdcal.calibration.readings import is_simulated, serial_of
-from mwdcal.calibration.record import DOCUMENT_VERSION, SOFTWARE, Signature
-from mwdcal.certificate.signature import SignatureCheck
+from mwdcal.calibration.record import DOCUMENT_VERSION, SOFTWARE
 
 INPUTS = {
     "apply": ("calibration", "readings"),
     "calibrate": ("run", "profile", "prior"),
-    **{f"certificate key {name}": () for name in ("create", "list", "retire", "revoke", "trust")},
-    "certificate sign": ("document",),
-    "certificate verify": ("document",),
     "compare": ("run", "profile"),
     "convert": ("calibration", "run"),
     "diagnose": ("calibration", "readings"),
@@ -38,8 +34,7 @@ class Envelope(msgspec.Struct, frozen=True, kw_only=True):
     """The head of a document.
 
     `software` is name and version; `serial` that of the tool, None where no input states one;
-    `simulated`: some input says that it is. `calibration_signature`: of the calibration that was used;
-    `signature`: of this document, once it is signed.
+    `simulated`: some input says that it is.
     """
 
     schema_version: int
@@ -47,8 +42,6 @@ class Envelope(msgspec.Struct, frozen=True, kw_only=True):
     software: str
     serial: str | None
     simulated: bool
-    calibration_signature: SignatureCheck | msgspec.UnsetType = msgspec.UNSET
-    signature: Signature | msgspec.UnsetType = msgspec.UNSET
 
 
 class ExampleDocument(msgspec.Struct, frozen=True, kw_only=True):
@@ -59,11 +52,7 @@ class ExampleDocument(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def enveloped(
-    command: str,
-    content: object,
-    *metadata: Mapping[str, object],
-    calibration_signature: SignatureCheck | msgspec.UnsetType = msgspec.UNSET,
-    **sha256: str,
+    command: str, content: object, *metadata: Mapping[str, object], **sha256: str
 ) -> dict[str, Any]:
     """The document of a command: its head, the SHA-256 of its input files, and the content.
 
@@ -76,7 +65,6 @@ def enveloped(
         software=SOFTWARE,
         serial=next(filter(None, map(serial_of, metadata)), None),
         simulated=any(map(is_simulated, metadata)),
-        calibration_signature=calibration_signature,
     )
     digests = {f"{name}_sha256": sha256.pop(name, "") or None for name in INPUTS[command]}
     if sha256:

@@ -11,7 +11,7 @@ import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from html import escape
 from itertools import pairwise
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import msgspec
 import numpy as np
@@ -29,8 +29,6 @@ DOCUMENT_VERSION = 1
 """Version of what commands print for machines: higher when a key goes, or changes its meaning."""
 SOFTWARE = f"mwdcal {__version__}"
 """Name and version of the program."""
-UNHASHED = ("time", "sha256", "signature")
-"""Fields of a calibration that its `sha256` is not of."""
 DIGITS = 12
 """Significant digits of every number in a calibration file."""
 MARGIN = 1.0
@@ -179,19 +177,6 @@ class OrderScore(msgspec.Struct, frozen=True, kw_only=True):
     error_ends_deg: float | None
 
 
-class Signature(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A signature of the document that it stands in: of its `canonical` JSON, all but `value`.
-
-    `key` is the SHA-256 of the raw public key, hexadecimal, its first 16 digits; `time` (UTC) is part
-    of what is signed; `value` in base64.
-    """
-
-    algorithm: Literal["Ed25519"] = "Ed25519"
-    key: str
-    time: str
-    value: str
-
-
 class TriadCalibration(msgspec.Struct, frozen=True, kw_only=True):
     """One triad: field = model(x, T - reference), x = P (raw / scale), in tool axes.
 
@@ -245,7 +230,6 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
     `serial` is that of the tool, absent where the run states none; `simulated`: of the run or the prior;
     `prior_sha256` of the file of the prior, absent where there was none.
     `sha256` is `content_sha256` of the record as it was made; earlier versions have none.
-    `signature` is absent until the file is signed, and in a record that is made from another.
     """
 
     schema_version: int = SCHEMA_VERSION
@@ -284,7 +268,6 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
     inherited: list[str] = []
     findings: list[Finding]
     sha256: str | msgspec.UnsetType = msgspec.UNSET
-    signature: Signature | msgspec.UnsetType = msgspec.UNSET
 
     plot: ClassVar[Any]
     """Figures of the calibration: `use.plots` puts them here, so that a record needs no drawing."""
@@ -338,10 +321,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def changed(self) -> bool:
-        """Whether anything but `time` has changed since the record was made; unknown without `sha256`.
-
-        A signature that is not `intact` tells more: see `certificate.signature`.
-        """
+        """Whether anything but `time` has changed since the record was made; unknown without `sha256`."""
         return self.sha256 is not msgspec.UNSET and self.sha256 != content_sha256(self)
 
     def change_findings(self) -> list[Finding]:
@@ -614,13 +594,13 @@ def _rounded(value: Any) -> Any:
 
 
 def content_sha256(calibration: Calibration) -> str:
-    """SHA-256 of all fields but `UNHASHED`, as compact JSON with sorted keys."""
+    """SHA-256 of all fields but `time` and `sha256`, as compact JSON with sorted keys."""
     return document_sha256(msgspec.to_builtins(calibration))
 
 
 def document_sha256(fields: Mapping[str, Any]) -> str:
     """The `content_sha256` of a calibration file, whose fields are these."""
-    kept = {name: value for name, value in fields.items() if name not in UNHASHED}
+    kept = {name: value for name, value in fields.items() if name not in ("time", "sha256")}
     return hashlib.sha256(canonical(kept)).hexdigest()
 
 
@@ -629,16 +609,9 @@ def canonical(fields: Mapping[str, Any]) -> bytes:
     return json.dumps(fields, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
 
 
-def signed_form(fields: Mapping[str, Any]) -> bytes:
-    """The only form that the file of a signed document may have: `canonical` with two spaces of indent."""
-    return json.dumps(fields, sort_keys=True, indent=2, allow_nan=False).encode() + b"\n"
-
-
 def sealed(calibration: Calibration) -> Calibration:
-    """The record with the `sha256` of its contents, by which a later change shows; it is unsigned."""
-    return msgspec.structs.replace(
-        calibration, sha256=content_sha256(calibration), signature=msgspec.UNSET
-    )
+    """The record with the `sha256` of its contents, by which a later change shows."""
+    return msgspec.structs.replace(calibration, sha256=content_sha256(calibration))
 
 
 def stated(value: float) -> float | None:

@@ -14,13 +14,7 @@ from typing import Any
 import msgspec
 
 from mwdcal.calibration.diagnosis.soundness import check
-from mwdcal.calibration.record import (
-    SCHEMA_VERSION,
-    Calibration,
-    document_sha256,
-    sealed,
-    signed_form,
-)
+from mwdcal.calibration.record import SCHEMA_VERSION, Calibration, document_sha256, sealed
 from mwdcal.errors import InputError, reason
 from mwdcal.files.formats import atomic, members
 from mwdcal.files.profiles import check_profile
@@ -33,8 +27,6 @@ _UNREADABLE = "No command would read such a file: calibrate again, or correct th
 
 def encode(calibration: Calibration) -> bytes:
     """The bytes of a calibration file."""
-    if calibration.signature is not msgspec.UNSET:
-        return signed_form(msgspec.to_builtins(calibration))
     return laid_out(msgspec.json.encode(calibration))
 
 
@@ -62,31 +54,23 @@ def load(path: str | os.PathLike[str]) -> tuple[Calibration, str]:
 
     `cals.parquet#SERIAL` is the calibration of one tool in the table of a fleet; the SHA-256 is that of the table.
     """
-    file = contents(path)
-    return decoded(file), file.digest
-
-
-def contents(path: str | os.PathLike[str]) -> members.Member:
-    """The bytes that `decoded` takes, the name of their file, and its SHA-256."""
     file, _ = members.split(path)
-    return members.read(path) if file.suffix.lower() == members.SUFFIX else whole_file(file)
-
-
-def decoded(file: members.Member) -> Calibration:
-    """The calibration in a file, or what is wrong with it."""
+    data, name, digest = (
+        members.read(path) if file.suffix.lower() == members.SUFFIX else _whole_file(file)
+    )
     try:
-        calibration = _decoded(file.record, file.name)
+        calibration = _decoded(data, name)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise InputError(
-            f"{file.name} is not a calibration file: {error}. Use a file that mwdcal calibrate wrote."
+            f"{name} is not a calibration file: {error}. Use a file that mwdcal calibrate wrote."
         ) from None
-    check(calibration, file.name, _AS_WRITTEN)
-    check_profile(calibration.profile, file.name)
-    return calibration
+    check(calibration, name, _AS_WRITTEN)
+    check_profile(calibration.profile, name)
+    return calibration, digest
 
 
-def whole_file(path: Path) -> members.Member:
-    """The bytes of a file, its name and its digest."""
+def _whole_file(path: Path) -> members.Member:
+    """The bytes of a calibration file, its name and its digest."""
     try:
         data = path.read_bytes()
     except OSError as error:

@@ -24,11 +24,10 @@ from mwdcal.errors import InputError
     help="Rows with a blank reading or temperature: refuse the file, or leave their results blank.",
 )
 @options.DECIMAL
-@options.KEY
 @options.JSON
 def command(
     calibration: Path, readings: Path, output: Path, outside: str, missing: str, decimal: str,
-    key: tuple[Path, ...], as_json: bool,
+    as_json: bool,
 ) -> None:  # fmt: skip
     """Correct READINGS (CSV, TSV, Parquet, XLSX, WITSML or LAS) with the CALIBRATION of their tool.
 
@@ -39,17 +38,15 @@ def command(
     Example: mwdcal apply tool.json surveys.csv -o corrected.csv
     Exit: 0 written, 2 input cannot be read, or does not belong to the calibration.
     """
-    from mwdcal.app.choices import load_calibration
     from mwdcal.app.correction import Applied, apply_to_any
     from mwdcal.app.envelope import enveloped
     from mwdcal.app.progress import bar
     from mwdcal.calibration.readings import simulated
-    from mwdcal.app.screens.records.signature import in_short
+    from mwdcal.files import documents
     from mwdcal.files.runs import BlankReadingError
 
-    options.check_outputs([output], [calibration, readings, *key])
-    loaded = load_calibration(calibration, key)
-    fitted = loaded.calibration
+    options.check_outputs([output], [calibration, readings])
+    fitted, digest = documents.load(calibration)
     try:
         with bar("correcting") as advance:
             tally, findings, readings_digest = apply_to_any(
@@ -58,17 +55,14 @@ def command(
     except BlankReadingError as error:
         advice = "Or leave the results of such rows blank: --missing blank."
         raise InputError(f"{error} {advice}") from None
-    findings = loaded.findings + findings
     blank = tally.blank(outside)
     document = enveloped(
         "apply",
         Applied(rows=tally.rows, blank=blank, output=str(output), findings=findings),
         *(fitted.tool, tally.metadata),
-        calibration_signature=loaded.signature,
-        calibration=loaded.digest,
+        calibration=digest,
         readings=readings_digest,
     )
     corrected = f"{tally.rows} rows corrected" + (f", {blank} of them blank" if blank else "")
-    signed = one_line(in_short(loaded.signature))
-    said = [corrected, f"wrote {one_line(output)}", signed, *simulated(fitted.tool)]
-    print_result(document if as_json else "   ".join(said), findings)
+    screen = "   ".join([corrected, f"wrote {one_line(output)}", *simulated(fitted.tool)])
+    print_result(document if as_json else screen, findings)

@@ -61,15 +61,6 @@ WHERE_OUTSIDE = preset(
 DECIMAL = preset(
     "--decimal", default=".", metavar="SIGN", help="Decimal sign of numbers in text files."
 )
-KEY = click.option(
-    "--key",
-    type=FILE,
-    multiple=True,
-    metavar="K.pub|KEYS.json",
-    envvar="MWDCAL_KEYS",
-    help="Public key, or file of keys, whose signatures are trusted; may be repeated. Default: the files that the "
-    "variable MWDCAL_KEYS names.",
-)
 JSON = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
 SEED = preset(
     "--seed", type=click.IntRange(0), default=0, help="Seed of all that is drawn at random."

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import radians
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -15,10 +15,8 @@ from mwdcal.app.messages import findings_as_typed, print_result
 from mwdcal.errors import InputError
 
 if TYPE_CHECKING:
-    from mwdcal.app.choices import LoadedCalibration
     from mwdcal.calibration.readings import Readings
     from mwdcal.calibration.record import Calibration
-    from mwdcal.certificate.signature import SignatureCheck
     from mwdcal.files.formats.table import Table
     from mwdcal.geometry.vectors import Array
     from mwdcal.survey.acceptance import SurveyLimits
@@ -66,12 +64,11 @@ if TYPE_CHECKING:
     "--html", type=options.FILE, metavar="S.html", help="Also write a page with the pictures."
 )
 @options.DECIMAL
-@options.KEY
 @options.JSON
 def command(
     calibration: Path, readings: Path, output: Path, reference: Path | None, msa: bool,
     msa_html: Path | None, limits: str, switch: str, tie_in: str | None, outside: str,
-    html: Path | None, decimal: str, key: tuple[Path, ...], as_json: bool,
+    html: Path | None, decimal: str, as_json: bool,
 ) -> None:  # fmt: skip
     """Surveys of a well: READINGS in their order, corrected by the CALIBRATION of their tool.
 
@@ -83,7 +80,6 @@ def command(
     Exit: 0 written, 2 input cannot be read, or does not belong to the calibration, 3 with --msa: the surveys do not
     separate interference from azimuth.
     """
-    from mwdcal.app.choices import load_calibration
     from mwdcal.files.formats import atomic
     from mwdcal.files.formats import table as tables
     from mwdcal.survey.tables import surveyed_table
@@ -91,18 +87,16 @@ def command(
 
     if msa_html and not msa:
         raise InputError("`msa_html` goes with `msa`. Leave it out, or add `msa`.")
-    inputs = [calibration, readings, reference, limits, *key]
+    inputs = [calibration, readings, reference, limits]
     options.check_outputs([output, msa_html], inputs, page=html)
     start, ends = _three("tie_in", tie_in), _switch(switch)
-    loaded = load_calibration(calibration, key)
-    scene = _read(loaded, readings, reference, limits, decimal)
+    scene = _read(calibration, readings, reference, limits, decimal)
     fitted, analysis = scene.calibration, None
     pages: list[tuple[Path, bytes | str]] = []
     if msa:
         analysis, pages = _analysed(scene, msa_html, as_json)
         fitted = analysis.calibration
     result = well(fitted, scene.readings, scene.limits, scene.north, scene.md, start, ends, outside)
-    result = replace(result, findings=loaded.findings + result.findings)
     if html:
         from mwdcal.app.pages.surveys.survey import render
 
@@ -117,7 +111,6 @@ def command(
 class _WellInputs:
     """What the command was given; digests of its files."""
 
-    signature: SignatureCheck
     calibration: Calibration
     table: Table
     readings: Readings
@@ -132,40 +125,29 @@ class _WellInputs:
         return self.calibration.tool, self.readings.metadata
 
     @property
-    def identities(self) -> dict[str, Any]:
-        """Digests of all files, and what the signature of the calibration says."""
-        return {**self.digests, "calibration_signature": self.signature}
-
-    @property
     def named(self) -> dict[str, str]:
         """Digests of the files that there are."""
         return {name: digest for name, digest in self.digests.items() if digest}
 
 
 def _read(
-    loaded: LoadedCalibration, readings: Path, reference: Path | None, limits: str, decimal: str
+    calibration: Path, readings: Path, reference: Path | None, limits: str, decimal: str
 ) -> _WellInputs:
     """The files read."""
+    from mwdcal.files import documents
     from mwdcal.files.runs import MOST_ROWS, read_export
     from mwdcal.survey.acceptance import load_survey_limits
     from mwdcal.survey.place.references import load_reference
     from mwdcal.survey.tables import survey_readings
 
-    fitted = loaded.calibration
+    fitted, digest = documents.load(calibration)
     bounds, limits_digest = load_survey_limits(limits)
     source = read_export(readings, fitted.profile, decimal=decimal, rows=MOST_ROWS)
     place, place_digest = load_reference(reference) if reference else (None, "")
     read, md, north = survey_readings(source, fitted, place)
-    digests = {"calibration": loaded.digest, "readings": source.digest, "reference": place_digest}
+    digests = {"calibration": digest, "readings": source.digest, "reference": place_digest}
     return _WellInputs(
-        loaded.signature,
-        fitted,
-        source,
-        read,
-        md,
-        north,
-        bounds,
-        {**digests, "limits": limits_digest},
+        fitted, source, read, md, north, bounds, {**digests, "limits": limits_digest}
     )
 
 
@@ -188,7 +170,7 @@ def _analysed(
         atomic.write_all(pages)
         if as_json:
             refused = refusal(analysis.summary, scene.limits, scene.north, scene.readings.count)
-            print_result(enveloped("survey", refused, *scene.stated, **scene.identities), [])
+            print_result(enveloped("survey", refused, *scene.stated, **scene.digests), [])
         analysis.check()
     return analysis, pages
 
@@ -209,8 +191,8 @@ def _print(
     msa = analysis.summary if analysis else None
     unused = unused_columns(scene.readings.unused)
     summary = screens.summary(result, *files, msa, unused)
-    document = enveloped("survey", summary, *scene.stated, **scene.identities)
-    shown = screens.screen(result, summary, scene.signature, *scene.stated)
+    document = enveloped("survey", summary, *scene.stated, **scene.digests)
+    shown = screens.screen(result, summary, *scene.stated)
     if analysis:
         shown = f"{screens_of_msa.screen(analysis, *scene.stated)}\n\n{shown}"
     findings = findings_as_typed([*(msa.findings if msa else []), *summary.findings])
