@@ -14,8 +14,9 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 
+from mwdcal.calibration.readings import TRIADS
 from mwdcal.drift.comparable import DEPENDENT, History
-from mwdcal.geometry.vectors import Array, Bools, diagonal, outer
+from mwdcal.geometry.vectors import AnyArray, Array, Bools, Ints, diagonal, outer
 
 LEVEL = 0.01
 """Share of unchanged tools that are called changed."""
@@ -52,9 +53,9 @@ class ChangeTest:
     """The outcome of the test of one tool: `probability` of as much under no change.
 
     `scores` (n - 1, p) of a step of each parameter between calibrations, NaN where they do not tell;
-    `largest_score` of those of steady parameters, and the `critical_score` that it may have; `misfit` (χ²) of one set of parameters with its
-    `degrees_of_freedom`. Of each pair of successive calibrations (n - 1,): `pair_misfit`,
-    `pair_freedom` and `pair_probability`, of that pair alone.
+    `largest_score` of those of steady parameters, and the `critical_score` that it may have; `misfit` (χ²)
+    of one set of parameters with its `degrees_of_freedom`. Of each pair of successive calibrations alone
+    (n - 1,): `pair_misfit`, `pair_freedom` and `pair_probability`.
     """
 
     level: float
@@ -127,24 +128,28 @@ class Contrasts:
         unit = np.where(self._unit > 0, self._unit, 1.0)
         return np.nan_to_num((values - middle) / unit) * (self._unit > 0)
 
-    def sums(self, departures: Array) -> Array:
-        """What speaks for a change (…, n - 1, p) at each transition, of covariance `information`."""
-        later = np.cumsum(_each(self.scaled, departures)[..., ::-1, :], -2)[..., ::-1, :]
-        rest = later[..., 1:, :]
-        mean = (later[..., 0, :] @ self._mean)[..., None, :]
-        return np.asarray(rest - _each(self.after, np.broadcast_to(mean, rest.shape)))
+    def pull(self, departures: Array) -> Array:
+        """What each calibration says (…, n, p) of parameters that depart so."""
+        return _each(self.scaled.astype(departures.dtype), departures)
 
-    def scores(self, departures: Array) -> Array:
+    def sums(self, pull: Array) -> Array:
+        """What speaks for a change (…, n - 1, p) at each transition, of covariance `information`."""
+        later = np.cumsum(pull[..., ::-1, :], -2)[..., ::-1, :]
+        rest = later[..., 1:, :]
+        mean = (later[..., 0, :] @ self._mean.astype(pull.dtype))[..., None, :]
+        after = self.after.astype(pull.dtype)
+        return np.asarray(rest - _each(after, np.broadcast_to(mean, rest.shape)))
+
+    def scores(self, pull: Array) -> Array:
         """Scores (…, n - 1, p) of a step of each parameter alone, of variance 1 under no change."""
         size = np.sqrt(np.where(self.known, diagonal(self.information), np.inf))
-        return np.asarray(self.sums(departures) / size)
+        return np.asarray(self.sums(pull) / size.astype(pull.dtype))
 
-    def misfit(self, departures: Array) -> Array:
+    def misfit(self, departures: Array, pull: Array) -> Array:
         """Misfit (…,) of one set of parameters to all calibrations."""
-        pull = _each(self.scaled, departures)
         total = pull.sum(-2)
-        whole = (departures * pull).sum((-1, -2))
-        return np.asarray(whole - (total * (total @ self._mean)).sum(-1))
+        whole = np.einsum("...ki,...ki->...", departures, pull)
+        return np.asarray(whole - (total * (total @ self._mean.astype(pull.dtype))).sum(-1))
 
     def drawn(self, noise: Array, stretch: Array) -> Array:
         """Departures (…, n, p) of an unchanged tool from standard normal `noise`, grown by `stretch`."""
@@ -152,15 +157,17 @@ class Contrasts:
         largest = values[:, -1:]
         inverse = np.where(values > DEPENDENT * largest, 1 / np.sqrt(np.maximum(values, 1e-300)), 0)
         root = vectors * inverse[:, None, :]
-        return _each(root.mT, noise) * stretch
+        return _each(root.mT.astype(noise.dtype), noise) * stretch
 
-    def pair(self, first: int) -> Contrasts:
-        """Of two successive calibrations alone."""
-        return Contrasts(self.scaled[first : first + 2])
+    def pair(self, first: int, departures: Array) -> tuple[Contrasts, Array]:
+        """Of two successive calibrations alone, and their departures (…, 2, p) in its units."""
+        pair = Contrasts(self.scaled[first : first + 2])
+        inverse = np.divide(1.0, pair._unit, out=np.zeros_like(pair._unit), where=pair._unit > 0)
+        return pair, departures[..., first : first + 2, :] * inverse.astype(departures.dtype)
 
     def sizes(self, steps: Sequence[tuple[int, int]], departures: Array) -> tuple[Array, Array]:
         """Sizes and standard uncertainties (s,) of steps (after, place) together, in the units of the values."""
-        sums = self.sums(departures)
+        sums = self.sums(self.pull(departures))
         told = np.array([sums[after - 1, place] for after, place in steps])
         matrix = np.array([[self._shared(a, b) for b in steps] for a in steps])
         covariance = np.linalg.pinv(matrix, DEPENDENT, hermitian=True)
@@ -181,48 +188,53 @@ def _each(matrices: Array, vectors: Array) -> Array:
 
 
 @lru_cache(maxsize=2)
-def _noise(count: int, size: int) -> Array:
+def _noise(count: int, size: int) -> AnyArray:
     """Standard normal numbers (draws, n, p), the same for every tool."""
-    return np.random.default_rng([SEED, count, size]).standard_normal((DRAWS, count, size))
+    rng = np.random.default_rng([SEED, count, size])
+    return rng.standard_normal((DRAWS, count, size), np.float32)
 
 
-def stretches(freedom: Array) -> Array:
-    """By how much errors (draws, n, p) exceed those of a known noise: Student's t of each calibration and triad."""
-    if np.isinf(freedom).all():
-        return np.ones((1, *freedom.shape))
+def stretches(history: History) -> AnyArray:
+    """By how much errors (draws, n, p) exceed those of a known noise: Student's t of each noise estimate.
+
+    Calibrations of a triad whose noise was estimated together (`pooled`) have one factor.
+    """
+    freedom = history.freedom
+    result = np.ones((DRAWS, *freedom.shape), np.float32)
     rng = np.random.default_rng([SEED, *freedom.shape])
-    result = np.ones((DRAWS, *freedom.shape))
-    for row, each in enumerate(freedom):
-        for degrees in np.unique(each[np.isfinite(each)]):
-            grown = np.sqrt(degrees / rng.chisquare(degrees, DRAWS))
-            result[:, row, each == degrees] = grown[:, None]
+    for triad in TRIADS:
+        columns = [place for place, name in enumerate(history.names) if name.startswith(triad)]
+        if not columns:
+            continue
+        degrees, together = freedom[:, columns[0]], history.pooled[:, columns[0]]
+        groups = [np.flatnonzero(together), *np.flatnonzero(~together)[:, None]]
+        for rows in (each for each in groups if each.size and np.isfinite(degrees[each[0]])):
+            grown = np.sqrt(degrees[rows[0]] / rng.chisquare(degrees[rows[0]], DRAWS))
+            result[:, rows[:, None], columns] = grown[:, None, None]
     return result
 
 
 def change_test(history: History, level: float = LEVEL) -> ChangeTest:
     """The test of one tool with two calibrations or more: `History` of (n, p)."""
-    contrasts = Contrasts(history.precision)
+    contrasts, steady = Contrasts(history.precision), history.steady
     departures = contrasts.departures(history.values)
-    steady = history.steady
-    null = contrasts.drawn(_noise(*history.values.shape), stretches(history.freedom))
-    drawn = contrasts.scores(null)[..., steady]
-    scores = np.where(contrasts.known, contrasts.scores(departures), np.nan)
-    most = np.abs(drawn).max((-1, -2), initial=0.0)
+    null = contrasts.drawn(_noise(*history.values.shape), stretches(history))
+    pull, null_pull = contrasts.pull(departures), contrasts.pull(null)
+    scores = np.where(contrasts.known, contrasts.scores(pull), np.nan)
     largest = float(np.nanmax(np.abs(scores[:, steady]), initial=0.0))
-    misfits, misfit = contrasts.misfit(null), float(contrasts.misfit(departures))
+    most = np.abs(contrasts.scores(null_pull)[..., steady]).max((-1, -2), initial=0.0)
+    misfit, misfits = float(contrasts.misfit(departures, pull)), contrasts.misfit(null, null_pull)
     (by_step, each_step), (by_misfit, each_misfit) = _ranks(most, largest), _ranks(misfits, misfit)
-    share = STEP_SHARE, 1 - STEP_SHARE
-    evidence = np.minimum(each_step / share[0], each_misfit / share[1])
-    least = min(by_step / share[0], by_misfit / share[1])
-    limit = np.quantile(evidence, level) * share[0]
-    critical = float(np.quantile(most, max(1 - limit, 0.0)))
-    changed = float((1 + np.sum(evidence <= least)) / (DRAWS + 1))
+    evidence = np.minimum(each_step / STEP_SHARE, each_misfit / (1 - STEP_SHARE))
+    least = min(by_step / STEP_SHARE, by_misfit / (1 - STEP_SHARE))
+    critical = float(np.quantile(most, 1 - np.quantile(evidence, level) * STEP_SHARE))
     pairs = [
-        _pair(contrasts.pair(k), departures[k : k + 2], null[:, k : k + 2])
+        _pair(*contrasts.pair(k, departures), contrasts.pair(k, null[:PAIR_DRAWS])[1])
         for k in range(len(scores))
     ]
     result = ChangeTest(
-        level, changed, scores, largest, critical, by_step, misfit, contrasts.freedom, by_misfit,
+        level, float((1 + np.sum(evidence <= least)) / (DRAWS + 1)), scores, largest, critical,
+        by_step, misfit, contrasts.freedom, by_misfit,
         *(np.array(part) for part in zip(*pairs, strict=True)), steps=(),
     )  # fmt: skip
     steps = _steps(contrasts, departures, steady, critical) if result.changed else ()
@@ -238,13 +250,13 @@ def _ranks(drawn: Array, value: float) -> tuple[float, Array]:
 
 def _pair(pair: Contrasts, departures: Array, null: Array) -> tuple[float, int, float]:
     """Misfit of two successive calibrations, its degrees of freedom and probability."""
-    misfit = float(pair.misfit(departures))
-    drawn = pair.misfit(null[:PAIR_DRAWS])
+    misfit = float(pair.misfit(departures, pair.pull(departures)))
+    drawn = pair.misfit(null, pair.pull(null))
     return misfit, pair.freedom, float((1 + np.sum(drawn >= misfit)) / (len(drawn) + 1))
 
 
 def _steps(
-    contrasts: Contrasts, departures: Array, steady: Array, critical: float
+    contrasts: Contrasts, departures: Array, steady: Ints, critical: float
 ) -> tuple[Step, ...]:
     """Steps that explain the change, the largest first, each with those before taken out."""
     named: list[tuple[int, int]] = []
@@ -252,7 +264,7 @@ def _steps(
     unit = np.where(contrasts._unit > 0, contrasts._unit, 1.0)
     left = departures
     while len(named) < MOST_STEPS:
-        scores = np.where(contrasts.known, contrasts.scores(left), 0.0)[:, steady]
+        scores = np.where(contrasts.known, contrasts.scores(contrasts.pull(left)), 0.0)[:, steady]
         row, column = np.unravel_index(np.argmax(np.abs(scores)), scores.shape)
         if abs(scores[row, column]) <= critical:
             break

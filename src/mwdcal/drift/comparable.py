@@ -14,7 +14,7 @@ from datetime import UTC, date, datetime
 import numpy as np
 
 from mwdcal.calibration.record import Calibration
-from mwdcal.geometry.vectors import Array, Ints, diagonal
+from mwdcal.geometry.vectors import Array, Bools, Ints, diagonal
 from mwdcal.sensor.models import OFF_COLUMNS, OFF_DIAGONAL, OFF_ROWS, Model
 
 KINDS = ("scale", "bias", "misalignment")
@@ -36,6 +36,8 @@ HELD = 1e-14
 """A parameter of less standard uncertainty is one that its model holds."""
 NODES = np.array([0.0, 1.0, -1.0, 0.5])
 """Temperatures of a range at which a course is read: 0 its middle, 1 and -1 its ends."""
+UNLIKE = 1e-3
+"""Ratios of noise as unlike as this are not those of one noise."""
 UNRECORDED = (-np.inf, np.inf)
 """The range of a calibration whose run recorded no temperature."""
 DAYS_PER_YEAR = 365.25
@@ -125,9 +127,10 @@ def _as_factors(affine: Array, change: Array, powers: Array) -> Factored:
 class History:
     """Calibrations of a tool, or of many tools that have as many, in common parameters: (…, n, p).
 
-    `values`, `covariance` (…, n, p, p) as stated, `precision` (…, n, p, p): what each calibration says of the
+    `values`, their `covariance` (…, n, p, p), `precision` (…, n, p, p): what each calibration says of the
     parameters, nothing along directions that it leaves free. `freedom` (…, n, p): degrees of freedom of
-    the noise estimate behind each parameter, infinite where it is declared. `years` (…, n) since the first.
+    the noise estimate behind each parameter, infinite where there is none; `pooled` (…, n, p): those of a triad
+    that are so marked are of one estimate. `years` (…, n) since the first.
     `names` (p,): "accelerometer bias-x"; a name with a `·` is a power of temperature.
     """
 
@@ -136,6 +139,7 @@ class History:
     covariance: Array
     precision: Array
     freedom: Array
+    pooled: Bools
     years: Array
 
     @property
@@ -172,3 +176,29 @@ def precision(covariance: Array, free: Array) -> Array:
     known = across @ np.linalg.pinv(inner, DEPENDENT, hermitian=True) @ across.transpose()
     result[np.ix_(moving, moving)] = known / np.outer(sd, sd)
     return result
+
+
+def one_noise(factors: Array, freedom: Array) -> tuple[Array, Array, Bools]:
+    """What variances (…, n) of one triad are multiplied by if the noise of the tool is one, and their freedom.
+
+    And which of them (…, n) then are of that one estimate.
+
+    `factors` (…, n): s², the ratio of the noise of each calibration to what is declared, of `freedom` degrees;
+    NaN where there is none. Ratios that differ by more than chance (`UNLIKE`) are kept apart.
+    Reference: Bartlett's test of equal variances.
+    """
+    from scipy.stats import chi2
+
+    known = np.isfinite(factors) & (factors > 0) & (freedom >= 1)
+    degrees, square = np.where(known, freedom, 0.0), np.where(known, factors, 1.0)
+    total, count = degrees.sum(-1, keepdims=True), known.sum(-1, keepdims=True)
+    mean = np.where(
+        total > 0, (degrees * square).sum(-1, keepdims=True) / np.maximum(total, 1.0), 1.0
+    )
+    spread = total * np.log(mean) - (degrees * np.log(square)).sum(-1, keepdims=True)
+    inverse = np.where(known, 1 / np.maximum(degrees, 1.0), 0.0).sum(-1, keepdims=True)
+    correction = 1 + (inverse - 1 / np.maximum(total, 1.0)) / (3 * np.maximum(count - 1, 1))
+    alike = known & (count > 1) & (chi2.sf(spread / correction, np.maximum(count - 1, 1)) > UNLIKE)
+    ratio = np.where(alike, mean / square, 1.0)
+    own = np.where(known, freedom, np.inf)
+    return ratio, np.where(alike, total, own), alike

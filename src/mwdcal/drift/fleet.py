@@ -9,7 +9,7 @@ import numpy as np
 
 from mwdcal.drift.change import LEVEL
 from mwdcal.drift.document import FleetDrift, FleetTool, ToolDrift, WalkRate
-from mwdcal.drift.tool import MeasuredTool, TypeRates, predicted
+from mwdcal.drift.tool import MeasuredTool, TypeRates, predicted, walk_rate
 
 SCORE_EDGES = np.array([0.0, 0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0, 3.0, 5.0, np.inf])
 """Edges of the classes of the largest score of a tool over its critical one."""
@@ -95,18 +95,9 @@ def _largest(drift: ToolDrift) -> str:
 
 def _of_type(rates: TypeRates, members: Iterable[MeasuredTool]) -> list[WalkRate]:
     """What a tool of a type moves by in a year, when nothing else is known of it."""
-    from mwdcal.drift.forecast import INTERVAL
-    from mwdcal.drift.walk import quantiles
-
     first = next(iter(members)).drift.parameters
     units = {(p.triad, p.name.partition("-")[0]): p.unit for p in first}
-    rows = []
-    for (triad, kind), each in rates.groups.items():
-        low, middle, high = np.sqrt(
-            quantiles(each.rates, each.peers_probability, INTERVAL)
-        ).tolist()
-        unit = units.get((triad, kind), "")
-        rows.append(
-            WalkRate(triad=triad, kind=kind, unit=unit, per_root_year=middle, low=low, high=high)
-        )
-    return rows
+    return [
+        walk_rate(triad, kind, units.get((triad, kind), ""), (each.rates, each.peers_probability))
+        for (triad, kind), each in rates.groups.items()
+    ]

@@ -55,7 +55,7 @@ def growths(tool: ToolHistory) -> list[Growth]:
     steady = [names[place] for place in places]
     for row, (triad, kind) in zip(units, GROUPS, strict=True):
         row[group_places(steady, triad, kind)] = 1.0
-    block = tool.history.covariance[-1][np.ix_(places, places)]
+    block = tool.covariance[-1][np.ix_(places, places)]
     each = np.stack([block, *map(np.diag, units)])[:, None]
     middle = sum(tool.temperature_c) / 2
     tools = replace(

@@ -17,11 +17,12 @@ from mwdcal.drift.comparable import (
     History,
     calibrated_on,
     factored,
+    one_noise,
     parameter_names,
     precision,
     years,
 )
-from mwdcal.geometry.vectors import Array
+from mwdcal.geometry.vectors import Array, Bools, outer
 
 NOTES = {
     "no-overlap": "not compared: its temperatures, {low:.0f}…{high:.0f} °C, and those of later calibrations, {others}, "
@@ -37,12 +38,24 @@ NOTES = {
 """What is said of a calibration that cannot be compared, or not in all of its parameters."""
 
 
+DECLARED = "declared"
+"""How a calibration says that the noise of its readings was declared."""
+DEGREES = "°"
+"""Unit in which misalignments are stated."""
+
+
+def factor(unit: str) -> float:
+    """What a value in the unit of calculation is multiplied by to be in the unit that is stated."""
+    return float(np.degrees(1)) if unit == DEGREES else 1.0
+
+
 @dataclass(frozen=True)
 class ToolHistory:
     """The calibrations of one tool, oldest first, as a `History` of those that can be compared.
 
     `notes` of every calibration; `used`: which are in `history`; `temperature_c`: the range over which they
-    are compared; `units` of its parameters; `earth`: gravity, field and dip in these units; `free` (f, p):
+    are compared; `units` in which its parameters are stated (see `factor`); `earth`: gravity, field and dip;
+    `covariance` (n, p, p) as each calibration states it, in `history` with the noise of all; `free` (f, p):
     what the latest leaves undetermined.
     """
 
@@ -53,6 +66,7 @@ class ToolHistory:
     temperature_c: tuple[float, float]
     units: tuple[str, ...]
     earth: tuple[float, float, float]
+    covariance: Array
     free: Array
     history: History
 
@@ -87,10 +101,14 @@ def tool_history(calibrations: Sequence[Calibration]) -> ToolHistory:
     notes = [[*first, *(next(more) if use else ())] for first, use in zip(notes, used, strict=True)]
     kept = [day for day, use in zip(days, used, strict=True) if use]
     names = parameter_names(orders)
-    history = History(names, *(np.stack([row[i] for row in rows]) for i in range(4)), years(kept))
+    values, covariance, free = ([row[i] for row in rows] for i in range(3))
+    ratio, *noise = (np.concatenate(part, -1) for part in zip(*form.noise(), strict=True))
+    like = np.stack(covariance) * outer(np.sqrt(ratio))
+    known = np.stack([precision(*each) for each in zip(like, free, strict=True)])
+    history = History(names, np.stack(values), like, known, *noise, years(kept))
     units = tuple(map(form.unit, names))
     tool = tuple(ordered), tuple(days), tuple(used), tuple(map(tuple, notes))
-    return ToolHistory(*tool, span, units, form.earth(), rows[-1][-1], history)
+    return ToolHistory(*tool, span, units, form.earth(), np.stack(covariance), free[-1], history)
 
 
 def _range(calibration: Calibration) -> tuple[float, float]:
@@ -143,8 +161,22 @@ class _Form:
     orders: dict[str, int]
     compared: Sequence[Calibration]
 
-    def row(self, calibration: Calibration) -> tuple[Array, Array, Array, Array, Array]:
-        """Values (p,), covariance and precision (p, p), degrees of freedom (p,) and free directions (f, p)."""
+    def noise(self) -> Iterator[tuple[Array, Array, Bools]]:
+        """What variances (n, k) of each triad's parameters are multiplied by, their freedom, which are pooled."""
+        for name, order in self.orders.items():
+            triads = [getattr(each, name) for each in self.compared]
+            factors = [None if t is None else t.variance_factor for t in triads]
+            square = np.array([np.nan if factor is None else factor for factor in factors])
+            freedom = np.array([t.degrees_of_freedom if t else 0.0 for t in triads])
+            declared = np.array([t is not None and t.noise_source == DECLARED for t in triads])
+            ratio, degrees, together = one_noise(np.where(declared, square, np.nan), freedom)
+            own = np.where(np.isnan(square) | (freedom < 1), np.inf, freedom)
+            parts = ratio, np.where(declared, degrees, own), together
+            first, second, third = (np.repeat(part[:, None], 12 + 6 * order, -1) for part in parts)
+            yield first, second, third
+
+    def row(self, calibration: Calibration) -> tuple[Array, Array, Array]:
+        """Values (p,), covariance (p, p) as stated, and free directions (f, p) of one calibration."""
         places, parts = calibration.places(), []
         size = len(calibration.parameters)
         for name, order in self.orders.items():
@@ -158,15 +190,15 @@ class _Form:
             values, slope = self._triad(calibration, triad)
             whole = np.zeros((len(values), size))
             whole[:, places[name]] = slope
-            parts.append((values, whole, np.full(len(values), _freedom(triad))))
-        values, slope, freedom = (np.concatenate(part) for part in zip(*parts, strict=True))
+            parts.append((values, whole))
+        values, slope = (np.concatenate(part) for part in zip(*parts, strict=True))
         covariance = slope @ calibration.parameter_covariance @ slope.transpose()
         free = [
             *(calibration.free_directions @ slope.transpose()),
             *self._stretch(calibration, values),
         ]
         rows = np.nan_to_num(np.reshape(free, (-1, len(values))))
-        return values, covariance, precision(covariance, rows), freedom, rows
+        return values, covariance, rows
 
     def _triad(self, calibration: Calibration, triad: TriadCalibration) -> tuple[Array, Array]:
         """Factors (k,) of a triad and their derivatives (k, p) by its parameters in the file."""
@@ -247,7 +279,7 @@ class _Form:
         """The unit of a parameter."""
         triad, _, title = name.partition(" ")
         if title.startswith("misalignment"):
-            return "rad"
+            return DEGREES
         last = self._last(triad)
         field = "" if last.relative and triad == TRIADS[1] else NANOTESLA
         return "" if title.startswith("scale") else ("g" if triad == TRIADS[0] else field)
@@ -263,8 +295,3 @@ def _powers_of_strength(size: int) -> Array:
     """By which power of the strength of the field each parameter (size,) of a triad goes: scale -1, bias 1."""
     course = np.tile(np.repeat([-1.0, 1.0], 3), 1 + (size - 12) // 6)
     return np.concatenate([course[:6], np.zeros(6), course[6:]])
-
-
-def _freedom(triad: TriadCalibration) -> float:
-    """Degrees of freedom of the noise estimate behind the uncertainties of a triad."""
-    return np.inf if triad.variance_factor is None else max(triad.degrees_of_freedom, 1.0)

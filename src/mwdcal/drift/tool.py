@@ -33,7 +33,7 @@ from mwdcal.drift.forecast import (
     growths,
     years_to,
 )
-from mwdcal.drift.histories import ToolHistory, tool_history
+from mwdcal.drift.histories import ToolHistory, factor, tool_history
 from mwdcal.drift.service import ServiceTest, service_rows
 from mwdcal.drift.walk import GROUPS, GroupRates, Increments, draws, group_places, quantiles
 from mwdcal.geometry.vectors import Array
@@ -60,6 +60,10 @@ FINDINGS = {
 }
 
 
+Distribution = tuple[Array, Array]
+"""Rates and their probabilities."""
+
+
 @dataclass(frozen=True)
 class MeasuredTool:
     """A tool before its rates are known: what its calibrations say by themselves."""
@@ -68,7 +72,6 @@ class MeasuredTool:
     calibrated: date
     increments: dict[tuple[str, str], Increments]
     growths: list[Growth]
-    variances: Array
     gaps: Array
     groups: list[tuple[str, str] | None]
 
@@ -97,10 +100,9 @@ def measured(
         basis="", peers=0, rates=[], forecast=[], due=[], next_due=None,
         service=service_rows(named, tests), findings=[],
     )  # fmt: skip
-    variances = np.diagonal(history.covariance, axis1=-2, axis2=-1)
     groups = [of_place.get(int(place)) for place in history.steady]
     return MeasuredTool(
-        drift, tool.compared_days[-1], increments, growths(tool), variances[:, history.steady],
+        drift, tool.compared_days[-1], increments, growths(tool),
         np.diff(history.years), groups,
     )  # fmt: skip
 
@@ -124,18 +126,19 @@ def _calibrations(tool: ToolHistory) -> list[ComparedCalibration]:
 def _parameters(tool: ToolHistory, test: ChangeTest | None) -> list[ParameterCourse]:
     """The parameters at the middle temperature; control limits are still missing."""
     history, courses = tool.history, []
-    sd = np.sqrt(np.maximum(np.diagonal(history.covariance, axis1=-2, axis2=-1), 0.0))
+    sd = np.sqrt(np.maximum(np.diagonal(tool.covariance, axis1=-2, axis2=-1), 0.0))
     known = np.diagonal(history.precision, axis1=-2, axis2=-1) > 0
     sd = np.where(known, sd, np.nan)
     nothing = [None] * len(sd)
     for place in history.steady.tolist():
         triad, _, name = history.names[place].partition(" ")
         scores = np.abs(test.scores[:, place]) if test else np.full(1, np.nan)
+        times = factor(tool.units[place])
         courses.append(
             ParameterCourse(
                 triad=triad, name=name, unit=tool.units[place],
-                values=[stated(v) for v in history.values[:, place]],
-                standard_uncertainties=[stated(s) for s in sd[:, place]],
+                values=[stated(v) for v in history.values[:, place] * times],
+                standard_uncertainties=[stated(s) for s in sd[:, place] * times],
                 low=nothing, high=nothing, outside=[False] * len(sd),
                 score=None if np.isnan(scores).all() else float(np.nanmax(scores)),
             )
@@ -149,10 +152,11 @@ def _verdict(tool: ToolHistory, test: ChangeTest) -> ChangeVerdict:
     steps = []
     for step in test.steps:
         triad, _, name = tool.history.names[step.place].partition(" ")
+        times = factor(tool.units[step.place])
         steps.append(
             ParameterStep(
                 triad=triad, name=name, unit=tool.units[step.place], after=days[step.after - 1],
-                by=days[step.after], change=step.size, standard_uncertainty=step.uncertainty,
+                by=days[step.after], change=step.size * times, standard_uncertainty=step.uncertainty * times,
                 score=step.score,
             )
         )  # fmt: skip
@@ -224,21 +228,19 @@ def predicted(
     return replace(drift, findings=_findings(drift, limits, today))
 
 
-Distribution = tuple[Array, Array]
-"""Rates and their probabilities."""
-
-
 def _rates(drift: ToolDrift, known: Mapping[tuple[str, str], Distribution]) -> list[WalkRate]:
     """The rates in words: what a parameter moves by in a year."""
     units = {(p.triad, p.name.partition("-")[0]): p.unit for p in drift.parameters}
     rows = []
     for (triad, kind), distribution in known.items():
-        low, middle, high = np.sqrt(quantiles(*distribution, INTERVAL)).tolist()
-        unit = units[triad, kind]
-        rows.append(
-            WalkRate(triad=triad, kind=kind, unit=unit, per_root_year=middle, low=low, high=high)
-        )
+        rows.append(walk_rate(triad, kind, units[triad, kind], distribution))
     return rows
+
+
+def walk_rate(triad: str, kind: str, unit: str, distribution: Distribution) -> WalkRate:
+    """A distribution over rates in words."""
+    low, middle, high = (np.sqrt(quantiles(*distribution, INTERVAL)) * factor(unit)).tolist()
+    return WalkRate(triad=triad, kind=kind, unit=unit, per_root_year=middle, low=low, high=high)
 
 
 def _controlled(
@@ -246,8 +248,9 @@ def _controlled(
 ) -> list[ParameterCourse]:
     """The parameters with control limits: from each calibration to the next, by walk and uncertainties."""
     courses = []
-    for place, (course, group) in enumerate(zip(tool.drift.parameters, tool.groups, strict=True)):
+    for course, group in zip(tool.drift.parameters, tool.groups, strict=True):
         rate = float(quantiles(*known[group], [0.5])[0]) if group in known else 0.0
+        rate *= factor(course.unit) ** 2
         low: list[float | None] = [None]
         high: list[float | None] = [None]
         outside = [False]
@@ -296,8 +299,7 @@ def _findings(drift: ToolDrift, limits: Mapping[str, float], today: date | None)
         say("single")
     elif drift.change.changed:
         say("changed", what=", ".join(map(_step_words, drift.change.steps)) or FINDINGS["misfit"])
-    failed = [row.name for row in drift.service if row.left_passed and not row.found_passed]
-    if failed:
+    if failed := [row.name for row in drift.service if row.left_passed and not row.found_passed]:
         count = f"{len(failed)} limit{'s' * (len(failed) > 1)}"
         say("left-limits", count=count, names=", ".join(failed))
     if not drift.basis:
@@ -305,12 +307,10 @@ def _findings(drift: ToolDrift, limits: Mapping[str, float], today: date | None)
     elif drift.basis == PEERS:
         say("peers", count=f"{drift.peers} tool{'s' * (drift.peers != 1)}")
     stated_angles = {each.angle for each in drift.forecast}
-    for angle in limits if drift.basis else ():
-        if angle not in stated_angles:
-            say("too-free", angle=angle)
-    for each in drift.due:
-        if each.now_deg > each.limit_deg:
-            say("inaccurate", angle=each.angle, now=each.now_deg, limit=each.limit_deg)
+    for angle in [a for a in limits if a not in stated_angles and drift.basis]:
+        say("too-free", angle=angle)
+    for each in (e for e in drift.due if e.now_deg > e.limit_deg):
+        say("inaccurate", angle=each.angle, now=each.now_deg, limit=each.limit_deg)
     if today and drift.next_due and drift.next_due < today.isoformat():
         say("overdue", due=drift.next_due)
     return findings
