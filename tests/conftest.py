@@ -118,3 +118,12 @@ def computed_once(results, monkeypatch):
     )
     for module, name in long:
         monkeypatch.setattr(module, name, remembered(getattr(module, name), results))
+
+
+@pytest.fixture(scope="session")
+def postgresql():
+    """The URL of a PostgreSQL server for this process, started when the first test needs it."""
+    from registry_support import postgresql_server
+
+    with postgresql_server() as url:
+        yield url

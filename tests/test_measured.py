@@ -28,6 +28,7 @@ def parameters(name, words):
 # ── Against what was published ───────────────────────────────────────────────────────────────
 
 
+SAP = tuple(measured.SAP)
 LINES = {"linear": LINEAR, "curved": "--nonlinearity magnetometer", "chosen": ""}
 """Models of a SAP set, by the words that ask for them; the default chooses."""
 
@@ -38,19 +39,27 @@ def scatter(name, kind, left_out=True):
     return figures.scatter_left_out if left_out else figures.scatter
 
 
-def test_sap_sets_by_models_that_are_given():
-    """Below the peer on every set; the linear model reaches what theory gives for it."""
-    for name in measured.SAP:
+LIKE_ALL = ("sap6/CF", "sap6/IB", "sap5/ab", "sap5/bh")
+"""Four sets for what all twelve are asked in a study: curved much, little, and hardly at all."""
+
+
+@pytest.mark.parametrize("names", [LIKE_ALL, pytest.param(SAP, marks=pytest.mark.study)])
+def test_sap_sets_by_models_that_are_given(names):
+    """Below the peer on every set."""
+    for name in names:
         linear, curved = (scatter(name, kind, False) for kind in ("linear", "curved"))
         assert curved < linear < measured.SAP[name][0], name  # own-axis terms never fit worse
         assert linear < scatter(name, "linear"), name
         assert curved < scatter(name, "curved"), name
-    linear, curved = (
-        np.mean([scatter(name, kind) for name in measured.SAP]) for kind in ("linear", "curved")
-    )
+    linear, curved = (np.mean([scatter(n, kind) for n in names]) for kind in ("linear", "curved"))
+    assert curved < linear
+
+
+@pytest.mark.study
+def test_sap_sets_reach_what_theory_gives_for_the_linear_model():
+    linear, curved = (np.mean([scatter(n, kind) for n in SAP]) for kind in ("linear", "curved"))
     assert curved <= 0.45
     assert linear == pytest.approx(0.457, abs=0.002)
-    assert curved < linear
 
 
 @pytest.mark.parametrize("name", ["sap5/ab", "sap6/IB"])
@@ -70,11 +79,14 @@ def test_sap_goals():
         assert scatter(name, "chosen", False) < measured.SAP[name][0], name
 
 
-def test_distox_default_is_best_in_directions_that_no_fit_is_told_of():
+@pytest.mark.parametrize(
+    "names", [["distox_cal1"], pytest.param(tuple(measured.DISTOX), marks=pytest.mark.study)]
+)
+def test_distox_default_is_best_in_directions_that_no_fit_is_told_of(names):
     """Ten directions of four rolls: own-axis terms do harm there, estimated scatter helps."""
     others = np.array([-1] * 16 + [k // 4 for k in range(40)])
     default, linear, curved = (
-        np.mean([measured.figures(name, words).scatter_in(others) for name in measured.DISTOX])
+        np.mean([measured.figures(name, words).scatter_in(others) for name in names])
         for words in ("", LINEAR, "--nonlinearity accelerometer")
     )
     assert default < 0.97 * linear
@@ -88,8 +100,9 @@ ROBUST = "--robust student-t"
 @pytest.mark.parametrize(
     ("words", "names"),
     [
-        ("", SETS),
-        (ROBUST, SETS[::4]),
+        ("", SETS[::3]),
+        (ROBUST, SETS[4::8]),
+        pytest.param("", SETS, marks=pytest.mark.study),
         pytest.param(ROBUST, SETS, marks=pytest.mark.study),
     ],
 )

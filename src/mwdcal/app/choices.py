@@ -12,6 +12,7 @@ from mwdcal.calibration.prior import DATASHEET, profile_for
 from mwdcal.calibration.readings import HIGHEST, Readings
 from mwdcal.calibration.record import Calibration
 from mwdcal.files import documents, profiles, runs
+from mwdcal.files.formats import members
 from mwdcal.sensor.profile import Profile
 
 Prior: TypeAlias = Calibration | Literal["datasheet"] | None
@@ -51,7 +52,22 @@ def prior_of(word: str | None) -> tuple[Prior, str]:
     """
     if not word:
         return None, ""
-    return (DATASHEET, "") if word == DATASHEET else documents.load(Path(word))
+    return (DATASHEET, "") if word == DATASHEET else load_calibration(Path(word))
+
+
+def load_calibration(path: Path) -> tuple[Calibration, str]:
+    """A calibration file, or one tool in the table of a fleet or in a registry; and its SHA-256.
+
+    `registry.sqlite#SERIAL` is the latest calibration of that tool.
+    """
+    file, serial = members.split(path)
+    if not members.is_database(file):
+        return documents.load(path)
+    from mwdcal.registry.lookup import calibration
+    from mwdcal.registry.store import open_registry
+
+    with open_registry(file) as registry:
+        return calibration(registry, serial)
 
 
 def order_of(word: str) -> int | Literal["auto"]:

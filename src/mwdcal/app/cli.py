@@ -34,6 +34,7 @@ COMMANDS = (
     "planning.plan",
     "profile",
     "surveys.reference",
+    "records.registry",
     "planning.simulate",
     "stations",
     "surveys.survey",

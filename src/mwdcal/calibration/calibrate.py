@@ -133,7 +133,9 @@ def _budget(fitted: FittedRuns) -> list[BudgetRow]:
     """What each source of error adds to the accuracy to expect."""
     reference, prior = fitted.profile.reference_temperature_c, fitted.options.knowledge
     tools = results.calibrated_tools(fitted.result, fitted.free, reference, prior)
-    shares = fitted.covariance.by_source()
+    repeatability = [getattr(fitted.profile, name).repeatability for name in TRIADS]
+    nominal = [getattr(fitted.profile, name).scale or 1.0 for name in TRIADS]
+    shares = fitted.covariance.by_source(np.divide(repeatability, nominal).tolist())
     sd = accuracy(tools, np.stack([*shares.values()]))
     degrees = {f"{angle}_deg": np.degrees(values[:, 0]) for angle, values in sd.items()}
     return [

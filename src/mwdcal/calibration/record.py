@@ -11,7 +11,7 @@ import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from html import escape
 from itertools import pairwise
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import msgspec
 import numpy as np
@@ -24,6 +24,7 @@ from mwdcal.geometry.vectors import Array, Bools, diagonal
 from mwdcal.sensor.models import Basis, Factors, Model, Polynomial
 from mwdcal.sensor.profile import Profile
 
+Record = TypeVar("Record", bound=msgspec.Struct)
 SCHEMA_VERSION = 1
 DOCUMENT_VERSION = 1
 """Version of what commands print for machines: higher when a key goes, or changes its meaning."""
@@ -577,12 +578,12 @@ def html_table(caption: str, rows: Iterable[tuple[str, ...]]) -> str:
     return f"<table><caption>{escape(caption)}</caption>{body}</table>"
 
 
-def rounded(calibration: Calibration) -> Calibration:
+def rounded(record: Record) -> Record:
     """The same record with every number at 12 significant digits, as files keep it.
 
     More digits would differ from machine to machine with the threads of its linear algebra.
     """
-    return msgspec.convert(_rounded(msgspec.to_builtins(calibration)), Calibration)
+    return msgspec.convert(_rounded(msgspec.to_builtins(record)), type(record))
 
 
 def _rounded(value: Any) -> Any:

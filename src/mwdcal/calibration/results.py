@@ -23,11 +23,13 @@ from mwdcal.calibration.prior import Knowledge
 from mwdcal.calibration.record import FREE_SHARE
 from mwdcal.estimation.batch import take
 from mwdcal.estimation.rank import Free
+from mwdcal.estimation.solvers import Linear
 from mwdcal.estimation.uncertainty import marginal_rank
 from mwdcal.geometry.vectors import Array, Bools, diagonal, outer
 from mwdcal.sensor.models import Whole
 
 NOISE, SETTINGS, PRIOR = "noise of the readings", "settings of the stand", "prior"
+REPEATABILITY = "repeatability of the readings"
 ORDER = "order of the temperature terms"
 EVEN = 1e-6
 """Departure of a correlation matrix from symmetry that is left as it is."""
@@ -76,14 +78,17 @@ class StatedCovariance:
         uneven = np.any(np.abs(whole - whole.mT) > EVEN * outer(sd), (-1, -2))
         return np.asarray(np.where(uneven[:, None, None], (whole + whole.mT) / 2, whole))
 
-    def by_source(self) -> dict[str, Array]:
+    def by_source(self, repeatability: Sequence[float] = ()) -> dict[str, Array]:
         """Covariance (B, p, p) by source; all together they are `total`.
 
-        A common error comes under its `common_source`.
+        A common error comes under its `common_source`. `repeatability` of each triad, in its field, is the part
+        of the declared noise that comes under this name.
         """
         result, (independent, _, prior, order) = self.result, self._parts
         settings = _scaled(result, _of_settings(result))
-        shares = {NOISE: independent - settings, SETTINGS: settings}
+        repeated = _scaled(result, _of_repeatability(result, repeatability))
+        noise = independent - settings - repeated
+        shares = {NOISE: noise, REPEATABILITY: repeated, SETTINGS: settings}
         for index, constant in enumerate(result.problem.evidence.constants):
             name, effect = common_source(constant.name), result.analysis.effects[..., index]
             shares[name] = shares.get(name, 0.0) + outer(effect)
@@ -125,7 +130,7 @@ def common_source(name: str) -> str:
     >>> [common_source(name) for name in ("stand-north", "azimuth-zero", "gravity", "prior")]
     ['tilt of the stand', 'azimuth zero of the stand', 'gravity reference error', 'prior']
     """
-    if name in (NOISE, SETTINGS, ORDER, PRIOR):
+    if name in (NOISE, REPEATABILITY, SETTINGS, ORDER, PRIOR):
         return name
     return "tilt of the stand" if name.startswith("stand-") else error_name(name)
 
@@ -160,18 +165,41 @@ def _of_settings(result: Fit) -> Array:
     A station's reading has the covariance C = I + GGᵀ in units of its noise, the columns of G being
     what its unknowns do; those of known angles are meant here.
     """
-    analysis, problem = result.analysis, result.problem
+    problem = result.problem
     if not any(problem.evidence.sd[n].any() for n in ("inclination", "azimuth", "toolface")):
-        return np.zeros_like(analysis.covariance)
+        return np.zeros_like(result.analysis.covariance)
     linear = problem.linear(result.state)
-    p = linear.size
-    if analysis.influence is None:
-        rows, information = linear.weigh(linear.design).mT, linear.normal.information
-        cross = np.linalg.solve(information[:, p:, p:], information[:, p:, :p])
-        moved = analysis.covariance[:, None] @ (rows[:, :, :p] - cross.mT[:, None] @ rows[:, :, p:])
-    else:
-        moved = analysis.influence[:, :, :p]
-    effect = moved @ linear.private
+    return _sum_of_squares(_moved(result, linear) @ linear.private)
+
+
+def _of_repeatability(result: Fit, repeatability: Sequence[float]) -> Array:
+    """Covariance (B, p, p) from the repeatability of each triad's readings, before scaling.
+
+    It is a part of the noise that is declared; where the noise is estimated it is in the estimate.
+    """
+    declared = np.isnan(result.noise)
+    if not (declared.any() and any(repeatability)):
+        return np.zeros_like(result.analysis.covariance)
+    shares = [
+        known[:, None, None] * sd / triad.sd
+        for known, sd, triad in zip(declared.mT, repeatability, result.problem.triads, strict=False)
+    ]
+    moved = _moved(result, result.problem.linear(result.state))
+    return _sum_of_squares(moved * np.concatenate(shares, -1)[:, :, None])
+
+
+def _moved(result: Fit, linear: Linear) -> Array:
+    """How an error of a station's whitened reading moves the parameters (B, n, p, m)."""
+    analysis, p = result.analysis, linear.size
+    if analysis.influence is not None:
+        return np.asarray(analysis.influence[:, :, :p])
+    rows, information = linear.weigh(linear.design).mT, linear.normal.information
+    cross = np.linalg.solve(information[:, p:, p:], information[:, p:, :p])
+    return analysis.covariance[:, None] @ (rows[:, :, :p] - cross.mT[:, None] @ rows[:, :, p:])
+
+
+def _sum_of_squares(effect: Array) -> Array:
+    """Covariance (B, p, p) of what independent errors of unit size do (B, n, p, a)."""
     return np.asarray(np.einsum("bnia,bnja->bij", effect, effect, optimize=True))
 
 

@@ -78,15 +78,17 @@ def load_profile(name_or_path: str | None = None) -> tuple[Profile, str]:
     """
     name = "generic" if name_or_path is None else name_or_path
     data, digest = read_toml(name, "profiles", "tool profile")
-    return _profile(data, Path(name).name), digest
+    return decoded_profile(data, Path(name).name), digest
 
 
 def built_in(folder: str) -> list[str]:
-    """Names of the TOML files in a folder of the package.
+    """Names of the TOML files in a folder of the package; no folder has none.
 
     >>> "generic" in built_in("profiles")
     True
     """
+    if not folder:
+        return []
     files = (file.name for file in resources.files("mwdcal").joinpath(folder).iterdir())
     return sorted(name.removesuffix(_SUFFIX) for name in files if name.endswith(_SUFFIX))
 
@@ -118,6 +120,10 @@ def read_toml(name: str, folder: str, kind: str) -> tuple[bytes, str]:
     names = built_in(folder)
     near = difflib.get_close_matches(name.lower(), names, n=2)
     meant = f" Did you mean {' or '.join(repr(n) for n in near)}?" if near else ""
+    if not names:
+        raise InputError(
+            f"{kind} must be the path of a TOML file; got '{name}', which is none. Check the path."
+        )
     raise InputError(
         f"{kind} must be a built-in name ({', '.join(names)}) or the path of a TOML "
         f"file; got '{name}', which is neither.{meant} Check the name or the path."
@@ -135,14 +141,17 @@ def decoded_toml(
     try:
         return msgspec.toml.decode(data, type=struct), digest
     except (msgspec.DecodeError, ValueError, RecursionError) as error:
+        names = ", ".join(built_in(folder))
+        compared = (
+            f"Compare it with the built-in ones: {names} (docs" if names else "Correct it (docs"
+        )
         raise InputError(
-            f"{name} is not a {kind}: {toml_problem(error)}. Compare it with the built-in ones: "
-            f"{', '.join(built_in(folder))} (docs, '{page}')."
+            f"{name} is not a {kind}: {toml_problem(error)}. {compared}, '{page}')."
         ) from None
 
 
-def _profile(data: bytes, source: str) -> Profile:
-    """The checked profile in the bytes of a TOML file."""
+def decoded_profile(data: bytes, source: str) -> Profile:
+    """The checked profile in the bytes of a TOML file, without a byte order mark."""
     try:
         profile = msgspec.toml.decode(data, type=Profile)
     except msgspec.ValidationError as error:

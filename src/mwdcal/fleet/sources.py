@@ -22,6 +22,7 @@ from mwdcal.files import contract, synonyms
 from mwdcal.files.contract import REFERENCES, magnetic_offset
 from mwdcal.files.formats import parquet
 from mwdcal.files.formats.columns import LABELS, check_names
+from mwdcal.files.formats.folders import visible_files
 from mwdcal.files.formats.table import SUFFIXES, check_file
 from mwdcal.fleet import run_files
 from mwdcal.fleet.run_files import FAULT, RUN_FILE
@@ -36,8 +37,6 @@ BLANK = ("", "__HIVE_DEFAULT_PARTITION__")
 LARGEST_GROUP = 20_000_000
 """Rows of the largest row group that is read; it is dealt as a whole."""
 PARQUET = ".parquet"
-HIDDEN = ("_", ".", "~$")
-"""How names begin of files and folders that are left alone: notes of systems and programs."""
 NAMES_SHOWN = 3
 """Most files that a note names."""
 
@@ -195,12 +194,7 @@ def input_files(path: Path) -> tuple[list[Path], list[Path]]:
                 f"of such; got '{path.suffix or 'no suffix'}'. Convert the table, with a column '{SERIAL}'."
             )
         return [path], []
-    visible = sorted(
-        file
-        for file in path.rglob("*")
-        if file.is_file()
-        and not any(part.startswith(HIDDEN) for part in file.relative_to(path).parts)
-    )
+    visible = visible_files(path)
     paths = [file for file in visible if file.suffix.lower() in SUFFIXES]
     for file in paths:
         if str(file) != str(file).encode("utf-8", "ignore").decode():

@@ -137,13 +137,14 @@ class VerdictRow(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Verdict(msgspec.Struct, frozen=True, kw_only=True):
-    """The outcome of a verification."""
+    """The outcome of a verification; `date` as the run states it."""
 
     passed: bool
     rule: str
     limits: str
     source: str
     run: str
+    date: str = ""
     stations: int
     rows: list[VerdictRow]
     findings: list[Finding]
@@ -204,6 +205,7 @@ def verify(calibration: Calibration, readings: Readings, limits: Limits) -> Verd
         limits=limits.name,
         source=limits.source,
         run=readings.source,
+        date=str(readings.metadata.get("date", "")),
         stations=readings.count,
         rows=rows,
         findings=sum((about for _, about in judged), [*_findings(test, skipped)]),

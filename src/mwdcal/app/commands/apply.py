@@ -38,15 +38,15 @@ def command(
     Example: mwdcal apply tool.json surveys.csv -o corrected.csv
     Exit: 0 written, 2 input cannot be read, or does not belong to the calibration.
     """
+    from mwdcal.app.choices import load_calibration
     from mwdcal.app.correction import Applied, apply_to_any
     from mwdcal.app.envelope import enveloped
     from mwdcal.app.progress import bar
     from mwdcal.calibration.readings import simulated
-    from mwdcal.files import documents
     from mwdcal.files.runs import BlankReadingError
 
     options.check_outputs([output], [calibration, readings])
-    fitted, digest = documents.load(calibration)
+    fitted, digest = load_calibration(calibration)
     try:
         with bar("correcting") as advance:
             tally, findings, readings_digest = apply_to_any(

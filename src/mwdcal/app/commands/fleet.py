@@ -67,14 +67,14 @@ def command(
         from mwdcal.app.pages import fleet_report
         from mwdcal.app.screens import fleet as screen
         from mwdcal.app.text import plural
-        from mwdcal.files.formats import atomic
+        from mwdcal.files.formats import atomic, folders
         from mwdcal.fleet import calibration_files
 
     options.check_outputs([output], [runs, tool], page=report)
     if calibrations:
         if records is False:
             raise InputError("`calibrations` needs the whole calibrations: leave out --no-records.")
-        calibration_files.check(calibrations)
+        folders.check_new(calibrations)
         records = True
     try:
         summary = fleet_table.calibrate_table(

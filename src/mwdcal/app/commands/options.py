@@ -5,7 +5,9 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from functools import partial
+from getpass import getuser
 from pathlib import Path
 from typing import Any, TypedDict
 from unicodedata import normalize
@@ -18,6 +20,8 @@ from mwdcal.errors import InputError
 Function = Callable[..., Any]
 Decorator = Callable[[Function], Function]
 FILE = click.Path(path_type=Path)
+REGISTRY = "MWDCAL_REGISTRY"
+"""Environment variable with the registry that is meant where none is named."""
 PICTURES = (".png", ".svg")
 """Suffixes of pictures."""
 
@@ -156,6 +160,39 @@ def fit_options(order: str, nonlinearity: str, prior: str, known: str) -> Decora
         return function
 
     return decorate
+
+
+def database(**more: Any) -> Decorator:
+    """The option that names a registry."""
+    return click.option(
+        "--database",
+        metavar="URL|FILE",
+        help=f"The registry: a file, or the URL of a PostgreSQL database. Default: ${REGISTRY}.",
+        **more,
+    )
+
+
+def _named_registry(context: click.Context, option: click.Parameter, typed: str | None) -> str:
+    """The registry that a subcommand, its group or the environment names."""
+    group = context.parent.params.get(option.name) if context.parent and option.name else None
+    named = typed or group
+    if not named and not context.resilient_parsing:
+        raise InputError(f"`database` must name the registry; got none. Or set {REGISTRY}.")
+    return named or ""
+
+
+def _system_user() -> str:
+    """The name under which the user is known to the system; empty where there is none."""
+    with suppress(KeyError, OSError, ImportError):
+        return getuser()
+    return ""
+
+
+DATABASE = database(callback=_named_registry)
+ACTOR = click.option(
+    "--as", "actor", metavar="NAME", default=_system_user, show_default="the user of the system",
+    help="Who acts, as the history states it.",
+)  # fmt: skip
 
 
 def check_outputs(

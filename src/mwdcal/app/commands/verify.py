@@ -27,15 +27,16 @@ def command(
     """
     from msgspec.structs import replace
 
+    from mwdcal.app.choices import load_calibration
     from mwdcal.app.envelope import enveloped
     from mwdcal.app.screens.verification import screen
     from mwdcal.calibration.diagnosis.findings import unused_columns
-    from mwdcal.files import documents, runs
+    from mwdcal.files import runs
     from mwdcal.files.limits import load_limits
     from mwdcal.use.verification import verify
 
     options.check_outputs([], [calibration, run, limits], page=report)
-    fitted, digest = documents.load(calibration)
+    fitted, digest = load_calibration(calibration)
     readings, _ = runs.read_run(run, fitted.profile, decimal=decimal)
     bounds, limits_digest = load_limits(limits)
     result = verify(fitted, readings, bounds)

@@ -1,10 +1,10 @@
-"""One tool out of the table of a fleet, as `cals.parquet#SERIAL` names it."""
+"""One tool out of many, as `cals.parquet#SERIAL` names it in the table of a fleet."""
 
 from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,6 +18,8 @@ RECORD = "calibration"
 MARK = "#"
 """What stands between the file of a fleet's table and a serial."""
 SUFFIX = ".parquet"
+DATABASE = b"SQLite format 3\0"
+"""How the file of a registry begins."""
 _SHOWN = 5
 """Most serials that a message names."""
 _HEAD = ["serial", "status", "message"]
@@ -40,9 +42,18 @@ def split(path: str | os.PathLike[str]) -> tuple[Path, str | None]:
     places = [place for place, character in enumerate(text) if character == MARK]
     for place in [] if Path(text).exists() else places:
         file = Path(text[:place])
-        if file.suffix.lower() == SUFFIX and file.is_file():
+        if (file.suffix.lower() == SUFFIX and file.is_file()) or is_database(file):
             return file, text[place + 1 :]
     return Path(text), None
+
+
+def is_database(file: Path) -> bool:
+    """Whether a file is a database, as a registry is."""
+    try:
+        with file.open("rb") as stream:
+            return stream.read(len(DATABASE)) == DATABASE
+    except (OSError, ValueError):
+        return False
 
 
 def name_of(path: str | os.PathLike[str]) -> str:
@@ -79,10 +90,15 @@ def read(path: str | os.PathLike[str]) -> Member:
     return Member(_record(table, file.name, group, row, name), name, digest)
 
 
-def records(path: Path) -> Iterator[tuple[str, bytes]]:
-    """Serial and calibration of each tool in the table of a fleet that has one."""
+def groups(path: Path) -> range:
+    """The row groups of the table of a fleet."""
+    return range(parquet.opened(path, path.name)[0].num_row_groups)
+
+
+def records(path: Path, some: Iterable[int] | None = None) -> Iterator[tuple[str, bytes]]:
+    """Serial and calibration of each tool in the table of a fleet that has one; of some row groups alone."""
     table, _ = parquet.opened(path, path.name)
-    for group in range(table.num_row_groups):
+    for group in range(table.num_row_groups) if some is None else some:
         serials, cells = (_cells(table, path.name, group, n) for n in (_HEAD[0], RECORD))
         yield from ((s, cell.encode()) for s, cell in zip(serials, cells, strict=True) if cell)
 

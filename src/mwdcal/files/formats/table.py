@@ -80,17 +80,23 @@ def read(
     """
     check_decimal(decimal)
     file = Path(path)
-    data = _content(file)
+    return parsed(_content(file), file.name, decimal=decimal, rows=rows, export=export)
+
+
+def parsed(
+    data: bytes, name: str, *, decimal: str = ".", rows: int = 0, export: TableFormat | None = None
+) -> Table:
+    """The table in the bytes of a file of that name: see `read`."""
     digest = hashlib.sha256(data).hexdigest()
-    form = _FORMATS[_suffix(file)]
+    form = _FORMATS[_suffix(Path(name))]
     arguments: dict[str, Any] = {"most": rows} if form is parquet else {}
     if export and form is text:
-        data, arguments = dialect.plain(data, export, file.name), {"delimiter": export.delimiter}
+        data, arguments = dialect.plain(data, export, name), {"delimiter": export.delimiter}
     elif export and form is workbook:
         arguments = {"form": export}
     decimal = export.decimal if export else decimal
-    parts: Parts = form.parse(data, file.name, **arguments)
-    return Table(parts.columns, parts.metadata, file.name, parts.lines, digest, decimal)
+    parts: Parts = form.parse(data, name, **arguments)
+    return Table(parts.columns, parts.metadata, name, parts.lines, digest, decimal)
 
 
 def check_decimal(decimal: str) -> None:

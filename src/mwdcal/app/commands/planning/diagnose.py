@@ -25,15 +25,16 @@ def command(calibration: Path, readings: Path, decimal: str, as_json: bool) -> N
     """
     from msgspec.structs import replace
 
+    from mwdcal.app.choices import load_calibration
     from mwdcal.app.envelope import enveloped
     from mwdcal.app.screens.diagnosis import screen
     from mwdcal.calibration.diagnosis.findings import unused_columns
     from mwdcal.faults.diagnosis import diagnose
     from mwdcal.faults.physics import NONE
-    from mwdcal.files import documents, runs
+    from mwdcal.files import runs
 
     options.check_outputs([], [calibration, readings])
-    fitted, digest = documents.load(calibration)
+    fitted, digest = load_calibration(calibration)
     later, _ = runs.read_run(readings, fitted.profile, decimal=decimal)
     result = diagnose(fitted, later)
     findings = findings_as_typed(

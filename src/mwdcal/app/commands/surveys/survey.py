@@ -134,13 +134,13 @@ def _read(
     calibration: Path, readings: Path, reference: Path | None, limits: str, decimal: str
 ) -> _WellInputs:
     """The files read."""
-    from mwdcal.files import documents
+    from mwdcal.app.choices import load_calibration
     from mwdcal.files.runs import MOST_ROWS, read_export
     from mwdcal.survey.acceptance import load_survey_limits
     from mwdcal.survey.place.references import load_reference
     from mwdcal.survey.tables import survey_readings
 
-    fitted, digest = documents.load(calibration)
+    fitted, digest = load_calibration(calibration)
     bounds, limits_digest = load_survey_limits(limits)
     source = read_export(readings, fitted.profile, decimal=decimal, rows=MOST_ROWS)
     place, place_digest = load_reference(reference) if reference else (None, "")

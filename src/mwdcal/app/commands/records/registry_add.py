@@ -1,0 +1,119 @@
+"""`mwdcal registry add` and `withdraw`: what comes into a registry, and what no longer counts."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from mwdcal.app.commands import options
+from mwdcal.app.messages import print_result
+from mwdcal.app.text import one_line
+from mwdcal.errors import InputError
+
+if TYPE_CHECKING:
+    from mwdcal.registry.imports import Adding, Source
+
+FEWEST = 3
+"""Portions of work from which workers of their own are worth their start."""
+TABLE = ".parquet"
+"""Suffix of tables that may hold many tools."""
+
+
+@options.command()
+@options.argument("files", nargs=-1, required=True)
+@options.DATABASE
+@options.ACTOR
+@click.option(
+    "--workers", type=click.IntRange(1), metavar="N", help="Processes. Default: one per core."
+)
+@options.JSON
+def command(
+    files: tuple[Path, ...], database: str, actor: str, workers: int | None, as_json: bool
+) -> None:
+    """Add FILES, or all files of folders: what each is shows in its content.
+
+    Calibrations, verifications (verify --json) and certificates as JSON; runs and readings as they came; tool
+    profiles, limits and laboratories; public keys; tables of calibrations that fleet wrote, each tool as a
+    calibration file; a folder that export wrote. What is there already is not added again, and a file that
+    cannot be added does not stop the others.
+
+    \b
+    Example: mwdcal registry add runs tool.toml cals.parquet --as "A. Borg" --database tools.sqlite
+    Exit: 0 added, or there already; 2 a file is missing, or not one could be added.
+    """
+    from mwdcal.app import pool
+
+    alone = workers == 1 or all(file.is_file() and file.suffix != TABLE for file in files)
+    with pool.preparing(1 if alone else workers):  # these imports, in the workers too
+        from mwdcal.app.screens.records import registry as screen
+        from mwdcal.registry import imports
+        from mwdcal.registry.store import open_registry
+        from mwdcal.use.correction_numba import cores
+
+    portions = imports.portions(imports.sources(files))
+    try:
+        with open_registry(database) as registry:
+            adding = imports.Adding(registry, actor)
+            _add_all(adding, portions, 1 if alone else workers or cores())
+            result = screen.added(registry, adding)
+    except KeyboardInterrupt as stop:
+        stop.add_note("What was added stays: the same command adds the rest.")
+        raise
+    about = {"simulated": adding.simulated}
+    document = screen.document("registry add", result, about)
+    print_result(
+        document if as_json else screen.added_text(result, adding.simulated), result.findings
+    )
+    sys.exit(0 if result.new or result.known else InputError.exit_code)
+
+
+def _add_all(adding: Adding, portions: Sequence[Sequence[Source]], workers: int) -> None:
+    """Add portions in their order, by workers if there are enough of them."""
+    import pickle
+
+    from mwdcal.app import pool, progress
+    from mwdcal.registry import imports
+
+    steps = pool.Steps(list, imports.solve)
+    ready: dict[int, bytes] = {}
+    with progress.bar("adding") as advance:
+        following = 0
+        for index, result in pool.results(
+            steps, portions, workers if len(portions) >= FEWEST else 1, None
+        ):
+            ready[index] = result
+            while following in ready:
+                for each in pickle.loads(ready.pop(following)):  # of our own workers
+                    adding.take(each)
+                following += 1
+            advance(following, len(portions))
+        adding.finish()
+
+
+@options.command()
+@click.argument("record")
+@click.option("--reason", required=True, metavar="TEXT", help="Why it no longer counts.")
+@options.DATABASE
+@options.ACTOR
+@options.JSON
+def withdraw(record: str, reason: str, database: str, actor: str, as_json: bool) -> None:
+    """Withdraw a RECORD, by its number or SHA-256: it stays in the history, and no longer counts.
+
+    \b
+    Example: mwdcal registry withdraw 1207 --reason "wrong stand angles" --database tools.sqlite
+    Exit: 0 withdrawn, 2 there is no such record, or it is withdrawn already.
+    """
+    from mwdcal.app.screens.records import registry as screen
+    from mwdcal.registry.lookup import one_record
+    from mwdcal.registry.store import open_registry
+
+    with open_registry(database) as registry:
+        row = one_record(registry, record)
+        registry.withdraw(row["number"], reason, actor)
+        result = screen.withdrawn(registry, row, reason)
+    text = f"withdrew record {result.number}, {result.kind} {result.name}: {reason}"
+    print_result(screen.document("registry withdraw", result, row) if as_json else one_line(text))

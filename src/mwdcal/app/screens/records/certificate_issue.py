@@ -1,0 +1,104 @@
+"""A certificate on the screen: what it is of, its decisions with their risk, and its uncertainty budget."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from mwdcal.app.screens.numbers import measured, number, unit, written
+from mwdcal.app.text import chance, one_line, table
+from mwdcal.app.text import quantity as in_unit
+from mwdcal.calibration.readings import SIMULATED
+from mwdcal.certificate.document import (
+    Budget,
+    BudgetLine,
+    Certificate,
+    ConformityTest,
+    LimitDecision,
+    Quantity,
+)
+
+NOT_STATED = "not stated"
+EXACT = "exact"
+"""In place of the share of a source that is assumed exact."""
+
+
+def screen(certificate: Certificate, outputs: Sequence[Path]) -> str:
+    """The certificate for people."""
+    tests = [test for test in (certificate.as_found, certificate.as_left) if test]
+    blocks = [
+        "\n".join(map(one_line, heading(certificate))),
+        *(_test(test) for test in tests),
+        *([] if certificate.as_left else ["conformity was not tested"]),
+        _budget(certificate.budget),
+        *([written(**{path.suffix[1:].upper(): path for path in outputs})] if outputs else []),
+    ]
+    return "\n\n".join(blocks)
+
+
+def heading(certificate: Certificate) -> list[str]:
+    """Number and item, days, and who stands for it."""
+    item, people = certificate.item, (certificate.measured_by, certificate.authorised_by)
+    simulated = [SIMULATED] if certificate.simulated else []
+    measured_by, authorised_by = (person.name if person else NOT_STATED for person in people)
+    customer = certificate.customer.name if certificate.customer else NOT_STATED
+    first = [f"certificate {certificate.number}", item.serial or NOT_STATED, item.type, *simulated]
+    days = [f"calibrated {certificate.calibrated}", f"issued {certificate.issued}"]
+    due = [f"next due {certificate.next_due}"] if certificate.next_due else []
+    names = [f"customer {customer}", f"measured by {measured_by}", f"authorised by {authorised_by}"]
+    return ["   ".join(parts) for parts in (first, days + due, names)]
+
+
+def _test(test: ConformityTest) -> str:
+    """A roll test: verdict, rule, and each decision with its risk."""
+    outcome = "PASS" if test.passed else "FAIL"
+    lines = [
+        f"{outcome}   {test.when}   {test.run}   limits {test.limits}",
+        f"rule: {test.rule_text}",
+    ]
+    header = ["", "value", "U", "limit", "accepted up to", "", "P within", "risk"]
+    rows = [_decision(decision) for decision in test.decisions]
+    return "\n".join(map(one_line, lines)) + "\n\n" + table(rows, header)
+
+
+def _decision(decision: LimitDecision) -> list[str]:
+    quantity = decision.quantity
+    value, expanded = value_and_uncertainty(quantity)
+    limits = (decision.limit, decision.acceptance_limit)
+    shown = [in_unit(limit, quantity.unit) for limit in limits]
+    verdict = "pass" if decision.passed else "FAIL"
+    chances = [chance(p) for p in (decision.probability_within, decision.risk)]
+    return [quantity.name, value, expanded, *shown, verdict, *chances]
+
+
+def value_and_uncertainty(quantity: Quantity) -> tuple[str, str]:
+    """Value and expanded uncertainty with their unit, to two significant digits of the latter."""
+    symbol = unit(quantity.unit)
+    if quantity.value is None:
+        return "undetermined", NOT_STATED
+    value, expanded = measured(quantity.value, quantity.expanded_uncertainty)
+    if quantity.expanded_uncertainty is None:
+        return value + symbol, NOT_STATED
+    return value + symbol, expanded + symbol
+
+
+def _budget(budget: Budget) -> str:
+    """The budget by source, with its sum and its expansion."""
+    rows = [_source(line) for line in (*budget.lines, budget.combined, budget.expanded)]
+    head = f"uncertainty budget (1σ), {budget.at}; k = {budget.coverage_factor:.3g}, {budget.coverage_probability:.0%}"
+    return f"{head}\n{table(rows, ['', 'kind', 'inclination', 'toolface', 'azimuth'])}"
+
+
+def _source(line: BudgetLine) -> list[str]:
+    total = line.id in ("combined", "expanded")
+    angles = [
+        _share(line, value) for value in (line.inclination_deg, line.toolface_deg, line.azimuth_deg)
+    ]
+    return [line.source, "" if total else line.kind, *angles]
+
+
+def _share(line: BudgetLine, value: float | None) -> str:
+    """What a source adds to the uncertainty of an angle."""
+    if line.basis.startswith("assumed exact"):
+        return EXACT
+    return "–" if value is None else f"{number(value, 2)}°"

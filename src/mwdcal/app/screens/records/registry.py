@@ -1,0 +1,247 @@
+"""What is printed of a registry, for people and for machines."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import msgspec
+
+from mwdcal.app.envelope import enveloped
+from mwdcal.app.screens.numbers import number
+from mwdcal.app.text import one_line, plural, table
+from mwdcal.calibration.readings import SIMULATED
+from mwdcal.calibration.record import Finding
+from mwdcal.registry.checking import Discrepancy
+from mwdcal.registry.imports import Adding, FileResult
+from mwdcal.registry.lookup import ListedRecord, ListedTool, Listing
+from mwdcal.registry.store import Registry
+
+KEYS = ("number", "kind", "sha256", "name")
+"""What names a record in a document."""
+ANGLES = ("inclination", "toolface", "azimuth")
+MOST_REFUSED = 20
+"""Most refused files that are named one by one."""
+DIGITS = 12
+"""Digits of a SHA-256 on the screen."""
+
+
+class RegistryCreated(msgspec.Struct, frozen=True, kw_only=True):
+    """A new registry, and the hash of its first event."""
+
+    registry: str
+    head: str
+
+
+class RegistryUpgraded(msgspec.Struct, frozen=True, kw_only=True):
+    """The versions of a registry's schema before and after."""
+
+    before: str
+    after: str
+
+
+class RegistryAdded(msgspec.Struct, frozen=True, kw_only=True):
+    """What was added: new records by kind, how many were known or refused, each file; the newest event."""
+
+    registry: str
+    new: dict[str, int]
+    known: int
+    refused: int
+    files: list[FileResult]
+    events: int
+    head: str
+    findings: list[Finding]
+
+
+class RegistryWithdrawn(msgspec.Struct, frozen=True, kw_only=True):
+    """A record that no longer counts, and why."""
+
+    number: int
+    kind: str
+    sha256: str
+    name: str
+    reason: str
+    head: str
+
+
+class RegistryDocument(msgspec.Struct, frozen=True, kw_only=True):
+    """A document of a registry, and the file that it was written to."""
+
+    number: int
+    kind: str
+    sha256: str
+    name: str
+    output: str
+
+
+class RegistryExported(msgspec.Struct, frozen=True, kw_only=True):
+    """A folder with all documents of a registry; how many events it had, and the hash of the newest."""
+
+    folder: str
+    files: int
+    events: int
+    head: str
+
+
+class RegistryCopied(msgspec.Struct, frozen=True, kw_only=True):
+    """A backup, and the hash of its newest event."""
+
+    file: str
+    head: str
+
+
+class RegistryProblem(msgspec.Struct, frozen=True, kw_only=True):
+    """Something in a registry that the program did not write; `number` of its event or record."""
+
+    id: str
+    text: str
+    number: int | None
+
+
+class RegistryChecked(msgspec.Struct, frozen=True, kw_only=True):
+    """Whether a registry is sound, and what is not; how many events it has, and the hash of the newest."""
+
+    registry: str
+    sound: bool
+    discrepancies: list[RegistryProblem]
+    events: int | None
+    head: str | None
+
+
+def document(command: str, content: object, *metadata: Mapping[str, object]) -> dict[str, Any]:
+    """A result for machines."""
+    return enveloped(command, content, *metadata)
+
+
+def added(registry: Registry, adding: Adding) -> RegistryAdded:
+    """What became of all files."""
+    results = adding.results
+    refused = [each for each in results if each.refused]
+    findings = [Finding(id="refused-file", text=_refusal(each)) for each in refused[:MOST_REFUSED]]
+    if refused[MOST_REFUSED:]:
+        more = f"{len(refused) - MOST_REFUSED} more files were not added, or not all of them."
+        findings.append(Finding(id="refused-file", text=more))
+    events, head = registry.head()
+    return RegistryAdded(
+        registry=registry.name,
+        new=dict(adding.new),
+        known=sum(each.known for each in results),
+        refused=sum(each.refused for each in results),
+        files=results,
+        events=events,
+        head=head,
+        findings=findings,
+    )
+
+
+def _refusal(each: FileResult) -> str:
+    """Why a file, or a part of it, was not added."""
+    if each.new or each.known or each.refused > 1:
+        return f"{each.file}: {plural(each.refused, 'record')} not added, such as: {each.message}"
+    return f"not added: {each.message}"
+
+
+def added_text(result: RegistryAdded, simulated: bool) -> str:
+    """The same for people."""
+    new = [plural(count, kind.replace("-", " ")) for kind, count in result.new.items()]
+    parts = [result.registry, f"added {', '.join(new)}" if new else "nothing new"]
+    if result.known:
+        parts.append(f"{plural(result.known, 'record')} there already")
+    if result.refused:
+        parts.append(f"{result.refused} refused")
+    return one_line("   ".join([*parts, *[SIMULATED] * simulated])) + _newest(
+        result.events, result.head
+    )
+
+
+def _newest(events: int | None, head: str | None) -> str:
+    """How long the history is, and the hash to note of it."""
+    return f"\n{plural(events or 0, 'event')}, the newest {head}"
+
+
+def withdrawn(registry: Registry, row: Mapping[str, Any], reason: str) -> RegistryWithdrawn:
+    """A record that was withdrawn."""
+    about = {key: row[key] for key in KEYS}
+    return RegistryWithdrawn(**about, reason=reason, head=registry.head()[1])
+
+
+def checked(registry: Registry, discrepancies: Sequence[Discrepancy]) -> RegistryChecked:
+    """The outcome of a check."""
+    problems = [RegistryProblem(id=d.id, text=d.text, number=d.number) for d in discrepancies]
+    events, head = (None, None) if problems else registry.head()
+    return RegistryChecked(
+        registry=registry.name,
+        sound=not problems,
+        discrepancies=problems,
+        events=events,
+        head=head,
+    )
+
+
+def check_text(result: RegistryChecked) -> str:
+    """The outcome of a check for people."""
+    if result.sound:
+        return one_line(f"PASS   {result.registry}: sound") + _newest(result.events, result.head)
+    lines = [f"FAIL   {result.registry}: {plural(len(result.discrepancies), 'discrepancy')}"]
+    lines += [f"! {each.text}" for each in result.discrepancies]
+    return "\n".join(map(one_line, lines))
+
+
+def list_text(listing: Listing) -> str:
+    """Tools, or records of a kind."""
+    blocks = [_heading(listing, f"{listing.kind}s")]
+    if listing.tools:
+        head = ["serial", "type", "calibrated", "n", *(f"{a} 1σ, °" for a in ANGLES)]
+        blocks.append(table([_tool_cells(t) for t in listing.tools], [*head, "due", "verdict"]))
+    if listing.records and listing.kind == "tool":
+        blocks.append(f"{plural(len(listing.records), 'measurement standard')} due")
+    if listing.records:
+        blocks.append(_records_table(listing.records, serials=True))
+    return "\n\n".join(blocks)
+
+
+def history_text(listing: Listing) -> str:
+    """The past of a tool."""
+    return "\n\n".join(
+        [_heading(listing, "records"), _records_table(listing.records, serials=False)]
+    )
+
+
+def _heading(listing: Listing, noun: str) -> str:
+    """How many there are, and which of them are shown."""
+    simulated = any(t.simulated for t in listing.tools) or any(r.simulated for r in listing.records)
+    shown_rows = len(listing.tools) or len(listing.records)
+    part = (
+        f"   {listing.offset + 1} to {listing.offset + shown_rows}"
+        if shown_rows < listing.total
+        else ""
+    )
+    words = [f"{listing.total} {noun}{part}", *[SIMULATED] * simulated]
+    return "   ".join(words)
+
+
+def _tool_cells(tool: ListedTool) -> list[str]:
+    angles = [number(getattr(tool, f"{angle}_deg"), 2) for angle in ANGLES]
+    facts = [tool.serial, tool.type or "", day(tool.calibrated), str(tool.calibrations)]
+    return [*facts, *angles, day(tool.next_due), tool.status or ""]
+
+
+def _records_table(records: Sequence[ListedRecord], serials: bool) -> str:
+    """Records, with the serial of each or without."""
+    head = ["record", "kind", *["serial"] * serials, "of", "what", "SHA-256", "added", "by"]
+    rows = []
+    for each in records:
+        what = [each.label or each.type or each.name, each.status or ""]
+        what += [f"due {day(each.next_due)}"] * bool(each.next_due)
+        what += [f"withdrawn: {each.reason}"] * bool(each.reason)
+        cells = [str(each.number), each.kind, *[each.serial or ""] * serials, day(each.time)]
+        described = ", ".join(filter(None, what))
+        rows.append(
+            [*cells, described, each.sha256[:DIGITS], each.added[: len("2026-01-31")], each.actor]
+        )
+    return table(rows, head, names=1)
+
+
+def day(time: str | None) -> str:
+    """The day of a time."""
+    return (time or "")[: len("2026-01-31")]

@@ -1,0 +1,216 @@
+"""The uncertainty budget of the angles by source, and the results with their expanded uncertainties.
+
+Everything is of the calibration itself. Sources are those of `Calibration.budget`; together they are what
+the covariance of the calibration gives. Reference: JCGM 100:2008, 4, 5 and G.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from mwdcal.calibration.prediction import (
+    TWELFTHS,
+    TYPICAL,
+    accuracy_at,
+    angles,
+    middle_temperature,
+    readings_at,
+    typical_accuracy,
+)
+from mwdcal.calibration.record import BudgetRow, Calibration, stated
+from mwdcal.calibration.results import NOISE, ORDER, PRIOR, REPEATABILITY, SETTINGS
+from mwdcal.certificate.decisions import PROBABILITY, student_factor
+from mwdcal.certificate.document import Budget, BudgetLine
+from mwdcal.geometry.vectors import Array
+
+STAND_ANGLES = ("inclination", "azimuth", "toolface")
+"""Angles that a stand sets."""
+UNDECLARED = {
+    "dip reference": "dip_deg",
+    "azimuth zero of the stand": "azimuth_zero_deg",
+    "inclination zero of the stand": "inclination_zero_deg",
+    "tilt of the stand": "tilt_deg",
+}
+"""Common errors that leave residuals, and the key of `[stand]` that declares each."""
+INVISIBLE = "no residual tests it"
+VISIBLE = "a large error of it would show in the residuals"
+
+
+def budget(calibration: Calibration) -> Budget:
+    """The uncertainty budget at 45° inclination: the accuracy that `calibrate` states, by source.
+
+    Definition: root mean square over azimuth and toolface, at `middle_temperature`. The coverage factor is the
+    largest of any angle and attitude there, and at least that of the triad with the fewest degrees of freedom.
+    """
+    names = angles(calibration)
+    rows = calibration.budget or [_whole(calibration)]
+    lines = [_line(calibration, row) for row in rows] + _exact_lines(calibration)
+    sums = {
+        f"{name}_deg": _root_sum_of_squares([getattr(row, f"{name}_deg") for row in rows])
+        for name in names
+    }
+    k = coverage_factors(calibration, TYPICAL, middle_temperature(calibration))
+    fewest = min(triad.degrees_of_freedom for triad in calibration.triads)
+    largest = float(np.nanmax([*k.values(), student_factor(fewest)]))
+    combined = BudgetLine(
+        id="combined",
+        source="combined standard uncertainty",
+        kind="B",
+        basis="root sum of squares",
+        **sums,
+    )
+    grown = {key: None if sd is None else largest * sd for key, sd in sums.items()}
+    basis = f"k = {largest:.3g}, {PROBABILITY:.0%}"
+    expanded = BudgetLine(
+        id="expanded", source="expanded uncertainty", kind="B", basis=basis, **grown
+    )
+    return Budget(
+        at=attitude_in_words(TYPICAL, middle_temperature(calibration)),
+        lines=lines,
+        combined=combined,
+        expanded=expanded,
+        coverage_factor=largest,
+        coverage_probability=PROBABILITY,
+    )
+
+
+def attitude_in_words(inclination: float, temperature: float) -> str:
+    """Where an accuracy holds: an inclination, radians, and a temperature."""
+    return (
+        f"inclination {np.degrees(inclination):.0f}°, root mean square over azimuth and toolface, "
+        f"{temperature:.1f} °C"
+    )
+
+
+def coverage_factors(
+    calibration: Calibration, inclination: float, temperature: float
+) -> dict[str, float]:
+    """Coverage factor by angle at an inclination: the largest of any azimuth and toolface; NaN: none is stated.
+
+    Definition: `Calibration.expanded_uncertainty` over `Calibration.uncertainty`.
+    """
+    grid = np.meshgrid(TWELFTHS, TWELFTHS, indexing="ij")
+    azimuth, toolface = (angle.ravel() for angle in grid)
+    readings = readings_at(calibration, inclination, azimuth, toolface, temperature)
+    factors = {}
+    for name in angles(calibration):
+        sd = calibration.uncertainty(name, readings)
+        width = calibration.expanded_uncertainty(name, readings, PROBABILITY)
+        known = np.isfinite(width) & (sd > 0)
+        factors[name] = float((width[known] / sd[known]).max()) if known.any() else float("nan")
+    return factors
+
+
+def accuracy_with_factor(
+    calibration: Calibration, inclination: float, temperature: float
+) -> dict[str, tuple[float | None, float | None]]:
+    """1σ in degrees and coverage factor by angle at an inclination; None: undetermined."""
+    sd: dict[str, Array] = accuracy_at(calibration, [inclination], temperature=temperature)
+    k = coverage_factors(calibration, inclination, temperature)
+    return {
+        name: (stated(np.degrees(value[0])), stated(k[name]) if np.isfinite(value[0]) else None)
+        for name, value in sd.items()
+    }
+
+
+def assumed_exact(calibration: Calibration) -> list[str]:
+    """References taken as exact: those whose error no residual would show, and then the others."""
+    return [line.source for line in _exact_lines(calibration)]
+
+
+def _exact_lines(calibration: Calibration) -> list[BudgetLine]:
+    """A line for each reference without a declared uncertainty."""
+    invisible = [(name, INVISIBLE) for name in calibration.assumed_exact]
+    visible = [(name, VISIBLE) for name in _undeclared(calibration)]
+    zeros = {f"{name}_deg": 0.0 for name in angles(calibration)}
+    return [
+        BudgetLine(
+            id=_identifier(name),
+            source=name,
+            kind="B",
+            basis=f"assumed exact: no uncertainty is declared, and {why}",
+            **zeros,
+        )
+        for name, why in invisible + visible
+    ]
+
+
+def _undeclared(calibration: Calibration) -> Iterator[str]:
+    """Common errors that could show in residuals, are in use, and are neither declared nor estimated."""
+    used = {row.observable for row in calibration.errors} - {*calibration.options.ignore}
+    known = {constant.name for constant in calibration.constants}
+    known |= {row.source for row in calibration.budget}
+    estimated = {
+        "azimuth zero of the stand": calibration.stand.azimuth_zero_deg,
+        "inclination zero of the stand": calibration.stand.inclination_zero_deg,
+        "tilt of the stand": calibration.stand.tilt_deg,
+    }
+    for name, key in UNDECLARED.items():
+        needed = {"tilt of the stand": "inclination"}.get(name, name.partition(" ")[0])
+        declared = calibration.profile.stand.of(key) or estimated.get(name) is not None
+        if needed in used and not declared and not {name, f"{name} error", needed} & known:
+            yield name
+
+
+def _whole(calibration: Calibration) -> BudgetRow:
+    """The accuracy in one row, of a calibration whose sources were not recorded."""
+    accuracy = {f"{n}_deg": sd for n, sd in typical_accuracy(calibration).items()}
+    return BudgetRow(source="calibration as a whole", **accuracy)
+
+
+def _line(calibration: Calibration, row: BudgetRow) -> BudgetLine:
+    """A source of the calibration's budget with its kind and basis."""
+    redundant = all(triad.variance_factor is not None for triad in calibration.triads)
+    by_statistics = row.source == ORDER or (row.source == NOISE and redundant)
+    return BudgetLine(
+        id=_identifier(row.source),
+        source=row.source,
+        kind="A" if by_statistics else "B",
+        basis=_basis(calibration, row.source),
+        inclination_deg=row.inclination_deg,
+        toolface_deg=row.toolface_deg,
+        azimuth_deg=row.azimuth_deg if calibration.has_field else None,
+    )
+
+
+def _basis(calibration: Calibration, source: str) -> str:
+    """Where the size of a source is known from."""
+    if source == NOISE:
+        return "; ".join(f"{t.name}: {t.noise_source}{_scaled(t)}" for t in calibration.triads)
+    if source == REPEATABILITY:
+        return "declared in the tool profile; scaled by the residuals"
+    if source == SETTINGS:
+        return f"declared for the stand{settings_in_words(calibration)}; scaled by the residuals"
+    if source == ORDER:
+        return "scatter of the soaks about the temperature terms"
+    if source == PRIOR:
+        return f"prior: {calibration.options.prior or 'declared'}"
+    return "declared; common to all stations"
+
+
+def _scaled(triad: object) -> str:
+    factor, freedom = (getattr(triad, n) for n in ("variance_factor", "degrees_of_freedom"))
+    if factor is None:
+        return ", not tested by residuals"
+    return f", scaled by the residuals (s = {factor**0.5:.3g}, {freedom:.0f} degrees of freedom)"
+
+
+def settings_in_words(calibration: Calibration) -> str:
+    """The declared 1σ of the stand's settings, in words that follow a noun; empty where there are none."""
+    stand = calibration.profile.stand
+    sd = {n: np.hypot(stand.of(f"{n}_deg"), stand.repeatability(f"{n}_deg")) for n in STAND_ANGLES}
+    declared = [f"{name} {value:.2g}°" for name, value in sd.items() if value]
+    return f": {', '.join(declared)}" if declared else ""
+
+
+def _root_sum_of_squares(parts: list[float | None]) -> float | None:
+    """The norm of the parts; None where one is undetermined, or there are none."""
+    values = [part for part in parts if part is not None]
+    return float(np.linalg.norm(values)) if values and len(values) == len(parts) else None
+
+
+def _identifier(name: str) -> str:
+    """A name in words as an identifier."""
+    return name.replace(" ", "-")

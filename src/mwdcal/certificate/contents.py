@@ -1,0 +1,301 @@
+"""`certificate`: the contents of a calibration certificate, from a calibration and what the laboratory states.
+
+Whatever ISO/IEC 17025:2017 asks for and nobody states becomes a finding in the certificate itself.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from calendar import monthrange
+from collections.abc import Iterator, Sequence
+from datetime import date
+
+import msgspec
+from msgspec.structs import replace
+
+from mwdcal.calibration.readings import is_simulated
+from mwdcal.calibration.record import SOFTWARE, Calibration, Finding, canonical, rounded
+from mwdcal.certificate.budget import assumed_exact, budget
+from mwdcal.certificate.decisions import When, conformity
+from mwdcal.certificate.document import (
+    Certificate,
+    ConformityTest,
+    Item,
+    Party,
+    Person,
+    SourceFile,
+    TracedStandard,
+)
+from mwdcal.certificate.laboratory import Laboratory
+from mwdcal.certificate.methods import method
+from mwdcal.certificate.tables import conditions, result_tables
+from mwdcal.certificate.traceability import references_in_use, traced
+from mwdcal.errors import InputError
+from mwdcal.files.documents import Verification
+
+DIGEST_DIGITS = 12
+"""Hexadecimal digits of the contents' SHA-256 in a certificate number."""
+NUMBER_PATTERN = "{serial}-{date}-{digest}"
+"""How a certificate number is made, unless the laboratory has a pattern of its own."""
+LONGEST_NUMBER = 64
+"""Characters of a certificate number."""
+NOT_TESTED = "Conformity was not tested: no roll test after the calibration was supplied."
+DATE_OF_FIT = (
+    "the run states no date: the day on which the calibration was computed stands for that of the "
+    "measurements."
+)
+NO_AS_FOUND = "No roll test before the adjustment (as found) was supplied."
+STATEMENTS = (
+    "The results relate only to the item that was calibrated.",
+    "This certificate must not be reproduced except in full without the approval of the laboratory.",
+    "The expanded uncertainty is the standard uncertainty multiplied by the coverage factor k, which by Student's t "
+    "for the degrees of freedom corresponds to a coverage probability of about 95 % (JCGM 100:2008).",
+)
+"""Statements of every certificate."""
+
+
+class Order(msgspec.Struct, frozen=True, kw_only=True):
+    """What is particular to one certificate, beside its calibration and the laboratory.
+
+    `customer`, `condition` and `received` stand before those of the laboratory file; `number` before its
+    pattern. `verification` (as left) and `as_found` are roll tests with this and with the previous calibration;
+    `calibration_sha256` is of the file of this one.
+    """
+
+    issued: date
+    number: str = ""
+    customer: str = ""
+    condition: str = ""
+    received: date | None = None
+    verification: Verification | None = None
+    as_found: Verification | None = None
+    calibration_sha256: str
+    files: tuple[SourceFile, ...] = ()
+
+
+def certificate(
+    calibration: Calibration, order: Order, laboratory: Laboratory | None = None
+) -> Certificate:
+    """The certificate of a calibration, with every number at 12 significant digits.
+
+    The number is made of the serial, the date of issue and the SHA-256 of all else.
+    """
+    stated = laboratory or Laboratory()
+    day, day_stated = calibrated_on(calibration)
+    if day_stated:
+        _check_days(day, order, stated)
+    tests, changed = _tests(calibration, order, stated)
+    standards = traced(calibration, stated, day)
+    contents = Certificate(
+        software=SOFTWARE,
+        serial=calibration.tool.get("serial") or None,
+        simulated=_simulated(calibration, order),
+        number="",
+        issued=order.issued.isoformat(),
+        laboratory=stated.laboratory or _party(calibration.tool.get("lab", "")),
+        place=stated.place,
+        customer=_party(order.customer) or stated.customer,
+        item=_item(calibration, order, stated),
+        calibrated=day.isoformat(),
+        next_due=_next_due(day, stated),
+        method=method(calibration),
+        conditions=conditions(calibration, stated),
+        results=result_tables(calibration),
+        budget=budget(calibration),
+        traceability=standards,
+        as_found=tests.get("as found"),
+        as_left=tests.get("as left"),
+        measured_by=stated.measured_by or _person(calibration.tool.get("operator", "")),
+        authorised_by=stated.authorised_by,
+        statements=_statements(tests),
+        findings=[],
+        files=list(order.files),
+    )
+    findings = [
+        *calibration.change_findings(),
+        *_not_stated(contents, calibration),
+        *([] if day_stated else [Finding(id="date-not-stated", text=DATE_OF_FIT)]),
+        *_overdue(standards, contents.calibrated),
+        *_exact(calibration),
+        *changed,
+        *calibration.findings,
+    ]
+    whole = rounded(replace(contents, findings=findings))
+    number = order.number or _number(whole, stated.number or NUMBER_PATTERN)
+    _check_number(number)
+    return replace(whole, number=number)
+
+
+def calibrated_on(calibration: Calibration) -> tuple[date, bool]:
+    """The day of the calibration, and whether its run states it as an ISO date: else it is that of the fit."""
+    try:
+        return date.fromisoformat(calibration.tool.get("date", "")[:10]), True
+    except ValueError:
+        return date.fromisoformat(calibration.time[:10]), False
+
+
+def _check_days(day: date, order: Order, laboratory: Laboratory) -> None:
+    """Refuse a certificate from before the calibration, and a tool that was received after it."""
+    received = order.received or laboratory.item.received
+    if order.issued < day:
+        raise InputError(
+            f"`date` must not be before the day of the calibration, {day}; got {order.issued}. Correct one of them."
+        )
+    if received and received > day:
+        raise InputError(
+            f"`received` must not be after the day of the calibration, {day}; got {received}. Correct one of them."
+        )
+
+
+def _check_number(number: str) -> None:
+    """Refuse a number that cannot stand on one line of every page."""
+    if not number.strip() or len(number) > LONGEST_NUMBER or not number.isprintable():
+        raise InputError(
+            f"`number` must be 1 to {LONGEST_NUMBER} printable characters; got {number[:80]!r}. Choose another."
+        )
+
+
+def _tests(
+    calibration: Calibration, order: Order, laboratory: Laboratory
+) -> tuple[dict[str, ConformityTest], list[Finding]]:
+    """The roll tests by when they were made, and findings about their decisions."""
+    tests: dict[str, ConformityTest] = {}
+    findings: list[Finding] = []
+    given: dict[When, Verification | None] = {
+        "as found": order.as_found,
+        "as left": order.verification,
+    }
+    for when, document in given.items():
+        if document is not None:
+            _check_test(document, calibration, order)
+            tests[when], about = conformity(when, document, calibration, laboratory.decision)
+            findings += about
+    return tests, findings
+
+
+def _check_test(document: Verification, calibration: Calibration, order: Order) -> None:
+    """Refuse a roll test of another tool, or with the wrong one of the two calibrations."""
+    as_left = document is order.verification
+    argument = "`verification`" if as_left else "`as_found`"
+    serial = calibration.tool.get("serial")
+    if serial and document.serial and document.serial != serial:
+        raise InputError(
+            f"{argument} is of tool {document.serial}, the calibration of tool {serial}. Name a roll test of the "
+            "same tool."
+        )
+    if as_left and document.calibration_sha256 != order.calibration_sha256:
+        other, this = (each.calibration_sha256[:16] for each in (document, order))
+        raise InputError(
+            f"{argument} is a test of another calibration (SHA-256 {other}…): it must be of this one ({this}…). "
+            "Verify this calibration, and save what is printed as JSON."
+        )
+    if not as_left and document.calibration_sha256 == order.calibration_sha256:
+        raise InputError(
+            f"{argument} is a test of this very calibration: it must be of the one that was in the tool before. "
+            "Verify that one by readings from before the adjustment, or leave it out."
+        )
+
+
+def _simulated(calibration: Calibration, order: Order) -> bool:
+    documents = [each for each in (order.as_found, order.verification) if each]
+    marked = calibration.simulated or is_simulated(calibration.tool)
+    return marked or any(each.simulated for each in documents)
+
+
+def _party(name: str) -> Party | None:
+    return Party(name=name) if name.strip() else None
+
+
+def _person(name: str) -> Person | None:
+    return Person(name=name) if name.strip() else None
+
+
+def _item(calibration: Calibration, order: Order, laboratory: Laboratory) -> Item:
+    details = laboratory.item
+    received = order.received or details.received
+    return Item(
+        type=details.type or calibration.tool.get("tool", "") or calibration.profile.name,
+        serial=calibration.tool.get("serial", ""),
+        manufacturer=details.manufacturer,
+        identification=details.identification,
+        condition=order.condition or details.condition,
+        received=received.isoformat() if received else "",
+    )
+
+
+def _next_due(day: date, laboratory: Laboratory) -> str:
+    """The day of the next calibration, by the laboratory's interval; empty where none is stated."""
+    if laboratory.recalibration is None:
+        return ""
+    years, month = divmod(day.month - 1 + laboratory.recalibration.months, 12)
+    year = min(day.year + years, date.max.year)
+    last = monthrange(year, month + 1)[1]
+    return date(year, month + 1, min(day.day, last)).isoformat()
+
+
+def _statements(tests: dict[str, ConformityTest]) -> list[str]:
+    """What every certificate states, and what it must say of tests that it lacks or of their rule."""
+    rules = dict.fromkeys(test.rule_text for test in tests.values())
+    return [
+        *STATEMENTS,
+        *(f"Decision rule: {rule}." for rule in rules),
+        *([] if "as left" in tests else [NOT_TESTED]),
+        *([] if "as found" in tests else [NO_AS_FOUND]),
+    ]
+
+
+def _not_stated(contents: Certificate, calibration: Calibration) -> Iterator[Finding]:
+    """A finding that names what ISO/IEC 17025:2017, 7.8.2.1, 7.8.4.1 and 7.8.6, ask for and nobody states."""
+    laboratory = contents.laboratory
+    traceable = {standard.quantity for standard in contents.traceability}
+    lacking = {
+        "laboratory": laboratory is None,
+        "address of the laboratory": laboratory is not None and not laboratory.address,
+        "place of the calibration": not contents.place,
+        "customer": contents.customer is None,
+        "serial of the item": not contents.item.serial,
+        "condition of the item": not contents.item.condition,
+        "measured by": contents.measured_by is None,
+        "authorised by": contents.authorised_by is None,
+        **{
+            f"traceability of {'' if quantity == 'gravity' else 'the '}{quantity}": quantity
+            not in traceable
+            for quantity in references_in_use(calibration)
+        },
+    }
+    names = [name for name, missing in lacking.items() if missing]
+    if names:
+        text = f"not stated: {', '.join(names)}."
+        yield Finding(id="not-stated", text=text)
+
+
+def _overdue(standards: Sequence[TracedStandard], calibrated: str) -> Iterator[Finding]:
+    for standard in standards:
+        if standard.overdue:
+            text = (
+                f"the calibration of the {standard.quantity} standard {standard.name} was due on {standard.due}, "
+                f"before the day of this calibration ({calibrated})."
+            )
+            yield Finding(id="standard-overdue", text=text)
+
+
+def _exact(calibration: Calibration) -> Iterator[Finding]:
+    if names := assumed_exact(calibration):
+        text = (
+            f"assumed exact in the budget: {', '.join(names)}. State their uncertainty in [stand] of the tool "
+            "profile, and calibrate again."
+        )
+        yield Finding(id="assumed-exact", text=text)
+
+
+def _number(contents: Certificate, pattern: str) -> str:
+    """The number of a certificate, from what it says."""
+    digest = hashlib.sha256(canonical(msgspec.to_builtins(contents))).hexdigest()
+    serial = re.sub(r"[^A-Za-z0-9._]+", "-", contents.item.serial).strip("-")[:40]
+    return pattern.format(
+        serial=serial or "tool",
+        date=contents.issued.replace("-", ""),
+        year=contents.issued[:4],
+        digest=digest[:DIGEST_DIGITS],
+    )

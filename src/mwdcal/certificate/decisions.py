@@ -1,0 +1,164 @@
+"""Decisions on conformity: the rule, the guard band, and the risk of the decision that was taken.
+
+The quantity that is judged is assumed normal about its value with its standard uncertainty.
+Reference: JCGM 106:2012, 7 and 8; ILAC-G8:09/2019, 4.2 and 5.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+from mwdcal.calibration.record import Calibration, Finding
+from mwdcal.certificate.document import ConformityTest, LimitDecision, Quantity
+from mwdcal.certificate.laboratory import DecisionRule
+from mwdcal.files.documents import Verification
+from mwdcal.geometry.vectors import Array, ArrayLike
+from mwdcal.use.verification import COVERAGE, RULES, SPREAD_OF, VerdictRow
+
+When: TypeAlias = Literal["as found", "as left"]
+"""When a roll test was made: before or after the adjustment."""
+GUARDED_RISK = "the probability that a tool which passes is outside the limit is at most 2.3 %"
+SIMPLE_RISK = "the probability of a wrong decision reaches 50 % where the value is at its limit"
+"""Largest risks of the rules of a verification: one-sided, beyond two standard uncertainties, and at the limit."""
+PROBABILITY = 0.95
+"""Coverage probability of every expanded uncertainty of a certificate."""
+
+
+def student_factor(freedom: ArrayLike) -> Array:
+    """Coverage factor k of a value with some degrees of freedom, of which less than one count as one.
+
+    Definition: Student's t for `PROBABILITY`, two-sided. Reference: JCGM 100:2008, G.3.
+    """
+    import numpy as np
+    from scipy.special import stdtrit
+
+    return np.asarray(stdtrit(np.maximum(freedom, 1.0), (1 + PROBABILITY) / 2))
+
+
+def probability_within(value: float, sd: float, limit: float, two_sided: bool) -> float:
+    """Probability that the true value is at most `limit`; `two_sided`: and at least its negative.
+
+    Definition: Φ((limit - value) / sd), for two sides less Φ((-limit - value) / sd). Singular: without
+    uncertainty 0 or 1. Reference: JCGM 106:2012, 7.2 and 7.4.
+    """
+    from scipy.special import ndtr
+
+    if sd == 0:
+        return float(value <= limit)
+    below = ndtr((-limit - value) / sd) if two_sided else 0.0
+    return float(ndtr((limit - value) / sd) - below)
+
+
+@dataclass(frozen=True)
+class Rule:
+    """A rule of decision: a guard band of `guard` standard uncertainties, none for simple acceptance."""
+
+    name: Literal["simple", "guarded"]
+    text: str
+    guard: float
+    coverage: float
+
+    def decision(self, row: VerdictRow) -> LimitDecision:
+        """The decision on a limit, by the set of the test that exceeds it first."""
+        value, sd, note = self._worst(row)
+        spread, within, passed = row.name.startswith(SPREAD_OF), None, False
+        if value is not None and sd is not None:
+            within = probability_within(value, sd, row.limit, two_sided=not spread)
+            passed = value + self.guard * sd <= row.limit  # as `verify` decides, to the last digit
+        quantity = Quantity(
+            id=row.name.replace(" ", "-"),
+            name=row.name,
+            unit=row.unit,
+            value=value,
+            standard_uncertainty=sd,
+            expanded_uncertainty=None if sd is None else self.coverage * sd,
+            coverage_factor=None if sd is None else self.coverage,
+            coverage_probability=None if sd is None else PROBABILITY,
+        )
+        return LimitDecision(
+            quantity=quantity,
+            limit=row.limit,
+            acceptance_limit=None if sd is None else row.limit - self.guard * sd,
+            passed=passed,
+            probability_within=within,
+            risk=None if within is None else (1 - within if passed else within),
+            note=note,
+        )
+
+    def _worst(self, row: VerdictRow) -> tuple[float | None, float | None, str]:
+        """Value and 1σ of the set that comes closest to the limit or exceeds it most, and where it is."""
+        if row.value is None or row.uncertainty is None or not row.sets:
+            return row.value, row.uncertainty, row.note
+        worst = max(row.sets, key=lambda each: each.value + self.guard * each.uncertainty)
+        if worst.value == row.value and worst.uncertainty == row.uncertainty:
+            return row.value, row.uncertainty, row.note
+        return worst.value, worst.uncertainty, worst.label or "stations outside of roll sets"
+
+
+def rule_of(
+    verification: Verification, calibration: Calibration, choice: DecisionRule | None
+) -> Rule:
+    """The rule for a test: the verification's, unless the laboratory asks for the guarded one.
+
+    The coverage factor of its uncertainties is at least `COVERAGE`, and Student's for the triad of the
+    calibration with the fewest degrees of freedom.
+    """
+    fewest = min(triad.degrees_of_freedom for triad in calibration.triads)
+    k = max(COVERAGE, float(student_factor(fewest)))
+    if choice is not None and choice.rule == "guarded":
+        text = (
+            f"guarded acceptance: noise-free value + {choice.guard_factor:g} U must not exceed the limit, "
+            f"U = {k:.3g} × its standard uncertainty"
+        )
+        text += f"; {choice.risk}" if choice.risk else ""
+        return Rule("guarded", text, choice.guard_factor * k, k)
+    if verification.rule == RULES["guarded"]:
+        return Rule("guarded", f"{verification.rule}; {GUARDED_RISK}", COVERAGE, k)
+    return Rule("simple", f"{verification.rule}; {SIMPLE_RISK}", 0.0, k)
+
+
+def conformity(
+    when: When,
+    verification: Verification,
+    calibration: Calibration,
+    choice: DecisionRule | None,
+) -> tuple[ConformityTest, list[Finding]]:
+    """A roll test as the certificate shows it, and a finding where the laboratory's rule decides otherwise."""
+    rule = rule_of(verification, calibration, choice)
+    decisions = [rule.decision(row) for row in verification.rows]
+    test = ConformityTest(
+        when=when,
+        passed=all(decision.passed for decision in decisions),
+        date=verification.date,
+        run=verification.run,
+        stations=verification.stations,
+        limits=verification.limits,
+        source=verification.source,
+        rule=rule.name,
+        rule_text=rule.text,
+        calibration_sha256=verification.calibration_sha256,
+        decisions=decisions,
+        findings=verification.findings,
+    )
+    return test, _changed(when, verification, decisions)
+
+
+def _changed(
+    when: str, verification: Verification, decisions: Sequence[LimitDecision]
+) -> list[Finding]:
+    """A finding that names the decisions which the verification took otherwise."""
+    other = [
+        f"{row.name} {_word(row.passed)} by the rule of the verification, {_word(decision.passed)} by the laboratory's"
+        for row, decision in zip(verification.rows, decisions, strict=True)
+        if row.passed != decision.passed
+    ]
+    text = (
+        f"decisions of the test {when} differ from those of the verification: {'; '.join(other)}."
+    )
+    return [Finding(id="decision-changed", text=text)] if other else []
+
+
+def _word(passed: bool) -> str:
+    return "passed" if passed else "failed"

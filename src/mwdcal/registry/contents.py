@@ -1,0 +1,163 @@
+"""What a file is to a registry: the records that are made of it, by its content."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from mwdcal.calibration.record import canonical
+from mwdcal.errors import InputError, reason
+from mwdcal.files import documents, runs
+from mwdcal.files.contract import CHANNELS
+from mwdcal.files.formats import members, parquet
+from mwdcal.files.formats import table as tables
+from mwdcal.files.profiles import decoded_profile
+from mwdcal.registry.store import LARGEST_OBJECT, Entry
+from mwdcal.sensor.profile import MeasurementStandard
+
+TABLES = (*tables.SUFFIXES, *tables.EXCHANGED)
+"""Suffixes of files with tables."""
+COMMANDS_KEPT = {"calibrate": "calibration", "verify": "verification", "certificate": "certificate"}
+"""Kinds of documents by the command that writes them."""
+LABORATORY_KEYS = ("laboratory", "customer", "measured_by", "authorised_by", "number")
+"""Of which a laboratory file has one at least."""
+PEOPLE = LABORATORY_KEYS[2:4]
+_BOM = b"\xef\xbb\xbf"
+_PEM = b"-----BEGIN "
+_UNKNOWN = (
+    "a registry keeps calibrations, verifications and certificates of mwdcal, runs, tool profiles, limits, "
+    "laboratories and public keys, and it is none of them. Leave it out."
+)
+
+
+class UnlikeRunError(InputError):
+    """A table that is a run only if some calibration was made of it: `entry`."""
+
+    def __init__(self, message: str, entry: Entry) -> None:
+        super().__init__(f"{message} Add it together with a calibration that was made of it.")
+        self.entry = entry
+
+
+def is_fleet(file: Path) -> bool:
+    """Whether a file is a table of calibrations, as `mwdcal fleet` writes it."""
+    if file.suffix.lower() != members.SUFFIX:
+        return False
+    return members.RECORD in parquet.opened(file, file.name)[1].names
+
+
+def of_fleet(file: Path, group: int) -> Iterator[Entry]:
+    """The calibrations in a row group of a fleet's table, each as the file that `mwdcal fleet` writes of it."""
+    for serial, record in members.records(file, [group]):
+        yield Entry("calibration", documents.laid_out(record), f"{serial}.json")
+
+
+def content(file: Path) -> bytes:
+    """The bytes of a file, of at most `LARGEST_OBJECT`."""
+    tables.check_file(file)
+    try:
+        size = file.stat().st_size
+        if size <= LARGEST_OBJECT:
+            return file.read_bytes()
+    except OSError as error:
+        raise InputError(f"{file}: cannot be read ({reason(error)}). Check its rights.") from None
+    raise InputError(
+        f"{file.name}: a registry takes files of at most {LARGEST_OBJECT:,} bytes; got {size:,}."
+    )
+
+
+def of_bytes(data: bytes, name: str) -> list[Entry]:
+    """The records that a file is, and what it names: people and standards.
+
+    The name of the file counts for tables, whose format is its suffix.
+
+    Raises:
+        UnlikeRunError: a table that may be a run whose columns have names of their own.
+        InputError: it is nothing that a registry keeps, or damaged.
+    """
+    text = data.removeprefix(_BOM).lstrip()
+    if text.startswith(_PEM):
+        return [_key(text, data, name)]
+    if text.startswith(b"{"):
+        return [Entry(_json_kind(data, name), data, name)]
+    if Path(name).suffix.lower() in TABLES:
+        return [_run(data, name)]
+    return _of_toml(data, name)
+
+
+def checked(entry: Entry) -> Entry:
+    """The entry, if it is a calibration one that every command accepts."""
+    if entry.kind == "calibration":
+        documents.decoded(entry.data, entry.name)
+    return entry
+
+
+def _key(text: bytes, data: bytes, name: str) -> Entry:
+    if b"PRIVATE" in text[:64]:
+        raise InputError(
+            f"{name}: a private key is for its owner alone; a registry keeps the public one. Add that."
+        )
+    return Entry("public-key", data, name)
+
+
+def _json_kind(data: bytes, name: str) -> str:
+    """The kind of a JSON document."""
+    try:
+        fields = msgspec.json.decode(data, type=dict[str, Any])
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise InputError(f"{name}: it is damaged ({error}). Write it again.") from None
+    kinds = {"quantity": "standard", "function": "person"}
+    kind = COMMANDS_KEPT.get(str(fields.get("command"))) or next(
+        (kind for key, kind in kinds.items() if key in fields), ""
+    )
+    if not kind:
+        raise InputError(f"{name}: {_UNKNOWN}")
+    return kind
+
+
+def _run(data: bytes, name: str) -> Entry:
+    """A table of readings, and whose they are where it says so."""
+    try:
+        table = tables.parsed(data, name)
+    except InputError as error:
+        raise UnlikeRunError(str(error), Entry("run", data, name)) from None
+    serials = runs.serials(table.metadata, tables.labels(table, "serial"))
+    entry = Entry("run", data, name, serials[0] if len(serials) == 1 else None)
+    if missing := {*CHANNELS["accelerometer"]} - {*table.columns}:
+        columns = ", ".join(sorted(missing))
+        raise UnlikeRunError(f"{name}: the columns of a run are missing ({columns}).", entry)
+    return entry
+
+
+def _of_toml(data: bytes, name: str) -> list[Entry]:
+    """A tool profile, limits or a laboratory, with the people and standards that it names."""
+    try:
+        fields = tomllib.loads(data.removeprefix(_BOM).decode())
+    except (ValueError, RecursionError):
+        raise InputError(f"{name}: {_UNKNOWN}") from None
+    try:
+        kind = _toml_kind(fields, data, name)
+        people = [fields[key] for key in PEOPLE if key in fields]
+        standards = msgspec.convert(fields.get("standards", []), list[MeasurementStandard])
+    except (msgspec.ValidationError, TypeError) as error:
+        raise InputError(f"{name}: {error}. Correct the file.") from None
+    derived = [("person", {"function": "", **each}) for each in people]
+    derived += [("standard", msgspec.to_builtins(each)) for each in standards]
+    return [
+        Entry(kind, data, name),
+        *(Entry(kind, canonical(about), f"{about['name']}.json") for kind, about in derived),
+    ]
+
+
+def _toml_kind(fields: Mapping[str, Any], data: bytes, name: str) -> str:
+    if {"spread", "error"} & {*fields}:
+        return "limits"
+    if {*LABORATORY_KEYS} & {*fields}:
+        return "laboratory"
+    if {"accelerometer", "magnetometer"} & {*fields}:
+        decoded_profile(data.removeprefix(_BOM), name)
+        return "profile"
+    raise InputError(f"{name}: {_UNKNOWN}")

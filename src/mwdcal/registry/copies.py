@@ -1,0 +1,76 @@
+"""Backup and restore: all rows of one state of a registry into another, which must be empty.
+
+A backup is a registry in a SQLite file, whichever database it is of.
+"""
+
+from __future__ import annotations
+
+import os
+
+import sqlalchemy as sa
+
+from mwdcal.errors import FitError
+from mwdcal.files.formats import atomic
+from mwdcal.registry.checking import check
+from mwdcal.registry.database import chain, migrating
+from mwdcal.registry.database.connections import ROWS_AT_ONCE, connect
+from mwdcal.registry.database.models import metadata
+from mwdcal.registry.store import Registry, open_registry, person
+
+
+def backup(registry: Registry, path: str | os.PathLike[str]) -> str:
+    """Write a backup while others go on writing; the hash of its newest event.
+
+    The file appears whole or not at all. It holds every write that was acknowledged before the call.
+    """
+    with atomic.replacing(path) as stream:
+        target = connect(stream.name, new=True, shared=False)
+        try:
+            with registry.reading() as source, target.writing() as sink:
+                migrating.create_tables(sink, str(path))
+                _copy(source, sink)
+                _, head = chain.head(sink)
+        finally:
+            target.engine.dispose()
+    return head
+
+
+def restore(path: str | os.PathLike[str], database: str | os.PathLike[str], actor: str) -> str:
+    """Fill an empty database, or a new file, from a backup; the hash of the backup's newest event.
+
+    The restoration is an event in the new history. Both are checked, the backup before.
+
+    Raises:
+        FitError: the backup was altered; nothing is restored.
+        InputError: the database is not empty, or either cannot be opened.
+    """
+    who, target = person(actor), connect(database, new=True)
+    try:
+        with open_registry(path) as source:
+            _refuse_altered(source)
+            with source.reading() as rows, target.writing() as sink:
+                migrating.create_tables(sink, target.name)
+                _copy(rows, sink)
+                _, head = chain.head(sink)
+                chain.append_one(sink, who, "restore", "registry", head)
+        _refuse_altered(Registry(target))
+    finally:
+        target.engine.dispose()
+    return head
+
+
+def _copy(source: sa.Connection, sink: sa.Connection) -> None:
+    for table in metadata.sorted_tables:
+        options = {"stream_results": True, "yield_per": ROWS_AT_ONCE}
+        for rows in (
+            source.execute(sa.select(table), execution_options=options).mappings().partitions()
+        ):
+            sink.execute(sa.insert(table), [dict(row) for row in rows])
+
+
+def _refuse_altered(registry: Registry) -> None:
+    problems = check(registry)
+    if problems:
+        raise FitError(
+            f"{registry.name}: it was altered or is damaged ({problems[0].text}). Use another backup."
+        )

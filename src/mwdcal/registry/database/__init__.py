@@ -1,0 +1,1 @@
+"""The registry's database: connections, tables and their migrations, and the chain of its history."""

@@ -1,0 +1,181 @@
+"""Connections to SQLite and PostgreSQL, transactions, and errors of either in words."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import sqlite3
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import sqlalchemy as sa
+
+from mwdcal.errors import InputError
+
+ROWS_AT_ONCE = 100
+"""Rows of a table that are in memory at once."""
+LONGEST_WAIT = 60.0
+"""Seconds for which a writer waits for its turn."""
+_LOCK = 0x6D776463616C
+"""The key of PostgreSQL's advisory lock that lets one writer in at a time."""
+_URL = re.compile(r"[A-Za-z][A-Za-z0-9+]+://")
+_WHAT_TO_DO = {
+    "locked": "Try again when the programs that write to it have ended.",
+    "full": "Make room on the disk; nothing of the last change was kept.",
+    "readonly": "Give yourself the right to write to the file and its folder, or copy it elsewhere.",
+    "read-only": "Give yourself the right to write to it.",
+    "unable to open": "Give yourself the right to write to the file and its folder, or copy it elsewhere.",
+    "malformed": "Restore it from a backup.",
+    "not a database": "Name a registry that mwdcal made.",
+    "disk i/o error": "Check the disk; SQLite needs a local one, or use PostgreSQL.",
+    "password": "Correct the user and the password in the URL.",
+}
+
+
+@dataclass(frozen=True)
+class Database:
+    """A database by the name that messages have for it, without password; `file` is that of SQLite.
+
+    `shared`: several programs will use it at once, for which SQLite keeps a second file beside it.
+    """
+
+    name: str
+    engine: sa.Engine
+    file: Path | None = None
+    shared: bool = True
+
+    @contextlib.contextmanager
+    def reading(self) -> Iterator[sa.Connection]:
+        """A transaction that sees one state of the database, whatever is written meanwhile."""
+        options = {} if self.file else {"isolation_level": "REPEATABLE READ"}
+        with explained(self), self.engine.connect() as plain:
+            connection = plain.execution_options(**options)
+            with connection.begin():
+                yield connection
+
+    @contextlib.contextmanager
+    def writing(self) -> Iterator[sa.Connection]:
+        """A transaction of the only writer: on the disk when the block ends, or without effect."""
+        with explained(self), self.engine.connect() as plain:
+            if self.file and self.shared:
+                _log_ahead(plain)
+            connection = plain.execution_options(mwdcal_writing=True)
+            with connection.begin():
+                if self.file is None:
+                    connection.execute(sa.text(f"SELECT pg_advisory_xact_lock({_LOCK})"))
+                yield connection
+
+
+def _log_ahead(connection: sa.Connection) -> None:
+    """Have SQLite write ahead into a log, so that readers and the writer do not wait for each other."""
+    with contextlib.suppress(sqlite3.Error):  # not on every disk; then they wait
+        connection.connection.cursor().execute("PRAGMA journal_mode=WAL")
+
+
+def _wait_for_the_disk(connection: Any, _record: object) -> None:
+    """Let COMMIT return only when the write is durable, where the server is set not to wait."""
+    with connection.cursor() as cursor:
+        cursor.execute("SHOW synchronous_commit")
+        if cursor.fetchone()[0] == "off":
+            cursor.execute("SET synchronous_commit = on")
+    connection.commit()
+
+
+def is_url(database: str | os.PathLike[str]) -> bool:
+    """Whether a database is named by a URL, rather than by the path of a file."""
+    return isinstance(database, str) and _URL.match(database) is not None
+
+
+def connect(database: str | os.PathLike[str], new: bool = False, shared: bool = True) -> Database:
+    """The database behind a path or a URL; a file that does not exist is refused unless `new`."""
+    if not is_url(database):
+        return _sqlite(Path(database), new, shared)
+    url = _parsed(str(database))
+    if url.get_backend_name() == "sqlite":
+        return _sqlite(Path(url.database or ""), new, shared)
+    name = url.set(query={}).render_as_string(hide_password=True)
+    if url.get_backend_name() != "postgresql":
+        raise InputError(
+            f"`database` must be a file or a URL of PostgreSQL; got '{name}'. Correct it."
+        )
+    if find_spec("psycopg") is None:
+        raise InputError(
+            f"{name}: PostgreSQL needs the package psycopg. Install it with: "
+            "pip install 'mwdcal[postgresql]'"
+        )
+    engine = sa.create_engine(url.set(drivername="postgresql+psycopg"), hide_parameters=True)
+    sa.event.listen(engine, "connect", _wait_for_the_disk)
+    return Database(name, engine)
+
+
+def _parsed(text: str) -> sa.URL:
+    try:
+        return sa.make_url(text)
+    except (sa.exc.ArgumentError, ValueError):
+        scheme = text.partition("://")[0]
+        raise InputError(
+            f"`database` must be a URL such as postgresql://user:password@host/name; got one that "
+            f"begins with '{scheme}://' and cannot be read. Correct it."
+        ) from None
+
+
+def _sqlite(path: Path, new: bool, shared: bool) -> Database:
+    """The database in a file."""
+    if path.is_dir():
+        raise InputError(f"{path}: a registry is a file, and this is a folder. Name the file.")
+    if new and not path.absolute().parent.is_dir():
+        raise InputError(f"{path}: its folder does not exist. Create it, or name another.")
+    if not new and not path.is_file():
+        raise InputError(f"{path}: no such file. Check the path, or create the registry.")
+    engine = sa.create_engine(
+        "sqlite://", creator=partial(_opened, path, new), poolclass=sa.QueuePool
+    )
+    sa.event.listen(engine, "begin", _begin)
+    return Database(str(path), engine, path, shared)
+
+
+def _opened(path: Path, new: bool) -> sqlite3.Connection:
+    mode = "rwc" if new else "rw"
+    connection = sqlite3.connect(
+        f"{path.absolute().as_uri()}?mode={mode}",
+        uri=True,
+        timeout=LONGEST_WAIT,
+        isolation_level=None,
+        check_same_thread=False,
+    )
+    connection.execute("PRAGMA synchronous=EXTRA")
+    connection.execute("PRAGMA foreign_keys=ON")
+    connection.execute("PRAGMA trusted_schema=OFF")
+    return connection
+
+
+def _begin(connection: sa.Connection) -> None:
+    writing = connection.get_execution_options().get("mwdcal_writing")
+    connection.exec_driver_sql("BEGIN IMMEDIATE" if writing else "BEGIN")
+
+
+@contextlib.contextmanager
+def explained(database: Database) -> Iterator[None]:
+    """Turn what the database refuses into one sentence without passwords."""
+    try:
+        yield
+    except (UnicodeError, OverflowError):
+        raise InputError(f"{database.name}: it is damaged. Restore it from a backup.") from None
+    except (sa.exc.SQLAlchemyError, sqlite3.Error) as error:
+        raise InputError(f"{database.name}: {sentence(error, database)}") from None
+
+
+def sentence(error: Exception, database: Database) -> str:
+    """What a database refused, and what to do about it."""
+    lines = str(getattr(error, "orig", None) or error).strip().splitlines()
+    text = lines[0].strip() if lines else type(error).__name__
+    password = database.engine.url.password
+    if password:
+        text = text.replace(str(password), "***")
+    advice = (advice for word, advice in _WHAT_TO_DO.items() if word in text.lower())
+    return f"{text.rstrip('.')}. {next(advice, 'Check the database.')}"

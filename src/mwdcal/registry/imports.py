@@ -1,0 +1,216 @@
+"""Files and folders into a registry: portions of work for any worker, and what became of each file."""
+
+from __future__ import annotations
+
+import pickle
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+from msgspec.structs import replace
+
+from mwdcal.errors import InputError, MwdcalError
+from mwdcal.files.formats import members
+from mwdcal.files.formats.folders import visible_files
+from mwdcal.registry import contents
+from mwdcal.registry.exports import read_manifest
+from mwdcal.registry.facts import content_address
+from mwdcal.registry.queries import records_page
+from mwdcal.registry.store import Draft, Entry, Registry, draft
+
+FILES_AT_ONCE = 50
+"""Files of a portion."""
+RECORDS_AT_ONCE = 1000
+"""Records that are added in one transaction."""
+COUNTS = ("new", "known", "refused")
+
+
+class Source(NamedTuple):
+    """A file to add, or a row group of the table of a fleet; of an export, what its manifest says of it."""
+
+    path: Path
+    group: int | None = None
+    kind: str = ""
+    name: str = ""
+    serial: str | None = None
+    sha256: str = ""
+    reason: str | None = None
+
+
+@dataclass
+class Prepared:
+    """What a source holds: drafts of records, or a `doubtful` one of a table that may be a run.
+
+    `problems` say what is wrong.
+    """
+
+    source: Source
+    drafts: list[Draft] = field(default_factory=list)
+    doubtful: Draft | None = None
+    problems: list[str] = field(default_factory=list)
+
+
+class FileResult(msgspec.Struct, frozen=True, kw_only=True):
+    """What became of a file: how many records are new, known already, or refused; and why."""
+
+    file: str
+    kind: str
+    new: int = 0
+    known: int = 0
+    refused: int = 0
+    message: str = ""
+
+
+def sources(paths: Iterable[Path]) -> list[Source]:
+    """What there is to add at some paths: files, and all files of folders; row groups of fleets by themselves.
+
+    Raises:
+        InputError: a path at which there is nothing, or an export with a damaged manifest.
+    """
+    result: dict[tuple[Path, int | None], Source] = {}
+    for path in paths:
+        for source in _of_folder(path) if path.is_dir() else _of_file(path):
+            result.setdefault((source.path.resolve(), source.group), source)
+    return [*result.values()]
+
+
+def _of_folder(folder: Path) -> Iterator[Source]:
+    """The files of an export by its manifest, or all visible ones."""
+    manifest = read_manifest(folder)
+    if manifest is None:
+        for file in visible_files(folder):
+            yield from _of_file(file)
+        return
+    for each in manifest.files:
+        about = each.kind, each.name, each.serial, each.sha256, each.reason
+        yield Source(folder / each.path, None, *about)
+
+
+def _of_file(file: Path) -> Iterator[Source]:
+    """A file, or the row groups of the table of a fleet."""
+    if not file.exists():
+        raise InputError(f"'{file}': no such file. Check the name and the folder.")
+    groups: Iterable[int | None] = [None]
+    with suppress(InputError):  # what cannot be read is reported where it is read
+        groups = members.groups(file) if contents.is_fleet(file) else groups
+    yield from (Source(file, group) for group in groups)
+
+
+def portions(whole: Sequence[Source]) -> list[Sequence[Source]]:
+    """Sources in parts that are worth a worker: row groups alone, files some at a time."""
+    groups = [[source] for source in whole if source.group is not None]
+    files = [source for source in whole if source.group is None]
+    some = [files[i : i + FILES_AT_ONCE] for i in range(0, len(files), FILES_AT_ONCE)]
+    return [*groups, *some]
+
+
+def solve(portion: Sequence[Source]) -> bytes:
+    """What a portion holds, for another process: a list of `Prepared`."""
+    return pickle.dumps([prepared(source) for source in portion])
+
+
+def prepared(source: Source) -> Prepared:
+    """What a source holds; what is wrong with it is data."""
+    result = Prepared(source)
+    try:
+        entries = _entries(source)
+    except contents.UnlikeRunError as error:
+        result.doubtful = draft(error.entry)
+        result.problems.append(str(error))
+        return result
+    except MwdcalError as error:
+        result.problems.append(str(error))
+        return result
+    for entry in entries:
+        try:
+            result.drafts.append(draft(contents.checked(entry)))
+        except MwdcalError as error:
+            result.problems.append(str(error))
+    return result
+
+
+def _entries(source: Source) -> Iterable[Entry]:
+    """The records that a source is said, or seen, to be."""
+    if source.group is not None:
+        return contents.of_fleet(source.path, source.group)
+    data = contents.content(source.path)
+    if not source.kind:
+        return contents.of_bytes(data, source.path.name)
+    if content_address(data) != source.sha256:
+        raise InputError(f"{source.path.name}: it was changed since it was exported. Export again.")
+    return [Entry(source.kind, data, source.name, source.serial)]
+
+
+class Adding:
+    """Files on their way into a registry, some hundred records in a transaction.
+
+    `results` say what became of each file, `new` how many records of each kind are new, `simulated` whether one of
+    the files rests on simulated data.
+    """
+
+    def __init__(self, registry: Registry, actor: str) -> None:
+        self._registry, self._actor = registry, actor
+        self._waiting: list[tuple[Source, Draft]] = []
+        self._doubtful: list[Prepared] = []
+        self._runs: set[str] = set()
+        self._files: dict[Path, FileResult] = {}
+        self.new: Counter[str] = Counter()
+        self.simulated = False
+
+    @property
+    def results(self) -> list[FileResult]:
+        """What became of each file."""
+        return [*self._files.values()]
+
+    def take(self, each: Prepared) -> None:
+        """Add what a source holds, soon."""
+        if each.doubtful:
+            self._doubtful.append(each)
+            return
+        for message in each.problems:
+            self._count(each.source, refused=1, message=message)
+        for one in each.drafts:
+            self._waiting.append((each.source, one))
+            self.simulated = self.simulated or bool(one["simulated"])
+            if one["run"]:
+                self._runs.add(one["run"])
+            if len(self._waiting) == RECORDS_AT_ONCE:
+                self._add()
+
+    def finish(self) -> None:
+        """Add what waits, and tables that turned out to be runs."""
+        for each in self._doubtful:
+            if each.doubtful and self._is_run(each.doubtful["sha256"]):
+                self._waiting.append((each.source, each.doubtful))
+            else:
+                self._count(each.source, refused=1, message=each.problems[0])
+        self._add()
+
+    def _is_run(self, sha256: str) -> bool:
+        """Whether a calibration was made of a file."""
+        return sha256 in self._runs or bool(
+            records_page(self._registry, "calibration", {"run": sha256}, limit=1).rows
+        )
+
+    def _add(self) -> None:
+        drafts = [one for _, one in self._waiting]
+        for (source, _), added in zip(
+            self._waiting, self._registry.insert(drafts, self._actor), strict=True
+        ):
+            self._count(source, added.kind, new=int(added.new), known=int(not added.new))
+            self.new[added.kind] += added.new
+            if added.new and source.reason:
+                self._registry.withdraw(added.number, source.reason, self._actor)
+        self._waiting = []
+
+    def _count(self, source: Source, kind: str = "", message: str = "", **more: int) -> None:
+        file = str(source.path)
+        before = self._files.get(source.path) or FileResult(file=file, kind=kind)
+        counts = {name: getattr(before, name) + more.get(name, 0) for name in COUNTS}
+        self._files[source.path] = replace(
+            before, kind=before.kind or kind, message=before.message or message, **counts
+        )

@@ -1,0 +1,177 @@
+"""What lists and pages ask of a registry. Rows are mappings with the columns of `database.models`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple
+
+import sqlalchemy as sa
+
+from mwdcal.registry.database.models import history, objects, records, tools, withdrawals
+from mwdcal.registry.store import Registry, unpacked
+
+Row = Mapping[str, Any]
+_RECORD = [column.name for column in records.columns]
+TOOL_ORDERS = ("serial", "type", "next_due", "calibrated")
+"""Columns by which tools can be sorted."""
+
+
+class Page(NamedTuple):
+    """A part of a list, and how many rows the whole has."""
+
+    total: int
+    rows: list[Row]
+
+
+def tools_page(
+    registry: Registry,
+    search: str = "",
+    where: Mapping[str, object] | None = None,
+    due_before: str | None = None,
+    order: str = "serial",
+    descending: bool = False,
+    offset: int = 0,
+    limit: int = 50,
+) -> Page:
+    """Tools whose serial or type contains `search`, whose columns equal `where`, due before a date.
+
+    Columns: those of `tools`. Rows without a value in the column `order` come last.
+    """
+    query = sa.select(tools)
+    if search:
+        query = query.where(sa.or_(*(_contains(c, search) for c in (tools.c.serial, tools.c.type))))
+    for name, value in (where or {}).items():
+        query = query.where(tools.c[name] == value)
+    if due_before:
+        query = query.where(tools.c.next_due < due_before)
+    by = tools.c[order]
+    keys = [by.desc() if descending else by.asc(), tools.c.serial]
+    return _page(registry, query, [by.is_(None), *keys] if by.nullable else keys, offset, limit)
+
+
+def _contains(column: sa.Column[Any], text: str) -> sa.ColumnElement[bool]:
+    return sa.func.lower(column).contains(text.lower(), autoescape=True)
+
+
+def _page(
+    registry: Registry, query: sa.Select[Any], order: list[Any], offset: int, limit: int
+) -> Page:
+    with registry.reading() as connection:
+        total = connection.scalar(sa.select(sa.func.count()).select_from(query.subquery())) or 0
+        rows = connection.execute(query.order_by(*order).offset(offset).limit(limit)).mappings()
+        return Page(total, [dict(row) for row in rows])
+
+
+def with_events() -> sa.Select[Any]:
+    """Records with who added them when (`added`, `actor`), and why they were withdrawn, if they were."""
+    return (
+        sa.select(
+            records,
+            history.c.time.label("added"),
+            history.c.actor,
+            withdrawals.c.number.label("withdrawn"),
+            withdrawals.c.reason,
+        )
+        .join(history, history.c.number == records.c.number)
+        .outerjoin(withdrawals, withdrawals.c.record == records.c.number)
+    )
+
+
+def past(registry: Registry, serial: str, offset: int = 0, limit: int = 200) -> Page:
+    """All records of a serial in the order in which they were added.
+
+    Columns: those of `records`, with `added` (time), `actor`, `withdrawn` (number of that event) and `reason`.
+    """
+    query = with_events().where(records.c.serial == serial)
+    return _page(registry, query, [records.c.number], offset, limit)
+
+
+def records_page(
+    registry: Registry,
+    kind: str,
+    where: Mapping[str, object] | None = None,
+    newest_first: bool = True,
+    offset: int = 0,
+    limit: int = 50,
+) -> Page:
+    """Records of a kind whose columns equal `where`, in order of the time they state; columns as of `past`."""
+    query = with_events().where(records.c.kind == kind)
+    for name, value in (where or {}).items():
+        query = query.where(records.c[name] == value)
+    keys = [records.c.time, records.c.number]
+    return _page(registry, query, [k.desc() if newest_first else k for k in keys], offset, limit)
+
+
+def record(registry: Registry, number: int) -> Row | None:
+    """The record of a number, with the columns of `past`; None where there is none."""
+    with registry.reading() as connection:
+        row = connection.execute(with_events().where(records.c.number == number)).mappings().first()
+        return dict(row) if row else None
+
+
+def calibrations(registry: Registry, serial: str) -> Iterator[tuple[Row, bytes]]:
+    """The calibrations of a tool that were not withdrawn, oldest first, each with its file's bytes."""
+    query = (
+        sa.select(records, objects.c.data, objects.c.size)
+        .join(objects, objects.c.sha256 == records.c.sha256)
+        .outerjoin(withdrawals, withdrawals.c.record == records.c.number)
+        .where(records.c.serial == serial, records.c.kind == "calibration")
+        .where(withdrawals.c.number.is_(None))
+        .order_by(records.c.time, records.c.number)
+    )
+    with registry.reading() as connection:
+        for row in connection.execute(query).mappings():
+            about = {name: row[name] for name in _RECORD}
+            yield about, unpacked(row["data"], row["size"])
+
+
+def latest_calibration(registry: Registry, serial: str) -> tuple[Row, bytes] | None:
+    """The newest calibration of a tool by its time, and its file's bytes; None where there is none."""
+    query = (
+        sa.select(records, objects.c.data, objects.c.size)
+        .join(tools, tools.c.latest == records.c.number)
+        .join(objects, objects.c.sha256 == records.c.sha256)
+        .where(tools.c.serial == serial)
+    )
+    with registry.reading() as connection:
+        row = connection.execute(query).mappings().first()
+    if row is None:
+        return None
+    return {name: row[name] for name in _RECORD}, unpacked(row["data"], row["size"])
+
+
+def due(registry: Registry, before: str, offset: int = 0, limit: int = 50) -> Page:
+    """Tools and standards whose next calibration is due before a date, the most overdue first.
+
+    Columns: `kind` (tool or standard), `serial`, `type`, `label`, `next_due`.
+    """
+    of_tools = sa.select(
+        sa.literal("tool").label("kind"),
+        *(tools.c.serial, tools.c.type, sa.null().label("label"), tools.c.next_due),
+    ).where(tools.c.next_due < before)
+    at = records.c
+    of_standards = (
+        sa.select(at.kind, at.serial, at.type, at.label, at.next_due)
+        .outerjoin(withdrawals, withdrawals.c.record == at.number)
+        .where(at.kind == "standard", at.next_due < before, withdrawals.c.number.is_(None))
+    )
+    both = sa.union_all(of_tools, of_standards).subquery()
+    return _page(
+        registry, sa.select(both), [both.c.next_due, both.c.kind, both.c.serial], offset, limit
+    )
+
+
+def events(registry: Registry, offset: int = 0, limit: int = 50) -> Page:
+    """Events of the history, newest first; columns: those of `history`."""
+    return _page(registry, sa.select(history), [history.c.number.desc()], offset, limit)
+
+
+def counts(registry: Registry) -> dict[str, int]:
+    """How many records there are of each kind, and how many `tools`, `events` and `withdrawals`."""
+    kinds = sa.select(records.c.kind, sa.func.count()).group_by(records.c.kind)
+    rest = {"tools": tools, "events": history, "withdrawals": withdrawals}
+    with registry.reading() as connection:
+        result = {row[0]: int(row[1]) for row in connection.execute(kinds)}
+        for name, table in rest.items():
+            result[name] = connection.scalar(sa.select(sa.func.count()).select_from(table)) or 0
+    return result

@@ -1,0 +1,280 @@
+"""`Registry`: documents into the database, in transactions that are durable or without effect."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import zlib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from datetime import datetime
+from typing import Any, NamedTuple
+
+import msgspec
+import sqlalchemy as sa
+
+from mwdcal.errors import InputError
+from mwdcal.registry.database import chain, schema
+from mwdcal.registry.database.connections import Database, connect
+from mwdcal.registry.database.models import objects, records, withdrawals
+from mwdcal.registry.database.tools import TOOL_KINDS, portions, refresh
+from mwdcal.registry.facts import FACTS_VERSION, LONGEST_NAME, content_address, facts, plain
+
+LARGEST_OBJECT = 500_000_000
+"""Bytes of the largest file that a registry takes."""
+Draft = dict[str, Any]
+"""What is inserted of an entry: see `draft`."""
+
+
+class Entry(NamedTuple):
+    """A file for the registry: its kind, its bytes as they are, and its name.
+
+    `serial` is that of the tool, where the file itself does not state it.
+    """
+
+    kind: str
+    data: bytes
+    name: str
+    serial: str | None = None
+
+
+class Added(NamedTuple):
+    """What became of an entry: the record of it, and whether it is new."""
+
+    number: int
+    kind: str
+    sha256: str
+    serial: str | None
+    new: bool
+
+
+class Registry:
+    """An open registry. Each call of a method is one transaction; several threads may share one."""
+
+    def __init__(self, database: Database) -> None:
+        self.database = database
+
+    @property
+    def name(self) -> str:
+        """What messages call it: its file, or its URL without password."""
+        return self.database.name
+
+    @contextlib.contextmanager
+    def reading(self) -> Iterator[sa.Connection]:
+        """A transaction that sees one state of the registry."""
+        with self.database.reading() as connection:
+            schema.check_version(connection, self.name)
+            yield connection
+
+    @contextlib.contextmanager
+    def writing(self) -> Iterator[sa.Connection]:
+        """A transaction of the only writer, durable when the block ends."""
+        with self.database.writing() as connection:
+            schema.check_version(connection, self.name)
+            yield connection
+
+    def add(
+        self, entries: Iterable[Entry], actor: str, when: datetime | None = None
+    ) -> list[Added]:
+        """Add files, all or none; what is there already is not added again.
+
+        `actor` is who adds them, `when` the time that the history states: now, if None. What the call
+        returns is on the disk. The files, compressed, are in memory at once.
+
+        Raises:
+            InputError: a file is not of its kind, its serial is another than the entry's, or the
+                database refuses.
+        """
+        return self.insert([draft(entry) for entry in entries], actor, when)
+
+    def insert(
+        self, drafts: Sequence[Draft], actor: str, when: datetime | None = None
+    ) -> list[Added]:
+        """The same with the drafts of entries, which other processes may have made."""
+        who, time = person(actor), chain.instant(when)
+        with self.writing() as connection:
+            return _insert(connection, drafts, who, time)
+
+    def withdraw(self, number: int, reason: str, actor: str, when: datetime | None = None) -> None:
+        """Mark a record as withdrawn for a reason; it stays, and lists no longer count it.
+
+        Raises:
+            InputError: there is no such record, or it is withdrawn already.
+        """
+        who, why, time = person(actor), plain(reason).strip(), chain.instant(when)
+        if not why:
+            raise InputError("`reason` must not be empty. Say why the record is withdrawn.")
+        with self.writing() as connection:
+            record = connection.execute(
+                sa.select(records).where(records.c.number == number)
+            ).one_or_none()
+            if record is None:
+                raise InputError(f"{self.name}: there is no record {number}. Check the number.")
+            before = sa.select(withdrawals.c.number).where(withdrawals.c.record == number)
+            if connection.scalar(before) is not None:
+                raise InputError(f"{self.name}: record {number} is withdrawn already.")
+            newest, previous = chain.head(connection)
+            row = {"number": newest + 1, "record": number, "reason": why}
+            connection.execute(sa.insert(withdrawals), row)
+            event = _event(row, record._mapping, who, time, "withdraw", chain.digest(row))
+            chain.append(connection, previous, [event])
+            _refresh_tools(connection, [record._mapping])
+
+    def content(self, sha256: str) -> bytes:
+        """The bytes of an object, as they were added.
+
+        Raises:
+            InputError: there is no such object.
+        """
+        with self.reading() as connection:
+            row = connection.execute(
+                sa.select(objects).where(objects.c.sha256 == sha256)
+            ).one_or_none()
+        if row is None:
+            raise InputError(f"{self.name}: there is no object {sha256}. Check the SHA-256.")
+        return unpacked(row.data, row.size)
+
+    def head(self) -> tuple[int, str]:
+        """Number and hash of the newest event of the history."""
+        with self.reading() as connection:
+            return chain.head(connection)
+
+
+def person(actor: str) -> str:
+    """The name of who acts, as the history states it."""
+    name = " ".join(plain(actor).split())
+    if not name or len(name) > LONGEST_NAME:
+        raise InputError(
+            f"`actor` must be a name of 1 to {LONGEST_NAME} characters; got {len(name)}. Say who acts."
+        )
+    return name
+
+
+def unpacked(data: bytes, size: int) -> bytes:
+    """An object's bytes from those stored; at most one more than `size` of them.
+
+    Raises:
+        InputError: they are damaged.
+    """
+    unpacker = zlib.decompressobj()
+    try:
+        content = unpacker.decompress(data, size + 1)
+    except (zlib.error, TypeError, ValueError, OverflowError):
+        content = b""
+    if len(content) != size or not unpacker.eof or unpacker.unused_data:
+        raise InputError(
+            "a file in the registry is damaged. Check the registry, and restore it from a backup."
+        )
+    return content
+
+
+def draft(entry: Entry) -> Draft:
+    """The rows of an entry, without their number: columns of a record, and `object`."""
+    if len(entry.data) > LARGEST_OBJECT:
+        raise InputError(
+            f"{entry.name}: a registry takes files of at most {LARGEST_OBJECT:,} bytes; got "
+            f"{len(entry.data):,}. Split the file."
+        )
+    about = facts(entry.kind, entry.data, entry.name)
+    serial = plain(entry.serial) if entry.serial else None
+    if serial and about.serial and serial != about.serial:
+        raise InputError(
+            f"{entry.name}: it is of the tool {about.serial!r}, not {serial!r}. Correct `serial`."
+        )
+    address = content_address(entry.data)
+    stored = {"sha256": address, "size": len(entry.data), "data": zlib.compress(entry.data, 6)}
+    return {
+        "kind": entry.kind,
+        "sha256": address,
+        "name": plain(entry.name)[-LONGEST_NAME:],
+        **msgspec.structs.asdict(about),
+        "serial": about.serial or serial,
+        "facts_version": FACTS_VERSION,
+        "object": stored,
+    }
+
+
+def record_digest(record: Mapping[str, Any], stored: Mapping[str, Any] | None) -> str:
+    """The digest of a record, and of the object that came with it, whose bytes it covers as stored."""
+    if stored is None:
+        return chain.digest(record)
+    packed = {**stored, "data": content_address(stored["data"])}
+    return chain.digest({**record, "object": packed})
+
+
+def _insert(connection: sa.Connection, drafts: Sequence[Draft], who: str, time: str) -> list[Added]:
+    """Insert what is new, with its events; what became of each."""
+    known = _known(connection, [draft["sha256"] for draft in drafts])
+    stored = {sha256 for sha256, _ in known}
+    number, previous = chain.head(connection)
+    rows, packed, events, result = [], [], [], []
+    for draft in drafts:
+        row = {name: value for name, value in draft.items() if name != "object"}
+        key = (row["sha256"], row["kind"])
+        new = key not in known
+        if new:
+            number += 1
+            known[key] = (number, row["serial"])
+            row["number"] = number
+            object_row = None if row["sha256"] in stored else {"number": number, **draft["object"]}
+            if object_row:
+                packed.append(object_row)
+                stored.add(row["sha256"])
+            rows.append(row)
+            events.append(_event(row, row, who, time, "add", record_digest(row, object_row)))
+        at, serial = known[key]
+        result.append(Added(at, row["kind"], row["sha256"], serial, new))
+    for table, values in ((objects, packed), (records, rows)):
+        if values:
+            connection.execute(sa.insert(table), values)
+    chain.append(connection, previous, events)
+    _refresh_tools(connection, rows)
+    return result
+
+
+def _known(
+    connection: sa.Connection, addresses: Sequence[str]
+) -> dict[tuple[str, str], tuple[int, str | None]]:
+    """Number and serial of the records there are, by SHA-256 and kind."""
+    at = records.c
+    query = sa.select(at.sha256, at.kind, at.number, at.serial)
+    return {
+        (row.sha256, row.kind): (row.number, row.serial)
+        for portion in portions(addresses)
+        for row in connection.execute(query.where(at.sha256.in_(portion)))
+    }
+
+
+def _event(row: Any, record: Any, who: str, time: str, action: str, digest: str) -> dict[str, Any]:
+    return {
+        "number": row["number"],
+        "time": time,
+        "actor": who,
+        "action": action,
+        "kind": record["kind"],
+        "subject": record["serial"] or record["label"] or record["name"],
+        "sha256": record["sha256"],
+        "row_sha256": digest,
+    }
+
+
+def _refresh_tools(connection: sa.Connection, rows: Iterable[Any]) -> None:
+    refresh(
+        connection, {row["serial"] for row in rows if row["serial"] and row["kind"] in TOOL_KINDS}
+    )
+
+
+@contextlib.contextmanager
+def open_registry(database: str | os.PathLike[str]) -> Iterator[Registry]:
+    """A registry by the path of its file or its URL, closed when the block ends.
+
+    Raises:
+        InputError: there is none, it is not a registry, or its schema is older or newer than this program's.
+    """
+    target = connect(database)
+    try:
+        with target.reading() as connection:
+            schema.known_version(connection, target.name)
+            schema.check_version(connection, target.name)
+        yield Registry(target)
+    finally:
+        target.engine.dispose()
