@@ -25,6 +25,7 @@ INPUTS = {
     "registry add": (),
     "registry backup": (),
     "registry check": (),
+    "registry drift": (),
     "registry export": (),
     "registry get": (),
     "registry history": (),

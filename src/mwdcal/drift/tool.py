@@ -78,15 +78,16 @@ class MeasuredTool:
 
 def measured(
     serial: str, calibrations: Sequence[Calibration], tests: Sequence[ServiceTest] = (),
-    level: float = LEVEL, digests: Mapping[str, str] | None = None,
+    level: float = LEVEL, digests: Mapping[str, str] | None = None, tested: bool = True,
 ) -> MeasuredTool:  # fmt: skip
     """The change test and the growth of one tool.
 
     `digests`: the SHA-256 of the file of each calibration by that of its contents, by which tests may name it.
+    Not `tested`: no change test, as of a peer.
     """
     tool = tool_history(calibrations)
     names, history = tool.history.names, tool.history
-    test = change_test(history, level) if len(tool.compared) > 1 else None
+    test = change_test(history, level) if tested and len(tool.compared) > 1 else None
     places = {group: group_places(names, *group) for group in GROUPS}
     increments = {g: Increments.of(history, some) for g, some in places.items() if some}
     of_place = {place: group for group, some in places.items() for place in some}

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
 
-from mwdcal.app.screens.numbers import measured, number, unit
+from mwdcal.app.drift import RegistryDrift
+from mwdcal.app.envelope import enveloped
+from mwdcal.app.screens.numbers import measured, number, unit, written
 from mwdcal.app.text import chance, one_line, plural, table
 from mwdcal.calibration.readings import SIMULATED
 from mwdcal.drift.document import DueDate, FleetDrift, FleetTool, ServiceRow, ToolDrift, WalkRate
@@ -112,6 +116,19 @@ def tool_screen(drift: ToolDrift) -> str:
             parts.append("\n".join(filter(None, [title, table(rows, header)])))
     notes = [f"{c.date} {note}" for c in drift.calibrations for note in c.notes]
     return "\n\n".join([*parts, *(["\n".join(notes)] if notes else [])])
+
+
+def document(result: RegistryDrift) -> dict[str, Any]:
+    """The drift for machines."""
+    about = result.tool or result.fleet
+    stated = {"serial": result.tool.serial if result.tool else "", "simulated": about.simulated}
+    return enveloped("registry drift", result, stated)
+
+
+def text(result: RegistryDrift, page: Path | None) -> str:
+    """The drift for people."""
+    shown = tool_screen(result.tool) if result.tool else fleet_screen(result.fleet)
+    return "\n\n".join(filter(None, [shown, written(page=page) if page else ""]))
 
 
 def simulated(drift: ToolDrift | FleetDrift) -> list[str]:
