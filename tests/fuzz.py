@@ -62,8 +62,13 @@ SAMPLES = {
     "plans": "plan",
     "measured": "run",
     "reference": "reference",
+    "verification": "verification",
+    "as_found": "verification",
+    "laboratory": "laboratory",
 }
 """The kind of file that each argument or option takes, by its name."""
+DOCUMENTS = ("calibration", "verification")
+"""Kinds of files that are JSON."""
 OUTPUTS = ("output", "report", "plot", "folder", "calibrations", "truth", "html", "msa_html")
 """Arguments and options that name what to write."""
 LIMITS = 'name = "lab"\n[spread]\ninclination_deg = 0.2\nazimuth_deg = 1.5\n'
@@ -149,6 +154,10 @@ def samples(folder: Path) -> dict[str, list[Any]]:
         *("--crs", "EPSG:23031", "--json"),
     )
     assert place.code == 0, place
+    roll = folder / "rolls.csv"
+    tests = [
+        cli_support.mwdcal("verify", folder / f"cal{k}.json", roll, "--json").out for k in (0, 1, 2)
+    ]
     return {
         "run": list(tables.values()),
         "log": [log(4, 4.0, (20, 80, 120)), log(5, 20.0, (20,))],
@@ -158,6 +167,8 @@ def samples(folder: Path) -> dict[str, list[Any]]:
         "limits": [LIMITS, SURVEY_LIMITS],
         "reference": [place.out],
         "effects": [EFFECTS],
+        "verification": tests,
+        "laboratory": [(EXAMPLE / "laboratory.toml").read_text("utf-8")],
         "plan": [PLAN],
     }
 
@@ -526,7 +537,7 @@ def files(r: random.Random, kind: str, sound: dict[str, list[Any]], stem: Path) 
         damaged(r, path)
         return Path(f"{path}#{r.choice(('T0', 'T1', 'T2', 'T9', '', '#', ' T0', '../T0'))}")
     else:
-        path = (document_file if kind == "calibration" else toml_file)(r, sample, stem)
+        path = (document_file if kind in DOCUMENTS else toml_file)(r, sample, stem)
     damaged(r, path)
     return path
 

@@ -25,6 +25,7 @@ from mwdcal.app.screens import (
 )
 from mwdcal.app.screens.surveys import reference, survey
 from mwdcal.calibration.record import DOCUMENT_VERSION, SCHEMA_VERSION, Calibration
+from mwdcal.certificate.document import Certificate
 from mwdcal.faults.diagnosis import Diagnosis
 from mwdcal.use.verification import Verdict
 
@@ -32,6 +33,7 @@ DIALECT = "https://json-schema.org/draft/2020-12/schema"
 CONTENTS: dict[str, type] = {
     "apply": correction.Applied,
     "calibrate": calibration.CalibrationSummary,
+    "certificate": Certificate,
     "compare": comparison.ComparisonSummary,
     "convert": conversion.ConversionSummary,
     "diagnose": Diagnosis,

@@ -33,6 +33,10 @@ SCREENS = {
     "verify-failed": ("verify", "tool.json", "demo/rolltest.csv", "--limits", "tight.toml"),
     "verify-not-rolled": ("verify", "tool.json", "part.csv"),
     "apply": ("apply", "tool.json", "hot.csv", "-o", "made.csv"),
+    "certificate": ("certificate", "dated.json", "--verification", "v.json", "--laboratory",
+                    "demo/laboratory.toml", "--date", "2026-04-01", "--number", "EX-1", "-o", "C.json"),
+    "certificate-failed": ("certificate", "dated.json", "--verification", "failed.json", "--date",
+                           "2026-04-01", "--number", "EX-2"),
     "compare": ("compare", "demo/run.csv", "--tool", "demo/tool.toml"),
     "compare-parameters": ("compare", "demo/run.csv", "--tool", "demo/tool.toml", "--parameters"),
     "convert": ("convert", "tool.json", "--notation", "forward", "--temperature", "90"),
@@ -126,12 +130,24 @@ def prepared(folder):
     changed(demo / "rolltest.csv", folder / "knocked.csv", knocked)
     changed(demo / "surveys.csv", folder / "hot.csv", hot)
     write_csv(folder / "soaks.csv", servo_run(temperatures=(0.0, 40.0, 80.0)))
+    dated(demo, folder)
     limits = 'name = "tight"\n[error]\ninclination_deg = 0.001\nazimuth_deg = 2\n'
     (folder / "tight.toml").write_text(limits, "utf-8")
     (folder / "stand.toml").write_text(
         "[stand]\nazimuth_zero_deg = 0.1\ntilt_deg = 0.05\n", "utf-8"
     )
+    for name, *limits in (("v.json",), ("failed.json", "--limits", folder / "tight.toml")):
+        test = mwdcal("verify", folder / "dated.json", demo / "rolltest.csv", "--json", *limits)
+        (folder / name).write_text(test.out, "utf-8")
     fleet(folder)
+
+
+def dated(demo, folder):
+    """The calibration of the run with a date, which a certificate shows."""
+    run = "# date = 2026-03-15\n" + (demo / "run.csv").read_text("utf-8")
+    (folder / "dated.csv").write_text(run, "utf-8")
+    line = ("calibrate", folder / "dated.csv", "--tool", demo / "tool.toml", "-o")
+    assert mwdcal(*line, folder / "dated.json").code == 0
 
 
 def fleet(folder):

@@ -13,6 +13,7 @@ from mwdcal.calibration.record import DOCUMENT_VERSION, SOFTWARE
 INPUTS = {
     "apply": ("calibration", "readings"),
     "calibrate": ("run", "profile", "prior"),
+    "certificate": (),
     "compare": ("run", "profile"),
     "convert": ("calibration", "run"),
     "diagnose": ("calibration", "readings"),
@@ -39,7 +40,10 @@ INPUTS = {
     "survey": ("calibration", "readings", "reference", "limits"),
     "verify": ("calibration", "run", "limits"),
 }
-"""The files behind the document of each command, whose digests are its keys `…_sha256`."""
+"""The files behind the document of each command, whose digests are its keys `…_sha256`.
+
+A certificate is its own document, and lists them under `files`.
+"""
 
 
 class Envelope(msgspec.Struct, frozen=True, kw_only=True):

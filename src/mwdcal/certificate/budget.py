@@ -178,7 +178,9 @@ def _line(calibration: Calibration, row: BudgetRow) -> BudgetLine:
 def _basis(calibration: Calibration, source: str) -> str:
     """Where the size of a source is known from."""
     if source == NOISE:
-        return "; ".join(f"{t.name}: {t.noise_source}{_scaled(t)}" for t in calibration.triads)
+        each = "; ".join(f"{t.name}: {t.noise_source}{_scaled(t)}" for t in calibration.triads)
+        apart = any(row.source == REPEATABILITY for row in calibration.budget)
+        return each if apart else f"{each}; with the repeatability of the tool during the run"
     if source == REPEATABILITY:
         return "declared in the tool profile; scaled by the residuals"
     if source == SETTINGS:

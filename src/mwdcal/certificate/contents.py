@@ -8,13 +8,14 @@ from __future__ import annotations
 import hashlib
 import re
 from calendar import monthrange
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from datetime import date
+from typing import Any
 
 import msgspec
 from msgspec.structs import replace
 
-from mwdcal.calibration.readings import is_simulated
+from mwdcal.calibration.readings import is_simulated, serial_of
 from mwdcal.calibration.record import SOFTWARE, Calibration, Finding, canonical, rounded
 from mwdcal.certificate.budget import assumed_exact, budget
 from mwdcal.certificate.decisions import When, conformity
@@ -29,6 +30,7 @@ from mwdcal.certificate.document import (
 )
 from mwdcal.certificate.laboratory import Laboratory
 from mwdcal.certificate.methods import method
+from mwdcal.certificate.repeatability import repeatability
 from mwdcal.certificate.tables import conditions, result_tables
 from mwdcal.certificate.traceability import references_in_use, traced
 from mwdcal.errors import InputError
@@ -85,46 +87,57 @@ def certificate(
     day, day_stated = calibrated_on(calibration)
     if day_stated:
         _check_days(day, order, stated)
-    tests, changed = _tests(calibration, order, stated)
-    standards = traced(calibration, stated, day)
+    given: dict[When, Verification | None] = {
+        "as found": order.as_found,
+        "as left": order.verification,
+    }
+    tests, changed = _tests(calibration, order, given, stated)
     contents = Certificate(
         software=SOFTWARE,
-        serial=calibration.tool.get("serial") or None,
+        serial=serial_of(calibration.tool),
         simulated=_simulated(calibration, order),
         number="",
         issued=order.issued.isoformat(),
-        laboratory=stated.laboratory or _party(calibration.tool.get("lab", "")),
-        place=stated.place,
-        customer=_party(order.customer) or stated.customer,
+        **_parties(calibration, order, stated),
         item=_item(calibration, order, stated),
         calibrated=day.isoformat(),
         next_due=_next_due(day, stated),
         method=method(calibration),
         conditions=conditions(calibration, stated),
-        results=result_tables(calibration),
+        results=[*result_tables(calibration), *repeatability(given)],
         budget=budget(calibration),
-        traceability=standards,
+        traceability=traced(calibration, stated, day),
         as_found=tests.get("as found"),
         as_left=tests.get("as left"),
-        measured_by=stated.measured_by or _person(calibration.tool.get("operator", "")),
-        authorised_by=stated.authorised_by,
         statements=_statements(tests),
         findings=[],
         files=list(order.files),
     )
-    findings = [
-        *calibration.change_findings(),
-        *_not_stated(contents, calibration),
-        *([] if day_stated else [Finding(id="date-not-stated", text=DATE_OF_FIT)]),
-        *_overdue(standards, contents.calibrated),
-        *_exact(calibration),
-        *changed,
-        *calibration.findings,
-    ]
+    unstated_day = [] if day_stated else [Finding(id="date-not-stated", text=DATE_OF_FIT)]
+    findings = [*_findings(contents, calibration), *unstated_day, *changed, *calibration.findings]
     whole = rounded(replace(contents, findings=findings))
     number = order.number or _number(whole, stated.number or NUMBER_PATTERN)
     _check_number(number)
     return replace(whole, number=number)
+
+
+def _parties(calibration: Calibration, order: Order, laboratory: Laboratory) -> dict[str, Any]:
+    """Laboratory, customer and people: as the laboratory states them, else as the run does."""
+    return {
+        "laboratory": laboratory.laboratory or _party(calibration.tool.get("lab", "")),
+        "place": laboratory.place,
+        "customer": _party(order.customer) or laboratory.customer,
+        "measured_by": laboratory.measured_by or _person(calibration.tool.get("operator", "")),
+        "authorised_by": laboratory.authorised_by,
+    }
+
+
+def _findings(contents: Certificate, calibration: Calibration) -> Iterator[Finding]:
+    """What the reader should know of the certificate: changes, gaps, overdue standards, exact references."""
+    yield from calibration.change_findings()
+    yield from _not_stated(contents, calibration)
+    yield from _overdue(contents.traceability, contents.calibrated)
+    yield from _exact(calibration)
 
 
 def calibrated_on(calibration: Calibration) -> tuple[date, bool]:
@@ -157,15 +170,14 @@ def _check_number(number: str) -> None:
 
 
 def _tests(
-    calibration: Calibration, order: Order, laboratory: Laboratory
+    calibration: Calibration,
+    order: Order,
+    given: Mapping[When, Verification | None],
+    laboratory: Laboratory,
 ) -> tuple[dict[str, ConformityTest], list[Finding]]:
     """The roll tests by when they were made, and findings about their decisions."""
     tests: dict[str, ConformityTest] = {}
     findings: list[Finding] = []
-    given: dict[When, Verification | None] = {
-        "as found": order.as_found,
-        "as left": order.verification,
-    }
     for when, document in given.items():
         if document is not None:
             _check_test(document, calibration, order)

@@ -17,10 +17,14 @@ CERTIFICATE_VERSION = 1
 
 
 class Party(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A laboratory or a customer: name, lines of the address, and what else identifies it."""
+    """A laboratory or a customer: name, lines of the address, and what else identifies it.
+
+    `country`: ISO 3166-1 code of two capitals, which a digital calibration certificate states.
+    """
 
     name: str
     address: list[str] = []
+    country: str = ""
     contact: str = ""
     accreditation: str = ""
 

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 CONTENTS = {
     "run.csv": "a calibration run of 48 stations",
     "tool.toml": "its tool profile",
+    "laboratory.toml": "what a laboratory states on its certificates",
     "rolltest.csv": "a roll test of the same tool",
     "surveys.csv": "readings to correct",
     "well.csv": "surveys of a well, with measured depths",

@@ -16,15 +16,15 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-def require(what: str, *libraries: str) -> None:
-    """Refuse to draw without the libraries that draw."""
+def require(what: str, *libraries: str, extra: str = "report") -> None:
+    """Refuse to draw without the libraries that draw, which an extra installs."""
     for name in libraries:
         try:
             import_module(name)
         except ImportError as error:
             raise InputError(
-                f"{what} needs {error.name}, which is not installed. Install mwdcal[report]: "
-                "pip install 'mwdcal[report]'"
+                f"{what} needs {error.name}, which is not installed. Install mwdcal[{extra}]: "
+                f"pip install 'mwdcal[{extra}]'"
             ) from None
 
 
@@ -35,6 +35,9 @@ def picture(figure: Figure, suffix: str) -> bytes:
     nothing = {"Software": None} if kind == "png" else {"Date": None, "Creator": None}
     with style():
         figure.savefig(stream, format=kind, dpi=160, metadata=nothing)
+    figure.set_layout_engine(
+        "none"
+    )  # a second layout would start from the first and differ by a hair
     return stream.getvalue()
 
 

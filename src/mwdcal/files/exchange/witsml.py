@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mwdcal.errors import InputError
-from mwdcal.files.exchange import description
+from mwdcal.files.exchange import description, xml
 from mwdcal.files.exchange.description import TableDescription
 from mwdcal.files.exchange.witsml_reader import MOST_ELEMENTS, Station, Trajectory, read_trajectory
 from mwdcal.files.exchange.witsml_schema import (
@@ -68,7 +68,6 @@ _NAMES = {"nameWell": "well", "nameWellbore": "wellbore", "name": "trajectory"}
 _UIDS = {"uidWell": "uid_well", "uidWellbore": "uid_wellbore", "uid": "uid_trajectory"}
 _CARRIED = re.compile(r"witsml ([A-Za-z0-9/]+)(?: \((\S+)\))?")
 _EXTENSION = "mwdcal metadata"
-_UNWRITABLE_XML = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ud800-\udfff\ufffe\uffff]")
 _LONGEST_UID = 64
 _KIND, _NEAR_VERTICAL = "toolface_kind", "magnetic"
 """The column that says which kind of toolface a station has, and one of its words."""
@@ -273,7 +272,7 @@ def _check_writable(columns: Mapping[str, Column], source: str) -> None:
         )
     for name, column in columns.items():
         texts = [name, *column] if isinstance(column, list) else [name]
-        bad = next(filter(_UNWRITABLE_XML.search, texts), None)
+        bad = next(filter(xml.UNWRITABLE.search, texts), None)
         if bad is not None:
             raise InputError(
                 f"{source}, column {name[:40]!r}: XML has no control characters; got {bad[:40]!r}. Remove them, "
@@ -298,10 +297,10 @@ def _cells(column: Column) -> list[str]:
 
 def _head(metadata: Mapping[str, object], azimuth: str, source: str) -> Iterator[str]:
     """The opening of the trajectory, its names and what is known of all of its stations."""
-    uids = {name: _plain(metadata[key]) for name, key in _UIDS.items() if key in metadata}
+    uids = {name: xml.one_line(metadata[key]) for name, key in _UIDS.items() if key in metadata}
     yield "<trajectory" + "".join(f" {n}={_quoted(uid)}" for n, uid in uids.items()) + ">"
     for element, key in _NAMES.items():
-        yield _element(element, _plain(metadata.get(key, "unknown")))
+        yield _element(element, xml.one_line(metadata.get(key, "unknown")))
     carried = {
         m[1]: (str(v), m[2] or "") for k, v in metadata.items() if (m := _CARRIED.fullmatch(k))
     }
@@ -310,12 +309,7 @@ def _head(metadata: Mapping[str, object], azimuth: str, source: str) -> Iterator
     for element in OF_TRAJECTORY:
         if element in carried:
             text, uom = carried[element]
-            yield _element(element, _plain(text), uom)
-
-
-def _plain(value: object) -> str:
-    """A metadata value as text of one line; the value itself stands among the extensions."""
-    return " ".join(_UNWRITABLE_XML.sub(" ", str(value)).split())
+            yield _element(element, xml.one_line(text), uom)
 
 
 def _station(

@@ -19,7 +19,7 @@ from mwdcal.certificate.document import (
 )
 
 NOT_STATED = "not stated"
-EXACT = "exact"
+ASSUMED_EXACT = "exact"
 """In place of the share of a source that is assumed exact."""
 
 
@@ -100,5 +100,5 @@ def _source(line: BudgetLine) -> list[str]:
 def _share(line: BudgetLine, value: float | None) -> str:
     """What a source adds to the uncertainty of an angle."""
     if line.basis.startswith("assumed exact"):
-        return EXACT
+        return ASSUMED_EXACT
     return "–" if value is None else f"{number(value, 2)}°"

@@ -1,0 +1,42 @@
+"""The certificate as one HTML file that needs nothing else."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import msgspec
+
+from mwdcal.app.pages.page import environment
+from mwdcal.app.pages.records.certificate_pictures import Picture
+from mwdcal.app.pages.records.certificate_text import certificate_text
+from mwdcal.certificate.document import Certificate
+
+if TYPE_CHECKING:
+    from markupsafe import Markup
+
+LONGEST_WORD = 16
+"""A longer word may break every `BREAKS` characters."""
+BREAKS = 8
+
+
+def render_page(certificate: Certificate, pictures: Sequence[Picture] = ()) -> str:
+    """The certificate as HTML: the same input gives the same text, byte for byte."""
+    text = certificate_text(certificate, pictures)
+    templates = environment()
+    templates.filters["breakable"] = breakable
+    template = templates.get_template("certificate.html")
+    shown = {picture.id: picture.figure for picture in pictures}
+    return template.render(text=msgspec.to_builtins(text), simulated=text.simulated, figures=shown)
+
+
+def breakable(text: str) -> Markup:
+    """Text as HTML that may break inside words too long for a narrow column."""
+    from markupsafe import Markup, escape
+
+    def parts(word: str) -> list[str]:
+        step = BREAKS if len(word) > LONGEST_WORD else len(word) or 1
+        return [word[start : start + step] for start in range(0, len(word), step)]
+
+    words = (Markup("<wbr>").join(map(escape, parts(word))) for word in text.split(" "))
+    return Markup(" ").join(words)
