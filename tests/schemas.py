@@ -23,10 +23,12 @@ from mwdcal.app.screens import (
     simulation,
     stations,
 )
+from mwdcal.app.screens.records import registry, signature
 from mwdcal.app.screens.surveys import reference, survey
 from mwdcal.calibration.record import DOCUMENT_VERSION, SCHEMA_VERSION, Calibration
 from mwdcal.certificate.document import Certificate
 from mwdcal.faults.diagnosis import Diagnosis
+from mwdcal.registry.lookup import Listing
 from mwdcal.use.verification import Verdict
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
@@ -34,6 +36,11 @@ CONTENTS: dict[str, type] = {
     "apply": correction.Applied,
     "calibrate": calibration.CalibrationSummary,
     "certificate": Certificate,
+    **dict.fromkeys(
+        (n for n in INPUTS if n.startswith("certificate key ")), signature.KeysDocument
+    ),
+    "certificate sign": signature.SignedDocument,
+    "certificate verify": signature.CheckedDocument,
     "compare": comparison.ComparisonSummary,
     "convert": conversion.ConversionSummary,
     "diagnose": Diagnosis,
@@ -43,6 +50,17 @@ CONTENTS: dict[str, type] = {
     "plan": plan.PlanDocument,
     "profile": proposal.ProposalSummary,
     "reference": reference.ReferenceSummary,
+    "registry add": registry.RegistryAdded,
+    "registry backup": registry.RegistryCopied,
+    "registry check": registry.RegistryChecked,
+    "registry export": registry.RegistryExported,
+    "registry get": registry.RegistryDocument,
+    "registry history": Listing,
+    "registry init": registry.RegistryCreated,
+    "registry list": Listing,
+    "registry restore": registry.RegistryCopied,
+    "registry upgrade": registry.RegistryUpgraded,
+    "registry withdraw": registry.RegistryWithdrawn,
     "simulate": simulation.SimulationSummary,
     "stations": stations.StationsSummary,
     "survey": survey.SurveySummary,
@@ -65,6 +83,9 @@ def of_command(command: str) -> dict[str, Any]:
     _, parts = msgspec.json.schema_components(types, ref_template="#/$defs/{name}")
     head, content = (closed(plain(parts.pop(each.__name__))) for each in types)
     digests = {f"{name}_sha256": DIGEST for name in INPUTS[command]}
+    if "calibration" not in INPUTS[command]:
+        del head["properties"]["calibration_signature"]
+        parts.pop("SignatureCheck", None)
     properties = {**head["properties"], **digests, **content["properties"]}
     properties["schema_version"] = {"const": DOCUMENT_VERSION}
     properties["command"] = {"const": command}
@@ -111,7 +132,10 @@ def write() -> None:
     """Write all schemas into the package."""
     package = Path(mwdcal.__file__).parent
     (package / "schemas").mkdir(exist_ok=True)
-    files = {f"schemas/{command}.schema.json": of_command(command) for command in CONTENTS}
+    files = {
+        f"schemas/{command.replace(' ', '-')}.schema.json": of_command(command)
+        for command in CONTENTS
+    }
     for name, schema in {**files, "calibration.schema.json": of_calibration_files()}.items():
         text = json.dumps(schema, indent=2)
         (package / name).write_text(text + "\n", encoding="utf-8")

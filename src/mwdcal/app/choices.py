@@ -2,21 +2,49 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal, TypeAlias, cast
+from typing import Any, Literal, NamedTuple, TypeAlias, cast
 
 from mwdcal.app.commands.options import Typed
 from mwdcal.calibration.options import AUTO, Options
 from mwdcal.calibration.prior import DATASHEET, profile_for
 from mwdcal.calibration.readings import HIGHEST, Readings
-from mwdcal.calibration.record import Calibration
+from mwdcal.calibration.record import Calibration, Finding
+from mwdcal.certificate.signature import FINDING_OF_STATE, SignatureCheck, check
+from mwdcal.certificate.trusted_keys import trusted
 from mwdcal.files import documents, profiles, runs
 from mwdcal.files.formats import members
 from mwdcal.sensor.profile import Profile
 
+
+class LoadedCalibration(NamedTuple):
+    """A calibration, the SHA-256 of its file, what its signature says, and what of that is a finding."""
+
+    calibration: Calibration
+    digest: str
+    signature: SignatureCheck
+    findings: list[Finding]
+
+
 Prior: TypeAlias = Calibration | Literal["datasheet"] | None
 """What is known before a fit: a calibration, the tolerances of the profile, or nothing."""
+
+
+def load_calibration(path: Path, keys: Sequence[Path]) -> LoadedCalibration:
+    """A calibration file, and what its signature says by the keys that are trusted.
+
+    Where there are keys, an unsigned calibration is a finding too.
+    """
+    trust = trusted(keys)
+    file = calibration_file(path)
+    calibration, checked = documents.decoded(file), check(file.record, trust)
+    findings = [Finding(id=FINDING_OF_STATE[checked.state], text=checked.text)]
+    sound = checked.state == "intact" or (checked.state == "unsigned" and not keys)
+    if sound or (checked.state == "altered" and calibration.changed):  # which is a finding itself
+        findings = []
+    return LoadedCalibration(calibration, file.digest, checked, findings)
 
 
 def load_run(
@@ -52,22 +80,28 @@ def prior_of(word: str | None) -> tuple[Prior, str]:
     """
     if not word:
         return None, ""
-    return (DATASHEET, "") if word == DATASHEET else load_calibration(Path(word))
+    return (DATASHEET, "") if word == DATASHEET else calibration_of(Path(word))
 
 
-def load_calibration(path: Path) -> tuple[Calibration, str]:
-    """A calibration file, or one tool in the table of a fleet or in a registry; and its SHA-256.
+def calibration_of(path: Path) -> tuple[Calibration, str]:
+    """The calibration in a file, and its SHA-256: see `calibration_file`."""
+    file = calibration_file(path)
+    return documents.decoded(file), file.digest
+
+
+def calibration_file(path: Path) -> members.Member:
+    """A calibration file, or one tool in the table of a fleet or in a registry; its name and SHA-256.
 
     `registry.sqlite#SERIAL` is the latest calibration of that tool.
     """
     file, serial = members.split(path)
     if not members.is_database(file):
-        return documents.load(path)
-    from mwdcal.registry.lookup import calibration
+        return documents.contents(path)
+    from mwdcal.registry.lookup import latest_file
     from mwdcal.registry.store import open_registry
 
     with open_registry(file) as registry:
-        return calibration(registry, serial)
+        return latest_file(registry, serial)
 
 
 def order_of(word: str) -> int | Literal["auto"]:

@@ -7,13 +7,18 @@ from typing import Any
 
 import msgspec
 
+from mwdcal.calibration.canonical import Signature
 from mwdcal.calibration.readings import is_simulated, serial_of
 from mwdcal.calibration.record import DOCUMENT_VERSION, SOFTWARE
+from mwdcal.certificate.signature import SignatureCheck
 
 INPUTS = {
     "apply": ("calibration", "readings"),
     "calibrate": ("run", "profile", "prior"),
     "certificate": (),
+    **{f"certificate key {name}": () for name in ("create", "list", "retire", "revoke", "trust")},
+    "certificate sign": ("document",),
+    "certificate verify": ("document",),
     "compare": ("run", "profile"),
     "convert": ("calibration", "run"),
     "diagnose": ("calibration", "readings"),
@@ -50,7 +55,8 @@ class Envelope(msgspec.Struct, frozen=True, kw_only=True):
     """The head of a document.
 
     `software` is name and version; `serial` that of the tool, None where no input states one;
-    `simulated`: some input says that it is.
+    `simulated`: some input says that it is. `calibration_signature`: of the calibration that was used;
+    `signature`: of this document, once it is signed.
     """
 
     schema_version: int
@@ -58,6 +64,8 @@ class Envelope(msgspec.Struct, frozen=True, kw_only=True):
     software: str
     serial: str | None
     simulated: bool
+    calibration_signature: SignatureCheck | msgspec.UnsetType = msgspec.UNSET
+    signature: Signature | msgspec.UnsetType = msgspec.UNSET
 
 
 class ExampleDocument(msgspec.Struct, frozen=True, kw_only=True):
@@ -86,3 +94,8 @@ def enveloped(
     if sha256:
         raise ValueError(f"{command} has no input {', '.join(sha256)}")
     return {**msgspec.to_builtins(head), **digests, **msgspec.to_builtins(content)}
+
+
+def with_signature(document: dict[str, Any], calibration: SignatureCheck) -> dict[str, Any]:
+    """The document of a command, with what the signature of its calibration says."""
+    return {**document, "calibration_signature": msgspec.to_builtins(calibration)}

@@ -6,9 +6,7 @@ a calibration in memory and one read back give the same results.
 
 from __future__ import annotations
 
-import hashlib
-import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from html import escape
 from itertools import pairwise
 from typing import Any, ClassVar, TypeVar
@@ -17,6 +15,8 @@ import msgspec
 import numpy as np
 
 from mwdcal import __version__
+from mwdcal.calibration.canonical import Signature, document_sha256
+from mwdcal.calibration.canonical import canonical as canonical
 from mwdcal.calibration.readings import NANOTESLA, SOAK_GAP, Readings, simulated
 from mwdcal.errors import InputError
 from mwdcal.geometry.observables import OBSERVABLES
@@ -231,6 +231,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
     `serial` is that of the tool, absent where the run states none; `simulated`: of the run or the prior;
     `prior_sha256` of the file of the prior, absent where there was none.
     `sha256` is `content_sha256` of the record as it was made; earlier versions have none.
+    `signature` is absent until the file is signed, and in a record that is made from another.
     """
 
     schema_version: int = SCHEMA_VERSION
@@ -269,6 +270,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
     inherited: list[str] = []
     findings: list[Finding]
     sha256: str | msgspec.UnsetType = msgspec.UNSET
+    signature: Signature | msgspec.UnsetType = msgspec.UNSET
 
     plot: ClassVar[Any]
     """Figures of the calibration: `use.plots` puts them here, so that a record needs no drawing."""
@@ -322,7 +324,10 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def changed(self) -> bool:
-        """Whether anything but `time` has changed since the record was made; unknown without `sha256`."""
+        """Whether anything but `time` has changed since the record was made; unknown without `sha256`.
+
+        A signature that is not `intact` tells more: see `certificate.signature`.
+        """
         return self.sha256 is not msgspec.UNSET and self.sha256 != content_sha256(self)
 
     def change_findings(self) -> list[Finding]:
@@ -595,24 +600,15 @@ def _rounded(value: Any) -> Any:
 
 
 def content_sha256(calibration: Calibration) -> str:
-    """SHA-256 of all fields but `time` and `sha256`, as compact JSON with sorted keys."""
+    """SHA-256 of all fields but `UNHASHED`, as compact JSON with sorted keys."""
     return document_sha256(msgspec.to_builtins(calibration))
 
 
-def document_sha256(fields: Mapping[str, Any]) -> str:
-    """The `content_sha256` of a calibration file, whose fields are these."""
-    kept = {name: value for name, value in fields.items() if name not in ("time", "sha256")}
-    return hashlib.sha256(canonical(kept)).hexdigest()
-
-
-def canonical(fields: Mapping[str, Any]) -> bytes:
-    """The one form in which fields are hashed and signed: compact JSON in ASCII with sorted keys."""
-    return json.dumps(fields, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
-
-
 def sealed(calibration: Calibration) -> Calibration:
-    """The record with the `sha256` of its contents, by which a later change shows."""
-    return msgspec.structs.replace(calibration, sha256=content_sha256(calibration))
+    """The record with the `sha256` of its contents, by which a later change shows; it is unsigned."""
+    return msgspec.structs.replace(
+        calibration, sha256=content_sha256(calibration), signature=msgspec.UNSET
+    )
 
 
 def stated(value: float) -> float | None:

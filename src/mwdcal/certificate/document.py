@@ -10,6 +10,7 @@ from typing import Literal
 
 import msgspec
 
+from mwdcal.calibration.canonical import Signature
 from mwdcal.calibration.record import Finding
 
 CERTIFICATE_VERSION = 1
@@ -166,19 +167,6 @@ class SourceFile(msgspec.Struct, frozen=True, kw_only=True):
     id: str
     name: str
     sha256: str
-
-
-class Signature(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A signature over the canonical JSON of the document without this field.
-
-    `key` is the SHA-256 of the raw public key, hexadecimal, its first 16 digits; `time` (UTC) is part
-    of what is signed; `value` in base64.
-    """
-
-    algorithm: Literal["Ed25519"] = "Ed25519"
-    key: str
-    time: str
-    value: str
 
 
 class Certificate(msgspec.Struct, frozen=True, kw_only=True):

@@ -13,14 +13,9 @@ from typing import Any
 
 import msgspec
 
+from mwdcal.calibration.canonical import document_sha256, signed_form
 from mwdcal.calibration.diagnosis.soundness import check
-from mwdcal.calibration.record import (
-    DOCUMENT_VERSION,
-    SCHEMA_VERSION,
-    Calibration,
-    document_sha256,
-    sealed,
-)
+from mwdcal.calibration.record import DOCUMENT_VERSION, SCHEMA_VERSION, Calibration, sealed
 from mwdcal.errors import InputError, reason
 from mwdcal.files.formats import atomic, members
 from mwdcal.files.profiles import check_profile
@@ -44,10 +39,13 @@ class Verification(Verdict, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     calibration_sha256: str
     run_sha256: str | None
     limits_sha256: str | None
+    calibration_signature: dict[str, Any] | msgspec.UnsetType = msgspec.UNSET
 
 
 def encode(calibration: Calibration) -> bytes:
     """The bytes of a calibration file."""
+    if calibration.signature is not msgspec.UNSET:
+        return signed_form(msgspec.to_builtins(calibration))
     return laid_out(msgspec.json.encode(calibration))
 
 
@@ -75,28 +73,31 @@ def load(path: str | os.PathLike[str]) -> tuple[Calibration, str]:
 
     `cals.parquet#SERIAL` is the calibration of one tool in the table of a fleet; the SHA-256 is that of the table.
     """
+    file = contents(path)
+    return decoded(file), file.digest
+
+
+def contents(path: str | os.PathLike[str]) -> members.Member:
+    """The bytes that `decoded` takes, the name of their file, and its SHA-256."""
     file, _ = members.split(path)
-    data, name, digest = (
-        members.read(path) if file.suffix.lower() == members.SUFFIX else _whole_file(file)
-    )
-    return decoded(data, name), digest
+    return members.read(path) if file.suffix.lower() == members.SUFFIX else whole_file(file)
 
 
-def decoded(data: bytes, name: str) -> Calibration:
-    """The calibration in the bytes of a file of that name, or what is wrong with it."""
+def decoded(file: members.Member) -> Calibration:
+    """The calibration in a file, or what is wrong with it."""
     try:
-        calibration = _decoded(data, name)
+        calibration = _decoded(file.record, file.name)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise InputError(
-            f"{name} is not a calibration file: {error}. Use a file that mwdcal calibrate wrote."
+            f"{file.name} is not a calibration file: {error}. Use a file that mwdcal calibrate wrote."
         ) from None
-    check(calibration, name, _AS_WRITTEN)
-    check_profile(calibration.profile, name)
+    check(calibration, file.name, _AS_WRITTEN)
+    check_profile(calibration.profile, file.name)
     return calibration
 
 
-def _whole_file(path: Path) -> members.Member:
-    """The bytes of a calibration file, its name and its digest."""
+def whole_file(path: Path) -> members.Member:
+    """The bytes of a file, its name and its digest."""
     try:
         data = path.read_bytes()
     except OSError as error:
@@ -124,7 +125,7 @@ def load_verification(path: str | os.PathLike[str]) -> tuple[Verification, str]:
     Raises:
         InputError: the file holds something else, or decisions that do not follow from its values.
     """
-    data, name, digest = _whole_file(Path(path))
+    data, name, digest = whole_file(Path(path))
     try:
         head = msgspec.json.decode(data, type=dict[str, Any])
         if head.get("command") != "verify":
@@ -183,6 +184,10 @@ def _unique(name: str, advice: str, pairs: list[tuple[str, Any]]) -> None:
 
 def published_schema(command: str = "") -> dict[str, Any]:
     """The schema of a calibration file, or of the document of a command, as shipped with the package."""
-    place = ("schemas", f"{command}.schema.json") if command else ("calibration.schema.json",)
+    place = (
+        ("schemas", f"{command.replace(' ', '-')}.schema.json")
+        if command
+        else ("calibration.schema.json",)
+    )
     text = resources.files("mwdcal").joinpath(*place).read_text("utf-8")
     return msgspec.json.decode(text, type=dict[str, Any])

@@ -19,7 +19,7 @@ from mwdcal.files.profiles import decoded_profile
 from mwdcal.registry.store import LARGEST_OBJECT, Entry
 from mwdcal.sensor.profile import MeasurementStandard
 
-TABLES = (*tables.SUFFIXES, *tables.EXCHANGED)
+TABLE_SUFFIXES = (*tables.SUFFIXES, *tables.EXCHANGED)
 """Suffixes of files with tables."""
 COMMANDS_KEPT = {"calibrate": "calibration", "verify": "verification", "certificate": "certificate"}
 """Kinds of documents by the command that writes them."""
@@ -27,8 +27,8 @@ LABORATORY_KEYS = ("laboratory", "customer", "measured_by", "authorised_by", "nu
 """Of which a laboratory file has one at least."""
 PEOPLE = LABORATORY_KEYS[2:4]
 _BOM = b"\xef\xbb\xbf"
-_PEM = b"-----BEGIN "
-_UNKNOWN = (
+_PRIVATE, _PUBLIC = b"PRIVATE KEY-----", b"-----BEGIN PUBLIC KEY-----"
+_NOT_KEPT = (
     "a registry keeps calibrations, verifications and certificates of mwdcal, runs, tool profiles, limits, "
     "laboratories and public keys, and it is none of them. Leave it out."
 )
@@ -78,12 +78,15 @@ def of_bytes(data: bytes, name: str) -> list[Entry]:
         UnlikeRunError: a table that may be a run whose columns have names of their own.
         InputError: it is nothing that a registry keeps, or damaged.
     """
-    text = data.removeprefix(_BOM).lstrip()
-    if text.startswith(_PEM):
-        return [_key(text, data, name)]
-    if text.startswith(b"{"):
+    if _PRIVATE in data:
+        raise InputError(
+            f"{name}: a private key is for its owner alone; a registry keeps the public one. Add that."
+        )
+    if _PUBLIC in data:
+        return [Entry("public-key", data, name)]
+    if data.removeprefix(_BOM).lstrip().startswith(b"{"):
         return [Entry(_json_kind(data, name), data, name)]
-    if Path(name).suffix.lower() in TABLES:
+    if Path(name).suffix.lower() in TABLE_SUFFIXES:
         return [_run(data, name)]
     return _of_toml(data, name)
 
@@ -91,16 +94,8 @@ def of_bytes(data: bytes, name: str) -> list[Entry]:
 def checked(entry: Entry) -> Entry:
     """The entry, if it is a calibration one that every command accepts."""
     if entry.kind == "calibration":
-        documents.decoded(entry.data, entry.name)
+        documents.decoded(members.Member(entry.data, entry.name, ""))
     return entry
-
-
-def _key(text: bytes, data: bytes, name: str) -> Entry:
-    if b"PRIVATE" in text[:64]:
-        raise InputError(
-            f"{name}: a private key is for its owner alone; a registry keeps the public one. Add that."
-        )
-    return Entry("public-key", data, name)
 
 
 def _json_kind(data: bytes, name: str) -> str:
@@ -114,7 +109,7 @@ def _json_kind(data: bytes, name: str) -> str:
         (kind for key, kind in kinds.items() if key in fields), ""
     )
     if not kind:
-        raise InputError(f"{name}: {_UNKNOWN}")
+        raise InputError(f"{name}: {_NOT_KEPT}")
     return kind
 
 
@@ -137,7 +132,7 @@ def _of_toml(data: bytes, name: str) -> list[Entry]:
     try:
         fields = tomllib.loads(data.removeprefix(_BOM).decode())
     except (ValueError, RecursionError):
-        raise InputError(f"{name}: {_UNKNOWN}") from None
+        raise InputError(f"{name}: {_NOT_KEPT}") from None
     try:
         kind = _toml_kind(fields, data, name)
         people = [fields[key] for key in PEOPLE if key in fields]
@@ -160,4 +155,4 @@ def _toml_kind(fields: Mapping[str, Any], data: bytes, name: str) -> str:
     if {"accelerometer", "magnetometer"} & {*fields}:
         decoded_profile(data.removeprefix(_BOM), name)
         return "profile"
-    raise InputError(f"{name}: {_UNKNOWN}")
+    raise InputError(f"{name}: {_NOT_KEPT}")

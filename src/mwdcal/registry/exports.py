@@ -17,13 +17,13 @@ from mwdcal.registry.database.models import history, objects, records, withdrawa
 from mwdcal.registry.facts import content_address
 from mwdcal.registry.store import Registry, unpacked
 
-MANIFEST = "manifest.json"
+EXPORT_MANIFEST = "manifest.json"
 """Name of the file of an export that names all others."""
 HISTORY = "history.jsonl"
 """Name of the file with the events, one a line."""
 EXPORT_VERSION = 1
 """Version of the manifest: higher when a key goes, or changes its meaning."""
-_ROWS = 100
+_RECORDS = 100
 
 
 class ExportedFile(msgspec.Struct, frozen=True, kw_only=True):
@@ -72,7 +72,7 @@ def export(
             simulated=simulated, events=events, head=head, history_sha256=lines, files=files
         )
         encoded = msgspec.json.format(msgspec.json.encode(manifest), indent=1)
-        (unfinished / MANIFEST).write_bytes(encoded + b"\n")
+        (unfinished / EXPORT_MANIFEST).write_bytes(encoded + b"\n")
     return manifest
 
 
@@ -89,7 +89,7 @@ def _rows(connection: sa.Connection) -> Iterator[Any]:
         .outerjoin(withdrawals, withdrawals.c.record == records.c.number)
         .order_by(records.c.number)
     )
-    yield from connection.execute(query, execution_options={"yield_per": _ROWS})
+    yield from connection.execute(query, execution_options={"yield_per": _RECORDS})
 
 
 def _written(row: Any, folder: Path) -> ExportedFile:
@@ -116,7 +116,7 @@ def _written_history(connection: sa.Connection, path: Path) -> str:
     """Write the history; the SHA-256 of the file."""
     query = sa.select(history).order_by(history.c.number)
     with path.open("wb") as stream:
-        for row in connection.execute(query, execution_options={"yield_per": _ROWS}).mappings():
+        for row in connection.execute(query, execution_options={"yield_per": _RECORDS}).mappings():
             stream.write(msgspec.json.encode(dict(row)) + b"\n")
     return content_address(path.read_bytes())
 
@@ -127,7 +127,7 @@ def read_manifest(folder: Path) -> Manifest | None:
     Raises:
         InputError: the manifest is damaged, or names files outside of the folder.
     """
-    path = folder / MANIFEST
+    path = folder / EXPORT_MANIFEST
     try:
         data = path.read_bytes()
         head = msgspec.json.decode(data, type=dict[str, Any]) if data else {}

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import base64
 import hashlib
 import json
 import math
+import re
 import tomllib
 from collections.abc import Callable, Mapping
 from datetime import UTC, date, datetime
@@ -20,6 +22,10 @@ FACTS_VERSION = 1
 """Version of the functions below: higher when one of them reads the same bytes otherwise."""
 LONGEST_NAME = 200
 """Characters of the longest serial, name or number that a registry takes."""
+_OWNER = re.compile(rb"^Owner: ([^\r\n]*)", re.MULTILINE)
+_PEM_KEY = re.compile(rb"-----BEGIN PUBLIC KEY-----\s(.*?)-----END PUBLIC KEY-----", re.DOTALL)
+_RAW_KEY = 32
+"""Bytes of a public key of Ed25519, the last ones of its SubjectPublicKeyInfo."""
 _METADATA_LINES = 200
 """Lines of a text table in which metadata are looked for."""
 
@@ -226,7 +232,13 @@ def _laboratory(data: bytes, name: str) -> Facts:
 
 
 def _public_key(data: bytes, name: str) -> Facts:
-    return Facts()
+    """Owner and key, as its signatures name it, of a PEM file; both as `certificate key create` writes them."""
+    owner, block = _OWNER.search(data), _PEM_KEY.search(data)
+    if block is None:
+        raise ValueError("no public key in PEM form")
+    raw = base64.b64decode(b"".join(block[1].split()), validate=True)[-_RAW_KEY:]
+    stated = owner[1].decode("utf-8", "replace").strip() if owner else ""
+    return Facts(label=_text(stated), type=hashlib.sha256(raw).hexdigest()[:16])
 
 
 RECORD_KINDS: dict[str, Callable[[bytes, str], Facts]] = {

@@ -202,7 +202,7 @@ class Adding:
             self._waiting, self._registry.insert(drafts, self._actor), strict=True
         ):
             self._count(source, added.kind, new=int(added.new), known=int(not added.new))
-            self.new[added.kind] += added.new
+            self.new.update([added.kind] * added.new)
             if added.new and source.reason:
                 self._registry.withdraw(added.number, source.reason, self._actor)
         self._waiting = []

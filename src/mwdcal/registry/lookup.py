@@ -3,23 +3,25 @@
 from __future__ import annotations
 
 import re
+from difflib import get_close_matches
+from pathlib import Path
 from typing import Any
 
 import msgspec
 
-from mwdcal.calibration.record import Calibration
 from mwdcal.errors import InputError
-from mwdcal.files import documents
 from mwdcal.files.formats.columns import shown
+from mwdcal.files.formats.members import MARK, Member
 from mwdcal.registry import queries
 from mwdcal.registry.database.models import records
 from mwdcal.registry.facts import RECORD_KINDS
 from mwdcal.registry.queries import Row
 from mwdcal.registry.store import Registry
 
+MOST_COMPARED = 10_000
+"""Most tools among whose serials a similar one is looked for."""
 SHORTEST_HASH = 8
 """Digits of a SHA-256 that name a document, at least."""
-TOOL, STANDARD = "tool", "standard"
 
 
 class ListedTool(msgspec.Struct, frozen=True, kw_only=True):
@@ -77,19 +79,23 @@ def listed(
     Raises:
         InputError: there is no such kind of records.
     """
-    if kind not in (None, TOOL, *RECORD_KINDS):
-        kinds = ", ".join([TOOL, *RECORD_KINDS])
+    if kind not in (None, "tool", *RECORD_KINDS):
+        kinds = ", ".join(["tool", *RECORD_KINDS])
         raise InputError(f"`kind` must be one of {kinds}; got {shown(kind)}. Correct it.")
-    if kind in (None, TOOL):
+    if kind in (None, "tool"):
         order = "next_due" if due else "serial"
         total, rows = queries.tools_page(
             registry, search, due_before=due or None, order=order, offset=offset, limit=limit
         )
         standards = standards_due(registry, due) if due else []
         return Listing(
-            kind=TOOL, total=total, offset=offset, tools=[_tool(r) for r in rows], records=standards
+            kind="tool",
+            total=total,
+            offset=offset,
+            tools=[_tool(r) for r in rows],
+            records=standards,
         )
-    if due and kind == STANDARD:
+    if due and kind == "standard":
         standards = standards_due(registry, due)
         some = standards[offset : offset + limit]
         return Listing(kind=kind, total=len(standards), offset=offset, records=some)
@@ -103,7 +109,7 @@ def standards_due(registry: Registry, due: str) -> list[ListedRecord]:
     """Measurement standards whose last certificate is due before a day, most overdue first."""
     at = records.c
     with registry.reading() as connection:
-        query = queries.with_events().where(at.kind == STANDARD).order_by(at.next_due, at.number)
+        query = queries.with_events().where(at.kind == "standard").order_by(at.next_due, at.number)
         rows = [dict(row) for row in connection.execute(query).mappings()]
     last = {(r["type"], r["label"], r["serial"]): r for r in rows if r["withdrawn"] is None}
     return sorted(
@@ -139,26 +145,25 @@ def document(registry: Registry, word: str) -> tuple[Row, bytes]:
     return row, registry.content(row["sha256"])
 
 
-def calibration(registry: Registry, serial: str | None) -> tuple[Calibration, str]:
-    """The latest calibration of a tool, of the only one where no serial is given; and its SHA-256.
+def latest_file(registry: Registry, serial: str | None) -> Member:
+    """The file of the latest calibration of a tool, of the only one where no serial is given.
 
     Raises:
-        InputError: there is none, or several tools to choose from.
+        InputError: there is none, or there are several tools to choose from.
     """
     if serial is None:
-        tools = queries.tools_page(registry, limit=2)
-        if tools.total != 1:
-            named = [str(row["serial"]) for row in tools.rows]
+        total, rows = queries.tools_page(registry, limit=1)
+        if total != 1:
+            example = f", such as '{registry.name}{MARK}{rows[0]['serial']}'" if rows else ""
             raise InputError(
-                f"{registry.name} has {tools.total} tools. Name one of them behind a #"
-                + (f", such as '{registry.name}#{named[0]}'." if named else ".")
+                f"{registry.name} has {total} tools. Name one of them behind a {MARK}{example}."
             )
-        serial = str(tools.rows[0]["serial"])
+        serial = str(rows[0]["serial"])
     latest = queries.latest_calibration(registry, serial)
     if latest is None:
         raise _unknown(registry, serial)
     row, data = latest
-    return documents.decoded(data, f"{registry.name}#{serial}"), str(row["sha256"])
+    return Member(data, f"{Path(registry.name).name}{MARK}{serial}", str(row["sha256"]))
 
 
 def one_record(registry: Registry, word: str) -> Row:
@@ -194,8 +199,9 @@ def _is_number(word: str) -> bool:
 
 def _unknown(registry: Registry, serial: str) -> InputError:
     """That there is no calibration of a tool, and which tools have similar serials."""
-    alike = queries.tools_page(registry, serial[:SHORTEST_HASH], limit=3).rows
-    meant = f" Is it {' or '.join(shown(row['serial']) for row in alike)}?" if alike else ""
+    _, rows = queries.tools_page(registry, limit=MOST_COMPARED)
+    near = get_close_matches(serial, [str(row["serial"]) for row in rows])
+    meant = f" Is it {' or '.join(map(shown, near))}?" if near else ""
     return InputError(
         f"{registry.name} has no tool {shown(serial)} with a calibration.{meant} Correct the serial."
     )

@@ -24,10 +24,11 @@ from mwdcal.errors import InputError
     help="Rows with a blank reading or temperature: refuse the file, or leave their results blank.",
 )
 @options.DECIMAL
+@options.TRUSTED_KEYS
 @options.JSON
 def command(
     calibration: Path, readings: Path, output: Path, outside: str, missing: str, decimal: str,
-    as_json: bool,
+    key: tuple[Path, ...], as_json: bool,
 ) -> None:  # fmt: skip
     """Correct READINGS (CSV, TSV, Parquet, XLSX, WITSML or LAS) with the CALIBRATION of their tool.
 
@@ -40,13 +41,15 @@ def command(
     """
     from mwdcal.app.choices import load_calibration
     from mwdcal.app.correction import Applied, apply_to_any
-    from mwdcal.app.envelope import enveloped
+    from mwdcal.app.envelope import enveloped, with_signature
     from mwdcal.app.progress import bar
+    from mwdcal.app.screens.records.signature import in_short
     from mwdcal.calibration.readings import simulated
     from mwdcal.files.runs import BlankReadingError
 
-    options.check_outputs([output], [calibration, readings])
-    fitted, digest = load_calibration(calibration)
+    options.check_outputs([output], [calibration, readings, *key])
+    loaded = load_calibration(calibration, key)
+    fitted = loaded.calibration
     try:
         with bar("correcting") as advance:
             tally, findings, readings_digest = apply_to_any(
@@ -55,14 +58,17 @@ def command(
     except BlankReadingError as error:
         advice = "Or leave the results of such rows blank: --missing blank."
         raise InputError(f"{error} {advice}") from None
+    findings = loaded.findings + findings
     blank = tally.blank(outside)
     document = enveloped(
         "apply",
         Applied(rows=tally.rows, blank=blank, output=str(output), findings=findings),
         *(fitted.tool, tally.metadata),
-        calibration=digest,
+        calibration=loaded.digest,
         readings=readings_digest,
     )
     corrected = f"{tally.rows} rows corrected" + (f", {blank} of them blank" if blank else "")
-    screen = "   ".join([corrected, f"wrote {one_line(output)}", *simulated(fitted.tool)])
-    print_result(document if as_json else screen, findings)
+    signed = one_line(in_short(loaded.signature))
+    said = [corrected, f"wrote {one_line(output)}", signed, *simulated(fitted.tool)]
+    document = with_signature(document, loaded.signature)
+    print_result(document if as_json else "   ".join(said), findings)

@@ -65,6 +65,15 @@ WHERE_OUTSIDE = preset(
 DECIMAL = preset(
     "--decimal", default=".", metavar="SIGN", help="Decimal sign of numbers in text files."
 )
+TRUSTED_KEYS = click.option(
+    "--key",
+    type=FILE,
+    multiple=True,
+    metavar="K.pub|KEYS.json",
+    envvar="MWDCAL_KEYS",
+    help="Public key, or file of keys, whose signatures are trusted; may be repeated. Default: the files that the "
+    "variable MWDCAL_KEYS names.",
+)
 JSON = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
 SEED = preset(
     "--seed", type=click.IntRange(0), default=0, help="Seed of all that is drawn at random."
@@ -177,7 +186,7 @@ def _named_registry(context: click.Context, option: click.Parameter, typed: str 
     group = context.parent.params.get(option.name) if context.parent and option.name else None
     named = typed or group
     if not named and not context.resilient_parsing:
-        raise InputError(f"`database` must name the registry; got none. Or set {REGISTRY}.")
+        raise InputError(f"--database must name the registry; got none. Or set ${REGISTRY}.")
     return named or ""
 
 

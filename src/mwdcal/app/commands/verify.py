@@ -15,10 +15,12 @@ from mwdcal.app.messages import findings_as_typed, print_result
 @options.preset("--limits", default="roll-test", metavar="NAME|FILE", help="Limits profile.")
 @options.report(help="Also write the report, with this verdict.")
 @options.DECIMAL
+@options.TRUSTED_KEYS
 @options.JSON
 def command(
-    calibration: Path, run: Path, limits: str, report: Path | None, decimal: str, as_json: bool
-) -> None:
+    calibration: Path, run: Path, limits: str, report: Path | None, decimal: str,
+    key: tuple[Path, ...], as_json: bool,
+) -> None:  # fmt: skip
     """Verify a CALIBRATION by a roll test: a RUN whose stations were not in the fit.
 
     \b
@@ -28,27 +30,33 @@ def command(
     from msgspec.structs import replace
 
     from mwdcal.app.choices import load_calibration
-    from mwdcal.app.envelope import enveloped
+    from mwdcal.app.envelope import enveloped, with_signature
     from mwdcal.app.screens.verification import screen
     from mwdcal.calibration.diagnosis.findings import unused_columns
     from mwdcal.files import runs
     from mwdcal.files.limits import load_limits
     from mwdcal.use.verification import verify
 
-    options.check_outputs([], [calibration, run, limits], page=report)
-    fitted, digest = load_calibration(calibration)
+    options.check_outputs([], [calibration, run, limits, *key], page=report)
+    loaded = load_calibration(calibration, key)
+    fitted = loaded.calibration
     readings, _ = runs.read_run(run, fitted.profile, decimal=decimal)
     bounds, limits_digest = load_limits(limits)
     result = verify(fitted, readings, bounds)
-    findings = findings_as_typed(result.findings + unused_columns(readings.unused))
+    findings = findings_as_typed(
+        loaded.findings + result.findings + unused_columns(readings.unused)
+    )
     result = replace(result, findings=findings)
     stated = fitted.tool, readings.metadata
-    digests = {"calibration": digest, "run": readings.run_sha256, "limits": limits_digest}
+    digests = {"calibration": loaded.digest, "run": readings.run_sha256, "limits": limits_digest}
     document = enveloped("verify", result, *stated, **digests)
+    document = with_signature(document, loaded.signature)
     if report:
         from mwdcal.app.pages.report import render
         from mwdcal.files.formats import atomic
 
         atomic.write(report, render(fitted, result, *stated))
-    print_result(document if as_json else screen(result, *stated), result.findings)
+    print_result(
+        document if as_json else screen(result, loaded.signature, *stated), result.findings
+    )
     sys.exit(0 if result.passed else 1)

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from mwdcal.app.choices import load_calibration
+from mwdcal.app.choices import calibration_of
 from mwdcal.app.envelope import enveloped
 from mwdcal.app.screens.numbers import HELD, UNDETERMINED, number, written
 from mwdcal.app.text import one_line, raised, table
@@ -101,7 +101,7 @@ class ConversionSummary(msgspec.Struct, frozen=True, kw_only=True):
 
 def convert_file(path: Path, notation: str, temperature: float | str | None) -> Converted:
     """Read a calibration file and convert it."""
-    calibration, sha256 = load_calibration(path)
+    calibration, sha256 = calibration_of(path)
     triads = convert(calibration, notation, temperature)
     findings = temperature_findings(calibration, notation, temperature)
     findings += calibration.change_findings()
@@ -110,7 +110,7 @@ def convert_file(path: Path, notation: str, temperature: float | str | None) -> 
 
 def loaded(path: Path, temperature: float | None) -> Converted:
     """A calibration file at a temperature, without values in any notation."""
-    calibration, sha256 = load_calibration(path)
+    calibration, sha256 = calibration_of(path)
     findings = [] if temperature is None else temperature_findings(calibration, "", temperature)
     findings += calibration.change_findings()
     return Converted(path, sha256, calibration, "", temperature, {}, findings)
@@ -316,7 +316,7 @@ class Exported(NamedTuple):
 
 def export_file(path: Path, form: str, word_bits: int | None) -> Exported:
     """Read a calibration file and make its C sources."""
-    calibration, sha256 = load_calibration(path)
+    calibration, sha256 = calibration_of(path)
     bits = (word_bits or DEFAULT_BITS) if form == "fixed-point" else None
     sources = export(calibration, form, sha256, bits or DEFAULT_BITS)
     findings = calibration.change_findings()

@@ -18,7 +18,7 @@ RECORD = "calibration"
 MARK = "#"
 """What stands between the file of a fleet's table and a serial."""
 SUFFIX = ".parquet"
-DATABASE = b"SQLite format 3\0"
+SQLITE = b"SQLite format 3\0"
 """How the file of a registry begins."""
 _SHOWN = 5
 """Most serials that a message names."""
@@ -51,7 +51,7 @@ def is_database(file: Path) -> bool:
     """Whether a file is a database, as a registry is."""
     try:
         with file.open("rb") as stream:
-            return stream.read(len(DATABASE)) == DATABASE
+            return stream.read(len(SQLITE)) == SQLITE
     except (OSError, ValueError):
         return False
 

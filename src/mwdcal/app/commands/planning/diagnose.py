@@ -25,7 +25,7 @@ def command(calibration: Path, readings: Path, decimal: str, as_json: bool) -> N
     """
     from msgspec.structs import replace
 
-    from mwdcal.app.choices import load_calibration
+    from mwdcal.app.choices import calibration_of
     from mwdcal.app.envelope import enveloped
     from mwdcal.app.screens.diagnosis import screen
     from mwdcal.calibration.diagnosis.findings import unused_columns
@@ -34,7 +34,7 @@ def command(calibration: Path, readings: Path, decimal: str, as_json: bool) -> N
     from mwdcal.files import runs
 
     options.check_outputs([], [calibration, readings])
-    fitted, digest = load_calibration(calibration)
+    fitted, digest = calibration_of(calibration)
     later, _ = runs.read_run(readings, fitted.profile, decimal=decimal)
     result = diagnose(fitted, later)
     findings = findings_as_typed(

@@ -142,7 +142,7 @@ def _scene(
     typed: options.Typed,
 ) -> _Scene:  # fmt: skip
     """The files that the command names, read."""
-    from mwdcal.app.choices import load_calibration, options_of, prior_of
+    from mwdcal.app.choices import calibration_of, options_of, prior_of
     from mwdcal.files import profiles
     from mwdcal.planning.effects import load_effects
     from mwdcal.planning.plans import load_plan
@@ -153,7 +153,7 @@ def _scene(
     physics, digest = load_effects(effects or "none")
     digests = {"plan": table.digest, "effects": digest if effects else ""}
     if calibration:
-        record, digests["calibration"] = load_calibration(calibration)
+        record, digests["calibration"] = calibration_of(calibration)
         true, profile = calibrated_tool(record)
         return _Scene(table, profile, physics, chosen, digests, record, true)
     profile, digests["profile"] = profiles.load_profile(tool or "servo")

@@ -10,7 +10,14 @@ from mwdcal.app.commands import Commands, Group
 @click.group(
     cls=Group,
     default="issue",
-    commands=Commands({"issue": "records.certificate_issue"}),
+    commands=Commands(
+        {
+            "issue": "records.certificate_issue",
+            "sign": "records.certificate_sign",
+            "verify": "records.certificate_verify",
+            "key": "records.certificate_key",
+        }
+    ),
     subcommand_metavar="CALIBRATION -o FILE | COMMAND [ARGS]...",
 )
 def command() -> None:
@@ -19,6 +26,7 @@ def command() -> None:
     `mwdcal certificate CALIBRATION` is short for `mwdcal certificate issue CALIBRATION`.
 
     \b
-    Examples: mwdcal certificate tool.json -o certificate.pdf
-              mwdcal certificate verify certificate.json --key laboratory.pub
+    Examples: mwdcal certificate tool.json -o certificate.json
+              mwdcal certificate sign certificate.json --key laboratory.key
+              mwdcal certificate verify certificate.json --key laboratory.key.pub
     """

@@ -17,7 +17,7 @@ from mwdcal.errors import InputError
 if TYPE_CHECKING:
     from mwdcal.registry.imports import Adding, Source
 
-FEWEST = 3
+FEWEST_PORTIONS = 3
 """Portions of work from which workers of their own are worth their start."""
 TABLE = ".parquet"
 """Suffix of tables that may hold many tools."""
@@ -83,7 +83,7 @@ def _add_all(adding: Adding, portions: Sequence[Sequence[Source]], workers: int)
     with progress.bar("adding") as advance:
         following = 0
         for index, result in pool.results(
-            steps, portions, workers if len(portions) >= FEWEST else 1, None
+            steps, portions, workers if len(portions) >= FEWEST_PORTIONS else 1, None
         ):
             ready[index] = result
             while following in ready:

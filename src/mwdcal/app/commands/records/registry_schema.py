@@ -22,7 +22,8 @@ def init(database: str, actor: str, as_json: bool) -> None:
     Exit: 0 created, 2 it exists already, or cannot be written.
     """
     from mwdcal.app.screens.records import registry as screen
-    from mwdcal.registry.store import create, open_registry
+    from mwdcal.registry.setup import create
+    from mwdcal.registry.store import open_registry
 
     create(database, actor)
     with open_registry(database) as registry:
@@ -46,12 +47,12 @@ def upgrade(database: str, actor: str, target: str | None, as_json: bool) -> Non
     Exit: 0 as it should be, 2 it cannot be opened, or a newer program made it.
     """
     from mwdcal.app.screens.records import registry as screen
-    from mwdcal.registry import store
+    from mwdcal.registry import setup
 
     if target:
-        before, after = store.move_to(database, target, actor)
+        before, after = setup.move_to(database, target, actor)
     else:
-        before, after = store.upgrade(database, actor)
+        before, after = setup.upgrade(database, actor)
     result = screen.RegistryUpgraded(before=before, after=after)
     words = f"schema {before} → {after}" if before != after else f"schema {after}, as it should be"
     print_result(screen.document("registry upgrade", result) if as_json else words)

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import radians
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -15,8 +15,10 @@ from mwdcal.app.messages import findings_as_typed, print_result
 from mwdcal.errors import InputError
 
 if TYPE_CHECKING:
+    from mwdcal.app.choices import LoadedCalibration
     from mwdcal.calibration.readings import Readings
     from mwdcal.calibration.record import Calibration
+    from mwdcal.certificate.signature import SignatureCheck
     from mwdcal.files.formats.table import Table
     from mwdcal.geometry.vectors import Array
     from mwdcal.survey.acceptance import SurveyLimits
@@ -64,11 +66,12 @@ if TYPE_CHECKING:
     "--html", type=options.FILE, metavar="S.html", help="Also write a page with the pictures."
 )
 @options.DECIMAL
+@options.TRUSTED_KEYS
 @options.JSON
 def command(
     calibration: Path, readings: Path, output: Path, reference: Path | None, msa: bool,
     msa_html: Path | None, limits: str, switch: str, tie_in: str | None, outside: str,
-    html: Path | None, decimal: str, as_json: bool,
+    html: Path | None, decimal: str, key: tuple[Path, ...], as_json: bool,
 ) -> None:  # fmt: skip
     """Surveys of a well: READINGS in their order, corrected by the CALIBRATION of their tool.
 
@@ -80,6 +83,7 @@ def command(
     Exit: 0 written, 2 input cannot be read, or does not belong to the calibration, 3 with --msa: the surveys do not
     separate interference from azimuth.
     """
+    from mwdcal.app.choices import load_calibration
     from mwdcal.files.formats import atomic
     from mwdcal.files.formats import table as tables
     from mwdcal.survey.tables import surveyed_table
@@ -87,16 +91,18 @@ def command(
 
     if msa_html and not msa:
         raise InputError("`msa_html` goes with `msa`. Leave it out, or add `msa`.")
-    inputs = [calibration, readings, reference, limits]
+    inputs = [calibration, readings, reference, limits, *key]
     options.check_outputs([output, msa_html], inputs, page=html)
     start, ends = _three("tie_in", tie_in), _switch(switch)
-    scene = _read(calibration, readings, reference, limits, decimal)
+    loaded = load_calibration(calibration, key)
+    scene = _read(loaded, readings, reference, limits, decimal)
     fitted, analysis = scene.calibration, None
     pages: list[tuple[Path, bytes | str]] = []
     if msa:
         analysis, pages = _analysed(scene, msa_html, as_json)
         fitted = analysis.calibration
     result = well(fitted, scene.readings, scene.limits, scene.north, scene.md, start, ends, outside)
+    result = replace(result, findings=loaded.findings + result.findings)
     if html:
         from mwdcal.app.pages.surveys.survey import render
 
@@ -111,6 +117,7 @@ def command(
 class _WellInputs:
     """What the command was given; digests of its files."""
 
+    signature: SignatureCheck
     calibration: Calibration
     table: Table
     readings: Readings
@@ -124,6 +131,13 @@ class _WellInputs:
         """What calibration and readings say of themselves."""
         return self.calibration.tool, self.readings.metadata
 
+    def enveloped(self, summary: object) -> dict[str, Any]:
+        """The result for machines, with what all inputs say of themselves."""
+        from mwdcal.app.envelope import enveloped, with_signature
+
+        document = enveloped("survey", summary, *self.stated, **self.digests)
+        return with_signature(document, self.signature)
+
     @property
     def named(self) -> dict[str, str]:
         """Digests of the files that there are."""
@@ -131,23 +145,29 @@ class _WellInputs:
 
 
 def _read(
-    calibration: Path, readings: Path, reference: Path | None, limits: str, decimal: str
+    loaded: LoadedCalibration, readings: Path, reference: Path | None, limits: str, decimal: str
 ) -> _WellInputs:
     """The files read."""
-    from mwdcal.app.choices import load_calibration
     from mwdcal.files.runs import MOST_ROWS, read_export
     from mwdcal.survey.acceptance import load_survey_limits
     from mwdcal.survey.place.references import load_reference
     from mwdcal.survey.tables import survey_readings
 
-    fitted, digest = load_calibration(calibration)
+    fitted = loaded.calibration
     bounds, limits_digest = load_survey_limits(limits)
     source = read_export(readings, fitted.profile, decimal=decimal, rows=MOST_ROWS)
     place, place_digest = load_reference(reference) if reference else (None, "")
     read, md, north = survey_readings(source, fitted, place)
-    digests = {"calibration": digest, "readings": source.digest, "reference": place_digest}
+    digests = {"calibration": loaded.digest, "readings": source.digest, "reference": place_digest}
     return _WellInputs(
-        fitted, source, read, md, north, bounds, {**digests, "limits": limits_digest}
+        loaded.signature,
+        fitted,
+        source,
+        read,
+        md,
+        north,
+        bounds,
+        {**digests, "limits": limits_digest},
     )
 
 
@@ -155,7 +175,6 @@ def _analysed(
     scene: _WellInputs, page: Path | None, as_json: bool
 ) -> tuple[Interference, list[tuple[Path, bytes | str]]]:
     """The multi-station analysis and its page; one that is not separable is printed and refused."""
-    from mwdcal.app.envelope import enveloped
     from mwdcal.app.screens.surveys.survey import refusal
     from mwdcal.files.formats import atomic
     from mwdcal.survey.multistation.interference import interference
@@ -170,7 +189,7 @@ def _analysed(
         atomic.write_all(pages)
         if as_json:
             refused = refusal(analysis.summary, scene.limits, scene.north, scene.readings.count)
-            print_result(enveloped("survey", refused, *scene.stated, **scene.digests), [])
+            print_result(scene.enveloped(refused), [])
         analysis.check()
     return analysis, pages
 
@@ -183,7 +202,6 @@ def _print(
     as_json: bool,
 ) -> None:
     """What came of it."""
-    from mwdcal.app.envelope import enveloped
     from mwdcal.app.screens.surveys import interference as screens_of_msa
     from mwdcal.app.screens.surveys import survey as screens
     from mwdcal.calibration.diagnosis.findings import unused_columns
@@ -191,8 +209,8 @@ def _print(
     msa = analysis.summary if analysis else None
     unused = unused_columns(scene.readings.unused)
     summary = screens.summary(result, *files, msa, unused)
-    document = enveloped("survey", summary, *scene.stated, **scene.digests)
-    shown = screens.screen(result, summary, *scene.stated)
+    document = scene.enveloped(summary)
+    shown = screens.screen(result, summary, scene.signature, *scene.stated)
     if analysis:
         shown = f"{screens_of_msa.screen(analysis, *scene.stated)}\n\n{shown}"
     findings = findings_as_typed([*(msa.findings if msa else []), *summary.findings])

@@ -19,10 +19,10 @@ from mwdcal.registry.store import Registry
 
 KEYS = ("number", "kind", "sha256", "name")
 """What names a record in a document."""
-ANGLES = ("inclination", "toolface", "azimuth")
+ACCURACIES = ("inclination", "toolface", "azimuth")
 MOST_REFUSED = 20
 """Most refused files that are named one by one."""
-DIGITS = 12
+HASH_DIGITS = 12
 """Digits of a SHA-256 on the screen."""
 
 
@@ -191,7 +191,7 @@ def list_text(listing: Listing) -> str:
     """Tools, or records of a kind."""
     blocks = [_heading(listing, f"{listing.kind}s")]
     if listing.tools:
-        head = ["serial", "type", "calibrated", "n", *(f"{a} 1σ, °" for a in ANGLES)]
+        head = ["serial", "type", "calibrated", "n", *(f"{a} 1σ, °" for a in ACCURACIES)]
         blocks.append(table([_tool_cells(t) for t in listing.tools], [*head, "due", "verdict"]))
     if listing.records and listing.kind == "tool":
         blocks.append(f"{plural(len(listing.records), 'measurement standard')} due")
@@ -221,7 +221,7 @@ def _heading(listing: Listing, noun: str) -> str:
 
 
 def _tool_cells(tool: ListedTool) -> list[str]:
-    angles = [number(getattr(tool, f"{angle}_deg"), 2) for angle in ANGLES]
+    angles = [number(getattr(tool, f"{angle}_deg"), 2) for angle in ACCURACIES]
     facts = [tool.serial, tool.type or "", day(tool.calibrated), str(tool.calibrations)]
     return [*facts, *angles, day(tool.next_due), tool.status or ""]
 
@@ -237,7 +237,13 @@ def _records_table(records: Sequence[ListedRecord], serials: bool) -> str:
         cells = [str(each.number), each.kind, *[each.serial or ""] * serials, day(each.time)]
         described = ", ".join(filter(None, what))
         rows.append(
-            [*cells, described, each.sha256[:DIGITS], each.added[: len("2026-01-31")], each.actor]
+            [
+                *cells,
+                described,
+                each.sha256[:HASH_DIGITS],
+                each.added[: len("2026-01-31")],
+                each.actor,
+            ]
         )
     return table(rows, head, names=1)
 

@@ -8,9 +8,11 @@ import msgspec
 import numpy as np
 
 from mwdcal.app.screens.numbers import fixed, written
+from mwdcal.app.screens.records.signature import in_short
 from mwdcal.app.text import one_line, plural, table
 from mwdcal.calibration.readings import simulated
 from mwdcal.calibration.record import Finding, stated
+from mwdcal.certificate.signature import SignatureCheck
 from mwdcal.survey.acceptance import SurveyLimits
 from mwdcal.survey.multistation.interference import InterferenceSize, MultiStationAnalysis
 from mwdcal.survey.well import North, Well
@@ -140,12 +142,15 @@ def end_of_path(well: Well) -> EndOfPath | None:
     )
 
 
-def screen(well: Well, facts: SurveySummary, *metadata: Mapping[str, object]) -> str:
-    """The surveys for people; `metadata` of calibration and readings."""
+def screen(
+    well: Well, facts: SurveySummary, signature: SignatureCheck, *metadata: Mapping[str, object]
+) -> str:
+    """The surveys for people; `signature` of the calibration, `metadata` of it and of the readings."""
     counts = [f"{facts.accepted} accepted", f"{facts.rejected} rejected"]
     if facts.not_judged:
         counts.append(f"{facts.not_judged} not judged")
-    heading = [well.readings.source, plural(facts.rows, "survey"), *counts, *simulated(*metadata)]
+    heading = [well.readings.source, plural(facts.rows, "survey"), *counts]
+    heading += [in_short(signature), *simulated(*metadata)]
     source = f" ({facts.source})" if facts.source else ""
     lines = [
         "   ".join(heading),

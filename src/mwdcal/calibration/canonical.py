@@ -1,0 +1,42 @@
+"""Documents as they are hashed and signed: one form for all that say the same."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from typing import Any, Literal
+
+import msgspec
+
+UNHASHED = ("time", "sha256", "signature")
+"""Fields of a calibration that its `sha256` is not of."""
+
+
+class Signature(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A signature of the document that it stands in: of its `canonical` JSON, all but `value`.
+
+    `key` is the SHA-256 of the raw public key, hexadecimal, its first 16 digits; `time` (UTC) is part
+    of what is signed; `value` in base64.
+    """
+
+    algorithm: Literal["Ed25519"] = "Ed25519"
+    key: str
+    time: str
+    value: str
+
+
+def canonical(fields: Mapping[str, Any]) -> bytes:
+    """The one form in which fields are hashed and signed: compact JSON in ASCII with sorted keys."""
+    return json.dumps(fields, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
+
+
+def signed_form(fields: Mapping[str, Any]) -> bytes:
+    """The only form that the file of a signed document may have: `canonical` with two spaces of indent."""
+    return json.dumps(fields, sort_keys=True, indent=2, allow_nan=False).encode() + b"\n"
+
+
+def document_sha256(fields: Mapping[str, Any]) -> str:
+    """The `content_sha256` of a calibration file, whose fields are these."""
+    kept = {name: value for name, value in fields.items() if name not in UNHASHED}
+    return hashlib.sha256(canonical(kept)).hexdigest()

@@ -1,0 +1,277 @@
+"""Signatures of documents: Ed25519 (RFC 8032) over their canonical JSON.
+
+A signed file has one form, `signed_form`: whatever differs from it was altered, were it a blank.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import hashlib
+import json
+import os
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+
+from mwdcal.calibration.canonical import Signature, canonical, signed_form
+from mwdcal.certificate.document import SourceFile
+from mwdcal.certificate.keys import PrivateKey, TrustedKey, available, now
+from mwdcal.certificate.trusted_keys import moment
+from mwdcal.errors import FitError, InputError
+from mwdcal.files import documents
+from mwdcal.files.formats.members import Member
+
+SIGNATURE_KEY = "signature"
+"""Key of a document under which its signature stands."""
+
+
+class SignatureCheck(msgspec.Struct, frozen=True, kw_only=True):
+    """What the signature of a document says: `state` for machines, `text` for people.
+
+    `key`, `owner` and `time` (the signer's, UTC) as far as they are known. Only `intact` shows that the document is
+    as it was signed, with a key that is trusted; `unchecked`: cryptography is not installed.
+    """
+
+    state: Literal["unsigned", "intact", "altered", "unknown", "revoked", "retired", "unchecked"]
+    key: str | None = None
+    owner: str | None = None
+    time: str | None = None
+    text: str
+
+
+class CheckedFile(msgspec.Struct, frozen=True, kw_only=True):
+    """A file that a certificate lists, and whether it is as it was: `missing` where it was not at hand."""
+
+    id: str
+    name: str
+    path: str | None
+    state: Literal["unchanged", "changed", "missing"]
+
+
+STATES = {
+    "unsigned": "the {document} is unsigned: nothing shows who made it and that it was not changed since.",
+    "intact": "the {document} is as {key} signed it on {time}.",
+    "altered": "the {document} was altered after it was signed{by}. Use the file as it was signed.",
+    "unknown": "the {document} is signed by {key}, which is not among the trusted keys: give its public key by "
+    "`key`, if you have it from its owner.",
+    "revoked": "the {document} is signed by {key}, which was revoked on {revoked}{reason}. Have it signed anew.",
+    "retired": "the {document} was signed on {time} by {key}, which was retired on {retired}. Have it signed with "
+    "the key that followed.",
+    "unchecked": "the {document} is signed by {key}, and not checked: cryptography is not installed. Install "
+    "mwdcal[certificate]: pip install 'mwdcal[certificate]'",
+}
+"""What is said of each state."""
+FINDING_OF_STATE = {
+    state: "changed" if state == "altered" else f"signature-{state}" for state in STATES
+}
+"""Ids of the findings that say so: an altered document is found by its hash as well."""
+DOCUMENT_NAMES = {
+    "calibrate": "calibration",
+    "verify": "verification",
+    "certificate": "certificate",
+}
+"""What documents are called, by the commands that made them."""
+
+
+# ------------------------------------------------------------------------------ signing
+
+
+def signed(file: Member, key: PrivateKey, replacing: bool = False) -> bytes:
+    """The file of a document, signed; `replacing` the signature that it has.
+
+    Raises:
+        InputError: it is not a document of mwdcal, or is signed already.
+        FitError: it was altered since the signature that would be replaced, or since it was calibrated.
+    """
+    data, name = file.record, file.name
+    fields = document_of(data, name)
+    if SIGNATURE_KEY in fields and not replacing:
+        who = check(data, {}).key
+        raise InputError(
+            f"{name} is signed already{f', by key {who}' if who else ''}. Keep that, or sign it anew: `replace`."
+        )
+    broken = check(data, {key.public.key: key.public}).state == "altered"
+    if broken or (fields["command"] == "calibrate" and documents.decoded(file).changed):
+        raise FitError(f"{name} was altered after it was made. Sign the file as it was.")
+    kept = {name: value for name, value in fields.items() if name != SIGNATURE_KEY}
+    unsigned = Signature(key=key.public.key, time=now(), value="")
+    value = base64.b64encode(key.sign(message(kept, unsigned))).decode()
+    signature = msgspec.structs.replace(unsigned, value=value)
+    return signed_form({**kept, SIGNATURE_KEY: msgspec.to_builtins(signature)})
+
+
+def message(fields: Mapping[str, Any], signature: Signature) -> bytes:
+    """What is signed: the canonical JSON of a document with its signature, but for the `value` of that."""
+    stated = msgspec.to_builtins(signature)
+    return canonical({**fields, SIGNATURE_KEY: {k: v for k, v in stated.items() if k != "value"}})
+
+
+def document_of(data: bytes, name: str) -> dict[str, Any]:
+    """The fields of a document.
+
+    Raises:
+        InputError: it is not JSON, or not a document of mwdcal.
+    """
+    fields = _fields(data)
+    if fields is None or not {"schema_version", "command"} <= {*fields}:
+        raise InputError(
+            f"{name} is not a document of mwdcal. Name a calibration file, or the JSON of a "
+            "verification or certificate."
+        )
+    return fields
+
+
+def _fields(data: bytes) -> dict[str, Any] | None:
+    """The object in a file; None where there is none, or a number in it is not one of JSON."""
+    try:
+        fields = json.loads(data, parse_constant=_no_number)
+    except (ValueError, RecursionError):
+        return None
+    return fields if isinstance(fields, dict) else None
+
+
+def _no_number(name: str) -> None:
+    raise ValueError(f"{name} is not a number of JSON")
+
+
+# ----------------------------------------------------------------------------- checking
+
+
+def check(data: bytes, trusted: Mapping[str, TrustedKey]) -> SignatureCheck:
+    """What the signature of the document in a file says, by the keys that are trusted.
+
+    A file that can no longer be read as JSON, but names a signature, is altered.
+    """
+    fields = _fields(data)
+    if fields is None:
+        named = SIGNATURE_KEY.encode() in data.replace(b"\0", b"")
+        return _said("altered" if named else "unsigned", {})
+    if SIGNATURE_KEY not in fields:
+        return _said("unsigned", fields)
+    try:
+        signature = msgspec.convert(fields.pop(SIGNATURE_KEY), Signature)
+        value = base64.b64decode(signature.value, validate=True)
+    except (msgspec.ValidationError, binascii.Error):
+        return _said("altered", fields)
+    key = trusted.get(signature.key)
+    if (
+        not _has_the_form(data, fields, signature)
+        or base64.b64encode(value) != signature.value.encode()
+    ):
+        return _said("altered", fields, signature, key)
+    if key is None:
+        return _said("unknown", fields, signature)
+    if not available():
+        return _said("unchecked", fields, signature, key)
+    intact = key.verifies(value, message(fields, signature))
+    return _said(_standing(key, signature) if intact else "altered", fields, signature, key)
+
+
+def _has_the_form(data: bytes, fields: Mapping[str, Any], signature: Signature) -> bool:
+    """Whether a file is as `signed` writes it, byte by byte."""
+    try:
+        return data == signed_form({**fields, SIGNATURE_KEY: msgspec.to_builtins(signature)})
+    except (ValueError, RecursionError):  # a number beyond all floats
+        return False
+
+
+def _standing(key: TrustedKey, signature: Signature) -> str:
+    """What an intact signature is worth: a revoked key has none, a retired one signed before."""
+    if key.revoked:
+        return "revoked"
+    if not key.retired:
+        return "intact"
+    try:
+        return "intact" if moment(signature.time) <= moment(key.retired) else "retired"
+    except ValueError:
+        return "retired"
+
+
+def _said(
+    state: Any,
+    fields: Mapping[str, Any],
+    signature: Signature | None = None,
+    key: TrustedKey | None = None,
+) -> SignatureCheck:
+    """The state with its sentence."""
+    words = {
+        "document": DOCUMENT_NAMES.get(str(fields.get("command")), "document"),
+        "key": (who := f"key {key.name if key else signature.key}" if signature else ""),
+        "time": signature.time if signature else "",
+        "by": f" by {who}" if who else "",
+        "revoked": key.revoked if key else "",
+        "reason": f": {key.reason}" if key and key.reason else "",
+        "retired": key.retired if key else "",
+    }
+    return SignatureCheck(
+        state=state,
+        key=signature.key if signature else None,
+        owner=(key.owner or None) if key else None,
+        time=signature.time if signature else None,
+        text=STATES[state].format(**words),
+    )
+
+
+# ---------------------------------------------------------------- the files of a certificate
+
+
+def check_files(
+    fields: Mapping[str, Any], folder: Path, named: Iterable[Path] = ()
+) -> list[CheckedFile]:
+    """The files that a certificate lists, by their SHA-256.
+
+    Each is one of the `named` files with its content or else its name, or lies where the certificate says, seen
+    from its `folder`, or beside it.
+    """
+    try:
+        listed = msgspec.convert(fields.get("files", []), list[SourceFile])
+    except msgspec.ValidationError as error:
+        raise InputError(f"'files' of the certificate cannot be read: {error}.") from None
+    digests = {path: _sha256(path) for path in named}
+    unlisted = [
+        path.name
+        for path, digest in digests.items()
+        if not any(_is(file, path, digest) for file in listed)
+    ]
+    if unlisted:
+        raise InputError(
+            f"{', '.join(unlisted)}: not among the files of the certificate. Leave it out."
+        )
+    return [_checked(file, digests, folder) for file in listed]
+
+
+def _is(file: SourceFile, path: Path, digest: str | None) -> bool:
+    """Whether a path on the command line may be the file that is listed."""
+    return digest == file.sha256 or path.name == _base(file.name)
+
+
+def _base(name: str) -> str:
+    """The last part of a path as any system writes it."""
+    return name.replace("\\", "/").rpartition("/")[2]
+
+
+def _checked(file: SourceFile, digests: Mapping[Path, str | None], folder: Path) -> CheckedFile:
+    """A file that is listed, looked up."""
+    given = sorted(
+        (path for path, digest in digests.items() if _is(file, path, digest)),
+        key=lambda path: digests[path] != file.sha256,
+    )
+    places = given or [folder / file.name.replace("\\", os.sep), folder / _base(file.name)]
+    path = next((place for place in places if given or _sha256(place)), None)
+    digest = _sha256(path) if path else None
+    state: Any = "missing" if not path else "unchanged" if digest == file.sha256 else "changed"
+    return CheckedFile(id=file.id, name=file.name, path=str(path) if path else None, state=state)
+
+
+def _sha256(path: Path) -> str | None:
+    """The SHA-256 of a file; None where it cannot be read."""
+    try:
+        if not path.is_file():
+            return None
+        with path.open("rb") as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+    except (OSError, ValueError):
+        return None
