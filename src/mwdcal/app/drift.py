@@ -16,6 +16,7 @@ from mwdcal.drift.tool import MeasuredTool, TypeRates, measured, predicted
 from mwdcal.errors import InputError, MwdcalError
 from mwdcal.files import documents
 from mwdcal.files.formats.columns import shown
+from mwdcal.files.formats.members import Member
 from mwdcal.files.limits import load_limits
 from mwdcal.registry import queries
 from mwdcal.registry.store import Registry
@@ -137,7 +138,7 @@ def _calibrations(registry: Registry, serial: str) -> tuple[list[Calibration], d
     """The calibrations of a tool, and the SHA-256 of each file by that of its content."""
     read, digests = [], {}
     for row, data in queries.calibrations(registry, serial):
-        calibration = documents.decoded(data, row["name"])
+        calibration = documents.decoded(Member(data, row["name"], row["sha256"]))
         read.append(calibration)
         digests[str(calibration.sha256)] = row["sha256"]
     return read, digests
