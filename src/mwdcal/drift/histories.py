@@ -33,6 +33,8 @@ NOTES = {
     "curved": "the {triad} has own-axis terms: its best straight line is compared",
     "held": "its model holds misalignments at zero: they are not compared",
     "free": "leaves undetermined: {free}: the others are compared",
+    "model": "the {triad} has the model '{model}', that of the latest is '{latest}': over temperature the two differ by "
+    "their own misfit",
     "order": "the {triad} has temperature terms of order {order}: compared to order {compared}",
 }
 """What is said of a calibration that cannot be compared, or not in all of its parameters."""
@@ -183,9 +185,7 @@ class _Form:
             triad = getattr(calibration, name)
             if triad is None:
                 count = 12 + 6 * order
-                parts.append(
-                    (np.full(count, np.nan), np.zeros((count, size)), np.full(count, np.inf))
-                )
+                parts.append((np.full(count, np.nan), np.zeros((count, size))))
                 continue
             values, slope = self._triad(calibration, triad)
             whole = np.zeros((len(values), size))
@@ -266,6 +266,9 @@ class _Form:
                 continue
             if triad.curved:
                 yield NOTES["curved"].format(triad=name)
+            latest = getattr(self._last(name), name).model
+            if compared and triad.model != latest:
+                yield NOTES["model"].format(triad=name, model=triad.model, latest=latest)
             if triad.order > compared:
                 yield NOTES["order"].format(triad=name, order=triad.order, compared=compared)
         if calibration.relative:

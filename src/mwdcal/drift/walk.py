@@ -23,10 +23,10 @@ DECADES = np.linspace(-4.0, 3.0, 57)
 """Rates that are tried: decimal logarithms of variance per year over the variance of a calibration."""
 CENTRES = np.linspace(-3.5, 2.5, 31)
 """Rates about which those of a type may lie, all equally probable before there are data."""
-SPREADS = np.array([0.05, 0.1, 0.2, 0.3, 0.5, 0.8])
+SPREADS = np.linspace(0.05, 1.0, 20)
 """Standard deviations, in decades, of the rates of tools of a type; see `SPREAD_SCALE`."""
-SPREAD_SCALE = 0.5
-"""Scale of the half-normal distribution of that standard deviation before there are data."""
+SPREAD_SCALE = 0.4
+"""Most probable of these before there are data, of a Rayleigh distribution: it keeps away from none at all."""
 SHORTEST = 1 / 365.25
 """Two calibrations on one day are taken as this far apart, years."""
 
@@ -115,7 +115,8 @@ class GroupRates:
     @cached_property
     def type_probability(self) -> Array:
         """Probability (c, s) of centre and spread of the type, by the tools it was learnt from."""
-        logs = self._evidence(self.log_likelihood).sum(0) - 0.5 * (SPREADS / SPREAD_SCALE) ** 2
+        prior = np.log(SPREADS) - 0.5 * (SPREADS / SPREAD_SCALE) ** 2
+        logs = self._evidence(self.log_likelihood).sum(0) + prior
         return np.asarray(np.exp(logs - logsumexp(logs)))
 
     @property
