@@ -62,7 +62,7 @@ def example(tmp_path_factory):
         "verify", folder.parent / "tools" / "SIM-0001.json", folder / "rolltest.csv", "--json"
     )
     (folder / "verified.json").write_text(ran.out, "utf-8")
-    (folder / "laboratory.toml").write_text(LAB, "utf-8")
+    (folder / "guest.toml").write_text(LAB, "utf-8")
     (folder / ".hidden.csv").write_text("x", "utf-8")
     assert run("verify", tool_1, folder / "rolltest.csv").code == 0
     return folder
@@ -92,13 +92,13 @@ def test_every_kind_of_file_is_what_it_is(example, tmp_path):
     registry(path, "init")
     result = registry(path, "add", example)
     assert result["new"] == {
-        "calibration": 6, "laboratory": 1, "person": 2, "standard": 5, "profile": 1, "verification": 1,
+        "calibration": 6, "laboratory": 2, "person": 4, "standard": 5, "profile": 1, "verification": 1,
         "run": 7,
     }  # fmt: skip
     assert (result["known"], result["refused"], result["simulated"]) == (0, 0, True)
     assert sum(result["new"].values()) + 1 == result["events"]
     again = registry(path, "add", example)
-    assert (again["new"], again["known"], again["head"]) == ({}, 23, result["head"])
+    assert (again["new"], again["known"], again["head"]) == ({}, 26, result["head"])
     assert registry(path, "check")["sound"]
 
 
@@ -142,15 +142,12 @@ def test_list_shows_the_last_calibration_and_its_accuracy(example, filled):
 
 
 def test_standards_are_listed_when_they_are_due(filled):
-    due = registry(filled, "list", "--due", "2027-02-15")["records"]
+    due = registry(filled, "list", "--due", "2036-02-01")["records"]
     assert [(r["label"], r["next_due"]) for r in due] == [
         ("thermometer", "2027-01-31"),
-        ("declination-inclination magnetometer", "2027-02-11"),
-        ("proton magnetometer", "2027-02-11"),
-    ] or {r["label"] for r in due[1:]} == {
-        "proton magnetometer", "declination-inclination magnetometer"
-    }  # fmt: skip
-    assert registry(filled, "list", "--due", "2026-01-01")["records"] == []
+        ("non-magnetic calibration stand", "2036-01-15"),
+    ]
+    assert registry(filled, "list", "--due", "2027-01-31")["records"] == []
 
 
 COMMANDS = {
@@ -192,7 +189,7 @@ def test_an_export_makes_the_same_registry(filled, example, tmp_path):
     copy = tmp_path / "copy.sqlite"
     registry(copy, "init")
     added = registry(copy, "add", tmp_path / "out")
-    assert (added["refused"], sum(added["new"].values())) == (0, 23)
+    assert (added["refused"], sum(added["new"].values())) == (0, 26)
     registry(copy, "export", tmp_path / "again")
     first, second = (
         json.loads((tmp_path / name / "manifest.json").read_bytes()) for name in ("out", "again")
@@ -216,7 +213,7 @@ def test_a_changed_file_of_an_export_is_refused_and_the_others_added(filled, tmp
     copy = tmp_path / "copy.sqlite"
     registry(copy, "init")
     added = registry(copy, "add", tmp_path / "out")
-    assert (added["refused"], sum(added["new"].values())) == (1, 22)
+    assert (added["refused"], sum(added["new"].values())) == (1, 25)
     assert "changed since it was exported" in added["findings"][0]["text"]
 
 
@@ -276,7 +273,7 @@ def test_a_table_of_other_columns_is_a_run_if_a_calibration_was_made_of_it(examp
     path = tmp_path / "r.sqlite"
     registry(path, "init")
     assert (
-        "columns of a run are missing"
+        "Add it together with a calibration"
         in run("registry", "--database", path, "add", exported, code=2).err
     )
     result = registry(path, "add", exported, tmp_path / "cal.json", tmp_path / "tool.toml")
