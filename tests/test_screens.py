@@ -292,7 +292,7 @@ def screen(width, *arguments, **variables):
     for varying in (
         "[0-9a-f]{64}",
         r"(?<=\d{8}-)[0-9a-f]{12}\b",
-        r"(?<= )[0-9a-f]{12}(?= )",
+        r"(?<= )[0-9a-f]{12}\b",
         today,
         *libraries,
     ):
