@@ -12,7 +12,7 @@ import json
 import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import msgspec
 
@@ -21,9 +21,8 @@ from mwdcal.certificate.document import SourceFile
 from mwdcal.certificate.keys import PrivateKey, TrustedKey, available, now
 from mwdcal.certificate.trusted_keys import moment
 from mwdcal.errors import FitError, InputError
-
-if TYPE_CHECKING:
-    from mwdcal.files.formats.members import Member
+from mwdcal.files import documents
+from mwdcal.files.formats.members import Member
 
 SIGNATURE_KEY = "signature"
 """Key of a document under which its signature stands."""
@@ -60,8 +59,8 @@ STATES = {
     "`key`, if you have it from its owner.",
     "revoked": "the {document} is signed by {key}, which was revoked on {revoked}{reason}. Ask for one "
     "that a valid key has signed.",
-    "retired": "the {document} was signed on {time} by {key}, which was retired on {retired}. Ask for one "
-    "that the key after it has signed.",
+    "retired": "the {document} was signed on {time} by {key}, which was retired on {retired}. Have it signed with "
+    "the key that followed.",
     "unchecked": "the {document} is signed by {key}, and not checked: cryptography is not installed. Install "
     "mwdcal[certificate]: pip install 'mwdcal[certificate]'",
 }
@@ -88,8 +87,6 @@ def signed(file: Member, key: PrivateKey, replacing: bool = False) -> bytes:
         InputError: it is not a document of mwdcal, or is signed already.
         FitError: it was altered since the signature that would be replaced, or since it was calibrated.
     """
-    from mwdcal.files.documents import decoded  # a check alone does without
-
     data, name = file.record, file.name
     fields = document_of(data, name)
     if SIGNATURE_KEY in fields and not replacing:
@@ -98,7 +95,7 @@ def signed(file: Member, key: PrivateKey, replacing: bool = False) -> bytes:
             f"{name} is signed already{f', by key {who}' if who else ''}. Keep that, or sign it anew: `replace`."
         )
     broken = check(data, {key.public.key: key.public}).state == "altered"
-    if broken or (fields["command"] == "calibrate" and decoded(file).changed):
+    if broken or (fields["command"] == "calibrate" and documents.decoded(file).changed):
         raise FitError(f"{name} was altered after it was made. Sign the file as it was.")
     kept = {name: value for name, value in fields.items() if name != SIGNATURE_KEY}
     unsigned = Signature(key=key.public.key, time=now(), value="")
