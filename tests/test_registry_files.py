@@ -184,6 +184,14 @@ def test_a_tool_that_is_not_there_is_named_with_those_that_are(filled, serial, w
     assert words in refused(mwdcal("convert", tool, "--notation", "forward"), 2)
 
 
+def test_the_registry_behind_a_tool_is_an_input_which_no_output_replaces(filled, example):
+    ran = mwdcal("apply", f"{filled}#SIM-0001", example / "rolltest.csv", "-o", filled)
+    assert "it is an input" in refused(ran, 2)
+    assert "it is an input" in refused(
+        mwdcal("registry", "--database", filled, "backup", filled), 2
+    )
+
+
 def test_an_export_makes_the_same_registry(filled, example, tmp_path):
     registry(filled, "export", tmp_path / "out")
     copy = tmp_path / "copy.sqlite"
