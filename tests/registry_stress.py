@@ -58,13 +58,19 @@ def write_on(database: str, log: str, writer: int, end: float) -> None:
                 time.sleep(0.2)
 
 
+def writers_context() -> multiprocessing.context.ForkServerContext:
+    """Processes that have imported what a writer needs, which takes seconds, before they begin."""
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["registry_stress"])
+    return context
+
+
 def stressed(
     database: str, folder: Path, writers: int, seconds: float, kills: int, seed: int = 1
 ) -> tuple[list[list[str]], Counter[str]]:
     """What was acknowledged to writers, by call, and how often they were killed or refused."""
     rng, begun = random.Random(seed), time.time()
-    end, context = begun + seconds, multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["registry_stress"])  # what a writer imports takes seconds
+    end, context = begun + seconds, writers_context()
     events: Counter[str] = Counter()
 
     def started(number: int):

@@ -221,7 +221,11 @@ def _other_facts(record: Row, data: bytes) -> list[str]:
         return ["its kind"]
     if again["serial"] is None:
         del again["serial"]  # stated by who added it
-    return [n for n, value in again.items() if _digest({"_": value}) != _digest({"_": record[n]})]
+    return [n for n, value in again.items() if not _same(value, record[n])]
+
+
+def _same(one: object, two: object) -> bool:
+    return type(one) is type(two) and one == two
 
 
 def _tools(connection: sa.Connection) -> Iterator[Discrepancy]:

@@ -159,11 +159,9 @@ def _form(
     """The certificate in the form that the suffix of its file names."""
     suffix = path.suffix.lower()
     if suffix == ".json":
-        import msgspec
+        from mwdcal.certificate.document import encode
 
-        from mwdcal.files.documents import laid_out
-
-        return laid_out(msgspec.json.encode(certificate))
+        return encode(certificate)
     if suffix == ".xml":
         from mwdcal.certificate.dcc import to_xml
 
