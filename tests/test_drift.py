@@ -52,9 +52,7 @@ class Bench:
 
     def readings(self, day="2024-05-01", serial="T-1"):
         readings = self.session.measured(self.tool, self.rng).readings
-        return replace(
-            readings, metadata={**readings.metadata, "serial": serial, "date": str(day)}
-        )
+        return replace(readings, metadata={**readings.metadata, "serial": serial, "date": str(day)})
 
     def calibration(self, day="2024-05-01", serial="T-1", **options):
         readings = self.readings(day, serial)
@@ -127,7 +125,9 @@ def test_models_of_temperature_give_one_set_of_parameters():
     apart = np.diff(tool.history.values, axis=0)[0] / np.sqrt(np.diag(tool.covariance[0]))
     turns = np.array(["misalignment" in name for name in tool.history.names])
     assert np.all(np.abs(apart[~turns]) < 1)
-    assert np.all(np.abs(apart[turns]) < 4)  # constant in one model, of each temperature in the other
+    assert np.all(
+        np.abs(apart[turns]) < 4
+    )  # constant in one model, of each temperature in the other
     assert any("differ by their own misfit" in note for note in tool.notes[0])
 
 
@@ -141,7 +141,10 @@ def test_another_nominal_scale_is_no_change():
         sd={**readings.sd, "accelerometer": readings.sd["accelerometer"] * 3.0 / 3.06},
         profile=other,
     )
-    both = [calibrate(readings, SERVO, Options(order=0)), calibrate(shrunk, other, Options(order=0))]
+    both = [
+        calibrate(readings, SERVO, Options(order=0)),
+        calibrate(shrunk, other, Options(order=0)),
+    ]
     values = tool_history(both).history.values
     np.testing.assert_allclose(values[0], values[1], rtol=1e-7, atol=1e-9)
 
@@ -311,14 +314,19 @@ def test_likelihood_of_a_rate_is_that_of_a_normal_vector():
 def test_intervals_of_rates_hold_the_true_ones():
     rng = np.random.default_rng(6)
     count, sd, inside, peers = 60, 1.0, [], []
-    for calibrations in (2, 4) * 8:  # of types of their own: what one type teaches errs for all its tools
+    for calibrations in (
+        2,
+        4,
+    ) * 8:  # of types of their own: what one type teaches errs for all its tools
         times = np.arange(float(calibrations))
         centre = rng.uniform(-0.5, 1.0)
         rate, fresh = 10.0 ** rng.normal(centre, 0.3, (2, count))
         tools = one_group(walked(rng, rate, sd, times, count), sd, times)
         increments = [Increments.of(tool, [BIAS]) for tool in tools]
         learnt = GroupRates.of(increments)
-        ends = [quantiles(learnt.rates, learnt.probability(i, True), (0.05, 0.95)) for i in increments]
+        ends = [
+            quantiles(learnt.rates, learnt.probability(i, True), (0.05, 0.95)) for i in increments
+        ]
         inside.append(np.mean([a <= true <= b for (a, b), true in zip(ends, rate, strict=True)]))
         a, b = quantiles(learnt.rates, learnt.peers_probability, (0.05, 0.95))
         peers.append(np.mean((fresh > a) & (fresh < b)))
