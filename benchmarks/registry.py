@@ -55,7 +55,9 @@ def tables(folder: Path, count: int) -> Iterator[Path]:
     sample = fitted(SAMPLE)
     for year in range(YEARS):
         path, tools = folder / f"{2022 + year}.parquet", count // YEARS
-        schema = pa.schema([(name, pa.string()) for name in ("serial", "status", "message", RECORD)])
+        schema = pa.schema(
+            [(name, pa.string()) for name in ("serial", "status", "message", RECORD)]
+        )
         with pq.ParquetWriter(path, schema) as writer:
             for first in range(0, tools, GROUP):
                 serials = [f"B-{tool:06}" for tool in range(first, min(first + GROUP, tools))]
@@ -113,7 +115,9 @@ def pages(registry: Registry, count: int) -> dict[str, Callable[[int], object]]:
 
 def report(count: int = CALIBRATIONS) -> str:
     """The section's figures as Markdown."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cores = (
+        len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    )
     with TemporaryDirectory() as place:
         folder, database = Path(place), Path(place) / "tools.sqlite"
         paths = [*tables(folder, count)]

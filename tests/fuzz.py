@@ -72,7 +72,6 @@ SAMPLES = {
     "laboratory": "laboratory",
     "database": "registry",
     "source": "registry",
-    "files": "document",
 }
 """The kind of file that each argument or option takes, by its name."""
 DOCUMENTS = ("calibration", "verification", "signed")

@@ -57,7 +57,8 @@ STATES = {
     "altered": "the {document} was altered after it was signed{by}. Use the file as it was signed.",
     "unknown": "the {document} is signed by {key}, which is not among the trusted keys: give its public key by "
     "`key`, if you have it from its owner.",
-    "revoked": "the {document} is signed by {key}, which was revoked on {revoked}{reason}. Ask for one that a valid key has signed.",
+    "revoked": "the {document} is signed by {key}, which was revoked on {revoked}{reason}. Ask for one "
+    "that a valid key has signed.",
     "retired": "the {document} was signed on {time} by {key}, which was retired on {retired}. Have it signed with "
     "the key that followed.",
     "unchecked": "the {document} is signed by {key}, and not checked: cryptography is not installed. Install "
