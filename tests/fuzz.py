@@ -66,7 +66,6 @@ SAMPLES = {
     "keys": "key",
     "public": "key",
     "document": "signed",
-    "files": "run",
     "verification": "verification",
     "as_found": "verification",
     "laboratory": "laboratory",
