@@ -67,7 +67,6 @@ SAMPLES = {
     "keys": "key",
     "public": "key",
     "document": "signed",
-    "files": "run",
     "verification": "verification",
     "as_found": "verification",
     "laboratory": "laboratory",
