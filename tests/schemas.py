@@ -23,11 +23,12 @@ from mwdcal.app.screens import (
     simulation,
     stations,
 )
-from mwdcal.app.screens.records import signature
+from mwdcal.app.screens.records import registry, signature
 from mwdcal.app.screens.surveys import reference, survey
 from mwdcal.calibration.record import DOCUMENT_VERSION, SCHEMA_VERSION, Calibration
 from mwdcal.certificate.document import Certificate
 from mwdcal.faults.diagnosis import Diagnosis
+from mwdcal.registry.lookup import Listing
 from mwdcal.use.verification import Verdict
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
@@ -49,6 +50,17 @@ CONTENTS: dict[str, type] = {
     "plan": plan.PlanDocument,
     "profile": proposal.ProposalSummary,
     "reference": reference.ReferenceSummary,
+    "registry add": registry.RegistryAdded,
+    "registry backup": registry.RegistryCopied,
+    "registry check": registry.RegistryChecked,
+    "registry export": registry.RegistryExported,
+    "registry get": registry.RegistryDocument,
+    "registry history": Listing,
+    "registry init": registry.RegistryCreated,
+    "registry list": Listing,
+    "registry restore": registry.RegistryCopied,
+    "registry upgrade": registry.RegistryUpgraded,
+    "registry withdraw": registry.RegistryWithdrawn,
     "simulate": simulation.SimulationSummary,
     "stations": stations.StationsSummary,
     "survey": survey.SurveySummary,

@@ -205,7 +205,9 @@ def test_json_of_calibrate_holds_the_numbers_of_the_text(tmp_path):
 def test_json_of_apply_holds_the_numbers_of_the_text(tmp_path, files):
     arguments = ("apply", *files, "-o", tmp_path / "out.csv")
     said, told = mwdcal(*arguments), mwdcal(*arguments, "--json").json
-    assert said.out == f"{told['rows']} rows corrected   wrote {told['output']}\n"
+    assert said.out == (
+        f"{told['rows']} rows corrected   wrote {told['output']}   unsigned calibration\n"
+    )
     assert said.err == "".join(f"! {f['text']}\n" for f in told["findings"])
 
 

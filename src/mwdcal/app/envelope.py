@@ -31,6 +31,7 @@ INPUTS = {
     "registry add": (),
     "registry backup": (),
     "registry check": (),
+    "registry drift": (),
     "registry export": (),
     "registry get": (),
     "registry history": (),

@@ -12,6 +12,7 @@ SUBCOMMANDS = {
     "list": "records.registry_queries:listing",
     "history": "records.registry_queries:history",
     "get": "records.registry_queries:get",
+    "drift": "records.registry_drift",
     "withdraw": "records.registry_add:withdraw",
     "export": "records.registry_copies:export",
     "check": "records.registry_schema:check",

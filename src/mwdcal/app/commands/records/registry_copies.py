@@ -35,16 +35,16 @@ def export(folder: Path, database: str, as_json: bool) -> None:
     result = screen.RegistryExported(
         folder=str(folder), files=len(manifest.files), events=manifest.events, head=manifest.head
     )
-    text = f"wrote {plural(result.files, 'document')} to {folder}   newest event {result.head[:16]}"
+    text = f"wrote {plural(result.files, 'document')} to {folder}   newest event {result.head}"
     about = {"simulated": manifest.simulated}
     print_result(screen.document("registry export", result, about) if as_json else one_line(text))
 
 
 @options.command()
-@options.argument("file")
+@options.argument("output", metavar="FILE")
 @options.DATABASE
 @options.JSON
-def backup(file: Path, database: str, as_json: bool) -> None:
+def backup(output: Path, database: str, as_json: bool) -> None:
     """Write a backup of a registry into a FILE, while others go on writing to it.
 
     Note the hash that it prints: `check --head` later tells whether all is still there.
@@ -57,19 +57,19 @@ def backup(file: Path, database: str, as_json: bool) -> None:
     from mwdcal.registry import copies
     from mwdcal.registry.store import open_registry
 
-    options.check_outputs([file], [database])
+    options.check_outputs([output], [database])
     with open_registry(database) as registry:
-        result = screen.RegistryCopied(file=str(file), head=copies.backup(registry, file))
-    text = f"wrote {file}   newest event {result.head}"
+        result = screen.RegistryCopied(file=str(output), head=copies.backup(registry, output))
+    text = f"wrote {output}   newest event {result.head}"
     print_result(screen.document("registry backup", result) if as_json else one_line(text))
 
 
 @options.command()
-@options.argument("file")
+@options.argument("source", metavar="FILE")
 @options.DATABASE
 @options.ACTOR
 @options.JSON
-def restore(file: Path, database: str, actor: str, as_json: bool) -> None:
+def restore(source: Path, database: str, actor: str, as_json: bool) -> None:
     """Fill a new registry, a file or an empty PostgreSQL database, from the backup in a FILE.
 
     \b
@@ -79,7 +79,7 @@ def restore(file: Path, database: str, actor: str, as_json: bool) -> None:
     from mwdcal.app.screens.records import registry as screen
     from mwdcal.registry import copies
 
-    head = copies.restore(file, database, actor)
-    result = screen.RegistryCopied(file=str(file), head=head)
-    text = f"restored the registry from {file}   newest event of the backup {head}"
+    head = copies.restore(source, database, actor)
+    result = screen.RegistryCopied(file=str(source), head=head)
+    text = f"restored the registry from {source}   newest event of the backup {head}"
     print_result(screen.document("registry restore", result) if as_json else one_line(text))

@@ -28,7 +28,7 @@ def init(database: str, actor: str, as_json: bool) -> None:
     create(database, actor)
     with open_registry(database) as registry:
         result = screen.RegistryCreated(registry=registry.name, head=registry.head()[1])
-    created = f"created the registry {result.registry}   its newest event {result.head[:16]}"
+    created = f"created the registry {result.registry}   newest event {result.head}"
     print_result(screen.document("registry init", result) if as_json else created)
 
 
@@ -54,7 +54,7 @@ def upgrade(database: str, actor: str, target: str | None, as_json: bool) -> Non
     else:
         before, after = setup.upgrade(database, actor)
     result = screen.RegistryUpgraded(before=before, after=after)
-    words = f"schema {before} → {after}" if before != after else f"schema {after}, as it should be"
+    words = f"schema {before} → {after}" if before != after else f"schema {after}   nothing to do"
     print_result(screen.document("registry upgrade", result) if as_json else words)
 
 
@@ -78,6 +78,7 @@ def check(database: str, head: str | None, as_json: bool) -> None:
     """
     from mwdcal.app.progress import bar
     from mwdcal.app.screens.records import registry as screen
+    from mwdcal.calibration.record import Finding
     from mwdcal.registry import checking
     from mwdcal.registry.store import open_registry
 
@@ -86,5 +87,6 @@ def check(database: str, head: str | None, as_json: bool) -> None:
             discrepancies = checking.check(registry, head, advance)
         result = screen.checked(registry, discrepancies)
     shown = screen.document("registry check", result) if as_json else screen.check_text(result)
-    print_result(shown)
+    findings = [Finding(id=each.id, text=f"{each.text}.") for each in result.discrepancies]
+    print_result(shown, findings)
     sys.exit(0 if result.sound else 1)

@@ -1,0 +1,161 @@
+"""The drift of the tools of a registry: its calibrations and roll tests, compared."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from datetime import date
+from typing import Any
+
+import msgspec
+
+from mwdcal.calibration.record import Calibration
+from mwdcal.drift.document import FleetDrift, ToolDrift
+from mwdcal.drift.fleet import fleet_drift
+from mwdcal.drift.service import ServiceTest
+from mwdcal.drift.tool import MeasuredTool, TypeRates, measured, predicted
+from mwdcal.errors import InputError, MwdcalError
+from mwdcal.files import documents
+from mwdcal.files.formats.columns import shown
+from mwdcal.files.formats.members import Member
+from mwdcal.files.limits import load_limits
+from mwdcal.registry import queries
+from mwdcal.registry.store import Registry
+from mwdcal.use.verification import Bounds, Verdict
+
+ANGLES = ("inclination", "toolface", "azimuth")
+PEERS_READ = 200
+"""Most other tools of its type that a single tool is compared with."""
+PAGE = 500
+"""Rows of a registry that are read at once."""
+
+
+class RegistryDrift(msgspec.Struct, frozen=True, kw_only=True):
+    """How one tool changes, or all tools of a registry; by the limits of the 95 % accuracy, degrees."""
+
+    registry: str
+    limits_deg: dict[str, float]
+    tool: ToolDrift | None = None
+    fleet: FleetDrift | None = None
+
+
+def limits_of(typed: Iterable[str]) -> dict[str, float]:
+    """Limits by angle, degrees, as typed: `inclination_deg=0.1`; by default those of the profile roll-test.
+
+    Raises:
+        InputError: what was typed is no angle with a positive number.
+    """
+    limits: dict[str, float] = {}
+    for text in typed:
+        name, _, value = text.partition("=")
+        angle = name.removesuffix("_deg")
+        try:
+            limits[angle] = float(value)
+        except ValueError:
+            limits[angle] = -1.0
+        if angle not in ANGLES or not 0 < limits[angle] < 180:
+            names = ", ".join(f"{angle}_deg" for angle in ANGLES)
+            raise InputError(
+                f"`limit` must be one of {names} with a positive number, such as inclination_deg=0.1; got "
+                f"{shown(text)}."
+            )
+    return limits or default_limits(load_limits()[0].error)
+
+
+def default_limits(errors: Bounds) -> dict[str, float]:
+    """The limits on errors of the angles."""
+    return {name: value for name, value in errors.items() if name in ANGLES}
+
+
+def of_registry(
+    registry: Registry, serial: str | None, limits: dict[str, float], level: float, today: date
+) -> RegistryDrift:
+    """The drift of a tool with its peers, or without a serial of all tools.
+
+    Raises:
+        InputError: there is no calibration of such a tool.
+    """
+    whole = {"registry": registry.name, "limits_deg": limits}
+    if serial is not None:
+        return RegistryDrift(**whole, tool=_of_tool(registry, serial, limits, level, today))
+    tools, refused = [], {}
+    for row in _tools(registry):
+        try:
+            if tool := _measured(registry, row["serial"], level):
+                tools.append(tool)
+        except MwdcalError as error:
+            refused[row["serial"]] = str(error)
+    if not tools:
+        raise InputError(
+            f"{registry.name}: there is no calibration to compare. Add some: mwdcal registry add."
+        )
+    fleet, _ = fleet_drift(tools, limits, today, refused, level)
+    return RegistryDrift(**whole, fleet=fleet)
+
+
+def _of_tool(
+    registry: Registry, serial: str, limits: dict[str, float], level: float, today: date
+) -> ToolDrift:
+    tool = _measured(registry, serial, level)
+    if tool is None:
+        raise InputError(
+            f"{registry.name} has no calibration of a tool {shown(serial)}. mwdcal registry list shows its tools."
+        )
+    peers = [tool, *_peers(registry, serial, tool.drift.type)]
+    return predicted(tool, TypeRates.of(peers), limits, today)
+
+
+def _peers(registry: Registry, serial: str, kind: str) -> Iterator[MeasuredTool]:
+    """Other tools of a type, at most `PEERS_READ`, spread evenly; those that cannot be read are left out."""
+    rows = [row for row in _tools(registry, type=kind) if row["serial"] != serial]
+    for row in rows[:: -(-len(rows) // PEERS_READ) or 1]:
+        try:
+            calibrations, _ = _calibrations(registry, row["serial"])
+        except MwdcalError:
+            continue
+        if len(calibrations) > 1:
+            yield measured(row["serial"], calibrations, tested=False)
+
+
+def _tools(registry: Registry, **where: object) -> Iterator[queries.Row]:
+    """All tools of a registry whose columns equal these."""
+    start, total = 0, 1
+    while start < total:
+        total, rows = queries.tools_page(registry, where=where, offset=start, limit=PAGE)
+        yield from rows
+        start += PAGE
+
+
+def _measured(registry: Registry, serial: str, level: float) -> MeasuredTool | None:
+    """A tool by its calibrations and roll tests; None where it has no calibration."""
+    calibrations, digests = _calibrations(registry, serial)
+    if not calibrations:
+        return None
+    tests = list(_tests(registry, serial)) if len(calibrations) else []
+    return measured(serial, calibrations, tests, level, digests)
+
+
+def _calibrations(registry: Registry, serial: str) -> tuple[list[Calibration], dict[str, str]]:
+    """The calibrations of a tool, and the SHA-256 of each file by that of its content."""
+    read, digests = [], {}
+    for row, data in queries.calibrations(registry, serial):
+        calibration = documents.decoded(Member(data, row["name"], row["sha256"]))
+        read.append(calibration)
+        digests[str(calibration.sha256)] = row["sha256"]
+    return read, digests
+
+
+def _tests(registry: Registry, serial: str) -> Iterator[ServiceTest]:
+    """The roll tests of a tool that were not withdrawn, each on the day of its run or, unknown, when it was added."""
+    where = {"serial": serial}
+    days = {row["sha256"]: row["time"] for row in _records(registry, "run", where)}
+    for row in _records(registry, "verification", where):
+        day = row["time"] or days.get(row["run"]) or row["added"]
+        document = msgspec.json.decode(registry.content(row["sha256"]), type=dict[str, Any])
+        verdict = msgspec.convert(document, Verdict)
+        yield ServiceTest(date.fromisoformat(day[:10]), row["calibration"] or "", verdict)
+
+
+def _records(registry: Registry, kind: str, where: dict[str, object]) -> Sequence[queries.Row]:
+    """The records of a kind that were not withdrawn."""
+    page = queries.records_page(registry, kind, where, newest_first=False, limit=PAGE)
+    return [row for row in page.rows if row["withdrawn"] is None]

@@ -1,0 +1,300 @@
+"""A tool's calibrations put into common parameters, and what of them cannot be compared."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from datetime import date
+
+import numpy as np
+
+from mwdcal.calibration.prediction import raw_reading
+from mwdcal.calibration.readings import NANOTESLA, SOAK_GAP, TRIADS
+from mwdcal.calibration.record import Calibration, TriadCalibration
+from mwdcal.drift.comparable import (
+    DIRECTIONS,
+    UNRECORDED,
+    History,
+    calibrated_on,
+    factored,
+    one_noise,
+    parameter_names,
+    precision,
+    years,
+)
+from mwdcal.geometry.vectors import Array, Bools, outer
+
+NOTES = {
+    "no-overlap": "not compared: its temperatures, {low:.0f}…{high:.0f} °C, and those of later calibrations, {others}, "
+    "have none in common",
+    "unrecorded": "its run recorded no temperature: taken as made where the others were",
+    "no-magnetometer": "has no magnetometer: only the accelerometer is compared",
+    "relative": "its magnetometer is calibrated to field = 1: scale and bias are compared but for a common factor",
+    "curved": "the {triad} has own-axis terms: its best straight line is compared",
+    "held": "its model holds misalignments at zero: they are not compared",
+    "free": "leaves undetermined: {free}: the others are compared",
+    "model": "the {triad} has the model '{model}', that of the latest is '{latest}': over temperature the two differ by "
+    "their own misfit",
+    "order": "the {triad} has temperature terms of order {order}: compared to order {compared}",
+}
+"""What is said of a calibration that cannot be compared, or not in all of its parameters."""
+
+
+DECLARED = "declared"
+"""How a calibration says that the noise of its readings was declared."""
+DEGREES = "°"
+"""Unit in which misalignments are stated."""
+
+
+def factor(unit: str) -> float:
+    """What a value in the unit of calculation is multiplied by to be in the unit that is stated."""
+    return float(np.degrees(1)) if unit == DEGREES else 1.0
+
+
+@dataclass(frozen=True)
+class ToolHistory:
+    """The calibrations of one tool, oldest first, as a `History` of those that can be compared.
+
+    `notes` of every calibration; `used`: which are in `history`; `temperature_c`: the range over which they
+    are compared; `units` in which its parameters are stated (see `factor`); `earth`: gravity, field and dip;
+    `covariance` (n, p, p) as each calibration states it, in `history` with the noise of all; `free` (f, p):
+    what the latest leaves undetermined.
+    """
+
+    calibrations: tuple[Calibration, ...]
+    days: tuple[date, ...]
+    used: tuple[bool, ...]
+    notes: tuple[tuple[str, ...], ...]
+    temperature_c: tuple[float, float]
+    units: tuple[str, ...]
+    earth: tuple[float, float, float]
+    covariance: Array
+    free: Array
+    history: History
+
+    @property
+    def compared(self) -> list[Calibration]:
+        """The calibrations in `history`."""
+        return [c for c, used in zip(self.calibrations, self.used, strict=True) if used]
+
+    @property
+    def compared_days(self) -> list[date]:
+        """The days of the calibrations in `history`."""
+        return [day for day, used in zip(self.days, self.used, strict=True) if used]
+
+
+def tool_history(calibrations: Sequence[Calibration]) -> ToolHistory:
+    """Calibrations (one or more) of one tool, in any order, in common parameters.
+
+    Those of the latest decide: one that has no temperature in common with it is left out, and says so.
+    """
+    ordered = sorted(calibrations, key=lambda c: (calibrated_on(c), c.time))
+    days = [calibrated_on(each) for each in ordered]
+    used, span, notes = _in_common(ordered)
+    compared = [each for each, use in zip(ordered, used, strict=True) if use]
+    latest = ordered[-1]
+    orders = _orders(compared, span)
+    middle = _middle(latest, span)
+    if not any(orders.values()):
+        span = (middle, middle)
+    form = _Form(latest, span, orders, compared)
+    rows = [form.row(each) for each in compared]
+    more = iter([form.notes(each) for each in compared])
+    notes = [[*first, *(next(more) if use else ())] for first, use in zip(notes, used, strict=True)]
+    kept = [day for day, use in zip(days, used, strict=True) if use]
+    names = parameter_names(orders)
+    values, covariance, free = ([row[i] for row in rows] for i in range(3))
+    ratio, *noise = (np.concatenate(part, -1) for part in zip(*form.noise(), strict=True))
+    like = np.stack(covariance) * outer(np.sqrt(ratio))
+    known = np.stack([precision(*each) for each in zip(like, free, strict=True)])
+    history = History(names, np.stack(values), like, known, *noise, years(kept))
+    units = tuple(map(form.unit, names))
+    tool = tuple(ordered), tuple(days), tuple(used), tuple(map(tuple, notes))
+    return ToolHistory(*tool, span, units, form.earth(), np.stack(covariance), free[-1], history)
+
+
+def _range(calibration: Calibration) -> tuple[float, float]:
+    """Temperatures that a calibration holds for, °C."""
+    if calibration.temperature_c is None:
+        return UNRECORDED
+    low, high = calibration.temperature_c
+    return low - calibration.margin, high + calibration.margin
+
+
+def _in_common(
+    ordered: Sequence[Calibration],
+) -> tuple[list[bool], tuple[float, float], list[list[str]]]:
+    """Which calibrations have temperatures in common, these, and notes of each; the latest first."""
+    used, notes, span = [], [], UNRECORDED
+    for each in reversed(ordered):
+        low, high = _range(each)
+        both = max(low, span[0]), min(high, span[1])
+        used.append(both[0] <= both[1])
+        if used[-1]:
+            span = both
+            notes.append([NOTES["unrecorded"]] if each.temperature_c is None else [])
+        else:
+            others = f"{span[0]:.0f}…{span[1]:.0f} °C"
+            notes.append([NOTES["no-overlap"].format(low=low, high=high, others=others)])
+    return used[::-1], span, notes[::-1]
+
+
+def _middle(latest: Calibration, span: tuple[float, float]) -> float:
+    """The temperature at which calibrations without a common course are compared."""
+    return float(np.clip(latest.reference_temperature, *span))
+
+
+def _orders(compared: Sequence[Calibration], span: tuple[float, float]) -> dict[str, int]:
+    """Order by triad to which temperature terms are compared: the lowest; none over a short range."""
+    short = not span[1] - span[0] > 2 * SOAK_GAP or not np.isfinite(span).all()
+    triads = [TRIADS[0], *TRIADS[1:][: any(c.has_field for c in compared)]]
+    each = {
+        name: [t.order for c in compared for t in c.triads if t.name == name] for name in triads
+    }
+    return {name: 0 if short else min(orders) for name, orders in each.items()}
+
+
+@dataclass(frozen=True)
+class _Form:
+    """How calibrations are put into common parameters: those of `latest`, over a range of temperatures."""
+
+    latest: Calibration
+    span: tuple[float, float]
+    orders: dict[str, int]
+    compared: Sequence[Calibration]
+
+    def noise(self) -> Iterator[tuple[Array, Array, Bools]]:
+        """What variances (n, k) of each triad's parameters are multiplied by, their freedom, which are pooled."""
+        for name, order in self.orders.items():
+            triads = [getattr(each, name) for each in self.compared]
+            factors = [None if t is None else t.variance_factor for t in triads]
+            square = np.array([np.nan if factor is None else factor for factor in factors])
+            freedom = np.array([t.degrees_of_freedom if t else 0.0 for t in triads])
+            declared = np.array([t is not None and t.noise_source == DECLARED for t in triads])
+            ratio, degrees, together = one_noise(np.where(declared, square, np.nan), freedom)
+            own = np.where(np.isnan(square) | (freedom < 1), np.inf, freedom)
+            parts = ratio, np.where(declared, degrees, own), together
+            first, second, third = (np.repeat(part[:, None], 12 + 6 * order, -1) for part in parts)
+            yield first, second, third
+
+    def row(self, calibration: Calibration) -> tuple[Array, Array, Array]:
+        """Values (p,), covariance (p, p) as stated, and free directions (f, p) of one calibration."""
+        places, parts = calibration.places(), []
+        size = len(calibration.parameters)
+        for name, order in self.orders.items():
+            triad = getattr(calibration, name)
+            if triad is None:
+                count = 12 + 6 * order
+                parts.append((np.full(count, np.nan), np.zeros((count, size))))
+                continue
+            values, slope = self._triad(calibration, triad)
+            whole = np.zeros((len(values), size))
+            whole[:, places[name]] = slope
+            parts.append((values, whole))
+        values, slope = (np.concatenate(part) for part in zip(*parts, strict=True))
+        covariance = slope @ calibration.parameter_covariance @ slope.transpose()
+        free = [
+            *(calibration.free_directions @ slope.transpose()),
+            *self._stretch(calibration, values),
+        ]
+        rows = np.nan_to_num(np.reshape(free, (-1, len(values))))
+        return values, covariance, rows
+
+    def _triad(self, calibration: Calibration, triad: TriadCalibration) -> tuple[Array, Array]:
+        """Factors (k,) of a triad and their derivatives (k, p) by its parameters in the file."""
+        x = self._points(triad.name)
+        axes = _axes(calibration, triad.name) @ np.linalg.inv(
+            _axes(self._last(triad.name), triad.name)
+        )
+        model = triad.functions(calibration.reference_temperature)
+        raw, order = x @ axes.transpose(), self.orders[triad.name]
+        result = factored(model, np.array(triad.parameters), raw, self.span, order, x)
+        strength = self._strength(calibration, triad.name)
+        powers = _powers_of_strength(len(result.values))
+        return result.values * strength**powers, result.jacobian * (strength**powers)[:, None]
+
+    def _last(self, triad: str) -> Calibration:
+        """The latest calibration of a triad: one in nT before one to field = 1."""
+        having = [each for each in self.compared if getattr(each, triad) is not None]
+        return next((c for c in reversed(having) if not self._unknown(c, triad)), having[-1])
+
+    @staticmethod
+    def _unknown(calibration: Calibration, triad: str) -> bool:
+        """Whether a triad is calibrated to a field of unknown strength."""
+        return triad == TRIADS[1] and calibration.relative
+
+    def _points(self, triad: str) -> Array:
+        """Readings (m, 3) of the latest calibration of a triad where its field points every way."""
+        last = self._last(triad)
+        strength = last.earth.get("field", 1.0) if triad == TRIADS[1] else last.earth["gravity_g"]
+        model = getattr(last, triad).functions(last.reference_temperature)
+        warmth = np.full(len(DIRECTIONS), np.clip(sum(self.span) / 2, *_range(last)))
+        return raw_reading(
+            model, np.array(getattr(last, triad).parameters), strength * DIRECTIONS, warmth
+        )
+
+    def _strength(self, calibration: Calibration, triad: str) -> float:
+        """The field that a triad calibrated to field = 1 is taken to have been in, where others are in nT."""
+        last = self._last(triad)
+        alike = self._unknown(calibration, triad) == self._unknown(last, triad)
+        return 1.0 if alike else float(last.earth["field"])
+
+    def _stretch(self, calibration: Calibration, values: Array) -> Array:
+        """The direction (0 or 1, p) along which a field of unknown strength stretches the parameters."""
+        if not calibration.relative:
+            return np.zeros((0, len(values)))
+        first = 12 + 6 * self.orders[TRIADS[0]]
+        row = np.zeros_like(values)
+        row[first:] = values[first:] * _powers_of_strength(len(values) - first)
+        return row[None]
+
+    def earth(self) -> tuple[float, float, float]:
+        """Gravity, g, field, in the unit of the values, and dip, radians."""
+        earth = self._last(TRIADS[-1] if TRIADS[-1] in self.orders else TRIADS[0]).earth
+        return (
+            earth["gravity_g"],
+            earth.get("field", 1.0),
+            float(np.radians(earth.get("dip_deg", 0.0))),
+        )
+
+    def notes(self, calibration: Calibration) -> Iterator[str]:
+        """What of a calibration is not compared, or as something else."""
+        for name, compared in self.orders.items():
+            triad = getattr(calibration, name)
+            if triad is None:
+                yield NOTES["no-magnetometer"]
+                continue
+            if triad.curved:
+                yield NOTES["curved"].format(triad=name)
+            latest = getattr(self._last(name), name).model
+            if compared and triad.model != latest:
+                yield NOTES["model"].format(triad=name, model=triad.model, latest=latest)
+            if triad.order > compared:
+                yield NOTES["order"].format(triad=name, order=triad.order, compared=compared)
+        if calibration.relative:
+            yield NOTES["relative"]
+        if calibration.options.parameters < 12:
+            yield NOTES["held"]
+        if free := calibration.undetermined():
+            yield NOTES["free"].format(free=", ".join(dict.fromkeys(each.id for each in free)))
+
+    def unit(self, name: str) -> str:
+        """The unit of a parameter."""
+        triad, _, title = name.partition(" ")
+        if title.startswith("misalignment"):
+            return DEGREES
+        last = self._last(triad)
+        field = "" if last.relative and triad == TRIADS[1] else NANOTESLA
+        return "" if title.startswith("scale") else ("g" if triad == TRIADS[0] else field)
+
+
+def _axes(calibration: Calibration, triad: str) -> Array:
+    """Matrix (3, 3) from the raw channels of a triad to its tool axes in nominal units."""
+    profile = getattr(calibration.profile, triad)
+    return np.asarray(profile.permutation / (profile.scale or 1.0))
+
+
+def _powers_of_strength(size: int) -> Array:
+    """By which power of the strength of the field each parameter (size,) of a triad goes: scale -1, bias 1."""
+    course = np.tile(np.repeat([-1.0, 1.0], 3), 1 + (size - 12) // 6)
+    return np.concatenate([course[:6], np.zeros(6), course[6:]])

@@ -1,0 +1,321 @@
+"""The drift of one tool, and of many tools of one type, whose walks are estimated together."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import date
+from zlib import crc32
+
+import numpy as np
+from msgspec.structs import replace
+
+from mwdcal.calibration.record import Calibration, Finding, stated
+from mwdcal.drift.change import LEVEL, ChangeTest, change_test
+from mwdcal.drift.document import (
+    AccuracyForecast,
+    ChangeVerdict,
+    ComparedCalibration,
+    DueDate,
+    ParameterCourse,
+    ParameterStep,
+    ToolDrift,
+    Transition,
+    WalkRate,
+)
+from mwdcal.drift.forecast import (
+    COVERAGE_FACTOR,
+    DRAWN_RATES,
+    INTERVAL,
+    LONGEST,
+    Growth,
+    day_after,
+    growths,
+    years_to,
+)
+from mwdcal.drift.histories import ToolHistory, factor, tool_history
+from mwdcal.drift.service import ServiceTest, service_rows
+from mwdcal.drift.walk import GROUPS, GroupRates, Increments, draws, group_places, quantiles
+from mwdcal.geometry.vectors import Array
+
+CONTROL = 3.0
+"""Standard deviations within which control limits lie."""
+MOST_PEERS = 2_000
+"""Most tools of a type that its rates are learnt from."""
+TIMES = np.linspace(0.0, LONGEST, 21)
+"""Years after a calibration for which its accuracy is forecast."""
+TOOL_AND_PEERS, PEERS = "tool and peers", "peers"
+FINDINGS = {
+    "changed": "the tool changed: {what}.",
+    "misfit": "the calibrations disagree beyond their uncertainties, though no step of a single parameter explains it",
+    "single": "there is one calibration: a change cannot be tested, and only peers tell how fast it drifts.",
+    "unpredicted": "the next due date cannot be predicted: no tool of type '{type}' has two calibrations that can be "
+    "compared.",
+    "peers": "one calibration tells nothing of drift: the rates are those of {count} of the same type.",
+    "few": "the rates rest on few calibrations: the interval of the due date is wide.",
+    "left-limits": "{count} passed as left and failed as found: the tool left its limits in service ({names}).",
+    "overdue": "the latest calibration was due again on {due}.",
+    "inaccurate": "the 95 % accuracy of {angle}, {now:.2g}°, exceeds the limit of {limit:g}° from the first day.",
+    "too-free": "{angle} has no stated accuracy: it rests on a direction that the calibration leaves undetermined.",
+}
+
+
+Distribution = tuple[Array, Array]
+"""Rates and their probabilities."""
+
+
+@dataclass(frozen=True)
+class MeasuredTool:
+    """A tool before its rates are known: what its calibrations say by themselves."""
+
+    drift: ToolDrift
+    calibrated: date
+    increments: dict[tuple[str, str], Increments]
+    growths: list[Growth]
+    gaps: Array
+    groups: list[tuple[str, str] | None]
+
+
+def measured(
+    serial: str, calibrations: Sequence[Calibration], tests: Sequence[ServiceTest] = (),
+    level: float = LEVEL, digests: Mapping[str, str] | None = None, tested: bool = True,
+) -> MeasuredTool:  # fmt: skip
+    """The change test and the growth of one tool.
+
+    `digests`: the SHA-256 of the file of each calibration by that of its contents, by which tests may name it.
+    Not `tested`: no change test, as of a peer.
+    """
+    tool = tool_history(calibrations)
+    names, history = tool.history.names, tool.history
+    test = change_test(history, level) if tested and len(tool.compared) > 1 else None
+    places = {group: group_places(names, *group) for group in GROUPS}
+    increments = {g: Increments.of(history, some) for g, some in places.items() if some}
+    of_place = {place: group for group, some in places.items() for place in some}
+    named = [(c, _digests(c, digests or {})) for c in tool.calibrations]
+    drift = ToolDrift(
+        serial=serial, type=tool.calibrations[-1].profile.name,
+        simulated=any(c.simulated for c in tool.calibrations),
+        temperature_c=tool.temperature_c if np.isfinite(tool.temperature_c).all() else None,
+        calibrations=_calibrations(tool), parameters=_parameters(tool, test),
+        change=None if test is None else _verdict(tool, test),
+        basis="", peers=0, rates=[], forecast=[], due=[], next_due=None,
+        service=service_rows(named, tests), findings=[],
+    )  # fmt: skip
+    groups = [of_place.get(int(place)) for place in history.steady]
+    return MeasuredTool(
+        drift, tool.compared_days[-1], increments, growths(tool),
+        np.diff(history.years), groups,
+    )  # fmt: skip
+
+
+def _digests(calibration: Calibration, digests: Mapping[str, str]) -> list[str]:
+    """The SHA-256 by which a roll test may name a calibration."""
+    own = str(calibration.sha256)
+    return [own, digests.get(own, own)]
+
+
+def _calibrations(tool: ToolHistory) -> list[ComparedCalibration]:
+    rows = zip(tool.calibrations, tool.days, tool.used, tool.notes, strict=True)
+    return [
+        ComparedCalibration(
+            date=day.isoformat(), run=c.run, sha256=str(c.sha256 or ""), used=used, notes=[*notes]
+        )
+        for c, day, used, notes in rows
+    ]
+
+
+def _parameters(tool: ToolHistory, test: ChangeTest | None) -> list[ParameterCourse]:
+    """The parameters at the middle temperature; control limits are still missing."""
+    history, courses = tool.history, []
+    sd = np.sqrt(np.maximum(np.diagonal(tool.covariance, axis1=-2, axis2=-1), 0.0))
+    known = np.diagonal(history.precision, axis1=-2, axis2=-1) > 0
+    sd = np.where(known, sd, np.nan)
+    nothing = [None] * len(sd)
+    for place in history.steady.tolist():
+        triad, _, name = history.names[place].partition(" ")
+        scores = np.abs(test.scores[:, place]) if test else np.full(1, np.nan)
+        times = factor(tool.units[place])
+        courses.append(
+            ParameterCourse(
+                triad=triad, name=name, unit=tool.units[place],
+                values=[stated(v) for v in history.values[:, place] * times],
+                standard_uncertainties=[stated(s) for s in sd[:, place] * times],
+                low=nothing, high=nothing, outside=[False] * len(sd),
+                score=None if np.isnan(scores).all() else float(np.nanmax(scores)),
+            )
+        )  # fmt: skip
+    return courses
+
+
+def _verdict(tool: ToolHistory, test: ChangeTest) -> ChangeVerdict:
+    """The outcome of the test in words and dates."""
+    days = [day.isoformat() for day in tool.compared_days]
+    steps = []
+    for step in test.steps:
+        triad, _, name = tool.history.names[step.place].partition(" ")
+        times = factor(tool.units[step.place])
+        steps.append(
+            ParameterStep(
+                triad=triad, name=name, unit=tool.units[step.place], after=days[step.after - 1],
+                by=days[step.after], change=step.size * times, standard_uncertainty=step.uncertainty * times,
+                score=step.score,
+            )
+        )  # fmt: skip
+    pairs = zip(
+        days, days[1:], test.pair_misfit, test.pair_freedom, test.pair_probability, strict=False
+    )
+    return ChangeVerdict(
+        changed=test.changed, level=test.level, probability=test.probability,
+        largest_score=test.largest_score, critical_score=test.critical_score, misfit=test.misfit,
+        degrees_of_freedom=test.degrees_of_freedom, misfit_probability=test.misfit_probability,
+        steps=steps,
+        transitions=[
+            Transition(start=a, end=b, misfit=float(m), degrees_of_freedom=int(f), probability=float(p))
+            for a, b, m, f, p in pairs
+        ],
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class TypeRates:
+    """The random walks of tools of one type, by group; `peers`: how many tools with two calibrations they rest on.
+
+    `members`: serials of the tools that they were learnt from.
+    """
+
+    groups: dict[tuple[str, str], GroupRates]
+    members: frozenset[str] = field(default_factory=frozenset)
+
+    @classmethod
+    def of(cls, tools: Sequence[MeasuredTool]) -> TypeRates:
+        """Of tools of one type, at most `MOST_PEERS` of them, spread evenly."""
+        several = [t for t in tools if any(i.noise.size for i in t.increments.values())]
+        some = several[:: -(-len(several) // MOST_PEERS) or 1]
+        each = {g: [t.increments[g] for t in some if g in t.increments] for g in GROUPS}
+        rates = {group: GroupRates.of(increments) for group, increments in each.items()}
+        kept = {group: found for group, found in rates.items() if found is not None}
+        return cls(kept, frozenset(t.drift.serial for t in some))
+
+
+def predicted(
+    tool: MeasuredTool, rates: TypeRates, limits: Mapping[str, float], today: date | None = None
+) -> ToolDrift:
+    """The drift of a tool with control limits, forecast and due dates, by the rates of its type.
+
+    `limits` in degrees by angle, which the 95 % accuracy is to keep; with `today`, an overdue calibration says so.
+    """
+    drift, serial = tool.drift, tool.drift.serial
+    among = serial in rates.members
+    known = {
+        group: (found.rates, found.probability(tool.increments[group], among))
+        for group, found in rates.groups.items()
+        if group in tool.increments
+    }
+    usable = [g for g in tool.growths if set(g.yearly) <= set(known)]
+    rng = np.random.default_rng(crc32(serial.encode()))
+    drawn = {group: draws(*each, DRAWN_RATES, rng) for group, each in known.items()}
+    due = [_due(tool, g, g.rate(drawn), limits[g.angle]) for g in usable if g.angle in limits]
+    own = any(each.noise.size for each in tool.increments.values())
+    drift = replace(
+        drift,
+        basis=(TOOL_AND_PEERS if own else PEERS) if known else "",
+        peers=len(rates.members - {serial}),
+        rates=_rates(drift, known),
+        parameters=_controlled(tool, known),
+        forecast=[_forecast(g, g.rate(drawn)) for g in usable],
+        due=due,
+        next_due=min((each.due for each in due), default=None),
+    )
+    return replace(drift, findings=_findings(drift, limits, today))
+
+
+def _rates(drift: ToolDrift, known: Mapping[tuple[str, str], Distribution]) -> list[WalkRate]:
+    """The rates in words: what a parameter moves by in a year."""
+    units = {(p.triad, p.name.partition("-")[0]): p.unit for p in drift.parameters}
+    rows = []
+    for (triad, kind), distribution in known.items():
+        rows.append(walk_rate(triad, kind, units[triad, kind], distribution))
+    return rows
+
+
+def walk_rate(triad: str, kind: str, unit: str, distribution: Distribution) -> WalkRate:
+    """A distribution over rates in words."""
+    low, middle, high = (np.sqrt(quantiles(*distribution, INTERVAL)) * factor(unit)).tolist()
+    return WalkRate(triad=triad, kind=kind, unit=unit, per_root_year=middle, low=low, high=high)
+
+
+def _controlled(
+    tool: MeasuredTool, known: Mapping[tuple[str, str], Distribution]
+) -> list[ParameterCourse]:
+    """The parameters with control limits: from each calibration to the next, by walk and uncertainties."""
+    courses = []
+    for course, group in zip(tool.drift.parameters, tool.groups, strict=True):
+        rate = float(quantiles(*known[group], [0.5])[0]) if group in known else 0.0
+        rate *= factor(course.unit) ** 2
+        low: list[float | None] = [None]
+        high: list[float | None] = [None]
+        outside = [False]
+        values, sds = course.values, course.standard_uncertainties
+        for k, gap in enumerate(tool.gaps.tolist()):
+            (v, w), (s, u) = values[k : k + 2], sds[k : k + 2]
+            if v is None or w is None or s is None or u is None:
+                low, high, outside = [*low, None], [*high, None], [*outside, False]
+                continue
+            half = CONTROL * float(np.sqrt(s**2 + u**2 + rate * gap))
+            low, high, outside = [*low, v - half], [*high, v + half], [*outside, abs(w - v) > half]
+        courses.append(replace(course, low=low, high=high, outside=outside))
+    return courses
+
+
+def _forecast(growth: Growth, yearly: Array) -> AccuracyForecast:
+    """1σ over time: the median, and the interval of the rates."""
+    rates = np.quantile(yearly, INTERVAL)
+    sd = np.degrees(np.sqrt(growth.calibration + rates[:, None] * TIMES))
+    low, middle, high = sd.tolist()
+    return AccuracyForecast(
+        angle=growth.angle, years=TIMES.tolist(), sd_deg=middle, low_deg=low, high_deg=high
+    )
+
+
+def _due(tool: MeasuredTool, growth: Growth, yearly: Array, limit_deg: float) -> DueDate:
+    """When an angle exceeds its limit."""
+    spans = years_to(np.radians(limit_deg), growth, yearly)
+    first, middle, last = np.quantile(spans, INTERVAL).tolist()
+    days = [day_after(tool.calibrated, span).isoformat() for span in (first, middle, last)]
+    return DueDate(
+        angle=growth.angle, limit_deg=limit_deg,
+        now_deg=float(np.degrees(COVERAGE_FACTOR * np.sqrt(growth.calibration))),
+        due=days[1], not_before=days[0], not_after=days[2], capped=last >= LONGEST,
+    )  # fmt: skip
+
+
+def _findings(drift: ToolDrift, limits: Mapping[str, float], today: date | None) -> list[Finding]:
+    """What the reader should know."""
+    findings = []
+
+    def say(name: str, **values: object) -> None:
+        findings.append(Finding(id=name, text=FINDINGS[name].format(**values)))
+
+    if drift.change is None:
+        say("single")
+    elif drift.change.changed:
+        say("changed", what=", ".join(map(_step_words, drift.change.steps)) or FINDINGS["misfit"])
+    if failed := [row.name for row in drift.service if row.left_passed and not row.found_passed]:
+        count = f"{len(failed)} limit{'s' * (len(failed) > 1)}"
+        say("left-limits", count=count, names=", ".join(failed))
+    if not drift.basis:
+        say("unpredicted", type=drift.type)
+    elif drift.basis == PEERS:
+        say("peers", count=f"{drift.peers} tool{'s' * (drift.peers != 1)}")
+    stated_angles = {each.angle for each in drift.forecast}
+    for angle in [a for a in limits if a not in stated_angles and drift.basis]:
+        say("too-free", angle=angle)
+    for each in (e for e in drift.due if e.now_deg > e.limit_deg):
+        say("inaccurate", angle=each.angle, now=each.now_deg, limit=each.limit_deg)
+    if today and drift.next_due and drift.next_due < today.isoformat():
+        say("overdue", due=drift.next_due)
+    return findings
+
+
+def _step_words(step: ParameterStep) -> str:
+    return f"{step.triad} {step.name} between {step.after} and {step.by} ({step.score:+.1f} standard uncertainties)"

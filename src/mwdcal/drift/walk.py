@@ -1,0 +1,148 @@
+"""How fast parameters wander: a random walk of each, its rate estimated with that of the tool's peers.
+
+Between two calibrations t years apart a parameter moves by a normal variable of variance q t. Parameters of
+a kind (`GROUPS`) have one rate; rates of tools of a type are log-normal about a common one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.special import logsumexp
+
+from mwdcal.calibration.readings import TRIADS
+from mwdcal.drift.comparable import KINDS, TITLES, History
+from mwdcal.geometry.vectors import Array
+
+GROUPS = tuple((triad, kind) for triad in TRIADS for kind in KINDS)
+"""Triad and kind of the parameters that wander at one rate."""
+DECADES = np.linspace(-4.0, 3.0, 57)
+"""Rates that are tried: decimal logarithms of variance per year over the variance of a calibration."""
+CENTRES = np.linspace(-3.5, 2.5, 31)
+"""Rates about which those of a type may lie, all equally probable before there are data."""
+SPREADS = np.linspace(0.05, 1.0, 20)
+"""Standard deviations, in decades, of the rates of tools of a type; see `SPREAD_SCALE`."""
+SPREAD_SCALE = 0.4
+"""Most probable of these before there are data, of a Rayleigh distribution: it keeps away from none at all."""
+SHORTEST = 1 / 365.25
+"""Two calibrations on one day are taken as this far apart, years."""
+
+
+def group_places(names: Sequence[str], triad: str, kind: str) -> list[int]:
+    """Places of the parameters of a group at the middle temperature."""
+    members = {f"{triad} {title}" for title in TITLES if title.startswith(kind)}
+    return [place for place, name in enumerate(names) if name in members]
+
+
+@dataclass(frozen=True)
+class Increments:
+    """Changes (m,) of a group from calibration to calibration, in axes in which walk and noise are both white.
+
+    Of variance q + `noise` (m,) at a rate q, variance per year.
+    """
+
+    change: Array
+    noise: Array
+
+    @classmethod
+    def of(cls, history: History, places: Sequence[int]) -> Increments:
+        """Those of the calibrations that have all parameters of the group."""
+        values, covariance = history.values[:, places], history.covariance
+        block = covariance[:, places][..., places]
+        known = np.diagonal(history.precision, axis1=-2, axis2=-1)[:, places]
+        usable = np.flatnonzero(np.isfinite(values).all(-1) & (known > 0).all(-1))
+        count, size = len(usable) - 1, len(places)
+        if count < 1 or not size:
+            return cls(np.zeros(0), np.zeros(0))
+        gaps = np.maximum(np.diff(history.years[usable]), SHORTEST)
+        step = np.diff(np.eye(count + 1), axis=0)
+        noise = np.zeros((count, size, count, size))
+        for column, calibration in enumerate(usable):
+            weight = step[:, column, None] * step[:, column] / np.sqrt(np.outer(gaps, gaps))
+            noise += weight[:, None, :, None] * block[calibration][None, :, None, :]
+        spread, axes = np.linalg.eigh(noise.reshape(count * size, count * size))
+        change = (np.diff(values[usable], axis=0) / np.sqrt(gaps)[:, None]).ravel()
+        return cls(change @ axes, np.maximum(spread, 0.0))
+
+    def log_likelihood(self, rates: Array) -> Array:
+        """Log likelihood (r,) of rates (r,), but for a constant."""
+        variance = rates[:, None] + self.noise
+        return np.asarray(-0.5 * np.sum(np.log(variance) + self.change**2 / variance, -1))
+
+
+@dataclass(frozen=True)
+class GroupRates:
+    """Rates of a group in the tools of one type, learnt from some of them.
+
+    `unit`: variance of a calibration, by which rates are counted; `log_likelihood` (tools, r) of the `rates`
+    of these tools.
+    """
+
+    unit: float
+    log_likelihood: Array
+
+    @classmethod
+    def of(cls, tools: Sequence[Increments]) -> GroupRates | None:
+        """Of tools of a type; None where none of them has two calibrations of the group."""
+        moved = [each for each in tools if each.noise.size]
+        if not moved:
+            return None
+        unit = float(np.median(np.concatenate([each.noise for each in moved]))) or 1.0
+        return cls(unit, np.stack([each.log_likelihood(unit * 10.0**DECADES) for each in moved]))
+
+    @property
+    def rates(self) -> Array:
+        """The rates (r,) that are tried, variance per year."""
+        return np.asarray(self.unit * 10.0**DECADES)
+
+    @cached_property
+    def _members(self) -> Array:
+        """Share (c, s, r) of the tools of a type with each rate, by centre and spread of the type."""
+        z = (DECADES - CENTRES[:, None, None]) / SPREADS[:, None]
+        density = np.exp(-0.5 * z**2)
+        return np.asarray(density / density.sum(-1, keepdims=True))
+
+    def _evidence(self, log_likelihood: Array) -> Array:
+        """Log probability (…, c, s) of a tool's calibrations, by centre and spread of its type."""
+        largest = log_likelihood.max(-1, keepdims=True)
+        share = np.exp(log_likelihood - largest) @ self._members.reshape(-1, len(DECADES)).mT
+        logs = np.log(np.maximum(share, 1e-300)) + largest
+        return np.asarray(logs.reshape(*largest.shape[:-1], len(CENTRES), len(SPREADS)))
+
+    @cached_property
+    def type_probability(self) -> Array:
+        """Probability (c, s) of centre and spread of the type, by the tools it was learnt from."""
+        prior = np.log(SPREADS) - 0.5 * (SPREADS / SPREAD_SCALE) ** 2
+        logs = self._evidence(self.log_likelihood).sum(0) + prior
+        return np.asarray(np.exp(logs - logsumexp(logs)))
+
+    @property
+    def peers_probability(self) -> Array:
+        """Probability (r,) of each rate of a tool of the type of which nothing else is known."""
+        return np.asarray(np.einsum("cs,csr->r", self.type_probability, self._members))
+
+    def probability(self, tool: Increments, among: bool) -> Array:
+        """Probability (r,) of each rate of a tool; `among` those that the type was learnt from or not."""
+        likelihood = tool.log_likelihood(self.rates)
+        weight = self.type_probability
+        if among and tool.noise.size:
+            logs = np.log(np.maximum(weight, 1e-300)) - self._evidence(likelihood)
+            weight = np.exp(logs - logs.max())
+        logs = likelihood + np.log(
+            np.maximum(np.einsum("cs,csr->r", weight, self._members), 1e-300)
+        )
+        return np.asarray(np.exp(logs - logsumexp(logs)))
+
+
+def quantiles(rates: Array, probability: Array, shares: Sequence[float]) -> Array:
+    """Rates below which lie the given shares of a distribution (r,) over rates (r,), between them interpolated."""
+    inner = np.cumsum(probability) - probability / 2
+    return np.asarray(np.exp(np.interp(shares, inner, np.log(rates))))
+
+
+def draws(rates: Array, probability: Array, count: int, rng: np.random.Generator) -> Array:
+    """Rates (count,) drawn from a distribution over rates."""
+    return quantiles(rates, probability, rng.uniform(size=count))

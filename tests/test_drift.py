@@ -1,0 +1,403 @@
+"""Drift: common parameters, the test of change, random walks and due dates, against other formulas and simulation."""
+
+from dataclasses import replace
+from datetime import date
+
+import numpy as np
+import pytest
+from msgspec.structs import replace as with_changes
+from scipy.stats import binom, multivariate_normal, norm
+
+from mwdcal.calibration.calibrate import calibrate
+from mwdcal.calibration.options import Options
+from mwdcal.calibration.prediction import typical_accuracy
+from mwdcal.calibration.readings import TRIADS
+from mwdcal.drift.change import Contrasts, change_test
+from mwdcal.drift.comparable import (
+    TITLES,
+    History,
+    calibrated_on,
+    one_noise,
+    parameter_names,
+    precision,
+)
+from mwdcal.drift.fleet import fleet_drift
+from mwdcal.drift.forecast import COVERAGE_FACTOR, growths, years_to
+from mwdcal.drift.histories import tool_history
+from mwdcal.drift.service import ServiceTest
+from mwdcal.drift.tool import TypeRates, measured, predicted
+from mwdcal.drift.walk import GROUPS, GroupRates, Increments, quantiles
+from mwdcal.files.profiles import load_profile
+from mwdcal.planning.plans import load_plan
+from mwdcal.planning.session import Session
+from mwdcal.planning.simulate import drawn
+from mwdcal.use.notation import convert
+from mwdcal.use.verification import Verdict, VerdictRow
+
+SERVO = load_profile("servo")[0]
+NAMES = parameter_names(dict.fromkeys(TRIADS, 0))
+SIZE = len(NAMES)
+BIAS = NAMES.index("accelerometer bias-x")
+LIMITS = {"inclination": 0.02, "azimuth": 0.2}
+TODAY = date(2026, 11, 22)
+
+
+class Bench:
+    """A simulated tool on its stand: a calibration for each visit."""
+
+    def __init__(self, plan, seed, order=0, profile=SERVO):
+        self.session = Session.of(load_plan(plan), profile)
+        self.rng = np.random.default_rng(seed)
+        self.tool = drawn(self.rng, profile, order)
+
+    def readings(self, day="2024-05-01", serial="T-1"):
+        readings = self.session.measured(self.tool, self.rng).readings
+        return replace(readings, metadata={**readings.metadata, "serial": serial, "date": str(day)})
+
+    def calibration(self, day="2024-05-01", serial="T-1", **options):
+        readings = self.readings(day, serial)
+        return calibrate(readings, self.session.profile, Options(**{"order": 0, **options}))
+
+    def shift(self, place, size):
+        moved = self.tool.accelerometer.copy()
+        moved[place] += size
+        self.tool = replace(self.tool, accelerometer=moved)
+
+
+@pytest.fixture(scope="module")
+def years():
+    """A tool with a step of 1 mg before its fourth calibration, one without, and one calibrated once."""
+    tools = {}
+    for serial, count in (("T-1", 5), ("T-2", 4), ("T-3", 1)):
+        bench = Bench("twelve-state", len(tools))
+        tools[serial] = []
+        for year in range(count):
+            if (serial, year) == ("T-1", 3):
+                bench.shift(3, 1e-3)
+            tools[serial].append(bench.calibration(f"{2020 + year}-05-01", serial))
+    return tools
+
+
+def history(values, covariance, freedom=np.inf, gap=1.0):
+    """Calibrations with values (n, p) and one covariance."""
+    count = len(values)
+    whole = np.broadcast_to(covariance, (count, SIZE, SIZE))
+    known = np.broadcast_to(np.linalg.inv(covariance), whole.shape)
+    degrees = np.full(values.shape, freedom)
+    same = np.zeros(values.shape, bool)
+    return History(NAMES, values, whole, known, degrees, same, gap * np.arange(count))
+
+
+def random_covariance(rng):
+    root = rng.normal(size=(SIZE, SIZE))
+    return root @ root.T / SIZE + np.eye(SIZE)
+
+
+# Common parameters
+
+
+@pytest.mark.parametrize("options", [{}, {"model": "factors"}])
+def test_values_and_covariance_are_those_of_the_notation_in_factors(options):
+    calibration = Bench("twelve-state", 3).calibration(**options)
+    tool = tool_history([calibration])
+    notations = convert(calibration, "factors", tool.temperature_c[0])
+    for triad, notation in notations.items():
+        scale = getattr(calibration.profile, triad).scale
+        off = notation.values["m"][~np.eye(3, dtype=bool)]
+        expected = [*notation.values["SF"][:, 0] / scale, *notation.values["B"][:, 0], *off]
+        sd = [
+            *notation.uncertainty["SF"][:, 0] / scale,
+            *notation.uncertainty["B"][:, 0],
+            *notation.uncertainty["m"][~np.eye(3, dtype=bool)],
+        ]
+        places = [NAMES.index(f"{triad} {title}") for title in TITLES]
+        np.testing.assert_allclose(tool.history.values[0, places], expected, rtol=1e-9, atol=1e-13)
+        stated = np.sqrt(np.diag(tool.covariance[0])[places])
+        np.testing.assert_allclose(stated, sd, rtol=1e-8)
+
+
+def test_models_of_temperature_give_one_set_of_parameters():
+    bench = Bench("laboratory-thermal", 4, order=1)
+    readings = bench.readings()
+    forms = ({"model": "polynomial", "order": 2}, {"model": "factors", "order": 2})
+    tool = tool_history([calibrate(readings, bench.session.profile, Options(**f)) for f in forms])
+    assert len(tool.history.names) == 2 * 24
+    apart = np.diff(tool.history.values, axis=0)[0] / np.sqrt(np.diag(tool.covariance[0]))
+    turns = np.array(["misalignment" in name for name in tool.history.names])
+    assert np.all(np.abs(apart[~turns]) < 1)
+    assert np.all(
+        np.abs(apart[turns]) < 4
+    )  # constant in one model, of each temperature in the other
+    assert any("differ by their own misfit" in note for note in tool.notes[0])
+
+
+def test_another_nominal_scale_is_no_change():
+    bench = Bench("twelve-state", 5)
+    readings = bench.readings()
+    other = with_changes(SERVO, accelerometer=with_changes(SERVO.accelerometer, scale=3.06))
+    shrunk = replace(
+        readings,
+        accelerometer=readings.accelerometer * 3.0 / 3.06,
+        sd={**readings.sd, "accelerometer": readings.sd["accelerometer"] * 3.0 / 3.06},
+        profile=other,
+    )
+    both = [
+        calibrate(readings, SERVO, Options(order=0)),
+        calibrate(shrunk, other, Options(order=0)),
+    ]
+    values = tool_history(both).history.values
+    np.testing.assert_allclose(values[0], values[1], rtol=1e-7, atol=1e-9)
+
+
+def test_along_a_free_direction_nothing_is_known():
+    rng = np.random.default_rng(1)
+    covariance, free = random_covariance(rng), rng.normal(size=(2, SIZE))
+    known = precision(covariance, free)
+    assert np.abs(known @ free.T).max() < 1e-9
+    wide = np.linalg.inv(covariance + 1e7 * free.T @ free)  # the same, as a limit
+    np.testing.assert_allclose(known, wide, atol=1e-6)
+
+
+def test_what_cannot_be_compared_is_said():
+    bench = Bench("twelve-state", 6)
+    plain = bench.calibration("2024-01-01")
+    elsewhere = with_changes(plain, temperature_c=(80.0, 81.0), time="2020-01-01T00:00:00+00:00")
+    elsewhere = with_changes(elsewhere, tool={**plain.tool, "date": "2020-01-01"})
+    alone = replace(bench.readings("2022-01-01"), magnetometer=None)
+    level = calibrate(alone, bench.session.profile, Options(order=0))
+    tool = tool_history([plain, with_changes(elsewhere), level])
+    assert tool.used == (False, True, True) or tool.calibrations[-1].temperature_c is None
+    assert any("no magnetometer" in note for note in tool.notes[1])
+    relative = tool_history([with_changes(plain, field_unit="relative (field = 1)"), plain])
+    assert any("common factor" in note for notes in relative.notes for note in notes)
+
+
+def test_the_day_of_a_calibration_is_that_of_its_run():
+    calibration = Bench("six-state", 7).calibration("2019-03-04")
+    assert calibrated_on(calibration) == date(2019, 3, 4)
+    undated = with_changes(calibration, tool={"date": "4 March"}, time="2026-01-02T03:04:05+00:00")
+    assert calibrated_on(undated) == date(2026, 1, 2)
+
+
+# The test of change
+
+
+def test_scores_and_misfit_are_those_of_generalised_least_squares():
+    rng = np.random.default_rng(2)
+    values = rng.normal(size=(4, SIZE))
+    covariances = [random_covariance(rng) for _ in range(4)]
+    known = np.stack([np.linalg.inv(c) for c in covariances])
+    contrasts = Contrasts(known)
+    departures = contrasts.departures(values)
+    pull = contrasts.pull(departures)
+    scores = contrasts.scores(pull)
+    white = [np.linalg.cholesky(p).T for p in known]
+    right = np.concatenate([w @ v for w, v in zip(white, values, strict=True)])
+    mean = np.concatenate(white)
+    for after, place in ((1, 0), (2, 7), (3, 20)):
+        step = np.concatenate([(k >= after) * w[:, place] for k, w in enumerate(white)])
+        design = np.column_stack([mean, step])
+        covariance = np.linalg.inv(design.T @ design)
+        estimate = covariance @ design.T @ right
+        expected = estimate[-1] / np.sqrt(covariance[-1, -1])
+        assert scores[after - 1, place] == pytest.approx(expected, rel=1e-8)
+    residual = right - mean @ np.linalg.lstsq(mean, right, rcond=None)[0]
+    assert contrasts.misfit(departures, pull) == pytest.approx(residual @ residual, rel=1e-8)
+    assert contrasts.freedom == 3 * SIZE
+
+
+@pytest.mark.parametrize("freedom", [np.inf, 12.0])
+def test_unchanged_tools_are_called_changed_at_the_stated_level(freedom):
+    rng = np.random.default_rng(3)
+    covariance, count, level = random_covariance(rng), 50, 0.2
+    root, called = np.linalg.cholesky(covariance), 0
+    for _ in range(count):
+        values = rng.normal(size=(2, SIZE)) @ root.T
+        scale = np.ones(2) if np.isinf(freedom) else rng.chisquare(freedom, 2) / freedom
+        stated = history(values, covariance, freedom)
+        both = scale[:, None, None]
+        stated = replace(
+            stated, covariance=stated.covariance * both, precision=stated.precision / both
+        )
+        called += change_test(stated, level).changed
+    low, high = binom.interval(0.9999, count, level)
+    # With two estimates of the noise the judgement errs on the safe side (Behrens and Fisher).
+    assert (low if np.isinf(freedom) else 0) <= called <= high
+
+
+def test_power_against_a_step_is_that_of_its_score():
+    rng = np.random.default_rng(4)
+    covariance, count, signal = random_covariance(rng), 30, 4.0
+    root = np.linalg.cholesky(covariance)
+    contrasts = Contrasts(history(np.zeros((2, SIZE)), covariance).precision)
+    unit = 1 / np.sqrt(np.diag(contrasts.precision[0])[BIAS] / 2)
+    tests = []
+    for _ in range(count):
+        values = rng.normal(size=(2, SIZE)) @ root.T
+        values[1, BIAS] += signal * unit
+        tests.append(change_test(history(values, covariance)))
+    critical = tests[0].critical_score
+    expected = norm.sf(critical - signal)
+    named = sum(any(s.place == BIAS for s in t.steps) for t in tests)
+    low, high = binom.interval(0.9999, count, expected)
+    assert low - 1 <= named <= high + 1
+    assert 3.3 < critical < 3.9  # 24 independent scores at 0.8 %: 3.59
+
+
+def test_the_largest_of_independent_scores_has_its_known_distribution():
+    test = change_test(history(np.zeros((2, SIZE)), np.eye(SIZE)))
+    none = change_test(history(np.zeros((2, SIZE)), np.eye(SIZE)), 0.2)
+    for each, level in ((test, 0.01), (none, 0.2)):
+        alarm = 1 - (1 - 2 * norm.sf(each.critical_score)) ** SIZE
+        assert 0.7 * level < alarm < 1.25 * level  # STEP_SHARE of it, and where both alarms agree
+
+
+def test_a_step_is_named_with_its_size(years):
+    drift = measured("T-1", years["T-1"]).drift
+    step = next(s for s in drift.change.steps if s.name == "bias-x")
+    assert drift.change.changed and step.triad == "accelerometer"
+    assert (step.after, step.by) == ("2022-05-01", "2023-05-01")
+    assert abs(step.change - 1e-3) < 4 * step.standard_uncertainty
+    assert not measured("T-2", years["T-2"]).drift.change.changed
+
+
+def test_noise_of_one_tool_is_pooled_unless_it_differs():
+    freedom = np.full(4, 30.0)
+    ratio, degrees, together = one_noise(np.array([0.8, 1.0, 1.2, 1.0]), freedom)
+    np.testing.assert_allclose(ratio, 1.0 / np.array([0.8, 1.0, 1.2, 1.0]))
+    assert together.all() and np.all(degrees == 120)
+    ratio, degrees, together = one_noise(np.array([0.8, 1.0, 9.0, 1.0]), freedom)
+    assert not together.any() and np.all(ratio == 1) and np.all(degrees == 30)
+    ratio, degrees, together = one_noise(np.array([np.nan, 1.0]), freedom[:2])
+    assert not together.any() and np.isinf(degrees[0])
+
+
+# Random walks and due dates
+
+
+def walked(rng, rate, sd, times, count):
+    """Values (tools, n) of one parameter that walks at a rate, measured with an uncertainty."""
+    moves = rng.normal(size=(count, len(times))) * np.sqrt(
+        rate[:, None] * np.diff(times, prepend=0.0)
+    )
+    return np.cumsum(moves, -1) + sd * rng.normal(size=(count, len(times)))
+
+
+def one_group(values, sd, times):
+    """Histories of tools whose first bias is given; all other parameters stay."""
+    rows = []
+    for each in values:
+        whole = np.zeros((len(times), SIZE))
+        whole[:, BIAS] = each
+        rows.append(replace(history(whole, sd**2 * np.eye(SIZE)), years=times))
+    return rows
+
+
+def test_likelihood_of_a_rate_is_that_of_a_normal_vector():
+    rng = np.random.default_rng(5)
+    times, covariance = np.array([0.0, 0.5, 2.0, 3.1]), random_covariance(rng)
+    tool = replace(history(rng.normal(size=(4, SIZE)), covariance), years=times)
+    places = [BIAS, BIAS + 1, BIAS + 2]
+    rates = np.array([0.1, 1.0, 5.0])
+    ours = Increments.of(tool, places).log_likelihood(rates)
+    block = covariance[np.ix_(places, places)]
+    step = np.diff(np.eye(4), axis=0)
+    noise = np.kron(step @ step.T, block)
+    change = np.diff(tool.values[:, places], axis=0).ravel()
+    expected = [
+        multivariate_normal(np.zeros(9), q * np.kron(np.diag(np.diff(times)), np.eye(3)) + noise).logpdf(change)
+        for q in rates
+    ]  # fmt: skip
+    np.testing.assert_allclose(np.diff(ours), np.diff(expected), rtol=1e-8)
+
+
+def test_intervals_of_rates_hold_the_true_ones():
+    rng = np.random.default_rng(6)
+    count, sd, inside, peers = 60, 1.0, [], []
+    for calibrations in (
+        2,
+        4,
+    ) * 8:  # of types of their own: what one type teaches errs for all its tools
+        times = np.arange(float(calibrations))
+        centre = rng.uniform(-0.5, 1.0)
+        rate, fresh = 10.0 ** rng.normal(centre, 0.3, (2, count))
+        tools = one_group(walked(rng, rate, sd, times, count), sd, times)
+        increments = [Increments.of(tool, [BIAS]) for tool in tools]
+        learnt = GroupRates.of(increments)
+        ends = [
+            quantiles(learnt.rates, learnt.probability(i, True), (0.05, 0.95)) for i in increments
+        ]
+        inside.append(np.mean([a <= true <= b for (a, b), true in zip(ends, rate, strict=True)]))
+        a, b = quantiles(learnt.rates, learnt.peers_probability, (0.05, 0.95))
+        peers.append(np.mean((fresh > a) & (fresh < b)))
+    for shares in (inside, peers):
+        assert 0.9 - 0.03 - 3 * np.std(shares) / np.sqrt(16) < np.mean(shares) < 0.98
+
+
+def test_growth_begins_at_the_accuracy_that_is_stated(years):
+    calibration = years["T-2"][-1]
+    each = {g.angle: g for g in growths(tool_history(years["T-2"]))}
+    for angle, stated in typical_accuracy(calibration).items():
+        assert np.degrees(np.sqrt(each[angle].calibration)) == pytest.approx(stated, rel=1e-6)
+    # An error e of the gravity vector tilts it by its part along one direction: e / g, squared.
+    bias = each["inclination"].yearly["accelerometer", "bias"]
+    assert bias == pytest.approx(1 / calibration.earth["gravity_g"] ** 2, rel=1e-3)
+    yearly = each["inclination"].rate({group: np.array(1e-9) for group in GROUPS})
+    span = years_to(np.radians(0.02), each["inclination"], yearly)
+    later = each["inclination"].calibration + span * yearly
+    assert np.sqrt(later) * COVERAGE_FACTOR == pytest.approx(np.radians(0.02))
+
+
+def test_due_dates_of_a_fleet_and_of_a_tool_calibrated_once(years):
+    tools = [measured(serial, each) for serial, each in years.items()]
+    fleet, (first, second, single) = fleet_drift(tools, LIMITS, TODAY, {"T-9": "no file"})
+    assert (fleet.tools, fleet.tested, fleet.changed) == (3, 2, 1)
+    assert fleet.worst[0].serial == "T-1" and fleet.refused == {"T-9": "no file"}
+    for drift in (first, second, single):
+        for due in drift.due:
+            assert drift.calibrations[-1].date <= due.not_before <= due.due <= due.not_after
+            assert due.due <= str(int(drift.calibrations[-1].date[:4]) + 5) + "-05-01"
+    assert (single.basis, single.change) == ("peers", None)
+    assert {f.id for f in single.findings} >= {"single", "peers"}
+    lonely = predicted(tools[2], TypeRates.of([tools[2]]), LIMITS)
+    assert lonely.due == [] and "unpredicted" in {f.id for f in lonely.findings}
+
+
+def test_a_tool_that_left_its_limits_in_service_says_so(years):
+    sha256 = years["T-2"][1].sha256
+
+    def test_of(day, value, passed):
+        row = VerdictRow(
+            name="error of inclination", unit="°", value=value, uncertainty=0.01, limit=0.25,
+            passed=passed, note="",
+        )  # fmt: skip
+        verdict = Verdict(
+            passed=passed, rule="", limits="roll-test", source="", run="", stations=12, rows=[row],
+            findings=[],
+        )  # fmt: skip
+        return ServiceTest(date.fromisoformat(day), sha256, verdict)
+
+    tests = [test_of("2022-04-30", 0.3, False), test_of("2021-05-02", 0.1, True)]
+    drift = measured("T-2", years["T-2"], tests).drift
+    (row,) = drift.service
+    assert (row.as_left, row.as_found, row.left_passed, row.found_passed) == (0.1, 0.3, True, False)
+    assert row.score == pytest.approx(0.2 / np.hypot(0.01, 0.01))
+    whole = predicted(measured("T-2", years["T-2"], tests), TypeRates.of([]), LIMITS)
+    assert "left-limits" in {finding.id for finding in whole.findings}
+
+
+def test_pages_mark_simulated_data_and_escape_names(years):
+    pytest.importorskip("matplotlib")
+    from mwdcal.app.pages.records.drift import render_fleet, render_tool
+    from mwdcal.app.pages.records.drift_figures import drift_picture
+    from mwdcal.app.screens.records.drift import fleet_screen, tool_screen
+
+    name = "<script>alert(1)</script>\x1b[2J"
+    tools = [measured(name, years["T-1"]), measured("T-2", years["T-2"])]
+    fleet, (drift, _) = fleet_drift(tools, LIMITS, TODAY)
+    for page in (render_tool(drift), render_fleet(fleet)):
+        assert "SIMULATED DATA" in page and "<script>alert" not in page and "\x1b" not in page
+    assert render_fleet(fleet) == render_fleet(fleet)
+    for screen in (tool_screen(drift), fleet_screen(fleet)):
+        assert "SIMULATED DATA" in screen and "\x1b" not in screen
+    assert len(drift_picture(drift).axes) == 6
