@@ -289,7 +289,13 @@ def screen(width, *arguments, **variables):
     shown = re.sub(r"[\d.]+ s, [\d.]+ tools/s", "? s, ? tools/s", shown)
     libraries = (rf"(?<={name} )\d[\w.]+" for name in ("mwdcal", "pygeomag", "ppigrf", "pyproj"))
     today = f"{datetime.now(UTC).date()}"
-    for varying in ("[0-9a-f]{64}", r"\b[0-9a-f]{12}\b", today, *libraries):
+    for varying in (
+        "[0-9a-f]{64}",
+        r"(?<=\d{8}-)[0-9a-f]{12}\b",
+        r"(?<= )[0-9a-f]{12}\b",
+        today,
+        *libraries,
+    ):
         shown = re.sub(varying, lambda part: "?" * len(part[0]), shown)
     times = re.compile(r"^(time of one fit, s)(.*)$", re.MULTILINE)
     return times.sub(lambda line: line[1] + re.sub(r"\d", "0", line[2]), shown)
