@@ -123,9 +123,9 @@ def timed(database: Path | str, folder: Path, count: int, brief: bool) -> bool:
             begun = time.perf_counter()
             result = task()
             print(f"  {name:26s} {time.perf_counter() - begun:.1f} s {result!r:.80}")
-    print(
-        f"  size of the backup         {(folder / 'backup.registry').stat().st_size / 1e6:.0f} MB"
-    )
+    if not brief:
+        size = (folder / "backup.registry").stat().st_size
+        print(f"  size of the backup         {size / 1e6:.0f} MB")
     return slow
 
 

@@ -5,7 +5,7 @@ import shutil
 import sqlite3
 import tempfile
 from contextlib import closing, contextmanager
-from pathlib import Path, PureWindowsPath
+from pathlib import Path, PurePosixPath, PureWindowsPath
 
 import pytest
 import sqlalchemy as sa
@@ -162,6 +162,19 @@ def test_paths_of_windows_are_no_urls():
     assert not connections.is_url(str(PureWindowsPath("C:/tools/tools.registry")))
     assert not connections.is_url("\\\\nas\\tools.registry")
     assert connections.is_url("postgresql://localhost/tools")
+
+
+@pytest.mark.parametrize(
+    ("path", "uri"),
+    [
+        (PureWindowsPath("C:\\a b\\50%#?.db"), "file:///C:/a%20b/50%25%23%3F.db"),
+        (PureWindowsPath("\\\\nas\\tools\\x.db"), "file:////nas/tools/x.db"),
+        (PurePosixPath("/tmp/größe.db"), "file:///tmp/gr%C3%B6%C3%9Fe.db"),
+    ],
+)
+def test_files_as_sqlite_opens_them(path, uri):
+    """Reference: the URI forms that SQLite's documentation of URI file names gives."""
+    assert connections.file_uri(path) == uri
 
 
 @pytest.mark.parametrize("name", ["a b#c?d%20.registry", "größe.registry"])

@@ -116,6 +116,8 @@ def test_a_backup_that_cannot_be_written_leaves_nothing(tmp_path):
     with open_registry(tmp_path / "tools.registry") as registry:
         with pytest.raises(InputError, match="does not exist"):
             copies.backup(registry, tmp_path / "no" / "tools.backup")
+        with pytest.raises(InputError, match="registry itself"):
+            copies.backup(registry, tmp_path / "tools.registry")
         copies.backup(registry, tmp_path / "tools.backup")
         copies.backup(registry, tmp_path / "tools.backup")  # replaces the older
     assert sorted(p.name for p in tmp_path.iterdir()) == ["tools.backup", "tools.registry"]

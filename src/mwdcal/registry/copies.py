@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import os
 from dataclasses import replace
+from pathlib import Path
 
 import sqlalchemy as sa
 
-from mwdcal.errors import FitError
+from mwdcal.errors import FitError, InputError
 from mwdcal.files.formats import atomic
 from mwdcal.registry.checking import check
 from mwdcal.registry.database import chain, migrating
@@ -23,7 +24,13 @@ def backup(registry: Registry, path: str | os.PathLike[str]) -> str:
     """Write a backup while others go on writing; the hash of its newest event.
 
     The file appears whole or not at all. It holds every write that was acknowledged before the call.
+
+    Raises:
+        InputError: it cannot be written, or `path` is the registry itself.
     """
+    file = registry.database.file
+    if file and atomic.identity(Path(path)) == atomic.identity(file):
+        raise InputError(f"`path` must not be the registry itself, '{path}'. Name another file.")
     with atomic.replacing(path) as stream:
         target = replace(connect(stream.name, new=True, shared=False), name=str(path))
         try:

@@ -78,7 +78,8 @@ class Registry:
         """Add files, all or none; what is there already is not added again.
 
         `actor` is who adds them, `when` the time that the history states: now, if None. What the call
-        returns is on the disk. The files, compressed, are in memory at once.
+        returns is on the disk. The files, compressed, are in memory at once. Where the connection breaks
+        during the call, nobody can know whether it took effect: add the same again.
 
         Raises:
             InputError: a file is not of its kind, its serial is another than the entry's, or the

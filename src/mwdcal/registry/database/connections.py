@@ -10,8 +10,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
+from urllib.parse import quote
 
 import sqlalchemy as sa
 
@@ -37,6 +38,9 @@ _WHAT_TO_DO = {
     "not a database": "Name a registry that mwdcal made.",
     "disk i/o error": "Check the disk; SQLite needs a local one, or use PostgreSQL.",
     "password": "Correct the user and the password in the URL.",
+    "permission denied": "Have the owner of the database give you the right.",
+    "does not exist": "Create it on the server, or correct the URL.",
+    "connection failed": "Check that the server runs, and the URL.",
 }
 
 
@@ -153,10 +157,16 @@ def _sqlite(path: Path, new: bool, shared: bool) -> Database:
     return Database(str(path), engine, path, shared)
 
 
+def file_uri(path: PurePath) -> str:
+    """The URI by which SQLite opens a file; of a Windows share, the server's name is part of the path."""
+    text = path.as_posix()
+    return f"file://{'' if text.startswith('/') else '/'}{quote(os.fsencode(text), safe='/:')}"
+
+
 def _opened(path: Path, new: bool) -> sqlite3.Connection:
     mode = "rwc" if new else "rw"
     connection = sqlite3.connect(
-        f"{path.absolute().as_uri()}?mode={mode}",
+        f"{file_uri(path.absolute())}?mode={mode}",
         uri=True,
         timeout=LONGEST_WAIT,
         isolation_level=None,
