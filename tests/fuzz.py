@@ -72,6 +72,7 @@ SAMPLES = {
     "laboratory": "laboratory",
     "database": "registry",
     "source": "registry",
+    "files": "any",
 }
 """The kind of file that each argument or option takes, by its name."""
 DOCUMENTS = ("calibration", "verification", "signed")
@@ -571,8 +572,9 @@ TABLE_SUFFIXES = (*(".csv",) * 4, ".tsv", ".parquet", ".xlsx", ".las", ".xml")
 
 def files(r: random.Random, kind: str, sound: dict[str, list[Any]], stem: Path) -> Path:
     """A file of a kind, damaged or not."""
-    if kind == "document":
-        some = files(r, r.choice(("calibration", "run", "profile", "limits")), sound, stem)
+    if kind == "any":
+        kinds = ("calibration", "run", "profile", "limits", "verification", "laboratory", "signed")
+        some = files(r, r.choice(kinds), sound, stem)
         return Path(str(some).partition("#")[0])
     sample = r.choice(sound[kind])
     if kind in ("run", "log"):

@@ -9,7 +9,7 @@ import msgspec
 
 from mwdcal.app.envelope import enveloped
 from mwdcal.app.screens.numbers import number
-from mwdcal.app.text import one_line, plural, table
+from mwdcal.app.text import UNCUT, one_line, plural, table
 from mwdcal.calibration.readings import SIMULATED
 from mwdcal.calibration.record import Finding
 from mwdcal.registry.checking import Discrepancy
@@ -190,8 +190,9 @@ def list_text(listing: Listing) -> str:
     """Tools, or records of a kind."""
     blocks = [_heading(listing, listing.kind)]
     if listing.tools:
-        head = ["serial", "type", "calibrated", "n", *(f"{a} 1σ, °" for a in ACCURACIES)]
-        blocks.append(table([_tool_cells(t) for t in listing.tools], [*head, "due", "verdict"]))
+        head = ["serial", "type", "calibrated", "n", *ACCURACIES, "due", "verdict"]
+        blocks.append(table([_tool_cells(t) for t in listing.tools], head, UNCUT))
+        blocks.append(f"{', '.join(ACCURACIES)}: 1σ to expect of the last calibration, degrees")
     if listing.records and listing.kind == "tool":
         blocks.append(f"{plural(len(listing.records), 'measurement standard')} due")
     if listing.records:
@@ -244,7 +245,7 @@ def _records_table(records: Sequence[ListedRecord], serials: bool) -> str:
                 each.actor,
             ]
         )
-    return table(rows, head, names=1)
+    return table(rows, head, UNCUT)
 
 
 def day(time: str | None) -> str:
