@@ -8,8 +8,10 @@ from typing import Any
 
 import msgspec
 
+from mwdcal.app.screens.records.drift import RegistryDrift
+from mwdcal.calibration.prediction import STATED_ANGLES
 from mwdcal.calibration.record import Calibration
-from mwdcal.drift.document import FleetDrift, ToolDrift
+from mwdcal.drift.document import ToolDrift
 from mwdcal.drift.fleet import fleet_drift
 from mwdcal.drift.service import ServiceTest
 from mwdcal.drift.tool import MeasuredTool, TypeRates, measured, predicted
@@ -22,20 +24,10 @@ from mwdcal.registry import queries
 from mwdcal.registry.store import Registry
 from mwdcal.use.verification import Bounds, Verdict
 
-ANGLES = ("inclination", "toolface", "azimuth")
 PEERS_READ = 200
 """Most other tools of its type that a single tool is compared with."""
 PAGE = 500
 """Rows of a registry that are read at once."""
-
-
-class RegistryDrift(msgspec.Struct, frozen=True, kw_only=True):
-    """How one tool changes, or all tools of a registry; by the limits of the 95 % accuracy, degrees."""
-
-    registry: str
-    limits_deg: dict[str, float]
-    tool: ToolDrift | None = None
-    fleet: FleetDrift | None = None
 
 
 def limits_of(typed: Iterable[str]) -> dict[str, float]:
@@ -52,8 +44,8 @@ def limits_of(typed: Iterable[str]) -> dict[str, float]:
             limits[angle] = float(value)
         except ValueError:
             limits[angle] = -1.0
-        if angle not in ANGLES or not 0 < limits[angle] < 180:
-            names = ", ".join(f"{angle}_deg" for angle in ANGLES)
+        if angle not in STATED_ANGLES or not 0 < limits[angle] < 180:
+            names = ", ".join(f"{angle}_deg" for angle in STATED_ANGLES)
             raise InputError(
                 f"`limit` must be one of {names} with a positive number, such as inclination_deg=0.1; got "
                 f"{shown(text)}."
@@ -63,7 +55,7 @@ def limits_of(typed: Iterable[str]) -> dict[str, float]:
 
 def default_limits(errors: Bounds) -> dict[str, float]:
     """The limits on errors of the angles."""
-    return {name: value for name, value in errors.items() if name in ANGLES}
+    return {name: value for name, value in errors.items() if name in STATED_ANGLES}
 
 
 def of_registry(
