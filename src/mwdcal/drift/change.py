@@ -70,7 +70,7 @@ class ChangeTest:
     pair_misfit: Array
     pair_freedom: Array
     pair_probability: Array
-    steps: tuple[Step, ...]
+    steps: tuple[Step, ...] = ()
 
     @property
     def changed(self) -> bool:
@@ -126,7 +126,7 @@ class Contrasts:
         latest = [column[~np.isnan(column)][-1:] for column in values.transpose()]
         middle = np.array([each[0] if each.size else 0.0 for each in latest])
         unit = np.where(self._unit > 0, self._unit, 1.0)
-        return np.nan_to_num((values - middle) / unit) * (self._unit > 0)
+        return np.asarray(np.nan_to_num((values - middle) / unit) * (self._unit > 0))
 
     def pull(self, departures: Array) -> Array:
         """What each calibration says (…, n, p) of parameters that depart so."""
@@ -235,7 +235,7 @@ def change_test(history: History, level: float = CHANGE_LEVEL) -> ChangeTest:
     result = ChangeTest(
         level, float((1 + np.sum(evidence <= least)) / (NULL_DRAWS + 1)), scores, largest, critical,
         by_step, misfit, contrasts.freedom, by_misfit,
-        *(np.array(part) for part in zip(*pairs, strict=True)), steps=(),
+        np.array([p[0] for p in pairs]), np.array([p[1] for p in pairs]), np.array([p[2] for p in pairs]),
     )  # fmt: skip
     steps = _steps(contrasts, departures, steady, critical) if result.changed else ()
     return replace(result, steps=steps)

@@ -104,10 +104,12 @@ def tool_history(calibrations: Sequence[Calibration]) -> ToolHistory:
     kept = [day for day, use in zip(days, used, strict=True) if use]
     names = parameter_names(orders)
     values, covariance, free = ([row[i] for row in rows] for i in range(3))
-    ratio, *noise = (np.concatenate(part, -1) for part in zip(*form.noise(), strict=True))
+    ratio, freedom, together = (
+        np.concatenate(part, -1) for part in zip(*form.noise(), strict=True)
+    )
     like = np.stack(covariance) * outer(np.sqrt(ratio))
     known = np.stack([precision(*each) for each in zip(like, free, strict=True)])
-    history = History(names, np.stack(values), like, known, *noise, years(kept))
+    history = History(names, np.stack(values), like, known, freedom, together, years(kept))
     units = tuple(map(form.unit, names))
     tool = tuple(ordered), tuple(days), tuple(used), tuple(map(tuple, notes))
     return ToolHistory(*tool, span, units, form.earth(), np.stack(covariance), free[-1], history)

@@ -130,7 +130,7 @@ def _parameters(tool: ToolHistory, test: ChangeTest | None) -> list[ParameterCou
     sd = np.sqrt(np.maximum(np.diagonal(tool.covariance, axis1=-2, axis2=-1), 0.0))
     known = np.diagonal(history.precision, axis1=-2, axis2=-1) > 0
     sd = np.where(known, sd, np.nan)
-    nothing = [None] * len(sd)
+    nothing: list[float | None] = [None] * len(sd)
     for place in history.steady.tolist():
         triad, _, name = history.names[place].partition(" ")
         scores = np.abs(test.scores[:, place]) if test else np.full(1, np.nan)
@@ -250,7 +250,7 @@ def _controlled(
     """The parameters with control limits: from each calibration to the next, by walk and uncertainties."""
     courses = []
     for course, group in zip(tool.drift.parameters, tool.groups, strict=True):
-        rate = float(quantiles(*known[group], [0.5])[0]) if group in known else 0.0
+        rate = float(quantiles(*known[group], [0.5])[0]) if group and group in known else 0.0
         rate *= factor(course.unit) ** 2
         low: list[float | None] = [None]
         high: list[float | None] = [None]

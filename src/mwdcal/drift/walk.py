@@ -145,4 +145,4 @@ def quantiles(rates: Array, probability: Array, shares: Sequence[float]) -> Arra
 
 def draws(rates: Array, probability: Array, count: int, rng: np.random.Generator) -> Array:
     """Rates (count,) drawn from a distribution over rates."""
-    return quantiles(rates, probability, rng.uniform(size=count))
+    return quantiles(rates, probability, rng.uniform(size=count).tolist())

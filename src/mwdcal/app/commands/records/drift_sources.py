@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from datetime import date
+from functools import partial
 from typing import Any
 
 import msgspec
@@ -66,9 +67,9 @@ def of_registry(
     Raises:
         InputError: there is no calibration of such a tool.
     """
-    whole = {"registry": registry.name, "limits_deg": limits}
+    whole = partial(RegistryDrift, registry=registry.name, limits_deg=limits)
     if serial is not None:
-        return RegistryDrift(**whole, tool=_of_tool(registry, serial, limits, level, today))
+        return whole(tool=_of_tool(registry, serial, limits, level, today))
     tools, refused = [], {}
     for row in _tools(registry):
         try:
@@ -81,7 +82,7 @@ def of_registry(
             f"{registry.name}: there is no calibration to compare. Add some: mwdcal registry add."
         )
     fleet, _ = fleet_drift(tools, limits, today, refused, level)
-    return RegistryDrift(**whole, fleet=fleet)
+    return whole(fleet=fleet)
 
 
 def _of_tool(
@@ -138,7 +139,7 @@ def _calibrations(registry: Registry, serial: str) -> tuple[list[Calibration], d
 
 def _tests(registry: Registry, serial: str) -> Iterator[ServiceTest]:
     """The roll tests of a tool that were not withdrawn, each on the day of its run or, unknown, when it was added."""
-    where = {"serial": serial}
+    where: dict[str, object] = {"serial": serial}
     days = {row["sha256"]: row["time"] for row in _records(registry, "run", where)}
     for row in _records(registry, "verification", where):
         day = row["time"] or days.get(row["run"]) or row["added"]

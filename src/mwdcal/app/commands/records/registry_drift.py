@@ -63,6 +63,5 @@ def command(
     with open_registry(database) as registry:
         result = drift_sources.of_registry(registry, serial, allowed, level, day)
     if html:
-        page = pages.render_tool(result.tool) if result.tool else pages.render_fleet(result.fleet)
-        atomic.write(html, page)
+        atomic.write(html, pages.render(result.tool, result.fleet))
     print_result(screen.document(result) if as_json else screen.text(result, html))

@@ -15,6 +15,11 @@ from mwdcal.drift.forecast import ACCURACY_PROBABILITY, COVERAGE_FACTOR, INTERVA
 from mwdcal.drift.tool import CONTROL
 
 
+def render(tool: ToolDrift | None, fleet: FleetDrift | None) -> str:
+    """The page of one tool, or of many."""
+    return (render_tool(tool) if tool else "") + (render_fleet(fleet) if fleet else "")
+
+
 def render_tool(drift: ToolDrift) -> str:
     """The page of one tool."""
     triads = figures.triads_of(drift)

@@ -130,14 +130,15 @@ def tool_screen(drift: ToolDrift) -> str:
 
 def document(result: RegistryDrift) -> dict[str, Any]:
     """The drift for machines."""
-    about = result.tool or result.fleet
-    stated = {"serial": result.tool.serial if result.tool else "", "simulated": about.simulated}
+    marked = [each.simulated for each in (result.tool, result.fleet) if each]
+    stated = {"serial": result.tool.serial if result.tool else "", "simulated": any(marked)}
     return enveloped("registry drift", result, stated)
 
 
 def text(result: RegistryDrift, page: Path | None) -> str:
     """The drift for people."""
-    shown = tool_screen(result.tool) if result.tool else fleet_screen(result.fleet)
+    shown = tool_screen(result.tool) if result.tool else ""
+    shown = fleet_screen(result.fleet) if result.fleet else shown
     return "\n\n".join(filter(None, [shown, written(page=page) if page else ""]))
 
 
