@@ -3,7 +3,7 @@
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: papers measured verification scatter diagnosis mutations help demo test test-quick test-studies test-oldest \
+.PHONY: papers measured verification scatter drift diagnosis mutations help demo test test-quick test-studies test-oldest \
 	test-versions fuzz kills check bench docs clean
 
 PYTHON ?= python3
@@ -107,6 +107,9 @@ papers: $(INSTALLED) ## recompute the papers and rewrite their pages and figures
 
 verification: $(INSTALLED) ## count wrong verdicts of simulated roll tests and rewrite docs/verification.md (two minutes)
 	@$(CLOCK); $(ONE_THREAD) $(BIN)/python examples/verification/verification.py
+
+drift: $(INSTALLED) ## test for changes of simulated tools and rewrite docs/drift-tables.md (twenty minutes)
+	@$(CLOCK); $(ONE_THREAD) $(BIN)/python examples/drift/drift.py
 
 scatter: $(INSTALLED) ## compare what plans state with simulated calibrations and rewrite docs/scatter.md (a quarter of an hour)
 	@$(CLOCK); $(ONE_THREAD) $(BIN)/python examples/planning/scatter.py

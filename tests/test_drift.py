@@ -14,7 +14,7 @@ from mwdcal.calibration.prediction import typical_accuracy
 from mwdcal.calibration.readings import TRIADS
 from mwdcal.drift.change import Contrasts, change_test
 from mwdcal.drift.comparable import (
-    TITLES,
+    FACTOR_NAMES,
     History,
     calibrated_on,
     one_noise,
@@ -26,7 +26,7 @@ from mwdcal.drift.forecast import COVERAGE_FACTOR, growths, years_to
 from mwdcal.drift.histories import tool_history
 from mwdcal.drift.service import ServiceTest
 from mwdcal.drift.tool import TypeRates, measured, predicted
-from mwdcal.drift.walk import GROUPS, GroupRates, Increments, quantiles
+from mwdcal.drift.walk import WALK_GROUPS, GroupRates, Increments, quantiles
 from mwdcal.files.profiles import load_profile
 from mwdcal.planning.plans import load_plan
 from mwdcal.planning.session import Session
@@ -110,7 +110,7 @@ def test_values_and_covariance_are_those_of_the_notation_in_factors(options):
             *notation.uncertainty["B"][:, 0],
             *notation.uncertainty["m"][~np.eye(3, dtype=bool)],
         ]
-        places = [NAMES.index(f"{triad} {title}") for title in TITLES]
+        places = [NAMES.index(f"{triad} {title}") for title in FACTOR_NAMES]
         np.testing.assert_allclose(tool.history.values[0, places], expected, rtol=1e-9, atol=1e-13)
         stated = np.sqrt(np.diag(tool.covariance[0])[places])
         np.testing.assert_allclose(stated, sd, rtol=1e-8)
@@ -255,7 +255,8 @@ def test_the_largest_of_independent_scores_has_its_known_distribution():
 def test_a_step_is_named_with_its_size(years):
     drift = measured("T-1", years["T-1"]).drift
     step = next(s for s in drift.change.steps if s.name == "bias-x")
-    assert drift.change.changed and step.triad == "accelerometer"
+    assert drift.change.changed
+    assert step.triad == "accelerometer"
     assert (step.after, step.by) == ("2022-05-01", "2023-05-01")
     assert abs(step.change - 1e-3) < 4 * step.standard_uncertainty
     assert not measured("T-2", years["T-2"]).drift.change.changed
@@ -265,11 +266,15 @@ def test_noise_of_one_tool_is_pooled_unless_it_differs():
     freedom = np.full(4, 30.0)
     ratio, degrees, together = one_noise(np.array([0.8, 1.0, 1.2, 1.0]), freedom)
     np.testing.assert_allclose(ratio, 1.0 / np.array([0.8, 1.0, 1.2, 1.0]))
-    assert together.all() and np.all(degrees == 120)
+    assert together.all()
+    assert np.all(degrees == 120)
     ratio, degrees, together = one_noise(np.array([0.8, 1.0, 9.0, 1.0]), freedom)
-    assert not together.any() and np.all(ratio == 1) and np.all(degrees == 30)
+    assert not together.any()
+    assert np.all(ratio == 1)
+    assert np.all(degrees == 30)
     ratio, degrees, together = one_noise(np.array([np.nan, 1.0]), freedom[:2])
-    assert not together.any() and np.isinf(degrees[0])
+    assert not together.any()
+    assert np.isinf(degrees[0])
 
 
 # Random walks and due dates
@@ -342,7 +347,7 @@ def test_growth_begins_at_the_accuracy_that_is_stated(years):
     # An error e of the gravity vector tilts it by its part along one direction: e / g, squared.
     bias = each["inclination"].yearly["accelerometer", "bias"]
     assert bias == pytest.approx(1 / calibration.earth["gravity_g"] ** 2, rel=1e-3)
-    yearly = each["inclination"].rate({group: np.array(1e-9) for group in GROUPS})
+    yearly = each["inclination"].rate({group: np.array(1e-9) for group in WALK_GROUPS})
     span = years_to(np.radians(0.02), each["inclination"], yearly)
     later = each["inclination"].calibration + span * yearly
     assert np.sqrt(later) * COVERAGE_FACTOR == pytest.approx(np.radians(0.02))
@@ -352,7 +357,8 @@ def test_due_dates_of_a_fleet_and_of_a_tool_calibrated_once(years):
     tools = [measured(serial, each) for serial, each in years.items()]
     fleet, (first, second, single) = fleet_drift(tools, LIMITS, TODAY, {"T-9": "no file"})
     assert (fleet.tools, fleet.tested, fleet.changed) == (3, 2, 1)
-    assert fleet.worst[0].serial == "T-1" and fleet.refused == {"T-9": "no file"}
+    assert fleet.worst[0].serial == "T-1"
+    assert fleet.refused == {"T-9": "no file"}
     for drift in (first, second, single):
         for due in drift.due:
             assert drift.calibrations[-1].date <= due.not_before <= due.due <= due.not_after
@@ -360,7 +366,8 @@ def test_due_dates_of_a_fleet_and_of_a_tool_calibrated_once(years):
     assert (single.basis, single.change) == ("peers", None)
     assert {f.id for f in single.findings} >= {"single", "peers"}
     lonely = predicted(tools[2], TypeRates.of([tools[2]]), LIMITS)
-    assert lonely.due == [] and "unpredicted" in {f.id for f in lonely.findings}
+    assert lonely.due == []
+    assert "unpredicted" in {f.id for f in lonely.findings}
 
 
 def test_a_tool_that_left_its_limits_in_service_says_so(years):
@@ -380,7 +387,12 @@ def test_a_tool_that_left_its_limits_in_service_says_so(years):
     tests = [test_of("2022-04-30", 0.3, False), test_of("2021-05-02", 0.1, True)]
     drift = measured("T-2", years["T-2"], tests).drift
     (row,) = drift.service
-    assert (row.as_left, row.as_found, row.left_passed, row.found_passed) == (0.1, 0.3, True, False)
+    assert (row.as_left, row.as_found, row.as_left_passed, row.as_found_passed) == (
+        0.1,
+        0.3,
+        True,
+        False,
+    )
     assert row.score == pytest.approx(0.2 / np.hypot(0.01, 0.01))
     whole = predicted(measured("T-2", years["T-2"], tests), TypeRates.of([]), LIMITS)
     assert "left-limits" in {finding.id for finding in whole.findings}
@@ -396,8 +408,11 @@ def test_pages_mark_simulated_data_and_escape_names(years):
     tools = [measured(name, years["T-1"]), measured("T-2", years["T-2"])]
     fleet, (drift, _) = fleet_drift(tools, LIMITS, TODAY)
     for page in (render_tool(drift), render_fleet(fleet)):
-        assert "SIMULATED DATA" in page and "<script>alert" not in page and "\x1b" not in page
+        assert "SIMULATED DATA" in page
+        assert "<script>alert" not in page
+        assert "\x1b" not in page
     assert render_fleet(fleet) == render_fleet(fleet)
     for screen in (tool_screen(drift), fleet_screen(fleet)):
-        assert "SIMULATED DATA" in screen and "\x1b" not in screen
+        assert "SIMULATED DATA" in screen
+        assert "\x1b" not in screen
     assert len(drift_picture(drift).axes) == 6

@@ -21,9 +21,9 @@ from scipy.stats import norm
 from mwdcal.calibration import results
 from mwdcal.calibration.estimate import Fit, fit
 from mwdcal.calibration.readings import TRIADS
-from mwdcal.drift.change import LEVEL, Contrasts, change_test
+from mwdcal.drift.change import CHANGE_LEVEL, Contrasts, change_test
 from mwdcal.drift.comparable import (
-    DIRECTIONS,
+    FIELD_DIRECTIONS,
     History,
     factored,
     one_noise,
@@ -32,7 +32,7 @@ from mwdcal.drift.comparable import (
 )
 from mwdcal.drift.forecast import COVERAGE_FACTOR, INTERVAL, growths, years_to
 from mwdcal.drift.histories import tool_history
-from mwdcal.drift.walk import GROUPS, GroupRates, Increments, draws, group_places
+from mwdcal.drift.walk import WALK_GROUPS, GroupRates, Increments, draws, group_places
 from mwdcal.files.profiles import load_profile
 from mwdcal.geometry.vectors import Array, outer
 from mwdcal.planning.expected import expected, planned_fit
@@ -122,7 +122,7 @@ def in_common(result: Fit, profile: Profile) -> tuple[Array, Array, Array, Array
         model = triad.model.finished(reference)[0]
         where = slice(start, start + model.size)
         strength = result.problem.constant(result.state, ("gravity", "field")[index]).mean()
-        points = DIRECTIONS * strength
+        points = FIELD_DIRECTIONS * strength
         put = factored(model, params[:, where], points, (reference, reference), 0)
         values.append(put.values)
         slopes[:, 12 * index : 12 * index + 12, where] = put.jacobian
@@ -190,7 +190,7 @@ def stepped(setting: Setting, part: int) -> dict[str, list[tuple[bool, bool, flo
     return result
 
 
-def bound(signal: float, level: float = LEVEL) -> float:
+def bound(signal: float, level: float = CHANGE_LEVEL) -> float:
     """Power of the best test of one normal variable, either sign, at a level."""
     limit = norm.isf(level / 2)
     return float(norm.sf(limit - signal) + norm.cdf(-limit - signal))
@@ -241,12 +241,13 @@ def covered(calibrations: int, part: int, tools: int = 300) -> tuple[float, floa
     setting = Setting(plan="twelve-state", before=1, after=calibrations - 1)
     rng = np.random.default_rng([SEED, 7, part])
     places = {
-        group: group_places(parameter_names(dict.fromkeys(TRIADS, 0)), *group) for group in GROUPS
+        group: group_places(parameter_names(dict.fromkeys(TRIADS, 0)), *group)
+        for group in WALK_GROUPS
     }
     profile = with_changes(SERVO, stand=STANDS[setting.stand])
     growth = growths(tool_history([expected(load_plan(setting.plan), profile)]))[0]
-    typical = dict(zip(GROUPS, (3e-5, 1e-4, 3e-5, 1e-4, 10.0, 1e-4), strict=True))
-    truth = {g: (typical[g] * 10 ** (0.3 * rng.normal(size=tools))) ** 2 for g in GROUPS}
+    typical = dict(zip(WALK_GROUPS, (3e-5, 1e-4, 3e-5, 1e-4, 10.0, 1e-4), strict=True))
+    truth = {g: (typical[g] * 10 ** (0.3 * rng.normal(size=tools))) ** 2 for g in WALK_GROUPS}
     size = np.zeros((tools, 24))
     for group, some in places.items():
         size[:, some] = np.sqrt(truth[group])[:, None]

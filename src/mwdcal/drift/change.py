@@ -18,16 +18,16 @@ from mwdcal.calibration.readings import TRIADS
 from mwdcal.drift.comparable import DEPENDENT, History
 from mwdcal.geometry.vectors import AnyArray, Array, Bools, Ints, diagonal, outer
 
-LEVEL = 0.01
+CHANGE_LEVEL = 0.01
 """Share of unchanged tools that are called changed."""
 STEP_SHARE = 0.8
 """Share of the level that steps of one parameter have; the misfit has the rest."""
-DRAWS = 9_999
+NULL_DRAWS = 9_999
 """Histories without change that the test is judged by."""
 PAIR_DRAWS = 1_999
 """Of these, those that two calibrations alone are judged by."""
-SEED = 15
-MOST_STEPS = 8
+SEED_OF_DRAWS = 15
+MOST_NAMED_STEPS = 8
 """Most steps of one tool that are named."""
 UNSEEN = 1e-6
 """A step of which the calibrations tell less than this share of what one of them does is not tested."""
@@ -70,7 +70,7 @@ class ChangeTest:
     pair_misfit: Array
     pair_freedom: Array
     pair_probability: Array
-    steps: tuple[Step, ...]
+    steps: tuple[Step, ...] = ()
 
     @property
     def changed(self) -> bool:
@@ -126,7 +126,7 @@ class Contrasts:
         latest = [column[~np.isnan(column)][-1:] for column in values.transpose()]
         middle = np.array([each[0] if each.size else 0.0 for each in latest])
         unit = np.where(self._unit > 0, self._unit, 1.0)
-        return np.nan_to_num((values - middle) / unit) * (self._unit > 0)
+        return np.asarray(np.nan_to_num((values - middle) / unit) * (self._unit > 0))
 
     def pull(self, departures: Array) -> Array:
         """What each calibration says (…, n, p) of parameters that depart so."""
@@ -168,11 +168,11 @@ class Contrasts:
     def sizes(self, steps: Sequence[tuple[int, int]], departures: Array) -> tuple[Array, Array]:
         """Sizes and standard uncertainties (s,) of steps (after, place) together, in the units of the values."""
         sums = self.sums(self.pull(departures))
-        told = np.array([sums[after - 1, place] for after, place in steps])
+        evidence = np.array([sums[after - 1, place] for after, place in steps])
         matrix = np.array([[self._shared(a, b) for b in steps] for a in steps])
         covariance = np.linalg.pinv(matrix, DEPENDENT, hermitian=True)
         unit = self._unit[[place for _, place in steps]]
-        return covariance @ told * unit, np.sqrt(np.diag(covariance)) * unit
+        return covariance @ evidence * unit, np.sqrt(np.diag(covariance)) * unit
 
     def _shared(self, one: tuple[int, int], other: tuple[int, int]) -> float:
         """Covariance of what speaks for two steps."""
@@ -190,8 +190,8 @@ def _each(matrices: Array, vectors: Array) -> Array:
 @lru_cache(maxsize=2)
 def _noise(count: int, size: int) -> AnyArray:
     """Standard normal numbers (draws, n, p), the same for every tool."""
-    rng = np.random.default_rng([SEED, count, size])
-    return rng.standard_normal((DRAWS, count, size), np.float32)
+    rng = np.random.default_rng([SEED_OF_DRAWS, count, size])
+    return rng.standard_normal((NULL_DRAWS, count, size), np.float32)
 
 
 def stretches(history: History) -> AnyArray:
@@ -200,8 +200,8 @@ def stretches(history: History) -> AnyArray:
     Calibrations of a triad whose noise was estimated together (`pooled`) have one factor.
     """
     freedom = history.freedom
-    result = np.ones((DRAWS, *freedom.shape), np.float32)
-    rng = np.random.default_rng([SEED, *freedom.shape])
+    result = np.ones((NULL_DRAWS, *freedom.shape), np.float32)
+    rng = np.random.default_rng([SEED_OF_DRAWS, *freedom.shape])
     for triad in TRIADS:
         columns = [place for place, name in enumerate(history.names) if name.startswith(triad)]
         if not columns:
@@ -209,12 +209,12 @@ def stretches(history: History) -> AnyArray:
         degrees, together = freedom[:, columns[0]], history.pooled[:, columns[0]]
         groups = [np.flatnonzero(together), *np.flatnonzero(~together)[:, None]]
         for rows in (each for each in groups if each.size and np.isfinite(degrees[each[0]])):
-            grown = np.sqrt(degrees[rows[0]] / rng.chisquare(degrees[rows[0]], DRAWS))
+            grown = np.sqrt(degrees[rows[0]] / rng.chisquare(degrees[rows[0]], NULL_DRAWS))
             result[:, rows[:, None], columns] = grown[:, None, None]
     return result
 
 
-def change_test(history: History, level: float = LEVEL) -> ChangeTest:
+def change_test(history: History, level: float = CHANGE_LEVEL) -> ChangeTest:
     """The test of one tool with two calibrations or more: `History` of (n, p)."""
     contrasts, steady = Contrasts(history.precision), history.steady
     departures = contrasts.departures(history.values)
@@ -233,9 +233,9 @@ def change_test(history: History, level: float = LEVEL) -> ChangeTest:
         for k in range(len(scores))
     ]
     result = ChangeTest(
-        level, float((1 + np.sum(evidence <= least)) / (DRAWS + 1)), scores, largest, critical,
+        level, float((1 + np.sum(evidence <= least)) / (NULL_DRAWS + 1)), scores, largest, critical,
         by_step, misfit, contrasts.freedom, by_misfit,
-        *(np.array(part) for part in zip(*pairs, strict=True)), steps=(),
+        np.array([p[0] for p in pairs]), np.array([p[1] for p in pairs]), np.array([p[2] for p in pairs]),
     )  # fmt: skip
     steps = _steps(contrasts, departures, steady, critical) if result.changed else ()
     return replace(result, steps=steps)
@@ -244,8 +244,8 @@ def change_test(history: History, level: float = LEVEL) -> ChangeTest:
 def _ranks(drawn: Array, value: float) -> tuple[float, Array]:
     """Probability of as much as a value among draws of no change, and of as much as each of them."""
     ascending = np.sort(drawn)
-    above = DRAWS - np.searchsorted(ascending, [value, *drawn], "left")
-    return float((1 + above[0]) / (DRAWS + 1)), above[1:] / DRAWS
+    above = NULL_DRAWS - np.searchsorted(ascending, [value, *drawn], "left")
+    return float((1 + above[0]) / (NULL_DRAWS + 1)), above[1:] / NULL_DRAWS
 
 
 def _pair(pair: Contrasts, departures: Array, null: Array) -> tuple[float, int, float]:
@@ -260,23 +260,23 @@ def _steps(
 ) -> tuple[Step, ...]:
     """Steps that explain the change, the largest first, each with those before taken out."""
     named: list[tuple[int, int]] = []
-    found: list[float] = []
+    scored: list[float] = []
     unit = np.where(contrasts._unit > 0, contrasts._unit, 1.0)
     left = departures
-    while len(named) < MOST_STEPS:
+    while len(named) < MOST_NAMED_STEPS:
         scores = np.where(contrasts.known, contrasts.scores(contrasts.pull(left)), 0.0)[:, steady]
         row, column = np.unravel_index(np.argmax(np.abs(scores)), scores.shape)
         if abs(scores[row, column]) <= critical:
             break
         named.append((int(row) + 1, int(steady[column])))
-        found.append(float(scores[row, column]))
+        scored.append(float(scores[row, column]))
         sizes, _ = contrasts.sizes(named, departures)
         left = departures.copy()
         for (after, place), size in zip(named, sizes, strict=True):
             left[after:, place] -= size / unit[place]
     if not named:
         return ()
-    each = zip(named, *contrasts.sizes(named, departures), found, strict=True)
+    each = zip(named, *contrasts.sizes(named, departures), scored, strict=True)
     return tuple(
         Step(place, after, float(size), float(sd), score)
         for (after, place), size, sd, score in each

@@ -17,28 +17,28 @@ from mwdcal.calibration.record import Calibration
 from mwdcal.geometry.vectors import Array, Bools, Ints, diagonal
 from mwdcal.sensor.models import OFF_COLUMNS, OFF_DIAGONAL, OFF_ROWS, Model
 
-KINDS = ("scale", "bias", "misalignment")
+WALK_KINDS = ("scale", "bias", "misalignment")
 """Kinds of parameters of a triad, in their order; those of a kind drift alike."""
-TITLES = (
-    *(f"{kind}-{axis}" for kind in KINDS[:2] for axis in "xyz"),
-    *(f"{KINDS[2]}-{'xyz'[i]}{'xyz'[j]}" for i, j in OFF_DIAGONAL),
+FACTOR_NAMES = (
+    *(f"{kind}-{axis}" for kind in WALK_KINDS[:2] for axis in "xyz"),
+    *(f"{WALK_KINDS[2]}-{'xyz'[i]}{'xyz'[j]}" for i, j in OFF_DIAGONAL),
 )
 """Names of the twelve parameters of a triad."""
 CORNER = 1 / np.sqrt(3)
-DIRECTIONS = np.array(
+FIELD_DIRECTIONS = np.array(
     [*np.eye(3), *-np.eye(3)]
     + [[i * CORNER, j * CORNER, k * CORNER] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)]
 )
 """Directions of the field (14, 3) over which a curved axis is put as a straight one."""
 DEPENDENT = 1e-9
 """Singular values below this share of the largest are rounding."""
-HELD = 1e-14
+HELD_SD = 1e-14
 """A parameter of less standard uncertainty is one that its model holds."""
 NODES = np.array([0.0, 1.0, -1.0, 0.5])
 """Temperatures of a range at which a course is read: 0 its middle, 1 and -1 its ends."""
 UNLIKE = 1e-3
 """Ratios of noise as unlike as this are not those of one noise."""
-UNRECORDED = (-np.inf, np.inf)
+ANY_TEMPERATURE = (-np.inf, np.inf)
 """The range of a calibration whose run recorded no temperature."""
 DAYS_PER_YEAR = 365.25
 
@@ -62,7 +62,7 @@ def years(days: Sequence[date]) -> Array:
 class Factored:
     """Factors (…, 12 + 6 n) of a triad, and what file parameters change of them (…, 12 + 6 n, p).
 
-    First the twelve at the middle of a temperature range (`TITLES`); then scale and bias by power 1…n of the
+    First the twelve at the middle of a temperature range (`FACTOR_NAMES`); then scale and bias by power 1…n of the
     distance from it, in halves of the range.
     """
 
@@ -99,9 +99,9 @@ def _as_factors(affine: Array, change: Array, powers: Array) -> Factored:
     `change` are their derivatives, `powers` (K, K) makes coefficients of values at the temperatures.
     """
     matrix, offset = affine[..., :3, :].mT, affine[..., 3, :]
-    by_matrix, own = np.swapaxes(change[..., :3, :, :], -3, -2), np.arange(3)
+    by_matrix, axis = np.swapaxes(change[..., :3, :, :], -3, -2), np.arange(3)
     scale = 1 / diagonal(matrix)
-    by_scale = -(scale**2)[..., None] * by_matrix[..., own, own, :]
+    by_scale = -(scale**2)[..., None] * by_matrix[..., axis, axis, :]
     mixing = matrix * scale[..., None, :]
     by_mixing = (
         by_matrix * scale[..., None, :, None] + matrix[..., None] * by_scale[..., None, :, :]
@@ -154,7 +154,7 @@ def parameter_names(orders: Mapping[str, int]) -> tuple[str, ...]:
         f"{triad} {title}{f'·{power}' if power else ''}"
         for triad, order in orders.items()
         for power in range(order + 1)
-        for title in (TITLES[:6] if power else TITLES)
+        for title in (FACTOR_NAMES[:6] if power else FACTOR_NAMES)
     )
 
 
@@ -164,7 +164,7 @@ def precision(covariance: Array, free: Array) -> Array:
     Along them nothing is known, and nothing of a parameter without variance, which the model holds.
     """
     variance = np.diag(covariance)
-    moving = np.flatnonzero(variance > HELD**2)
+    moving = np.flatnonzero(variance > HELD_SD**2)
     result = np.zeros_like(covariance)
     if not moving.size:
         return result
@@ -200,5 +200,5 @@ def one_noise(factors: Array, freedom: Array) -> tuple[Array, Array, Bools]:
     correction = 1 + (inverse - 1 / np.maximum(total, 1.0)) / (3 * np.maximum(count - 1, 1))
     alike = known & (count > 1) & (chi2.sf(spread / correction, np.maximum(count - 1, 1)) > UNLIKE)
     ratio = np.where(alike, mean / square, 1.0)
-    own = np.where(known, freedom, np.inf)
-    return ratio, np.where(alike, total, own), alike
+    single = np.where(known, freedom, np.inf)
+    return ratio, np.where(alike, total, single), alike

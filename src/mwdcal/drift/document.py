@@ -131,8 +131,8 @@ class ServiceRow(msgspec.Struct, frozen=True, kw_only=True):
     change: float | None
     standard_uncertainty: float | None
     score: float | None
-    left_passed: bool
-    found_passed: bool
+    as_left_passed: bool
+    as_found_passed: bool
 
 
 class ToolDrift(msgspec.Struct, frozen=True, kw_only=True):

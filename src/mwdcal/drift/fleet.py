@@ -7,7 +7,7 @@ from datetime import date
 
 import numpy as np
 
-from mwdcal.drift.change import LEVEL
+from mwdcal.drift.change import CHANGE_LEVEL
 from mwdcal.drift.document import FleetDrift, FleetTool, ToolDrift, WalkRate
 from mwdcal.drift.tool import MeasuredTool, TypeRates, predicted, walk_rate
 
@@ -19,7 +19,7 @@ LISTED = 25
 
 def fleet_drift(
     tools: Sequence[MeasuredTool], limits: Mapping[str, float], today: date,
-    refused: Mapping[str, str] | None = None, level: float = LEVEL, listed: int = LISTED,
+    refused: Mapping[str, str] | None = None, level: float = CHANGE_LEVEL, listed: int = LISTED,
 ) -> tuple[FleetDrift, list[ToolDrift]]:  # fmt: skip
     """The drift of tools, each with the rates of its type, and the summary.
 
@@ -80,7 +80,7 @@ def fleet_tool(drift: ToolDrift, today: date) -> FleetTool:
         next_due=drift.next_due,
         not_before=first,
         overdue=bool(drift.next_due and drift.next_due < today.isoformat()),
-        left_limits=any(row.left_passed and not row.found_passed for row in drift.service),
+        left_limits=any(row.as_left_passed and not row.as_found_passed for row in drift.service),
     )
 
 

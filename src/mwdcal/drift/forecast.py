@@ -14,9 +14,9 @@ import numpy as np
 from scipy.special import ndtri
 
 from mwdcal.calibration.prediction import CalibratedTools, accuracy
-from mwdcal.drift.comparable import DAYS_PER_YEAR, TITLES
+from mwdcal.drift.comparable import DAYS_PER_YEAR, FACTOR_NAMES
 from mwdcal.drift.histories import ToolHistory
-from mwdcal.drift.walk import GROUPS, group_places
+from mwdcal.drift.walk import WALK_GROUPS, group_places
 from mwdcal.geometry.vectors import Array
 from mwdcal.sensor.models import Basis, Factors
 
@@ -24,7 +24,7 @@ ACCURACY_PROBABILITY = 0.95
 """Share of directions whose error is to stay within a limit."""
 INTERVAL = (0.05, 0.5, 0.95)
 """Shares of the probability below which lie the earliest, the expected and the latest day."""
-LONGEST = 5.0
+LONGEST_INTERVAL = 5.0
 """No calibration is called good for longer, years."""
 DRAWN_RATES = 2_000
 """Draws of the rates of a tool."""
@@ -49,11 +49,11 @@ def growths(tool: ToolHistory) -> list[Growth]:
     """The growth of each angle that the latest calibration gives; none of those that it leaves undetermined."""
     latest, names = tool.calibrations[-1], tool.history.names
     size, triads = 12, [triad.name for triad in latest.triads]
-    places = [names.index(f"{triad} {title}") for triad in triads for title in TITLES]
+    places = [names.index(f"{triad} {title}") for triad in triads for title in FACTOR_NAMES]
     values = tool.history.values[-1][places].reshape(len(triads), size)
-    units = [np.zeros(len(places)) for _ in GROUPS]
+    units = [np.zeros(len(places)) for _ in WALK_GROUPS]
     steady = [names[place] for place in places]
-    for row, (triad, kind) in zip(units, GROUPS, strict=True):
+    for row, (triad, kind) in zip(units, WALK_GROUPS, strict=True):
         row[group_places(steady, triad, kind)] = 1.0
     block = tool.covariance[-1][np.ix_(places, places)]
     each = np.stack([block, *map(np.diag, units)])[:, None]
@@ -69,7 +69,7 @@ def growths(tool: ToolHistory) -> list[Growth]:
     for angle, sd in accuracy(tools, each).items():
         first, *others = (sd[:, 0] ** 2).tolist()
         if np.isfinite(first):
-            yearly = {g: v for g, v in zip(GROUPS, others, strict=True) if v > 0}
+            yearly = {g: v for g, v in zip(WALK_GROUPS, others, strict=True) if v > 0}
             result.append(Growth(angle, first, yearly))
     return result
 
@@ -81,5 +81,5 @@ def years_to(limit: float, growth: Growth, yearly: Array) -> Array:
 
 
 def day_after(start: date, span: float) -> date:
-    """The day that is some years, at most `LONGEST`, after another."""
-    return start + timedelta(days=int(min(max(span, 0.0), LONGEST) * DAYS_PER_YEAR))
+    """The day that is some years, at most `LONGEST_INTERVAL`, after another."""
+    return start + timedelta(days=int(min(max(span, 0.0), LONGEST_INTERVAL) * DAYS_PER_YEAR))

@@ -12,8 +12,8 @@ from mwdcal.calibration.prediction import raw_reading
 from mwdcal.calibration.readings import NANOTESLA, SOAK_GAP, TRIADS
 from mwdcal.calibration.record import Calibration, TriadCalibration
 from mwdcal.drift.comparable import (
-    DIRECTIONS,
-    UNRECORDED,
+    ANY_TEMPERATURE,
+    FIELD_DIRECTIONS,
     History,
     calibrated_on,
     factored,
@@ -33,8 +33,8 @@ NOTES = {
     "curved": "the {triad} has own-axis terms: its best straight line is compared",
     "held": "its model holds misalignments at zero: they are not compared",
     "free": "leaves undetermined: {free}: the others are compared",
-    "model": "the {triad} has the model '{model}', that of the latest is '{latest}': over temperature the two differ by "
-    "their own misfit",
+    "model": "the {triad} has the model '{model}', that of the latest is '{latest}': over temperature the two "
+    "differ by their own misfit",
     "order": "the {triad} has temperature terms of order {order}: compared to order {compared}",
 }
 """What is said of a calibration that cannot be compared, or not in all of its parameters."""
@@ -104,10 +104,12 @@ def tool_history(calibrations: Sequence[Calibration]) -> ToolHistory:
     kept = [day for day, use in zip(days, used, strict=True) if use]
     names = parameter_names(orders)
     values, covariance, free = ([row[i] for row in rows] for i in range(3))
-    ratio, *noise = (np.concatenate(part, -1) for part in zip(*form.noise(), strict=True))
+    ratio, freedom, together = (
+        np.concatenate(part, -1) for part in zip(*form.noise(), strict=True)
+    )
     like = np.stack(covariance) * outer(np.sqrt(ratio))
     known = np.stack([precision(*each) for each in zip(like, free, strict=True)])
-    history = History(names, np.stack(values), like, known, *noise, years(kept))
+    history = History(names, np.stack(values), like, known, freedom, together, years(kept))
     units = tuple(map(form.unit, names))
     tool = tuple(ordered), tuple(days), tuple(used), tuple(map(tuple, notes))
     return ToolHistory(*tool, span, units, form.earth(), np.stack(covariance), free[-1], history)
@@ -116,7 +118,7 @@ def tool_history(calibrations: Sequence[Calibration]) -> ToolHistory:
 def _range(calibration: Calibration) -> tuple[float, float]:
     """Temperatures that a calibration holds for, °C."""
     if calibration.temperature_c is None:
-        return UNRECORDED
+        return ANY_TEMPERATURE
     low, high = calibration.temperature_c
     return low - calibration.margin, high + calibration.margin
 
@@ -125,7 +127,7 @@ def _in_common(
     ordered: Sequence[Calibration],
 ) -> tuple[list[bool], tuple[float, float], list[list[str]]]:
     """Which calibrations have temperatures in common, these, and notes of each; the latest first."""
-    used, notes, span = [], [], UNRECORDED
+    used, notes, span = [], [], ANY_TEMPERATURE
     for each in reversed(ordered):
         low, high = _range(each)
         both = max(low, span[0]), min(high, span[1])
@@ -172,8 +174,8 @@ class _Form:
             freedom = np.array([t.degrees_of_freedom if t else 0.0 for t in triads])
             declared = np.array([t is not None and t.noise_source == DECLARED for t in triads])
             ratio, degrees, together = one_noise(np.where(declared, square, np.nan), freedom)
-            own = np.where(np.isnan(square) | (freedom < 1), np.inf, freedom)
-            parts = ratio, np.where(declared, degrees, own), together
+            single = np.where(np.isnan(square) | (freedom < 1), np.inf, freedom)
+            parts = ratio, np.where(declared, degrees, single), together
             first, second, third = (np.repeat(part[:, None], 12 + 6 * order, -1) for part in parts)
             yield first, second, third
 
@@ -228,9 +230,9 @@ class _Form:
         last = self._last(triad)
         strength = last.earth.get("field", 1.0) if triad == TRIADS[1] else last.earth["gravity_g"]
         model = getattr(last, triad).functions(last.reference_temperature)
-        warmth = np.full(len(DIRECTIONS), np.clip(sum(self.span) / 2, *_range(last)))
+        warmth = np.full(len(FIELD_DIRECTIONS), np.clip(sum(self.span) / 2, *_range(last)))
         return raw_reading(
-            model, np.array(getattr(last, triad).parameters), strength * DIRECTIONS, warmth
+            model, np.array(getattr(last, triad).parameters), strength * FIELD_DIRECTIONS, warmth
         )
 
     def _strength(self, calibration: Calibration, triad: str) -> float:

@@ -38,10 +38,10 @@ def service_rows(
     return rows
 
 
-def _compared(calibrated: date, left: ServiceTest, found: ServiceTest) -> Iterator[ServiceRow]:
+def _compared(calibrated: date, left: ServiceTest, last: ServiceTest) -> Iterator[ServiceRow]:
     """The limits that both tests judge."""
     before = {row.name: row for row in left.verdict.rows}
-    for row in found.verdict.rows:
+    for row in last.verdict.rows:
         if row.name not in before:
             continue
         first = before[row.name]
@@ -49,7 +49,7 @@ def _compared(calibrated: date, left: ServiceTest, found: ServiceTest) -> Iterat
         yield ServiceRow(
             calibrated=calibrated.isoformat(),
             as_left_date=left.day.isoformat(),
-            as_found_date=found.day.isoformat(),
+            as_found_date=last.day.isoformat(),
             name=row.name,
             unit=row.unit,
             limit=row.limit,
@@ -58,16 +58,16 @@ def _compared(calibrated: date, left: ServiceTest, found: ServiceTest) -> Iterat
             change=change,
             standard_uncertainty=sd,
             score=None if change is None or not sd else change / sd,
-            left_passed=first.passed,
-            found_passed=row.passed,
+            as_left_passed=first.passed,
+            as_found_passed=row.passed,
         )
 
 
-def _change(left: VerdictRow, found: VerdictRow) -> tuple[float | None, float | None]:
+def _change(left: VerdictRow, last: VerdictRow) -> tuple[float | None, float | None]:
     """What a figure changed by and its standard uncertainty, the tests being independent."""
-    if left.value is None or found.value is None:
+    if left.value is None or last.value is None:
         return None, None
-    change = found.value - left.value
-    if left.uncertainty is None or found.uncertainty is None:
+    change = last.value - left.value
+    if left.uncertainty is None or last.uncertainty is None:
         return change, None
-    return change, float(np.hypot(left.uncertainty, found.uncertainty))
+    return change, float(np.hypot(left.uncertainty, last.uncertainty))

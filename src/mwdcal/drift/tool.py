@@ -11,7 +11,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from mwdcal.calibration.record import Calibration, Finding, stated
-from mwdcal.drift.change import LEVEL, ChangeTest, change_test
+from mwdcal.drift.change import CHANGE_LEVEL, ChangeTest, change_test
 from mwdcal.drift.document import (
     AccuracyForecast,
     ChangeVerdict,
@@ -27,7 +27,7 @@ from mwdcal.drift.forecast import (
     COVERAGE_FACTOR,
     DRAWN_RATES,
     INTERVAL,
-    LONGEST,
+    LONGEST_INTERVAL,
     Growth,
     day_after,
     growths,
@@ -35,14 +35,14 @@ from mwdcal.drift.forecast import (
 )
 from mwdcal.drift.histories import ToolHistory, factor, tool_history
 from mwdcal.drift.service import ServiceTest, service_rows
-from mwdcal.drift.walk import GROUPS, GroupRates, Increments, draws, group_places, quantiles
+from mwdcal.drift.walk import WALK_GROUPS, GroupRates, Increments, draws, group_places, quantiles
 from mwdcal.geometry.vectors import Array
 
 CONTROL = 3.0
 """Standard deviations within which control limits lie."""
 MOST_PEERS = 2_000
 """Most tools of a type that its rates are learnt from."""
-TIMES = np.linspace(0.0, LONGEST, 21)
+TIMES = np.linspace(0.0, LONGEST_INTERVAL, 21)
 """Years after a calibration for which its accuracy is forecast."""
 TOOL_AND_PEERS, PEERS = "tool and peers", "peers"
 FINDINGS = {
@@ -78,7 +78,7 @@ class MeasuredTool:
 
 def measured(
     serial: str, calibrations: Sequence[Calibration], tests: Sequence[ServiceTest] = (),
-    level: float = LEVEL, digests: Mapping[str, str] | None = None, tested: bool = True,
+    level: float = CHANGE_LEVEL, digests: Mapping[str, str] | None = None, tested: bool = True,
 ) -> MeasuredTool:  # fmt: skip
     """The change test and the growth of one tool.
 
@@ -88,7 +88,7 @@ def measured(
     tool = tool_history(calibrations)
     names, history = tool.history.names, tool.history
     test = change_test(history, level) if tested and len(tool.compared) > 1 else None
-    places = {group: group_places(names, *group) for group in GROUPS}
+    places = {group: group_places(names, *group) for group in WALK_GROUPS}
     increments = {g: Increments.of(history, some) for g, some in places.items() if some}
     of_place = {place: group for group, some in places.items() for place in some}
     named = [(c, _digests(c, digests or {})) for c in tool.calibrations]
@@ -110,8 +110,8 @@ def measured(
 
 def _digests(calibration: Calibration, digests: Mapping[str, str]) -> list[str]:
     """The SHA-256 by which a roll test may name a calibration."""
-    own = str(calibration.sha256)
-    return [own, digests.get(own, own)]
+    content = str(calibration.sha256)
+    return [content, digests.get(content, content)]
 
 
 def _calibrations(tool: ToolHistory) -> list[ComparedCalibration]:
@@ -130,7 +130,7 @@ def _parameters(tool: ToolHistory, test: ChangeTest | None) -> list[ParameterCou
     sd = np.sqrt(np.maximum(np.diagonal(tool.covariance, axis1=-2, axis2=-1), 0.0))
     known = np.diagonal(history.precision, axis1=-2, axis2=-1) > 0
     sd = np.where(known, sd, np.nan)
-    nothing = [None] * len(sd)
+    nothing: list[float | None] = [None] * len(sd)
     for place in history.steady.tolist():
         triad, _, name = history.names[place].partition(" ")
         scores = np.abs(test.scores[:, place]) if test else np.full(1, np.nan)
@@ -191,9 +191,9 @@ class TypeRates:
         """Of tools of one type, at most `MOST_PEERS` of them, spread evenly."""
         several = [t for t in tools if any(i.noise.size for i in t.increments.values())]
         some = several[:: -(-len(several) // MOST_PEERS) or 1]
-        each = {g: [t.increments[g] for t in some if g in t.increments] for g in GROUPS}
+        each = {g: [t.increments[g] for t in some if g in t.increments] for g in WALK_GROUPS}
         rates = {group: GroupRates.of(increments) for group, increments in each.items()}
-        kept = {group: found for group, found in rates.items() if found is not None}
+        kept = {group: learnt for group, learnt in rates.items() if learnt is not None}
         return cls(kept, frozenset(t.drift.serial for t in some))
 
 
@@ -207,18 +207,18 @@ def predicted(
     drift, serial = tool.drift, tool.drift.serial
     among = serial in rates.members
     known = {
-        group: (found.rates, found.probability(tool.increments[group], among))
-        for group, found in rates.groups.items()
+        group: (learnt.rates, learnt.probability(tool.increments[group], among))
+        for group, learnt in rates.groups.items()
         if group in tool.increments
     }
     usable = [g for g in tool.growths if set(g.yearly) <= set(known)]
     rng = np.random.default_rng(crc32(serial.encode()))
     drawn = {group: draws(*each, DRAWN_RATES, rng) for group, each in known.items()}
     due = [_due(tool, g, g.rate(drawn), limits[g.angle]) for g in usable if g.angle in limits]
-    own = any(each.noise.size for each in tool.increments.values())
+    several = any(each.noise.size for each in tool.increments.values())
     drift = replace(
         drift,
-        basis=(TOOL_AND_PEERS if own else PEERS) if known else "",
+        basis=(TOOL_AND_PEERS if several else PEERS) if known else "",
         peers=len(rates.members - {serial}),
         rates=_rates(drift, known),
         parameters=_controlled(tool, known),
@@ -250,7 +250,7 @@ def _controlled(
     """The parameters with control limits: from each calibration to the next, by walk and uncertainties."""
     courses = []
     for course, group in zip(tool.drift.parameters, tool.groups, strict=True):
-        rate = float(quantiles(*known[group], [0.5])[0]) if group in known else 0.0
+        rate = float(quantiles(*known[group], [0.5])[0]) if group and group in known else 0.0
         rate *= factor(course.unit) ** 2
         low: list[float | None] = [None]
         high: list[float | None] = [None]
@@ -285,7 +285,7 @@ def _due(tool: MeasuredTool, growth: Growth, yearly: Array, limit_deg: float) ->
     return DueDate(
         angle=growth.angle, limit_deg=limit_deg,
         now_deg=float(np.degrees(COVERAGE_FACTOR * np.sqrt(growth.calibration))),
-        due=days[1], not_before=days[0], not_after=days[2], capped=last >= LONGEST,
+        due=days[1], not_before=days[0], not_after=days[2], capped=last >= LONGEST_INTERVAL,
     )  # fmt: skip
 
 
@@ -300,7 +300,9 @@ def _findings(drift: ToolDrift, limits: Mapping[str, float], today: date | None)
         say("single")
     elif drift.change.changed:
         say("changed", what=", ".join(map(_step_words, drift.change.steps)) or FINDINGS["misfit"])
-    if failed := [row.name for row in drift.service if row.left_passed and not row.found_passed]:
+    if failed := [
+        row.name for row in drift.service if row.as_left_passed and not row.as_found_passed
+    ]:
         count = f"{len(failed)} limit{'s' * (len(failed) > 1)}"
         say("left-limits", count=count, names=", ".join(failed))
     if not drift.basis:

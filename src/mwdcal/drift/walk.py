@@ -1,7 +1,7 @@
 """How fast parameters wander: a random walk of each, its rate estimated with that of the tool's peers.
 
 Between two calibrations t years apart a parameter moves by a normal variable of variance q t. Parameters of
-a kind (`GROUPS`) have one rate; rates of tools of a type are log-normal about a common one.
+a kind (`WALK_GROUPS`) have one rate; rates of tools of a type are log-normal about a common one.
 """
 
 from __future__ import annotations
@@ -14,16 +14,16 @@ import numpy as np
 from scipy.special import logsumexp
 
 from mwdcal.calibration.readings import TRIADS
-from mwdcal.drift.comparable import KINDS, TITLES, History
+from mwdcal.drift.comparable import FACTOR_NAMES, WALK_KINDS, History
 from mwdcal.geometry.vectors import Array
 
-GROUPS = tuple((triad, kind) for triad in TRIADS for kind in KINDS)
+WALK_GROUPS = tuple((triad, kind) for triad in TRIADS for kind in WALK_KINDS)
 """Triad and kind of the parameters that wander at one rate."""
 DECADES = np.linspace(-4.0, 3.0, 57)
 """Rates that are tried: decimal logarithms of variance per year over the variance of a calibration."""
-CENTRES = np.linspace(-3.5, 2.5, 31)
+RATE_CENTRES = np.linspace(-3.5, 2.5, 31)
 """Rates about which those of a type may lie, all equally probable before there are data."""
-SPREADS = np.linspace(0.05, 1.0, 20)
+RATE_SPREADS = np.linspace(0.05, 1.0, 20)
 """Standard deviations, in decades, of the rates of tools of a type; see `SPREAD_SCALE`."""
 SPREAD_SCALE = 0.4
 """Most probable of these before there are data, of a Rayleigh distribution: it keeps away from none at all."""
@@ -33,7 +33,7 @@ SHORTEST = 1 / 365.25
 
 def group_places(names: Sequence[str], triad: str, kind: str) -> list[int]:
     """Places of the parameters of a group at the middle temperature."""
-    members = {f"{triad} {title}" for title in TITLES if title.startswith(kind)}
+    members = {f"{triad} {title}" for title in FACTOR_NAMES if title.startswith(kind)}
     return [place for place, name in enumerate(names) if name in members]
 
 
@@ -101,7 +101,7 @@ class GroupRates:
     @cached_property
     def _members(self) -> Array:
         """Share (c, s, r) of the tools of a type with each rate, by centre and spread of the type."""
-        z = (DECADES - CENTRES[:, None, None]) / SPREADS[:, None]
+        z = (DECADES - RATE_CENTRES[:, None, None]) / RATE_SPREADS[:, None]
         density = np.exp(-0.5 * z**2)
         return np.asarray(density / density.sum(-1, keepdims=True))
 
@@ -110,12 +110,12 @@ class GroupRates:
         largest = log_likelihood.max(-1, keepdims=True)
         share = np.exp(log_likelihood - largest) @ self._members.reshape(-1, len(DECADES)).mT
         logs = np.log(np.maximum(share, 1e-300)) + largest
-        return np.asarray(logs.reshape(*largest.shape[:-1], len(CENTRES), len(SPREADS)))
+        return np.asarray(logs.reshape(*largest.shape[:-1], len(RATE_CENTRES), len(RATE_SPREADS)))
 
     @cached_property
     def type_probability(self) -> Array:
         """Probability (c, s) of centre and spread of the type, by the tools it was learnt from."""
-        prior = np.log(SPREADS) - 0.5 * (SPREADS / SPREAD_SCALE) ** 2
+        prior = np.log(RATE_SPREADS) - 0.5 * (RATE_SPREADS / SPREAD_SCALE) ** 2
         logs = self._evidence(self.log_likelihood).sum(0) + prior
         return np.asarray(np.exp(logs - logsumexp(logs)))
 
@@ -145,4 +145,4 @@ def quantiles(rates: Array, probability: Array, shares: Sequence[float]) -> Arra
 
 def draws(rates: Array, probability: Array, count: int, rng: np.random.Generator) -> Array:
     """Rates (count,) drawn from a distribution over rates."""
-    return quantiles(rates, probability, rng.uniform(size=count))
+    return quantiles(rates, probability, rng.uniform(size=count).tolist())

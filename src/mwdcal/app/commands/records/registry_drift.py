@@ -51,7 +51,7 @@ def command(
     Example: mwdcal registry drift --limit inclination_deg=0.1 --html fleet.html --database tools.sqlite
     Exit: 0 compared, 2 there is no such tool, or the registry cannot be opened.
     """
-    from mwdcal.app import drift
+    from mwdcal.app.commands.records import drift_sources
     from mwdcal.app.pages.records import drift as pages
     from mwdcal.app.screens.records import drift as screen
     from mwdcal.files.formats import atomic
@@ -59,10 +59,9 @@ def command(
 
     options.check_outputs([], [], page=html)
     day = (today or datetime.now(UTC)).date()
-    allowed = drift.limits_of(limits)
+    allowed = drift_sources.limits_of(limits)
     with open_registry(database) as registry:
-        result = drift.of_registry(registry, serial, allowed, level, day)
+        result = drift_sources.of_registry(registry, serial, allowed, level, day)
     if html:
-        page = pages.render_tool(result.tool) if result.tool else pages.render_fleet(result.fleet)
-        atomic.write(html, page)
+        atomic.write(html, pages.render(result.tool, result.fleet))
     print_result(screen.document(result) if as_json else screen.text(result, html))

@@ -11,8 +11,13 @@ from mwdcal.app.screens.numbers import number
 from mwdcal.app.screens.records.drift import due_words, rate_rows, service_rows, step_rows
 from mwdcal.app.text import chance, plural
 from mwdcal.drift.document import FleetDrift, ParameterCourse, ToolDrift
-from mwdcal.drift.forecast import ACCURACY_PROBABILITY, COVERAGE_FACTOR, INTERVAL, LONGEST
+from mwdcal.drift.forecast import ACCURACY_PROBABILITY, COVERAGE_FACTOR, INTERVAL, LONGEST_INTERVAL
 from mwdcal.drift.tool import CONTROL
+
+
+def render(tool: ToolDrift | None, fleet: FleetDrift | None) -> str:
+    """The page of one tool, or of many."""
+    return (render_tool(tool) if tool else "") + (render_fleet(fleet) if fleet else "")
 
 
 def render_tool(drift: ToolDrift) -> str:
@@ -31,7 +36,7 @@ def render_tool(drift: ToolDrift) -> str:
         service=service_rows(drift.service),
         rows=list(_parameter_rows(drift)),
         control=CONTROL,
-        longest=LONGEST,
+        longest=LONGEST_INTERVAL,
         factor=COVERAGE_FACTOR,
         share=ACCURACY_PROBABILITY,
         interval=INTERVAL,
@@ -44,7 +49,7 @@ def _tool_banner(drift: ToolDrift) -> dict[str, str]:
     after = (
         f"Next calibration due {drift.next_due}" if drift.next_due else "No due date is predicted"
     )
-    if any(row.left_passed and not row.found_passed for row in drift.service):
+    if any(row.as_left_passed and not row.as_found_passed for row in drift.service):
         return banner("bad", "Left its limits", "Passed as left and failed as found", after)
     if drift.change is None:
         count = plural(sum(each.used for each in drift.calibrations), "calibration")

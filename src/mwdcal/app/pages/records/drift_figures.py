@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-ABREAST = 3
+COURSES_ABREAST = 3
 """Panels in a row."""
 HEIGHT = 1.15
 """Of a row of panels, inches."""
@@ -59,8 +59,8 @@ def drift_picture(drift: ToolDrift) -> Figure:
 
 def _courses(drift: ToolDrift, courses: Sequence[ParameterCourse], label: str) -> Figure:
     """Panels, three abreast, of some parameters."""
-    rows = -(-len(courses) // ABREAST)
-    figure, grid = plots.new_figure(label, HEIGHT * rows + 0.3, rows, ABREAST, sharex=True)
+    rows = -(-len(courses) // COURSES_ABREAST)
+    figure, grid = plots.new_figure(label, HEIGHT * rows + 0.3, rows, COURSES_ABREAST, sharex=True)
     days = [date.fromisoformat(c.date) for c in drift.calibrations if c.used]
     for axes, course in zip(grid.ravel(), courses, strict=False):
         _course(axes, drift, course, days)

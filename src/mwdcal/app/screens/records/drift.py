@@ -6,7 +6,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from mwdcal.app.drift import RegistryDrift
+import msgspec
+
 from mwdcal.app.envelope import enveloped
 from mwdcal.app.screens.numbers import measured, number, unit, written
 from mwdcal.app.text import chance, one_line, plural, table
@@ -36,6 +37,15 @@ WORST_TITLES = [
     "largest change",
     "due",
 ]
+
+
+class RegistryDrift(msgspec.Struct, frozen=True, kw_only=True):
+    """How one tool changes, or all tools of a registry; by the limits of the 95 % accuracy, degrees."""
+
+    registry: str
+    limits_deg: dict[str, float]
+    tool: ToolDrift | None = None
+    fleet: FleetDrift | None = None
 
 
 def step_rows(drift: ToolDrift) -> list[list[str]]:
@@ -91,9 +101,9 @@ def _value(value: float | None, symbol: str) -> str:
 
 def _result(row: ServiceRow) -> str:
     """Whether a tool kept a limit in service."""
-    if row.found_passed:
-        return "kept" if row.left_passed else "passes again"
-    return "left in service" if row.left_passed else "failed before"
+    if row.as_found_passed:
+        return "kept" if row.as_left_passed else "passes again"
+    return "left in service" if row.as_left_passed else "failed before"
 
 
 def tool_screen(drift: ToolDrift) -> str:
@@ -120,14 +130,15 @@ def tool_screen(drift: ToolDrift) -> str:
 
 def document(result: RegistryDrift) -> dict[str, Any]:
     """The drift for machines."""
-    about = result.tool or result.fleet
-    stated = {"serial": result.tool.serial if result.tool else "", "simulated": about.simulated}
+    marked = [each.simulated for each in (result.tool, result.fleet) if each]
+    stated = {"serial": result.tool.serial if result.tool else "", "simulated": any(marked)}
     return enveloped("registry drift", result, stated)
 
 
 def text(result: RegistryDrift, page: Path | None) -> str:
     """The drift for people."""
-    shown = tool_screen(result.tool) if result.tool else fleet_screen(result.fleet)
+    shown = tool_screen(result.tool) if result.tool else ""
+    shown = fleet_screen(result.fleet) if result.fleet else shown
     return "\n\n".join(filter(None, [shown, written(page=page) if page else ""]))
 
 

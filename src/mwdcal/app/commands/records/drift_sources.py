@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from datetime import date
+from functools import partial
 from typing import Any
 
 import msgspec
 
+from mwdcal.app.screens.records.drift import RegistryDrift
+from mwdcal.calibration.prediction import STATED_ANGLES
 from mwdcal.calibration.record import Calibration
-from mwdcal.drift.document import FleetDrift, ToolDrift
+from mwdcal.drift.document import ToolDrift
 from mwdcal.drift.fleet import fleet_drift
 from mwdcal.drift.service import ServiceTest
 from mwdcal.drift.tool import MeasuredTool, TypeRates, measured, predicted
@@ -22,20 +25,10 @@ from mwdcal.registry import queries
 from mwdcal.registry.store import Registry
 from mwdcal.use.verification import Bounds, Verdict
 
-ANGLES = ("inclination", "toolface", "azimuth")
 PEERS_READ = 200
 """Most other tools of its type that a single tool is compared with."""
 PAGE = 500
 """Rows of a registry that are read at once."""
-
-
-class RegistryDrift(msgspec.Struct, frozen=True, kw_only=True):
-    """How one tool changes, or all tools of a registry; by the limits of the 95 % accuracy, degrees."""
-
-    registry: str
-    limits_deg: dict[str, float]
-    tool: ToolDrift | None = None
-    fleet: FleetDrift | None = None
 
 
 def limits_of(typed: Iterable[str]) -> dict[str, float]:
@@ -52,8 +45,8 @@ def limits_of(typed: Iterable[str]) -> dict[str, float]:
             limits[angle] = float(value)
         except ValueError:
             limits[angle] = -1.0
-        if angle not in ANGLES or not 0 < limits[angle] < 180:
-            names = ", ".join(f"{angle}_deg" for angle in ANGLES)
+        if angle not in STATED_ANGLES or not 0 < limits[angle] < 180:
+            names = ", ".join(f"{angle}_deg" for angle in STATED_ANGLES)
             raise InputError(
                 f"`limit` must be one of {names} with a positive number, such as inclination_deg=0.1; got "
                 f"{shown(text)}."
@@ -63,7 +56,7 @@ def limits_of(typed: Iterable[str]) -> dict[str, float]:
 
 def default_limits(errors: Bounds) -> dict[str, float]:
     """The limits on errors of the angles."""
-    return {name: value for name, value in errors.items() if name in ANGLES}
+    return {name: value for name, value in errors.items() if name in STATED_ANGLES}
 
 
 def of_registry(
@@ -74,9 +67,9 @@ def of_registry(
     Raises:
         InputError: there is no calibration of such a tool.
     """
-    whole = {"registry": registry.name, "limits_deg": limits}
+    whole = partial(RegistryDrift, registry=registry.name, limits_deg=limits)
     if serial is not None:
-        return RegistryDrift(**whole, tool=_of_tool(registry, serial, limits, level, today))
+        return whole(tool=_of_tool(registry, serial, limits, level, today))
     tools, refused = [], {}
     for row in _tools(registry):
         try:
@@ -89,7 +82,7 @@ def of_registry(
             f"{registry.name}: there is no calibration to compare. Add some: mwdcal registry add."
         )
     fleet, _ = fleet_drift(tools, limits, today, refused, level)
-    return RegistryDrift(**whole, fleet=fleet)
+    return whole(fleet=fleet)
 
 
 def _of_tool(
@@ -146,7 +139,7 @@ def _calibrations(registry: Registry, serial: str) -> tuple[list[Calibration], d
 
 def _tests(registry: Registry, serial: str) -> Iterator[ServiceTest]:
     """The roll tests of a tool that were not withdrawn, each on the day of its run or, unknown, when it was added."""
-    where = {"serial": serial}
+    where: dict[str, object] = {"serial": serial}
     days = {row["sha256"]: row["time"] for row in _records(registry, "run", where)}
     for row in _records(registry, "verification", where):
         day = row["time"] or days.get(row["run"]) or row["added"]
