@@ -124,7 +124,8 @@ def report(count: int = CALIBRATIONS) -> str:
         create(database, "bench")
         with open_registry(database) as registry:
             adding = seconds(partial(imported, registry, paths, cores))
-            size = sum(file.stat().st_size for file in folder.glob("tools.sqlite*"))
+        size = database.stat().st_size
+        with open_registry(database) as registry:
             times = {
                 name: [seconds(partial(page, k)) for k in range(ROUNDS)]
                 for name, page in pages(registry, count).items()

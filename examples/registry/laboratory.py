@@ -29,7 +29,7 @@ SERVO = Path(__file__).parents[1] / "servo"
 """The folder of the example tool: its profile and the file of its laboratory."""
 SEED = 20261122
 FIRST_YEAR = 2022
-YEARLY = 2e-4
+YEARLY = 3e-5
 """What a scale and a bias change by from one visit to the next, 1σ, as shares of gravity and of the field."""
 KNOCK = 4e-3
 """What the knock adds to the bias of the first tool's accelerometer along y, g."""
