@@ -38,7 +38,10 @@ PACKAGES = (
     "mwdcal", "numpy", "scipy", "numba", "pyarrow", "pyswarms", "AllanTools",
     "circuitpython-mag-cal", "imucal", "pandas", "welleng",
 )  # fmt: skip
-ORDER = ("fleet", "apply", "fits", "procedures", "surveys", "swarms", "peers", "allan", "commands")
+ORDER = (
+    *("fleet", "apply", "fits", "procedures", "surveys", "registry", "swarms", "peers", "allan"),
+    "commands",
+)
 """Order of the runs: the memory of a fleet is that of the largest process so far."""
 PLOTTED = (
     "fits",
@@ -76,11 +79,17 @@ UNITS = {"s": ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs")), "MB": ((1.0, "MB"),)}
 
 @dataclass
 class Group:
-    """What one module measured; `growth` are tools, seconds and memory (MB)."""
+    """What one module measured; `growth` are tools, seconds and memory (MB), `text` figures of other kinds."""
 
     rows: list[Row] = field(default_factory=list)
+    text: str = ""
     growth: list[tuple[int, float, float]] = field(default_factory=list)
     missing: str = ""
+
+    @property
+    def shown(self) -> str:
+        """The figures as Markdown, or why there are none."""
+        return self.missing or self.text or group_table(self.rows)
 
 
 def fleet(quick: bool) -> Group:
@@ -88,7 +97,7 @@ def fleet(quick: bool) -> Group:
     module, cores = import_module("fleet"), count_cores()
     sizes = [10**k for k in range(2, 5 if quick else 7)]
     grown = list(module.growth(sizes, cores))
-    return Group(module.against_scipy(2_000 if quick else 20_000, cores), grown)
+    return Group(module.against_scipy(2_000 if quick else 20_000, cores), growth=grown)
 
 
 def apply(quick: bool) -> Group:
@@ -101,7 +110,12 @@ def apply(quick: bool) -> Group:
     return Group(found)
 
 
-OWN = {"fleet": fleet, "apply": apply}
+def registry(quick: bool) -> Group:
+    """Import, size, queries and check of a registry."""
+    return Group(text=import_module("registry").report(2_000 if quick else 100_000))
+
+
+OWN = {"fleet": fleet, "apply": apply, "registry": registry}
 
 
 def measured(name: str, quick: bool) -> Group:
@@ -229,7 +243,7 @@ def page(groups: dict[str, Group], quick: bool) -> str:
         "growth": growth_table(groups["fleet"].growth) if groups["fleet"].growth else "",
     }
     for name, group in groups.items():
-        parts[name] = group.missing or group_table(group.rows)
+        parts[name] = group.shown
     for name, value in parts.items():
         text = text.replace("{" + name + "}", value)
     return text
@@ -241,7 +255,7 @@ def renewed(text: str, groups: dict[str, Group]) -> str:
     for section in re.split(r"(?m)^(?=## )", TEXTS.read_text("utf-8")):
         for name, group in groups.items():
             if "{" + name + "}" in section:
-                shown = group.missing or group_table(group.rows)
+                shown = group.shown
                 about = f"Measured by itself: {datetime.now(UTC).date()}, {machine()}."
                 filled = section.replace("{" + name + "}", f"{shown}\n\n{about}")
                 heading = section.partition("\n")[0]

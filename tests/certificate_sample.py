@@ -191,7 +191,7 @@ SAMPLE = Certificate(
             date="2025-01-10",
             due="2026-01-10",
             overdue=True,
-            standard_uncertainty="0.01°",
+            standard_uncertainty="inclination 0.01°, azimuth 0.05°, toolface 0.02°",
         ),
         TracedStandard(
             quantity="field",

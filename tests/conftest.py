@@ -125,5 +125,5 @@ def postgresql():
     """The URL of a PostgreSQL server for this process, started when the first test needs it."""
     from registry_support import postgresql_server
 
-    with postgresql_server() as url:
+    with postgresql_server(durable=False) as url:
         yield url

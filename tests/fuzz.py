@@ -26,6 +26,7 @@ import warnings
 from collections import Counter
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 from xml.sax.saxutils import escape
 
 import click
@@ -62,12 +63,19 @@ SAMPLES = {
     "plans": "plan",
     "measured": "run",
     "reference": "reference",
+    "key": "key",
+    "keys": "key",
+    "public": "key",
+    "document": "signed",
     "verification": "verification",
     "as_found": "verification",
     "laboratory": "laboratory",
+    "database": "registry",
+    "source": "registry",
+    "files": "any",
 }
 """The kind of file that each argument or option takes, by its name."""
-DOCUMENTS = ("calibration", "verification")
+DOCUMENTS = ("calibration", "verification", "signed")
 """Kinds of files that are JSON."""
 OUTPUTS = ("output", "report", "plot", "folder", "calibrations", "truth", "html", "msa_html")
 """Arguments and options that name what to write."""
@@ -166,11 +174,21 @@ def samples(folder: Path) -> dict[str, list[Any]]:
         "profile": [(EXAMPLE / "tool.toml").read_text("utf-8")],
         "limits": [LIMITS, SURVEY_LIMITS],
         "reference": [place.out],
+        **signed(folder, calibrations[0]),
         "effects": [EFFECTS],
         "verification": tests,
         "laboratory": [(EXAMPLE / "laboratory.toml").read_text("utf-8")],
+        "registry": [registry_of(folder / "tools.sqlite", folder / "cals.parquet", runs_of_many)],
         "plan": [PLAN],
     }
+
+
+def registry_of(path: Path, *documents: Path) -> bytes:
+    """The file of a registry that holds some documents."""
+    for line in (("init",), ("add", *documents)):
+        ran = cli_support.mwdcal("registry", "--database", path, *line, "--as", "A. Borg")
+        assert ran.code == 0, ran
+    return path.read_bytes()
 
 
 # ------------------------------------------------------------------------------------- damage
@@ -410,6 +428,29 @@ def leaves(node: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
     return [p for key, value in pairs for p in ((*path, key), *leaves(value, (*path, key)))]
 
 
+def signed(folder: Path, calibration: str) -> dict[str, list[str]]:
+    """Keys, and documents that are signed or not."""
+    key, listed = folder / "lab.key", folder / "keys.json"
+    certificate = {
+        "schema_version": 1,
+        "command": "certificate",
+        "serial": "T-1",
+        "simulated": True,
+    }
+    certificate["files"] = [{"id": "run", "name": "in-files.csv", "sha256": "0" * 64}]
+    unsigned, document = json.dumps(certificate), folder / "signed.json"
+    document.write_text(unsigned, "utf-8")
+    for typed in (
+        ("key", "create", "-o", key, "--owner", "<b>L\u00e4b</b>"),
+        ("key", "trust", listed, f"{key}.pub"),
+        ("sign", document, "--key", key),
+    ):
+        ran = cli_support.mwdcal("certificate", *typed)
+        assert ran.code == 0, ran
+    keys = [path.read_text("utf-8") for path in (key, Path(f"{key}.pub"), listed)]
+    return {"key": keys, "signed": [calibration, unsigned, document.read_text("utf-8")]}
+
+
 def document_file(r: random.Random, sample: str, stem: Path) -> Path:
     """A calibration with some members changed."""
     document = json.loads(sample)
@@ -488,9 +529,16 @@ WORDS = {
     "workers": ("1",),
     "word_bits": ("32", "24", "16", "11"),
     "day": (*("2026-07-01",) * 6, "2025-01-01", "1950-06-30", "2024-02-30", "1.7.2026"),
+    "received": ("2026-07-01", "2025-01-01", "2024-02-30"),
     "crs": ("EPSG:23031", "EPSG:4326", "EPSG:2048", "EPSG:1"),
     "field_nt": ("48000", "51000.5", "48"),
     "gravity_g": ("1.0013", "9.81"),
+    "serial": ("T0", "T1", "T9"),
+    "record": ("T0", "T1", "1", "2", "900", "abcdef12"),
+    "kind": ("calibration", "run", "tool", "standard", "x"),
+    "due": ("2027-01-01", "2026-02-30", "x"),
+    "target": ("0001", "0002", "x"),
+    "head": ("0" * 64, "x"),
 }
 """Values of options that are not read off the command line itself."""
 USUAL = {
@@ -503,6 +551,7 @@ USUAL = {
     "report": 0.04,
     "plot": 0.04,
     "repeat": 0.5,
+    "database": 0.95,
 }
 """Share of command lines that have an option."""
 OTHERWISE = 0.08
@@ -523,6 +572,10 @@ TABLE_SUFFIXES = (*(".csv",) * 4, ".tsv", ".parquet", ".xlsx", ".las", ".xml")
 
 def files(r: random.Random, kind: str, sound: dict[str, list[Any]], stem: Path) -> Path:
     """A file of a kind, damaged or not."""
+    if kind == "any":
+        kinds = ("calibration", "run", "profile", "limits", "verification", "laboratory", "signed")
+        some = files(r, r.choice(kinds), sound, stem)
+        return Path(str(some).partition("#")[0])
     sample = r.choice(sound[kind])
     if kind in ("run", "log"):
         plain = (".txt",) if kind == "log" else ()
@@ -531,6 +584,9 @@ def files(r: random.Random, kind: str, sound: dict[str, list[Any]], stem: Path) 
         path = table_file(r, sample, stem, (".parquet", ".parquet", ".csv", ".xlsx"))
         if r.random() < 0.2:
             return folder_of_runs(r, sound, stem)
+    elif kind == "registry":
+        path = stem.with_suffix(".sqlite")
+        path.write_bytes(sample)
     elif isinstance(sample, bytes):
         path = stem.with_suffix(".parquet")
         path.write_bytes(sample)
@@ -538,6 +594,7 @@ def files(r: random.Random, kind: str, sound: dict[str, list[Any]], stem: Path) 
         return Path(f"{path}#{r.choice(('T0', 'T1', 'T2', 'T9', '', '#', ' T0', '../T0'))}")
     else:
         path = (document_file if kind in DOCUMENTS else toml_file)(r, sample, stem)
+        path.chmod(0o600)  # as that of a private key must be
     damaged(r, path)
     return path
 
@@ -558,6 +615,8 @@ def value(r: random.Random, p: click.Parameter, sound: dict[str, list[Any]], fol
     if name in OUTPUTS:
         suffixes = re.findall(r"\.\w+", metavar) or sorted({*TABLE_SUFFIXES})
         return str(folder / f"out-{name}{r.choice(suffixes)}")
+    if name == "database" and r.random() < 0.2:
+        return str(folder / "out-database.sqlite")
     if name in SAMPLES and (name not in WORDS or r.random() < 0.3):
         return str(files(r, SAMPLES[name], sound, folder / f"in-{name}"))
     if isinstance(p.type, click.Choice):
@@ -638,6 +697,8 @@ def finite_columns(path: Path) -> list[str]:
 
 def readable(line: list[str], path: Path) -> list[str]:
     """What is wrong with a file that a command has written."""
+    if line[0] == "registry":  # documents under any name
+        return []
     if path.suffix == ".json" and line[0] == "calibrate":
         mwdcal.load(path)
     if path.suffix == ".json":
@@ -646,6 +707,8 @@ def readable(line: list[str], path: Path) -> list[str]:
         return ["unescaped text"] if "<script>alert" in path.read_text("utf-8") else []
     elif path.suffix == ".parquet" and line[0] == "fleet":
         return [f"not finite: {name}" for name in finite_columns(path)]
+    elif path.suffix == ".xml" and line[0] == "certificate":
+        ElementTree.parse(path)
     elif path.suffix in WRITERS:
         table.read(path)
     return []
@@ -654,13 +717,16 @@ def readable(line: list[str], path: Path) -> list[str]:
 def promises(line: list[str], ran: cli_support.Ran, folder: Path, before: set[Path]) -> list[str]:
     """What of the promises to every command is not kept."""
     broken = []
-    written = {p for p in folder.rglob("*") if p not in before}
+    journals = ("-wal", "-shm")  # which SQLite leaves beside a database that is damaged
+    written = {p for p in folder.rglob("*") if p not in before and not p.name.endswith(journals)}
     named = {p for p in written if p.relative_to(folder).parts[0].startswith("out-")}
     shown = {
         p for p in named if p.name.startswith(("out-plot", "out-report"))
     }  # of a refused log too
     if ran.code not in (
-        {0, 1, 2, 3} if line[0] in ("diagnose", "verify") or line[1:2] == ["verify"] else {0, 2, 3}
+        {0, 1, 2, 3}
+        if line[0] in ("diagnose", "verify") or line[1:2] in (["verify"], ["check"])
+        else {0, 2, 3}
     ):
         broken.append(f"exit {ran.code}")
     if written - named:

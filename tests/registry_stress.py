@@ -10,6 +10,7 @@ processes that serve writers are killed as well, by which the server stops and r
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import multiprocessing
 import os
@@ -57,13 +58,19 @@ def write_on(database: str, log: str, writer: int, end: float) -> None:
                 time.sleep(0.2)
 
 
+def writers_context() -> multiprocessing.context.ForkServerContext:
+    """Processes that have imported what a writer needs, which takes seconds, before they begin."""
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["registry_stress"])
+    return context
+
+
 def stressed(
     database: str, folder: Path, writers: int, seconds: float, kills: int, seed: int = 1
 ) -> tuple[list[list[str]], Counter[str]]:
     """What was acknowledged to writers, by call, and how often they were killed or refused."""
     rng, begun = random.Random(seed), time.time()
-    end, context = begun + seconds, multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["registry_stress"])  # what a writer imports takes seconds
+    end, context = begun + seconds, writers_context()
     events: Counter[str] = Counter()
 
     def started(number: int):
@@ -76,10 +83,11 @@ def stressed(
     number = writers
     for kill in range(kills):
         time.sleep(max(0.0, begun + (kill + rng.random()) * seconds / (kills + 1) - time.time()))
-        served = backends(database) if kill % 10 == 9 else []
+        served = backends(database) if kill % 25 == 12 else []
         if served:
-            events["server processes killed"] += 1
-            os.kill(rng.choice(served), signal.SIGKILL)
+            with contextlib.suppress(ProcessLookupError):  # it has just ended
+                os.kill(rng.choice(served), signal.SIGKILL)
+                events["server processes killed"] += 1
             continue
         at = rng.randrange(writers)
         if running[at].is_alive():

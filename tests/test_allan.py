@@ -14,7 +14,7 @@ import pytest
 from cli_support import mwdcal, refused, write_csv
 from mwdcal.files import logs
 from mwdcal.files.profiles import load_profile
-from mwdcal.logs import allan, noise_terms
+from mwdcal.logs import allan, noise, noise_terms
 from mwdcal.logs.noise import find_noise
 from test_stations import tumble
 
@@ -31,8 +31,11 @@ remembered = cache(allan.moments)
 
 
 @pytest.fixture(autouse=True)
-def equal_moments_once(monkeypatch):
-    """The moments of records of one length are the same in many tests: computed once."""
+def equal_moments_once(monkeypatch, computed_once):
+    """The moments of records of one length are the same in many tests: computed once.
+
+    And so is the noise of one log, whatever is shown of it.
+    """
 
     def moments(count, averaging, kind="overlapping"):
         return remembered(count, tuple(averaging), kind)
@@ -311,7 +314,11 @@ def test_the_fit_is_not_contradicted_by_its_own_noise():
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("count", "white", "walk"),
-    [(200, 1, 0.3), (1024, 1, 0.3), (COUNT, 1, 0.1)],
+    [
+        (200, 1, 0.3),
+        (1024, 1, 0.3),
+        pytest.param(COUNT, 1, 0.1, marks=pytest.mark.study),
+    ],
 )
 def test_short_averages_are_left_out_as_seldom_as_stated(count, white, walk):
     """1 in 1000 stated, 10 in 1000 before: variances of few degrees of freedom are skew.
@@ -352,7 +359,9 @@ def test_correlated_noise_is_no_quantisation():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("drift", [0, 1e-5, 2e-5, 1e-4])
+@pytest.mark.parametrize(
+    "drift", [0, 2e-5, *(pytest.param(each, marks=pytest.mark.study) for each in (1e-5, 1e-4))]
+)
 def test_the_interval_of_one_station_holds_at_any_drift(drift):
     """N 1e-3 raw·√s, K 1e-4 raw/√s at 5 Hz, station of 30 s: 61 % at 2e-5 raw/s before.
 
@@ -458,6 +467,20 @@ def test_json_has_the_same_in_raw_units_and_seconds(log):
         assert channel["station"]["lower"] < truth / np.sqrt(12) * 1.5
     assert set(found["profile"]) == {"accelerometer", "magnetometer"}
     assert found["findings"] == []
+
+
+@pytest.mark.parametrize(("kind", "times"), [("overlapping", 1), ("modified", 2)])
+def test_channels_of_one_length_share_their_moments(log, monkeypatch, kind, times):
+    asked, compute = [], allan.moments
+
+    def counted(*given):
+        asked.append(given)
+        return compute(*given)
+
+    monkeypatch.setattr(allan, "moments", counted)
+    noise._moments.cache_clear()
+    find_noise(logs.read(str(log)), kind=kind)
+    assert len(asked) == times
 
 
 def test_units_do_not_depend_on_the_rate(tmp_path):

@@ -6,7 +6,6 @@ import math
 import types
 import typing
 import warnings
-from collections import Counter
 from datetime import date
 from xml.etree import ElementTree
 
@@ -17,8 +16,9 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 import dcc_clients
+from cli_support import EXAMPLE, mwdcal
 from dcc_clients import NAMESPACES, with_schema
-from mwdcal.calibration.record import Finding, canonical
+from mwdcal.calibration.record import Finding
 from mwdcal.certificate.dcc import to_xml
 from mwdcal.certificate.dcc.quantities import dsi_unit
 from mwdcal.certificate.document import (
@@ -36,19 +36,23 @@ from mwdcal.certificate.document import (
     Signature,
     SourceFile,
     TracedStandard,
+    encode,
 )
 from mwdcal.errors import InputError
+from mwdcal.files.exchange import xml
 
 UNITS = {
     "1": (r"\one", 1.0),
     "": (r"\one", 1.0),
     "%": (r"\one", 0.01),
+    "‰ of the field": (r"\one", 1e-3),
     "g": (r"\metre\second\tothe{-2}", 9.80665),
     "mg": (r"\metre\second\tothe{-2}", 9.80665e-3),
     "g/°C": (r"\metre\second\tothe{-2}\kelvin\tothe{-1}", 9.80665),
     "g/°C2": (r"\metre\second\tothe{-2}\kelvin\tothe{-2}", 9.80665),
     "nT": (r"\nano\tesla", 1.0),
     "nT/°C": (r"\nano\tesla\kelvin\tothe{-1}", 1.0),
+    "nT/°C2": (r"\nano\tesla\kelvin\tothe{-2}", 1.0),
     "nT/°C³": (r"\nano\tesla\kelvin\tothe{-3}", 1.0),
     "1/°C": (r"\kelvin\tothe{-1}", 1.0),
     "1/°C2": (r"\kelvin\tothe{-2}", 1.0),
@@ -70,7 +74,7 @@ HOSTILE = [
     "]]></dcc:name><x/>",
     "&lt;",
     "'\"><script>",
-    "\ud800\uffff",
+    "\x85\uffff",
     "a\r\nb\u2028c",
 ]
 
@@ -272,21 +276,31 @@ def bare():
     )
 
 
+def within(place, each):
+    """A quantity as clients give it: they know it by its label alone."""
+    return replace(each, id=f"{place}/{each.id}")
+
+
 def decisions(certificate):
-    tests = filter(None, (certificate.as_found, certificate.as_left))
-    return [each for test in tests for each in test.decisions]
+    found, left = certificate.as_found, certificate.as_left
+    tests = {"as-found": found.decisions, "as-left": left.decisions}
+    return [
+        replace(each, quantity=within(place, each.quantity))
+        for place, of_test in tests.items()
+        for each in of_test
+    ]
 
 
 def budget_values(budget):
     for line in (*budget.lines, budget.combined, budget.expanded):
         for name in ("inclination", "toolface", "azimuth"):
             value = getattr(line, f"{name}_deg")
-            yield Quantity(id=f"{line.id}-{name}", name=name, unit="°", value=value)
+            yield Quantity(id=f"budget/{line.id}/{name}", name=name, unit="°", value=value)
 
 
 def calibration_results(certificate):
     """All quantities among the results, in their order."""
-    tables = [each for table in certificate.results for each in table.quantities]
+    tables = [within(table.id, each) for table in certificate.results for each in table.quantities]
     tested = [each.quantity for each in decisions(certificate)]
     return [*tables, *budget_values(certificate.budget), *tested]
 
@@ -294,7 +308,7 @@ def calibration_results(certificate):
 def all_quantities(certificate):
     """Results, conditions, and the limits and probabilities beside the decisions."""
     yield from calibration_results(certificate)
-    yield from certificate.conditions
+    yield from (within("condition", each) for each in certificate.conditions)
     for each in decisions(certificate):
         unit = each.quantity.unit
         numbers = {
@@ -304,7 +318,7 @@ def all_quantities(certificate):
             "risk": ("1", each.risk),
         }
         for name, (of, value) in numbers.items():
-            yield Quantity(id=name, name=name, unit=of, value=value)
+            yield Quantity(id=f"{each.quantity.id}/{name}", name=name, unit=of, value=value)
 
 
 def coverage(each):
@@ -333,8 +347,8 @@ def schema(schemas):
     return dcc_clients.schema(schemas)
 
 
-def errors(schema, xml):
-    return [f"{e.path}: {e.reason}" for e in schema.iter_errors(ElementTree.fromstring(xml))]
+def errors(schema, written):
+    return [f"{e.path}: {e.reason}" for e in schema.iter_errors(ElementTree.fromstring(written))]
 
 
 @with_schema
@@ -404,21 +418,20 @@ def in_order(certificate):
 @example(whole())
 @example(bare())
 def test_any_text_in_any_field_is_valid_and_kept(schema, certificate):
-    xml = to_xml(certificate)
-    assert errors(schema, xml) == []
-    assert xml == to_xml(certificate)
-    root = ElementTree.fromstring(xml)
+    written = to_xml(certificate)
+    assert errors(schema, written) == []
+    assert written == to_xml(certificate)
+    root = ElementTree.fromstring(written)
     inside = root.find("dcc:document", NAMESPACES)
     assert inside.findtext("dcc:mimeType", None, NAMESPACES) == "application/json"
     data = base64.b64decode(inside.findtext("dcc:dataBase64", None, NAMESPACES))
-    assert data == canonical(msgspec.to_builtins(certificate))
     assert json.loads(data) == msgspec.to_builtins(certificate)
+    assert data == encode(certificate)
 
 
-def test_the_json_inside_is_the_certificate():
-    root = ElementTree.fromstring(to_xml(whole()))
-    data = base64.b64decode(root.findtext("dcc:document/dcc:dataBase64", None, NAMESPACES))
-    assert msgspec.json.decode(data, type=Certificate) == whole()
+def test_characters_that_xml_cannot_hold_are_left_out():
+    assert xml.lines("a\x00b\ud800\r\nc\ufffe ") == "a b \nc"
+    assert xml.one_line(" a\x1b[31m\n\ud800b ") == "a [31m b"
 
 
 def test_without_a_date_there_is_no_certificate():
@@ -455,15 +468,70 @@ def test_units_mean_what_ptb_says(name, base, scale):
 # ── Clients ──────────────────────────────────────────────────────────────────────────────────
 
 
-def test_pydcc_reads_every_result():
-    certificate = whole()
-    client, results = dcc_clients.pydcc_results(to_xml(certificate))
+@pytest.fixture(scope="session")
+def issued(tmp_path_factory):
+    """A certificate of a thermal calibration with roll tests as found and as left, by the command line."""
+    folder = tmp_path_factory.mktemp("issued")
+    paths = {name: folder / f"{name}.json" for name in ("cal", "old", "left", "found", "truth")}
+    run, roll = folder / "run.csv", folder / "roll.csv"
+    outputs = folder / "C.json", folder / "C.xml"
+
+    def simulated(seed, *words):
+        mwdcal("simulate", "--seed", seed, "--truth", paths["truth"], *words)
+
+    simulated(5, "--plan", "laboratory-thermal", "--tool", "servo", "-o", run)
+    mwdcal("calibrate", run, "--tool", "servo", "-o", paths["cal"])
+    simulated(7, "--plan", "six-state", "--tool", "servo", "-o", run)
+    run.write_text(run.read_text("utf-8").replace("SIM-7", "SIM-5"), "utf-8")  # it has changed
+    mwdcal("calibrate", run, "--tool", "servo", "-o", paths["old"])
+    simulated(6, "--plan", "roll-test", "--calibration", paths["cal"], "-o", roll)
+    for test, calibration in (("left", "cal"), ("found", "old")):
+        paths[test].write_text(mwdcal("verify", paths[calibration], roll, "--json").out, "utf-8")
+    ran = mwdcal(
+        "certificate", paths["cal"], "--verification", paths["left"], "--as-found", paths["found"],
+        "--laboratory", EXAMPLE / "laboratory.toml", "-o", outputs[0], "-o", outputs[1],
+    )  # fmt: skip
+    assert ran.code == 0, ran.err
+    data, written = (path.read_bytes() for path in outputs)
+    return msgspec.json.decode(data, type=Certificate), written, data
+
+
+@with_schema
+def test_a_certificate_of_the_command_is_valid_and_carries_its_json(schema, issued):
+    certificate, written, data = issued
+    assert errors(schema, written) == []
+    root = ElementTree.fromstring(written)
+    assert base64.b64decode(root.findtext("dcc:document/dcc:dataBase64", None, NAMESPACES)) == data
+    units = {each.unit for each in calibration_results(certificate)}
+    assert {"g", "g/°C", "nT", "nT/°C", "1", "1/°C", "°"} <= units, units
+    assert certificate.as_found.passed != certificate.as_left.passed
+    found = [e.text for e in root.iter(f"{{{NAMESPACES['dcc']}}}conformity")]
+    expected = [test.passed for test in (certificate.as_found, certificate.as_left)]
+    expected += [
+        passed
+        for test in (certificate.as_found, certificate.as_left)
+        for passed in (*(each.passed for each in test.decisions), test.passed)
+    ]
+    assert found == ["pass" if passed else "fail" for passed in expected]
+
+
+@pytest.fixture(params=["whole", "issued"])
+def both(request):
+    """A certificate, and its XML."""
+    if request.param == "whole":
+        return whole(), to_xml(whole())
+    return request.getfixturevalue("issued")[:2]
+
+
+def test_pydcc_reads_every_result(both):
+    certificate, written = both
+    client, results = dcc_clients.pydcc_results(written)
     assert client.uid() == certificate.number
     assert client.calibration_laboratory_name() == certificate.laboratory.name
-    assert client.calibration_date().date() == date(2026, 3, 5)  # of the roll test as left
-    assert client.item_id()["identifications"]["identification"][0]["value"] == "SN 7"
+    assert client.mandatory_language() == "en"
+    assert certificate.item.serial in str(client.item_id())
     expected = [each for each in calibration_results(certificate) if each.value is not None]
-    assert len(results) == len(expected) == 20
+    assert len(results) == len(expected) >= 20
     for each, (name, result) in zip(expected, results, strict=True):
         unit, factor = UNITS[each.unit]
         assert (result["label"], result["unit"]) == (each.id, unit)
@@ -479,11 +547,20 @@ def test_pydcc_reads_every_result():
             close(float(uncertainty["coverageProbability"]), stated[2])
 
 
+def test_dates_are_those_of_the_measurements():
+    client, _ = dcc_clients.pydcc_results(to_xml(whole()))
+    assert client.calibration_date().date() == date(2026, 3, 5)  # of the roll test as left
+    core = client.administrative_data.find("dcc:coreData", NAMESPACES)
+    assert core.findtext("dcc:beginPerformanceDate", None, NAMESPACES) == "2026-03-02"
+    assert core.findtext("dcc:receiptDate", None, NAMESPACES) == "2026-03-01"
+    assert core.findtext("dcc:issueDate", None, NAMESPACES) == "2026-03-06"
+
+
 @with_schema
-def test_dcc_quantities_reads_every_quantity(tmp_path, schemas):
-    certificate = whole()
+def test_dcc_quantities_reads_every_quantity(tmp_path, schemas, both):
+    certificate, written = both
     path = tmp_path / "dcc.xml"
-    path.write_bytes(to_xml(certificate))
+    path.write_bytes(written)
     with warnings.catch_warnings():
         # Student's factors are not those of the normal distribution that it takes where none is stated
         warnings.filterwarnings("ignore", "Normal distribution mismatch")
@@ -491,15 +568,37 @@ def test_dcc_quantities_reads_every_quantity(tmp_path, schemas):
         warnings.filterwarnings("ignore", PER)
         read = dcc_clients.quantities(path, schemas)
     expected = [each for each in all_quantities(certificate) if each.value is not None]
-    assert Counter(q.data.label for q in read) == Counter(each.id for each in expected)
-    place = lambda label, value: (label, f"{value:.9e}")  # noqa: E731
-    read = sorted(read, key=lambda q: place(q.data.label, q.values[0]))
-    expected = sorted(expected, key=lambda q: place(q.id, q.value * UNITS[q.unit][1]))
-    for each, quantity_ in zip(expected, read, strict=True):
+
+    read = sorted(read, key=lambda q: (q.data.label, str(q.dsi_unit).lstrip("|"), q.values[0]))
+    expected.sort(key=lambda q: (q.id, UNITS[q.unit][0].lstrip("|"), q.value * UNITS[q.unit][1]))
+    assert [each.data.label for each in read] == [each.id for each in expected]
+    for each, result in zip(expected, read, strict=True):
         unit, factor = UNITS[each.unit]
-        assert str(quantity_.dsi_unit).lstrip("|") == unit.lstrip("|")
-        close(quantity_.values[0], each.value * factor)
+        assert str(result.dsi_unit).lstrip("|") == unit.lstrip("|")
+        close(result.values[0], each.value * factor)
         if (stated := coverage(each)) is None:
-            assert math.isnan(quantity_.uncertainties[0])
+            assert math.isnan(result.uncertainties[0])
         else:
-            close(quantity_.uncertainties[0] * stated[1], stated[0] * factor)
+            close(result.uncertainties[0] * stated[1], stated[0] * factor)
+
+
+def test_what_is_undetermined_has_text_and_no_number():
+    written = to_xml(whole())
+    assert b"NaN" not in written
+    assert b">None<" not in written
+    root = ElementTree.fromstring(written)
+    texts = root.findall(".//dcc:text[@refType]", NAMESPACES)
+    budget = ["inclination", "toolface", "azimuth", "azimuth"]  # of a source, of the sums
+    open_ones = ["dip", "toolface zero", "rotation x", *budget, "toolface"]
+    assert [each.findtext("dcc:name/dcc:content", None, NAMESPACES) for each in texts] == open_ones
+    assert all("Undetermined" in "".join(each.itertext()) for each in texts)
+    labels = {each.text for each in root.iter(f"{{{NAMESPACES['si']}}}label")}
+    none = {"accelerometer/toolface-zero", "free/rotation-x", "budget/dip/inclination"}
+    assert labels.isdisjoint({*none, "condition/dip", "as-found/toolface"})
+    assert {"accelerometer/bias-x", "as-found/toolface/limit", "condition/gravity"} <= labels
+
+
+def test_labels_are_unique(issued):
+    root = ElementTree.fromstring(issued[1])
+    labels = [each.text for each in root.iter(f"{{{NAMESPACES['si']}}}label")]
+    assert len(labels) == len(set(labels)) > 100

@@ -34,7 +34,7 @@ WARNINGS = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic")
 FORMS = {"c-header": "double", "fixed-point": "fixed"}
 COMPILER = shutil.which("gcc") or shutil.which("cc")
 VERTICAL, NO_GRAVITY, NO_NORTH, AXIAL_FIELD, OUTSIDE, SATURATED = 1, 2, 4, 8, 16, 32
-COUNT = 10_000
+COUNT = 3000
 REFERENCE = 20.0
 EARTH = (1.0, 50_000.0, np.radians(60.0))
 VECTORS = ("gx_g", "gy_g", "gz_g", "bx_nt", "by_nt", "bz_nt")
@@ -147,7 +147,7 @@ def readings(calibration, axes, count=COUNT, seed=5, earth=EARTH):
     warmth = np.round(rng.uniform(low, high, count), 3)
     wanted = attitude(inc, azi, face)(*earth)
     nominal = [np.zeros((count, 3)), np.zeros((count, 3))]
-    for _ in range(30):
+    for _ in range(8):
         fields = calibration.fields(Readings(*nominal, temperature=warmth))
         nominal = [n + w - f for n, w, f in zip(nominal, wanted, fields, strict=True)]
     columns = {"temperature_c": warmth}
@@ -224,7 +224,7 @@ def case(request, tmp_path_factory):
 @pytest.mark.slow
 @pytest.mark.parametrize("bits", [None, 32, 24, 16, 13])
 def test_the_c_function_meets_apply_within_the_stated_error(tmp_path, case, bits):
-    """10,000 random readings; and the bound is not idle: some quantity comes to a tenth of it."""
+    """Thousands of random readings; and the bound is not idle: some quantity comes to a tenth of it."""
     calibration, columns, expected = case
     options = () if bits is None else ("--word-bits", bits)
     form = "c-header" if bits is None else "fixed-point"

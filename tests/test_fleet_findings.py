@@ -78,7 +78,7 @@ def test_findings_of_options(tmp_path, options):
 
 def test_no_station_to_reshoot_escapes_the_bound(tmp_path):
     """Many runs of few and many stations, with errors from none to plain."""
-    runs = {f"{seed}-{by}": spoiled(seed, by=by) for seed in range(16) for by in (0.0, 3e-3, 4e-3)}
+    runs = {f"{seed}-{by}": spoiled(seed, by=by) for seed in range(8) for by in (0.0, 3e-3, 4e-3)}
     found = {method: calibrated(
         write_fleet(tmp_path / "runs.parquet", runs), "--method", method
     ) for method in ("joint", "least-squares")}  # fmt: skip
@@ -88,7 +88,7 @@ def test_no_station_to_reshoot_escapes_the_bound(tmp_path):
             made = alone(columns, "x", method=method)
             assert rows[serial]["reshoot"] == [r.station for r in made.station_rows if r.reshoot]
             some += bool(rows[serial]["reshoot"])
-    assert 6 < some < 90
+    assert 3 < some < 45
 
 
 @pytest.mark.parametrize("freedom", [1, 2, 3, 4, 5, 6])

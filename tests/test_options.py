@@ -135,10 +135,10 @@ OBSERVED = {
 
 @pytest.mark.parametrize("method", OBSERVED)
 def test_intervals_of_paper_weights_cover(method):
-    """80 runs: the share of intervals that cover is known to about 1 %."""
-    tool, many = alone(4, 80)
+    """40 runs: the share of intervals that cover is known to about 1 %."""
+    tool, many = alone(4, 40)
     covered = []
-    for member in range(80):
+    for member in range(40):
         data = replace(
             many, accelerometer=many.accelerometer[member], magnetometer=many.magnetometer[member]
         )

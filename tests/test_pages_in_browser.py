@@ -53,18 +53,27 @@ SAMPLES = {
     "stations": ("stations", EXAMPLE / "log.csv", "-o", "new.csv"),
     "plan": ("plan", *TOOL, "--plan", "laboratory-thermal", "--plan", "moosavi-12"),
     "survey": ("survey", "tool.json", EXAMPLE / "well.csv", "-o", "new.csv"),
+    "certificate": (
+        *("certificate", "tool.json", "--laboratory", EXAMPLE / "laboratory.toml"),
+        *("--verification", "left.json", "--as-found", "found.json"),
+    ),
     "survey-rejected": ("survey", "tool.json", "iron.csv", "-o", "new.csv"),
 }
 """Commands that also write a page, by the name of the sample."""
 
 
+def page_options(command):
+    """Options of a command that name a page to write."""
+    return [
+        option.opts[0]
+        for option in command.params
+        if {"--report", "--html"} & {*option.opts} or ".html" in (option.metavar or "")
+    ]
+
+
 def with_a_page():
     """Commands that can write a page."""
-    return {
-        name
-        for name, command in commands().items()
-        if any({"--report", "--html"} & {*option.opts} for option in command.params)
-    }
+    return {name for name, command in commands().items() if page_options(command)}
 
 
 PAGES = [name for name, typed in SAMPLES.items() if called(typed) in with_a_page()]
@@ -105,6 +114,12 @@ def folder(tmp_path_factory):
     (folder / "tight.toml").write_text(limits, "utf-8")
     ran = mwdcal("calibrate", EXAMPLE / "run.csv", *TOOL, "-o", folder / "tool.json")
     assert ran.code == 0, ran
+    before = ("--method", "least-squares", "-o", folder / "before.json")
+    assert mwdcal("calibrate", EXAMPLE / "run.csv", *TOOL, *before).code == 0
+    tight = ("--limits", folder / "tight.toml")
+    for when, name, *limits in (("left", "tool"), ("found", "before", *tight)):
+        ran = mwdcal("verify", folder / f"{name}.json", EXAMPLE / "rolltest.csv", *limits, "--json")
+        (folder / f"{when}.json").write_text(ran.out, "utf-8")
     fleet(folder / "fleet.parquet")
     iron = read_csv(EXAMPLE / "well.csv")
     iron["mz"] = [f"{float(v) + 0.06:.6f}" for v in iron["mz"]]
@@ -227,10 +242,8 @@ def written(folder, monkeypatch):
     def page(name):
         path = folder / f"{name}.html"
         if not path.exists():
-            option = {"--report", "--html"} & {
-                opt for param in commands()[called(SAMPLES[name])].params for opt in param.opts
-            }
-            ran = mwdcal(*SAMPLES[name], *option, path)
+            option, *_ = page_options(commands()[called(SAMPLES[name])])
+            ran = mwdcal(*SAMPLES[name], option, path)
             assert path.exists(), ran
         return path
 

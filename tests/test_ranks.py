@@ -316,11 +316,11 @@ def test_two_groups_are_refused_and_what_they_leave_free_is_named(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_group_at_exactly_vertical_converges_in_60_of_60_tools(tmp_path):
+def test_a_group_at_exactly_vertical_converges_for_every_tool(tmp_path):
     angles, group = rolls((0, 45, 90, 135))
     group = [f"roll {k}" for k in group]
     found = []
-    for seed, tool in enumerate(factors_within_limits(np.random.default_rng(60), 60)):
+    for seed, tool in enumerate(factors_within_limits(np.random.default_rng(60), 30)):
         run = run_file(tmp_path, tool, SOAKS[0], angles, UNKNOWN, seed=seed, group=group)
         ran = mwdcal("calibrate", run, "--tool", "servo", "-o", tmp_path / "cal.json")
         assert ran.code == 0, ran

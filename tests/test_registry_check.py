@@ -2,17 +2,20 @@
 
 import json
 import random
+import re
 import shutil
 import sqlite3
-from contextlib import closing
+from contextlib import closing, contextmanager, suppress
 
+import psycopg
 import pytest
+import sqlalchemy as sa
 
 from mwdcal.errors import InputError
 from mwdcal.registry import checking
 from mwdcal.registry.setup import create
 from mwdcal.registry.store import Entry, open_registry
-from registry_support import calibration
+from registry_support import calibration, drop_database, empty_database
 
 TABLES = ("objects", "records", "withdrawals", "history", "tools", "alembic_version")
 RUN = b"# serial = A-1\n# simulated = yes\nax,ay,az\n" + b"".join(
@@ -143,25 +146,27 @@ def swap_rows(connection, table, rng):
 CHANGES = (change_value, change_value, change_value, delete_row, insert_row, swap_rows)
 
 
+@contextmanager
+def without_triggers(connection):
+    """A transaction in which nothing keeps tables from being changed; the triggers are there again afterwards."""
+    query = "SELECT name, sql FROM sqlite_master WHERE type = 'trigger'"
+    triggers = connection.execute(query).fetchall()
+    connection.execute("BEGIN")
+    for name, _ in triggers:
+        connection.execute(f"DROP TRIGGER {name}")
+    yield
+    for _, statement in triggers:
+        connection.execute(statement)
+    connection.commit()
+
+
 def tampered(path, rng):
-    """Change something past the triggers, which are put back afterwards; what was done."""
-    with closing(sqlite3.connect(path)) as connection:
-        triggers = connection.execute(
-            "SELECT name, sql FROM sqlite_master WHERE type = 'trigger'"
-        ).fetchall()
-        while True:
-            table, change = rng.choice(TABLES), rng.choice(CHANGES)
-            connection.execute("BEGIN")
-            for name, _ in triggers:
-                connection.execute(f"DROP TRIGGER {name}")
-            try:
+    """Change something past the triggers; what was done."""
+    while True:
+        table, change = rng.choice(TABLES), rng.choice(CHANGES)
+        with closing(sqlite3.connect(path)) as connection, suppress(sqlite3.IntegrityError):
+            with without_triggers(connection):
                 change(connection, table, rng)
-            except sqlite3.IntegrityError:
-                connection.rollback()
-                continue
-            for _, statement in triggers:
-                connection.execute(statement)
-            connection.commit()
             return change.__name__, table
 
 
@@ -207,3 +212,131 @@ def test_changed_bytes_of_the_file_are_reported(original, tmp_path):
 @pytest.mark.study
 def test_changed_bytes_of_the_file_are_reported_in_each_of_a_thousand_trials(original, tmp_path):
     assert unnoticed_bytes(original, tmp_path, range(1000, 2000)) == []
+
+
+def test_removed_events_show_by_the_head_that_was_known(original, tmp_path):
+    path = tmp_path / "changed.registry"
+    with open_registry(original) as registry:
+        head = registry.head()[1]
+    shutil.copyfile(original, path)
+    with closing(sqlite3.connect(path)) as connection, without_triggers(connection):
+        for table in ("history", "withdrawals"):
+            connection.execute(f"DELETE FROM {table} WHERE number = 16")
+        one_more = "records = records + 1, calibrations = calibrations + 1"
+        connection.execute(f"UPDATE tools SET {one_more} WHERE serial = 'A-1'")
+    assert verdict(path) == set()  # the rows fit together: nothing in them tells
+    assert verdict(path, head) == {"head"}
+    assert verdict(original, head) == set()
+
+
+@pytest.mark.parametrize(
+    "statement",
+    [
+        "DROP INDEX records_serial",
+        "DROP TRIGGER history_no_update",
+        "DROP TRIGGER objects_no_delete",
+        "DROP TABLE tools",
+        "CREATE TABLE more (number INTEGER)",
+        "CREATE TRIGGER sly AFTER INSERT ON records BEGIN DELETE FROM tools; END",
+        "ALTER TABLE history ADD COLUMN more TEXT",
+    ],
+)
+def test_a_changed_schema_is_reported(original, tmp_path, statement):
+    path = tmp_path / "changed.registry"
+    shutil.copyfile(original, path)
+    with closing(sqlite3.connect(path)) as connection:
+        connection.execute(statement)
+    assert verdict(path) & {"schema", "unreadable"}
+
+
+@pytest.mark.parametrize("table", ["objects", "records", "withdrawals", "history"])
+def test_triggers_refuse_changes(original, tmp_path, table):
+    path = tmp_path / "changed.registry"
+    shutil.copyfile(original, path)
+    with closing(sqlite3.connect(path)) as connection:
+        for statement in (f"UPDATE {table} SET number = 99", f"DELETE FROM {table}"):
+            with pytest.raises(sqlite3.IntegrityError, match="only grows"):
+                connection.execute(statement)
+
+
+class PostgresqlTables:
+    """A connection to PostgreSQL that takes the statements above."""
+
+    def __init__(self, url):
+        self.connection = psycopg.connect(url)
+        self.connection.execute("SET session_replication_role = replica")  # no triggers, no keys
+
+    def execute(self, query, values=()):
+        if pragma := re.match(r"PRAGMA table_info\((\w+)\)", query):
+            columns = "SELECT 0, column_name FROM information_schema.columns WHERE table_name = %s "
+            return self.connection.execute(f"{columns} ORDER BY ordinal_position", pragma.groups())
+        return self.connection.execute(query.replace("rowid", "ctid").replace("?", "%s"), values)
+
+
+def undetected_in_postgresql(server, seeds):
+    """Changes through SQL that a check of a registry in PostgreSQL does not report."""
+    original, missed = empty_database(server), []
+    sound(original)
+    template = sa.make_url(original).database
+    for seed in seeds:
+        rng, changed = random.Random(seed), empty_database(server, template)
+        while True:
+            table, change = rng.choice(TABLES), rng.choice(CHANGES)
+            tables = PostgresqlTables(changed)
+            with closing(tables.connection), suppress(psycopg.Error):
+                before = {t: tables.execute(f"SELECT * FROM {t}").fetchall() for t in TABLES}
+                change(tables, table, rng)
+                after = {t: tables.execute(f"SELECT * FROM {t}").fetchall() for t in TABLES}
+                tables.connection.commit()
+                break
+        same = {t: sorted(map(str, rows)) for t, rows in before.items()} == {
+            t: sorted(map(str, rows)) for t, rows in after.items()
+        }
+        if not same and not verdict(changed):
+            missed.append((seed, change.__name__, table))
+        drop_database(server, changed)
+    return missed
+
+
+def test_changes_of_postgresql_are_reported(postgresql):
+    assert undetected_in_postgresql(postgresql, range(8)) == []
+
+
+@pytest.mark.study
+def test_each_of_a_thousand_changes_of_postgresql_is_reported(postgresql):
+    assert undetected_in_postgresql(postgresql, range(1000, 2000)) == []
+
+
+@pytest.mark.parametrize(
+    "statement",
+    [
+        "DROP INDEX records_serial",
+        "DROP TRIGGER history_no_update ON history",
+        "ALTER TABLE objects DISABLE TRIGGER objects_no_delete",
+        "ALTER TABLE records ALTER COLUMN name DROP NOT NULL",
+        "ALTER TABLE records DROP CONSTRAINT records_sha256",
+        "CREATE OR REPLACE FUNCTION mwdcal_refuse() RETURNS trigger LANGUAGE plpgsql AS 'BEGIN RETURN NEW; END'",
+        "CREATE TRIGGER sly AFTER INSERT ON records FOR EACH ROW EXECUTE FUNCTION mwdcal_refuse()",
+    ],
+)
+def test_a_changed_schema_of_postgresql_is_reported(postgresql, statement):
+    changed = empty_database(postgresql)
+    create(changed, "Ada")
+    assert verdict(changed) == set()
+    with closing(psycopg.connect(changed, autocommit=True)) as connection:
+        connection.execute(statement)
+    assert verdict(changed) == {"schema"}
+
+
+@pytest.mark.parametrize("table", ["objects", "records", "withdrawals", "history"])
+def test_triggers_of_postgresql_refuse_changes(postgresql, table):
+    changed = empty_database(postgresql)
+    create(changed, "Ada")
+    with closing(psycopg.connect(changed, autocommit=True)) as connection:
+        for statement in (
+            f"UPDATE {table} SET number = 9",
+            f"DELETE FROM {table}",
+            f"TRUNCATE {table} CASCADE",
+        ):
+            with pytest.raises(psycopg.errors.RaiseException, match="only grows"):
+                connection.execute(statement)

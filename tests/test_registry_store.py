@@ -5,15 +5,9 @@ import pytest
 from mwdcal.registry import checking, copies, queries
 from mwdcal.registry.setup import create
 from mwdcal.registry.store import Entry, open_registry
-from registry_support import calibration, empty_database
+from registry_support import calibration, registry_database
 
-
-@pytest.fixture(params=["sqlite", "postgresql"])
-def database(request, tmp_path):
-    """An empty database of either kind."""
-    if request.param == "sqlite":
-        return tmp_path / "tools.registry"
-    return empty_database(request.getfixturevalue("postgresql"))
+database = pytest.fixture(params=["sqlite", "postgresql"])(registry_database)
 
 
 def test_what_is_added_comes_back_once(database):

@@ -3,14 +3,17 @@
 `python tests/test_screens.py` rewrites the stored ones in `tests/screens`.
 """
 
+import hashlib
 import io
+import json
 import os
 import re
 import shutil
 import sys
 import tempfile
 from collections import Counter
-from contextlib import redirect_stderr, redirect_stdout
+from contextlib import redirect_stderr, redirect_stdout, suppress
+from datetime import UTC, datetime
 from pathlib import Path
 from unittest.mock import patch
 
@@ -19,10 +22,13 @@ import pytest
 
 from cli_support import called, commands, mwdcal, read_csv, servo_run, write_csv
 from mwdcal.app import cli, progress, text
+from mwdcal.certificate import keys, signature
 
 STORED = Path(__file__).parent / "screens"
 WIDTHS = (80, 120)
 PLACE = ("--latitude", "60", "--longitude", "3.5", "--altitude-m", "40", "--date", "2026-07-01")
+REGISTRY = ("--database", "tools.sqlite")
+NEW_REGISTRY = ("--database", "new.sqlite")
 SCREENS = {
     "example": ("example", "new"),
     "calibrate": ("calibrate", "demo/run.csv", "--tool", "demo/tool.toml", "-o", "made.json"),
@@ -51,16 +57,38 @@ SCREENS = {
     "reference": ("reference", *PLACE, "--crs", "EPSG:23031", "--field-nt", "50500"),
     "reference-fill": ("reference", *PLACE, "--model", "igrf14", "--fill", "blank.csv", "-o",
                        "made.csv"),
+    "registry-init": ("registry", "init", *NEW_REGISTRY),
+    "registry-add": ("registry", "add", "moved.csv", "stand.toml", *REGISTRY),
+    "registry-list": ("registry", "list", *REGISTRY),
+    "registry-list-due": ("registry", "list", "--due", "2030-01-01", *REGISTRY),
+    "registry-history": ("registry", "history", "SIM-0001", *REGISTRY),
+    "registry-get": ("registry", "get", "SIM-0001", "-o", "made.json", *REGISTRY),
+    "registry-withdraw": ("registry", "withdraw", "2", "--reason", "wrong stand angles", *REGISTRY),
+    "registry-export": ("registry", "export", "new", *REGISTRY),
+    "registry-check": ("registry", "check", *REGISTRY),
+    "registry-check-altered": ("registry", "check", "--head", "0" * 64, *REGISTRY),
+    "registry-backup": ("registry", "backup", "made.sqlite", *REGISTRY),
+    "registry-restore": ("registry", "restore", "unchanged.sqlite", *NEW_REGISTRY),
+    "registry-upgrade": ("registry", "upgrade", *REGISTRY),
     "simulate": ("simulate", "--plan", "six-state", "--effects", "stand.toml", "-o", "made.csv"),
     "simulate-repeat": ("simulate", "--plan", "six-state", "--repeat", "20", "--limits", "tight.toml",
                         "--workers", "1", "-o", "made.parquet"),
     "stations": ("stations", "demo/log.csv", "-o", "stations.csv"),
     "survey": ("survey", "tool.json", "demo/well.csv", "-o", "made.csv"),
+    "certificate-sign": ("certificate", "sign", "certificate.json", "--key", "lab.key", "-o", "made.json"),
+    "certificate-verify": ("certificate", "verify", "signed.json", "--key", "lab.key.pub"),
+    "certificate-altered": ("certificate", "verify", "altered.json", "--key", "lab.key.pub"),
+    "key-list": ("certificate", "key", "list", "keys.json"),
+    "key-retire": ("certificate", "key", "retire", "old.json", "139e", "--at", "2027-01-01"),
+    "verify-signed": ("verify", "signed-tool.json", "demo/rolltest.csv", "--key", "keys.json"),
     "misused": ("calibrate", "demo/run.csv"),
 }  # fmt: skip
 """Commands and what they run on."""
-WITHOUT_A_SCREEN = {"completion", "certificate"}
-"""Commands whose result is a script."""
+WITHOUT_A_SCREEN = {
+    "completion",
+    *(f"certificate key {name}" for name in ("create", "trust", "revoke")),
+}
+"""Commands whose result is a script, or a key or time that is new each time; those of keys show a list of them."""
 
 
 class Terminal(io.TextIOWrapper):
@@ -140,6 +168,84 @@ def prepared(folder):
         test = mwdcal("verify", folder / "dated.json", demo / "rolltest.csv", "--json", *limits)
         (folder / name).write_text(test.out, "utf-8")
     fleet(folder)
+    registry(folder)
+    signatures(folder)
+
+
+def registry(folder):
+    """A registry with a calibration, its run, roll test and verdict, a certificate and the laboratory."""
+    pytest.importorskip("sqlalchemy")
+    whole = ("registry", "--database", folder / "unchanged.sqlite")
+    assert mwdcal(*whole, "init", "--as", "A. Borg").code == 0
+    certificate = [folder / each if "." in each else each for each in SCREENS["certificate"]]
+    assert mwdcal(*certificate).code == 0
+    (folder / "C.json").rename(folder / "issued.json")
+    names = (
+        *("dated.json", "dated.csv", "v.json", "demo/rolltest.csv", "demo/laboratory.toml"),
+        "issued.json",
+    )
+    added = mwdcal(*whole, "add", *(folder / name for name in names), "--as", "A. Borg")
+    assert (added.code, added.err) == (0, "")
+    undone(folder)
+
+
+def undone(folder):
+    """Take back what a command has left: a new folder or registry, and what the registry was given."""
+    shutil.rmtree(folder / "new", ignore_errors=True)
+    for left in folder.glob("new.sqlite*"):
+        left.unlink()
+    with suppress(FileNotFoundError):
+        shutil.copy(folder / "unchanged.sqlite", folder / "tools.sqlite")
+
+
+def signatures(folder):
+    """Documents signed with a key that is the same each time, one of them altered; a list of keys."""
+    pytest.importorskip("cryptography")
+    write_key(folder / "lab.key", "Calibration laboratory")
+    document = {
+        "schema_version": 1,
+        "command": "certificate",
+        "serial": "SIM-0001",
+        "simulated": True,
+    }
+    files = [("calibration", "tool.json"), ("run", "demo/run.csv"), ("verification", "lost.json")]
+    listed = [
+        {
+            "id": name,
+            "name": path,
+            "sha256": hashlib.sha256((folder / path).read_bytes()).hexdigest(),
+        }
+        for name, path in files[:1]
+    ] + [{"id": name, "name": path, "sha256": "0" * 64} for name, path in files[1:]]
+    (folder / "certificate.json").write_text(json.dumps({**document, "files": listed}), "utf-8")
+    with patch.object(signature, "now", lambda: "2026-07-01T12:00:00+00:00"):
+        for name, target in (("certificate", "signed"), ("tool", "signed-tool")):
+            typed = (
+                folder / f"{name}.json",
+                "--key",
+                folder / "lab.key",
+                "-o",
+                folder / f"{target}.json",
+            )
+            assert mwdcal("certificate", "sign", *typed).code == 0
+    altered = (folder / "signed.json").read_bytes().replace(b"SIM-0001", b"SIM-0002")
+    (folder / "altered.json").write_bytes(altered)
+    for name in ("keys.json", "old.json"):
+        typed = (folder / name, folder / "lab.key.pub")
+        assert mwdcal("certificate", "key", "trust", *typed).code == 0
+
+
+def write_key(path, owner):
+    """A key that is the same each time."""
+    curve = pytest.importorskip(
+        "cryptography.hazmat.primitives.asymmetric.ed25519"
+    ).Ed25519PrivateKey
+    private = curve.from_private_bytes(bytes(32))
+    with (
+        patch.object(curve, "generate", lambda: private),
+        patch.object(keys, "now", lambda: "2026-01-01T00:00:00+00:00"),
+    ):
+        keys.create(path, owner, "")
 
 
 def dated(demo, folder):
@@ -182,7 +288,14 @@ def screen(width, *arguments, **variables):
     shown = f"exit {code}\n--- stdout\n{out}--- stderr\n{err}"
     shown = re.sub(r"[\d.]+ s, [\d.]+ tools/s", "? s, ? tools/s", shown)
     libraries = (rf"(?<={name} )\d[\w.]+" for name in ("mwdcal", "pygeomag", "ppigrf", "pyproj"))
-    for varying in ("[0-9a-f]{64}", *libraries):
+    today = f"{datetime.now(UTC).date()}"
+    for varying in (
+        "[0-9a-f]{64}",
+        r"(?<=\d{8}-)[0-9a-f]{12}\b",
+        r"(?<= )[0-9a-f]{12}\b",
+        today,
+        *libraries,
+    ):
         shown = re.sub(varying, lambda part: "?" * len(part[0]), shown)
     times = re.compile(r"^(time of one fit, s)(.*)$", re.MULTILINE)
     return times.sub(lambda line: line[1] + re.sub(r"\d", "0", line[2]), shown)
@@ -211,7 +324,7 @@ def test_every_command_has_a_screen():
 def test_screens_are_the_stored_ones_and_nothing_is_lost_or_too_wide(work, name):
     whole = screen(160, *SCREENS[name])
     for width in WIDTHS:
-        shutil.rmtree("new", ignore_errors=True)
+        undone(Path())
         shown = screen(width, *SCREENS[name])
         assert max(map(len, shown.splitlines())) <= width
         assert not Counter(words(whole)) - Counter(words(shown))
@@ -306,7 +419,7 @@ def test_findings_are_on_stderr_alone_and_once(work, name):
 def test_a_quiet_command_prints_errors_alone(work, name, terminal):
     arguments = SCREENS[name]
     usual = mwdcal(*arguments)
-    shutil.rmtree("new", ignore_errors=True)
+    undone(Path())
     if terminal:
         code, out, err = seen(80, *arguments, "--quiet")
     else:
@@ -322,7 +435,7 @@ def test_a_quiet_command_prints_errors_alone(work, name, terminal):
 
 def untimed(document):
     """A document without measured times."""
-    timed = ("seconds", "tools_per_second", "time", "parts_done_before")
+    timed = ("seconds", "tools_per_second", "time", "parts_done_before", "head")
     if isinstance(document, dict):
         return {k: untimed(v) for k, v in document.items() if k not in timed}
     return [untimed(v) for v in document] if isinstance(document, list) else document
@@ -331,7 +444,7 @@ def untimed(document):
 @pytest.mark.parametrize("name", [n for n in SCREENS if n not in ("misused", "calibrate-refused")])
 def test_a_quiet_command_prints_its_json_all_the_same(work, name):
     usual = mwdcal(*SCREENS[name], "--json")
-    shutil.rmtree("new", ignore_errors=True)
+    undone(Path())
     quiet = mwdcal(*SCREENS[name], "--json", "--quiet")
     assert quiet.err == ""
     assert untimed(quiet.json) == untimed(usual.json)
@@ -351,7 +464,7 @@ if __name__ == "__main__":
         os.chdir(place)
         for each, words_typed in SCREENS.items():
             for columns in WIDTHS:
-                shutil.rmtree("new", ignore_errors=True)
+                undone(Path())
                 stored(each, columns).write_text(screen(columns, *words_typed), "utf-8")
         os.chdir("/")
     sys.exit(0)

@@ -6,14 +6,16 @@ import json
 import os
 import random
 import re
+import shlex
 import shutil
 import stat
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
-from cli_support import EXAMPLE, calibrated, mwdcal, process, refused, servo_run, write_csv
+from cli_support import EXAMPLE, ROOT, calibrated, mwdcal, process, refused, servo_run, write_csv
 from mwdcal.certificate import keys as key_files
 from mwdcal.certificate import signature, trusted_keys
 from mwdcal.errors import InputError
@@ -256,7 +258,10 @@ def test_what_only_looks_the_same_is_altered(tmp_path, key, public, change):
     path.write_bytes(change(data))
     assert state(path, "--key", public) == (1, "altered")
     ran = mwdcal("certificate", "verify", path, "--key", public)
-    assert (ran.code, ran.out) == (1, f"FAIL   {path}\n")
+    simulated = (
+        "   SIMULATED DATA" if "SIMULATED" in ran.out else ""
+    )  # unless it is no JSON any more
+    assert (ran.code, ran.out) == (1, f"FAIL   {path}{simulated}\n")
     assert ran.err.count("altered after it was signed") == 1
 
 
@@ -665,3 +670,73 @@ def test_signed_files_are_in_memory_what_they_are_on_disk(key):
 def test_the_command_in_a_process_of_its_own(tmp_path, key, public):
     path = signed(certificate(tmp_path), key)
     assert process("certificate", "verify", path, "--key", public).returncode == 0
+
+
+# --------------------------------------------------------------------------- the page
+
+
+@pytest.fixture
+def chain(tmp_path, files, key):
+    """Calibration, verification and certificate, each signed before the next is made."""
+    calibration, verification = tmp_path / "tool.json", tmp_path / "verification.json"
+    shutil.copy(files[0], calibration)
+    signed(calibration, key)
+    verification.write_text(mwdcal("verify", calibration, files[1], "--json").out, encoding="utf-8")
+    signed(verification, key)
+    path = tmp_path / "certificate.json"
+    ran = mwdcal("certificate", calibration, "--verification", verification, "-o", path)
+    assert ran.code == 0, ran
+    return signed(path, key)
+
+
+def test_a_certificate_and_all_that_it_rests_on(chain, key, public):
+    verify = ("certificate", "verify", chain, "--key", public, "--json")
+    listed = {file["name"]: file["state"] for file in mwdcal(*verify).json["files"]}
+    assert {"tool.json", "verification.json"} <= {*listed}
+    assert {*listed.values()} <= {"unchanged", "missing"}
+    for name in ("tool.json", "verification.json", "certificate.json"):
+        path = chain.with_name(name)
+        assert state(path, "--key", public) == (0, "intact")
+        data = path.read_bytes()
+        for other in changed_bytes(data, random.Random(name), 8):
+            path.write_bytes(other)
+            assert mwdcal("certificate", "verify", chain, "--key", public).code == 1
+        path.write_bytes(data)
+
+
+def test_a_calibration_that_is_signed_too_late_is_named(tmp_path, files, key):
+    calibration, path = tmp_path / "tool.json", tmp_path / "certificate.json"
+    shutil.copy(files[0], calibration)
+    assert mwdcal("certificate", calibration, "-o", path).code == 0
+    signed(calibration, key)
+    ran = mwdcal("certificate", "sign", path, "--key", key)
+    assert "! changed since the certificate was issued: tool.json." in ran.err
+
+
+def test_the_recipe_of_the_page_checks_a_certificate(chain, public, monkeypatch):
+    """Python code that does without mwdcal, as the page prints it."""
+    page = (ROOT / "docs" / "signature.md").read_text("utf-8")
+    (recipe,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    monkeypatch.chdir(chain.parent)
+    shutil.copy(public, "laboratory.key.pub")
+    exec(recipe, {})
+    chain.write_bytes(chain.read_bytes().replace(b'"simulated": ', b'"simulated":  '))
+    with pytest.raises(AssertionError):
+        exec(recipe, {})
+
+
+def test_the_commands_of_the_page_run(tmp_path, files, monkeypatch):
+    """Those that make, list, rotate and revoke keys, in their order."""
+    page = (ROOT / "docs" / "signature.md").read_text("utf-8")
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(files[0], "tool.json")
+    verdict = mwdcal("verify", "tool.json", files[1], "--json").out
+    Path("verification.json").write_text(verdict, encoding="utf-8")
+    issue = ("tool.json", "--verification", "verification.json", "-o", "certificate.json")
+    assert mwdcal("certificate", *issue).code == 0
+    blocks = re.findall(r"```\n((?:mwdcal .*\n)+)```", page)
+    lines = [shlex.split(line)[1:] for line in "".join(blocks).splitlines()]
+    assert len(lines) >= 10
+    for words in lines:
+        ran = mwdcal(*words)
+        assert ran.code == 0, (words, ran)

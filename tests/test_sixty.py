@@ -22,7 +22,7 @@ from simulation import (
 )
 from test_observables import complex_value
 
-SEEDS = 200
+SEEDS = 160
 NOISE = np.repeat([1e-4, 15.0], 3)
 FIELD, DIP = 50_000.0, 65 * DEG
 ANGLES = np.tile(np.stack(plan((0, 45, 90, 135), 9)), 5)
@@ -64,11 +64,12 @@ def bound(tools, stand):
 def predicted(tools, limit):
     """Covariance (tools, k, k) of the k = 6 x 60 observables elsewhere, from the bound."""
     raw = factor_readings(tools, WARM, vectors(OTHER))
-    rows = [
-        complex_steps(lambda x, name=name: complex_value(name, factor_fields(x, WARM, raw)), tools)
-        for name in NAMES
-    ]
-    rows = np.concatenate(rows, 1)
+
+    def observed(factors):
+        fields = factor_fields(factors, WARM, raw)
+        return np.concatenate([complex_value(name, fields) for name in NAMES], 1)
+
+    rows = complex_steps(observed, tools)
     return rows @ limit @ np.swapaxes(rows, -1, -2)
 
 

@@ -25,7 +25,8 @@ from mwdcal.planning.plans import load_plan
 from mwdcal.planning.session import Session
 from mwdcal.planning.simulate import Earth, Truth, drawn
 
-HERE = Path(__file__).parent
+SERVO = Path(__file__).parents[1] / "servo"
+"""The folder of the example tool: its profile and the file of its laboratory."""
 SEED = 20261122
 FIRST_YEAR = 2022
 YEARLY = 2e-4
@@ -37,13 +38,14 @@ DAYS_APART = 0.9
 
 
 def laboratory(folder: Path, tools: int, years: int) -> None:
-    """Write profile, run files and the roll test."""
-    profile, _ = load_profile(str(HERE / "tool.toml"))
+    """Write the profile, the laboratory, run files and the roll test."""
+    profile, _ = load_profile(str(SERVO / "tool.toml"))
     sessions = [Session.of(load_plan(name), profile) for name in ("twenty-four-state", "roll-test")]
     rng = np.random.default_rng(SEED)
     truth = drawn(rng, profile, 0, (tools,))
     (folder / "runs").mkdir(parents=True, exist_ok=True)
-    atomic.write(folder / "tool.toml", (HERE / "tool.toml").read_bytes())
+    for name in ("tool.toml", "laboratory.toml"):
+        atomic.write(folder / name, (SERVO / name).read_bytes())
     for year in range(FIRST_YEAR, FIRST_YEAR + years):
         last = year == FIRST_YEAR + years - 1
         truth = truth if year == FIRST_YEAR else aged(truth, rng, knocked=last)

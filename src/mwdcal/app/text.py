@@ -13,6 +13,8 @@ from typing import Any, TypeAlias
 
 NARROWEST, WIDEST = 80, 160
 """Columns for which a terminal gets its tables and lines, however many it has."""
+NOT_STATED = "not stated"
+"""In place of what a document must have room for, and does not say."""
 WIDE = 300
 """Width of a table in a file whose last column holds remarks, which are never cut."""
 UNCUT = 1_000_000

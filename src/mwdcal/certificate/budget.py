@@ -11,12 +11,10 @@ from collections.abc import Iterator
 import numpy as np
 
 from mwdcal.calibration.prediction import (
-    TWELFTHS,
     TYPICAL,
     accuracy_at,
     angles,
     middle_temperature,
-    readings_at,
     typical_accuracy,
 )
 from mwdcal.calibration.record import BudgetRow, Calibration, stated
@@ -34,6 +32,10 @@ UNDECLARED = {
     "tilt of the stand": "tilt_deg",
 }
 """Common errors that leave residuals, and the key of `[stand]` that declares each."""
+SCALED = (NOISE, REPEATABILITY, SETTINGS)
+"""Sources whose variance is scaled by that of the residuals."""
+AXES_OF_A_TERM = 3
+"""Axes on which a term beyond the order is seen: as many degrees of freedom has its size."""
 INVISIBLE = "no residual tests it"
 VISIBLE = "a large error of it would show in the residuals"
 
@@ -42,7 +44,7 @@ def budget(calibration: Calibration) -> Budget:
     """The uncertainty budget at 45° inclination: the accuracy that `calibrate` states, by source.
 
     Definition: root mean square over azimuth and toolface, at `middle_temperature`. The coverage factor is the
-    largest of any angle and attitude there, and at least that of the triad with the fewest degrees of freedom.
+    largest of any angle.
     """
     names = angles(calibration)
     rows = calibration.budget or [_whole(calibration)]
@@ -51,9 +53,7 @@ def budget(calibration: Calibration) -> Budget:
         f"{name}_deg": _root_sum_of_squares([getattr(row, f"{name}_deg") for row in rows])
         for name in names
     }
-    k = coverage_factors(calibration, TYPICAL, middle_temperature(calibration))
-    fewest = min(triad.degrees_of_freedom for triad in calibration.triads)
-    largest = float(np.nanmax([*k.values(), student_factor(fewest)]))
+    largest = max(coverage_factors(calibration).values())
     combined = BudgetLine(
         id="combined",
         source="combined standard uncertainty",
@@ -84,35 +84,32 @@ def attitude_in_words(inclination: float, temperature: float) -> str:
     )
 
 
-def coverage_factors(
-    calibration: Calibration, inclination: float, temperature: float
-) -> dict[str, float]:
-    """Coverage factor by angle at an inclination: the largest of any azimuth and toolface; NaN: none is stated.
+def coverage_factors(calibration: Calibration) -> dict[str, float]:
+    """Coverage factor by angle: Student's for the effective degrees of freedom of the budget.
 
-    Definition: `Calibration.expanded_uncertainty` over `Calibration.uncertainty`.
+    Definition: Welch-Satterthwaite. What the residuals scale has the degrees of freedom of the triad with the
+    fewest, the order of the temperature terms those of the three axes it is seen on, all else
+    infinitely many; and no more are counted than that triad has. Reference: JCGM 100:2008, G.4.
     """
-    grid = np.meshgrid(TWELFTHS, TWELFTHS, indexing="ij")
-    azimuth, toolface = (angle.ravel() for angle in grid)
-    readings = readings_at(calibration, inclination, azimuth, toolface, temperature)
+    fewest = max(min(triad.degrees_of_freedom for triad in calibration.triads), 1.0)
     factors = {}
     for name in angles(calibration):
-        sd = calibration.uncertainty(name, readings)
-        width = calibration.expanded_uncertainty(name, readings, PROBABILITY)
-        known = np.isfinite(width) & (sd > 0)
-        factors[name] = float((width[known] / sd[known]).max()) if known.any() else float("nan")
+        parts = {row.source: getattr(row, f"{name}_deg") or 0.0 for row in calibration.budget}
+        scaled = sum(parts.get(source, 0.0) ** 2 for source in SCALED)
+        spread = scaled**2 / fewest + parts.get(ORDER, 0.0) ** 4 / AXES_OF_A_TERM
+        total = sum(part**2 for part in parts.values())
+        effective = min(total**2 / spread, fewest) if spread else fewest
+        factors[name] = float(student_factor(effective))
     return factors
 
 
 def accuracy_with_factor(
     calibration: Calibration, inclination: float, temperature: float
-) -> dict[str, tuple[float | None, float | None]]:
+) -> dict[str, tuple[float | None, float]]:
     """1σ in degrees and coverage factor by angle at an inclination; None: undetermined."""
     sd: dict[str, Array] = accuracy_at(calibration, [inclination], temperature=temperature)
-    k = coverage_factors(calibration, inclination, temperature)
-    return {
-        name: (stated(np.degrees(value[0])), stated(k[name]) if np.isfinite(value[0]) else None)
-        for name, value in sd.items()
-    }
+    k = coverage_factors(calibration)
+    return {name: (stated(np.degrees(value[0])), k[name]) for name, value in sd.items()}
 
 
 def assumed_exact(calibration: Calibration) -> list[str]:

@@ -28,7 +28,7 @@ from mwdcal.certificate.document import (
     SourceFile,
     TracedStandard,
 )
-from mwdcal.certificate.laboratory import Laboratory
+from mwdcal.certificate.laboratory import Laboratory, filled_pattern
 from mwdcal.certificate.methods import method
 from mwdcal.certificate.repeatability import repeatability
 from mwdcal.certificate.tables import conditions, result_tables
@@ -62,7 +62,8 @@ class Order(msgspec.Struct, frozen=True, kw_only=True):
 
     `customer`, `condition` and `received` stand before those of the laboratory file; `number` before its
     pattern. `verification` (as left) and `as_found` are roll tests with this and with the previous calibration;
-    `calibration_sha256` is of the file of this one.
+    `calibration_sha256` is of the file of this one. `findings` are about the files themselves, such as their
+    signatures.
     """
 
     issued: date
@@ -74,6 +75,7 @@ class Order(msgspec.Struct, frozen=True, kw_only=True):
     as_found: Verification | None = None
     calibration_sha256: str
     files: tuple[SourceFile, ...] = ()
+    findings: tuple[Finding, ...] = ()
 
 
 def certificate(
@@ -114,7 +116,13 @@ def certificate(
         files=list(order.files),
     )
     unstated_day = [] if day_stated else [Finding(id="date-not-stated", text=DATE_OF_FIT)]
-    findings = [*_findings(contents, calibration), *unstated_day, *changed, *calibration.findings]
+    findings = [
+        *order.findings,
+        *_findings(contents, calibration),
+        *unstated_day,
+        *changed,
+        *calibration.findings,
+    ]
     whole = rounded(replace(contents, findings=findings))
     number = order.number or _number(whole, stated.number or NUMBER_PATTERN)
     _check_number(number)
@@ -305,7 +313,8 @@ def _number(contents: Certificate, pattern: str) -> str:
     """The number of a certificate, from what it says."""
     digest = hashlib.sha256(canonical(msgspec.to_builtins(contents))).hexdigest()
     serial = re.sub(r"[^A-Za-z0-9._]+", "-", contents.item.serial).strip("-")[:40]
-    return pattern.format(
+    return filled_pattern(
+        pattern,
         serial=serial or "tool",
         date=contents.issued.replace("-", ""),
         year=contents.issued[:4],

@@ -12,6 +12,7 @@ import msgspec
 
 from mwdcal.calibration.canonical import Signature
 from mwdcal.calibration.record import Finding
+from mwdcal.files.documents import laid_out
 
 CERTIFICATE_VERSION = 1
 """Version of the certificate's JSON: higher when a key goes, or changes its meaning."""
@@ -199,3 +200,8 @@ class Certificate(msgspec.Struct, frozen=True, kw_only=True):
     findings: list[Finding]
     files: list[SourceFile]
     signature: Signature | msgspec.UnsetType = msgspec.UNSET
+
+
+def encode(certificate: Certificate) -> bytes:
+    """The bytes of the certificate's JSON file, which its XML carries too."""
+    return laid_out(msgspec.json.encode(certificate))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 from datetime import date
 from typing import Literal
 
@@ -120,14 +121,16 @@ def _problem(laboratory: Laboratory) -> str:
 
 def number_problem(pattern: str) -> str:
     """Why a pattern cannot give certificate numbers; empty where it can."""
-    try:
-        filled = pattern.format(**dict.fromkeys(NUMBER_FIELDS, "0"))
-    except (KeyError, IndexError, ValueError, AttributeError, TypeError):
-        filled = ""
-    if not filled or "{digest}" not in pattern:
-        fields = ", ".join(f"{{{name}}}" for name in NUMBER_FIELDS)
-        return (
-            f"key 'number': must be a pattern of {fields} that contains {{digest}}, by which no two "
-            f"certificates share a number; got {pattern[:60]!r}."
-        )
-    return ""
+    filled = filled_pattern(pattern, **dict.fromkeys(NUMBER_FIELDS, ""))
+    if "{digest}" in pattern and not {"{", "}"} & {*filled}:
+        return ""
+    fields = ", ".join(f"{{{name}}}" for name in NUMBER_FIELDS)
+    return (
+        f"key 'number': must be a pattern of {fields} that contains {{digest}}, by which no two "
+        f"certificates share a number; got {pattern[:60]!r}."
+    )
+
+
+def filled_pattern(pattern: str, **values: str) -> str:
+    """A pattern of numbers with its fields filled in; nothing else in braces means anything."""
+    return re.sub(r"\{(\w+)\}", lambda field: values.get(field[1], field[0]), pattern)

@@ -57,7 +57,8 @@ STATES = {
     "altered": "the {document} was altered after it was signed{by}. Use the file as it was signed.",
     "unknown": "the {document} is signed by {key}, which is not among the trusted keys: give its public key by "
     "`key`, if you have it from its owner.",
-    "revoked": "the {document} is signed by {key}, which was revoked on {revoked}{reason}. Have it signed anew.",
+    "revoked": "the {document} is signed by {key}, which was revoked on {revoked}{reason}. Ask for one "
+    "that a valid key has signed.",
     "retired": "the {document} was signed on {time} by {key}, which was retired on {retired}. Have it signed with "
     "the key that followed.",
     "unchecked": "the {document} is signed by {key}, and not checked: cryptography is not installed. Install "
@@ -115,7 +116,7 @@ def document_of(data: bytes, name: str) -> dict[str, Any]:
     Raises:
         InputError: it is not JSON, or not a document of mwdcal.
     """
-    fields = _fields(data)
+    fields = fields_of(data)
     if fields is None or not {"schema_version", "command"} <= {*fields}:
         raise InputError(
             f"{name} is not a document of mwdcal. Name a calibration file, or the JSON of a "
@@ -124,7 +125,7 @@ def document_of(data: bytes, name: str) -> dict[str, Any]:
     return fields
 
 
-def _fields(data: bytes) -> dict[str, Any] | None:
+def fields_of(data: bytes) -> dict[str, Any] | None:
     """The object in a file; None where there is none, or a number in it is not one of JSON."""
     try:
         fields = json.loads(data, parse_constant=_no_number)
@@ -145,7 +146,7 @@ def check(data: bytes, trusted: Mapping[str, TrustedKey]) -> SignatureCheck:
 
     A file that can no longer be read as JSON, but names a signature, is altered.
     """
-    fields = _fields(data)
+    fields = fields_of(data)
     if fields is None:
         named = SIGNATURE_KEY.encode() in data.replace(b"\0", b"")
         return _said("altered" if named else "unsigned", {})

@@ -20,7 +20,6 @@ from mwdcal.certificate.keys import (
     read_public,
 )
 from mwdcal.errors import InputError
-from mwdcal.files.documents import laid_out
 from mwdcal.files.formats import atomic
 
 _LAST_TIME = "9999"
@@ -135,6 +134,8 @@ def _exchanged(file: Path, keys: list[TrustedKey], old: TrustedKey, new: Trusted
 
 
 def _written(file: Path, keys: list[TrustedKey]) -> TrustedKeys:
+    from mwdcal.files.documents import laid_out  # a check alone does without
+
     written = TrustedKeys(keys=keys)
     atomic.write(file, laid_out(msgspec.json.encode(written)))
     return written

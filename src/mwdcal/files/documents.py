@@ -13,7 +13,7 @@ from typing import Any
 
 import msgspec
 
-from mwdcal.calibration.canonical import document_sha256, signed_form
+from mwdcal.calibration.canonical import Signature, document_sha256, signed_form
 from mwdcal.calibration.diagnosis.soundness import check
 from mwdcal.calibration.record import DOCUMENT_VERSION, SCHEMA_VERSION, Calibration, sealed
 from mwdcal.errors import InputError, reason
@@ -29,7 +29,10 @@ _UNREADABLE = "No command would read such a file: calibrate again, or correct th
 
 
 class Verification(Verdict, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The document that `mwdcal verify` prints as JSON: a verdict, and what it rests on."""
+    """The document that `mwdcal verify` prints as JSON: a verdict, and what it rests on.
+
+    `calibration_signature` is what it said of the signature of the calibration, `signature` its own.
+    """
 
     schema_version: int
     command: str
@@ -39,7 +42,8 @@ class Verification(Verdict, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     calibration_sha256: str
     run_sha256: str | None
     limits_sha256: str | None
-    calibration_signature: dict[str, Any] | msgspec.UnsetType = msgspec.UNSET
+    calibration_signature: dict[str, str | None] | msgspec.UnsetType = msgspec.UNSET
+    signature: Signature | msgspec.UnsetType = msgspec.UNSET
 
 
 def encode(calibration: Calibration) -> bytes:

@@ -11,6 +11,8 @@ at T itself.
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import msgspec
 import numpy as np
 from msgspec.structs import replace
@@ -235,8 +237,7 @@ def _channel(
 ) -> ChannelNoise:
     """The noise of one channel; samples are counted inside, seconds outside."""
     factors = allan.octaves(len(value))
-    moments = allan.moments(len(value), factors)
-    requested = moments if kind == "overlapping" else allan.moments(len(value), factors, kind)
+    moments, requested = _moments(len(value), "overlapping"), _moments(len(value), kind)
     centred = allan.variance(value, factors, centred=True)
     slope = np.asarray(allan.drift(value))
     terms = noise_terms.fit(centred[None], slope[None], moments)
@@ -266,6 +267,12 @@ def _channel(
         doubts=[finding.id for finding in remarks if finding.id in DOUBTS],
         station=_station(value, station * rate, moments, terms),
     )
+
+
+@lru_cache(maxsize=4)
+def _moments(count: int, kind: Kind) -> Moments:
+    """The moments at all octaves of a record: channels of one length have the same."""
+    return allan.moments(count, allan.octaves(count), kind)
 
 
 def _terms(terms: NoiseTerms, rate: float) -> dict[str, Term]:

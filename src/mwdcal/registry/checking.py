@@ -14,7 +14,7 @@ import sqlalchemy as sa
 
 from mwdcal.errors import InputError
 from mwdcal.registry.database import chain, migrating
-from mwdcal.registry.database.connections import ROWS_AT_ONCE
+from mwdcal.registry.database.connections import OBJECTS_AT_ONCE, ROWS_AT_ONCE
 from mwdcal.registry.database.models import history, objects, records, tools, withdrawals
 from mwdcal.registry.database.tools import TOOL_KINDS, rows_of
 from mwdcal.registry.facts import FACTS_VERSION, content_address, facts
@@ -109,7 +109,7 @@ def _events(connection: sa.Connection, progress: Progress) -> Iterator[Discrepan
     rows = [
         _Rows(connection, records),
         _Rows(connection, withdrawals),
-        _Rows(connection, objects, 4),
+        _Rows(connection, objects, OBJECTS_AT_ONCE),
     ]
     before = (0, chain.GENESIS)
     options = {"stream_results": True, "yield_per": ROWS_AT_ONCE}
@@ -221,7 +221,11 @@ def _other_facts(record: Row, data: bytes) -> list[str]:
         return ["its kind"]
     if again["serial"] is None:
         del again["serial"]  # stated by who added it
-    return [n for n, value in again.items() if _digest({"_": value}) != _digest({"_": record[n]})]
+    return [n for n, value in again.items() if not _same(value, record[n])]
+
+
+def _same(one: object, two: object) -> bool:
+    return type(one) is type(two) and one == two
 
 
 def _tools(connection: sa.Connection) -> Iterator[Discrepancy]:

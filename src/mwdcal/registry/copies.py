@@ -6,15 +6,17 @@ A backup is a registry in a SQLite file, whichever database it is of.
 from __future__ import annotations
 
 import os
+from dataclasses import replace
+from pathlib import Path
 
 import sqlalchemy as sa
 
-from mwdcal.errors import FitError
+from mwdcal.errors import FitError, InputError
 from mwdcal.files.formats import atomic
 from mwdcal.registry.checking import check
 from mwdcal.registry.database import chain, migrating
-from mwdcal.registry.database.connections import ROWS_AT_ONCE, connect
-from mwdcal.registry.database.models import metadata
+from mwdcal.registry.database.connections import OBJECTS_AT_ONCE, ROWS_AT_ONCE, connect
+from mwdcal.registry.database.models import metadata, objects
 from mwdcal.registry.store import Registry, open_registry, person
 
 
@@ -22,12 +24,18 @@ def backup(registry: Registry, path: str | os.PathLike[str]) -> str:
     """Write a backup while others go on writing; the hash of its newest event.
 
     The file appears whole or not at all. It holds every write that was acknowledged before the call.
+
+    Raises:
+        InputError: it cannot be written, or `path` is the registry itself.
     """
+    file = registry.database.file
+    if file and atomic.identity(Path(path)) == atomic.identity(file):
+        raise InputError(f"`path` must not be the registry itself, '{path}'. Name another file.")
     with atomic.replacing(path) as stream:
-        target = connect(stream.name, new=True, shared=False)
+        target = replace(connect(stream.name, new=True, shared=False), name=str(path))
         try:
             with registry.reading() as source, target.writing() as sink:
-                migrating.create_tables(sink, str(path))
+                migrating.create_tables(sink, target.name)
                 _copy(source, sink)
                 _, head = chain.head(sink)
         finally:
@@ -46,7 +54,7 @@ def restore(path: str | os.PathLike[str], database: str | os.PathLike[str], acto
     """
     who, target = person(actor), connect(database, new=True)
     try:
-        with open_registry(path) as source:
+        with open_registry(path, shared=False) as source:
             _refuse_altered(source)
             with source.reading() as rows, target.writing() as sink:
                 migrating.create_tables(sink, target.name)
@@ -61,7 +69,8 @@ def restore(path: str | os.PathLike[str], database: str | os.PathLike[str], acto
 
 def _copy(source: sa.Connection, sink: sa.Connection) -> None:
     for table in metadata.sorted_tables:
-        options = {"stream_results": True, "yield_per": ROWS_AT_ONCE}
+        portion = OBJECTS_AT_ONCE if table is objects else ROWS_AT_ONCE
+        options = {"stream_results": True, "yield_per": portion}
         for rows in (
             source.execute(sa.select(table), execution_options=options).mappings().partitions()
         ):

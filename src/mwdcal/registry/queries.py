@@ -37,7 +37,7 @@ def tools_page(
 
     Columns: those of `tools`. Rows without a value in the column `order` come last.
     """
-    query = sa.select(tools)
+    query = sa.select(tools.c.serial)
     if search:
         query = query.where(sa.or_(*(_contains(c, search) for c in (tools.c.serial, tools.c.type))))
     for name, value in (where or {}).items():
@@ -46,20 +46,28 @@ def tools_page(
         query = query.where(tools.c.next_due < due_before)
     by = tools.c[order]
     keys = [by.desc() if descending else by.asc(), tools.c.serial]
-    return _page(registry, query, [by.is_(None), *keys] if by.nullable else keys, offset, limit)
+    keys = [by.is_(None), *keys] if by.nullable else keys
+    part = query.order_by(*keys).offset(offset).limit(limit).subquery()
+    rows = sa.select(tools).join(part, part.c.serial == tools.c.serial).order_by(*keys)
+    return _page(registry, query, rows)
 
 
 def _contains(column: sa.Column[Any], text: str) -> sa.ColumnElement[bool]:
     return sa.func.lower(column).contains(text.lower(), autoescape=True)
 
 
-def _page(
-    registry: Registry, query: sa.Select[Any], order: list[Any], offset: int, limit: int
-) -> Page:
+def _page(registry: Registry, whole: sa.Select[Any], part: sa.Select[Any]) -> Page:
+    """The rows of a part, and how many the whole has.
+
+    A part is sorted by its keys alone, and the rows are joined to it: databases sort wide rows slowly.
+    """
     with registry.reading() as connection:
-        total = connection.scalar(sa.select(sa.func.count()).select_from(query.subquery())) or 0
-        rows = connection.execute(query.order_by(*order).offset(offset).limit(limit)).mappings()
-        return Page(total, [dict(row) for row in rows])
+        rows = connection.execute(part).mappings().all()
+        return Page(_count(connection, whole), [dict(row) for row in rows])
+
+
+def _count(connection: sa.Connection, query: sa.Select[Any]) -> int:
+    return connection.scalar(sa.select(sa.func.count()).select_from(query.subquery())) or 0
 
 
 def with_events() -> sa.Select[Any]:
@@ -82,8 +90,8 @@ def past(registry: Registry, serial: str, offset: int = 0, limit: int = 200) -> 
 
     Columns: those of `records`, with `added` (time), `actor`, `withdrawn` (number of that event) and `reason`.
     """
-    query = with_events().where(records.c.serial == serial)
-    return _page(registry, query, [records.c.number], offset, limit)
+    query = sa.select(records.c.number).where(records.c.serial == serial)
+    return _records_page(registry, query, [records.c.number], offset, limit)
 
 
 def records_page(
@@ -95,11 +103,21 @@ def records_page(
     limit: int = 50,
 ) -> Page:
     """Records of a kind whose columns equal `where`, in order of the time they state; columns as of `past`."""
-    query = with_events().where(records.c.kind == kind)
+    query = sa.select(records.c.number).where(records.c.kind == kind)
     for name, value in (where or {}).items():
         query = query.where(records.c[name] == value)
     keys = [records.c.time, records.c.number]
-    return _page(registry, query, [k.desc() if newest_first else k for k in keys], offset, limit)
+    order = [key.desc() if newest_first else key for key in keys]
+    return _records_page(registry, query, order, offset, limit)
+
+
+def _records_page(
+    registry: Registry, query: sa.Select[Any], order: list[Any], offset: int, limit: int
+) -> Page:
+    """A part of the records whose numbers a query gives."""
+    part = query.order_by(*order).offset(offset).limit(limit).subquery()
+    rows = with_events().join(part, part.c.number == records.c.number).order_by(*order)
+    return _page(registry, query, rows)
 
 
 def record(registry: Registry, number: int) -> Row | None:
@@ -155,23 +173,33 @@ def due(registry: Registry, before: str, offset: int = 0, limit: int = 50) -> Pa
         .outerjoin(withdrawals, withdrawals.c.record == at.number)
         .where(at.kind == "standard", at.next_due < before, withdrawals.c.number.is_(None))
     )
-    both = sa.union_all(of_tools, of_standards).subquery()
-    return _page(
-        registry, sa.select(both), [both.c.next_due, both.c.kind, both.c.serial], offset, limit
-    )
+    part = of_tools.order_by(tools.c.next_due, tools.c.serial).limit(offset + limit).subquery()
+    both = sa.union_all(sa.select(part), of_standards).subquery()
+    order = both.c.next_due, both.c.kind, both.c.serial
+    with registry.reading() as connection:
+        rows = connection.execute(sa.select(both).order_by(*order).offset(offset).limit(limit))
+        total = _count(connection, of_tools) + _count(connection, of_standards)
+        return Page(total, [dict(row) for row in rows.mappings()])
 
 
 def events(registry: Registry, offset: int = 0, limit: int = 50) -> Page:
-    """Events of the history, newest first; columns: those of `history`."""
-    return _page(registry, sa.select(history), [history.c.number.desc()], offset, limit)
+    """Events of the history, newest first; columns: those of `history`. Their numbers have no gap."""
+    newest = sa.select(sa.func.max(history.c.number))
+    with registry.reading() as connection:
+        total = connection.scalar(newest) or 0
+        part = sa.select(history).where(history.c.number <= total - offset)
+        rows = connection.execute(part.order_by(history.c.number.desc()).limit(limit)).mappings()
+        return Page(total, [dict(row) for row in rows])
 
 
 def counts(registry: Registry) -> dict[str, int]:
     """How many records there are of each kind, and how many `tools`, `events` and `withdrawals`."""
     kinds = sa.select(records.c.kind, sa.func.count()).group_by(records.c.kind)
-    rest = {"tools": tools, "events": history, "withdrawals": withdrawals}
+    rest = {
+        "tools": sa.select(sa.func.count()).select_from(tools),
+        "events": sa.select(sa.func.max(history.c.number)),
+        "withdrawals": sa.select(sa.func.count()).select_from(withdrawals),
+    }
     with registry.reading() as connection:
         result = {row[0]: int(row[1]) for row in connection.execute(kinds)}
-        for name, table in rest.items():
-            result[name] = connection.scalar(sa.select(sa.func.count()).select_from(table)) or 0
-    return result
+        return result | {name: connection.scalar(query) or 0 for name, query in rest.items()}

@@ -78,7 +78,8 @@ class Registry:
         """Add files, all or none; what is there already is not added again.
 
         `actor` is who adds them, `when` the time that the history states: now, if None. What the call
-        returns is on the disk. The files, compressed, are in memory at once.
+        returns is on the disk. The files, compressed, are in memory at once. Where the connection breaks
+        during the call, nobody can know whether it took effect: add the same again.
 
         Raises:
             InputError: a file is not of its kind, its serial is another than the entry's, or the
@@ -264,13 +265,15 @@ def _refresh_tools(connection: sa.Connection, rows: Iterable[Any]) -> None:
 
 
 @contextlib.contextmanager
-def open_registry(database: str | os.PathLike[str]) -> Iterator[Registry]:
+def open_registry(database: str | os.PathLike[str], shared: bool = True) -> Iterator[Registry]:
     """A registry by the path of its file or its URL, closed when the block ends.
+
+    Not `shared`: a file that nobody writes to, as a backup, which may be on a network drive.
 
     Raises:
         InputError: there is none, it is not a registry, or its schema is older or newer than this program's.
     """
-    target = connect(database)
+    target = connect(database, shared=shared)
     try:
         with target.reading() as connection:
             schema.known_version(connection, target.name)

@@ -51,7 +51,7 @@ def measured(value: float, uncertainty: float | None) -> tuple[str, str]:
         return number(value, 9), "0"
     decimals = 1 - exponent(uncertainty)
     power = exponent(max(abs(value), uncertainty))
-    if decimals <= 7 and power < 7:
+    if power == 0 or (decimals <= 7 and power < 7):
         return fixed(value, decimals), fixed(uncertainty, decimals)
     scaled = (fixed(v * 10.0**-power, decimals + power) for v in (value, uncertainty))
     first, second = (f"{text}×10{superscript(power)}" for text in scaled)

@@ -18,11 +18,18 @@ from mwdcal.certificate.dcc.elements import (
     day,
     leaf,
     node,
-    ref_type,
     title,
+    typed,
     words,
 )
-from mwdcal.certificate.document import Certificate, ConformityTest, Item, Party, Person
+from mwdcal.certificate.document import (
+    Certificate,
+    ConformityTest,
+    Item,
+    Party,
+    Person,
+    TracedStandard,
+)
 from mwdcal.errors import InputError
 
 UNKNOWN_COUNTRY = "ZZ"
@@ -60,23 +67,30 @@ def administrative_data(certificate: Certificate) -> ET.Element:
 
 def software(name_and_version: str) -> ET.Element:
     """A program by its name and version, "mwdcal 1.2"."""
-    name, _, version = name_and_version.strip().rpartition(" ")
+    before, _, last = name_and_version.strip().rpartition(" ")
+    name, version = (before, last) if before else (last, "")
     release = leaf("release", version, UNSTATED)
     return node("software", title(name), release, leaf("type", "application"))
 
 
-def identification(issuer: str, value: str, name: str, *basic: str, fallback: str = "") -> Child:
+def identification(
+    issuer: str, value: str, name: str, basic: str = "", fallback: str = ""
+) -> Child:
     """A number by which something is known, and who gave it; none where it is blank."""
     stated = leaf("value", value, fallback)
     if stated is None:
         return None
-    kind = ref_type("", *basic) or None
-    return node("identification", leaf("issuer", issuer), stated, title(name), refType=kind)
+    return typed("identification", "", leaf("issuer", issuer), stated, title(name), basic=basic)
+
+
+def when_id(test: ConformityTest) -> str:
+    """The id of a test: as-found or as-left."""
+    return test.when.replace(" ", "-")
 
 
 def rule_id(test: ConformityTest) -> str:
     """The id of the statement with the decision rule of a test."""
-    return f"decision-rule-{test.when.replace(' ', '-')}"
+    return f"decision-rule-{when_id(test)}"
 
 
 def tests(certificate: Certificate) -> list[ConformityTest]:
@@ -121,17 +135,10 @@ def _country(party: Party) -> str:
 
 
 def _where(certificate: Certificate) -> str:
-    """The place in the words of the schema; a place of its own is stated in full besides."""
-    if not certificate.place.strip():
-        return "laboratory"
-    parties = {"laboratory": certificate.laboratory, "customer": certificate.customer}
-    here = (who for who, party in parties.items() if party and _is_at(certificate.place, party))
-    return next(here, "other")
-
-
-def _is_at(place: str, party: Party) -> bool:
-    lines = [party.name, *party.address]
-    return place.strip().casefold() in {line.strip().casefold() for line in lines}
+    """The place in the words of the schema: the laboratory, unless it is that of the customer."""
+    customer = certificate.customer or Party(name="")
+    lines = {line.strip().casefold() for line in (customer.name, *customer.address)} - {""}
+    return "customer" if certificate.place.strip().casefold() in lines else "laboratory"
 
 
 def _item(item: Item) -> ET.Element:
@@ -179,10 +186,12 @@ def _persons(certificate: Certificate) -> Iterator[ET.Element]:
 def _statements(certificate: Certificate) -> Iterator[ET.Element]:
     """What applies to the whole calibration: simulation, traceability, conformity, and the certificate's own words."""
     if certificate.simulated:
-        yield _statement("simulated", words("declaration", f"{SIMULATED}: no tool was measured."))
+        yield typed(
+            "statement", "simulated", words("declaration", f"{SIMULATED}: no tool was measured.")
+        )
     for text in certificate.statements:
         if (declaration := words("declaration", text)) is not None:
-            yield _statement("statement", declaration)
+            yield typed("statement", "statement", declaration)
     yield from _signature(certificate)
     yield from _place(certificate)
     yield from _traceability(certificate)
@@ -190,48 +199,54 @@ def _statements(certificate: Certificate) -> Iterator[ET.Element]:
         yield _decision_rule(test)
         yield _conformity(test)
     if day(certificate.next_due):
-        yield _statement(
-            "next-due", title("Next calibration due"), leaf("date", day(certificate.next_due))
+        yield typed(
+            "statement",
+            "next-due",
+            title("Next calibration due"),
+            leaf("date", day(certificate.next_due)),
         )
     for finding in certificate.findings:
         if (declaration := words("declaration", finding.text)) is not None:
-            yield _statement(finding.id, declaration)
-
-
-def _statement(name: str, *children: Child, basic: str = "", **attributes: str) -> ET.Element:
-    types = ref_type(name, *([basic] if basic else []))
-    return node("statement", *children, refType=types or None, **attributes)
+            yield typed("statement", finding.id, declaration)
 
 
 def _signature(certificate: Certificate) -> Iterator[ET.Element]:
     if certificate.signature is not msgspec.UNSET:
         signed = certificate.signature
         text = f"The JSON in this document is signed: {signed.algorithm}, key {signed.key}, {signed.time}."
-        yield _statement("signature", words("declaration", text))
+        yield typed("statement", "signature", words("declaration", text))
 
 
 def _place(certificate: Certificate) -> Iterator[ET.Element]:
     if (place := words("further", certificate.place)) is not None:
         location = node("location", place)
-        yield _statement("place", title("Place of the calibration"), location)
+        yield typed("statement", "place", title("Place of the calibration"), location)
 
 
 def _traceability(certificate: Certificate) -> Iterator[ET.Element]:
-    if certificate.traceability:
-        yield _statement(
+    """The certificates by which the results are traceable; nothing where no standard has one."""
+    standards = [each for each in certificate.traceability if each.certificate.strip()]
+    if standards:
+        lines = (f"{each.quantity}: {each.name}, {_source(each)}" for each in standards)
+        yield typed(
+            "statement",
             "traceability",
             title("Metrological traceability"),
-            *(leaf("reference", standard.certificate) for standard in certificate.traceability),
-            words(
-                "declaration",
-                "The results are traceable to the standards among the measuring equipment.",
-            ),
+            *(leaf("reference", each.certificate) for each in standards),
+            words("declaration", "\n".join(["Traceable by these certificates.", *lines])),
             basic="metrologicallyTraceableToSI",
         )
 
 
+def _source(standard: TracedStandard) -> str:
+    """The certificate of a standard: number, issuer, and whether it is overdue."""
+    issuer = f" of {standard.issuer}" if standard.issuer.strip() else ""
+    return f"certificate {standard.certificate}{issuer}" + (", overdue" if standard.overdue else "")
+
+
 def _decision_rule(test: ConformityTest) -> ET.Element:
-    return _statement(
+    return typed(
+        "statement",
         f"{test.rule}-acceptance",
         title(f"Decision rule, {test.when}"),
         leaf("reference", test.limits),
@@ -243,7 +258,8 @@ def _decision_rule(test: ConformityTest) -> ET.Element:
 
 
 def _conformity(test: ConformityTest) -> ET.Element:
-    return _statement(
+    return typed(
+        "statement",
         test.when,
         title(f"Conformity, {test.when}"),
         leaf("norm", "ISO/IEC 17025:2017, 7.8.6"),

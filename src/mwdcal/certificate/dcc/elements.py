@@ -64,11 +64,14 @@ def title(text: str) -> Child:
     return words("name", one_line(text), UNSTATED)
 
 
-def ref_type(name: str, *basic: str) -> str:
-    """Types of content: PTB's basic ones, then ours by its name."""
-    token = _OUTSIDE_TOKEN.sub("-", name).strip("-")
-    ours = [f"{REF_TYPES}_{token}"] if token else []
-    return " ".join([*(f"basic_{each}" for each in basic), *ours])
+def typed(
+    tag: str, kind: str, *children: Child, basic: str = "", **attributes: str | None
+) -> ET.Element:
+    """An element with types of content: PTB's basic ones, blanks between them, then ours by its name."""
+    token = _OUTSIDE_TOKEN.sub("-", kind).strip("-")
+    types = [f"basic_{each}" for each in basic.split()]
+    types += [f"{REF_TYPES}_{token}"] if token else []
+    return node(tag, *children, refType=" ".join(types), **attributes)
 
 
 def day(text: str) -> str:

@@ -40,6 +40,7 @@ class _Symbol(NamedTuple):
 _SYMBOLS = {
     "1": _Symbol({}),
     "%": _Symbol({}, Decimal("0.01")),
+    "‰": _Symbol({}, Decimal("0.001")),
     "g": _Symbol(_ACCELERATION, _STANDARD_G),
     "mg": _Symbol(_ACCELERATION, _STANDARD_G / 1000),
     "m": _Symbol({"metre": 1}),
@@ -62,6 +63,8 @@ _SUPERSCRIPTS = str.maketrans("⁻¹²³⁴⁵⁶⁷⁸⁹", "-123456789")
 def dsi_unit(text: str) -> DsiUnit:
     r"""The D-SI form of a unit such as "g/°C" or "nT"; "°C" by itself is `\degreecelsius`.
 
+    What a share is of, as in "‰ of the field", is no part of its unit.
+
     Singular: a unit that is not of the SI is marked with a vertical bar, as D-SI has it.
     """
     if text.strip() == "°C":
@@ -80,7 +83,7 @@ def dsi_unit(text: str) -> DsiUnit:
 
 def _parts(text: str) -> Iterator[tuple[_Symbol | None, int]]:
     """Symbols of a unit with their exponents, below the fraction bar negative; None: not known."""
-    for place, product in enumerate(text.translate(_SUPERSCRIPTS).split("/")):
+    for place, product in enumerate(text.partition(" of ")[0].translate(_SUPERSCRIPTS).split("/")):
         for part in product.replace("·", " ").strip("() ").split() or ["1"]:
             match = _FACTOR_AND_POWER.fullmatch(part)
             exponent = int(match[2] or 1) if match else 1

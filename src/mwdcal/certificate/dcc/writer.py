@@ -8,13 +8,12 @@ Reference: PTB, DCC 3.3.0 (https://ptb.de/dcc/v3.3.0/), D-SI 2.2.
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from xml.etree import ElementTree as ET
 
-import msgspec
+from msgspec.structs import replace
 
 from mwdcal.calibration.readings import SIMULATED
-from mwdcal.calibration.record import canonical
 from mwdcal.certificate.dcc.administrative import (
     administrative_data,
     conformity,
@@ -22,6 +21,7 @@ from mwdcal.certificate.dcc.administrative import (
     rule_id,
     software,
     tests,
+    when_id,
 )
 from mwdcal.certificate.dcc.elements import (
     Child,
@@ -29,8 +29,8 @@ from mwdcal.certificate.dcc.elements import (
     content,
     leaf,
     node,
-    ref_type,
     title,
+    typed,
     words,
 )
 from mwdcal.certificate.dcc.quantities import real
@@ -44,6 +44,7 @@ from mwdcal.certificate.document import (
     Quantity,
     ResultTable,
     TracedStandard,
+    encode,
 )
 
 DCC_VERSION = "3.3.0"
@@ -52,8 +53,8 @@ DOCUMENT_NAME = "certificate.json"
 NO_VALUE = "Undetermined: the measurements give no value."
 _NAMESPACE = "https://ptb.de/dcc"
 _ANGLES = ("inclination", "toolface", "azimuth")
-_MEASURED_VALUE = ("measuredValue",)
-"""PTB's types of content of a result, unlike those of a limit, say."""
+_MEASURED_VALUE = "measuredValue"
+"""PTB's type of content of a result, unlike that of a limit."""
 
 
 def to_xml(certificate: Certificate) -> bytes:
@@ -84,8 +85,8 @@ def to_xml(certificate: Certificate) -> bytes:
 
 
 def _document(certificate: Certificate) -> ET.Element:
-    """The certificate's JSON, in the one form in which it is signed."""
-    data = base64.b64encode(canonical(msgspec.to_builtins(certificate))).decode()
+    """The certificate's JSON file."""
+    data = base64.b64encode(encode(certificate)).decode()
     return node(
         "document",
         title("The certificate as JSON of mwdcal"),
@@ -101,7 +102,7 @@ def _measurement_results(certificate: Certificate) -> ET.Element:
     standards = [_equipment(standard) for standard in certificate.traceability]
     conditions = [_condition(quantity) for quantity in certificate.conditions]
     files = [
-        _metadata("file", title(file.name), leaf("reference", f"SHA-256 {file.sha256}"))
+        typed("metaData", "file", title(file.name), leaf("reference", f"SHA-256 {file.sha256}"))
         for file in certificate.files
     ]
     return node(
@@ -116,24 +117,20 @@ def _measurement_results(certificate: Certificate) -> ET.Element:
     )
 
 
-def _metadata(name: str, *children: Child, basic: str = "", **attributes: str) -> ET.Element:
-    types = ref_type(name, *([basic] if basic else []))
-    return node("metaData", *children, refType=types or None, **attributes)
-
-
 def _method(method: Method) -> ET.Element:
     said = [method.text, f"Model: {method.model}"]
     said += [f"Deviation from the method: {each}" for each in method.deviations]
     stations = Quantity(id="stations", name="Stations", unit="1", value=method.stations)
-    return node(
+    return typed(
         "usedMethod",
+        "",
         title(method.name),
         words("description", "\n".join(said)),
         *(leaf("reference", each) for each in method.references),
         node(
             "usedMethodQuantities", node("usedMethodQuantity", title(stations.name), real(stations))
         ),
-        refType=ref_type("", "calibrationMethod"),
+        basic="calibrationMethod",
     )
 
 
@@ -143,12 +140,13 @@ def _uncertainty_method(budget: Budget) -> ET.Element:
         "An expanded uncertainty is the standard uncertainty times the coverage factor that is stated with it. "
         f"In the uncertainty budget the factor is {factor:g}, the coverage probability {100 * probability:g} %."
     )
-    return node(
+    return typed(
         "usedMethod",
+        "",
         title("Uncertainty of measurement"),
         words("description", text),
         leaf("norm", "JCGM 100:2008"),
-        refType=ref_type("", "methodMeasurementUncertainty"),
+        basic="methodMeasurementUncertainty",
     )
 
 
@@ -170,53 +168,57 @@ def _equipment(standard: TracedStandard) -> ET.Element:
         for name, text in said.items()
         if (fact := words("noQuantity", text)) is not None
     )
-    return node(
+    return typed(
         "measuringEquipment",
+        "",
         title(standard.name),
         container("identifications", numbers),
         container("measuringEquipmentQuantities", facts),
-        refType=ref_type("", "measurementStandard"),
+        basic="measurementStandard",
     )
 
 
 def _condition(quantity: Quantity) -> ET.Element:
-    basic = ("temperature",) if quantity.unit.strip() == "°C" else ()
-    return node(
+    kinds = {"temperature": quantity.unit == "°C", "humidityRelative": "humidity" in quantity.name}
+    stated = _within("condition", quantity)
+    return typed(
         "influenceCondition",
+        quantity.id,
         title(quantity.name),
-        node("data", _undetermined(quantity) if quantity.value is None else _quantity(quantity)),
-        refType=ref_type(quantity.id, *basic) or None,
+        node("data", _undetermined(stated) if stated.value is None else _quantity(stated)),
+        basic=" ".join(kind for kind, applies in kinds.items() if applies),
     )
 
 
-def _quantity(
-    quantity: Quantity, *metadata: Child, basic: tuple[str, ...] = _MEASURED_VALUE
-) -> Child:
+def _within(place: str, quantity: Quantity) -> Quantity:
+    """The quantity with the id that it has in the whole certificate: clients give quantities without their place."""
+    return replace(quantity, id=f"{place}/{quantity.id}")
+
+
+def _quantity(quantity: Quantity, *metadata: Child, basic: str = _MEASURED_VALUE) -> Child:
     """A quantity with its value, none where it is undetermined; metadata are what is decided on it."""
     if quantity.value is None:
         return None
-    return node(
+    return typed(
         "quantity",
+        quantity.id,
         title(quantity.name or quantity.id),
         words("description", quantity.at),
         real(quantity),
         container("measurementMetaData", metadata),
-        refType=ref_type(quantity.id, *basic) or None,
+        basic=basic,
     )
 
 
 def _undetermined(quantity: Quantity) -> ET.Element:
     """What stands in place of the number of a quantity that is undetermined."""
-    return node(
-        "text",
-        title(quantity.name or quantity.id),
-        content(f"{NO_VALUE} {quantity.at}"),
-        refType=ref_type(f"undetermined-{quantity.id}"),
-    )
+    name = title(quantity.name or quantity.id)
+    text = content(f"{NO_VALUE} {quantity.at}")
+    return typed("text", f"undetermined-{quantity.id}", name, text)
 
 
 def _data(
-    quantities: Iterable[Quantity], *head: Child, basic: tuple[str, ...] = _MEASURED_VALUE
+    quantities: Iterable[Quantity], *head: Child, basic: str = _MEASURED_VALUE
 ) -> list[Child]:
     """A list of the quantities that have values, behind its head, and a text for each of the others."""
     quantities = list(quantities)
@@ -227,12 +229,12 @@ def _data(
 
 def _result(name: str, note: str, kind: str, data: list[Child]) -> ET.Element:
     stated: list[Child] = [child for child in data if child is not None]
-    return node(
+    return typed(
         "result",
+        kind,
         title(name),
         words("description", note),
         node("data", *(stated or [words("text", "No results.")])),
-        refType=ref_type(kind) or None,
     )
 
 
@@ -242,32 +244,49 @@ def _name(text: str, simulated: bool) -> Child:
 
 def _calibration(certificate: Certificate) -> ET.Element:
     tables = [_table(table) for table in certificate.results]
-    return node(
+    return typed(
         "measurementResult",
+        "calibration",
         _name(certificate.title, certificate.simulated),
         node("results", *tables, _budget(certificate.budget)),
-        refType=ref_type("calibration"),
     )
 
 
 def _table(table: ResultTable) -> ET.Element:
-    return _result(table.title, table.note, table.id, _data(table.quantities))
+    quantities = (_within(table.id, each) for each in table.quantities)
+    return _result(table.title, table.note, table.id, _data(quantities))
 
 
 def _budget(budget: Budget) -> ET.Element:
-    """A list for each source, of what it adds to the uncertainty of each angle; then their sum, and expanded."""
-    lines = [*budget.lines, budget.combined, budget.expanded]
-    data = [child for line in lines for child in _budget_line(line)]
-    return _result("Uncertainty budget", budget.at, "uncertainty-budget", data)
+    """A list for each source, of what it adds to the uncertainty of each angle; then their sum, and expanded.
+
+    An angle of which no source says anything, as without a magnetometer, is undetermined in the sum alone.
+    """
+    known = [
+        angle for angle in _ANGLES if any(_sd(line, angle) is not None for line in budget.lines)
+    ]
+    data = [child for line in budget.lines for child in _budget_line(line, known)]
+    sums = [
+        child
+        for line in (budget.combined, budget.expanded)
+        for child in _budget_line(line, _ANGLES)
+    ]
+    return _result("Uncertainty budget", budget.at, "uncertainty-budget", [*data, *sums])
 
 
-def _budget_line(line: BudgetLine) -> Iterator[Child]:
-    angles = (
-        Quantity(id=f"{line.id}-{name}", name=name, unit="°", value=getattr(line, f"{name}_deg"))
-        for name in _ANGLES
+def _sd(line: BudgetLine, angle: str) -> float | None:
+    """What a line of the budget adds to an angle, degrees."""
+    value: float | None = getattr(line, f"{angle}_deg")
+    return value
+
+
+def _budget_line(line: BudgetLine, angles: Iterable[str]) -> list[Child]:
+    quantities = (
+        Quantity(id=f"budget/{line.id}/{angle}", name=angle, unit="°", value=_sd(line, angle))
+        for angle in angles
     )
     basis = words("description", f"Type {line.kind}. {line.basis}")
-    yield from _data(angles, title(line.source), basis, basic=())
+    return _data(quantities, title(line.source), basis, basic="")
 
 
 def _roll_test(test: ConformityTest, simulated: bool) -> ET.Element:
@@ -279,15 +298,17 @@ def _roll_test(test: ConformityTest, simulated: bool) -> ET.Element:
         leaf("status", "beforeAdjustment" if before else "afterAdjustment"),
         node("data", words("text", test.when)),
     )
-    values = [_quantity(each.quantity, _decision(each, test)) for each in test.decisions]
-    without = [each for each in test.decisions if each.quantity.value is None]
+    decisions = [replace(d, quantity=_within(when_id(test), d.quantity)) for d in test.decisions]
+    values = [_quantity(each.quantity, _decision(each, test)) for each in decisions]
+    without = [each for each in decisions if each.quantity.value is None]
     texts = [_undetermined(each.quantity) for each in without]
     facts = (
         f"Run {test.run}, {test.stations} stations. Limits: {test.limits} ({test.source}). "
         f"Calibration SHA-256 {test.calibration_sha256}."
     )
-    return node(
+    return typed(
         "measurementResult",
+        test.when,
         _name(f"Roll test, {test.when}", simulated),
         words("description", facts),
         node("influenceConditions", state),
@@ -297,16 +318,16 @@ def _roll_test(test: ConformityTest, simulated: bool) -> ET.Element:
         ),
         node(
             "measurementMetaData",
-            _metadata(
+            typed(
+                "metaData",
                 "verdict",
                 title(f"Conformity, {test.when}"),
                 conformity(test.passed),
                 basic="conformity",
             ),
             *(_decision(each, test) for each in without),
-            *(_metadata(f.id, words("declaration", f.text)) for f in test.findings),
+            *(typed("metaData", f.id, words("declaration", f.text)) for f in test.findings),
         ),
-        refType=ref_type(test.when),
     )
 
 
@@ -325,10 +346,14 @@ def _decision(decision: LimitDecision, test: ConformityTest) -> ET.Element:
         ("risk", "Probability of a wrong decision", "1", decision.risk),
     )
     values = (
-        _quantity(Quantity(id=kind, name=text, unit=one, value=value), basic=())
+        _quantity(
+            Quantity(id=f"{decision.quantity.id}/{kind}", name=text, unit=one, value=value),
+            basic="",
+        )
         for kind, text, one, value in numbers
     )
-    return _metadata(
+    return typed(
+        "metaData",
         decision.quantity.id,
         title(f"Decision on {name}"),
         words("declaration", decision.note),

@@ -10,15 +10,19 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
+from urllib.parse import quote
 
 import sqlalchemy as sa
 
 from mwdcal.errors import InputError
+from mwdcal.registry.database.places import on_network
 
 ROWS_AT_ONCE = 100
 """Rows of a table that are in memory at once."""
+OBJECTS_AT_ONCE = 8
+"""Files of a registry that are in memory at once."""
 LONGEST_WAIT = 60.0
 """Seconds for which a writer waits for its turn."""
 _LOCK = 0x6D776463616C
@@ -34,6 +38,9 @@ _WHAT_TO_DO = {
     "not a database": "Name a registry that mwdcal made.",
     "disk i/o error": "Check the disk; SQLite needs a local one, or use PostgreSQL.",
     "password": "Correct the user and the password in the URL.",
+    "permission denied": "Have the owner of the database give you the right.",
+    "does not exist": "Create it on the server, or correct the URL.",
+    "connection failed": "Check that the server runs, and the URL.",
 }
 
 
@@ -41,7 +48,8 @@ _WHAT_TO_DO = {
 class Database:
     """A database by the name that messages have for it, without password; `file` is that of SQLite.
 
-    `shared`: several programs will use it at once, for which SQLite keeps a second file beside it.
+    `shared`: several programs may use it at once, for which SQLite keeps a log beside it; otherwise
+    it is a file that only this program writes, as a backup that is not finished.
     """
 
     name: str
@@ -62,8 +70,8 @@ class Database:
     def writing(self) -> Iterator[sa.Connection]:
         """A transaction of the only writer: on the disk when the block ends, or without effect."""
         with explained(self), self.engine.connect() as plain:
-            if self.file and self.shared:
-                _log_ahead(plain)
+            if self.file:
+                _set_journal(plain, self.shared)
             connection = plain.execution_options(mwdcal_writing=True)
             with connection.begin():
                 if self.file is None:
@@ -71,10 +79,15 @@ class Database:
                 yield connection
 
 
-def _log_ahead(connection: sa.Connection) -> None:
-    """Have SQLite write ahead into a log, so that readers and the writer do not wait for each other."""
-    with contextlib.suppress(sqlite3.Error):  # not on every disk; then they wait
-        connection.connection.cursor().execute("PRAGMA journal_mode=WAL")
+def _set_journal(connection: sa.Connection, shared: bool) -> None:
+    """Have SQLite write ahead into a log, so that readers and the writer do not wait for each other.
+
+    A file that nobody else uses, and that is thrown away where its writer fails, needs no journal.
+    """
+    modes = ("journal_mode=WAL",) if shared else ("journal_mode=OFF", "synchronous=OFF")
+    with contextlib.suppress(sqlite3.Error):  # no log on every disk; then they wait
+        for mode in modes:
+            connection.connection.cursor().execute(f"PRAGMA {mode}")
 
 
 def _wait_for_the_disk(connection: Any, _record: object) -> None:
@@ -132,6 +145,11 @@ def _sqlite(path: Path, new: bool, shared: bool) -> Database:
         raise InputError(f"{path}: its folder does not exist. Create it, or name another.")
     if not new and not path.is_file():
         raise InputError(f"{path}: no such file. Check the path, or create the registry.")
+    if shared and on_network(path):
+        raise InputError(
+            f"{path}: it is on a network drive, where SQLite cannot keep the writers of several machines "
+            "apart. Put the registry on a local disk, or into PostgreSQL."
+        )
     engine = sa.create_engine(
         "sqlite://", creator=partial(_opened, path, new), poolclass=sa.QueuePool
     )
@@ -139,10 +157,16 @@ def _sqlite(path: Path, new: bool, shared: bool) -> Database:
     return Database(str(path), engine, path, shared)
 
 
+def file_uri(path: PurePath) -> str:
+    """The URI by which SQLite opens a file; of a Windows share, the server's name is part of the path."""
+    text = path.as_posix()
+    return f"file://{'' if text.startswith('/') else '/'}{quote(os.fsencode(text), safe='/:')}"
+
+
 def _opened(path: Path, new: bool) -> sqlite3.Connection:
     mode = "rwc" if new else "rw"
     connection = sqlite3.connect(
-        f"{path.absolute().as_uri()}?mode={mode}",
+        f"{file_uri(path.absolute())}?mode={mode}",
         uri=True,
         timeout=LONGEST_WAIT,
         isolation_level=None,
@@ -171,7 +195,7 @@ def explained(database: Database) -> Iterator[None]:
 
 
 def sentence(error: Exception, database: Database) -> str:
-    """What a database refused, and what to do about it."""
+    """What a database refused, without passwords, and what to do about it."""
     lines = str(getattr(error, "orig", None) or error).strip().splitlines()
     text = lines[0].strip() if lines else type(error).__name__
     password = database.engine.url.password

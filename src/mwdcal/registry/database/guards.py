@@ -10,11 +10,14 @@ FUNCTION = "mwdcal_refuse"
 """The PostgreSQL function that the triggers call."""
 FUNCTION_BODY = f"BEGIN RAISE EXCEPTION '{REFUSAL}'; END"
 _EVENTS = {"sqlite": ("UPDATE", "DELETE"), "postgresql": ("UPDATE", "DELETE", "TRUNCATE")}
+_TYPES = {"DELETE": 2 + 8, "UPDATE": 2 + 16, "TRUNCATE": 2 + 32}
+"""PostgreSQL's numbers of triggers before such a statement."""
 
 
-def trigger_names(dialect: str, tables: Iterable[str]) -> list[str]:
-    """The names of all triggers."""
-    return [f"{table}_no_{event.lower()}" for table in tables for event in _EVENTS[dialect]]
+def triggers_of_postgresql(tables: Iterable[str]) -> dict[str, tuple[str, int]]:
+    """The triggers that PostgreSQL must have: the table and the type of each, by name."""
+    events = _EVENTS["postgresql"]
+    return {f"{t}_no_{event.lower()}": (t, _TYPES[event]) for t in tables for event in events}
 
 
 def guard_statements(dialect: str, tables: Iterable[str]) -> Iterator[str]:

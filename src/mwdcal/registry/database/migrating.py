@@ -17,7 +17,7 @@ from alembic.script import ScriptDirectory
 from mwdcal.errors import InputError
 from mwdcal.registry.database.chain import append_one
 from mwdcal.registry.database.connections import Database
-from mwdcal.registry.database.guards import FUNCTION_BODY, trigger_names
+from mwdcal.registry.database.guards import FUNCTION_BODY, triggers_of_postgresql
 from mwdcal.registry.database.models import GUARDED, metadata
 from mwdcal.registry.database.schema import (
     SCHEMA_VERSION_OF_REGISTRY,
@@ -82,6 +82,8 @@ def change(database: Database, target: str, actor: str) -> tuple[str, str]:
         raise InputError(
             f"`target` must be one of the schema's versions {', '.join(steps)}; got {target!r}. Choose one."
         )
+    with database.reading() as connection:
+        known_version(connection, database.name)  # nothing is written to what is not a registry
     with database.writing() as connection:
         current = known_version(connection, database.name)
         if current != target:
@@ -141,14 +143,23 @@ def _postgresql_differences(connection: sa.Connection) -> list[str]:
         for d in compare_metadata(context, metadata)
     ]
     query = sa.text(
-        "SELECT tgname, tgenabled, prosrc FROM pg_trigger JOIN pg_proc ON pg_proc.oid = tgfoid "
-        "WHERE NOT tgisinternal AND tgrelid IN (SELECT to_regclass(name) FROM unnest(CAST(:tables AS text[])) AS name)"
+        "SELECT tgname, tgenabled, relname, tgtype, prosrc FROM pg_trigger "
+        "JOIN pg_proc ON pg_proc.oid = tgfoid JOIN pg_class ON pg_class.oid = tgrelid "
+        "WHERE NOT tgisinternal AND tgrelid IN "
+        "(SELECT to_regclass(name) FROM unnest(CAST(:tables AS text[])) AS name)"
     )
-    present = {row.tgname: row for row in connection.execute(query, {"tables": sorted(ours)})}
-    for name in {*present, *trigger_names("postgresql", [t.name for t in GUARDED])}:
-        row = present.get(name)
-        if row is None or row.tgenabled != "O" or row.prosrc.strip() != FUNCTION_BODY:
-            wrong.append(f"trigger '{name}' of the schema is missing or not as mwdcal makes it")
+    present = {
+        row.tgname: (row.relname, row.tgtype)
+        if row.tgenabled == "O" and row.prosrc.strip() == FUNCTION_BODY
+        else None
+        for row in connection.execute(query, {"tables": sorted(ours)})
+    }
+    expected = triggers_of_postgresql(table.name for table in GUARDED)
+    wrong += [
+        f"trigger '{name}' of the schema is missing or not as mwdcal makes it"
+        for name in {*present, *expected}
+        if name not in expected or present.get(name) != expected[name]
+    ]
     return sorted(wrong)
 
 

@@ -51,8 +51,9 @@ records = sa.Table(
     sa.Column("facts_version", sa.Integer, nullable=False),
     sa.UniqueConstraint("sha256", "kind", name="records_sha256"),
     sa.Index("records_serial", "serial", "kind", "time"),
-    sa.Index("records_time", "kind", "time"),
+    sa.Index("records_time", "kind", "time", "number"),
     sa.Index("records_calibration", "calibration"),
+    sa.Index("records_run", "run"),
 )
 
 withdrawals = sa.Table(

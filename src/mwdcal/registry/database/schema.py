@@ -12,12 +12,12 @@ SCHEMA_VERSION_OF_REGISTRY = "0002"
 """The newest migration: the schema that this program works with."""
 VERSION_TABLE = "alembic_version"
 """Where Alembic keeps the version."""
-_VERSION = sa.text(f"SELECT version_num FROM {VERSION_TABLE}")
+_STATED_VERSION = sa.text(f"SELECT version_num FROM {VERSION_TABLE}")
 
 
 def stated_version(connection: sa.Connection) -> str:
     """The version that a registry states; empty where it does not state one."""
-    rows = connection.scalars(_VERSION).all()
+    rows = connection.scalars(_STATED_VERSION).all()
     return str(rows[0]) if len(rows) == 1 else ""
 
 

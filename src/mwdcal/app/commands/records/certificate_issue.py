@@ -65,11 +65,12 @@ ISO_DAY = click.DateTime(["%Y-%m-%d"])
     metavar="YYYY-MM-DD",
     help="Day of issue; today (UTC) if not given.",
 )
+@options.TRUSTED_KEYS
 @options.JSON
 def command(
     calibration: Path, output: tuple[Path, ...], verification: Path | None, as_found: Path | None,
     laboratory: Path | None, number: str, customer: str, condition: str,
-    received: datetime | None, day: datetime | None, as_json: bool,
+    received: datetime | None, day: datetime | None, key: tuple[Path, ...], as_json: bool,
 ) -> None:  # fmt: skip
     """Issue the certificate of a CALIBRATION: ISO/IEC 17025 contents, uncertainty budget, decisions with their risk.
 
@@ -81,6 +82,7 @@ def command(
     """
     from msgspec import to_builtins
 
+    from mwdcal.app.choices import load_calibration
     from mwdcal.app.screens.records.certificate_issue import screen
     from mwdcal.certificate.contents import Order, certificate
     from mwdcal.certificate.laboratory import load_laboratory
@@ -90,12 +92,12 @@ def command(
     _check_forms(output)
     paths = {"calibration": calibration, "verification": verification, "as-found": as_found}
     paths["laboratory"] = laboratory
-    options.check_outputs(output, paths.values())
-    fitted, digest = documents.load(calibration)
+    options.check_outputs(output, [*paths.values(), *key])
+    loaded = load_calibration(calibration, key)
     as_left, left_digest = _read(documents.load_verification, verification)
     before, before_digest = _read(documents.load_verification, as_found)
     stated, laboratory_digest = _read(load_laboratory, laboratory)
-    digests = (digest, left_digest, before_digest, laboratory_digest)
+    digests = (loaded.digest, left_digest, before_digest, laboratory_digest)
     order = Order(
         issued=day.date() if day else datetime.now(UTC).date(),
         number=number,
@@ -104,11 +106,13 @@ def command(
         received=received.date() if received else None,
         verification=as_left,
         as_found=before,
-        calibration_sha256=digest,
+        calibration_sha256=loaded.digest,
         files=tuple(_sources(paths, digests, output)),
+        findings=tuple(loaded.findings),
     )
-    result = certificate(fitted, order, stated)
-    atomic.write_all([(path, _form(path, result, fitted, order)) for path in output])
+    result = certificate(loaded.calibration, order, stated)
+    forms = [(path, _form(path, result, loaded.calibration, order)) for path in output]
+    atomic.write_all(forms)
     print_result(to_builtins(result) if as_json else screen(result, output), result.findings)
 
 
@@ -155,11 +159,9 @@ def _form(
     """The certificate in the form that the suffix of its file names."""
     suffix = path.suffix.lower()
     if suffix == ".json":
-        import msgspec
+        from mwdcal.certificate.document import encode
 
-        from mwdcal.files.documents import laid_out
-
-        return laid_out(msgspec.json.encode(certificate))
+        return encode(certificate)
     if suffix == ".xml":
         from mwdcal.certificate.dcc import to_xml
 

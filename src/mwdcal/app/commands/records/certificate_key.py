@@ -34,19 +34,19 @@ def subcommand(function: Callable[..., Any]) -> Any:
     return command.command(name, cls=Command)(options.JSON(function))
 
 
-def _print(name: str, file: Path, keys: list[TrustedKey], as_json: bool) -> None:
-    """The keys in a file."""
+def _print(name: str, file: Path, keys: list[TrustedKey], as_json: bool, **written: Path) -> None:
+    """The keys in a file, and what was written."""
     from mwdcal.app.envelope import enveloped
     from mwdcal.app.screens.records import signature as screens
 
     result = screens.KeysDocument(file=str(file), keys=keys)
     shown = enveloped(f"certificate key {name}", result)
-    print_result(shown if as_json else screens.keys(result))
+    print_result(shown if as_json else screens.keys(result, **written))
 
 
 @subcommand
-@options.output(metavar="K", help="Private key to write; the public one becomes K.pub.")
-@click.option("--owner", default="", metavar="TEXT", help="Whose key it is: stated in K.pub.")
+@options.output(metavar="K.key", help="Private key to write; the public one becomes K.key.pub.")
+@click.option("--owner", default="", metavar="TEXT", help="Whose key it is, stated in K.key.pub.")
 @click.option(
     "--passphrase",
     is_flag=True,
@@ -54,7 +54,7 @@ def _print(name: str, file: Path, keys: list[TrustedKey], as_json: bool) -> None
     "MWDCAL_KEY_PASSPHRASE, where it is set.",
 )
 def create(output: Path, owner: str, passphrase: bool, as_json: bool) -> None:
-    """Make a key: K signs, and only you may read it; K.pub checks, and everybody should have it.
+    """Make a key: K.key signs, and only you may read it; K.key.pub checks, and everybody may have it.
 
     No file is overwritten.
 
@@ -68,7 +68,7 @@ def create(output: Path, owner: str, passphrase: bool, as_json: bool) -> None:
 
     encrypted = passphrase or keys.PASSPHRASE in os.environ
     public, file = keys.create(output, owner, known(new=True) if encrypted else "")
-    _print("create", file, [public], as_json)
+    _print("create", file, [public], as_json, private=output, public=file)
 
 
 @subcommand

@@ -50,5 +50,6 @@ def command(document: Path, key: Path, output: Path | None, replace: bool, as_js
     file = documents.whole_file(document)
     data = signed(file, read_private(key, known), replace)
     atomic.write(target, data)
-    result, shown = screens.signed_document(data, target, document.parent, file.digest)
-    print_result(shown if as_json else screens.signed(result), result.findings)
+    result, fields = screens.signed_document(data, target, document.parent)
+    shown = screens.for_machines("sign", result, fields, file.digest)
+    print_result(shown if as_json else screens.signed(result, fields), result.findings)

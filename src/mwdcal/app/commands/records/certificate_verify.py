@@ -41,6 +41,6 @@ def command(document: Path, files: tuple[Path, ...], key: tuple[Path, ...], as_j
     file = documents.whole_file(document)
     result, fields = screens.checked_document(file, document, keys, files)
     result = replace(result, findings=findings_as_typed(result.findings))
-    shown = screens.enveloped_check(result, fields, file.digest)
-    print_result(shown if as_json else screens.checked(result), result.findings)
+    shown = screens.for_machines("verify", result, fields, file.digest)
+    print_result(shown if as_json else screens.checked(result, fields), result.findings)
     sys.exit(0 if result.passed else 1)

@@ -7,18 +7,18 @@ import click
 from mwdcal.app.commands import Commands, Group, options
 
 SUBCOMMANDS = {
-    "init": "records.registry_schema:init",
+    "init": "records.registry_whole:init",
     "add": "records.registry_add",
     "list": "records.registry_queries:listing",
     "history": "records.registry_queries:history",
     "get": "records.registry_queries:get",
     "drift": "records.registry_drift",
     "withdraw": "records.registry_add:withdraw",
-    "export": "records.registry_copies:export",
-    "check": "records.registry_schema:check",
-    "backup": "records.registry_copies:backup",
-    "restore": "records.registry_copies:restore",
-    "upgrade": "records.registry_schema:upgrade",
+    "export": "records.registry_whole:export",
+    "check": "records.registry_whole:check",
+    "backup": "records.registry_whole:backup",
+    "restore": "records.registry_whole:restore",
+    "upgrade": "records.registry_whole:upgrade",
 }
 """Modules of the subcommands, in the order of the help."""
 

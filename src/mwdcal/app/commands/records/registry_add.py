@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from mwdcal.app.commands import options
-from mwdcal.app.messages import print_result
+from mwdcal.app.messages import lines, print_result, say
 from mwdcal.app.text import one_line
 from mwdcal.errors import InputError
 
@@ -63,12 +62,13 @@ def command(
     except KeyboardInterrupt as stop:
         stop.add_note("What was added stays: the same command adds the rest.")
         raise
-    about = {"simulated": adding.simulated}
-    document = screen.document("registry add", result, about)
-    print_result(
-        document if as_json else screen.added_text(result, adding.simulated), result.findings
-    )
-    sys.exit(0 if result.new or result.known else InputError.exit_code)
+    if not (result.new or result.known):
+        for line in lines(result.findings):
+            say(line)
+        raise InputError(f"{result.registry}: not one of the files could be added. Correct them.")
+    document = screen.document("registry add", result, {"simulated": adding.simulated})
+    shown = document if as_json else screen.added_text(result, adding.simulated)
+    print_result(shown, result.findings)
 
 
 def _add_all(adding: Adding, portions: Sequence[Sequence[Source]], workers: int) -> None:

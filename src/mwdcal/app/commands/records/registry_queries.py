@@ -99,5 +99,5 @@ def get(record: str, database: str, output: Path, as_json: bool) -> None:
         row, data = lookup.document(registry, record)
         atomic.write(output, data)
     result = screen.RegistryDocument(**{k: row[k] for k in screen.KEYS}, output=str(output))
-    text = f"wrote {output}   {result.kind} {result.name}   SHA-256 {result.sha256[:16]}"
+    text = f"wrote {output}   {result.kind} {result.name}   SHA-256 {result.sha256}"
     print_result(screen.document("registry get", result, row) if as_json else one_line(text))

@@ -61,7 +61,7 @@ class TextBlock(msgspec.Struct, frozen=True, tag="text", tag_field="kind"):
     bullets: bool = False
 
 
-class Outcome(msgspec.Struct, frozen=True):
+class TestOutcome(msgspec.Struct, frozen=True):
     """The decision of one test in a box: level, word, headline and second line."""
 
     level: Mark
@@ -73,7 +73,7 @@ class Outcome(msgspec.Struct, frozen=True):
 class OutcomesBlock(msgspec.Struct, frozen=True, tag="outcomes", tag_field="kind"):
     """Decisions side by side."""
 
-    outcomes: list[Outcome]
+    outcomes: list[TestOutcome]
 
 
 class Signatory(msgspec.Struct, frozen=True):

@@ -31,12 +31,13 @@ def render_page(certificate: Certificate, pictures: Sequence[Picture] = ()) -> s
 
 
 def breakable(text: str) -> Markup:
-    """Text as HTML that may break inside words too long for a narrow column."""
+    """Text as HTML that may break inside words too long for a narrow column, but not in dates and short names."""
     from markupsafe import Markup, escape
 
-    def parts(word: str) -> list[str]:
-        step = BREAKS if len(word) > LONGEST_WORD else len(word) or 1
-        return [word[start : start + step] for start in range(0, len(word), step)]
+    def markup(word: str) -> Markup:
+        if len(word) > LONGEST_WORD:
+            parts = (word[start : start + BREAKS] for start in range(0, len(word), BREAKS))
+            return Markup("<wbr>").join(map(escape, parts))
+        return Markup("<span class=whole>{}</span>").format(word) if "-" in word else escape(word)
 
-    words = (Markup("<wbr>").join(map(escape, parts(word))) for word in text.split(" "))
-    return Markup(" ").join(words)
+    return Markup(" ").join(map(markup, text.split(" ")))

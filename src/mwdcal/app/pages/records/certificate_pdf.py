@@ -5,6 +5,7 @@ Only the fonts that typst brings are used: the same input, and the same version 
 
 from __future__ import annotations
 
+import unicodedata
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from functools import partial
@@ -17,13 +18,19 @@ from mwdcal.app.pages.pictures import picture, require
 from mwdcal.app.pages.records.certificate_blocks import mapped_texts
 from mwdcal.app.pages.records.certificate_pictures import Picture
 from mwdcal.app.pages.records.certificate_text import certificate_text
-from mwdcal.calibration.record import canonical
 from mwdcal.certificate.document import Certificate
+from mwdcal.files.documents import laid_out
 
 STANDARD: Literal["a-3a"] = "a-3a"
 """Of PDF: for archives, tagged for readers of screens, with files attached."""
-SHOW = b'#set document(title: "text")\n#set text(font: "Libertinus Serif")\n#sys.inputs.text'
+SHOW = b"""#set document(title: "text")
+#set text(font: json(bytes(sys.inputs.fonts)), fallback: false)
+#sys.inputs.text"""
 """A document of nothing but a text."""
+FONTS = ("Libertinus Serif", "DejaVu Sans Mono", "New Computer Modern", "New Computer Modern Math")
+"""Those that typst brings, in the order in which a character is looked for."""
+SCRIPTS = ((0x80, 0x530), (0x1E00, 0x2C00))
+"""Latin, Greek and Cyrillic letters, and signs: what these fonts have, and where they are asked."""
 
 
 def render_pdf(certificate: Certificate, pictures: Sequence[Picture] = ()) -> bytes:
@@ -37,7 +44,9 @@ def render_pdf(certificate: Certificate, pictures: Sequence[Picture] = ()) -> by
     """
     require("a certificate as PDF", "typst", extra="certificate")
     text = msgspec.to_builtins(certificate_text(certificate, pictures))
-    lacking = _lacking("".join(sorted(_characters(text))))
+    characters = _characters(text)
+    odd = frozenset(filter(_odd, characters))
+    lacking = odd | _lacking("".join(sorted(characters - odd)))
     shown = mapped_texts(text, partial(_by_code, lacking))
     template = resources.files("mwdcal.app.pages").joinpath("templates", "certificate.typ")
     return _compiled(
@@ -45,7 +54,7 @@ def render_pdf(certificate: Certificate, pictures: Sequence[Picture] = ()) -> by
         _timestamp(certificate),
         text=_json(shown),
         pictures=_json({each.id: picture(each.figure, ".svg").decode() for each in pictures}),
-        certificate=canonical(msgspec.to_builtins(certificate)).decode(),
+        certificate=laid_out(msgspec.json.encode(certificate)).decode(),
     )
 
 
@@ -60,7 +69,7 @@ def _compiled(source: bytes, timestamp: int, **inputs: str) -> bytes:
         source,
         format="pdf",
         ignore_system_fonts=True,
-        sys_inputs=inputs,
+        sys_inputs=inputs | {"fonts": _json(FONTS)},
         pdf_standards=[STANDARD],
         timestamp=timestamp,
     )
@@ -88,6 +97,12 @@ def _characters(data: Any) -> set[str]:
 
     mapped_texts(data, gather)
     return characters
+
+
+def _odd(character: str) -> bool:
+    """Whether it is of another script, or not printed; typst fails on some of these next to others."""
+    of_ours = any(low <= ord(character) < high for low, high in SCRIPTS)
+    return not of_ours or unicodedata.category(character).startswith("C")
 
 
 def _lacking(characters: str) -> frozenset[str]:

@@ -16,13 +16,13 @@ from mwdcal.app.pages.records.certificate_blocks import (
     FactList,
     FactsBlock,
     Mark,
-    Outcome,
     OutcomesBlock,
     PictureBlock,
     Section,
     Signatory,
     SignaturesBlock,
     TableBlock,
+    TestOutcome,
     TextBlock,
     mapped_texts,
 )
@@ -30,11 +30,12 @@ from mwdcal.app.screens.numbers import (
     UNDETERMINED,
     capital,
     exponent,
+    fixed,
     measured,
     number,
     unit,
 )
-from mwdcal.app.text import chance, harmless, plural
+from mwdcal.app.text import NOT_STATED, chance, harmless, plural
 from mwdcal.certificate.document import (
     Budget,
     BudgetLine,
@@ -51,12 +52,14 @@ from mwdcal.certificate.document import (
 if TYPE_CHECKING:
     from mwdcal.app.pages.records.certificate_pictures import Picture
 
-NOT_STATED = "not stated"
-"""In place of what a certificate must have room for, and does not say."""
 SIMULATED_DATA = "SIMULATED DATA"
+EXACT_DIGITS = 6
+"""Significant digits of a number without uncertainty, at most."""
+RESULT_DIGITS = 3
+"""Significant digits of a result without uncertainty, such as the mean of errors."""
 NEARLY_CERTAIN = 1e-6
 """A probability nearer to one than this is given as a bound."""
-_BLANK = Cell([NOT_STATED], "free")
+_NOT_STATED_CELL = Cell([NOT_STATED], "free")
 
 
 def certificate_text(certificate: Certificate, pictures: Sequence[Picture] = ()) -> CertificateText:
@@ -79,32 +82,41 @@ def certificate_text(certificate: Certificate, pictures: Sequence[Picture] = ())
 # ------------------------------------------------------------------ numbers
 
 
-def quantity_numbers(quantity: Quantity) -> tuple[str, str, str]:
+def quantity_numbers(quantity: Quantity, digits: int = EXACT_DIGITS) -> tuple[str, str, str]:
     """Value, standard and expanded uncertainty with their unit.
 
-    Uncertainties have two significant digits, the value the last decimal place of the expanded one.
+    Uncertainties have two significant digits, the value the last decimal place of the expanded one; a value
+    without uncertainty has `digits` at most.
     """
     symbol = unit("" if quantity.unit == "1" else quantity.unit)
-    u, expanded = quantity.standard_uncertainty, quantity.expanded_uncertainty
-    widest = u if expanded is None else expanded
-    if quantity.value is None:
-        first, last = UNDETERMINED, NOT_STATED
-    else:
-        first, last = measured(quantity.value, widest)
-        first = (plain(quantity.value) if widest is None else first) + symbol
-    stated = NOT_STATED if u is None else number(u, 2) + symbol
-    return first, stated, NOT_STATED if expanded is None else _beside(last, expanded) + symbol
+    value, u = quantity.value, quantity.standard_uncertainty
+    widest = u if quantity.expanded_uncertainty is None else quantity.expanded_uncertainty
+    blank = UNDETERMINED if value is None else NOT_STATED
+    first, last = blank, None
+    if value is not None:
+        first, last = (
+            measured(value, widest) if widest is not None else (plain(value, digits), None)
+        )
+        first += symbol
+    stated = blank if u is None else _two_digits(u, last or "") + symbol
+    if quantity.expanded_uncertainty is None:
+        return first, stated, blank
+    return first, stated, (last or number(widest, 2)) + symbol
 
 
-def _beside(text: str, value: float) -> str:
-    """An uncertainty as `measured` wrote it beside its value, or by itself where there is none."""
-    return number(value, 2) if text in (UNDETERMINED, NOT_STATED) else text
+def _two_digits(value: float, beside: str) -> str:
+    """An uncertainty to two digits, with a power of ten only where the one beside it has one."""
+    return (
+        fixed(value, 1 - exponent(value))
+        if value and "." in beside and "×" not in beside
+        else number(value, 2)
+    )
 
 
-def plain(value: float) -> str:
-    """A number as it was set, such as a limit."""
-    text = f"{value:.6g}".replace("-", "−")
-    return number(value, 6) if "e" in text else text
+def plain(value: float, digits: int = EXACT_DIGITS) -> str:
+    """A number as it was set, such as a limit, or to some significant digits."""
+    text = f"{value:.{digits}g}".replace("-", "−")
+    return number(value, digits) if "e" in text else text
 
 
 def probability(value: float) -> str:
@@ -162,7 +174,9 @@ def _laboratory(party: Party | None) -> tuple[str, list[str]]:
     if party is None:
         return "Laboratory not stated", []
     accredited = f"Accreditation: {party.accreditation}" if party.accreditation else ""
-    return party.name, list(filter(None, [*party.address, party.contact, accredited]))
+    return party.name, list(
+        filter(None, [*party.address, party.country, party.contact, accredited])
+    )
 
 
 def _facts(title: str, facts: Mapping[str, str | Sequence[str]]) -> FactList:
@@ -215,7 +229,7 @@ def _conformity(certificate: Certificate) -> Iterator[Block]:
         yield TextBlock(findings, "Findings of the roll tests", bullets=True)
 
 
-def _outcome(test: ConformityTest) -> Outcome:
+def _outcome(test: ConformityTest) -> TestOutcome:
     missed = [each.quantity.name for each in test.decisions if not each.passed]
     count = plural(len(test.decisions), "limit")
     level: Mark = "good" if test.passed else "bad"
@@ -223,7 +237,7 @@ def _outcome(test: ConformityTest) -> Outcome:
     if not test.passed and not missed:
         headline = "Fail"
     after = f"Not met: {', '.join(missed)}. " if missed else ""
-    return Outcome(level, test.when, headline, f"{after}Decision rule: {test.rule}.")
+    return TestOutcome(level, test.when, headline, f"{after}Decision rule: {test.rule}.")
 
 
 def _test_facts(tests: Sequence[ConformityTest]) -> TableBlock:
@@ -322,10 +336,12 @@ def _coverages(quantities: Iterable[Quantity]) -> str:
 
 
 def _results(table: ResultTable) -> TableBlock:
-    return quantity_table(table.quantities, table.title, table.note)
+    return quantity_table(table.quantities, table.title, table.note, RESULT_DIGITS)
 
 
-def quantity_table(quantities: Sequence[Quantity], title: str, note: str = "") -> TableBlock:
+def quantity_table(
+    quantities: Sequence[Quantity], title: str, note: str = "", digits: int = EXACT_DIGITS
+) -> TableBlock:
     """Quantities with values and uncertainties; columns of which nothing is stated are left out."""
     covered = [_coverage(q.coverage_factor, q.coverage_probability) for q in quantities]
     coverages = _coverages(quantities)
@@ -337,7 +353,7 @@ def quantity_table(quantities: Sequence[Quantity], title: str, note: str = "") -
     }
     rows = []
     for q, coverage in zip(quantities, covered, strict=True):
-        value, u, expanded = quantity_numbers(q)
+        value, u, expanded = quantity_numbers(q, digits)
         cells = {"at": q.at or "–", "u": u, "U": expanded, "k, coverage": coverage or NOT_STATED}
         shown = [_cell(value), *(_cell(cells[name]) for name in stated if stated[name])]
         rows.append([Cell([q.name]), *shown])
@@ -414,7 +430,9 @@ def _traceability(standards: Sequence[TracedStandard]) -> Block:
             [
                 Cell([each.quantity]),
                 Cell([each.name, *filter(None, [serial])]),
-                Cell([*filter(None, [each.certificate, by])]) if each.certificate or by else _BLANK,
+                Cell([*filter(None, [each.certificate, by])])
+                if each.certificate or by
+                else _NOT_STATED_CELL,
                 _cell(each.date or NOT_STATED),
                 due or _cell(each.due or NOT_STATED),
                 _cell(each.standard_uncertainty or NOT_STATED),

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from mwdcal.app.screens.numbers import measured, number, unit, written
-from mwdcal.app.text import chance, one_line, table
+from mwdcal.app.screens.numbers import UNDETERMINED, measured, number, unit, written
+from mwdcal.app.text import NOT_STATED, chance, one_line, table
 from mwdcal.app.text import quantity as in_unit
+from mwdcal.calibration.prediction import STATED_ANGLES
 from mwdcal.calibration.readings import SIMULATED
 from mwdcal.certificate.document import (
     Budget,
@@ -18,7 +19,6 @@ from mwdcal.certificate.document import (
     Quantity,
 )
 
-NOT_STATED = "not stated"
 ASSUMED_EXACT = "exact"
 """In place of the share of a source that is assumed exact."""
 
@@ -75,7 +75,7 @@ def value_and_uncertainty(quantity: Quantity) -> tuple[str, str]:
     """Value and expanded uncertainty with their unit, to two significant digits of the latter."""
     symbol = unit(quantity.unit)
     if quantity.value is None:
-        return "undetermined", NOT_STATED
+        return UNDETERMINED, NOT_STATED
     value, expanded = measured(quantity.value, quantity.expanded_uncertainty)
     if quantity.expanded_uncertainty is None:
         return value + symbol, NOT_STATED
@@ -83,22 +83,26 @@ def value_and_uncertainty(quantity: Quantity) -> tuple[str, str]:
 
 
 def _budget(budget: Budget) -> str:
-    """The budget by source, with its sum and its expansion."""
-    rows = [_source(line) for line in (*budget.lines, budget.combined, budget.expanded)]
-    head = f"uncertainty budget (1σ), {budget.at}; k = {budget.coverage_factor:.3g}, {budget.coverage_probability:.0%}"
-    return f"{head}\n{table(rows, ['', 'kind', 'inclination', 'toolface', 'azimuth'])}"
-
-
-def _source(line: BudgetLine) -> list[str]:
-    total = line.id in ("combined", "expanded")
-    angles = [
-        _share(line, value) for value in (line.inclination_deg, line.toolface_deg, line.azimuth_deg)
+    """The budget by source, with its sum and its expansion; no azimuth of a tool that has none."""
+    lines = (*budget.lines, budget.combined, budget.expanded)
+    names = [
+        n
+        for n in STATED_ANGLES
+        if n != "azimuth" or any(line.azimuth_deg is not None for line in lines)
     ]
-    return [line.source, "" if total else line.kind, *angles]
+    rows = [_source(line, names) for line in lines]
+    head = f"uncertainty budget (1σ), {budget.at}; k = {budget.coverage_factor:.3g}, {budget.coverage_probability:.0%}"
+    return f"{one_line(head)}\n{table(rows, ['', 'kind', *names])}"
+
+
+def _source(line: BudgetLine, names: Sequence[str]) -> list[str]:
+    total = line.id in ("combined", "expanded")
+    shares = [_share(line, getattr(line, f"{name}_deg")) for name in names]
+    return [line.source, "" if total else line.kind, *shares]
 
 
 def _share(line: BudgetLine, value: float | None) -> str:
     """What a source adds to the uncertainty of an angle."""
     if line.basis.startswith("assumed exact"):
         return ASSUMED_EXACT
-    return "–" if value is None else f"{number(value, 2)}°"
+    return UNDETERMINED if value is None else f"{number(value, 2)}°"

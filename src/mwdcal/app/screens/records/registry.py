@@ -9,7 +9,7 @@ import msgspec
 
 from mwdcal.app.envelope import enveloped
 from mwdcal.app.screens.numbers import number
-from mwdcal.app.text import one_line, plural, table
+from mwdcal.app.text import UNCUT, one_line, plural, table
 from mwdcal.calibration.readings import SIMULATED
 from mwdcal.calibration.record import Finding
 from mwdcal.registry.checking import Discrepancy
@@ -22,7 +22,7 @@ KEYS = ("number", "kind", "sha256", "name")
 ACCURACIES = ("inclination", "toolface", "azimuth")
 MOST_REFUSED = 20
 """Most refused files that are named one by one."""
-HASH_DIGITS = 12
+SHOWN_DIGITS = 12
 """Digits of a SHA-256 on the screen."""
 
 
@@ -182,17 +182,17 @@ def check_text(result: RegistryChecked) -> str:
     """The outcome of a check for people."""
     if result.sound:
         return one_line(f"PASS   {result.registry}: sound") + _newest(result.events, result.head)
-    lines = [f"FAIL   {result.registry}: {plural(len(result.discrepancies), 'discrepancy')}"]
-    lines += [f"! {each.text}" for each in result.discrepancies]
-    return "\n".join(map(one_line, lines))
+    count = len(result.discrepancies)
+    return one_line(f"FAIL   {result.registry}: altered in {plural(count, 'place')}")
 
 
 def list_text(listing: Listing) -> str:
     """Tools, or records of a kind."""
-    blocks = [_heading(listing, f"{listing.kind}s")]
+    blocks = [_heading(listing, listing.kind)]
     if listing.tools:
-        head = ["serial", "type", "calibrated", "n", *(f"{a} 1σ, °" for a in ACCURACIES)]
-        blocks.append(table([_tool_cells(t) for t in listing.tools], [*head, "due", "verdict"]))
+        head = ["serial", "type", "calibrated", "n", *ACCURACIES, "due", "verdict"]
+        blocks.append(table([_tool_cells(t) for t in listing.tools], head, UNCUT))
+        blocks.append(f"{', '.join(ACCURACIES)}: 1σ to expect of the last calibration, degrees")
     if listing.records and listing.kind == "tool":
         blocks.append(f"{plural(len(listing.records), 'measurement standard')} due")
     if listing.records:
@@ -203,7 +203,7 @@ def list_text(listing: Listing) -> str:
 def history_text(listing: Listing) -> str:
     """The past of a tool."""
     return "\n\n".join(
-        [_heading(listing, "records"), _records_table(listing.records, serials=False)]
+        [_heading(listing, "record"), _records_table(listing.records, serials=False)]
     )
 
 
@@ -216,7 +216,7 @@ def _heading(listing: Listing, noun: str) -> str:
         if shown_rows < listing.total
         else ""
     )
-    words = [f"{listing.total} {noun}{part}", *[SIMULATED] * simulated]
+    words = [f"{plural(listing.total, noun)}{part}", *[SIMULATED] * simulated]
     return "   ".join(words)
 
 
@@ -240,12 +240,12 @@ def _records_table(records: Sequence[ListedRecord], serials: bool) -> str:
             [
                 *cells,
                 described,
-                each.sha256[:HASH_DIGITS],
+                each.sha256[:SHOWN_DIGITS],
                 each.added[: len("2026-01-31")],
                 each.actor,
             ]
         )
-    return table(rows, head, names=1)
+    return table(rows, head, UNCUT)
 
 
 def day(time: str | None) -> str:

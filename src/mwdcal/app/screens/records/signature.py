@@ -12,6 +12,7 @@ from mwdcal.app.envelope import enveloped
 from mwdcal.app.screens.numbers import written
 from mwdcal.app.text import one_line, table
 from mwdcal.calibration.canonical import Signature
+from mwdcal.calibration.readings import simulated
 from mwdcal.calibration.record import Finding
 from mwdcal.certificate.keys import TrustedKey
 from mwdcal.certificate.signature import (
@@ -21,6 +22,7 @@ from mwdcal.certificate.signature import (
     SignatureCheck,
     check_files,
     document_of,
+    fields_of,
 )
 from mwdcal.certificate.signature import check as check_signature
 from mwdcal.errors import InputError
@@ -74,10 +76,8 @@ def in_short(check: SignatureCheck) -> str:
     return one_line(IN_SHORT[check.state].format(key=name))
 
 
-def signed_document(
-    data: bytes, path: Path, folder: Path, digest: str
-) -> tuple[SignedDocument, dict[str, Any]]:
-    """What was signed, and the document that says so: `digest` of the file as it was before.
+def signed_document(data: bytes, path: Path, folder: Path) -> tuple[SignedDocument, dict[str, Any]]:
+    """What was signed, and the fields of the document.
 
     `folder`: where the files of a certificate are looked for, of which one may have changed.
     """
@@ -90,13 +90,13 @@ def signed_document(
         time=signature.time,
         findings=_changed_files(_files_of(fields, folder, ())),
     )
-    stated = _stated(fields)
-    return result, enveloped("certificate sign", result, stated, document=digest)
+    return result, fields
 
 
-def signed(result: SignedDocument) -> str:
-    """What was signed, by which key, and where it is."""
-    return f"signed by key {result.key}   {written(document=result.file)}"
+def signed(result: SignedDocument, fields: Mapping[str, Any]) -> str:
+    """By which key a document was signed, and where it is."""
+    said = [f"signed by key {result.key}", f"wrote {one_line(result.file)}"]
+    return "   ".join([*said, *simulated(_stated(fields))])
 
 
 def checked_document(
@@ -107,7 +107,8 @@ def checked_document(
     The files of a certificate are looked up only where it is intact: a stranger's may name any.
     """
     check = check_signature(file.record, keys)
-    fields = {} if check.state == "altered" else document_of(file.record, file.name)
+    altered = check.state == "altered"
+    fields = fields_of(file.record) or {} if altered else document_of(file.record, file.name)
     if named and fields.get("command", "certificate") != "certificate":
         raise InputError("FILES go with a certificate, which lists its own. Leave them out.")
     intact = check.state == "intact"
@@ -125,11 +126,11 @@ def checked_document(
     return result, fields
 
 
-def enveloped_check(
-    result: CheckedDocument, fields: Mapping[str, Any], digest: str
+def for_machines(
+    command: str, result: object, fields: Mapping[str, Any], digest: str
 ) -> dict[str, Any]:
-    """The result for machines."""
-    return enveloped("certificate verify", result, _stated(fields), document=digest)
+    """The result, of a document with these fields, whose file had that SHA-256."""
+    return enveloped(f"certificate {command}", result, _stated(fields), document=digest)
 
 
 def _stated(fields: Mapping[str, Any]) -> dict[str, Any]:
@@ -148,26 +149,25 @@ def _changed_files(files: Sequence[CheckedFile]) -> list[Finding]:
     return [Finding(id="changed-file", text=text)] if changed else []
 
 
-def checked(result: CheckedDocument) -> str:
+def checked(result: CheckedDocument, fields: Mapping[str, Any]) -> str:
     """The outcome, and each file."""
     outcome = "PASS" if result.passed else "FAIL"
-    lines = [
-        f"{outcome}   {one_line(result.file)}",
-        *([one_line(result.check.text)] * result.passed),
-    ]
+    first = [outcome, one_line(result.file), *simulated(_stated(fields))]
+    lines = ["   ".join(first), *[one_line(result.check.text)] * (result.check.state == "intact")]
     if not result.files:
         return "\n".join(lines)
     rows = [[file.name, file.id, FILE_STATES[file.state]] for file in result.files]
     return "\n".join(lines) + "\n\n" + table(rows, ["file of the certificate", "", ""])
 
 
-def keys(result: KeysDocument) -> str:
-    """One row for each key."""
-    rows = [[key.key, key.owner, key.created, _standing(key)] for key in result.keys]
-    return table(rows, ["key", "owner", "created", ""])
+def keys(result: KeysDocument, **files: Path) -> str:
+    """One row for each key, and the files that were written."""
+    rows = [[key.key, key.owner, key.created[:10], _standing(key)] for key in result.keys]
+    shown = table(rows, ["key", "owner", "created", ""])
+    return f"{shown}\n\n{written(**files)}" if files else shown
 
 
 def _standing(key: TrustedKey) -> str:
     if key.revoked:
-        return f"revoked {key.revoked}" + (f": {key.reason}" if key.reason else "")
-    return f"retired {key.retired}" if key.retired else "valid"
+        return f"revoked {key.revoked[:10]}" + (f": {key.reason}" if key.reason else "")
+    return f"retired {key.retired[:10]}" if key.retired else "valid"

@@ -61,8 +61,9 @@ def _create_objects_and_records() -> None:
         sa.UniqueConstraint("sha256", "kind", name="records_sha256"),
     )
     op.create_index("records_serial", "records", ["serial", "kind", "time"])
-    op.create_index("records_time", "records", ["kind", "time"])
+    op.create_index("records_time", "records", ["kind", "time", "number"])
     op.create_index("records_calibration", "records", ["calibration"])
+    op.create_index("records_run", "records", ["run"])
 
 
 def downgrade() -> None:

@@ -1,0 +1,159 @@
+"""The registry: import, size, queries and check at 100 000 calibrations, in a SQLite file.
+
+    python benchmarks/registry.py [--calibrations 100000]
+
+Calibration files of 24 stations and 24 parameters, as `mwdcal fleet` writes them: a few hundred simulated tools are
+calibrated, and their records repeated under other serials and dates, each sealed again, so that every file is one of
+its own; their covariances, parameters and stations repeat, which matters to no query. Five calibrations of each tool.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import msgspec
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from measuring import seconds
+
+from mwdcal.calibration.calibrate import calibrate
+from mwdcal.calibration.options import Options
+from mwdcal.calibration.record import Calibration, sealed
+from mwdcal.files.formats.members import RECORD
+from mwdcal.files.profiles import load_profile
+from mwdcal.planning.plans import load_plan
+from mwdcal.planning.session import Session
+from mwdcal.planning.simulate import drawn
+from mwdcal.registry import checking, imports, queries
+from mwdcal.registry.setup import create
+from mwdcal.registry.store import Registry, open_registry
+
+CALIBRATIONS, YEARS, SAMPLE, GROUP = 100_000, 5, 40, 1000
+"""Calibrations in all, those of each tool, tools that are fitted, and rows of a row group."""
+ROUNDS = 20
+"""Runs of each query, on other tools where it is about one."""
+
+
+def fitted(count: int) -> list[Calibration]:
+    """Calibrations of simulated tools."""
+    profile, rng = load_profile("servo")[0], np.random.default_rng(0)
+    session = Session.of(load_plan("twenty-four-state"), profile)
+    return [
+        calibrate(session.measured(drawn(rng, profile, 0), rng).readings, profile, Options(order=0))
+        for _ in range(count)
+    ]
+
+
+def tables(folder: Path, count: int) -> Iterator[Path]:
+    """Tables of calibrations as `mwdcal fleet` writes them, one for each year."""
+    sample = fitted(SAMPLE)
+    for year in range(YEARS):
+        path, tools = folder / f"{2022 + year}.parquet", count // YEARS
+        schema = pa.schema(
+            [(name, pa.string()) for name in ("serial", "status", "message", RECORD)]
+        )
+        with pq.ParquetWriter(path, schema) as writer:
+            for first in range(0, tools, GROUP):
+                serials = [f"B-{tool:06}" for tool in range(first, min(first + GROUP, tools))]
+                whole = [
+                    renamed(sample[i % SAMPLE], serial, 2022 + year)
+                    for i, serial in enumerate(serials)
+                ]
+                texts = [[text] * len(serials) for text in ("ok", "")]
+                writer.write_table(pa.table([serials, *texts, whole], schema=schema))
+        yield path
+
+
+def renamed(record: Calibration, serial: str, year: int) -> str:
+    """The calibration as one of another tool and year."""
+    about = {"serial": serial, "date": f"{year}-03-01", "simulated": "True"}
+    time = f"{year}-03-01"
+    changed = msgspec.structs.replace(record, tool=about, serial=serial, time=time)
+    return msgspec.json.encode(sealed(changed)).decode()
+
+
+def imported(registry: Registry, paths: list[Path], workers: int) -> None:
+    """Add tables as `mwdcal registry add` does."""
+    from mwdcal.app.commands.records.registry_add import _add_all
+
+    portions = imports.portions(imports.sources(paths))
+    _add_all(imports.Adding(registry, "bench"), portions, workers)
+
+
+def pages(registry: Registry, count: int) -> dict[str, Callable[[int], object]]:
+    """What lists and pages ask, by name; each takes the number of its round."""
+    tools = count // YEARS
+
+    def serial(k: int) -> str:
+        return f"B-{(7919 * k) % tools:06}"
+
+    return {
+        "tools, first page": lambda k: queries.tools_page(registry),
+        "tools, last page": lambda k: queries.tools_page(registry, offset=tools - 50),
+        "tools by day of calibration": lambda k: queries.tools_page(
+            registry, order="calibrated", descending=True
+        ),
+        "tools with a text in serial or type": lambda k: queries.tools_page(
+            registry, search=serial(k)[3:]
+        ),
+        "tools due": lambda k: queries.tools_page(registry, due_before="2030-01-01"),
+        "past of a tool": lambda k: queries.past(registry, serial(k)),
+        "latest calibration of a tool": lambda k: queries.latest_calibration(registry, serial(k)),
+        "all calibrations of a tool": lambda k: [*queries.calibrations(registry, serial(k))],
+        "calibrations, newest first": lambda k: queries.records_page(registry, "calibration"),
+        "history, newest events": lambda k: queries.events(registry),
+        "what is due": lambda k: queries.due(registry, "2030-01-01"),
+        "counts of everything": lambda k: queries.counts(registry),
+    }
+
+
+def report(count: int = CALIBRATIONS) -> str:
+    """The section's figures as Markdown."""
+    cores = (
+        len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    )
+    with TemporaryDirectory() as place:
+        folder, database = Path(place), Path(place) / "tools.sqlite"
+        paths = [*tables(folder, count)]
+        create(database, "bench")
+        with open_registry(database) as registry:
+            adding = seconds(partial(imported, registry, paths, cores))
+            size = sum(file.stat().st_size for file in folder.glob("tools.sqlite*"))
+            times = {
+                name: [seconds(partial(page, k)) for k in range(ROUNDS)]
+                for name, page in pages(registry, count).items()
+            }
+            problems: list[object] = []
+            checking_time = seconds(lambda: problems.extend(checking.check(registry)))
+        assert not problems, problems[:3]
+    return shown(count, cores, adding, size, checking_time, times)
+
+
+def shown(
+    count: int, cores: int, adding: float, size: int, checking_time: float, times: dict[str, list[float]]
+) -> str:  # fmt: skip
+    """The figures as Markdown."""
+    lines = [
+        f"- {count:,} calibrations of {count // YEARS:,} tools, {cores} cores".replace(",", " "),
+        f"- import, every file checked as `apply` checks it: {adding:.0f} s, {count / adding:.0f} a second",
+        f"- size: {size / 1e6:.0f} MB, {size / count / 1e3:.1f} kB for each calibration (54 kB as a file)",
+        f"- check of every byte: {checking_time:.0f} s, {count / checking_time:.0f} calibrations a second",
+        "",
+        "| query | median, ms | slowest, ms |",
+        "| --- | --- | --- |",
+    ]
+    for name, each in times.items():
+        lines.append(f"| {name} | {1e3 * float(np.median(each)):.1f} | {1e3 * max(each):.1f} |")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--calibrations", type=int, default=CALIBRATIONS)
+    print(report(parser.parse_args().calibrations))
