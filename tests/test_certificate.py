@@ -251,8 +251,7 @@ def test_the_accuracy_is_that_of_the_calibration_at_the_attitudes_and_temperatur
 
 def test_the_coverage_factor_is_that_of_welch_and_satterthwaite(thermal):
     """Of lines with these degrees of freedom; computed by hand."""
-    from mwdcal.calibration.record import BudgetRow
-    from mwdcal.calibration.results import NOISE, ORDER
+    from mwdcal.calibration.record import NOISE, ORDER, BudgetRow
 
     def factor(noise, order, freedom):
         sizes = {NOISE: noise, ORDER: order, "tilt of the stand": 1.0}

@@ -15,8 +15,9 @@ from typing import Any
 import msgspec
 from msgspec.structs import replace
 
+from mwdcal.calibration.canonical import canonical, rounded
 from mwdcal.calibration.readings import is_simulated, serial_of
-from mwdcal.calibration.record import SOFTWARE, Calibration, Finding, canonical, rounded
+from mwdcal.calibration.record import SOFTWARE, Calibration, Finding
 from mwdcal.certificate.budget import assumed_exact, budget
 from mwdcal.certificate.decisions import When, conformity
 from mwdcal.certificate.document import (
