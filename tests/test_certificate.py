@@ -481,6 +481,20 @@ def test_an_overdue_standard_is_marked_on_the_day_of_the_calibration(thermal):
     assert document.calibrated == "2026-03-15"
 
 
+def test_a_standard_that_was_calibrated_later_is_a_finding(thermal):
+    days = {
+        "before": date(2026, 3, 14),
+        "on the day": date(2026, 3, 15),
+        "after": date(2026, 3, 16),
+    }
+    standards = tuple(
+        MeasurementStandard(quantity="stand", name=name, issued=day) for name, day in days.items()
+    )
+    document = issued(thermal, Laboratory(standards=standards))
+    (text,) = (f.text for f in document.findings if f.id == "standard-later")
+    assert "stand standard after was calibrated on 2026-03-16" in text
+
+
 def test_standards_of_the_laboratory_replace_those_of_the_profile(servo):
     def standard(quantity, name, certificate=""):
         return MeasurementStandard(quantity=quantity, name=name, certificate=certificate)
@@ -513,7 +527,9 @@ def test_the_next_calibration_is_due_after_whole_months(servo, day, months, due)
 def test_without_a_date_of_the_run_the_day_of_the_fit_stands_and_is_said_to(servo):
     document = issued(servo)
     assert document.calibrated == servo.time[:10]
-    assert "date-not-stated" in named(document.findings)
+    said = named(document.findings)["date-not-stated"]
+    early = document.calibrated > document.issued
+    assert ("dated before it" in said) == early
 
 
 def test_days_in_the_wrong_order_are_refused(thermal):
