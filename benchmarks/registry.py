@@ -124,7 +124,8 @@ def report(count: int = CALIBRATIONS) -> str:
         create(database, "bench")
         with open_registry(database) as registry:
             adding = seconds(partial(imported, registry, paths, cores))
-            size = sum(file.stat().st_size for file in folder.glob("tools.sqlite*"))
+        size = database.stat().st_size
+        with open_registry(database) as registry:
             times = {
                 name: [seconds(partial(page, k)) for k in range(ROUNDS)]
                 for name, page in pages(registry, count).items()
@@ -135,12 +136,17 @@ def report(count: int = CALIBRATIONS) -> str:
     return shown(count, cores, adding, size, checking_time, times)
 
 
+def spaced(count: int) -> str:
+    """A count in groups of three digits."""
+    return f"{count:,}".replace(",", " ")
+
+
 def shown(
     count: int, cores: int, adding: float, size: int, checking_time: float, times: dict[str, list[float]]
 ) -> str:  # fmt: skip
     """The figures as Markdown."""
     lines = [
-        f"- {count:,} calibrations of {count // YEARS:,} tools, {cores} cores".replace(",", " "),
+        f"- {spaced(count)} calibrations of {spaced(count // YEARS)} tools, {cores} cores",
         f"- import, every file checked as `apply` checks it: {adding:.0f} s, {count / adding:.0f} a second",
         f"- size: {size / 1e6:.0f} MB, {size / count / 1e3:.1f} kB for each calibration (54 kB as a file)",
         f"- check of every byte: {checking_time:.0f} s, {count / checking_time:.0f} calibrations a second",

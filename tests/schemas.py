@@ -23,7 +23,7 @@ from mwdcal.app.screens import (
     simulation,
     stations,
 )
-from mwdcal.app.screens.records import registry, signature
+from mwdcal.app.screens.records import drift, registry, signature
 from mwdcal.app.screens.surveys import reference, survey
 from mwdcal.calibration.record import DOCUMENT_VERSION, SCHEMA_VERSION, Calibration
 from mwdcal.certificate.document import Certificate
@@ -53,6 +53,7 @@ CONTENTS: dict[str, type] = {
     "registry add": registry.RegistryAdded,
     "registry backup": registry.RegistryCopied,
     "registry check": registry.RegistryChecked,
+    "registry drift": drift.RegistryDrift,
     "registry export": registry.RegistryExported,
     "registry get": registry.RegistryDocument,
     "registry history": Listing,

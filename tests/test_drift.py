@@ -416,3 +416,25 @@ def test_pages_mark_simulated_data_and_escape_names(years):
         assert "SIMULATED DATA" in screen
         assert "\x1b" not in screen
     assert len(drift_picture(drift).axes) == 6
+
+
+def test_the_command_reads_a_registry(years, tmp_path):
+    pytest.importorskip("sqlalchemy")
+    from cli_support import mwdcal
+    from mwdcal.files import documents
+
+    (tmp_path / "files").mkdir()
+    for serial, each in years.items():
+        for number, calibration in enumerate(each):
+            documents.write(tmp_path / "files" / f"{serial}-{number}.json", calibration)
+    where = ("--database", tmp_path / "tools.sqlite")
+    assert mwdcal("registry", "init", *where).code == 0
+    assert mwdcal("registry", "add", tmp_path / "files", *where, "--workers", "1").code == 0
+    one = mwdcal("registry", "drift", "T-1", *where, "--json").json
+    assert (one["command"], one["serial"], one["simulated"]) == ("registry drift", "T-1", True)
+    assert one["tool"]["change"]["changed"]
+    assert one["fleet"] is None
+    every = mwdcal("registry", "drift", *where, "--limit", "inclination_deg=0.02", "--json").json
+    assert (every["fleet"]["tools"], every["limits_deg"]) == (3, {"inclination": 0.02})
+    for wrong in (("T-0",), ("--limit", "dip_deg=1"), ("--limit", "inclination_deg=-1")):
+        assert mwdcal("registry", "drift", *wrong, *where).code == 2

@@ -57,6 +57,8 @@ SAMPLES = {
         *("certificate", "tool.json", "--laboratory", EXAMPLE / "laboratory.toml"),
         *("--verification", "left.json", "--as-found", "found.json"),
     ),
+    "registry-drift": ("registry", "drift", "SIM-0001", "--database", "tools.sqlite"),
+    "registry-drift-fleet": ("registry", "drift", "--database", "tools.sqlite"),
     "survey-rejected": ("survey", "tool.json", "iron.csv", "-o", "new.csv"),
 }
 """Commands that also write a page, by the name of the sample."""
@@ -121,6 +123,9 @@ def folder(tmp_path_factory):
         ran = mwdcal("verify", folder / f"{name}.json", EXAMPLE / "rolltest.csv", *limits, "--json")
         (folder / f"{when}.json").write_text(ran.out, "utf-8")
     fleet(folder / "fleet.parquet")
+    registry = ("registry", "--database", folder / "tools.sqlite")
+    assert mwdcal(*registry, "init").code == 0
+    assert mwdcal(*registry, "add", folder / "tool.json", folder / "before.json").code == 0
     iron = read_csv(EXAMPLE / "well.csv")
     iron["mz"] = [f"{float(v) + 0.06:.6f}" for v in iron["mz"]]
     write_csv(folder / "iron.csv", iron, 'simulated = "yes"')

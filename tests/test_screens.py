@@ -62,6 +62,7 @@ SCREENS = {
     "registry-list": ("registry", "list", *REGISTRY),
     "registry-list-due": ("registry", "list", "--due", "2030-01-01", *REGISTRY),
     "registry-history": ("registry", "history", "SIM-0001", *REGISTRY),
+    "registry-drift": ("registry", "drift", "SIM-0001", "--today", "2026-11-22", *REGISTRY),
     "registry-get": ("registry", "get", "SIM-0001", "-o", "made.json", *REGISTRY),
     "registry-withdraw": ("registry", "withdraw", "2", "--reason", "wrong stand angles", *REGISTRY),
     "registry-export": ("registry", "export", "new", *REGISTRY),

@@ -64,4 +64,5 @@ def command(
         result = drift_sources.of_registry(registry, serial, allowed, level, day)
     if html:
         atomic.write(html, pages.render(result.tool, result.fleet))
-    print_result(screen.document(result) if as_json else screen.text(result, html))
+    shown = screen.document(result) if as_json else screen.text(result, html)
+    print_result(shown, result.tool.findings if result.tool else [])
