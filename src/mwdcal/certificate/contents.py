@@ -116,7 +116,7 @@ def certificate(
         findings=[],
         files=list(order.files),
     )
-    unstated_day = [] if day_stated else [_unstated_day(day, order.issued)]
+    unstated_day = [] if day_stated else [_unstated_day(day, order)]
     findings = [
         *order.findings,
         *_findings(contents, calibration),
@@ -158,9 +158,9 @@ def calibrated_on(calibration: Calibration) -> tuple[date, bool]:
         return date.fromisoformat(calibration.time[:10]), False
 
 
-def _unstated_day(day: date, issued: date) -> Finding:
-    before = f" The certificate is dated before it, {issued}: state the date in the run."
-    return Finding(id="date-not-stated", text=DATE_OF_FIT + (before if issued < day else ""))
+def _unstated_day(day: date, order: Order) -> Finding:
+    before = f" The certificate is dated before it, {order.issued}: state the date in the run."
+    return Finding(id="date-not-stated", text=DATE_OF_FIT + (before if order.issued < day else ""))
 
 
 def _check_days(day: date, order: Order, laboratory: Laboratory) -> None:
@@ -299,16 +299,16 @@ def _not_stated(contents: Certificate, calibration: Calibration) -> Iterator[Fin
 
 def _out_of_date(standard: TracedStandard, calibrated: str) -> Iterator[Finding]:
     """A finding if the calibration of a standard was not valid on the day of this one."""
-    name, own = (
+    name, this = (
         f"the {standard.quantity} standard {standard.name}",
         f"this calibration ({calibrated})",
     )
     if standard.overdue:
-        text = f"the calibration of {name} was due on {standard.due}, before the day of {own}."
+        text = f"the calibration of {name} was due on {standard.due}, before the day of {this}."
         yield Finding(id="standard-overdue", text=text)
     if standard.date > calibrated:
         text = (
-            f"{name} was calibrated on {standard.date}, after the day of {own}: name that before."
+            f"{name} was calibrated on {standard.date}, after the day of {this}: name that before."
         )
         yield Finding(id="standard-later", text=text)
 
