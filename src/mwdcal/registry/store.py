@@ -158,7 +158,7 @@ def unpacked(data: bytes, size: int) -> bytes:
     """
     unpacker = zlib.decompressobj()
     try:
-        content = unpacker.decompress(data, size + 1)
+        content = unpacker.decompress(data, min(size, LARGEST_OBJECT) + 1)
     except (zlib.error, TypeError, ValueError, OverflowError):
         content = b""
     if len(content) != size or not unpacker.eof or unpacker.unused_data:
