@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 from mwdcal.errors import InputError, reason
 from mwdcal.files.formats import parquet
+from mwdcal.files.formats.atomic import SQLITE
 from mwdcal.files.formats.columns import as_text, shown
 
 RECORD = "calibration"
@@ -19,8 +20,6 @@ RECORD = "calibration"
 MARK = "#"
 """What stands between the file of a fleet's table and a serial."""
 SUFFIX = ".parquet"
-SQLITE = b"SQLite format 3\0"
-"""How the file of a registry begins."""
 NEARLY_URL = re.compile(r"postgres\w*(\+\w+)?:|\bpassword *=", re.IGNORECASE)
 """What the URL of a database has, however mistyped, and no file's name: it may hold a password."""
 _SHOWN = 5
