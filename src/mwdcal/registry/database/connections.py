@@ -42,7 +42,10 @@ _WHAT_TO_DO = {
     "permission denied": "Have the owner of the database give you the right.",
     "does not exist": "Create it on the server, or correct the URL.",
     "resolve host": "Correct the name of the server in the URL.",
-    "connection failed": "Check that the server runs, and the URL.",
+    **dict.fromkeys(
+        ("connection failed", "connection refused", "connection is bad", "server closed"),
+        "Check that the server runs, and the URL.",
+    ),
 }
 
 
