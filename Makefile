@@ -4,7 +4,7 @@ SHELL := /bin/bash
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .PHONY: papers measured verification scatter drift diagnosis mutations help demo test test-quick test-studies test-oldest \
-	test-versions fuzz kills check bench docs clean
+	test-versions fuzz kills registry-stress check bench docs clean
 
 PYTHON ?= python3
 PYTHONS ?= python3.12 python3.13
@@ -83,6 +83,10 @@ mutations: $(INSTALLED) ## change one operator or constant in so many (EVERY=40)
 
 kills: $(INSTALLED) ## end commands at random moments (COUNT=1000) and check what they leave
 	@$(CLOCK); $(ONE_THREAD) $(BIN)/python tests/kills.py --count $(or $(COUNT),1000) --seed $(or $(SEED),1)
+
+registry-stress: $(INSTALLED) ## write to registries by 50 processes, end some at random, and check what is left (two minutes)
+	@$(CLOCK); $(ONE_THREAD) PYTHONPATH=tests $(BIN)/python tests/registry_stress.py \
+		--writers 50 --seconds 60 --kills $(or $(COUNT),100)
 
 check: $(INSTALLED) ## lint, format, types, architecture, doctests, docs
 	@$(CLOCK); \

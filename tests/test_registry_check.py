@@ -260,6 +260,15 @@ def test_a_serial_that_is_no_text_is_reported(original, tmp_path):
     assert verdict(path) == {"tools"}
 
 
+def test_a_time_that_is_no_text_is_reported(original, tmp_path):
+    path = tmp_path / "changed.registry"
+    shutil.copyfile(original, path)
+    with closing(sqlite3.connect(path)) as connection, without_triggers(connection):
+        connection.execute("UPDATE history SET time = CAST(time AS BLOB) WHERE number = 2")
+        connection.commit()
+    assert {"event", "unreadable"} <= verdict(path)
+
+
 def test_no_more_is_unpacked_than_a_registry_takes(monkeypatch):
     monkeypatch.setattr(store, "LARGEST_OBJECT", 1000)
     packed = zlib.compress(bytes(10_000_000), 9)

@@ -60,12 +60,12 @@ def example(tmp_path_factory):
         "--calibrations", folder.parent / "tools")  # fmt: skip
     tool_1 = folder / "2023.parquet#SIM-0001"
     ran = run(
-        "verify", folder.parent / "tools" / "SIM-0001.json", folder / "rolltest.csv", "--json"
+        "verify", folder.parent / "tools" / "SIM-0001.json", folder / "rolltest-2023.csv", "--json"
     )
     (folder / "verified.json").write_text(ran.out, "utf-8")
     (folder / "guest.toml").write_text(LAB, "utf-8")
     (folder / ".hidden.csv").write_text("x", "utf-8")
-    assert run("verify", tool_1, folder / "rolltest.csv").code == 0
+    assert run("verify", tool_1, folder / "rolltest-2023.csv").code == 0
     return folder
 
 
@@ -94,12 +94,12 @@ def test_every_kind_of_file_is_what_it_is(example, tmp_path):
     result = registry(path, "add", example)
     assert result["new"] == {
         "calibration": 6, "laboratory": 2, "person": 4, "standard": 5, "profile": 1, "verification": 1,
-        "run": 7,
+        "run": 8,
     }  # fmt: skip
     assert (result["known"], result["refused"], result["simulated"]) == (0, 0, True)
     assert sum(result["new"].values()) + 1 == result["events"]
     again = registry(path, "add", example)
-    assert (again["new"], again["known"], again["head"]) == ({}, 26, result["head"])
+    assert (again["new"], again["known"], again["head"]) == ({}, 27, result["head"])
     assert registry(path, "check")["sound"]
 
 
@@ -108,7 +108,7 @@ def test_records_are_linked_by_the_sha256_of_files(example, filled):
     assert [r["kind"] for r in past].count("calibration") == 2
     by_kind = {(r["kind"], r["time"]): r for r in past}
     assert by_kind["run", "2023-03-01"]["sha256"] in {
-        sha256(example / "runs" / "2023" / "SIM-0001.csv"), sha256(example / "rolltest.csv")
+        sha256(example / "runs" / "2023" / "SIM-0001.csv"), sha256(example / "rolltest-2023.csv")
     }  # fmt: skip
     fitted = by_kind["calibration", "2023-03-01"]
     assert fitted["sha256"] == sha256(example.parent / "tools" / "SIM-0001.json")
@@ -164,7 +164,7 @@ COMMANDS = {
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_a_tool_of_a_registry_is_named_as_one_of_a_fleet(example, filled, tmp_path, name):
-    roll = example / "rolltest.csv"
+    roll = example / "rolltest-2023.csv"
     whole, alone = (
         mwdcal(*COMMANDS[name](tool, roll, tmp_path), "--json")
         for tool in (f"{filled}#SIM-0001", example.parent / "tools" / "SIM-0001.json")
@@ -186,7 +186,7 @@ def test_a_tool_that_is_not_there_is_named_with_those_that_are(filled, serial, w
 
 
 def test_the_registry_behind_a_tool_is_an_input_which_no_output_replaces(filled, example):
-    ran = mwdcal("apply", f"{filled}#SIM-0001", example / "rolltest.csv", "-o", filled)
+    ran = mwdcal("apply", f"{filled}#SIM-0001", example / "rolltest-2023.csv", "-o", filled)
     assert "would be lost" in refused(ran, 2)
     assert "would be lost" in refused(mwdcal("registry", "--database", filled, "backup", filled), 2)
 
@@ -196,7 +196,7 @@ def test_an_export_makes_the_same_registry(filled, example, tmp_path):
     copy = tmp_path / "copy.sqlite"
     registry(copy, "init")
     added = registry(copy, "add", tmp_path / "out")
-    assert (added["refused"], sum(added["new"].values())) == (0, 26)
+    assert (added["refused"], sum(added["new"].values())) == (0, 27)
     registry(copy, "export", tmp_path / "again")
     first, second = (
         json.loads((tmp_path / name / "manifest.json").read_bytes()) for name in ("out", "again")
@@ -220,7 +220,7 @@ def test_a_changed_file_of_an_export_is_refused_and_the_others_added(filled, tmp
     copy = tmp_path / "copy.sqlite"
     registry(copy, "init")
     added = registry(copy, "add", tmp_path / "out")
-    assert (added["refused"], sum(added["new"].values())) == (1, 25)
+    assert (added["refused"], sum(added["new"].values())) == (1, 26)
     assert "changed since it was exported" in added["findings"][0]["text"]
 
 

@@ -2,8 +2,8 @@
 
     python examples/registry/laboratory.py laboratory [--tools 200] [--years 5]
 
-Every tool comes back once a year, its scales and biases a little changed. The first tool is knocked before its last
-visit, which ends with a roll test. All data are simulated; the same numbers, the same bytes.
+Every tool comes back once a year, its scales and biases a little changed. The first tool has a roll test at each of its
+last two visits, and is knocked between them. All data are simulated; the same numbers, the same bytes.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ DAYS_APART = 0.9
 
 
 def laboratory(folder: Path, tools: int, years: int) -> None:
-    """Write the profile, the laboratory, run files and the roll test."""
+    """Write the profile, the laboratory, run files and roll tests."""
     profile, _ = load_profile(str(SERVO / "tool.toml"))
     sessions = [Session.of(load_plan(name), profile) for name in ("twenty-four-state", "roll-test")]
     rng = np.random.default_rng(SEED)
@@ -47,12 +47,13 @@ def laboratory(folder: Path, tools: int, years: int) -> None:
     for name in ("tool.toml", "laboratory.toml"):
         atomic.write(folder / name, (SERVO / name).read_bytes())
     for year in range(FIRST_YEAR, FIRST_YEAR + years):
-        last = year == FIRST_YEAR + years - 1
-        truth = truth if year == FIRST_YEAR else aged(truth, rng, knocked=last)
+        visits_to_come = FIRST_YEAR + years - 1 - year
+        truth = truth if year == FIRST_YEAR else aged(truth, rng, knocked=not visits_to_come)
         (folder / "runs" / str(year)).mkdir(exist_ok=True)
         for serial, run in runs(sessions[0], truth, rng, year):
             write(folder / "runs" / str(year) / f"{serial}.csv", run)
-    write(folder / "rolltest.csv", next(runs(sessions[1], truth, rng, year))[1])
+        if visits_to_come < 2:
+            write(folder / f"rolltest-{year}.csv", next(runs(sessions[1], truth, rng, year))[1])
 
 
 def aged(truth: Truth, rng: np.random.Generator, knocked: bool) -> Truth:

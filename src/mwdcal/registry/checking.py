@@ -59,6 +59,9 @@ def check(
                     break
     except InputError as error:
         result.append(Discrepancy("unreadable", str(error)))
+    except TypeError:
+        text = "a value is not of the type that the program writes, and nothing after it can be compared"
+        result.append(Discrepancy("unreadable", text))
     return result
 
 

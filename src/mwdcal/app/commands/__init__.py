@@ -25,7 +25,9 @@ class Commands(UserDict[str, Any]):
     def __getitem__(self, name: str) -> Any:
         """The command of that name."""
         module, _, attribute = super().__getitem__(name).partition(":")
-        return getattr(import_module(f"{__name__}.{module}"), attribute or "command")
+        command = getattr(import_module(f"{__name__}.{module}"), attribute or "command")
+        command.name = name
+        return command
 
 
 class Group(click.Group):
