@@ -196,7 +196,7 @@ def _without_primary_key(connection: sa.Connection) -> list[str]:
         table.name: list(table.primary_key.columns.keys()) for table in metadata.sorted_tables
     }
     present = sa.inspect(connection).get_multi_pk_constraint(filter_names=[*expected])
-    keys = {name: key and key["constrained_columns"] for (_, name), key in present.items()}
+    keys = {name: key["constrained_columns"] for (_, name), key in present.items()}
     return [name for name, columns in expected.items() if keys.get(name) != columns]
 
 
