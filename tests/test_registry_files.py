@@ -300,6 +300,13 @@ def test_days_and_serials_that_people_write_otherwise_are_named(example, tmp_pat
     assert registry(path, "add", tmp_path / "all.parquet")["findings"] == []  # nothing new
 
 
+def test_a_page_behind_the_last_one_is_empty(filled):
+    assert (
+        run("registry", "--database", filled, "list", "--offset", 99).out.strip()
+        == "3 tools   SIMULATED DATA"
+    )
+
+
 def test_nothing_replaces_a_registry_but_a_backup_another(filled, tmp_path):
     other = tmp_path / "other.sqlite"
     registry(other, "init")

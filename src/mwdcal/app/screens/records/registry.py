@@ -251,7 +251,7 @@ def _heading(listing: Listing, noun: str) -> str:
     shown_rows = len(listing.tools) or len(listing.records)
     part = (
         f"   {listing.offset + 1} to {listing.offset + shown_rows}"
-        if shown_rows < listing.total
+        if 0 < shown_rows < listing.total
         else ""
     )
     words = [f"{plural(listing.total, noun)}{part}", *[SIMULATED] * simulated]
