@@ -301,10 +301,8 @@ def test_days_and_serials_that_people_write_otherwise_are_named(example, tmp_pat
 
 
 def test_a_page_behind_the_last_one_is_empty(filled):
-    assert (
-        run("registry", "--database", filled, "list", "--offset", 99).out.strip()
-        == "3 tools   SIMULATED DATA"
-    )
+    shown = run("registry", "--database", filled, "list", "--offset", 99).out
+    assert shown == "3 tools\n"
 
 
 def test_nothing_replaces_a_registry_but_a_backup_another(filled, tmp_path):
