@@ -49,11 +49,12 @@ class Increments:
 
     @classmethod
     def of(cls, history: History, places: Sequence[int]) -> Increments:
-        """Those of the calibrations that have all parameters of the group."""
+        """Those of the calibrations that have all parameters of the group and none of the others as a prior."""
         values, covariance = history.values[:, places], history.covariance
         block = covariance[:, places][..., places]
         known = np.diagonal(history.precision, axis1=-2, axis2=-1)[:, places]
-        usable = np.flatnonzero(np.isfinite(values).all(-1) & (known > 0).all(-1))
+        independent = True if history.has_prior is None else ~history.has_prior
+        usable = np.flatnonzero(np.isfinite(values).all(-1) & (known > 0).all(-1) & independent)
         count, size = len(usable) - 1, len(places)
         if count < 1 or not size:
             return cls(np.zeros(0), np.zeros(0))
