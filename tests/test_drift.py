@@ -339,6 +339,18 @@ def test_intervals_of_rates_hold_the_true_ones():
         assert 0.9 - 0.03 - 3 * np.std(shares) / np.sqrt(16) < np.mean(shares) < 0.98
 
 
+def test_one_knocked_tool_does_not_spoil_the_rates_of_its_peers():
+    rng = np.random.default_rng(21)
+    times, rate = np.arange(3.0), np.full(21, 0.5)
+    values = walked(rng, rate, 1.0, times, 21)
+    values[-1, 2:] += 1e3
+    tools = [Increments.of(tool, [BIAS]) for tool in one_group(values, 1.0, times)]
+    alone, among = GroupRates.of(tools[:-1]), GroupRates.of(tools)
+    quarters = [quantiles(g.rates, g.peers_probability, [0.25, 0.5, 0.75]) for g in (alone, among)]
+    # Less than the centre of 20 log-normal rates is uncertain by (0.3 / √20 decades); without the share, 1.4.
+    assert np.log10(quarters[1] / quarters[0]) == pytest.approx(0, abs=0.05)
+
+
 def test_growth_begins_at_the_accuracy_that_is_stated(years):
     calibration = years["T-2"][-1]
     each = {g.angle: g for g in growths(tool_history(years["T-2"]))}

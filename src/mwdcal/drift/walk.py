@@ -1,7 +1,7 @@
 """How fast parameters wander: a random walk of each, its rate estimated with that of the tool's peers.
 
 Between two calibrations t years apart a parameter moves by a normal variable of variance q t. Parameters of
-a kind (`WALK_GROUPS`) have one rate; rates of tools of a type are log-normal about a common one.
+a kind (`WALK_GROUPS`) have one rate; rates of tools of a type are log-normal about a common one, but for a few (`UNLIKE_SHARE`) of any rate.
 """
 
 from __future__ import annotations
@@ -27,6 +27,8 @@ RATE_SPREADS = np.linspace(0.05, 1.0, 20)
 """Standard deviations, in decades, of the rates of tools of a type; see `SPREAD_SCALE`."""
 SPREAD_SCALE = 0.4
 """Most probable of these before there are data, of a Rayleigh distribution: it keeps away from none at all."""
+UNLIKE_SHARE = 0.02
+"""Share of the tools of a type, knocked or repaired ones, whose rates are unlike those of the others."""
 SHORTEST = 1 / 365.25
 """Two calibrations on one day are taken as this far apart, years."""
 
@@ -104,7 +106,8 @@ class GroupRates:
         """Share (c, s, r) of the tools of a type with each rate, by centre and spread of the type."""
         z = (DECADES - RATE_CENTRES[:, None, None]) / RATE_SPREADS[:, None]
         density = np.exp(-0.5 * z**2)
-        return np.asarray(density / density.sum(-1, keepdims=True))
+        alike = density / density.sum(-1, keepdims=True)
+        return np.asarray((1 - UNLIKE_SHARE) * alike + UNLIKE_SHARE / len(DECADES))
 
     def _evidence(self, log_likelihood: Array) -> Array:
         """Log probability (…, c, s) of a tool's calibrations, by centre and spread of its type."""
