@@ -30,7 +30,7 @@ from mwdcal.files.profiles import load_profile
 from mwdcal.planning.plans import load_plan
 from mwdcal.planning.session import Session
 from mwdcal.planning.simulate import drawn
-from mwdcal.registry import checking, imports, queries
+from mwdcal.registry import checking, imports, lookup, queries
 from mwdcal.registry.setup import create
 from mwdcal.registry.store import Registry, open_registry
 
@@ -108,7 +108,7 @@ def pages(registry: Registry, count: int) -> dict[str, Callable[[int], object]]:
         "all calibrations of a tool": lambda k: [*queries.calibrations(registry, serial(k))],
         "calibrations, newest first": lambda k: queries.records_page(registry, "calibration"),
         "history, newest events": lambda k: queries.events(registry),
-        "what is due": lambda k: queries.due(registry, "2030-01-01"),
+        "what is due": lambda k: lookup.listed(registry, None, "", "2030-01-01", 0, 50),
         "counts of everything": lambda k: queries.counts(registry),
     }
 

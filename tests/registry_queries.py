@@ -17,7 +17,7 @@ from pathlib import Path
 
 import sqlalchemy as sa
 
-from mwdcal.registry import checking, copies, queries
+from mwdcal.registry import checking, copies, lookup, queries
 from mwdcal.registry.setup import create
 from mwdcal.registry.store import Entry, Registry, open_registry
 from registry_support import calibration, empty_database, postgresql_server
@@ -79,7 +79,7 @@ def pages(registry: Registry, tools: int) -> dict[str, Callable[[], object]]:
         "calibrations, oldest": lambda: queries.records_page(
             registry, "calibration", newest_first=False
         ),
-        "due": lambda: queries.due(registry, "2026-12-31"),
+        "due": lambda: lookup.listed(registry, None, "", "2026-12-31", 0, 50),
         "history": lambda: queries.events(registry),
         "history, half way": lambda: queries.events(registry, offset=tools * PER_TOOL // 2),
         "counts": lambda: queries.counts(registry),

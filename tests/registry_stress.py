@@ -34,14 +34,14 @@ from registry_support import calibration, empty_database, postgresql_server
 SERIALS = 40
 
 
-def write_on(database: str, log: str, writer: int, end: float) -> None:
-    """Add files until the end, and note each acknowledged call: SHA-256 of its files, one line."""
+def write_on(database: str, log: str, writer: int, end: str) -> None:
+    """Add files until the file `end` exists, and note each acknowledged call: SHA-256 of its files, one line."""
     rng, count = random.Random(writer), 0
     with open(log, "ab", buffering=0) as acknowledged:
-        while time.time() < end:
+        while not os.path.exists(end):
             try:
                 with open_registry(database) as registry:
-                    while time.time() < end:
+                    while not os.path.exists(end):
                         files = []
                         for _ in range(rng.choice([1, 1, 1, 5])):
                             count += 1
@@ -69,18 +69,20 @@ def stressed(
     database: str, folder: Path, writers: int, seconds: float, kills: int, seed: int = 1
 ) -> tuple[list[list[str]], Counter[str]]:
     """What was acknowledged to writers, by call, and how often they were killed or refused."""
-    rng, begun = random.Random(seed), time.time()
-    end, context = begun + seconds, writers_context()
-    events: Counter[str] = Counter()
+    rng, context = random.Random(seed), writers_context()
+    end, events = folder / "end", Counter[str]()
 
     def started(number: int):
-        arguments = (database, str(folder / f"{number}.log"), number, end)
+        arguments = (database, str(folder / f"{number}.log"), number, str(end))
         process = context.Process(target=write_on, args=arguments)
         process.start()
         return process
 
     running = [started(number) for number in range(writers)]
     number = writers
+    while not any(log.stat().st_size for log in folder.glob("*.log")):
+        time.sleep(0.02)  # until the first has begun: a process takes seconds on a busy machine
+    begun = time.time()
     for kill in range(kills):
         time.sleep(max(0.0, begun + (kill + rng.random()) * seconds / (kills + 1) - time.time()))
         served = backends(database) if kill % 25 == 12 else []
@@ -96,8 +98,10 @@ def stressed(
         running[at].join()
         running[at] = started(number)
         number += 1
+    time.sleep(max(0.0, begun + seconds - time.time()))
+    end.touch()
     for process in running:
-        process.join(seconds + 120)
+        process.join(120)
         events[f"exit status {process.exitcode}"] += 1
     return acknowledged_in(folder, events), events
 

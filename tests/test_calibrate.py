@@ -49,8 +49,8 @@ def many_runs(count, seed, inclinations, toolfaces, unknown=(), sd=NOISE):
 def half_widths(result, raw):
     """Errors' 95 % half widths (runs, 5, n) at raw readings, written once more.
 
-    Per triad s² times the covariance; Student's t with the degrees of freedom of Welch and
-    Satterthwaite. Also the corrected vectors (runs, n, 6).
+    Per triad s² times the covariance; Student's t with the degrees of freedom of the triad with the
+    fewest, of those that an observable needs. Also the corrected vectors (runs, n, 6).
     """
     triads = list(zip(result.problem.triads, result.problem.slices(), strict=True))
     size, runs = triads[-1][1].stop, len(result.state.params)
@@ -65,12 +65,9 @@ def half_widths(result, raw):
     for name in SHOWN:
         rows = np.einsum("bni,bnip->bnp", OBSERVABLES[name].gradient(*fields), slopes)
         square = np.einsum("bnp,bpq,bnq->bn", rows, covariance, rows)
-        below = 0.0
-        for t, (_, where) in enumerate(triads):
-            part = rows[..., where]
-            part = np.einsum("bnp,bpq,bnq->bn", part, covariance[:, where, where], part)
-            below = below + part**2 / result.analysis.freedom[:, t, None]
-        widths.append(np.sqrt(square) * stdtrit(square**2 / below, 0.975))
+        needed = 1 if name in ("gravity", "inclination") else 2
+        freedom = result.analysis.freedom[:, :needed].min(-1)
+        widths.append(np.sqrt(square) * stdtrit(freedom, 0.975)[:, None])
     return np.stack(widths, 1), np.concatenate(fields, -1)
 
 

@@ -251,8 +251,7 @@ def test_the_accuracy_is_that_of_the_calibration_at_the_attitudes_and_temperatur
 
 def test_the_coverage_factor_is_that_of_welch_and_satterthwaite(thermal):
     """Of lines with these degrees of freedom; computed by hand."""
-    from mwdcal.calibration.record import BudgetRow
-    from mwdcal.calibration.results import NOISE, ORDER
+    from mwdcal.calibration.record import NOISE, ORDER, BudgetRow
 
     def factor(noise, order, freedom):
         sizes = {NOISE: noise, ORDER: order, "tilt of the stand": 1.0}
@@ -482,6 +481,20 @@ def test_an_overdue_standard_is_marked_on_the_day_of_the_calibration(thermal):
     assert document.calibrated == "2026-03-15"
 
 
+def test_a_standard_that_was_calibrated_later_is_a_finding(thermal):
+    days = {
+        "before": date(2026, 3, 14),
+        "on the day": date(2026, 3, 15),
+        "after": date(2026, 3, 16),
+    }
+    standards = tuple(
+        MeasurementStandard(quantity="stand", name=name, issued=day) for name, day in days.items()
+    )
+    document = issued(thermal, Laboratory(standards=standards))
+    (text,) = (f.text for f in document.findings if f.id == "standard-later")
+    assert "stand standard after was calibrated on 2026-03-16" in text
+
+
 def test_standards_of_the_laboratory_replace_those_of_the_profile(servo):
     def standard(quantity, name, certificate=""):
         return MeasurementStandard(quantity=quantity, name=name, certificate=certificate)
@@ -512,9 +525,11 @@ def test_the_next_calibration_is_due_after_whole_months(servo, day, months, due)
 
 
 def test_without_a_date_of_the_run_the_day_of_the_fit_stands_and_is_said_to(servo):
-    document = issued(servo)
-    assert document.calibrated == servo.time[:10]
-    assert "date-not-stated" in named(document.findings)
+    for day, early in ((date(2000, 1, 1), True), (date(2999, 1, 1), False)):
+        document = issued(servo, issued=day)
+        assert document.calibrated == servo.time[:10]
+        said = named(document.findings)["date-not-stated"]
+        assert ("dated before it, 2000-01-01" in said) == early
 
 
 def test_days_in_the_wrong_order_are_refused(thermal):

@@ -59,8 +59,8 @@ def pages(pdf):
 
 
 def squeezed(text):
-    """Text without blanks, and without the places where a long word may break."""
-    return re.sub(r"[\s\u200b]+", "", text)
+    """Text without blanks."""
+    return re.sub(r"\s+", "", text)
 
 
 class Words(HTMLParser):

@@ -154,7 +154,7 @@ def test_a_defect_is_called_one_and_shows_no_traceback(tmp_path, monkeypatch):
     def broken(*arguments):
         raise ZeroDivisionError("oh")
 
-    monkeypatch.setattr(documents, "load", broken)
+    monkeypatch.setattr(documents, "contents", broken)
     monkeypatch.delenv("MWDCAL_DEBUG", raising=False)
     ran = mwdcal("convert", tmp_path / "c.json", "--notation", "affine")
     assert ran.code == 70
@@ -169,7 +169,7 @@ def test_not_enough_memory_is_told(tmp_path, monkeypatch):
     def big(*arguments):
         raise MemoryError
 
-    monkeypatch.setattr(documents, "load", big)
+    monkeypatch.setattr(documents, "contents", big)
     assert "not enough memory" in refused(mwdcal("convert", "c", "--notation", "affine"), 2)
 
 

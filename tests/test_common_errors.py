@@ -6,6 +6,7 @@ of the package is used for it.
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from cli_support import EXAMPLE, mwdcal, servo_run, write_csv
 from mwdcal.calibration.calibrate import calibrate
@@ -268,3 +269,27 @@ def test_a_prior_of_the_same_stand_is_reported():
     bare = runs("toolface-zero", 0.0, declared=False, count=1, seed=4)[1]
     record = calibrate(member_readings(bare, 0), Profile(name="x"), options)
     assert not [f for f in record.findings if f.id == "prior-shared"]
+
+
+def test_intervals_hold_95_percent_where_the_triads_share_errors():
+    """Their errors are correlated by those of the stand: Student's t is of the sources, not of the triads.
+
+    Of the triads it would make k 4 and more, and hold 98.5 % or more of azimuths and dips.
+    """
+    tool, data = runs("dip", SIZES["dip"], count=120)
+    rng, covered, ratios_to_student = np.random.default_rng(7), {"azimuth": [], "dip": []}, []
+    for pair in zip(data.accelerometer, data.magnetometer, strict=True):
+        record = calibrate(Readings(*pair, known=data.known, sd=data.sd), Profile(name="tool"))
+        attitudes = rng.uniform(20, 160, 20) * DEG, *rng.uniform(0, 2 * np.pi, (2, 20))
+        probe = Readings(*tool.clean(*attitudes))
+        fewest = min(triad.degrees_of_freedom for triad in record.triads)
+        for name, true in (("azimuth", attitudes[1]), ("dip", tool.dip)):
+            error = centred(OBSERVABLES[name].value(*record.fields(probe)) - true)
+            width = record.expanded_uncertainty(name, probe)
+            covered[name].append(np.abs(error) < width)
+            ratios_to_student.append(
+                width / record.uncertainty(name, probe) / stats.t.ppf(0.975, fewest)
+            )
+    np.testing.assert_allclose(ratios_to_student, 1.0, rtol=1e-9)
+    for name, inside in covered.items():
+        assert 0.93 < np.mean(inside) < 0.975, name  # 0.95 with a deviation of 0.006

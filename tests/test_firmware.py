@@ -24,8 +24,9 @@ from cli_support import (
     write_csv,
 )
 from mwdcal import calibrate, read_run, save
+from mwdcal.calibration.canonical import rounded
 from mwdcal.calibration.readings import Readings
-from mwdcal.calibration.record import StationRow, rounded
+from mwdcal.calibration.record import StationRow
 from mwdcal.files import documents
 from simulation import Tool, attitude
 from test_notation import AXES, SCALES, TRIADS, made, signed

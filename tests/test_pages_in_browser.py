@@ -65,12 +65,10 @@ SAMPLES = {
 
 
 def page_options(command):
-    """Options of a command that name a page to write."""
-    return [
-        option.opts[0]
-        for option in command.params
-        if {"--report", "--html"} & {*option.opts} or ".html" in (option.metavar or "")
-    ]
+    """Options of a command that name a page to write, the usual ones first."""
+    options = [(option.opts[0], option.metavar or "") for option in command.params]
+    usual = [name for name, _ in options if name in ("--report", "--html")]
+    return usual or [name for name, metavar in options if ".html" in metavar]
 
 
 def with_a_page():

@@ -524,7 +524,7 @@ def test_a_simulated_stand_is_off_by_its_uncertainty():
 
 def test_the_bundled_example_is_what_its_script_writes(tmp_path):
     folder = Path("examples/servo").resolve()
-    for name in ("make.py", "tool.toml"):
+    for name in ("make.py", "tool.toml", "laboratory.toml"):
         shutil.copy(folder / name, tmp_path / name)
     subprocess.run([sys.executable, tmp_path / "make.py"], check=True, env=os.environ)
     for name in CONTENTS:

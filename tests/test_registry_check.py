@@ -5,6 +5,7 @@ import random
 import re
 import shutil
 import sqlite3
+import zlib
 from contextlib import closing, contextmanager, suppress
 
 import psycopg
@@ -12,7 +13,7 @@ import pytest
 import sqlalchemy as sa
 
 from mwdcal.errors import InputError
-from mwdcal.registry import checking
+from mwdcal.registry import checking, store
 from mwdcal.registry.setup import create
 from mwdcal.registry.store import Entry, open_registry
 from registry_support import calibration, drop_database, empty_database
@@ -249,6 +250,34 @@ def test_a_changed_schema_is_reported(original, tmp_path, statement):
     assert verdict(path) & {"schema", "unreadable"}
 
 
+def test_a_serial_that_is_no_text_is_reported(original, tmp_path):
+    path = tmp_path / "changed.registry"
+    shutil.copyfile(original, path)
+    with closing(sqlite3.connect(path)) as connection:
+        columns = "(serial, first_seen, records, calibrations, simulated)"
+        connection.execute(f"INSERT INTO tools {columns} VALUES (x'41', '', 1, 1, 0)")
+        connection.commit()
+    assert verdict(path) == {"tools"}
+
+
+def test_a_time_that_is_no_text_is_reported(original, tmp_path):
+    path = tmp_path / "changed.registry"
+    shutil.copyfile(original, path)
+    with closing(sqlite3.connect(path)) as connection, without_triggers(connection):
+        connection.execute("UPDATE history SET time = CAST(time AS BLOB) WHERE number = 2")
+        connection.commit()
+    assert {"event", "unreadable"} <= verdict(path)
+
+
+def test_no_more_is_unpacked_than_a_registry_takes(monkeypatch):
+    monkeypatch.setattr(store, "LARGEST_OBJECT", 1000)
+    packed = zlib.compress(bytes(10_000_000), 9)
+    with pytest.raises(InputError, match="damaged"):  # not what it unpacks to
+        store.unpacked(packed, 10_000_000)
+    with pytest.raises(InputError, match="damaged"):
+        store.unpacked(packed, 2**62)
+
+
 @pytest.mark.parametrize("table", ["objects", "records", "withdrawals", "history"])
 def test_triggers_refuse_changes(original, tmp_path, table):
     path = tmp_path / "changed.registry"
@@ -317,6 +346,17 @@ def test_each_of_a_thousand_changes_of_postgresql_is_reported(postgresql):
         "ALTER TABLE records DROP CONSTRAINT records_sha256",
         "CREATE OR REPLACE FUNCTION mwdcal_refuse() RETURNS trigger LANGUAGE plpgsql AS 'BEGIN RETURN NEW; END'",
         "CREATE TRIGGER sly AFTER INSERT ON records FOR EACH ROW EXECUTE FUNCTION mwdcal_refuse()",
+        "DROP TRIGGER history_no_update ON history; CREATE TRIGGER history_no_update BEFORE UPDATE ON history "
+        "FOR EACH STATEMENT WHEN (false) EXECUTE FUNCTION mwdcal_refuse()",
+        "CREATE RULE lost AS ON INSERT TO tools DO INSTEAD NOTHING",
+        "ALTER TABLE records ENABLE ROW LEVEL SECURITY",
+        "ALTER TABLE history SET UNLOGGED",
+        "ALTER TABLE history DROP CONSTRAINT history_pkey",
+        "ALTER TABLE records ADD CONSTRAINT few CHECK (number < 1000)",
+        "ALTER TABLE records ALTER COLUMN name SET DEFAULT 'none'",
+        'ALTER TABLE tools ALTER COLUMN serial TYPE text COLLATE "default"',
+        "CREATE TABLE part () INHERITS (records)",
+        "DROP INDEX records_run; CREATE INDEX records_run ON records (run) WHERE kind = 'run'",
     ],
 )
 def test_a_changed_schema_of_postgresql_is_reported(postgresql, statement):

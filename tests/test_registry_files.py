@@ -14,6 +14,7 @@ pq = pytest.importorskip("pyarrow.parquet")
 pa = pytest.importorskip("pyarrow")
 pytest.importorskip("sqlalchemy")
 
+from mwdcal.registry.imports import Adding  # noqa: E402
 from test_schemas import checked  # noqa: E402
 
 LABORATORY = ROOT / "examples" / "registry" / "laboratory.py"
@@ -186,10 +187,8 @@ def test_a_tool_that_is_not_there_is_named_with_those_that_are(filled, serial, w
 
 def test_the_registry_behind_a_tool_is_an_input_which_no_output_replaces(filled, example):
     ran = mwdcal("apply", f"{filled}#SIM-0001", example / "rolltest-2023.csv", "-o", filled)
-    assert "it is an input" in refused(ran, 2)
-    assert "it is an input" in refused(
-        mwdcal("registry", "--database", filled, "backup", filled), 2
-    )
+    assert "would be lost" in refused(ran, 2)
+    assert "would be lost" in refused(mwdcal("registry", "--database", filled, "backup", filled), 2)
 
 
 def test_an_export_makes_the_same_registry(filled, example, tmp_path):
@@ -242,6 +241,80 @@ def test_a_withdrawn_calibration_counts_no_longer_also_in_an_export(filled, exam
     assert registry(work, "check")["sound"]
     again = mwdcal("registry", "--database", work, "withdraw", digest, "--reason", "x")
     assert "withdrawn already" in refused(again, 2)
+
+
+def test_an_interrupted_import_leaves_no_withdrawn_calibration_that_counts(
+    filled, example, tmp_path, monkeypatch
+):
+    work, copy = tmp_path / "work.sqlite", tmp_path / "copy.sqlite"
+    shutil.copy(filled, work)
+    digest = sha256(example.parent / "tools" / "SIM-0001.json")
+    registry(work, "withdraw", digest[:12], "--reason", "wrong stand angles")
+    registry(work, "export", tmp_path / "out")
+    registry(copy, "init")
+
+    def stopped(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:  # stopped as soon as the first transaction is on the disk
+        patch.setattr(Adding, "_note", stopped)
+        mwdcal("registry", "--database", copy, "add", tmp_path / "out", "--workers", 1)
+    registry(copy, "add", tmp_path / "out")
+    past = registry(copy, "history", "SIM-0001")["records"]
+    assert [r["sha256"] for r in past if r["reason"]] == [digest]
+
+
+def test_a_reason_that_many_files_have_is_given_once(example, tmp_path):
+    for number in range(30):
+        (tmp_path / f"notes{number:02d}.txt").write_text(f"to do {number}", "utf-8")
+    shutil.copy(example / "tool.toml", tmp_path)
+    path = tmp_path / "r.sqlite"
+    registry(path, "init")
+    findings = registry(path, "add", *sorted(tmp_path.glob("[nt]*.t*")))["findings"]
+    assert [f["id"] for f in findings] == ["refused-file"]
+    assert "30 files, such as notes00.txt: a registry keeps" in findings[0]["text"]
+
+
+def test_days_and_serials_that_people_write_otherwise_are_named(example, tmp_path):
+    text = (example / "runs" / "2022" / "SIM-0001.csv").read_text("utf-8")
+    runs = tmp_path / "runs"
+    runs.mkdir()
+    for number, serial in enumerate(("Ab-1", "AB -1", "ab\u20101", "AB-11", "AB-11b")):
+        changed = text.replace("SIM-0001", serial)
+        if number == 3:
+            changed = changed.replace("2022-03-01", "01.03.2022")
+        (runs / f"{number}.csv").write_text(changed, "utf-8")
+    tool = ("--tool", example / "tool.toml", "--workers", 1)
+    run("fleet", runs, *tool, "-o", tmp_path / "all.parquet")
+    path = tmp_path / "r.sqlite"
+    registry(path, "init")
+    findings = {
+        f["id"]: f["text"] for f in registry(path, "add", tmp_path / "all.parquet")["findings"]
+    }
+    assert set(findings) == {"no-date", "similar-serials"}
+    assert (
+        "1 calibration without a day of the measurement, such as AB-11.json" in findings["no-date"]
+    )
+    assert "'AB -1' and 'Ab-1' and 'ab\u20101'" in findings["similar-serials"]
+    assert "AB-11" not in findings["similar-serials"]
+    assert registry(path, "add", tmp_path / "all.parquet")["findings"] == []  # nothing new
+
+
+def test_a_page_behind_the_last_one_is_empty(filled):
+    shown = run("registry", "--database", filled, "list", "--offset", 99).out
+    assert shown == "3 tools\n"
+
+
+def test_nothing_replaces_a_registry_but_a_backup_another(filled, tmp_path):
+    other = tmp_path / "other.sqlite"
+    registry(other, "init")
+    before = other.read_bytes()
+    for words in (["backup", other], ["get", "SIM-0001", "-o", other]):
+        ran = mwdcal("registry", "--database", filled, *words)
+        assert "it is a registry, which would be lost" in refused(ran, 2)
+    assert other.read_bytes() == before
+    for _ in range(2):
+        registry(filled, "backup", tmp_path / "backup.sqlite")
 
 
 def test_what_is_no_file_of_a_registry_is_named_and_stops_nothing(example, tmp_path):

@@ -4,6 +4,7 @@ import json
 import re
 import shlex
 
+import pypdf
 import pytest
 
 from cli_support import ROOT, mwdcal
@@ -44,6 +45,11 @@ def test_the_recipe_leads_from_an_empty_folder_to_a_signed_certificate(tmp_path,
     certificate = json.loads((tmp_path / "laboratory" / "certificate.json").read_bytes())
     assert (certificate["as_found"]["passed"], certificate["as_left"]["passed"]) == (False, True)
     assert certificate["simulated"]
+    assert any(
+        "accelerometer bias-y between 2025" in remark["text"] for remark in certificate["findings"]
+    )
+    pages = pypdf.PdfReader(tmp_path / "laboratory" / "certificate.pdf").pages
+    assert any("Biases from calibration to calibration" in page.extract_text() for page in pages)
     ran = mwdcal("registry", "--database", "tools.sqlite", "history", "SIM-0001", "--json")
     kinds = [record["kind"] for record in ran.json["records"]]
     expected = {"calibration": 5, "run": 7, "verification": 3, "certificate": 1}

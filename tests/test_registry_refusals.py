@@ -11,6 +11,7 @@ import pytest
 import sqlalchemy as sa
 
 from mwdcal.errors import InputError
+from mwdcal.files import documents
 from mwdcal.registry import copies
 from mwdcal.registry.database import connections, places
 from mwdcal.registry.setup import create, upgrade
@@ -194,12 +195,24 @@ def test_odd_names_of_files(tmp_path, name):
         "postgresql+asyncpg://ada:s3cret@127.0.0.1:1/tools",
         "postgresql://ada:s3cret@127.0.0.1:1/tools?sslmode=s3cret",
         "postgresql://ada:s3cret@[::1/tools",
+        "postgresql://ada:key@s3cret@127.0.0.1/tools",
+        "postgresql://ada:key@s3cret:x@127.0.0.1/tools",
+        "postgresql:ada:s3cret@127.0.0.1",
+        "postgres:/ada:s3cret@127.0.0.1/tools",
+        " postgresql://ada:s3cret@127.0.0.1/tools",
+        "jdbc:postgresql://ada:s3cret@127.0.0.1/tools",
+        "host=127.0.0.1 user=ada password=s3cret",
     ],
 )
 def test_urls_that_lead_nowhere(url):
     for call in (opened, lambda u: create(u, "Ada"), lambda u: upgrade(u, "Ada")):
         with refused():
             call(url)
+
+
+def test_a_calibration_is_not_read_from_a_server():
+    with refused("mwdcal registry get"):
+        documents.load("postgresql:/ada:s3cret@127.0.0.1/tools#SIM-0001")
 
 
 def test_servers_that_refuse(postgresql):

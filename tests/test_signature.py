@@ -323,6 +323,14 @@ def test_rotation_and_revocation(tmp_path, key, public):
     assert state(path, "--key", listed, "--key", public) == (1, "revoked")
     assert state(path, "--key", public, "--key", listed) == (1, "revoked")
     assert "laptop stolen" in mwdcal("certificate", "key", "list", listed).out
+    written = before.decode()
+    for place, retired in enumerate(("2001-01-02T00:00:00+12:00", "2001-01-01T13:00:00+00:00")):
+        other = written.replace('"retired": ""', f'"retired": "{retired}"')
+        (tmp_path / f"{place}.json").write_text(other)
+    both = trusted_keys.trusted([tmp_path / "1.json", tmp_path / "0.json"])
+    assert (
+        both[digits].retired == "2001-01-02T00:00:00+12:00"
+    )  # the earlier: 12:00 UTC of the first
     assert "already" in refused(mwdcal("certificate", "key", "trust", listed, public), 2)
 
 
@@ -478,7 +486,18 @@ def test_a_calibration_that_was_changed_is_not_signed(tmp_path, files, key):
 
 
 @pytest.mark.parametrize(
-    "content", ["", "[]", "{}", '{"a": NaN}', "1", '{"command": "x"}', "[" * 99_999]
+    "content",
+    [
+        "",
+        "[]",
+        "{}",
+        '{"a": NaN}',
+        "1",
+        '{"command": "x"}',
+        "[" * 99_999,
+        '{"schema_version": 1, "command": "certificate", "value": 1e999}',
+        '{"schema_version": 1, "command": "certificate", "item": {"serial": "A", "serial": "B"}}',
+    ],
 )
 def test_what_is_no_document_is_not_signed_or_verified(tmp_path, key, public, content):
     path = tmp_path / "other.json"
@@ -526,6 +545,37 @@ def test_the_files_of_a_certificate_are_checked(tmp_path, files, key, public):
     other = tmp_path / "other.txt"
     other.write_text("another")
     assert "not among the files" in refused(mwdcal(*verify, other), 2)
+
+
+def test_a_changed_file_is_named_beside_a_copy_of_the_original(tmp_path, files, key, public):
+    """Every file that is named must be as it was; files of one name in two folders are told apart by content."""
+    folders = [tmp_path / name for name in ("left", "found", "changed")]
+    for folder, extra in zip(folders, (b"", b"\n", b" "), strict=True):
+        folder.mkdir()
+        (folder / "cal.json").write_bytes(files[0].read_bytes() + extra)
+    left, found, changed = (folder / "cal.json" for folder in folders)
+    copy = Path(shutil.copy(left, tmp_path / "copy.json"))
+    rows = [listed(left, "left/cal.json"), listed(found, "found/cal.json")]
+    path = signed(certificate(tmp_path, files=rows), key)
+
+    def states(*named):
+        ran = mwdcal("certificate", "verify", path, *named, "--key", public, "--json")
+        return ran.code, [file["state"] for file in ran.json["files"]]
+
+    assert states() == states(found, left) == states(copy, found) == (0, ["unchanged"] * 2)
+    assert states(changed, copy, found) == (1, ["changed"] * 2)
+    one = signed(certificate(tmp_path, files=rows[:1]), key)
+    ran = mwdcal("certificate", "verify", one, changed, copy, "--key", public, "--json")
+    assert (ran.code, ran.json["files"][0]["path"]) == (1, str(changed))
+
+
+def test_a_folder_in_place_of_a_file_is_a_change(tmp_path, files, key, public):
+    calibration = Path(shutil.copy(files[0], tmp_path / "cal.json"))
+    path = signed(certificate(tmp_path, files=[listed(calibration)]), key)
+    calibration.unlink()
+    calibration.mkdir()
+    ran = mwdcal("certificate", "verify", path, "--key", public, "--json")
+    assert (ran.code, ran.json["files"][0]["state"]) == (1, "changed")
 
 
 def test_files_lie_where_the_certificate_says_or_beside_it(tmp_path, files, key, public):

@@ -10,6 +10,7 @@ import numpy as np
 
 from mwdcal.calibration import results
 from mwdcal.calibration.automatic.auto import Choice, choose
+from mwdcal.calibration.canonical import rounded
 from mwdcal.calibration.diagnosis.findings import described, findings
 from mwdcal.calibration.diagnosis.flags import FittedRuns
 from mwdcal.calibration.diagnosis.refusals import UNSOUND_ADVICE, check, fit_refusals
@@ -27,7 +28,6 @@ from mwdcal.calibration.record import (
     StandErrors,
     TriadCalibration,
     Undetermined,
-    rounded,
     sealed,
     stated,
 )

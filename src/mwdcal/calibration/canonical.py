@@ -5,10 +5,13 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import msgspec
 
+Record = TypeVar("Record", bound=msgspec.Struct)
+DIGITS = 12
+"""Significant digits of every number in a calibration file."""
 UNHASHED = ("time", "sha256", "signature")
 """Fields of a calibration that its `sha256` is not of."""
 
@@ -40,3 +43,19 @@ def document_sha256(fields: Mapping[str, Any]) -> str:
     """The `content_sha256` of a calibration file, whose fields are these."""
     kept = {name: value for name, value in fields.items() if name not in UNHASHED}
     return hashlib.sha256(canonical(kept)).hexdigest()
+
+
+def rounded(record: Record) -> Record:
+    """The same record with every number at 12 significant digits, as files keep it.
+
+    More digits would differ from machine to machine with the threads of its linear algebra.
+    """
+    return msgspec.convert(_rounded(msgspec.to_builtins(record)), type(record))
+
+
+def _rounded(value: Any) -> Any:
+    if isinstance(value, float):
+        return float(f"{value:.{DIGITS - 1}e}")
+    if isinstance(value, dict):
+        return {key: _rounded(item) for key, item in value.items()}
+    return [_rounded(item) for item in value] if isinstance(value, list | tuple) else value

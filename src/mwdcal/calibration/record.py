@@ -9,14 +9,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from html import escape
 from itertools import pairwise
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar
 
 import msgspec
 import numpy as np
 
 from mwdcal import __version__
 from mwdcal.calibration.canonical import Signature, document_sha256
-from mwdcal.calibration.canonical import canonical as canonical
 from mwdcal.calibration.readings import NANOTESLA, SOAK_GAP, Readings, simulated
 from mwdcal.errors import InputError
 from mwdcal.geometry.observables import OBSERVABLES
@@ -24,18 +23,22 @@ from mwdcal.geometry.vectors import Array, Bools, diagonal
 from mwdcal.sensor.models import Basis, Factors, Model, Polynomial
 from mwdcal.sensor.profile import Profile
 
-Record = TypeVar("Record", bound=msgspec.Struct)
 SCHEMA_VERSION = 1
 DOCUMENT_VERSION = 1
 """Version of what commands print for machines: higher when a key goes, or changes its meaning."""
 SOFTWARE = f"mwdcal {__version__}"
 """Name and version of the program."""
-DIGITS = 12
-"""Significant digits of every number in a calibration file."""
 MARGIN = 1.0
 """Degrees Celsius by which a temperature may lie outside the calibrated range, as it is read."""
 MAGNETIC = ("azimuth", "field", "dip", "magnetic_toolface", "north_toolface", "bx", "by", "bz")
 """Observables that need a magnetometer."""
+NOISE, SETTINGS = "noise of the readings", "settings of the stand"
+REPEATABILITY, ORDER = "repeatability of the readings", "order of the temperature terms"
+"""Sources of a budget."""
+SCALED = (NOISE, REPEATABILITY, SETTINGS)
+"""Sources whose variance is scaled by that of the residuals."""
+AXES_OF_A_TERM = 3
+"""Axes on which a term beyond the order is seen: as many degrees of freedom has its size."""
 LARGEST_ANGLE_SD = 0.5
 """Largest standard uncertainty of a direction that is stated, rad: a fifth too small already, as the
 error of a direction no longer follows that of its vector, and soon without meaning."""
@@ -75,6 +78,10 @@ class BudgetRow(msgspec.Struct, frozen=True, kw_only=True):
     inclination_deg: float | None
     toolface_deg: float | None
     azimuth_deg: float | None = None
+
+
+ANGLE_COLUMNS = ("inclination_deg", "toolface_deg", "azimuth_deg")
+"""Fields of a `BudgetRow` with the share of a source in each angle."""
 
 
 class StandErrors(msgspec.Struct, frozen=True, kw_only=True):
@@ -485,28 +492,43 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
     ) -> Array:
         """Half width (…, n) of the interval that holds the calibration's error with a probability.
 
-        Student's t with the effective degrees of freedom of both triads (Welch-Satterthwaite);
-        NaN as in `uncertainty`. Reference: JCGM 100, G.4.
+        Student's t with the `effective_freedom` of the observable; NaN as in `uncertainty`.
         Singular: near vertical an error across the tool axis tilts it whichever way it points, so
         that of the inclination is the length of a vector; see `_tilt_width`.
         """
         from scipy.special import stdtrit
 
-        rows, covariance = self.sensitivity(name, readings), self.parameter_covariance
-        spread = np.zeros(rows.shape[:-1])
-        for triad, where in zip(self.triads, self.places().values(), strict=True):
-            part = rows[..., where]
-            variance = np.einsum("...i,ij,...j->...", part, covariance[where, where], part)
-            spread = spread + variance**2 / max(triad.degrees_of_freedom, 1.0)
+        freedom = self.effective_freedom(name)
         sd = self.uncertainty(name, readings)
-        freedom = np.maximum(sd**4 / np.where(spread > 0, spread, 1.0), 1.0)
         width = np.asarray(sd * stdtrit(freedom, (1 + probability) / 2))
         if name != "inclination":
             return width
         return self._tilt_width(readings, width, freedom, probability)
 
+    def effective_freedom(self, name: str) -> float:
+        """Effective degrees of freedom of the uncertainty of an observable, one or more.
+
+        Definition: Welch-Satterthwaite for the sources of the budget, which are independent; the
+        triads are not, by the errors that they share. What the residuals scale has the degrees of
+        freedom of the triad with the fewest, the order of the temperature terms those of the axes
+        that it is seen on, all else infinitely many. No more are counted than that triad has, as the
+        shares differ with attitude; an observable without a share has the fewest of any angle.
+        Reference: JCGM 100:2008, G.4.
+        """
+        triads = self.triads if name in MAGNETIC else [self.accelerometer]
+        fewest = max(min(triad.degrees_of_freedom for triad in triads), 1.0)
+        angles = [angle for angle in ANGLE_COLUMNS if angle == f"{name}_deg"] or ANGLE_COLUMNS
+        return min(self._freedom_by_source(angle, fewest) for angle in angles)
+
+    def _freedom_by_source(self, angle: str, fewest: float) -> float:
+        """Welch-Satterthwaite for an angle of the budget; `fewest`: of what the residuals scale."""
+        variance = {row.source: (getattr(row, angle) or 0.0) ** 2 for row in self.budget}
+        scaled = sum(variance.get(source, 0.0) for source in SCALED)
+        spread = scaled**2 / fewest + variance.get(ORDER, 0.0) ** 2 / AXES_OF_A_TERM
+        return min(sum(variance.values()) ** 2 / spread, fewest) if spread else fewest
+
     def _tilt_width(
-        self, readings: Readings, width: Array, freedom: Array, probability: float
+        self, readings: Readings, width: Array, freedom: float, probability: float
     ) -> Array:
         """The half width (…, n) of inclination: `width` away from vertical, that of a tilt near it.
 
@@ -581,22 +603,6 @@ def html_table(caption: str, rows: Iterable[tuple[str, ...]]) -> str:
     lines = ("".join(f"<td>{escape(cell)}</td>" for cell in row) for row in rows)
     body = "".join(f"<tr>{line}</tr>" for line in lines)
     return f"<table><caption>{escape(caption)}</caption>{body}</table>"
-
-
-def rounded(record: Record) -> Record:
-    """The same record with every number at 12 significant digits, as files keep it.
-
-    More digits would differ from machine to machine with the threads of its linear algebra.
-    """
-    return msgspec.convert(_rounded(msgspec.to_builtins(record)), type(record))
-
-
-def _rounded(value: Any) -> Any:
-    if isinstance(value, float):
-        return float(f"{value:.{DIGITS - 1}e}")
-    if isinstance(value, dict):
-        return {key: _rounded(item) for key, item in value.items()}
-    return [_rounded(item) for item in value] if isinstance(value, list | tuple) else value
 
 
 def content_sha256(calibration: Calibration) -> str:

@@ -20,7 +20,7 @@ from mwdcal.calibration.automatic.courses import misfit_covariance
 from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.prediction import CalibratedTools
 from mwdcal.calibration.prior import Knowledge
-from mwdcal.calibration.record import FREE_SHARE
+from mwdcal.calibration.record import FREE_SHARE, NOISE, ORDER, REPEATABILITY, SETTINGS
 from mwdcal.estimation.batch import take
 from mwdcal.estimation.rank import Free
 from mwdcal.estimation.solvers import Linear
@@ -28,9 +28,8 @@ from mwdcal.estimation.uncertainty import marginal_rank
 from mwdcal.geometry.vectors import Array, Bools, diagonal, outer
 from mwdcal.sensor.models import Whole
 
-NOISE, SETTINGS, PRIOR = "noise of the readings", "settings of the stand", "prior"
-REPEATABILITY = "repeatability of the readings"
-ORDER = "order of the temperature terms"
+PRIOR = "prior"
+"""The source of a budget that a prior is."""
 EVEN = 1e-6
 """Departure of a correlation matrix from symmetry that is left as it is."""
 

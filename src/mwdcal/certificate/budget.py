@@ -17,8 +17,16 @@ from mwdcal.calibration.prediction import (
     middle_temperature,
     typical_accuracy,
 )
-from mwdcal.calibration.record import BudgetRow, Calibration, stated
-from mwdcal.calibration.results import NOISE, ORDER, PRIOR, REPEATABILITY, SETTINGS
+from mwdcal.calibration.record import (
+    NOISE,
+    ORDER,
+    REPEATABILITY,
+    SETTINGS,
+    BudgetRow,
+    Calibration,
+    stated,
+)
+from mwdcal.calibration.results import PRIOR
 from mwdcal.certificate.decisions import PROBABILITY, student_factor
 from mwdcal.certificate.document import Budget, BudgetLine
 from mwdcal.geometry.vectors import Array
@@ -32,10 +40,6 @@ UNDECLARED = {
     "tilt of the stand": "tilt_deg",
 }
 """Common errors that leave residuals, and the key of `[stand]` that declares each."""
-SCALED = (NOISE, REPEATABILITY, SETTINGS)
-"""Sources whose variance is scaled by that of the residuals."""
-AXES_OF_A_TERM = 3
-"""Axes on which a term beyond the order is seen: as many degrees of freedom has its size."""
 INVISIBLE = "no residual tests it"
 VISIBLE = "a large error of it would show in the residuals"
 
@@ -85,22 +89,8 @@ def attitude_in_words(inclination: float, temperature: float) -> str:
 
 
 def coverage_factors(calibration: Calibration) -> dict[str, float]:
-    """Coverage factor by angle: Student's for the effective degrees of freedom of the budget.
-
-    Definition: Welch-Satterthwaite. What the residuals scale has the degrees of freedom of the triad with the
-    fewest, the order of the temperature terms those of the three axes it is seen on, all else
-    infinitely many; and no more are counted than that triad has. Reference: JCGM 100:2008, G.4.
-    """
-    fewest = max(min(triad.degrees_of_freedom for triad in calibration.triads), 1.0)
-    factors = {}
-    for name in angles(calibration):
-        parts = {row.source: getattr(row, f"{name}_deg") or 0.0 for row in calibration.budget}
-        scaled = sum(parts.get(source, 0.0) ** 2 for source in SCALED)
-        spread = scaled**2 / fewest + parts.get(ORDER, 0.0) ** 4 / AXES_OF_A_TERM
-        total = sum(part**2 for part in parts.values())
-        effective = min(total**2 / spread, fewest) if spread else fewest
-        factors[name] = float(student_factor(effective))
-    return factors
+    """Coverage factor by angle: Student's for its `effective_freedom`."""
+    return {n: float(student_factor(calibration.effective_freedom(n))) for n in angles(calibration)}
 
 
 def accuracy_with_factor(

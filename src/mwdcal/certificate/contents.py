@@ -8,15 +8,16 @@ from __future__ import annotations
 import hashlib
 import re
 from calendar import monthrange
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from datetime import date
 from typing import Any
 
 import msgspec
 from msgspec.structs import replace
 
+from mwdcal.calibration.canonical import canonical, rounded
 from mwdcal.calibration.readings import is_simulated, serial_of
-from mwdcal.calibration.record import SOFTWARE, Calibration, Finding, canonical, rounded
+from mwdcal.calibration.record import SOFTWARE, Calibration, Finding
 from mwdcal.certificate.budget import assumed_exact, budget
 from mwdcal.certificate.decisions import When, conformity
 from mwdcal.certificate.document import (
@@ -115,7 +116,7 @@ def certificate(
         findings=[],
         files=list(order.files),
     )
-    unstated_day = [] if day_stated else [Finding(id="date-not-stated", text=DATE_OF_FIT)]
+    unstated_day = [] if day_stated else [_unstated_day(day, order)]
     findings = [
         *order.findings,
         *_findings(contents, calibration),
@@ -144,7 +145,8 @@ def _findings(contents: Certificate, calibration: Calibration) -> Iterator[Findi
     """What the reader should know of the certificate: changes, gaps, overdue standards, exact references."""
     yield from calibration.change_findings()
     yield from _not_stated(contents, calibration)
-    yield from _overdue(contents.traceability, contents.calibrated)
+    for standard in contents.traceability:
+        yield from _out_of_date(standard, contents.calibrated)
     yield from _exact(calibration)
 
 
@@ -154,6 +156,11 @@ def calibrated_on(calibration: Calibration) -> tuple[date, bool]:
         return date.fromisoformat(calibration.tool.get("date", "")[:10]), True
     except ValueError:
         return date.fromisoformat(calibration.time[:10]), False
+
+
+def _unstated_day(day: date, order: Order) -> Finding:
+    before = f" The certificate is dated before it, {order.issued}: state the date in the run."
+    return Finding(id="date-not-stated", text=DATE_OF_FIT + (before if order.issued < day else ""))
 
 
 def _check_days(day: date, order: Order, laboratory: Laboratory) -> None:
@@ -290,14 +297,20 @@ def _not_stated(contents: Certificate, calibration: Calibration) -> Iterator[Fin
         yield Finding(id="not-stated", text=text)
 
 
-def _overdue(standards: Sequence[TracedStandard], calibrated: str) -> Iterator[Finding]:
-    for standard in standards:
-        if standard.overdue:
-            text = (
-                f"the calibration of the {standard.quantity} standard {standard.name} was due on {standard.due}, "
-                f"before the day of this calibration ({calibrated})."
-            )
-            yield Finding(id="standard-overdue", text=text)
+def _out_of_date(standard: TracedStandard, calibrated: str) -> Iterator[Finding]:
+    """A finding if the calibration of a standard was not valid on the day of this one."""
+    name, this = (
+        f"the {standard.quantity} standard {standard.name}",
+        f"this calibration ({calibrated})",
+    )
+    if standard.overdue:
+        text = f"the calibration of {name} was due on {standard.due}, before the day of {this}."
+        yield Finding(id="standard-overdue", text=text)
+    if standard.date > calibrated:
+        text = (
+            f"{name} was calibrated on {standard.date}, after the day of {this}: name that before."
+        )
+        yield Finding(id="standard-later", text=text)
 
 
 def _exact(calibration: Calibration) -> Iterator[Finding]:

@@ -9,8 +9,9 @@ import base64
 import binascii
 import hashlib
 import json
+import math
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -126,16 +127,28 @@ def document_of(data: bytes, name: str) -> dict[str, Any]:
 
 
 def fields_of(data: bytes) -> dict[str, Any] | None:
-    """The object in a file; None where there is none, or a number in it is not one of JSON."""
+    """The object in a file; None where there is none, or it has a key twice, or a number that is not finite."""
     try:
-        fields = json.loads(data, parse_constant=_no_number)
+        fields = json.loads(
+            data, parse_constant=_finite, parse_float=_finite, object_pairs_hook=_object
+        )
     except (ValueError, RecursionError):
         return None
     return fields if isinstance(fields, dict) else None
 
 
-def _no_number(name: str) -> None:
-    raise ValueError(f"{name} is not a number of JSON")
+def _finite(text: str) -> float:
+    number = float(text)
+    if not math.isfinite(number):
+        raise ValueError(f"{text} is not finite")
+    return number
+
+
+def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    fields = dict(pairs)
+    if len(fields) < len(pairs):
+        raise ValueError("a key stands twice")
+    return fields
 
 
 # ----------------------------------------------------------------------------- checking
@@ -175,7 +188,7 @@ def _has_the_form(data: bytes, fields: Mapping[str, Any], signature: Signature) 
     """Whether a file is as `signed` writes it, byte by byte."""
     try:
         return data == signed_form({**fields, SIGNATURE_KEY: msgspec.to_builtins(signature)})
-    except (ValueError, RecursionError):  # a number beyond all floats
+    except RecursionError:
         return False
 
 
@@ -235,18 +248,22 @@ def check_files(
     unlisted = [
         path.name
         for path, digest in digests.items()
-        if not any(_is(file, path, digest) for file in listed)
+        if not any(_is(file, path, digest, listed) for file in listed)
     ]
     if unlisted:
         raise InputError(
             f"{', '.join(unlisted)}: not among the files of the certificate. Leave it out."
         )
-    return [_checked(file, digests, folder) for file in listed]
+    return [
+        _checked(file, [p for p, digest in digests.items() if _is(file, p, digest, listed)], folder)
+        for file in listed
+    ]
 
 
-def _is(file: SourceFile, path: Path, digest: str | None) -> bool:
-    """Whether a path on the command line may be the file that is listed."""
-    return digest == file.sha256 or path.name == _base(file.name)
+def _is(file: SourceFile, path: Path, digest: str | None, listed: Iterable[SourceFile]) -> bool:
+    """Whether a path on the command line is meant to be a file that is listed: by content, or else by name."""
+    namesakes = {each.sha256 for each in listed if _base(each.name) == _base(file.name)}
+    return digest == file.sha256 or (path.name == _base(file.name) and digest not in namesakes)
 
 
 def _base(name: str) -> str:
@@ -254,17 +271,26 @@ def _base(name: str) -> str:
     return name.replace("\\", "/").rpartition("/")[2]
 
 
-def _checked(file: SourceFile, digests: Mapping[Path, str | None], folder: Path) -> CheckedFile:
-    """A file that is listed, looked up."""
-    given = sorted(
-        (path for path, digest in digests.items() if _is(file, path, digest)),
-        key=lambda path: digests[path] != file.sha256,
+def _checked(file: SourceFile, given: Sequence[Path], folder: Path) -> CheckedFile:
+    """A file that is listed, looked up: all that are `given` must be it; a folder in its place is none."""
+    beside = [folder / file.name.replace("\\", os.sep), folder / _base(file.name)]
+    places = given or [place for place in beside if _exists(place)][:1]
+    if not places:
+        return CheckedFile(id=file.id, name=file.name, path=None, state="missing")
+    changed = [place for place in places if _sha256(place) != file.sha256]
+    return CheckedFile(
+        id=file.id,
+        name=file.name,
+        path=str((changed or places)[0]),
+        state="changed" if changed else "unchanged",
     )
-    places = given or [folder / file.name.replace("\\", os.sep), folder / _base(file.name)]
-    path = next((place for place in places if given or _sha256(place)), None)
-    digest = _sha256(path) if path else None
-    state: Any = "missing" if not path else "unchanged" if digest == file.sha256 else "changed"
-    return CheckedFile(id=file.id, name=file.name, path=str(path) if path else None, state=state)
+
+
+def _exists(path: Path) -> bool:
+    try:
+        return path.exists()
+    except OSError:  # such as a name that is too long
+        return False
 
 
 def _sha256(path: Path) -> str | None:

@@ -22,7 +22,7 @@ from mwdcal.certificate.keys import (
 from mwdcal.errors import InputError
 from mwdcal.files.formats import atomic
 
-_LAST_TIME = "9999"
+_LAST_TIME = "9999-12-31"
 _LEAST_DIGITS = 4
 """Digits of a key that must be typed to name it."""
 
@@ -45,7 +45,7 @@ def trusted(paths: Iterable[Path]) -> dict[str, TrustedKey]:
         for key in read_trusted(path):
             both = (key, keys.get(key.key, key))
             keys[key.key] = min(
-                both, key=lambda k: (not k.revoked, k.retired or _LAST_TIME, not k.owner)
+                both, key=lambda k: (not k.revoked, moment(k.retired or _LAST_TIME), not k.owner)
             )
     return keys
 

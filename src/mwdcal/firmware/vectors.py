@@ -7,8 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from mwdcal.calibration.canonical import DIGITS
 from mwdcal.calibration.prediction import readings_at
-from mwdcal.calibration.record import DIGITS, Calibration
+from mwdcal.calibration.record import Calibration
 from mwdcal.files.contract import CHANNELS
 from mwdcal.files.formats import text
 from mwdcal.files.formats.columns import Column

@@ -59,6 +59,9 @@ def check(
                     break
     except InputError as error:
         result.append(Discrepancy("unreadable", str(error)))
+    except TypeError:
+        text = "a value is not of the type that the program writes, and nothing after it can be compared"
+        result.append(Discrepancy("unreadable", text))
     return result
 
 
@@ -230,22 +233,20 @@ def _same(one: object, two: object) -> bool:
 
 def _tools(connection: sa.Connection) -> Iterator[Discrepancy]:
     """The table of tools against the records that it is computed from."""
-    last, counted = None, 0
-    while True:
-        query = sa.select(tools).order_by(tools.c.serial).limit(ROWS_AT_ONCE)
-        if last is not None:
-            query = query.where(tools.c.serial > last)
-        rows = {row["serial"]: dict(row) for row in connection.execute(query).mappings()}
-        if not rows:
-            break
-        expected = {row["serial"]: row for row in rows_of(connection, list(rows))}
-        for serial, row in rows.items():
+    counted = 0
+    query = sa.select(tools).order_by(tools.c.serial)
+    options = {"stream_results": True, "yield_per": ROWS_AT_ONCE}
+    for portion in connection.execute(query, execution_options=options).mappings().partitions():
+        expected = {
+            row["serial"]: row for row in rows_of(connection, [t["serial"] for t in portion])
+        }
+        for row in map(dict, portion):
+            serial = row["serial"]
             if serial not in expected or _digest(row) != _digest(expected[serial]):
                 yield Discrepancy(
                     "tools", f"the row of tool {serial!r} is not what its records give"
                 )
-        counted += len(rows)
-        last = max(rows)
+        counted += len(portion)
     at = records.c
     serials = sa.select(sa.func.count(at.serial.distinct())).where(at.kind.in_(TOOL_KINDS))
     if connection.scalar(serials) != counted:

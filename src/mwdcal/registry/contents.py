@@ -9,7 +9,7 @@ from typing import Any
 
 import msgspec
 
-from mwdcal.calibration.record import canonical
+from mwdcal.calibration.canonical import canonical
 from mwdcal.errors import InputError, reason
 from mwdcal.files import documents, runs
 from mwdcal.files.contract import CHANNELS

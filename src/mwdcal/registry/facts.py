@@ -118,6 +118,17 @@ def _measured(stated: object) -> str | None:
         return None
 
 
+class _Dated(msgspec.Struct):
+    """The part of a calibration that states its day."""
+
+    tool: dict[str, Any] = {}
+
+
+def states_day(calibration: bytes) -> bool:
+    """Whether a calibration states the day of its measurement, rather than that of the fit alone."""
+    return _measured(msgspec.json.decode(calibration, type=_Dated).tool.get("date")) is not None
+
+
 def _norm(rows: list[Mapping[str, Any]], key: str) -> float | None:
     """The root of the sum of squares of a column of the budget; None where a part is undetermined."""
     parts = [row.get(key) for row in rows]

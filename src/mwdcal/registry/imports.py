@@ -17,8 +17,9 @@ from mwdcal.errors import InputError, MwdcalError
 from mwdcal.files.formats import members
 from mwdcal.files.formats.folders import visible_files
 from mwdcal.registry import contents
+from mwdcal.registry.database.tools import TOOL_KINDS
 from mwdcal.registry.exports import read_manifest
-from mwdcal.registry.facts import content_address
+from mwdcal.registry.facts import content_address, states_day
 from mwdcal.registry.queries import records_page
 from mwdcal.registry.store import Draft, Entry, Registry, draft
 
@@ -45,13 +46,14 @@ class Source(NamedTuple):
 class Prepared:
     """What a source holds: drafts of records, or a `doubtful` one of a table that may be a run.
 
-    `problems` say what is wrong.
+    `problems` say what is wrong, `undated` has the SHA-256 of calibrations that state no day of measurement.
     """
 
     source: Source
     drafts: list[Draft] = field(default_factory=list)
     doubtful: Draft | None = None
     problems: list[str] = field(default_factory=list)
+    undated: set[str] = field(default_factory=set)
 
 
 class FileResult(msgspec.Struct, frozen=True, kw_only=True):
@@ -127,7 +129,10 @@ def prepared(source: Source) -> Prepared:
         return result
     for entry in entries:
         try:
-            result.drafts.append(draft(contents.checked(entry)))
+            one = draft(contents.checked(entry))
+            result.drafts.append(one)
+            if entry.kind == "calibration" and not states_day(entry.data):
+                result.undated.add(one["sha256"])
         except MwdcalError as error:
             result.problems.append(str(error))
     return result
@@ -148,8 +153,9 @@ def _entries(source: Source) -> Iterable[Entry]:
 class Adding:
     """Files on their way into a registry, some hundred records in a transaction.
 
-    `results` say what became of each file, `new` how many records of each kind are new, `simulated` whether one of
-    the files rests on simulated data.
+    `results` say what became of each file, `new` how many records of each kind are new, `serials` of which tools,
+    `undated` the names of new calibrations whose runs state no date, `simulated` whether one of the files rests
+    on simulated data.
     """
 
     def __init__(self, registry: Registry, actor: str) -> None:
@@ -157,8 +163,11 @@ class Adding:
         self._waiting: list[tuple[Source, Draft]] = []
         self._doubtful: list[Prepared] = []
         self._runs: set[str] = set()
+        self._undated: set[str] = set()
         self._files: dict[Path, FileResult] = {}
         self.new: Counter[str] = Counter()
+        self.serials: set[str] = set()
+        self.undated: list[str] = []
         self.simulated = False
 
     @property
@@ -171,6 +180,7 @@ class Adding:
         if each.doubtful:
             self._doubtful.append(each)
             return
+        self._undated |= each.undated
         for message in each.problems:
             self._count(each.source, refused=1, message=message)
         for one in each.drafts:
@@ -198,14 +208,21 @@ class Adding:
 
     def _add(self) -> None:
         drafts = [one for _, one in self._waiting]
-        for (source, _), added in zip(
-            self._waiting, self._registry.insert(drafts, self._actor), strict=True
-        ):
+        reasons = [source.reason for source, _ in self._waiting]
+        all_added = self._registry.insert(drafts, self._actor, reasons=reasons)
+        for (source, one), added in zip(self._waiting, all_added, strict=True):
             self._count(source, added.kind, new=int(added.new), known=int(not added.new))
-            self.new.update([added.kind] * added.new)
-            if added.new and source.reason:
-                self._registry.withdraw(added.number, source.reason, self._actor)
+            if added.new:
+                self.new[added.kind] += 1
+                self._note(one)
         self._waiting = []
+
+    def _note(self, new: Draft) -> None:
+        """Remember the serial of a new record, and whether it is a calibration of an unknown day."""
+        if new["serial"] and new["kind"] in TOOL_KINDS:
+            self.serials.add(new["serial"])
+        if new["sha256"] in self._undated:
+            self.undated.append(new["name"])
 
     def _count(self, source: Source, kind: str = "", message: str = "", **more: int) -> None:
         file = str(source.path)

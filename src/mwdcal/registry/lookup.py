@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Collection
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
+from unicodedata import category, normalize
 
 import msgspec
+import sqlalchemy as sa
 
 from mwdcal.errors import InputError
 from mwdcal.files.formats.columns import shown
 from mwdcal.files.formats.members import MARK, Member
 from mwdcal.registry import queries
-from mwdcal.registry.database.models import records
+from mwdcal.registry.database.models import records, tools
 from mwdcal.registry.facts import RECORD_KINDS
 from mwdcal.registry.queries import Row
 from mwdcal.registry.store import Registry
@@ -205,6 +208,26 @@ def _unknown(registry: Registry, serial: str) -> InputError:
     return InputError(
         f"{registry.name} has no tool {shown(serial)} with a calibration.{meant} Correct the serial."
     )
+
+
+def alike(registry: Registry, serials: Collection[str]) -> list[list[str]]:
+    """Serials of different tools that differ in case, spaces or the form of characters alone, one of `serials` each."""
+    meant = {_spelling(serial) for serial in serials}
+    groups: dict[str, list[str]] = {}
+    if meant:
+        with registry.reading() as connection:
+            for serial in connection.scalars(sa.select(tools.c.serial).order_by(tools.c.serial)):
+                if (spelling := _spelling(serial)) in meant:
+                    groups.setdefault(spelling, []).append(serial)
+    return [group for group in groups.values() if len(group) > 1]
+
+
+def _spelling(serial: str) -> str:
+    """What is common to the ways in which people write a serial."""
+    if serial.isascii():
+        return "".join(serial.casefold().split())
+    characters = normalize("NFKC", serial).casefold()
+    return "".join("-" if category(c) == "Pd" else c for c in characters if not c.isspace())
 
 
 def _tool(row: Row) -> ListedTool:

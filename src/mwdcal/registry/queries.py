@@ -158,30 +158,6 @@ def latest_calibration(registry: Registry, serial: str) -> tuple[Row, bytes] | N
     return {name: row[name] for name in _RECORD}, unpacked(row["data"], row["size"])
 
 
-def due(registry: Registry, before: str, offset: int = 0, limit: int = 50) -> Page:
-    """Tools and standards whose next calibration is due before a date, the most overdue first.
-
-    Columns: `kind` (tool or standard), `serial`, `type`, `label`, `next_due`.
-    """
-    of_tools = sa.select(
-        sa.literal("tool").label("kind"),
-        *(tools.c.serial, tools.c.type, sa.null().label("label"), tools.c.next_due),
-    ).where(tools.c.next_due < before)
-    at = records.c
-    of_standards = (
-        sa.select(at.kind, at.serial, at.type, at.label, at.next_due)
-        .outerjoin(withdrawals, withdrawals.c.record == at.number)
-        .where(at.kind == "standard", at.next_due < before, withdrawals.c.number.is_(None))
-    )
-    part = of_tools.order_by(tools.c.next_due, tools.c.serial).limit(offset + limit).subquery()
-    both = sa.union_all(sa.select(part), of_standards).subquery()
-    order = both.c.next_due, both.c.kind, both.c.serial
-    with registry.reading() as connection:
-        rows = connection.execute(sa.select(both).order_by(*order).offset(offset).limit(limit))
-        total = _count(connection, of_tools) + _count(connection, of_standards)
-        return Page(total, [dict(row) for row in rows.mappings()])
-
-
 def events(registry: Registry, offset: int = 0, limit: int = 50) -> Page:
     """Events of the history, newest first; columns: those of `history`. Their numbers have no gap."""
     newest = sa.select(sa.func.max(history.c.number))

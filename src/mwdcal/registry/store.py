@@ -88,12 +88,23 @@ class Registry:
         return self.insert([draft(entry) for entry in entries], actor, when)
 
     def insert(
-        self, drafts: Sequence[Draft], actor: str, when: datetime | None = None
+        self,
+        drafts: Sequence[Draft],
+        actor: str,
+        when: datetime | None = None,
+        reasons: Sequence[str | None] = (),
     ) -> list[Added]:
-        """The same with the drafts of entries, which other processes may have made."""
+        """The same with the drafts of entries, which other processes may have made.
+
+        `reasons`: of each that is withdrawn at once if it is new, why.
+        """
         who, time = person(actor), chain.instant(when)
         with self.writing() as connection:
-            return _insert(connection, drafts, who, time)
+            result = _insert(connection, drafts, who, time)
+            for each, why in zip(result, reasons, strict=False):
+                if each.new and why:
+                    _withdraw(connection, self.name, each.number, plain(why), who, time)
+            return result
 
     def withdraw(self, number: int, reason: str, actor: str, when: datetime | None = None) -> None:
         """Mark a record as withdrawn for a reason; it stays, and lists no longer count it.
@@ -105,20 +116,7 @@ class Registry:
         if not why:
             raise InputError("`reason` must not be empty. Say why the record is withdrawn.")
         with self.writing() as connection:
-            record = connection.execute(
-                sa.select(records).where(records.c.number == number)
-            ).one_or_none()
-            if record is None:
-                raise InputError(f"{self.name}: there is no record {number}. Check the number.")
-            before = sa.select(withdrawals.c.number).where(withdrawals.c.record == number)
-            if connection.scalar(before) is not None:
-                raise InputError(f"{self.name}: record {number} is withdrawn already.")
-            newest, previous = chain.head(connection)
-            row = {"number": newest + 1, "record": number, "reason": why}
-            connection.execute(sa.insert(withdrawals), row)
-            event = _event(row, record._mapping, who, time, "withdraw", chain.digest(row))
-            chain.append(connection, previous, [event])
-            _refresh_tools(connection, [record._mapping])
+            _withdraw(connection, self.name, number, why, who, time)
 
     def content(self, sha256: str) -> bytes:
         """The bytes of an object, as they were added.
@@ -158,7 +156,7 @@ def unpacked(data: bytes, size: int) -> bytes:
     """
     unpacker = zlib.decompressobj()
     try:
-        content = unpacker.decompress(data, size + 1)
+        content = unpacker.decompress(data, min(size, LARGEST_OBJECT) + 1)
     except (zlib.error, TypeError, ValueError, OverflowError):
         content = b""
     if len(content) != size or not unpacker.eof or unpacker.unused_data:
@@ -230,6 +228,24 @@ def _insert(connection: sa.Connection, drafts: Sequence[Draft], who: str, time: 
     chain.append(connection, previous, events)
     _refresh_tools(connection, rows)
     return result
+
+
+def _withdraw(
+    connection: sa.Connection, name: str, number: int, why: str, who: str, time: str
+) -> None:
+    """Mark a record as withdrawn, with its event."""
+    record = connection.execute(sa.select(records).where(records.c.number == number)).one_or_none()
+    if record is None:
+        raise InputError(f"{name}: there is no record {number}. Check the number.")
+    before = sa.select(withdrawals.c.number).where(withdrawals.c.record == number)
+    if connection.scalar(before) is not None:
+        raise InputError(f"{name}: record {number} is withdrawn already.")
+    newest, previous = chain.head(connection)
+    row = {"number": newest + 1, "record": number, "reason": why}
+    connection.execute(sa.insert(withdrawals), row)
+    event = _event(row, record._mapping, who, time, "withdraw", chain.digest(row))
+    chain.append(connection, previous, [event])
+    _refresh_tools(connection, [record._mapping])
 
 
 def _known(

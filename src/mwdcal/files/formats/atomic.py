@@ -26,6 +26,10 @@ try:
 except ImportError:  # Windows, where an open file can be neither removed nor renamed
     fcntl = None
 
+SQLITE = b"SQLite format 3\0"
+"""How the file of a registry begins."""
+_WRITTEN_AHEAD = 18, 2
+"""Where such a file says so, and how, if it is shared: a registry in use, and no backup of one."""
 _PATTERN = ".mwdcal-*.tmp"
 _DAY = 86_400.0
 """Seconds after which a file of another machine counts as left behind: its locks may not reach here."""
@@ -102,7 +106,18 @@ def _hindrance(file: Path) -> str:
     writable = stat.S_IWUSR | stat.S_IWGRP | stat.S_IWOTH  # for the superuser anything else is
     if file.exists() and not (file.stat().st_mode & writable and os.access(file, os.W_OK)):
         return "it is write-protected. Name another file, or remove the protection."
+    if file.exists() and _is_registry_in_use(file):
+        return "it is a registry, which would be lost. Name another file."
     return ""
+
+
+def _is_registry_in_use(file: Path) -> bool:
+    """Whether a file is a database that is not a mere backup."""
+    place, mark = _WRITTEN_AHEAD
+    with contextlib.suppress(OSError), file.open("rb") as stream:
+        head = stream.read(place + 1)
+        return head.startswith(SQLITE) and head[place:] == bytes([mark])
+    return False
 
 
 def _missing(folder: Path) -> str:

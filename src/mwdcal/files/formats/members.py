@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import re
 from collections.abc import Iterable, Iterator
 from difflib import get_close_matches
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Any, NamedTuple
 
 from mwdcal.errors import InputError, reason
 from mwdcal.files.formats import parquet
+from mwdcal.files.formats.atomic import SQLITE
 from mwdcal.files.formats.columns import as_text, shown
 
 RECORD = "calibration"
@@ -18,8 +20,8 @@ RECORD = "calibration"
 MARK = "#"
 """What stands between the file of a fleet's table and a serial."""
 SUFFIX = ".parquet"
-SQLITE = b"SQLite format 3\0"
-"""How the file of a registry begins."""
+NEARLY_URL = re.compile(r"postgres\w*(\+\w+)?:|\bpassword *=", re.IGNORECASE)
+"""What the URL of a database has, however mistyped, and no file's name: it may hold a password."""
 _SHOWN = 5
 """Most serials that a message names."""
 _HEAD = ["serial", "status", "message"]
@@ -37,8 +39,15 @@ def split(path: str | os.PathLike[str]) -> tuple[Path, str | None]:
     """The file that a path names, and the serial behind it; None where there is none.
 
     A file that has the whole name is meant by it.
+
+    Raises:
+        InputError: the path is the URL of a database.
     """
     text = os.fspath(path)
+    if NEARLY_URL.search(text):
+        raise InputError(
+            "a calibration in a PostgreSQL database cannot be named here. Write it to a file: mwdcal registry get."
+        )
     places = [place for place, character in enumerate(text) if character == MARK]
     for place in [] if Path(text).exists() else places:
         file = Path(text[:place])

@@ -14,7 +14,7 @@ from typing import Any
 
 import sqlalchemy as sa
 
-from mwdcal.calibration.record import canonical
+from mwdcal.calibration.canonical import canonical
 from mwdcal.registry.database.models import history
 
 GENESIS = "0" * 64

@@ -17,6 +17,7 @@ from urllib.parse import quote
 import sqlalchemy as sa
 
 from mwdcal.errors import InputError
+from mwdcal.files.formats.members import NEARLY_URL
 from mwdcal.registry.database.places import on_network
 
 ROWS_AT_ONCE = 100
@@ -40,7 +41,11 @@ _WHAT_TO_DO = {
     "password": "Correct the user and the password in the URL.",
     "permission denied": "Have the owner of the database give you the right.",
     "does not exist": "Create it on the server, or correct the URL.",
-    "connection failed": "Check that the server runs, and the URL.",
+    "resolve host": "Correct the name of the server in the URL.",
+    **dict.fromkeys(
+        ("connection failed", "connection refused", "connection is bad", "server closed"),
+        "Check that the server runs, and the URL.",
+    ),
 }
 
 
@@ -107,6 +112,8 @@ def is_url(database: str | os.PathLike[str]) -> bool:
 def connect(database: str | os.PathLike[str], new: bool = False, shared: bool = True) -> Database:
     """The database behind a path or a URL; a file that does not exist is refused unless `new`."""
     if not is_url(database):
+        if NEARLY_URL.search(os.fspath(database)):
+            raise _no_url()
         return _sqlite(Path(database), new, shared)
     url = _parsed(str(database))
     if url.get_backend_name() == "sqlite":
@@ -128,13 +135,20 @@ def connect(database: str | os.PathLike[str], new: bool = False, shared: bool = 
 
 def _parsed(text: str) -> sa.URL:
     try:
-        return sa.make_url(text)
+        url = sa.make_url(text)
     except (sa.exc.ArgumentError, ValueError):
-        scheme = text.partition("://")[0]
-        raise InputError(
-            f"`database` must be a URL such as postgresql://user:password@host/name; got one that "
-            f"begins with '{scheme}://' and cannot be read. Correct it."
-        ) from None
+        raise _no_url() from None
+    if "@" in (url.host or ""):  # the rest of a password
+        raise _no_url()
+    return url
+
+
+def _no_url() -> InputError:
+    """That a URL cannot be read, without a word of it."""
+    return InputError(
+        "`database` must be a file, or a URL such as postgresql://user:password@host/name, with %40 for an @ in the "
+        "password; got neither. Correct it."
+    )
 
 
 def _sqlite(path: Path, new: bool, shared: bool) -> Database:

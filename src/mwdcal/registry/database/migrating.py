@@ -133,26 +133,53 @@ def _expected_catalogue() -> dict[tuple[str, str], tuple[str, str | None]]:
     return result
 
 
+_OUR_TABLES = (
+    "WITH ours AS (SELECT to_regclass(name) AS ours FROM unnest(CAST(:tables AS text[])) AS name) "
+)
+_TRIGGERS_THERE = sa.text(
+    _OUR_TABLES
+    + "SELECT tgname, relname, tgtype, prosrc, tgenabled = 'O' AND tgattr = '' AND tgqual IS NULL AS always "
+    "FROM ours JOIN pg_trigger ON tgrelid = ours JOIN pg_proc ON pg_proc.oid = tgfoid "
+    "JOIN pg_class ON pg_class.oid = tgrelid WHERE NOT tgisinternal"
+)
+_UNSEEN_BY_ALEMBIC = sa.text(
+    _OUR_TABLES + "SELECT 'table', relname FROM ours JOIN pg_class ON oid = ours "
+    "WHERE relpersistence <> 'p' OR relrowsecurity "
+    "OR EXISTS (SELECT FROM pg_inherits WHERE ours IN (inhparent, inhrelid)) "
+    "UNION ALL SELECT 'rule', rulename FROM ours JOIN pg_rewrite ON ev_class = ours "
+    "UNION ALL SELECT 'constraint', conname FROM ours JOIN pg_constraint ON conrelid = ours "
+    "WHERE contype IN ('c', 'x') "
+    "UNION ALL SELECT 'index', relname FROM ours JOIN pg_index ON indrelid = ours "
+    "JOIN pg_class ON pg_class.oid = indexrelid JOIN pg_am ON pg_am.oid = relam "
+    "WHERE amname <> 'btree' OR indpred IS NOT NULL OR NOT (indisvalid AND indisready) "
+    "UNION ALL SELECT 'column', attname FROM ours JOIN pg_attribute ON attrelid = ours "
+    "JOIN pg_collation ON pg_collation.oid = attcollation "
+    "WHERE collname <> 'C' AND ours <> to_regclass(:version)"
+)
+"""Rules, policies, inheritance, tables that a crash empties, and other parts that Alembic does not compare."""
+
+
 def _postgresql_differences(connection: sa.Connection) -> list[str]:
-    """Differences of tables and indexes as Alembic finds them, and triggers that are missing or off."""
+    """Differences as Alembic finds them, what it does not compare, and triggers that are missing or off."""
     ours = {*metadata.tables, VERSION_TABLE}
-    options = {"include_name": lambda name, kind, parents: kind != "table" or name in ours}
+    options = {
+        "include_name": lambda name, kind, parents: kind != "table" or name in ours,
+        "compare_server_default": True,
+    }
     context = MigrationContext.configure(connection, opts=options)
     wrong = [
         f"the schema is not as mwdcal makes it: {_words(d)}"
         for d in compare_metadata(context, metadata)
     ]
-    query = sa.text(
-        "SELECT tgname, tgenabled, relname, tgtype, prosrc FROM pg_trigger "
-        "JOIN pg_proc ON pg_proc.oid = tgfoid JOIN pg_class ON pg_class.oid = tgrelid "
-        "WHERE NOT tgisinternal AND tgrelid IN "
-        "(SELECT to_regclass(name) FROM unnest(CAST(:tables AS text[])) AS name)"
-    )
+    names = {"tables": sorted(ours), "version": VERSION_TABLE}
+    parts = [(row[0], row[1]) for row in connection.execute(_UNSEEN_BY_ALEMBIC, names)]
+    parts += [("primary key of", name) for name in _without_primary_key(connection)]
+    wrong += [f"{kind} '{name}' of the schema is not as mwdcal makes it" for kind, name in parts]
     present = {
         row.tgname: (row.relname, row.tgtype)
-        if row.tgenabled == "O" and row.prosrc.strip() == FUNCTION_BODY
+        if row.always and row.prosrc.strip() == FUNCTION_BODY
         else None
-        for row in connection.execute(query, {"tables": sorted(ours)})
+        for row in connection.execute(_TRIGGERS_THERE, {"tables": sorted(ours)})
     }
     expected = triggers_of_postgresql(table.name for table in GUARDED)
     wrong += [
@@ -161,6 +188,16 @@ def _postgresql_differences(connection: sa.Connection) -> list[str]:
         if name not in expected or present.get(name) != expected[name]
     ]
     return sorted(wrong)
+
+
+def _without_primary_key(connection: sa.Connection) -> list[str]:
+    """Tables whose primary key is another than it was."""
+    expected = {
+        table.name: list(table.primary_key.columns.keys()) for table in metadata.sorted_tables
+    }
+    present = sa.inspect(connection).get_multi_pk_constraint(filter_names=[*expected])
+    keys = {name: key["constrained_columns"] for (_, name), key in present.items()}
+    return [name for name, columns in expected.items() if keys.get(name) != columns]
 
 
 def _words(difference: Any) -> str:

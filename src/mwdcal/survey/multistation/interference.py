@@ -8,8 +8,9 @@ import msgspec
 import numpy as np
 
 from mwdcal.calibration import results
+from mwdcal.calibration.canonical import rounded
 from mwdcal.calibration.readings import Readings, is_simulated
-from mwdcal.calibration.record import Calibration, Finding, rounded, sealed, stated
+from mwdcal.calibration.record import Calibration, Finding, sealed, stated
 from mwdcal.calibration.residuals import RESHOOT
 from mwdcal.errors import FitError
 from mwdcal.estimation.uncertainty import station_misfit

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from datetime import UTC, datetime
+from datetime import UTC, date, datetime
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
@@ -15,9 +16,12 @@ from mwdcal.app.messages import print_result
 from mwdcal.errors import InputError
 
 if TYPE_CHECKING:
+    from mwdcal.app.choices import LoadedCalibration
+    from mwdcal.app.pages.records.certificate_pictures import Picture
     from mwdcal.calibration.record import Calibration
     from mwdcal.certificate.contents import Order
     from mwdcal.certificate.document import Certificate, SourceFile
+    from mwdcal.drift.document import ToolDrift
 
 Read = TypeVar("Read")
 CERTIFICATE_FORMS = (".json", ".html", ".pdf", ".xml")
@@ -54,6 +58,11 @@ ISO_DAY = click.DateTime(["%Y-%m-%d"])
     metavar="LAB.toml",
     help="What the laboratory states: name, people, standards, decision rule.",
 )
+@click.option(
+    "--registry",
+    metavar="URL|FILE",
+    help="Registry with the earlier calibrations of the tool, whose drift the certificate then shows.",
+)
 @click.option("--number", default="", metavar="N", help="Number of the certificate.")
 @click.option("--customer", default="", metavar="NAME", help="Customer.")
 @click.option("--condition", default="", metavar="TEXT", help="Condition of the tool when it came.")
@@ -69,7 +78,7 @@ ISO_DAY = click.DateTime(["%Y-%m-%d"])
 @options.JSON
 def command(
     calibration: Path, output: tuple[Path, ...], verification: Path | None, as_found: Path | None,
-    laboratory: Path | None, number: str, customer: str, condition: str,
+    laboratory: Path | None, registry: str | None, number: str, customer: str, condition: str,
     received: datetime | None, day: datetime | None, key: tuple[Path, ...], as_json: bool,
 ) -> None:  # fmt: skip
     """Issue the certificate of a CALIBRATION: ISO/IEC 17025 contents, uncertainty budget, decisions with their risk.
@@ -92,14 +101,16 @@ def command(
     _check_forms(output)
     paths = {"calibration": calibration, "verification": verification, "as-found": as_found}
     paths["laboratory"] = laboratory
-    options.check_outputs(output, [*paths.values(), *key])
+    options.check_outputs(output, [*paths.values(), registry, *key])
     loaded = load_calibration(calibration, key)
     as_left, left_digest = _read(documents.load_verification, verification)
     before, before_digest = _read(documents.load_verification, as_found)
     stated, laboratory_digest = _read(load_laboratory, laboratory)
+    issued = day.date() if day else datetime.now(UTC).date()
+    drift = _drift(registry, loaded, issued) if registry else None
     digests = (loaded.digest, left_digest, before_digest, laboratory_digest)
     order = Order(
-        issued=day.date() if day else datetime.now(UTC).date(),
+        issued=issued,
         number=number,
         customer=customer,
         condition=condition,
@@ -108,10 +119,11 @@ def command(
         as_found=before,
         calibration_sha256=loaded.digest,
         files=tuple(_sources(paths, digests, output)),
-        findings=tuple(loaded.findings),
+        findings=(*loaded.findings, *(drift.findings if drift else ())),
     )
     result = certificate(loaded.calibration, order, stated)
-    forms = [(path, _form(path, result, loaded.calibration, order)) for path in output]
+    pictures = cache(partial(_pictures, loaded.calibration, order, drift))
+    forms = [(path, _form(path, result, pictures)) for path in output]
     atomic.write_all(forms)
     print_result(to_builtins(result) if as_json else screen(result, output), result.findings)
 
@@ -153,8 +165,23 @@ def _from(path: Path, folder: Path) -> str:
         return whole.as_posix()
 
 
+def _drift(registry: str, loaded: LoadedCalibration, today: date) -> ToolDrift | None:
+    """How the tool changed up to its calibration; None where the registry has no earlier one."""
+    from mwdcal.app.commands.records.drift_sources import drift_of
+    from mwdcal.registry.store import open_registry
+
+    with open_registry(registry) as opened:
+        return drift_of(opened, loaded.calibration, loaded.digest, today)
+
+
+def _pictures(calibration: Calibration, order: Order, drift: ToolDrift | None) -> list[Picture]:
+    from mwdcal.app.pages.records.certificate_pictures import certificate_pictures
+
+    return certificate_pictures(calibration, order.verification, order.as_found, drift)
+
+
 def _form(
-    path: Path, certificate: Certificate, calibration: Calibration, order: Order
+    path: Path, certificate: Certificate, pictures: Callable[[], list[Picture]]
 ) -> bytes | str:
     """The certificate in the form that the suffix of its file names."""
     suffix = path.suffix.lower()
@@ -166,13 +193,10 @@ def _form(
         from mwdcal.certificate.dcc import to_xml
 
         return to_xml(certificate)
-    from mwdcal.app.pages.records.certificate_pictures import certificate_pictures
-
-    pictures = certificate_pictures(calibration, order.verification, order.as_found)
     if suffix == ".pdf":
         from mwdcal.app.pages.records.certificate_pdf import render_pdf
 
-        return render_pdf(certificate, pictures)
+        return render_pdf(certificate, pictures())
     from mwdcal.app.pages.records.certificate_page import render_page
 
-    return render_page(certificate, pictures)
+    return render_page(certificate, pictures())

@@ -12,6 +12,7 @@ import msgspec
 from mwdcal.app.screens.records.drift import RegistryDrift
 from mwdcal.calibration.prediction import STATED_ANGLES
 from mwdcal.calibration.record import Calibration
+from mwdcal.drift.comparable import calibrated_on
 from mwdcal.drift.document import ToolDrift
 from mwdcal.drift.fleet import fleet_drift
 from mwdcal.drift.service import ServiceTest
@@ -87,6 +88,28 @@ def of_registry(
         )
     fleet, _ = fleet_drift(tools, limits, today, refused, level)
     return whole(fleet=fleet)
+
+
+def drift_of(
+    registry: Registry, calibration: Calibration, sha256: str, today: date
+) -> ToolDrift | None:
+    """The drift of a tool up to a calibration, which the registry need not have yet.
+
+    None where the tool has no serial, or the registry no earlier calibration of it.
+    """
+    serial = calibration.tool.get("serial")
+    if serial is None:
+        return None
+    calibrations, digests = _calibrations(registry, serial)
+    known = [c for c in calibrations if c.sha256 != calibration.sha256]
+    day = calibrated_on(calibration)
+    earlier = [c for c in known if calibrated_on(c) <= day]
+    if not earlier:
+        return None
+    digests |= {str(calibration.sha256): sha256}
+    tool = measured(serial, [*earlier, calibration], [*_tests(registry, serial)], digests=digests)
+    rates = TypeRates.of([tool, *_peers(registry, serial, tool.drift.type)])
+    return predicted(tool, rates, default_limits(load_limits()[0].error), today)
 
 
 def _of_tool(

@@ -58,7 +58,7 @@ def command(
     from mwdcal.files.formats import atomic
     from mwdcal.registry.store import open_registry
 
-    options.check_outputs([], [], page=html)
+    options.check_outputs([], [database], page=html)
     day = (today or datetime.now(UTC)).date()
     allowed = drift_sources.limits_of(limits)
     with open_registry(database) as registry, bar("comparing") as advance:

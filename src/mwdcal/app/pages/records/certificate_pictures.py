@@ -15,6 +15,8 @@ from mwdcal.use.verification import Verdict
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from mwdcal.drift.document import ToolDrift
+
 
 @dataclass(frozen=True)
 class Picture:
@@ -35,10 +37,27 @@ class Picture:
 
 
 def certificate_pictures(
-    calibration: Calibration, as_left: Verdict | None = None, as_found: Verdict | None = None
+    calibration: Calibration,
+    as_left: Verdict | None = None,
+    as_found: Verdict | None = None,
+    drift: ToolDrift | None = None,
 ) -> list[Picture]:
-    """What the results look like: errors before and after, residuals, 1σ, roll tests."""
-    return [*_fit(calibration), *_accuracy(calibration), *_roll_tests(as_found, as_left)]
+    """What the results look like: errors before and after, residuals, 1σ, roll tests, earlier calibrations."""
+    tests = _roll_tests(as_found, as_left)
+    return [*_fit(calibration), *_accuracy(calibration), *tests, *_past(drift)]
+
+
+def _past(drift: ToolDrift | None) -> Iterator[Picture]:
+    if drift is None:
+        return
+    from mwdcal.app.pages.records.drift_figures import drift_picture
+
+    note = (
+        "Differences from the first calibration, with 95 % bars. Pale columns: control limits, three standard "
+        "deviations of what both uncertainties and the random walk allow. Dashed: a change that the uncertainties do "
+        "not explain."
+    )
+    yield Picture("drift", "Biases from calibration to calibration", drift_picture(drift), note)
 
 
 def _fit(calibration: Calibration) -> Iterator[Picture]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -12,16 +13,17 @@ from mwdcal.app.screens.numbers import number
 from mwdcal.app.text import UNCUT, one_line, plural, table
 from mwdcal.calibration.readings import SIMULATED
 from mwdcal.calibration.record import Finding
+from mwdcal.files.formats.columns import shown
 from mwdcal.registry.checking import Discrepancy
 from mwdcal.registry.imports import Adding, FileResult
-from mwdcal.registry.lookup import ListedRecord, ListedTool, Listing
+from mwdcal.registry.lookup import ListedRecord, ListedTool, Listing, alike
 from mwdcal.registry.store import Registry
 
 KEYS = ("number", "kind", "sha256", "name")
 """What names a record in a document."""
 ACCURACIES = ("inclination", "toolface", "azimuth")
 MOST_REFUSED = 20
-"""Most refused files that are named one by one."""
+"""Most findings of a kind."""
 SHOWN_DIGITS = 12
 """Digits of a SHA-256 on the screen."""
 
@@ -116,11 +118,7 @@ def document(command: str, content: object, *metadata: Mapping[str, object]) -> 
 def added(registry: Registry, adding: Adding) -> RegistryAdded:
     """What became of all files."""
     results = adding.results
-    refused = [each for each in results if each.refused]
-    findings = [Finding(id="refused-file", text=_refusal(each)) for each in refused[:MOST_REFUSED]]
-    if refused[MOST_REFUSED:]:
-        more = f"{len(refused) - MOST_REFUSED} more files were not added, or not all of them."
-        findings.append(Finding(id="refused-file", text=more))
+    findings = [*_refusals(results), *_doubts(registry, adding)]
     events, head = registry.head()
     return RegistryAdded(
         registry=registry.name,
@@ -134,11 +132,51 @@ def added(registry: Registry, adding: Adding) -> RegistryAdded:
     )
 
 
-def _refusal(each: FileResult) -> str:
-    """Why a file, or a part of it, was not added."""
-    if each.new or each.known or each.refused > 1:
-        return f"{each.file}: {plural(each.refused, 'record')} not added, such as: {each.message}"
-    return f"not added: {each.message}"
+def _refusals(results: Sequence[FileResult]) -> list[Finding]:
+    """Why files, or parts of them, were not added: each reason once, with a file that has it."""
+    groups: dict[tuple[str, ...], list[FileResult]] = {}
+    for each in results:
+        if each.refused:
+            part = each.new or each.known or each.refused > 1
+            why = each.message.removeprefix(f"{Path(each.file).name}: ")
+            groups.setdefault((why, each.file) if part else (why,), []).append(each)
+    some = [*groups.values()][:MOST_REFUSED]
+    findings = [Finding(id="refused-file", text=_refusal(group)) for group in some]
+    if more := sum(map(len, groups.values())) - sum(map(len, some)):
+        text = f"{more} more files were not added, or not all of them."
+        findings.append(Finding(id="refused-file", text=text))
+    return findings
+
+
+def _refusal(group: Sequence[FileResult]) -> str:
+    """Why files that have it in common were not added, or a part of one."""
+    first = group[0]
+    if len(group) > 1:
+        return f"not added, {len(group)} files, such as {first.message}"
+    if first.new or first.known or first.refused > 1:
+        return (
+            f"{first.file}: {plural(first.refused, 'record')} not added, such as: {first.message}"
+        )
+    return f"not added: {first.message}"
+
+
+def _doubts(registry: Registry, adding: Adding) -> list[Finding]:
+    """What was added, and may not be as it was meant."""
+    findings = []
+    if adding.undated:
+        text = (
+            f"{plural(len(adding.undated), 'calibration')} without a day of the measurement, such as "
+            f'{adding.undated[0]}: that of the fit counts. State it in the run, as # date = "2026-01-31", and '
+            "calibrate again."
+        )
+        findings.append(Finding(id="no-date", text=text))
+    for group in alike(registry, adding.serials)[:MOST_REFUSED]:
+        text = (
+            f"the serials {' and '.join(map(shown, group))} are of different tools, and differ in case, spaces or "
+            "the form of characters alone. If they mean one tool, correct the files, and withdraw the others."
+        )
+        findings.append(Finding(id="similar-serials", text=text))
+    return findings
 
 
 def added_text(result: RegistryAdded, simulated: bool) -> str:
@@ -213,7 +251,7 @@ def _heading(listing: Listing, noun: str) -> str:
     shown_rows = len(listing.tools) or len(listing.records)
     part = (
         f"   {listing.offset + 1} to {listing.offset + shown_rows}"
-        if shown_rows < listing.total
+        if 0 < shown_rows < listing.total
         else ""
     )
     words = [f"{plural(listing.total, noun)}{part}", *[SIMULATED] * simulated]
