@@ -1,7 +1,8 @@
 """How fast parameters wander: a random walk of each, its rate estimated with that of the tool's peers.
 
 Between two calibrations t years apart a parameter moves by a normal variable of variance q t. Parameters of
-a kind (`WALK_GROUPS`) have one rate; rates of tools of a type are log-normal about a common one, but for a few (`UNLIKE_SHARE`) of any rate.
+a kind (`WALK_GROUPS`) have one rate; rates of tools of a type are log-normal about a common one, but
+for a few (`UNLIKE_SHARE`) of any rate.
 """
 
 from __future__ import annotations
