@@ -124,7 +124,9 @@ def _of_tool(
     return predicted(tool, TypeRates.of(peers), limits, today)
 
 
-def _peers(registry: Registry, serial: str, kind: str, advance: Advance) -> Iterator[MeasuredTool]:
+def _peers(
+    registry: Registry, serial: str, kind: str, advance: Advance = lambda done, total: None
+) -> Iterator[MeasuredTool]:
     """Other tools of a type, at most `PEERS_READ`, spread evenly; those that cannot be read are left out."""
     rows = [row for row in _tools(registry, type=kind) if row["serial"] != serial]
     some = rows[:: -(-len(rows) // PEERS_READ) or 1]
