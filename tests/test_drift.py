@@ -11,8 +11,8 @@ from scipy.stats import binom, multivariate_normal, norm
 from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.prediction import typical_accuracy
-from mwdcal.calibration.readings import TRIADS
-from mwdcal.drift.change import Contrasts, change_test
+from mwdcal.calibration.readings import TRIADS, fingerprints
+from mwdcal.drift.change import NULL_DRAWS, Contrasts, change_test
 from mwdcal.drift.comparable import (
     FACTOR_NAMES,
     History,
@@ -339,6 +339,18 @@ def test_intervals_of_rates_hold_the_true_ones():
         assert 0.9 - 0.03 - 3 * np.std(shares) / np.sqrt(16) < np.mean(shares) < 0.98
 
 
+def test_one_knocked_tool_does_not_spoil_the_rates_of_its_peers():
+    rng = np.random.default_rng(21)
+    times, rate = np.arange(3.0), np.full(21, 0.5)
+    values = walked(rng, rate, 1.0, times, 21)
+    values[-1, 2:] += 1e3
+    tools = [Increments.of(tool, [BIAS]) for tool in one_group(values, 1.0, times)]
+    alone, among = GroupRates.of(tools[:-1]), GroupRates.of(tools)
+    quarters = [quantiles(g.rates, g.peers_probability, [0.25, 0.5, 0.75]) for g in (alone, among)]
+    # Less than the centre of 20 log-normal rates is uncertain by (0.3 / √20 decades); without the share, 1.4.
+    assert np.log10(quarters[1] / quarters[0]) == pytest.approx(0, abs=0.05)
+
+
 def test_growth_begins_at_the_accuracy_that_is_stated(years):
     calibration = years["T-2"][-1]
     each = {g.angle: g for g in growths(tool_history(years["T-2"]))}
@@ -416,6 +428,79 @@ def test_pages_mark_simulated_data_and_escape_names(years):
         assert "SIMULATED DATA" in screen
         assert "\x1b" not in screen
     assert len(drift_picture(drift).axes) == 6
+
+
+def recognised(readings):
+    """Readings whose stations can be recognised, as those of a file."""
+    return replace(readings, digest=fingerprints([readings.accelerometer, readings.magnetometer]))
+
+
+def test_calibrations_of_the_same_stations_count_once():
+    bench = Bench("twelve-state", 11)
+    readings, other = (recognised(bench.readings(f"{year}-05-01")) for year in (2024, 2025))
+    first, again = (calibrate(readings, SERVO, Options(order=0, seed=seed)) for seed in (0, 1))
+    part = calibrate(readings, SERVO, Options(order=0, exclude=readings.station[:1]))
+    last = calibrate(other, SERVO, Options(order=0))
+    tool = tool_history([first, again, part, last])
+    assert sum(tool.used) == 2
+    assert tool.used[-1]
+    assert sum("counts instead" in " ".join(notes) for notes in tool.notes) == 2
+    alone = measured("T-1", [first, again]).drift
+    assert alone.change is None
+
+
+def test_a_calibration_with_a_prior_says_so_and_teaches_no_rate():
+    bench = Bench("twelve-state", 12)
+
+    def made(day, prior=None):
+        return calibrate(recognised(bench.readings(day)), SERVO, Options(order=0, prior=prior))
+
+    first = made("2023-05-01")
+    second, third = made("2024-05-01", first), made("2025-05-01", first)
+    tool = tool_history([first, second])
+    assert tool.history.has_prior.tolist() == [False, True]
+    assert any("prior" in note for note in tool.notes[1])
+    assert all(not i.noise.size for i in measured("T-1", [first, second]).increments.values())
+    # Without its prior in the history it is independent of what is there.
+    assert not tool_history([made("2022-05-01"), third]).history.has_prior.any()
+
+
+def test_the_least_probability_that_is_drawn_is_a_bound(years):
+    pytest.importorskip("matplotlib")
+    from mwdcal.app.pages.records.drift import render_fleet, render_tool
+    from mwdcal.app.screens.records.drift import fleet_screen, tool_screen
+
+    fleet, (drift, _) = fleet_drift(
+        [measured("T-1", years["T-1"]), measured("T-2", years["T-2"])], LIMITS, TODAY
+    )
+    assert drift.change.probability == 1 / (NULL_DRAWS + 1)
+    for text in (tool_screen(drift), fleet_screen(fleet), render_tool(drift), render_fleet(fleet)):
+        assert "≤ 0.0001" in text
+        assert text.count("0.0001 ") + text.count("0.0001<") <= text.count("≤ 0.0001")
+
+
+def test_comparing_reports_its_progress(years, tmp_path):
+    pytest.importorskip("sqlalchemy")
+    from cli_support import mwdcal
+    from mwdcal.app.commands.records.drift_sources import of_registry
+    from mwdcal.files import documents
+    from mwdcal.registry.store import open_registry
+
+    (tmp_path / "files").mkdir()
+    for serial in ("T-1", "T-2"):
+        for number, calibration in enumerate(years[serial]):
+            documents.write(tmp_path / "files" / f"{serial}-{number}.json", calibration)
+    database = tmp_path / "tools.sqlite"
+    where = ("--database", database)
+    assert mwdcal("registry", "init", *where).code == 0
+    assert mwdcal("registry", "add", tmp_path / "files", *where, "--workers", "1").code == 0
+    for serial, total in ((None, 2), ("T-1", 1)):
+        heard: list[tuple[int, int]] = []
+        with open_registry(str(database)) as registry:
+            of_registry(
+                registry, serial, LIMITS, 0.01, TODAY, lambda *done, into=heard: into.append(done)
+            )
+        assert heard == [(done, total) for done in range(total)]
 
 
 def test_the_command_reads_a_registry(years, tmp_path):

@@ -26,6 +26,10 @@ NULL_DRAWS = 9_999
 """Histories without change that the test is judged by."""
 PAIR_DRAWS = 1_999
 """Of these, those that two calibrations alone are judged by."""
+LEAST_PROBABILITY = 1 / (NULL_DRAWS + 1)
+"""The smallest probability that the draws can state: it stands for this or less."""
+LEAST_PAIR_PROBABILITY = 1 / (PAIR_DRAWS + 1)
+"""The smallest of two calibrations alone."""
 SEED_OF_DRAWS = 15
 MOST_NAMED_STEPS = 8
 """Most steps of one tool that are named."""

@@ -131,6 +131,7 @@ class History:
     parameters, nothing along directions that it leaves free. `freedom` (…, n, p): degrees of freedom of
     the noise estimate behind each parameter, infinite where there is none; `pooled` (…, n, p): those of a triad
     that are so marked are of one estimate. `years` (…, n) since the first.
+    `has_prior` (n,): calibrations made with another of these as their prior, or None: none.
     `names` (p,): "accelerometer bias-x"; a name with a `·` is a power of temperature.
     """
 
@@ -141,6 +142,7 @@ class History:
     freedom: Array
     pooled: Bools
     years: Array
+    has_prior: Bools | None = None
 
     @property
     def steady(self) -> Ints:

@@ -53,7 +53,10 @@ class ParameterStep(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Transition(msgspec.Struct, frozen=True, kw_only=True):
-    """Two successive calibrations compared: misfit (χ²) of one set of parameters to both."""
+    """Two successive calibrations compared: misfit (χ²) of one set of parameters to both.
+
+    `probability` of as much under no change; it is drawn, and 0.0005 (1 of 2,000) means 0.0005 or less.
+    """
 
     start: str
     end: str
@@ -66,7 +69,7 @@ class ChangeVerdict(msgspec.Struct, frozen=True, kw_only=True):
     """Whether a tool changed: `probability` of as much under no change, over all parameters and transitions.
 
     `largest_score` of all steps of one parameter, and the `critical_score` that raises an alarm; `misfit` (χ²)
-    of one set of parameters to all calibrations.
+    of one set of parameters to all calibrations. Probabilities are drawn: 0.0001 (1 of 10,000) means 0.0001 or less.
     """
 
     changed: bool
@@ -160,7 +163,10 @@ class ToolDrift(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class FleetTool(msgspec.Struct, frozen=True, kw_only=True):
-    """A tool among others: when calibrated last, whether changed and by what, and when due."""
+    """A tool among others: when calibrated last, whether changed and by what, and when due.
+
+    `probability` as in `ChangeVerdict`: 0.0001 means 0.0001 or less.
+    """
 
     serial: str
     type: str

@@ -27,6 +27,8 @@ from mwdcal.geometry.vectors import Array, Bools, outer
 NOTES = {
     "no-overlap": "not compared: its temperatures, {low:.0f}…{high:.0f} °C, and those of later calibrations, {others}, "
     "have none in common",
+    "again": "not compared: it has stations in common with the calibration of {later}, which counts instead",
+    "prior": "has an earlier calibration as its prior: a change shows less, and no rate is learnt from it",
     "unrecorded": "its run recorded no temperature: taken as made where the others were",
     "no-magnetometer": "has no magnetometer: only the accelerometer is compared",
     "relative": "its magnetometer is calibrated to field = 1: scale and bias are compared but for a common factor",
@@ -99,7 +101,11 @@ def tool_history(calibrations: Sequence[Calibration]) -> ToolHistory:
         span = (middle, middle)
     form = _Form(latest, span, orders, compared)
     rows = [form.row(each) for each in compared]
-    more = iter([form.notes(each) for each in compared])
+    prior = _has_prior(compared)
+    more = iter(
+        [*([NOTES["prior"]] if rests else []), *form.notes(each)]
+        for each, rests in zip(compared, prior, strict=True)
+    )
     notes = [[*first, *(next(more) if use else ())] for first, use in zip(notes, used, strict=True)]
     kept = [day for day, use in zip(days, used, strict=True) if use]
     names = parameter_names(orders)
@@ -109,10 +115,22 @@ def tool_history(calibrations: Sequence[Calibration]) -> ToolHistory:
     )
     like = np.stack(covariance) * outer(np.sqrt(ratio))
     known = np.stack([precision(*each) for each in zip(like, free, strict=True)])
-    history = History(names, np.stack(values), like, known, freedom, together, years(kept))
+    history = History(names, np.stack(values), like, known, freedom, together, years(kept), prior)
     units = tuple(map(form.unit, names))
     tool = tuple(ordered), tuple(days), tuple(used), tuple(map(tuple, notes))
     return ToolHistory(*tool, span, units, form.earth(), np.stack(covariance), free[-1], history)
+
+
+def _stations(calibration: Calibration) -> set[str]:
+    """Fingerprints of the accelerometer at the stations of a calibration's own run."""
+    return {row.digest.partition("-")[0] for row in calibration.station_rows} - {""}
+
+
+def _has_prior(compared: Sequence[Calibration]) -> Bools:
+    """Which calibrations (n,) had others of these as their prior, and so are not independent of them."""
+    behind = [{digest.partition("-")[0] for digest in c.inherited} for c in compared]
+    measured = set().union(*map(_stations, compared))
+    return np.array([bool(each & measured) for each in behind])
 
 
 def _range(calibration: Calibration) -> tuple[float, float]:
@@ -126,14 +144,22 @@ def _range(calibration: Calibration) -> tuple[float, float]:
 def _in_common(
     ordered: Sequence[Calibration],
 ) -> tuple[list[bool], tuple[float, float], list[list[str]]]:
-    """Which calibrations have temperatures in common, these, and notes of each; the latest first."""
+    """Which calibrations have temperatures in common and no station, the temperatures, and notes; latest first."""
     used, notes, span = [], [], ANY_TEMPERATURE
+    latest_of: dict[str, Calibration] = {}
     for each in reversed(ordered):
+        stations = _stations(each)
+        if again := [latest_of[station] for station in stations & latest_of.keys()]:
+            later = max(map(calibrated_on, again)).isoformat()
+            used.append(False)
+            notes.append([NOTES["again"].format(later=later)])
+            continue
         low, high = _range(each)
         both = max(low, span[0]), min(high, span[1])
         used.append(both[0] <= both[1])
         if used[-1]:
             span = both
+            latest_of |= dict.fromkeys(stations, each)
             notes.append([NOTES["unrecorded"]] if each.temperature_c is None else [])
         else:
             others = f"{span[0]:.0f}…{span[1]:.0f} °C"

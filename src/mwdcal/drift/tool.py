@@ -48,11 +48,10 @@ TOOL_AND_PEERS, PEERS = "tool and peers", "peers"
 FINDINGS = {
     "changed": "the tool changed: {what}.",
     "misfit": "the calibrations disagree beyond their uncertainties, though no step of a single parameter explains it",
-    "single": "there is one calibration: a change cannot be tested, and only peers tell how fast it drifts.",
+    "single": "there is one calibration to compare: a change cannot be tested, and only peers tell how fast it drifts.",
     "unpredicted": "the next due date cannot be predicted: no tool of type '{type}' has two calibrations that can be "
     "compared.",
-    "peers": "one calibration tells nothing of drift: the rates are those of {count} of the same type.",
-    "few": "the rates rest on few calibrations: the interval of the due date is wide.",
+    "peers": "its own calibrations tell no rate of drift: the rates are those of {count} of the same type.",
     "left-limits": "{count} passed as left and failed as found: the tool left its limits in service ({names}).",
     "overdue": "the latest calibration was due again on {due}.",
     "inaccurate": "the 95 % accuracy of {angle}, {now:.2g}°, exceeds the limit of {limit:g}° from the first day.",

@@ -1,7 +1,8 @@
 """How fast parameters wander: a random walk of each, its rate estimated with that of the tool's peers.
 
 Between two calibrations t years apart a parameter moves by a normal variable of variance q t. Parameters of
-a kind (`WALK_GROUPS`) have one rate; rates of tools of a type are log-normal about a common one.
+a kind (`WALK_GROUPS`) have one rate; rates of tools of a type are log-normal about a common one, but
+for a few (`UNLIKE_SHARE`) of any rate.
 """
 
 from __future__ import annotations
@@ -27,6 +28,8 @@ RATE_SPREADS = np.linspace(0.05, 1.0, 20)
 """Standard deviations, in decades, of the rates of tools of a type; see `SPREAD_SCALE`."""
 SPREAD_SCALE = 0.4
 """Most probable of these before there are data, of a Rayleigh distribution: it keeps away from none at all."""
+UNLIKE_SHARE = 0.02
+"""Share of the tools of a type, knocked or repaired ones, whose rates are unlike those of the others."""
 SHORTEST = 1 / 365.25
 """Two calibrations on one day are taken as this far apart, years."""
 
@@ -49,11 +52,12 @@ class Increments:
 
     @classmethod
     def of(cls, history: History, places: Sequence[int]) -> Increments:
-        """Those of the calibrations that have all parameters of the group."""
+        """Those of the calibrations that have all parameters of the group and none of the others as a prior."""
         values, covariance = history.values[:, places], history.covariance
         block = covariance[:, places][..., places]
         known = np.diagonal(history.precision, axis1=-2, axis2=-1)[:, places]
-        usable = np.flatnonzero(np.isfinite(values).all(-1) & (known > 0).all(-1))
+        independent = True if history.has_prior is None else ~history.has_prior
+        usable = np.flatnonzero(np.isfinite(values).all(-1) & (known > 0).all(-1) & independent)
         count, size = len(usable) - 1, len(places)
         if count < 1 or not size:
             return cls(np.zeros(0), np.zeros(0))
@@ -103,7 +107,8 @@ class GroupRates:
         """Share (c, s, r) of the tools of a type with each rate, by centre and spread of the type."""
         z = (DECADES - RATE_CENTRES[:, None, None]) / RATE_SPREADS[:, None]
         density = np.exp(-0.5 * z**2)
-        return np.asarray(density / density.sum(-1, keepdims=True))
+        alike = density / density.sum(-1, keepdims=True)
+        return np.asarray((1 - UNLIKE_SHARE) * alike + UNLIKE_SHARE / len(DECADES))
 
     def _evidence(self, log_likelihood: Array) -> Array:
         """Log probability (…, c, s) of a tool's calibrations, by centre and spread of its type."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from datetime import date
 from functools import partial
 from typing import Any
@@ -26,6 +26,8 @@ from mwdcal.registry import queries
 from mwdcal.registry.store import Registry
 from mwdcal.use.verification import Bounds, Verdict
 
+Advance = Callable[[int, int], None]
+"""Hears how many tools are done, and of how many."""
 PEERS_READ = 200
 """Most other tools of its type that a single tool is compared with."""
 PAGE = 500
@@ -61,18 +63,20 @@ def default_limits(errors: Bounds) -> dict[str, float]:
 
 
 def of_registry(
-    registry: Registry, serial: str | None, limits: dict[str, float], level: float, today: date
-) -> RegistryDrift:
-    """The drift of a tool with its peers, or without a serial of all tools.
+    registry: Registry, serial: str | None, limits: dict[str, float], level: float, today: date,
+    advance: Advance = lambda done, total: None,
+) -> RegistryDrift:  # fmt: skip
+    """The drift of a tool with its peers, or without a serial of all tools; `advance` hears how many are done.
 
     Raises:
         InputError: there is no calibration of such a tool.
     """
     whole = partial(RegistryDrift, registry=registry.name, limits_deg=limits)
     if serial is not None:
-        return whole(tool=_of_tool(registry, serial, limits, level, today))
-    tools, refused = [], {}
-    for row in _tools(registry):
+        return whole(tool=_of_tool(registry, serial, limits, level, today, advance))
+    tools, refused, rows = [], {}, list(_tools(registry))
+    for done, row in enumerate(rows):
+        advance(done, len(rows))
         try:
             if tool := _measured(registry, row["serial"], level):
                 tools.append(tool)
@@ -109,21 +113,25 @@ def drift_of(
 
 
 def _of_tool(
-    registry: Registry, serial: str, limits: dict[str, float], level: float, today: date
-) -> ToolDrift:
+    registry: Registry, serial: str, limits: dict[str, float], level: float, today: date, advance: Advance,
+) -> ToolDrift:  # fmt: skip
     tool = _measured(registry, serial, level)
     if tool is None:
         raise InputError(
             f"{registry.name} has no calibration of a tool {shown(serial)}. mwdcal registry list shows its tools."
         )
-    peers = [tool, *_peers(registry, serial, tool.drift.type)]
+    peers = [tool, *_peers(registry, serial, tool.drift.type, advance)]
     return predicted(tool, TypeRates.of(peers), limits, today)
 
 
-def _peers(registry: Registry, serial: str, kind: str) -> Iterator[MeasuredTool]:
+def _peers(
+    registry: Registry, serial: str, kind: str, advance: Advance = lambda done, total: None
+) -> Iterator[MeasuredTool]:
     """Other tools of a type, at most `PEERS_READ`, spread evenly; those that cannot be read are left out."""
     rows = [row for row in _tools(registry, type=kind) if row["serial"] != serial]
-    for row in rows[:: -(-len(rows) // PEERS_READ) or 1]:
+    some = rows[:: -(-len(rows) // PEERS_READ) or 1]
+    for done, row in enumerate(some):
+        advance(done, len(some))
         try:
             calibrations, _ = _calibrations(registry, row["serial"])
         except MwdcalError:
@@ -146,7 +154,7 @@ def _measured(registry: Registry, serial: str, level: float) -> MeasuredTool | N
     calibrations, digests = _calibrations(registry, serial)
     if not calibrations:
         return None
-    tests = list(_tests(registry, serial)) if len(calibrations) else []
+    tests = list(_tests(registry, serial))
     return measured(serial, calibrations, tests, level, digests)
 
 

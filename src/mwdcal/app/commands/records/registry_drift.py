@@ -53,6 +53,7 @@ def command(
     """
     from mwdcal.app.commands.records import drift_sources
     from mwdcal.app.pages.records import drift as pages
+    from mwdcal.app.progress import bar
     from mwdcal.app.screens.records import drift as screen
     from mwdcal.files.formats import atomic
     from mwdcal.registry.store import open_registry
@@ -60,8 +61,8 @@ def command(
     options.check_outputs([], [database], page=html)
     day = (today or datetime.now(UTC)).date()
     allowed = drift_sources.limits_of(limits)
-    with open_registry(database) as registry:
-        result = drift_sources.of_registry(registry, serial, allowed, level, day)
+    with open_registry(database) as registry, bar("comparing") as advance:
+        result = drift_sources.of_registry(registry, serial, allowed, level, day, advance)
     if html:
         atomic.write(html, pages.render(result.tool, result.fleet))
     shown = screen.document(result) if as_json else screen.text(result, html)

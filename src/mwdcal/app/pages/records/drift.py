@@ -8,8 +8,15 @@ from mwdcal import __version__
 from mwdcal.app.pages.page import banner, environment
 from mwdcal.app.pages.records import drift_figures as figures
 from mwdcal.app.screens.numbers import number
-from mwdcal.app.screens.records.drift import due_words, rate_rows, service_rows, step_rows
-from mwdcal.app.text import chance, plural
+from mwdcal.app.screens.records.drift import (
+    drawn_chance,
+    due_words,
+    pair_chance,
+    rate_rows,
+    service_rows,
+    step_rows,
+)
+from mwdcal.app.text import plural
 from mwdcal.drift.document import FleetDrift, ParameterCourse, ToolDrift
 from mwdcal.drift.forecast import ACCURACY_PROBABILITY, COVERAGE_FACTOR, INTERVAL, LONGEST_INTERVAL
 from mwdcal.drift.tool import CONTROL
@@ -36,6 +43,8 @@ def render_tool(drift: ToolDrift) -> str:
         service=service_rows(drift.service),
         rows=list(_parameter_rows(drift)),
         control=CONTROL,
+        drawn_chance=drawn_chance,
+        pair_chance=pair_chance,
         longest=LONGEST_INTERVAL,
         factor=COVERAGE_FACTOR,
         share=ACCURACY_PROBABILITY,
@@ -55,7 +64,7 @@ def _tool_banner(drift: ToolDrift) -> dict[str, str]:
         count = plural(sum(each.used for each in drift.calibrations), "calibration")
         return banner("open", "Not tested", f"{count} to compare: a change cannot be tested", after)
     change = drift.change
-    level = f"probability {chance(change.probability)} under no change; level {number(100 * change.level)} %"
+    level = f"probability {drawn_chance(change.probability)} under no change; level {number(100 * change.level)} %"
     if change.changed:
         return banner("attention", "Changed", f"The tool changed ({level})", after)
     return banner("good", "Not changed", f"No change is seen ({level})", after)
@@ -84,6 +93,7 @@ def render_fleet(fleet: FleetDrift) -> str:
     """The page of many tools."""
     return environment().get_template("drift_fleet.html").render(
         fleet=fleet,
+        drawn_chance=drawn_chance,
         simulated=fleet.simulated,
         banner=_fleet_banner(fleet),
         scores=figures.draw_scores(fleet) if fleet.tested else None,

@@ -12,6 +12,7 @@ from mwdcal.app.envelope import enveloped
 from mwdcal.app.screens.numbers import measured, number, unit, written
 from mwdcal.app.text import chance, one_line, plural, table
 from mwdcal.calibration.readings import SIMULATED
+from mwdcal.drift.change import LEAST_PAIR_PROBABILITY, LEAST_PROBABILITY
 from mwdcal.drift.document import DueDate, FleetDrift, FleetTool, ServiceRow, ToolDrift, WalkRate
 
 STEP_TITLES = ["changed", "between", "and", "by", "1σ", "score"]
@@ -37,6 +38,21 @@ WORST_TITLES = [
     "largest change",
     "due",
 ]
+
+
+def drawn_chance(probability: float | None, least: float = LEAST_PROBABILITY) -> str:
+    """A probability that was drawn: the least that the draws can state is a bound.
+
+    >>> [drawn_chance(p) for p in (0.41234, 0.0002, 0.0001, None)]
+    ['0.41', '0.0002', '≤ 0.0001', '–']
+    """
+    bound = probability is not None and probability <= least
+    return ("≤ " if bound else "") + chance(probability)
+
+
+def pair_chance(probability: float) -> str:
+    """The probability of two calibrations alone."""
+    return drawn_chance(probability, LEAST_PAIR_PROBABILITY)
 
 
 class RegistryDrift(msgspec.Struct, frozen=True, kw_only=True):
@@ -154,7 +170,8 @@ def _change_lines(drift: ToolDrift) -> Iterator[str]:
         return
     word = "CHANGED" if change.changed else "no change seen"
     yield (
-        f"{word}: probability {chance(change.probability)} under no change, level {number(100 * change.level)} %   "
+        f"{word}: probability {drawn_chance(change.probability)} under no change, "
+        f"level {number(100 * change.level)} %   "
         f"largest score {number(change.largest_score)}, critical {number(change.critical_score)}   "
         f"misfit χ² {number(change.misfit)} of {change.degrees_of_freedom}"
     )
@@ -166,7 +183,7 @@ def fleet_rows(tools: Sequence[FleetTool]) -> list[list[str]]:
     return [
         [
             tool.serial, tool.type, str(tool.calibrations), tool.calibrated, words[tool.changed],
-            chance(tool.probability), tool.parameter.replace("-", " "),
+            drawn_chance(tool.probability), tool.parameter.replace("-", " "),
             (tool.next_due or "–") + (" overdue" if tool.overdue else ""),
         ]
         for tool in tools
