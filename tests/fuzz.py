@@ -72,6 +72,7 @@ SAMPLES = {
     "laboratory": "laboratory",
     "database": "registry",
     "source": "registry",
+    "registry": "registry",
     "files": "any",
 }
 """The kind of file that each argument or option takes, by its name."""
