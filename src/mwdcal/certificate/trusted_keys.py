@@ -68,7 +68,7 @@ def _decoded(data: bytes, name: str) -> TrustedKeys:
                 raise ValueError(f"the key {key.key!r} is not that of its bytes")
             for time in filter(None, (key.retired, key.revoked)):
                 moment(time)
-    except (ValueError, RecursionError) as error:
+    except (msgspec.DecodeError, ValueError, RecursionError) as error:
         raise InputError(
             f"{name} is not a file of keys: {error}. Use one that `certificate key trust` wrote."
         ) from None
