@@ -101,8 +101,14 @@ def literal_columns(app, what, name, obj, options, lines) -> None:
     lines[:] = [*"\n\n".join(kept).split("\n"), ""]
 
 
+def commands_are_outdated(app, env, added, changed, removed) -> list[str]:
+    """The page of the commands, which is not known to depend on the code it is read from."""
+    return ["commands"]
+
+
 def setup(app) -> None:
     app.connect("source-read", leave_out_missing)
+    app.connect("env-get-outdated", commands_are_outdated)
     app.connect("autodoc-process-docstring", literal_columns)
     app.connect("autodoc-process-docstring", escape_docstring)
     for part in ("description", "options", "arguments", "epilog"):
