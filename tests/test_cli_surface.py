@@ -337,6 +337,7 @@ EDITED = {
     "temperatures reversed": with_value("temperature_c", value=[60.0, 20.0]),
     "temperatures of three": with_value("temperature_c", value=[20.0, 30.0, 40.0]),
     "no stations": without("station_rows"),
+    "time unknown": with_value("time", value="yesterday"),
     "earth unknown": with_value("earth", value={}),
 }
 

@@ -16,7 +16,6 @@ from mwdcal.drift.change import NULL_DRAWS, Contrasts, change_test
 from mwdcal.drift.comparable import (
     FACTOR_NAMES,
     History,
-    calibrated_on,
     one_noise,
     parameter_names,
     precision,
@@ -174,9 +173,9 @@ def test_what_cannot_be_compared_is_said():
 
 def test_the_day_of_a_calibration_is_that_of_its_run():
     calibration = Bench("six-state", 7).calibration("2019-03-04")
-    assert calibrated_on(calibration) == date(2019, 3, 4)
+    assert calibration.day == date(2019, 3, 4)
     undated = with_changes(calibration, tool={"date": "4 March"}, time="2026-01-02T03:04:05+00:00")
-    assert calibrated_on(undated) == date(2026, 1, 2)
+    assert undated.day == date(2026, 1, 2)
 
 
 # The test of change

@@ -62,11 +62,14 @@ def test_every_line_of_the_first_pages_runs(tmp_path, monkeypatch, page):
     pytest.importorskip("matplotlib")
     text = (ROOT / page).read_text("utf-8")
     blocks = re.findall(r"^```(\w*)\n(.*?)^```$", text, re.DOTALL | re.MULTILINE)
-    shell = "".join(block for language, block in blocks if not language)
-    lines = re.findall(r"^(?:\$ )?mwdcal (.*)", shell, re.MULTILINE)
+    of_line = re.compile(r"^(\$ )?mwdcal (.*)\n((?:(?!\$ |mwdcal ).*\n)*)", re.MULTILINE)
+    runs = [run for language, block in blocks if not language for run in of_line.findall(block)]
+    lines = [line for _, line, _ in runs]
     assert lines[0] == "example demo"
     assert "compare demo/run.csv --tool demo/tool.toml" in lines
     monkeypatch.chdir(tmp_path)
-    for line in lines:
+    for dollar, line, output in runs:
         ran = mwdcal(*shlex.split(line))
         assert ran.code == 0, (line, ran)
+        if dollar and output.strip():
+            assert [*map(str.rstrip, ran.out.splitlines())] == output.rstrip().split("\n"), line

@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from datetime import date
 from itertools import pairwise
 from typing import Any
 
@@ -44,6 +45,14 @@ def serial_of(metadata: Mapping[str, object]) -> str | None:
     """The serial of the tool that metadata state; None where they state none."""
     serial = metadata.get("serial")
     return None if serial in (None, "") else str(serial)
+
+
+def stated_day(metadata: Mapping[str, object]) -> date | None:
+    """The day of a measurement as metadata state it; None where `date` does not begin with an ISO date."""
+    try:
+        return date.fromisoformat(str(metadata.get("date"))[: len("2026-01-31")])
+    except ValueError:
+        return None
 
 
 def simulated(*metadata: Mapping[str, object]) -> list[str]:

@@ -7,6 +7,7 @@ a calibration in memory and one read back give the same results.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from datetime import date
 from html import escape
 from itertools import pairwise
 from typing import Any, ClassVar
@@ -16,7 +17,7 @@ import numpy as np
 
 from mwdcal import __version__
 from mwdcal.calibration.canonical import Signature, document_sha256
-from mwdcal.calibration.readings import NANOTESLA, SOAK_GAP, Readings, simulated
+from mwdcal.calibration.readings import NANOTESLA, SOAK_GAP, Readings, simulated, stated_day
 from mwdcal.errors import InputError
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array, Bools, diagonal
@@ -310,9 +311,13 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
         for name in ("inclination", "toolface", "azimuth")[: 1 + len(self.triads)]:
             parts = [getattr(row, f"{name}_deg") for row in self.budget]
             if parts:
-                free = None in parts
-                words[name] = "undetermined" if free else f"{np.linalg.norm(parts):.2g}°"
+                words[name] = "undetermined" if None in parts else f"{np.linalg.norm(parts):.2g}°"
         return words
+
+    @property
+    def day(self) -> date:
+        """The day of the measurement as its run states it, else that of the fit."""
+        return stated_day(self.tool) or date.fromisoformat(self.time[: len("2026-01-31")])
 
     @property
     def reference_temperature(self) -> float:

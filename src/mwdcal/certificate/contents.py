@@ -16,7 +16,7 @@ import msgspec
 from msgspec.structs import replace
 
 from mwdcal.calibration.canonical import canonical, rounded
-from mwdcal.calibration.readings import is_simulated, serial_of
+from mwdcal.calibration.readings import is_simulated, serial_of, stated_day
 from mwdcal.calibration.record import SOFTWARE, Calibration, Finding
 from mwdcal.certificate.budget import assumed_exact, budget
 from mwdcal.certificate.decisions import When, conformity
@@ -87,7 +87,7 @@ def certificate(
     The number is made of the serial, the date of issue and the SHA-256 of all else.
     """
     stated = laboratory or Laboratory()
-    day, day_stated = calibrated_on(calibration)
+    day, day_stated = calibration.day, stated_day(calibration.tool)
     if day_stated:
         _check_days(day, order, stated)
     given: dict[When, Verification | None] = {
@@ -148,14 +148,6 @@ def _findings(contents: Certificate, calibration: Calibration) -> Iterator[Findi
     for standard in contents.traceability:
         yield from _out_of_date(standard, contents.calibrated)
     yield from _exact(calibration)
-
-
-def calibrated_on(calibration: Calibration) -> tuple[date, bool]:
-    """The day of the calibration, and whether its run states it as an ISO date: else it is that of the fit."""
-    try:
-        return date.fromisoformat(calibration.tool.get("date", "")[:10]), True
-    except ValueError:
-        return date.fromisoformat(calibration.time[:10]), False
 
 
 def _unstated_day(day: date, order: Order) -> Finding:

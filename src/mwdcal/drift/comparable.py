@@ -9,11 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from datetime import UTC, date, datetime
+from datetime import date
 
 import numpy as np
 
-from mwdcal.calibration.record import Calibration
 from mwdcal.geometry.vectors import Array, Bools, Ints, diagonal
 from mwdcal.sensor.models import OFF_COLUMNS, OFF_DIAGONAL, OFF_ROWS, Model
 
@@ -41,16 +40,6 @@ UNLIKE = 1e-3
 ANY_TEMPERATURE = (-np.inf, np.inf)
 """The range of a calibration whose run recorded no temperature."""
 DAYS_PER_YEAR = 365.25
-
-
-def calibrated_on(calibration: Calibration) -> date:
-    """The day of a calibration: `date` of its run where that is an ISO date, else when it was computed."""
-    for text in (calibration.tool.get("date", ""), calibration.time):
-        try:
-            return date.fromisoformat(text[:10])
-        except ValueError:
-            continue
-    return datetime.fromtimestamp(0, UTC).date()
 
 
 def years(days: Sequence[date]) -> Array:

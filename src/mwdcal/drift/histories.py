@@ -15,7 +15,6 @@ from mwdcal.drift.comparable import (
     ANY_TEMPERATURE,
     FIELD_DIRECTIONS,
     History,
-    calibrated_on,
     factored,
     one_noise,
     parameter_names,
@@ -90,8 +89,8 @@ def tool_history(calibrations: Sequence[Calibration]) -> ToolHistory:
 
     Those of the latest decide: one that has no temperature in common with it is left out, and says so.
     """
-    ordered = sorted(calibrations, key=lambda c: (calibrated_on(c), c.time))
-    days = [calibrated_on(each) for each in ordered]
+    ordered = sorted(calibrations, key=lambda c: (c.day, c.time))
+    days = [each.day for each in ordered]
     used, span, notes = _in_common(ordered)
     compared = [each for each, use in zip(ordered, used, strict=True) if use]
     latest = ordered[-1]
@@ -150,7 +149,7 @@ def _in_common(
     for each in reversed(ordered):
         stations = _stations(each)
         if again := [latest_of[station] for station in stations & latest_of.keys()]:
-            later = max(map(calibrated_on, again)).isoformat()
+            later = max(each.day for each in again).isoformat()
             used.append(False)
             notes.append([NOTES["again"].format(later=later)])
             continue

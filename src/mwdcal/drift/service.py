@@ -9,7 +9,6 @@ from datetime import date
 import numpy as np
 
 from mwdcal.calibration.record import Calibration
-from mwdcal.drift.comparable import calibrated_on
 from mwdcal.drift.document import ServiceRow
 from mwdcal.use.verification import Verdict, VerdictRow
 
@@ -34,7 +33,7 @@ def service_rows(
     for calibration, names in calibrations:
         mine = sorted((t for t in tests if t.calibration_sha256 in names), key=lambda t: t.day)
         if len(mine) > 1 and mine[0].day < mine[-1].day:
-            rows += _compared(calibrated_on(calibration), mine[0], mine[-1])
+            rows += _compared(calibration.day, mine[0], mine[-1])
     return rows
 
 

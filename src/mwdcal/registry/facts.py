@@ -9,12 +9,12 @@ import math
 import re
 import tomllib
 from collections.abc import Callable, Mapping
-from datetime import UTC, date, datetime
+from datetime import UTC, datetime
 from typing import Any
 
 import msgspec
 
-from mwdcal.calibration.readings import is_simulated
+from mwdcal.calibration.readings import is_simulated, stated_day
 from mwdcal.errors import InputError
 from mwdcal.files import metadata
 
@@ -110,12 +110,10 @@ def _instant(value: object) -> str | None:
     return moment.astimezone(UTC).isoformat(timespec="seconds")
 
 
-def _measured(stated: object) -> str | None:
-    """The day of a measurement as a run states it; None where that is no date."""
-    try:
-        return date.fromisoformat(str(stated)[: len("2026-01-31")]).isoformat()
-    except ValueError:
-        return None
+def _day(metadata: Mapping[str, object]) -> str | None:
+    """The day of a measurement as metadata state it."""
+    day = stated_day(metadata)
+    return day.isoformat() if day else None
 
 
 class _Dated(msgspec.Struct):
@@ -126,7 +124,7 @@ class _Dated(msgspec.Struct):
 
 def states_day(calibration: bytes) -> bool:
     """Whether a calibration states the day of its measurement, rather than that of the fit alone."""
-    return _measured(msgspec.json.decode(calibration, type=_Dated).tool.get("date")) is not None
+    return stated_day(msgspec.json.decode(calibration, type=_Dated).tool) is not None
 
 
 def _norm(rows: list[Mapping[str, Any]], key: str) -> float | None:
@@ -142,7 +140,7 @@ def _calibration(data: bytes, name: str) -> Facts:
     return Facts(
         serial=_text(fields.get("serial") or tool.get("serial")),
         type=_text(fields["profile"].get("name")),
-        time=_measured(tool.get("date")) or _instant(fields["time"]),
+        time=_day(tool) or _instant(fields["time"]),
         run=_text(fields.get("run_sha256")),
         previous=_text(fields.get("prior_sha256")),
         inclination_deg=_norm(budget, "inclination_deg"),
@@ -228,7 +226,7 @@ def _run(data: bytes, name: str) -> Facts:
             continue  # a remark of another program
     return Facts(
         serial=_text(values.get("serial")),
-        time=_measured(values.get("date")),
+        time=_day(values),
         simulated=int(is_simulated(values)),
     )
 

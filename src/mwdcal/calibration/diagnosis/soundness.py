@@ -7,6 +7,7 @@ calibration file that is read.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from datetime import datetime
 from typing import Any
 
 import msgspec
@@ -103,7 +104,11 @@ def _floats(value: Any, path: str = "") -> Iterator[tuple[str, float]]:
 
 
 def _surroundings(calibration: Calibration) -> Iterator[str]:
-    """Temperatures and an earth's field that cannot be."""
+    """A time, temperatures and an earth's field that cannot be."""
+    try:
+        datetime.fromisoformat(calibration.time)
+    except ValueError:
+        yield f"'time' must be a date and time of ISO 8601; got {calibration.time[:80]!r}"
     low, high = calibration.temperature_c or (0.0, 0.0)
     if low > high:
         yield f"'temperature_c' must be the lowest and the highest; got {low:g} and {high:g}"

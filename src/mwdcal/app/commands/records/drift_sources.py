@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from datetime import date
 from functools import partial
 from typing import Any
@@ -12,7 +12,6 @@ import msgspec
 from mwdcal.app.screens.records.drift import RegistryDrift
 from mwdcal.calibration.prediction import STATED_ANGLES
 from mwdcal.calibration.record import Calibration
-from mwdcal.drift.comparable import calibrated_on
 from mwdcal.drift.document import ToolDrift
 from mwdcal.drift.fleet import fleet_drift
 from mwdcal.drift.service import ServiceTest
@@ -102,8 +101,8 @@ def drift_of(
         return None
     calibrations, digests = _calibrations(registry, serial)
     known = [c for c in calibrations if c.sha256 != calibration.sha256]
-    day = calibrated_on(calibration)
-    earlier = [c for c in known if calibrated_on(c) <= day]
+    day = calibration.day
+    earlier = [c for c in known if c.day <= day]
     if not earlier:
         return None
     digests |= {str(calibration.sha256): sha256}
@@ -142,11 +141,7 @@ def _peers(
 
 def _tools(registry: Registry, **where: object) -> Iterator[queries.Row]:
     """All tools of a registry whose columns equal these."""
-    start, total = 0, 1
-    while start < total:
-        total, rows = queries.tools_page(registry, where=where, offset=start, limit=PAGE)
-        yield from rows
-        start += PAGE
+    return _rows(partial(queries.tools_page, registry, where=where))
 
 
 def _measured(registry: Registry, serial: str, level: float) -> MeasuredTool | None:
@@ -179,7 +174,16 @@ def _tests(registry: Registry, serial: str) -> Iterator[ServiceTest]:
         yield ServiceTest(date.fromisoformat(day[:10]), row["calibration"] or "", verdict)
 
 
-def _records(registry: Registry, kind: str, where: dict[str, object]) -> Sequence[queries.Row]:
+def _records(registry: Registry, kind: str, where: dict[str, object]) -> Iterator[queries.Row]:
     """The records of a kind that were not withdrawn."""
-    page = queries.records_page(registry, kind, where, newest_first=False, limit=PAGE)
-    return [row for row in page.rows if row["withdrawn"] is None]
+    pages = partial(queries.records_page, registry, kind, where, newest_first=False)
+    return (row for row in _rows(pages) if row["withdrawn"] is None)
+
+
+def _rows(page: Callable[..., queries.Page]) -> Iterator[queries.Row]:
+    """All rows of a query that gives them in pages."""
+    start, total = 0, 1
+    while start < total:
+        total, rows = page(offset=start, limit=PAGE)
+        yield from rows
+        start += PAGE

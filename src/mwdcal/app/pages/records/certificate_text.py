@@ -29,13 +29,18 @@ from mwdcal.app.pages.records.certificate_blocks import (
 from mwdcal.app.screens.numbers import (
     UNDETERMINED,
     capital,
-    exponent,
-    fixed,
     measured,
     number,
     unit,
 )
+from mwdcal.app.screens.records.quantities import (
+    EXACT_DIGITS,
+    plain,
+    probability,
+    quantity_numbers,
+)
 from mwdcal.app.text import NOT_STATED, chance, harmless, plural
+from mwdcal.calibration.readings import SIMULATED
 from mwdcal.certificate.document import (
     Budget,
     BudgetLine,
@@ -52,19 +57,14 @@ from mwdcal.certificate.document import (
 if TYPE_CHECKING:
     from mwdcal.app.pages.records.certificate_pictures import Picture
 
-SIMULATED_DATA = "SIMULATED DATA"
-EXACT_DIGITS = 6
-"""Significant digits of a number without uncertainty, at most."""
 RESULT_DIGITS = 3
 """Significant digits of a result without uncertainty, such as the mean of errors."""
-NEARLY_CERTAIN = 1e-6
-"""A probability nearer to one than this is given as a bound."""
 _NOT_STATED_CELL = Cell([NOT_STATED], "free")
 
 
 def certificate_text(certificate: Certificate, pictures: Sequence[Picture] = ()) -> CertificateText:
     """The certificate in words: the same for every form, harmless in any of them."""
-    simulated = f"{SIMULATED_DATA} – this certificate describes no real tool"
+    simulated = f"{SIMULATED} – this certificate describes no real tool"
     name, lines = _laboratory(certificate.laboratory)
     text = CertificateText(
         title=certificate.title,
@@ -77,60 +77,6 @@ def certificate_text(certificate: Certificate, pictures: Sequence[Picture] = ())
         end=f"End of certificate {certificate.number}",
     )
     return msgspec.convert(mapped_texts(msgspec.to_builtins(text), harmless), CertificateText)
-
-
-# ------------------------------------------------------------------ numbers
-
-
-def quantity_numbers(quantity: Quantity, digits: int = EXACT_DIGITS) -> tuple[str, str, str]:
-    """Value, standard and expanded uncertainty with their unit.
-
-    Uncertainties have two significant digits, the value the last decimal place of the expanded one; a value
-    without uncertainty has `digits` at most.
-    """
-    symbol = unit("" if quantity.unit == "1" else quantity.unit)
-    value, u = quantity.value, quantity.standard_uncertainty
-    widest = u if quantity.expanded_uncertainty is None else quantity.expanded_uncertainty
-    blank = UNDETERMINED if value is None else NOT_STATED
-    first, last = blank, None
-    if value is not None:
-        first, last = (
-            measured(value, widest) if widest is not None else (plain(value, digits), None)
-        )
-        first += symbol
-    stated = blank if u is None else _two_digits(u, last or "") + symbol
-    if quantity.expanded_uncertainty is None:
-        return first, stated, blank
-    return first, stated, (last or number(widest, 2)) + symbol
-
-
-def _two_digits(value: float, beside: str) -> str:
-    """An uncertainty to two digits, with a power of ten only where the one beside it has one."""
-    return (
-        fixed(value, 1 - exponent(value))
-        if value and "." in beside and "×" not in beside
-        else number(value, 2)
-    )
-
-
-def plain(value: float, digits: int = EXACT_DIGITS) -> str:
-    """A number as it was set, such as a limit, or to some significant digits."""
-    text = f"{value:.{digits}g}".replace("-", "−")
-    return number(value, digits) if "e" in text else text
-
-
-def probability(value: float) -> str:
-    """A probability with two significant digits of what is missing to one.
-
-    >>> [probability(p) for p in (0.123, 0.99871, 1.0, 0.0)]
-    ['0.12', '0.9987', '> 0.999999', '< 1e-9']
-    """
-    missing = 1 - value
-    if missing > 0.5:
-        return chance(value)
-    if missing < NEARLY_CERTAIN:
-        return f"> {1 - NEARLY_CERTAIN:.6f}"
-    return f"{value:.{1 - exponent(missing)}f}"
 
 
 def _percent(share: float) -> str:

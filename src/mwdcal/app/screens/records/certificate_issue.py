@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from mwdcal.app.screens.numbers import UNDETERMINED, measured, number, unit, written
+from mwdcal.app.screens.numbers import UNDETERMINED, number, written
+from mwdcal.app.screens.records.quantities import quantity_numbers
 from mwdcal.app.text import NOT_STATED, chance, one_line, table
 from mwdcal.app.text import quantity as in_unit
 from mwdcal.calibration.prediction import STATED_ANGLES
@@ -16,7 +17,6 @@ from mwdcal.certificate.document import (
     Certificate,
     ConformityTest,
     LimitDecision,
-    Quantity,
 )
 
 ASSUMED_EXACT = "exact"
@@ -63,23 +63,12 @@ def _test(test: ConformityTest) -> str:
 
 def _decision(decision: LimitDecision) -> list[str]:
     quantity = decision.quantity
-    value, expanded = value_and_uncertainty(quantity)
+    value, _, expanded = quantity_numbers(quantity)
     limits = (decision.limit, decision.acceptance_limit)
     shown = [in_unit(limit, quantity.unit) for limit in limits]
     verdict = "pass" if decision.passed else "FAIL"
     chances = [chance(p) for p in (decision.probability_within, decision.risk)]
     return [quantity.name, value, expanded, *shown, verdict, *chances]
-
-
-def value_and_uncertainty(quantity: Quantity) -> tuple[str, str]:
-    """Value and expanded uncertainty with their unit, to two significant digits of the latter."""
-    symbol = unit(quantity.unit)
-    if quantity.value is None:
-        return UNDETERMINED, NOT_STATED
-    value, expanded = measured(quantity.value, quantity.expanded_uncertainty)
-    if quantity.expanded_uncertainty is None:
-        return value + symbol, NOT_STATED
-    return value + symbol, expanded + symbol
 
 
 def _budget(budget: Budget) -> str:
