@@ -413,9 +413,7 @@ def test_text_of_others_stays_text(tmp_path, text, form):
     """Serial, run and profile may be anything; the serial comes back from the string, byte for byte."""
     record = whole(made("factors", (1, 1)))
     profile = msgspec.structs.replace(record.profile, name=text)
-    record = msgspec.structs.replace(
-        record, tool={"serial": text}, run=text, time=text, profile=profile
-    )
+    record = msgspec.structs.replace(record, tool={"serial": text}, run=text, profile=profile)
     folder, _ = sources(tmp_path, saved(tmp_path, record), form)
     kind = FORMS[form]
     assert run(compiled(folder, kind)).returncode == 0
