@@ -391,6 +391,29 @@ def test_the_rule_of_a_guarded_verification_stands(servo):
         assert "decision-changed" not in named(document.findings)
 
 
+def test_each_roll_test_has_the_factor_of_the_calibration_that_it_tests(servo):
+    """Student's factors of 95 % for 10 and 5 degrees of freedom by JCGM 100, table G.2."""
+    as_found = verification(servo, row(), calibration_sha256="1" * 64, degrees_of_freedom=10.0)
+    document = issued(servo, as_found=as_found, verification=verification(servo, row()))
+    (before,), (after,) = document.as_found.decisions, document.as_left.decisions
+    assert before.quantity.expanded_uncertainty == pytest.approx(2.23 * 0.01, abs=5e-5)
+    assert after.quantity.expanded_uncertainty == pytest.approx(2.0 * 0.01)
+    guarded = Laboratory(decision=DecisionRule(rule="guarded"))
+    five = replace(as_found, degrees_of_freedom=5.0)
+    (decision,) = issued(servo, guarded, as_found=five).as_found.decisions
+    assert decision.acceptance_limit == pytest.approx(0.1 - 2.57 * 0.01, abs=5e-5)
+    assert "freedom-not-stated" not in named(document.findings)
+
+
+def test_a_test_that_does_not_state_its_degrees_of_freedom_has_a_finding(servo):
+    """Of an earlier version: as left those of the calibration are known, as found they are not."""
+    old = verification(servo, row(), degrees_of_freedom=None)
+    assert "freedom-not-stated" not in named(issued(servo, verification=old).findings)
+    document = issued(servo, as_found=replace(old, calibration_sha256="1" * 64))
+    assert "freedom-not-stated" in named(document.findings)
+    assert document.as_found.decisions[0].quantity.coverage_factor == 2.0
+
+
 def test_the_risk_of_the_customer_is_kept_by_the_guard_band():
     """Drawn: tools whose true value is uniform about the limit; of those that pass by value, few are outside."""
     rng, limit, sd = np.random.default_rng(7), 0.1, 0.01

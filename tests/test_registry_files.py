@@ -112,7 +112,7 @@ def test_records_are_linked_by_the_sha256_of_files(example, filled):
     }  # fmt: skip
     fitted = by_kind["calibration", "2023-03-01"]
     assert fitted["sha256"] == sha256(example.parent / "tools" / "SIM-0001.json")
-    verified = by_kind["verification", None]
+    verified = by_kind["verification", "2023-03-01"]
     assert verified["status"] == "passed"
     assert (
         json.loads((example / "verified.json").read_text())["calibration_sha256"]

@@ -18,7 +18,7 @@ from mwdcal.calibration.readings import is_simulated, stated_day
 from mwdcal.errors import InputError
 from mwdcal.files import metadata
 
-FACTS_VERSION = 1
+FACTS_VERSION = 2
 """Version of the functions below: higher when one of them reads the same bytes otherwise."""
 LONGEST_NAME = 200
 """Characters of the longest serial, name or number that a registry takes."""
@@ -155,6 +155,7 @@ def _verification(data: bytes, name: str) -> Facts:
     return Facts(
         serial=_text(fields.get("serial")),
         label=_text(fields.get("limits")),
+        time=_day(fields),
         run=_text(fields.get("run_sha256")),
         calibration=_text(fields.get("calibration_sha256")),
         status=_outcome(fields["passed"]),
