@@ -491,6 +491,32 @@ def test_what_is_particular_stands_before_the_laboratory_file(servo):
     assert document.number == "N-1"
 
 
+@pytest.mark.parametrize(
+    ("when", "day", "named_as"),
+    [
+        ("as_found", "2026-03-15", None),
+        ("as_found", "2026-03-16", "after the day of the calibration"),
+        ("verification", "2026-03-15", None),
+        ("verification", "2026-03-14", "before the day of the calibration"),
+        ("verification", "15 March", None),
+    ],
+)
+def test_a_roll_test_on_the_wrong_side_of_the_calibration_is_a_finding(
+    thermal, when, day, named_as
+):
+    """The calibration is of 2026-03-15."""
+    digest = "1" * 64 if when == "as_found" else "0" * 64
+    test = verification(thermal, row(), date=day, calibration_sha256=digest)
+    text = named(issued(thermal, **{when: test}).findings).get("test-date")
+    assert (named_as in text) if named_as else (text is None)
+
+
+def test_a_certificate_from_before_its_roll_test_is_refused(thermal):
+    test = verification(thermal, row(), date="2026-04-02")
+    with pytest.raises(mwdcal.InputError, match="must not be before the day of `verification`"):
+        issued(thermal, verification=test)
+
+
 def test_an_overdue_standard_is_marked_on_the_day_of_the_calibration(thermal):
     def standard(name, due):
         return MeasurementStandard(quantity="stand", name=name, due=due)

@@ -79,6 +79,18 @@ class Words(HTMLParser):
             self.words.append(data)
 
 
+def test_the_page_names_the_factor_of_each_roll_test_where_they_differ():
+    first, *others = SAMPLE.as_found.decisions
+    few = replace(
+        first,
+        quantity=replace(first.quantity, coverage_factor=2.57, expanded_uncertainty=2.57 * 0.01),
+    )
+    test = replace(SAMPLE.as_found, decisions=[few])
+    assert f"{others[0].quantity.coverage_factor:.2f}" == "2.00"
+    text = squeezed(render_page(changed(as_found=test), []))
+    assert "(asfound:k=2.57,95.45%;asleft:k=2.00,95.45%)" in text
+
+
 def page_text(certificate):
     return squeezed("".join(Words(render_page(certificate)).words))
 

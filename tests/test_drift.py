@@ -130,6 +130,37 @@ def test_models_of_temperature_give_one_set_of_parameters():
     assert any("differ by their own misfit" in note for note in tool.notes[0])
 
 
+def test_a_calibration_without_temperature_terms_is_compared_at_the_temperature_of_its_run():
+    """A tool that drifts with temperature and is as it was: terms over a range, then one soak of another run, away
+    from the reference temperature of 30 °C."""
+    bench = Bench("laboratory-thermal", 4, order=1)
+    first, second = bench.readings("2024-05-01"), bench.readings("2025-05-01")
+    soak = np.abs(second.temperature - second.temperature.min()) < 1
+    plain = calibrate(second.select(soak), SERVO, Options(order=0))
+    tool = tool_history([calibrate(first, SERVO, Options(order=1)), plain])
+    assert tool.temperature_c[0] == pytest.approx(np.mean(plain.temperature_c))
+    assert abs(tool.temperature_c[0] - 30) > 4
+    assert not change_test(tool.history, 1e-3).changed
+    assert not any("no temperature terms" in note for note in tool.notes[-1])
+
+
+def test_calibrations_without_temperature_terms_of_other_temperatures_say_so():
+    bench = Bench("laboratory-thermal", 4, order=1)
+    runs = [bench.readings(day) for day in ("2024-05-01", "2025-05-01")]
+    lowest = runs[0].temperature.min()
+    soaks = [np.abs(run.temperature - lowest) < 1 for run in runs]
+    first, second = (
+        calibrate(
+            replace(run.select(soak), temperature=run.temperature[soak] + shift),
+            SERVO,
+            Options(order=0),
+        )
+        for run, soak, shift in zip(runs, soaks, (0.0, 4.0), strict=True)
+    )
+    tool = tool_history([first, second])
+    assert all("counts as a change" in " ".join(notes) for notes in tool.notes)
+
+
 def test_another_nominal_scale_is_no_change():
     bench = Bench("twelve-state", 5)
     readings = bench.readings()

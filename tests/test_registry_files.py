@@ -300,6 +300,21 @@ def test_days_and_serials_that_people_write_otherwise_are_named(example, tmp_pat
     assert registry(path, "add", tmp_path / "all.parquet")["findings"] == []  # nothing new
 
 
+def test_a_calibration_that_was_changed_is_added_and_said_to_be(example, tmp_path):
+    """A number of it, beside its hash; the file as it was written is not named."""
+    sound = example.parent / "tools" / "SIM-0001.json"
+    fields = json.loads(sound.read_bytes())
+    fields["accelerometer"]["parameters"][0] += 1e-3
+    altered = tmp_path / "altered.json"
+    altered.write_text(json.dumps(fields))
+    database = tmp_path / "r.sqlite"
+    registry(database, "init")
+    result = registry(database, "add", sound, altered)
+    findings = {finding["id"]: finding["text"] for finding in result["findings"]}
+    assert findings["changed"].startswith("1 calibration changed after mwdcal calibrate made it")
+    assert "altered.json" in findings["changed"]
+
+
 def test_a_page_behind_the_last_one_is_empty(filled):
     shown = run("registry", "--database", filled, "list", "--offset", 99).out
     assert shown == "3 tools\n"

@@ -10,7 +10,7 @@ import numpy as np
 
 from mwdcal.calibration.prediction import raw_reading
 from mwdcal.calibration.readings import NANOTESLA, SOAK_GAP, TRIADS
-from mwdcal.calibration.record import Calibration, TriadCalibration
+from mwdcal.calibration.record import MARGIN, Calibration, TriadCalibration
 from mwdcal.drift.comparable import (
     ANY_TEMPERATURE,
     FIELD_DIRECTIONS,
@@ -36,6 +36,8 @@ NOTES = {
     "free": "leaves undetermined: {free}: the others are compared",
     "model": "the {triad} has the model '{model}', that of the latest is '{latest}': over temperature the two "
     "differ by their own misfit",
+    "elsewhere": "has no temperature terms and was made at {run:.1f} °C: compared at {middle:.1f} °C, what the tool "
+    "drifts between them counts as a change",
     "order": "the {triad} has temperature terms of order {order}: compared to order {compared}",
 }
 """What is said of a calibration that cannot be compared, or not in all of its parameters."""
@@ -95,7 +97,7 @@ def tool_history(calibrations: Sequence[Calibration]) -> ToolHistory:
     compared = [each for each, use in zip(ordered, used, strict=True) if use]
     latest = ordered[-1]
     orders = _orders(compared, span)
-    middle = _middle(latest, span)
+    middle = _middle(compared, span)
     if not any(orders.values()):
         span = (middle, middle)
     form = _Form(latest, span, orders, compared)
@@ -166,9 +168,18 @@ def _in_common(
     return used[::-1], span, notes[::-1]
 
 
-def _middle(latest: Calibration, span: tuple[float, float]) -> float:
-    """The temperature at which calibrations without a common course are compared."""
-    return float(np.clip(latest.reference_temperature, *span))
+def _middle(compared: Sequence[Calibration], span: tuple[float, float]) -> float:
+    """The temperature at which calibrations without a common course are compared.
+
+    That of the runs of those without temperature terms, which say nothing of others; else the latest's reference.
+    """
+    runs = [np.mean(c.temperature_c) for c in compared if c.temperature_c and _constant(c)]
+    return float(np.clip(np.mean(runs) if runs else compared[-1].reference_temperature, *span))
+
+
+def _constant(calibration: Calibration) -> bool:
+    """Whether a triad of a calibration has no temperature terms."""
+    return not all(triad.order for triad in calibration.triads)
 
 
 def _orders(compared: Sequence[Calibration], span: tuple[float, float]) -> dict[str, int]:
@@ -298,6 +309,9 @@ class _Form:
                 yield NOTES["model"].format(triad=name, model=triad.model, latest=latest)
             if triad.order > compared:
                 yield NOTES["order"].format(triad=name, order=triad.order, compared=compared)
+        middle, measured = sum(self.span) / 2, calibration.temperature_c
+        if measured and _constant(calibration) and abs(np.mean(measured) - middle) > MARGIN:
+            yield NOTES["elsewhere"].format(run=np.mean(measured), middle=middle)
         if calibration.relative:
             yield NOTES["relative"]
         if calibration.options.parameters < 12:

@@ -10,6 +10,7 @@ from typing import Any
 import msgspec
 
 from mwdcal.calibration.canonical import canonical
+from mwdcal.calibration.record import Calibration
 from mwdcal.errors import InputError, reason
 from mwdcal.files import documents, runs
 from mwdcal.files.contract import CHANNELS
@@ -91,11 +92,11 @@ def of_bytes(data: bytes, name: str) -> list[Entry]:
     return _of_toml(data, name)
 
 
-def checked(entry: Entry) -> Entry:
-    """The entry, if it is a calibration one that every command accepts."""
+def checked(entry: Entry) -> Calibration | None:
+    """The calibration that an entry is, one that every command accepts; None where it is another document."""
     if entry.kind == "calibration":
-        documents.decoded(members.Member(entry.data, entry.name, ""))
-    return entry
+        return documents.decoded(members.Member(entry.data, entry.name, ""))
+    return None
 
 
 def _json_kind(data: bytes, name: str) -> str:

@@ -116,17 +116,6 @@ def _day(metadata: Mapping[str, object]) -> str | None:
     return day.isoformat() if day else None
 
 
-class _Dated(msgspec.Struct):
-    """The part of a calibration that states its day."""
-
-    tool: dict[str, Any] = {}
-
-
-def states_day(calibration: bytes) -> bool:
-    """Whether a calibration states the day of its measurement, rather than that of the fit alone."""
-    return stated_day(msgspec.json.decode(calibration, type=_Dated).tool) is not None
-
-
 def _norm(rows: list[Mapping[str, Any]], key: str) -> float | None:
     """The root of the sum of squares of a column of the budget; None where a part is undetermined."""
     parts = [row.get(key) for row in rows]
