@@ -173,11 +173,11 @@ def _check_days(day: date, order: Order, laboratory: Laboratory) -> None:
 def _order_of_days(tests: Mapping[str, ConformityTest], day: date) -> Iterator[Finding]:
     """A finding if a test as found was made after the day of the calibration, or one as left before it."""
     for when, wrong in (("as found", operator.gt), ("as left", operator.lt)):
-        made = stated_day({"date": tests[when].date}) if when in tests else None
-        if made and wrong(made, day):
-            side = "after" if made > day else "before"
+        test_day = stated_day({"date": tests[when].date}) if when in tests else None
+        if test_day and wrong(test_day, day):
+            side = "after" if test_day > day else "before"
             text = (
-                f"the roll test {when} was made on {made}, {side} the day of the calibration, {day}: check that it "
+                f"the roll test {when} was made on {test_day}, {side} the day of the calibration, {day}: check that it "
                 f"shows the tool {when}."
             )
             yield Finding(id="test-date", text=text)
@@ -234,11 +234,11 @@ def _check_test(document: Verification, calibration: Calibration, order: Order) 
 
 def _check_issued(document: Verification, order: Order) -> None:
     """Refuse a certificate from before a roll test that it shows."""
-    made = stated_day({"date": document.date})
-    if made and order.issued < made:
+    test_day = stated_day({"date": document.date})
+    if test_day and order.issued < test_day:
         argument = "`verification`" if document is order.verification else "`as_found`"
         raise InputError(
-            f"`date` must not be before the day of {argument}, {made}; got {order.issued}. Correct one of them."
+            f"`date` must not be before the day of {argument}, {test_day}; got {order.issued}. Correct one of them."
         )
 
 
