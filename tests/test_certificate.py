@@ -612,6 +612,21 @@ def test_conditions_state_the_place_with_the_uncertainty_that_was_declared(therm
     assert exact["gravity"].standard_uncertainty is None
 
 
+def test_a_dip_that_the_readings_tell_has_the_factor_of_their_residuals():
+    """Student's of 95 % for the degrees of freedom, by its distribution; declared gravity has the normal one."""
+    profile = mwdcal.load_profile(EXAMPLE / "tool.toml")
+    profile = replace(profile, stand=replace(profile.stand, gravity_g=2e-5, dip_deg=1.0))
+    profile = replace(profile, magnetometer=replace(profile.magnetometer, noise=None))
+    run = mwdcal.read_run(EXAMPLE / "run.csv", profile)
+    few = mwdcal.calibrate(run.select(np.arange(run.count) % 4 == 0))
+    rows = {quantity.id: quantity for quantity in issued(few).conditions}
+    fewest = min(triad.degrees_of_freedom for triad in few.triads)
+    assert fewest < 30
+    assert rows["dip"].standard_uncertainty < 0.1
+    assert rows["dip"].coverage_factor == pytest.approx(stats.t.ppf(0.975, fewest), rel=1e-9)
+    assert rows["gravity"].coverage_factor == pytest.approx(1.95996, rel=1e-4)
+
+
 def test_whatever_is_simulated_marks_the_certificate(servo):
     real = replace(
         servo, simulated=False, tool={k: v for k, v in servo.tool.items() if k != "simulated"}

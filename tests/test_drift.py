@@ -161,14 +161,15 @@ def test_calibrations_without_temperature_terms_of_other_temperatures_say_so():
     assert all("counts as a change" in " ".join(notes) for notes in tool.notes)
 
 
-def test_another_nominal_scale_is_no_change():
+@pytest.mark.parametrize("scale", [3.06, 3.75])
+def test_another_nominal_scale_is_no_change(scale):
     bench = Bench("twelve-state", 5)
     readings = bench.readings()
-    other = with_changes(SERVO, accelerometer=with_changes(SERVO.accelerometer, scale=3.06))
+    other = with_changes(SERVO, accelerometer=with_changes(SERVO.accelerometer, scale=scale))
     shrunk = replace(
         readings,
-        accelerometer=readings.accelerometer * 3.0 / 3.06,
-        sd={**readings.sd, "accelerometer": readings.sd["accelerometer"] * 3.0 / 3.06},
+        accelerometer=readings.accelerometer * 3.0 / scale,
+        sd={**readings.sd, "accelerometer": readings.sd["accelerometer"] * 3.0 / scale},
         profile=other,
     )
     both = [
@@ -177,6 +178,27 @@ def test_another_nominal_scale_is_no_change():
     ]
     values = tool_history(both).history.values
     np.testing.assert_allclose(values[0], values[1], rtol=1e-7, atol=1e-9)
+
+
+@pytest.mark.parametrize("latest", [0, 1])
+def test_readings_in_millivolts_are_compared_with_those_in_volts(latest):
+    """The same station readings, once in V and once in mV, whichever is the latest."""
+    bench = Bench("twelve-state", 5)
+    readings = bench.readings()
+    milli = with_changes(SERVO, accelerometer=with_changes(SERVO.accelerometer, scale=3000.0))
+    both = [
+        calibrate(replace(readings, profile=profile), profile, Options(order=0))
+        for profile in (SERVO, milli)[:: 1 if latest else -1]
+    ]
+    both = [
+        with_changes(c, tool={**c.tool, "date": day}, station_rows=[])
+        for c, day in zip(both, ("2024-05-01", "2025-05-01"), strict=True)
+    ]
+    tool = tool_history(both)
+    np.testing.assert_allclose(*tool.history.values, rtol=1e-7, atol=1e-9)
+    assert tool.notes[0] == (
+        "the readings of the accelerometer are in another unit than those of the latest: compared in nominal units",
+    )
 
 
 def test_along_a_free_direction_nothing_is_known():
