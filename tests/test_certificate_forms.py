@@ -79,6 +79,12 @@ class Words(HTMLParser):
             self.words.append(data)
 
 
+def test_the_symbol_of_the_standard_uncertainty_stays_small():
+    page = render_page(SAMPLE, [])
+    assert "u: standard uncertainty; U: expanded uncertainty" in page
+    assert "U: standard uncertainty" not in page
+
+
 def test_the_page_names_the_factor_of_each_roll_test_where_they_differ():
     first, *others = SAMPLE.as_found.decisions
     few = replace(

@@ -315,7 +315,7 @@ def quantity_table(
     if stated["U"]:
         meant += f"{'; ' if meant else ''}U: expanded uncertainty"
         meant += f", {coverages}" if coverages and not stated["k, coverage"] else ""
-    notes = [note, f"{capital(meant)}." if meant else ""]
+    notes = [note, f"{meant}." if meant else ""]
     return TableBlock(order, rows, title, notes=[*filter(None, notes)])
 
 
