@@ -10,7 +10,6 @@ import binascii
 import hashlib
 import json
 import math
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -273,7 +272,7 @@ def _base(name: str) -> str:
 
 def _checked(file: SourceFile, given: Sequence[Path], folder: Path) -> CheckedFile:
     """A file that is listed, looked up: all that are `given` must be it; a folder in its place is none."""
-    beside = [folder / file.name.replace("\\", os.sep), folder / _base(file.name)]
+    beside = [*_stated_places(file.name, folder), folder / _base(file.name)]
     places = given or [place for place in beside if _exists(place)][:1]
     if not places:
         return CheckedFile(id=file.id, name=file.name, path=None, state="missing")
@@ -284,6 +283,12 @@ def _checked(file: SourceFile, given: Sequence[Path], folder: Path) -> CheckedFi
         path=str((changed or places)[0]),
         state="changed" if changed else "unchanged",
     )
+
+
+def _stated_places(name: str, folder: Path) -> list[Path]:
+    """Where a certificate says that a file is; nowhere on another machine: Windows would log in there to look."""
+    place = name.replace("\\", "/")
+    return [] if place.startswith("//") else [folder / place]
 
 
 def _exists(path: Path) -> bool:
