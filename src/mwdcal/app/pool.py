@@ -201,7 +201,7 @@ def _on_cluster(steps: Steps, tasks: Sequence[Any], address: str) -> Iterator[tu
     except ImportError:
         raise InputError(
             "`scheduler` needs the extra 'cluster'. Install it, here and on every worker: "
-            "pip install 'mwdcal[parquet,cluster]'"
+            'pip install "mwdcal[parquet,cluster]"'
         ) from None
     with _connected(distributed, address) as client:
         futures = client.map(steps, tasks, pure=False, retries=ATTEMPTS)
@@ -221,7 +221,7 @@ def _on_cluster(steps: Steps, tasks: Sequence[Any], address: str) -> Iterator[tu
         except ModuleNotFoundError as error:
             raise InputError(
                 f"a worker of {address} has no {error.name}. Install mwdcal there: pip install "
-                "'mwdcal[parquet,cluster]'"
+                '"mwdcal[parquet,cluster]"'
             ) from error
         except LOST as error:
             raise InputError(

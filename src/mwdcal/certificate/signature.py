@@ -62,7 +62,7 @@ STATES = {
     "retired": "the {document} was signed on {time} by {key}, which was retired on {retired}. Have it signed with "
     "the key that followed.",
     "unchecked": "the {document} is signed by {key}, and not checked: cryptography is not installed. Install "
-    "mwdcal[certificate]: pip install 'mwdcal[certificate]'",
+    'mwdcal[certificate]: pip install "mwdcal[certificate]"',
 }
 """What is said of each state."""
 FINDING_OF_STATE = {

@@ -120,6 +120,8 @@ def _hindrance(file: Path) -> str:
         return "it is not a regular file. Name a file to write."
     if not file.parent.is_dir():
         return _missing(file.parent)
+    if fcntl is None and ":" in file.name:
+        return "behind the colon is the name of a stream inside the file. Name a file without."
     writable = stat.S_IWUSR | stat.S_IWGRP | stat.S_IWOTH  # for the superuser anything else is
     if file.exists() and not (file.stat().st_mode & writable and os.access(file, os.W_OK)):
         return "it is write-protected. Name another file, or remove the protection."

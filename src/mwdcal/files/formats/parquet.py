@@ -174,7 +174,7 @@ def modules(source: str) -> tuple[Any, Any]:
     except ImportError:
         raise InputError(
             f"{source}: Parquet files need the extra 'parquet'. "
-            "Install it with: pip install 'mwdcal[parquet]'"
+            'Install it with: pip install "mwdcal[parquet]"'
         ) from None
     return pyarrow, pyarrow.parquet
 
