@@ -34,8 +34,8 @@ _WRITTEN_AHEAD = 18, 2
 _PATTERN = ".mwdcal-*.tmp"
 _DAY = 86_400.0
 """Seconds after which a file of another machine counts as left behind: its locks may not reach here."""
-_MINUTE = 60.0
-"""Seconds after which a file that is not open counts as left behind: its writer may be about to rename it."""
+_RENAME_SECONDS = 5.0
+"""Seconds after which a file that is not open counts as left behind on Windows: its writer may yet rename it."""
 _PAUSES = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
 """Seconds between attempts to rename a file that a virus scanner or an indexer holds open for a moment."""
 
@@ -269,7 +269,7 @@ def _remove_if_left(path: Path) -> None:
         return
     age = time.time() - path.stat().st_mtime
     if fcntl is None:
-        if age > _MINUTE:
+        if age > _RENAME_SECONDS:
             path.unlink()  # refused by the system while it is open
         return
     near = path.name.startswith(f".mwdcal-{_machine()}-")
