@@ -367,7 +367,7 @@ def test_pictures_have_titles_and_texts_for_those_who_do_not_see_them(pictures):
 
 def test_without_typst_one_sentence_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "typst", None)
-    with pytest.raises(InputError, match=re.escape("pip install 'mwdcal[certificate]'")) as refused:
+    with pytest.raises(InputError, match=re.escape('pip install "mwdcal[certificate]"')) as refused:
         render_pdf(SAMPLE)
     assert "\n" not in str(refused.value)
 

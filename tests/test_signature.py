@@ -628,6 +628,18 @@ def test_the_table_of_a_fleet_is_looked_up_by_its_file(tmp_path, files, key, pub
     assert (ran.code, ran.json["files"][0]["state"]) == (1, "changed")
 
 
+@pytest.mark.parametrize("slash", ["/", "\\"])
+def test_no_other_machine_is_asked_for_a_file(tmp_path, files, key, public, slash):
+    """Windows logs in at the machine that a name with two slashes begins with; elsewhere one is as good as two."""
+    (tmp_path / "other").mkdir()
+    there = shutil.copy(files[0], tmp_path / "other" / "elsewhere.json")
+    name = f"/{there}".replace("/", slash)
+    path = signed(certificate(tmp_path, files=[listed(there, name)]), key)
+    verify = ("certificate", "verify", path, "--key", public, "--json")
+    assert mwdcal(*verify).json["files"][0]["state"] == "missing"
+    assert mwdcal(*verify[:3], there, *verify[3:]).json["files"][0]["state"] == "unchanged"
+
+
 def test_an_altered_certificate_makes_nobody_look_for_files(tmp_path, files, key, public):
     path = signed(certificate(tmp_path, files=[listed(files[0], str(files[0]))]), key)
     path.write_bytes(path.read_bytes().replace(b'"C-1"', b'"C-2"'))
@@ -713,9 +725,9 @@ def test_without_cryptography_it_says_what_to_install(tmp_path, files, key, publ
     monkeypatch.setitem(sys.modules, "cryptography.hazmat.primitives.asymmetric.ed25519", None)
     ran = mwdcal("verify", path, files[1], "--key", public)
     assert "signature not checked" in ran.out
-    assert "pip install 'mwdcal[certificate]'" in ran.err
+    assert 'pip install "mwdcal[certificate]"' in ran.err
     message = refused(mwdcal("certificate", "sign", path, "--key", key), 2)
-    assert "pip install 'mwdcal[certificate]'" in message
+    assert 'pip install "mwdcal[certificate]"' in message
     refused(mwdcal("certificate", "key", "create", "-o", tmp_path / "n.key"), 2)
     ran = mwdcal("certificate", "verify", path, "--key", public)
     assert ran.code == 1

@@ -10,7 +10,6 @@ import binascii
 import hashlib
 import json
 import math
-import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import timedelta
@@ -65,7 +64,7 @@ STATES = {
     "retired": "the {document} was signed on {time} by {key}, which was retired on {retired}. Have it signed with "
     "the key that followed.",
     "unchecked": "the {document} is signed by {key}, and not checked: cryptography is not installed. Install "
-    "mwdcal[certificate]: pip install 'mwdcal[certificate]'",
+    'mwdcal[certificate]: pip install "mwdcal[certificate]"',
 }
 """What is said of each state."""
 CLOCKS_APART = timedelta(minutes=5)
@@ -302,7 +301,7 @@ def _base(name: str) -> str:
 def _checked(file: SourceFile, given: Sequence[Path], folder: Path) -> CheckedFile:
     """A file that is listed, looked up: all that are `given` must be it; a folder in its place is none."""
     names = dict.fromkeys((file.name, _table(file.name)))
-    beside = [folder / part for n in names for part in (n.replace("\\", os.sep), _base(n))]
+    beside = [p for name in names for p in (*_stated_places(name, folder), folder / _base(name))]
     places = given or [place for place in beside if _exists(place)][:1]
     if not places:
         return CheckedFile(id=file.id, name=file.name, path=None, state="missing")
@@ -313,6 +312,12 @@ def _checked(file: SourceFile, given: Sequence[Path], folder: Path) -> CheckedFi
         path=str((changed or places)[0]),
         state="changed" if changed else "unchanged",
     )
+
+
+def _stated_places(name: str, folder: Path) -> list[Path]:
+    """Where a certificate says that a file is; nowhere on another machine: Windows would log in there to look."""
+    place = name.replace("\\", "/")
+    return [] if place.startswith("//") else [folder / place]
 
 
 def _exists(path: Path) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -85,8 +86,8 @@ def of_bytes(data: bytes, name: str) -> list[Entry]:
         )
     if _PUBLIC in data:
         return [Entry("public-key", data, name)]
-    if data.removeprefix(_BOM).lstrip().startswith(b"{"):
-        return [Entry(_json_kind(data, name), data, name)]
+    if (text := _json_text(data)).startswith(b"{"):
+        return [Entry(_json_kind(text, name), data, name)]
     if Path(name).suffix.lower() in TABLE_SUFFIXES:
         return [_run(data, name)]
     return _of_toml(data, name)
@@ -97,6 +98,13 @@ def checked(entry: Entry) -> Calibration | None:
     if entry.kind == "calibration":
         return documents.decoded(members.Member(entry.data, entry.name, ""))
     return None
+
+
+def _json_text(data: bytes) -> bytes:
+    """The file in UTF-8 without what stands before its text; as it is where it is no text."""
+    with suppress(UnicodeDecodeError):
+        return documents.in_utf8(data).lstrip()
+    return data
 
 
 def _json_kind(data: bytes, name: str) -> str:
