@@ -20,7 +20,7 @@ from mwdcal.faults.weighing import padded
 from mwdcal.geometry.vectors import reference_vectors, tool_from_earth
 from mwdcal.planning import simulate
 from mwdcal.planning.effects import Effects, FaultEffect, load_effects
-from mwdcal.sensor.profile import Profile
+from mwdcal.sensor.profile import Datasheet, Profile, TriadProfile
 from simulation import Tool
 
 PLAN = simulate.grid([5, 45, 90, 135], 6, [0, 90, 180, 270], [20.0, 90.0])
@@ -37,7 +37,8 @@ DIP = np.radians(63.0)
 def tool(number):
     """A tool and its calibration, of a run of its own with the noise declared."""
     rng = np.random.default_rng([77, number])
-    truth = simulate.drawn(rng, Profile(name="servo"), order=1)
+    tolerances = TriadProfile(datasheet=Datasheet())
+    truth = simulate.drawn(rng, Profile(name="servo", magnetometer=tolerances), order=1)
     run = simulate.run(truth, PLAN, rng)
     sd = {name: np.resize(value[0], (PLAN.count, 3)) for name, value in NOISE.items()}
     return mwdcal.calibrate(
