@@ -107,7 +107,7 @@ def results():
 def computed_once(results, monkeypatch):
     """What takes most of the time of a command is computed once for all tests of what it shows."""
     from mwdcal.comparison import compare
-    from mwdcal.logs import noise
+    from mwdcal.logs import noise, noise_terms
     from mwdcal.planning import planned
 
     long = (
@@ -115,6 +115,7 @@ def computed_once(results, monkeypatch):
         (planned, "best_plan"),
         (compare, "compare"),
         (noise, "find_noise"),
+        (noise_terms, "fit"),
     )
     for module, name in long:
         monkeypatch.setattr(module, name, remembered(getattr(module, name), results))

@@ -29,7 +29,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mwdcal.geometry.vectors import Array, Bools, Ints
+from mwdcal.geometry.vectors import Array, Bools, Ints, outer
 from mwdcal.logs.allan import Moments, deviation, drift_variance, expected, freedom
 
 FEWEST_FACTORS = 6
@@ -230,7 +230,8 @@ def _misfit(used: _Used, bounded: Array) -> tuple[Array, Ints]:
 
 def _joint(unit: Array, squares: Array) -> Array:
     """Covariance (B, m, m) of the variances under noise of these squares (B, 4)."""
-    return np.asarray(np.einsum("mnac,ba,bc->bmn", unit, squares, squares, optimize=True))
+    products = outer(squares).reshape(len(squares), -1)
+    return (products @ unit.reshape(-1, products.shape[-1]).T).reshape(-1, *unit.shape[:2])
 
 
 def _whitening(unit: Array, squares: Array) -> Array:
