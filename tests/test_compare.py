@@ -304,6 +304,7 @@ def test_a_run_that_nothing_can_calibrate():
     assert "every method refused: " in command.text(found)
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_a_failing_part_is_counted_and_its_method_not_preferred(monkeypatch):
     original = module.fit
 

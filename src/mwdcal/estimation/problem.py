@@ -45,6 +45,8 @@ INFORMED = 1e-13
 """A prior says something of a direction if its precision exceeds this share of the largest."""
 GEOMETRIC_NOISE = 1e-4
 """Noise, as a share of the field, at which rank is counted whatever the actual noise."""
+NOISELESS = ("state", "predictions", "linear True")
+"""What a problem's memo has that no noise enters."""
 
 
 @dataclass(frozen=True)
@@ -119,6 +121,12 @@ class Problem:
     evidence: Evidence
     prior: Prior
     memo: dict[str, Any] = field(init=False, repr=False, compare=False, default_factory=dict)
+
+    def of_other_noise(self, triads: tuple[Triad, ...], evidence: Evidence) -> Problem:
+        """The same with other uncertainties alone: what does not depend on them is kept."""
+        other = replace(self, triads=triads, evidence=evidence)
+        other.memo.update({name: self.memo[name] for name in NOISELESS if name in self.memo})
+        return other
 
     def slices(self) -> list[slice]:
         """Where each triad's parameters lie."""

@@ -469,7 +469,7 @@ def with_scatter(problem: Problem, state: State, ratios: dict[str, Array]) -> Pr
         if name in scatter:
             noise = np.sqrt(np.mean(triad.sd**2, (1, 2))) / size
             scatter[name] = np.minimum(scatter[name], np.maximum(noise, LEAST_SCATTER)[:, None])
-    return replace(problem, evidence=replace(problem.evidence, scatter=scatter))
+    return problem.of_other_noise(problem.triads, replace(problem.evidence, scatter=scatter))
 
 
 @np.errstate(invalid="ignore", divide="ignore", over="ignore")
