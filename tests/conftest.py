@@ -77,6 +77,14 @@ def without_pictures(monkeypatch):
     monkeypatch.setattr(pictures, "svg", lambda figure, key: Markup("<svg></svg>"))
 
 
+@pytest.fixture
+def without_layout(monkeypatch):
+    """Pictures whose panels stay where they begin: to find them places takes most of drawing."""
+    from matplotlib.figure import Figure
+
+    monkeypatch.setattr(Figure, "set_layout_engine", lambda self, layout=None, **options: None)
+
+
 def remembered(function, results):
     """The function, which computes once for equal arguments, and says of its progress the same again."""
 

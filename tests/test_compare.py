@@ -473,6 +473,7 @@ def test_ratios_beyond_the_axis_have_their_value_at_its_edge(whole, method):
     assert separate(figure) == []
 
 
+@pytest.mark.usefixtures("without_layout")
 def test_parameters_beyond_the_axis_have_an_arrow_and_the_largest_its_value(whole):
     figures = pytest.importorskip("mwdcal.app.pages.comparison")
     rows = list(whole.rows)

@@ -409,6 +409,7 @@ def test_a_tool_that_left_its_limits_in_service_says_so(years):
     assert "left-limits" in {finding.id for finding in whole.findings}
 
 
+@pytest.mark.usefixtures("without_layout")
 def test_pages_mark_simulated_data_and_escape_names(years):
     pytest.importorskip("matplotlib")
     from mwdcal.app.pages.records.drift import render_fleet, render_tool
