@@ -71,7 +71,7 @@ def made(model, orders=(2, 1), axes="left-handed", *, seed=1, free=None, left_ou
     profile = {name: {"axes": own, "scale": scale} for name, own, scale in pairs}
     record |= {
         "tool": {}, "profile_sha256": "", "run": "", "run_sha256": "", "software": "",
-        "method": "joint", "time": "2026-01-02T03:04:05+00:00", "field_unit": "nT", "stations": 1, "singular_values": [],
+        "method": "joint", "time": "2026-01-02", "field_unit": "nT", "stations": 1, "singular_values": [],
         "temperature_c": RANGE, "covariance": (root @ root.T).tolist(), "constants": [],
         "profile": {"name": "own", "reference_temperature_c": REFERENCE, **profile},
         "free": [] if free is None else [free(params).tolist()],

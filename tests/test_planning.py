@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from itertools import combinations, pairwise, permutations
 
@@ -10,11 +11,12 @@ import pytest
 from msgspec.structs import replace as with_changes
 from scipy.stats import chi2
 
+from cli_support import mwdcal, refused
 from mwdcal.calibration import results
 from mwdcal.calibration.estimate import fit
 from mwdcal.calibration.prediction import accuracy_at, readings_at
-from mwdcal.calibration.readings import TRIADS
 from mwdcal.errors import FitError, InputError
+from mwdcal.files.documents import read
 from mwdcal.files.profiles import built_in, load_profile
 from mwdcal.geometry.vectors import reference_vectors
 from mwdcal.planning import planned
@@ -23,12 +25,14 @@ from mwdcal.planning.moves import Stand, move_seconds, session_seconds, shortest
 from mwdcal.planning.optimal import Design, Information, best
 from mwdcal.planning.planned import WORKING_INCLINATIONS, best_plan, judged, smallest_plan
 from mwdcal.planning.plans import load_plan, run_sheet, taken
+from mwdcal.sensor.profile import TriadProfile
 from simulation import DEG, attitude
 
 SERVO = load_profile("servo")[0]
 EXACT = with_changes(
     SERVO, stand=with_changes(SERVO.stand, inclination_deg=0.0, azimuth_deg=0.0, toolface_deg=0.0)
 )
+GRAVITY = with_changes(SERVO, magnetometer=TriadProfile())
 ANGLES = ("inclination", "azimuth", "toolface")
 COUNTS = {
     "acceptance-104": 104, "candidates": 504, "laboratory-thermal": 48, "moosavi-12": 48,
@@ -75,6 +79,7 @@ def test_the_laboratory_turns_every_axis_of_both_triads_to_its_extremes():
             ("twelve-state", SERVO, "uncertain", 500),
             ("moosavi-12", SERVO, "uncertain", 500),
             ("laboratory-thermal", SERVO, "uncertain", 200),
+            ("twelve-state", GRAVITY, "gravity alone", 1000),
         )
     ],
 )
@@ -93,9 +98,9 @@ def test_expected_covariance_is_that_of_simulated_calibrations(name, profile, co
     field, dip = (readings.known[name][0] for name in ("field", "dip"))
     noisy = [
         vectors + readings.sd[kind] * rng.normal(size=vectors.shape)
-        for kind, vectors in zip(TRIADS, attitude(*angles)(1.0, field, dip), strict=True)
+        for kind, vectors in zip(readings.triads, attitude(*angles)(1.0, field, dip), strict=False)
     ]
-    many = replace(readings, accelerometer=noisy[0], magnetometer=noisy[1])
+    many = replace(readings, **dict(zip(readings.triads, noisy, strict=False)))
     fitted = fit(many, choice.options)
     reference = choice.profile.reference_temperature_c
     values, nominal = (
@@ -418,6 +423,32 @@ def test_a_sheet_asks_for_the_place(tmp_path):
     assert all(np.isnan(bare[f"ref_{name}"]).all() for name in ("gravity_g", "field_nt", "dip_deg"))
     stated = run_sheet(load_plan("laboratory-thermal")).columns
     assert set(stated["ref_dip_deg"]) == {70.5}
+
+
+def test_a_profile_without_magnetometer_is_of_a_tool_without_one(tmp_path):
+    """Plan, sheet, simulated run and its calibration: gravity alone, and what a plan says comes true."""
+    profile = tmp_path / "gravity.toml"
+    profile.write_text('name = "gravity"\n[accelerometer]\nnoise = 1e-4\n', "utf-8")
+    planned = mwdcal(*("plan", "--tool", profile, "-o", tmp_path / "sheet.csv", "--json"))
+    assert planned.code == 0, planned
+    document = json.loads(planned.out)
+    assert document["magnetometer"] is None
+    assert document["size"] == 12
+    assert "has no [magnetometer]" in planned.err
+    sheet = (tmp_path / "sheet.csv").read_text("utf-8")
+    assert "ax,ay,az" in sheet
+    assert not any(word in sheet for word in ("mx", "field", "dip"))
+    for name, command in {
+        "run.csv": ("simulate", "--tool", profile),
+        "cal.json": ("calibrate", tmp_path / "run.csv", "--tool", profile, "--order", "0"),
+    }.items():
+        ran = mwdcal(*command, "-o", tmp_path / name)
+        assert ran.code == 0, ran
+    record = read(tmp_path / "cal.json")
+    assert record.magnetometer is None
+    assert record.accelerometer.rank == 12
+    wanted = mwdcal("plan", "--tool", profile, "--accuracy", "azimuth=0.1")
+    assert "cannot be wanted" in refused(wanted, 2)
 
 
 @pytest.mark.parametrize("name", ["Temp", "Temperature_C", "DIP", "ref_Field_nT"])

@@ -29,12 +29,13 @@ STILL = 1e-6
 def nominal_run(plan: Table, profile: Profile) -> tuple[Readings, Profile]:
     """What a nominal tool reads at the stations of a plan, with the noise and the stand of a profile.
 
-    Where the plan does not state gravity, field or dip they are those of `Earth`.
+    Where the plan does not state gravity, field or dip they are those of `Earth`. A profile that says nothing of a
+    magnetometer is of a tool without one.
 
     Raises:
         InputError: the plan does not state an attitude, or the profile not the noise of a triad.
     """
-    for kind in CHANNELS:
+    for kind in [*CHANNELS][: 1 + profile.has_magnetometer]:
         if getattr(profile, kind).noise is None:
             raise InputError(
                 f"the profile '{profile.name}' does not state the noise of the {kind}, on which every "
@@ -49,8 +50,9 @@ def nominal_run(plan: Table, profile: Profile) -> tuple[Readings, Profile]:
                 "states the attitude of every station."
             )
     known |= dict(zip(EARTH, planned_earth(plan), strict=True))
-    fields = reference_vectors(*(known[name] for name in (*ANGLES, *EARTH)))
-    nominal = from_readings(Readings(*fields, known=known), profile)
+    gravity, field = reference_vectors(*(known[name] for name in (*ANGLES, *EARTH)))
+    read = Readings(gravity, field if profile.has_magnetometer else None, known=known)
+    nominal = from_readings(read, profile)
     columns = {**nominal.columns, **plan.columns}
     whole = replace(plan, columns=columns, metadata={**plan.metadata, "simulated": True})
     return to_readings(whole, profile)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import product
+from itertools import chain, product
 from math import prod
 from pathlib import Path
 
@@ -14,7 +14,7 @@ import numpy as np
 from mwdcal.calibration.readings import CONSTANTS, SOAK_GAP
 from mwdcal.errors import InputError
 from mwdcal.estimation.evidence import ANGLES
-from mwdcal.files.contract import CHANNELS, COLUMNS, RAW, REFERENCES, check_near_misses
+from mwdcal.files.contract import CHANNELS, COLUMNS, REFERENCES, check_near_misses
 from mwdcal.files.formats import table as tables
 from mwdcal.files.formats.columns import LABELS, Column
 from mwdcal.files.formats.table import Table, labels, numbers
@@ -232,13 +232,14 @@ def attitudes(plan: Table) -> Array:
     return np.stack([np.asarray(plan.columns[REFERENCES[n].column], float) for n in ANGLES], -1)
 
 
-def run_sheet(plan: Table) -> Table:
+def run_sheet(plan: Table, magnetometer: bool = True) -> Table:
     """The run file of a plan to be filled in: its columns, and blank ones for readings and place."""
+    triads = [*CHANNELS.values()][: 1 + magnetometer]
     head = {
         name: cells for name, cells in plan.columns.items() if name in ("station", "temperature_c")
     }
-    place = [REFERENCES[name].column for name in CONSTANTS]
-    order = dict.fromkeys([*head, *RAW, *plan.columns, *place])
+    place = [REFERENCES[name].column for name in CONSTANTS[: len(CONSTANTS) if magnetometer else 1]]
+    order = dict.fromkeys([*head, *chain(*triads), *plan.columns, *place])
     return replace(
         plan, columns={n: plan.columns.get(n, np.full(plan.count, np.nan)) for n in order}
     )

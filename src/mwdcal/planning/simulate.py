@@ -140,7 +140,8 @@ def drawn(
     declared = [getattr(profile, name).nonlinearity for name in TRIADS]
     curves = [sd and sd * rng.uniform(-ROOT3, ROOT3, (*lead, 3, 2)) for sd in declared]
     reference = profile.reference_temperature_c
-    return Truth(first, second, order=order, reference=reference, curves=tuple(curves))
+    field = second if profile.has_magnetometer else None
+    return Truth(first, field, order=order, reference=reference, curves=tuple(curves))
 
 
 def _factors(unit: Array, profile: Profile, triad: str, order: int) -> Array:

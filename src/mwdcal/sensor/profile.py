@@ -158,3 +158,8 @@ class Profile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     standards: tuple[MeasurementStandard, ...] | msgspec.UnsetType = msgspec.UNSET
     table: TableFormat | msgspec.UnsetType = msgspec.UNSET
     columns: dict[str, ColumnSource] | msgspec.UnsetType = msgspec.UNSET
+
+    @property
+    def has_magnetometer(self) -> bool:
+        """Whether it says anything of a magnetometer; with readings of one it may still say nothing."""
+        return self.magnetometer != TriadProfile()

@@ -44,14 +44,15 @@ class PlanSummary(msgspec.Struct, frozen=True, kw_only=True):
     """What `plan` prints of one plan.
 
     `accuracy_deg` at 45° inclination, as `calibrate` states it; `accuracy_by_inclination_deg` by angle at
-    `inclinations_deg`. `efficiency_bound`: at least this share of the best D-value per parameter.
+    `inclinations_deg`. `efficiency_bound`: at least this share of the best D-value per parameter. Without
+    `magnetometer` the profile says nothing of one.
     """
 
     plan: str
     stations: int
     session_hours: float
     accelerometer: PlannedTriad
-    magnetometer: PlannedTriad
+    magnetometer: PlannedTriad | None = None
     accuracy_deg: dict[str, float | None]
     inclinations_deg: list[float]
     accuracy_by_inclination_deg: dict[str, list[float | None]]
@@ -144,9 +145,15 @@ def _by_inclination(calibration: Calibration) -> dict[str, list[float | None]]:
 
 
 def findings(plans: Sequence[Planned]) -> list[Finding]:
-    """What the plans leave undetermined."""
+    """That the tool has no magnetometer, and what the plans leave undetermined."""
+    profile = plans[0].calibration.profile
+    text = f"the profile '{profile.name}' has no [magnetometer]: planned is a tool without one."
+    without = [] if profile.has_magnetometer else [Finding(id="no-magnetometer", text=text)]
     entries = [(each, free) for each in plans for free in left_undetermined(each.calibration)]
-    return [Finding(id=free.id, text=f"{each.plan.source}: {free.text}") for each, free in entries]
+    undetermined = [
+        Finding(id=free.id, text=f"{each.plan.source}: {free.text}") for each, free in entries
+    ]
+    return without + undetermined
 
 
 def document(
@@ -210,7 +217,7 @@ def accuracy(each: PlanSummary) -> str:
 
 
 def _orders(each: PlanSummary) -> str:
-    orders = dict.fromkeys((each.accelerometer.order, each.magnetometer.order))
+    orders = dict.fromkeys(t.order for t in (each.accelerometer, each.magnetometer) if t)
     return " and ".join(map(str, orders))
 
 

@@ -124,7 +124,7 @@ def command(
     digests = {"profile": digest, "measured": done.digest if done else ""}
     text = shown(result, digests, output, html)
     if output:
-        table.write(output, run_sheet(result[0].plan))
+        table.write(output, run_sheet(result[0].plan, profile.has_magnetometer))
     if html:
         from mwdcal.app.pages.plan import render
 
