@@ -391,6 +391,29 @@ def test_the_rule_of_a_guarded_verification_stands(servo):
         assert "decision-changed" not in named(document.findings)
 
 
+def test_each_roll_test_has_the_factor_of_the_calibration_that_it_tests(servo):
+    """Student's factors of 95 % for 10 and 5 degrees of freedom by JCGM 100, table G.2."""
+    as_found = verification(servo, row(), calibration_sha256="1" * 64, degrees_of_freedom=10.0)
+    document = issued(servo, as_found=as_found, verification=verification(servo, row()))
+    (before,), (after,) = document.as_found.decisions, document.as_left.decisions
+    assert before.quantity.expanded_uncertainty == pytest.approx(2.23 * 0.01, abs=5e-5)
+    assert after.quantity.expanded_uncertainty == pytest.approx(2.0 * 0.01)
+    guarded = Laboratory(decision=DecisionRule(rule="guarded"))
+    five = replace(as_found, degrees_of_freedom=5.0)
+    (decision,) = issued(servo, guarded, as_found=five).as_found.decisions
+    assert decision.acceptance_limit == pytest.approx(0.1 - 2.57 * 0.01, abs=5e-5)
+    assert "freedom-not-stated" not in named(document.findings)
+
+
+def test_a_test_that_does_not_state_its_degrees_of_freedom_has_a_finding(servo):
+    """Of an earlier version: as left those of the calibration are known, as found they are not."""
+    old = verification(servo, row(), degrees_of_freedom=None)
+    assert "freedom-not-stated" not in named(issued(servo, verification=old).findings)
+    document = issued(servo, as_found=replace(old, calibration_sha256="1" * 64))
+    assert "freedom-not-stated" in named(document.findings)
+    assert document.as_found.decisions[0].quantity.coverage_factor == 2.0
+
+
 def test_the_risk_of_the_customer_is_kept_by_the_guard_band():
     """Drawn: tools whose true value is uniform about the limit; of those that pass by value, few are outside."""
     rng, limit, sd = np.random.default_rng(7), 0.1, 0.01
@@ -466,6 +489,32 @@ def test_what_is_particular_stands_before_the_laboratory_file(servo):
     document = issued(servo, laboratory, customer="Other", condition="bent", number="N-1")
     assert (document.customer.name, document.item.condition) == ("Other", "bent")
     assert document.number == "N-1"
+
+
+@pytest.mark.parametrize(
+    ("when", "day", "named_as"),
+    [
+        ("as_found", "2026-03-15", None),
+        ("as_found", "2026-03-16", "after the day of the calibration"),
+        ("verification", "2026-03-15", None),
+        ("verification", "2026-03-14", "before the day of the calibration"),
+        ("verification", "15 March", None),
+    ],
+)
+def test_a_roll_test_on_the_wrong_side_of_the_calibration_is_a_finding(
+    thermal, when, day, named_as
+):
+    """The calibration is of 2026-03-15."""
+    digest = "1" * 64 if when == "as_found" else "0" * 64
+    test = verification(thermal, row(), date=day, calibration_sha256=digest)
+    text = named(issued(thermal, **{when: test}).findings).get("test-date")
+    assert (named_as in text) if named_as else (text is None)
+
+
+def test_a_certificate_from_before_its_roll_test_is_refused(thermal):
+    test = verification(thermal, row(), date="2026-04-02")
+    with pytest.raises(mwdcal.InputError, match="must not be before the day of `verification`"):
+        issued(thermal, verification=test)
 
 
 def test_an_overdue_standard_is_marked_on_the_day_of_the_calibration(thermal):
@@ -561,6 +610,21 @@ def test_conditions_state_the_place_with_the_uncertainty_that_was_declared(therm
     assert rows["condition-1"].expanded_uncertainty == pytest.approx(2 * 1.95996, rel=1e-4)
     exact = {quantity.id: quantity for quantity in issued(servo).conditions}
     assert exact["gravity"].standard_uncertainty is None
+
+
+def test_a_dip_that_the_readings_tell_has_the_factor_of_their_residuals():
+    """Student's of 95 % for the degrees of freedom, by its distribution; declared gravity has the normal one."""
+    profile = mwdcal.load_profile(EXAMPLE / "tool.toml")
+    profile = replace(profile, stand=replace(profile.stand, gravity_g=2e-5, dip_deg=1.0))
+    profile = replace(profile, magnetometer=replace(profile.magnetometer, noise=None))
+    run = mwdcal.read_run(EXAMPLE / "run.csv", profile)
+    few = mwdcal.calibrate(run.select(np.arange(run.count) % 4 == 0))
+    rows = {quantity.id: quantity for quantity in issued(few).conditions}
+    fewest = min(triad.degrees_of_freedom for triad in few.triads)
+    assert fewest < 30
+    assert rows["dip"].standard_uncertainty < 0.1
+    assert rows["dip"].coverage_factor == pytest.approx(stats.t.ppf(0.975, fewest), rel=1e-9)
+    assert rows["gravity"].coverage_factor == pytest.approx(1.95996, rel=1e-4)
 
 
 def test_whatever_is_simulated_marks_the_certificate(servo):

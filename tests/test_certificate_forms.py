@@ -79,6 +79,24 @@ class Words(HTMLParser):
             self.words.append(data)
 
 
+def test_the_symbol_of_the_standard_uncertainty_stays_small():
+    page = render_page(SAMPLE, [])
+    assert "u: standard uncertainty; U: expanded uncertainty" in page
+    assert "U: standard uncertainty" not in page
+
+
+def test_the_page_names_the_factor_of_each_roll_test_where_they_differ():
+    first, *others = SAMPLE.as_found.decisions
+    few = replace(
+        first,
+        quantity=replace(first.quantity, coverage_factor=2.57, expanded_uncertainty=2.57 * 0.01),
+    )
+    test = replace(SAMPLE.as_found, decisions=[few])
+    assert f"{others[0].quantity.coverage_factor:.2f}" == "2.00"
+    text = squeezed(render_page(changed(as_found=test), []))
+    assert "(asfound:k=2.57,95.45%;asleft:k=2.00,95.45%)" in text
+
+
 def page_text(certificate):
     return squeezed("".join(Words(render_page(certificate)).words))
 
@@ -349,7 +367,7 @@ def test_pictures_have_titles_and_texts_for_those_who_do_not_see_them(pictures):
 
 def test_without_typst_one_sentence_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "typst", None)
-    with pytest.raises(InputError, match=re.escape("pip install 'mwdcal[certificate]'")) as refused:
+    with pytest.raises(InputError, match=re.escape('pip install "mwdcal[certificate]"')) as refused:
         render_pdf(SAMPLE)
     assert "\n" not in str(refused.value)
 

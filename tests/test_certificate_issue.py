@@ -182,6 +182,13 @@ def test_an_unknown_suffix_is_refused_before_any_work(here, tmp_path, name):
     assert "the suffix must be one of .json, .html, .pdf, .xml" in message
 
 
+def test_a_day_of_issue_that_is_refused_is_named_as_it_was_typed(here, tmp_path):
+    day = json.loads((here / "new.json").read_bytes())["tool"].get("date")
+    assert day, "the run states its day"
+    line = ("certificate", "new.json", "-o", tmp_path / "C.json", "--date", "1999-01-01")
+    assert "--date must not be before the day of the calibration" in refused(mwdcal(*line), 2)
+
+
 def test_all_files_are_written_or_none(here, tmp_path, monkeypatch):
     def fails(*_):
         raise InputError("`output` cannot be made. Try another form.")

@@ -213,6 +213,23 @@ def test_noise_half_as_large_again_is_reported_and_the_expected_errors_stay():
     assert field.expected < 10.0 < field.after
 
 
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+def test_an_error_that_no_residual_shows_stays_as_uncertain_as_it_was_declared(factor):
+    """The toolface zero of a stand turns every reading alike; the readings are quieter or louder than declared."""
+    _, data = runs("toolface-zero", 0.02 * DEG, declared=True, count=1)
+    declared = {
+        "accelerometer": np.array(1e-4 / factor),
+        "magnetometer": np.array(10.0 / factor),
+    }
+    readings = Readings(
+        data.accelerometer[0], data.magnetometer[0], known=data.known,
+        sd={**data.sd, **declared},
+    )  # fmt: skip
+    record = calibrate(readings, Profile(name="x"))
+    (zero,) = [c for c in record.constants if c.name == "toolface zero of the stand"]
+    assert zero.standard_uncertainty == pytest.approx(0.02, rel=1e-6)
+
+
 def test_estimated_inclination_zero_is_unbiased_with_honest_uncertainty():
     _, data = runs("inclination-zero", 0.2 * DEG, declared=False)
     result = fit(data, Options(estimate=("inclination-zero",)))

@@ -130,14 +130,46 @@ def test_models_of_temperature_give_one_set_of_parameters():
     assert any("differ by their own misfit" in note for note in tool.notes[0])
 
 
-def test_another_nominal_scale_is_no_change():
+def test_a_calibration_without_temperature_terms_is_compared_at_the_temperature_of_its_run():
+    """A tool that drifts with temperature and is as it was: terms over a range, then one soak of another run, away
+    from the reference temperature of 30 °C."""
+    bench = Bench("laboratory-thermal", 4, order=1)
+    first, second = bench.readings("2024-05-01"), bench.readings("2025-05-01")
+    soak = np.abs(second.temperature - second.temperature.min()) < 1
+    plain = calibrate(second.select(soak), SERVO, Options(order=0))
+    tool = tool_history([calibrate(first, SERVO, Options(order=1)), plain])
+    assert tool.temperature_c[0] == pytest.approx(np.mean(plain.temperature_c))
+    assert abs(tool.temperature_c[0] - 30) > 4
+    assert not change_test(tool.history, 1e-3).changed
+    assert not any("no temperature terms" in note for note in tool.notes[-1])
+
+
+def test_calibrations_without_temperature_terms_of_other_temperatures_say_so():
+    bench = Bench("laboratory-thermal", 4, order=1)
+    runs = [bench.readings(day) for day in ("2024-05-01", "2025-05-01")]
+    lowest = runs[0].temperature.min()
+    soaks = [np.abs(run.temperature - lowest) < 1 for run in runs]
+    first, second = (
+        calibrate(
+            replace(run.select(soak), temperature=run.temperature[soak] + shift),
+            SERVO,
+            Options(order=0),
+        )
+        for run, soak, shift in zip(runs, soaks, (0.0, 4.0), strict=True)
+    )
+    tool = tool_history([first, second])
+    assert all("counts as a change" in " ".join(notes) for notes in tool.notes)
+
+
+@pytest.mark.parametrize("scale", [3.06, 3.75])
+def test_another_nominal_scale_is_no_change(scale):
     bench = Bench("twelve-state", 5)
     readings = bench.readings()
-    other = with_changes(SERVO, accelerometer=with_changes(SERVO.accelerometer, scale=3.06))
+    other = with_changes(SERVO, accelerometer=with_changes(SERVO.accelerometer, scale=scale))
     shrunk = replace(
         readings,
-        accelerometer=readings.accelerometer * 3.0 / 3.06,
-        sd={**readings.sd, "accelerometer": readings.sd["accelerometer"] * 3.0 / 3.06},
+        accelerometer=readings.accelerometer * 3.0 / scale,
+        sd={**readings.sd, "accelerometer": readings.sd["accelerometer"] * 3.0 / scale},
         profile=other,
     )
     both = [
@@ -146,6 +178,27 @@ def test_another_nominal_scale_is_no_change():
     ]
     values = tool_history(both).history.values
     np.testing.assert_allclose(values[0], values[1], rtol=1e-7, atol=1e-9)
+
+
+@pytest.mark.parametrize("latest", [0, 1])
+def test_readings_in_millivolts_are_compared_with_those_in_volts(latest):
+    """The same station readings, once in V and once in mV, whichever is the latest."""
+    bench = Bench("twelve-state", 5)
+    readings = bench.readings()
+    milli = with_changes(SERVO, accelerometer=with_changes(SERVO.accelerometer, scale=3000.0))
+    both = [
+        calibrate(replace(readings, profile=profile), profile, Options(order=0))
+        for profile in (SERVO, milli)[:: 1 if latest else -1]
+    ]
+    both = [
+        with_changes(c, tool={**c.tool, "date": day}, station_rows=[])
+        for c, day in zip(both, ("2024-05-01", "2025-05-01"), strict=True)
+    ]
+    tool = tool_history(both)
+    np.testing.assert_allclose(*tool.history.values, rtol=1e-7, atol=1e-9)
+    assert tool.notes[0] == (
+        "the readings of the accelerometer are in another unit than those of the latest: compared in nominal units",
+    )
 
 
 def test_along_a_free_direction_nothing_is_known():

@@ -221,7 +221,7 @@ def test_a_missing_extra_is_named(tmp_path, monkeypatch, module, suffix):
 
     path = put(tmp_path, b"PK\x03\x04", f"run.{suffix}")
     monkeypatch.setattr(builtins, "__import__", without)
-    remedy = rf"need the extra '{suffix}'. Install it with: pip install 'mwdcal\[{suffix}\]'"
+    remedy = rf"need the extra '{suffix}'. Install it with: pip install \"mwdcal\[{suffix}\]\""
     with pytest.raises(InputError, match=remedy):
         read(path)
     with pytest.raises(InputError, match=remedy):

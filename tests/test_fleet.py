@@ -911,7 +911,7 @@ def test_a_cluster_without_its_extra(fleet, tmp_path, monkeypatch):
 
     monkeypatch.setattr(pool, "import_module", absent)
     ran = mwdcal("fleet", fleet[0], "-o", tmp_path / "o.parquet", "--scheduler", "tcp://host:8786")
-    assert "pip install 'mwdcal[parquet,cluster]'" in refused(ran, 2)
+    assert 'pip install "mwdcal[parquet,cluster]"' in refused(ran, 2)
 
 
 @pytest.mark.slow

@@ -17,7 +17,7 @@ pq = pytest.importorskip("pyarrow.parquet")
 openpyxl = pytest.importorskip("openpyxl")
 
 from mwdcal.app import fleet_table  # noqa: E402
-from mwdcal.files.formats import members  # noqa: E402
+from mwdcal.files.formats import members, parquet  # noqa: E402
 
 FIT = ("--order", 0, "--nonlinearity", "none")
 """The options of `calibrate` that are the defaults of a fleet."""
@@ -261,7 +261,7 @@ def test_an_interrupted_fleet_of_run_files_goes_on(lab, monkeypatch):
         def stop(writer):
             raise KeyboardInterrupt
 
-        patch.setattr(fleet_table, "_close", stop)
+        patch.setattr(parquet, "close", stop)
         calibrated_before = mwdcal("fleet", lab, "-o", table, "--tool", "servo", "--workers", 1)
     assert calibrated_before.code == 130
     table.unlink(missing_ok=True)

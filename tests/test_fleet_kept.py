@@ -8,8 +8,8 @@ import shutil
 import pytest
 
 from cli_support import mwdcal, refused
-from mwdcal.app import fleet_table, pool
-from mwdcal.files.formats import atomic
+from mwdcal.app import pool
+from mwdcal.files.formats import atomic, parquet
 from mwdcal.fleet import kept
 from mwdcal.fleet import tables as fleet_tables
 from test_fleet import pa, pq, short_run, write_fleet
@@ -56,7 +56,7 @@ def interrupted(path):
         def stop(writer):
             raise KeyboardInterrupt
 
-        patch.setattr(fleet_table, "_close", stop)
+        patch.setattr(parquet, "close", stop)
         ran, output = fleet(path)
     assert ran.code == 130, ran
     output.unlink(missing_ok=True)
@@ -235,13 +235,13 @@ def test_an_input_that_changes_meanwhile_is_refused(
 
 def test_an_input_that_changes_after_the_last_part_is_refused(tmp_path, small_parts, monkeypatch):
     path = small_fleet(tmp_path)
-    real = fleet_table._close
+    real = parquet.close
 
     def close(writer):
         real(writer)
         grown(path)
 
-    monkeypatch.setattr(fleet_table, "_close", close)
+    monkeypatch.setattr(parquet, "close", close)
     ran, output = fleet(path)
     assert "has changed" in refused(ran, 2)
     assert not output.exists()

@@ -198,7 +198,7 @@ def test_a_large_file_takes_bounded_memory(tmp_path):
 
 def test_a_missing_extra_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "lasio", None)
-    with pytest.raises(InputError, match=r"pip install 'mwdcal\[survey\]'"):
+    with pytest.raises(InputError, match=r"pip install \"mwdcal\[survey\]\""):
         read(put(tmp_path, LAS))
 
 

@@ -270,9 +270,14 @@ def test_soaks_keep_their_order():
         ("name = 'x'\n[[stations]]\nazimuth_deg = 1", "inclination_deg"),
         ("name = 'x'\n[[stations]]\ninclination_deg = 1\nroll = 2", "roll"),
         ("name =", "is not a plan"),
-        ("name = 'x'\ntemperature_c = nan\n[[stations]]\ninclination_deg = 1", "must be finite"),
-        ("name = 'x'\ngravity_g = nan\n[[stations]]\ninclination_deg = 1", "must be finite"),
-        ("name = 'x'\n[[stations]]\ninclination_deg = [1, inf]", "must be finite"),
+        (
+            "name = 'x'\ntemperature_c = nan\n[[stations]]\ninclination_deg = 1",
+            "'temperature_c': must be",
+        ),
+        ("name = 'x'\ngravity_g = nan\n[[stations]]\ninclination_deg = 1", "'gravity_g': must be"),
+        ("name = 'x'\n[[stations]]\ninclination_deg = [1, 200]", "between 0 and 180 °; got 200"),
+        ("name = 'x'\ndip_deg = 95\n[[stations]]\ninclination_deg = 1", "'dip_deg': must be"),
+        ("name = 'x'\n[[stations]]\ninclination_deg = [1, inf]", "'inclination_deg': must be"),
         (
             f"name = 'x'\n[[stations]]\ninclination_deg = {list(range(180))}\n"
             f"azimuth_deg = {list(range(300))}\n",
@@ -415,6 +420,14 @@ def test_blank_cells_of_the_place_take_the_mean_of_the_others(tmp_path):
     plan = written_plan(tmp_path / "p.csv", ",ref_gravity_g,ref_field_nt,ref_dip_deg", cells)
     place = [values[1] for values in planned_earth(plan)]
     np.testing.assert_allclose(place, [0.991, 53_000, -71 * DEG])
+
+
+def test_where_the_field_is_vertical_no_azimuth_is_known():
+    plan = load_plan("twelve-state")
+    vertical = replace(plan, columns={**plan.columns, "ref_dip_deg": np.full(plan.count, 90.0)})
+    sd = accuracy_at(expected(vertical, SERVO), [45 * DEG])
+    assert np.isnan(sd["azimuth"]).all()
+    assert sd["inclination"] < 0.01 * DEG
 
 
 def test_a_sheet_asks_for_the_place(tmp_path):

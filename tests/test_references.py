@@ -294,7 +294,7 @@ def test_a_missing_library_says_what_to_install(monkeypatch, name, options):
     monkeypatch.setitem(sys.modules, name, None)
     message = refused(mwdcal("reference", *TYPED, *options), 2)
     assert f"needs {name}" in message
-    assert "pip install 'mwdcal[survey]'" in message
+    assert 'pip install "mwdcal[survey]"' in message
 
 
 def test_below_ground_gravity_is_less_certain():

@@ -112,7 +112,7 @@ def test_records_are_linked_by_the_sha256_of_files(example, filled):
     }  # fmt: skip
     fitted = by_kind["calibration", "2023-03-01"]
     assert fitted["sha256"] == sha256(example.parent / "tools" / "SIM-0001.json")
-    verified = by_kind["verification", None]
+    verified = by_kind["verification", "2023-03-01"]
     assert verified["status"] == "passed"
     assert (
         json.loads((example / "verified.json").read_text())["calibration_sha256"]
@@ -298,6 +298,21 @@ def test_days_and_serials_that_people_write_otherwise_are_named(example, tmp_pat
     assert "'AB -1' and 'Ab-1' and 'ab\u20101'" in findings["similar-serials"]
     assert "AB-11" not in findings["similar-serials"]
     assert registry(path, "add", tmp_path / "all.parquet")["findings"] == []  # nothing new
+
+
+def test_a_calibration_that_was_changed_is_added_and_said_to_be(example, tmp_path):
+    """A number of it, beside its hash; the file as it was written is not named."""
+    sound = example.parent / "tools" / "SIM-0001.json"
+    fields = json.loads(sound.read_bytes())
+    fields["accelerometer"]["parameters"][0] += 1e-3
+    altered = tmp_path / "altered.json"
+    altered.write_text(json.dumps(fields))
+    database = tmp_path / "r.sqlite"
+    registry(database, "init")
+    result = registry(database, "add", sound, altered)
+    findings = {finding["id"]: finding["text"] for finding in result["findings"]}
+    assert findings["changed"].startswith("1 calibration changed after mwdcal calibrate made it")
+    assert "altered.json" in findings["changed"]
 
 
 def test_a_page_behind_the_last_one_is_empty(filled):

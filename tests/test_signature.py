@@ -591,6 +591,55 @@ def test_files_lie_where_the_certificate_says_or_beside_it(tmp_path, files, key,
         (tmp_path / "cal.json").unlink()
 
 
+@pytest.mark.parametrize(
+    ("time", "said"),
+    [
+        ("2000-01-01T00:00:00+00:00", "before the key was created"),
+        ("2999-01-01T00:00:00+00:00", "in the future"),
+        ("", "cannot be read"),
+        (None, ""),
+    ],
+)
+def test_a_date_that_cannot_be_is_said(tmp_path, key, public, monkeypatch, time, said):
+    """The date is the signer's claim: the signature is intact nevertheless."""
+    if time is not None:
+        monkeypatch.setattr("mwdcal.certificate.signature.now", lambda: time)
+    path = signed(certificate(tmp_path), key)
+    monkeypatch.undo()
+    ran = mwdcal("certificate", "verify", path, "--key", public, "--json")
+    assert (ran.code, ran.json["check"]["state"]) == (0, "intact")
+    after = (
+        ran.json["check"]["text"]
+        .partition(" signed it on ")[2]
+        .removeprefix(f"{ran.json['check']['time']}.")
+    )
+    assert (said in after) if said else (after == "")
+
+
+@pytest.mark.parametrize("named", [False, True])
+def test_the_table_of_a_fleet_is_looked_up_by_its_file(tmp_path, files, key, public, named):
+    """A certificate of one tool of a table lists the SHA-256 of the table."""
+    table = shutil.copy(files[0], tmp_path / "cals.parquet")
+    path = signed(certificate(tmp_path, files=[listed(table, "cals.parquet#T-1#b")]), key)
+    verify = ("certificate", "verify", path, *[table] * named, "--key", public, "--json")
+    assert mwdcal(*verify).json["files"][0]["state"] == "unchanged"
+    table.write_bytes(b"other")
+    ran = mwdcal(*verify)
+    assert (ran.code, ran.json["files"][0]["state"]) == (1, "changed")
+
+
+@pytest.mark.parametrize("slash", ["/", "\\"])
+def test_no_other_machine_is_asked_for_a_file(tmp_path, files, key, public, slash):
+    """Windows logs in at the machine that a name with two slashes begins with; elsewhere one is as good as two."""
+    (tmp_path / "other").mkdir()
+    there = shutil.copy(files[0], tmp_path / "other" / "elsewhere.json")
+    name = f"/{there}".replace("/", slash)
+    path = signed(certificate(tmp_path, files=[listed(there, name)]), key)
+    verify = ("certificate", "verify", path, "--key", public, "--json")
+    assert mwdcal(*verify).json["files"][0]["state"] == "missing"
+    assert mwdcal(*verify[:3], there, *verify[3:]).json["files"][0]["state"] == "unchanged"
+
+
 def test_an_altered_certificate_makes_nobody_look_for_files(tmp_path, files, key, public):
     path = signed(certificate(tmp_path, files=[listed(files[0], str(files[0]))]), key)
     path.write_bytes(path.read_bytes().replace(b'"C-1"', b'"C-2"'))
@@ -676,9 +725,9 @@ def test_without_cryptography_it_says_what_to_install(tmp_path, files, key, publ
     monkeypatch.setitem(sys.modules, "cryptography.hazmat.primitives.asymmetric.ed25519", None)
     ran = mwdcal("verify", path, files[1], "--key", public)
     assert "signature not checked" in ran.out
-    assert "pip install 'mwdcal[certificate]'" in ran.err
+    assert 'pip install "mwdcal[certificate]"' in ran.err
     message = refused(mwdcal("certificate", "sign", path, "--key", key), 2)
-    assert "pip install 'mwdcal[certificate]'" in message
+    assert 'pip install "mwdcal[certificate]"' in message
     refused(mwdcal("certificate", "key", "create", "-o", tmp_path / "n.key"), 2)
     ran = mwdcal("certificate", "verify", path, "--key", public)
     assert ran.code == 1

@@ -230,7 +230,7 @@ def test_a_missing_extra_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "defusedxml", None)
     path = tmp_path / "t.xml"
     path.write_bytes(trajectory(station(RAW)))
-    with pytest.raises(InputError, match=r"pip install 'mwdcal\[survey\]'"):
+    with pytest.raises(InputError, match=r"pip install \"mwdcal\[survey\]\""):
         read(path)
 
 

@@ -34,7 +34,14 @@ from mwdcal.files.formats.members import RECORD
 from mwdcal.fleet import kept
 from mwdcal.fleet.parts import Plan, load, solve
 from mwdcal.fleet.sources import SERIAL, FleetTable, check_unchanged, open_source
-from mwdcal.fleet.tables import Partition, Tools, find_tools, in_several_folders, partitions
+from mwdcal.fleet.tables import (
+    Partition,
+    Tools,
+    close_rows,
+    find_tools,
+    in_several_folders,
+    partitions,
+)
 from mwdcal.sensor.profile import Profile
 from mwdcal.use.correction_numba import cores
 
@@ -120,6 +127,7 @@ def _place_of_parts(target: Path, output: Path) -> Iterator[Path]:
                 "another -o."
             )
         yield folder
+        close_rows()  # the dealt rows: Windows removes no open file
         atomic.sweep(folder)
         kept.remove(folder)
 
@@ -245,7 +253,7 @@ def _merge(
                         stream.name, schema, use_dictionary=texts, compression=packing
                     )
                 writer.write_table(part.cast(writer.schema))
-            _close(writer)
+            parquet.close(writer)
         except OSError as error:
             raise InputError(
                 f"cannot write '{target}': {reason(error)}. Finished parts are kept: make "
@@ -253,12 +261,5 @@ def _merge(
             ) from error
         finally:
             with contextlib.suppress(OSError):
-                _close(writer)
+                parquet.close(writer)
         check_unchanged(source.pieces)
-
-
-def _close(writer: Any) -> None:
-    """Close a Parquet file, once: where the disk is full a second attempt fails as the first did."""
-    if writer is not None and writer.is_open:
-        writer.is_open = False
-        writer.writer.close()

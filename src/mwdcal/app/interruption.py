@@ -105,7 +105,7 @@ def _replaced(
     """What handled the signals that ask a process to end, before `new` did; none outside the main thread."""
     if current_thread() is not main_thread():
         return {}
-    names = ("SIGINT", "SIGTERM", "SIGHUP")
+    names = ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK")  # the last is Ctrl-Break of Windows
     handlers = {s: signal.getsignal(s) for s in signal.Signals if s.name in names}
     before = {each: handler for each, handler in handlers.items() if replaceable(handler)}
     for each in before:

@@ -5,7 +5,9 @@ Both streams take any text in any encoding; one that is closed, or that nobody r
 
 from __future__ import annotations
 
+import codecs
 import contextlib
+import errno
 import json
 import os
 import re
@@ -29,6 +31,8 @@ ONLY_ERRORS = "mwdcal.quiet"
 """Where the context of a command says that it prints only errors, and JSON."""
 COLOURS = {"!": "yellow", "PASS": "green", "pass": "green", "FAIL": "red"}
 """Colours of marks and verdicts on a terminal, where the words alone say the same."""
+READER_HAS_LEFT = {errno.EPIPE, errno.EINVAL} if sys.platform == "win32" else {errno.EPIPE}
+"""Numbers of the error of a pipe that nobody reads; Windows calls it an invalid argument."""
 _MARKED = re.compile(r"^(!|PASS|FAIL)(?= )|(?<=   )(pass|FAIL)(?=   |$)", re.MULTILINE)
 """A mark or verdict at the beginning of a line, or alone in a cell of a table."""
 
@@ -84,7 +88,9 @@ def as_typed(text: str) -> str:
     """
     context = click.get_current_context(silent=True)
     parameters = context.command.params if context else []
-    options = {p.name: p.opts[-1] for p in parameters if isinstance(p, click.Option)}
+    typed = [p for p in parameters if isinstance(p, click.Option)]
+    options = {p.opts[-1].lstrip("-").replace("-", "_"): p.opts[-1] for p in typed}
+    options |= {p.name: p.opts[-1] for p in typed if p.name}
     return re.sub(r"`(\w+)`", lambda name: options.get(name[1], name[0]), text)
 
 
@@ -108,7 +114,7 @@ class Screen:
 
     def __getattr__(self, name: str) -> Any:
         """What a terminal is asked for: its encoding, its descriptor; not its bytes."""
-        if name not in ("encoding", "fileno", "isatty"):
+        if name not in ("closed", "encoding", "fileno", "isatty"):
             raise AttributeError(name)
         return getattr(self._stream, name)
 
@@ -133,7 +139,7 @@ class Screen:
         except OSError as error:
             with contextlib.suppress(OSError), Path(os.devnull).open("wb") as nothing:
                 os.dup2(nothing.fileno(), self._stream.fileno())
-            if not self._messages and not isinstance(error, BrokenPipeError):
+            if not self._messages and error.errno not in READER_HAS_LEFT:
                 message = f"cannot write the result: {reason(error)}. Send it elsewhere."
                 raise InputError(message) from error
 
@@ -196,7 +202,7 @@ def print_result(result: Any, findings: Iterable[Finding] = ()) -> None:
 
 
 def _shown(document: str) -> str:
-    """JSON in characters that stdout has and that do not control a terminal; escapes for others."""
-    fits = fitting(document, sys.stdout.encoding) == document
-    others = UNSAFE_BUT_LINES if fits else re.compile(r"[^\x00-\x7e]")
+    """JSON in characters that do not control a terminal; in ASCII where stdout is not in UTF-8, as JSON must be."""
+    unicode = codecs.lookup(sys.stdout.encoding or "utf-8").name == "utf-8"
+    others = UNSAFE_BUT_LINES if unicode else re.compile(r"[^\x00-\x7e]")
     return others.sub(lambda character: json.dumps(character[0])[1:-1], document)

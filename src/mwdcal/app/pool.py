@@ -15,7 +15,7 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
@@ -42,6 +42,10 @@ The process that workers are copies of has one thread: Python warns of copies of
 """
 ATTEMPTS = 3
 """How often a part whose worker died is given to another."""
+MOST_PROCESSES = 61
+"""Worker processes of one pool: Windows cannot wait for more."""
+WAIT_SECONDS = 0.5
+"""Seconds of one wait for results: on Windows, Ctrl-C has no effect before a wait is over."""
 CLUSTER_TIMEOUT = 30.0
 """Seconds in which a scheduler must answer, and have a worker; asked again after as long a silence."""
 CLOSING = 5.0
@@ -91,7 +95,7 @@ def results(
         return _on_cluster(steps, tasks, scheduler)
     if workers == 1 or len(tasks) == 1:
         return ((index, steps(task)) for index, task in enumerate(tasks))
-    return _on_cores(steps, tasks, min(workers, len(tasks)))
+    return _on_cores(steps, tasks, min(workers, len(tasks), MOST_PROCESSES))
 
 
 @contextmanager
@@ -176,11 +180,18 @@ def _by_pool(
                         break
                 if not running:
                     return
-                for done in wait(running, return_when=FIRST_COMPLETED).done:
+                for done in _ready(running):
                     index = running.pop(done)
                     yield index, done.result()
         finally:
             pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _ready(running: Iterable[Future[bytes]]) -> set[Future[bytes]]:
+    """The futures that are done: one at least."""
+    while not (done := wait(running, WAIT_SECONDS, FIRST_COMPLETED).done):
+        pass
+    return done
 
 
 def _on_cluster(steps: Steps, tasks: Sequence[Any], address: str) -> Iterator[tuple[int, bytes]]:
@@ -190,7 +201,7 @@ def _on_cluster(steps: Steps, tasks: Sequence[Any], address: str) -> Iterator[tu
     except ImportError:
         raise InputError(
             "`scheduler` needs the extra 'cluster'. Install it, here and on every worker: "
-            "pip install 'mwdcal[parquet,cluster]'"
+            'pip install "mwdcal[parquet,cluster]"'
         ) from None
     with _connected(distributed, address) as client:
         futures = client.map(steps, tasks, pure=False, retries=ATTEMPTS)
@@ -210,7 +221,7 @@ def _on_cluster(steps: Steps, tasks: Sequence[Any], address: str) -> Iterator[tu
         except ModuleNotFoundError as error:
             raise InputError(
                 f"a worker of {address} has no {error.name}. Install mwdcal there: pip install "
-                "'mwdcal[parquet,cluster]'"
+                '"mwdcal[parquet,cluster]"'
             ) from error
         except LOST as error:
             raise InputError(

@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import replace
 from functools import partial
 from itertools import chain
@@ -109,8 +110,7 @@ def apply_to_file(
         raise no_stations(source.name)
     worker = _Worker(calibration, source, first, outside, missing, source.rows >= least)
     done, tallies = 0, []
-    with atomic.replacing(output) as stream:
-        sink = worker.sink(stream, output)
+    with atomic.replacing(output) as stream, closing(worker.sink(stream, output)) as sink:
         work = partial(_exactly_if_refused, source, partial(worker.corrected, sink))
         for rendered, size, tally in overlapped(chain([first], pieces), work):
             sink.write(rendered)

@@ -181,11 +181,12 @@ def accuracy(
 def _root_mean_square(rows: Array, number: Ints, covariance: Array, free: Array) -> Array:
     """1σ (…, B) of what changes by `rows` (E, a, c), those of each tool having a `number` (B,).
 
-    NaN where a row moves with a direction in `free` (B, f, c).
+    NaN where a row moves with a direction in `free` (B, f, c), and beyond a half turn, which tells nothing.
     """
     weights = rows.mT @ rows / rows.shape[1]
     variance = np.einsum("bij,...bij->...b", weights[number], covariance)
     sd = np.sqrt(np.maximum(variance, 0.0))
+    sd = np.where(sd > np.pi, np.nan, sd)
     if not free.size:
         return np.asarray(sd)
     moved = np.abs(np.einsum("bai,bki->bak", rows[number], free)).max((-1, -2))

@@ -96,14 +96,18 @@ class StatedCovariance:
 
 
 def constants_covariance(result: Fit) -> Array:
-    """Covariance (B, q, q) of the constants of the run, times s².
+    """Covariance (B, q, q) of the constants of the run; what the readings do to it is times s².
 
-    The error of a reference is never more uncertain than it was declared.
+    Errors of references and stand that were declared with a precision Λ do V Λ V to their covariance V, whatever
+    the residuals are. None is more uncertain than it was declared.
     """
-    analysis, constants = result.analysis, result.problem.evidence.constants
-    scaled = analysis.constants * variance_scales(result).max(-1)[:, None, None]
+    whole, shared = result.analysis.constants, result.problem.evidence.constants
+    known = [np.where(c.unknown, 0.0, 1.0) / c.sd**2 for c in shared]
+    precision = np.reshape(known, (len(shared), len(whole))).T
+    declared = (whole * precision[:, None, :]) @ whole
+    scaled = variance_scales(result).max(-1)[:, None, None] * (whole - declared) + declared
     less = np.ones(scaled.shape[:2])
-    for place, constant in enumerate(constants):
+    for place, constant in enumerate(shared):
         if not constant.unknown:
             sd = np.sqrt(np.maximum(scaled[:, place, place], 1e-300))
             less[:, place] = np.minimum(constant.sd / sd, 1.0)

@@ -6,6 +6,7 @@ Whatever ISO/IEC 17025:2017 asks for and nobody states becomes a finding in the 
 from __future__ import annotations
 
 import hashlib
+import operator
 import re
 from calendar import monthrange
 from collections.abc import Iterator, Mapping
@@ -121,6 +122,7 @@ def certificate(
         *order.findings,
         *_findings(contents, calibration),
         *unstated_day,
+        *(_order_of_days(tests, day) if day_stated else ()),
         *changed,
         *calibration.findings,
     ]
@@ -168,6 +170,19 @@ def _check_days(day: date, order: Order, laboratory: Laboratory) -> None:
         )
 
 
+def _order_of_days(tests: Mapping[str, ConformityTest], day: date) -> Iterator[Finding]:
+    """A finding if a test as found was made after the day of the calibration, or one as left before it."""
+    for when, wrong in (("as found", operator.gt), ("as left", operator.lt)):
+        test_day = stated_day({"date": tests[when].date}) if when in tests else None
+        if test_day and wrong(test_day, day):
+            side = "after" if test_day > day else "before"
+            text = (
+                f"the roll test {when} was made on {test_day}, {side} the day of the calibration, {day}: check that it "
+                f"shows the tool {when}."
+            )
+            yield Finding(id="test-date", text=text)
+
+
 def _check_number(number: str) -> None:
     """Refuse a number that cannot stand on one line of every page."""
     if not number.strip() or len(number) > LONGEST_NUMBER or not number.isprintable():
@@ -188,6 +203,7 @@ def _tests(
     for when, document in given.items():
         if document is not None:
             _check_test(document, calibration, order)
+            _check_issued(document, order)
             tests[when], about = conformity(when, document, calibration, laboratory.decision)
             findings += about
     return tests, findings
@@ -213,6 +229,16 @@ def _check_test(document: Verification, calibration: Calibration, order: Order) 
         raise InputError(
             f"{argument} is a test of this very calibration: it must be of the one that was in the tool before. "
             "Verify that one by readings from before the adjustment, or leave it out."
+        )
+
+
+def _check_issued(document: Verification, order: Order) -> None:
+    """Refuse a certificate from before a roll test that it shows."""
+    test_day = stated_day({"date": document.date})
+    if test_day and order.issued < test_day:
+        argument = "`verification`" if document is order.verification else "`as_found`"
+        raise InputError(
+            f"`date` must not be before the day of {argument}, {test_day}; got {order.issued}. Correct one of them."
         )
 
 

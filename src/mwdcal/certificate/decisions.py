@@ -15,7 +15,13 @@ from mwdcal.certificate.document import ConformityTest, LimitDecision, Quantity
 from mwdcal.certificate.laboratory import DecisionRule
 from mwdcal.files.documents import Verification
 from mwdcal.geometry.vectors import Array, ArrayLike
-from mwdcal.use.verification import COVERAGE, RULES, SPREAD_OF, VerdictRow
+from mwdcal.use.verification import (
+    COVERAGE,
+    RULES,
+    SPREAD_OF,
+    VerdictRow,
+    fewest_degrees_of_freedom,
+)
 
 When: TypeAlias = Literal["as found", "as left"]
 """When a roll test was made: before or after the adjustment."""
@@ -24,6 +30,12 @@ SIMPLE_RISK = "the probability of a wrong decision reaches 50 % where the value 
 """Largest risks of the rules of a verification: one-sided, beyond two standard uncertainties, and at the limit."""
 PROBABILITY = 0.95
 """Coverage probability of every expanded uncertainty of a certificate."""
+UNKNOWN_FREEDOM = Finding(
+    id="freedom-not-stated",
+    text=f"the test as found does not state the degrees of freedom of its calibration: its coverage factor is "
+    f"{COVERAGE:g}, not Student's. Verify that calibration again, and save what is printed as JSON.",
+)
+"""Of a test with another calibration, in a document of an earlier version."""
 
 
 def student_factor(freedom: ArrayLike) -> Array:
@@ -97,16 +109,13 @@ class Rule:
         return worst.value, worst.uncertainty, worst.label or "stations outside of roll sets"
 
 
-def rule_of(
-    verification: Verification, calibration: Calibration, choice: DecisionRule | None
-) -> Rule:
+def rule_of(verification: Verification, freedom: float | None, choice: DecisionRule | None) -> Rule:
     """The rule for a test: the verification's, unless the laboratory asks for the guarded one.
 
-    The coverage factor of its uncertainties is at least `COVERAGE`, and Student's for the triad of the
-    calibration with the fewest degrees of freedom.
+    The coverage factor of its uncertainties is at least `COVERAGE`, and Student's for the degrees of
+    `freedom` of the calibration that was tested; `COVERAGE` where they are not known.
     """
-    fewest = min(triad.degrees_of_freedom for triad in calibration.triads)
-    k = max(COVERAGE, float(student_factor(fewest)))
+    k = COVERAGE if freedom is None else max(COVERAGE, float(student_factor(freedom)))
     if choice is not None and choice.rule == "guarded":
         text = (
             f"guarded acceptance: noise-free value + {choice.guard_factor:g} U must not exceed the limit, "
@@ -125,8 +134,15 @@ def conformity(
     calibration: Calibration,
     choice: DecisionRule | None,
 ) -> tuple[ConformityTest, list[Finding]]:
-    """A roll test as the certificate shows it, and a finding where the laboratory's rule decides otherwise."""
-    rule = rule_of(verification, calibration, choice)
+    """A roll test as the certificate shows it, and findings about its decisions and its coverage factor.
+
+    The degrees of freedom are those of the calibration that was tested, as the verification states them. One of
+    an earlier version states none: those of `calibration` serve a test as left, and none serve one as found.
+    """
+    freedom = verification.degrees_of_freedom
+    if freedom is None and when == "as left":
+        freedom = fewest_degrees_of_freedom(calibration)
+    rule = rule_of(verification, freedom, choice)
     decisions = [rule.decision(row) for row in verification.rows]
     test = ConformityTest(
         when=when,
@@ -142,7 +158,8 @@ def conformity(
         decisions=decisions,
         findings=verification.findings,
     )
-    return test, _changed(when, verification, decisions)
+    unknown = [UNKNOWN_FREEDOM] if freedom is None else []
+    return test, unknown + _changed(when, verification, decisions)
 
 
 def _changed(

@@ -81,7 +81,7 @@ def ed25519() -> Any:
     except ImportError:
         raise InputError(
             "signatures need cryptography, which is not installed. Install mwdcal[certificate]: "
-            "pip install 'mwdcal[certificate]'"
+            'pip install "mwdcal[certificate]"'
         ) from None
 
 

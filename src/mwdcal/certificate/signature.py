@@ -10,8 +10,9 @@ import binascii
 import hashlib
 import json
 import math
-import os
+import re
 from collections.abc import Iterable, Mapping, Sequence
+from datetime import timedelta
 from pathlib import Path
 from typing import Any, Literal
 
@@ -63,9 +64,13 @@ STATES = {
     "retired": "the {document} was signed on {time} by {key}, which was retired on {retired}. Have it signed with "
     "the key that followed.",
     "unchecked": "the {document} is signed by {key}, and not checked: cryptography is not installed. Install "
-    "mwdcal[certificate]: pip install 'mwdcal[certificate]'",
+    'mwdcal[certificate]: pip install "mwdcal[certificate]"',
 }
 """What is said of each state."""
+CLOCKS_APART = timedelta(minutes=5)
+"""By how much clocks of two computers may differ."""
+FLEET_TABLE = re.compile(r"(?i)(\.parquet)#.*")
+"""The end of a name of a tool in the table of a fleet."""
 FINDING_OF_STATE = {
     state: "changed" if state == "altered" else f"signature-{state}" for state in STATES
 }
@@ -225,8 +230,24 @@ def _said(
         key=signature.key if signature else None,
         owner=(key.owner or None) if key else None,
         time=signature.time if signature else None,
-        text=STATES[state].format(**words),
+        text=STATES[state].format(**words) + (_clock(key, signature) if state == "intact" else ""),
     )
+
+
+def _clock(key: TrustedKey | None, signature: Signature | None) -> str:
+    """What is odd about the date of an intact signature, which is a claim of the signer; empty if nothing is."""
+    if key is None or signature is None:
+        return ""
+    try:
+        signed_at = moment(signature.time)
+        created = moment(key.created) if key.created else signed_at
+    except ValueError:
+        return " One of the dates of key and signature cannot be read."
+    if signed_at > moment(now()) + CLOCKS_APART:
+        return " That is in the future: a clock is wrong, or the date."
+    if signed_at < created - CLOCKS_APART:
+        return f" That is before the key was created, {key.created}: a clock is wrong, or the date."
+    return ""
 
 
 # ---------------------------------------------------------------- the files of a certificate
@@ -263,7 +284,13 @@ def check_files(
 def _is(file: SourceFile, path: Path, digest: str | None, listed: Iterable[SourceFile]) -> bool:
     """Whether a path on the command line is meant to be a file that is listed: by content, or else by name."""
     namesakes = {each.sha256 for each in listed if _base(each.name) == _base(file.name)}
-    return digest == file.sha256 or (path.name == _base(file.name) and digest not in namesakes)
+    called = path.name in (_base(file.name), _base(_table(file.name)))
+    return digest == file.sha256 or (called and digest not in namesakes)
+
+
+def _table(name: str) -> str:
+    """The table of a fleet in a name such as `cals.parquet#SERIAL`, whose SHA-256 is listed; others as they are."""
+    return FLEET_TABLE.sub(r"\1", name)
 
 
 def _base(name: str) -> str:
@@ -273,7 +300,8 @@ def _base(name: str) -> str:
 
 def _checked(file: SourceFile, given: Sequence[Path], folder: Path) -> CheckedFile:
     """A file that is listed, looked up: all that are `given` must be it; a folder in its place is none."""
-    beside = [folder / file.name.replace("\\", os.sep), folder / _base(file.name)]
+    names = dict.fromkeys((file.name, _table(file.name)))
+    beside = [p for name in names for p in (*_stated_places(name, folder), folder / _base(name))]
     places = given or [place for place in beside if _exists(place)][:1]
     if not places:
         return CheckedFile(id=file.id, name=file.name, path=None, state="missing")
@@ -284,6 +312,12 @@ def _checked(file: SourceFile, given: Sequence[Path], folder: Path) -> CheckedFi
         path=str((changed or places)[0]),
         state="changed" if changed else "unchanged",
     )
+
+
+def _stated_places(name: str, folder: Path) -> list[Path]:
+    """Where a certificate says that a file is; nowhere on another machine: Windows would log in there to look."""
+    place = name.replace("\\", "/")
+    return [] if place.startswith("//") else [folder / place]
 
 
 def _exists(path: Path) -> bool:

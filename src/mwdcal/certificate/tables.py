@@ -16,6 +16,7 @@ from mwdcal.certificate.decisions import PROBABILITY, student_factor
 from mwdcal.certificate.document import Quantity, ResultTable
 from mwdcal.certificate.laboratory import Laboratory
 from mwdcal.geometry.observables import TITLES
+from mwdcal.use.verification import fewest_degrees_of_freedom
 
 STATED_INCLINATIONS = (float(np.radians(5.0)), TYPICAL, float(np.radians(90.0)))
 """Inclinations at which the accuracy of the angles is stated."""
@@ -24,11 +25,11 @@ ONE = "1"
 NUMBERS = ("gain", "scale", "misalignment")
 """Parameters without a unit, unless the triad is curved; all others have the unit of the field."""
 AT_THE_PLACE = {
-    "gravity": ("gravity", "gravity_g", "g"),
-    "field": ("strength of the magnetic field", "field", "nT"),
-    "dip": ("dip of the magnetic field", "dip_deg", "°"),
+    "gravity": ("gravity", "gravity_g", "g", "gravity_g"),
+    "field": ("strength of the magnetic field", "field", "nT", "field_nt"),
+    "dip": ("dip of the magnetic field", "dip_deg", "°", "dip_deg"),
 }
-"""Title, key in `Calibration.earth`, and unit, of what the place of the calibration had."""
+"""Title, key in `Calibration.earth`, unit, and key of `[stand]`, of what the place of the calibration had."""
 
 
 def expanded(
@@ -60,7 +61,7 @@ def conditions(calibration: Calibration, laboratory: Laboratory) -> list[Quantit
     normal = float(student_factor(np.inf))
     return [
         *_temperatures(calibration),
-        *_place(calibration, normal),
+        *_place(calibration),
         *(
             expanded(f"condition-{i}", c.name, c.unit, c.value, c.uncertainty, normal)
             for i, c in enumerate(laboratory.conditions, 1)
@@ -76,15 +77,22 @@ def _temperatures(calibration: Calibration) -> Iterator[Quantity]:
         )
 
 
-def _place(calibration: Calibration, k: float) -> Iterator[Quantity]:
-    """Gravity, field and dip: estimated ones with the uncertainty of the estimate, others as declared."""
+def _place(calibration: Calibration) -> Iterator[Quantity]:
+    """Gravity, field and dip: estimated ones with the uncertainty of the estimate, others as declared.
+
+    The coverage factor is Student's of the residuals where more is known by the readings than was declared.
+    """
+    fewest = fewest_degrees_of_freedom(calibration)
     constants = {constant.name: constant for constant in calibration.constants}
-    for name, (title, key, unit) in AT_THE_PLACE.items():
+    for name, (title, key, unit, declared) in AT_THE_PLACE.items():
         if key not in calibration.earth or (name == "field" and calibration.relative):
             continue
         estimated, shared = constants.get(name), constants.get(error_name(name))
         sd = next((c.standard_uncertainty for c in (estimated, shared) if c), None)
         words = f"{title}, estimated" if estimated else title
+        most = calibration.profile.stand.of(declared) ** 2 / 2
+        by_readings = estimated or (shared and shared.standard_uncertainty**2 < most)
+        k = float(student_factor(fewest if by_readings else np.inf))
         yield expanded(name, words, unit, calibration.earth[key], sd, k)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from mwdcal.calibration.prediction import raw_reading
 from mwdcal.calibration.readings import NANOTESLA, SOAK_GAP, TRIADS
-from mwdcal.calibration.record import Calibration, TriadCalibration
+from mwdcal.calibration.record import MARGIN, Calibration, TriadCalibration
 from mwdcal.drift.comparable import (
     ANY_TEMPERATURE,
     FIELD_DIRECTIONS,
@@ -36,11 +36,16 @@ NOTES = {
     "free": "leaves undetermined: {free}: the others are compared",
     "model": "the {triad} has the model '{model}', that of the latest is '{latest}': over temperature the two "
     "differ by their own misfit",
+    "unit": "the readings of the {triad} are in another unit than those of the latest: compared in nominal units",
+    "elsewhere": "has no temperature terms and was made at {run:.1f} °C: compared at {middle:.1f} °C, what the tool "
+    "drifts between them counts as a change",
     "order": "the {triad} has temperature terms of order {order}: compared to order {compared}",
 }
 """What is said of a calibration that cannot be compared, or not in all of its parameters."""
 
 
+SCALE_CHANGE = 0.1
+"""Share by which the scale of a sensor never changes: nominal scales that differ by more may be of other units."""
 DECLARED = "declared"
 """How a calibration says that the noise of its readings was declared."""
 DEGREES = "°"
@@ -95,7 +100,7 @@ def tool_history(calibrations: Sequence[Calibration]) -> ToolHistory:
     compared = [each for each, use in zip(ordered, used, strict=True) if use]
     latest = ordered[-1]
     orders = _orders(compared, span)
-    middle = _middle(latest, span)
+    middle = _middle(compared, span)
     if not any(orders.values()):
         span = (middle, middle)
     form = _Form(latest, span, orders, compared)
@@ -166,9 +171,18 @@ def _in_common(
     return used[::-1], span, notes[::-1]
 
 
-def _middle(latest: Calibration, span: tuple[float, float]) -> float:
-    """The temperature at which calibrations without a common course are compared."""
-    return float(np.clip(latest.reference_temperature, *span))
+def _middle(compared: Sequence[Calibration], span: tuple[float, float]) -> float:
+    """The temperature at which calibrations without a common course are compared.
+
+    That of the runs of those without temperature terms, which say nothing of others; else the latest's reference.
+    """
+    runs = [np.mean(c.temperature_c) for c in compared if c.temperature_c and _constant(c)]
+    return float(np.clip(np.mean(runs) if runs else compared[-1].reference_temperature, *span))
+
+
+def _constant(calibration: Calibration) -> bool:
+    """Whether a triad of a calibration has no temperature terms."""
+    return not all(triad.order for triad in calibration.triads)
 
 
 def _orders(compared: Sequence[Calibration], span: tuple[float, float]) -> dict[str, int]:
@@ -229,9 +243,32 @@ class _Form:
 
     def _triad(self, calibration: Calibration, triad: TriadCalibration) -> tuple[Array, Array]:
         """Factors (k,) of a triad and their derivatives (k, p) by its parameters in the file."""
+        return self._factors(calibration, triad, self._unit_ratio(calibration, triad))
+
+    def _unit_ratio(self, calibration: Calibration, triad: TriadCalibration) -> float:
+        """By what the unit of a triad's readings is another than the latest's: 1, or the ratio of nominal scales.
+
+        The ratio, where nominal scales differ by more than a sensor's can, and by it the scales differ less.
+        """
+        last = self._last(triad.name)
+        now, then = (getattr(c.profile, triad.name).scale or 1.0 for c in (last, calibration))
+        ratio = float(then / now)
+        if abs(np.log(ratio)) <= np.log1p(SCALE_CHANGE):
+            return 1.0
+        scale, latest = (
+            np.abs(self._factors(c, getattr(c, triad.name), 1.0)[0][:3]).mean()
+            for c in (calibration, last)
+        )
+        return ratio if abs(np.log(scale / ratio / latest)) < abs(np.log(scale / latest)) else 1.0
+
+    def _factors(
+        self, calibration: Calibration, triad: TriadCalibration, unit_ratio: float
+    ) -> tuple[Array, Array]:
+        """The same where the readings are in a unit of which the latest's is `unit_ratio`."""
         x = self._points(triad.name)
-        axes = _axes(calibration, triad.name) @ np.linalg.inv(
-            _axes(self._last(triad.name), triad.name)
+        axes = unit_ratio * (
+            _axes(calibration, triad.name)
+            @ np.linalg.inv(_axes(self._last(triad.name), triad.name))
         )
         model = triad.functions(calibration.reference_temperature)
         raw, order = x @ axes.transpose(), self.orders[triad.name]
@@ -287,23 +324,32 @@ class _Form:
     def notes(self, calibration: Calibration) -> Iterator[str]:
         """What of a calibration is not compared, or as something else."""
         for name, compared in self.orders.items():
-            triad = getattr(calibration, name)
-            if triad is None:
-                yield NOTES["no-magnetometer"]
-                continue
-            if triad.curved:
-                yield NOTES["curved"].format(triad=name)
-            latest = getattr(self._last(name), name).model
-            if compared and triad.model != latest:
-                yield NOTES["model"].format(triad=name, model=triad.model, latest=latest)
-            if triad.order > compared:
-                yield NOTES["order"].format(triad=name, order=triad.order, compared=compared)
+            yield from self._notes_of(calibration, name, compared)
+        middle, measured = sum(self.span) / 2, calibration.temperature_c
+        if measured and _constant(calibration) and abs(np.mean(measured) - middle) > MARGIN:
+            yield NOTES["elsewhere"].format(run=np.mean(measured), middle=middle)
         if calibration.relative:
             yield NOTES["relative"]
         if calibration.options.parameters < 12:
             yield NOTES["held"]
         if free := calibration.undetermined():
             yield NOTES["free"].format(free=", ".join(dict.fromkeys(each.id for each in free)))
+
+    def _notes_of(self, calibration: Calibration, name: str, compared: int) -> Iterator[str]:
+        """The same of one triad, compared to some order."""
+        triad: TriadCalibration | None = getattr(calibration, name)
+        if triad is None:
+            yield NOTES["no-magnetometer"]
+            return
+        if self._unit_ratio(calibration, triad) != 1.0:
+            yield NOTES["unit"].format(triad=name)
+        if triad.curved:
+            yield NOTES["curved"].format(triad=name)
+        latest = getattr(self._last(name), name).model
+        if compared and triad.model != latest:
+            yield NOTES["model"].format(triad=name, model=triad.model, latest=latest)
+        if triad.order > compared:
+            yield NOTES["order"].format(triad=name, order=triad.order, compared=compared)
 
     def unit(self, name: str) -> str:
         """The unit of a parameter."""

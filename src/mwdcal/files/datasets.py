@@ -42,7 +42,7 @@ def fetch(name: str) -> Path:
         import pooch
     except ImportError:
         raise InputError(
-            "measured sets need the extra 'data': pip install 'mwdcal[data]'."
+            "measured sets need the extra 'data': pip install \"mwdcal[data]\"."
         ) from None
     if FOLDER in os.environ:
         return _local(Path(os.environ[FOLDER]), name, known[name])

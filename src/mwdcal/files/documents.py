@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import hashlib
 import json
 import os
@@ -109,6 +110,16 @@ def whole_file(path: Path) -> members.Member:
     return members.Member(data, path.name, hashlib.sha256(data).hexdigest())
 
 
+def in_utf8(data: bytes) -> bytes:
+    """JSON in UTF-8 without a mark; Windows PowerShell saves in UTF-16 what a command prints.
+
+    Raises `UnicodeDecodeError` where the mark of UTF-16 is wrong.
+    """
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return data.decode("utf-16").encode()
+    return data.removeprefix(codecs.BOM_UTF8)
+
+
 def _decoded(data: bytes, name: str) -> Calibration:
     """The calibration in the bytes of a file."""
     version = msgspec.json.decode(data, type=dict[str, Any]).get("schema_version")
@@ -131,6 +142,7 @@ def load_verification(path: str | os.PathLike[str]) -> tuple[Verification, str]:
     """
     data, name, digest = whole_file(Path(path))
     try:
+        data = in_utf8(data)
         head = msgspec.json.decode(data, type=dict[str, Any])
         if head.get("command") != "verify":
             raise msgspec.ValidationError("it is not of that command")

@@ -21,7 +21,7 @@ import numpy as np
 
 from mwdcal.errors import InputError, reason
 from mwdcal.files.contract import RANGES
-from mwdcal.files.formats import parquet
+from mwdcal.files.formats import atomic, parquet
 from mwdcal.files.formats.columns import LABELS
 from mwdcal.files.formats.table import labels
 from mwdcal.fleet import kept, run_files
@@ -266,7 +266,7 @@ def _whole_folder(folder: Path) -> Iterator[Path]:
         unfinished.mkdir(parents=True)
         yield unfinished
         kept.write_manifest(unfinished)
-        unfinished.rename(folder)
+        atomic.rename(unfinished, folder)
     except OSError as error:
         raise InputError(
             f"cannot write to '{folder.parent}': {reason(error)}. Make room there, or choose another "
@@ -348,6 +348,12 @@ def _rows(piece: Piece, columns: tuple[str, ...], start: int, stop: int) -> list
         except Exception:
             _reading.cache_clear()
             raise
+
+
+def close_rows() -> None:
+    """Close the file that rows were last read from."""
+    with _ONE_AT_A_TIME:
+        _reading.cache_clear()
 
 
 @lru_cache(maxsize=1)

@@ -151,7 +151,8 @@ def _azimuth_gradient(g: Array, b: Array) -> Array:
     north_b = [-gz * gx, -gz * gy, gx**2 + gy**2]
     numerator = north[..., None] * np.stack([*east_g, *east_b], -1)
     numerator -= east[..., None] * np.stack([*north_g, *north_b], -1)
-    square = np.where(is_vertical(g), np.nan, east**2 + north**2)
+    square = east**2 + north**2
+    square = np.where(is_vertical(g) | (square == 0), np.nan, square)
     return np.asarray(numerator / square[..., None])
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from itertools import chain, product
 from math import prod
@@ -14,7 +13,14 @@ import numpy as np
 from mwdcal.calibration.readings import CONSTANTS, SOAK_GAP
 from mwdcal.errors import InputError
 from mwdcal.estimation.evidence import ANGLES
-from mwdcal.files.contract import CHANNELS, COLUMNS, REFERENCES, check_near_misses
+from mwdcal.files.contract import (
+    CHANNELS,
+    COLUMNS,
+    REFERENCES,
+    TEMPERATURE,
+    Range,
+    check_near_misses,
+)
 from mwdcal.files.formats import table as tables
 from mwdcal.files.formats.columns import LABELS, Column
 from mwdcal.files.formats.table import Table, labels, numbers
@@ -78,9 +84,12 @@ class PlanFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         check_count(count, source)
         attitudes = [each for some in self.stations for each in some.attitudes]
         place = {"gravity": self.gravity_g, "field": self.field_nt, "dip": self.dip_deg}
-        _check_finite([*soaks, *np.ravel(attitudes), *filter(None, place.values())], source)
         columns = dict(zip(ANGLES, np.tile(np.transpose(attitudes), len(soaks)), strict=True))
         columns |= {n: np.full(count, float(v)) for n, v in place.items() if v is not None}
+        _check_values("temperature_c", np.asarray(soaks, float), TEMPERATURE, source)
+        for name, values in columns.items():
+            key = REFERENCES[name].column.removeprefix("ref_")
+            _check_values(key, values, REFERENCES[name].values, source)
         return Table(
             {
                 "station": [str(number + 1) for number in range(count)],
@@ -97,10 +106,12 @@ def _listed(values: Values) -> list[float]:
     return values if isinstance(values, list) else [values]
 
 
-def _check_finite(values: Sequence[float], source: str) -> None:
-    if not np.isfinite(values).all():
+def _check_values(key: str, values: Array, allowed: Range, source: str) -> None:
+    """Refuse numbers of a TOML file that no run file may have."""
+    wrong = values[~np.isfinite(values) | allowed.outside(values)]
+    if wrong.size:
         raise InputError(
-            f"{source}: every number must be finite. Correct 'nan' and 'inf', or leave the key out."
+            f"{source}, key '{key}': must be {allowed}; got {wrong[0]:g}. Correct it, or leave the key out."
         )
 
 
@@ -142,14 +153,14 @@ def _blank(cells: Column) -> bool:
     return isinstance(cells, np.ndarray) and bool(np.isnan(cells).all())
 
 
-def load_measured(path: str) -> Table:
-    """The stations of a run that is measured already, as a plan.
+def load_measured(path: str, magnetometer: bool = True) -> Table:
+    """The stations of a run that is measured already, as a plan for one triad or both.
 
     Raises:
-        InputError: it cannot be read, or holds one triad alone.
+        InputError: it cannot be read, or does not hold the triads of the plan.
     """
     table = tables.read(Path(path))
-    for triad, names in CHANNELS.items():
+    for triad, names in [*CHANNELS.items()][: 1 + magnetometer]:
         missing = [name for name in names if name not in table.columns]
         if missing:
             raise InputError(

@@ -27,7 +27,7 @@ from mwdcal.planning.effects import Effects, approach, response, wandering
 from mwdcal.planning.plans import ROOM_TEMPERATURE
 from mwdcal.sensor.datasheets import ROOT3, tolerance
 from mwdcal.sensor.models import Basis, Factors, Model
-from mwdcal.sensor.profile import COMMON, Profile
+from mwdcal.sensor.profile import COMMON, Datasheet, Profile, TriadProfile
 
 DRIFT_POWERS = np.array([1.0, 1e-3, 1e-6])
 """Powers of a drift over temperature: the square and the cube are a tenth and a hundredth of it over 100 °C."""
@@ -122,7 +122,7 @@ class Truth:
 
 def servo(rng: np.random.Generator) -> Truth:
     """A servo instrument within the datasheet limits of Moosavi's Table 1: see `SERVO`."""
-    return drawn(rng, Profile(name="servo"))
+    return drawn(rng, Profile(name="servo", magnetometer=TriadProfile(datasheet=Datasheet())))
 
 
 def drawn(
@@ -131,7 +131,7 @@ def drawn(
     """Tools within the tolerances of a profile's datasheets; what these do not state is as of `SERVO`.
 
     Every tolerance is the standard deviation of a uniform distribution, about nominal, and so is a declared
-    nonlinearity. The same numbers are drawn at every order.
+    nonlinearity. The same numbers are drawn at every order. Without magnetometer where the profile has none.
     """
     unit = rng.uniform(-ROOT3, ROOT3, (*lead, len(TRIADS), 30))
     first, second = (

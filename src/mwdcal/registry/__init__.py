@@ -6,5 +6,5 @@ from mwdcal.errors import InputError
 
 if not (find_spec("sqlalchemy") and find_spec("alembic")):
     raise InputError(
-        "the registry needs SQLAlchemy and Alembic. Install them with: pip install 'mwdcal[registry]'"
+        'the registry needs SQLAlchemy and Alembic. Install them with: pip install "mwdcal[registry]"'
     )

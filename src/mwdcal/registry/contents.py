@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
 from mwdcal.calibration.canonical import canonical
+from mwdcal.calibration.record import Calibration
 from mwdcal.errors import InputError, reason
 from mwdcal.files import documents, runs
 from mwdcal.files.contract import CHANNELS
@@ -84,18 +86,25 @@ def of_bytes(data: bytes, name: str) -> list[Entry]:
         )
     if _PUBLIC in data:
         return [Entry("public-key", data, name)]
-    if data.removeprefix(_BOM).lstrip().startswith(b"{"):
-        return [Entry(_json_kind(data, name), data, name)]
+    if (text := _json_text(data)).startswith(b"{"):
+        return [Entry(_json_kind(text, name), data, name)]
     if Path(name).suffix.lower() in TABLE_SUFFIXES:
         return [_run(data, name)]
     return _of_toml(data, name)
 
 
-def checked(entry: Entry) -> Entry:
-    """The entry, if it is a calibration one that every command accepts."""
+def checked(entry: Entry) -> Calibration | None:
+    """The calibration that an entry is, one that every command accepts; None where it is another document."""
     if entry.kind == "calibration":
-        documents.decoded(members.Member(entry.data, entry.name, ""))
-    return entry
+        return documents.decoded(members.Member(entry.data, entry.name, ""))
+    return None
+
+
+def _json_text(data: bytes) -> bytes:
+    """The file in UTF-8 without what stands before its text; as it is where it is no text."""
+    with suppress(UnicodeDecodeError):
+        return documents.in_utf8(data).lstrip()
+    return data
 
 
 def _json_kind(data: bytes, name: str) -> str:

@@ -18,7 +18,7 @@ from mwdcal.calibration.readings import is_simulated, stated_day
 from mwdcal.errors import InputError
 from mwdcal.files import metadata
 
-FACTS_VERSION = 1
+FACTS_VERSION = 2
 """Version of the functions below: higher when one of them reads the same bytes otherwise."""
 LONGEST_NAME = 200
 """Characters of the longest serial, name or number that a registry takes."""
@@ -116,17 +116,6 @@ def _day(metadata: Mapping[str, object]) -> str | None:
     return day.isoformat() if day else None
 
 
-class _Dated(msgspec.Struct):
-    """The part of a calibration that states its day."""
-
-    tool: dict[str, Any] = {}
-
-
-def states_day(calibration: bytes) -> bool:
-    """Whether a calibration states the day of its measurement, rather than that of the fit alone."""
-    return stated_day(msgspec.json.decode(calibration, type=_Dated).tool) is not None
-
-
 def _norm(rows: list[Mapping[str, Any]], key: str) -> float | None:
     """The root of the sum of squares of a column of the budget; None where a part is undetermined."""
     parts = [row.get(key) for row in rows]
@@ -155,6 +144,7 @@ def _verification(data: bytes, name: str) -> Facts:
     return Facts(
         serial=_text(fields.get("serial")),
         label=_text(fields.get("limits")),
+        time=_day(fields),
         run=_text(fields.get("run_sha256")),
         calibration=_text(fields.get("calibration_sha256")),
         status=_outcome(fields["passed"]),

@@ -13,13 +13,14 @@ from typing import NamedTuple
 import msgspec
 from msgspec.structs import replace
 
+from mwdcal.calibration.readings import stated_day
 from mwdcal.errors import InputError, MwdcalError
 from mwdcal.files.formats import members
 from mwdcal.files.formats.folders import visible_files
 from mwdcal.registry import contents
 from mwdcal.registry.database.tools import TOOL_KINDS
 from mwdcal.registry.exports import read_manifest
-from mwdcal.registry.facts import content_address, states_day
+from mwdcal.registry.facts import content_address
 from mwdcal.registry.queries import records_page
 from mwdcal.registry.store import Draft, Entry, Registry, draft
 
@@ -46,7 +47,8 @@ class Source(NamedTuple):
 class Prepared:
     """What a source holds: drafts of records, or a `doubtful` one of a table that may be a run.
 
-    `problems` say what is wrong, `undated` has the SHA-256 of calibrations that state no day of measurement.
+    `problems` say what is wrong. SHA-256 of calibrations: `undated` of those that state no day of measurement,
+    `changed` of those whose contents are not those that were written.
     """
 
     source: Source
@@ -54,6 +56,7 @@ class Prepared:
     doubtful: Draft | None = None
     problems: list[str] = field(default_factory=list)
     undated: set[str] = field(default_factory=set)
+    changed: set[str] = field(default_factory=set)
 
 
 class FileResult(msgspec.Struct, frozen=True, kw_only=True):
@@ -129,10 +132,12 @@ def prepared(source: Source) -> Prepared:
         return result
     for entry in entries:
         try:
-            one = draft(contents.checked(entry))
+            calibration, one = contents.checked(entry), draft(entry)
             result.drafts.append(one)
-            if entry.kind == "calibration" and not states_day(entry.data):
+            if calibration and not stated_day(calibration.tool):
                 result.undated.add(one["sha256"])
+            if calibration and source.group is None and calibration.changed:
+                result.changed.add(one["sha256"])
         except MwdcalError as error:
             result.problems.append(str(error))
     return result
@@ -154,8 +159,8 @@ class Adding:
     """Files on their way into a registry, some hundred records in a transaction.
 
     `results` say what became of each file, `new` how many records of each kind are new, `serials` of which tools,
-    `undated` the names of new calibrations whose runs state no date, `simulated` whether one of the files rests
-    on simulated data.
+    `undated` the names of new calibrations whose runs state no date, `changed` of those that were changed after
+    they were made, `simulated` whether one of the files rests on simulated data.
     """
 
     def __init__(self, registry: Registry, actor: str) -> None:
@@ -164,10 +169,12 @@ class Adding:
         self._doubtful: list[Prepared] = []
         self._runs: set[str] = set()
         self._undated: set[str] = set()
+        self._changed: set[str] = set()
         self._files: dict[Path, FileResult] = {}
         self.new: Counter[str] = Counter()
         self.serials: set[str] = set()
         self.undated: list[str] = []
+        self.changed: list[str] = []
         self.simulated = False
 
     @property
@@ -181,6 +188,7 @@ class Adding:
             self._doubtful.append(each)
             return
         self._undated |= each.undated
+        self._changed |= each.changed
         for message in each.problems:
             self._count(each.source, refused=1, message=message)
         for one in each.drafts:
@@ -218,11 +226,13 @@ class Adding:
         self._waiting = []
 
     def _note(self, new: Draft) -> None:
-        """Remember the serial of a new record, and whether it is a calibration of an unknown day."""
+        """Remember the serial of a new record, and whether it is a calibration of an unknown day, or was changed."""
         if new["serial"] and new["kind"] in TOOL_KINDS:
             self.serials.add(new["serial"])
         if new["sha256"] in self._undated:
             self.undated.append(new["name"])
+        if new["sha256"] in self._changed:
+            self.changed.append(new["name"])
 
     def _count(self, source: Source, kind: str = "", message: str = "", **more: int) -> None:
         file = str(source.path)

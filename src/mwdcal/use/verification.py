@@ -137,7 +137,11 @@ class VerdictRow(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Verdict(msgspec.Struct, frozen=True, kw_only=True):
-    """The outcome of a verification; `date` as the run states it."""
+    """The outcome of a verification; `date` as the run states it.
+
+    `degrees_of_freedom`: of the triad of the calibration with the fewest, on which the standard
+    uncertainties rest. None: a document of an earlier version.
+    """
 
     passed: bool
     rule: str
@@ -149,6 +153,7 @@ class Verdict(msgspec.Struct, frozen=True, kw_only=True):
     rows: list[VerdictRow]
     findings: list[Finding]
     station_rows: list[VerifiedStation] = []
+    degrees_of_freedom: float | None = None
 
     plot: ClassVar[Any]
     """Figures of the verdict, as `Calibration.plot`."""
@@ -210,7 +215,13 @@ def verify(calibration: Calibration, readings: Readings, limits: Limits) -> Verd
         rows=rows,
         findings=sum((about for _, about in judged), [*_findings(test, skipped)]),
         station_rows=_station_rows(test, rows, [outcome[-1] for outcome in outcomes]),
+        degrees_of_freedom=fewest_degrees_of_freedom(calibration),
     )
+
+
+def fewest_degrees_of_freedom(calibration: Calibration) -> float:
+    """Degrees of freedom of the residuals of the triad that has the fewest."""
+    return min(triad.degrees_of_freedom for triad in calibration.triads)
 
 
 def _station_rows(

@@ -24,7 +24,7 @@ def require(what: str, *libraries: str, extra: str = "report") -> None:
         except ImportError as error:
             raise InputError(
                 f"{what} needs {error.name}, which is not installed. Install mwdcal[{extra}]: "
-                f"pip install 'mwdcal[{extra}]'"
+                f'pip install "mwdcal[{extra}]"'
             ) from None
 
 

@@ -134,7 +134,7 @@ def _module(source: str) -> Any:
     except ImportError:
         raise InputError(
             f"{source}: LAS files need the extra 'survey'. "
-            "Install it with: pip install 'mwdcal[survey]'"
+            'Install it with: pip install "mwdcal[survey]"'
         ) from None
     logging.getLogger("lasio").addHandler(logging.NullHandler())
     return lasio

@@ -79,7 +79,7 @@ def _modules(source: str) -> tuple[Any, type[Exception]]:
     except ImportError:
         raise InputError(
             f"{source}: WITSML files need the extra 'survey'. "
-            "Install it with: pip install 'mwdcal[survey]'"
+            'Install it with: pip install "mwdcal[survey]"'
         ) from None
     return ElementTree, DefusedXmlException
 

@@ -25,6 +25,7 @@ try:
     fcntl: Any = import_module("fcntl")
 except ImportError:  # Windows, where an open file can be neither removed nor renamed
     fcntl = None
+    msvcrt: Any = import_module("msvcrt")
 
 SQLITE = b"SQLite format 3\0"
 """How the file of a registry begins."""
@@ -33,6 +34,10 @@ _WRITTEN_AHEAD = 18, 2
 _PATTERN = ".mwdcal-*.tmp"
 _DAY = 86_400.0
 """Seconds after which a file of another machine counts as left behind: its locks may not reach here."""
+_RENAME_SECONDS = 5.0
+"""Seconds after which a file that is not open counts as left behind on Windows: its writer may yet rename it."""
+_PAUSES = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
+"""Seconds between attempts to rename a file that a virus scanner or an indexer holds open for a moment."""
 
 
 def write_all(files: Iterable[tuple[Path | None, bytes | str]]) -> None:
@@ -73,9 +78,9 @@ def replacing(path: str | os.PathLike[str], durable: bool = True) -> Iterator[IO
             if durable:
                 os.fsync(stream.fileno())  # wait until it is on the disk
             if fcntl:
-                temporary.replace(file)  # still locked: no sweep comes between
+                rename(temporary, file)  # still locked: no sweep comes between
         if not fcntl:
-            temporary.replace(file)
+            rename(temporary, file)
     except OSError as error:
         raise _refusal(path, error) from error
     finally:
@@ -83,10 +88,22 @@ def replacing(path: str | os.PathLike[str], durable: bool = True) -> Iterator[IO
             temporary.unlink(missing_ok=True)
 
 
+def rename(old: Path, new: Path) -> None:
+    """Give a file or a folder another name, that of a file which it replaces, or a free one."""
+    for pause in () if fcntl else _PAUSES:
+        with contextlib.suppress(PermissionError):
+            old.replace(new)
+            return
+        time.sleep(pause)
+    old.replace(new)
+
+
 def target(path: str | os.PathLike[str]) -> Path:
     """The file behind `path`, links followed; refuses folders, devices and what is write-protected."""
     try:
         file = Path(os.path.realpath(path))
+        with contextlib.suppress(FileNotFoundError, NotADirectoryError):
+            file.lstat()  # raises for a name that no file can have
         why = _hindrance(file)
     except (OSError, ValueError) as error:
         raise _refusal(path, error) from error
@@ -103,6 +120,8 @@ def _hindrance(file: Path) -> str:
         return "it is not a regular file. Name a file to write."
     if not file.parent.is_dir():
         return _missing(file.parent)
+    if fcntl is None and ":" in file.name:
+        return "behind the colon is the name of a stream inside the file. Name a file without."
     writable = stat.S_IWUSR | stat.S_IWGRP | stat.S_IWOTH  # for the superuser anything else is
     if file.exists() and not (file.stat().st_mode & writable and os.access(file, os.W_OK)):
         return "it is write-protected. Name another file, or remove the protection."
@@ -198,10 +217,8 @@ def _held(path: Path) -> IO[bytes] | None:
             stream = path.open("ab")
         except FileNotFoundError:
             continue  # its last holder came between, and has removed the folder
-        if fcntl is None:
-            return stream
         try:
-            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            _lock(stream)
         except BlockingIOError:
             stream.close()
             return None
@@ -211,6 +228,17 @@ def _held(path: Path) -> IO[bytes] | None:
             if os.path.samestat(path.stat(), os.fstat(stream.fileno())):
                 return stream
         stream.close()  # the last holder has removed it
+
+
+def _lock(stream: IO[bytes]) -> None:
+    """Lock a file until it is closed or its process ends; raises BlockingIOError where another has it."""
+    if fcntl:
+        fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        return
+    try:
+        msvcrt.locking(stream.fileno(), msvcrt.LK_NBLCK, 1)
+    except PermissionError as error:
+        raise BlockingIOError(*error.args) from error
 
 
 def _begun(temporary: Path) -> IO[bytes]:
@@ -239,13 +267,15 @@ def _remove_if_left(path: Path) -> None:
     """Remove a temporary file that nobody holds; raises OSError where one does, or may."""
     if path.is_symlink() or not path.is_file():
         return
+    age = time.time() - path.stat().st_mtime
     if fcntl is None:
-        path.unlink()  # refused by the system while it is open
+        if age > _RENAME_SECONDS:
+            path.unlink()  # refused by the system while it is open
         return
     near = path.name.startswith(f".mwdcal-{_machine()}-")
     with path.open("rb+") as stream:
         fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        if near or time.time() - os.fstat(stream.fileno()).st_mtime > _DAY:
+        if near or age > _DAY:
             path.unlink()
 
 

@@ -11,6 +11,7 @@ from unicodedata import normalize
 from urllib.parse import quote
 
 from mwdcal.errors import InputError, reason
+from mwdcal.files.formats import atomic
 
 HIDDEN = ("_", ".", "~$")
 """How names begin of files and folders that are left alone: notes of systems and programs."""
@@ -91,7 +92,7 @@ def whole(folder: Path) -> Iterator[Path]:
         check_new(folder)
         if folder.exists():
             folder.rmdir()
-        unfinished.rename(folder)
+        atomic.rename(unfinished, folder)
     except OSError as error:
         raise InputError(
             f"cannot write to '{folder}': {reason(error)}. Make room there, or name another folder."

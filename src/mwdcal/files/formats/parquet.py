@@ -79,6 +79,16 @@ def opened(source: Any, name: str, **options: Any) -> tuple[Any, Any]:
         return parquet.ParquetFile(source, **options), schema
 
 
+def close(writer: Any) -> None:
+    """Close a file that a writer opened by its path, once: where the disk is full another attempt fails as well."""
+    if writer is not None and writer.is_open:
+        writer.is_open = False
+        try:
+            writer.writer.close()
+        finally:
+            writer.file_handle.close()
+
+
 def _check_sizes(file: Any, stored: int, source: str) -> None:
     """Refuse a file of `stored` bytes of which a part would unpack to far more than that.
 
@@ -164,7 +174,7 @@ def modules(source: str) -> tuple[Any, Any]:
     except ImportError:
         raise InputError(
             f"{source}: Parquet files need the extra 'parquet'. "
-            "Install it with: pip install 'mwdcal[parquet]'"
+            'Install it with: pip install "mwdcal[parquet]"'
         ) from None
     return pyarrow, pyarrow.parquet
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
 from typing import IO, Any
 
 import msgspec
@@ -60,7 +61,12 @@ class ParquetSink:
             described = {parquet.KEY: self._described(findings)}
             stored = base64.b64encode(self._schema.with_metadata(described).serialize())
             self._writer.add_key_value_metadata({**described, _ARROW_SCHEMA: stored})
-        self._writer.close()
+        parquet.close(self._writer)
+
+    def close(self) -> None:
+        """Close the file, finished or not."""
+        with suppress(OSError):
+            parquet.close(self._writer)
 
     def _described(self, findings: Sequence[str]) -> bytes:
         metadata = {**self._metadata, "findings": list(findings)} if findings else self._metadata
@@ -178,6 +184,9 @@ class TextSink:
         elif findings:
             self._stream.seek(self._place)
             self._stream.write(_line(findings).ljust(self._room))
+
+    def close(self) -> None:
+        """Leave the stream to what opened it."""
 
     def _spelt(self, cells: Any) -> Any:
         """A column of numbers (blank: null) or of text, as text tables have them."""

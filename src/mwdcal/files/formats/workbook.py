@@ -73,7 +73,7 @@ def _module(source: str) -> Any:
     except ImportError:
         raise InputError(
             f"{source}: Excel files need the extra 'xlsx'. "
-            "Install it with: pip install 'mwdcal[xlsx]'"
+            'Install it with: pip install "mwdcal[xlsx]"'
         ) from None
     return openpyxl
 

@@ -126,7 +126,7 @@ def connect(database: str | os.PathLike[str], new: bool = False, shared: bool = 
     if find_spec("psycopg") is None:
         raise InputError(
             f"{name}: PostgreSQL needs the package psycopg. Install it with: "
-            "pip install 'mwdcal[postgresql]'"
+            'pip install "mwdcal[postgresql]"'
         )
     engine = sa.create_engine(url.set(drivername="postgresql+psycopg"), hide_parameters=True)
     sa.event.listen(engine, "connect", _wait_for_the_disk)

@@ -258,7 +258,7 @@ def _coefficients(library: str, file: str) -> tuple[str, str]:
     except OSError:
         raise InputError(
             f"{library} {version(library)} has no file {file}. Install another version: "
-            "pip install -U 'mwdcal[survey]'"
+            'pip install -U "mwdcal[survey]"'
         ) from None
     return data.decode("utf-8"), hashlib.sha256(data).hexdigest()
 
@@ -270,5 +270,5 @@ def _named(model: str, file: str, library: str) -> str:
 def _missing(name: str, what: str) -> InputError:
     return InputError(
         f"{what} needs {name}, which is not installed. Install the extra 'survey': "
-        "pip install 'mwdcal[survey]'"
+        'pip install "mwdcal[survey]"'
     )

@@ -106,7 +106,7 @@ def command(
     chosen = options_of(typed, prior)
     stand = Stand(speed, settle, soak, screen.reach(reach))
     tables = [load_plan(name) for name in plans]
-    done = load_measured(str(measured)) if measured else None
+    done = load_measured(str(measured), profile.has_magnetometer) if measured else None
     search = profile, chosen, criterion, stand, done
     candidates = tables[0] if tables else None
     with progress.bar("planning") as show:

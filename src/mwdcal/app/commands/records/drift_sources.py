@@ -169,7 +169,8 @@ def _tests(registry: Registry, serial: str) -> Iterator[ServiceTest]:
     days = {row["sha256"]: row["time"] for row in _records(registry, "run", where)}
     for row in _records(registry, "verification", where):
         day = row["time"] or days.get(row["run"]) or row["added"]
-        document = msgspec.json.decode(registry.content(row["sha256"]), type=dict[str, Any])
+        data = documents.in_utf8(registry.content(row["sha256"]))
+        document = msgspec.json.decode(data, type=dict[str, Any])
         verdict = msgspec.convert(document, Verdict)
         yield ServiceTest(date.fromisoformat(day[:10]), row["calibration"] or "", verdict)
 

@@ -265,7 +265,10 @@ def _decision(decision: LimitDecision | None, guarded: bool) -> list[Cell]:
 def _decision_notes(tests: Sequence[ConformityTest]) -> list[str]:
     """What the table of decisions means, and the remarks on single decisions."""
     each = [(test.when, decision) for test in tests for decision in test.decisions]
-    covered = _coverages([decision.quantity for _, decision in each])
+    factors = {test.when: _coverages([d.quantity for d in test.decisions]) for test in tests}
+    apart = len(set(factors.values())) > 1
+    said = [f"{when}: {factor}" if apart else factor for when, factor in factors.items() if factor]
+    covered = "; ".join(dict.fromkeys(said))
     notes = [
         f"U: expanded uncertainty{f' ({covered})' if covered else ''}. Decisions are by the rule stated below, on "
         "values that are not rounded. P within: probability that the true value is within the limit, given "
@@ -312,7 +315,7 @@ def quantity_table(
     if stated["U"]:
         meant += f"{'; ' if meant else ''}U: expanded uncertainty"
         meant += f", {coverages}" if coverages and not stated["k, coverage"] else ""
-    notes = [note, f"{capital(meant)}." if meant else ""]
+    notes = [note, f"{meant}." if meant else ""]
     return TableBlock(order, rows, title, notes=[*filter(None, notes)])
 
 

@@ -170,6 +170,12 @@ def _doubts(registry: Registry, adding: Adding) -> list[Finding]:
             "calibrate again."
         )
         findings.append(Finding(id="no-date", text=text))
+    if adding.changed:
+        text = (
+            f"{plural(len(adding.changed), 'calibration')} changed after mwdcal calibrate made it, such as "
+            f"{adding.changed[0]}: if that was not meant, withdraw it, and add the file as it was written."
+        )
+        findings.append(Finding(id="changed", text=text))
     for group in alike(registry, adding.serials)[:MOST_REFUSED]:
         text = (
             f"the serials {' and '.join(map(shown, group))} are of different tools, and differ in case, spaces or "
