@@ -133,13 +133,20 @@ def cell(value: object) -> str:
     return "" if np.isnan(value) else repr(value.item() if hasattr(value, "item") else value)
 
 
+def cells(column):
+    """The same of a whole column."""
+    if isinstance(column, np.ndarray) and column.dtype.kind == "f":
+        return ["" if value != value else repr(value) for value in column.tolist()]
+    return [cell(value) for value in column]
+
+
 def write_csv(path: Path, columns: dict[str, Any], *metadata: str, delimiter: str = ",") -> Path:
     """A run file by a writer that is not the package's own."""
     with path.open("w", encoding="utf-8", newline="") as stream:
         stream.writelines(f"# {line}\n" for line in metadata)
         writer = csv.writer(stream, delimiter=delimiter, lineterminator="\n")
         writer.writerow(columns)
-        writer.writerows(zip(*([cell(v) for v in c] for c in columns.values()), strict=True))
+        writer.writerows(zip(*map(cells, columns.values()), strict=True))
     return path
 
 

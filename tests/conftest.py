@@ -77,6 +77,14 @@ def without_pictures(monkeypatch):
     monkeypatch.setattr(pictures, "svg", lambda figure, key: Markup("<svg></svg>"))
 
 
+@pytest.fixture
+def without_layout(monkeypatch):
+    """Pictures whose panels stay where they begin: to find them places takes most of drawing."""
+    from matplotlib.figure import Figure
+
+    monkeypatch.setattr(Figure, "set_layout_engine", lambda self, layout=None, **options: None)
+
+
 def remembered(function, results):
     """The function, which computes once for equal arguments, and says of its progress the same again."""
 
@@ -107,7 +115,7 @@ def results():
 def computed_once(results, monkeypatch):
     """What takes most of the time of a command is computed once for all tests of what it shows."""
     from mwdcal.comparison import compare
-    from mwdcal.logs import noise
+    from mwdcal.logs import noise, noise_terms
     from mwdcal.planning import planned
 
     long = (
@@ -115,6 +123,7 @@ def computed_once(results, monkeypatch):
         (planned, "best_plan"),
         (compare, "compare"),
         (noise, "find_noise"),
+        (noise_terms, "fit"),
     )
     for module, name in long:
         monkeypatch.setattr(module, name, remembered(getattr(module, name), results))

@@ -34,7 +34,7 @@ remembered = cache(allan.moments)
 def equal_moments_once(monkeypatch, computed_once):
     """The moments of records of one length are the same in many tests: computed once.
 
-    And so is the noise of one log, whatever is shown of it.
+    And so is the noise of one log, whatever is shown of it, and of a channel that logs share.
     """
 
     def moments(count, averaging, kind="overlapping"):

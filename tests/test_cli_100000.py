@@ -9,7 +9,7 @@ from cli_support import SERVO_NOISE, channels, mwdcal, stations, write_csv
 from simulation import Tool
 
 
-@pytest.mark.parametrize("count", [20_000, pytest.param(100_000, marks=pytest.mark.study)])
+@pytest.mark.parametrize("count", [8_000, pytest.param(100_000, marks=pytest.mark.study)])
 def test_a_hundred_thousand_stations_take_two_minutes(tmp_path, count):
     """And fewer take a share of that: nothing grows faster than the stations."""
     rng = np.random.default_rng(3)

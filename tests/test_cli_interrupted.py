@@ -66,7 +66,7 @@ def test_killed_at_any_moment_it_leaves_the_old_file_or_the_new_one(tmp_path):
     target, dice = tmp_path / "cal.json", random.Random(1)
     target.write_bytes(OLD)
     outcomes = []
-    for _ in range(12):
+    for _ in range(5):  # `make kills` does it a thousand times
         kill_after(dice.uniform(0, 0.7), target)
         outcomes.append(target.read_bytes() == OLD)
         assert whole(target)
@@ -75,19 +75,10 @@ def test_killed_at_any_moment_it_leaves_the_old_file_or_the_new_one(tmp_path):
 
 
 def test_killed_around_the_write_it_leaves_the_old_file_or_the_new_one(tmp_path):
-    target, dice = tmp_path / "cal.json", random.Random(2)
+    target = tmp_path / "cal.json"
     target.write_bytes(OLD)
     outcomes = set()
-    for delay in [
-        0,
-        0.1,
-        0.2,
-        0.249,
-        0.25,
-        0.255,
-        0.3,
-        dice.uniform(0.2, 0.3),
-    ]:
+    for delay in (0.1, 0.249, 0.255, 0.3):
         assert kill_after(delay, target, writing=True) in (0, -signal.SIGKILL)
         outcomes.add(target.read_bytes() == OLD)
         assert whole(target)
@@ -243,8 +234,10 @@ def test_a_signal_in_a_place_that_cannot_fail_ends_the_command_all_the_same(hand
         del each
         time.sleep(10)
 
+    before = time.monotonic()
     with pytest.raises(Ended), orderly_end():
         work()
+    assert time.monotonic() - before < 8  # seconds: the wait is not sat out
     assert capfd.readouterr().err == ""
 
 
@@ -269,17 +262,13 @@ def test_other_errors_stay_what_they_are():
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes on this system")
-def test_a_command_that_waits_for_a_pipe_can_be_terminated(tmp_path):
+def test_no_command_waits_for_a_pipe(tmp_path):
     pipe = tmp_path / "tool.toml"
     os.mkfifo(pipe)
     arguments = ("calibrate", EXAMPLE / "run.csv", "--tool", pipe, "-o", tmp_path / "cal.json")
-    child = started("import sys\nfrom mwdcal.app.cli import main\nmain(sys.argv[1:])", *arguments)
-    time.sleep(2)
-    child.send_signal(signal.SIGTERM)
-    _, err = child.communicate(timeout=30)
-    assert child.returncode in (2, 128 + signal.SIGTERM)
-    assert err.lstrip().startswith("mwdcal: ")
-    assert "Traceback" not in err
+    ended = process(*arguments, timeout=60)
+    assert ended.returncode == 2, ended
+    assert "expected a TOML file" in ended.stderr
 
 
 def without_time(path):
@@ -287,47 +276,54 @@ def without_time(path):
     return re.sub(rb'(_?time"?[: =]+")[^"]*"', rb"\1", path.read_bytes())
 
 
-def twice(tmp_path, *arguments, suffix):
-    """The output of a command in two folders, with one and with four threads."""
-    found = []
+SEVERAL = """
+import sys
+from mwdcal.app.cli import main
+for suffix in {suffixes}:
+    try:
+        main([*sys.argv[1:], "out" + suffix])
+    except SystemExit as stop:
+        assert not stop.code, stop
+"""
+
+
+def twice(tmp_path, *arguments, suffixes):
+    """The folders of a command's outputs, with one and with four threads."""
+    folders = []
     for threads in ("1", "4"):
         folder = tmp_path / threads
         folder.mkdir(exist_ok=True)
         names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
         environment = {**os.environ, **dict.fromkeys(names, threads), "PYTHONHASHSEED": threads}
-        done = process(*arguments, f"out{suffix}", cwd=folder, env=environment)
+        command = [sys.executable, "-c", SEVERAL.format(suffixes=suffixes), *map(str, arguments)]
+        done = subprocess.run(command, capture_output=True, cwd=folder, env=environment)
         assert done.returncode == 0, done
-        found.append(folder / f"out{suffix}")
-    return found
+        folders.append(folder)
+    return folders
 
 
-def test_the_same_input_gives_the_same_calibration(tmp_path):
-    first, second = twice(tmp_path, *CALIBRATE, suffix=".json")
-    assert without_time(first) == without_time(second)
-    left, right = (json.loads(p.read_bytes()) for p in (first, second))
-    assert {k for k in left if left[k] != right[k]} <= {"time"}
-
-
-@pytest.mark.parametrize("suffix", [".csv", ".parquet", ".xlsx"])
-def test_the_same_input_gives_the_same_corrected_readings(tmp_path, suffix):
-    if suffix == ".parquet":
-        pytest.importorskip("pyarrow")
-    if suffix == ".xlsx":
-        pytest.importorskip("openpyxl")
+def test_the_same_input_gives_the_same_corrected_readings(tmp_path):
+    pytest.importorskip("pyarrow")
+    pytest.importorskip("openpyxl")
     assert mwdcal(*CALIBRATE, tmp_path / "cal.json").code == 0
-    run = EXAMPLE / "rolltest.csv"
-    first, second = twice(tmp_path, "apply", tmp_path / "cal.json", run, "-o", suffix=suffix)
-    assert first.read_bytes() == second.read_bytes()
+    arguments = ("apply", tmp_path / "cal.json", EXAMPLE / "rolltest.csv", "-o")
+    suffixes = (".csv", ".parquet", ".xlsx")
+    first, second = twice(tmp_path, *arguments, suffixes=suffixes)
+    for suffix in suffixes:
+        ours, theirs = (folder / f"out{suffix}" for folder in (first, second))
+        assert ours.read_bytes() == theirs.read_bytes(), suffix
 
 
-def test_the_same_input_gives_the_same_report(tmp_path):
+def test_the_same_input_gives_the_same_calibration_and_report(tmp_path):
     pytest.importorskip("mwdcal.app.pages.report")
-    arguments = (*CALIBRATE, "cal.json", "--report")
-    first, second = twice(tmp_path, *arguments, suffix=".html")
-    times = {json.loads((p.parent / "cal.json").read_bytes())["time"] for p in (first, second)}
-    texts = []
-    for path in (first, second):
-        text = path.read_text("utf-8")
+    folders = twice(tmp_path, *CALIBRATE, "cal.json", "--report", suffixes=(".html",))
+    first, second = (folder / "cal.json" for folder in folders)
+    assert without_time(first) == without_time(second)
+    left, right = (json.loads(path.read_bytes()) for path in (first, second))
+    assert {k for k in left if left[k] != right[k]} <= {"time"}
+    times, texts = {left["time"], right["time"]}, []
+    for folder in folders:
+        text = (folder / "out.html").read_text("utf-8")
         for stamp in times:
             minute = stamp[:16].replace("T", " ")
             in_style = minute[11:].replace(":", r"\3a ")  # the page footer, escaped for CSS

@@ -304,6 +304,7 @@ def test_a_run_that_nothing_can_calibrate():
     assert "every method refused: " in command.text(found)
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_a_failing_part_is_counted_and_its_method_not_preferred(monkeypatch):
     original = module.fit
 
@@ -472,6 +473,7 @@ def test_ratios_beyond_the_axis_have_their_value_at_its_edge(whole, method):
     assert separate(figure) == []
 
 
+@pytest.mark.usefixtures("without_layout")
 def test_parameters_beyond_the_axis_have_an_arrow_and_the_largest_its_value(whole):
     figures = pytest.importorskip("mwdcal.app.pages.comparison")
     rows = list(whole.rows)

@@ -247,6 +247,7 @@ def test_errors_by_temperature_have_the_mean_of_each_soak():
         np.testing.assert_allclose(means[:, 1], [np.mean(errors[t]) for t in sorted(errors)])
 
 
+@pytest.mark.usefixtures("without_layout")
 def test_without_temperature_nothing_is_drawn_against_it():
     for name in ("temperature", "accuracy_over_temperature"):
         with pytest.raises(InputError, match="no temperature terms"):
@@ -258,6 +259,7 @@ def test_without_temperature_nothing_is_drawn_against_it():
         assert f'id="{key}-' not in page
 
 
+@pytest.mark.usefixtures("without_layout")
 def test_a_thermal_report_has_all_figures_against_temperature():
     page = render(heated())
     for key in ("temperature", "temperature-errors", "accuracy-temperature"):
@@ -456,6 +458,7 @@ def test_a_simulated_roll_test_is_labelled_as_one():
     assert "Simulated data." in page[page.index('id="verification"') : page.index('id="errors"')]
 
 
+@pytest.mark.usefixtures("without_layout")
 def test_labels_of_the_roll_test_are_escaped():
     result = verdict("one")
     rows = [msgspec.structs.replace(row, station="<script>") for row in result.station_rows]

@@ -9,7 +9,6 @@ import re
 import shutil
 from functools import cached_property
 from importlib.resources import files
-from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -217,8 +216,9 @@ class Seen:
         faults += [f"blank: sheet {number}" for number, sheet in enumerate(paper, 1) if sheet.blank]
         return faults + [f"{len(paper)} sheets"] * (len(paper) > MOST_SHEETS)
 
-    def light(self, selector):
+    def light(self, selector, *view):
         """Mean lightness of an element, 0 to 255."""
+        self.look(*view)
         shot = self.page.locator(selector).first.screenshot()
         return float(np.mean(Image.open(io.BytesIO(shot)).convert("L")))
 
@@ -256,20 +256,35 @@ def written(folder, monkeypatch):
 @pytest.mark.parametrize("name", PAGES)
 def test_a_page_can_be_read_by_everybody(written, open_page, name):
     seen = open_page(written(name))
-    views = [*product(WIDTHS, SCHEMES)]
+    views = [*zip(WIDTHS, SCHEMES, strict=True)]
     faults = {"printed": seen.paper_faults()}
-    for view in views:
+    if seen.page.locator("figure").count():
+        light, dark = (seen.light("figure", WIDTHS[0], scheme) for scheme in SCHEMES)
+        assert light > 200, light
+        assert dark < 90, dark
+    for view in views:  # a place does not depend on the colours
         seen.look(*view)
         faults[view] = seen.faults()
-        if view[0] == WIDTHS[0] and seen.page.locator("figure").count():
-            light = seen.light("figure")
-            assert light > 200 if view[1] == "light" else light < 90, (view, light)
     seen.shorten()
-    for view in zip(WIDTHS, SCHEMES, strict=True):
+    for view in views:
         seen.look(*view)
         faults[view] += seen.accessibility_faults()
     assert faults == {"printed": [], **{view: [] for view in views}}
     assert seen.complaints == []
+
+
+def test_only_colours_change_in_the_dark():
+    """So faults of places are looked for in one scheme at each width."""
+    style = (files("mwdcal.app.pages") / "templates" / "style.css").read_text("utf-8")
+    _, dark, _ = re.split(
+        r"@media \(prefers-color-scheme: dark\) \{(.*?\n)\}\n", style, flags=re.DOTALL
+    )
+    assert "prefers-color-scheme" not in style.replace(dark, "", 1).partition("dark) {")[2]
+    declared = re.findall(r"([\w-]+):\s*([^;]+);", dark)
+    assert len(declared) > 10
+    for name, value in declared:
+        is_colour = name.startswith("--") and re.fullmatch(r"#[0-9a-f]{3,6}", value)
+        assert is_colour or name in ("filter", "mix-blend-mode", "color-scheme"), name
 
 
 def test_a_page_says_the_same_without_its_script(written, open_page):

@@ -205,7 +205,7 @@ def carried(count):
     }
 
 
-@pytest.mark.parametrize("count", [1, 5, 1000, pytest.param(300_000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [1, 5, 1000, pytest.param(100_000, marks=pytest.mark.slow)])
 def test_what_is_carried_along_is_untouched_at_any_length(tmp_path, cold, count):
     own = carried(count)
     schema = arrow.schema([arrow.field(n, c.type, nullable=n != "id") for n, c in own.items()])
@@ -527,7 +527,7 @@ ENDED = {"SIGINT": "interrupted", "SIGTERM": "terminated", "SIGHUP": "terminated
 @pytest.mark.parametrize(("name", "word"), ENDED.items())
 def test_ended_in_the_middle_of_a_long_table(tmp_path, warm, name, word):
     number = getattr(signal, name)
-    write_parquet(tmp_path / "log.parquet", log(250_000))
+    write_parquet(tmp_path / "log.parquet", log(70_000))
     child = caught_writing(tmp_path, warm[0])
     child.send_signal(number)
     _, err = child.communicate(timeout=30)
@@ -762,11 +762,15 @@ def test_progress_begins_with_what_was_told_before_it_was_seen(monkeypatch):
 
 
 @pytest.mark.slow
-def test_memory_does_not_grow_with_the_table(tmp_path, warm):
+@pytest.mark.parametrize(
+    ("parts", "most"), [(6, 0.4e9), pytest.param(12, 0.6e9, marks=pytest.mark.study)]
+)
+def test_memory_does_not_grow_with_the_table(tmp_path, warm, parts, most):
+    """The corrected table alone would take 0.35e9 bytes, or 0.7e9; the larger one meets the compiled loops."""
     resource = pytest.importorskip("resource")
     part = arrow.table(log(250_000, low=10, high=40))
     with parquet.ParquetWriter(tmp_path / "log.parquet", part.schema) as writer:
-        for _ in range(12):
+        for _ in range(parts):
             writer.write_table(part)
     # from a small process: the peak of a command begins with the size of who starts it
     launch = (
@@ -782,10 +786,10 @@ def test_memory_does_not_grow_with_the_table(tmp_path, warm):
         text=True,
         check=True,
     )
-    assert parquet.read_metadata(out).num_rows == 3_000_000
+    assert parquet.read_metadata(out).num_rows == parts * part.num_rows
     unit = 1 if sys.platform == "darwin" else 1024
     peak = int(done.stderr.split()[-1]) * unit
-    assert peak < 0.6e9
+    assert peak < most
     assert resource is not None
 
 

@@ -61,13 +61,21 @@ def _raised_again(received: list[tuple[int, float]]) -> Iterator[None]:
             before(lost)
             return
         received.clear()
-        Timer(AGAIN, signal.raise_signal, lost.exc_value.args).start()
+        Timer(AGAIN, _signal_main_thread, lost.exc_value.args).start()
 
     sys.unraisablehook = hook
     try:
         yield
     finally:
         sys.unraisablehook = before
+
+
+def _signal_main_thread(number: int) -> None:
+    """A signal that also ends a wait of the main thread, where the system can send it there."""
+    if sys.platform == "win32":
+        signal.raise_signal(number)
+    else:
+        signal.pthread_kill(main_thread().ident or 0, number)
 
 
 @contextmanager

@@ -402,7 +402,7 @@ def _louder(problem: Problem, factor: Array) -> Problem:
     evidence = problem.evidence
     sd = {n: s * factor if n in ANGLES else s for n, s in evidence.sd.items()}
     scatter = {n: s * factor for n, s in evidence.scatter.items()}
-    return replace(problem, triads=triads, evidence=replace(evidence, sd=sd, scatter=scatter))
+    return problem.of_other_noise(triads, replace(evidence, sd=sd, scatter=scatter))
 
 
 def _rescaled(problem: Problem, scale: Array) -> Problem:
@@ -412,4 +412,4 @@ def _rescaled(problem: Problem, scale: Array) -> Problem:
         t if t.declared else replace(t, sd=np.maximum(t.sd * factor, LEAST_NOISE * _size(t.raw)))
         for t, factor in zip(problem.triads, factors, strict=True)
     )
-    return replace(problem, triads=triads)
+    return problem.of_other_noise(triads, problem.evidence)

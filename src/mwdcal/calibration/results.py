@@ -291,7 +291,7 @@ def triad_singular_values(result: Fit, index: int) -> Array:
 
     Largest first, as shares of it.
     """
-    reduced, _, _ = result.problem.linear(result.state, geometry=True).normal.reduced()
+    reduced, _, _ = result.problem.linear(result.state, geometry=True).normal.reduced
     norms, where = result.analysis.determined.norms, result.problem.slices()[index]
     scaled = reduced / outer(norms)
     other = np.ones(norms.shape[-1], bool)

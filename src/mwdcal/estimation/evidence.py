@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -67,14 +68,47 @@ class Evidence:
         """Where a reference value is given (B, n)."""
         return ~np.isnan(self.known[name])
 
-    @property
+    @cached_property
+    def known_or_zero(self) -> dict[str, Array]:
+        """The reference values, zero where unknown."""
+        return {name: np.nan_to_num(values) for name, values in self.known.items()}
+
+    @cached_property
     def members(self) -> Array:
         """Membership (B, n, k) of the k groups, as zeros and ones."""
         numbers = np.arange(int(self.group.max(initial=-1)) + 1)
         return np.asarray(self.group[..., None] == numbers, float)
 
-    def shared(self, name: str) -> Array:
-        """Membership (B, n, k) of the groups for which an angle is a shared unknown."""
-        members = self.members
-        given = np.einsum("bnk,bn->bk", members, self.is_known(name))
-        return np.asarray(members * (given == 0)[:, None, :])
+    @cached_property
+    def shared(self) -> dict[str, Array]:
+        """Membership (B, n, k) of the groups for which the inclination, or azimuth, is a shared unknown."""
+        unknown = {
+            name: np.einsum("bnk,bn->bk", self.members, self.is_known(name)) == 0
+            for name in ANGLES[:2]
+        }
+        return {name: self.members * groups[:, None, :] for name, groups in unknown.items()}
+
+    @cached_property
+    def free(self) -> Bools:
+        """Stations (B, n) of which neither direction nor toolface is known."""
+        given = [self.is_known(name) for name in ANGLES]
+        return np.asarray(~np.any(given, 0) & (self.group < 0))
+
+    @cached_property
+    def turn_sd(self) -> Array:
+        """Standard uncertainties (B, n, 3) of the angles that each station has for itself."""
+        return self._turn_sd(self.sd)
+
+    @cached_property
+    def exact_turn_sd(self) -> Array:
+        """The same where every reference is exact."""
+        return self._turn_sd(dict.fromkeys(ANGLES, np.zeros(())))
+
+    def _turn_sd(self, stated: Mapping[str, Array]) -> Array:
+        alone = [np.where(self._tied(name), 0.0, UNKNOWN) for name in ANGLES]
+        given = zip(ANGLES, alone, strict=True)
+        return np.stack([np.where(self.is_known(n), stated[n], sd) for n, sd in given], -1)
+
+    def _tied(self, name: str) -> Bools:
+        """Where an angle (B, n) that is unknown is that of the station's group."""
+        return (self.group >= 0) & (name != "toolface")

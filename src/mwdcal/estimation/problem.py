@@ -25,11 +25,10 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from mwdcal.estimation.evidence import ANGLES, EARTH, STAND, STAND_ERRORS, UNKNOWN, Evidence
+from mwdcal.estimation.evidence import EARTH, STAND, STAND_ERRORS, UNKNOWN, Evidence
 from mwdcal.estimation.solvers import Linear
 from mwdcal.geometry.vectors import (
     Array,
-    Bools,
     earth_field,
     earth_gravity,
     eigen,
@@ -46,6 +45,8 @@ INFORMED = 1e-13
 """A prior says something of a direction if its precision exceeds this share of the largest."""
 GEOMETRIC_NOISE = 1e-4
 """Noise, as a share of the field, at which rank is counted whatever the actual noise."""
+NOISELESS = ("state", "predictions", "linear True")
+"""What a problem's memo has that no noise enters."""
 
 
 @dataclass(frozen=True)
@@ -121,6 +122,12 @@ class Problem:
     prior: Prior
     memo: dict[str, Any] = field(init=False, repr=False, compare=False, default_factory=dict)
 
+    def of_other_noise(self, triads: tuple[Triad, ...], evidence: Evidence) -> Problem:
+        """The same with other uncertainties alone: what does not depend on them is kept."""
+        other = replace(self, triads=triads, evidence=evidence)
+        other.memo.update({name: self.memo[name] for name in NOISELESS if name in self.memo})
+        return other
+
     def slices(self) -> list[slice]:
         """Where each triad's parameters lie."""
         ends = np.cumsum([0] + [t.model.size for t in self.triads])
@@ -136,7 +143,7 @@ class Problem:
 
     def constant(self, state: State, name: str) -> Array:
         """Value (B, n) of gravity, field or dip at each station."""
-        value = np.nan_to_num(self.evidence.known[name])
+        value = self.evidence.known_or_zero[name]
         for index, constant in enumerate(self.evidence.constants):
             if constant.name == name:
                 value = value + constant.mask * state.constants[:, index, None]
@@ -146,7 +153,10 @@ class Problem:
 
     def targets(self, state: State) -> list[Array]:
         """Vectors (B, n, 3) that perfect triads would read: gravity, then the field."""
-        gravity, field, dip = (self.constant(state, c) for c in EARTH)
+        return self._seen(state, *(self.constant(state, c) for c in EARTH))
+
+    @staticmethod
+    def _seen(state: State, gravity: Array, field: Array, dip: Array) -> list[Array]:
         earth = earth_gravity(gravity), earth_field(field, dip)
         return [np.einsum("bnij,bnj->bni", state.attitude, vector) for vector in earth]
 
@@ -173,7 +183,11 @@ class Problem:
         )
         result = []
         for triad, where, target, change in zip(
-            self.triads, self.slices(), self.targets(state), changes, strict=False
+            self.triads,
+            self.slices(),
+            self._seen(state, gravity, field, dip),
+            changes,
+            strict=False,
         ):
             params = state.params[:, where]
             fields = triad.model.fields(params, triad.raw, self.temperature)
@@ -243,7 +257,7 @@ class Problem:
         columns = {}
         for name in self.evidence.scatter:
             if name == "direction":
-                sharing = self.evidence.shared("inclination").sum(-1)
+                sharing = self.evidence.shared["inclination"].sum(-1)
                 columns[name] = turns[..., :2] * sharing[..., None, None]
                 continue
             size = 1.0 if name == "dip" else self.constant(state, name)[..., None, None]
@@ -307,22 +321,17 @@ class Problem:
         precision[:, :p, :p] = known
         return precision, pull
 
-    def _free(self) -> Bools:
-        """Stations (B, n) of which neither direction nor toolface is known."""
-        loose = ~self.evidence.is_known("inclination") & ~self.evidence.is_known("azimuth")
-        return loose & ~self.evidence.is_known("toolface") & (self.evidence.group < 0)
-
     def _private_turns(self, state: State, geometry: bool) -> Array:
         """Axes (B, n, 3, 3), as columns, of the station's private turns times their σ."""
         across = np.einsum("bnij,bnj->bni", state.attitude, self._across(state))
         natural = np.stack([across, state.attitude[..., :, 2], np.zeros_like(across)], -1)
         natural[..., 2, 2] = 1.0
-        for index, name in enumerate(ANGLES):
-            stated = 0.0 if geometry else self.evidence.sd[name]
-            tied = (self.evidence.group >= 0) & (name != "toolface")
-            sd = np.where(self.evidence.is_known(name), stated, np.where(tied, 0.0, UNKNOWN))
-            natural[..., index] *= sd[..., None]
-        return np.where(self._free()[..., None, None], UNKNOWN * np.eye(3), natural)
+        sd = self.evidence.exact_turn_sd if geometry else self.evidence.turn_sd
+        natural *= sd[..., None, :]
+        free = self.evidence.free
+        if not free.any():
+            return natural
+        return np.where(free[..., None, None], UNKNOWN * np.eye(3), natural)
 
     def _across(self, state: State) -> Array:
         """Earth axis (B, n, 3) about which a station inclines: horizontal, across its azimuth.
@@ -336,7 +345,7 @@ class Problem:
         by_toolface = np.isnan(known["azimuth"]) & ~np.isnan(known["toolface"])
         if not by_toolface.any():
             return across
-        toolface = np.nan_to_num(known["toolface"])
+        toolface = self.evidence.known_or_zero["toolface"]
         fixed = np.stack([np.cos(toolface), -np.sin(toolface), np.zeros_like(toolface)], -1)
         turned = np.einsum("bnij,bni->bnj", state.attitude, fixed)
         return np.where(by_toolface[..., None], turned, across)
@@ -365,10 +374,12 @@ class Problem:
 
     def _group_turns(self, state: State, turns: Array) -> list[Array]:
         """Columns (B, n, m, k) of both shared turns of each group."""
+        if not self.evidence.members.shape[-1]:
+            return []
         columns = []
         for name, axis in self._group_axes(state).items():
             tool = np.einsum("bnij,bkj->bnik", state.attitude, axis)
-            columns.append(turns @ tool * self.evidence.shared(name)[..., None, :])
+            columns.append(turns @ tool * self.evidence.shared[name][..., None, :])
         return columns
 
     def move(self, state: State, linear: Linear, step: Array) -> State:
@@ -398,7 +409,7 @@ class Problem:
             return attitude
         axes, parts = self._group_axes(state).items(), np.split(turns, 2, -1)
         for (name, axis), turn in zip(axes, parts, strict=True):
-            vector = np.einsum("bnk,bk,bki->bni", self.evidence.shared(name), turn, axis)
+            vector = np.einsum("bnk,bk,bki->bni", self.evidence.shared[name], turn, axis)
             attitude = attitude @ rotation(vector)
         return attitude
 
@@ -411,4 +422,4 @@ class Problem:
         about_down = np.zeros_like(turn[..., 0])
         about_down[..., 2] = np.einsum("bni,bni->bn", turn[..., 1], state.attitude[..., :, 2])
         natural = rotation(turn[..., 2]) @ rotation(turn[..., 0]) @ attitude @ rotation(about_down)
-        return np.where(self._free()[..., None, None], free, natural)
+        return np.where(self.evidence.free[..., None, None], free, natural)

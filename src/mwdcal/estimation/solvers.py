@@ -105,7 +105,8 @@ class Linear:
         """Its normal equations: the sum over stations, priors included."""
         columns = np.concatenate([self.design, self.residual[..., None]], -1)
         weighed = self.weigh(columns)
-        whole = np.einsum("...nmi,...nmj->...ij", columns, weighed, optimize=True)
+        rows = (*columns.shape[:-3], -1, columns.shape[-1])
+        whole = columns.reshape(rows).mT @ weighed.reshape(rows)
         pulled = (self.prior @ self.pull[..., None])[..., 0]
         information = whole[..., :-1, :-1] + self.prior
         cost = whole[..., -1, -1] + np.sum(self.pull * pulled, -1)
@@ -114,7 +115,7 @@ class Linear:
     @cached_property
     def determined(self) -> Determined:
         """Which directions it determines, if it is of the geometry."""
-        return Determined.by(self.normal.reduced()[0], self.norms)
+        return Determined.by(self.normal.reduced[0], self.norms)
 
     def cost(self, at: Linear) -> Array:
         """ρᵀC⁻¹ρ over all stations, and the prior's part (B,), of residuals `at` a state; C is ours."""
@@ -156,6 +157,12 @@ class Normal:
     cost: Array
     size: int
 
+    @cached_property
+    def among_shared(self) -> Array:
+        """H_ss⁻¹ (B, s, s): inverse of the information of the shared unknowns."""
+        return inverse(self.information[..., self.size :, self.size :])
+
+    @cached_property
     def reduced(self) -> tuple[Array, Array, Array]:
         """Information (B, p, p) and gradient (B, p) of the parameters, and the elimination.
 
@@ -164,7 +171,7 @@ class Normal:
         """
         p = self.size
         block, cross = self.information[..., :p, :p], self.information[..., p:, :p]
-        eliminate = inverse(self.information[..., p:, p:]) @ cross
+        eliminate = self.among_shared @ cross
         reduced = block - cross.mT @ eliminate
         offset = eliminate.mT @ self.gradient[..., p:, None]
         return reduced, self.gradient[..., :p] - offset[..., 0], eliminate
@@ -303,10 +310,9 @@ class _Descent:
 
 
 def _step(normal: Normal, determined: Determined, damping: Array | float = 0.0) -> Array:
-    reduced, gradient, eliminate = normal.reduced()
+    reduced, gradient, eliminate = normal.reduced
     step = -(determined.inverse(reduced, damping) @ gradient[..., None])
-    p = normal.size
-    shared = inverse(normal.information[..., p:, p:]) @ normal.gradient[..., p:, None]
+    shared = normal.among_shared @ normal.gradient[..., normal.size :, None]
     return np.concatenate([step, -shared - eliminate @ step], -2)[..., 0]
 
 

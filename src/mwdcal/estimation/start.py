@@ -200,7 +200,7 @@ def _share(problem: Problem, angles: dict[str, Array]) -> dict[str, Array]:
         "inclination": np.arctan2(np.hypot(mean[..., 0], mean[..., 1]), mean[..., 2]),
         "azimuth": np.arctan2(mean[..., 1], mean[..., 0]),
     }
-    shared = {n: np.where(evidence.shared(n).sum(-1) > 0, m, angles[n]) for n, m in means.items()}
+    shared = {n: np.where(evidence.shared[n].sum(-1) > 0, m, angles[n]) for n, m in means.items()}
     return angles | shared
 
 
@@ -221,7 +221,7 @@ def _by_toolface(
         """Sum (B, n, 3) over a station's group of fields turned back, where the angle is unknown."""
         back = tool_from_earth(inclination, np.zeros_like(inclination), angles["toolface"])
         turned = np.einsum("bnji,bnj->bni", back, field)
-        members = evidence.shared(name) * faced[..., None]
+        members = evidence.shared[name] * faced[..., None]
         total = evidence.members @ (members.mT @ turned)
         some = np.einsum("bnk,bk->bn", evidence.members, members.sum(-2)) > 0
         alone = lone & ~evidence.is_known(name)

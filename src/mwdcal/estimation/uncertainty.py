@@ -130,7 +130,7 @@ def determined_apart(problem: Problem, state: State, known: dict[int, Array]) ->
     much its own evidence would say of it.
     """
     linear = problem.linear(state, geometry=True)
-    whole, _, _ = linear.normal.reduced()
+    whole, _, _ = linear.normal.reduced
     slices, information = problem.slices(), np.zeros_like(whole)
     for index, where in enumerate(slices):
         fitted = known[index] / GEOMETRIC_NOISE**2 if index in known else whole[:, where, where]
@@ -218,7 +218,7 @@ def unweighted_pulls(problem: Problem, even: Problem, state: State) -> dict[int,
     """Pulls (B, n, p_t, 3) of least squares with the noise of `even`, all references being exact."""
     linear = even.linear(state)
     determined = Determined.of(even, state)
-    reduced, _, eliminate = linear.normal.reduced()
+    reduced, _, eliminate = linear.normal.reduced
     p = linear.size
     rows = linear.design[..., :p] - linear.design[..., p:] @ eliminate[:, None]
     moved = -determined.inverse(reduced)[:, None] @ rows.mT
@@ -240,7 +240,7 @@ def _inverse_where_known(information: Array) -> Array:
 def whole_covariance(linear: Linear, determined: Determined) -> Array:
     """Covariance (B, p + s, p + s) of parameters and shared unknowns."""
     normal = linear.normal
-    reduced, _, eliminate = normal.reduced()
+    reduced, _, eliminate = normal.reduced
     params = determined.inverse(reduced)
     cross = -params @ eliminate.mT
     p = normal.size
@@ -469,7 +469,7 @@ def with_scatter(problem: Problem, state: State, ratios: dict[str, Array]) -> Pr
         if name in scatter:
             noise = np.sqrt(np.mean(triad.sd**2, (1, 2))) / size
             scatter[name] = np.minimum(scatter[name], np.maximum(noise, LEAST_SCATTER)[:, None])
-    return replace(problem, evidence=replace(problem.evidence, scatter=scatter))
+    return problem.of_other_noise(problem.triads, replace(problem.evidence, scatter=scatter))
 
 
 @np.errstate(invalid="ignore", divide="ignore", over="ignore")

@@ -29,7 +29,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mwdcal.geometry.vectors import Array, Bools, Ints
+from mwdcal.geometry.vectors import Array, Bools, Ints, outer
 from mwdcal.logs.allan import Moments, deviation, drift_variance, expected, freedom
 
 FEWEST_FACTORS = 6
@@ -53,8 +53,6 @@ KEPT_VARIANCE = 1e-9
 """Share of its variance that a term keeps where all terms are absent."""
 ROUNDED_EIGENVALUE = 1e-4
 """Eigenvalue of the correlation between averaging factors below which rounding decides."""
-SUBSETS = [s for size in range(1, 5) for s in combinations(range(4), size)]
-"""Which terms are present."""
 
 
 class NoiseTerms(NamedTuple):
@@ -232,7 +230,8 @@ def _misfit(used: _Used, bounded: Array) -> tuple[Array, Ints]:
 
 def _joint(unit: Array, squares: Array) -> Array:
     """Covariance (B, m, m) of the variances under noise of these squares (B, 4)."""
-    return np.asarray(np.einsum("mnac,ba,bc->bmn", unit, squares, squares, optimize=True))
+    products = outer(squares).reshape(len(squares), -1)
+    return (products @ unit.reshape(-1, products.shape[-1]).T).reshape(-1, *unit.shape[:2])
 
 
 def _whitening(unit: Array, squares: Array) -> Array:
@@ -253,18 +252,26 @@ def _inverse(design: Array) -> Array:
 def _nonnegative(design: Array, data: Array, present: tuple[int, ...]) -> Array:
     """Least-squares solution (B, 4) without negative entries of design (B, m, 4) · x = data (B, m).
 
-    The best of all choices of entries, among those `present`, that are not zero.
+    The best of all choices of entries, among those `present`, that are not zero. The triangle of the
+    design, as turned as the data, has the same solutions.
     """
+    turn, triangle = np.linalg.qr(design)
+    data = np.einsum("bmj,bm->bj", turn, data)
     best = np.zeros((len(data), 4))
     cost = np.sum(data**2, -1)
-    for subset in (s for s in SUBSETS if set(s) <= set(present)):
-        part = design[..., subset]
-        solution = np.einsum("bjm,bm->bj", _inverse(part), data)
-        rest = np.sum((data - np.einsum("bmj,bj->bm", part, solution)) ** 2, -1)
-        better = (solution >= 0).all(-1) & (rest < cost)
-        cost = np.where(better, rest, cost)
+    for size in range(1, len(present) + 1):
+        subsets = np.array(list(combinations(present, size)))
+        parts = np.moveaxis(triangle[..., subsets], -2, -3)
+        solutions = np.einsum("bsjm,bm->bsj", _inverse(parts), data)
+        fitted = np.einsum("bsmj,bsj->bsm", parts, solutions)
+        rest = np.sum((data[:, None] - fitted) ** 2, -1)
+        rest = np.where((solutions >= 0).all(-1), rest, np.inf)
+        least = np.argmin(rest, -1)
+        better = np.flatnonzero(rest.min(-1) < cost)
+        chosen = least[better]
+        cost[better] = rest[better, chosen]
         best[better] = 0.0
-        best[np.ix_(better, subset)] = solution[better]
+        best[better[:, None], subsets[chosen]] = solutions[better, chosen]
     return best
 
 

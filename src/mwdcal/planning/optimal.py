@@ -89,14 +89,15 @@ class Design:
         any others could still gain over them is bounded by the steepest slope (Kiefer and Wolfowitz).
         """
         information, count = self.information, np.count_nonzero(self.members)
-        reached = _log_det(information, self.members.astype(np.float64))
-        weights = np.full(information.count, count / information.count)
         size, bound = information.size, np.inf
+        reached = _log_det(information.of(self.members.astype(np.float64)), size)
+        weights = np.full(information.count, count / information.count)
         for _ in range(WEIGHT_STEPS):
-            slopes = _slopes(information, weights)
+            whole = information.of(weights)
+            slopes = _slopes(information, whole)
             mean = float(weights @ slopes) / count
             gain = count * (float(slopes.max()) - mean)
-            bound = min(bound, _log_det(information, weights) + gain)
+            bound = min(bound, _log_det(whole, size) + gain)
             if gain < CLOSE * size:
                 break
             weights = weights * slopes / mean
@@ -177,18 +178,17 @@ def _log_gain(rows: Array, whole: Array) -> Array:
     return np.asarray(np.linalg.slogdet(inner)[1])
 
 
-def _log_det(information: Information, weights: Array) -> float:
-    """Log det of the parameters' information, what is shared being eliminated."""
-    whole, size = information.of(weights), information.size
+def _log_det(whole: Array, size: int) -> float:
+    """Log det of the parameters' information, what is shared being eliminated from the `whole` (k, k)."""
     return float(np.linalg.slogdet(whole)[1] - np.linalg.slogdet(whole[size:, size:])[1])
 
 
-def _slopes(information: Information, weights: Array) -> Array:
-    """Change (n,) of `_log_det` by the weight of each candidate."""
-    whole, size, rows = information.of(weights), information.size, information.rows
-    slopes = np.einsum("nmi,ij,nmj->n", rows, inverse(whole), rows, optimize=True)
-    shared = rows[..., size:]
-    if shared.shape[-1]:
-        back = inverse(whole[size:, size:])
-        slopes = slopes - np.einsum("nmi,ij,nmj->n", shared, back, shared, optimize=True)
-    return np.asarray(slopes)
+def _slopes(information: Information, whole: Array) -> Array:
+    """Change (n,) of `_log_det` by the weight of each candidate, where the information is `whole` (k, k)."""
+    size, rows = information.size, information.rows
+    return _squares(rows, whole) - _squares(rows[..., size:], whole[size:, size:])
+
+
+def _squares(rows: Array, whole: Array) -> Array:
+    """Trace (n,) of R M⁻¹ Rᵀ for the rows of each candidate."""
+    return np.asarray(np.sum(rows @ inverse(whole) * rows, (-2, -1)))

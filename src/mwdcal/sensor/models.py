@@ -71,6 +71,8 @@ class Basis:
     def __call__(self, temperature: Array) -> Array:
         """Values φ_k (..., n, order + 1)."""
         scaled = (np.asarray(temperature, float) - self.middle) / self.half
+        if self.order == 0:
+            return np.asarray(scaled * 0.0 + 1.0)[..., None]
         if self.chebyshev:
             return np.asarray(np.polynomial.chebyshev.chebvander(scaled, self.order))
         return np.asarray(np.polynomial.polynomial.polyvander(scaled, self.order))
@@ -144,11 +146,13 @@ class Polynomial:
 
     def jacobian(self, params: Array, raw: Array, temperature: Array) -> Array:
         """Derivative of the field with respect to the parameters (..., n, 3, p): the basis."""
-        x = self._scaled(raw)
-        by_matrix = np.einsum("ij,...k->...ijk", np.eye(3), x)
-        one = affine_terms(by_matrix, np.broadcast_to(np.eye(3), (*x.shape[:-1], 3, 3)))
-        blocks = np.einsum("...nk,...nip->...nikp", self.basis(temperature), one)
-        result = blocks.reshape(*one.shape[:-1], self.affine)
+        x, values = self._scaled(raw), self.basis(temperature)
+        by_matrix = values[..., None] * x[..., None, :]
+        blocks = np.zeros((*by_matrix.shape[:-2], 3, values.shape[-1], 12))
+        matrix, offset = affine_parts(blocks)
+        for axis in range(3):
+            matrix[..., axis, :, axis, :], offset[..., axis, :, axis] = by_matrix, values
+        result = blocks.reshape(*blocks.shape[:-2], self.affine)
         if self.curved:
             curves = [np.eye(3) * (x**power)[..., None, :] for power in (2, 3)]
             result = np.concatenate([result, *curves], -1)

@@ -71,9 +71,8 @@ def _parts(calibration: Calibration) -> Iterator[str]:
 
 def _numbers(calibration: Calibration) -> Iterator[str]:
     """Numbers that are not finite, too large, or negative where none can be."""
-    for path, value in _floats(msgspec.to_builtins(calibration)):
-        if not abs(value) <= LARGEST:
-            yield f"'{path}' must be a finite number below {LARGEST:g}; got {value:g}"
+    for path, value in _impossible(msgspec.to_builtins(calibration)):
+        yield f"'{path}' must be a finite number below {LARGEST:g}; got {value:g}"
     for triad in calibration.triads:
         positive = {
             "noise": triad.noise,
@@ -91,16 +90,18 @@ def _numbers(calibration: Calibration) -> Iterator[str]:
             yield f"'misfit_probability' of the {triad.name} must be 0…1; got {triad.misfit_probability:g}"
 
 
-def _floats(value: Any, path: str = "") -> Iterator[tuple[str, float]]:
-    """Every number with a fraction in a document, and where it stands."""
+def _impossible(value: Any, path: str = "") -> Iterator[tuple[str, float]]:
+    """Every number with a fraction in a document that cannot be, and where it stands."""
     if isinstance(value, float):
-        yield path, value
+        if not abs(value) <= LARGEST:
+            yield path, value
     elif isinstance(value, dict):
         for key, item in value.items():
-            yield from _floats(item, f"{path}.{key}" if path else str(key))
+            yield from _impossible(item, f"{path}.{key}" if path else str(key))
     elif isinstance(value, list | tuple):
         for index, item in enumerate(value):
-            yield from _floats(item, f"{path}[{index}]")
+            if not (isinstance(item, float) and abs(item) <= LARGEST):
+                yield from _impossible(item, f"{path}[{index}]")
 
 
 def _surroundings(calibration: Calibration) -> Iterator[str]:
