@@ -505,7 +505,7 @@ def test_real_data_is_not_called_simulated(page):
 
 def test_missing_extra_says_what_to_install(whole, monkeypatch):
     monkeypatch.setitem(sys.modules, "jinja2", None)
-    with pytest.raises(InputError, match=r"install 'mwdcal\[report\]'"):
+    with pytest.raises(InputError, match=r'install "mwdcal\[report\]"'):
         render(whole)
 
 
