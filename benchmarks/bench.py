@@ -112,7 +112,7 @@ def apply(quick: bool) -> Group:
 
 def registry(quick: bool) -> Group:
     """Import, size, queries and check of a registry."""
-    return Group(text=import_module("registry").report(2_000 if quick else 100_000))
+    return Group(text=import_module("registry").everywhere(2_000 if quick else 100_000))
 
 
 OWN = {"fleet": fleet, "apply": apply, "registry": registry}

@@ -1,6 +1,6 @@
-"""The registry: import, size, queries and check at 100 000 calibrations, in a SQLite file.
+"""The registry: import, size, queries and check at 100 000 calibrations, in a SQLite file or in PostgreSQL.
 
-    python benchmarks/registry.py [--calibrations 100000]
+    python benchmarks/registry.py [--calibrations 100000] [--database postgresql://…, an empty database]
 
 Calibration files of 24 stations and 24 parameters, as `mwdcal fleet` writes them: a few hundred simulated tools are
 calibrated, and their records repeated under other serials and dates, each sealed again, so that every file is one of
@@ -113,19 +113,29 @@ def pages(registry: Registry, count: int) -> dict[str, Callable[[int], object]]:
     }
 
 
-def report(count: int = CALIBRATIONS) -> str:
-    """The section's figures as Markdown."""
+def stored(registry: Registry) -> int:
+    """Bytes of the database."""
+    with registry.reading() as connection:
+        if connection.dialect.name == "postgresql":
+            query = "SELECT pg_database_size(current_database())"
+        else:
+            query = "SELECT page_count * page_size FROM pragma_page_count(), pragma_page_size()"
+        return int(connection.exec_driver_sql(query).scalar_one())
+
+
+def report(count: int = CALIBRATIONS, database: str = "") -> str:
+    """The section's figures as Markdown; `database`: an empty one in PostgreSQL, by default a SQLite file."""
     cores = (
         len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     )
     with TemporaryDirectory() as place:
-        folder, database = Path(place), Path(place) / "tools.sqlite"
+        folder, database = Path(place), database or str(Path(place) / "tools.sqlite")
         paths = [*tables(folder, count)]
         create(database, "bench")
         with open_registry(database) as registry:
             adding = seconds(partial(imported, registry, paths, cores))
-        size = database.stat().st_size
         with open_registry(database) as registry:
+            size = stored(registry)
             times = {
                 name: [seconds(partial(page, k)) for k in range(ROUNDS)]
                 for name, page in pages(registry, count).items()
@@ -159,7 +169,18 @@ def shown(
     return "\n".join(lines)
 
 
+def everywhere(count: int = CALIBRATIONS) -> str:
+    """The figures of both databases as Markdown."""
+    from registry_support import empty_database, postgresql_server
+
+    with postgresql_server() as server:
+        other = report(count, empty_database(server))
+    return f"{report(count)}\n\nIn PostgreSQL, on the same machine:\n\n{other}"
+
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--calibrations", type=int, default=CALIBRATIONS)
-    print(report(parser.parse_args().calibrations))
+    parser.add_argument("--database", default="", help="URL of an empty PostgreSQL database")
+    arguments = parser.parse_args()
+    print(report(arguments.calibrations, arguments.database))
