@@ -72,7 +72,7 @@ class Basis:
         """Values φ_k (..., n, order + 1)."""
         scaled = (np.asarray(temperature, float) - self.middle) / self.half
         if self.order == 0:
-            return np.atleast_1d(scaled * 0.0 + 1.0)[..., None]
+            return np.asarray(scaled * 0.0 + np.ones(1))[..., None]
         if self.chebyshev:
             return np.asarray(np.polynomial.chebyshev.chebvander(scaled, self.order))
         return np.asarray(np.polynomial.polynomial.polyvander(scaled, self.order))
