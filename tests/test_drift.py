@@ -229,6 +229,7 @@ def test_the_day_of_a_calibration_is_that_of_its_run():
     assert calibration.day == date(2019, 3, 4)
     undated = with_changes(calibration, tool={"date": "4 March"}, time="2026-01-02T03:04:05+00:00")
     assert undated.day == date(2026, 1, 2)
+    assert with_changes(undated, time="20260102T030405Z").day == date(2026, 1, 2)
 
 
 # The test of change

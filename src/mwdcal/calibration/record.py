@@ -7,7 +7,7 @@ a calibration in memory and one read back give the same results.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from datetime import date
+from datetime import date, datetime
 from html import escape
 from itertools import pairwise
 from typing import Any, ClassVar
@@ -317,7 +317,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
     @property
     def day(self) -> date:
         """The day of the measurement as its run states it, else that of the fit."""
-        return stated_day(self.tool) or date.fromisoformat(self.time[: len("2026-01-31")])
+        return stated_day(self.tool) or datetime.fromisoformat(self.time).date()
 
     @property
     def reference_temperature(self) -> float:
