@@ -572,22 +572,19 @@ def test_a_pool_of_processes_writes_the_same_bytes(fleet, tmp_path):
     assert sum(large) <= 10  # of 2400 triads 2.4 exceed the noise by chance, one in a thousand
 
 
+def by_two_workers(fleet, folder):
+    """Arguments that calibrate a fleet by two workers."""
+    inputs, output = (fleet[0], "--tool", "servo"), folder / "cals.parquet"
+    return ["fleet", *inputs, "-o", output, "--workers", 2]
+
+
 @pytest.mark.slow
 def test_neither_the_command_nor_its_workers_load_pandas(fleet, tmp_path):
     seen, package = tmp_path / "seen", tmp_path / "path" / "pandas.py"
     package.parent.mkdir()
     package.write_text(f"open({str(seen)!r}, 'w').close()\nraise ImportError\n", "utf-8")
     environment = os.environ | {"PYTHONPATH": str(package.parent)}
-    command = [
-        "fleet",
-        fleet[0],
-        "-o",
-        tmp_path / "cals.parquet",
-        "--tool",
-        "servo",
-        "--workers",
-        2,
-    ]
+    command = by_two_workers(fleet, tmp_path)
     subprocess.run([*MWDCAL, *map(str, command)], env=environment, check=True, capture_output=True)
     assert not seen.exists()
     bare = [sys.executable, "-c", "import pyarrow; pyarrow.array([1.0])"]
@@ -813,16 +810,7 @@ def test_the_process_that_is_copied_has_no_thread_of_a_memory_pool(fleet, tmp_pa
         "kept.remove = count\nif __name__ == '__main__':\n    cli.main()\n"
     )
     (tmp_path / "count.py").write_text(script, "utf-8")
-    command = [
-        "fleet",
-        fleet[0],
-        "-o",
-        tmp_path / "cals.parquet",
-        "--tool",
-        "servo",
-        "--workers",
-        2,
-    ]
+    command = by_two_workers(fleet, tmp_path)
     done = subprocess.run(
         [sys.executable, "-W", "always", tmp_path / "count.py", *map(str, command)],
         capture_output=True, text=True, check=True,

@@ -22,6 +22,15 @@ from mwdcal.files.synonyms import CONVERSIONS, resembled
 from mwdcal.geometry.vectors import Array, Bools
 
 CHANNELS = {"accelerometer": ("ax", "ay", "az"), "magnetometer": ("mx", "my", "mz")}
+
+
+def channels(magnetometer: bool) -> dict[str, tuple[str, ...]]:
+    """Channels by triad of a tool with a magnetometer, or without."""
+    return {
+        kind: names for kind, names in CHANNELS.items() if magnetometer or kind == "accelerometer"
+    }
+
+
 RAW = tuple(name for triad in CHANNELS.values() for name in triad)
 
 # Metadata that changes what the numbers mean.

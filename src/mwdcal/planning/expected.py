@@ -15,7 +15,7 @@ from mwdcal.calibration.readings import HIGHEST, LEAST_TEMPERATURE_SPAN, SOAK_GA
 from mwdcal.calibration.record import Calibration, Undetermined
 from mwdcal.errors import FitError, InputError
 from mwdcal.estimation.evidence import ANGLES, EARTH
-from mwdcal.files.contract import CHANNELS, REFERENCES
+from mwdcal.files.contract import REFERENCES, channels
 from mwdcal.files.formats.table import Table
 from mwdcal.files.runs import check_references, from_readings, to_readings
 from mwdcal.geometry.vectors import Array, reference_vectors
@@ -35,7 +35,7 @@ def nominal_run(plan: Table, profile: Profile) -> tuple[Readings, Profile]:
     Raises:
         InputError: the plan does not state an attitude, or the profile not the noise of a triad.
     """
-    for kind in [*CHANNELS][: 1 + profile.has_magnetometer]:
+    for kind in channels(profile.has_magnetometer):
         if getattr(profile, kind).noise is None:
             raise InputError(
                 f"the profile '{profile.name}' does not state the noise of the {kind}, on which every "

@@ -14,11 +14,11 @@ from mwdcal.calibration.readings import CONSTANTS, SOAK_GAP
 from mwdcal.errors import InputError
 from mwdcal.estimation.evidence import ANGLES
 from mwdcal.files.contract import (
-    CHANNELS,
     COLUMNS,
     REFERENCES,
     TEMPERATURE,
     Range,
+    channels,
     check_near_misses,
 )
 from mwdcal.files.formats import table as tables
@@ -160,7 +160,7 @@ def load_measured(path: str, magnetometer: bool = True) -> Table:
         InputError: it cannot be read, or does not hold the triads of the plan.
     """
     table = tables.read(Path(path))
-    for triad, names in [*CHANNELS.items()][: 1 + magnetometer]:
+    for triad, names in channels(magnetometer).items():
         missing = [name for name in names if name not in table.columns]
         if missing:
             raise InputError(
@@ -245,12 +245,12 @@ def attitudes(plan: Table) -> Array:
 
 def run_sheet(plan: Table, magnetometer: bool = True) -> Table:
     """The run file of a plan to be filled in: its columns, and blank ones for readings and place."""
-    triads = [*CHANNELS.values()][: 1 + magnetometer]
+    raw = chain(*channels(magnetometer).values())
     head = {
         name: cells for name, cells in plan.columns.items() if name in ("station", "temperature_c")
     }
     place = [REFERENCES[name].column for name in CONSTANTS[: len(CONSTANTS) if magnetometer else 1]]
-    order = dict.fromkeys([*head, *chain(*triads), *plan.columns, *place])
+    order = dict.fromkeys([*head, *raw, *plan.columns, *place])
     return replace(
         plan, columns={n: plan.columns.get(n, np.full(plan.count, np.nan)) for n in order}
     )
