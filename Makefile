@@ -3,7 +3,7 @@
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: papers measured verification scatter drift diagnosis mutations help demo test test-quick test-studies test-oldest \
+.PHONY: papers measured verification scatter coverage drift diagnosis mutations help demo test test-quick test-studies test-oldest \
 	test-versions fuzz kills registry-stress check bench docs clean
 
 PYTHON ?= python3
@@ -111,6 +111,10 @@ papers: $(INSTALLED) ## recompute the papers and rewrite their pages and figures
 
 verification: $(INSTALLED) ## count wrong verdicts of simulated roll tests and rewrite docs/verification.md (two minutes)
 	@$(CLOCK); $(ONE_THREAD) $(BIN)/python examples/verification/verification.py
+
+coverage: $(INSTALLED) ## compare stated uncertainties with simulated errors and rewrite docs/coverage (STUDY=ladders: one page)
+	@$(CLOCK); for study in $(or $(STUDY),$(filter-out world,$(basename $(notdir $(wildcard examples/coverage/*.py))))); do \
+		$(ONE_THREAD) $(BIN)/python examples/coverage/$$study.py; done
 
 drift: $(INSTALLED) ## test for changes of simulated tools and rewrite docs/drift-tables.md (twenty minutes)
 	@$(CLOCK); $(ONE_THREAD) $(BIN)/python examples/drift/drift.py

@@ -38,7 +38,7 @@ FLOORS = (
 ARRAY_ROOMS = ("geometry", "estimation", "sensor.models")
 
 MAX_ROOMS = 20
-MAX_MODULES = 12
+MAX_MODULES = 16
 MAX_FUNCTION_LINES = 50
 MAX_MODULE_LINES = 400
 
