@@ -340,8 +340,9 @@ def test_uncertainties_without_any_weight_are_refused(record, kind):
     """Settings of the stand so uncertain that their weights are zero: no curve, and no verdict."""
     sd = {**NOISE, "inclination": np.full(12, 1e200)}
     limits = Limits(name="i", **{kind: Bounds(inclination_deg=0.1)})
+    run = msgspec_replace(roll(45, sd=sd), settings="per-station")
     with pytest.raises(InputError, match=r"roll.csv: .* too far apart to judge its inclination"):
-        verify(record, roll(45, sd=sd), limits)
+        verify(record, run, limits)
 
 
 @pytest.mark.parametrize("ratio", [1e2, 1e3, 1e7, 1e9])
@@ -353,7 +354,7 @@ def test_uncertainties_too_far_apart_are_refused_and_others_judged(record, ratio
     sd = {**NOISE, "inclination": np.where(np.arange(12) % 3 == 0, 1.0, ratio) * 1e-4}
     limits = Limits(name="i", error=Bounds(inclination_deg=0.1))
     known = {**roll(45).known, "inclination": np.full(12, 45 * DEG)}
-    run = msgspec_replace(roll(45, sd=sd), known=known)
+    run = msgspec_replace(roll(45, sd=sd), known=known, settings="per-station")
     if ratio > 1e4:
         with pytest.raises(InputError, match="too far apart to judge its inclination"):
             verify(record, run, limits)

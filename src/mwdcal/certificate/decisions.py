@@ -7,21 +7,18 @@ Reference: JCGM 106:2012, 7 and 8; ILAC-G8:09/2019, 4.2 and 5.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias
+
+from msgspec import UNSET
 
 from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.certificate.document import ConformityTest, LimitDecision, Quantity
 from mwdcal.certificate.laboratory import DecisionRule
 from mwdcal.files.documents import Verification
 from mwdcal.geometry.vectors import Array, ArrayLike
-from mwdcal.use.verification import (
-    COVERAGE,
-    RULES,
-    SPREAD_OF,
-    VerdictRow,
-    fewest_degrees_of_freedom,
-)
+from mwdcal.use.risk import COVERAGE, probability_within
+from mwdcal.use.verification import RULES, VerdictRow, fewest_degrees_of_freedom, guard
 
 When: TypeAlias = Literal["as found", "as left"]
 """When a roll test was made: before or after the adjustment."""
@@ -49,64 +46,55 @@ def student_factor(freedom: ArrayLike) -> Array:
     return np.asarray(stdtrit(np.maximum(freedom, 1.0), (1 + PROBABILITY) / 2))
 
 
-def probability_within(value: float, sd: float, limit: float, two_sided: bool) -> float:
-    """Probability that the true value is at most `limit`; `two_sided`: and at least its negative.
-
-    Definition: Φ((limit - value) / sd), for two sides less Φ((-limit - value) / sd). Singular: without
-    uncertainty 0 or 1. Reference: JCGM 106:2012, 7.2 and 7.4.
-    """
-    from scipy.special import ndtr
-
-    if sd == 0:
-        return float(value <= limit)
-    below = ndtr((-limit - value) / sd) if two_sided else 0.0
-    return float(ndtr((limit - value) / sd) - below)
-
-
 @dataclass(frozen=True)
 class Rule:
-    """A rule of decision: a guard band of `guard` standard uncertainties, none for simple acceptance."""
+    """A rule of decision: a guard band of some expanded uncertainties, none for simple acceptance.
+
+    `guard_factor` is in units of U, or None for that of `verify`. `coverage`: factor of the U of values that
+    do not state degrees of freedom of their own.
+    """
 
     name: Literal["simple", "guarded"]
     text: str
-    guard: float
+    guard_factor: float | None
     coverage: float
 
+    def factors(self, row: VerdictRow) -> tuple[float, float]:
+        """Standard uncertainties of the guard band, and of U, of the value of a row."""
+        coverage = self.coverage
+        if row.degrees_of_freedom is not UNSET:
+            few = row.freedom is not None
+            coverage = max(COVERAGE, float(student_factor(row.freedom))) if few else COVERAGE
+        if self.guard_factor is None:
+            return guard(True, row.freedom), coverage
+        return self.guard_factor * coverage, coverage
+
     def decision(self, row: VerdictRow) -> LimitDecision:
-        """The decision on a limit, by the set of the test that exceeds it first."""
-        value, sd, note = self._worst(row)
-        spread, within, passed = row.name.startswith(SPREAD_OF), None, False
+        """The decision on a limit."""
+        value, sd, within, passed = row.value, row.uncertainty, None, False
+        band, coverage = self.factors(row)
         if value is not None and sd is not None:
-            within = probability_within(value, sd, row.limit, two_sided=not spread)
-            passed = value + self.guard * sd <= row.limit  # as `verify` decides, to the last digit
+            within = probability_within(value, sd, row.limit, row.two_sided, row.freedom)
+            passed = value + band * sd <= row.limit  # as `verify` decides, to the last digit
         quantity = Quantity(
             id=row.name.replace(" ", "-"),
             name=row.name,
             unit=row.unit,
             value=value,
             standard_uncertainty=sd,
-            expanded_uncertainty=None if sd is None else self.coverage * sd,
-            coverage_factor=None if sd is None else self.coverage,
+            expanded_uncertainty=None if sd is None else coverage * sd,
+            coverage_factor=None if sd is None else coverage,
             coverage_probability=None if sd is None else PROBABILITY,
         )
         return LimitDecision(
             quantity=quantity,
             limit=row.limit,
-            acceptance_limit=None if sd is None else row.limit - self.guard * sd,
+            acceptance_limit=None if sd is None else row.limit - band * sd,
             passed=passed,
             probability_within=within,
             risk=None if within is None else (1 - within if passed else within),
-            note=note,
+            note=row.note,
         )
-
-    def _worst(self, row: VerdictRow) -> tuple[float | None, float | None, str]:
-        """Value and 1σ of the set that comes closest to the limit or exceeds it most, and where it is."""
-        if row.value is None or row.uncertainty is None or not row.sets:
-            return row.value, row.uncertainty, row.note
-        worst = max(row.sets, key=lambda each: each.value + self.guard * each.uncertainty)
-        if worst.value == row.value and worst.uncertainty == row.uncertainty:
-            return row.value, row.uncertainty, row.note
-        return worst.value, worst.uncertainty, worst.label or "stations outside of roll sets"
 
 
 def rule_of(verification: Verification, freedom: float | None, choice: DecisionRule | None) -> Rule:
@@ -117,14 +105,16 @@ def rule_of(verification: Verification, freedom: float | None, choice: DecisionR
     """
     k = COVERAGE if freedom is None else max(COVERAGE, float(student_factor(freedom)))
     if choice is not None and choice.rule == "guarded":
+        rule = Rule("guarded", "", choice.guard_factor, k)
+        factors = {f"{rule.factors(row)[1]:.3g}" for row in verification.rows}
         text = (
             f"guarded acceptance: noise-free value + {choice.guard_factor:g} U must not exceed the limit, "
-            f"U = {k:.3g} × its standard uncertainty"
+            f"U = {' or '.join(sorted(factors))} × its standard uncertainty"
         )
         text += f"; {choice.risk}" if choice.risk else ""
-        return Rule("guarded", text, choice.guard_factor * k, k)
+        return replace(rule, text=text)
     if verification.rule == RULES["guarded"]:
-        return Rule("guarded", f"{verification.rule}; {GUARDED_RISK}", COVERAGE, k)
+        return Rule("guarded", f"{verification.rule}; {GUARDED_RISK}", None, k)
     return Rule("simple", f"{verification.rule}; {SIMPLE_RISK}", 0.0, k)
 
 
