@@ -19,11 +19,10 @@ from mwdcal.calibration.settings import DIRECTION, is_assumed, settings_of
 from mwdcal.errors import InputError
 from mwdcal.estimation.evidence import ANGLES
 from mwdcal.geometry.observables import OBSERVABLES, OUTPUTS
-from mwdcal.geometry.vectors import Array, Bools, Ints, eigen
+from mwdcal.geometry.vectors import Array, Bools, Ints
 from mwdcal.use import roll_test
-from mwdcal.use.retest import Draws
 from mwdcal.use.roll_sets import ROLL_SET, RollSet, near_vertical, roll_sets
-from mwdcal.use.roll_test import DECLARED, FITTED, Coverage, Curve, Scatter
+from mwdcal.use.roll_test import DECLARED, FITTED, Coverage, Curve, Scatter, draws
 
 UNDEFINED_AT_VERTICAL = ("azimuth", "toolface")
 """Angles that do not exist at vertical."""
@@ -106,19 +105,16 @@ class ReferenceErrors:
 
 @dataclass(frozen=True)
 class _Rolled:
-    """Values (k,) of a rolled set to judge, and their curve.
+    """Values (k,) of a rolled set to judge, their curve, and the uncertainty of the references.
 
-    `noisy`: share of the noise in the variance of a value. `errors` (d, k): of the values in tests like this one,
-    without those that all have in common, `common` (d,), of 1σ `shared`.
+    `noisy`: share of the noise in the variance of a value, what all values share apart.
     """
 
     roll_set: RollSet
     part: Array
     curve: Curve
     noisy: float
-    errors: Array
-    common: Array
-    shared: float
+    reference: ReferenceErrors
 
 
 @dataclass(frozen=True)
@@ -159,25 +155,12 @@ class RollTest:
         """Number (n,) of the setting of the stand that each station belongs to."""
         return settings_of(self.readings)
 
-    @cached_property
-    def draws(self) -> Draws:
-        """The errors of tests like this one."""
-        return Draws(self.readings.count)
-
-    @cached_property
-    def _noise_root(self) -> Array:
-        """Matrices (n, 6, 6) from standard normal numbers to the noise of both vectors."""
-        values, vectors = eigen(self.calibration.noise_covariance(self.readings))
-        return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :])
-
-    def _gradient(self, name: str) -> Array:
-        """Gradient (n, 6) of an observable by the standard normal numbers behind the noise."""
-        gradient = np.nan_to_num(OBSERVABLES[name].gradient(*self.fields))
-        return np.asarray(np.einsum("ni,nij->nj", gradient, self._noise_root))
-
     def _noise(self, name: str) -> Array:
         """Standard uncertainty (n,) of an observable by the noise of the test's own readings."""
-        return np.asarray(np.maximum(np.linalg.norm(self._gradient(name), axis=-1), TINY))
+        gradient = np.nan_to_num(OBSERVABLES[name].gradient(*self.fields))
+        noise = self.calibration.noise_covariance(self.readings)
+        variance = np.einsum("ni,nij,nj->n", gradient, noise, gradient)
+        return np.asarray(np.maximum(np.sqrt(variance), TINY))
 
     def noise_freedom(self, name: str) -> float:
         """Degrees of freedom of the noise of an observable: infinite where the noise of all triads is declared."""
@@ -311,9 +294,9 @@ class RollTest:
         reference, common = self.readings.uncertainty(name)[alone], self._common(name)[alone]
         sd = np.sqrt(noise**2 + reference**2 + common**2)
         freedom = self.noise_freedom(name) * (sd / noise) ** 4
-        drawn = self.draws.noise(self._gradient(name))[:, alone]
+        drawn = noise * draws(f"noise of {name}", self.readings.count)[:, alone]
         drawn = drawn + reference * self._reference_draws(name, alone)
-        errors = np.sign(error) * (drawn + common * self.draws.common(name)[:, None])
+        errors = np.sign(error) * (drawn + common * draws(f"zero of {name}", 1))
         return [
             Statistic(
                 abs(float(error[k])), float(sd[k]), abs(float(error[k])),
@@ -325,7 +308,7 @@ class RollTest:
 
     def _reference_draws(self, name: str, index: Ints) -> Array:
         """Standard normal numbers (d, k) of the references of stations, the same for those of one setting."""
-        numbers = self.draws.reference(name)
+        numbers = draws(f"reference {name}", self.readings.count)
         if name in ANGLES:
             return numbers[:, self.settings[index] if name in DIRECTION else index]
         return np.broadcast_to(numbers[:, :1], (len(numbers), len(index)))
@@ -369,34 +352,28 @@ class RollTest:
                 f"{self.readings.source}: the uncertainties of {roll_set.label} are too far apart to judge "
                 f"its {name}. Check the columns sd_: they are in the unit of their column."
             )
-        drawn, alone = self._reference_draws(name, index), self.draws.reference(f"{name} alone")
         noisy = float(np.mean(noise**2) / np.mean(sd**2 + among**2))
-        errors = self.draws.noise(self._gradient(name))[:, index]
-        errors = errors + own * alone[:, index] + among * drawn
-        common = reference.setting * drawn[:, 0] + reference.zero * self.draws.common(name)
-        return _Rolled(roll_set, part, curve, noisy, errors, common, reference.shared)
+        return _Rolled(roll_set, part, curve, noisy, reference)
 
     def _curve_of(self, name: str, rolled: _Rolled, noise: Scatter, error: bool) -> Statistic:
         """Noise-free spread, or largest error, of a rolled set."""
         roll_set, part, curve = rolled.roll_set, rolled.part, rolled.curve
-        assert curve.gain is not None
-        moved = roll_test.matched(curve, rolled.errors @ curve.gain.T)
-        judged = roll_test.figure(part, curve, noise, error, moved)
+        first, reference = int(roll_set.index[0]), rolled.reference
+        judged = roll_test.figure(part, curve, noise, error, roll_test.drawn(curve, name, first))
         most, least, farthest = np.degrees(roll_test.ends(curve))
         at = f"toolface {farthest:.0f}°" if error else f"toolfaces {least:.0f}° to {most:.0f}°"
         where = f"{roll_set.label}; {at}"
         if curve.rough(noise.known):
             where += f"; raw figure judged: {float(curve.scale):.2g} × the noise is left about a smooth curve"
-        side = np.sign(curve.at(np.radians(farthest)[None])[0])
         if not error:
             curve, middle = roll_test.about_middle(curve)
             part = part - middle
-        sd = float(np.hypot(judged.uncertainty, rolled.shared))
+        sd = float(np.hypot(judged.uncertainty, reference.shared))
         share = float(judged.uncertainty / sd) ** 2
         freedom = float(judged.freedom) / max(share, TINY) ** 2
         return Statistic(
             float(judged.value), sd, float(judged.raw), where, roll_set.index, part, roll_set.label,
-            curve, freedom, judged.errors + side * rolled.common,
+            curve, freedom, judged.errors + judged.side * self.common_errors(name, reference, first),
         )  # fmt: skip
 
     def reference_errors(self, name: str, roll_set: RollSet, error: bool) -> ReferenceErrors:
@@ -417,6 +394,11 @@ class RollTest:
         most = float(sd.max()) if error else 0.0
         whole = most * float(np.sqrt(np.mean((sd / most) ** 2))) if most else 0.0
         return ReferenceErrors(np.zeros(sd.shape), None, whole, zero)
+
+    def common_errors(self, name: str, reference: ReferenceErrors, first: int) -> Array:
+        """What a set (its `first` station) shares would be off by (d,) in tests like this one."""
+        setting = self._reference_draws(name, np.array([first]))[:, 0]
+        return reference.setting * setting + reference.zero * draws(f"zero of {name}", 1)[:, 0]
 
     def _centred(self, name: str, index: Ints) -> Array:
         """Values (k,) of a set about their middle; of toolface its errors."""

@@ -76,8 +76,7 @@ class Curve:
     """Mean and harmonics fitted to a roll set.
 
     Shapes: coefficients (..., 5): mean, cosines, sines; covariance (..., 5, 5), both zero for a
-    harmonic that was not fitted; square (...): χ² of the residuals with `freedom` degrees of freedom;
-    `gain` (..., 5, n) takes the values to the coefficients.
+    harmonic that was not fitted; square (...): χ² of the residuals with `freedom` degrees of freedom.
     """
 
     coefficients: Array
@@ -85,7 +84,6 @@ class Curve:
     square: Array
     freedom: int
     harmonics: int = len(HARMONICS)
-    gain: Array | None = None
 
     def at(self, toolface: Array) -> Array:
         """Values (..., n) at toolfaces (n,)."""
@@ -234,8 +232,7 @@ def fitted(
     rows = white @ basis(toolface)[..., places]
     seen = np.einsum("...ij,...j->...i", white, value)
     covariance = inverse(np.swapaxes(rows, -1, -2) @ rows)
-    gain = covariance @ np.swapaxes(rows, -1, -2)
-    coefficients = np.einsum("...in,...n->...i", gain, seen)
+    coefficients = np.einsum("...ij,...nj,...n->...i", covariance, rows, seen)
     left = seen - np.einsum("...ni,...i->...n", rows, coefficients)
     whole = np.eye(COEFFICIENTS)[:, places]
     return Curve(
@@ -244,7 +241,6 @@ def fitted(
         square=np.sum(left**2, -1),
         freedom=value.shape[-1] - len(places),
         harmonics=harmonics,
-        gain=whole @ gain @ white,
     )
 
 
@@ -277,7 +273,8 @@ def extent(curve: Curve, noise: Scatter | None = None, moved: Array | None = Non
 class Figure:
     """Spread of an observable in roll sets (...), or its largest error: without noise, its 1σ, and `raw` with it.
 
-    `freedom`: degrees of freedom of the 1σ; `errors` (..., d) in tests like this one, on average zero.
+    `freedom`: degrees of freedom of the 1σ; `errors` (..., d) in tests like this one, on average zero. `side`: sign
+    of the curve where it is farthest from zero.
     """
 
     value: Array
@@ -285,6 +282,7 @@ class Figure:
     raw: Array
     freedom: Array
     errors: Array
+    side: Array
 
 
 def figure(
@@ -305,8 +303,10 @@ def figure(
     rough = curve.rough(noise.known)
     wider = np.where(rough, curve.scale / noise.scale, 1.0)
     freedom = np.where(rough, curve.freedom, noise.freedom)
-    value = np.where(rough, raw, value)
-    return Figure(value, sd * wider, raw, freedom, errors * wider[..., None])
+    value, errors = np.where(rough, raw, value), errors * wider[..., None]
+    course = curve.at(CIRCLE)
+    side = np.where(course.max(-1) > -course.min(-1), 1.0, -1.0)
+    return Figure(value, sd * wider, raw, freedom, errors, side)
 
 
 @dataclass(frozen=True)
@@ -375,20 +375,16 @@ def about_middle(curve: Curve) -> tuple[Curve, Array]:
     return replace(curve, coefficients=curve.coefficients - middle[..., None] * first), middle
 
 
-def drawn(curve: Curve, number: int = 0) -> Array:
-    """Changes (..., d, 5) of the coefficients by noise: always the same of the set of a number."""
-    return np.einsum("...ij,dj->...di", _root(curve.covariance), _draws(number))
+def drawn(curve: Curve, name: str = "", number: int = 0) -> Array:
+    """Changes (..., d, 5) of the coefficients by noise: always the same of an observable and a set's number."""
+    return np.einsum("...ij,dj->...di", _root(curve.covariance), _even_draws(name, number))
 
 
-def matched(curve: Curve, moved: Array) -> Array:
-    """Changes (d, 5) of the coefficients, turned and stretched a little to the very covariance of the curve."""
-    places = FITTED[curve.harmonics]
-    some = moved[:, places]
-    root, wanted = (
-        np.linalg.cholesky(matrix)
-        for matrix in (some.T @ some / len(some), curve.covariance[np.ix_(places, places)])
-    )
-    return np.linalg.solve(root, some.T).T @ wanted.T @ np.eye(COEFFICIENTS)[places]
+@cache
+def draws(name: str, count: int) -> Array:
+    """Standard normal numbers (2 · PAIRS, count) in opposite pairs, always the same for a name."""
+    half = np.random.default_rng([RANDOM_SEED, *name.encode()]).normal(size=(count, PAIRS)).T
+    return np.concatenate([half, -half])
 
 
 def _measures(coefficients: Array) -> tuple[Array, Array]:
@@ -410,9 +406,9 @@ def _root(covariance: Array) -> Array:
 
 
 @cache
-def _draws(number: int) -> Array:
+def _even_draws(name: str, number: int) -> Array:
     """Draws (2 · PAIRS, 5) in opposite pairs, of mean zero and covariance one exactly."""
-    drawn = np.random.default_rng([RANDOM_SEED, number]).normal(size=(PAIRS, COEFFICIENTS))
+    drawn = draws(f"{name} {number}", COEFFICIENTS)[:PAIRS]
     square = drawn.swapaxes(-1, -2) @ drawn / PAIRS
     even = np.linalg.solve(np.linalg.cholesky(square), drawn.swapaxes(-1, -2)).swapaxes(-1, -2)
     return np.concatenate([even, -even])
