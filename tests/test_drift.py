@@ -568,7 +568,7 @@ def test_a_run_without_gravity_is_no_change_of_the_tool(stated):
     drift = measured("T-1", calibrations).drift
     assert not drift.change.changed
     assert any("1.5 mg" in note for c in drift.calibrations for note in c.notes)
-    unlike = with_changes(calibrations[1 - stated], earth=calibrations[stated].earth)
+    unlike = with_changes(calibrations[1 - stated], gravity_stated=True)
     both = [unlike, calibrations[stated]]
     assert measured("T-1", both).drift.change.changed  # as if both had stated it
 

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from msgspec import UNSET
 
 from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import FREE_SHARE, Calibration, stated
@@ -39,8 +40,10 @@ def angles(calibration: Calibration) -> tuple[str, ...]:
 
 
 def unknown_gravity(calibration: Calibration) -> bool:
-    """Whether the calibration took gravity as exactly 1 g, which no reference says."""
-    return calibration.earth["gravity_g"] == 1.0
+    """Whether gravity was taken as 1 g without a reference; in files of earlier versions, whether it is 1 g."""
+    if calibration.gravity_stated is UNSET:
+        return calibration.earth["gravity_g"] == 1.0
+    return not calibration.gravity_stated
 
 
 def middle_temperature(calibration: Calibration) -> float:

@@ -31,9 +31,9 @@ NOTES = {
     "unrecorded": "its run recorded no temperature: taken as made where the others were",
     "no-magnetometer": "has no magnetometer: only the accelerometer is compared",
     "relative": "its magnetometer is calibrated to field = 1: scale and bias are compared but for a common factor",
-    "gravity": "its run states no ref_gravity_g, or 1 g: local gravity is unknown to 1.5 mg, which all scales of the "
+    "gravity": "its run states no ref_gravity_g: local gravity is unknown to 1.5 mg, which all scales of the "
     "accelerometer share; such a common change is no change of the tool",
-    "gravity-alike": "its run states no ref_gravity_g, or 1 g, like all others: compared as if all were made at one "
+    "gravity-alike": "its run states no ref_gravity_g, like all others: compared as if all were made at one "
     "place",
     "curved": "the {triad} has own-axis terms: its best straight line is compared",
     "held": "its model holds misalignments at zero: they are not compared",

@@ -27,8 +27,8 @@ WELL_FINDINGS = {
     "columns ref_gravity_g, ref_field_nt, ref_dip_deg.",
     "partly-judged": "{names} of {partly} of {rows} surveys are not judged: no reference. `accepted` says nothing "
     "about them.",
-    "laboratory-gravity": "the calibration's gravity is 1 g, as where its run states none: |g| is then in units of the "
-    "laboratory's gravity, and judged with 1.5 mg more of uncertainty. Calibrate with ref_gravity_g.",
+    "laboratory-gravity": "gravity at the laboratory is unknown (1 g was assumed), so |g| is judged 1.5 mg more "
+    "loosely. To tighten this, give ref_gravity_g in the calibration run.",
     "magnetic-north": "no declination: azimuths and the well path count from magnetic north.",
     "path-from-first": "the well path starts at the first station, at north 0, east 0 and TVD 0. `tie_in` gives its "
     "position.",
