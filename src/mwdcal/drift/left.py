@@ -17,7 +17,7 @@ from mwdcal.drift.service import ServiceTest
 from mwdcal.drift.walk import VISIT
 from mwdcal.geometry.vectors import Array
 
-SIGNIFICANT = 3.0
+CLEAR_STEP = 3.0
 """Standard uncertainties that a step between calibrations has, to be one."""
 SHORTENED = 0.5
 """Share of a time in which a tool left a limit after which it is due: it may have left on any day of it."""
@@ -51,7 +51,7 @@ class Departure:
     def left(self, limits: Mapping[str, float]) -> Iterator[Left]:
         """What it says of limits in degrees by angle."""
         degrees = float(np.degrees(self.size))
-        if degrees > limits.get(self.angle, np.inf) and self.size > SIGNIFICANT * self.uncertainty:
+        if degrees > limits.get(self.angle, np.inf) and self.size > CLEAR_STEP * self.uncertainty:
             yield Left(self.start, self.end, f"{self.angle} changed by {degrees:.2g}°")
 
 
