@@ -18,7 +18,7 @@ from mwdcal.certificate.laboratory import DecisionRule
 from mwdcal.files.documents import Verification
 from mwdcal.geometry.vectors import Array, ArrayLike
 from mwdcal.use.risk import COVERAGE, probability_within
-from mwdcal.use.verification import RULES, VerdictRow, fewest_degrees_of_freedom, guard
+from mwdcal.use.verification import RULES, SETTINGS, VerdictRow, fewest_degrees_of_freedom, guard
 
 When: TypeAlias = Literal["as found", "as left"]
 """When a roll test was made: before or after the adjustment."""
@@ -94,6 +94,7 @@ class Rule:
             probability_within=within,
             risk=None if within is None else (1 - within if passed else within),
             note=row.note,
+            degrees_of_freedom=row.freedom,
         )
 
 
@@ -134,9 +135,13 @@ def conformity(
         freedom = fewest_degrees_of_freedom(calibration)
     rule = rule_of(verification, freedom, choice)
     decisions = [rule.decision(row) for row in verification.rows]
+    passed = all(decision.passed for decision in decisions)
+    risk = verification.risk  # of the other verdict, if the laboratory's rule has led to it
+    if risk is not None and passed != verification.passed:
+        risk = 1 - risk
     test = ConformityTest(
         when=when,
-        passed=all(decision.passed for decision in decisions),
+        passed=passed,
         date=verification.date,
         run=verification.run,
         stations=verification.stations,
@@ -147,6 +152,8 @@ def conformity(
         calibration_sha256=verification.calibration_sha256,
         decisions=decisions,
         findings=verification.findings,
+        risk=risk,
+        settings=SETTINGS.get(verification.settings, ""),
     )
     unknown = [UNKNOWN_FREEDOM] if freedom is None else []
     return test, unknown + _changed(when, verification, decisions)

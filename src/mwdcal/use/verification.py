@@ -9,9 +9,10 @@ from typing import Any, ClassVar, Literal
 import msgspec
 import numpy as np
 
+from mwdcal.calibration.notebooks import html_table
 from mwdcal.calibration.readings import Readings
-from mwdcal.calibration.record import MARGIN, Calibration, Finding, html_table, stated
-from mwdcal.calibration.settings import is_assumed
+from mwdcal.calibration.record import MARGIN, Calibration, Finding, stated
+from mwdcal.calibration.settings import ASSUMED, is_assumed
 from mwdcal.errors import InputError
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array
@@ -21,8 +22,12 @@ from mwdcal.use.roll_test import DEPARTURE_CHANCE, HARMONICS, Largest, largest
 
 SPREAD_OF = "spread of "
 """How the name of a limit on a spread begins."""
-PER_DIRECTION = "per-direction"
-"""The practice of a stand that is assumed where nobody states it."""
+SETTINGS = {
+    "assumed": ASSUMED,
+    "per-direction": "The stand was set once per roll set: its error is common to the set.",
+    "per-station": "The stand was set at every station: its errors average down over a roll set.",
+}
+"""How often the stand's direction was set, in words."""
 WEAK = 0.5
 """A test whose 1σ is a larger share of the limit hardly distinguishes a good tool from a bad one."""
 NAMED_HARMONIC = 3.0
@@ -171,8 +176,8 @@ class Verdict(msgspec.Struct, frozen=True, kw_only=True):
     `degrees_of_freedom`: of the triad of the calibration with the fewest. None: a document of an earlier version.
     `risk`: probability that the verdict is wrong, all sets and limits together: that a true value is beyond
     its limit in a pass, that none is in a fail. None: a limit could not be judged.
-    `settings`: how often the stand's direction was set, "per-direction" or "per-station", and whether nobody
-    stated it.
+    `settings`: how often the stand's direction was set, "per-direction", "per-station", or "assumed" to be once
+    per direction; empty where nobody stated it and nothing rests on it.
     """
 
     passed: bool
@@ -188,7 +193,6 @@ class Verdict(msgspec.Struct, frozen=True, kw_only=True):
     degrees_of_freedom: float | None = None
     risk: float | None = None
     settings: str = ""
-    settings_assumed: bool = False
 
     plot: ClassVar[Any]
     """Figures of the verdict, as `Calibration.plot`."""
@@ -253,8 +257,7 @@ def verify(calibration: Calibration, readings: Readings, limits: Limits) -> Verd
         station_rows=_station_rows(test, rows, [outcome[-1] for outcome in outcomes]),
         degrees_of_freedom=fewest_degrees_of_freedom(calibration),
         risk=_risk(judged, passed),
-        settings=readings.settings or PER_DIRECTION,
-        settings_assumed=is_assumed(readings),
+        settings="assumed" if is_assumed(readings) else readings.settings,
     )
 
 
