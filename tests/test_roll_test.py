@@ -3,7 +3,17 @@
 import numpy as np
 import pytest
 
-from mwdcal.use.roll_test import Curve, coverage, ends, extent, fitted, scatter
+from mwdcal.use.roll_test import (
+    Curve,
+    coverage,
+    drawn,
+    ends,
+    extent,
+    figure,
+    fitted,
+    largest,
+    scatter,
+)
 from simulation import DEG
 
 TWELVE = np.arange(12) * 30 * DEG
@@ -148,3 +158,89 @@ def test_a_curve_without_a_covariance_has_no_range():
     curve = Curve(coefficients=np.zeros(5), covariance=nothing, square=np.array(0.0), freedom=7)
     with np.errstate(invalid="ignore"):
         assert np.isnan(extent(curve).range_sd)
+
+
+FOUR = np.arange(4) * 90 * DEG
+
+
+def test_four_toolfaces_give_the_mean_and_first_harmonic_whatever_the_second():
+    value = 0.3 + 0.2 * np.cos(FOUR - 1.0) + 0.05 * np.sin(2 * FOUR + 0.4)
+    curve = fitted(value, np.full(4, 0.01), FOUR, harmonics=1)
+    assert curve.amplitudes == pytest.approx([0.2, 0.0])
+    assert curve.coefficients[0] == pytest.approx(0.3)
+    assert curve.freedom == 1
+    # an orthogonal design of four: σ²/4 of the mean, σ²/2 of each part of the harmonic
+    assert np.diagonal(curve.covariance) == pytest.approx([2.5e-5, 5e-5, 0, 5e-5, 0])
+    assert curve.square == pytest.approx((0.05 * np.sin(0.4)) ** 2 * 4 / 0.01**2)
+
+
+def test_a_few_small_residuals_never_replace_a_stated_noise():
+    """Six toolfaces, one degree of freedom: whatever is left, the 1σ is that of the declared noise."""
+    rng = np.random.default_rng(6)
+    six = np.arange(6) * 60 * DEG
+    _, curve = rolls(rng, 3000, 0.1, 0.02, toolface=six)
+    noise = scatter([curve])
+    assert noise.scale == pytest.approx(1.0)
+    found = extent(curve, noise)
+    assert found.range_sd.min() > 0.6 * np.median(found.range_sd)
+
+
+def test_an_estimated_noise_is_pooled_by_degrees_of_freedom():
+    """10 of the calibration, and residuals of two curves: (10 + χ²) / (10 + ν), with ν more degrees of freedom."""
+    value = np.zeros(12)
+    value[::2] = 0.02
+    curve = fitted(value, np.full(12, 0.01), TWELVE)
+    noise = scatter([curve, curve], 10.0)
+    left = value - 0.01  # an alternation that no harmonic takes
+    square = np.sum((left / 0.01) ** 2)
+    assert noise.freedom == 24
+    assert noise.scale == pytest.approx(np.sqrt((10 + 2 * square) / 24))
+
+
+def test_residuals_against_a_noise_of_few_degrees_of_freedom_follow_fisher():
+    """F of 1 and 3 degrees of freedom: beyond 10.13 lies 5 %, beyond 167.03 a thousandth (tables)."""
+    curve = Curve(np.zeros(5), np.eye(5), np.array([160.0, 175.0, 11.0]), 1)
+    assert curve.rough(3.0).tolist() == [False, True, False]
+    assert curve.rough().tolist() == [True, True, True]
+
+
+@pytest.mark.parametrize("count", [2, 3, 6])
+def test_the_largest_of_equal_figures_has_little_bias_left(count):
+    """The largest of k normal values lies 0.56, 0.85, 1.27 σ above their common mean (d2 / 2 and so on)."""
+    rng = np.random.default_rng(7)
+    value = 1 + 0.05 * rng.normal(size=(1500, count))
+    half = rng.normal(size=(300, count))
+    errors = 0.05 * np.broadcast_to(np.concatenate([half, -half]), (1500, 600, count))
+    found = largest(value, np.full(value.shape, 0.05), errors)
+    bias = {2: 0.56, 3: 0.85, 6: 1.27}[count]
+    assert (value.max(-1).mean() - 1) / 0.05 == pytest.approx(bias, abs=0.06)
+    assert abs(found.value.mean() - 1) < 0.25 * bias * 0.05 + 0.003
+    assert 0.38 < (found.value <= 1).mean() < 0.55
+    departure = (found.value - 1) / found.uncertainty
+    assert 0.85 < np.sqrt(np.mean(departure**2)) < 1.15
+
+
+def test_the_largest_of_figures_far_apart_is_the_largest():
+    rng = np.random.default_rng(8)
+    errors = 0.01 * rng.normal(size=(1000, 3))
+    found = largest(np.array([0.5, 1.0, 0.2]), np.full(3, 0.01), errors - errors.mean(0))
+    assert found.value == pytest.approx(1.0, abs=1e-3)
+    assert found.uncertainty == pytest.approx(0.01, rel=0.1)
+    assert found.place == 1
+
+
+def test_stations_of_one_setting_share_its_error():
+    """Two passes of twelve, each set once: the mean has half the variance of a setting, and σ²/24 of noise."""
+    toolface, number = np.tile(TWELVE, 2), np.repeat([0, 1], 12)
+    shared = 0.1**2 * (number[:, None] == number)
+    curve = fitted(np.zeros(24), np.full(24, 0.01), toolface, shared=shared)
+    assert curve.covariance[0, 0] == pytest.approx(0.1**2 / 2 + 0.01**2 / 24, rel=1e-6)
+    assert curve.covariance[1, 1] == pytest.approx(0.01**2 / 12, rel=1e-6)
+
+
+def test_what_is_off_in_tests_like_this_one_has_the_stated_size():
+    value = 0.1 * np.cos(TWELVE)
+    curve = fitted(value, np.full(12, 0.005), TWELVE)
+    one = figure(value, curve, scatter([curve]), error=False, moved=drawn(curve, "inclination", 3))
+    assert one.errors.mean() == pytest.approx(0, abs=1e-12)
+    assert one.errors.std() == pytest.approx(one.uncertainty, rel=0.05)

@@ -18,7 +18,13 @@ from mwdcal.certificate.laboratory import DecisionRule
 from mwdcal.files.documents import Verification
 from mwdcal.geometry.vectors import Array, ArrayLike
 from mwdcal.use.risk import COVERAGE, probability_within
-from mwdcal.use.verification import RULES, SETTINGS, VerdictRow, fewest_degrees_of_freedom, guard
+from mwdcal.use.verification import (
+    RULES,
+    SETTING_PRACTICES,
+    VerdictRow,
+    fewest_degrees_of_freedom,
+    guard,
+)
 
 When: TypeAlias = Literal["as found", "as left"]
 """When a roll test was made: before or after the adjustment."""
@@ -46,6 +52,11 @@ def student_factor(freedom: ArrayLike) -> Array:
     return np.asarray(stdtrit(np.maximum(freedom, 1.0), (1 + PROBABILITY) / 2))
 
 
+def coverage_of(freedom: float | None) -> float:
+    """Coverage factor of a value of a roll test: at least `COVERAGE`; None: unlimited degrees of freedom."""
+    return COVERAGE if freedom is None else max(COVERAGE, float(student_factor(freedom)))
+
+
 @dataclass(frozen=True)
 class Rule:
     """A rule of decision: a guard band of some expanded uncertainties, none for simple acceptance.
@@ -63,8 +74,7 @@ class Rule:
         """Standard uncertainties of the guard band, and of U, of the value of a row."""
         coverage = self.coverage
         if row.degrees_of_freedom is not UNSET:
-            few = row.freedom is not None
-            coverage = max(COVERAGE, float(student_factor(row.freedom))) if few else COVERAGE
+            coverage = coverage_of(row.freedom)
         if self.guard_factor is None:
             return guard(True, row.freedom), coverage
         return self.guard_factor * coverage, coverage
@@ -104,7 +114,7 @@ def rule_of(verification: Verification, freedom: float | None, choice: DecisionR
     The coverage factor of its uncertainties is at least `COVERAGE`, and Student's for the degrees of
     `freedom` of the calibration that was tested; `COVERAGE` where they are not known.
     """
-    k = COVERAGE if freedom is None else max(COVERAGE, float(student_factor(freedom)))
+    k = coverage_of(freedom)
     if choice is not None and choice.rule == "guarded":
         rule = Rule("guarded", "", choice.guard_factor, k)
         factors = {f"{rule.factors(row)[1]:.3g}" for row in verification.rows}
@@ -153,7 +163,7 @@ def conformity(
         decisions=decisions,
         findings=verification.findings,
         risk=risk,
-        settings=SETTINGS.get(verification.settings, ""),
+        settings=SETTING_PRACTICES.get(verification.settings, ""),
     )
     unknown = [UNKNOWN_FREEDOM] if freedom is None else []
     return test, unknown + _changed(when, verification, decisions)

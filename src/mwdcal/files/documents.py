@@ -171,8 +171,10 @@ def _contradiction(verification: Verification) -> str:
         value, sd = row.value, row.uncertainty
         if row.limit <= 0 or (sd is not None and (sd < 0 or value is None)):
             return f"the limit of {row.name!r} must be positive, and an uncertainty needs a value"
-        known = value is not None and sd is not None
-        if row.passed != (known and value + guard(guarded, row.freedom) * sd <= row.limit):
+        within = False
+        if value is not None and sd is not None:
+            within = value + guard(guarded, row.freedom) * sd <= row.limit
+        if row.passed != within:
             return f"the decision on {row.name!r} does not follow from its value and limit"
     if not verification.rows or verification.passed != all(r.passed for r in verification.rows):
         return "its verdict does not follow from its decisions"

@@ -33,8 +33,9 @@ from mwdcal.planning.simulate import Truth, drawn
 from mwdcal.sensor.profile import Profile
 from mwdcal.use import roll_test
 from mwdcal.use.departures import LEVEL, UNDEFINED_AT_VERTICAL, RollTest
+from mwdcal.use.risk import COVERAGE
 from mwdcal.use.roll_sets import RollSet
-from mwdcal.use.verification import COVERAGE, Limits
+from mwdcal.use.verification import Limits
 
 TOOLS_AT_ONCE = 200
 """Tools that are simulated and fitted at once, with random numbers of their own."""
@@ -393,7 +394,7 @@ class _Seen:
         sd = self.noise(name)
         curves = [
             roll_test.fitted(
-                part, np.hypot(sd[:, each.index], reference.own), self.toolface[:, each.index],
+                part, np.hypot(sd[:, each.index], reference.individual), self.toolface[:, each.index],
                 self.nominal.harmonics(each), reference.together,
             )
             for part, each, reference in zip(parts, limit.sets, references, strict=True)
@@ -405,5 +406,5 @@ class _Seen:
             common = self.nominal.common_errors(name, references[k], first)
             errors = one.errors + one.side[:, None] * common
             figures.append((one.value, np.hypot(one.uncertainty, references[k].shared), errors))
-        found = roll_test.largest(*(np.stack(each, -1) for each in zip(*figures, strict=True)))
-        return found.value * limit.factor, found.uncertainty * limit.factor
+        worst = roll_test.largest(*(np.stack(each, -1) for each in zip(*figures, strict=True)))
+        return worst.value * limit.factor, worst.uncertainty * limit.factor

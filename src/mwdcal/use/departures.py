@@ -22,7 +22,7 @@ from mwdcal.geometry.observables import OBSERVABLES, OUTPUTS
 from mwdcal.geometry.vectors import Array, Bools, Ints
 from mwdcal.use import roll_test
 from mwdcal.use.roll_sets import ROLL_SET, RollSet, near_vertical, roll_sets
-from mwdcal.use.roll_test import DECLARED, FITTED, Coverage, Curve, Scatter, draws
+from mwdcal.use.roll_test import FITTED, UNLIMITED, Coverage, Curve, Scatter, draws
 
 UNDEFINED_AT_VERTICAL = ("azimuth", "toolface")
 """Angles that do not exist at vertical."""
@@ -39,7 +39,7 @@ SEEN = 0.7
 WORST_CONDITION = 1e10
 """Condition number of a curve's covariance above which its digits are those of rounding."""
 TINY = 1e-15
-LEAST_NOISE = 1e-6
+LEAST_ALONE = 1e-6
 """Least noise of a value beside errors that it shares with others, in sizes of these: their matrix stays regular."""
 
 
@@ -61,7 +61,7 @@ class Statistic:
     part: Array
     label: str = ""
     curve: Curve | None = None
-    freedom: float = DECLARED
+    freedom: float = UNLIMITED
     errors: Array = field(default_factory=lambda: np.zeros(0))
 
 
@@ -72,7 +72,7 @@ class Departures:
     `skipped`: why it cannot be judged. `blocked`: why no limit on it can be passed; `unrolled`:
     because the tool was not rolled all round: there is no noise-free value, and `statistics` have
     the raw one. `apart`: parts of the run that were left out, and why. `unseen`:
-    the toolfaces hardly show one of the harmonics. `calm`: values scatter improbably little about the curves.
+    the toolfaces hardly show one of the harmonics. `remarks`: ids of findings about the scatter.
     """
 
     statistics: tuple[Statistic, ...] = ()
@@ -81,18 +81,18 @@ class Departures:
     unrolled: bool = False
     apart: tuple[str, ...] = ()
     unseen: bool = False
-    calm: bool = False
+    remarks: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
 class ReferenceErrors:
     """Standard uncertainties of the references of a roll set of k stations.
 
-    `own` (k,): of each station alone; `together` (k, k): covariance of settings that some stations share, or
+    `individual` (k,): of each station alone; `together` (k, k): covariance of settings that some stations share, or
     None. `setting` or strength, and `zero` of the stand: of what all stations of the set share.
     """
 
-    own: Array
+    individual: Array
     together: Array | None
     setting: float
     zero: float
@@ -166,7 +166,7 @@ class RollTest:
         """Degrees of freedom of the noise of an observable: infinite where the noise of all triads is declared."""
         triads = self.calibration.triads[: 2 if name in MAGNETIC else 1]
         estimated = [t for t in triads if t.name not in self.readings.sd and not t.noise_declared]
-        return min((t.degrees_of_freedom for t in estimated), default=DECLARED)
+        return min((t.degrees_of_freedom for t in estimated), default=UNLIMITED)
 
     def _common(self, name: str) -> Array:
         """Standard uncertainty (n,) of a reference by errors that all stations of the stand share."""
@@ -233,10 +233,10 @@ class RollTest:
             return Departures(skipped="; ".join(apart))
         free = any(self._free_spread(name, s.index) for s in fit)
         unrolled = f"{wrong[0].label} was not rolled: {gaps[wrong[0].label]}" if wrong else ""
-        statistics, calm = self._curves(name, rolled, False)
+        statistics, remarks = self._curves(name, rolled, False)
         statistics += [self._unrolled(name, s) for s in wrong]
         unseen = any(self.harmonics(s) < max(FITTED) for s in rolled)
-        return self._outcome(name, statistics, free, unrolled, apart, unseen, calm)
+        return self._outcome(name, statistics, free, unrolled, apart, unseen, remarks)
 
     def _unrolled(self, name: str, roll_set: RollSet) -> Statistic:
         """Spread, with its noise, of a set that was not rolled."""
@@ -266,27 +266,27 @@ class RollTest:
         unseen = circle is not None and not gap and bool(circle.seen.min() < SEEN)
         left = f"{near.sum()} of {given.sum()} stations lie within 5° of vertical"
         apart = (left,) if near.any() else ()
-        statistics, calm = self._errors(name, judged)
-        return self._outcome(name, statistics, free, unrolled, apart, unseen, calm)
+        statistics, remarks = self._errors(name, judged)
+        return self._outcome(name, statistics, free, unrolled, apart, unseen, remarks)
 
     def _outcome(
         self, name: str, statistics: list[Statistic], free: bool, unrolled: str,
-        apart: tuple[str, ...], unseen: bool, calm: bool,
+        apart: tuple[str, ...], unseen: bool, remarks: tuple[str, ...],
     ) -> Departures:  # fmt: skip
         """The statistics, and why no limit can be passed: `free` and `unrolled` are reasons."""
         if name == "field" and self.calibration.relative:
             return Departures(blocked="the calibration is relative: field = 1, not nT", apart=apart)
         blocked = NOT_DETERMINED if free else unrolled
-        return Departures(tuple(statistics), "", blocked, bool(unrolled), apart, unseen, calm)
+        return Departures(tuple(statistics), "", blocked, bool(unrolled), apart, unseen, remarks)
 
-    def _errors(self, name: str, judged: Ints) -> tuple[list[Statistic], bool]:
+    def _errors(self, name: str, judged: Ints) -> tuple[list[Statistic], tuple[str, ...]]:
         """Largest errors of rolled sets, and of each station outside of them."""
         seen = [replace(s, index=s.index[np.isin(s.index, judged)]) for s in self.sets]
         whole = [s for s in seen if not self.loose(s.index) and (s.one_azimuth or name in LEVEL)]
         inside = np.concatenate([s.index for s in whole]) if whole else ()
         alone = judged[~np.isin(judged, inside)]
-        curves, calm = self._curves(name, whole, True)
-        return curves + self._single(name, alone), calm
+        curves, remarks = self._curves(name, whole, True)
+        return curves + self._single(name, alone), remarks
 
     def _single(self, name: str, alone: Ints) -> list[Statistic]:
         """The error of each of some stations (k,)."""
@@ -315,34 +315,33 @@ class RollTest:
 
     def _curves(
         self, name: str, sets: Sequence[RollSet], error: bool
-    ) -> tuple[list[Statistic], bool]:
-        """Noise-free spread, or largest error, of rolled sets, and whether they scatter improbably little."""
+    ) -> tuple[list[Statistic], tuple[str, ...]]:
+        """Noise-free spread, or largest error, of rolled sets, and remarks on their scatter."""
         if not sets:
-            return [], False
+            return [], ()
         rolled = [self._rolled(name, s, error) for s in sets]
-        if self._doubted(name) and any(
-            each.curve.rough(self.noise_freedom(name)) for each in rolled
-        ):
-            rolled = [self._rolled(name, s, error, doubted=True) for s in sets]
-        known = self.noise_freedom(name) / max(each.noisy for each in rolled) ** 2
+        stated, doubted = self.noise_freedom(name), False
+        if name in DIRECTION and is_assumed(self.readings):
+            doubted = any(bool(each.curve.rough(stated)) for each in rolled)
+        if doubted:  # that the direction was set once was an assumption
+            rolled = [self._rolled(name, s, error, doubted) for s in sets]
+        known = stated / max(each.noisy for each in rolled) ** 2
         noise = roll_test.scatter([each.curve for each in rolled], known)
-        return [self._curve_of(name, each, noise, error) for each in rolled], bool(noise.calm)
-
-    def _doubted(self, name: str) -> bool:
-        """Whether that a direction was set once is an assumption, which the scatter of an angle may contradict."""
-        return name in DIRECTION and is_assumed(self.readings)
+        remarks = {"little-scatter": bool(noise.calm), "settings-doubted": doubted}
+        statistics = [self._curve_of(name, each, noise, error) for each in rolled]
+        return statistics, tuple(remark for remark, holds in remarks.items() if holds)
 
     def _rolled(self, name: str, roll_set: RollSet, error: bool, doubted: bool = False) -> _Rolled:
         """The values of a rolled set, their curve, and what their errors would be in other tests."""
         index = roll_set.index
         part = self._error(name)[index] if error else self._centred(name, index)
         noise, reference = self._noise(name)[index], self.reference_errors(name, roll_set, error)
-        own, together = reference.own, reference.together
+        individual, together = reference.individual, reference.together
         if doubted and not roll_set.declared:
-            own = self.readings.uncertainty(name)[index]
-        sd = np.hypot(noise, own)
+            individual = self.readings.uncertainty(name)[index]
+        sd = np.hypot(noise, individual)
         among = np.zeros(sd.shape) if together is None else np.sqrt(np.diagonal(together))
-        sd = np.maximum(sd, LEAST_NOISE * among)
+        sd = np.maximum(sd, LEAST_ALONE * among)
         curve = roll_test.fitted(part, sd, self.toolface[index], self.harmonics(roll_set), together)
         places = FITTED[curve.harmonics]
         numbers = [*curve.coefficients, *curve.covariance.flat]

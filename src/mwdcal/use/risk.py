@@ -14,8 +14,8 @@ from mwdcal.geometry.vectors import Array, eigen
 
 COVERAGE = 2.0
 """Coverage factor of the guard band and of the remark that a value is close to its limit."""
-DRAWS = 2000
-RANDOM_SEED = 1
+REPETITIONS = 2000
+RISK_SEED = 1
 
 
 def cumulative(score: float, freedom: float | None) -> float:
@@ -35,7 +35,7 @@ def guard_factor(freedom: float | None) -> float:
         return COVERAGE
     from scipy.special import ndtr, stdtrit
 
-    return float(max(COVERAGE, stdtrit(max(freedom, 1.0), ndtr(COVERAGE))))
+    return max(COVERAGE, float(stdtrit(max(freedom, 1.0), float(ndtr(COVERAGE)))))
 
 
 def probability_within(
@@ -65,9 +65,11 @@ def risk_of_all(within: Sequence[float], passed: bool, errors: Array) -> float:
     size = np.linalg.norm(errors, axis=0)
     correlation = errors.T @ errors / np.maximum(np.outer(size, size), 1e-300)
     values, vectors = eigen(correlation)
-    rng = np.random.default_rng(RANDOM_SEED)
-    normal = rng.normal(size=(DRAWS, len(chance))) @ (vectors * np.sqrt(np.maximum(values, 0.0))).T
-    uniform = (np.arange(DRAWS) + 0.5) / DRAWS
+    rng = np.random.default_rng(RISK_SEED)
+    normal = (
+        rng.normal(size=(REPETITIONS, len(chance))) @ (vectors * np.sqrt(np.maximum(values, 0.0))).T
+    )
+    uniform = (np.arange(REPETITIONS) + 0.5) / REPETITIONS
 
     def given(first: int, score: Array) -> Array:
         """Scores (d, k) of all limits where that of the first is known."""

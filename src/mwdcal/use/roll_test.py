@@ -32,8 +32,10 @@ CARRIED = 2.0
 """Largest standard uncertainty of the curve anywhere on the circle, in noises of one reading."""
 DEPARTURE_CHANCE = 1e-3
 """Residuals from the curve that are less likely than this are not noise alone."""
-DECLARED = np.inf
+UNLIMITED = np.inf
 """Degrees of freedom of a noise that was declared, not estimated."""
+CLOSED_FORM = 100
+"""Degrees of freedom up to which χ² is computed without SciPy."""
 CURVE_POINTS = 120
 """Toolfaces at which a curve is evaluated: its range is at most 0.14 % too small."""
 PAIRS = 500
@@ -105,7 +107,7 @@ class Curve:
         """Residuals divided by what noise alone would give (...); 1 without degrees of freedom."""
         return np.sqrt(self.square / self.freedom) if self.freedom else np.ones(self.square.shape)
 
-    def rough(self, known: float = DECLARED) -> Bools:
+    def rough(self, known: float = UNLIMITED) -> Bools:
         """Where the residuals are larger than noise alone would give: the error is not smooth.
 
         `known`: degrees of freedom of the stated noise.
@@ -131,7 +133,7 @@ class Scatter:
     seen: Array
 
 
-def scatter(curves: Sequence[Curve], known: float = DECLARED) -> Scatter:
+def scatter(curves: Sequence[Curve], known: float = UNLIMITED) -> Scatter:
     """Noise of one observable in one run, by all its curves but those that are not smooth."""
     square, freedom = np.zeros(()), np.zeros((), int)
     for curve in curves:
@@ -147,17 +149,19 @@ def scatter(curves: Sequence[Curve], known: float = DECLARED) -> Scatter:
     return Scatter(known, scale, whole, calm, seen)
 
 
-def chance(square: Array, freedom: Array, known: float = DECLARED) -> Array:
+def chance(square: Array, freedom: Array, known: float = UNLIMITED) -> Array:
     """Chance (...) that noise as stated makes χ² larger; 1 without degrees of freedom.
 
     Definition: the tail of χ², or of Fisher's F where the noise was estimated with `known` degrees of freedom.
     """
-    if not np.isfinite(known):
+    if not np.isfinite(known) and np.max(freedom) <= CLOSED_FORM:
         return tail(square, freedom)
-    from scipy.special import fdtrc
+    from scipy.special import chdtrc, fdtrc
 
-    least = np.maximum(freedom, 1)
-    return np.where(freedom > 0, fdtrc(least, max(known, 1.0), square / least), 1.0)
+    some, least = freedom > 0, np.maximum(freedom, 1)
+    if not np.isfinite(known):
+        return np.where(some, chdtrc(least, square), 1.0)
+    return np.where(some, fdtrc(least, max(known, 1.0), square / least), 1.0)
 
 
 @dataclass(frozen=True)
@@ -228,7 +232,8 @@ def fitted(
     places = FITTED[harmonics]
     white = np.eye(sd.shape[-1]) / sd[..., None]
     if shared is not None:
-        white = inverse(np.linalg.cholesky(inverse(white @ white) + shared))
+        variance = np.eye(sd.shape[-1]) * sd[..., None] ** 2
+        white = inverse(np.asarray(np.linalg.cholesky(variance + shared)))
     rows = white @ basis(toolface)[..., places]
     seen = np.einsum("...ij,...j->...i", white, value)
     covariance = inverse(np.swapaxes(rows, -1, -2) @ rows)
@@ -260,13 +265,13 @@ def extent(curve: Curve, noise: Scatter | None = None, moved: Array | None = Non
     still = _measures(middle)
     changed = _measures(middle + noise.scale[..., None, None] * moved)
     seen = _measures(middle + noise.seen[..., None, None] * moved) if noise.calm.any() else changed
-    found: list[Array] = []
+    parts: list[Array] = []
     for value, other, by_seen in zip(still, changed, seen, strict=True):
         change = other - value
         corrected = np.maximum(value[..., 0] - (by_seen - value).mean(-1), 0.0)
         sd = np.sqrt(np.mean(change**2, -1))
-        found += [corrected, sd, change - change.mean(-1, keepdims=True)]
-    return Extent(*found)
+        parts += [corrected, sd, change - change.mean(-1, keepdims=True)]
+    return Extent(*parts)
 
 
 @dataclass(frozen=True)
@@ -377,7 +382,8 @@ def about_middle(curve: Curve) -> tuple[Curve, Array]:
 
 def drawn(curve: Curve, name: str = "", number: int = 0) -> Array:
     """Changes (..., d, 5) of the coefficients by noise: always the same of an observable and a set's number."""
-    return np.einsum("...ij,dj->...di", _root(curve.covariance), _even_draws(name, number))
+    root = _root(curve.covariance)
+    return np.asarray(np.einsum("...ij,dj->...di", root, _even_draws(name, number)))
 
 
 @cache

@@ -22,7 +22,7 @@ from mwdcal.use.roll_test import DEPARTURE_CHANCE, HARMONICS, Largest, largest
 
 SPREAD_OF = "spread of "
 """How the name of a limit on a spread begins."""
-SETTINGS = {
+SETTING_PRACTICES = {
     "assumed": ASSUMED,
     "per-direction": "The stand was set once per roll set: its error is common to the set.",
     "per-station": "The stand was set at every station: its errors average down over a roll set.",
@@ -52,6 +52,8 @@ VERDICT_FINDINGS = {
     "too small by it: add toolfaces between them.",
     "little-scatter": "{title}: the readings scatter less about the curves than the stated noise explains (chance "
     "below {chance:g}). It is overstated, or readings are repeated. The 1σ rests on the stated noise.",
+    "settings-doubted": "{title}: the readings scatter about the curves as if the stand was set at every station. Its "
+    "error is counted both ways. State [stand] settings in the profile.",
     "weak-test": "{row.name}: its 1σ of {row.uncertainty:.2g} {row.unit} is more than half of the limit: this "
     "test can hardly tell a good tool from a bad one. Average longer at each station, or take more toolfaces.",
     "roll-harmonics": "{row.name} over a turn of toolface: {causes}.",
@@ -393,15 +395,15 @@ def _judged(title: str, name: str, limit: float, outcome: Departures, guarded: b
             sets=sets, degrees_of_freedom=None,
         )  # fmt: skip
         return _Judged(row, findings)
-    found = _largest(outcome)
-    worst = outcome.statistics[int(found.place)]
+    overall = _largest(outcome)
+    worst = outcome.statistics[int(overall.place)]
     value, sd, freedom = (
-        float(found.value) * factor,
-        float(found.uncertainty) * factor,
+        float(overall.value) * factor,
+        float(overall.uncertainty) * factor,
         stated_freedom(worst.freedom),
     )
     passed = value + guard(guarded, freedom) * sd <= limit
-    note = worst.where + _choice(outcome, (worst.value - float(found.value)) * factor, unit)
+    note = worst.where + _choice(outcome, (worst.value - float(overall.value)) * factor, unit)
     row = VerdictRow(
         name=title, unit=unit, value=value, uncertainty=sd, limit=limit, passed=passed,
         note=note + _remark(value, sd, limit, passed), raw=most,
@@ -413,7 +415,7 @@ def _judged(title: str, name: str, limit: float, outcome: Departures, guarded: b
         findings.append(_finding("weak-test", row=row))
     if causes := _causes(row, name, worst):
         findings.append(_finding("roll-harmonics", row=row, causes="; ".join(causes)))
-    return _Judged(row, findings, found.errors)
+    return _Judged(row, findings, overall.errors)
 
 
 def _findings_about(title: str, outcome: Departures) -> list[Finding]:
@@ -421,9 +423,8 @@ def _findings_about(title: str, outcome: Departures) -> list[Finding]:
     findings = [Finding(id="partly-judged", text=f"{title}: {text}.") for text in outcome.apart]
     if outcome.unseen:
         findings.append(_finding("harmonic-unseen", title=title))
-    if outcome.calm:
-        findings.append(_finding("little-scatter", title=title, chance=DEPARTURE_CHANCE))
-    return findings
+    remarks = (_finding(each, title=title, chance=DEPARTURE_CHANCE) for each in outcome.remarks)
+    return [*findings, *remarks]
 
 
 def guard(guarded: bool, freedom: float | None) -> float:

@@ -16,7 +16,7 @@ from mwdcal.app.messages import findings_as_typed
 from mwdcal.app.pages.page import banner, environment
 from mwdcal.app.screens.calibration import how, known_inclinations
 from mwdcal.app.screens.numbers import HELD, capital, exponent, factor_places
-from mwdcal.app.screens.verification import OUTSIDE, freedom
+from mwdcal.app.screens.verification import BETWEEN_SETS, freedom
 from mwdcal.app.text import plural, quantity, raised
 from mwdcal.calibration.prediction import accuracy_at, angles, middle_temperature, typical_accuracy
 from mwdcal.calibration.readings import is_simulated, soaks
@@ -27,7 +27,7 @@ from mwdcal.geometry.observables import TITLES
 from mwdcal.use import plots
 from mwdcal.use import verdict_plots as verdict_plots  # puts `plot` on verdicts
 from mwdcal.use.notation import Notation, convert
-from mwdcal.use.verification import SETTINGS
+from mwdcal.use.verification import SETTING_PRACTICES
 
 if TYPE_CHECKING:
     from mwdcal.use.verification import Verdict, VerdictRow
@@ -70,8 +70,8 @@ def render(
         accuracy=_accuracy(calibration),
         soaked=_soaked(calibration),
         kinds=_kinds(verdict),
-        settings=SETTINGS,
-        outside=OUTSIDE,
+        settings=SETTING_PRACTICES,
+        outside=BETWEEN_SETS,
         titles=TITLES,
         large=LARGE_RATIO,
         tolerance=RANK_TOLERANCE,

@@ -10,14 +10,14 @@ from mwdcal.app.screens.records.signature import in_short
 from mwdcal.app.text import NOT_STATED, WIDE, chance, one_line, quantity, table
 from mwdcal.calibration.readings import simulated
 from mwdcal.certificate.signature import SignatureCheck
-from mwdcal.use.verification import SETTINGS, JudgedSet, Verdict, VerdictRow
+from mwdcal.use.verification import SETTING_PRACTICES, JudgedSet, Verdict, VerdictRow
 
 FREEDOM = "DoF"
 """Title of a column of degrees of freedom."""
 MANY = 10_000
 """As good as unlimited degrees of freedom."""
-OUTSIDE = "stations outside of roll sets"
-RISK = "risk of a wrong verdict, all roll sets and limits together"
+BETWEEN_SETS = "stations outside of roll sets"
+VERDICT_RISK = "risk of a wrong verdict, all roll sets and limits together"
 
 
 def screen(result: Verdict, signature: SignatureCheck, *metadata: Mapping[str, object]) -> str:
@@ -33,9 +33,9 @@ def screen(result: Verdict, signature: SignatureCheck, *metadata: Mapping[str, o
     first += simulated(*metadata)
     source = f" ({result.source})" if result.source else ""
     lines = ["   ".join(first), f"limits {result.limits}{source}", f"rule: {result.rule}"]
-    lines += [SETTINGS[result.settings]] if result.settings in SETTINGS else []
+    lines += [SETTING_PRACTICES[result.settings]] if result.settings in SETTING_PRACTICES else []
     if result.risk is not None:
-        lines.append(f"{RISK}: {chance(result.risk)}")
+        lines.append(f"{VERDICT_RISK}: {chance(result.risk)}")
     header = ["", "raw", "noise-free", "1σ", FREEDOM, "limit", "", "where"]
     blocks = ["\n".join(map(one_line, lines)), table(rows, header, WIDE), *_sets(result)]
     return "\n\n".join(blocks)
@@ -44,7 +44,7 @@ def screen(result: Verdict, signature: SignatureCheck, *metadata: Mapping[str, o
 def _sets(result: Verdict) -> list[str]:
     """What each roll set shows of each limit, where there are several."""
     rows = [
-        [row.name, one_line(each.label or OUTSIDE), *map(str, cells)]
+        [row.name, one_line(each.label or BETWEEN_SETS), *map(str, cells)]
         for row in result.rows
         if len(row.sets) > 1 and row.uncertainty is not None
         for each in row.sets
