@@ -33,13 +33,14 @@ LIMIT = 0.005
 
 def places(system: pyproj.CRS) -> Iterator[tuple[float, float]]:
     """Latitudes and longitudes in the area of use of a system."""
-    area = system.area_of_use
-    if area.south < -90:  # as PROJ says where the database has no bounds
-        area = system.geodetic_crs.area_of_use
-    span = (area.east - area.west) % 360 or 360.0
+    west, south, east, north = system.area_of_use.bounds
+    if south < -90:  # as PROJ says where the database has no bounds
+        params = {each.name: each.value for each in system.coordinate_operation.params}
+        centre = params["Longitude of natural origin"]
+        west, south, east, north = centre - 3, 0.0, centre + 3, 60.0
+    span = (east - west) % 360 or 360.0
     for up, right in SHARES:
-        longitude = (area.west + right * span + 180) % 360 - 180
-        yield area.south + up * (area.north - area.south), longitude
+        yield south + up * (north - south), (west + right * span + 180) % 360 - 180
 
 
 def bearing_of_north(
