@@ -41,6 +41,7 @@ MAGNETIC = (
     "field_nt",
     "dip_deg",
     "magnetic_toolface_deg",
+    *("sd_azimuth_deg", "sd_field_nt", "sd_dip_deg", "sd_magnetic_toolface_deg"),
 )
 TOOL = Tool.random(4, noise=(1e-12, 1e-7))
 SURVEYS = [  # inclination, azimuth, toolface
