@@ -107,13 +107,15 @@ def command(
     stand = Stand(speed, settle, soak, screen.reach(reach))
     tables = [load_plan(name) for name in plans]
     done = load_measured(str(measured), profile.has_magnetometer) if measured else None
-    search = profile, chosen, criterion, stand, done
+    if accuracy and stations:
+        raise InputError("`accuracy` finds the number of stations itself. Leave `stations` out.")
     candidates = tables[0] if tables else None
     with progress.bar("planning") as show:
         if accuracy:
             wanted = screen.wanted_accuracy(accuracy)
-            result = [planned.smallest_plan(candidates, wanted, *search)]
+            result = [planned.smallest_plan(candidates, wanted, profile, chosen, stand, done)]
         elif stations or done:
+            search = profile, chosen, criterion, stand, done
             result = [planned.best_plan(candidates, stations or 1, *search)]
         else:
             result = []
