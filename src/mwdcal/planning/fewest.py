@@ -34,7 +34,7 @@ def variances(information: Information, members: Bools, wanted: Array) -> Array:
     whole, size = information.of(members.astype(np.float64)), information.size
     if np.linalg.cond(whole) > 1e14:
         return np.full(len(wanted), np.inf)
-    return np.einsum("cij,ji->c", wanted, inverse(whole)[:size, :size])
+    return np.asarray(np.einsum("cij,ji->c", wanted, inverse(whole)[:size, :size]))
 
 
 def least_worst(
@@ -94,7 +94,7 @@ def suffice(information: Information, count: int, wanted: Array, kept: Bools) ->
     `kept` (n,) are among them.
     """
     size, free = information.size, ~kept
-    new = count - np.count_nonzero(kept)
+    new = count - int(np.count_nonzero(kept))
     weights = np.where(free, new / np.count_nonzero(free), 1.0)
     shares = np.full(len(wanted), 1 / len(wanted))
     for _ in range(MOST_STEPS):
@@ -128,7 +128,7 @@ def _capped(weights: Array, total: float) -> Array:
 
 def least_count(information: Information, wanted: Array, kept: Bools, most: int) -> int:
     """A number of candidates, `kept` (n,) ones among them, below which the variances cannot be within 1."""
-    low, high = np.count_nonzero(kept), most
+    low, high = int(np.count_nonzero(kept)), most
     while high - low > 1:
         middle = (low + high) // 2
         if suffice(information, middle, wanted, kept):

@@ -203,8 +203,10 @@ class Gains:
         moved = rows @ back
         inner = np.eye(rows.shape[1]) + moved @ rows.mT
         fallen = np.linalg.solve(inner, moved[..., :size]).mT @ moved[..., :size]
-        flat = np.reshape(wanted, (-1, size * size))
-        return flat @ back[:size, :size].ravel() - fallen.reshape(len(rows), -1) @ flat.mT
+        flat = np.reshape(np.asarray(wanted), (-1, size * size))
+        return np.asarray(
+            flat @ back[:size, :size].ravel() - fallen.reshape(len(rows), -1) @ flat.mT
+        )
 
 
 def _log_gain(rows: Array, whole: Array) -> Array:

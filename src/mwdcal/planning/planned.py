@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
+from msgspec.structs import replace as with_fields
 
 from mwdcal.calibration import results
 from mwdcal.calibration.automatic.auto import Choice
@@ -105,10 +106,10 @@ class Planned:
     def findings(self) -> list[Finding]:
         """What the calibration and the search will say, and which errors hide."""
         stations = sorted({k for some in self.hidden.values() for k in some})
-        labels_ = labels(self.plan, "station") or [str(k + 1) for k in range(self.plan.count)]
+        named = [station_names(self.plan)[k] for k in stations]
         text = (
-            f"errors of {', '.join(self.hidden)} hide at station {listed([labels_[k] for k in stations], OUT_NAMED)}: "
-            "however large, they widen the residuals of all stations, and none can be named. Add stations."
+            f"calibrate cannot trace a wrong {', '.join(self.hidden)} to station {listed(named, OUT_NAMED)}, however "
+            "wrong it is: the residuals of all stations grow alike. Add stations."
         )
         hidden = [Finding(id="hidden-errors", text=text)] if stations else []
         return [*self.calibration.findings, *hidden, *self.search]
@@ -132,7 +133,7 @@ def judged(
     carried = carried_out(plan, profile, options)
     others = at_temperatures(_reached(candidates or load_plan("candidates"), stand), plan)
     whole = joined(plan, others)
-    information, _ = Information.of_fit(planned_fit(whole, profile, options)[1])
+    information, _ = Information.of_fit(planned_fit(whole, _set_anew(profile), options)[1])
     share = Design(information, np.arange(whole.count) < plan.count).efficiency
     return Planned.of(plan, carried, share, stand)
 
@@ -162,33 +163,48 @@ def smallest_plan(
     options: Options | None = None,
     stand: Stand = USUAL_STAND,
     measured: Table | None = None,
+    count: int | None = None,
 ) -> Planned:
     """The plan of the fewest stations that gives wanted accuracies, 1σ in degrees by angle, and is redundant.
 
     An accuracy holds at every one of `WORKING_INCLINATIONS`, from the coldest soak to the hottest. Redundant:
-    `Planned.is_redundant`. Raises as `judged`, and `InputError` where all candidates together do not give the
-    accuracy.
+    `Planned.is_redundant`. With a `count` the plan has so many stations, whatever they give. Raises as `judged`, and
+    `InputError` where all candidates together do not give the accuracy.
     """
     search = Search.of(candidates, profile, options, "I", stand, measured)
     _check_determined(search.calibration, accuracy_deg)
+    wanted = search.variances(accuracy_deg)
+    if count:
+        return search.least_worst(count, wanted)
     if not _reaches(search.calibration, accuracy_deg):
         raise InputError(
             f"all {search.most} candidates together do not give the wanted accuracy. Add candidates, "
             "average longer at each, or use a more exact stand."
         )
-    wanted = search.variances(accuracy_deg)
     bound = least_count(search.information, wanted, search.kept, search.plan.count) - search.before
-    count, enough = max(bound, search.fewest(0)), 0
-    while True:
-        count = min(count, search.most)
-        made = search.least_worst(count, wanted)
-        if made and _reaches(made.calibration, accuracy_deg):
-            enough = enough or count
-            if made.is_redundant or count == search.most:
-                break
-        count += 1 + count // LEAP
+    made, enough = _grown(search, max(bound, search.fewest(0)), wanted, accuracy_deg)
     bound = max(bound, search.fewest(FEW_FREEDOM))
     return replace(made, bound=bound, search=_of_search(bound, enough, made.plan.count))
+
+
+def _grown(
+    search: Search, count: int, wanted: Array, accuracy_deg: Mapping[str, float]
+) -> tuple[Planned, int]:
+    """The first plan from a `count` of stations on that is accurate and redundant, and how many are accurate."""
+    enough = 0
+    while True:
+        count = min(count, search.most)
+        try:
+            made = search.least_worst(count, wanted)
+        except FitError:  # too few for a calibration
+            if count == search.most:
+                raise
+        else:
+            accurate = _reaches(made.calibration, accuracy_deg)
+            enough = enough or count * accurate
+            if (accurate and made.is_redundant) or count == search.most:
+                return made, enough or count
+        count += 1 + count // LEAP
 
 
 def _of_search(bound: int, enough: int, count: int) -> list[Finding]:
@@ -196,14 +212,14 @@ def _of_search(bound: int, enough: int, count: int) -> list[Finding]:
     said = []
     if count > bound:
         text = (
-            f"fewer stations may do: fewer than {bound} cannot give the accuracy and {FEW_FREEDOM:.0f} degrees of "
-            f"freedom, and from {bound} to {count - 1} the search found none."
+            f"fewer stations may do: a plan of {bound} is not ruled out, although the search found none. Fewer than "
+            f"{bound} cannot give the accuracy and {FEW_FREEDOM:.0f} degrees of freedom."
         )
         said.append(Finding(id="fewer-may-do", text=text))
     if count > enough:
         text = (
             f"{enough} stations give the accuracy. {count} also give {FEW_FREEDOM:.0f} degrees of freedom and trace a "
-            f"wrong setting of any one station. For fewer use `stations` {enough}."
+            f"wrong setting of any one station. For fewer add `stations` {enough}."
         )
         said.append(Finding(id="redundancy", text=text))
     return said
@@ -243,7 +259,7 @@ class Search:
         if measured:
             inside = at_place(inside, measured) if candidates else at_temperatures(inside, measured)
             whole = replace(joined(measured, inside), source=inside.source)
-        choice, result = planned_fit(whole, profile, options)
+        choice, result = planned_fit(whole, _set_anew(profile), options)
         information, turn = Information.of_fit(result)
         to_file = results.to_file(result, choice.profile.reference_temperature_c)[0]
         before = whole.count - inside.count
@@ -289,13 +305,16 @@ class Search:
         for temperature in np.linspace(*span, WORKING_TEMPERATURES).tolist() if span else [None]:
             for name, most in accuracy_deg.items():
                 moved = self._moved(name, temperature)
-                each.append(moved.mT @ moved / moved.shape[1] / (np.radians(most) * (1 - SLACK)) ** 2)
+                each.append(
+                    moved.mT @ moved / moved.shape[1] / (np.radians(most) * (1 - SLACK)) ** 2
+                )
         return np.concatenate(each)
 
     def _moved(self, name: str, temperature: float | None) -> Array:
         """Changes (i, a, r) of an angle at `WORKING_INCLINATIONS` by the directions `turn`."""
         grid = np.meshgrid(WORKING_INCLINATIONS, TWELFTHS, TWELFTHS, indexing="ij")
-        readings = readings_at(self.calibration, *(axis.ravel() for axis in grid), temperature)
+        inclination, azimuth, toolface = (axis.ravel() for axis in grid)
+        readings = readings_at(self.calibration, inclination, azimuth, toolface, temperature)
         moved = self.calibration.sensitivity(name, readings) @ self.turn
         return np.reshape(moved, (len(WORKING_INCLINATIONS), -1, moved.shape[-1]))
 
@@ -307,31 +326,25 @@ class Search:
 
     def best(self, count: int) -> Design:
         """The best so many stations beside those measured."""
-        if not 1 <= count <= self.most:
-            raise InputError(
-                f"`stations` must be between 1 and the {self.most} candidates; got {count}."
-            )
         self._check_size(count)
         return best(self.information, self.before + count, self.wanted[self.criterion], self.kept)
 
-    def least_worst(self, count: int, wanted: Array) -> Planned | None:
-        """The best so many stations by the largest of variances; None where one is above 1 or they give no calibration.
+    def least_worst(self, count: int, wanted: Array) -> Planned:
+        """The best so many stations by the largest of variances.
 
-        Of those with which all are within 1, each the best by a criterion, that is taken which hides the fewest errors.
+        Where all are within 1 there is freedom left: of plans that use it, each for another criterion, that is taken
+        which hides the fewest errors. Raises `FitError` where no calibration can come of so few.
         """
         self._check_size(count)
         found, largest = least_worst(self.information, self.before + count, wanted, self.kept)
-        if largest > 1:
-            return None
-        plans = []
-        for criterion in CRITERIA:
-            weight = self.wanted[criterion]
-            members = exchanged(self.information, found, weight, self.kept, wanted)
-            try:
-                plans.append(self.planned(Design(self.information, members)))
-            except FitError:
-                continue
-        return min(plans, key=Planned.hides, default=None)
+        choices = [found]
+        if largest <= 1:
+            every = [self.wanted[criterion] for criterion in CRITERIA]
+            choices = [exchanged(self.information, found, w, self.kept, wanted) for w in every]
+        elif not np.isfinite(largest):
+            raise FitError(f"{count} stations cannot give a calibration. Add stations.")
+        plans = [self.planned(Design(self.information, members)) for members in choices]
+        return min(plans, key=Planned.hides)
 
     def fewest(self, freedom: float) -> int:
         """Fewer stations, beside those measured, cannot give a triad so many degrees of freedom."""
@@ -340,7 +353,11 @@ class Search:
         return max(1, math.ceil((unknowns + freedom) / 3) - self.before)
 
     def _check_size(self, count: int) -> None:
-        """Refuse a search that would take hours."""
+        """Refuse more stations than candidates, and a search that would take hours."""
+        if not 1 <= count <= self.most:
+            raise InputError(
+                f"`stations` must be between 1 and the {self.most} candidates; got {count}."
+            )
         if count * self.plan.count > MOST_SEARCHED:
             raise InputError(
                 f"the best {count} of {self.most} candidates take too long to find: the product of both must not "
@@ -360,13 +377,23 @@ class Search:
         return Planned.of(plan, carried, design.efficiency, self.stand, self.before)
 
 
+def station_names(plan: Table) -> list[str]:
+    """The labels of the stations of a plan, their numbers where it has none."""
+    return labels(plan, "station") or [str(k + 1) for k in range(plan.count)]
+
+
+def _set_anew(profile: Profile) -> Profile:
+    """The profile with a stand that is set anew at every station: only an order says which ones share a setting."""
+    return with_fields(profile, stand=with_fields(profile.stand, settings="per-station"))
+
+
 def _check_reached(plan: Table, stand: Stand) -> None:
     """Refuse a plan with stations that the stand does not reach; the message names them."""
     inside = stand.within(attitudes(plan))
     for name, reached in zip(ANGLES, inside.mT, strict=True):
         if not reached.all():
             low, high = stand.reach[name]
-            names = labels(plan, "station") or [str(k + 1) for k in range(plan.count)]
+            names = station_names(plan)
             out = listed([names[k] for k in np.flatnonzero(~reached)], OUT_NAMED)
             raise InputError(
                 f"{plan.source}: the stand reaches {name} {low:g}:{high:g}°, and station {out} lie outside. Leave "

@@ -101,7 +101,9 @@ def _response(result: Fit, column: Array) -> _Response:
 def _squares(rows: Array, unknowns: Array) -> Array:
     """Sum of squares (B, n), over all stations' rows (B, n, k, p), that each of unknowns (B, n, p) makes."""
     flat = rows.reshape(len(rows), -1, rows.shape[-1])
-    return np.asarray(np.einsum("bnp,bpq,bnq->bn", unknowns, flat.mT @ flat, unknowns, optimize=True))
+    return np.asarray(
+        np.einsum("bnp,bpq,bnq->bn", unknowns, flat.mT @ flat, unknowns, optimize=True)
+    )
 
 
 def _detection(result: Fit, response: _Response) -> tuple[Array, Array]:

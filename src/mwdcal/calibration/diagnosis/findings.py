@@ -65,8 +65,8 @@ REMARKS = {
     "residuals": "{triad}: residuals are {times:.2f} times the declared noise{rare}: the noise figure, a reference, or "
     "the model is wrong. Uncertainties are scaled up accordingly.",
     "no-redundancy": "{triads}: no redundancy, so nothing in this run checks the fit. Add stations.",
-    "few-degrees-of-freedom": "the {few}: another run like this one may state {share:.0f} % more or less (1σ), and errors of "
-    "single stations are hard to see. Add stations.",
+    "few-degrees-of-freedom": "the {few}: another run like this one may state {share:.0f} % more or less (1σ), and an "
+    "error of a single station is hard to see. Add stations.",
     "scatter": "beyond sensor noise, these vary from station to station: {what} (1σ, estimated; weights and "
     "uncertainties include it). Look for iron near the stand and play in the tool holder; or the model lacks "
     "something.",
@@ -196,7 +196,9 @@ def _few_degrees(fitted: FittedRuns) -> Flag:
         return f"{' and the '.join(each)} degrees of freedom"
 
     least = np.where(few, freedom, np.inf).min(-1)
-    return _remark("few-degrees-of-freedom", np.any(few, -1), few=named, share=100 / np.sqrt(2 * least))
+    return _remark(
+        "few-degrees-of-freedom", np.any(few, -1), few=named, share=100 / np.sqrt(2 * least)
+    )
 
 
 def _structure(fitted: FittedRuns) -> Iterator[Flag]:
