@@ -22,7 +22,7 @@ from mwdcal.geometry.vectors import Array, reference_vectors
 from mwdcal.planning.simulate import Earth
 from mwdcal.sensor.profile import Profile
 
-OF_READINGS = ("repeated-readings",)
+READING_FINDINGS = ("repeated-readings",)
 """Findings that hold of readings without noise and not of real ones."""
 STILL = 1e-6
 """A channel that moves by no more than this share of gravity or field over a plan does not move."""
@@ -134,7 +134,7 @@ def carried_out(
     """The calibration that a plan will give, as `expected`, and the fit that it is the record of."""
     choice, result = planned_fit(plan, profile, options)
     calibration = recorded(choice, result)
-    said = [finding for finding in calibration.findings if finding.id not in OF_READINGS]
+    said = [finding for finding in calibration.findings if finding.id not in READING_FINDINGS]
     return msgspec.structs.replace(calibration, findings=said), result
 
 

@@ -15,15 +15,15 @@ from __future__ import annotations
 import numpy as np
 
 from mwdcal.geometry.vectors import Array, Bools, inverse
-from mwdcal.planning.optimal import Gains, Information, best, first_best
+from mwdcal.planning.optimal import LITTLE, Gains, Information, best, first_best
 
-ROUNDS = 8
+WEIGHINGS = 8
 """Times that the variances are weighed anew."""
 MOST_EXCHANGES = 100
 """Exchanges of one search, at most."""
 LOWERED = 1e-6
 """Smallest share by which an exchange has to lower the largest variance."""
-MOST_STEPS = 300
+BOUND_STEPS = 300
 """Steps at most in which the bound is improved."""
 MOST_PRODUCTS = 4e8
 """Products, at most, in one look at all exchanges; in a larger search there are none."""
@@ -44,20 +44,20 @@ def least_worst(
 
     A mean is weighed anew only while it is above 1.
     """
-    weight, found, least = np.full(len(wanted), 1 / len(wanted)), kept, np.inf
-    for _ in range(ROUNDS):
+    weight, chosen, least = np.full(len(wanted), 1 / len(wanted)), kept, np.inf
+    for _ in range(WEIGHINGS):
         mean = np.einsum("c,cij->ij", weight, wanted)
         members = best(information, count, mean, kept).members
         each = variances(information, members, wanted)
         if each.max() < least * (1 - LOWERED):
-            found, least = members, float(each.max())
+            chosen, least = members, float(each.max())
         if least <= 1 or not np.isfinite(least):
             break
         weight = weight * each / (weight @ each)
     products = count * information.rows.size * information.size * (1 + len(wanted) / 6)
     if np.isfinite(least) and products < MOST_PRODUCTS:
-        found, least = _lowered(information, found, wanted, kept)
-    return found, least
+        chosen, least = _lowered(information, chosen, wanted, kept)
+    return chosen, least
 
 
 def _lowered(
@@ -68,13 +68,13 @@ def _lowered(
     for _ in range(MOST_EXCHANGES):
         places = np.flatnonzero(members & ~kept)
         gains = [_in_place_of(information, members, place, wanted) for place in places.tolist()]
-        lowest = -np.array([each.max() for each in gains])
-        which = first_best(-lowest)
-        if not lowest[which] < least * (1 - LOWERED):
+        which = first_best(np.array([each.max() for each in gains]))
+        other = members.copy()
+        other[[places[which], first_best(gains[which])]] = [False, True]
+        lowest = float(variances(information, other, wanted).max())
+        if not lowest < least * (1 - LOWERED):
             break
-        members = members.copy()
-        members[[places[which], first_best(gains[which])]] = [False, True]
-        least = float(lowest[which])
+        members, least = other, lowest
     return members, least
 
 
@@ -82,8 +82,8 @@ def _in_place_of(information: Information, members: Bools, place: int, wanted: A
     """The largest variance (n,), negative, with each candidate in the place of a member."""
     others = members & (np.arange(len(members)) != place)
     whole = information.of(others.astype(np.float64))
-    if np.linalg.cond(whole) > 1e14:  # without it nothing can be said
-        return np.full(len(members), -np.inf)
+    if np.linalg.cond(whole) > 1e14:  # too few without it
+        whole = whole + LITTLE * information.of(np.ones(len(members)))
     after = Gains(information, whole, wanted).left()
     return np.asarray(np.where(members, -np.inf, -after.max(-1)))
 
@@ -97,7 +97,7 @@ def suffice(information: Information, count: int, wanted: Array, kept: Bools) ->
     new = count - int(np.count_nonzero(kept))
     weights = np.where(free, new / np.count_nonzero(free), 1.0)
     shares = np.full(len(wanted), 1 / len(wanted))
-    for _ in range(MOST_STEPS):
+    for _ in range(BOUND_STEPS):
         back = inverse(information.of(weights))
         each = np.einsum("cij,ji->c", wanted, back[:size, :size])
         if each.max() <= 1:
@@ -127,7 +127,7 @@ def _capped(weights: Array, total: float) -> Array:
 
 
 def least_count(information: Information, wanted: Array, kept: Bools, most: int) -> int:
-    """A number of candidates, `kept` (n,) ones among them, below which the variances cannot be within 1."""
+    """A number of candidates, `kept` (n,) ones and at least one more, below which the variances cannot be within 1."""
     low, high = int(np.count_nonzero(kept)), most
     while high - low > 1:
         middle = (low + high) // 2

@@ -10,7 +10,7 @@ bound; D. M. Titterington, "Algorithms for computing D-optimal designs" (1976), 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -24,7 +24,9 @@ CLOSE = 2e-3
 """The bound on the D-value per parameter is looked for to this share of it."""
 GAIN = 1e-9
 """Smallest improvement of a criterion that counts."""
-EQUAL = 1e-7
+LITTLE = 1e-6
+"""Weight of all candidates beside stations that are too few alone, for numbers to exist."""
+TIE = 1e-7
 """Candidates whose gains differ by less than this share are equal: the first is taken."""
 
 
@@ -137,7 +139,7 @@ def exchanged(
 def _added(information: Information, count: int, wanted: Array | None, kept: Bools) -> Bools:
     """A start: to those kept the station that gains most, one after the other."""
     chosen = kept.copy()
-    little = 1e-6 * information.of(np.ones(information.count))
+    little = LITTLE * information.of(np.ones(information.count))
     for _ in range(count - np.count_nonzero(kept)):
         gains = Gains(
             information, information.of(chosen.astype(np.float64)) + little, wanted
@@ -153,7 +155,7 @@ def first_best(gains: Array) -> int:
     1
     """
     largest = gains.max()
-    return int(np.argmax(gains >= largest - EQUAL * abs(largest)))
+    return int(np.argmax(gains >= largest - TIE * abs(largest)))
 
 
 def _exchange(
@@ -168,13 +170,22 @@ def _exchange(
             chosen[place] = True
             continue
         gains = np.where(chosen, -np.inf, Gains(information, whole, wanted).of_adding())
+        least = gains[place] + max(GAIN, TIE * abs(gains[place]))
         if limits is not None:
-            gains[Gains(information, whole, limits).left().max(-1) > 1] = -np.inf
+            better = gains > least
+            some = replace(information, rows=information.rows[better])
+            gains[better] = np.where(_within(some, whole, limits), gains[better], -np.inf)
         other = first_best(gains)
-        better = gains[other] > gains[place] + max(GAIN, EQUAL * abs(gains[place]))
-        chosen[other if better else place] = True
-        improved |= bool(better)
+        gained = bool(gains[other] > least)
+        chosen[other if gained else place] = True
+        improved |= gained
     return improved
+
+
+def _within(information: Information, whole: Array, limits: Array) -> Bools:
+    """With which candidates (n,), each added to `whole` (k, k), no variance is above 1."""
+    none = not information.count
+    return np.zeros(0, bool) if none else Gains(information, whole, limits).left().max(-1) <= 1
 
 
 @dataclass(frozen=True)

@@ -44,7 +44,7 @@ WORKING_INCLINATIONS = np.radians([5.0, 30.0, 60.0, 90.0, 120.0])
 """Inclinations over which an I-optimal plan makes the angles accurate."""
 WORKING_TEMPERATURES = 7
 """Temperatures, evenly from the coldest to the hottest soak, at which a wanted accuracy holds."""
-SLACK = 1e-6
+ACCURACY_MARGIN = 1e-6
 """A search aims at wanted accuracies smaller by this share, for rounding not to decide."""
 LEAP = 50
 """A search for the smallest plan adds one station at a time, beyond this many a share of one in as many."""
@@ -182,9 +182,9 @@ def smallest_plan(
             "average longer at each, or use a more exact stand."
         )
     bound = least_count(search.information, wanted, search.kept, search.plan.count) - search.before
-    made, enough = _grown(search, max(bound, search.fewest(0)), wanted, accuracy_deg)
+    result, enough = _grown(search, max(bound, search.fewest(0)), wanted, accuracy_deg)
     bound = max(bound, search.fewest(FEW_FREEDOM))
-    return replace(made, bound=bound, search=_of_search(bound, enough, made.plan.count))
+    return replace(result, bound=bound, search=_of_search(bound, enough, result.plan.count))
 
 
 def _grown(
@@ -195,16 +195,17 @@ def _grown(
     while True:
         count = min(count, search.most)
         try:
-            made = search.least_worst(count, wanted)
+            result = search.least_worst(count, wanted)
         except FitError:  # too few for a calibration
             if count == search.most:
                 raise
         else:
-            accurate = _reaches(made.calibration, accuracy_deg)
+            accurate = _reaches(result.calibration, accuracy_deg)
             enough = enough or count * accurate
-            if (accurate and made.is_redundant) or count == search.most:
-                return made, enough or count
+            if (accurate and result.is_redundant) or count == search.most:
+                return result, enough or count
         count += 1 + count // LEAP
+        count = max(count, search.fewest(FEW_FREEDOM)) if enough else count
 
 
 def _of_search(bound: int, enough: int, count: int) -> list[Finding]:
@@ -306,7 +307,10 @@ class Search:
             for name, most in accuracy_deg.items():
                 moved = self._moved(name, temperature)
                 each.append(
-                    moved.mT @ moved / moved.shape[1] / (np.radians(most) * (1 - SLACK)) ** 2
+                    moved.mT
+                    @ moved
+                    / moved.shape[1]
+                    / (np.radians(most) * (1 - ACCURACY_MARGIN)) ** 2
                 )
         return np.concatenate(each)
 
@@ -336,11 +340,11 @@ class Search:
         which hides the fewest errors. Raises `FitError` where no calibration can come of so few.
         """
         self._check_size(count)
-        found, largest = least_worst(self.information, self.before + count, wanted, self.kept)
-        choices = [found]
+        start, largest = least_worst(self.information, self.before + count, wanted, self.kept)
+        choices = [start]
         if largest <= 1:
             every = [self.wanted[criterion] for criterion in CRITERIA]
-            choices = [exchanged(self.information, found, w, self.kept, wanted) for w in every]
+            choices = [exchanged(self.information, start, w, self.kept, wanted) for w in every]
         elif not np.isfinite(largest):
             raise FitError(f"{count} stations cannot give a calibration. Add stations.")
         plans = [self.planned(Design(self.information, members)) for members in choices]

@@ -26,9 +26,9 @@ from mwdcal.geometry.vectors import Array, eigen, quotient
 
 POWER = 0.8
 """Share of runs in which an error of the stated size is reported."""
-ROUNDS = 60
+REPETITIONS = 60
 """Rounds in which the size of an error and its effect on the other stations are found in turn."""
-HIDDEN = 0.9
+HIDING_RISE = 0.9
 """An error hides among the other stations where the limit of the test rises by this share of the station's χ²."""
 
 
@@ -48,11 +48,10 @@ class Detection:
 class _Response:
     """What errors of one unit, of each station in turn, do to whitened residuals.
 
-    `own` (B, n, m) to the station's; `square` (B, n) is its χ², `others` (B, n) that of all others, and `triads`
-    (B, n, t) the sum of squares of each triad.
+    `square` (B, n) is the χ² of the station, `others` (B, n) that of all others, and `triads` (B, n, t) the sum of
+    squares of each triad.
     """
 
-    own: Array
     square: Array
     others: Array
     triads: Array
@@ -65,13 +64,13 @@ def detections(result: Fit) -> dict[str, Detection]:
     known = [name for name in EARTH if len(problem.triads) > 1 or name == "gravity"]
     columns = {n: problem.stand_column(state, f"{n}-zero", turns) for n in ANGLES}
     columns |= {name: earth[..., EARTH.index(name)] for name in known}
-    found = {}
+    by_observable = {}
     for name, column in columns.items():
         given = problem.evidence.is_known(name) & (problem.evidence.include > 0)
         if np.any(given):
             each = _detection(result, _response(result, column))
-            found[name] = Detection(*(np.where(given, sd, np.nan) for sd in each))
-    return found
+            by_observable[name] = Detection(*(np.where(given, sd, np.nan) for sd in each))
+    return by_observable
 
 
 def _response(result: Fit, column: Array) -> _Response:
@@ -83,19 +82,19 @@ def _response(result: Fit, column: Array) -> _Response:
         unknowns = -np.einsum("bpq,bnmq,bnm->bnp", whole, weighed, column, optimize=True)
     else:
         unknowns = np.einsum("bnpm,bnm->bnp", analysis.influence, column)
-    own = linear.weigh(column[..., None])[..., 0] + np.einsum("bnmp,bnp->bnm", weighed, unknowns)
+    itself = linear.weigh(column[..., None])[..., 0] + np.einsum("bnmp,bnp->bnm", weighed, unknowns)
     values, vectors = eigen(analysis.spread)
     roots = np.sqrt(quotient(np.ones_like(values), values, values > TESTED))
     tests = (vectors * roots[..., None, :]).mT
     seen = tests @ weighed
-    square = np.sum((tests @ own[..., None])[..., 0] ** 2, -1)
+    square = np.sum((tests @ itself[..., None])[..., 0] ** 2, -1)
     others = _squares(seen, unknowns) - np.sum((seen @ unknowns[..., None])[..., 0] ** 2, -1)
     triads = []
     for first in range(0, weighed.shape[2], 3):
         rows, axes = weighed[:, :, first : first + 3], slice(first, first + 3)
         instead = np.sum((rows @ unknowns[..., None])[..., 0] ** 2, -1)
-        triads.append(_squares(rows, unknowns) - instead + np.sum(own[..., axes] ** 2, -1))
-    return _Response(own, square, np.maximum(others, 0.0), np.stack(triads, -1))
+        triads.append(_squares(rows, unknowns) - instead + np.sum(itself[..., axes] ** 2, -1))
+    return _Response(square, np.maximum(others, 0.0), np.maximum(np.stack(triads, -1), 0.0))
 
 
 def _squares(rows: Array, unknowns: Array) -> Array:
@@ -116,13 +115,13 @@ def _detection(result: Fit, response: _Response) -> tuple[Array, Array]:
     with np.errstate(all="ignore"):
         limit = chdtri(tested, RESHOOT / tested.shape[-1])
         rise = limit * response.others / response.square / rest
-        hidden = ~(rise < HIDDEN)
+        hidden = ~(rise < HIDING_RISE)
         needed = chndtrinc(limit, tested, 1 - POWER)
-        for _ in range(ROUNDS):
+        for _ in range(REPETITIONS):
             wider = limit + np.where(hidden, 0.0, rise) * needed
             needed = chndtrinc(wider, tested, 1 - POWER)
         named = np.where(hidden, np.inf, np.sqrt(needed / response.square))
         freedom = freedom_of(result)[:, None]
         whole = chndtrinc(chdtri(freedom, MISFIT_CHANCE), freedom, 1 - POWER)
-        size = whole * analysis.freedom[:, None] / freedom / response.triads
-    return np.fmin(named, np.sqrt(size).min(-1)), named
+        size = np.sqrt(whole * analysis.freedom[:, None] / freedom / response.triads)
+    return np.fmin(named, size.min(-1)), named
