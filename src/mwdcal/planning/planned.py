@@ -213,7 +213,7 @@ def _of_search(bound: int, enough: int, count: int) -> list[Finding]:
     said = []
     if count > bound:
         text = (
-            f"fewer stations may do: a plan of {bound} is not ruled out, although the search found none. Fewer than "
+            f"fewer may do: a plan of {bound} stations is not ruled out, although the search found none. Fewer than "
             f"{bound} cannot give the accuracy and {FEW_FREEDOM:.0f} degrees of freedom."
         )
         said.append(Finding(id="fewer-may-do", text=text))
