@@ -218,11 +218,6 @@ class TriadCalibration(msgspec.Struct, frozen=True, kw_only=True):
     degrees_of_freedom: float
     misfit_probability: float | None = None
 
-    @property
-    def noise_declared(self) -> bool:
-        """Whether its noise was declared, not estimated."""
-        return self.noise_source == "declared"
-
     def functions(self, reference: float) -> Model:
         """The model that these parameters belong to."""
         basis = Basis(self.order, reference)

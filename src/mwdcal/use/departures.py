@@ -22,7 +22,7 @@ from mwdcal.geometry.observables import OBSERVABLES, OUTPUTS
 from mwdcal.geometry.vectors import Array, Bools, Ints
 from mwdcal.use import roll_test
 from mwdcal.use.roll_sets import ROLL_SET, RollSet, near_vertical, roll_sets
-from mwdcal.use.roll_test import FITTED, UNLIMITED, Coverage, Curve, Scatter, draws
+from mwdcal.use.roll_test import FITTED, UNLIMITED, Coverage, Curve, NoiseScale, draws
 
 UNDEFINED_AT_VERTICAL = ("azimuth", "toolface")
 """Angles that do not exist at vertical."""
@@ -165,7 +165,9 @@ class RollTest:
     def noise_freedom(self, name: str) -> float:
         """Degrees of freedom of the noise of an observable: infinite where the noise of all triads is declared."""
         triads = self.calibration.triads[: 2 if name in MAGNETIC else 1]
-        estimated = [t for t in triads if t.name not in self.readings.sd and not t.noise_declared]
+        estimated = [
+            t for t in triads if t.name not in self.readings.sd and t.noise_source != "declared"
+        ]
         return min((t.degrees_of_freedom for t in estimated), default=UNLIMITED)
 
     def _common(self, name: str) -> Array:
@@ -354,7 +356,7 @@ class RollTest:
         noisy = float(np.mean(noise**2) / np.mean(sd**2 + among**2))
         return _Rolled(roll_set, part, curve, noisy, reference)
 
-    def _curve_of(self, name: str, rolled: _Rolled, noise: Scatter, error: bool) -> Statistic:
+    def _curve_of(self, name: str, rolled: _Rolled, noise: NoiseScale, error: bool) -> Statistic:
         """Noise-free spread, or largest error, of a rolled set."""
         roll_set, part, curve = rolled.roll_set, rolled.part, rolled.curve
         first, reference = int(roll_set.index[0]), rolled.reference

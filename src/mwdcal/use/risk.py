@@ -14,7 +14,7 @@ from mwdcal.geometry.vectors import Array, eigen
 
 COVERAGE = 2.0
 """Coverage factor of the guard band and of the remark that a value is close to its limit."""
-REPETITIONS = 2000
+RISK_DRAWS = 2000
 RISK_SEED = 1
 
 
@@ -67,9 +67,9 @@ def risk_of_all(within: Sequence[float], passed: bool, errors: Array) -> float:
     values, vectors = eigen(correlation)
     rng = np.random.default_rng(RISK_SEED)
     normal = (
-        rng.normal(size=(REPETITIONS, len(chance))) @ (vectors * np.sqrt(np.maximum(values, 0.0))).T
+        rng.normal(size=(RISK_DRAWS, len(chance))) @ (vectors * np.sqrt(np.maximum(values, 0.0))).T
     )
-    uniform = (np.arange(REPETITIONS) + 0.5) / REPETITIONS
+    uniform = (np.arange(RISK_DRAWS) + 0.5) / RISK_DRAWS
 
     def given(first: int, score: Array) -> Array:
         """Scores (d, k) of all limits where that of the first is known."""

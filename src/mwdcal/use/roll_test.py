@@ -117,7 +117,7 @@ class Curve:
 
 
 @dataclass(frozen=True)
-class Scatter:
+class NoiseScale:
     """Noise of one observable in one run (...), in units of the stated noise.
 
     `known`: degrees of freedom of the stated noise. A declared noise keeps its size: `scale` is 1. An estimated
@@ -133,7 +133,7 @@ class Scatter:
     seen: Array
 
 
-def scatter(curves: Sequence[Curve], known: float = UNLIMITED) -> Scatter:
+def scatter(curves: Sequence[Curve], known: float = UNLIMITED) -> NoiseScale:
     """Noise of one observable in one run, by all its curves but those that are not smooth."""
     square, freedom = np.zeros(()), np.zeros((), int)
     for curve in curves:
@@ -146,7 +146,7 @@ def scatter(curves: Sequence[Curve], known: float = UNLIMITED) -> Scatter:
         scale = np.sqrt((known + square) / np.maximum(whole, 1e-9))
     calm = np.asarray(chance(square, freedom, known) > 1 - DEPARTURE_CHANCE) & (freedom > 0)
     seen = np.where(calm, np.sqrt(square / np.maximum(freedom, 1)), scale)
-    return Scatter(known, scale, whole, calm, seen)
+    return NoiseScale(known, scale, whole, calm, seen)
 
 
 def chance(square: Array, freedom: Array, known: float = UNLIMITED) -> Array:
@@ -249,7 +249,7 @@ def fitted(
     )
 
 
-def extent(curve: Curve, noise: Scatter | None = None, moved: Array | None = None) -> Extent:
+def extent(curve: Curve, noise: NoiseScale | None = None, moved: Array | None = None) -> Extent:
     """Range and largest departure over the whole circle, corrected for the bias by noise.
 
     Definition (parametric bootstrap): both are computed for the fitted curve, c, and for many
@@ -291,7 +291,7 @@ class Figure:
 
 
 def figure(
-    part: Array, curve: Curve, noise: Scatter, error: bool, moved: Array | None = None
+    part: Array, curve: Curve, noise: NoiseScale, error: bool, moved: Array | None = None
 ) -> Figure:
     """The figure to judge of values (..., n) about their middle, or of errors, through which `curve` goes.
 
