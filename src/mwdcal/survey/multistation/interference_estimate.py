@@ -44,18 +44,18 @@ DETERMINED_SHARE = 0.5
 """A direction is determined by the readings if they leave less than this share of what was assumed."""
 
 
-DRIFTS = {"owsg": "owsg-mwd", "none": ""}
+DRIFT_SOURCES = {"owsg": "owsg-mwd", "none": ""}
 """Words for what sensors may have drifted by: limits of surveys whose sensor terms it is."""
 
 
 def sensor_drift(name_or_path: str | os.PathLike[str] = "owsg") -> SensorTerms:
-    """Drift of the sensors since the laboratory, 1σ of each axis: by a word of `DRIFTS`, or the [sensor] of limits.
+    """Drift of the sensors since the laboratory, 1σ of each axis: by a word of `DRIFT_SOURCES`, or the [sensor] of limits.
 
     Raises:
         InputError: no such limits.
     """
     name = os.fspath(name_or_path)
-    source = DRIFTS.get(name, name)
+    source = DRIFT_SOURCES.get(name, name)
     return load_survey_limits(source)[0].sensor if source else SensorTerms()
 
 
