@@ -93,9 +93,9 @@ class FaultEvidence:
 
     @cached_property
     def by_fault(self) -> dict[str, float]:
-        """Log evidence of each fault over none: the mean over its forms."""
+        """Log evidence of each fault over none: the mean over its forms; none for one that has no form here."""
         others = over_forms(self.forms, self.by_form) | {DEAD: log_mean(self.dead_ratios)}
-        return {name: float(others.get(name, 0.0)) for name in (NONE, *FAULTS)}
+        return {NONE: 0.0} | {name: float(others.get(name, -np.inf)) for name in FAULTS}
 
     def likelihoods(self) -> dict[str, float]:
         """Share of each fault, all being as likely beforehand."""
