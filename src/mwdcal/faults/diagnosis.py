@@ -157,7 +157,7 @@ def _named(calibration: Calibration, evidence: FaultEvidence, fault: str) -> dic
         channel, moved, onset = _dead(calibration, evidence)
         extra = {"above_c": None if np.isinf(onset) else onset}
     else:
-        form, sizes, covariance = evidence.sizes(fault)
+        form, sizes, covariance = evidence.sizes(fault, whole=True)
         channel = channel_name(calibration, form.channel)
         moved, extra = _moved(calibration, form, sizes, covariance), {"above_c": None}
     sized: dict[str, Any] = {"parameters": moved, "channel": channel, **extra}

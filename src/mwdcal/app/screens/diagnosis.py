@@ -15,7 +15,7 @@ MEANINGS = {
     "impact": "a sensor, or a triad, that a blow has moved",
     "dead-channel": "a channel that stands still",
     "heat": "bias and scale drift with temperature beyond the calibration",
-    "magnetised": "interference of a drill string, collar or package, fixed in the tool",
+    "magnetised": "interference of a string or collar, fixed in the tool",
     "casing": "casing or steel nearby, fixed in the Earth",
     "turn-on": "biases of all channels after switching on",
 }
