@@ -13,6 +13,7 @@ import numpy as np
 
 from mwdcal.calibration.prediction import raw_reading
 from mwdcal.calibration.readings import CONSTANTS, TRIADS, Readings
+from mwdcal.calibration.settings import DIRECTION, settings_of
 from mwdcal.estimation.evidence import ANGLES
 from mwdcal.faults.physics import Damage, changed_field, changed_readings
 from mwdcal.geometry.vectors import (
@@ -245,7 +246,7 @@ def simulated(
     common = common_errors(rng, session, effects, lead) if common is None else common
     angles = {
         name: _settings(session, name, effects, common)
-        + session.uncertainty(name) * rng.normal(size=(*lead, count))
+        + session.uncertainty(name) * _alike(session, name, rng.normal(size=(*lead, count)))
         for name in ANGLES
     }
     damage = effects.fault.damage(rng, session.profile or Profile(name="servo"), lead)
@@ -268,10 +269,16 @@ def simulated(
         known=session.known,
         sd=session.sd,
         group=session.group,
+        settings=session.settings,
         station=session.station,
         metadata={**session.metadata, "simulated": True},
     )
     return Simulation(result, angles, warmth, turn_on, damage)
+
+
+def _alike(session: Readings, name: str, numbers: Array) -> Array:
+    """Random numbers (..., n), the same for stations of one setting of the stand; toolface is set at each."""
+    return numbers[..., settings_of(session)] if name in DIRECTION else numbers
 
 
 def _settings(session: Readings, name: str, effects: Effects, common: Mapping[str, Array]) -> Array:
