@@ -18,6 +18,7 @@ from mwdcal.estimation.evidence import ANGLES
 from mwdcal.faults.physics import Damage, changed_field, changed_readings
 from mwdcal.geometry.vectors import (
     Array,
+    diagonal,
     earth_field,
     earth_gravity,
     reference_vectors,
@@ -319,7 +320,10 @@ def _read(
         return sound
     whole = [sound.get(name, 0 * vector) for name, vector in zip(TRIADS, vectors, strict=True)]
     raw, both = (np.concatenate(pair, -1) for pair in (whole, vectors))
-    changed = changed_readings(damage, raw, both, temperature, truth.reference)
+    gain = np.ones_like(raw)
+    for start, (name, (model, params)) in zip((0, 3), truth.triads.items(), strict=False):
+        gain[..., start : start + 3] = 1 / diagonal(model.slope(params, sound[name], temperature))
+    changed = changed_readings(damage, raw, both, temperature, truth.reference, gain)
     return {name: changed[..., 3 * i : 3 * i + 3] for i, name in enumerate(sound)}
 
 
