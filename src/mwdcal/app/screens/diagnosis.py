@@ -17,7 +17,7 @@ MEANINGS = {
     "dead-channel": "a channel that stands still",
     "heat": "bias and scale drift with temperature beyond the calibration",
     "magnetised": "interference of a string or collar, fixed in the tool",
-    "casing": "casing or steel nearby, fixed in the Earth",
+    "casing": "casing or steel nearby, or references that are off",
     "turn-on": "biases of all channels after switching on",
 }
 """Each fault in words."""
@@ -27,7 +27,7 @@ ADVICE = {
     "dead-channel": "take the tool out of service: replace the sensor or its channel",
     "heat": "calibrate again over the whole range of temperatures; hold a suspect channel at the highest one",
     "magnetised": "verify without string and collar, or demagnetise them; mwdcal survey --msa corrects surveys",
-    "casing": "the calibration may be sound: measure again away from casing and steel",
+    "casing": "the calibration may be sound: check the references, and measure again away from casing and steel",
     "turn-on": "switch off and on and read again; calibrate again if the biases come back",
 }
 """What to do about each."""
