@@ -18,6 +18,7 @@ import numpy as np
 from mwdcal import __version__
 from mwdcal.calibration.canonical import Signature, document_sha256
 from mwdcal.calibration.readings import NANOTESLA, SOAK_GAP, Readings, simulated, stated_day
+from mwdcal.calibration.tilt import tilt_width
 from mwdcal.errors import InputError
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array, Bools, diagonal
@@ -36,6 +37,8 @@ MAGNETIC = ("azimuth", "field", "dip", "magnetic_toolface", "north_toolface", "b
 NOISE, SETTINGS = "noise of the readings", "settings of the stand"
 REPEATABILITY, ORDER = "repeatability of the readings", "order of the temperature terms"
 """Sources of a budget."""
+MOST_FREEDOM = 1e6
+"""Degrees of freedom that stand for infinitely many."""
 SCALED = (NOISE, REPEATABILITY, SETTINGS)
 """Sources whose variance is scaled by that of the residuals."""
 AXES_OF_A_TERM = 3
@@ -217,6 +220,13 @@ class TriadCalibration(msgspec.Struct, frozen=True, kw_only=True):
     variance_factor: float | None
     degrees_of_freedom: float
     misfit_probability: float | None = None
+
+    @property
+    def freedom_of_noise(self) -> float:
+        """Degrees of freedom of its noise: of the residuals, but where they confirm a declared one."""
+        known = self.noise_source == "declared" and self.variance_factor is not None
+        confirmed = known and (self.variance_factor or 0.0) <= 1.0
+        return MOST_FREEDOM if confirmed else self.degrees_of_freedom
 
     def functions(self, reference: float) -> Model:
         """The model that these parameters belong to."""
@@ -499,7 +509,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
 
         Student's t with the `effective_freedom` of the observable; NaN as in `uncertainty`.
         Singular: near vertical an error across the tool axis tilts it whichever way it points, so
-        that of the inclination is the length of a vector; see `_tilt_width`.
+        that of the inclination is the length of a vector; see `tilt_width`.
         """
         from scipy.special import stdtrit
 
@@ -516,14 +526,15 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
         Definition: Welch-Satterthwaite for the sources of the budget, which are independent; the
         triads are not, by the errors that they share. What the residuals scale has the degrees of
         freedom of the triad with the fewest, the order of the temperature terms those of the axes
-        that it is seen on, all else infinitely many. No more are counted than that triad has, as the
+        that it is seen on, all else infinitely many: a declared noise too that the residuals do not
+        exceed. No more are counted than that triad has, as the
         shares differ with attitude; an observable without a share has the fewest of any angle.
         Reference: JCGM 100:2008, G.4.
         """
         triads = self.triads if name in MAGNETIC else [self.accelerometer]
-        fewest = max(min(triad.degrees_of_freedom for triad in triads), 1.0)
+        fewest = max(min(triad.freedom_of_noise for triad in triads), 1.0)
         angles = [angle for angle in ANGLE_COLUMNS if angle == f"{name}_deg"] or ANGLE_COLUMNS
-        return min(self._freedom_by_source(angle, fewest) for angle in angles)
+        return min(min(self._freedom_by_source(angle, fewest) for angle in angles), MOST_FREEDOM)
 
     def _freedom_by_source(self, angle: str, fewest: float) -> float:
         """Welch-Satterthwaite for an angle of the budget; `fewest`: of what the residuals scale."""
@@ -535,23 +546,11 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
     def _tilt_width(
         self, readings: Readings, width: Array, freedom: float, probability: float
     ) -> Array:
-        """The half width (…, n) of inclination: `width` away from vertical, that of a tilt near it.
-
-        Definition: the tilt (gx, gy) / |g| has two errors, and with their larger uncertainty u its
-        error is below k u, k² = ν ((1 - p)^(-2/ν) - 1), Hotelling's for two. The one takes over from
-        the other between tilts of k u and 2 k u. Reference: JCGM 102, 7.
-        """
+        """The half width (…, n) of inclination: see `tilt_width`."""
         g, _ = self.fields(readings)
         rows = self.jacobian(readings)[..., :2, :] / np.linalg.norm(g, axis=-1)[..., None, None]
         spread = rows @ self.parameter_covariance @ rows.mT
-        half, odd = (spread[..., 0, 0] + spread[..., 1, 1]) / 2, spread[..., 0, 1]
-        largest = half + np.hypot((spread[..., 0, 0] - spread[..., 1, 1]) / 2, odd)
-        factor = freedom * np.expm1(-2 / freedom * np.log1p(-probability))
-        tilt_width = np.sqrt(np.maximum(largest, 0.0) * factor)
-        tilt = np.linalg.norm(g[..., :2], axis=-1) / np.linalg.norm(g, axis=-1)
-        share = np.clip(tilt / np.maximum(tilt_width, 1e-300) - 1, 0.0, 1.0)
-        share = share**2 * (3 - 2 * share)
-        return np.asarray(tilt_width + share * (width - tilt_width) + 0 * width)
+        return tilt_width(g, spread, width, freedom, probability)
 
     def rests_on_free(self, name: str, readings: Readings) -> Bools:
         """Where (…, n) an observable moves with a direction that no evidence determines."""

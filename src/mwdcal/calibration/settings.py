@@ -6,6 +6,8 @@ down over the turn, and small scatter within the set is no evidence that it is s
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from mwdcal.calibration.readings import Readings
@@ -30,14 +32,17 @@ def settings_of(readings: Readings) -> Ints:
     group with equal references, wherever they are in the run. Returning to a direction later is a
     new setting. Stations without either angle have a setting of their own.
     """
-    shape = readings.accelerometer.shape[:-1]
-    group = np.broadcast_to(readings.groups, shape)
-    angles = [readings.reference(name) for name in DIRECTION]
+    group = np.broadcast_to(readings.groups, readings.accelerometer.shape[:-1])
+    return numbered(group, [readings.reference(name) for name in DIRECTION], readings.settings)
+
+
+def numbered(group: Ints, angles: Sequence[Array], practice: str) -> Ints:
+    """`settings_of` stations of groups (..., n) and reference inclination and azimuth (..., n), by a practice."""
     next_to = [np.stack([x[..., 1:], x[..., :-1]]) for x in (group, *angles)]
     shared = _equal(*next_to)
-    if readings.settings == "per-station":
+    if practice == "per-station":
         shared &= group[..., 1:] >= 0
-    first = np.ones((*shape[:-1], 1), bool)
+    first = np.ones((*group.shape[:-1], 1), bool)
     number = np.cumsum(np.concatenate([first, ~shared], -1), -1) - 1
     if (group < 0).all():
         return np.asarray(number)

@@ -78,14 +78,8 @@ class Suspect:
 
     def start(self, readable: Array | None = None) -> State:
         """Where the calibration sees the tools; `readable` (B, n, m) are readings to take for that instead."""
-        evidence, (batch, count) = self.problem.evidence, self.problem.temperature.shape
-        constants = [constant.value for constant in evidence.constants]
-        empty = State(
-            self.expected,
-            np.broadcast_to(np.eye(3), (batch, count, 3, 3)),
-            np.stack(constants, -1) if constants else np.zeros((batch, 0)),
-            np.zeros((batch, count, 0)),
-        )
+        level = np.broadcast_to(np.eye(3), (*self.problem.temperature.shape, 3, 3))
+        empty = self.problem.start(self.expected, level)
         problem = self.problem if readable is None else with_raw(self.problem, readable)
         return oriented(problem, empty)
 
@@ -130,7 +124,8 @@ def departures_seen(suspect: Suspect, state: State) -> Array:
         gain = inverse(triad.model.slope(state.params[:, where], triad.raw, problem.temperature))
     whole = np.zeros((*raw.shape[:-1], 6))
     whole[..., :count] = raw
-    return columns(whole, vectors, state.attitude, suspect.warmth, gain)[..., :count, :]
+    attitude = problem.attitude(state)
+    return columns(whole, vectors, attitude, suspect.warmth, gain)[..., :count, :]
 
 
 @dataclass(frozen=True)
