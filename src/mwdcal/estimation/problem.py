@@ -335,7 +335,7 @@ class Problem:
         turns, _ = self.station_columns(state)
         sd = self.evidence.set_together
         each = np.stack([part.sum(-1) for part in np.split(sd, 2, -1)], -1)
-        return (turns @ self._angle_axes(state)[..., :2]) * each[..., None, :]
+        return np.asarray((turns @ self._angle_axes(state)[..., :2]) * each[..., None, :])
 
     def _constant_columns(
         self, state: State, by_earth: Array, turns: Array, geometry: bool

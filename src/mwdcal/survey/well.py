@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from msgspec import UNSET
 
 from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import Calibration, Finding
@@ -26,8 +27,8 @@ WELL_FINDINGS = {
     "columns ref_gravity_g, ref_field_nt, ref_dip_deg.",
     "partly-judged": "{names} of {partly} of {rows} surveys are not judged: no reference. `accepted` says nothing "
     "about them.",
-    "laboratory-gravity": "the calibration's gravity is 1 g, as where its run states none: |g| is then in units of the "
-    "laboratory's gravity, and judged with 1.5 mg more of uncertainty. Calibrate with ref_gravity_g.",
+    "laboratory-gravity": "gravity at the laboratory is unknown (1 g was assumed), so |g| is judged 1.5 mg more "
+    "loosely. To tighten this, give ref_gravity_g in the calibration run.",
     "magnetic-north": "no declination: azimuths and the well path count from magnetic north.",
     "path-from-first": "the well path starts at the first station, at north 0, east 0 and TVD 0. `tie_in` gives its "
     "position.",
@@ -256,8 +257,10 @@ def _to_judge(
 
 
 def unknown_gravity(calibration: Calibration) -> bool:
-    """Whether the calibration took gravity as exactly 1 g, which no reference says."""
-    return calibration.earth["gravity_g"] == 1.0
+    """Whether gravity was taken as 1 g without a reference; in files of earlier versions, whether it is 1 g."""
+    if calibration.gravity_stated is UNSET:
+        return calibration.earth["gravity_g"] == 1.0
+    return not calibration.gravity_stated
 
 
 def _positions(
