@@ -4,6 +4,7 @@ import msgspec
 import numpy as np
 import pytest
 from scipy.special import stdtrit
+from scipy.stats import chi2
 
 from mwdcal.calibration.automatic.order_selection import choose_order
 from mwdcal.calibration.calibrate import calibrate
@@ -50,8 +51,8 @@ def half_widths(result, raw):
     """Errors' 95 % half widths (runs, 5, n) at raw readings, written once more.
 
     Per triad s² times the covariance; Student's t with the degrees of freedom of the triad with the
-    fewest, of those that an observable needs. A declared noise never shrinks: s² below one leaves it
-    as it is, and known. Also the corrected vectors (runs, n, 6).
+    fewest, of those that an observable needs. A declared noise never shrinks, and is known where the
+    residuals agree with it (chance above 0.05). Also the corrected vectors (runs, n, 6).
     """
     triads = list(zip(result.problem.triads, result.problem.slices(), strict=True))
     size, runs = triads[-1][1].stop, len(result.state.params)
@@ -61,7 +62,11 @@ def half_widths(result, raw):
         fields.append(triad.model.fields(params, raw[t], warmth))
         slopes[:, :, 3 * t : 3 * t + 3, where] = triad.model.jacobian(params, raw[t], warmth)
         scale[:, where] = np.sqrt(result.analysis.variance_factor[:, t, None])
-    confirmed = np.isnan(result.noise) & (result.analysis.variance_factor < 1)
+    square, freedom = (
+        result.analysis.variance_factor * result.analysis.freedom,
+        result.analysis.freedom,
+    )
+    confirmed = np.isnan(result.noise) & (chi2.sf(square, freedom) > 0.05)
     scale = np.where(np.isnan(result.noise).any(), np.maximum(scale, 1.0), scale)
     freedoms = np.where(confirmed, np.inf, result.analysis.freedom)
     covariance = result.analysis.covariance * scale[:, :, None] * scale[:, None, :]

@@ -299,8 +299,8 @@ def test_intervals_hold_95_percent_where_the_triads_share_errors():
         record = calibrate(Readings(*pair, known=data.known, sd=data.sd), Profile(name="tool"))
         attitudes = rng.uniform(20, 160, 20) * DEG, *rng.uniform(0, 2 * np.pi, (2, 20))
         probe = Readings(*tool.clean(*attitudes))
-        # a declared noise that the residuals do not exceed is known
-        excess = [t.degrees_of_freedom for t in record.triads if t.variance_factor > 1]
+        # a declared noise that the residuals agree with is known
+        excess = [t.degrees_of_freedom for t in record.triads if t.misfit_probability <= 0.05]
         fewest = min(excess, default=1e6)
         for name, true in (("azimuth", attitudes[1]), ("dip", tool.dip)):
             error = centred(OBSERVABLES[name].value(*record.fields(probe)) - true)

@@ -39,6 +39,8 @@ REPEATABILITY, ORDER = "repeatability of the readings", "order of the temperatur
 """Sources of a budget."""
 MOST_FREEDOM = 1e6
 """Degrees of freedom that stand for infinitely many."""
+DOUBT = 0.05
+"""Chance of residuals so large, if all is as declared, from which on a declared noise counts as known."""
 SCALED = (NOISE, REPEATABILITY, SETTINGS)
 """Sources whose variance is scaled by that of the residuals."""
 AXES_OF_A_TERM = 3
@@ -223,10 +225,9 @@ class TriadCalibration(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def freedom_of_noise(self) -> float:
-        """Degrees of freedom of its noise: of the residuals, but where they confirm a declared one."""
-        known = self.noise_source == "declared" and self.variance_factor is not None
-        confirmed = known and (self.variance_factor or 0.0) <= 1.0
-        return MOST_FREEDOM if confirmed else self.degrees_of_freedom
+        """Degrees of freedom of its noise: of the residuals, unless these agree with a declared one."""
+        agrees = (self.misfit_probability or 0.0) > DOUBT and self.noise_source == "declared"
+        return MOST_FREEDOM if agrees else self.degrees_of_freedom
 
     def functions(self, reference: float) -> Model:
         """The model that these parameters belong to."""
@@ -531,8 +532,8 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
         Definition: Welch-Satterthwaite for the sources of the budget, which are independent; the
         triads are not, by the errors that they share. What the residuals scale has the degrees of
         freedom of the triad with the fewest, the order of the temperature terms those of the axes
-        that it is seen on, all else infinitely many: a declared noise too that the residuals do not
-        exceed. No more are counted than that triad has, as the
+        that it is seen on, all else infinitely many: a declared noise too that the residuals agree
+        with. No more are counted than that triad has, as the
         shares differ with attitude; an observable without a share has the fewest of any angle.
         Reference: JCGM 100:2008, G.4.
         """

@@ -78,8 +78,14 @@ class StatedCovariance:
 
     @property
     def _lone_settings(self) -> Array:
-        """The same as it is stated: what is declared does not shrink."""
-        return _scaled(self.result, self._unscaled_settings, least=1.0)
+        """The same as it is stated: times s² of both triads together if that is above one.
+
+        One turn of the stand moves both triads: one factor, so that what they share stays alike.
+        """
+        analysis = self.result.analysis
+        squares = np.nan_to_num(analysis.variance_factor * analysis.freedom).sum(-1)
+        together = np.maximum(squares / np.maximum(analysis.freedom.sum(-1), 1.0), 1.0)
+        return self._unscaled_settings * together[:, None, None]
 
     @cached_property
     def total(self) -> Array:
@@ -199,10 +205,10 @@ def unconfirmed_dip(result: Fit) -> Array:
     return np.asarray(np.where(confirmed, np.nan, dip))
 
 
-def _scaled(result: Fit, covariance: Array, least: float = 0.0) -> Array:
-    """A covariance (B, p, p) of independent errors times the `variance_scales`, and no less than `least`."""
+def _scaled(result: Fit, covariance: Array) -> Array:
+    """A covariance (B, p, p) of independent errors of the readings times the `variance_scales`."""
     sizes = [t.model.size for t in result.problem.triads]
-    grown = np.repeat(np.sqrt(np.maximum(variance_scales(result), least)), sizes, axis=-1)
+    grown = np.repeat(np.sqrt(variance_scales(result)), sizes, axis=-1)
     return np.asarray(covariance * outer(grown))
 
 

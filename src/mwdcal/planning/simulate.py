@@ -13,6 +13,7 @@ import numpy as np
 
 from mwdcal.calibration.prediction import raw_reading
 from mwdcal.calibration.readings import CONSTANTS, TRIADS, Readings
+from mwdcal.calibration.settings import DIRECTION, settings_of
 from mwdcal.estimation.evidence import ANGLES
 from mwdcal.faults.physics import Damage, changed_field, changed_readings
 from mwdcal.geometry.vectors import (
@@ -242,9 +243,12 @@ def simulated(
     lead, count = truth.accelerometer.shape[:-1], session.count
     times = np.arange(1.0, count + 1) if minutes is None else minutes
     common = common_errors(rng, session, effects, lead) if common is None else common
+    setting = dict.fromkeys(ANGLES, np.arange(count)) | dict.fromkeys(
+        DIRECTION, settings_of(session)
+    )
     angles = {
         name: _settings(session, name, effects, common)
-        + session.uncertainty(name) * rng.normal(size=(*lead, count))
+        + session.uncertainty(name) * rng.normal(size=(*lead, count))[..., setting[name]]
         for name in ANGLES
     }
     damage = effects.fault.damage(rng, session.profile or Profile(name="servo"), lead)
@@ -267,6 +271,7 @@ def simulated(
         known=session.known,
         sd=session.sd,
         group=session.group,
+        settings=session.settings,
         station=session.station,
         metadata={**session.metadata, "simulated": True},
     )
