@@ -85,7 +85,7 @@ class StatedCovariance:
         analysis = self.result.analysis
         squares = np.nan_to_num(analysis.variance_factor * analysis.freedom).sum(-1)
         together = np.maximum(squares / np.maximum(analysis.freedom.sum(-1), 1.0), 1.0)
-        return self._unscaled_settings * together[:, None, None]
+        return np.asarray(self._unscaled_settings * together[:, None, None])
 
     @cached_property
     def total(self) -> Array:

@@ -58,6 +58,8 @@ class Suspect:
             triads.append(Triad(model, raw[None], np.maximum(sd, floor)[None]))
         count = sum(triad.model.size for triad in triads)
         evidence = evidence_of(readings, np.ones(readings.count))
+        if evidence.assumed:  # nobody says that stations of one direction were set together
+            evidence = replace(evidence, apart=np.ones_like(evidence.apart))
         nothing = Prior(np.zeros((1, count, count)), np.zeros((1, count)))
         problem = Problem(tuple(triads), temperature[None], evidence, nothing)
         return cls(
