@@ -16,6 +16,7 @@ from mwdcal.app.messages import findings_as_typed
 from mwdcal.app.pages.page import banner, environment
 from mwdcal.app.screens.calibration import how, known_inclinations
 from mwdcal.app.screens.numbers import HELD, capital, exponent, factor_places
+from mwdcal.app.screens.verification import BETWEEN_SETS, freedom
 from mwdcal.app.text import plural, quantity, raised
 from mwdcal.calibration.prediction import accuracy_at, angles, middle_temperature, typical_accuracy
 from mwdcal.calibration.readings import is_simulated, soaks
@@ -26,6 +27,7 @@ from mwdcal.geometry.observables import TITLES
 from mwdcal.use import plots
 from mwdcal.use import verdict_plots as verdict_plots  # puts `plot` on verdicts
 from mwdcal.use.notation import Notation, convert
+from mwdcal.use.verification import SETTING_PRACTICES
 
 if TYPE_CHECKING:
     from mwdcal.use.verification import Verdict, VerdictRow
@@ -47,7 +49,9 @@ def render(
 
     `metadata` are those of the roll test behind the verdict.
     """
-    template = environment().get_template("report.html")
+    pages = environment()
+    pages.filters["freedom"] = freedom
+    template = pages.get_template("report.html")
     return template.render(
         cal=calibration,
         name=calibration.tool.get("serial") or calibration.profile.name,
@@ -66,6 +70,8 @@ def render(
         accuracy=_accuracy(calibration),
         soaked=_soaked(calibration),
         kinds=_kinds(verdict),
+        settings=SETTING_PRACTICES,
+        outside=BETWEEN_SETS,
         titles=TITLES,
         large=LARGE_RATIO,
         tolerance=RANK_TOLERANCE,

@@ -196,6 +196,8 @@ def _test_facts(tests: Sequence[ConformityTest]) -> TableBlock:
         "Limits": lambda test: test.limits,
         "Source of the limits": lambda test: test.source,
         "Decision rule": lambda test: test.rule_text or test.rule,
+        "Setting of the stand": lambda test: test.settings,
+        "Risk of a wrong verdict": lambda test: "" if test.risk is None else chance(test.risk),
         digest: lambda test: test.calibration_sha256,
     }
     rows = {name: [fact(test) for test in tests] for name, fact in facts.items()}

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from mwdcal.app.screens.numbers import UNDETERMINED, number, written
 from mwdcal.app.screens.records.quantities import quantity_numbers
+from mwdcal.app.screens.verification import VERDICT_RISK
 from mwdcal.app.text import NOT_STATED, chance, one_line, table
 from mwdcal.app.text import quantity as in_unit
 from mwdcal.calibration.prediction import STATED_ANGLES
@@ -55,6 +56,8 @@ def _test(test: ConformityTest) -> str:
     lines = [
         f"{outcome}   {test.when}   {test.run}   limits {test.limits}",
         f"rule: {test.rule_text}",
+        *([test.settings] if test.settings else []),
+        *([f"{VERDICT_RISK}: {chance(test.risk)}"] if test.risk is not None else []),
     ]
     header = ["", "value", "U", "limit", "accepted up to", "", "P within", "risk"]
     rows = [_decision(decision) for decision in test.decisions]
