@@ -527,7 +527,10 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
         width = np.asarray(sd * stdtrit(freedom, (1 + probability) / 2))
         if name != "inclination":
             return width
-        return self._tilt_width(readings, width, freedom, probability)
+        g, _ = self.fields(readings)
+        rows = self.jacobian(readings)[..., :2, :] / np.linalg.norm(g, axis=-1)[..., None, None]
+        spread = rows @ self.parameter_covariance @ rows.mT
+        return tilt_width(g, spread, width, freedom, probability)
 
     def effective_freedom(self, name: str) -> float:
         """Effective degrees of freedom of the uncertainty of an observable, one or more.
@@ -551,15 +554,6 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
         scaled = sum(variance.get(source, 0.0) for source in SCALED)
         spread = scaled**2 / fewest + variance.get(ORDER, 0.0) ** 2 / AXES_OF_A_TERM
         return min(sum(variance.values()) ** 2 / spread, fewest) if spread else fewest
-
-    def _tilt_width(
-        self, readings: Readings, width: Array, freedom: float, probability: float
-    ) -> Array:
-        """The half width (…, n) of inclination: see `tilt_width`."""
-        g, _ = self.fields(readings)
-        rows = self.jacobian(readings)[..., :2, :] / np.linalg.norm(g, axis=-1)[..., None, None]
-        spread = rows @ self.parameter_covariance @ rows.mT
-        return tilt_width(g, spread, width, freedom, probability)
 
     def rests_on_free(self, name: str, readings: Readings) -> Bools:
         """Where (…, n) an observable moves with a direction that no evidence determines."""
