@@ -49,7 +49,7 @@ DRIFT_SOURCES = {"owsg": "owsg-mwd", "none": ""}
 
 
 def sensor_drift(name_or_path: str | os.PathLike[str] = "owsg") -> SensorTerms:
-    """Drift of the sensors since the laboratory, 1σ of each axis: by a word of `DRIFT_SOURCES`, or the [sensor] of limits.
+    """Drift of the sensors since the laboratory, 1σ of each axis: by a word of `DRIFT_SOURCES` or a limits file.
 
     Raises:
         InputError: no such limits.
