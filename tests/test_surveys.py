@@ -635,8 +635,8 @@ def test_results_say_whether_interference_was_taken_off(example, tmp_path):
         # 2034 nT move the dip by 0.1°, 5375 nT |b| by 300 nT
         (90, 90, {"dip_deg": 0.1}, (2000, np.arctan(2000 / 21_791.5)), (0, 0.0)),
         (90, 90, {"field_nt": 300.0}, (3000, np.arctan(3000 / 21_791.5)), (0, 0.0)),
-        # horizontal north: along the tool nothing turns, across it all of 500 nT east do
-        (90, 0, {"dip_deg": 0.1}, (None, 0.0), (500, np.arctan(500 / 21_791.5))),
+        # horizontal north: along the tool nothing turns, across it all of 300 nT east do
+        (90, 0, {"dip_deg": 0.1}, (None, 0.0), (300, np.arctan(300 / 21_791.5))),
     ],
 )
 def test_interference_that_would_pass(inclination, azimuth, limits, along, across):

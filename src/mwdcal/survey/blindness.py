@@ -14,8 +14,8 @@ from mwdcal.survey.stations import STATIONS_AT_ONCE
 
 AXIAL = np.arange(50.0, 3001.0, 50.0)
 """Sizes of interference along the tool that are tried, nT; more than the last is not usual."""
-CROSS_AXIAL = np.arange(100.0, 501.0, 100.0)
-"""Sizes across it."""
+CROSS_AXIAL = np.arange(50.0, 301.0, 50.0)
+"""Sizes across it: to twice what multi-station analysis assumes."""
 AROUND_TOOL = np.radians(np.arange(0.0, 360.0, 30.0))
 """Directions across it, rad."""
 WHERE = ("along the tool", "across it")
