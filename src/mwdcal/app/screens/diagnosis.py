@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from mwdcal.app.text import chance, number, one_line, plural, quantity, table
+from mwdcal.app.screens.numbers import estimate, measured
+from mwdcal.app.text import chance, number, one_line, plural, table
 from mwdcal.calibration.readings import simulated
 from mwdcal.faults.diagnosis import Diagnosis, Rival
 from mwdcal.faults.physics import NONE, SURROUNDINGS
@@ -16,7 +17,7 @@ MEANINGS = {
     "dead-channel": "a channel that stands still",
     "heat": "bias and scale drift with temperature beyond the calibration",
     "magnetised": "interference of a string or collar, fixed in the tool",
-    "casing": "casing or steel nearby, fixed in the Earth",
+    "casing": "casing or steel nearby, or references that are off",
     "turn-on": "biases of all channels after switching on",
 }
 """Each fault in words."""
@@ -26,7 +27,7 @@ ADVICE = {
     "dead-channel": "take the tool out of service: replace the sensor or its channel",
     "heat": "calibrate again over the whole range of temperatures; hold a suspect channel at the highest one",
     "magnetised": "verify without string and collar, or demagnetise them; mwdcal survey --msa corrects surveys",
-    "casing": "the calibration may be sound: measure again away from casing and steel",
+    "casing": "the calibration may be sound: check the references, and measure again away from casing and steel",
     "turn-on": "switch off and on and read again; calibrate again if the biases come back",
 }
 """What to do about each."""
@@ -84,13 +85,13 @@ def _place(channel: str) -> str:
 
 
 def _size(size: float, uncertainty: float | None, unit: str | None) -> str:
-    return f"{quantity(size, unit or '')} ± {quantity(uncertainty, unit or '')}"
+    return estimate(size, uncertainty, unit or "")
 
 
 def _moved(result: Diagnosis) -> str:
     """Table of all sizes of the fault."""
     rows = [
-        [row.parameter, row.channel or "", number(row.size), number(row.uncertainty), row.unit]
+        [row.parameter, row.channel or "", *measured(row.size, row.uncertainty), row.unit]
         for row in result.parameters
     ]
     return table(rows, ["moved", "channel", "by", "1σ", "unit"])
