@@ -121,7 +121,7 @@ class AcceptanceTests:
         scaled = shift / sd[:, None]
         square = np.einsum("nki,nij,nkj->nk", scaled, inverse, scaled)
         inside = (np.abs(shift) <= self.fixed).all(-1) & (square <= self.largest[:, None] ** 2)
-        return np.asarray(inside & ~self.missing.all(-1)[:, None])
+        return np.asarray(inside & (~self.missing).any(-1, keepdims=True))
 
 
 @dataclass(frozen=True)

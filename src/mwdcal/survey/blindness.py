@@ -73,8 +73,8 @@ def _of(tests: AcceptanceTests, g: Array, b: Array) -> tuple[Array, Array]:
     sizes, turns = [], []
     for fields in _candidates():
         seen = g[:, None], b[:, None] + fields
-        shift, turn = (_change(names, g, b, seen) for names in (STRENGTH_NAMES, ("azimuth",)))
-        passing = tests.accept(shift)
+        passing = tests.accept(_change(STRENGTH_NAMES, g, b, seen))
+        turn = _change(("azimuth",), g, b, seen)
         turn = np.where(passing, np.abs(np.nan_to_num(centred(turn[..., 0]))), 0.0)
         best = np.argmax(turn, -1)[:, None]
         turns.append(np.take_along_axis(turn, best, -1)[:, 0])

@@ -261,7 +261,7 @@ def _loosened(known: Knowledge, directions: Array, sd: Array) -> tuple[Knowledge
     weighed = known.precision @ directions
     left = np.linalg.inv(np.diag(sd**-2) + directions.T @ weighed)
     precision = known.precision - weighed @ left @ weighed.T
-    return replace(known, precision=precision), -left @ weighed.T, left
+    return replace(known, precision=precision), -left @ weighed.T, np.asarray(left)
 
 
 def _drifted(calibration: Calibration, known: Knowledge, drift: SensorTerms) -> Knowledge:
