@@ -73,7 +73,7 @@ def _of(tests: AcceptanceTests, g: Array, b: Array) -> tuple[Array, Array]:
     sizes, turns = [], []
     for fields in _candidates():
         seen = g[:, None], b[:, None] + fields
-        passing = tests.accept(_change(STRENGTH_NAMES, g, b, seen))
+        passing = tests.accept(_change(tuple(STRENGTH_NAMES), g, b, seen))
         turn = _change(("azimuth",), g, b, seen)
         turn = np.where(passing, np.abs(np.nan_to_num(centred(turn[..., 0]))), 0.0)
         best = np.argmax(turn, -1)[:, None]
