@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from mwdcal.app.text import chance, number, one_line, plural, quantity, table
+from mwdcal.app.screens.numbers import estimate, measured
+from mwdcal.app.text import chance, number, one_line, plural, table
 from mwdcal.calibration.readings import simulated
 from mwdcal.faults.diagnosis import Diagnosis, Rival
 from mwdcal.faults.physics import NONE, SURROUNDINGS
@@ -84,13 +85,13 @@ def _place(channel: str) -> str:
 
 
 def _size(size: float, uncertainty: float | None, unit: str | None) -> str:
-    return f"{quantity(size, unit or '')} ± {quantity(uncertainty, unit or '')}"
+    return estimate(size, uncertainty, unit or "")
 
 
 def _moved(result: Diagnosis) -> str:
     """Table of all sizes of the fault."""
     rows = [
-        [row.parameter, row.channel or "", number(row.size), number(row.uncertainty), row.unit]
+        [row.parameter, row.channel or "", *measured(row.size, row.uncertainty), row.unit]
         for row in result.parameters
     ]
     return table(rows, ["moved", "channel", "by", "1σ", "unit"])
