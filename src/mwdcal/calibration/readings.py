@@ -30,6 +30,8 @@ RELATIVE = "relative (field = 1)"
 """Unit of the calibrated field where its strength is known at no station."""
 SOAK_GAP = 5.0
 """Temperatures closer than this belong to one soak, °C."""
+RAMP_PARTS = 6
+"""A ramp is judged in parts of about this share of the run's span: enough for every order and one more to test it."""
 LEAST_TEMPERATURE_SPAN = 10.0
 """A run that spans less has no temperature terms, °C. An order needs as much for each power."""
 HIGHEST = 3
@@ -240,12 +242,25 @@ class Readings:
 
 
 def soaks(temperature: Array) -> Ints:
-    """Number (..., n) of the soak that each station belongs to, coldest first."""
+    """Number (..., n) of the soak that each station belongs to, coldest first.
+
+    Soaks are more than `SOAK_GAP` apart. Temperatures without such a gap, a ramp, count as one soak up to
+    10 °C (`LEAST_TEMPERATURE_SPAN`) and a `RAMP_PARTS`th of the run's span, and are beyond that cut into
+    soaks of equal width.
+    """
     order = np.argsort(temperature, -1, kind="stable")
     ascending = np.take_along_axis(temperature, order, -1)
-    steps = np.cumsum(np.diff(ascending, prepend=ascending[..., :1], axis=-1) > SOAK_GAP, -1)
+    width = np.maximum(LEAST_TEMPERATURE_SPAN, np.ptp(ascending, -1)[..., None] / RAMP_PARTS)
+    apart = np.diff(ascending, prepend=-np.inf, append=np.inf, axis=-1) > SOAK_GAP
+    low = np.maximum.accumulate(np.where(apart[..., :-1], ascending, -np.inf), -1)
+    ends = np.flip(np.where(apart[..., 1:], ascending, np.inf), -1)
+    span = np.flip(np.minimum.accumulate(ends, -1), -1) - low
+    parts = np.floor(span / width) + 1
+    part = np.floor((ascending - low) * parts / np.where(span > 0, span, 1.0))
+    part = np.minimum(part, parts - 1)
+    new = apart[..., :-1] | (np.diff(part, prepend=0, axis=-1) != 0)
     numbers = np.empty(order.shape, int)
-    np.put_along_axis(numbers, order, steps, -1)
+    np.put_along_axis(numbers, order, np.cumsum(new, -1) - 1, -1)
     return numbers
 
 
