@@ -110,6 +110,8 @@ class Readings:
             its amplitude). Missing or NaN reference uncertainties are zero.
         group: stations of the same non-negative number share one direction of the tool
             axis; -1 is none.
+        settings: what one setting of the stand's inclination and azimuth is good for, "per-direction"
+            or "per-station"; blank: not stated.
         station: labels, for messages and tables.
         digest: `fingerprints` of the raw readings: they tell verification data from the fit's.
         metadata: serial, date, operator, …, as the file states them.
@@ -125,6 +127,7 @@ class Readings:
     known: Mapping[str, Array] = field(default_factory=dict)
     sd: Mapping[str, Array] = field(default_factory=dict)
     group: Ints | None = None
+    settings: str = ""
     station: tuple[str, ...] = ()
     digest: tuple[str, ...] = ()
     metadata: Mapping[str, object] = field(default_factory=dict)
