@@ -226,7 +226,9 @@ def soak_temperatures(plan: Table) -> Array:
     temperature = np.asarray(plan.columns.get("temperature_c", ()), float)
     temperature = temperature[~np.isnan(temperature)]
     soak = soaks(temperature) if temperature.size else np.zeros(0, int)
-    return np.array([temperature[soak == number].mean() for number in range(soak.max(initial=-1) + 1)])
+    return np.array(
+        [temperature[soak == number].mean() for number in range(soak.max(initial=-1) + 1)]
+    )
 
 
 def soak_numbers(plan: Table) -> Ints:

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from mwdcal.calibration.automatic.courses import orders_of, terms_beyond
 from mwdcal.calibration.diagnosis.axes import explaining
 from mwdcal.calibration.diagnosis.flags import FittedRuns, Flag, listed, spaced
 from mwdcal.calibration.diagnosis.plausibility import (
@@ -27,13 +28,22 @@ from mwdcal.calibration.diagnosis.plausibility import (
 )
 from mwdcal.calibration.diagnosis.soundness import is_covariance
 from mwdcal.calibration.diagnosis.structure import described, effects
+from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.methods import EVIDENCE
 from mwdcal.calibration.options import Options
-from mwdcal.calibration.readings import CONSTANTS, EARTH_RANGES, TRIADS, Readings, soaks
+from mwdcal.calibration.readings import (
+    CONSTANTS,
+    EARTH_RANGES,
+    HIGHEST,
+    TRIADS,
+    Readings,
+    highest_order,
+    soaks,
+)
 from mwdcal.calibration.residuals import shown_in
 from mwdcal.calibration.results import temperature_range
 from mwdcal.errors import FitError, InputError
-from mwdcal.estimation.batch import batch_of_one
+from mwdcal.estimation.batch import batch_of_one, take
 from mwdcal.estimation.robust import LOSSES
 from mwdcal.estimation.solvers import Status
 from mwdcal.estimation.uncertainty import station_misfit
@@ -132,9 +142,11 @@ OF_FITS = {
     "residuals": "the {triad}'s residuals are {much}: no sensor model explains these readings. Check that columns, "
     "reference angles and groups belong to the stations they stand at, and 'axes' and 'noise' in the tool "
     "profile.{culprit}{axes}",
+    "temperature": "the {triad}'s residuals are {much}, because its readings vary with temperature more than `order` "
+    "{order} follows: this run spans {span:.0f} °C. {remedy}.",
     "weak-geometry": "the stations are too weak to fit the model: nothing determines {names}. Add stations at other "
     "inclinations (at least three, well apart, up and down) with six or more toolfaces each, or give more reference "
-    "angles.{axes}",
+    "angles{lower}.{axes}",
     "no-redundancy": "the {triad} has no redundancy ({freedom:.1f} degrees of freedom): its noise cannot be estimated. "
     "Add stations, or declare 'noise' in the tool profile.",
     "gain": "the {triad}'s gain on tool axis {axis} comes out at {gain:.3g} times nominal and {wrong} (accepted: "
@@ -307,7 +319,7 @@ def _temperatures(readings: Readings, order: int) -> Iterator[Flag]:
         yield Flag(BAD_INPUT, _all(readings, True), OF_READINGS["no temperature"], needs)
         return
     levels, span = soaks(readings.temperature).max(-1) + 1, np.ptp(readings.temperature, axis=-1)
-    few = (levels < order + 1) | (span < 10 * order)
+    few = highest_order(readings.temperature) < order
     values = {"span": span, "levels": levels, "plural": np.where(levels > 1, "s", "")}
     yield Flag("temperature-span", few, OF_READINGS["span"], needs | values)
 
@@ -353,7 +365,7 @@ def _by_arrays(fitted: FittedRuns) -> Iterator[Flag]:
         name = status.name.lower().replace("_", "-")
         yield refusal("unsettled", unsettled, name, message=status.message)
     for triad in triads:
-        yield _absurd(fitted, triad)
+        yield from _absurd(fitted, triad)
     yield _too_weak(fitted)
     for triad in triads:
         freedom = result.analysis.freedom[:, triad]
@@ -403,21 +415,52 @@ def _culprit(fitted: FittedRuns, place: int) -> str:
     )
 
 
-def _absurd(fitted: FittedRuns, index: int) -> Flag:
+def _absurd(fitted: FittedRuns, index: int) -> Iterator[Flag]:
     """Residuals that no error of a sensor explains: columns, references or groups are mixed up."""
     result, raw = fitted.result, fitted.result.problem.triads[index].raw
     excess = np.sqrt(np.nan_to_num(result.analysis.variance_factor[:, index]))
     noise = result.noise[:, index]
     declared, signal = np.isnan(noise), np.minimum(_strength(raw), 2 * raw.std(axis=1).max(-1))
-    absurd = np.where(declared, excess > ABSURD_RATIO, noise > COARSE_NOISE * signal)
+
+    def is_absurd(share: Array | float) -> Bools:
+        return np.where(
+            declared, excess * share > ABSURD_RATIO, noise * share > COARSE_NOISE * signal
+        )
 
     def much(place: int) -> str:
         if declared[place]:
             return f"{excess[place]:.0f} times the declared noise"
         return f"{noise[place] / signal[place]:.0%} of the field"
 
-    absurd &= result.analysis.freedom[:, index] >= 1
-    return _refusal(fitted, "residuals", absurd, triad=TRIADS[index], much=much)
+    absurd = is_absurd(1.0) & (result.analysis.freedom[:, index] >= 1)
+    warmed = absurd & ~is_absurd(_without_temperature(result, index, absurd))
+    words = {"triad": TRIADS[index], "much": much}
+    yield _refusal(
+        fitted, "temperature", warmed, "temperature-order", **words, **_spanned(fitted, index)
+    )
+    yield _refusal(fitted, "residuals", absurd & ~warmed, **words)
+
+
+def _without_temperature(result: Fit, index: int, members: Bools) -> Array:
+    """The share (B,) of a triad's residuals that further powers of temperature would leave `members` (B,)."""
+    share, factor = np.ones(len(members)), result.analysis.variance_factor[:, index]
+    places = np.flatnonzero(members & np.isfinite(factor))
+    if places.size:
+        left = terms_beyond(take(result, places)).scatter[:, index]
+        share[places] = np.sqrt(left / factor[places])
+    return share
+
+
+def _spanned(fitted: FittedRuns, index: int) -> Words:
+    """The order of a triad, the span of temperatures, and what to do."""
+    temperature, order = fitted.result.problem.temperature, orders_of(fitted.result)[index]
+    higher = np.minimum(highest_order(temperature), HIGHEST) > order
+    remedy = np.where(
+        higher & (fitted.options.method != "swarm"),
+        "Use `order` auto, or a higher one",
+        "Measure over a narrower range, or let the tool come to rest at each temperature",
+    )
+    return {"order": order, "span": np.ptp(temperature, axis=-1), "remedy": remedy}
 
 
 def _too_weak(fitted: FittedRuns) -> Flag:
@@ -428,7 +471,9 @@ def _too_weak(fitted: FittedRuns) -> Flag:
         each = [f"{TRIADS[t]} {e.id.removeprefix('weak-')}" for e in bad[place] for t in e.triads]
         return listed([*dict.fromkeys(each)], PARAMETERS_NAMED)
 
-    return _refusal(fitted, "weak-geometry", np.array([*map(bool, bad)]), names=names)
+    thermal = any(orders_of(fitted.result))
+    lower = ", or repeat attitudes at other temperatures, or lower `order`" if thermal else ""
+    return _refusal(fitted, "weak-geometry", np.array([*map(bool, bad)]), names=names, lower=lower)
 
 
 def _odd_gain(fitted: FittedRuns, index: int) -> Flag:
