@@ -205,9 +205,9 @@ def main() -> None:
         f"cooling at two attitudes between a cold and a hot tumble. All runs go from {COLD:g} to {HOT:g} °C. Noise "
         "0.1 mg and 15 nT, stand 0.01° (inclination), 0.05° (azimuth), 0.02° (toolface), references exact.\n\n"
         "Each cell is the share of errors within 1.96 stated standard uncertainties: of scales, biases and "
-        "misalignments of the triads that have all terms, and of angles at random attitudes and temperatures of the "
-        "range. *order found* counts the tools for which both triads got the order of the tool; where a term is smaller "
-        "than the noise shows, the order is lower and the uncertainty includes what the term may be.\n"
+        "misalignments of triads that have all terms, and of angles at random attitudes and temperatures of the "
+        "range. *order found* counts the tools for which both triads got the order of the tool; a term may be smaller "
+        "than the noise shows: the order is then lower, and the uncertainty includes what the term may be.\n"
     )
     facts = {"Runs per row": RUNS, "Seed": SEED}
     world.write(

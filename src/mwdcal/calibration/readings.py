@@ -117,6 +117,7 @@ class Readings:
         metadata: serial, date, operator, …, as the file states them.
         source: name of the file.
         unused: columns of the file that are not used, each with what it resembles.
+        others: the numbers (..., n) in those of them that have one at every station, by name.
         profile: the tool profile by which raw channels became these readings, if there was one.
         run_sha256, profile_sha256: of the files that both come from.
     """
@@ -133,6 +134,7 @@ class Readings:
     metadata: Mapping[str, object] = field(default_factory=dict)
     source: str = ""
     unused: tuple[str, ...] = ()
+    others: Mapping[str, Array] = field(default_factory=dict)
     profile: Profile | None = None
     run_sha256: str = ""
     profile_sha256: str = ""
@@ -239,6 +241,7 @@ class Readings:
             known={k: self.reference(k)[chosen] for k in self.known},
             sd={k: np.broadcast_to(v, shapes[k])[chosen] for k, v in self.sd.items()},
             group=rows(self.group),
+            others={name: rows(values) for name, values in self.others.items()},
             station=tuple(self.station[i] for i in chosen) if self.station else (),
             digest=tuple(self.digest[i] for i in chosen) if self.digest else (),
         )

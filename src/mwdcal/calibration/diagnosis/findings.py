@@ -25,8 +25,8 @@ from mwdcal.calibration.diagnosis.plausibility import (
     stations_to_reshoot,
     unchecked,
 )
+from mwdcal.calibration.diagnosis.structure import COLUMN, suspected
 from mwdcal.calibration.diagnosis.structure import described as seen_as
-from mwdcal.calibration.diagnosis.structure import effects, suspected
 from mwdcal.calibration.readings import EARTH_RANGES, HIGHEST, TRIADS
 from mwdcal.calibration.record import Finding
 from mwdcal.calibration.residuals import REASONS, shown_in, tail
@@ -195,8 +195,10 @@ def _structure(fitted: FittedRuns) -> Iterator[Flag]:
     """What the residuals look like, where they are more than noise."""
     unit = shown_in("field", fitted.readings.relative)[1]
     for place in np.flatnonzero(suspected(fitted.result, fitted.chances)).tolist():
-        for effect in effects(fitted.member(place)):
-            yield _common(fitted, f"looks-like-{effect.name}", seen_as(effect, unit), [place])
+        for effect in fitted.effects(place):
+            column = effect.name.startswith(COLUMN)
+            name = "column-explains" if column else f"looks-like-{effect.name}"
+            yield _common(fitted, name, seen_as(effect, unit), [place])
 
 
 def _scatter(fitted: FittedRuns) -> Flag:

@@ -27,7 +27,7 @@ from mwdcal.calibration.diagnosis.plausibility import (
     straying,
 )
 from mwdcal.calibration.diagnosis.soundness import is_covariance
-from mwdcal.calibration.diagnosis.structure import described, effects
+from mwdcal.calibration.diagnosis.structure import COLUMN, described
 from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.methods import EVIDENCE
 from mwdcal.calibration.options import Options
@@ -141,7 +141,7 @@ OF_FITS = {
     "unsettled": "the fit failed: {message}.{axes}",
     "residuals": "the {triad}'s residuals are {much}: no sensor model explains these readings. Check that columns, "
     "reference angles and groups belong to the stations they stand at, and 'axes' and 'noise' in the tool "
-    "profile.{culprit}{axes}",
+    "profile.{column}{culprit}{axes}",
     "temperature": "the {triad}'s residuals are {much}, because its readings vary with temperature more than `order` "
     "{order} follows: this run spans {span:.0f} °C. {remedy}.",
     "weak-geometry": "the stations are too weak to fit the model: nothing determines {names}. Add stations at other "
@@ -388,7 +388,7 @@ def _refusal(
 
     The words may end with the station to look at first, and with the axes with which the run would fit.
     """
-    ends = {"culprit": partial(_culprit, fitted), "axes": partial(_axes, fitted)}
+    ends = {word: partial(end, fitted) for word, end in ENDS.items()}
     return Flag(status or words, members, OF_FITS[words], ends | values)
 
 
@@ -413,6 +413,21 @@ def _culprit(fitted: FittedRuns, place: int) -> str:
         f" Station {label} alone has {share:.0%} of the misfit: `exclude` {label}, or fit with "
         "`robust` student-t."
     )
+
+
+def _column(fitted: FittedRuns, place: int) -> str:
+    """The column that the run does not use and that explains most of the residuals, in words."""
+    unit = shown_in("field", fitted.readings.relative)[1]
+    named = (
+        [e for e in fitted.effects(place) if e.name.startswith(COLUMN)]
+        if fitted.readings.others
+        else []
+    )
+    return "".join(f" {described(effect, unit)}" for effect in named[:1])
+
+
+ENDS = {"culprit": _culprit, "axes": _axes, "column": _column}
+"""What the words of a refusal may end with, for one run."""
 
 
 def _absurd(fitted: FittedRuns, index: int) -> Iterator[Flag]:
@@ -523,7 +538,7 @@ def _unexplained_errors(fitted: FittedRuns, sound: Bools) -> Flag:
         return {"name": name, "after": after, "expected": expected, "unit": spaced(unit)}
 
     def looks(place: int) -> str:
-        first = effects(fitted.member(place))[:1]
+        first = fitted.effects(place)[:1]
         return "".join(f" {described(each, shown_in('field', relative)[1])}" for each in first)
 
     return _refusal(fitted, "errors", flags, of=worst, looks=looks)
