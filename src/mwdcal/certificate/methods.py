@@ -48,6 +48,8 @@ def _model(triad: TriadCalibration) -> str:
 def _deviations(calibration: Calibration) -> Iterator[str]:
     """What was done other than the usual procedure, a phrase each."""
     options = calibration.options
+    if calibration.without_temperature:
+        yield f"{calibration.without_temperature}: the results hold at the temperature of the calibration alone"
     if calibration.excluded:
         yield f"stations excluded from the fit: {', '.join(calibration.excluded)}"
     if options.robust:

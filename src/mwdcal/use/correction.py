@@ -28,8 +28,7 @@ ROW_FINDINGS = {
     "other-tool": "the readings are of tool {tools[1]}, the calibration of tool {tools[0]}: is it the right one?",
     "missing-reading": "{tally.lacking} of {tally.rows} rows lack a reading: their results are blank.",
     "outside-temperature": "{beyond}: their results are {results}.",
-    "no-temperature": "the calibration was made at unrecorded temperatures, without temperature terms: nothing says "
-    "how good the results are at the readings' {warmth} °C.",
+    "no-temperature": "the calibration has no temperature terms, and its run recorded no temperature{readings_at}.",
     "implausible-gravity": "{off[gravity]}: the tool moved while it was read, or a reading is in another unit.",
     "implausible-field": "{off[field]}: iron or a current was near, or a reading is in another unit.",
     "field-relative": "the magnetometer is calibrated to field = 1: bx_nt, by_nt, bz_nt and field_nt are relative, "
@@ -188,16 +187,18 @@ def findings(
         "other-tool": tools,
         "missing-reading": tally.lacking,
         "outside-temperature": tally.beyond,
-        "no-temperature": calibration.unrecorded(readings),
+        "no-temperature": calibration.without_temperature,
         "implausible-gravity": "gravity" in off,
         "implausible-field": "field" in off,
         "field-relative": calibration.relative,
         "undetermined": tally.moved,
     }
+    warm = "…".join(dict.fromkeys(f"{end:.1f}" for end in tally.warmth))
+    unknown = f": nothing says how good the results are at the readings' {warm} °C"
     words = {
         "beyond": beyond,
         "results": RESULTS_BEYOND[outside == "extrapolate"],
-        "warmth": "…".join(dict.fromkeys(f"{end:.1f}" for end in tally.warmth)),
+        "readings_at": unknown if calibration.unrecorded(readings) else "",
         "moved": ", ".join(tally.moved),
         "free": ", ".join(dict.fromkeys(u.id for u in calibration.undetermined())),
     }

@@ -111,9 +111,12 @@ def _fit_outcome(calibration: Calibration) -> tuple[str, str]:
     if again:
         parts.append(f"{plural(again, 'station')} to re-shoot")
     accepted = capital(undetermined) if free else "Fit accepted"
-    headline = "Fit doubtful" if doubts else accepted
-    text = f"{headline} – {'; '.join(parts)}" if parts else headline
-    return text, "attention" if parts or free else "good"
+    headline, level = (
+        "Fit doubtful" if doubts else accepted,
+        "attention" if parts or free else "good",
+    )
+    parts += filter(None, [calibration.without_temperature])
+    return f"{headline} – {'; '.join(parts)}" if parts else headline, level
 
 
 def _findings(calibration: Calibration, verdict: Verdict | None) -> list[Finding]:

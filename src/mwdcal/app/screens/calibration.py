@@ -153,6 +153,8 @@ def heading(calibration: Calibration) -> str:
     parts = [calibration.run, serial, f"{calibration.stations} stations"]
     if calibration.temperature_c:
         parts.append("{:.1f}–{:.1f} °C".format(*calibration.temperature_c))
+    else:
+        parts.append(calibration.without_temperature)
     parts.append(f"I {min(inclinations):.0f}–{max(inclinations):.0f}°")
     parts += simulated(calibration.tool)
     ranks = [f"{t.name} {t.rank} of {t.size} determined" for t in calibration.triads]
