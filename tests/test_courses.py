@@ -321,3 +321,42 @@ def test_an_order_that_does_not_follow_the_run_is_refused_for_its_temperatures()
         calibrate(readings, Profile(name="x"), Options(order=0))
     free = calibrate(replace(readings, sd={}), Profile(name="x"), Options(order=0))
     assert {f.id for f in free.findings} >= {"accelerometer-temperature-misfit"}
+
+
+def unrecorded(seed, declared=False):
+    """A run over 120 °C whose temperature is in a column of no telling name, and what else its table has."""
+    angles, warmth = ramp(1.0)
+    one = single(read(tools(1, seed), angles, warmth, seed, declared))
+    rng, count = np.random.default_rng(seed), one.count
+    others = {
+        "X17": warmth,
+        "number": np.arange(1.0, count + 1),
+        "inclination of the tool": np.degrees(angles[0]) + 0.02 * rng.normal(size=count),
+        "battery": rng.uniform(size=count),
+        "wandering": np.cumsum(rng.normal(size=count)),
+    }
+    return replace(one, temperature=None, others=others)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_column_that_explains_the_residuals_is_named_and_others_are_not(seed):
+    """The tool drifts with the only column that is its temperature; the others have nothing to do with it."""
+    (found,) = [
+        f.text
+        for f in calibrate(unrecorded(seed), Profile(name="x")).findings
+        if f.id == "column-explains"
+    ]
+    assert found.startswith("Column 'X17' is not used, and explains 9")
+    assert "name it 'temperature_c'" in found
+    quiet = unrecorded(seed, declared=True)
+    quiet = replace(quiet, sd={name: value / 10 for name, value in quiet.sd.items()})
+    with pytest.raises(FitError, match="no sensor model explains.*Column 'X17' is not used"):
+        calibrate(quiet, Profile(name="x"))
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3, 4])
+def test_no_column_explains_the_residuals_of_a_tool_at_one_temperature(seed):
+    warm = unrecorded(seed)
+    still = single(read(tools(1, seed), ramp(1.0)[0], np.full(warm.count, 25.0), seed, False))
+    still = replace(still, temperature=None, others=warm.others)
+    assert "column-explains" not in {f.id for f in calibrate(still, Profile(name="x")).findings}

@@ -19,7 +19,7 @@ from mwdcal.calibration.results import StatedCovariance, triad_results
 from mwdcal.estimation.batch import take
 from mwdcal.geometry.observables import OBSERVABLES
 
-RUNS, SEED = 200, 24
+RUNS, BATCH, SEED = 200, 50, 24
 NOISE = {"accelerometer": 1e-4, "magnetometer": 15.0}
 STAND = {"inclination": 0.01, "azimuth": 0.05, "toolface": 0.02}
 COLD, HOT, STATIONS, JUDGED = 25.0, 145.0, 72, 20
@@ -163,15 +163,14 @@ def of_parameters(
     )
 
 
-def row(
+def judge(
     design: Design, order: int, given: int | str, declared: bool, rng: np.random.Generator
-) -> list:
-    """One row of the table: tools of an order, calibrated with the order that is given."""
-    tools = [world.tool(rng, order) for _ in range(RUNS)]
-    readings = measured(design, tools, rng, declared)
+) -> tuple[int, dict[str, list]]:
+    """Of `BATCH` tools how many got their order, and errors and stated 1σ of parameters and angles."""
+    tools = [world.tool(rng, order) for _ in range(BATCH)]
     judged: dict[str, list] = {name: [] for name in ("parameters", *ANGLES)}
     right = 0
-    for pair, members, result in fitted(readings, given):
+    for pair, members, result in fitted(measured(design, tools, rng, declared), given):
         right += len(members) * (pair == (order, order))
         some, covariance = [tools[m] for m in members], StatedCovariance(result).total
         size = (len(members), JUDGED)
@@ -179,20 +178,24 @@ def row(
         attitude = [tilt, rng.uniform(0, 360, size), rng.uniform(0, 360, size)]
         warmth = rng.uniform(COLD, HOT, size)
         judged["parameters"].append(of_parameters(result, covariance, some, order))
-        for name, pair_ in of_angles(result, covariance, some, attitude, warmth).items():
-            judged[name].append(pair_)
+        for name, both in of_angles(result, covariance, some, attitude, warmth).items():
+            judged[name].append(both)
+    return right, judged
+
+
+def row(
+    design: Design, order: int, given: int | str, declared: bool, rng: np.random.Generator
+) -> list:
+    """One row of the table: tools of an order, calibrated with the order that is given."""
+    parts = [judge(design, order, given, declared, rng) for _ in range(RUNS // BATCH)]
     shares = []
-    for each in judged.values():
-        errors, sd = (np.concatenate([np.ravel(e[k]) for e in each]) for k in (0, 1))
+    for name in ("parameters", *ANGLES):
+        pairs = [pair for _, judged in parts for pair in judged[name]]
+        errors, sd = (np.concatenate([np.ravel(pair[k]) for pair in pairs]) for k in (0, 1))
         shares.append(world.percent(world.covered(errors, sd)))
-    return [
-        design.name,
-        order,
-        given,
-        "declared" if declared else "estimated",
-        f"{right} of {RUNS}",
-        *shares,
-    ]
+    right = sum(part[0] for part in parts)
+    noise = "declared" if declared else "estimated"
+    return [design.name, order, given, noise, f"{right} of {RUNS}", *shares]
 
 
 def main() -> None:

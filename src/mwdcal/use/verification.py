@@ -267,8 +267,6 @@ def _findings(test: RollTest, skipped: Sequence[str]) -> Iterator[Finding]:
     warmth = readings.temperature
     tested = "" if warmth is None else _span(float(warmth.min()), float(warmth.max()))
     yield from calibration.change_findings()
-    if calibration.without_temperature:
-        yield _finding("no-temperature", tested=f", {tested} °C" if tested else "")
     if beyond := int(calibration.outside(readings, MARGIN).sum()):
         where = f"{beyond} of {readings.count} stations ({tested} °C)"
         calibrated = _span(*calibration.temperature_c or (np.nan, np.nan))
@@ -279,6 +277,8 @@ def _findings(test: RollTest, skipped: Sequence[str]) -> Iterator[Finding]:
         yield _finding("not-judged", limits="; ".join(skipped))
     if not test.sets:
         yield _finding("no-roll-set")
+    if calibration.without_temperature:
+        yield _finding("no-temperature", tested=f", {tested} °C" if tested else "")
 
 
 def _finding(name: str, **values: object) -> Finding:
