@@ -182,6 +182,10 @@ class Readings:
         """Unit in which a magnetometer is calibrated from these readings."""
         return RELATIVE if self.relative else NANOTESLA
 
+    def states(self, name: str) -> bool:
+        """Whether the value `name` is given at any station."""
+        return bool((~np.isnan(np.asarray(self.known.get(name, np.nan), float))).any())
+
     def reference(self, name: str) -> Array:
         """The known value `name` (..., n), NaN where blank.
 
