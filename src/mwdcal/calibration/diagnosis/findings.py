@@ -24,11 +24,8 @@ from mwdcal.calibration.diagnosis.plausibility import (
     stations_to_reshoot,
     unchecked,
 )
-<<<<<<< HEAD
-from mwdcal.calibration.diagnosis.structure import COLUMN, suspected
-=======
 from mwdcal.calibration.diagnosis.repeats import copies
->>>>>>> main
+from mwdcal.calibration.diagnosis.structure import COLUMN, suspected
 from mwdcal.calibration.diagnosis.structure import described as seen_as
 from mwdcal.calibration.readings import EARTH_RANGES, HIGHEST, TRIADS
 from mwdcal.calibration.record import Finding
