@@ -604,15 +604,6 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
         """Whether the readings have temperatures and the run of the calibration recorded none."""
         return self.temperature_c is None and readings.temperature is not None
 
-    @property
-    def without_temperature(self) -> str:
-        """What a headline says of a calibration whose run recorded no temperature; empty if it did."""
-        return "" if self.temperature_c else WITHOUT_TEMPERATURE
-
-
-WITHOUT_TEMPERATURE = "no temperature recorded"
-"""What headlines say of a calibration whose run recorded no temperature."""
-
 
 def content_sha256(calibration: Calibration) -> str:
     """SHA-256 of all fields but `UNHASHED`, as compact JSON with sorted keys."""

@@ -187,7 +187,7 @@ def findings(
         "other-tool": tools,
         "missing-reading": tally.lacking,
         "outside-temperature": tally.beyond,
-        "no-temperature": calibration.without_temperature,
+        "no-temperature": calibration.temperature_c is None,
         "implausible-gravity": "gravity" in off,
         "implausible-field": "field" in off,
         "field-relative": calibration.relative,

@@ -278,7 +278,7 @@ def _findings(test: RollTest, skipped: Sequence[str]) -> Iterator[Finding]:
         yield _finding("not-judged", limits="; ".join(skipped))
     if not test.sets:
         yield _finding("no-roll-set")
-    if calibration.without_temperature:
+    if calibration.temperature_c is None:
         yield _finding("no-temperature", tested=f", {tested} °C" if tested else "")
 
 

@@ -17,7 +17,13 @@ from mwdcal.app.pages.page import banner, environment
 from mwdcal.app.screens.calibration import how, known_inclinations
 from mwdcal.app.screens.numbers import HELD, capital, exponent, factor_places
 from mwdcal.app.text import plural, quantity, raised
-from mwdcal.calibration.prediction import accuracy_at, angles, middle_temperature, typical_accuracy
+from mwdcal.calibration.prediction import (
+    accuracy_at,
+    angles,
+    middle_temperature,
+    typical_accuracy,
+    without_temperature,
+)
 from mwdcal.calibration.readings import is_simulated, soaks
 from mwdcal.calibration.record import MAGNETIC, Calibration, Finding, TriadCalibration
 from mwdcal.errors import InputError
@@ -115,7 +121,7 @@ def _fit_outcome(calibration: Calibration) -> tuple[str, str]:
         "Fit doubtful" if doubts else accepted,
         "attention" if parts or free else "good",
     )
-    parts += filter(None, [calibration.without_temperature])
+    parts += filter(None, [without_temperature(calibration)])
     return f"{headline} – {'; '.join(parts)}" if parts else headline, level
 
 

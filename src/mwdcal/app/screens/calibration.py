@@ -12,7 +12,7 @@ from mwdcal.app.messages import findings_as_typed
 from mwdcal.app.screens.numbers import written
 from mwdcal.app.text import chance, number, one_line, quantity, table
 from mwdcal.calibration.automatic.nonlinearity import CurveScore
-from mwdcal.calibration.prediction import typical_accuracy
+from mwdcal.calibration.prediction import typical_accuracy, without_temperature
 from mwdcal.calibration.readings import simulated
 from mwdcal.calibration.record import (
     BudgetRow,
@@ -154,7 +154,7 @@ def heading(calibration: Calibration) -> str:
     if calibration.temperature_c:
         parts.append("{:.1f}–{:.1f} °C".format(*calibration.temperature_c))
     else:
-        parts.append(calibration.without_temperature)
+        parts.append(without_temperature(calibration))
     parts.append(f"I {min(inclinations):.0f}–{max(inclinations):.0f}°")
     parts += simulated(calibration.tool)
     ranks = [f"{t.name} {t.rank} of {t.size} determined" for t in calibration.triads]

@@ -15,6 +15,7 @@ import numpy as np
 
 from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.readings import HIGHEST, highest_order, usable_soaks
+from mwdcal.estimation.batch import take
 from mwdcal.estimation.problem import Problem, State
 from mwdcal.estimation.uncertainty import TANGENT_STEP, tangent
 from mwdcal.geometry.vectors import Array, Bools, Ints, diagonal, eigen, inverse, outer, quotient
@@ -25,8 +26,8 @@ UNLIKELY = 1e-3
 """A term is there if noise alone gives one as large with a probability below this."""
 LEFT_TO_TERM = 1e-6
 """A direction of a term counts if the fit leaves this share of its information to it."""
-TOLD = 4e-4
-"""A direction of a term counts as told by the attitudes with this share of the information."""
+VISIBLE = 4e-4
+"""A direction of a term counts as visible to the attitudes with this share of the information."""
 ALIGNED = 0.05
 """Attitudes and temperature go together where the fit leaves less of the information on its next power."""
 RIDGE = 1e-11
@@ -106,6 +107,16 @@ def terms_beyond(result: Fit) -> OmittedTerms:
     declared = np.isnan(result.noise) & (rest < 1)
     scatter, rest = np.where(declared, 1.0, scatter), np.where(declared, 1e9, rest)
     return OmittedTerms(square, freedom, left_over, size, noise, scatter, rest)
+
+
+def share_beyond(result: Fit, index: int, members: Bools) -> Array:
+    """The share (B,) of a triad's residuals that further powers of temperature would leave `members` (B,)."""
+    share, factor = np.ones(len(members)), result.analysis.variance_factor[:, index]
+    places = np.flatnonzero(members & np.isfinite(factor))
+    if places.size:
+        left = terms_beyond(take(result, places)).scatter[:, index]
+        share[places] = np.sqrt(left / factor[places])
+    return share
 
 
 def _every_term(result: Fit) -> Array:
@@ -225,7 +236,7 @@ def _in_turn(whole: Array, pulled: Array, tested: Ints, fitted: Ints) -> Array:
 def _share_left(alone: Array, left: Array) -> Array:
     """The least share (B,) of information `alone` (B, c, c) that is `left` in any direction that it has."""
     values, vectors = eigen(alone)
-    kept = values > TOLD
+    kept = values > VISIBLE
     scaled = vectors * np.sqrt(quotient(np.ones_like(values), values, kept))[:, None]
     share = scaled.mT @ left @ scaled
     np.einsum("bii->bi", share)[...] += ~kept

@@ -6,15 +6,14 @@ single run is refused by the first flag that holds, and so is each tool of a fle
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from mwdcal.calibration.automatic.courses import orders_of, terms_beyond
-from mwdcal.calibration.diagnosis.axes import explaining
+from mwdcal.calibration.automatic.courses import orders_of, share_beyond
+from mwdcal.calibration.diagnosis.causes import ENDS, spanned
 from mwdcal.calibration.diagnosis.flags import FittedRuns, Flag, listed, spaced
 from mwdcal.calibration.diagnosis.plausibility import (
     excessive_errors,
@@ -27,14 +26,12 @@ from mwdcal.calibration.diagnosis.plausibility import (
     straying,
 )
 from mwdcal.calibration.diagnosis.soundness import is_covariance
-from mwdcal.calibration.diagnosis.structure import COLUMN, described
-from mwdcal.calibration.estimate import Fit
+from mwdcal.calibration.diagnosis.structure import described
 from mwdcal.calibration.methods import EVIDENCE
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import (
     CONSTANTS,
     EARTH_RANGES,
-    HIGHEST,
     TRIADS,
     Readings,
     highest_order,
@@ -43,10 +40,9 @@ from mwdcal.calibration.readings import (
 from mwdcal.calibration.residuals import shown_in
 from mwdcal.calibration.results import temperature_range
 from mwdcal.errors import FitError, InputError
-from mwdcal.estimation.batch import batch_of_one, take
+from mwdcal.estimation.batch import batch_of_one
 from mwdcal.estimation.robust import LOSSES
 from mwdcal.estimation.solvers import Status
-from mwdcal.estimation.uncertainty import station_misfit
 from mwdcal.geometry.vectors import Array, Bools
 from mwdcal.sensor.models import Basis, Factors, Polynomial, Whole, restricted
 from mwdcal.sensor.profile import COMMON
@@ -61,8 +57,6 @@ PARAMETERS_NAMED = 4
 """Most undetermined parameters that a message lists."""
 ABSURD_RATIO = 30.0
 """Residuals of more than this many times the declared noise mean that something is plain wrong."""
-CULPRIT_SHARE = 0.3
-"""Share of all misfit at which a single station is named as the cause."""
 COARSE_NOISE = 0.05
 """Estimated noise of more than this share of the field likewise."""
 BAD_INPUT = "bad-input"
@@ -392,44 +386,6 @@ def _refusal(
     return Flag(status or words, members, OF_FITS[words], ends | values)
 
 
-def _axes(fitted: FittedRuns, place: int) -> str:
-    """The axes with which a run would fit, in words; nothing if there are none."""
-    each = [
-        f"axes = {json.dumps(axes)} of [{name}]"
-        for name, axes in explaining(*fitted.alone(place)).items()
-    ]
-    return f" The run fits with {' and '.join(each)}." if each else ""
-
-
-def _culprit(fitted: FittedRuns, place: int) -> str:
-    """The station to look at first, if a single one has most of the misfit."""
-    square = station_misfit(fitted.member(place).analysis)[0][0]
-    worst = int(np.argmax(square))
-    share = square[worst] / max(float(square.sum()), 1e-300)
-    if share < CULPRIT_SHARE:
-        return ""
-    label = fitted.alone(place)[0].labels[worst]
-    return (
-        f" Station {label} alone has {share:.0%} of the misfit: `exclude` {label}, or fit with "
-        "`robust` student-t."
-    )
-
-
-def _column(fitted: FittedRuns, place: int) -> str:
-    """The column that the run does not use and that explains most of the residuals, in words."""
-    unit = shown_in("field", fitted.readings.relative)[1]
-    named = (
-        [e for e in fitted.effects(place) if e.name.startswith(COLUMN)]
-        if fitted.readings.others
-        else []
-    )
-    return "".join(f" {described(effect, unit)}" for effect in named[:1])
-
-
-ENDS = {"culprit": _culprit, "axes": _axes, "column": _column}
-"""What the words of a refusal may end with, for one run."""
-
-
 def _absurd(fitted: FittedRuns, index: int) -> Iterator[Flag]:
     """Residuals that no error of a sensor explains: columns, references or groups are mixed up."""
     result, raw = fitted.result, fitted.result.problem.triads[index].raw
@@ -448,34 +404,12 @@ def _absurd(fitted: FittedRuns, index: int) -> Iterator[Flag]:
         return f"{noise[place] / signal[place]:.0%} of the field"
 
     absurd = is_absurd(1.0) & (result.analysis.freedom[:, index] >= 1)
-    warmed = absurd & ~is_absurd(_without_temperature(result, index, absurd))
+    warmed = absurd & ~is_absurd(share_beyond(result, index, absurd))
     words = {"triad": TRIADS[index], "much": much}
     yield _refusal(
-        fitted, "temperature", warmed, "temperature-order", **words, **_spanned(fitted, index)
+        fitted, "temperature", warmed, "temperature-order", **words, **spanned(fitted, index)
     )
     yield _refusal(fitted, "residuals", absurd & ~warmed, **words)
-
-
-def _without_temperature(result: Fit, index: int, members: Bools) -> Array:
-    """The share (B,) of a triad's residuals that further powers of temperature would leave `members` (B,)."""
-    share, factor = np.ones(len(members)), result.analysis.variance_factor[:, index]
-    places = np.flatnonzero(members & np.isfinite(factor))
-    if places.size:
-        left = terms_beyond(take(result, places)).scatter[:, index]
-        share[places] = np.sqrt(left / factor[places])
-    return share
-
-
-def _spanned(fitted: FittedRuns, index: int) -> Words:
-    """The order of a triad, the span of temperatures, and what to do."""
-    temperature, order = fitted.result.problem.temperature, orders_of(fitted.result)[index]
-    higher = np.minimum(highest_order(temperature), HIGHEST) > order
-    remedy = np.where(
-        higher & (fitted.options.method != "swarm"),
-        "Use `order` auto, or a higher one",
-        "Measure over a narrower range, or let the tool come to rest at each temperature",
-    )
-    return {"order": order, "span": np.ptp(temperature, axis=-1), "remedy": remedy}
 
 
 def _too_weak(fitted: FittedRuns) -> Flag:
