@@ -42,8 +42,8 @@ FIRST_HARMONIC = {
 SECOND_HARMONIC = "a difference in scale, or a misalignment, of "
 """What a second harmonic comes from."""
 VERDICT_FINDINGS = {
-    "no-temperature": "the tool was calibrated at unrecorded temperatures, and tested at {tested} °C: "
-    "the verdict holds for the temperatures of the test alone.",
+    "no-temperature": "the calibration has no temperature terms, and its run recorded no temperature: the verdict "
+    "holds at the temperature of the test alone{tested}.",
     "outside-temperature": "{where} lie outside the calibrated range {calibrated} °C. The calibration has no "
     "temperature terms: drift over the difference counts as its error.",
     "not-judged": "not judged: {limits}.",
@@ -346,8 +346,6 @@ def _findings(test: RollTest, skipped: Sequence[str]) -> Iterator[Finding]:
     warmth = readings.temperature
     tested = "" if warmth is None else _span(float(warmth.min()), float(warmth.max()))
     yield from calibration.change_findings()
-    if calibration.unrecorded(readings):
-        yield _finding("no-temperature", tested=tested)
     if beyond := int(calibration.outside(readings, MARGIN).sum()):
         where = f"{beyond} of {readings.count} stations ({tested} °C)"
         calibrated = _span(*calibration.temperature_c or (np.nan, np.nan))
@@ -358,6 +356,8 @@ def _findings(test: RollTest, skipped: Sequence[str]) -> Iterator[Finding]:
         yield _finding("not-judged", limits="; ".join(skipped))
     if not test.sets:
         yield _finding("no-roll-set")
+    if calibration.temperature_c is None:
+        yield _finding("no-temperature", tested=f", {tested} °C" if tested else "")
 
 
 def _finding(name: str, **values: object) -> Finding:
