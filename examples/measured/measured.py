@@ -36,9 +36,9 @@ from mwdcal.files.datasets import fetch
 from mwdcal.files.formats.table import Table
 from mwdcal.files.profiles import load_profile
 from mwdcal.files.runs import read_run, to_readings
+from mwdcal.geometry.directions import directions, group_scatter
 from mwdcal.sensor.profile import TriadProfile
 from mwdcal.use.notation import Notation, convert
-from mwdcal.use.roll_sets import directions, group_scatter
 
 SAP = {
     "sap6/BB": (0.692, 0.389), "sap6/CF": (0.556, 0.414), "sap6/HC": (0.724, 0.181),
