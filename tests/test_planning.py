@@ -442,7 +442,7 @@ def test_the_search_finds_plans_as_small_as_are_known(wanted, known):
 
 
 def test_a_plan_says_how_well_its_uncertainties_will_be_known():
-    """s² of simulated runs scatters twice as much as the finding says of s, and `calibrate` reports the same of such a run."""
+    """s² of simulated runs scatters twice as much as the finding says of s; `calibrate` reports it too."""
     plan = load_plan("six-state")
     planned_ = judged(plan, SERVO)
     [text] = [f.text for f in planned_.findings if f.id == "few-degrees-of-freedom"]
