@@ -24,9 +24,9 @@ from mwdcal.comparison.compare import SCATTER, compare
 from mwdcal.errors import InputError
 from mwdcal.estimation.rank import Free
 from mwdcal.estimation.uncertainty import unrotating
+from mwdcal.geometry.directions import group_scatter
 from mwdcal.planning import simulate
 from mwdcal.sensor.profile import Profile, TriadProfile
-from mwdcal.use.roll_sets import group_scatter
 from simulation import Tool, attitude, plan
 from test_calibrate import NOISE, PROFILE, make
 

@@ -442,13 +442,13 @@ def test_the_search_finds_plans_as_small_as_are_known(wanted, known):
 
 
 def test_a_plan_says_how_well_its_uncertainties_will_be_known():
-    """s of simulated runs scatters as the finding says, and `calibrate` reports the same of such a run."""
+    """s² of simulated runs scatters twice as much as the finding says of s; `calibrate` reports it too."""
     plan = load_plan("six-state")
     planned_ = judged(plan, SERVO)
     [text] = [f.text for f in planned_.findings if f.id == "few-degrees-of-freedom"]
     stated = float(text.partition(" %")[0].rpartition(" ")[2])
     fitted = noisy_runs(plan, SERVO, 4000)
-    scatter = 100 * np.std(np.sqrt(fitted.analysis.variance_factor), axis=0)
+    scatter = 50 * np.std(fitted.analysis.variance_factor, axis=0)  # half of that of s²
     assert scatter.max() == pytest.approx(stated, rel=0.12)
     assert [f.id for f in expected(plan, SERVO).findings] == ["few-degrees-of-freedom"]
 

@@ -36,9 +36,9 @@ from mwdcal.files.datasets import fetch
 from mwdcal.files.formats.table import Table
 from mwdcal.files.profiles import load_profile
 from mwdcal.files.runs import read_run, to_readings
+from mwdcal.geometry.directions import directions, group_scatter
 from mwdcal.sensor.profile import TriadProfile
 from mwdcal.use.notation import Notation, convert
-from mwdcal.use.roll_sets import directions, group_scatter
 
 SAP = {
     "sap6/BB": (0.692, 0.389), "sap6/CF": (0.556, 0.414), "sap6/HC": (0.724, 0.181),
@@ -589,7 +589,7 @@ def _intro() -> list[str]:
         "Each set is calibrated with every method, as `mwdcal calibrate` does with the words in the",
         "first column; rows with the same figures are one. *default*: `--method joint`, own-axis",
         "quadratic and cubic terms where the run speaks for them (`--nonlinearity auto`), and, where",
-        "the profile offers such terms, the scatter of strengths, dip and direction from shot to shot",
+        "the run has groups, the scatter of strengths, dip and direction from shot to shot",
         "estimated beside the noise ([Methods](methods.md#own-axis-nonlinearity)).",
         "The paper's weights and restricted models are tried with every method, robust weights and",
         "own-axis terms with the default one. *Left out*: each station from a fit without it; this is",

@@ -47,6 +47,8 @@ NOISE_ROUNDS = 8
 """Most repetitions of fit and estimate of the noise."""
 SETTLED = 1e-3
 """Change of noise and station weights, as a share, at which weighing and fitting in turn ends."""
+FEWEST_CHECKS = 20
+"""Checks of the parameters that a run has to have for its scatter to be estimated."""
 SCATTER_ROUNDS = 16
 """Most repetitions where a scatter from station to station is estimated too…"""
 SCATTER_SETTLED = 0.02
@@ -172,10 +174,27 @@ def fit(readings: Readings, options: Options | None = None, include: Array | Non
 
 
 def scatters(readings: Readings, options: Options) -> bool:
-    """Whether a scatter from station to station is estimated: in a joint fit that estimates the noise of both."""
+    """Whether a scatter from station to station is estimated: in a joint fit that estimates the noise of both.
+
+    It takes groups, and redundancy to tell it from the noise: in runs of eight stations it does harm.
+    """
     noisy = not any(name in readings.sd for name in TRIADS) and readings.magnetometer is not None
-    grouped = bool((readings.groups >= 0).any())
-    return options.scatter and noisy and options.method == "joint" and grouped
+    wanted = options.scatter and noisy and options.method == "joint"
+    return wanted and _checks(readings, options) >= FEWEST_CHECKS
+
+
+def _checks(readings: Readings, options: Options) -> int:
+    """Statements about stations beyond the number of parameters; 0 without a group.
+
+    Definition: strengths and dip, reference angles, and two for each station of a group but its first; the fewest
+    of a batch.
+    """
+    group = np.sort(readings.groups, -1)
+    again = np.count_nonzero((group[..., 1:] >= 0) & (np.diff(group, axis=-1) == 0), axis=-1)
+    angles = sum(np.count_nonzero(~np.isnan(readings.reference(n)), axis=-1) for n in ANGLES)
+    parameters = 12 * sum(1 + order for order in options.orders)
+    checks = 3 * readings.count + np.asarray(angles) + 2 * again - parameters
+    return int(np.min(np.where(again > 0, checks, 0)))
 
 
 def _evidence(readings: Readings, include: Array, options: Options) -> Evidence:

@@ -25,10 +25,10 @@ from mwdcal.estimation.evidence import ANGLES
 from mwdcal.estimation.minimisers.swarm import least_squares_forward, swarm_forward, vector_cost
 from mwdcal.estimation.rank import Free, free_directions
 from mwdcal.estimation.solvers import Status
+from mwdcal.geometry.directions import directions, group_scatter
 from mwdcal.geometry.vectors import Array, reference_vectors
 from mwdcal.sensor.profile import Profile
 from mwdcal.use.notation import Notation
-from mwdcal.use.roll_sets import directions, group_scatter
 
 SCATTER = "scatter within groups"
 FOLDS = 8

@@ -52,7 +52,7 @@ def with_curves(
     readings: Readings, tools: Ints, options: Options, profile: Profile, fail: Fail
 ) -> Iterator[tuple[Ints, Options]]:
     """The given tools by the own-axis terms that their runs show."""
-    terms = offered(profile, options)
+    options, terms = scattered(readings, options), offered(profile, options)
     if not terms:
         options = replace(options, nonlinearity=options.curved)
         try:
@@ -63,7 +63,7 @@ def with_curves(
         else:
             yield tools, options
         return
-    options = scattered(readings, options)
+    options = replace(options, nonlinearity={})
 
     def shown(some: Readings) -> Bools:
         curves = compare_curves(some, options, terms)

@@ -260,7 +260,10 @@ def curves(scores: list[CurveScore]) -> str:
     rows = []
     for s in scores:
         shown = number(s.left_out) if s.odds is None else f"{s.odds:+.1f}"
-        rows.append([" and ".join(s.triads) or "none", shown, "chosen" if s.chosen else ""])
+        grouped = [] if s.group_scatter_deg is None else [quantity(s.group_scatter_deg, "°")]
+        names = " and ".join(s.triads) or "none"
+        rows.append([names, shown, *grouped, "chosen" if s.chosen else ""])
     judged = any(s.odds is not None for s in scores)
-    measure = "odds, powers of ten" if judged else "χ² left out"
-    return table(rows, ["own-axis nonlinearity of", measure, ""])
+    measures = ["odds, powers of ten" if judged else "χ² left out"]
+    measures += ["scatter in groups, left out"] * (len(rows[0]) - 3)
+    return table(rows, ["own-axis nonlinearity of", *measures, ""])

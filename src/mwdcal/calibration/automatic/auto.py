@@ -104,13 +104,12 @@ def _with_curves(
     options: Options, readings: Readings, profile: Profile, progress: Progress
 ) -> tuple[Options, list[CurveScore]]:
     """The options with own-axis terms as asked for, or with those that the run shows."""
-    terms = offered(profile, options)
+    options, terms = scattered(readings, options), offered(profile, options)
     if not terms:
         check_curves(readings, tuple(options.curved))
         return replace(options, nonlinearity=options.curved), []
     progress("own-axis nonlinearity: comparing fits with and without it")
-    options = scattered(readings, options)
-    chosen, curves = choose_curves(readings, options, terms)
+    chosen, curves = choose_curves(readings, replace(options, nonlinearity={}), terms)
     return replace(options, nonlinearity=chosen), curves
 
 

@@ -17,8 +17,10 @@ from mwdcal.calibration.automatic.order_selection import left_out, misfit, with_
 from mwdcal.calibration.estimate import fit, scatters
 from mwdcal.calibration.options import AUTO, USUAL, Options
 from mwdcal.calibration.readings import TRIADS, Readings
+from mwdcal.calibration.record import stated
 from mwdcal.estimation.batch import batch_of_one
 from mwdcal.estimation.uncertainty import log_evidence
+from mwdcal.geometry.directions import directions, group_scatter
 from mwdcal.geometry.vectors import Array, Ints
 from mwdcal.sensor.profile import Profile
 
@@ -43,12 +45,14 @@ class CurveScore:
 
     `left_out`: χ² per reading of stations left out, in units of a declared noise; `odds`: decimal
     logarithm of the probability of the readings over that without terms, where it is estimated.
+    `group_scatter_deg`: how far directions within groups scatter at stations left out, if there are groups.
     """
 
     triads: tuple[str, ...]
     left_out: float | None
     chosen: bool
     odds: float | None = None
+    group_scatter_deg: float | None = None
 
 
 @dataclass(frozen=True)
@@ -93,12 +97,8 @@ def with_strengths(options: Options, profile: Profile) -> Options:
 
 
 def scattered(readings: Readings, options: Options) -> Options:
-    """The options under which own-axis terms are tried, and fitted or not.
-
-    Where the noise is estimated, so is the scatter from station to station.
-    """
-    options = replace(options, nonlinearity={}, scatter=True)
-    return replace(options, scatter=scatters(readings, options))
+    """The options of every fit of a run: where the noise is estimated and groups exist, so is the scatter."""
+    return replace(options, scatter=scatters(readings, replace(options, scatter=True)))
 
 
 def choose_curves(
@@ -110,8 +110,23 @@ def choose_curves(
     for place, triads in enumerate(curves.choices):
         value = float(curves.score[0, place])
         left_out, odds = (None, value / float(np.log(10))) if curves.odds else (value, None)
-        table.append(CurveScore(triads, left_out, place == chosen, odds))
+        scatter = None
+        if len(curves.choices) > 1:
+            each = replace(options, robust=None, nonlinearity={n: terms[n] for n in triads})
+            scatter = _group_scatter(readings, each)
+        table.append(CurveScore(triads, left_out, place == chosen, odds, scatter))
     return {n: terms[n] for n in curves.choices[chosen]}, table if len(table) > 1 else []
+
+
+def _group_scatter(readings: Readings, options: Options) -> float | None:
+    """How far directions within groups scatter, degrees, each station being corrected by a fit without its part."""
+    if readings.magnetometer is None or not (readings.groups >= 0).any():
+        return None
+    every = np.arange(readings.count)
+    part = every % min(readings.count, MOST_PARTS)
+    problem, state, _ = left_out(batch_of_one(readings), options, part)
+    g, b = (vectors[part, every] for vectors in problem.fields(state))
+    return stated(np.degrees(group_scatter(directions(g, b), readings.groups)))
 
 
 def compare_curves(readings: Readings, options: Options, terms: Mapping[str, float]) -> Curves:
