@@ -407,7 +407,7 @@ def test_stations_that_are_copies_are_named():
     copied = msgspec_replace(data, accelerometer=a, magnetometer=m, known=known)
     found = calibrate(copied, PROFILE).findings
     [copies] = [f.text for f in found if f.id == "repeated-readings"]
-    assert copies.startswith("station 10, 21: readings identical to those of an earlier station")
+    assert copies.startswith("station 10, 21: the same readings as an earlier station")
 
 
 def test_free_turn_and_its_course_with_temperature_are_named_simulated():

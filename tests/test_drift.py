@@ -21,7 +21,7 @@ from mwdcal.drift.comparable import (
     precision,
 )
 from mwdcal.drift.fleet import fleet_drift
-from mwdcal.drift.forecast import COVERAGE_FACTOR, growths, years_to
+from mwdcal.drift.forecast import RISK, Paths, outlook
 from mwdcal.drift.histories import tool_history
 from mwdcal.drift.service import ServiceTest
 from mwdcal.drift.tool import TypeRates, measured, predicted
@@ -196,8 +196,9 @@ def test_readings_in_millivolts_are_compared_with_those_in_volts(latest):
     ]
     tool = tool_history(both)
     np.testing.assert_allclose(*tool.history.values, rtol=1e-7, atol=1e-9)
-    assert tool.notes[0] == (
-        "the readings of the accelerometer are in another unit than those of the latest: compared in nominal units",
+    assert (
+        "the readings of the accelerometer are in another unit than those of the latest: compared in nominal units"
+        in tool.notes[0]
     )
 
 
@@ -406,16 +407,30 @@ def test_one_knocked_tool_does_not_spoil_the_rates_of_its_peers():
 
 def test_growth_begins_at_the_accuracy_that_is_stated(years):
     calibration = years["T-2"][-1]
-    each = {g.angle: g for g in growths(tool_history(years["T-2"]))}
+    ahead = outlook(tool_history(years["T-2"]))
+    each = {g.angle: g for g in ahead.growths}
     for angle, stated in typical_accuracy(calibration).items():
         assert np.degrees(np.sqrt(each[angle].calibration)) == pytest.approx(stated, rel=1e-6)
     # An error e of the gravity vector tilts it by its part along one direction: e / g, squared.
     bias = each["inclination"].yearly["accelerometer", "bias"]
     assert bias == pytest.approx(1 / calibration.earth["gravity_g"] ** 2, rel=1e-3)
-    yearly = each["inclination"].rate({group: np.array(1e-9) for group in WALK_GROUPS})
-    span = years_to(np.radians(0.02), each["inclination"], yearly)
-    later = each["inclination"].calibration + span * yearly
-    assert np.sqrt(later) * COVERAGE_FACTOR == pytest.approx(np.radians(0.02))
+
+
+def test_a_tool_is_due_when_its_largest_error_is_beyond_the_limit_with_the_stated_risk(years):
+    """Biases alone walk, of an exact calibration: an error (x, y, z) of gravity tilts the tool by its part along the
+    direction of growing inclination, which 45° and the toolface t give as (sin t, cos t, 1) / √2."""
+    ahead = outlook(tool_history(years["T-2"]))
+    growth = next(g for g in ahead.growths if g.angle == "inclination")
+    rng, rate, limit, draws = np.random.default_rng(8), (2e-4) ** 2, np.radians(0.02), 40_000
+    rates = {group: np.zeros(draws) for group in WALK_GROUPS[:6]}
+    rates["accelerometer", "bias"] = np.full(draws, rate)
+    paths = Paths.of(np.zeros_like(ahead.covariance), ahead.places, rates, rng)
+    span = np.quantile(growth.kept(paths, limit)[0], RISK)
+    faces = np.arange(12) * np.pi / 6
+    tilt = np.stack([np.sin(faces), np.cos(faces), np.ones(12)]) / np.sqrt(2)
+    error = np.sqrt(span * rate) * rng.normal(size=(draws, 3)) @ tilt
+    beyond = np.mean(np.abs(error).max(-1) > limit)
+    assert beyond == pytest.approx(RISK, abs=4 * np.sqrt(2 * RISK / draws))
 
 
 def test_due_dates_of_a_fleet_and_of_a_tool_calibrated_once(years):
@@ -426,7 +441,8 @@ def test_due_dates_of_a_fleet_and_of_a_tool_calibrated_once(years):
     assert fleet.refused == {"T-9": "no file"}
     for drift in (first, second, single):
         for due in drift.due:
-            assert drift.calibrations[-1].date <= due.not_before <= due.due <= due.not_after
+            assert drift.calibrations[-1].date <= due.due <= due.not_before <= due.expected
+            assert due.expected <= due.not_after
             assert due.due <= str(int(drift.calibrations[-1].date[:4]) + 5) + "-05-01"
     assert (single.basis, single.change) == ("peers", None)
     assert {f.id for f in single.findings} >= {"single", "peers"}
@@ -460,7 +476,101 @@ def test_a_tool_that_left_its_limits_in_service_says_so(years):
     )
     assert row.score == pytest.approx(0.2 / np.hypot(0.01, 0.01))
     whole = predicted(measured("T-2", years["T-2"], tests), TypeRates.of([]), LIMITS)
-    assert "left-limits" in {finding.id for finding in whole.findings}
+    assert {"left-limits", "shortened"} <= {finding.id for finding in whole.findings}
+    assert (
+        whole.next_due == "2023-10-30"
+    )  # 364 days in which it failed: half of them after 2023-05-01
+    kept = predicted(measured("T-2", years["T-2"], tests[1:]), TypeRates.of([]), LIMITS)
+    assert kept.next_due is None
+    alone = predicted(measured("T-2", years["T-2"], tests[:1]), TypeRates.of([]), LIMITS)
+    assert alone.next_due == whole.next_due
+    visit = [
+        test_of("2021-05-02", 0.3, False)
+    ]  # the calibration was bad, nothing happened in service
+    assert not measured("T-2", years["T-2"], visit).failures
+
+
+def walking(seed, size, days):
+    """A tool whose accelerometer biases walk by a normal variable of this size from day to day."""
+    bench, result = Bench("twelve-state", seed), []
+    for day in days:
+        result.append(bench.calibration(day))
+        for place in (3, 4, 5):
+            bench.shift(place, size * bench.rng.normal())
+    return result
+
+
+def test_a_walk_beyond_any_grid_is_found_and_shortens_the_interval():
+    """10 mg a year is 300 standard uncertainties: the rate is that of the biases' own differences."""
+    calibrations = walking(14, 1e-2, [f"{year}-05-01" for year in range(2021, 2026)])
+    tool = measured("T-1", calibrations)
+    drift = predicted(tool, TypeRates.of([tool]), {"inclination": 0.25})
+    rate = next(r for r in drift.rates if (r.triad, r.kind) == ("accelerometer", "bias"))
+    values = np.array([p.values for p in drift.parameters if p.name.startswith("bias")][:3])
+    observed = np.sqrt(np.mean(np.diff(values, axis=-1) ** 2))
+    assert rate.per_root_year == pytest.approx(observed, rel=0.15)
+    assert rate.low < observed < rate.high
+    assert drift.next_due < "2025-11-01"
+    assert drift.due[0].risk == RISK
+
+
+def test_one_large_step_shortens_the_interval_whatever_the_peers():
+    """A knock of 6 mg (0.24° and more at 45° inclination) in a year: due within half a year."""
+    bench = Bench("twelve-state", 15)
+    calibrations = [bench.calibration("2024-05-01")]
+    bench.shift(5, 6e-3)
+    calibrations.append(bench.calibration("2025-05-01"))
+    tool = measured("T-1", calibrations)
+    (step,) = (each for each in tool.departures if each.angle == "inclination")
+    assert step.size == pytest.approx(6e-3 / np.sqrt(2), abs=4 * step.uncertainty)
+    (left,) = step.left({"inclination": 0.2})
+    assert (left.start, left.end) == (date(2024, 5, 1), date(2025, 5, 1))
+    assert not list(step.left({"inclination": 0.3}))
+    peers = [measured(f"P-{k}", walking(k, 0.0, ("2024-05-01", "2025-05-01"))) for k in (16, 17)]
+    drift = predicted(tool, TypeRates.of([tool, *peers]), {"inclination": 0.2})
+    assert drift.next_due <= "2025-10-30"
+
+
+def test_a_repair_between_two_calibrations_of_one_visit_is_no_walk():
+    """As found and as left, on successive days, with a step of 6 mg: the walk is that of the years between."""
+    days = ("2023-05-01", "2024-05-01", "2024-05-02", "2025-05-01")
+    bench, calibrations = Bench("twelve-state", 18), []
+    for day in days:
+        if day == "2024-05-02":
+            bench.shift(5, 6e-3)
+        calibrations.append(bench.calibration(day))
+    tool = measured("T-1", calibrations)
+    assert tool.increments["accelerometer", "bias"].noise.size == 2 * 3
+    assert not any(list(each.left({"inclination": 0.2})) for each in tool.departures)
+    assert predicted(tool, TypeRates.of([tool]), {"inclination": 0.2}).next_due > "2026-05-01"
+
+
+@pytest.mark.parametrize("stated", [0, 1])
+def test_a_run_without_gravity_is_no_change_of_the_tool(stated):
+    """Local gravity 0.9985 g, one of two runs does not say so: its scales are all wrong by 1.5 mg."""
+    bench = Bench("acceptance-104", 19)
+    calibrations = []
+    for number, day in enumerate(("2024-05-01", "2025-05-01")):
+        readings = bench.readings(day)
+        local = readings.accelerometer.copy()
+        sensed = bench.tool.triads["accelerometer"][0].fields(
+            bench.tool.accelerometer, local, readings.temperature
+        )
+        slope = bench.tool.triads["accelerometer"][0].slope(
+            bench.tool.accelerometer, local, readings.temperature
+        )
+        local = local - 0.0015 * np.linalg.solve(slope, sensed[..., None])[..., 0]
+        known = {**readings.known, "gravity": np.full(readings.count, 0.9985)}
+        if number != stated:
+            known.pop("gravity")
+        each = replace(readings, accelerometer=local, known=known)
+        calibrations.append(calibrate(each, SERVO, Options(order=0)))
+    drift = measured("T-1", calibrations).drift
+    assert not drift.change.changed
+    assert any("1.5 mg" in note for c in drift.calibrations for note in c.notes)
+    unlike = with_changes(calibrations[1 - stated], gravity_stated=True)
+    both = [unlike, calibrations[stated]]
+    assert measured("T-1", both).drift.change.changed  # as if both had stated it
 
 
 @pytest.mark.usefixtures("without_layout")

@@ -93,6 +93,11 @@ REFUSALS = {
     "negative repeatability": (A + "repeatability = -1e-9", "accelerometer.repeatability"),
     "huge nonlinearity": (A + "nonlinearity = 5", "accelerometer.nonlinearity"),
     "negative stand": ('name = "a"\n[stand]\ntoolface_deg = -1', "'stand.toolface_deg'"),
+    "practice of the stand": (
+        'name = "a"\n[stand]\nsettings = "daily"',
+        """key 'stand.settings': must be "per-direction" or "per-station"; got 'daily'""",
+    ),
+    "practice as number": ('name = "a"\n[stand]\nsettings = 3', "got a whole number"),
     "cold": ('name = "a"\nreference_temperature_c = -300', "'reference_temperature_c'"),
     "date": ('name = "a"\nreference_temperature_c = 2020-01-01', "a number; got a date"),
     "triad as number": ('name = "a"\naccelerometer = 3', "must be a section; got a whole number"),

@@ -1,4 +1,4 @@
-"""What the test of change and the due date are worth, on simulated tools: false alarms, power, coverage.
+"""What the test of change is worth, on simulated tools: false alarms and power.
 
     make drift        (writes docs/drift-tables.md)
 
@@ -8,7 +8,7 @@ All data are simulated. It is about the statistics themselves, and imports the c
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -30,15 +30,12 @@ from mwdcal.drift.comparable import (
     parameter_names,
     precision,
 )
-from mwdcal.drift.forecast import COVERAGE_FACTOR, INTERVAL, growths, years_to
-from mwdcal.drift.histories import tool_history
-from mwdcal.drift.walk import WALK_GROUPS, GroupRates, Increments, draws, group_places
 from mwdcal.files.profiles import load_profile
 from mwdcal.geometry.vectors import Array, outer
-from mwdcal.planning.expected import expected, planned_fit
+from mwdcal.planning.expected import planned_fit
 from mwdcal.planning.plans import load_plan
 from mwdcal.planning.session import Session
-from mwdcal.planning.simulate import Truth, drawn
+from mwdcal.planning.simulate import drawn
 from mwdcal.sensor.profile import Profile, StandProfile
 
 SERVO = load_profile("servo")[0]
@@ -75,17 +72,8 @@ class Setting:
         return self.before + self.after
 
 
-def walked(truth: Truth, moves: Array) -> Truth:
-    """Tools whose parameters (…, 24) of both triads have moved."""
-    moved = truth.accelerometer + moves[..., :12], truth.magnetometer + moves[..., 12:]
-    return replace(truth, accelerometer=moved[0], magnetometer=moved[1])
-
-
-def histories(
-    setting: Setting, part: int, tools: int = AT_ONCE, moves: Callable[[int], Array] | None = None,
-    years: Sequence[float] | None = None,
-) -> Iterator[History]:  # fmt: skip
-    """Histories of tools calibrated again and again; `moves` (tools, 24) of parameters before each calibration."""
+def histories(setting: Setting, part: int, tools: int = AT_ONCE) -> Iterator[History]:
+    """Histories of tools calibrated again and again."""
     profile = with_changes(SERVO, stand=STANDS[setting.stand])
     table = load_plan(setting.plan)
     choice, _ = planned_fit(table, profile)
@@ -93,23 +81,21 @@ def histories(
     truth = drawn(rng, profile, 0, (tools,))
     common = session.common(rng, (tools,)) if setting.one_stand else None
     rows = []
-    for number in range(setting.count):
-        if moves is not None:
-            truth = walked(truth, moves(number))
+    for _ in range(setting.count):
         readings = session.measured(truth, rng, common).readings
         if not setting.declared:
             readings = replace(
                 readings, sd={k: v for k, v in readings.sd.items() if k not in TRIADS}
             )
         rows.append(in_common(fit(readings, choice.options), profile))
-    times = np.arange(setting.count) if years is None else np.asarray(years)
+    times = np.arange(setting.count) * 1.0
     names = parameter_names(dict.fromkeys(TRIADS, 0))
     for each in zip(*(zip(*row, strict=True) for row in rows), strict=True):
         values, covariance, factors, degrees = (np.stack(c) for c in zip(*each, strict=True))
         ratio, freedom, one = (p.mT.repeat(12, -1) for p in one_noise(factors.mT, degrees.mT))
         covariance = covariance * outer(np.sqrt(ratio))
         known = np.stack([precision(matrix, np.zeros((0, 24))) for matrix in covariance])
-        yield History(names, values, covariance, known, freedom, one, times * 1.0)
+        yield History(names, values, covariance, known, freedom, one, times)
 
 
 def in_common(result: Fit, profile: Profile) -> tuple[Array, Array, Array, Array]:
@@ -236,60 +222,6 @@ def power_rows(tools: int, pool: ProcessPoolExecutor) -> Iterator[str]:
             )
 
 
-def covered(calibrations: int, part: int, tools: int = 300) -> tuple[float, float, float]:
-    """Share of tools whose due date lies in its 90 % interval, and before and after it."""
-    setting = Setting(plan="twelve-state", before=1, after=calibrations - 1)
-    rng = np.random.default_rng([SEED, 7, part])
-    places = {
-        group: group_places(parameter_names(dict.fromkeys(TRIADS, 0)), *group)
-        for group in WALK_GROUPS
-    }
-    profile = with_changes(SERVO, stand=STANDS[setting.stand])
-    growth = growths(tool_history([expected(load_plan(setting.plan), profile)]))[0]
-    typical = dict(zip(WALK_GROUPS, (3e-5, 1e-4, 3e-5, 1e-4, 10.0, 1e-4), strict=True))
-    truth = {g: (typical[g] * 10 ** (0.3 * rng.normal(size=tools))) ** 2 for g in WALK_GROUPS}
-    size = np.zeros((tools, 24))
-    for group, some in places.items():
-        size[:, some] = np.sqrt(truth[group])[:, None]
-    walk = partial(_walk, rng, size)
-    each = list(histories(setting, 2000 + part, tools, walk))
-    rates = {}
-    for group, some in places.items():
-        increments = [Increments.of(history, some) for history in each]
-        learnt = GroupRates.of(increments)
-        if learnt:
-            rates[group] = [
-                draws(learnt.rates, learnt.probability(i, True), 2000, rng) for i in increments
-            ]
-    limit = 2.5 * COVERAGE_FACTOR * np.sqrt(growth.calibration)
-    right = years_to(limit, growth, growth.rate(truth))
-    ends = [
-        np.quantile(
-            years_to(limit, growth, growth.rate({g: r[i] for g, r in rates.items()})), INTERVAL
-        )
-        for i in range(tools)
-    ]
-    first, _, last = np.transpose(ends)
-    return tuple(
-        float(np.mean(v)) for v in ((right >= first) & (right <= last), right < first, right > last)
-    )
-
-
-def _walk(rng: np.random.Generator, size: Array, number: int) -> Array:
-    """What parameters move by before a calibration, nothing before the first."""
-    return size * rng.normal(size=size.shape) * bool(number)
-
-
-def coverage_rows(tools: int, pool: ProcessPoolExecutor) -> Iterator[str]:
-    """Rows of the table of due dates."""
-    parts = max(tools // 300, 1)
-    for count in (2, 3, 5):
-        each = np.array(list(pool.map(partial(covered, count), range(parts))))
-        inside, early, late = each.mean(0)
-        share = interval(round(inside * 300 * parts), 300 * parts)
-        yield f"| {count} | {300 * parts} | {share} | {100 * early:.1f} % | {100 * late:.1f} % |"
-
-
 HEAD = """# Drift: what the tests find (simulated)
 
 Written by `examples/drift/drift.py`; SIMULATED DATA, all of it. See [drift](drift.md) for what is tested.
@@ -314,16 +246,6 @@ did not (directed). *Bound*: what the best test of this one parameter at this on
 | plan and stand | step of | before + after | signal, free | signal, directed | bound | changed | rightly named |
 |---|---|---|---|---|---|---|---|
 """
-DUE_HEAD = """
-## Due dates
-
-Tools whose parameters walk at rates of their own, log-normal about those of their type (0.3 decades of standard
-deviation): share of them whose true day, when the 95 % accuracy of inclination exceeds its limit, lies in the stated
-90 % interval, before and after it.
-
-| calibrations of each | tools | inside | before | after |
-|---|---|---|---|---|
-"""
 
 
 def main() -> None:
@@ -338,7 +260,6 @@ def main() -> None:
         parts = [
             HEAD, *(f"{row}\n" for row in false_alarm_rows(options.tools, pool)),
             POWER_HEAD, *(f"{row}\n" for row in power_rows(options.steps, pool)),
-            DUE_HEAD, *(f"{row}\n" for row in coverage_rows(options.steps * 4, pool)),
         ]  # fmt: skip
     options.output.write_text("".join(parts), "utf-8")
 

@@ -83,9 +83,7 @@ def _record(choice: Choice, fitted: FittedRuns) -> Calibration:
     to_file = results.to_file(result, reference)[0]
     low, high = results.temperature_range(result, prior)
     triads = [_triad(fitted, index) for index in range(len(result.problem.triads))]
-    tool = {k: str(v) for k, v in readings.metadata.items() if k in IDENTITY}
-    if prior and prior.simulated:
-        tool["simulated"] = str(True)
+    tool = _identity(readings, prior is not None and prior.simulated)
     return Calibration(
         tool=tool,
         serial=serial_of(tool) or msgspec.UNSET,
@@ -118,6 +116,7 @@ def _record(choice: Choice, fitted: FittedRuns) -> Calibration:
         constants=_constants(result),
         stand=StandErrors(**_first(results.stand_errors(result))),
         earth=_first(results.earth(result)),
+        gravity_stated=readings.states("gravity"),
         budget=_budget(fitted),
         assumed_exact=results.assumed_exact(result, readings.relative),
         errors=error_rows(fitted.residuals(0)),
@@ -127,6 +126,12 @@ def _record(choice: Choice, fitted: FittedRuns) -> Calibration:
         inherited=list(prior.stations) if prior else [],
         findings=findings(fitted),
     )
+
+
+def _identity(readings: Readings, simulated: bool) -> dict[str, str]:
+    """What the run says of the tool, of whom and where it was measured; `simulated`: so is its prior."""
+    tool = {k: str(v) for k, v in readings.metadata.items() if k in IDENTITY}
+    return {**tool, "simulated": str(True)} if simulated else tool
 
 
 def _budget(fitted: FittedRuns) -> list[BudgetRow]:

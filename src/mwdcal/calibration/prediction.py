@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from msgspec import UNSET
 
 from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import FREE_SHARE, Calibration, stated
@@ -23,6 +24,9 @@ TWELFTHS = np.arange(12) * np.pi / 6
 """Azimuths, and toolfaces, over which an uncertainty is averaged (root mean square)."""
 TYPICAL = float(np.radians(45))
 """The inclination that stands for a tool's accuracy where one number must do."""
+UNKNOWN_GRAVITY = 0.0015
+"""Standard uncertainty of |g| in units of a laboratory's gravity that was taken as 1 g: that is anything from
+9.780 to 9.832 m/s²."""
 CORNERS = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
 """Four fields, in units of their strength, from which an affine function of the field is known."""
 CORNER_SHARES = np.array([[1.0, -1, -1, -1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
@@ -33,6 +37,13 @@ _STEPS = 8
 def angles(calibration: Calibration) -> tuple[str, ...]:
     """Names of the angles that the calibrated triads can give."""
     return STATED_ANGLES[: 1 + len(calibration.triads)]
+
+
+def unknown_gravity(calibration: Calibration) -> bool:
+    """Whether gravity was taken as 1 g without a reference; in files of earlier versions, whether it is 1 g."""
+    if calibration.gravity_stated is UNSET:
+        return calibration.earth["gravity_g"] == 1.0
+    return not calibration.gravity_stated
 
 
 def middle_temperature(calibration: Calibration) -> float:
@@ -136,6 +147,32 @@ class CalibratedTools:
         )
 
 
+def _gradients(
+    earth: Array, triads: int, inclination: float, azimuths: Array = TWELFTHS
+) -> tuple[tuple[Array, Array], Array, dict[str, Array]]:
+    """Fields (E, a, 3) of both triads at azimuths and all toolfaces, those of `triads`, and gradients by angle."""
+    grid = np.meshgrid([inclination], azimuths, TWELFTHS, indexing="ij")
+    attitudes = [angle.reshape(1, -1) for angle in grid]
+    both = reference_vectors(*attitudes, *(earth[:, i, None] for i in range(3)))
+    vectors = np.stack(both[:triads], -2)
+    gradients = {
+        name: OBSERVABLES[name].gradient(*both)[..., : 3 * triads].reshape(vectors.shape)
+        for name in STATED_ANGLES[: 1 + triads]
+    }
+    return both, vectors, gradients
+
+
+def angle_changes(tools: CalibratedTools, inclination: float = TYPICAL) -> dict[str, Array]:
+    """Change (B, a, p) of each angle by all parameters, radians, at an inclination and a = 48 attitudes.
+
+    North, east, south and west, each with twelve toolfaces. Singular: NaN at exactly vertical for toolface and
+    azimuth.
+    """
+    both, _, gradients = _gradients(tools.earth, len(tools.models), inclination, TWELFTHS[::3])
+    change = tools.changes(both, noise=False)
+    return {n: np.einsum("bati,btaip->bap", g, change) for n, g in gradients.items()}
+
+
 def accuracy(
     tools: CalibratedTools, covariance: Array, inclination: float = TYPICAL, noise: bool = False
 ) -> dict[str, Array]:
@@ -151,14 +188,7 @@ def accuracy(
     curved = any(model.curved for model in tools.models)
     if not curved:
         earth, number = np.unique(earth, axis=0, return_inverse=True)
-    grid = np.meshgrid([inclination], TWELFTHS, TWELFTHS, indexing="ij")
-    attitudes = [angle.reshape(1, -1) for angle in grid]
-    both = reference_vectors(*attitudes, *(earth[:, i, None] for i in range(3)))
-    vectors = np.stack(both[: len(tools.models)], -2)
-    gradients = {
-        name: OBSERVABLES[name].gradient(*both)[..., : 3 * len(tools.models)].reshape(vectors.shape)
-        for name in STATED_ANGLES[: 1 + len(tools.models)]
-    }
+    both, vectors, gradients = _gradients(earth, len(tools.models), inclination)
     free = tools.free
     if noise:
         covariance, free = _with_noise(covariance, free, 3 * len(tools.models))

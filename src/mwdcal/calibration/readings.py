@@ -108,6 +108,8 @@ class Readings:
             its amplitude). Missing or NaN reference uncertainties are zero.
         group: stations of the same non-negative number share one direction of the tool
             axis; -1 is none.
+        settings: what one setting of the stand's inclination and azimuth is good for, "per-direction"
+            or "per-station"; blank: not stated.
         station: labels, for messages and tables.
         digest: `fingerprints` of the raw readings: they tell verification data from the fit's.
         metadata: serial, date, operator, …, as the file states them.
@@ -123,6 +125,7 @@ class Readings:
     known: Mapping[str, Array] = field(default_factory=dict)
     sd: Mapping[str, Array] = field(default_factory=dict)
     group: Ints | None = None
+    settings: str = ""
     station: tuple[str, ...] = ()
     digest: tuple[str, ...] = ()
     metadata: Mapping[str, object] = field(default_factory=dict)
@@ -174,6 +177,10 @@ class Readings:
     def field_unit(self) -> str:
         """Unit in which a magnetometer is calibrated from these readings."""
         return RELATIVE if self.relative else NANOTESLA
+
+    def states(self, name: str) -> bool:
+        """Whether the value `name` is given at any station."""
+        return bool((~np.isnan(np.asarray(self.known.get(name, np.nan), float))).any())
 
     def reference(self, name: str) -> Array:
         """The known value `name` (..., n), NaN where blank.

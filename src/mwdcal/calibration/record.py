@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from datetime import date, datetime
-from html import escape
 from itertools import pairwise
 from typing import Any, ClassVar
 
@@ -17,6 +16,7 @@ import numpy as np
 
 from mwdcal import __version__
 from mwdcal.calibration.canonical import Signature, document_sha256
+from mwdcal.calibration.notebooks import html_table
 from mwdcal.calibration.readings import NANOTESLA, SOAK_GAP, Readings, simulated, stated_day
 from mwdcal.errors import InputError
 from mwdcal.geometry.observables import OBSERVABLES
@@ -238,6 +238,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
     `excluded` the labels of stations of the run that were left out of the fit on request.
     `serial` is that of the tool, absent where the run states none; `simulated`: of the run or the prior;
     `prior_sha256` of the file of the prior, absent where there was none.
+    `gravity_stated`: whether the run states gravity at any station; absent in earlier versions.
     `sha256` is `content_sha256` of the record as it was made; earlier versions have none.
     `signature` is absent until the file is signed, and in a record that is made from another.
     """
@@ -269,6 +270,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
     constants: list[Constant]
     stand: StandErrors = StandErrors()
     earth: dict[str, float]
+    gravity_stated: bool | msgspec.UnsetType = msgspec.UNSET
     budget: list[BudgetRow] = []
     assumed_exact: list[str] = []
     errors: list[ErrorRow]
@@ -601,13 +603,6 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
     def unrecorded(self, readings: Readings) -> bool:
         """Whether the readings have temperatures and the run of the calibration recorded none."""
         return self.temperature_c is None and readings.temperature is not None
-
-
-def html_table(caption: str, rows: Iterable[tuple[str, ...]]) -> str:
-    """A table for notebooks: a heading, then the cells of each row as text."""
-    lines = ("".join(f"<td>{escape(cell)}</td>" for cell in row) for row in rows)
-    body = "".join(f"<tr>{line}</tr>" for line in lines)
-    return f"<table><caption>{escape(caption)}</caption>{body}</table>"
 
 
 def content_sha256(calibration: Calibration) -> str:

@@ -30,6 +30,11 @@ from mwdcal.sensor.models import Whole
 
 PRIOR = "prior"
 """The source of a budget that a prior is."""
+SIGNS = (
+    "signs of the magnetometer at a northern site",
+    "signs of the magnetometer at a southern site",
+)
+"""What is assumed where only the profile says which hemisphere the dip is of: northern, southern."""
 EVEN = 1e-6
 """Departure of a correlation matrix from symmetry that is left as it is."""
 
@@ -142,18 +147,38 @@ def assumed_exact(result: Fit, relative: bool) -> list[str]:
     """References taken as exact whose error moves no residual: it goes into the calibration whole.
 
     A toolface zero turns both triads, and a strength scales one, as sensors of other mounting or
-    scale would have it. The field = 1 of a `relative` magnetometer is no reference.
+    scale would have it. The field = 1 of a `relative` magnetometer is no reference. The signs of the magnetometer
+    are assumed where nothing confirms the hemisphere: see `unconfirmed_dip`.
     """
-    evidence, names = result.problem.evidence, ("toolface", "gravity", "field")
+    evidence, quantities = result.problem.evidence, ("toolface", "gravity", "field")
     declared = {c.name.removesuffix("-zero") for c in evidence.constants} | set(evidence.absent)
     if relative:
         declared.add("field")
     exact = [
         name
-        for name in names[: 1 + len(result.problem.triads)]
+        for name in quantities[: 1 + len(result.problem.triads)]
         if evidence.is_known(name).any() and name not in declared
     ]
-    return ["toolface zero of the stand" if n == "toolface" else f"{n} reference" for n in exact]
+    names = ["toolface zero of the stand" if n == "toolface" else f"{n} reference" for n in exact]
+    dip = float(unconfirmed_dip(result)[0])
+    return names if np.isnan(dip) else [*names, SIGNS[dip < 0]]
+
+
+def unconfirmed_dip(result: Fit) -> Array:
+    """Dip (B,), radians, whose sign rests on the signs of the magnetometer in the profile alone, else NaN.
+
+    Definition: with all signs reversed a field of dip D reads like one of dip -D with north and south exchanged.
+    A known dip tells the two apart, and so does an azimuth, unless the zero of azimuth is unknown.
+    """
+    problem, known = result.problem, result.problem.evidence.is_known
+    if len(problem.triads) == 1:
+        return np.full(len(result.status), np.nan)
+    unknown = {constant.name for constant in problem.evidence.constants if constant.unknown}
+    confirmed = known("dip").any(-1)
+    if "azimuth-zero" not in unknown:
+        confirmed |= known("azimuth").any(-1)
+    dip = np.arcsin(np.sin(problem.constant(result.state, "dip").mean(-1)))
+    return np.asarray(np.where(confirmed, np.nan, dip))
 
 
 def _scaled(result: Fit, covariance: Array) -> Array:

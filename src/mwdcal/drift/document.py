@@ -96,16 +96,20 @@ class WalkRate(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class DueDate(msgspec.Struct, frozen=True, kw_only=True):
-    """When the 95 % accuracy of an angle exceeds its limit: expected, and not before or after (90 %).
+    """When the largest error of an angle over azimuth and toolface, at 45° inclination, exceeds its limit.
 
-    `now_deg`: the 95 % accuracy on the day of the calibration. `capped`: a day stands for one beyond five years.
+    `due`: the day on which it does with a probability of `risk`, or earlier where the tool left a limit in a shorter
+    time. It leaves the limit by `expected` with 50 %; `not_before` and `not_after` hold that day with 90 %. `now_deg`:
+    95 % bound of the error on the day of the calibration. `capped`: `not_after` stands for a day beyond five years.
     """
 
     angle: str
     limit_deg: float
     now_deg: float
     due: str
+    risk: float
     not_before: str
+    expected: str
     not_after: str
     capped: bool
 
@@ -142,7 +146,8 @@ class ToolDrift(msgspec.Struct, frozen=True, kw_only=True):
     """How one tool changes from calibration to calibration, and when the next one is due.
 
     `basis` of the rates: "tool and peers", "peers" or none. `change` is None of a single calibration, `due` empty
-    where nothing can be predicted; `next_due` is the earliest expected.
+    where nothing can be predicted. `next_due`: the day on which the tool is beyond any of its limits with the risk
+    of these, or the earlier one that a limit it has left before allows.
     """
 
     serial: str

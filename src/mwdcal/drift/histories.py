@@ -8,7 +8,7 @@ from datetime import date
 
 import numpy as np
 
-from mwdcal.calibration.prediction import raw_reading
+from mwdcal.calibration.prediction import UNKNOWN_GRAVITY, raw_reading, unknown_gravity
 from mwdcal.calibration.readings import NANOTESLA, SOAK_GAP, TRIADS
 from mwdcal.calibration.record import MARGIN, Calibration, TriadCalibration
 from mwdcal.drift.comparable import (
@@ -31,6 +31,10 @@ NOTES = {
     "unrecorded": "its run recorded no temperature: taken as made where the others were",
     "no-magnetometer": "has no magnetometer: only the accelerometer is compared",
     "relative": "its magnetometer is calibrated to field = 1: scale and bias are compared but for a common factor",
+    "gravity": "its run states no ref_gravity_g: local gravity is unknown to 1.5 mg, which all scales of the "
+    "accelerometer share; such a common change is no change of the tool",
+    "gravity-alike": "its run states no ref_gravity_g, like all others: compared as if all were made at one "
+    "place",
     "curved": "the {triad} has own-axis terms: its best straight line is compared",
     "held": "its model holds misalignments at zero: they are not compared",
     "free": "leaves undetermined: {free}: the others are compared",
@@ -63,8 +67,8 @@ class ToolHistory:
 
     `notes` of every calibration; `used`: which are in `history`; `temperature_c`: the range over which they
     are compared; `units` in which its parameters are stated (see `factor`); `earth`: gravity, field and dip;
-    `covariance` (n, p, p) as each calibration states it, in `history` with the noise of all; `free` (f, p):
-    what the latest leaves undetermined.
+    `covariance` (n, p, p) as each calibration states it, in `history` with the noise of all; `free`: directions
+    (f, p) that each leaves undetermined.
     """
 
     calibrations: tuple[Calibration, ...]
@@ -75,7 +79,7 @@ class ToolHistory:
     units: tuple[str, ...]
     earth: tuple[float, float, float]
     covariance: Array
-    free: Array
+    free: tuple[Array, ...]
     history: History
 
     @property
@@ -122,7 +126,7 @@ def tool_history(calibrations: Sequence[Calibration]) -> ToolHistory:
     history = History(names, np.stack(values), like, known, freedom, together, years(kept), prior)
     units = tuple(map(form.unit, names))
     tool = tuple(ordered), tuple(days), tuple(used), tuple(map(tuple, notes))
-    return ToolHistory(*tool, span, units, form.earth(), np.stack(covariance), free[-1], history)
+    return ToolHistory(*tool, span, units, form.earth(), np.stack(covariance), tuple(free), history)
 
 
 def _stations(calibration: Calibration) -> set[str]:
@@ -234,12 +238,21 @@ class _Form:
             parts.append((values, whole))
         values, slope = (np.concatenate(part) for part in zip(*parts, strict=True))
         covariance = slope @ calibration.parameter_covariance @ slope.transpose()
+        if self._assumed_gravity(calibration):
+            common = np.zeros_like(values)
+            first = slice(0, 12 + 6 * self.orders[TRIADS[0]])
+            common[first] = UNKNOWN_GRAVITY * _stretched(values[first])
+            covariance = covariance + np.outer(common, common)
         free = [
             *(calibration.free_directions @ slope.transpose()),
             *self._stretch(calibration, values),
         ]
         rows = np.nan_to_num(np.reshape(free, (-1, len(values))))
         return values, covariance, rows
+
+    def _assumed_gravity(self, calibration: Calibration) -> bool:
+        """Whether a calibration took gravity as 1 g and others did not: its local gravity is then unknown."""
+        return unknown_gravity(calibration) and not all(map(unknown_gravity, self.compared))
 
     def _triad(self, calibration: Calibration, triad: TriadCalibration) -> tuple[Array, Array]:
         """Factors (k,) of a triad and their derivatives (k, p) by its parameters in the file."""
@@ -309,7 +322,7 @@ class _Form:
             return np.zeros((0, len(values)))
         first = 12 + 6 * self.orders[TRIADS[0]]
         row = np.zeros_like(values)
-        row[first:] = values[first:] * _powers_of_strength(len(values) - first)
+        row[first:] = _stretched(values[first:])
         return row[None]
 
     def earth(self) -> tuple[float, float, float]:
@@ -328,6 +341,8 @@ class _Form:
         middle, measured = sum(self.span) / 2, calibration.temperature_c
         if measured and _constant(calibration) and abs(np.mean(measured) - middle) > MARGIN:
             yield NOTES["elsewhere"].format(run=np.mean(measured), middle=middle)
+        if unknown_gravity(calibration) and len(self.compared) > 1:
+            yield NOTES["gravity" if self._assumed_gravity(calibration) else "gravity-alike"]
         if calibration.relative:
             yield NOTES["relative"]
         if calibration.options.parameters < 12:
@@ -365,6 +380,11 @@ def _axes(calibration: Calibration, triad: str) -> Array:
     """Matrix (3, 3) from the raw channels of a triad to its tool axes in nominal units."""
     profile = getattr(calibration.profile, triad)
     return np.asarray(profile.permutation / (profile.scale or 1.0))
+
+
+def _stretched(values: Array) -> Array:
+    """What parameters (size,) of a triad move by, over the share by which the strength of its field is another."""
+    return values * _powers_of_strength(len(values))
 
 
 def _powers_of_strength(size: int) -> Array:

@@ -24,16 +24,18 @@ from mwdcal.drift.document import (
     WalkRate,
 )
 from mwdcal.drift.forecast import (
-    COVERAGE_FACTOR,
-    DRAWN_RATES,
+    DRAWN_PATHS,
     INTERVAL,
     LONGEST_INTERVAL,
+    RISK,
     Growth,
+    Outlook,
+    Paths,
     day_after,
-    growths,
-    years_to,
+    outlook,
 )
 from mwdcal.drift.histories import ToolHistory, factor, tool_history
+from mwdcal.drift.left import Departure, Left, departures, failures
 from mwdcal.drift.service import ServiceTest, service_rows
 from mwdcal.drift.walk import WALK_GROUPS, GroupRates, Increments, draws, group_places, quantiles
 from mwdcal.geometry.vectors import Array
@@ -54,7 +56,11 @@ FINDINGS = {
     "peers": "its own calibrations tell no rate of drift: the rates are those of {count} of the same type.",
     "left-limits": "{count} passed as left and failed as found: the tool left its limits in service ({names}).",
     "overdue": "the latest calibration was due again on {due}.",
-    "inaccurate": "the 95 % accuracy of {angle}, {now:.2g}°, exceeds the limit of {limit:g}° from the first day.",
+    "shortened": "it left a limit between {start} and {end}: {how}. It is due after half of that time at the latest.",
+    "walk-unseen": "the calibrations show no walk of {groups} beyond their uncertainty: its rate is a bound.",
+    "walk-edge": "the rate of {groups} is likeliest at the largest that was tried: due dates are too late.",
+    "inaccurate": "the error of {angle} may be {now:.2g}° (95 %) on the day of the calibration, more than the limit of "
+    "{limit:g}°.",
     "too-free": "{angle} has no stated accuracy: it rests on a direction that the calibration leaves undetermined.",
 }
 
@@ -70,7 +76,9 @@ class MeasuredTool:
     drift: ToolDrift
     calibrated: date
     increments: dict[tuple[str, str], Increments]
-    growths: list[Growth]
+    outlook: Outlook
+    departures: list[Departure]
+    failures: list[Left]
     gaps: Array
     groups: list[tuple[str, str] | None]
 
@@ -91,6 +99,7 @@ def measured(
     increments = {g: Increments.of(history, some) for g, some in places.items() if some}
     of_place = {place: group for group, some in places.items() for place in some}
     named = [(c, _digests(c, digests or {})) for c in tool.calibrations]
+    ahead = outlook(tool)
     drift = ToolDrift(
         serial=serial, type=tool.calibrations[-1].profile.name,
         simulated=any(c.simulated for c in tool.calibrations),
@@ -102,8 +111,8 @@ def measured(
     )  # fmt: skip
     groups = [of_place.get(int(place)) for place in history.steady]
     return MeasuredTool(
-        drift, tool.compared_days[-1], increments, growths(tool),
-        np.diff(history.years), groups,
+        drift, tool.compared_days[-1], increments, ahead, departures(tool, ahead),
+        list(failures(named, tests)), np.diff(history.years), groups,
     )  # fmt: skip
 
 
@@ -210,10 +219,19 @@ def predicted(
         for group, learnt in rates.groups.items()
         if group in tool.increments
     }
-    usable = [g for g in tool.growths if set(g.yearly) <= set(known)]
+    usable = [g for g in tool.outlook.growths if set(g.yearly) <= set(known)]
     rng = np.random.default_rng(crc32(serial.encode()))
-    drawn = {group: draws(*each, DRAWN_RATES, rng) for group, each in known.items()}
-    due = [_due(tool, g, g.rate(drawn), limits[g.angle]) for g in usable if g.angle in limits]
+    drawn = {group: draws(*each, DRAWN_PATHS, rng) for group, each in known.items()}
+    left = _shortest(tool, limits)
+    latest = date.max if left is None else tool.calibrated + left.span
+    due, days = [], [] if left is None else [latest.isoformat()]
+    if judged := [g for g in usable if g.angle in limits]:
+        paths = Paths.of(tool.outlook.covariance, tool.outlook.places, drawn, rng)
+        kept, error = zip(
+            *(g.kept(paths, np.radians(limits[g.angle])) for g in judged), strict=True
+        )
+        due = [_due(tool, *each, latest, limits) for each in zip(judged, kept, error, strict=True)]
+        days.append(_day(tool, float(np.quantile(np.min(kept, 0), RISK))))
     several = any(each.noise.size for each in tool.increments.values())
     drift = replace(
         drift,
@@ -223,9 +241,27 @@ def predicted(
         parameters=_controlled(tool, known),
         forecast=[_forecast(g, g.rate(drawn)) for g in usable],
         due=due,
-        next_due=min((each.due for each in due), default=None),
+        next_due=min(days, default=None),
     )
-    return replace(drift, findings=_findings(drift, limits, today))
+    findings = [*_findings(drift, limits, today), *_of_the_walk(tool, rates)]
+    if left is not None and drift.next_due == latest.isoformat():
+        findings.append(_said("shortened", start=left.start, end=left.end, how=left.how))
+    return replace(drift, findings=findings)
+
+
+def _shortest(tool: MeasuredTool, limits: Mapping[str, float]) -> Left | None:
+    """The shortest time in which the tool left a limit, by roll tests or from one calibration to the next."""
+    stepped = [left for each in tool.departures for left in each.left(limits)]
+    return min([*tool.failures, *stepped], key=lambda left: left.span, default=None)
+
+
+def _of_the_walk(tool: MeasuredTool, rates: TypeRates) -> list[Finding]:
+    """Findings of rates whose likelihood is highest at an end of those that were tried."""
+    sides: dict[str, list[str]] = {"walk-unseen": [], "walk-edge": []}
+    for (triad, kind), learnt in rates.groups.items():
+        if (side := learnt.edge(tool.increments.get((triad, kind)))) is not None:
+            sides[side].append(f"{triad} {kind}")
+    return [_said(side, groups=", ".join(groups)) for side, groups in sides.items() if groups]
 
 
 def _rates(drift: ToolDrift, known: Mapping[tuple[str, str], Distribution]) -> list[WalkRate]:
@@ -276,16 +312,28 @@ def _forecast(growth: Growth, yearly: Array) -> AccuracyForecast:
     )
 
 
-def _due(tool: MeasuredTool, growth: Growth, yearly: Array, limit_deg: float) -> DueDate:
-    """When an angle exceeds its limit."""
-    spans = years_to(np.radians(limit_deg), growth, yearly)
-    first, middle, last = np.quantile(spans, INTERVAL).tolist()
-    days = [day_after(tool.calibrated, span).isoformat() for span in (first, middle, last)]
+def _day(tool: MeasuredTool, span: float) -> str:
+    """The day so many years after the latest calibration."""
+    return day_after(tool.calibrated, span).isoformat()
+
+
+def _due(
+    tool: MeasuredTool, growth: Growth, kept: Array, error: Array, latest: date,
+    limits: Mapping[str, float],
+) -> DueDate:  # fmt: skip
+    """When the tool is beyond the limit of an angle with a probability of `RISK`, or at the `latest`."""
+    spans = np.quantile(kept, INTERVAL).tolist()
+    first, middle, last = (_day(tool, span) for span in spans)
     return DueDate(
-        angle=growth.angle, limit_deg=limit_deg,
-        now_deg=float(np.degrees(COVERAGE_FACTOR * np.sqrt(growth.calibration))),
-        due=days[1], not_before=days[0], not_after=days[2], capped=last >= LONGEST_INTERVAL,
+        angle=growth.angle, limit_deg=limits[growth.angle],
+        now_deg=float(np.degrees(np.quantile(error, 1 - RISK))),
+        due=min(first, latest.isoformat()), risk=RISK,
+        not_before=first, expected=middle, not_after=last, capped=spans[-1] >= LONGEST_INTERVAL,
     )  # fmt: skip
+
+
+def _said(name: str, **values: object) -> Finding:
+    return Finding(id=name, text=FINDINGS[name].format(**values))
 
 
 def _findings(drift: ToolDrift, limits: Mapping[str, float], today: date | None) -> list[Finding]:
@@ -293,7 +341,7 @@ def _findings(drift: ToolDrift, limits: Mapping[str, float], today: date | None)
     findings = []
 
     def say(name: str, **values: object) -> None:
-        findings.append(Finding(id=name, text=FINDINGS[name].format(**values)))
+        findings.append(_said(name, **values))
 
     if drift.change is None:
         say("single")

@@ -62,7 +62,7 @@ _LIMITS: dict[type[msgspec.Struct], dict[str, tuple[float, float, str]]] = {
         Datasheet.__struct_fields__, (*_ALL, f"1 sigma, more than zero; {_UNKNOWN}")
     ),
     StandProfile: {
-        **{name: _ANGLE for name in StandProfile.__struct_fields__ if name != "coil"},
+        **{name: _ANGLE for name in StandProfile.__struct_fields__ if name.endswith("_deg")},
         "gravity_g": (0.0, 2.0, "1 sigma, in g."),
         "field_nt": (0.0, 200_000.0, "1 sigma, in nT."),
     },
@@ -196,6 +196,13 @@ def _invalid(message: str, source: str) -> InputError:
         return InputError(
             f"{source}: key '{missing[1]}' must be present; got none. "
             f'Add a line such as {missing[1]} = "my tool".'
+        )
+    if where == "stand.settings":
+        got = problem.partition("got ")[2].strip("`") or problem.rpartition(" ")[2]
+        return InputError(
+            f'{source}, key \'{where}\': must be "per-direction" or "per-station"; got '
+            f"{_WORDS.get(got, got[:80])}. Say whether the operator sets inclination and azimuth once for a "
+            "roll set, or at every station."
         )
     if "axes" in where:
         return _axes_error(where, _axes_got(problem), source)

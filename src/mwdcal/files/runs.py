@@ -262,6 +262,7 @@ def convert(
         temperature=_given(cells, "temperature_c"),
         known=known,
         sd=sd | _reference_uncertainties(cells, shape, profile, known) | common,
+        settings=profile.stand.practice,
     )
     return readings, scales
 

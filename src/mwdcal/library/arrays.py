@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, TypedDict, Unpack
+from typing import Any, Literal, TypedDict, Unpack
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from mwdcal.calibration.readings import TRIADS, Readings, fingerprints, group_nu
 from mwdcal.errors import InputError
 from mwdcal.files.contract import RAW_SPREAD, REFERENCES, TEMPERATURE, Range
 from mwdcal.geometry.vectors import Array, ArrayLike, Bools, wrap
-from mwdcal.sensor.profile import COMMON
+from mwdcal.sensor.profile import COMMON, PRACTICES
 
 DEGREES_SUFFIX = "_deg"
 """Ending of the keyword twins that take degrees."""
@@ -42,6 +42,7 @@ def readings(
     temperature: ArrayLike | None = None,
     sd: Mapping[str, ArrayLike] | None = None,
     group: Sequence[object] | None = None,
+    settings: Literal["", "per-direction", "per-station"] = "",
     station: Sequence[object] | None = None,
     metadata: Mapping[str, object] | None = None,
     **references: Unpack[References],
@@ -64,6 +65,9 @@ def readings(
             The noise of a triad that is not named is estimated from the residuals.
         group: numbers or names; stations of one group share a direction of the tool axis. Blank, None,
             NaN or negative: no group.
+        settings: whether the stand's direction is set once for stations that follow each other with
+            equal inclination and azimuth ("per-direction"), or at every station ("per-station").
+            Blank: not stated, once is assumed.
         station: labels, for messages and tables.
         metadata: `serial`, `date`, `operator`, …; `simulated` marks data of no real tool.
         references: `inclination`, `azimuth`, `toolface`, `gravity`, `field` and `dip`, where known.
@@ -79,6 +83,10 @@ def readings(
             f"`magnetometer` must have the shape of `accelerometer`, {g.shape}; got {b.shape}. Give "
             "both at the same stations."
         )
+    if settings not in ("", *PRACTICES):
+        raise InputError(
+            f"`settings` must be {' or '.join(PRACTICES)}; got {settings!r}. Leave it out where it is not known."
+        )
     shape, triads = g.shape[:-1], [g] if b is None else [g, b]
     return Readings(
         accelerometer=g,
@@ -87,6 +95,7 @@ def readings(
         known=_known(references, shape),
         sd=_uncertainties(sd or {}, shape),
         group=None if group is None else group_numbers(_labels("group", group, shape)),
+        settings=settings,
         station=() if station is None else tuple(_labels("station", station, shape)),
         digest=fingerprints(triads) if len(shape) == 1 else (),
         metadata=dict(metadata or {}),

@@ -18,6 +18,9 @@ from mwdcal.geometry.vectors import Array
 COMMON = ("azimuth-zero", "toolface-zero", "inclination-zero", "tilt")
 """Errors of the stand that all its stations have in common; in a profile `azimuth_zero_deg` …"""
 
+PRACTICES = ("per-direction", "per-station")
+"""How often the operator sets the direction of a stand: once for a roll set, or at every station."""
+
 Axis = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
 
 
@@ -66,11 +69,13 @@ class TriadProfile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
 class StandProfile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Standard uncertainties (1 σ) of the references that a stand gives.
 
-    `inclination_deg` … are of one setting, independent from station to station, where the run does
-    not state its own; `repeatability_…` is added to either in quadrature. The others are errors
+    `inclination_deg` … are of one setting, where the run does not state its own; `repeatability_…` is
+    added to either in quadrature. Toolface is set at every station. The others are errors
     that all stations have in common: zeros of the three scales, the lean of the stand's vertical,
     and the references for gravity, field and dip where the run does not state their uncertainty.
     `coil`: the field is made by a coil or simulated, and may be of any strength.
+    `settings`: "per-direction" where the operator sets inclination and azimuth once and rolls the
+    tool, "per-station" where the stand is set anew at every station.
     """
 
     inclination_deg: float = 0.0
@@ -87,10 +92,16 @@ class StandProfile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     field_nt: float = 0.0
     dip_deg: float = 0.0
     coil: bool = False
+    settings: Literal["per-direction", "per-station"] | msgspec.UnsetType = msgspec.UNSET
 
     def of(self, column: str) -> float:
         """Standard uncertainty of a reference such as "azimuth_deg" where the run states none."""
         return float(getattr(self, column))
+
+    @property
+    def practice(self) -> str:
+        """Its `settings`; blank where they are not stated."""
+        return self.settings if isinstance(self.settings, str) else ""
 
     def repeatability(self, column: str) -> float:
         """What is added to the standard uncertainty of an angle in quadrature; strengths have none."""

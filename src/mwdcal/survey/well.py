@@ -8,6 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
+from mwdcal.calibration.prediction import UNKNOWN_GRAVITY, unknown_gravity
 from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.geometry.observables import EXTRAPOLATED, RESULTS, VECTORS
@@ -26,8 +27,8 @@ WELL_FINDINGS = {
     "columns ref_gravity_g, ref_field_nt, ref_dip_deg.",
     "partly-judged": "{names} of {partly} of {rows} surveys are not judged: no reference. `accepted` says nothing "
     "about them.",
-    "laboratory-gravity": "the calibration's gravity is 1 g, as where its run states none: |g| is then in units of the "
-    "laboratory's gravity, and judged with 1.5 mg more of uncertainty. Calibrate with ref_gravity_g.",
+    "laboratory-gravity": "gravity at the laboratory is unknown (1 g was assumed), so |g| is judged 1.5 mg more "
+    "loosely. To tighten this, give ref_gravity_g in the calibration run.",
     "magnetic-north": "no declination: azimuths and the well path count from magnetic north.",
     "path-from-first": "the well path starts at the first station, at north 0, east 0 and TVD 0. `tie_in` gives its "
     "position.",
@@ -39,9 +40,6 @@ WELL_FINDINGS = {
 """What the findings about a well say, in their order."""
 CORRECTED = "interference-corrected"
 """The finding of a calibration from which multi-station analysis has taken interference."""
-UNKNOWN_GRAVITY = 0.0015
-"""Standard uncertainty of |g| in units of a laboratory's gravity that was taken as 1 g: that is anything from
-9.780 to 9.832 m/s²."""
 
 
 @dataclass(frozen=True)
@@ -253,11 +251,6 @@ def _to_judge(
         b = b * field[:, None]
         known |= {"field": np.full(len(b), np.nan), "dip": readings.reference("dip") + 0 * field}
     return (g, b), replace(readings, known=known, sd=sd)
-
-
-def unknown_gravity(calibration: Calibration) -> bool:
-    """Whether the calibration took gravity as exactly 1 g, which no reference says."""
-    return calibration.earth["gravity_g"] == 1.0
 
 
 def _positions(

@@ -8,8 +8,9 @@ from typing import Any, ClassVar, Literal
 import msgspec
 import numpy as np
 
+from mwdcal.calibration.notebooks import html_table
 from mwdcal.calibration.readings import Readings
-from mwdcal.calibration.record import MARGIN, Calibration, Finding, html_table, stated
+from mwdcal.calibration.record import MARGIN, Calibration, Finding, stated
 from mwdcal.errors import InputError
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.use.departures import LEVEL, Departures, RollTest, Statistic

@@ -13,18 +13,18 @@ from mwdcal.calibration.automatic.courses import misfit_size, orders_of, terms_b
 from mwdcal.calibration.diagnosis.flags import FittedRuns, Flag, listed, spaced
 from mwdcal.calibration.diagnosis.plausibility import (
     NOISE_RATIO,
-    copies,
     departures,
     robust,
     stations_to_reshoot,
     unchecked,
 )
+from mwdcal.calibration.diagnosis.repeats import copies
 from mwdcal.calibration.diagnosis.structure import described as seen_as
 from mwdcal.calibration.diagnosis.structure import effects, suspected
 from mwdcal.calibration.readings import EARTH_RANGES, HIGHEST, TRIADS
 from mwdcal.calibration.record import Finding
 from mwdcal.calibration.residuals import REASONS, shown_in, tail
-from mwdcal.calibration.results import common_source
+from mwdcal.calibration.results import common_source, unconfirmed_dip
 from mwdcal.estimation.problem import Prior
 from mwdcal.estimation.rank import free_directions
 from mwdcal.estimation.solvers import Determined
@@ -66,8 +66,11 @@ REMARKS = {
     "scatter": "beyond sensor noise, these vary from station to station: {what} (1σ, estimated; weights and "
     "uncertainties include it). Look for iron near the stand and play in the tool holder; or the model lacks "
     "something.",
-    "repeated-readings": "station {stations}: readings identical to those of an earlier station. Copies count as "
-    "measurements of their own, and uncertainties come out too small. Remove them.",
+    "hemisphere": "the dip comes out negative ({dip:.1f}°) and no reference confirms it: either the site is in the "
+    "southern hemisphere, or all signs of the magnetometer are reversed and azimuths are wrong by 180°. "
+    "Give ref_dip_deg, or ref_azimuth_deg at one direction.",
+    "repeated-readings": "station {stations}: the same readings as an earlier station, closer than noise allows. "
+    "Copies count as measurements of their own, and uncertainties come out too small. Remove them.",
     "temperature-misfit": "{triad}: {of[cause]}, beyond what noise explains: {of[rms]:.2g} {of[unit]} rms per axis "
     "over the range ({of[angle]:.2g}° across the field). The uncertainties here include it. {of[remedy]}.",
     "temperature-untested": "{triads}: {levels} temperatures are as many as a course of order {order} takes, so "
@@ -127,6 +130,7 @@ def finding_flags(fitted: FittedRuns) -> Iterator[Flag]:
     yield from _noise(fitted)
     bare = unchecked(fitted.result)
     yield _remark("no-redundancy", np.any(bare, -1), triads=partial(_joined, bare))
+    yield _hemisphere(fitted)
     yield from _structure(fitted)
     yield _scatter(fitted)
     yield _repeated(fitted)
@@ -181,6 +185,12 @@ def _noise(fitted: FittedRuns) -> Iterator[Flag]:
             yield Flag(f"{triad}-{end}", holds[:, index], REMARKS[end], values)
 
 
+def _hemisphere(fitted: FittedRuns) -> Flag:
+    """A negative dip that only the signs of the magnetometer tell from a positive one."""
+    dip = np.degrees(unconfirmed_dip(fitted.result))
+    return _remark("hemisphere", dip < 0, dip=dip)
+
+
 def _structure(fitted: FittedRuns) -> Iterator[Flag]:
     """What the residuals look like, where they are more than noise."""
     unit = shown_in("field", fitted.readings.relative)[1]
@@ -206,7 +216,7 @@ def _scatter(fitted: FittedRuns) -> Flag:
 
 
 def _repeated(fitted: FittedRuns) -> Flag:
-    """Stations whose readings are identical to another's."""
+    """Stations whose readings are those of another."""
     repeated = copies(fitted.result)
 
     def stations(place: int) -> str:

@@ -181,18 +181,6 @@ def unchecked(result: Fit) -> Bools:
     return np.asarray(result.analysis.freedom < 1)
 
 
-def copies(result: Fit) -> Bools:
-    """Stations (B, n) whose readings are those of an earlier one of the same run, to the last digit."""
-    problem = result.problem
-    rows = np.concatenate([*(t.raw for t in problem.triads), problem.temperature[..., None]], -1)
-    key = np.sort(np.einsum("bnk,k->bn", rows, np.sqrt(2.0 + np.arange(rows.shape[-1]))), -1)
-    repeated = np.zeros(rows.shape[:-1], bool)
-    for member in np.flatnonzero(np.any(np.diff(key, axis=-1) == 0, -1)):
-        _, first, place = np.unique(rows[member], axis=0, return_index=True, return_inverse=True)
-        repeated[member] = first[place.ravel()] != np.arange(len(repeated[member]))
-    return repeated
-
-
 def departures(result: Fit) -> tuple[Array, Ints]:
     """The χ² (B,) of the departure from the prior, Λd with covariance Λ - ΛCΛ, and its freedom."""
     prior, covariance = result.problem.prior, result.analysis.covariance

@@ -16,6 +16,7 @@ from mwdcal.calibration import results
 from mwdcal.calibration.automatic.courses import OFFSETS
 from mwdcal.calibration.estimate import Fit, fit
 from mwdcal.calibration.options import Options
+from mwdcal.calibration.prediction import UNKNOWN_GRAVITY, unknown_gravity
 from mwdcal.calibration.prior import Knowledge, for_run
 from mwdcal.calibration.readings import CONSTANTS, Readings
 from mwdcal.calibration.record import Calibration
@@ -25,7 +26,6 @@ from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array, Bools, diagonal
 from mwdcal.survey.place.references import PLACE_SD
 from mwdcal.survey.stations import RANDOM
-from mwdcal.survey.well import UNKNOWN_GRAVITY, unknown_gravity
 
 OFFSET_NAMES = ("cross-axial x", "cross-axial y", "axial")
 """Directions of interference, in the order of the tool axes x, y, z."""

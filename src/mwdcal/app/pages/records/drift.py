@@ -9,6 +9,7 @@ from mwdcal.app.pages.page import banner, environment
 from mwdcal.app.pages.records import drift_figures as figures
 from mwdcal.app.screens.numbers import number
 from mwdcal.app.screens.records.drift import (
+    DUE_TITLES,
     drawn_chance,
     due_words,
     pair_chance,
@@ -18,7 +19,7 @@ from mwdcal.app.screens.records.drift import (
 )
 from mwdcal.app.text import plural
 from mwdcal.drift.document import FleetDrift, ParameterCourse, ToolDrift
-from mwdcal.drift.forecast import ACCURACY_PROBABILITY, COVERAGE_FACTOR, INTERVAL, LONGEST_INTERVAL
+from mwdcal.drift.forecast import COVERAGE_FACTOR, LONGEST_INTERVAL, RISK
 from mwdcal.drift.tool import CONTROL
 
 
@@ -39,6 +40,7 @@ def render_tool(drift: ToolDrift) -> str:
         forecast=figures.draw_forecast(drift) if drift.forecast and drift.basis else None,
         steps=step_rows(drift),
         due=[due_words(each) for each in drift.due],
+        due_titles=DUE_TITLES,
         rates=rate_rows(drift.rates),
         service=service_rows(drift.service),
         rows=list(_parameter_rows(drift)),
@@ -47,8 +49,7 @@ def render_tool(drift: ToolDrift) -> str:
         pair_chance=pair_chance,
         longest=LONGEST_INTERVAL,
         factor=COVERAGE_FACTOR,
-        share=ACCURACY_PROBABILITY,
-        interval=INTERVAL,
+        risk=RISK,
         version=__version__,
     )  # fmt: skip
 

@@ -14,9 +14,13 @@ from mwdcal.app.text import chance, one_line, plural, table
 from mwdcal.calibration.readings import SIMULATED
 from mwdcal.drift.change import LEAST_PAIR_PROBABILITY, LEAST_PROBABILITY
 from mwdcal.drift.document import DueDate, FleetDrift, FleetTool, ServiceRow, ToolDrift, WalkRate
+from mwdcal.drift.forecast import RISK
 
+DUE_RULE = (
+    f"the tool is beyond a limit with {100 * RISK:g} % then, or has been in as short a time before"
+)
 STEP_TITLES = ["changed", "between", "and", "by", "1σ", "score"]
-DUE_TITLES = ["angle", "95 % now", "limit", "due", "not before", "not after"]
+DUE_TITLES = ["angle", "error now", "limit", "due", "50 % beyond", "95 % beyond"]
 SERVICE_TITLES = [
     "calibrated",
     "limit on",
@@ -76,10 +80,10 @@ def step_rows(drift: ToolDrift) -> list[list[str]]:
 
 
 def due_words(due: DueDate) -> list[str]:
-    """A due date as a row."""
+    """A due date as a row, with the days by which the tool is beyond the limit with 50 % and 95 %."""
     latest = f"{due.not_after} or later" if due.capped else due.not_after
     values = number(due.now_deg, 2), number(due.limit_deg)
-    return [due.angle, *(f"{v}°" for v in values), due.due, due.not_before, latest]
+    return [due.angle, *(f"{v}°" for v in values), due.due, due.expected, latest]
 
 
 def rate_rows(rates: Sequence[WalkRate]) -> list[list[str]]:
@@ -134,7 +138,7 @@ def tool_screen(drift: ToolDrift) -> str:
     )
     for title, header, rows in (
         ("", STEP_TITLES, steps),
-        ("next calibration", DUE_TITLES, due),
+        (f"next calibration due {drift.next_due}: {DUE_RULE}", DUE_TITLES, due),
         ("in service", SERVICE_TITLES, service),
         ("random walk", RATE_TITLES, rate_rows(drift.rates)),
     ):

@@ -1,0 +1,132 @@
+"""Findings about what a run cannot show: copies of stations, the hemisphere, unknown gravity."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mwdcal.calibration.calibrate import calibrate
+from mwdcal.calibration.diagnosis.repeats import resolution
+from mwdcal.calibration.readings import Readings
+from mwdcal.sensor.profile import Profile
+from mwdcal.survey.well import unknown_gravity
+from simulation import DEG, Tool, plan
+
+PROFILE = Profile(name="test tool")
+NOISE = {"accelerometer": np.array(1e-4), "magnetometer": np.array(15.0)}
+
+
+def run(
+    seed=0,
+    repeats=1,
+    counts=None,
+    unknown=(),
+    toolfaces=12,
+    sd=NOISE,
+    inclinations=(5, 45, 90, 135),
+):
+    """A run, each of its attitudes measured `repeats` times, rounded to `counts` times the noise."""
+    tool = Tool.random(seed + 3)
+    inc, azi, face = (np.tile(each, repeats) for each in plan(inclinations, toolfaces))
+    rng = np.random.default_rng(seed)
+    triads = [each[0] for each in tool.readings(rng, 1, inc, azi, face)]
+    if counts:
+        steps = [counts * noise for noise in tool.noise]
+        triads = [np.round(t / step) * step for t, step in zip(triads, steps, strict=True)]
+        sd = {name: np.hypot(1.0, counts / np.sqrt(12)) * noise for name, noise in sd.items()}
+    known = {"inclination": inc, "azimuth": azi, "toolface": face}
+    known |= {"field": np.full(len(inc), tool.field), "dip": np.full(len(inc), tool.dip)}
+    return Readings(*triads, known={k: v for k, v in known.items() if k not in unknown}, sd=sd)
+
+
+def found(data):
+    return {finding.id: finding.text for finding in calibrate(data, PROFILE).findings}
+
+
+def copied(data, times, step, of=slice(None)):
+    """The run with copies of some stations appended that differ by `step` noises each."""
+    grow = [np.concatenate([getattr(data, n)] + [getattr(data, n)[of] + (k + 1) * step * float(NOISE[n])
+            for k in range(times)]) for n in NOISE]  # fmt: skip
+    known = {n: np.concatenate([v] + [v[of]] * times) for n, v in data.known.items()}
+    return Readings(*grow, known=known, sd=data.sd)
+
+
+@pytest.mark.parametrize("sd", [NOISE, {}], ids=["declared", "estimated"])
+@pytest.mark.parametrize("step", [0.0, 1e-5, 5e-3])
+def test_copies_are_named_whatever_their_last_digits(step, sd):
+    assert "repeated-readings" not in found(run(sd=sd))
+    assert "repeated-readings" in found(copied(run(sd=sd), 3, step))
+    text = found(copied(run(sd=sd), 1, step, of=slice(4, 5)))["repeated-readings"]
+    assert text.startswith("station 49: ")
+
+
+@pytest.mark.parametrize("counts", [None, 0.3, 1.0, 3.0, 20.0])
+@pytest.mark.parametrize("times", [1.0, 10.0])
+def test_repeated_attitudes_are_no_copies(counts, times):
+    """Three measurements at each attitude, with noise as it is and declared ten times too large.
+
+    In coarse counts they often agree to the last digit.
+    """
+    for seed in range(3):
+        data = run(seed, repeats=3, counts=counts)
+        data = replace(data, sd={name: times * sd for name, sd in data.sd.items()})
+        assert "repeated-readings" not in found(data)
+
+
+def test_one_copied_station_in_counts_finer_than_the_noise_is_named():
+    data = run(counts=0.3)
+    assert "repeated-readings" in found(copied(data, 1, 0.0, of=slice(7, 8)))
+
+
+def test_resolution_is_the_step_of_counts_and_none_of_real_numbers():
+    rng = np.random.default_rng(0)
+    for step in (0.02, 0.7, 5.0):
+        counts = rng.integers(-30000, 30000, 48) * step + 0.123
+        assert resolution(counts) == pytest.approx(step, rel=1e-6)
+    assert resolution(rng.normal(0, 1e4, 48)) == 0.0
+    assert resolution(np.ones(5)) == 0.0
+
+
+def roll_sets(dip, sign=1.0, known=()):
+    """Six roll sets in unknown directions; `sign` turns the magnetometer's."""
+    tool = replace_dip(Tool.random(5), dip)
+    rng = np.random.default_rng(5)
+    inc = np.repeat([12.0, 48, 88, 91, 133, 60], 8) * DEG
+    azi = np.repeat(rng.uniform(0, 360, 6), 8) * DEG
+    face = np.tile(np.arange(8) * 45.0, 6) * DEG
+    a, m = (each[0] for each in tool.readings(rng, 1, inc, azi, face))
+    values = {
+        "azimuth": np.where(np.arange(48) < 8, azi, np.nan),
+        "dip": np.full(48, sign * tool.dip),
+    }
+    group = np.repeat(np.arange(6), 8)
+    return Readings(a, sign * m, known={n: values[n] for n in known}, sd=NOISE, group=group)
+
+
+def replace_dip(tool, dip):
+    return Tool(tool.matrix, tool.offset, dip=dip * DEG)
+
+
+@pytest.mark.parametrize(("dip", "sign", "site"), [(63, 1, "northern"), (63, -1, "southern"),
+                                                   (-55, 1, "southern"), (-55, -1, "northern")])  # fmt: skip
+def test_the_hemisphere_that_only_signs_tell_is_never_chosen_in_silence(dip, sign, site):
+    record = calibrate(roll_sets(dip, sign), PROFILE)
+    named = [f for f in record.findings if f.id == "hemisphere"]
+    assert record.earth["dip_deg"] == pytest.approx(sign * dip, abs=0.2)
+    assert bool(named) == (site == "southern")
+    assert f"signs of the magnetometer at a {site} site" in record.assumed_exact
+
+
+@pytest.mark.parametrize("known", ["azimuth", "dip"])
+def test_a_reference_of_dip_or_azimuth_confirms_the_hemisphere(known):
+    record = calibrate(roll_sets(-55, known=(known,)), PROFILE)
+    assert not any(f.id == "hemisphere" for f in record.findings)
+    assert not any("signs" in name for name in record.assumed_exact)
+
+
+@pytest.mark.parametrize("gravity", [None, np.ones(48), np.full(48, 0.9985)])
+def test_gravity_of_one_that_is_stated_is_known(gravity):
+    data = run()
+    known = data.known if gravity is None else {**data.known, "gravity": gravity}
+    record = calibrate(replace(data, known=known), PROFILE)
+    assert unknown_gravity(record) == (gravity is None)

@@ -1,0 +1,68 @@
+"""Settings of the stand: which stations share one."""
+
+import numpy as np
+import pytest
+
+from mwdcal.calibration.settings import is_assumed, settings_of
+from mwdcal.errors import InputError
+from mwdcal.library.arrays import readings
+
+
+def run(inclination, azimuth, **more):
+    vectors = np.ones((len(inclination), 3))
+    return readings(vectors, inclination_deg=inclination, azimuth_deg=azimuth, **more)
+
+
+NAN = np.nan
+CASES = {
+    "two directions": ([5, 5, 45, 45], [0, 0, 0, 0], {}, "aabb"),
+    "azimuth alone changes": ([45, 45, 45], [0, 90, 90], {}, "abb"),
+    "back to a direction": ([5, 45, 5], [0, 0, 0], {}, "abc"),
+    "a full turn is none": ([5, 5, 5], [0, 360, -360], {}, "aaa"),
+    "rounding": ([5, 5 + 1e-9], [0, 360 - 1e-9], {}, "aa"),
+    "a hundredth of a degree": ([5, 5.01], [0, 0], {}, "ab"),
+    "no azimuth": ([5, 5, 45], [NAN] * 3, {}, "aab"),
+    "no direction": ([NAN] * 3, [NAN] * 3, {}, "abc"),
+    "a blank between": ([5, NAN, 5], [0, NAN, 0], {}, "abc"),
+    "stated per direction": ([5, 5], [0, 0], {"settings": "per-direction"}, "aa"),
+    "stated per station": ([5, 5], [0, 0], {"settings": "per-station"}, "ab"),
+    "groups, apart": ([5, 45, 5, 45], [0, 0, 0, 0], {"group": ["x", "y", "x", "y"]}, "abab"),
+    "a group is stronger than the profile": (
+        [5, 5, 5],
+        [0, 0, 0],
+        {"group": ["x", "x", ""], "settings": "per-station"},
+        "aab",
+    ),
+    "a group of two references": ([5, 6, 5], [0, 0, 0], {"group": ["x", "x", "x"]}, "aba"),
+    "groups end a set": ([5, 5], [0, 0], {"group": ["x", "y"]}, "ab"),
+}
+
+
+@pytest.mark.parametrize(("inclination", "azimuth", "more", "names"), CASES.values(), ids=CASES)
+def test_stations_of_one_setting(inclination, azimuth, more, names):
+    number = settings_of(run(inclination, azimuth, **more))
+    together = np.array([[a == b for a in names] for b in names])
+    np.testing.assert_array_equal(number[:, None] == number, together)
+    assert number.max() < len(names)
+
+
+def test_runs_of_a_batch_have_patterns_of_their_own():
+    vectors = np.ones((2, 3, 3))
+    whole = readings(vectors, inclination_deg=np.array([[5, 5, 45], [5, 45, 45]]), azimuth_deg=0.0)
+    number = settings_of(whole)
+    assert (number[0] == number[0, 0]).tolist() == [True, True, False]
+    assert (number[1] == number[1, 2]).tolist() == [False, True, True]
+
+
+@pytest.mark.parametrize(
+    ("more", "expected"),
+    [({}, True), ({"settings": "per-direction"}, False), ({"group": ["x", "x"]}, False)],
+)
+def test_the_assumption_is_one_where_nobody_states_the_practice(more, expected):
+    assert is_assumed(run([5, 5], [0, 0], **more)) is expected
+    assert not is_assumed(run([5, 45], [0, 0], **more))
+
+
+def test_an_unknown_practice_is_refused():
+    with pytest.raises(InputError, match="per-direction or per-station; got 'daily'"):
+        run([5, 5], [0, 0], settings="daily")
