@@ -10,12 +10,14 @@ import numpy as np
 
 from mwdcal.calibration import results
 from mwdcal.calibration.automatic.auto import Choice, choose
+from mwdcal.calibration.automatic.drift import fit_run
 from mwdcal.calibration.canonical import rounded
 from mwdcal.calibration.diagnosis.findings import described, findings
 from mwdcal.calibration.diagnosis.flags import FittedRuns
 from mwdcal.calibration.diagnosis.refusals import UNSOUND_ADVICE, check, fit_refusals
 from mwdcal.calibration.diagnosis.soundness import inconsistency
-from mwdcal.calibration.estimate import Fit, fit
+from mwdcal.calibration.drift import Drift
+from mwdcal.calibration.estimate import Fit
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.prediction import accuracy
 from mwdcal.calibration.readings import TRIADS, Readings, is_simulated, serial_of
@@ -34,7 +36,8 @@ from mwdcal.calibration.record import (
 from mwdcal.calibration.residuals import error_rows, measure_rows
 from mwdcal.errors import FitError
 from mwdcal.estimation.batch import batch_of_one
-from mwdcal.estimation.evidence import STAND_ERRORS
+from mwdcal.estimation.evidence import STAND_ERRORS, WALKS
+from mwdcal.estimation.problem import WALK_AXES
 from mwdcal.geometry.vectors import Array
 from mwdcal.sensor.models import Polynomial
 from mwdcal.sensor.profile import Profile
@@ -57,7 +60,7 @@ def calibrate(
     calibration to be trusted.
     """
     choice = choose(readings, profile, options or Options(), progress)
-    return recorded(choice, fit(choice.readings, choice.options))
+    return recorded(choice, fit_run(choice.readings, choice.options))
 
 
 def recorded(choice: Choice, result: Fit) -> Calibration:
@@ -114,6 +117,7 @@ def _record(choice: Choice, fitted: FittedRuns) -> Calibration:
         free=[(to_file @ entry.direction).tolist() for entry in fitted.free[0]],
         singular_values=result.analysis.determined.values[0].tolist(),
         constants=_constants(result),
+        drift=_drifts(result, readings.field_unit),
         stand=StandErrors(**_first(results.stand_errors(result))),
         earth=_first(results.earth(result)),
         gravity_stated=readings.states("gravity"),
@@ -156,7 +160,8 @@ def _constants(result: Fit) -> list[Constant]:
     triples = zip(result.state.constants[0], sd, problem.evidence.constants, strict=True)
     for value, uncertainty, constant in triples:
         lone = constant.name == "dip" and len(problem.triads) == 1
-        if lone or (constant.unknown and constant.name in STAND_ERRORS):  # those are in `stand`
+        in_stand = constant.unknown and constant.name in STAND_ERRORS
+        if lone or in_stand or constant.name in WALK_AXES:  # those are in `stand`, or `drift`
             continue
         unit = {"gravity": "g", "field": "nT"}.get(constant.name, "°")
         factor = float(np.degrees(1)) if unit == "°" else 1.0
@@ -169,6 +174,23 @@ def _constants(result: Fit) -> list[Constant]:
             )
         )
     return constants
+
+
+def _drifts(result: Fit, field_unit: str) -> list[Drift]:
+    """How far field and offsets drifted within the run."""
+    units = [(1e3, "mg"), (1.0, field_unit), (1.0, field_unit)]
+    changes = results.drifts(result)
+    return [
+        Drift(
+            name=name.removesuffix("-drift"),
+            change=float(change[0]) * factor,
+            standard_uncertainty=float(sd[0]) * factor,
+            unit=unit,
+        )
+        for (name, (change, sd)), (factor, unit) in zip(
+            changes.items(), [units[[*WALKS].index(n)] for n in changes], strict=True
+        )
+    ]
 
 
 def _triad(fitted: FittedRuns, index: int) -> TriadCalibration:

@@ -195,15 +195,24 @@ def _general(problem: Problem, options: Options, finite: Bools) -> Fit:
     """The fit by the method's minimiser, with estimated noise and station weights in turn."""
     solved = solve(problem, start(problem), options)
     iterations, trust = solved.iterations, np.ones(problem.evidence.include.shape)
-    stage = Stage(problem, solved, trust, np.zeros_like(iterations))
+    stage = _Stage(problem, solved, trust, np.zeros_like(iterations))
     if not _all_declared(problem):
         stage = _estimate_noise(stage, options)
     if options.robust:
         stage = _downweigh(stage, options)
-    return finished(stage, options, finite, iterations)
+    return _finished(stage, options, finite, iterations)
 
 
-def finished(stage: Stage, options: Options, finite: Bools, iterations: Ints) -> Fit:
+def refitted(result: Fit, problem: Problem, state: State, scale: Array, options: Options) -> Fit:
+    """A fit of a problem that has more unknowns than that of `result`, the noise times `scale` (B, triads)."""
+    problem = _rescaled(problem, scale)
+    solved = solve(problem, state, options)
+    stage = _Stage(problem, solved, result.trust, solved.iterations)
+    finite = result.status != int(Status.NOT_FINITE)
+    return _finished(stage, options, finite, result.iterations + solved.iterations)
+
+
+def _finished(stage: _Stage, options: Options, finite: Bools, iterations: Ints) -> Fit:
     """The fit at the end of all turns: gauge settled, and analysed."""
     problem, solved, trust = stage.problem, stage.solved, stage.trust
     trusted, state = _trusting(problem, trust), solved.state
@@ -234,7 +243,7 @@ def _closed(problem: Problem, finite: Bools) -> tuple[Fit, Bools]:
     state, analysis, good = closed_form.solution(problem, at)
     good = good & analysis.determined.keep.all(-1)
     if good.any() and not _all_declared(problem):
-        problem = rescaled_noise(problem, np.sqrt(analysis.variance_factor))
+        problem = _rescaled(problem, np.sqrt(analysis.variance_factor))
         state, analysis, settled = closed_form.solution(problem, at)
         good &= settled
     sound = finite & np.isfinite(state.params).all(-1)
@@ -284,7 +293,7 @@ def _bounded_factor(analysis: Analysis, trust: Array, loss: str, freedom: Array)
 
 
 @dataclass(frozen=True)
-class Stage:
+class _Stage:
     """Where weighing and fitting in turn have come to: problem, solution, station weights (B, n).
 
     `steps` (B,) counts the steps of all fits so far.
@@ -296,7 +305,7 @@ class Stage:
     steps: Ints
 
 
-def in_turn(stage: Stage, rounds: int, turn: Callable[[Stage], tuple[Stage, Bools]]) -> Stage:
+def _in_turn(stage: _Stage, rounds: int, turn: Callable[[_Stage], tuple[_Stage, Bools]]) -> _Stage:
     """The stage after turns that also say who has settled: each member ends as if it were alone."""
     whole, active = stage, np.arange(len(stage.trust))
     for _ in range(rounds):
@@ -310,7 +319,7 @@ def in_turn(stage: Stage, rounds: int, turn: Callable[[Stage], tuple[Stage, Bool
     return stage if len(active) == len(whole.trust) else put(whole, active, stage)
 
 
-def _estimate_noise(stage: Stage, options: Options) -> Stage:
+def _estimate_noise(stage: _Stage, options: Options) -> _Stage:
     """Variance per triad by restricted maximum likelihood, fit and estimate in turn.
 
     A triad without redundancy keeps its start: its residuals are rounding, and say nothing.
@@ -319,10 +328,10 @@ def _estimate_noise(stage: Stage, options: Options) -> Stage:
     scatter = stage.problem.evidence.scatter
     rounds, least = (SCATTER_ROUNDS, SCATTER_SETTLED) if scatter else (NOISE_ROUNDS, SETTLED)
 
-    def turn(now: Stage) -> tuple[Stage, Bools]:
+    def turn(now: _Stage) -> tuple[_Stage, Bools]:
         analysis = analyse(now.problem, now.solved.state)
         scale = np.sqrt(np.where(analysis.freedom >= 1, analysis.variance_factor, np.nan))
-        problem, solved = rescaled_noise(now.problem, scale), now.solved
+        problem, solved = _rescaled(now.problem, scale), now.solved
         settled = ~np.any(np.abs(scale[:, free] - 1) >= least, -1)
         if scatter:
             ratios = scatter_ratios(now.problem, solved.state, analysis)
@@ -335,7 +344,7 @@ def _estimate_noise(stage: Stage, options: Options) -> Stage:
             settled |= steps > MOST_STEPS_IN_TURN
         return replace(now, problem=problem, solved=solved, steps=steps), settled
 
-    return in_turn(stage, rounds, turn)
+    return _in_turn(stage, rounds, turn)
 
 
 def _steady(old: Problem, new: Problem) -> Bools:
@@ -349,11 +358,11 @@ def _steady(old: Problem, new: Problem) -> Bools:
     return np.asarray(np.all(each, 0))
 
 
-def _downweigh(stage: Stage, options: Options) -> Stage:
+def _downweigh(stage: _Stage, options: Options) -> _Stage:
     """Weigh the stations by their misfit and fit in turn."""
     loss, declared = options.robust or LOSSES[0], _all_declared(stage.problem)
 
-    def turn(now: Stage) -> tuple[Stage, Bools]:
+    def turn(now: _Stage) -> tuple[_Stage, Bools]:
         problem, solved = now.problem, now.solved
         weighed = _trusting(problem, now.trust)
         analysis = analyse(weighed, solved.state)
@@ -364,7 +373,7 @@ def _downweigh(stage: Stage, options: Options) -> Stage:
         trust = weight(loss, square / excess[:, None], freedom)
         if not declared:
             factor = _bounded_factor(analysis, now.trust, loss, _tested(freedom))
-            problem = rescaled_noise(problem, np.sqrt(factor))
+            problem = _rescaled(problem, np.sqrt(factor))
             if problem.evidence.scatter:
                 share = np.array([weighted(loss, k) for k in _tested(freedom)])
                 ratios = scatter_ratios(weighed, solved.state, analysis)
@@ -373,9 +382,9 @@ def _downweigh(stage: Stage, options: Options) -> Stage:
         solved = solve(_trusting(problem, trust), solved.state, options)
         steps = now.steps + solved.iterations
         settled = ~np.any(np.abs(trust / now.trust - 1) >= SETTLED, -1)
-        return Stage(problem, solved, trust, steps), settled | (steps > MOST_STEPS_IN_TURN)
+        return _Stage(problem, solved, trust, steps), settled | (steps > MOST_STEPS_IN_TURN)
 
-    return in_turn(stage, ROBUST_ROUNDS, turn)
+    return _in_turn(stage, ROBUST_ROUNDS, turn)
 
 
 def _typical(square: Array, freedom: Array) -> Array:
@@ -410,7 +419,7 @@ def _louder(problem: Problem, factor: Array) -> Problem:
     return problem.of_other_noise(triads, replace(evidence, sd=sd, scatter=scatter))
 
 
-def rescaled_noise(problem: Problem, scale: Array) -> Problem:
+def _rescaled(problem: Problem, scale: Array) -> Problem:
     """The problem with the noise of triads that declare none times `scale` (B, triads)."""
     factors = np.moveaxis(np.where(np.isfinite(scale), scale, 1.0), -1, 0)[..., None, None]
     triads = tuple(

@@ -16,6 +16,7 @@ import numpy as np
 
 from mwdcal import __version__
 from mwdcal.calibration.canonical import Signature, document_sha256
+from mwdcal.calibration.drift import Drift
 from mwdcal.calibration.notebooks import html_table
 from mwdcal.calibration.readings import NANOTESLA, SOAK_GAP, Readings, simulated, stated_day
 from mwdcal.errors import InputError
@@ -268,6 +269,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
     free: list[list[float]]
     singular_values: list[float]
     constants: list[Constant]
+    drift: list[Drift] = []
     stand: StandErrors = StandErrors()
     earth: dict[str, float]
     gravity_stated: bool | msgspec.UnsetType = msgspec.UNSET

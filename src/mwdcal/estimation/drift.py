@@ -15,7 +15,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mwdcal.estimation.batch import take
 from mwdcal.estimation.evidence import WALKS, Evidence, SharedConstant
 from mwdcal.estimation.problem import Problem, State
 from mwdcal.estimation.uncertainty import Analysis, whole_covariance
@@ -27,9 +26,9 @@ STATIONS_PER_TERM = 4
 """Fewest stations for each cosine."""
 LEAST_WALK = 1e-3
 """A walk over the run is at least this share of the noise of a reading: a smaller one is none."""
-LEAST_FREEDOM = 2.0
+FEWEST_USED = 2.0
 """Fewest degrees of freedom that are counted to the estimate of a walk's variance."""
-ROUNDS = 25
+VARIANCE_ROUNDS = 25
 """Repetitions of the estimate of variances."""
 
 
@@ -65,7 +64,7 @@ def with_walks(problem: Problem, state: State, sizes: dict[str, Array]) -> tuple
     zero, new = np.zeros(batch), list(evidence.constants)
     for name, size in sizes.items():
         for axis in WALKS[name]:
-            for value, share in zip(values.T, variance, strict=True):
+            for value, share in zip(values.swapaxes(0, 1), variance, strict=True):
                 mask = np.broadcast_to(value, (batch, count))
                 sd = size * np.sqrt(share)
                 new.append(SharedConstant(axis, mask, zero, sd, unknown=False))
@@ -133,15 +132,11 @@ class WalkScores:
         )
 
 
-def walk_scores(problem: Problem, state: State, analysis: Analysis, common: bool) -> WalkScores:
+def walk_scores(problem: Problem, state: State, analysis: Analysis) -> WalkScores:
     """Scores of the walks of a run that has none in its fit: what the fit's unknowns cannot take up.
 
-    `common`: the geometry of the first member stands for that of all.
+    The problem may be of one member for the residuals (B, n, m) of many.
     """
-    if common:
-        first = np.arange(1)
-        scores = walk_scores(*take((problem, state, replace(analysis)), first), common=False)
-        return replace(scores, score=_score(*take((problem, state), first), analysis.residual))
     columns = _cosine_columns(problem, state)
     linear = problem.linear(state)
     whole = whole_covariance(linear, analysis.determined)
@@ -152,8 +147,10 @@ def walk_scores(problem: Problem, state: State, analysis: Analysis, common: bool
     information = information - crossed.mT @ whole @ crossed
     count = columns.shape[-1] // len(families(problem))
     every = np.arange(columns.shape[-1]).reshape(-1, count)
+    residual = analysis.residual
+    score = (columns.reshape(rows).mT @ residual.reshape(len(residual), -1, 1))[..., 0]
     return WalkScores(
-        _score(problem, state, analysis.residual),
+        score,
         information,
         dict(zip(families(problem), every, strict=True)),
     )
@@ -164,17 +161,15 @@ def _cosine_columns(problem: Problem, state: State) -> Array:
     sized = {name: size for name, size in noise(problem).items() if name in families(problem)}
     walking, at = with_walks(problem, state, sized)
     sd = np.stack([c.sd for c in walking.evidence.constants], -1)
-    kept = [i for index in places(walking.evidence).values() for i in index[cosines(index, problem)]]
+    kept = [
+        i for index in places(walking.evidence).values() for i in index[cosines(index, problem)]
+    ]
     return np.asarray(walking.walk_columns(at)[..., kept] * sd[:, None, None, kept])
 
 
-def _score(problem: Problem, state: State, residual: Array) -> Array:
-    columns = _cosine_columns(problem, state)
-    flat = columns.reshape(len(columns), -1, columns.shape[-1])
-    return np.asarray((flat.mT @ residual.reshape(len(residual), -1, 1))[..., 0])
-
-
-def walk_variances(scores: WalkScores, variance: Array, freedom: Array, declared: Bools) -> tuple[Array, Array]:
+def walk_variances(
+    scores: WalkScores, variance: Array, freedom: Array, declared: Bools
+) -> tuple[Array, Array]:
     """Variances (B, w) of the walks in units of the noise, and of the noise (B, t): REML.
 
     `variance` (B, t) is s² of the fit without walks, of so many degrees of `freedom`; that of the noise
@@ -189,34 +184,43 @@ def walk_variances(scores: WalkScores, variance: Array, freedom: Array, declared
     left = np.where(declared, 1.0, variance)
     first = [scores.of_walk(name) for name in scores.places]
     theta = np.stack([np.maximum(q - m, 0.1 * m) / s for q, m, s in first], -1)
-    for _ in range(ROUNDS):
+    for _ in range(VARIANCE_ROUNDS):
         ratio = np.repeat(left[:, owner] / theta, width, -1)
         whole = scores.information + ratio[..., None] * np.eye(ratio.shape[-1])
         whole = inverse(whole)
         value = (whole @ scores.score[..., None])[..., 0]
-        told = (1 - diagonal(whole) * ratio).reshape(-1, count, width).sum(-1)
+        used = (1 - diagonal(whole) * ratio).reshape(-1, count, width).sum(-1)
         square = (value**2).reshape(-1, count, width).sum(-1)
-        theta = np.maximum(square / np.maximum(told, 1e-9), LEAST_WALK**2)
+        theta = np.maximum(square / np.maximum(used, 1e-9), LEAST_WALK**2)
         explained = (value * scores.score).reshape(-1, count, width).sum(-1)
         by_triad = np.stack([explained[:, owner == t].sum(-1) for t in range(misfit.shape[-1])], -1)
         left = np.where(declared, 1.0, np.maximum((misfit - by_triad) / freedom, 1e-3 * variance))
-    return theta * _widened(told), left
+    return theta * _widened(used), left
 
 
 def _widened(freedom: Array) -> Array:
     """What makes a normal 95 % interval as wide as Student's t for a variance of so many degrees of freedom."""
     from scipy.special import stdtrit
 
-    return np.asarray((stdtrit(np.maximum(freedom, LEAST_FREEDOM), 0.975) / 1.959964) ** 2)
+    return np.asarray((stdtrit(np.maximum(freedom, FEWEST_USED), 0.975) / 1.959964) ** 2)
 
 
-def walk(problem: Problem, state: State, name: str) -> Array:
-    """A fitted walk about its mean (B, n, 3), g or nT: of a triad's axes, or north, east, down."""
-    index = places(problem.evidence)[name].reshape(3, -1)
-    values = terms_of(problem.evidence.include.shape[-1])[0]
-    return np.einsum("bak,nk->bna", state.constants[:, index[:, 1:]], values[:, 1:])
+def walk(problem: Problem, state: State, name: str) -> tuple[Array, Array]:
+    """A fitted walk about its mean (B, n, 3), g or nT, and the cosines (n, K) that it is a sum of.
+
+    Its axes are those of a triad, or north, east, down.
+    """
+    terms = terms_of(problem.evidence.include.shape[-1])[0][:, 1:]
+    value = state.constants[:, _of_cosines(problem, name)].reshape(len(state.constants), 3, -1)
+    return np.einsum("bak,nk->bna", value, terms), terms
 
 
-def is_fitted(problem: Problem) -> bool:
-    """Whether walks are among the constants of a run."""
-    return bool(places(problem.evidence))
+def walk_covariance(problem: Problem, analysis: Analysis, name: str) -> Array:
+    """Covariance (B, 3K, 3K) of the coefficients of a fitted walk, axis by axis."""
+    index = _of_cosines(problem, name)
+    return np.asarray(analysis.constants[:, index[:, None], index])
+
+
+def _of_cosines(problem: Problem, name: str) -> Ints:
+    index = places(problem.evidence)[name]
+    return np.asarray(index[cosines(index, problem)])

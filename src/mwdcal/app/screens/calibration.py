@@ -12,6 +12,7 @@ from mwdcal.app.messages import findings_as_typed
 from mwdcal.app.screens.numbers import written
 from mwdcal.app.text import chance, number, one_line, quantity, table
 from mwdcal.calibration.automatic.nonlinearity import CurveScore
+from mwdcal.calibration.drift import Drift
 from mwdcal.calibration.prediction import typical_accuracy
 from mwdcal.calibration.readings import simulated
 from mwdcal.calibration.record import (
@@ -70,6 +71,7 @@ class CalibrationSummary(msgspec.Struct, frozen=True, kw_only=True):
     budget: list[BudgetRow]
     assumed_exact: list[str]
     constants: list[Constant]
+    drift: list[Drift]
     stand: StandErrors
     findings: list[Finding]
     orders: list[OrderScore]

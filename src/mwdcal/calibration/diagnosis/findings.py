@@ -21,10 +21,11 @@ from mwdcal.calibration.diagnosis.plausibility import (
 from mwdcal.calibration.diagnosis.repeats import copies
 from mwdcal.calibration.diagnosis.structure import described as seen_as
 from mwdcal.calibration.diagnosis.structure import effects, suspected
+from mwdcal.calibration.drift import SHOWN_DRIFT
 from mwdcal.calibration.readings import EARTH_RANGES, HIGHEST, TRIADS
 from mwdcal.calibration.record import Finding
 from mwdcal.calibration.residuals import REASONS, shown_in, tail
-from mwdcal.calibration.results import common_source, unconfirmed_dip
+from mwdcal.calibration.results import common_source, drifts, unconfirmed_dip
 from mwdcal.estimation.problem import Prior
 from mwdcal.estimation.rank import free_directions
 from mwdcal.estimation.solvers import Determined
@@ -61,7 +62,14 @@ REMARKS = {
     "sd_, are too large, and weigh the stations wrongly if not all by as much. Uncertainties are scaled down "
     "accordingly.",
     "residuals": "{triad}: residuals are {times:.2f} times the declared noise{rare}: the noise figure, a reference, or "
-    "the model is wrong. Uncertainties are scaled up accordingly.",
+    "the model is wrong. The uncertainty is scaled up as if each station had an error of its own; an error that "
+    "stations share may be larger than it says.",
+    "field-drift": "The field drifted by {change:.2g} {unit} (1σ {sd:.1g} {unit}) during the run. The fit allows for "
+    "the drift, and the uncertainty includes it. Give ref_field_nt and ref_dip_deg of each station from a reference "
+    "magnetometer, or repeat the run at a quiet time.",
+    "offset-drift": "The offsets of the {triad} drifted by {change:.2g} {unit} (1σ {sd:.1g} {unit}) during the run. "
+    "The fit allows for the drift, and the uncertainty includes it. Let the tool warm up, and change inclination and "
+    "azimuth in another order than from end to end.",
     "no-redundancy": "{triads}: no redundancy, so nothing in this run checks the fit. Add stations.",
     "scatter": "beyond sensor noise, these vary from station to station: {what} (1σ, estimated; weights and "
     "uncertainties include it). Look for iron near the stand and play in the tool holder; or the model lacks "
@@ -131,6 +139,7 @@ def finding_flags(fitted: FittedRuns) -> Iterator[Flag]:
     bare = unchecked(fitted.result)
     yield _remark("no-redundancy", np.any(bare, -1), triads=partial(_joined, bare))
     yield _hemisphere(fitted)
+    yield from _drifts(fitted)
     yield from _structure(fitted)
     yield _scatter(fitted)
     yield _repeated(fitted)
@@ -189,6 +198,18 @@ def _hemisphere(fitted: FittedRuns) -> Flag:
     """A negative dip that only the signs of the magnetometer tell from a positive one."""
     dip = np.degrees(unconfirmed_dip(fitted.result))
     return _remark("hemisphere", dip < 0, dip=dip)
+
+
+def _drifts(fitted: FittedRuns) -> Iterator[Flag]:
+    """Drifts that are larger than what may be noise."""
+    for name, (change, sd) in drifts(fitted.result).items():
+        triad = name.removesuffix("-drift")
+        scale, unit = shown_in(
+            "gravity" if triad == TRIADS[0] else "field", fitted.readings.relative
+        )
+        words = REMARKS["offset-drift" if triad in TRIADS else name]
+        values = {"triad": triad, "change": change * scale, "sd": sd * scale, "unit": unit}
+        yield Flag(name, change > SHOWN_DRIFT * sd, words, values)
 
 
 def _structure(fitted: FittedRuns) -> Iterator[Flag]:
